@@ -81,7 +81,7 @@ def _request_stream(vehicle: Vehicle, m: Message, c: Channel) -> None:
     rate = m.integer("req_message_rate") if m.integer("start_stop") else 0
     for number in ALL_GROUPS if group == MAV_DATA_STREAM.ALL else (group,):
         label, names = GROUPS.get(number, ("", ()))
-        if names and c.port is not None:
+        if label and c.port is not None:
             v.params.assign(f"SR{min(c.port, 6)}_{label}", rate)
         for name in names:
             c.set_default(name, 1.0 / min(rate, 100) if rate > 0 else None)

@@ -7,6 +7,7 @@ from collections import deque
 
 from fractus_mavlink.enums import FENCE_TYPE, MAV_CMD, MAV_SEVERITY
 
+from fractus_vehicle.accessories import set_servo
 from fractus_vehicle.home import set_home_at, set_home_here
 from fractus_vehicle.mission_items import Item
 from fractus_vehicle.shaping import wrap_pi
@@ -73,10 +74,12 @@ def _do(v: VehicleState, item: Item) -> None:
             v.heading.look_at(None)
         case MAV_CMD.DO_FENCE_ENABLE:
             switch_fence(v, item.param1)
+        case MAV_CMD.DO_SET_SERVO | MAV_CMD.DO_REPEAT_SERVO:
+            set_servo(v, item.param1, item.param2)
         case MAV_CMD.DO_SET_HOME:
             set_home_here(v) if item.param1 > 0.5 else set_home_at(v, item.x, item.y, item.z)
         case _:
-            pass  # servos, relays, cameras and mounts: there are none
+            pass  # nothing hangs on them: cameras, mounts, grippers
 
 
 def switch_fence(v: VehicleState, action: float) -> bool:
@@ -112,6 +115,7 @@ _TITLES: dict[int, str] = {
     MAV_CMD.NAV_LOITER_UNLIM: "LoitUnlim",
     MAV_CMD.NAV_LOITER_TIME: "LoitTime",
     MAV_CMD.NAV_LOITER_TURNS: "LoitTurns",
+    MAV_CMD.NAV_LOITER_TO_ALT: "LoitAltitude",
     MAV_CMD.NAV_DELAY: "Delay",
     MAV_CMD.CONDITION_DELAY: "CondDelay",
     MAV_CMD.CONDITION_DISTANCE: "CondDist",
@@ -121,6 +125,20 @@ _TITLES: dict[int, str] = {
     MAV_CMD.DO_SET_SERVO: "SetServo",
     MAV_CMD.DO_SET_RELAY: "SetRelay",
     MAV_CMD.DO_SET_ROI: "SetROI",
+    MAV_CMD.DO_REPEAT_SERVO: "RepeatServo",
+    MAV_CMD.DO_REPEAT_RELAY: "RepeatRelay",
+    MAV_CMD.DO_DIGICAM_CONFIGURE: "DigiCamCfg",
+    MAV_CMD.DO_DIGICAM_CONTROL: "DigiCamCtrl",
+    MAV_CMD.DO_SET_CAM_TRIGG_DIST: "SetCamTrigDst",
+    MAV_CMD.DO_FENCE_ENABLE: "FenceEnable",
+    MAV_CMD.DO_LAND_START: "LandStart",
+    MAV_CMD.DO_MOUNT_CONTROL: "MountControl",
+    MAV_CMD.DO_GRIPPER: "Gripper",
+    MAV_CMD.DO_PARACHUTE: "Parachute",
+    MAV_CMD.DO_SPRAYER: "Sprayer",
+    MAV_CMD.DO_AUX_FUNCTION: "AuxFunction",
+    MAV_CMD.DO_WINCH: "Winch",
+    MAV_CMD.DO_GUIDED_LIMITS: "GuidedLimits",
     MAV_CMD.JUMP_TAG: "JumpTag",
 }
 

@@ -21,6 +21,7 @@ SUPPORTED = frozenset(
         MAV_CMD.NAV_LOITER_UNLIM,
         MAV_CMD.NAV_LOITER_TURNS,
         MAV_CMD.NAV_LOITER_TIME,
+        MAV_CMD.NAV_LOITER_TO_ALT,
         MAV_CMD.NAV_RETURN_TO_LAUNCH,
         MAV_CMD.NAV_LAND,
         MAV_CMD.NAV_TAKEOFF,
@@ -33,6 +34,15 @@ SUPPORTED = frozenset(
         MAV_CMD.DO_SET_HOME,
         MAV_CMD.DO_SET_RELAY,
         MAV_CMD.DO_SET_SERVO,
+        MAV_CMD.DO_REPEAT_RELAY,
+        MAV_CMD.DO_REPEAT_SERVO,
+        MAV_CMD.DO_PARACHUTE,
+        MAV_CMD.DO_GRIPPER,
+        MAV_CMD.DO_SPRAYER,
+        MAV_CMD.DO_AUX_FUNCTION,
+        MAV_CMD.DO_WINCH,
+        MAV_CMD.DO_DIGICAM_CONFIGURE,
+        MAV_CMD.DO_GUIDED_LIMITS,
         MAV_CMD.DO_LAND_START,
         MAV_CMD.DO_SET_ROI_LOCATION,
         MAV_CMD.DO_SET_ROI_NONE,
@@ -104,6 +114,7 @@ _CURRENT_FRAMES: dict[int, int] = {
     MAV_FRAME.GLOBAL_INT: MAV_FRAME.GLOBAL,
     MAV_FRAME.GLOBAL_RELATIVE_ALT_INT: MAV_FRAME.GLOBAL_RELATIVE_ALT,
     MAV_FRAME.GLOBAL_TERRAIN_ALT_INT: MAV_FRAME.GLOBAL_TERRAIN_ALT,
+    MAV_FRAME.MISSION: MAV_FRAME.GLOBAL,
 }
 
 
@@ -114,6 +125,7 @@ PLACED = frozenset(
         MAV_CMD.NAV_LOITER_UNLIM,
         MAV_CMD.NAV_LOITER_TURNS,
         MAV_CMD.NAV_LOITER_TIME,
+        MAV_CMD.NAV_LOITER_TO_ALT,
         MAV_CMD.NAV_LAND,
         MAV_CMD.NAV_TAKEOFF,
         MAV_CMD.NAV_SPLINE_WAYPOINT,
@@ -125,6 +137,25 @@ PLACED = frozenset(
 )
 
 
+# Of these, only a count of the parameters is stored: the first, a delay in whole seconds, or none.
+STORED_PARAMETERS: dict[int, int] = {
+    MAV_CMD.NAV_WAYPOINT: 1,
+    MAV_CMD.NAV_SPLINE_WAYPOINT: 1,
+    MAV_CMD.NAV_TAKEOFF: 1,
+    MAV_CMD.NAV_RETURN_TO_LAUNCH: 0,
+}
+_UINT16_MAX = 65535
+
+
+def _parameters(message: Message, command: int) -> tuple[float, float, float, float]:
+    """What is stored of the four parameters."""
+    one, *more = (_finite(message.real(f"param{at}")) for at in range(1, 5))
+    stored = STORED_PARAMETERS.get(command)
+    if stored is None:
+        return (one, more[0], more[1], more[2])
+    return (float(min(max(int(one), 0), _UINT16_MAX)) if stored else 0.0, 0.0, 0.0, 0.0)
+
+
 def item_from(message: Message) -> Item:
     """Read MISSION_ITEM_INT, or MISSION_ITEM with its degrees in floats."""
     frame = message.integer("frame")
@@ -133,18 +164,19 @@ def item_from(message: Message) -> Item:
     if message.name == "MISSION_ITEM":
         x, y = (x * scale if math.isfinite(x) else 0.0), (y * scale if math.isfinite(y) else 0.0)
     command, z = message.integer("command"), message.real("z")
+    param1, param2, param3, param4 = _parameters(message, command)
     return Item(
         command=command,
         frame=_CURRENT_FRAMES.get(frame, frame)
         if command in PLACED or command >= MAV_CMD.NAV_FENCE_RETURN_POINT
         else MAV_FRAME.GLOBAL,
-        param1=_finite(message.real("param1")),
-        param2=_finite(message.real("param2")),
-        param3=_finite(message.real("param3")),
-        param4=_finite(message.real("param4")),
+        param1=param1,
+        param2=param2,
+        param3=param3,
+        param4=param4,
         x=int(max(-2147483648, min(2147483647, round(x)))),
         y=int(max(-2147483648, min(2147483647, round(y)))),
-        z=z if Item(command).navigates else _finite(z),
+        z=z if command in PLACED or Item(command).navigates else _finite(z),
         autocontinue=message.integer("autocontinue"),
     )
 
@@ -159,15 +191,15 @@ def judge(item: Item, kind: MAV_MISSION_TYPE) -> MAV_MISSION_RESULT:
         known = item.command in SUPPORTED
     if not known:
         return MAV_MISSION_RESULT.UNSUPPORTED
-    if item.frame not in GLOBAL_FRAMES and item.frame != MAV_FRAME.MISSION and item.has_place:
-        return MAV_MISSION_RESULT.UNSUPPORTED_FRAME
-    if kind is MAV_MISSION_TYPE.FENCE:
-        return MAV_MISSION_RESULT.ACCEPTED  # judged as a whole
-    if item.navigates and not valid_coordinates(item.x, item.y):
-        return MAV_MISSION_RESULT.INVALID_PARAM5_X if abs(item.x) > 900_000_000 else MAV_MISSION_RESULT.INVALID_PARAM6_Y
-    if item.navigates and not abs(item.z) < ALTITUDE_MAX_M:
-        return MAV_MISSION_RESULT.INVALID_PARAM7
-    return MAV_MISSION_RESULT.ACCEPTED
+    if kind is MAV_MISSION_TYPE.MISSION and item.command not in PLACED:
+        return MAV_MISSION_RESULT.ACCEPTED
+    if kind is not MAV_MISSION_TYPE.FENCE:  # a fence is judged as a whole
+        if not valid_coordinates(item.x, item.y):
+            beyond = abs(item.x) > 900_000_000
+            return MAV_MISSION_RESULT.INVALID_PARAM5_X if beyond else MAV_MISSION_RESULT.INVALID_PARAM6_Y
+        if not abs(item.z) < ALTITUDE_MAX_M:
+            return MAV_MISSION_RESULT.INVALID_PARAM7
+    return MAV_MISSION_RESULT.ACCEPTED if item.frame in GLOBAL_FRAMES else MAV_MISSION_RESULT.UNSUPPORTED_FRAME
 
 
 def judge_numbers(message: Message) -> MAV_MISSION_RESULT:

@@ -128,5 +128,7 @@ GROUPS: dict[int, tuple[str, tuple[str, ...]]] = {
             "ESC_TELEMETRY_1_TO_4",
         ),
     ),
+    # What is heard of other aircraft has no number of its own, but a rate among all.
+    -1: ("ADSB", ()),
 }
 ALL_GROUPS = tuple(GROUPS)

@@ -231,3 +231,52 @@ def test_a_mission_that_is_flown_is_not_cleared():
     pilot.send("MISSION_CLEAR_ALL", HERE)
     assert pilot.expect("MISSION_ACK").integer("type") == MAV_MISSION_RESULT.ERROR
     assert len(vehicle.mission.items) == 3
+
+
+def test_items_are_judged_by_what_is_stored_of_them():
+    for item, result in (
+        ({"command": 22, "frame": 99, "z": 9.0}, MAV_MISSION_RESULT.UNSUPPORTED_FRAME),
+        ({"command": 20, "frame": 99, "z": math.nan}, MAV_MISSION_RESULT.ACCEPTED),
+        ({"command": 201, "frame": 3, "x": 950_000_000}, MAV_MISSION_RESULT.INVALID_PARAM5_X),
+        ({"command": 178, "frame": 99, "x": 950_000_000}, MAV_MISSION_RESULT.ACCEPTED),
+        ({"command": 218, "param1": 9.0}, MAV_MISSION_RESULT.ACCEPTED),
+    ):
+        _, pilot = alone()
+        assert upload(pilot, 0, [HOME, item]) == result, item
+
+
+def test_of_a_waypoint_only_the_delay_is_stored():
+    vehicle, pilot = alone()
+    upload(pilot, 0, [HOME, _waypoint(9.0, frame=2, param1=2.7, param2=5.0, param3=1.0, param4=90.0)])
+    item = vehicle.mission.items[1]
+    assert (item.param1, item.param2, item.param3, item.param4, item.frame) == (2.0, 0.0, 0.0, 0.0, 0)
+
+
+def test_all_streams_set_all_their_parameters():
+    vehicle, pilot = alone()
+    pilot.channel.port = 0
+    pilot.send("REQUEST_DATA_STREAM", HERE | {"req_stream_id": 0, "req_message_rate": 4, "start_stop": 1})
+    rates = {name: value for name, value in vehicle.params.items() if name.startswith("SR0_")}
+    assert {name for name, value in rates.items() if value != 4.0} == {"SR0_PARAMS"}
+
+
+def test_a_spline_stops_at_its_end():
+    vehicle, pilot = airborne(10.0)
+    upload(pilot, 0, [HOME, _waypoint(25.0, command=82)])
+    pilot.mode(COPTER_MODE.AUTO)
+    took = pilot.wait(lambda: vehicle.mission.complete, 20.0)
+    assert math.hypot(vehicle.est.vn, vehicle.est.ve) < 0.5
+    assert took < 12.0
+    pilot.fly_on(3.0)
+    assert distance_m(vehicle, 25.0, 0.0) < 0.5
+
+
+def test_what_is_asked_for_during_a_pause_waits_for_its_end():
+    vehicle, pilot = airborne(8.0)
+    assert pilot.command(MAV_CMD.DO_PAUSE_CONTINUE, 0) is MAV_RESULT.ACCEPTED
+    pilot.go_to(15.0, 0.0, 8.0)
+    pilot.fly_on(4.0)
+    assert distance_m(vehicle, 0.0, 0.0) < 1.0
+    assert pilot.command(MAV_CMD.DO_PAUSE_CONTINUE, 1) is MAV_RESULT.ACCEPTED
+    pilot.fly_on(9.0)
+    assert distance_m(vehicle, 15.0, 0.0) < 1.0

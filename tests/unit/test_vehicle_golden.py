@@ -12,13 +12,13 @@ from fractus_vehicle.pilot import Pilot
 from vehicle_flights import at_random, breaches, by_hand, failing, mission, pilot_of, smart_return
 
 FLIGHTS: tuple[tuple[Callable[[Pilot], None], int, dict[str, float], str], ...] = (
-    (mission, 2, {"SIM_WIND_SPD": 5.0, "SIM_WIND_TURB": 1.5, "WP_YAW_BEHAVIOR": 0.0}, "f17bcb2aa7bf43eb"),
+    (mission, 2, {"SIM_WIND_SPD": 5.0, "SIM_WIND_TURB": 1.5, "WP_YAW_BEHAVIOR": 0.0}, "148c5aaf26fb501a"),
     (by_hand, 3, {"SIM_WIND_SPD": 4.0, "SIM_WIND_TURB": 2.0}, "7370294851b0f38d"),
     (smart_return, 4, {}, "52bace01359d30c2"),
     (breaches, 5, {}, "eeac150a02ecce96"),
     (breaches, 6, {"FENCE_ACTION": 3.0}, "b32f502e5493fe61"),
     (failing, 7, {}, "3812c15abb37984e"),
-    (at_random, 10, {}, "21b81cf40d2bbef8"),
+    (at_random, 10, {}, "3520ebfb3509fbaf"),
     (at_random, 17, {}, "383365f682249acd"),
 )
 

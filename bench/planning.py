@@ -91,7 +91,7 @@ def traffic_monitoring() -> Application:
 def inventory(nodes: int, candidates: int) -> Inventory:
     """A count of edge nodes, candidates of them among the streets and the others elsewhere, and a drone for five."""
     rng = random.Random(SEED)
-    wifi = {"technology": "WiFi", "range": 80, "pairing": {"networkId": "fractus"}}
+    wifi = {"technology": "WiFi", "device": "wlan0", "range": 80, "pairing": {"networkId": "fractus"}}
     camera = {"methods": ["CaptureImage", "RetrieveImage"]}
     edge = EdgeNode.from_body(
         manifest("EdgeNode", "edge", {"location": at(0, 0), "interfaces": [wifi], "services": {"camera": camera}})

@@ -119,7 +119,9 @@ class Maker:
 
     def interfaces(self) -> list[dict[str, Any]]:
         reach = self.rng.choice([None, 80, 80, 150, 150])
-        wifi = [{"technology": "WiFi", "range": reach, "pairing": {"networkId": "n"}}] if reach else []
+        wifi = (
+            [{"technology": "WiFi", "device": "wlan0", "range": reach, "pairing": {"networkId": "n"}}] if reach else []
+        )
         return [{"technology": "4G"}, *wifi]
 
     def drones(self) -> list[Drone]:

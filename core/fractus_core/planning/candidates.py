@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from fractus_core.api.components import Component
 from fractus_core.api.model import Condition, quantity
-from fractus_core.api.nodes import DroneStatus, EdgeNodeStatus, Interface, NodeServices
+from fractus_core.api.nodes import DroneStatus, EdgeNodeStatus, Interface, NodeServices, direct_interface
 from fractus_core.api.plans import Rejection
 from fractus_core.planning.inventory import Host, Settings
 
@@ -137,20 +137,17 @@ def check_resources(ledger: Ledger, node: str, components: Iterable[Component]) 
 def direct_reach_m(ours: Iterable[Interface], theirs: Iterable[Interface]) -> float | None:
     """How far two nodes can be apart and still talk directly, in metres; None when no interfaces match.
 
-    Interfaces match in technology and pairing mode; the lesser range counts.
+    The interfaces that their agents make links over match in technology and pairing mode; the lesser range counts.
     """
-    best: float | None = None
-    theirs = tuple(theirs)
-    for a in ours:
-        if a.range is None or a.pairing is None:
-            continue
-        for b in theirs:
-            if b.technology != a.technology or b.range is None or b.pairing is None or b.pairing.mode != a.pairing.mode:
-                continue
-            best = max(best or 0.0, min(a.range, b.range))
-    return best
+    a, b = direct_interface(ours), direct_interface(theirs)
+    if a is None or b is None or a.technology != b.technology:
+        return None
+    if a.range is None or b.range is None or a.pairing is None or b.pairing is None or a.pairing.mode != b.pairing.mode:
+        return None
+    return min(a.range, b.range)
 
 
 def direct_range_m(interfaces: Iterable[Interface]) -> float | None:
-    """The longest range of a node's interfaces that can pair; None when it has none: no direct link is longer."""
-    return max((i.range for i in interfaces if i.range is not None and i.pairing is not None), default=None)
+    """The range of the interface that a node makes direct links over; None when it has none: no direct link is longer."""
+    found = direct_interface(interfaces)
+    return found.range if found is not None else None

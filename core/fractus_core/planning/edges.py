@@ -9,7 +9,7 @@ import numpy as np
 
 from fractus_core.api.components import Component
 from fractus_core.api.geometry import Point
-from fractus_core.api.nodes import Drone, EdgeNode, Interface
+from fractus_core.api.nodes import Drone, EdgeNode, Interface, direct_interface
 from fractus_core.api.plans import PlannedInstance, Serves
 from fractus_core.geo import distance_m, ground
 from fractus_core.planning.area import OperationArea
@@ -190,11 +190,12 @@ class _Reaches:
 
     def __init__(self, ours: Sequence[Interface]) -> None:
         self._ours = ours
-        self._known: dict[tuple[tuple[object, ...], ...], float | None] = {}
+        self._known: dict[tuple[object, ...], float | None] = {}
 
     def to(self, theirs: Sequence[Interface]) -> float | None:
         """How far the nodes can be apart and still talk directly; None when no interfaces match."""
-        key = tuple((i.technology, i.range, i.pairing.mode if i.pairing is not None else None) for i in theirs)
+        found = direct_interface(theirs)
+        key = (found.technology, found.range, found.pairing and found.pairing.mode) if found is not None else ()
         if key not in self._known:
             self._known[key] = direct_reach_m(self._ours, theirs)
         return self._known[key]

@@ -70,7 +70,6 @@ def plan_links(
 
 
 def _link(drone: Drone, node: EdgeNode, hosted: Sequence[tuple[Component, PlannedInstance]]) -> PlannedLink | None:
-    # Agents make links over one interface of their node; what else it has counts for the plan, but links no one.
     ours, theirs = direct_interface(drone.spec.interfaces), direct_interface(node.spec.interfaces)
     reach_m = direct_reach_m([ours], [theirs]) if ours is not None and theirs is not None else None
     if ours is None or theirs is None or theirs.pairing is None or reach_m is None:

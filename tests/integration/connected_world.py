@@ -70,7 +70,8 @@ class Agent:
         self.add_radio()
         self.certify(name)
         interfaces = [
-            {"technology": "4G"},
+            # So slow that a link is better also where a busy machine hardly gets to carry its frames.
+            {"technology": "4G", "bandwidth": 1},
             {
                 "technology": "WiFi",
                 "device": "wlan0",

@@ -46,7 +46,7 @@ def test_traffic_takes_the_link_and_comes_back_before_it_ends(world: World) -> N
     metrics = drone.metrics()
     assert metrics['fractus_link_up{path="e1"}'] == 1
     assert metrics["fractus_switches_total"] == metrics["fractus_traffic_direct"] == 1
-    assert metrics['fractus_path_bandwidth_mbps{path="e1"}'] > metrics['fractus_path_bandwidth_mbps{path="cloud"}'] == 8
+    assert metrics['fractus_path_bandwidth_mbps{path="e1"}'] > metrics['fractus_path_bandwidth_mbps{path="cloud"}'] == 1
     assert metrics['fractus_path_quality{path="e1"}'] > 0
     # The drone flies away: traffic is led back while the link still works, so that no call is lost.
     drone.fly(70.0, velocity=(3.0, 0.0, 0.0))
@@ -163,9 +163,11 @@ def test_a_peer_that_does_not_pair_costs_nothing(world: World, fault: str) -> No
     drone = world.drone()
     links = [world.link(drone, edge, bandwidth=13.0), world.link(drone, other)]
     world.serve()
-    for agent, link in zip((edge, other), links, strict=True):
-        agent.plan(link)
-        agent.start()
+    # The edge node knows of no ready pod, so that nothing takes its link in the moment before it falls silent.
+    edge.plan(world.link(drone, edge, bandwidth=13.0, services=[]))
+    other.plan(links[1])
+    edge.start()
+    other.start()
     drone.plan(*links)
     drone.start()
     client = world.client(drone, 100_000, 0.1)
@@ -173,9 +175,8 @@ def test_a_peer_that_does_not_pair_costs_nothing(world: World, fault: str) -> No
         until(lambda: "pairing" in drone.log(), "an attempt", world)
         world.command(station="e1", silent=True)
     until(lambda: client.by == "e2", "an answer over the link to the honest node", world)
-    assert {answer[1] for answer in client.answers} <= {"cloud", "e1", "e2"}
-    if fault == "impostor":
-        assert "e1" not in {answer[1] for answer in client.answers}
+    assert "e1" not in {answer[1] for answer in client.answers}
+    assert len(client.failed) <= 1  # in the planned switch, by a client that repeats nothing
 
 
 def test_a_missing_device_is_a_condition_and_is_used_when_it_comes(world: World) -> None:

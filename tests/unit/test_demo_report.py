@@ -190,6 +190,13 @@ def test_a_record_is_read_from_the_files_of_the_demo(tmp_path: Path, record: Rec
     (tmp_path / "audit").mkdir()
     (tmp_path / "audit" / "mobility.000000000001.jsonl").write_text(earlier)
     (tmp_path / "audit" / "mobility.jsonl").write_text(lines + '{"time": "2027-')
+    choice = {
+        "kind": "choice",
+        "time": demo_flight.stamp(demo_flight.APPLIED_S + 60),
+        "peer": "edge-1",
+        "code": "Connect",
+    }
+    (tmp_path / "audit" / "links.jsonl").write_text(json.dumps(choice) + "\n")
     assert figures(Record.read(tmp_path)) == figures(record)
     assert "camera saw" not in summary(record)
 

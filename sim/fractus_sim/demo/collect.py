@@ -16,7 +16,7 @@ from fractus_sim.report.record import AUDIT, OBJECTS, PICTURES, Record, of_missi
 
 _AUDIT = "/var/lib/fractus/audit"
 _ALBUMS = "/var/lib/fractus/camera"
-_AUDIT_FILE = re.compile(r"(mobility|camera)(\.\d{12})?\.jsonl")
+_AUDIT_FILE = re.compile(r"(mobility|camera|links)(\.\d{12})?\.jsonl")
 _PICTURE = re.compile(r"[0-9a-f]{32}/\d{17}-\d{4}\.jpg")
 _TRIES = 5
 _SHARES = (0.25, 0.5, 0.75)

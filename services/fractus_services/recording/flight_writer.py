@@ -120,7 +120,16 @@ class FlightWriter:
         if not self._recording or self._tape.size_bytes >= self.segments.segment_bytes:
             self.end()
         elif time.monotonic() >= self._flush_due_s:
-            self._flush_due_s = time.monotonic() + FLUSH_S
+            self.flush()
+
+    def flush(self) -> None:
+        """Bring the segment so far to the disk.
+
+        Raises:
+            OSError: the disk does not take it, or is nearly full.
+        """
+        self._flush_due_s = time.monotonic() + FLUSH_S
+        if self._tape is not None:
             self._tape.flush()
             self.segments.check_space()
 

@@ -8,12 +8,14 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from fractus_core.api.plans import GrantSpec
 
-from fractus_services.recording.flight_writer import FlightWriter
 from fractus_services.recording.segments import Segments
+
+if TYPE_CHECKING:
+    from fractus_services.recording.flight_writer import FlightWriter
 
 log = logging.getLogger(__name__)
 
@@ -64,6 +66,9 @@ class Recorder:
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
         if segments is not None:
+            # Imported here: a service that records nothing does without the libraries of file formats.
+            from fractus_services.recording.flight_writer import FlightWriter  # noqa: PLC0415
+
             writer = FlightWriter(segments, node, always=always)
             self._thread = threading.Thread(target=self._run, args=(writer,), name="recorder", daemon=True)
             self._thread.start()

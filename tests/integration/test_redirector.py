@@ -12,8 +12,10 @@ from ipaddress import IPv4Address
 from pathlib import Path
 
 import pytest
+from fractus_agent.links.interfaces.addresses import Addresses
 from fractus_agent.redirector import redirector as module
 from fractus_agent.redirector.conntrack import Conntrack
+from fractus_agent.redirector.netlink import in_namespace
 from fractus_agent.redirector.redirector import Namespaces, Redirector
 from redirect_rig import DIRECT, DRONE, POD, VIP, Rig, rig, run
 
@@ -274,3 +276,21 @@ def test_an_instance_takes_calls_over_links_alone(world: Rig, redirector: Redire
     redirector.serve([])
     assert ask_once(world) == "cloud"
     assert not reached(str(POD.address))
+
+
+def test_a_device_that_a_killed_agent_raised_is_known_to_the_next(world: Rig) -> None:
+    def words() -> str:
+        done = subprocess.run(
+            [*world.inside("drone"), "ip", "link", "show", "dev", "fxl0"], capture_output=True, text=True, check=True
+        )
+        return done.stdout
+
+    address = IPv4Address("169.254.7.7")
+    for was_up in (False, True):
+        run(*world.inside("drone"), "ip", "link", "set", "fxl0", "up" if was_up else "down")
+        for agent in range(2):  # the first one is killed
+            in_namespace(world.path("drone"), lambda: Addresses("fxl0").set(address))
+            assert "UP" in words(), agent
+        in_namespace(world.path("drone"), lambda: Addresses("fxl0").clear())
+        assert ("state UP" in words()) is was_up
+        assert "alias" not in words()

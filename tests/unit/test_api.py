@@ -2,14 +2,17 @@
 
 import pathlib
 from datetime import datetime
+from typing import Any
 
 import pytest
 import yaml
 from fractus_core.api import KINDS, Application, InvalidObject, Policy, Zone
 from fractus_core.api.crd import crd
 from fractus_core.api.model import quantity
+from fractus_core.api.nodes import Interface
 from fractus_core.api.schedules import ActiveTime, active_at
 from fractus_core.validation import check_application, check_area, check_policy
+from pydantic import ValidationError
 from test_planning import CHECKER, PATH, STORE, VIEWER, application, component, manifest, navigator
 
 ROOT = pathlib.Path(__file__).parents[2]
@@ -307,3 +310,22 @@ def test_full_control_takes_one_control_point(control):
     with pytest.raises(InvalidObject, match=r"controlPoints: a driver with full control has one control point"):
         application(navigator(PATH) | control | {"controlPoints": [point, point]})
     application(navigator(PATH) | {"control": "partial", "controlPoints": [point, point]})
+
+
+@pytest.mark.parametrize(
+    ("field", "good", "bad"),
+    [
+        ("device", ["wlan0", "wlx00c0caa5_1", "eth0.7"], ['w"; drop', "wlan0 ", "-w", "../x", "a" * 16]),
+        ("networkId", ["fleet", "Fleet 7!", "n" * 32], ["", "n" * 33, "réseau", "a\nb"]),
+    ],
+)
+def test_names_of_devices_and_networks_are_what_nodes_can_have(field: str, good: list[str], bad: list[str]) -> None:
+    def interface(name: str) -> dict[str, Any]:
+        pairing = {"networkId": name if field == "networkId" else "net"}
+        return {"technology": "WiFi", "device": name if field == "device" else "wlan0", "range": 80, "pairing": pairing}
+
+    for name in good:
+        Interface.model_validate(interface(name))
+    for name in bad:
+        with pytest.raises(ValidationError):
+            Interface.model_validate(interface(name))

@@ -52,7 +52,9 @@ class Pairing(Model):
     """How two interfaces of one technology find each other."""
 
     mode: Literal["adhoc", "infrastructure"] = Field(default="adhoc", description="Ad hoc, or through an access point.")
-    network_id: str = Field(min_length=1, max_length=64, description="Name of the network (SSID for WiFi).")
+    network_id: str = Field(
+        min_length=1, max_length=32, pattern=r"^[ -~]+$", description="Name of the network (SSID for WiFi), in ASCII."
+    )
 
 
 class Interface(Model):
@@ -60,7 +62,10 @@ class Interface(Model):
 
     technology: Technology = Field(description="What it connects by.")
     device: str | None = Field(
-        default=None, max_length=15, description="Name of the device on the node, such as wlan0."
+        default=None,
+        max_length=15,
+        pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$",
+        description="Name of the device on the node, such as wlan0.",
     )
     range: float | None = Field(
         default=None, gt=0, le=100_000, description="Reach of a direct link in metres; unset: no direct links."

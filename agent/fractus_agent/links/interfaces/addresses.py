@@ -26,10 +26,13 @@ ROUTES = Path("/proc/net/route")
 """The main routing table, of the network namespace that the process is in."""
 LINK_LOCAL = IPv4Network("169.254.0.0/16")
 
-_NEW_LINK, _NEW_ADDRESS, _DELETE_ADDRESS, _LIST_ADDRESSES = 16, 20, 21, 22
+RAISED = b"raised by fractus-agent"
+"""Alias of a device that was brought up here: it stays with the device when the agent is killed, and ends with a reboot."""
+
+_NEW_LINK, _LIST_LINKS, _NEW_ADDRESS, _DELETE_ADDRESS, _LIST_ADDRESSES = 16, 18, 20, 21, 22
 _LINK = struct.Struct("=BxHiII")
 _ADDRESS = struct.Struct("=BBBBI")
-_PEER, _LOCAL, _BROADCAST = 1, 2, 4
+_PEER, _LOCAL, _BROADCAST, _ALIAS = 1, 2, 4, 20
 _IFF_UP = 1
 _GET_FLAGS = 0x8913
 _NAME_AND_FLAGS = struct.Struct("=16sH22x")
@@ -48,7 +51,6 @@ class Addresses:
 
     def __init__(self, device: str) -> None:
         self._device = device
-        self._raised = False
 
     def other_traffic(self) -> str:
         """What shows that the device carries other traffic of the node than that of direct links; empty when nothing does.
@@ -78,8 +80,7 @@ class Addresses:
         netlink = Netlink(NETLINK_ROUTE)
         try:
             if not self._is_up():
-                _set_up(netlink, index, True)
-                self._raised = True
+                _ask(netlink, _NEW_LINK, 0, _link(index, _IFF_UP) + attribute(_ALIAS, RAISED))
             _ask(netlink, _NEW_ADDRESS, NLM_F_CREATE | NLM_F_REPLACE, _described(index, address))
             for other in _listed(netlink, index):
                 if other != address:
@@ -88,7 +89,7 @@ class Addresses:
             netlink.close()
 
     def clear(self) -> None:
-        """Take all link-local addresses away, and have the device down again where it was not up before.
+        """Take all link-local addresses away, and have the device down again where it was not up before, by an earlier agent too.
 
         Raises:
             NetlinkError: the kernel refused.
@@ -101,9 +102,8 @@ class Addresses:
         try:
             for address in list(_listed(netlink, index)):
                 _ask(netlink, _DELETE_ADDRESS, 0, _described(index, address))
-            if self._raised:
-                _set_up(netlink, index, False)
-                self._raised = False
+            if _alias(netlink, index) == RAISED:
+                _ask(netlink, _NEW_LINK, 0, _link(index, 0) + attribute(_ALIAS, b""))
         finally:
             netlink.close()
 
@@ -122,8 +122,16 @@ class Addresses:
             raise NoDevice(f"the node has no network device {self._device}") from error
 
 
-def _set_up(netlink: Netlink, index: int, up: bool) -> None:
-    _ask(netlink, _NEW_LINK, 0, _LINK.pack(socket.AF_UNSPEC, 0, index, _IFF_UP if up else 0, _IFF_UP))
+def _link(index: int, flags: int) -> bytes:
+    return _LINK.pack(socket.AF_UNSPEC, 0, index, flags, _IFF_UP)
+
+
+def _alias(netlink: Netlink, index: int) -> bytes:
+    """The alias of a device; empty without one."""
+    for body in list(netlink.dump(_LIST_LINKS, _LINK.pack(socket.AF_UNSPEC, 0, 0, 0, 0))):
+        if _LINK.unpack_from(body)[2] == index:
+            return next((value for kind, value in attributes(body[_LINK.size :]) if kind == _ALIAS), b"").rstrip(b"\0")
+    return b""
 
 
 def _described(index: int, address: IPv4Address) -> bytes:

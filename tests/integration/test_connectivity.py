@@ -48,6 +48,7 @@ def test_traffic_takes_the_link_and_comes_back_before_it_ends(world: World) -> N
     assert metrics["fractus_switches_total"] == metrics["fractus_traffic_direct"] == 1
     assert metrics['fractus_path_bandwidth_mbps{path="e1"}'] > metrics['fractus_path_bandwidth_mbps{path="cloud"}'] == 1
     assert metrics['fractus_path_quality{path="e1"}'] > 0
+    until(lambda: drone.metrics().get('fractus_service_sent_mbps{service="10.96.0.5:8080/TCP"}'), "its flow", world)
     # The drone flies away: traffic is led back while the link still works, so that no call is lost.
     drone.fly(70.0, velocity=(3.0, 0.0, 0.0))
     drone.fly(-57.0, velocity=(-3.0, 0.0, 0.0))

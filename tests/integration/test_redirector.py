@@ -294,3 +294,17 @@ def test_a_device_that_a_killed_agent_raised_is_known_to_the_next(world: Rig) ->
         in_namespace(world.path("drone"), lambda: Addresses("fxl0").clear())
         assert ("state UP" in words()) is was_up
         assert "alias" not in words()
+
+
+async def test_what_a_service_moves_over_the_link_is_counted(world: Rig, redirector: Redirector) -> None:
+    world.servers()
+    assert ask_once(world) == "cloud"
+    assert redirector.counted() == {}
+    await redirector.switch(TO_EDGE, planned=True)
+    client = world.client(3, size=100_000)
+    await asyncio.to_thread(answers, client)
+    sent, received = redirector.counted()[VIP]
+    assert 300_000 < sent < 400_000
+    assert 100 < received < 100_000
+    run(*world.inside("drone"), "nft", "flush", "ruleset")
+    assert redirector.counted() == {}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import Callable
 from importlib.metadata import EntryPoint
 from ipaddress import IPv4Address
@@ -11,7 +12,7 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
-from fractus_agent.links import connectivity, peer
+from fractus_agent.links import connectivity, drone, peer
 from fractus_agent.links.drone import DroneEnd
 from fractus_agent.links.heuristics import Heuristics
 from fractus_agent.links.interfaces import addresses
@@ -172,3 +173,46 @@ def test_a_node_without_clients_leads_only_what_paired_nodes_send() -> None:
     assert len(leads) == 2
     assert all(line.strip().startswith('iifname "wlan0" ip saddr @peers ') for line in leads)
     assert "hook output" in nft.table("wlan0", nft.Ports(1, 2), clients=True)
+
+
+@pytest.mark.parametrize(("mbps", "probes"), [(16.0, {2}), (2.0, {5, 6})])
+def test_a_link_is_probed_only_while_its_traffic_leaves_room(
+    mbps: float, probes: set[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(drone, "PROBE_S", 0.1)
+    service = Endpoint(IPv4Address("10.96.0.5"), 8080)
+
+    class Counting(Calls):
+        looks, enough = 0, asyncio.Event()
+
+        def counted(self) -> dict[Endpoint, tuple[int, int]]:
+            self.looks += 1
+            if self.looks == 5:
+                self.enough.set()
+            return {service: (round(time.monotonic() * mbps * 125_000), 0)}
+
+    class Probed(Calls):
+        latency_ms, probed = 1.0, 0
+
+        async def probe(self) -> float:
+            self.probed += 1
+            return 10.0
+
+    async def use() -> float:
+        redirector, session = Counting(), Probed()
+        end = DroneEnd(
+            "d1", Path(), cast(Redirector, redirector), cloud=lambda: PATH, seen=lambda: None,
+            report=lambda _: None, record=lambda *_: None,
+        )  # fmt: skip
+        using = asyncio.create_task(end._use(cast(Session, session)))
+        async with asyncio.timeout(30):
+            await redirector.enough.wait()
+        measured = end._direct
+        using.cancel()
+        await asyncio.gather(using, return_exceptions=True)
+        # The first rate comes with the second look: what was measured before that was probed.
+        assert session.probed in probes
+        assert measured is not None
+        return measured.ingress_mbps
+
+    assert asyncio.run(use()) == pytest.approx(max(mbps, 10.0), rel=0.1)

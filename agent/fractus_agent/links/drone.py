@@ -30,6 +30,7 @@ from fractus_agent.links.addressing import link_address
 from fractus_agent.links.connector import Connector
 from fractus_agent.links.decisions import Actions, Situation, Traffic, decide
 from fractus_agent.links.evidence import Record, records
+from fractus_agent.links.flows import FULL, WINDOW_S, Flows
 from fractus_agent.links.heuristics import Heuristics
 from fractus_agent.links.lessons import Lessons
 from fractus_agent.links.pairing import Session
@@ -43,7 +44,7 @@ log = logging.getLogger(__name__)
 
 DECIDE_S = 0.5
 PROBE_S = 3.0
-"""Seconds between two probes of a link that is up."""
+"""Seconds between two measurements of a link that is up."""
 PROBES = 3
 """The best of the last N counts: a probe that meets the components' own traffic shows what is left beside it."""
 LEAVE_S = 2.0
@@ -90,6 +91,7 @@ class DroneEnd:
         self._heuristics = Heuristics()
         self._said: tuple[str, Mapping[str, Any]] | None = None
         self._direct: PathMetrics | None = None
+        self._flows = Flows()
         self._parting = False
         self._lost = asyncio.Event()
         self._wake = asyncio.Event()
@@ -241,7 +243,8 @@ class DroneEnd:
             while True:
                 while session.latency_ms is None:  # noqa: ASYNC110 (the session has no event for it)
                     await asyncio.sleep(0.01)
-                rates.append(await session.probe())
+                peak = self._flows.peak_mbps
+                rates.append(peak if rates and peak >= FULL * max(rates) else await session.probe())
                 rate = max(rates)
                 latency_ms = session.latency_ms
                 self._direct = PathMetrics(rate, rate, latency_ms, latency_ms, direct=True)
@@ -249,11 +252,21 @@ class DroneEnd:
                 level = logging.INFO if len(rates) == 1 else logging.DEBUG
                 log.log(level, "links: measured (peer=%s mbps=%.1f latency_ms=%.1f)", session.peer, rate, latency_ms)
                 self._wake.set()
-                await asyncio.sleep(PROBE_S)
+                await self._watch(PROBE_S)
         finally:
+            self._flows = Flows()
             self._said = self._direct = None
             self._lost.set()
             self._wake.set()
+
+    async def _watch(self, seconds: float) -> None:
+        """Look at what flows, for so long."""
+        for _ in range(round(seconds / WINDOW_S)):
+            await asyncio.sleep(WINDOW_S)
+            try:
+                self._flows.take(time.monotonic(), self._redirector.counted())
+            except NetlinkError as error:
+                log.debug("links: counters not read (error=%s)", error)
 
     def _link_changed(self, link: Link, reason: str) -> None:
         now_s = time.monotonic()
@@ -287,6 +300,7 @@ class DroneEnd:
                 unknown=dict(self._unknown),
                 cloud=situation.cloud,
                 offers=self._lessons.offers(),
+                flows=self._flows.by_service,
             )
         )
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 
 from fractus_core.linking import PathMetrics, Phase
 
+from fractus_agent.links.plans import route_key
 from fractus_agent.links.reports import DroneReport
 
 log = logging.getLogger(__name__)
@@ -23,6 +24,11 @@ _HELP = {
     "fractus_link_up": ("gauge", "Whether the direct link goes to this node."),
     "fractus_link_attempts_failed": ("gauge", "Attempts to pair that failed since the link last worked."),
     "fractus_traffic_direct": ("gauge", "How many services take the direct link."),
+    "fractus_service_sent_mbps": (
+        "gauge",
+        "What a service moved to the other node over the link, in the last seconds.",
+    ),
+    "fractus_service_received_mbps": ("gauge", "What a service moved from the other node over the link."),
     "fractus_switches_total": ("counter", "Changes of services' paths since the agent started."),
 }
 
@@ -49,7 +55,8 @@ class LinkMetrics:
                 kind, what = _HELP[name]
                 lines += [f"# HELP {name} {what}", f"# TYPE {name} {kind}"]
                 shown = name
-            label = f'{{path="{path}"}}' if path else ""
+            kind = "service" if name.startswith("fractus_service") else "path"
+            label = f'{{{kind}="{path}"}}' if path else ""
             lines.append(f"{name}{label} {value:g}")
         return "\n".join(lines) + "\n"
 
@@ -58,6 +65,9 @@ class LinkMetrics:
         if (report := self._report) is None:
             return
         yield "fractus_traffic_direct", "", len(report.direct)
+        for service, flow in report.flows.items():
+            yield "fractus_service_sent_mbps", route_key(service), flow.sent_mbps
+            yield "fractus_service_received_mbps", route_key(service), flow.received_mbps
         yield from _path(CLOUD, report.cloud)
         for peer, offered in report.offers.items():
             up = report.link.phase is Phase.UP and report.link.peer == peer.name

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any
 
@@ -15,6 +15,7 @@ from fractus_core.linking import Link, PathMetrics, Peer, Phase, Reach
 from fractus_agent.cluster.store import End, Object, Store
 from fractus_agent.conditions import Condition, timestamp, to_kubernetes
 from fractus_agent.links.decisions import Actions
+from fractus_agent.links.flows import Flow
 from fractus_agent.links.plans import virtuals
 from fractus_agent.redirector.nft import Endpoint
 from fractus_agent.supervisor import repeat
@@ -39,6 +40,7 @@ class DroneReport:
         unknown: applications whose heuristic is not known here, and why.
         cloud: what the cloud path offers.
         offers: what the links to peers are expected to offer where the drone is; None out of reach.
+        flows: what services moved over the link lately.
     """
 
     links: tuple[DirectLink, ...]
@@ -50,6 +52,7 @@ class DroneReport:
     unknown: Mapping[str, str]
     cloud: PathMetrics
     offers: Mapping[Peer, PathMetrics | None]
+    flows: Mapping[Endpoint, Flow] = field(default_factory=dict)
 
 
 def drone_status(report: DroneReport, about: DirectLink) -> tuple[dict[str, Any], list[Condition]]:

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from ipaddress import IPv4Address
 
+from fractus_agent.redirector.counters import counted
 from fractus_agent.redirector.netlink import (
     NLA_F_NESTED,
     NLM_F_ACK,
@@ -34,7 +35,8 @@ from fractus_agent.redirector.netlink import (
 )
 
 TABLE = "fractus"
-TARGETS, MARKS, COUNTERS, PEERS = "targets", "marks", "counters", "peers"
+TARGETS, MARKS, PEERS = "targets", "marks", "peers"
+SENT, RECEIVED = "sent", "received"
 GUARDED, CALLERS = "guarded", "callers"
 
 MARK_MASK, MARK_BASE = 0xFFF00000, 0xF6A00000
@@ -43,6 +45,9 @@ MARK_MASK, MARK_BASE = 0xFFF00000, 0xF6A00000
 MAX_NUMBER = 0xFFFFF
 
 COMMAND_TIMEOUT_S = 10.0
+
+COUNTED_S = 60
+"""Bytes of a service are counted until nothing has moved for so long."""
 
 _SUBSYSTEM = 10 << 8
 _NEW_ELEMENTS, _DELETE_ELEMENTS, _BEGIN, _END = _SUBSYSTEM | 12, _SUBSYSTEM | 14, 0x10, 0x11
@@ -139,8 +144,13 @@ table ip {TABLE} {{
 	map {MARKS} {{
 		type ipv4_addr . inet_proto . inet_service : mark
 	}}
-	map {COUNTERS} {{
-		type mark : counter
+	set {SENT} {{
+		type mark
+		flags dynamic, timeout
+	}}
+	set {RECEIVED} {{
+		type mark
+		flags dynamic, timeout
 	}}
 	set {PEERS} {{
 		type ipv4_addr
@@ -161,9 +171,13 @@ table ip {TABLE} {{
 		type nat hook postrouting priority 50; policy accept;
 		{ours} oifname "{devices}" masquerade
 	}}
-	chain count {{
+	chain sending {{
 		type filter hook postrouting priority 150; policy accept;
-		counter name ct mark map @{COUNTERS}
+		{ours} oifname "{devices}" update @{SENT} {{ ct mark timeout {COUNTED_S}s counter }}
+	}}
+	chain receiving {{
+		type filter hook prerouting priority 0; policy accept;
+		{ours} iifname "{devices}" update @{RECEIVED} {{ ct mark timeout {COUNTED_S}s counter }}
 	}}
 	chain arriving {{
 		type filter hook input priority -5; policy accept;
@@ -296,6 +310,15 @@ class Maps:
             self._make_table()
             self._transact(changes if callers is not None else [*guards, *changes])
         self._guards = guards
+
+    def counted(self) -> dict[int, tuple[int, int]]:
+        """Bytes sent and received over direct interfaces, by the number that connections carry.
+
+        Raises:
+            NetlinkError: the kernel does not tell.
+        """
+        sent, received = (counted(self._netlink, TABLE, name) for name in (SENT, RECEIVED))
+        return {mark - MARK_BASE: (sent.get(mark, 0), received.get(mark, 0)) for mark in {*sent, *received}}
 
     def _transact(self, changes: Sequence[tuple[int, bytes]]) -> None:
         numbered = [(kind, self._netlink.sequence(), body) for kind, body in changes]

@@ -133,6 +133,15 @@ class Redirector:
         """Where connections to virtual endpoints go now; those that are not named take the cloud path."""
         return dict(self._redirects)
 
+    def counted(self) -> dict[Endpoint, tuple[int, int]]:
+        """Bytes that services have sent and received over the link since they took it; those of which nothing is known are not named.
+
+        Raises:
+            NetlinkError: the kernel does not tell.
+        """
+        found = self._maps.counted()
+        return {service: found[number] for service, number in self._numbers.items() if number in found}
+
     def admit(self, peers: Iterable[IPv4Address]) -> None:
         """Lead on the connections of these nodes, and of no others, that come over direct interfaces.
 

@@ -501,6 +501,18 @@ def test_a_return_that_a_pilot_chooses_after_a_failsafe_is_the_pilots() -> None:
     assert told_of(*heard[2], state=ours)[0].authority is Authority.PILOT
 
 
+@pytest.mark.parametrize(("silent_s", "mode", "authority"), [
+    (5.1, RTL, Authority.SYSTEM), (2.0, RTL, Authority.PILOT), (5.1, LOITER, Authority.PILOT),
+])  # fmt: skip
+def test_a_return_that_began_while_the_link_was_cut_is_the_failsafes(
+    silent_s: float, mode: FlightMode, authority: Authority
+) -> None:
+    heard = told.VehicleObserved(replace(FLYING, mode=mode, silent_s=silent_s))
+    state, _ = told_of(*FLIES, heard, told.Heartbeat())
+    assert state.authority is authority
+    assert state.returning is (authority is Authority.SYSTEM)
+
+
 def test_a_return_that_is_found_is_told_from_one_of_the_system() -> None:
     known, _ = told_of(told.ArmingRequested("a", "A", (1.0, 2.0, 3.0)), told.VehicleObserved(replace(FLYING, mode=RTL)))
     found, _ = told_of(told.VehicleFound(), state=replace(known, expected_mode=None))

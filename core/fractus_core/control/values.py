@@ -58,6 +58,7 @@ class VehicleFacts:
         failsafe: whether its state says that a failsafe acts.
         failsafe_text: what it last said of a failsafe.
         failsafe_text_at: when it said so, in the time of the events.
+        silent_s: how long before its last heartbeat came the one before that, in its own seconds.
     """
 
     connected: bool = False
@@ -67,6 +68,7 @@ class VehicleFacts:
     failsafe: bool = False
     failsafe_text: str = ""
     failsafe_text_at: float = -math.inf
+    silent_s: float = 0.0
 
 
 class OutcomeKind(Enum):

@@ -24,6 +24,10 @@ from fractus_core.control.values import Authority, FlightMode, ModeKind, Outcome
 FAILSAFE_TEXT_S = 3.0
 """A mode change this soon after the autopilot spoke of a failsafe is the failsafe's."""
 
+CUT_S = 4.0
+"""A link that was cut for so long lets the failsafe act that waits five seconds for the next heartbeat, one a second: unheard,
+and cleared as soon as the companion is heard again. Nothing but the mode tells of it."""
+
 UNCONFIRMED_S = 10.0
 """A mode that the system asked for may show this long after its answer was given up: only the answers may have been lost."""
 
@@ -170,6 +174,8 @@ def _foreign_mode(step: Step) -> None:
     # A failsafe stays reported for the rest of the flight: a pilot may choose the mode long after it.
     begins = vehicle.failsafe and not state.failsafe_seen
     said = vehicle.failsafe_text if step.now - vehicle.failsafe_text_at < FAILSAFE_TEXT_S else ""
+    if vehicle.silent_s >= CUT_S and vehicle.mode.kind is ModeKind.RETURNING and not said:
+        said = f"{vehicle.mode.name}, while the link was cut"
     if (begins or said) and vehicle.mode.comes_down and not piloted:
         reason = f"the autopilot's own failsafe took the drone ({said or vehicle.mode.name})"
         step.audit("takeover", vehicle.mode.name, "system", reason, "AutopilotFailsafe")

@@ -66,6 +66,7 @@ class VehicleState:
         satellites: that the receiver sees; None until it has told.
         wind_at: when the autopilot told of the wind.
         reports: number, MAV_SEVERITY and text of what the autopilot said of late.
+        silent_s: how long before its last heartbeat came the one before that.
         located: whether GPS has a three-dimensional fix of some accuracy; positions without one are not taken.
     """
 
@@ -109,6 +110,7 @@ class VehicleState:
     path_lost: bool = False
     failsafe_text: str = ""
     failsafe_text_at: float = -math.inf
+    silent_s: float = 0.0
 
     @property
     def _landed_told(self) -> bool:

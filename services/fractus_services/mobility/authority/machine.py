@@ -68,6 +68,7 @@ class Machine:
             failsafe=vehicle.failsafe,
             failsafe_text=vehicle.failsafe_text,
             failsafe_text_at=vehicle.failsafe_text_at,
+            silent_s=vehicle.silent_s * self._autopilot.pace,
         )
 
     def close(self) -> None:

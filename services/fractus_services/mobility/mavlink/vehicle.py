@@ -48,6 +48,7 @@ class Vehicle(VehicleState):
 
 
 def _heartbeat(vehicle: Vehicle, message: Message, now: float) -> None:
+    vehicle.silent_s = now - vehicle.heartbeat_at if math.isfinite(vehicle.heartbeat_at) else 0.0
     vehicle.heartbeat_at = now
     vehicle.foreign = vehicle.stack.foreign(message.integer("type"), message.integer("autopilot"))
     vehicle.mode = vehicle.stack.mode(message.integer("custom_mode"))

@@ -207,6 +207,11 @@ def test_out_of_a_zone_but_not_up_into_it() -> None:
     under = at(25, 0, alt=12.5, airframe=RETRACING)
     assert ask(above, goto(60, 0, 11), under).action == "allow", "out from under it"
     assert ask(above, goto(60, 0, 30), under).action == "deny", "it would climb into it on its way out"
+    assert ask(above, goto(60, 0, 12.7), under).action == "allow", "on at its height, as well as that is known"
+    assert ask(above, goto(60, 0, 13.6), under).action == "deny", "even closer below it"
+    lower = replace(under, altitude_m=10.0)
+    assert ask(above, goto(60, 0, 11.9), lower).action == "allow"
+    assert ask(above, goto(60, 0, 12.5), lower).action == "deny", "into its margin of height"
     inside = at(25, 0, alt=20)
     assert ask(above, goto(60, 0, 30), replace(inside, airframe=RETRACING)).action == "allow"
 

@@ -127,6 +127,16 @@ def band_meets(band: AltitudeBand | None, lower_m: float, upper_m: float, home: 
     return True
 
 
+def band_gap_m(band: AltitudeBand | None, lower_m: float, upper_m: float, home: Home | None, flat: bool) -> float:
+    """How far altitudes from lower to upper (above home) stay below or above a band; 0 where they may touch it."""
+    if band is None:
+        return 0.0
+    floor, ceiling = (
+        None if edge is None else height_m(edge, band.reference, home, flat) for edge in (band.lower, band.upper)
+    )
+    return max(0.0 if floor is None else floor - upper_m, 0.0 if ceiling is None else lower_m - ceiling, 0.0)
+
+
 def band_holds(band: AltitudeBand | None, lower_m: float, upper_m: float, home: Home | None, flat: bool) -> bool:
     """Whether altitudes from lower to upper (above home) surely lie inside a band; unknown datums do not."""
     if band is None:

@@ -11,7 +11,15 @@ from shapely.geometry.base import BaseGeometry
 
 from fractus_core.api.policies import GeofenceAction
 from fractus_core.exhaustive import exhaustive
-from fractus_core.policy.compiled import OPERATION_AREA, Air, CompiledGrant, Inclusion, PolicyZone, band_meets
+from fractus_core.policy.compiled import (
+    OPERATION_AREA,
+    Air,
+    CompiledGrant,
+    Inclusion,
+    PolicyZone,
+    band_gap_m,
+    band_meets,
+)
 from fractus_core.policy.motion import XY, Leg, earliest_stop, stop_altitude_m
 from fractus_core.policy.values import Situation, Takeover, Verdict, deny, distinct, metres
 
@@ -26,6 +34,9 @@ area lies."""
 
 INSIDE_M = 0.25
 """A corrected target keeps this much more than the margin, so that it never lies on a border."""
+
+LEVEL_M = 0.5
+"""Heights this close are one: neither a barometer nor a controller holds them any better."""
 
 _SAMPLES = 24
 """Points of a leg's illegal part at which its distance to the border must not shrink."""
@@ -157,7 +168,7 @@ def _exclusions(leg: Leg, now: Situation, grant: CompiledGrant, air: Air) -> Ite
         level = _is_level_with(zone, now, grant)
         if (
             shape.dwithin(certain, margin_m)
-            and (level or not _comes_level(zone, leg, now, grant))
+            and (level or not _comes_level(zone, leg, now, grant, leg.lower_m - air.lower_m))
             and _leads_out(shape, leg, margin_m, clearance_m)
             and _leads_away(shape, leg, certain)
         ):
@@ -183,9 +194,21 @@ def _is_level_with(zone: PolicyZone, now: Situation, grant: CompiledGrant) -> bo
     return band_meets(zone.band, low, high, now.home, grant.flat_terrain)
 
 
-def _comes_level(zone: PolicyZone, leg: Leg, now: Situation, grant: CompiledGrant) -> bool:
-    """Whether a leg comes between the altitudes of a zone."""
-    return band_meets(zone.band, leg.lower_m, leg.upper_m, now.home, grant.flat_terrain)
+def _comes_level(zone: PolicyZone, leg: Leg, now: Situation, grant: CompiledGrant, height_margin_m: float) -> bool:
+    """Whether a leg of a drone below or above a zone comes between its altitudes, or too close to them.
+
+    A drone that is too close already may fly on at its height, as well as that is known.
+    """
+    rest_m = stop_altitude_m(now)
+    gap_m, present_m = (
+        band_gap_m(zone.band, lower_m, upper_m, now.home, grant.flat_terrain)
+        for lower_m, upper_m in (
+            (leg.lower_m, leg.upper_m),
+            (min(now.altitude_m, rest_m), max(now.altitude_m, rest_m)),
+        )
+    )
+    kept_m = height_margin_m if present_m >= height_margin_m else present_m - LEVEL_M
+    return gap_m <= 0.0 or gap_m < kept_m
 
 
 def _exclusion_breach(zone: PolicyZone, leg: Leg, margin_m: float, enters: bool) -> Breach:

@@ -35,6 +35,10 @@ from fractus_vehicle.state import VehicleConfig
 
 STEPS = Path(__file__).parents[1] / "golden/vehicle/arducopter-4.6.3.tsv"
 HOME = Place.from_degrees(50.864, 4.679, 0.1)
+"""Where the real one stood."""
+
+ELSEWHERE_M = 5_000.0
+"""Further away than any step leads."""
 TARGET: dict[str, Value] = {"target_system": 1, "target_component": 1}
 GUIDED, RTL, BRAKE = 4, 6, 17
 KINDS = {"mission": 0, "fence": 1, "rally": 2}
@@ -207,12 +211,24 @@ class Player:
         messages = self.line.hear()
         for message in messages:
             self.last[message.name] = message
+            if message.name == "GLOBAL_POSITION_INT":
+                self._settle(Place(message.integer("lat"), message.integer("lon"), 0.0))
             if message.name == "STATUSTEXT":
                 self._chunks += message.text("text")
                 if not message.integer("id") or len(message.text("text")) < 50:
                     self.texts.append(f"[{message.integer('severity')}] {self._chunks.strip()}")
                     self._chunks = ""
         return messages
+
+    def _settle(self, here: Place) -> None:
+        """Count from where the vehicle is, if that is not where the script was recorded."""
+        if here.lat_e7 and math.hypot(*self.home.vector_to(here)[:2]) > ELSEWHERE_M:
+            self.home = here
+
+    def _datum_m(self, frame: int) -> float:
+        """How high above the datum of a frame home is: two count from mean sea level."""
+        at = self.last["GLOBAL_POSITION_INT"]
+        return (at.integer("alt") - at.integer("relative_alt")) / 1000.0 if frame in {0, 5} else 0.0
 
     def _stream(self, duration_s: float) -> Iterator[Message]:
         end = self.line.now_s + duration_s
@@ -472,8 +488,8 @@ class Player:
         """A position target so far from here; the way and the highest speed within 6 s."""
         before, (n0, e0, u0) = len(self.texts), self._position()
         place = self.home.offset(n0 + float(north), e0 + float(east))
-        base = {0: HOME.alt_m, 5: HOME.alt_m}.get(int(frame), 0.0)
-        values: dict[str, Value] = {"coordinate_frame": int(frame), "type_mask": 0xDF8, "alt": base + u0 + float(up)}
+        alt_m = self._datum_m(int(frame)) + u0 + float(up)
+        values: dict[str, Value] = {"coordinate_frame": int(frame), "type_mask": 0xDF8, "alt": alt_m}
         self.line.send(
             "SET_POSITION_TARGET_GLOBAL_INT", TARGET | values | {"lat_int": place.lat_e7, "lon_int": place.lon_e7}
         )
@@ -500,7 +516,7 @@ class Player:
             values |= {"x": x + n0, "y": e0, "z": -u0} if number == 1 else {"x": x}
         else:
             place, name = self.home.offset(n0 + x, e0), "SET_POSITION_TARGET_GLOBAL_INT"
-            values |= {"lat_int": place.lat_e7, "lon_int": place.lon_e7, "alt": u0}
+            values |= {"lat_int": place.lat_e7, "lon_int": place.lon_e7, "alt": self._datum_m(number) + u0}
             values |= {"lat_int": int(asked["lat_int"])} if "lat_int" in asked else {}
         peak, end, once = 0.0, self.line.now_s + float(duration), "x" in {f.partition("=")[0] for f in fields}
         self.line.send(name, values)

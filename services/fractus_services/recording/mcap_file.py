@@ -89,6 +89,9 @@ def complete(path: Path) -> None:
         try:
             with create(part) as out:
                 _copy(file, out)
+                # What was on the disk before must not be lost with the power for the sake of an index.
+                out.flush()
+                os.fsync(out.fileno())
         except OSError:
             part.unlink(missing_ok=True)
             raise

@@ -15,7 +15,7 @@ from fractus_services.errors import Unavailable
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority import drivers
 from fractus_services.mobility.rpc.telemetry import located
-from mobility_world import FRAME, GROUND_M, GUIDED, LOITER, World, at, end, fly, refusal, spec
+from mobility_world import FRAME, GROUND_M, GUIDED, LOITER, SMART_RTL, World, at, end, fly, refusal, spec
 
 AWAY = (0.0, 100.0, 0.0)
 UP = (0.0, 0.0, 60.0)
@@ -104,6 +104,30 @@ def test_a_home_that_cannot_be_set_back_ends_the_flight(tmp_path: Path) -> None:
             await world.until(world.outcome)
             assert "cannot be set back" in world.kinds("takeover")[0]["reason"]
             await world.until(lambda: not world.plane.vehicle.armed)
+
+    fly(flight)
+
+
+@pytest.mark.parametrize("refused", [True, False])
+def test_a_home_that_does_not_stay_set_back_keeps_no_drone_in_the_air(tmp_path: Path, refused: bool) -> None:
+    """Refused by the autopilot, or moved again and again: where the path is remembered, it leads to where the mission armed."""
+
+    async def again_and_again(world: World) -> None:
+        while True:
+            move(world, AWAY)
+            await asyncio.sleep(0.1)
+
+    async def flight() -> None:
+        async with World(tmp_path, retraces=True) as world, flying(world) as grant:
+            await end(world.service.goto(grant, GotoArgs(*at(0, 60), 12.0), 0))
+            if refused:
+                world.plane.refuses.add(MAV_CMD.DO_SET_HOME)
+            moving = asyncio.ensure_future(again_and_again(world))
+            await drivers.give_back(world.control, grant)
+            await world.until(lambda: world.plane.vehicle.mode == SMART_RTL, 120)
+            await world.until(lambda: not world.plane.vehicle.armed, 200)
+            moving.cancel()
+            assert abs(world.plane.xy[1]) < 3
 
     fly(flight)
 

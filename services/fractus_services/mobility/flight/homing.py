@@ -67,12 +67,14 @@ class Homing:
         grant, vehicle, stack = control.last_grant, control.autopilot.vehicle, control.autopilot.stack
         self.given_up = None
         if kind is TaskKind.RETURN and tries < MAX_TRIES:
-            # The autopilot's own return leads to where home is.
-            await keep_home(control.autopilot, lambda: control.state)
+            await self._keep_home()
         # A landing under way is a failsafe's or a pilot's choice, with a battery that may be too low for any other way.
         landing = vehicle.mode.kind is ModeKind.LANDING or self._blind()
         if kind is TaskKind.LAND and (grant is None or landing or not self._lands_in_zone(grant)):
             return stack.land
+        if vehicle.in_air and not vehicle.mode.comes_down and tries <= MAX_TRIES and self._path_is_home():
+            control.note("returnToLaunch", "home was moved; the drone goes back the way it came", "HomeMoved")
+            return stack.return_retracing
         if grant is None or not vehicle.in_air or vehicle.mode.comes_down or self._blind():
             return stack.return_straight
         try:
@@ -90,6 +92,23 @@ class Homing:
         log.error("homing: no legal way home is known, the drone %s (reason=%s)", how, why)
         self.given_up = grant
         return stack.return_retracing if back else stack.return_straight
+
+    async def _keep_home(self) -> None:
+        """Set home back if it was moved: the autopilot's own return leads there.
+
+        Raises:
+            AutopilotError: it does not stay set back. While the vehicle is heard that counts as a try: a station that moves
+                home again and again does not keep the drone in the air.
+        """
+        control = self._control
+        try:
+            await keep_home(control.autopilot, lambda: control.state)
+        except AutopilotError as error:
+            raise AutopilotError(str(error), link=not control.autopilot.connected) from error
+
+    def _path_is_home(self) -> bool:
+        """Whether home was moved, so that only the path flown leads back to where the mission armed."""
+        return self._control.retraces and home_moved(self._control.state, self._control.autopilot.vehicle)
 
     def _give_up(self, grant: ActiveGrant, tries: int) -> str:
         """Why the way home is not flown by us any more; nothing where the straight one is legal."""
@@ -118,7 +137,8 @@ class Homing:
                 return ""
             if refusal.verdict.code == "NoLegalWay" or refusal.verdict.code in STOPPED:
                 return str(refusal)
-            raise AutopilotError(str(refusal), link=isinstance(refusal, Unavailable)) from refusal
+            moved = home_moved(control.state, control.autopilot.vehicle)
+            raise AutopilotError(str(refusal), link=isinstance(refusal, Unavailable) and not moved) from refusal
         finally:
             control.end_system_flight(constraints)
         return ""

@@ -209,9 +209,14 @@ def test_out_of_a_zone_but_not_up_into_it() -> None:
     assert ask(above, goto(60, 0, 30), under).action == "deny", "it would climb into it on its way out"
     assert ask(above, goto(60, 0, 12.7), under).action == "allow", "on at its height, as well as that is known"
     assert ask(above, goto(60, 0, 13.6), under).action == "deny", "even closer below it"
+    for alt in (13.2, 13.6):
+        close = replace(under, altitude_m=alt)
+        assert ask(above, goto(60, 0, alt), close).action == "allow", "on at its height"
+        assert ask(above, goto(60, 0, alt + 0.1), close).action == "deny", "closer with each leg"
     lower = replace(under, altitude_m=10.0)
     assert ask(above, goto(60, 0, 11.9), lower).action == "allow"
     assert ask(above, goto(60, 0, 12.5), lower).action == "deny", "into its margin of height"
+    assert ask(above, goto(60, 0, 12.1), replace(lower, altitude_m=11.9)).action == "deny"
     inside = at(25, 0, alt=20)
     assert ask(above, goto(60, 0, 30), replace(inside, airframe=RETRACING)).action == "allow"
 

@@ -197,7 +197,8 @@ def _is_level_with(zone: PolicyZone, now: Situation, grant: CompiledGrant) -> bo
 def _comes_level(zone: PolicyZone, leg: Leg, now: Situation, grant: CompiledGrant, height_margin_m: float) -> bool:
     """Whether a leg of a drone below or above a zone comes between its altitudes, or too close to them.
 
-    A drone that is too close already may fly on at its height, as well as that is known.
+    A drone that is too close already may fly on at its height, as well as that is known: closer by no more than LEVEL_M, and
+    never into the nearer half of the margin, however many legs it asks for.
     """
     rest_m = stop_altitude_m(now)
     gap_m, present_m = (
@@ -207,8 +208,11 @@ def _comes_level(zone: PolicyZone, leg: Leg, now: Situation, grant: CompiledGran
             (min(now.altitude_m, rest_m), max(now.altitude_m, rest_m)),
         )
     )
-    kept_m = height_margin_m if present_m >= height_margin_m else present_m - LEVEL_M
-    return gap_m <= 0.0 or gap_m < kept_m
+    kept_m = height_margin_m
+    if present_m < height_margin_m:
+        kept_m = min(present_m, max(present_m - LEVEL_M, height_margin_m / 2))
+    # Heights converted between datums differ in their last digits.
+    return gap_m <= 0.0 or gap_m < kept_m - 1e-6
 
 
 def _exclusion_breach(zone: PolicyZone, leg: Leg, margin_m: float, enters: bool) -> Breach:

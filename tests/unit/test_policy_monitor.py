@@ -320,7 +320,10 @@ def test_a_climb_to_below_a_zone_is_let_pass_and_so_is_a_landing() -> None:
     assert isinstance(leg, GotoArgs)
     for tenths in range(50, 160):
         climb = min(2.5, math.sqrt(2 * max(16.0 - tenths / 10, 0.05)))
-        assert monitor(at(0, 0, tenths / 10, down_mps=-climb, latency_s=0.77), grant, bound_for=leg) is None
+        climbing = at(0, 0, tenths / 10, down_mps=-climb, latency_s=0.77)
+        for changed in (False, True):
+            assert monitor(climbing, grant, bound_for=leg, changed=changed) is None
+    assert monitor(at(0, 0, 13.0, down_mps=-2.0), compiled(exclusion(AROUND, lower=15)), bound_for=leg) is not None
     below = compiled(exclusion(AROUND, upper=10))
     landing = at(0, 0, 12.0, down_mps=1.5)
     assert monitor(landing, below) is not None

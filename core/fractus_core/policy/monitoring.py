@@ -78,13 +78,13 @@ def monitor(
     now = replace(now, forward_mps2=min(now.forward_mps2 or 0.0, 0.0))
     stop = stop_point(now, start)
     ahead = stop if bound_for is None else _arrival(now, start, stop, grant.frame.xy(bound_for.lat, bound_for.lon))
-    level_m = stop_altitude_m(now) if bound_for is None else _level_m(now, bound_for, grant)
+    level_m = _level_m(now, bound_for, grant)
     worst = _worst(_fences(now, grant, _look_ahead(now, start, ahead, margin, level_m), leaving=leaving))
     if worst is not None:
         return replace(worst, brake_first=worst.action == "takeover" and moving(now))
     for begin, then in surging:
         # Its way may end before the fence: it is stopped, and taken over only if it really goes too far.
-        further = _look_ahead(then, begin, stop_point(then, begin), margin, stop_altitude_m(then))
+        further = _look_ahead(then, begin, stop_point(then, begin), margin, _level_m(then, bound_for, grant))
         worst = _worst(_fences(then, grant, further, leaving=True))
         if worst is not None:
             return replace(worst, action="deny", takeover="hover")
@@ -118,10 +118,10 @@ def _arrival(now: Situation, start: XY, stop: XY, target: XY) -> XY:
     return target if arrives else stop
 
 
-def _level_m(now: Situation, bound_for: GotoArgs, grant: CompiledGrant) -> float:
+def _level_m(now: Situation, bound_for: GotoArgs | None, grant: CompiledGrant) -> float:
     """The altitude at which a drone comes to rest that climbs or sinks to that of its leg; see `_arrival`."""
     rest_m, climb = stop_altitude_m(now), -now.down_mps
-    if bound_for.alt is None or climb == 0.0:
+    if bound_for is None or bound_for.alt is None or climb == 0.0:
         return rest_m
     target_m = height_m(bound_for.alt, bound_for.reference, now.home, grant.flat_terrain)
     if target_m is None:

@@ -484,6 +484,18 @@ class Flight:
         )
         self.oracle.appears(Wall(shapely.box(*box), low, high))
 
+    def add_zone_overhead(self) -> None:
+        """A zone above the drone, now, that it can still stop below."""
+        chance, (x, y, height), (_, climb) = self.chance, self.oracle.place(), self.oracle.speeds()
+        half_m, low = chance.uniform(15, 60), height + 4.0 + 2.0 * abs(climb) + chance.uniform(0.5, 6)
+        box = x - half_m, y - half_m, x + half_m, y + half_m
+        action, name = chance.choice(["ignore", "adjust", "hover"]), f"z{len(self.policies)}"
+        policy = zone(name, action, *box)
+        policy["zones"][0]["altitude"] = {"lower": low, "upper": 60.0, "reference": "home"}
+        self.policies.append(policy)
+        self.account.events.append(f"{self.sky.time() - 1000:7.2f} zone {name} {action} from {low:.1f} m overhead")
+        self.oracle.appears(Wall(shapely.box(*box), low, 60.0))
+
     def add_limit(self) -> None:
         """A limit of height or of speed, now."""
         chance, rules = self.chance, self.oracle.rules
@@ -617,7 +629,9 @@ class Flight:
             asyncio.get_running_loop().call_later(self.weather.cut[0], self._sever)
         for _ in range(chance.randrange(6)):
             await asyncio.sleep(chance.uniform(2, 30))
-            if chance.random() < 0.75:
+            if chance.random() < 0.15:
+                self.add_zone_overhead()
+            elif chance.random() < 0.75:
                 self.add_zone(ahead=chance.random() < 0.7)
             else:
                 self.add_limit()

@@ -250,7 +250,7 @@ def _storage(vehicle: Vehicle, o: Order, _c: Channel) -> MAV_RESULT:
     v = vehicle.state
     if o.params[0] != 2.0 or v.armed:
         return MAV_RESULT.DENIED
-    v.params.reset()
+    v.params.erase()
     v.say(MAV_SEVERITY.WARNING, "All parameters reset, reboot board")
     return MAV_RESULT.ACCEPTED
 

@@ -97,6 +97,7 @@ class Parameters(Mapping[str, float]):
         self._values = {parameter.name: parameter.coerce(parameter.default) for parameter in table()}
         self._store = store
         self._watchers: list[Callable[[str], None]] = []
+        self._erased: set[str] = set()
         if store is not None and store.exists():
             for stored, value in _stored(store):
                 if stored in self._values:
@@ -139,20 +140,21 @@ class Parameters(Mapping[str, float]):
         if name not in self._values or name in READ_ONLY or not math.isfinite(value):
             return False
         self.assign(name, value)
+        self._erased.discard(name)
         self._save()
         return True
 
-    def reset(self) -> None:
-        """Set all parameters that a client may set back to their defaults."""
-        for row in table():
-            if row.name not in READ_ONLY and self._values[row.name] != row.coerce(row.default):
-                self.assign(row.name, row.default)
+    def erase(self) -> None:
+        """Forget what clients have stored; until the next boot the values stay as they are."""
+        self._erased = set(self._values) - READ_ONLY
         self._save()
 
     def changes(self) -> dict[str, float]:
-        """The parameters that differ from their defaults."""
+        """The stored parameters that differ from their defaults: what the next boot finds."""
         return {
-            row.name: self._values[row.name] for row in table() if self._values[row.name] != row.coerce(row.default)
+            row.name: self._values[row.name]
+            for row in table()
+            if row.name not in self._erased and self._values[row.name] != row.coerce(row.default)
         }
 
     def find(self, name: str, index: int = -1) -> tuple[str, Parameter, int] | None:

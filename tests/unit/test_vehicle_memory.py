@@ -83,6 +83,19 @@ def test_a_reboot_keeps_what_is_stored_and_forgets_the_rest():
     pilot.wait(lambda: not arming_refusals(rebooted), 10.0)
 
 
+def test_erased_parameters_have_their_defaults_after_the_next_boot():
+    vehicle, pilot = alone()
+    pilot.parameter("WPNAV_SPEED", 750.0)
+    assert pilot.command(MAV_CMD.PREFLIGHT_STORAGE, 2) is MAV_RESULT.ACCEPTED
+    assert vehicle.params["WPNAV_SPEED"] == 750.0
+    pilot.parameter("RTL_ALT", 2500.0)
+    pilot.command(MAV_CMD.PREFLIGHT_REBOOT_SHUTDOWN, 1)
+    pilot.fly_on(0.1)
+    rebooted = pilot.craft.vehicle.state
+    assert rebooted.params["WPNAV_SPEED"] == Parameters()["WPNAV_SPEED"]
+    assert rebooted.params["RTL_ALT"] == 2500.0
+
+
 def test_it_does_not_reboot_in_the_air():
     vehicle, pilot = airborne(5.0)
     assert pilot.command(MAV_CMD.PREFLIGHT_REBOOT_SHUTDOWN, 1) is MAV_RESULT.FAILED

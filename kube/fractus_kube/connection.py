@@ -114,6 +114,18 @@ class Connection:
         except (KubeError, *_FAILURES):
             return False
 
+    async def answers(self, timeout_s: float) -> bool:
+        """Whether anything is heard from the API server within some seconds, be it a refusal: the path to it works."""
+        try:
+            async with asyncio.timeout(timeout_s), self.answer("GET", "/livez", None):
+                return True
+        except KubeError:
+            return True
+        except aiohttp.ClientConnectorError as error:
+            return isinstance(error.os_error, ConnectionRefusedError)
+        except _FAILURES:
+            return False
+
     @asynccontextmanager
     async def answer(
         self,

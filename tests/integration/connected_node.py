@@ -42,6 +42,12 @@ class Files:
                 yield Listed(tuple(links))
             await asyncio.sleep(POLL_S)
 
+    async def answers(self, timeout_s: float) -> bool:
+        if self.read("api.json") is False:
+            await asyncio.sleep(timeout_s)
+            return False
+        return True
+
     async def apply_status(self, _kind: str, name: str, status: dict[str, Any], end: End | None = None) -> None:
         if self.read("api.json") is False:
             raise KubeError(0, "Unreachable", "the API server is out of reach")

@@ -69,9 +69,17 @@ class Agent:
         run(*world.inside("cloud"), "ip", "route", "add", f"10.88.{self.number}.0/24", "via", f"10.90.{self.number}.1")
         self.add_radio()
         self.certify(name)
+        # So slow that a link is better also where a busy machine hardly gets to carry its frames.
+        self.describe(uplink_mbps=1)
+        self._process: subprocess.Popen[str] | None = None
+        self._reading: threading.Thread | None = None
+        self._said: queue.Queue[str] = queue.Queue()
+        self.statuses: dict[str, dict[str, Any]] = {}
+
+    def describe(self, uplink_mbps: float) -> None:
+        """What the node's description says."""
         interfaces = [
-            # So slow that a link is better also where a busy machine hardly gets to carry its frames.
-            {"technology": "4G", "bandwidth": 1},
+            {"technology": "4G", "bandwidth": uplink_mbps},
             {
                 "technology": "WiFi",
                 "device": "wlan0",
@@ -80,14 +88,12 @@ class Agent:
             },
         ]
         spec: dict[str, Any] = {"interfaces": interfaces}
-        if kind == "EdgeNode":
-            spec["location"] = {"lat": place(*at)["lat"], "lon": place(*at)["lon"]}
-        body = {"apiVersion": "fractus.dev/v1alpha1", "kind": kind, "metadata": {"name": name}, "spec": spec}
-        self._write("node.json", body)
-        self._process: subprocess.Popen[str] | None = None
-        self._reading: threading.Thread | None = None
-        self._said: queue.Queue[str] = queue.Queue()
-        self.statuses: dict[str, dict[str, Any]] = {}
+        if self.kind == "EdgeNode":
+            spec["location"] = {"lat": place(*self.at)["lat"], "lon": place(*self.at)["lon"]}
+        self._write(
+            "node.json",
+            {"apiVersion": "fractus.dev/v1alpha1", "kind": self.kind, "metadata": {"name": self.name}, "spec": spec},
+        )
 
     def add_radio(self) -> None:
         hardware = bytes([2, 0, 0, 0, 0, self.number])

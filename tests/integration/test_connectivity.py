@@ -301,6 +301,28 @@ def test_the_loss_of_the_uplink_leaves_direct_traffic_alone(world: World) -> Non
     assert not client.failed
 
 
+def test_a_cloud_path_that_is_cut_is_left_though_it_was_the_better_one(world: World) -> None:
+    edge = world.edge("e1", 20.0)
+    drone = flying(world, edge)
+    client = world.client(drone, 100_000, 0.05)
+    until(lambda: client.by == "e1", "an answer over the link", world)
+    drone.describe(uplink_mbps=900)
+    until(lambda: client.by == "cloud", "an answer of the cloud", world)
+    drone.uplink(up=False)
+    for agent in (drone, edge):
+        agent.api(up=False)
+    until(lambda: client.by == "e1", "an answer over the link, though the cloud path declares more", world)
+    cut = len(client.answers)
+    until(lambda: len(client.answers) > cut + 100, "more of them", world)
+    assert {answer[1] for answer in client.answers[cut:]} == {"e1"}
+    drone.uplink(up=True)
+    for agent in (drone, edge):
+        agent.api(up=True)
+    until(lambda: client.by == "cloud", "an answer of the cloud, which is the better path again", world)
+    assert "FAILED" not in {answer[1] for answer in client.answers[cut:]}
+    until(lambda: drone.status("app-d1-e1").get("traffic") == "cloud", "the status", world)
+
+
 def test_an_agent_that_dies_in_the_middle_of_a_switch(world: World) -> None:
     edge = world.edge("e1", 20.0)
     drone = flying(world, edge)

@@ -112,6 +112,43 @@ def test_a_pod_that_moves_is_followed_and_one_that_goes_is_left() -> None:
     assert done(replace(DIRECT, routes={})).abrupt == {VIP: None}
 
 
+SILENT = {"cloud": None}
+
+
+@pytest.mark.parametrize(
+    "heuristic_of", [("max", "ingress-bandwidth"), ("min", "ingress-latency"), ("preferDirect", None)]
+)
+def test_a_cloud_path_that_does_not_answer_is_no_target(heuristic_of: tuple[str, str | None]) -> None:
+    traffic = replace(TRAFFIC, heuristic=heuristic(*heuristic_of))
+    worse = replace(WIFI, ingress_mbps=0.1, egress_mbps=0.1, ingress_latency_ms=500.0)
+    linked = replace(LINKED, traffic=(traffic,), direct=worse, **SILENT)
+    found = done(linked)
+    # Its connections hang: they are closed, not drained.
+    assert (found.abrupt, found.planned, found.targets["ns/app"].code) == ({VIP: ROUTE}, {}, "CloudSilent")
+    kept = done(replace(linked, redirects={VIP: ROUTE}))
+    assert kept.abrupt == kept.planned == {}
+    # Once it answers, traffic goes back to it as from any slower path.
+    back = done(replace(linked, redirects={VIP: ROUTE}, cloud=CLOUD))
+    assert back.planned == ({} if heuristic_of[0] == "preferDirect" else {VIP: None})
+
+
+def test_without_a_cloud_path_a_slow_link_is_made_and_kept_to_its_end() -> None:
+    slow = replace(TRAFFIC, peers=(replace(NEAR, offers=replace(WIFI, ingress_mbps=0.5)),))
+    alone = Situation(NOW_S, HERE, (slow,), NO_LINK, HEARD, CLOUD)
+    assert done(alone).peer == ""
+    assert done(replace(alone, **SILENT)).peer == "e1"
+    for east in (-69.0, -75.0):  # about to leave the declared reach, and beyond it
+        leaving = replace(DIRECT, track=Track((east, 0.0, 0.0), velocity_mps=(-3.0, 0.0, 0.0)), **SILENT)
+        found = done(leaving)
+        assert (found.peer, found.planned, found.abrupt) == ("e1", {}, {})
+        assert not done(replace(leaving, redirects={})).abrupt, "nothing is led onto a link that is about to end"
+
+
+def test_where_nothing_answers_traffic_waits_for_the_cloud_path() -> None:
+    found = done(replace(DIRECT, link=NO_LINK, direct=None, routes={}, **SILENT))
+    assert (found.abrupt, found.planned) == ({VIP: None}, {})
+
+
 # Lessons
 
 

@@ -228,6 +228,10 @@ class Store:
                 backoff.succeeded()
             await asyncio.sleep(backoff.delay_s())
 
+    async def answers(self, timeout_s: float) -> bool:
+        """Whether anything is heard from the API server within some seconds, be it a refusal: the path to it works."""
+        return await self._client.answers(timeout_s)
+
     async def close(self) -> None:
         """Close the connections."""
         await self._client.aclose()

@@ -10,8 +10,8 @@ from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 
-from fractus_core.api.nodes import Drone, EdgeNode, Interface, direct_interface
-from fractus_core.linking import PathMetrics, Seen
+from fractus_core.api.nodes import Drone, Interface, direct_interface
+from fractus_core.linking import Seen
 
 from fractus_agent.cluster.store import End, Store
 from fractus_agent.links import beacons, metrics, pairing
@@ -26,6 +26,7 @@ from fractus_agent.links.metrics import LinkMetrics
 from fractus_agent.links.peer import PeerEnd
 from fractus_agent.links.plans import LinkPlans
 from fractus_agent.links.reports import DroneReport, LinkReports, peer_condition
+from fractus_agent.links.uplink import Node, Uplink
 from fractus_agent.redirector import nft
 from fractus_agent.redirector.conntrack import Conntrack
 from fractus_agent.redirector.netlink import NETLINK_NETFILTER, Netlink, NetlinkError
@@ -43,23 +44,6 @@ LOG = "links.jsonl"
 CHECK_S = 2.0
 """Seconds between looks at the interface: a device may go, and come back without its address."""
 RETRY_S = 5.0
-
-_UPLINK_LATENCY_MS = {"Ethernet": 1.0, "WiFi": 5.0, "5G": 15.0, "4G": 60.0, "BLE": 60.0}
-"""One way to the cloud, by what the node is connected with."""
-_UPLINK_MBPS = 8.0
-
-Node = Drone | EdgeNode
-
-
-def cloud_path(node: Node | None) -> PathMetrics:
-    """What the path to the cloud offers, by the best of a node's other interfaces."""
-    interfaces = node.spec.interfaces if node is not None else ()
-    direct = direct_interface(interfaces)
-    others = [each for each in interfaces if each is not direct]
-    best = max(others, key=lambda each: each.bandwidth_mbps, default=None)
-    rate = best.bandwidth_mbps if best is not None else _UPLINK_MBPS
-    latency_ms = _UPLINK_LATENCY_MS[best.technology if best is not None else "4G"]
-    return PathMetrics(rate, rate, latency_ms, latency_ms)
 
 
 class Connectivity:
@@ -92,6 +76,7 @@ class Connectivity:
         changed: Callable[[], None] = lambda: None,
         pods: Path = PODS,
     ) -> None:
+        self._store = store
         self._node = node
         self._tls = tls
         self._audit = audit / LOG
@@ -229,12 +214,13 @@ class Connectivity:
                 netlink.close()
 
     async def _run_end(self, redirector: Redirector, device: str, record: Record) -> None:
+        uplink = Uplink(self._resource, self._store.answers)
         if self._end == "drone":
             drone = self._drone = DroneEnd(
                 self._node,
                 self._tls,
                 redirector,
-                cloud=lambda: cloud_path(self._resource()),
+                cloud=uplink.offers,
                 seen=self._seen,
                 report=self._report,
                 record=record,
@@ -250,6 +236,7 @@ class Connectivity:
                 tasks.create_task(told.run(device))
                 tasks.create_task(run())
                 if self._drone is not None:
+                    tasks.create_task(uplink.run())
                     tasks.create_task(metrics.serve(self._metrics.text))
         finally:
             self._drone = self._peer = None

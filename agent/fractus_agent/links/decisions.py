@@ -56,7 +56,7 @@ class Situation:
         traffic: by application.
         link: the direct link as it is.
         reaches: what was learned of peers' links, by name.
-        cloud: what the cloud path offers.
+        cloud: what the cloud path offers; None while it does not answer.
         direct: what was measured of the link that is up; None before that.
         routes: where on the link its peer takes the calls to services; empty until it says so, and once the link is lost.
         redirects: where calls to services are led now.
@@ -67,7 +67,7 @@ class Situation:
     traffic: tuple[Traffic, ...]
     link: Link
     reaches: Mapping[str, Reach]
-    cloud: PathMetrics
+    cloud: PathMetrics | None
     direct: PathMetrics | None = None
     routes: Mapping[Endpoint, Endpoint] = field(default_factory=dict)
     redirects: Mapping[Endpoint, Endpoint] = field(default_factory=dict)
@@ -122,10 +122,13 @@ def _wanted(now: Situation, settings: Settings) -> LinkDecision:
         return LinkDecision("", bool(present), "NotPlanned", "no application's traffic may take a direct link")
     if now.track is None:
         return LinkDecision(present, False, "PositionUnknown", "where the drone is is not known, so nothing is changed")
-    return plan_link(
+    found = plan_link(
         now.track, [peer for peer in deciding.peers if _expected(peer, now.track, now)], now.cloud, now.link, now.now_s,
         heuristic=deciding.heuristic, settings=settings, reaches=now.reaches,
     )  # fmt: skip
+    if now.cloud is None and now.link.phase is Phase.UP and not found.peer:
+        return LinkDecision(present, False, "CloudSilent", "the cloud path does not answer, so the link is kept")
+    return found
 
 
 def _expected(peer: Peer, track: Track, now: Situation) -> bool:
@@ -138,9 +141,9 @@ def _expected(peer: Peer, track: Track, now: Situation) -> bool:
 
 
 def _lives(service: Endpoint, now: Situation) -> bool:
-    """Whether the path that a service takes now works: the cloud path always counts as one that does."""
+    """Whether the path that a service takes now works."""
     before = now.redirects.get(service)
-    return before is None or before in now.routes.values()
+    return now.cloud is not None if before is None else before in now.routes.values()
 
 
 def _leaves(now: Situation, settings: Settings) -> bool:

@@ -60,7 +60,7 @@ class DroneEnd:
         node: this node.
         tls: its certificate, key and authority.
         redirector: of this node.
-        cloud: what the cloud path offers.
+        cloud: what the cloud path offers; None while it does not answer.
         seen: what telemetry says of the drone now; None while it says nothing.
         report: takes what becomes of the links.
         record: writes an entry of the audit log: its kind and content.
@@ -72,7 +72,7 @@ class DroneEnd:
         tls: Path,
         redirector: Redirector,
         *,
-        cloud: Callable[[], PathMetrics],
+        cloud: Callable[[], PathMetrics | None],
         seen: Callable[[], Seen | None],
         report: Callable[[DroneReport], None],
         record: Record,

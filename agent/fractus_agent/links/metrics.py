@@ -68,7 +68,10 @@ class LinkMetrics:
         for service, flow in report.flows.items():
             yield "fractus_service_sent_mbps", route_key(service), flow.sent_mbps
             yield "fractus_service_received_mbps", route_key(service), flow.received_mbps
-        yield from _path(CLOUD, report.cloud)
+        if report.cloud is not None:
+            yield from _path(CLOUD, report.cloud)
+        else:
+            yield "fractus_path_bandwidth_mbps", CLOUD, 0.0
         for peer, offered in report.offers.items():
             up = report.link.phase is Phase.UP and report.link.peer == peer.name
             yield "fractus_link_up", peer.name, up

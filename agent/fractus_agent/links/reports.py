@@ -38,7 +38,7 @@ class DroneReport:
         measured: of the link that is up; None before that.
         reaches: what was learned of peers.
         unknown: applications whose heuristic is not known here, and why.
-        cloud: what the cloud path offers.
+        cloud: what the cloud path offers; None while it does not answer.
         offers: what the links to peers are expected to offer where the drone is; None out of reach.
         flows: what services moved over the link lately.
     """
@@ -50,7 +50,7 @@ class DroneReport:
     measured: PathMetrics | None
     reaches: Mapping[str, Reach]
     unknown: Mapping[str, str]
-    cloud: PathMetrics
+    cloud: PathMetrics | None
     offers: Mapping[Peer, PathMetrics | None]
     flows: Mapping[Endpoint, Flow] = field(default_factory=dict)
 

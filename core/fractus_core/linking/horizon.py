@@ -101,7 +101,7 @@ def solve(horizon: Horizon) -> Solution:
 def plan_link(
     track: Track,
     peers: Sequence[Peer],
-    cloud: PathMetrics,
+    cloud: PathMetrics | None,
     link: Link,
     now_s: float,
     *,
@@ -114,7 +114,7 @@ def plan_link(
     Args:
         track: where the drone is and will be.
         peers: nodes that it may link to.
-        cloud: what the cloud path offers now.
+        cloud: what the cloud path offers now; None while it does not answer.
         link: the direct link as it is.
         now_s: a monotonic clock.
         heuristic: what makes a path good.
@@ -130,8 +130,9 @@ def plan_link(
     positions = predict(track, settings)
     rows = [[offered(peer, expected(reaches, peer.name), at, settings) for at in positions] for peer in usable]
     direct = tuple(tuple(UNREACHABLE if path is None else heuristic(path) for path in row) for row in rows)
-    base = heuristic(cloud)
-    advantage = max((score - base for row in direct for score in row), default=0.0)
+    scores = [score for row in direct for score in row if score != UNREACHABLE]
+    base = heuristic(cloud) if cloud is not None else _nothing(scores)
+    advantage = max(scores, default=base) - base
     # A link that is up at once would be one of its own successors.
     connect_steps = max(math.ceil((settings.link_up_s + settings.probe_s) / settings.step_s), 1)
     cost = max(advantage, 0.0) * settings.switch_cost_s / settings.step_s
@@ -151,6 +152,11 @@ def plan_link(
     return LinkDecision(
         names[best], names[best] != present, code, reason, _unroll(best, current, names, horizon, solution)
     )
+
+
+def _nothing(scores: Sequence[float]) -> float:
+    """The score of no path at all: so much worse than the worst link that each of them is worth a switch."""
+    return min(scores, default=0.0) - max(map(abs, scores), default=0.0)
 
 
 def _while_connecting(current: int, elapsed_s: float, horizon: Horizon, solution: Solution) -> tuple[int, str]:

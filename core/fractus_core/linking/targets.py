@@ -11,7 +11,7 @@ from fractus_core.linking.values import Link, PathMetrics, Peer, Phase, Reach, S
 
 def choose_target(
     heuristic: TargetHeuristic,
-    cloud: PathMetrics,
+    cloud: PathMetrics | None,
     direct: PathMetrics | None,
     *,
     is_direct: bool,
@@ -22,7 +22,7 @@ def choose_target(
 
     Args:
         heuristic: what makes a path good.
-        cloud: what the cloud path offers.
+        cloud: what the cloud path offers; None while it does not answer.
         direct: what was measured of the direct link; None while there is none, or it has not been measured.
         is_direct: whether traffic takes the direct link now.
         leaving: whether the drone is about to leave the reach of the link, or to connect to another peer.
@@ -30,6 +30,10 @@ def choose_target(
     """
     if direct is None:
         return TargetDecision(False, is_direct, False, "NoDirectLink", "there is no direct link")
+    if cloud is None:
+        # A link that is about to be left carries what it can until it is gone, and takes nothing more.
+        takes = is_direct or not leaving
+        return TargetDecision(takes, takes != is_direct, True, "CloudSilent", "the cloud path does not answer")
     if leaving:
         return TargetDecision(False, is_direct, True, "LeavingLink", "the direct link is about to be left")
     ours, theirs = (direct, cloud) if is_direct else (cloud, direct)

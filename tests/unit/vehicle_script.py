@@ -521,7 +521,7 @@ class Player:
         peak, end, once = 0.0, self.line.now_s + float(duration), "x" in {f.partition("=")[0] for f in fields}
         self.line.send(name, values)
         while self.line.now_s < end:
-            again = self.line.now_s + 0.2
+            again = min(self.line.now_s + 0.2, end)
             while self.line.now_s < again:
                 peak = max(peak, self._fast()[0])
             if not once:

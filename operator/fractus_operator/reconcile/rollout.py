@@ -33,7 +33,7 @@ _LAST = (kinds.SERVICE, kinds.ENDPOINT_SLICE, kinds.NETWORK_POLICY, kinds.DIRECT
 
 
 class Rollout:
-    """PartPool an application's children what its plan says.
+    """Makes an application's children what its plan says.
 
     Deployments go first: until their pods have nodes, nothing else that is new takes the API server from the scheduler.
     A pod starts without the rest, which takes longer than applying it, but can call nothing before it has its Grant.

@@ -75,7 +75,7 @@ def main() -> int:
             if second % 3 == 0:
                 writer.flush()
             writer.tick()
-        writer.end()
+        writer.close()
         cpu = (time.process_time() - begun_s) / seconds * 100
         rate_kb = sum(path.stat().st_size for path in Path(directory).iterdir()) / seconds / 1e3
     more_mb = resident_mb() - before_mb

@@ -13,7 +13,7 @@ from fractus_agent.cluster.store import Object, Store
 from fractus_agent.grants.keeper import GrantDirectory, GrantKeeper
 from fractus_agent.grants.verifier import GrantVerifier
 from fractus_agent.identity.identity import Identity
-from fractus_agent.registration.evidence import audit_heads
+from fractus_agent.registration.evidence import audit_heads, recording_problems
 from fractus_agent.registration.handover import Handover
 from fractus_agent.registration.registration import Registration
 from fractus_agent.registration.status import Observed, StatusReporter
@@ -159,6 +159,7 @@ class Agent:
             described=self._registration.described,
             handed=self._handover.condition,
             audit=audit_heads(self._settings.audit),
+            unrecorded=recording_problems(self._settings.state),
         )
 
     def _telemetry_changed(self) -> None:

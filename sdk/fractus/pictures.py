@@ -91,7 +91,11 @@ class Camera(ServiceClient):
         return tuple(ImageInfo.from_proto(image, reply.decision) for image in reply.images)
 
     async def delete(self, name: str) -> Result:
-        """Delete a picture from the node."""
+        """Delete a picture from the node.
+
+        Where the node records pictures (`fractus camera serve --recordings`), the copy in the recording stays until its segment
+        makes room for newer ones.
+        """
         reply: types_pb2.Decision = (
             await self._channel.unary("DeleteImage", camera_pb2.DeleteImageRequest(name=name))
         ).decision

@@ -27,6 +27,11 @@ class ServiceOptions:
         """File that remembers which grants were seen."""
         return self.state / "grants-seen.json"
 
+    @property
+    def recording_problem(self) -> Path:
+        """File that says why nothing is recorded, while that is so; the node's agent reads it."""
+        return self.state / "recording.problem"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MobilityOptions(ServiceOptions):

@@ -15,6 +15,7 @@ from fractus_core.api.names import component_identity
 from fractus_proto.v1 import camera_pb2, camera_pb2_grpc
 from fractus_proto.v1 import mobility_pb2 as pb
 from mcap.reader import make_reader
+from mcap.writer import MCAP0_MAGIC
 from mobility_rig import HOME, NODE, PASSENGER, Driver, Rig, altitude_limit, fence, grant, passenger_grant
 from pymavlink import mavutil
 
@@ -62,6 +63,19 @@ async def flushed(directory: Path) -> None:
             await asyncio.sleep(0.1)
 
 
+def indexed(directory: Path) -> bool:
+    return min(directory.glob("*.mcap")).read_bytes().endswith(MCAP0_MAGIC)
+
+
+async def completed(directory: Path) -> None:
+    """Wait until what was recorded before the last start has its index."""
+    async with asyncio.timeout(120):
+        while True:
+            if indexed(directory):
+                return
+            await asyncio.sleep(0.1)
+
+
 async def test_a_flight_and_its_pictures_are_recorded_and_a_kill_costs_little(rig: Rig) -> None:
     mobility, pictures = rig.directory / "recordings" / "mobility", rig.directory / "recordings" / "camera"
     camera = [{"service": "camera", "methods": ["CaptureImage"]}]
@@ -81,6 +95,7 @@ async def test_a_flight_and_its_pictures_are_recorded_and_a_kill_costs_little(ri
     rig.kill("service")
     rig.start_service("--recordings", str(mobility))
     await rig.until(lambda t: t.autopilot_connected and not t.armed, 120, "landed")
+    await completed(mobility)
     rig.kill("service", signal.SIGTERM)
     rig.kill("camera", signal.SIGTERM)
 

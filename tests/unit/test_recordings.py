@@ -14,12 +14,13 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from fractus_agent.conditions import Condition
+from fractus_agent.registration.evidence import recording_problems
 from fractus_agent.registration.status import Observed, node_status
 from fractus_agent.telemetry.feed import snapshot
 from fractus_core.api import Grant
@@ -28,10 +29,12 @@ from fractus_mavlink.enums import MAV_AUTOPILOT, MAV_MODE_FLAG
 from fractus_proto.v1.mobility_pb2 import Telemetry
 from fractus_services.recording import flight_writer, recorder
 from fractus_services.recording.flight_writer import FlightWriter
+from fractus_services.recording.mcap_file import completed
 from fractus_services.recording.recorder import Recorder
 from fractus_services.recording.segments import MIN_SEGMENT_BYTES, Segments, segments_in
 from fractus_storage.audit import AuditLog
 from mcap.reader import NonSeekingReader, make_reader
+from mcap.writer import MCAP0_MAGIC
 from test_audit_export import GRANT
 
 S = 1_000_000_000
@@ -65,10 +68,36 @@ class Vehicle:
         return self.endpoint.encode("STATUSTEXT", {"severity": 4, "text": words.encode()})
 
 
+class Steady:
+    """A clock that does not jump."""
+
+    now_s = 0.0
+
+
+@pytest.fixture(autouse=True)
+def steady() -> Iterator[None]:
+    Steady.now_s = 0.0
+    yield
+    while opened:
+        opened.pop().segments.release()
+
+
+opened: list[FlightWriter] = []
+
+
 def writer_in(directory: Path, megabytes: float = 4.0, *, always: bool = False) -> FlightWriter:
-    writer = FlightWriter(Segments(directory, int(megabytes * 1e6), reserve_bytes=0), "drone-1", always=always)
-    writer.begin()
-    return writer
+    """A writer of a process that takes the place of the one before."""
+    while opened:
+        opened.pop().segments.release()
+    segments = Segments(directory, int(megabytes * 1e6), reserve_bytes=0)
+    opened.append(FlightWriter(segments, "drone-1", always=always, steady=lambda: Steady.now_s))
+    opened[-1].begin()
+    return opened[-1]
+
+
+def made_whole(writer: FlightWriter, path: Path) -> None:
+    """Wait until what a crash left is complete."""
+    until(lambda: writer.tick() or path.read_bytes().endswith(MCAP0_MAGIC))
 
 
 def fly(writer: FlightWriter, begin_s: int, seconds: int, vehicle: Vehicle | None = None) -> None:
@@ -76,6 +105,7 @@ def fly(writer: FlightWriter, begin_s: int, seconds: int, vehicle: Vehicle | Non
     vehicle, companion = vehicle or Vehicle(), Endpoint(244, 191)
     for second in range(begin_s - 60, begin_s + seconds + 60):
         armed, now = begin_s <= second < begin_s + seconds, T0 + second * S
+        Steady.now_s += 1.0
         writer.received(now, vehicle.heartbeat(armed))
         writer.received(now + 1000, vehicle.position(39.0 + second * 1e-5, 22.0, 100.0 + second) + vehicle.attitude())
         writer.sent(now + 2000, companion.encode("TIMESYNC", {"ts1": second}))
@@ -133,6 +163,7 @@ def test_a_flight_is_recorded_with_a_little_before_and_after(tmp_path: Path) -> 
 def test_each_flight_has_files_of_its_own_and_the_ground_has_none(tmp_path: Path) -> None:
     writer = writer_in(tmp_path)
     for second in range(600):
+        Steady.now_s = float(second)
         writer.received(T0 + second * S, Vehicle().heartbeat(False))
         writer.tick()
     assert not list(tmp_path.iterdir())
@@ -249,20 +280,127 @@ def test_what_a_crash_leaves_can_be_read_and_is_completed(tmp_path: Path) -> Non
     for kept in (whole, whole[:-3], whole + b"\x06\xff\xff"):
         messages.write_bytes(kept)
         again = writer_in(tmp_path)
+        made_whole(again, messages)
         assert len(mcap(messages)["/drone-1/location foxglove.LocationFix"]) == 20
         assert stat.S_IMODE(messages.stat().st_mode) == 0o600
         assert again.segments.begin(T0).name.startswith("000002")
     done = messages.read_bytes()
-    writer_in(tmp_path)
+    writer_in(tmp_path).tick()
     assert messages.read_bytes() == done, "what is complete is left alone"
+
+
+def crashed(directory: Path, seconds: int = 200) -> Path:
+    """A directory in which a process was killed in flight; the file that has no index."""
+    writer, vehicle = writer_in(directory), Vehicle()
+    for second in range(seconds):
+        writer.received(T0 + second * S, vehicle.heartbeat(True) + vehicle.position(39.0, 22.0, 100.0))
+    writer.flush()
+    (path,) = files(directory, ".mcap")
+    return path
+
+
+def test_nothing_is_completed_while_a_drone_flies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    broken = crashed(tmp_path)
+    left = broken.read_bytes()
+    monkeypatch.setattr(flight_writer, "COMPLETE_S", 0.0001)
+    writer, vehicle = writer_in(tmp_path), Vehicle()
+    for second in range(100):
+        Steady.now_s += 0.25
+        writer.received(T0 + (300 + second) * S, vehicle.heartbeat(True))
+        writer.tick()
+    assert broken.read_bytes() == left and not files(tmp_path, ".part")
+    Steady.now_s += 11.0
+    steps = 0
+
+    def landed() -> bool:
+        nonlocal steps
+        steps += 1
+        writer.tick()
+        return broken.read_bytes().endswith(MCAP0_MAGIC)
+
+    until(landed)
+    assert steps > 5, "a little at a time"
+    assert len(mcap(broken)["/drone-1/location foxglove.LocationFix"]) == 200
+
+
+def test_a_file_that_made_room_meanwhile_does_not_come_back(tmp_path: Path) -> None:
+    broken = crashed(tmp_path)
+    steps = completed(broken)
+    next(steps)
+    broken.unlink()
+    list(steps)
+    assert not broken.exists() and not files(tmp_path, ".part")
+
+
+def test_what_a_crash_left_half_made_is_removed_and_nothing_else(tmp_path: Path) -> None:
+    orphan, foreign = tmp_path / "000007-20260601T120000Z.part", tmp_path / "download.part"
+    orphan.write_bytes(b"x")
+    foreign.write_bytes(b"x")
+    writer_in(tmp_path)
+    assert not orphan.exists() and foreign.exists()
+
+
+def test_one_file_that_cannot_be_completed_stops_no_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    broken = crashed(tmp_path)
+
+    def full(_file: int) -> None:
+        raise OSError(errno.EDQUOT, "Disk quota exceeded")
+
+    monkeypatch.setattr(os, "fsync", full)
+    writer = writer_in(tmp_path)
+    until(lambda: writer.tick() or "Disk quota exceeded" in caplog.text)
+    assert not files(tmp_path, ".part") and str(broken) in caplog.text
+    fly(writer, 1000, 5)
+    assert len(files(tmp_path, ".mcap")) == 2
+
+
+def test_a_directory_has_one_writer(tmp_path: Path) -> None:
+    first, second = (Segments(tmp_path, 4_000_000, reserve_bytes=0) for _ in range(2))
+    first.prepare()
+    with pytest.raises(
+        OSError, match=r"another service records into .*; give each its own directory with --recordings"
+    ):
+        second.prepare()
+    taken = Recorder(second, "drone-1")
+    until(lambda: taken.problem)
+    assert f"another service records into {tmp_path}" in taken.problem
+    asyncio.run(taken.close())
+    first.release()
+    second.prepare()
+    second.release()
+
+
+def test_only_a_directory_that_it_makes_gets_its_mode(tmp_path: Path) -> None:
+    shared = tmp_path / "shared"
+    shared.mkdir()
+    shared.chmod(0o755)
+    writer_in(shared)
+    assert stat.S_IMODE(shared.stat().st_mode) == 0o755
+    writer_in(shared / "own")
+    assert stat.S_IMODE((shared / "own").stat().st_mode) == 0o700
+
+
+@pytest.mark.parametrize("step_s", [-3600, 3600])
+def test_the_wall_clock_does_not_say_when_a_flight_ends(tmp_path: Path, step_s: int) -> None:
+    writer, vehicle = writer_in(tmp_path), Vehicle()
+    for second in range(60):
+        Steady.now_s += 1.0
+        now = T0 + second * S + (step_s * S if second >= 15 else 0)
+        writer.received(now, vehicle.heartbeat(10 <= second < 14))
+        writer.tick()
+    (path,) = files(tmp_path, ".tlog")
+    assert len([m for m in tlog(path) if m.get_type() == "HEARTBEAT"]) == pytest.approx(10 + 4 + 10, abs=2)
 
 
 def test_a_clock_that_is_set_back_lets_nothing_grow(tmp_path: Path) -> None:
     writer, vehicle = writer_in(tmp_path), Vehicle()
     for second in range(3000):
+        Steady.now_s = float(second)
         writer.received(T0 - second * S, vehicle.heartbeat(False))
         writer.tick()
-    assert len(writer._before) <= flight_writer.MAX_BEFORE
+    assert len(writer._before) <= 11
     fly(writer, 0, 5)
     fly(writer, -10_000, 5)
     assert [path.name[:6] for path in files(tmp_path, ".mcap")] == ["000001", "000002"]
@@ -394,6 +532,28 @@ def test_an_error_of_ours_is_a_problem_and_no_crash(tmp_path: Path, monkeypatch:
     asyncio.run(taken.close())
 
 
+@pytest.mark.usefixtures("quick")
+def test_the_agent_is_told_what_is_not_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    state = tmp_path / "camera"
+    state.mkdir()
+    (state / "recording.problem").write_text("of an earlier process")
+    full = threading.Event()
+    full.set()
+
+    def check(_self: Segments) -> None:
+        if full.is_set():
+            raise OSError(errno.ENOSPC, "no room")
+
+    monkeypatch.setattr(Segments, "check_space", check)
+    Recorder(None, "drone-1", told=state / "recording.problem")
+    assert recording_problems(tmp_path) == []
+    taken = Recorder(Segments(tmp_path / "r", 4_000_000), "drone-1", told=state / "recording.problem")
+    until(lambda: recording_problems(tmp_path) == ["camera: recording stopped: no room"])
+    full.clear()
+    until(lambda: recording_problems(tmp_path) == [])
+    asyncio.run(taken.close())
+
+
 async def test_entries_of_the_audit_log_are_copied(tmp_path: Path) -> None:
     copied: list[dict[str, Any]] = []
     log = AuditLog(tmp_path / "audit.jsonl", lambda: 1_780_000_000.0, copied=copied.append)
@@ -406,9 +566,12 @@ def test_the_status_of_the_node_tells_that_nothing_is_recorded() -> None:
     from datetime import UTC, datetime
 
     certified = Condition("Certified", "True", "Issued", "")
-    for problem in ("", "recording stopped: No space left on device"):
-        seen = snapshot(Telemetry(recording_problem=problem))
-        observed = Observed("Drone", has_mobility=True, needs_certificate=True, certified=certified, snapshot=seen)
+    cases = (("", (), ""), ("flights stopped", (), "flights stopped"), ("", ("camera: full",), "camera: full"))
+    for flights, others, problem in cases:
+        seen = snapshot(Telemetry(recording_problem=flights))
+        observed = Observed(
+            "Drone", has_mobility=True, needs_certificate=True, certified=certified, snapshot=seen, unrecorded=others
+        )
         status = node_status(observed, {}, 1, datetime(2026, 6, 1, tzinfo=UTC))
         told = [c["message"] for c in status["conditions"] if c["type"] == "Recording" and c["status"] == "False"]
         assert told == ([problem] if problem else [])

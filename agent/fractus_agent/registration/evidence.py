@@ -1,4 +1,4 @@
-"""How far the audit logs of the node's services have come, so that the cluster knows what they must have."""
+"""What the services of the node leave in files for the cluster to know: how far their audit logs are, and what is not recorded."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import re
 from pathlib import Path
 
 _HEAD = re.compile(r"[a-z0-9-]{1,63}:\d{1,15}:[0-9a-f]{64}")
+
+MAX_PROBLEM_BYTES = 500
 
 
 def audit_heads(directory: Path) -> list[str]:
@@ -20,4 +22,17 @@ def audit_heads(directory: Path) -> list[str]:
             continue
         if _HEAD.fullmatch(head):
             found.append(head)
+    return found
+
+
+def recording_problems(state: Path) -> list[str]:
+    """Why services record nothing that should: SERVICE: PROBLEM for each that says so below the node's state directory."""
+    found = []
+    for path in sorted(state.glob("*/recording.problem")):
+        try:
+            said = path.read_bytes()[:MAX_PROBLEM_BYTES].decode(errors="replace").strip()
+        except OSError:
+            continue
+        if said:
+            found.append(f"{path.parent.name}: {said}")
     return found

@@ -57,6 +57,8 @@ class Observed:
     described: Condition | None = None
     handed: Condition | None = None
     audit: Sequence[str] = ()
+    unrecorded: Sequence[str] = ()
+    """Why services other than mobility record nothing that should."""
 
 
 def readiness(observed: Observed) -> Condition:
@@ -106,8 +108,9 @@ def node_status(observed: Observed, previous: Object, generation: int | None, no
 
 
 def _unrecorded(observed: Observed) -> Condition | None:
-    """That flights are not recorded though they should be; nothing is told while they are."""
-    problem = observed.snapshot.recording_problem if observed.snapshot is not None else ""
+    """That flights or pictures are not recorded though they should be; nothing is told while they are."""
+    flights = observed.snapshot.recording_problem if observed.snapshot is not None else ""
+    problem = "; ".join(filter(None, (flights, *observed.unrecorded)))
     return Condition("Recording", "False", "RecordingStopped", problem) if problem else None
 
 

@@ -79,7 +79,8 @@ class CameraServiceServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def DeleteImage(self, request, context):
-        """Missing associated documentation comment in .proto file."""
+        """Where the node records pictures, the copy in the recording stays until its segment makes room for newer ones.
+        """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')

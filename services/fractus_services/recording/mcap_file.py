@@ -14,7 +14,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from fractus_services.recording.messages import SCHEMAS
-from fractus_services.recording.segments import create
+from fractus_services.recording.segments import PART_SUFFIX, create
 
 CHUNK_BYTES = 256_000
 """Messages are compressed and written in pieces of this size, before compression."""
@@ -72,14 +72,15 @@ class McapFile:
         self._writer.finish()
 
 
-def complete(path: Path) -> None:
-    """Write the index of a file that was never closed, as far as it can be read; one that was closed is left alone.
+def completed(path: Path) -> Iterator[None]:
+    """Write the index of a file that was never closed, as far as it can be read, a message at each step.
+
+    The file is as it was until the last step; one that was closed is left alone, and so is one that is removed meanwhile.
 
     Raises:
-        OSError: the disk does not take it; the file is as it was.
+        OSError: the disk does not take it.
     """
-    part = path.with_suffix(".part")
-    part.unlink(missing_ok=True)
+    part = path.with_suffix(PART_SUFFIX)
     with path.open("rb") as file:
         size = file.seek(0, os.SEEK_END)
         file.seek(max(size - len(MCAP0_MAGIC), 0))
@@ -88,17 +89,17 @@ def complete(path: Path) -> None:
         file.seek(0)
         try:
             with create(part) as out:
-                _copy(file, out)
+                yield from _copied(file, out)
                 # What was on the disk before must not be lost with the power for the sake of an index.
                 out.flush()
                 os.fsync(out.fileno())
-        except OSError:
+            if os.fstat(file.fileno()).st_nlink:
+                part.replace(path)
+        finally:
             part.unlink(missing_ok=True)
-            raise
-    part.replace(path)
 
 
-def _copy(file: IO[bytes], out: IO[bytes]) -> None:
+def _copied(file: IO[bytes], out: IO[bytes]) -> Iterator[None]:
     writer: Any = Writer(out, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4)
     writer.start(profile="", library="fractus")
     schemas: dict[int, int] = {}
@@ -113,6 +114,7 @@ def _copy(file: IO[bytes], out: IO[bytes]) -> None:
             )
         elif isinstance(record, Message):
             writer.add_message(channels[record.channel_id], record.log_time, record.data, record.publish_time)
+        yield
     writer.finish()
 
 

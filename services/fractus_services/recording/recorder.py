@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import queue
 import threading
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fractus_core.api.plans import GrantSpec
+from fractus_storage.files import write_file
 
 from fractus_services.recording.segments import Segments
 
@@ -43,6 +46,7 @@ class Recorder:
         node: the first part of every topic.
         always: see `FlightWriter`.
         max_waiting: what waits for the thread at most.
+        told: file that holds `problem` while there is one, for the node's agent; None: it is not written.
         clock: Unix nanoseconds.
     """
 
@@ -53,6 +57,7 @@ class Recorder:
         *,
         always: bool = False,
         max_waiting: int = MAX_WAITING,
+        told: Path | None = None,
         clock: Callable[[], int] = time.time_ns,
     ) -> None:
         self._max_waiting = max_waiting if segments is not None else 0
@@ -61,6 +66,9 @@ class Recorder:
         self._waiting: queue.SimpleQueue[Callable[[FlightWriter], None]] = queue.SimpleQueue()
         self._lost = 0
         self._problem = ""
+        self._told = told
+        # What an earlier process could not record is no problem of this one.
+        self._tell("")
         self._busy_since_s: float | None = None
         self._rests_until_s = 0.0
         self._closing = threading.Event()
@@ -125,7 +133,7 @@ class Recorder:
             closing = self._closing.wait(DRAIN_S)
             self._guarded(writer, lambda: self._drain(writer))
             if closing:
-                self._guarded(writer, writer.end)
+                self._guarded(writer, writer.close)
                 return
 
     def _guarded(self, writer: FlightWriter, work: Callable[[], None]) -> None:
@@ -146,12 +154,24 @@ class Recorder:
         self._rests_until_s = time.monotonic() + RETRY_S
         if not self._problem:
             log.error("recording: stopped, flights go on (directory=%s): %s", writer.segments.directory, why)
-        self._problem = f"recording stopped: {why}"
+        self._tell(f"recording stopped: {why}")
+
+    def _tell(self, problem: str) -> None:
+        self._problem = problem
+        if self._told is None:
+            return
+        # A disk that takes no file takes no state and no audit log either: that is told elsewhere.
+        with contextlib.suppress(OSError):
+            if problem:
+                write_file(self._told, problem.encode(), durable=False)
+            else:
+                self._told.unlink(missing_ok=True)
 
     def _drain(self, writer: FlightWriter) -> None:
         if writer.rests and time.monotonic() >= self._rests_until_s:
             writer.begin()
-            writer.rests, self._problem = False, ""
+            writer.rests = False
+            self._tell("")
             log.warning("recording: goes on (directory=%s)", writer.segments.directory)
         for _ in range(self._waiting.qsize()):
             self._waiting.get_nowait()(writer)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
+import fcntl
 import os
 import re
 from datetime import UTC, datetime
@@ -19,6 +21,9 @@ MIN_SEGMENT_BYTES, MAX_SEGMENT_BYTES = 250_000, 32_000_000
 PARTS = 16
 """A bound holds this many segments of full size, so that little is lost when the oldest goes."""
 
+PART_SUFFIX = ".part"
+"""Of a file that is being made."""
+
 _NAME = re.compile(r"(?P<number>\d{6,})-\d{8}T\d{6}Z\.(mcap|tlog)")
 
 
@@ -26,7 +31,7 @@ class Segments:
     """Segments are numbered, as a clock may be set back; the files of one have one name and several suffixes.
 
     Args:
-        directory: where they are kept; nothing else is.
+        directory: where they are kept; nothing else is, and no other process keeps its own there.
         limit_bytes: what all of them may take.
         reserve_bytes: what must stay free on the disk.
     """
@@ -35,6 +40,7 @@ class Segments:
         self.directory = directory
         self._limit_bytes = limit_bytes
         self._reserve_bytes = reserve_bytes
+        self._lock: int | None = None
         self.segment_bytes = min(max(limit_bytes // PARTS, MIN_SEGMENT_BYTES), MAX_SEGMENT_BYTES)
 
     def begin(self, time_ns: int) -> Path:
@@ -48,15 +54,33 @@ class Segments:
         return self.directory / f"{max(self.found(), default=0) + 1:06d}-{moment}"
 
     def prepare(self) -> None:
-        """Make the directory, and room in it.
+        """Make the directory, take it for this process, and make room in it.
 
         Raises:
-            OSError: it cannot be written, or the disk is full.
+            OSError: it cannot be written, or another process records into it, or the disk is full.
         """
-        self.directory.mkdir(DIRECTORY_MODE, parents=True, exist_ok=True)
-        self.directory.chmod(DIRECTORY_MODE)
+        with contextlib.suppress(FileExistsError):
+            # Only what is made here gets its mode: one that was there belongs to who made it.
+            self.directory.mkdir(DIRECTORY_MODE, parents=True)
+        self._take()
         self._make_room()
         self.check_space()
+
+    def tidy(self) -> None:
+        """Remove what a crash left half made.
+
+        Raises:
+            OSError: it cannot be removed.
+        """
+        for path in self.directory.glob(f"*{PART_SUFFIX}"):
+            if _NAME.fullmatch(path.with_suffix(".mcap").name):
+                path.unlink(missing_ok=True)
+
+    def release(self) -> None:
+        """Leave the directory to others."""
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
 
     def found(self) -> dict[int, list[Path]]:
         """The files of all segments by the segments' numbers, oldest first."""
@@ -77,6 +101,20 @@ class Segments:
         free = disk.f_bavail * disk.f_frsize
         if free < self._reserve_bytes:
             raise OSError(errno.ENOSPC, f"only {free / 1e6:.0f} MB are free on its disk")
+
+    def _take(self) -> None:
+        if self._lock is not None:
+            return
+        lock = os.open(self.directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            os.close(lock)
+            if isinstance(error, BlockingIOError):
+                reason = f"another service records into {self.directory}; give each its own directory with --recordings"
+                raise OSError(errno.EBUSY, reason) from None
+            raise
+        self._lock = lock
 
     def _make_room(self) -> None:
         """Remove the oldest segments until a whole one fits in."""

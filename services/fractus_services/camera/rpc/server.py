@@ -72,7 +72,11 @@ async def run(options: CameraOptions, stop: asyncio.Event) -> None:
     node = options.node or (description.value.name if description.value is not None else socket.gethostname())
     tls = TlsFiles(options.tls)
     recorder = Recorder(
-        segments_in(options.recordings, options.recordings_mb), node, always=True, max_waiting=MAX_WAITING_PICTURES
+        segments_in(options.recordings, options.recordings_mb),
+        node,
+        always=True,
+        max_waiting=MAX_WAITING_PICTURES,
+        told=options.recording_problem,
     )
     audit = AuditLog(options.audit, clock, tls=options.tls, copied=recorder.take_entry)
     grants = GrantFiles(

@@ -40,6 +40,7 @@ _OPTIONS = (
 )
 
 _FILES = ("ca.crt", "tls.key", "tls.crt")
+_REMEDY = "set FRACTUS_TLS_DIR to the directory of this component's tls.crt, tls.key and ca.crt"
 _Stamp = tuple[tuple[int, int, int], ...]
 
 
@@ -162,10 +163,12 @@ class ServiceChannel:
         try:
             found = [(self._endpoint.tls_dir / name).stat() for name in _FILES]
         except OSError as error:
-            raise NotConfigured(
-                f"cannot read {error.filename}: {error.strerror}; mount the component's certificate there"
-            ) from None
+            raise self._unreadable(error) from None
         return tuple((s.st_mtime_ns, s.st_size, s.st_ino) for s in found)
+
+    @staticmethod
+    def _unreadable(error: OSError) -> NotConfigured:
+        return NotConfigured(f"the certificate {error.filename} cannot be read: {error.strerror}; {_REMEDY}")
 
     def _connect(self) -> _Connection:
         stamp = self._stamp()
@@ -173,10 +176,14 @@ class ServiceChannel:
             try:
                 ca, key, chain = ((self._endpoint.tls_dir / name).read_bytes() for name in _FILES)
             except OSError as error:
-                raise NotConfigured(f"cannot read {error.filename}: {error.strerror}") from None
+                raise self._unreadable(error) from None
             before, stamp = stamp, self._stamp()
             if before == stamp:
                 break
+        for name, content in zip(_FILES, (ca, key, chain), strict=True):
+            # gRPC itself would only fail to connect, indefinitely and without a word of this.
+            if b"-----BEGIN " not in content:
+                raise NotConfigured(f"{self._endpoint.tls_dir / name} is no PEM file; {_REMEDY}")
         credentials = grpc.ssl_channel_credentials(ca, key, chain)
         options = (*_OPTIONS, ("grpc.ssl_target_name_override", self._endpoint.server_name))
         channel = grpc.aio.secure_channel(self.address, credentials, options=options)

@@ -13,7 +13,7 @@ import grpc.aio
 from fractus_proto.v1 import mobility_pb2
 
 from fractus.channel import Retries, ServiceChannel
-from fractus.errors import ControlLost, FractusError, MissionComplete, Unavailable
+from fractus.errors import ControlLost, FractusError, MissionComplete, NotConfigured, Unavailable
 from fractus.tasks import ControlPoint
 from fractus.values import Position
 
@@ -189,6 +189,10 @@ class Control:
                 await self._follow()
             except grpc.aio.AioRpcError as failed:
                 error = failed
+            except NotConfigured as failed:
+                # A certificate that is not there, or not one: no other attempt would find it.
+                self._lose(failed)
+                return
             if self._returning or self._lost is not None:
                 return
             if self._granted.is_set():

@@ -169,9 +169,7 @@ class Busy(FractusError):
 
 
 class NotConfigured(FractusError):
-    """The environment lacks what Fractus gives the pods of a component."""
-
-    remedy = "run it as a component of an application, or set the variable"
+    """The environment lacks what Fractus gives the pods of a component; the message says what to set."""
 
 
 def decision_of(error: Any) -> Decision | None:

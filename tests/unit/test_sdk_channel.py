@@ -8,11 +8,12 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import fractus
 import grpc
 import pytest
 from fractus.channel import ServiceChannel
 from fractus.environment import Endpoint
-from fractus.errors import Unavailable
+from fractus.errors import NotConfigured, Unavailable
 from grpc.aio import Metadata
 
 
@@ -48,3 +49,33 @@ async def test_what_is_for_this_moment_is_not_asked_for_later(method: str) -> No
     with pytest.raises(Unavailable):
         await channel.unary(method, "request")
     assert len(channel.calls) == 1
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (None, "the certificate {0}/ca.crt cannot be read: No such file or directory"),
+        (b"", "{0}/ca.crt is no PEM file"),
+    ],
+)
+def test_a_driver_without_a_certificate_ends_with_one_sentence(
+    tmp_path: Path, content: bytes | None, said: str
+) -> None:
+    if content is not None:
+        for name in ("ca.crt", "tls.key", "tls.crt"):
+            (tmp_path / name).write_bytes(content)
+
+    async def program(_drone: fractus.Mobility, _control: fractus.Control) -> None:
+        raise AssertionError("there is no control")
+
+    remedy = "set FRACTUS_TLS_DIR to the directory of this component's tls.crt, tls.key and ca.crt"
+    with pytest.raises(SystemExit) as ended:
+        fractus.run(program, endpoint=Endpoint("127.0.0.1:1", "drone-1", tmp_path), stay=False)
+    assert ended.value.code == f"{said.format(tmp_path)}; {remedy}"
+
+
+async def test_control_without_a_certificate_is_no_loss_of_control(tmp_path: Path) -> None:
+    async with fractus.mobility(Endpoint("127.0.0.1:1", "drone-1", tmp_path)) as drone:
+        with pytest.raises(NotConfigured, match="set FRACTUS_TLS_DIR"):
+            async with drone.control():
+                pass

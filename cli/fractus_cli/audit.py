@@ -87,7 +87,7 @@ def show(paths: tuple[Path, ...], after: int | None, before: int | None, every: 
     """Print what policies corrected, refused or took over, and who had the drone, from the audit logs in PATHS.
 
     PATHS are as for `verify`. Logs whose chains are not sound are shown with a warning on standard error. json is one object
-    a line, as in the log.
+    a line, as in the log, with `node` and `log`.
     """
     found = found_logs(paths)
     _problems(found)
@@ -98,7 +98,7 @@ def show(paths: tuple[Path, ...], after: int | None, before: int | None, every: 
             own = {key: value for key, value in entry.items() if key != "time_ns"}
             click.echo(json.dumps(own, sort_keys=True, ensure_ascii=False))
         else:
-            click.echo(f"{entry['time']}  {entry['log']}  {_line(entry)}")
+            click.echo(f"{entry['time']}  {entry['node']}/{entry['log']}  {_line(entry)}")
 
 
 def _line(entry: dict[str, Any]) -> str:
@@ -132,7 +132,7 @@ def export(
 ) -> None:
     """Write the audit logs in PATHS for other programs: flown paths, verdicts, takeovers, and zones.
 
-    PATHS are as for `verify`. geojson and kml have paths and decisions, csv a row for every entry, mcap everything for
+    PATHS are as for `verify`, of one drone or several. geojson and kml have paths and decisions, csv a row for every entry, mcap everything for
     Foxglove. Logs whose chains are not sound are written with a warning, which geojson, kml and mcap also carry.
     """
     from fractus_cli.flight_export import WRITERS, Export  # noqa: PLC0415 - showing and verifying need no geometry

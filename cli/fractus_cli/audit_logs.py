@@ -70,23 +70,57 @@ class Window:
 
 
 def entries(found: dict[Path, list[Path]], window: Window) -> Iterator[Entry]:
-    """The entries of several logs in the order of their times, each with `log`, the name of its log, and `time_ns`.
+    """The entries of several logs in the order of their times.
 
-    Lines that are no entries are left out: `judged` tells of them.
+    Each has `log`, the name of its log, `time_ns`, and `node`, whose log it is. Lines that are no entries are left out: `judged`
+    tells of them.
     """
-    each = (_entries(name.stem, files, window) for name, files in found.items())
+    nodes = _nodes(found)
+    each = (_entries(name.stem, nodes[name], files, window) for name, files in found.items())
     return heapq.merge(*each, key=lambda entry: entry["time_ns"])
 
 
-def _entries(log: str, files: Iterable[Path], window: Window) -> Iterator[Entry]:
+def _entries(log: str, node: str, files: Iterable[Path], window: Window) -> Iterator[Entry]:
     for _, _, line in lines_of(files):
-        try:
-            entry = json.loads(line)
-        except (ValueError, RecursionError):
-            continue
-        time_ns = moment_ns(entry.get("time")) if isinstance(entry, dict) else None
+        entry = _read(line)
+        time_ns = moment_ns(entry.get("time"))
+        # What began before the window counts in it, too.
+        node = _started(entry) or node
         if time_ns is not None and time_ns in window:
-            yield entry | {"log": log, "time_ns": time_ns}
+            yield entry | {"log": log, "node": node, "time_ns": time_ns}
+
+
+def _nodes(found: dict[Path, list[Path]]) -> dict[Path, str]:
+    """Whose each log is: what a service said when it started, there or in a log beside it; else the directory's name."""
+    said = {name: _first_started(files) for name, files in found.items()}
+    beside: dict[Path, set[str]] = {}
+    for name, node in said.items():
+        beside.setdefault(name.parent, set()).update(filter(None, (node,)))
+
+    def other(name: Path) -> str:
+        only = beside[name.parent]
+        return next(iter(only)) if len(only) == 1 else name.parent.resolve().name
+
+    return {name: node or other(name) for name, node in said.items()}
+
+
+def _first_started(files: Iterable[Path]) -> str:
+    return next(
+        (node for _, _, line in lines_of(files) if b'"started"' in line and (node := _started(_read(line)))), ""
+    )
+
+
+def _started(entry: Entry) -> str:
+    return str(entry.get("node") or "") if entry.get("kind") == "started" else ""
+
+
+def _read(line: bytes) -> Entry:
+    """An entry; an empty one where the line is none."""
+    try:
+        entry = json.loads(line)
+    except (ValueError, RecursionError):
+        return {}
+    return entry if isinstance(entry, dict) else {}
 
 
 def decided(entry: Entry) -> bool:

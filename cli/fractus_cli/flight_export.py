@@ -8,7 +8,7 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import IO, Any
+from typing import IO, Any, cast
 from xml.sax.saxutils import escape
 
 from fractus_core.api import Zone
@@ -23,7 +23,7 @@ GAP_NS = 10_000_000_000
 """A path ends where the flight recorder, which writes twice a second while the motors run, is silent for longer."""
 
 _COLUMNS = (
-    "time", "log", "kind", "lat", "lon", "alt_m", "amsl_m", "speed_mps", "battery", "mode", "controller", "component",
+    "time", "node", "log", "kind", "lat", "lon", "alt_m", "amsl_m", "speed_mps", "battery", "mode", "controller", "component",
     "method", "action", "code", "reason", "policies", "seq", "hash",
 )  # fmt: skip
 
@@ -57,55 +57,63 @@ class Export:
 
 @dataclass(slots=True)
 class _Path:
-    """One flight: from the motors' start to their stop."""
+    """One flight of a drone: from the motors' start to their stop."""
 
+    node: str
     times: list[int] = field(default_factory=list)
     points: list[tuple[float, float, float]] = field(default_factory=list)
 
 
 @dataclass(slots=True)
 class _Flown:
-    """The paths and what was decided on them, with where the drone was: lon, lat, metres above sea level."""
+    """The paths of a drone and what was decided on them, with where it was: lon, lat, metres above sea level."""
 
     paths: list[_Path] = field(default_factory=list)
     decisions: list[tuple[Entry, tuple[float, float, float] | None]] = field(default_factory=list)
+    last: tuple[float, float, float] | None = None
+    home_m: float = 0.0
 
-
-def _flown(entries: Iterable[Entry]) -> _Flown:
-    flown, last, home_m = _Flown(), None, 0.0
-    for entry in entries:
+    def add(self, entry: Entry) -> None:
+        """Take the drone's next entry."""
         lat, lon, alt = number(entry.get("lat")), number(entry.get("lon")), number(entry.get("alt")) or 0.0
         if entry.get("kind") == "state":
             if lat is None or lon is None:
-                continue
+                return
             amsl = number(entry.get("amsl"))
-            home_m = amsl - alt if amsl is not None else home_m
-            last = (lon, lat, home_m + alt)
-            if not flown.paths or entry["time_ns"] - flown.paths[-1].times[-1] > GAP_NS:
-                flown.paths.append(_Path())
-            flown.paths[-1].times.append(entry["time_ns"])
-            flown.paths[-1].points.append(last)
+            self.home_m = amsl - alt if amsl is not None else self.home_m
+            self.last = (lon, lat, self.home_m + alt)
+            if not self.paths or entry["time_ns"] - self.paths[-1].times[-1] > GAP_NS:
+                self.paths.append(_Path(entry["node"]))
+            self.paths[-1].times.append(entry["time_ns"])
+            self.paths[-1].points.append(self.last)
         elif decided(entry):
             # The monitor's entries do not say where: the recorder does, twice a second.
-            at = (lon, lat, home_m + alt) if lat is not None and lon is not None else last
-            flown.decisions.append((entry, at))
-    return flown
+            at = (lon, lat, self.home_m + alt) if lat is not None and lon is not None else self.last
+            self.decisions.append((entry, at))
+
+
+def _flown(entries: Iterable[Entry]) -> dict[str, _Flown]:
+    """What each node did, by its name; nodes that neither flew nor decided are left out."""
+    flown: dict[str, _Flown] = {}
+    for entry in entries:
+        flown.setdefault(entry["node"], _Flown()).add(entry)
+    return {node: one for node, one in sorted(flown.items()) if one.paths or one.decisions}
 
 
 def write_geojson(export: Export, out: IO[bytes]) -> None:
     """A FeatureCollection (RFC 7946): paths, decisions and areas; heights are metres above sea level."""
     features: list[Feature] = []
     flown = _flown(export.entries)
-    for path in flown.paths:
+    for path in (path for one in flown.values() for path in one.paths):
         spots = [list(point) for point in path.points]
         line = len(spots) > 1
         features.append({
             "type": "Feature",
-            "properties": {"kind": "path", "begin": _iso(path.times[0]), "end": _iso(path.times[-1])}
+            "properties": {"kind": "path", "node": path.node, "begin": _iso(path.times[0]), "end": _iso(path.times[-1])}
             | ({"times": [_iso(time_ns) for time_ns in path.times]}),
             "geometry": {"type": "LineString" if line else "Point", "coordinates": spots if line else spots[0]},
         })  # fmt: skip
-    for entry, at in flown.decisions:
+    for entry, at in (decision for one in flown.values() for decision in one.decisions):
         geometry = {"type": "Point", "coordinates": list(at)} if at is not None else None
         features.append({"type": "Feature", "properties": _told(entry), "geometry": geometry})
     features += export.places.features()
@@ -115,17 +123,26 @@ def write_geojson(export: Export, out: IO[bytes]) -> None:
 
 def _told(entry: Entry) -> dict[str, Any]:
     told = {key: entry[key] for key in ("action", "code", "reason", "policies", "method", "mode") if entry.get(key)}
-    return {"kind": entry["kind"], "time": _iso(entry["time_ns"]), "component": who(entry)} | told
+    return {
+        "kind": entry["kind"],
+        "node": entry["node"],
+        "time": _iso(entry["time_ns"]),
+        "component": who(entry),
+    } | told
 
 
 def write_kml(export: Export, out: IO[bytes]) -> None:
-    """A document (OGC 07-147r2) with a line for each flight, a point for each decision, and the areas on the ground."""
+    """A document (OGC 07-147r2): a folder for each drone, with a line for each flight and a point for each decision; and the areas."""
     flown = _flown(export.entries)
     marks = [f"<description>{escape(one)}</description>\n" for one in (" ".join(export.problems),) if one]
-    marks += map(_line, flown.paths)
-    marks += [_point(entry, at) for entry, at in flown.decisions if at is not None]
+    marks += [_folder(node, one) for node, one in flown.items()]
     marks += [zone_placemark(zone, []) for zone, _, _ in export.places.areas]
     out.write(kml_document(marks).encode())
+
+
+def _folder(node: str, flown: _Flown) -> str:
+    points = (_point(entry, at) for entry, at in flown.decisions if at is not None)
+    return f"<Folder><name>{escape(node)}</name>\n{''.join((*map(_line, flown.paths), *points))}</Folder>\n"
 
 
 def _line(path: _Path) -> str:
@@ -171,13 +188,12 @@ def _plain(value: object) -> bool:
 
 def write_mcap(export: Export, out: IO[bytes]) -> None:
     """A file for Foxglove: location, state, decisions and log of each node, and the areas as GeoJSON."""
-    file, node = McapFile(out), "drone"
+    # The writer asks how far it is, which a pipe cannot say.
+    file = McapFile(cast(IO[bytes], _Counted(out)))
     file.describe("audit", {"verified": "no" if export.problems else "yes", "problems": "\n".join(export.problems)})
     features = export.places.features()
     for entry in export.entries:
-        time_ns = entry["time_ns"]
-        if entry.get("kind") == "started":
-            node = str(entry.get("node") or node)
+        time_ns, node = entry["time_ns"], entry["node"]
         records = list(of_audit(entry, node))
         if entry.get("kind") == "state":
             records += _located(entry, node)
@@ -187,6 +203,24 @@ def write_mcap(export: Export, out: IO[bytes]) -> None:
         for record in records:
             file.write(f"/{node}/{record.topic}", record.schema, record.time_ns, record.content)
     file.close()
+
+
+class _Counted:
+    """A file that is only written to, from its beginning to its end."""
+
+    def __init__(self, out: IO[bytes]) -> None:
+        self._out = out
+        self._at = 0
+
+    def write(self, data: bytes) -> int:
+        self._at += len(data)
+        return self._out.write(data)
+
+    def tell(self) -> int:
+        return self._at
+
+    def flush(self) -> None:
+        self._out.flush()
 
 
 def _located(entry: Entry, node: str) -> Iterator[Any]:

@@ -213,6 +213,73 @@ def test_show_tells_what_was_decided(log: Path) -> None:
     assert not run("show", log, "--before", demo_flight.stamp(demo_flight.APPLIED_S)).stdout
 
 
+@pytest.fixture
+async def fleet(tmp_path: Path, log: Path, entries: list[dict[str, Any]]) -> list[Path]:
+    """The directories of two drones that flew at the same time, the second one a little to the north."""
+    other, now = tmp_path / "other" / "mobility.jsonl", 0.0
+    writer = AuditLog(other, lambda: now)
+    for entry in entries:
+        now = datetime.fromisoformat(entry["time"]).timestamp()
+        moved = {"node": "drone-2"} if entry["kind"] == "started" else {}
+        moved |= {"lat": entry["lat"] + 0.01} if "lat" in entry else {}
+        said = {key: value for key, value in (entry | moved).items() if key not in {"kind", "time"}}
+        writer.append(entry["kind"], said)
+    await writer.close()
+    return [log.parent, other.parent]
+
+
+def test_each_drone_has_a_track_of_its_own(fleet: list[Path], entries: list[dict[str, Any]], tmp_path: Path) -> None:
+    states = [entry for entry in entries if entry["kind"] == "state"]
+    drawn = json.loads(run("export", *fleet, "--to", "geojson").stdout)["features"]
+
+    def of(kind: str) -> dict[str, Any]:
+        found = [f for f in drawn if f["properties"]["kind"] == kind]
+        return {f["properties"]["node"]: f["geometry"]["coordinates"] for f in found}
+
+    assert [point[1] for point in of("path")["drone-1"]] == [state["lat"] for state in states]
+    assert [point[1] for point in of("path")["drone-2"]] == [state["lat"] + 0.01 for state in states]
+    places = of("monitor")
+    assert places["drone-2"][1] == pytest.approx(places["drone-1"][1] + 0.01), "where that drone was, not the other"
+
+    space = {"k": "http://www.opengis.net/kml/2.2"}
+    folders = ElementTree.fromstring(run("export", *fleet, "--to", "kml").stdout).findall(".//k:Folder", space)
+    assert [folder.findtext("k:name", "", space) for folder in folders] == ["drone-1", "drone-2"]
+    assert [len(folder.findall(".//k:LineString", space)) for folder in folders] == [1, 1]
+
+    rows = list(csv.DictReader(io.StringIO(run("export", *fleet, "--to", "csv").stdout)))
+    assert {row["node"] for row in rows} == {"drone-1", "drone-2"}
+    assert sum(row["node"] == "drone-2" and row["kind"] == "state" for row in rows) == len(states)
+
+    run("export", *fleet, "--to", "mcap", "--file", tmp_path / "both.mcap")
+    with (tmp_path / "both.mcap").open("rb") as file:
+        found = list(make_reader(file).iter_messages(topics=["/drone-2/location"]))
+    assert [json.loads(message.data)["latitude"] for _, _, message in found] == [s["lat"] + 0.01 for s in states]
+
+
+def test_what_was_before_the_window_leaves_no_topic(log: Path, tmp_path: Path) -> None:
+    landed = json.loads(log.read_text().splitlines()[-1])["time"]
+    run("export", log, "--to", "mcap", "--after", landed, "--file", tmp_path / "late.mcap")
+    with (tmp_path / "late.mcap").open("rb") as file:
+        reader = make_reader(file)
+        summary = reader.get_summary()
+        topics = {channel.topic for _, channel, _ in reader.iter_messages()}
+    assert summary is not None and topics
+    assert {channel.topic for channel in summary.channels.values()} == topics
+    assert {schema.name for schema in summary.schemas.values()} <= {"foxglove.LocationFix", "fractus.State"}
+    assert all(topic.startswith("/drone-1/") for topic in topics), "the node that started before the window"
+
+
+def test_mcap_goes_through_a_pipe(log: Path, tmp_path: Path) -> None:
+    argv = [sys.executable, "-m", "fractus_cli", "audit", "export", str(log), "--to", "mcap"]
+    with (tmp_path / "piped.mcap").open("wb") as out, subprocess.Popen(argv, stdout=subprocess.PIPE) as first:
+        subprocess.run(["cat"], stdin=first.stdout, stdout=out, check=True, timeout=60)
+    assert first.returncode == 0
+    run("export", log, "--to", "mcap", "--file", tmp_path / "whole.mcap")
+    assert (tmp_path / "piped.mcap").read_bytes() == (tmp_path / "whole.mcap").read_bytes()
+    with (tmp_path / "piped.mcap").open("rb") as file:
+        assert sum(1 for _ in make_reader(file, validate_crcs=True).iter_messages()) > 10
+
+
 async def test_a_pause_ends_a_path(log: Path, tmp_path: Path) -> None:
     now = demo_flight.TAKEOFF_S + 5000.0
     writer = AuditLog(log, lambda: now)

@@ -12,6 +12,7 @@ import click
 from fractus_services.recording.messages import moment_ns, sentence
 
 from fractus_cli.audit_logs import Window, decided, entries, found_logs, judged
+from fractus_cli.output import output_option
 
 if TYPE_CHECKING:
     from fractus_storage.checkpoints import Checkpoint
@@ -36,10 +37,12 @@ def audit() -> None:
     " has it. Every entry since must be there.",
 )
 @click.option("--ca", type=_FILE, help="ca.crt that the certificates in checkpoints must be of.")
-def verify_command(paths: tuple[Path, ...], since: tuple[str, ...], ca: Path | None) -> None:
+@output_option
+def verify_command(paths: tuple[Path, ...], since: tuple[str, ...], ca: Path | None, output: str) -> None:
     """Check that no entry of the audit logs in PATHS was changed, removed or inserted.
 
-    PATHS are directories, logs (with their segments), or single segments.
+    PATHS are directories, logs (with their segments), or single segments. Exits with 1 at the first log that is not sound; json
+    lists all of them first.
     """
     found = found_logs(paths)
     known = _checkpoints(since, ca)
@@ -51,8 +54,12 @@ def verify_command(paths: tuple[Path, ...], since: tuple[str, ...], ca: Path | N
             raise click.ClickException(
                 f"--since: the checkpoint is of {stem}.jsonl, and there are several: {', '.join(same)}; give one at a time"
             )
+    if output == "json":
+        click.echo(json.dumps([_judgement(name, files, known.get(name.stem)) for name, files in found.items()]))
     for name, files in found.items():
-        _check(name, files, known.get(name.stem))
+        said = _check(name, files, known.get(name.stem))
+        if output == "text":
+            click.echo(said)
 
 
 def _moment(context: click.Context, option: click.Parameter, text: str | None) -> int | None:
@@ -80,9 +87,7 @@ def _problems(found: dict[Path, list[Path]]) -> list[str]:
 @_PATHS
 @_window
 @click.option("--all", "every", is_flag=True, help="Also calls that were permitted, grants, and where the drone was.")
-@click.option(
-    "-o", "--output", type=click.Choice(["text", "json"]), default="text", help="text for people, json for programs."
-)
+@output_option
 def show(paths: tuple[Path, ...], after: int | None, before: int | None, every: bool, output: str) -> None:
     """Print what policies corrected, refused or took over, and who had the drone, from the audit logs in PATHS.
 
@@ -199,7 +204,20 @@ def _checkpoints(since: tuple[str, ...], ca: Path | None) -> dict[str, Checkpoin
     return known
 
 
-def _check(name: Path, files: list[Path], checkpoint: Checkpoint | None) -> None:
+def _judgement(name: Path, files: list[Path], checkpoint: Checkpoint | None) -> dict[str, Any]:
+    finding, problem = judged(name, files, checkpoint.link if checkpoint is not None else None)
+    return {
+        "log": str(name if name in files else files[0]), "files": [str(file) for file in files], "entries": finding.entries,
+        "sound": not problem, "problem": problem, "removed": finding.before, "torn": finding.torn, "whole": name in files,
+    }  # fmt: skip
+
+
+def _check(name: Path, files: list[Path], checkpoint: Checkpoint | None) -> str:
+    """What is said of a log that is sound.
+
+    Raises:
+        click.ClickException: it is not.
+    """
     finding, problem = judged(name, files, checkpoint.link if checkpoint is not None else None)
     if problem:
         raise click.ClickException(problem)
@@ -217,4 +235,4 @@ def _check(name: Path, files: list[Path], checkpoint: Checkpoint | None) -> None
         said.append("a part of the log, so what came before and after is not judged")
     if finding.torn:
         said.append("the last line is incomplete (a crash, or it is being written)")
-    click.echo(f"{files[0] if part else name}: {'; '.join(said)}")
+    return f"{files[0] if part else name}: {'; '.join(said)}"

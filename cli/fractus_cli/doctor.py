@@ -13,6 +13,7 @@ import click
 from cryptography import x509
 from fractus_core.api import KINDS
 
+from fractus_cli.output import output_option
 from fractus_cli.reading import (
     EXIT_PROBLEM,
     GROUP,
@@ -22,7 +23,6 @@ from fractus_cli.reading import (
     cluster,
     conditions_of,
     kubeconfig_option,
-    output_option,
 )
 
 MIN_VERSION = (1, 32)

@@ -8,7 +8,8 @@ from typing import Any
 
 import click
 
-from fractus_cli.reading import EXIT_PROBLEM, GROUP, Body, Cluster, cluster, kubeconfig_option, output_option
+from fractus_cli.output import output_option
+from fractus_cli.reading import EXIT_PROBLEM, GROUP, Body, Cluster, cluster, kubeconfig_option
 
 _LISTED = 5
 

@@ -24,6 +24,7 @@ from fractus_core.policy.values import Airframe, Attitude, Call, Home, Situation
 
 from fractus_cli.calls import figures, parse_call, parse_time
 from fractus_cli.manifests import BadManifest, Manifests, read_manifests
+from fractus_cli.output import output_option
 from fractus_cli.planning import plan_all
 
 R = TypeVar("R", bound=Resource)
@@ -78,7 +79,7 @@ def policy() -> None:
     help="How the autopilot's failsafe flies home: straight (RTL), or back as it came (SmartRTL).",
 )  # fmt: skip
 @click.option("--flat-terrain", is_flag=True, help="Take the ground for as high as home everywhere.")
-@click.option("-o", "--output", type=click.Choice(["text", "json"]), default="text", show_default=True)
+@output_option
 def check(paths: Sequence[pathlib.Path], drone_file: pathlib.Path, output: str, **asked: Any) -> None:
     """What would become of a call, and why: the same engine and the same answer as in flight.
 

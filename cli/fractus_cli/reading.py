@@ -22,9 +22,6 @@ kubeconfig_option = click.option(
     type=click.Path(exists=True, dir_okay=False),
     help="Which cluster; else KUBECONFIG, then ~/.kube/config.",
 )
-output_option = click.option(
-    "-o", "--output", type=click.Choice(["text", "json"]), default="text", help="text for people, json for programs."
-)
 
 
 class Cluster:

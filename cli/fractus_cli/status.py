@@ -9,7 +9,8 @@ from typing import Any
 
 import click
 
-from fractus_cli.reading import GROUP, Body, Cluster, cluster, conditions_of, kubeconfig_option, output_option, table
+from fractus_cli.output import output_option
+from fractus_cli.reading import GROUP, Body, Cluster, cluster, conditions_of, kubeconfig_option, table
 
 PERIOD_S = 2.0
 

@@ -15,6 +15,8 @@ from fractus.drone import Mobility
 from fractus.environment import DEFAULT_TLS_DIR, MOBILITY_PORT, Endpoint
 from fractus.telemetry import Telemetry
 
+from fractus_cli.output import output_option
+
 
 @click.command()
 @click.option("--node", envvar="FRACTUS_NODE", required=True, help="Name of the drone's node.")
@@ -29,7 +31,7 @@ from fractus.telemetry import Telemetry
 )
 @click.option("--interval", "interval_s", default=1.0, show_default=True, help="Seconds between lines, 0.05 at least.")
 @click.option("--count", type=click.IntRange(min=1), help="Stop after this many lines.")
-@click.option("-o", "--output", type=click.Choice(["text", "json"]), default="text", show_default=True)
+@output_option
 def telemetry(*, node: str, address: str, tls: Path, interval_s: float, count: int | None, output: str) -> None:
     """Print the state of the drone of a node until interrupted.
 

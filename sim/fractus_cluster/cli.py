@@ -2,43 +2,28 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sys
-from collections.abc import Callable
-from functools import wraps
+from dataclasses import asdict
 from pathlib import Path
-from typing import ParamSpec
 
 import click
 
 from fractus_cluster.binaries import CLUSTER_PROGRAMS, PROGRAMS, ensure_binaries
 from fractus_cluster.cluster import Cluster, NodeStatus, print_report
-from fractus_cluster.errors import ClusterError, PrerequisiteError
+from fractus_cluster.errors import ClusterError
 from fractus_cluster.machine import holders
 from fractus_cluster.prerequisites import check_root
 from fractus_cluster.state import known_clusters, state_root
 
-_P = ParamSpec("_P")
-
-
-def _one_line_errors(command: Callable[_P, None]) -> Callable[_P, None]:
-    """Turn what went wrong into one line and an exit code: 3 for what the machine lacks, else 1."""
-
-    @wraps(command)
-    def wrapped(*args: _P.args, **kwargs: _P.kwargs) -> None:
-        try:
-            command(*args, **kwargs)
-        except PrerequisiteError as error:
-            click.echo(f"error: {error}", err=True)
-            sys.exit(3)
-        except ClusterError as error:
-            click.echo(f"error: {error}", err=True)
-            sys.exit(1)
-
-    return wrapped
-
-
 _name_option = click.option("--name", help="The cluster; may be left out when there is only one.")
+
+_output_option = click.option(
+    "-o", "--output", type=click.Choice(["text", "json"]), default="text", help="text for people, json for programs."
+)
+
+_NOT_WELL = 2
 
 
 @click.group()
@@ -50,7 +35,6 @@ def cluster() -> None:
 @click.argument("file", type=click.Path(path_type=Path, dir_okay=False, exists=True))
 @click.option("--name", help="Name of the cluster instead of the one in the file.")
 @click.option("--image", "images", multiple=True, help="Image that every node gets before pods start; repeatable.")
-@_one_line_errors
 def up(file: Path, name: str | None, images: tuple[str, ...]) -> None:
     """Make the cluster be as FILE describes, whatever state it is in."""
     Cluster.load(file, name=name, report=print_report).up(images=images)
@@ -59,7 +43,6 @@ def up(file: Path, name: str | None, images: tuple[str, ...]) -> None:
 @cluster.command()
 @_name_option
 @click.option("--all", "every", is_flag=True, help="All clusters of this machine.")
-@_one_line_errors
 def down(name: str | None, every: bool) -> None:
     """Take the cluster away with everything that it put on the machine."""
     check_root()
@@ -73,17 +56,27 @@ def down(name: str | None, every: bool) -> None:
 
 @cluster.command()
 @_name_option
-@_one_line_errors
-def status(name: str | None) -> None:
-    """Show how the cluster's nodes are; exit code 1 unless all are well."""
+@_output_option
+def status(name: str | None, output: str) -> None:
+    """Show how the cluster's nodes are.
+
+    Exits with 2 unless all are well.
+    """
     found = Cluster.existing(name)
-    states = found.status()
-    radio_words = {True: ", radio runs", False: ", radio dead", None: ""}[found.radio.running]
-    click.echo(f"cluster {found.name}: control plane {'runs' if found.running else 'is down'}{radio_words}")
-    for node in states:
-        click.echo(f"  {node.name:<20} {node.node_class:<6} {node.address:<15} {_words(node)}")
-    if not found.running or found.radio.running is False or not all(_well(node) for node in states):
-        sys.exit(1)
+    states, radio = found.status(), found.radio.running
+    well = found.running and radio is not False and all(map(_well, states))
+    if output == "json":
+        nodes = [asdict(node) for node in states]
+        click.echo(
+            json.dumps({"name": found.name, "well": well, "running": found.running, "radio": radio, "nodes": nodes})
+        )
+    else:
+        radio_words = {True: ", radio runs", False: ", radio dead", None: ""}[radio]
+        click.echo(f"cluster {found.name}: control plane {'runs' if found.running else 'is down'}{radio_words}")
+        for node in states:
+            click.echo(f"  {node.name:<20} {node.node_class:<6} {node.address:<15} {_words(node)}")
+    if not well:
+        sys.exit(_NOT_WELL)
 
 
 def _well(node: NodeStatus) -> bool:
@@ -106,7 +99,6 @@ def _words(node: NodeStatus) -> str:
 @cluster.command()
 @_name_option
 @click.option("--path", "only_path", is_flag=True, help="Print where it is instead of its content.")
-@_one_line_errors
 def kubeconfig(name: str | None, only_path: bool) -> None:
     """Print the administrator's kubeconfig."""
     file = Cluster.existing(name).kubeconfig
@@ -118,10 +110,13 @@ def kubeconfig(name: str | None, only_path: bool) -> None:
 @cluster.command("load-image")
 @click.argument("images", nargs=-1, required=True, metavar="IMAGE...")
 @_name_option
-@_one_line_errors
-def load_image(images: tuple[str, ...], name: str | None) -> None:
+@_output_option
+def load_image(images: tuple[str, ...], name: str | None, output: str) -> None:
     """Deliver images to all nodes: names in buildah's storage, or OCI or Docker archives."""
     delivered = Cluster.existing(name, report=print_report).load_images(images)
+    if output == "json":
+        click.echo(json.dumps(delivered))
+        return
     for node, count in delivered.items():
         click.echo(f"{node}: {count} new")
 
@@ -130,7 +125,6 @@ def load_image(images: tuple[str, ...], name: str | None) -> None:
 @click.argument("state", type=click.Choice(["on", "off"]))
 @click.argument("node")
 @_name_option
-@_one_line_errors
 def power(state: str, node: str, name: str | None) -> None:
     """Pull a node's power, or give it back; its vehicle keeps its own."""
     Cluster.existing(name, report=print_report).set_power(node, on=state == "on")
@@ -140,7 +134,6 @@ def power(state: str, node: str, name: str | None) -> None:
 @click.argument("state", type=click.Choice(["cut", "heal"]))
 @click.argument("node")
 @_name_option
-@_one_line_errors
 def link(state: str, node: str, name: str | None) -> None:
     """Cut a node's uplink, or restore it."""
     target = Cluster.existing(name).node(node)
@@ -156,13 +149,12 @@ def link(state: str, node: str, name: str | None) -> None:
 @click.option("--fade", type=float, metavar="DB", help="Loss between it and all others beyond that of the way.")
 @click.option("--uplink", type=click.Choice(["on", "off"]), help="Its mobile uplink.")
 @_name_option
-@_one_line_errors
 def radio(node: str, wifi: str | None, fade: float | None, uplink: str | None, name: str | None) -> None:
     """Disturb a node's simulated WiFi or mobile uplink, or restore it."""
     found = Cluster.existing(name)
     hardware = found.node(node).spec.hardware
     if (wifi is not None or fade is not None) and hardware.wifi is None:
-        raise ClusterError(f"node {node} has no simulated WiFi")
+        raise ClusterError(f"node {node} has no simulated WiFi; give it hardware.wifi in the cluster's file")
     if uplink is not None and hardware.uplink is None:
         raise ClusterError(f"node {node} has no mobile uplink; `fractus cluster link cut {node}` cuts its wire")
     if wifi is not None:
@@ -177,7 +169,6 @@ def radio(node: str, wifi: str | None, fade: float | None, uplink: str | None, n
 @click.argument("node")
 @click.argument("command", nargs=-1, required=True, type=click.UNPROCESSED)
 @_name_option
-@_one_line_errors
 def exec_(node: str, command: tuple[str, ...], name: str | None) -> None:
     """Run a command on a node, as root."""
     argv = Cluster.existing(name).node(node).exec_command(command)
@@ -189,23 +180,25 @@ def exec_(node: str, command: tuple[str, ...], name: str | None) -> None:
 @click.argument("node", required=False)
 @click.option("--lines", default=100, show_default=True, help="How many of the last lines.")
 @_name_option
-@_one_line_errors
 def logs(program: str, node: str | None, lines: int, name: str | None) -> None:
     """Print the log of PROGRAM (kubelet, containerd, etcd, ...) on NODE, or of the control plane's."""
     folder = Cluster.existing(name).logs / (node or "control-plane")
     file = folder / f"{program}.log"
     if not file.is_file():
         there = ", ".join(sorted(path.stem for path in folder.glob("*.log"))) if folder.is_dir() else "nothing"
-        raise ClusterError(f"no log {file}; there is {there}")
+        raise ClusterError(f"there is no log {file}; name one of: {there}")
     for line in file.read_text(errors="replace").splitlines()[-lines:]:
         click.echo(line)
 
 
 @cluster.command()
 @click.option("--with", "extra", multiple=True, type=click.Choice(sorted(set(PROGRAMS) - set(CLUSTER_PROGRAMS))))
-@_one_line_errors
-def binaries(extra: tuple[str, ...]) -> None:
+@_output_option
+def binaries(extra: tuple[str, ...], output: str) -> None:
     """Provide the Kubernetes programs, building those that are missing, and print where they are."""
     found = ensure_binaries((*CLUSTER_PROGRAMS, *extra), report=print_report)
+    if output == "json":
+        click.echo(json.dumps({program: str(path) for program, path in found.paths.items()}, sort_keys=True))
+        return
     for program, path in sorted(found.paths.items()):
         click.echo(f"{program} {path}")

@@ -306,7 +306,7 @@ class Cluster:
     def _memory(self) -> Memory:
         memory = self._state.read_memory()
         if memory is None:
-            raise ClusterError(f"cluster {self.name} is not up")
+            raise ClusterError(f"cluster {self.name} is not up; bring it up: fractus cluster up FILE")
         return memory
 
     def _wiring(self, memory: Memory) -> network.Wiring:

@@ -122,7 +122,7 @@ class Node:
             children = Path(f"/proc/{record.pid}/task/{record.pid}/children").read_text().split()
             if children:
                 return int(children[0])
-        raise ClusterError(f"node {self.name} is off")
+        raise ClusterError(f"node {self.name} is off; give it power: fractus cluster power on {self.name}")
 
     def exec_command(self, argv: Sequence[str]) -> list[str]:
         """Return a command for this machine that runs `argv` on the node.

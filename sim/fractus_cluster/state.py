@@ -138,8 +138,6 @@ def only_cluster() -> str:
     """
     names = known_clusters()
     if len(names) != 1:
-        have = (
-            f"there are {', '.join(names)}; name one with --name" if names else "bring one up: fractus cluster up FILE"
-        )
-        raise ClusterError(f"which cluster? {have}")
+        several = f"there are clusters {', '.join(names)}; name one with --name"
+        raise ClusterError(several if names else "there is no cluster; bring one up: fractus cluster up FILE")
     return names[0]

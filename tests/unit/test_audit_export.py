@@ -172,6 +172,18 @@ def test_what_was_changed_is_written_with_a_warning(log: Path) -> None:
     assert "not verified" in run("show", log).stderr
 
 
+def test_verification_is_for_programs_too(fleet: list[Path]) -> None:
+    told = json.loads(run("verify", *fleet, "-o", "json").stdout)
+    assert [(one["sound"], one["problem"], one["whole"]) for one in told] == [(True, "", True)] * 2
+    path = fleet[1] / "mobility.jsonl"
+    path.write_bytes(path.read_bytes().replace(b"MethodDenied", b"MethodAllows"))
+    result = CliRunner().invoke(audit, ["verify", *map(str, fleet), "-o", "json"])
+    assert result.exit_code == 1
+    found = {one["log"]: one for one in json.loads(result.stdout)}
+    assert "was changed after it was written" in found[str(path)]["problem"]
+    assert sum(one["sound"] for one in found.values()) == 1
+
+
 def test_lines_that_are_no_entries_are_left_out(log: Path) -> None:
     whole = log.read_bytes()
     odd = [

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import importlib.metadata
 import importlib.util
+import json
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import click
 import pytest
+from fractus_cli import EXIT_BAD_INPUT
 from fractus_cli import main as cli
+from fractus_cluster.cluster import Cluster, NodeStatus
 
 
 class Infeasible(Exception):
@@ -122,3 +126,44 @@ def test_help_imports_no_command() -> None:
     imported = {module.partition(".")[0] for module in done.stderr.split()}
     assert {module for module in imported if module.startswith("fractus")} == {"fractus_cli"}
     assert not imported & {"grpc", "numpy", "shapely", "pydantic", "yaml"}
+
+
+def test_errors_of_clusters_read_like_all_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("FRACTUS_STATE", str(tmp_path))
+    assert cli.run(["cluster", "status"]) == EXIT_BAD_INPUT
+    assert capsys.readouterr().err == "fractus: there is no cluster; bring one up: fractus cluster up FILE\n"
+
+
+@pytest.mark.parametrize(("powered", "code"), [(True, 0), (False, 2)])
+def test_the_status_of_a_cluster_is_for_programs_too(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], powered: bool, code: int
+) -> None:
+    node = NodeStatus("drone-1", "drone", "10.0.0.2", powered, True, True, None, True)
+    shown = SimpleNamespace(name="demo", running=True, radio=SimpleNamespace(running=None), status=lambda: [node])
+    monkeypatch.setattr(Cluster, "existing", lambda _name: shown)
+    assert run_to_end(["cluster", "status", "-o", "json"]) == code
+    told = json.loads(capsys.readouterr().out)
+    assert (told["well"], told["radio"], told["nodes"][0]["name"]) == (powered, None, "drone-1")
+    assert told["nodes"][0]["vehicle_running"] is None
+    assert run_to_end(["cluster", "status"]) == code
+    assert "drone-1" in capsys.readouterr().out
+
+
+def run_to_end(arguments: list[str]) -> int:
+    try:
+        return cli.run(arguments)
+    except SystemExit as ended:
+        return int(ended.code or 0)
+
+
+def test_a_link_of_no_kind_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("grants", "tls", "state"):
+        (tmp_path / name).mkdir()
+    given = [f"--{name}={tmp_path / name}" for name in ("grants", "tls", "state")]
+    argv = ["mobility", "serve", *given, f"--audit={tmp_path}/audit.jsonl", f"--description={tmp_path}/none.yaml"]
+    assert cli.run([*argv, f"--node-object={tmp_path}/none.json", "--autopilot", "bluetooth:x"]) == EXIT_BAD_INPUT
+    said = capsys.readouterr().err.splitlines()
+    assert "bluetooth" in said[-1] and said[-1].startswith("fractus: ")
+    assert not any("Traceback" in line for line in said)

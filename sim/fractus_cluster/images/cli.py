@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import click
 
 from fractus_cluster.cluster import print_report
-from fractus_cluster.errors import ClusterError
 from fractus_cluster.images.build import TARGETS, build_images, find_source
 
 
@@ -26,12 +24,6 @@ def images() -> None:
 @click.option("--force", is_flag=True, help="Build although nothing changed.")
 def build(targets: tuple[str, ...], source: Path | None, tag: str, force: bool) -> None:
     """Build the TARGETs, or all; those of which nothing changed are left alone. Prints the images' names."""
-    try:
-        built = build_images(
-            source or find_source(), targets=targets or TARGETS, tag=tag, force=force, report=print_report
-        )
-    except ClusterError as error:
-        click.echo(f"error: {error}", err=True)
-        sys.exit(1)
+    built = build_images(source or find_source(), targets=targets or TARGETS, tag=tag, force=force, report=print_report)
     for image in built:
         click.echo(image)

@@ -343,7 +343,7 @@ class Fleet:
         """What one was told that its state may not show yet."""
         since = self.time_s - float(self.latency[i]) - COURSE_S
         self.sent[i] = [(at, velocity) for at, velocity in self.sent[i] if at >= since]
-        return tuple(dict.fromkeys(velocity for _, velocity in self.sent[i]))
+        return tuple(dict.fromkeys(velocity for _, velocity in reversed(self.sent[i])))[::-1]
 
     def send(self, i: int, verdict: Verdict, *, returns: bool = False) -> None:
         """Put what the engine made of a request on its way: it comes within the latency, and after those before it.

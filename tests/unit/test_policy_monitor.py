@@ -275,6 +275,16 @@ def test_a_climb_to_an_altitude_that_is_allowed_is_let_pass_though_the_link_is_s
     assert correction(monitor(fast, grant, bound_for=higher)) == "AltitudeAboveLimit"
 
 
+def test_a_climb_that_ends_by_a_velocity_is_let_pass_though_the_link_is_slow() -> None:
+    grant, up, level = compiled(altitude(upperLimit=16)), (0.0, 0.0, -2.6), (1.0, 0.0, 0.0)
+    climbing = at(0, 0, 12.5, down_mps=-2.6, latency_s=0.77)
+    assert monitor(replace(climbing, pending=(up, level)), grant) is None
+    assert correction(monitor(replace(climbing, pending=(level, up)), grant)) == "AltitudeAboveLimit"
+    assert correction(monitor(replace(climbing, altitude_m=15.5, pending=(level,)), grant)) == "AltitudeAboveLimit"
+    below = compiled(exclusion(AROUND, lower=18))
+    assert monitor(replace(climbing, altitude_m=14.0, pending=(level,)), below) is not None
+
+
 AROUND = box(-50, -50, 50, 50)
 
 

@@ -88,7 +88,8 @@ def monitor(
         worst = _worst(_fences(then, grant, further, leaving=True))
         if worst is not None:
             return replace(worst, action="deny", takeover="hover")
-    return _heights(now, grant, start, stop, level_m, sinks_back=leaving) or _speeds(now, grant, start)
+    told_m = _told_m(now, level_m)
+    return _heights(now, grant, start, stop, told_m, sinks_back=leaving) or _speeds(now, grant, start)
 
 
 def _worst(found: list[tuple[int, Verdict]]) -> Verdict | None:
@@ -130,6 +131,19 @@ def _level_m(now: Situation, bound_for: GotoArgs | None, grant: CompiledGrant) -
     late = abs(climb) * reaction_s(now, now.airframe.climb_accel_mps2)
     ahead, beyond = (target_m - now.altitude_m) * up, (rest_m - target_m) * up
     return target_m if ahead >= -strays and 0.0 < beyond <= late + strays else rest_m
+
+
+def _told_m(now: Situation, rest_m: float) -> float:
+    """The altitude at which a drone comes to rest that was told already to climb or sink no further.
+
+    It reacts to that from then on; a correction to a limit that it was permitted to come to rest at would come later still.
+    Zones get no such allowance: they are judged by where it rests if it is told only now.
+    """
+    climb = -now.down_mps
+    if not now.pending or -now.pending[-1][2] * climb > 0.0:
+        return rest_m
+    late_m = min(abs(climb) * now.latency_s, abs(rest_m - now.altitude_m))
+    return rest_m - math.copysign(late_m, climb)
 
 
 def must_rest(now: Situation, grant: CompiledGrant) -> bool:

@@ -214,7 +214,7 @@ class Situation:
         forward_mps2: how much the drone speeds up along its course (negative: slows down), from the last velocities; None
             while it is unknown.
         pending: velocities north, east and down that it was told to take up a moment ago, which it may do at once or has
-            begun to, though neither velocity nor acceleration show it yet.
+            begun to, though neither velocity nor acceleration show it yet; the latest last.
         vertical: whether the drone is taking off or landing, when lower altitude limits do not hold.
         attitude: None while it is unknown; the camera may look anywhere then, unless a gimbal keeps it level.
         lens: None on a node whose camera is not described: it may see everything around it.

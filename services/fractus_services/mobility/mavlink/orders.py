@@ -41,13 +41,13 @@ class Orders:
         self.fly((north * share, east * share, down), now)
 
     def since(self, moment: float) -> tuple[Velocity, ...]:
-        """What was sent after a moment, and a velocity that is in force since before; the rest is forgotten.
+        """What was sent after a moment, the latest last, and a velocity that is in force since before; the rest is forgotten.
 
         A vehicle that slows down to that velocity does not go on braking.
         """
         while self._sent and self._sent[0][0] < moment and not (len(self._sent) == 1 and _holds(self._sent[0][1])):
             self._sent.popleft()
-        return tuple(dict.fromkeys(velocity for _, velocity in self._sent))
+        return tuple(dict.fromkeys(velocity for _, velocity in reversed(self._sent)))[::-1]
 
 
 def _holds(velocity: Velocity) -> bool:

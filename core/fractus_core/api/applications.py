@@ -8,7 +8,7 @@ from typing import Any, Literal
 from pydantic import Field
 
 from fractus_core.api.components import Component, Placement, PointsOfInterest, Reference
-from fractus_core.api.model import AGE, READY, Condition, Model, OpenModel, Resource, keyed
+from fractus_core.api.model import AGE, READY, Conditions, Model, ObservedGeneration, OpenModel, Resource, keyed
 from fractus_core.api.rules import Broken, rule
 
 
@@ -164,7 +164,7 @@ class ApplicationSpec(Model):
 class ApplicationStatus(OpenModel):
     """Where the application stands."""
 
-    observed_generation: int | None = None
+    observed_generation: ObservedGeneration = None
     phase: (
         Literal[
             "Pending",
@@ -182,14 +182,14 @@ class ApplicationStatus(OpenModel):
             "Invalid",
         ]
         | None
-    ) = None
+    ) = Field(default=None, description="How far it is, and its drone.")
     drone: str | None = Field(default=None, description="The drone that flies it.")
     controller: str | None = Field(
         default=None, description="Who flies it, while it is in the air: system, pilot, or a component."
     )
     pods: str | None = Field(default=None, description="Ready pods of all pods, such as 6/7.")
     message: str | None = Field(default=None, description="One sentence on what is going on.")
-    conditions: tuple[Condition, ...] = ()
+    conditions: Conditions = ()
 
 
 class Application(Resource, plural="applications", short="fapp", namespaced=True):

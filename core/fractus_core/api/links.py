@@ -9,7 +9,7 @@ from pydantic import Field
 
 from fractus_core.api.components import Heuristic
 from fractus_core.api.geometry import Position
-from fractus_core.api.model import AGE, Condition, OpenModel, Resource
+from fractus_core.api.model import AGE, Conditions, ObservedGeneration, OpenModel, Resource
 from fractus_core.api.nodes import CONDITIONS_BY_TYPE, Pairing, Technology
 from fractus_core.api.plans import ApplicationReference
 
@@ -39,7 +39,7 @@ class TargetAddress(OpenModel):
 class Caller(OpenModel):
     """An instance on the drone that may call a service."""
 
-    instance: str
+    instance: str = Field(description="Name of the instance that calls.")
     address: str | None = Field(default=None, max_length=45, description="Its pod's IP; unset while there is none.")
 
 
@@ -81,7 +81,7 @@ class DirectLinkSpec(OpenModel):
 class DirectLinkStatus(OpenModel):
     """What became of the link; the drone's agent writes it, but for the condition PeerReady."""
 
-    observed_generation: int | None = None
+    observed_generation: ObservedGeneration = None
     phase: Literal["Idle", "Connecting", "Up"] | None = Field(default=None, description="How far the link is.")
     traffic: Literal["cloud", "direct"] | None = Field(default=None, description="Which path the traffic takes.")
     reason: str | None = Field(default=None, description="CamelCase reason of the last decision, for programs.")
@@ -90,7 +90,7 @@ class DirectLinkStatus(OpenModel):
     latency: float | None = Field(default=None, ge=0, description="Milliseconds one way, measured on the link last.")
     switches: int | None = Field(default=None, ge=0, description="How often the traffic changed its path.")
     last_switch: datetime | None = Field(default=None, description="When it last did.")
-    conditions: tuple[Condition, ...] = Field(default=(), json_schema_extra=CONDITIONS_BY_TYPE)
+    conditions: Conditions = Field(default=(), json_schema_extra=CONDITIONS_BY_TYPE)
 
 
 class DirectLink(

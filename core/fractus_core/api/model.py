@@ -152,12 +152,17 @@ class Condition(OpenModel):
     """A Kubernetes condition: one observed fact about an object."""
 
     type: str = Field(description="What is observed, CamelCase.", max_length=316)
-    status: Literal["True", "False", "Unknown"]
+    status: Literal["True", "False", "Unknown"] = Field(
+        description="Whether it holds; Unknown while that cannot be told."
+    )
     reason: str = Field(description="CamelCase reason of the last transition, for programs.", max_length=1024)
     message: str = Field(default="", description="One sentence for people.", max_length=32768)
     last_transition_time: datetime = Field(description="When the status last changed.")
     observed_generation: int | None = Field(default=None, ge=0, description="metadata.generation this was said of.")
 
+
+ObservedGeneration = Annotated[int | None, Field(description="metadata.generation that the status was said of.")]
+Conditions = Annotated[tuple[Condition, ...], Field(description="Single facts about it, by type.")]
 
 Column = tuple[str, str, str]
 """A printer column: title, type, JSONPath."""

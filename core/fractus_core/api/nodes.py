@@ -10,7 +10,7 @@ from pydantic import Field, JsonValue
 
 from fractus_core.api.geometry import Point, Position
 from fractus_core.api.methods import CameraMethod, MobilityMethod
-from fractus_core.api.model import AGE, GROUP, READY, Condition, Model, OpenModel, Resource
+from fractus_core.api.model import AGE, GROUP, READY, Conditions, Model, OpenModel, Resource
 from fractus_core.api.names import Name
 from fractus_core.api.rules import Broken, named_by_others, rule
 
@@ -280,9 +280,9 @@ class DroneStatus(OpenModel):
     position: Position | None = None
     battery: Battery | None = None
     controller: str | None = Field(default=None, description="Who flies: system, pilot, or the driver's identity.")
-    last_seen: datetime | None = None
+    last_seen: datetime | None = Field(default=None, description="When its agent last wrote this.")
     audit: tuple[str, ...] = _AUDIT
-    conditions: tuple[Condition, ...] = Field(default=(), json_schema_extra=CONDITIONS_BY_TYPE)
+    conditions: Conditions = Field(default=(), json_schema_extra=CONDITIONS_BY_TYPE)
 
     @property
     def in_air(self) -> bool:
@@ -345,9 +345,9 @@ class EdgeNodeSpec(Model):
 class EdgeNodeStatus(OpenModel):
     """What the node's agent last saw."""
 
-    last_seen: datetime | None = None
+    last_seen: datetime | None = Field(default=None, description="When its agent last wrote this.")
     audit: tuple[str, ...] = _AUDIT
-    conditions: tuple[Condition, ...] = Field(default=(), json_schema_extra=CONDITIONS_BY_TYPE)
+    conditions: Conditions = Field(default=(), json_schema_extra=CONDITIONS_BY_TYPE)
 
 
 class EdgeNode(Resource, plural="edgenodes", short="edn"):

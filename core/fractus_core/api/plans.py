@@ -16,7 +16,7 @@ from fractus_core.api.components import (
     ServiceRequest,
 )
 from fractus_core.api.geometry import Area, Point, Position
-from fractus_core.api.model import AGE, Condition, InvalidObject, Model, OpenModel, Resource
+from fractus_core.api.model import AGE, Conditions, InvalidObject, Model, ObservedGeneration, OpenModel, Resource
 from fractus_core.api.names import component_identity
 from fractus_core.api.policies import PolicySpec, ZoneShape
 
@@ -27,7 +27,7 @@ GeoJson = Annotated[dict[str, Any], WithJsonSchema({"type": "object", "x-kuberne
 class Alternative(Model):
     """A drone that could fly the application, with what ranks it."""
 
-    node: str
+    node: str = Field(description="The drone.")
     score: float = Field(description="Higher is better; comparable within one plan only.")
 
 
@@ -43,7 +43,7 @@ class LegLegality(Model):
 
     start: Position
     end: Position
-    flown_by: Literal["system", "driver"]
+    flown_by: Literal["system", "driver"] = Field(description="Whose leg it is.")
     outcome: Literal["Detour", "Corrected", "Denied"] = Field(
         description="The system flies around; altitude or speed are corrected; it is not flown, or not to its end."
     )
@@ -63,7 +63,7 @@ class Mission(Model):
 class DroneChoice(Model):
     """The drone that flies, and the runners-up in order."""
 
-    node: str
+    node: str = Field(description="The drone.")
     score: float | None = Field(default=None, description="Higher is better; comparable within one plan only.")
     shared_with: str | None = Field(
         default=None, description="namespace/name of the application that flies the drone; this one comes along."
@@ -81,25 +81,27 @@ class DroneChoice(Model):
     policy_conflict: str | None = Field(
         default=None, description="Why the policies do not let the mission be flown as planned; unset: they do."
     )
-    alternatives: tuple[Alternative, ...] = ()
+    alternatives: tuple[Alternative, ...] = Field(default=(), description="The next best drones, best first.")
 
 
 class Serves(Model):
     """Which instance a hybrid instance is near to."""
 
-    component: str
-    node: str
+    component: str = Field(description="Its component.")
+    node: str = Field(description="Its node.")
 
 
 class PlannedInstance(Model):
     """One instance of a component on a node."""
 
-    component: str
+    component: str = Field(description="Name of the component.")
     instance: str = Field(description="Name of the instance, unique in the namespace; pods and grants carry it.")
     node: str | None = Field(description="Name of the node; null: any cloud node.", default=None)
-    placement: Placement
-    role: Role
-    replicas: int = Field(default=1, ge=1)
+    placement: Placement = Field(description="As the component declares it.")
+    role: Role = Field(
+        description="What it is there for: on the drone, at a location, near another instance, in the cloud."
+    )
+    replicas: int = Field(default=1, ge=1, description="Pods of it; more than one only in the cloud.")
     serves: Serves | None = None
     coverage: float | None = Field(default=None, ge=0, le=1, description="Share of the operation area it adds.")
     location: int | None = Field(
@@ -110,8 +112,8 @@ class PlannedInstance(Model):
 class Rejection(Model):
     """A node that was considered for a component and dropped."""
 
-    component: str
-    node: str
+    component: str = Field(description="Name of the component.")
+    node: str = Field(description="Name of the node.")
     reason: str = Field(description="CamelCase, for programs.")
     message: str = Field(description="One sentence for people.")
 
@@ -119,12 +121,12 @@ class Rejection(Model):
 class DeploymentPlanSpec(Model):
     """What was decided and why."""
 
-    application: str
-    application_generation: int | None = None
+    application: str = Field(description="Name of the application, in this namespace.")
+    application_generation: int | None = Field(default=None, description="metadata.generation of it that was planned.")
     operation_area: GeoJson | None = Field(default=None, description="GeoJSON (lon, lat) MultiPolygon.")
     drone: DroneChoice | None = None
-    placements: tuple[PlannedInstance, ...] = ()
-    rejected: tuple[Rejection, ...] = ()
+    placements: tuple[PlannedInstance, ...] = Field(default=(), description="Which instance runs where.")
+    rejected: tuple[Rejection, ...] = Field(default=(), description="Nodes that were dropped, with the first reason.")
     rejected_omitted: int | None = Field(
         default=None,
         ge=1,
@@ -148,13 +150,13 @@ class DeploymentPlan(Resource, plural="deploymentplans", short="fplan", namespac
 class GrantedZone(ZoneShape):
     """A zone of a granted policy, with its geometry, so that the node needs nothing else."""
 
-    name: str
+    name: str = Field(description="Name of the Zone.")
 
 
 class GrantedPolicy(Model):
     """A policy that holds for the instance, with its zones resolved."""
 
-    name: str
+    name: str = Field(description="Name of the Policy.")
     spec: PolicySpec
     zones: tuple[GrantedZone, ...] = Field(
         default=(),
@@ -175,9 +177,9 @@ class GrantedPolicy(Model):
 class ApplicationReference(Model):
     """The application that it is for; its uid tells it from another one of its name."""
 
-    namespace: str
-    name: str
-    uid: str
+    namespace: str = Field(description="Its namespace.")
+    name: str = Field(description="Its name.")
+    uid: str = Field(description="Its metadata.uid.")
 
 
 class GrantedLimits(Model):
@@ -190,20 +192,26 @@ class GrantedLimits(Model):
 class GrantSpec(Model):
     """The policy configuration of one component instance on one node."""
 
-    node: str
+    node: str = Field(description="The node whose services it is for.")
     application: ApplicationReference
-    component: str
-    instance: str
-    class_: ComponentClass | None = Field(default=None, alias="class")
-    control: ControlScope | None = None
-    control_points: tuple[ControlPoint, ...] = ()
+    component: str = Field(description="Name of the component.")
+    instance: str = Field(description="Name of the instance, unique in the namespace.")
+    class_: ComponentClass | None = Field(
+        default=None, alias="class", description="driver flies the drone, passenger comes along; unset: on no drone."
+    )
+    control: ControlScope | None = Field(
+        default=None, description="What a driver has of the flight: all of it, or a part."
+    )
+    control_points: tuple[ControlPoint, ...] = Field(default=(), description="Where a driver flies, in this order.")
     points_of_interest: PointsOfInterest | None = None
     tour: tuple[Position, ...] = Field(
         default=(),
         description="Places that the system flies the drone to, in this order, and home from the last: the mission of an"
         " application without a driver. Empty: a driver flies, or the application comes along with another.",
     )
-    services: tuple[ServiceRequest, ...] = ()
+    services: tuple[ServiceRequest, ...] = Field(
+        default=(), description="The system services that it may call, with the methods."
+    )
     operation_area: tuple[Area, ...] = Field(
         default=(), description="Where services may be used; needed on a drone. Empty: anywhere (fixed nodes)."
     )
@@ -213,7 +221,7 @@ class GrantSpec(Model):
     depot: Point | None = None
     home: Position | None = None
     limits: GrantedLimits | None = None
-    policies: tuple[GrantedPolicy, ...] = ()
+    policies: tuple[GrantedPolicy, ...] = Field(default=(), description="Those that hold for it.")
     mission: str | None = Field(
         default=None,
         max_length=253,
@@ -259,10 +267,12 @@ class GrantSpec(Model):
 class GrantStatus(OpenModel):
     """What became of the grant on its node."""
 
-    phase: Literal["Pending", "Active", "Complete", "Revoked", "Failed"] | None = None
-    message: str | None = None
-    observed_generation: int | None = None
-    conditions: tuple[Condition, ...] = ()
+    phase: Literal["Pending", "Active", "Complete", "Revoked", "Failed"] | None = Field(
+        default=None, description="Pending until the node has it; then how its mission stands."
+    )
+    message: str | None = Field(default=None, description="One sentence for people.")
+    observed_generation: ObservedGeneration = None
+    conditions: Conditions = ()
 
 
 class Grant(Resource, plural="grants", short="fgr", written_by_operator=True, selectable=(".spec.node",)):

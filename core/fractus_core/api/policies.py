@@ -11,7 +11,7 @@ from pydantic.alias_generators import to_snake
 
 from fractus_core.api.geometry import Altitude, AltitudeBand, Area, Reference
 from fractus_core.api.methods import Method
-from fractus_core.api.model import AGE, READY, Condition, Model, OpenModel, Resource
+from fractus_core.api.model import AGE, READY, Conditions, Model, ObservedGeneration, OpenModel, Resource
 from fractus_core.api.names import ComponentName, Name
 from fractus_core.api.rules import Broken, named_by_others, rule
 from fractus_core.api.schedules import ActiveTime, Validity
@@ -20,8 +20,8 @@ from fractus_core.api.schedules import ActiveTime, Validity
 class ReadyStatus(OpenModel):
     """Whether the object is usable, and why not."""
 
-    observed_generation: int | None = None
-    conditions: tuple[Condition, ...] = ()
+    observed_generation: ObservedGeneration = None
+    conditions: Conditions = ()
 
 
 class ZoneShape(Model):

@@ -238,10 +238,14 @@ def _refusal(code: grpc.StatusCode, text: str, what: str, decision: Decision | N
     return _STATE_ERRORS.get(state, StateError)(state, f"{what}: {text}")
 
 
+_FOREIGN = "another authority signed its certificate: correct FRACTUS_TLS_DIR, or the address"
 _REMEDIES = {
     "hostname verification": "it is another node's: correct FRACTUS_NODE, or the address",
     "not in peer certificate": "it is another node's: correct FRACTUS_NODE, or the address",
-    "certificate_verify_failed": "another authority signed its certificate: correct FRACTUS_TLS_DIR, or the address",
+    "certificate_verify_failed": _FOREIGN,
+    "certificate signature failure": _FOREIGN,
+    "create security handshaker": "tls.crt and tls.key are no pair: correct FRACTUS_TLS_DIR",
+    "socket closed": "it may not know the authority of our certificate: see its log, and correct FRACTUS_TLS_DIR",
     "wrong_version_number": "it speaks no TLS: correct the address",
     "method not found": "another service listens there, or another version: correct the address",
 }

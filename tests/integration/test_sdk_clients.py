@@ -405,12 +405,26 @@ async def test_the_server_must_be_the_node_that_was_meant(stage: Stage) -> None:
     assert stage.drone.calls == []
 
 
-async def test_a_stranger_gets_no_answer(stage: Stage, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("ours", "remedy"),
+    [
+        (("ca.crt",), "may not know the authority of our certificate: .* FRACTUS_TLS_DIR"),
+        ((), "another authority signed its certificate: correct FRACTUS_TLS_DIR"),
+        (("ca.crt", "tls.crt"), "tls.crt and tls.key are no pair: correct FRACTUS_TLS_DIR"),
+    ],
+)
+async def test_a_stranger_gets_no_answer_and_is_told_why(
+    stage: Stage, tmp_path: Path, ours: tuple[str, ...], remedy: str
+) -> None:
     tls = Authority().issue(tmp_path / "stranger", [x509.UniformResourceIdentifier(NAVIGATOR)])
-    (tls / "ca.crt").write_bytes((stage.endpoint.tls_dir / "ca.crt").read_bytes())
+    for name in ours:
+        (tls / name).write_bytes((stage.endpoint.tls_dir / name).read_bytes())
     async with Mobility(replace(stage.endpoint, tls_dir=tls), reconnect_timeout_s=0.3) as drone:
-        with pytest.raises(fractus.Unavailable):
+        with pytest.raises(fractus.Unavailable, match=remedy):
             await drone.position()
+        with pytest.raises(fractus.Unavailable, match=remedy):
+            async with drone.control():
+                pass
     assert stage.drone.calls == []
 
 

@@ -27,6 +27,12 @@ name, address, work_s = sys.argv[1], sys.argv[2], float(sys.argv[3])
 def answer(request, context):
     time.sleep(work_s)
     return name.encode() + b" " + request[:32]
+def send(request, context):  # as many bytes as are asked for, in messages of 200 kB
+    left = int(request)
+    while left:
+        size = min(left, 200_000)
+        yield bytes(size)
+        left -= size
 def stream(requests, context):
     for request in requests:
         yield name.encode() + b" " + request
@@ -34,6 +40,8 @@ class Handler(grpc.GenericRpcHandler):
     def service(self, details):
         if details.method == "/test/Stream":
             return grpc.stream_stream_rpc_method_handler(stream)
+        if details.method == "/test/Send":
+            return grpc.unary_stream_rpc_method_handler(send)
         return grpc.unary_unary_rpc_method_handler(answer)
 server = grpc.server(ThreadPoolExecutor(8))
 server.add_generic_rpc_handlers((Handler(),))

@@ -1,7 +1,10 @@
-"""When a connection may be closed without a loss: between a reply and the next request, as its client and server usually behave.
+"""When a connection may be closed without a loss: between a reply and the next request, by how its client and server behave.
 
 A request that meets a connection while it is being closed is lost, for its client notices only when it runs. So a connection is
 closed as soon as its reply is complete, and where a client calls all the time, early in a rest that is long enough.
+
+Frames of HTTP/2 that ask and answer nothing, such as pings and window updates, go both ways at any time. They are told from
+requests and replies by their length: on their own they are shorter, and beside a long reply few.
 """
 
 from __future__ import annotations
@@ -15,12 +18,18 @@ MIN_IDLE_MS, MAX_IDLE_MS = 2 * JIFFY_MS, 500
 WORK_MARGIN = 1.5
 DECAY = 0.9
 UNKNOWN_WORK_MS = 60.0
-"""A reply may be complete once nothing has come for longer than its server usually takes to answer. Frames that answer nothing,
-such as HTTP/2's pings and window updates, look like replies; so how long a service works is learned from its connections
-all the time."""
+"""A reply may be complete once nothing has come for longer than its server usually takes to answer. How long a service works is
+learned from its connections all the time."""
 
-MIN_REPLY_BYTES = 35
-"""HTTP/2's ping (17) and window update (13) together are shorter, all replies longer."""
+MIN_REPLY_BYTES, MIN_REQUEST_BYTES = 35, 31
+"""HTTP/2's ping (17) and window update (13) together are shorter; a request of gRPC's has 31 where it says nothing at all."""
+CONTROL_SHARE = 1 / 256
+"""What a client sends at most while it takes a long reply: two window updates (26) for each frame of data (16,384) are half of it."""
+
+LONG_BYTES = 8 * 1024
+LONG_IDLE_MS = 250.0
+"""A long reply may pause for a segment that was lost: TCP sends it again after 200 ms."""
+PAUSE_MARGIN = 2.0
 
 NOTICE_MS = 8.0
 """What is asked of the rest that is left: the client has to run to notice that its connection was closed."""
@@ -28,47 +37,65 @@ NOTICE_MS = 8.0
 
 @dataclass(frozen=True, slots=True)
 class Exchange:
-    """What was seen of a connection while it was looked at again and again.
+    """A request and its reply, as far as they were seen of a connection that is looked at again and again.
 
     Attributes:
         connection: as it was last.
-        sent_at_ms: when the client last sent.
-        before_bytes: received before that; None when it was not looked at then.
-        usual_bytes: of the reply before; None when it was not seen.
+        before_bytes: received in all before the reply, or before the first look.
+        at_send: as it was when something of the client's had arrived last.
+        seen: whether the request was seen.
+        asked_bytes: of the request.
+        previous_bytes: of the reply before; None where that was not seen as a whole, or the request not.
+        pause_ms: longest silence within the reply.
     """
 
     connection: Connection
-    sent_at_ms: float
-    before_bytes: int | None = None
-    usual_bytes: int | None = None
+    before_bytes: int
+    at_send: Connection
+    seen: bool = False
+    asked_bytes: int = 0
+    previous_bytes: int | None = None
+    pause_ms: int = 0
 
     @classmethod
-    def first(cls, connection: Connection, now_ms: float) -> Exchange:
+    def first(cls, connection: Connection) -> Exchange:
         """A connection that is looked at for the first time."""
-        return cls(connection, now_ms - connection.sent_ms)
+        return cls(connection, connection.received_bytes, connection)
 
-    def then(self, connection: Connection, now_ms: float) -> Exchange:
+    def then(self, connection: Connection) -> Exchange:
         """The same connection, looked at again."""
-        sent_at_ms = now_ms - connection.sent_ms
-        # Ages are told in steps; requests in several segments are sent over a time, and are one as long as nothing comes.
-        if sent_at_ms <= self.sent_at_ms + 2 * JIFFY_MS or not self._replied:
-            return replace(self, connection=connection, sent_at_ms=max(sent_at_ms, self.sent_at_ms))
-        return Exchange(connection, sent_at_ms, self.connection.received_bytes, self._reply_bytes)
+        more = connection.received_bytes > self.connection.received_bytes
+        pause_ms = max(self.pause_ms, self.connection.received_ms) if more else self.pause_ms
+        now = replace(self, connection=connection, pause_ms=pause_ms)
+        sent = connection.sent_bytes - self.at_send.sent_bytes
+        if not sent:
+            return now
+        if self.seen and self.reply_bytes < MIN_REPLY_BYTES:
+            # A request in several segments is sent over a time; it is one as long as nothing comes.
+            return replace(now, at_send=connection, asked_bytes=self.asked_bytes + sent)
+        came = connection.received_bytes - self.at_send.received_bytes
+        if sent < max(MIN_REQUEST_BYTES, CONTROL_SHARE * came):
+            return replace(now, at_send=connection)
+        previous = self.reply_bytes if self.seen else None
+        return Exchange(connection, self.connection.received_bytes, connection, True, sent, previous)
 
     @property
-    def _reply_bytes(self) -> int | None:
-        return None if self.before_bytes is None else self.connection.received_bytes - self.before_bytes
+    def reply_bytes(self) -> int:
+        """How much came since the request, or since the first look."""
+        return self.connection.received_bytes - self.before_bytes
 
     @property
-    def _replied(self) -> bool:
-        """Whether more came since the last request than answers nothing, as far as that is known."""
-        return (reply := self._reply_bytes) is None or reply >= MIN_REPLY_BYTES
+    def long(self) -> bool:
+        """Whether the reply comes in several segments, so that it may pause within."""
+        return self.reply_bytes >= LONG_BYTES
 
     @property
     def complete(self) -> bool:
-        """Whether a reply came that is as long as the one before."""
-        reply, usual = self._reply_bytes, self.usual_bytes
-        return reply is not None and usual is not None and reply >= max(usual, MIN_REPLY_BYTES)
+        """Whether a short request was answered by a short reply, as long as the one before: a longer one may go on."""
+        if self.previous_bytes is None or self.long or self.asked_bytes >= LONG_BYTES:
+            return False
+        expected = max(self.previous_bytes, MIN_REPLY_BYTES)
+        return expected <= self.reply_bytes <= expected + MIN_REPLY_BYTES
 
 
 class Habits:
@@ -81,11 +108,11 @@ class Habits:
     def learn(self, connection: Connection) -> None:
         """Learn from a connection as it is now."""
         if connection.answered:
-            usual = DECAY * self._worked_ms.get(connection.peer, 0.0)
-            self._worked_ms[connection.peer] = max(usual, connection.worked_ms)
+            known_ms = DECAY * self._worked_ms.get(connection.peer, 0.0)
+            self._worked_ms[connection.peer] = max(known_ms, connection.worked_ms)
         elif rested := connection.rested_ms:
-            usual = self._rested_ms.get(connection.peer, rested) / DECAY
-            self._rested_ms[connection.peer] = min(usual, rested)
+            known_ms = self._rested_ms.get(connection.peer, rested) / DECAY
+            self._rested_ms[connection.peer] = min(known_ms, rested)
 
     def closable(self, exchange: Exchange, left: float) -> bool:
         """Whether a connection may be closed now.
@@ -97,18 +124,21 @@ class Habits:
         connection = exchange.connection
         if not connection.answered:
             return False
-        patience = min(2 * left, 1.0)
-        if self._about_to_ask(connection, patience):
+        demand = min(2 * left, 1.0)
+        if self._about_to_ask(connection, demand):
             return False
         if exchange.complete:
             return True
         worked_ms = max(self._worked_ms.get(connection.peer, UNKNOWN_WORK_MS), connection.worked_ms)
-        return connection.idle_ms >= max(min(WORK_MARGIN * worked_ms, MAX_IDLE_MS) * patience, MIN_IDLE_MS)
+        idle_ms = min(WORK_MARGIN * worked_ms, MAX_IDLE_MS)
+        if exchange.long:
+            idle_ms = max(idle_ms, LONG_IDLE_MS, min(PAUSE_MARGIN * exchange.pause_ms, MAX_IDLE_MS))
+        return connection.idle_ms >= max(idle_ms * demand, MIN_IDLE_MS)
 
-    def _about_to_ask(self, connection: Connection, patience: float) -> bool:
-        """Whether too little is left of the rest that clients of this service usually take."""
+    def _about_to_ask(self, connection: Connection, demand: float) -> bool:
+        """Whether too little is left of the rest that clients of this service take."""
         rest_ms = self._rested_ms.get(connection.peer)
-        # Who has rested for much longer than usual has no habit that tells when the next request comes.
+        # Who has rested for much longer than before has no habit that tells when the next request comes.
         if rest_ms is None or connection.received_ms >= MAX_IDLE_MS:
             return False
-        return rest_ms - connection.received_ms < max(NOTICE_MS, rest_ms / 2) * patience
+        return rest_ms - connection.received_ms < max(NOTICE_MS, rest_ms / 2) * demand

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from ipaddress import IPv4Address
@@ -81,6 +81,17 @@ class Namespaces:
                 log.debug("redirector: network namespace left out (path=%s error=%s)", path, error)
         return self._open.values()
 
+    def to(self, services: Collection[Endpoint]) -> Iterator[tuple[Sockets, Connection]]:
+        """The connections to some services; without those of namespaces that cannot be looked at, such as a pod's that ends."""
+        for sockets in self.refresh():
+            try:
+                found = sockets.to(services)
+            except NetlinkError as error:
+                log.warning("redirector: connections not looked at (error=%s)", error)
+                continue
+            for connection in found:
+                yield sockets, connection
+
     def close(self) -> None:
         """Close all sockets."""
         for sockets in self._open.values():
@@ -127,6 +138,7 @@ class Redirector:
         self._draining: set[int] = set()
         self._last_number = 0
         self._habits = Habits()
+        self._exchanges: dict[bytes, Exchange] = {}
 
     @property
     def redirects(self) -> Mapping[Endpoint, Endpoint]:
@@ -277,11 +289,8 @@ class Redirector:
     def _paths(self, numbers: Mapping[Endpoint, int]) -> list[_Left]:
         """What is left of services with these numbers, as it is now; without connections where the kernel does not tell."""
         found: dict[Endpoint, set[bytes]] = {service: set() for service in numbers}
-        try:
-            for connection in (c for sockets in self._namespaces.refresh() for c in sockets.to(found)):
-                found[connection.peer].add(connection.identity)
-        except NetlinkError as error:
-            log.warning("redirector: connections not looked at (error=%s)", error)
+        for _, connection in self._namespaces.to(found):
+            found[connection.peer].add(connection.identity)
         return [_Left(service, number, frozenset(found[service])) for service, number in numbers.items()]
 
     def _leave(self, paths: Iterable[_Left]) -> int:
@@ -301,32 +310,33 @@ class Redirector:
         return cut
 
     def learn(self) -> None:
-        """Look at the connections to the services, and learn how long these work for a request."""
-        try:
-            found = [c for sockets in self._namespaces.refresh() for c in sockets.to(self._numbers)]
-        except NetlinkError as error:
-            log.debug("redirector: connections not looked at (error=%s)", error)
-            return
-        for connection in found:
+        """Look at the connections to the services: what they are doing, and how long the services work for a request."""
+        before, self._exchanges = self._exchanges, {}
+        for _, connection in self._namespaces.to(self._numbers):
             self._habits.learn(connection)
+            known = before.get(connection.identity)
+            self._exchanges[connection.identity] = known.then(connection) if known else Exchange.first(connection)
 
     async def _drain(self, old: Collection[bytes], moved: Collection[Endpoint]) -> int:
         """Close old connections as they become idle, until the time is over; how many."""
         loop = asyncio.get_running_loop()
         begun, drained = loop.time(), 0
         watched = [
-            (sockets, Exchange.first(connection, begun * 1e3))
-            for sockets in self._namespaces.refresh()
-            for connection in sockets.to(moved)
+            (sockets, self._exchanges.get(connection.identity) or Exchange.first(connection))
+            for sockets, connection in self._namespaces.to(moved)
             if connection.identity in old
         ]
         while watched and (left := 1 - (loop.time() - begun) / DRAIN_TIMEOUT_S) > 0:
             there = []
             for sockets, exchange in watched:
-                connection = sockets.now(exchange.connection)
+                try:
+                    connection = sockets.now(exchange.connection)
+                except NetlinkError as error:  # it is closed with those that were not idle in time
+                    log.warning("redirector: a connection is not drained (error=%s)", error)
+                    continue
                 if connection is None:
                     continue
-                seen = exchange.then(connection, loop.time() * 1e3)
+                seen = exchange.then(connection)
                 if not self._habits.closable(seen, left):
                     there.append((sockets, seen))
                 # At once: the next request comes at some time, and none is to come in between.

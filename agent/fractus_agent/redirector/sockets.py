@@ -23,9 +23,9 @@ _ID = struct.Struct(">HH16s16s")
 _ID_BYTES = 48
 _ANSWER_HEAD = 4
 _QUEUES = struct.Struct("=III")
-_INFO = struct.Struct("=24xI16x4I68xQ")
+_INFO = struct.Struct("=24xI16x4I60xQQ")
 """tcp_info: unacknowledged segments; ages in ms of the last data sent, ACK sent (always 0), data received, ACK received; bytes
-received."""
+sent and acknowledged, and received."""
 
 _MAPPED = b"\0" * 10 + b"\xff\xff"
 TCP_ESTABLISHED, TCP_SYN_SENT, TCP_CLOSE_WAIT = 1, 2, 8
@@ -50,6 +50,7 @@ class Connection:
         received_ms: age of the last data received.
         acknowledged_ms: age of the last ACK received.
         received_bytes: since it was opened.
+        sent_bytes: since it was opened, as far as they were acknowledged.
     """
 
     identity: bytes
@@ -61,6 +62,7 @@ class Connection:
     received_ms: int = 0
     acknowledged_ms: int = 0
     received_bytes: int = 0
+    sent_bytes: int = 0
 
     @property
     def answered(self) -> bool:
@@ -170,7 +172,7 @@ def _read(answer: bytes) -> Connection | None:
     _expires, _received, queued = _QUEUES.unpack_from(answer, _ANSWER_HEAD + _ID_BYTES)
     rest = answer[_ANSWER_HEAD + _ID_BYTES + _QUEUES.size + 8 :]
     info = next((value for kind, value in attributes(rest) if kind == _TCP_INFO), b"").ljust(_INFO.size, b"\0")
-    unacknowledged, sent_ms, _, received_ms, acknowledged_ms, received_bytes = _INFO.unpack_from(info)
+    unacknowledged, sent_ms, _, received_ms, acknowledged_ms, sent_bytes, received_bytes = _INFO.unpack_from(info)
     return Connection(
         identity,
         family,
@@ -181,4 +183,5 @@ def _read(answer: bytes) -> Connection | None:
         received_ms,
         acknowledged_ms,
         received_bytes,
+        sent_bytes,
     )

@@ -7,6 +7,7 @@ import dataclasses
 import datetime as dt
 import enum
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -60,8 +61,10 @@ def _plain(value: Any) -> Any:
 
 
 def _line(sample: Telemetry) -> str:
-    speed = (sample.velocity.north**2 + sample.velocity.east**2) ** 0.5
+    speed = "speed unknown"
+    if sample.velocity is not None:
+        speed = f"{math.hypot(sample.velocity.north, sample.velocity.east):4.1f} m/s"
     return (
-        f"{sample.time:%H:%M:%S}  {sample.flight_state:<9}  {sample.mode:<9}  {sample.position}  {speed:4.1f} m/s"
+        f"{sample.time:%H:%M:%S}  {sample.flight_state:<9}  {sample.mode:<9}  {sample.position or 'position unknown'}  {speed}"
         f"  battery {sample.battery_remaining:.0%}  by {sample.controller or 'no one'}"
     )

@@ -115,20 +115,20 @@ class Telemetry:
 
     Attributes:
         time: when the service sent it, UTC.
-        position: degrees, and metres above home; zeros that mean nothing while `position_error_m` is None.
+        position: degrees, and metres above home; None while it is unknown, or older than a second.
         altitude_amsl_m: metres above mean sea level.
-        velocity: over ground; as `position` while that is unknown.
+        velocity: over ground; None while the position is.
         yaw_deg: where the nose points, degrees clockwise from true north.
         battery_remaining: 0 to 1; `battery` has more.
         armed: whether the motors run.
         in_air: whether it flies; in doubt it does.
         mode: the autopilot's name of its flight mode: GUIDED, RTL.
         ready: whether the motors could be started now; `health` says why not.
-        home: degrees, and metres above mean sea level.
+        home: degrees, and metres above mean sea level; None until the autopilot has one.
         flight_state: inactive, charging, takingOff, flying or landing.
         controller: who flies: `system`, `pilot`, or the SPIFFE id of the driver instance.
         attitude: None while it is unknown.
-        position_error_m: bound of the horizontal error in metres; None while the position is unknown.
+        position_error_m: bound of the horizontal error in metres; None while the position is.
         autopilot_connected: whether the autopilot is heard.
         gps: None until the receiver has told.
         battery: charge, voltage and current.
@@ -138,16 +138,16 @@ class Telemetry:
     """
 
     time: datetime
-    position: Position
+    position: Position | None
     altitude_amsl_m: float
-    velocity: Velocity
+    velocity: Velocity | None
     yaw_deg: float
     battery_remaining: float
     armed: bool
     in_air: bool
     mode: str
     ready: bool
-    home: Position
+    home: Position | None
     flight_state: str
     controller: str
     attitude: Attitude | None
@@ -162,19 +162,20 @@ class Telemetry:
     @classmethod
     def from_proto(cls, message: mobility_pb2.Telemetry) -> Telemetry:
         """Read the wire form."""
-        error_m = message.position_error_m if message.HasField("position") else None
+        located = message.HasField("position")
+        error_m = message.position_error_m if located else None
         return cls(
             time=message.time.ToDatetime(tzinfo=UTC),
-            position=Position.from_proto(message.position),
+            position=Position.from_proto(message.position) if located else None,
             altitude_amsl_m=message.altitude_amsl_m,
-            velocity=Velocity.from_proto(message.velocity),
+            velocity=Velocity.from_proto(message.velocity) if located else None,
             yaw_deg=message.yaw_deg,
             battery_remaining=message.battery_remaining,
             armed=message.armed,
             in_air=message.in_air,
             mode=message.mode,
             ready=message.ready,
-            home=Position.from_proto(message.home),
+            home=Position.from_proto(message.home) if message.HasField("home") else None,
             flight_state=message.flight_state,
             controller=message.controller,
             attitude=Attitude.from_proto(message.attitude) if message.HasField("attitude") else None,

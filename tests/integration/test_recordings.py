@@ -11,6 +11,7 @@ from typing import Any
 
 import chart
 import pytest
+from fractus_agent.registration.evidence import recording_problems
 from fractus_core.api.names import component_identity
 from fractus_proto.v1 import camera_pb2, camera_pb2_grpc
 from fractus_proto.v1 import mobility_pb2 as pb
@@ -127,6 +128,24 @@ async def test_a_recording_that_cannot_be_written_keeps_no_drone_on_the_ground(r
     assert "recording stopped" in (await rig.telemetry()).recording_problem
     await driver.goto(10, 0, 5.0)
     assert rig.log("service").count("recording: stopped") == 1
+    await driver.stub.ReturnControl(pb.ReturnControlRequest(), timeout=10)
+
+
+async def test_the_second_service_of_a_directory_says_so_where_the_agent_looks(rig: Rig) -> None:
+    shared = str(rig.directory / "shared")
+    rig.write_grant(grant())
+    rig.start_service("--recordings", shared)
+    rig.start_vehicle()
+    driver = Driver(rig)
+    await driver.up(5.0)
+    rig.start_camera("--recordings", shared)
+    said = f"pictures: recording stopped: another service records into {shared}; give each its own directory with --recordings"
+    async with asyncio.timeout(60):
+        while True:
+            if recording_problems(rig.directory) == [said]:
+                break
+            await asyncio.sleep(0.1)
+    assert not (await rig.telemetry()).recording_problem
     await driver.stub.ReturnControl(pb.ReturnControlRequest(), timeout=10)
 
 

@@ -123,6 +123,46 @@ def test_an_agent_that_is_killed_leaves_the_cloud_path_and_starts_clean(world: W
     assert drone.addresses() == [f"{link_address('d1')}/16"]
 
 
+def test_what_agents_that_were_killed_left_is_removed_though_no_link_is_planned(world: World) -> None:
+    edge = world.edge("e1", 20.0)
+    drone = flying(world, edge)
+    client = world.client(drone, 100_000, 0.1)
+    until(lambda: client.by == "e1", "an answer over the link", world)
+    for agent in (drone, edge):  # the mission ends while there is no agent
+        agent.kill()
+        agent.plan()
+        for stored in (agent.folder / "links").glob("*.json"):
+            stored.unlink()
+        assert agent.tables()
+        agent.start()
+    until(lambda: not drone.tables() and not edge.tables(), "no table", world)
+    until(lambda: not drone.addresses() and not edge.addresses(), "no address", world)
+    assert world.conntrack(drone) == world.conntrack(edge) == 0
+    until(lambda: client.by == "cloud", "an answer of the cloud", world)
+
+
+def test_instances_are_isolated_before_there_is_a_radio(world: World) -> None:
+    edge = world.edge("e1", 20.0)
+    drone = world.drone()
+    service = world.link(drone, edge)["spec"]["services"][0] | {
+        "callers": [{"instance": "client", "address": drone.pod}]
+    }
+    link = world.link(drone, edge, services=[service])
+    world.serve()
+    assert drone.reaches(edge.pod, VIP.port), "by the cloud"
+    edge.lose_radio()
+    edge.plan(link)
+    edge.start()
+    until(lambda: not drone.reaches(edge.pod, VIP.port), "isolation", world)
+    assert edge.condition("app-d1-e1", "PeerReady")["reason"] == "DeviceMissing"
+    edge.regain_radio()
+    drone.plan(link)
+    drone.start()
+    client = world.client(drone, 100_000, 0.1)
+    until(lambda: client.by == "e1", "an answer over the link", world)
+    assert not drone.reaches(edge.pod, VIP.port)
+
+
 def test_the_edge_nodes_agent_is_killed_and_comes_back(world: World) -> None:
     edge = world.edge("e1", 20.0)
     drone = flying(world, edge)

@@ -27,7 +27,7 @@ from fractus_agent.links.peer import PeerEnd
 from fractus_agent.links.plans import LinkPlans
 from fractus_agent.links.reports import DroneReport, LinkReports, peer_condition
 from fractus_agent.links.uplink import Node, Uplink
-from fractus_agent.redirector import nft
+from fractus_agent.redirector import leftovers, nft
 from fractus_agent.redirector.conntrack import Conntrack
 from fractus_agent.redirector.netlink import NETLINK_NETFILTER, Netlink, NetlinkError
 from fractus_agent.redirector.redirector import Namespaces, Redirector
@@ -124,10 +124,12 @@ class Connectivity:
 
     async def _hold(self) -> None:
         """Hold the interface while it is there to be used and links are planned."""
+        clean = False
         while True:
             self._changed.clear()
             interface = self._interface()
             if interface is None or not self._plans.links:
+                clean = clean or await _clean(interface, self._node)
                 with suppress(TimeoutError):
                     await asyncio.wait_for(self._changed.wait(), RETRY_S)
                 continue
@@ -172,36 +174,48 @@ class Connectivity:
         """Everything that one interface takes, made new at the beginning and removed in the end."""
         assert interface.device is not None
         ports = nft.Ports(udp=beacons.PORT, tcp=pairing.PORT)
-        device = interface.device
         drone = self._end == "drone"
-        await self._appeared(Plain(device, link_address(self._node)))
-        # Only now is it known whether it is a radio.
-        controller = self._controller(interface)
-        # Closed before it gets an address.
-        nft.create(device, ports, clients=drone)
+        controller = _controller(interface, self._node)
+        # Closed before it gets an address. One that cannot be used is left alone; instances are isolated without it.
+        device = interface.device if self._usable(controller) else nft.NO_DEVICE
+
+        def make_table() -> None:
+            nft.create(device, ports, clients=drone)
+
+        make_table()
         netlink = Netlink(NETLINK_NETFILTER)
         conntrack = Conntrack(netlink)
         # What an agent before this one led anywhere, that knows where it is to be no more.
         conntrack.forget_all()
-        redirector = Redirector(
-            nft.Maps(netlink, lambda: nft.create(device, ports, clients=drone)),
-            conntrack,
-            Namespaces(self._pods if drone else None),
-        )
+        maps = nft.Maps(netlink, make_table)
+        redirector = Redirector(maps, conntrack, Namespaces(self._pods if drone else None))
+
+        async def keep_up() -> None:
+            nonlocal controller, device
+            while device == nft.NO_DEVICE:
+                await asyncio.sleep(CHECK_S)
+                # Only where it is there can be told whether it is a radio.
+                controller = _controller(interface, self._node)
+                if self._usable(controller):
+                    device = controller.device
+                    maps.remake()
+            await self._keep_up(controller)
+
         # Outside of the group: redirects are kept alive while the end leads the traffic back.
         keeping = asyncio.create_task(redirector.run())
         try:
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(_outlived(keeping))
-                tasks.create_task(self._keep_up(controller))
-                tasks.create_task(self._run_end(redirector, device, record))
+                tasks.create_task(keep_up())
+                tasks.create_task(self._run_end(redirector, interface.device, record))
         finally:
             keeping.cancel()
             await asyncio.gather(keeping, return_exceptions=True)
             redirector.close()
             try:
                 # Before the table goes: what is up without it is open to every radio in reach.
-                await controller.down()
+                if device != nft.NO_DEVICE:
+                    await controller.down()
             except InterfaceProblem as problem:
                 log.warning("links: the packet filter stays: %s", problem)
             else:
@@ -247,24 +261,14 @@ class Connectivity:
         if self._problem is None:
             self._reports.drone(report)
 
-    def _controller(self, interface: Interface) -> Controller:
-        """What controls an interface: a radio has to join a network first."""
-        device, pairing = interface.device, interface.pairing
-        assert device is not None
-        assert pairing is not None
-        address = link_address(self._node)
-        if (DEVICES / device / "phy80211").exists():
-            return Wifi(device, address, pairing, SUPPLICANT)
-        return Plain(device, address)
-
-    async def _appeared(self, controller: Controller) -> None:
-        """Wait for the device."""
-        while True:
-            try:
-                return controller.check()
-            except InterfaceProblem as problem:
-                self._set_problem(problem.reason, str(problem))
-            await asyncio.sleep(CHECK_S)
+    def _usable(self, controller: Controller) -> bool:
+        """Whether the device is there, and for direct links alone."""
+        try:
+            controller.check()
+        except InterfaceProblem as problem:
+            self._set_problem(problem.reason, str(problem))
+            return False
+        return True
 
     async def _keep_up(self, controller: Controller) -> None:
         """Have the interface up, whatever becomes of its device."""
@@ -283,6 +287,30 @@ class Connectivity:
             log.log(logging.WARNING if found else logging.INFO, "links: %s", message or "the interface is up")
             self._problem = found
             self._say()
+
+
+def _controller(interface: Interface, node: str) -> Controller:
+    """What controls an interface of a node: a radio has to join a network first."""
+    device, pairing = interface.device, interface.pairing
+    assert device is not None
+    assert pairing is not None
+    if (DEVICES / device / "phy80211").exists():
+        return Wifi(device, link_address(node), pairing, SUPPLICANT)
+    return Plain(device, link_address(node))
+
+
+async def _clean(interface: Interface | None, node: str) -> bool:
+    """Remove what an agent that was killed while its links ended has left; whether that is done."""
+    try:
+        if leftovers.table_is_left():
+            if interface is not None:
+                await _controller(interface, node).down()
+            leftovers.remove()
+            log.info("links: removed what an earlier agent left")
+    except (InterfaceProblem, NetlinkError, nft.RedirectFailed) as error:
+        log.warning("links: what an earlier agent left stays, trying again (error=%s)", error)
+        return False
+    return True
 
 
 async def _outlived(keeping: asyncio.Task[None]) -> None:

@@ -35,6 +35,8 @@ from fractus_agent.redirector.netlink import (
 )
 
 TABLE = "fractus"
+NO_DEVICE = "/"
+"""A name that no device can have: of the direct interface while there is none to be used."""
 TARGETS, MARKS, PEERS = "targets", "marks", "peers"
 SENT, RECEIVED = "sent", "received"
 GUARDED, CALLERS = "guarded", "callers"
@@ -310,6 +312,17 @@ class Maps:
             self._make_table()
             self._transact(changes if callers is not None else [*guards, *changes])
         self._guards = guards
+
+    def remake(self) -> None:
+        """Make the table again, for another device; guards are in it, all else comes with the next write.
+
+        Raises:
+            RedirectFailed: nft refuses.
+            NetlinkError: the kernel refused.
+        """
+        self._make_table()
+        if self._guards:
+            self._transact(self._guards)
 
     def counted(self) -> dict[int, tuple[int, int]]:
         """Bytes sent and received over direct interfaces, by the number that connections carry.

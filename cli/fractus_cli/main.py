@@ -13,7 +13,14 @@ import click
 
 from fractus_cli import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK
 
-_MARKERS = {"core": "shapely", "kube": "kubernetes", "operator": "cryptography", "services": "cv2", "sim": "matplotlib"}
+_MARKERS = {
+    "core": "shapely",
+    "kube": "kubernetes",
+    "operator": "cryptography",
+    "services": "cv2",
+    "sim": "matplotlib",
+    "view": "aiohttp",
+}
 """A module that tells whether an extra is installed: looking for it takes a millisecond, importing a command a second."""
 
 
@@ -57,6 +64,7 @@ COMMANDS: dict[str, Entry] = {
     "status": Entry("fractus_cli.status:status", "Show the drones and applications of a cluster.", "kube"),
     "telemetry": Entry("fractus_cli.telemetry:telemetry", "Print the state of a drone until interrupted."),
     "vehicle": Entry("fractus_vehicle.__main__:vehicle", "Simulate ArduCopter-compatible vehicles.", "sim"),
+    "view": Entry("fractus_view.command:view", "Show flights on a web page, as they happen or from recordings.", "view"),
     "zones": Entry("fractus_cli.zones:zones", "Read and write Zones in other formats.", "core"),
 }  # fmt: skip
 

@@ -14,7 +14,7 @@ import pytest
 import vocabulary
 
 ROOT = Path(__file__).resolve().parents[2]
-ROOMS = ("core", "kube", "mavlink", "operator", "agent", "services", "cli", "sdk", "sim")
+ROOMS = ("core", "kube", "mavlink", "operator", "agent", "services", "cli", "view", "sdk", "sim")
 
 MAX_FLOORS = 7
 MAX_MODULE_LINES = 400
@@ -109,7 +109,7 @@ def test_the_lint_finds_words_and_numbers() -> None:
 
 DOCUMENTS = ("README.md", "CONTRIBUTING.md", "SECURITY.md", "docs")
 FILE = re.compile(
-    r"`((?:core|storage|kube|mavlink|operator|agent|services|cli|sdk|sim|proto|tests|bench|docs|charts|crds|examples)/[\w./-]+)`"
+    r"`((?:core|storage|kube|mavlink|operator|agent|services|cli|view|sdk|sim|proto|tests|bench|docs|charts|crds|examples)/[\w./-]+)`"
 )
 LINK = re.compile(r"\]\((?!https?:|#)([^)#\s]+)")
 

@@ -1,0 +1,281 @@
+"""The live view in a real Chromium, with the recording of a real flight."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import io
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import grpc
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from fractus_proto.v1 import camera_pb2, camera_pb2_grpc
+from fractus_proto.v1 import mobility_pb2 as pb
+from mobility_rig import PASSENGER, Driver, Rig, altitude_limit, fence, grant, passenger_grant
+from PIL import Image
+from playwright.sync_api import Browser, Page, Playwright, Route, expect, sync_playwright
+
+CHROMIUM = shutil.which("chromium")
+TIMEOUT_MS = 90_000
+FLOWN, ZONE = (11, 87, 184), (194, 24, 43)
+"""Colours of the page in light."""
+
+pytestmark = [
+    pytest.mark.skipif(
+        CHROMIUM is None, reason="there is no Chromium here: make packages installs it where apt-get is"
+    ),
+    pytest.mark.xdist_group("browser"),
+]
+
+QUIET = ("--no-sandbox", "--disable-background-networking", "--disable-component-update", "--disable-sync")
+SOFTWARE_GL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+
+
+async def fly(directory: Path) -> None:
+    """A flight past a zone, with a corrected and a refused target and a picture."""
+    rig = Rig(directory)
+    try:
+        school = fence("school", "exclusion", "ignore", 20, 45, 45, 70, lower=0, upper=30)
+        rig.write_grant(grant(altitude_limit(5, 15), school))
+        rig.write_grant(passenger_grant(services=[{"service": "camera", "methods": ["CaptureImage"]}]))
+        rig.start_service("--recordings", str(directory / "recordings" / "mobility"))
+        rig.start_vehicle()
+        address = rig.start_camera("--recordings", str(directory / "recordings" / "camera"))
+        driver = Driver(rig)
+        await driver.up(10.0)
+        stub = camera_pb2_grpc.CameraServiceStub(rig.channel(PASSENGER, address=address))
+        await stub.CaptureImage(camera_pb2.CaptureImageRequest(), timeout=60, wait_for_ready=True)
+        await driver.goto(30, 30, 20.0)
+        with contextlib.suppress(grpc.aio.AioRpcError):
+            await driver.goto(32, 60, 10.0)
+        await driver.goto(60, 0, 12.0)
+        await driver.stub.ReturnControl(pb.ReturnControlRequest(), timeout=10)
+        await rig.until(lambda t: t.autopilot_connected and not t.armed, 120, "landed")
+        rig.kill("service", signal.SIGTERM)
+        rig.kill("camera", signal.SIGTERM)
+    finally:
+        await rig.close()
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("flight")
+    asyncio.run(fly(directory))
+    return directory / "recordings"
+
+
+@pytest.fixture(scope="module")
+def playwright(recordings: Path) -> Iterator[Playwright]:
+    """After the flight, for it keeps an event loop of its own running."""
+    with sync_playwright() as playwright:
+        yield playwright
+
+
+@pytest.fixture(scope="module")
+def browser(playwright: Playwright) -> Iterator[Browser]:
+    with launched(playwright, *SOFTWARE_GL) as browser:
+        yield browser
+
+
+@contextlib.contextmanager
+def launched(playwright: Playwright, *more: str) -> Iterator[Browser]:
+    browser = playwright.chromium.launch(executable_path=CHROMIUM, args=[*QUIET, *more], timeout=TIMEOUT_MS)
+    yield browser
+    browser.close()
+
+
+@contextlib.contextmanager
+def serving(*arguments: str | Path) -> Iterator[str]:
+    """The address that `fractus view` prints."""
+    command = [sys.executable, "-m", "fractus_cli", "view", "--listen", "127.0.0.1:0", *map(str, arguments)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            found = re.search(r"http://\S+", process.stdout.readline())
+            assert found is not None
+            yield found[0]
+        finally:
+            process.send_signal(signal.SIGTERM)
+        assert process.wait(20) == 0
+
+
+@contextlib.contextmanager
+def opened(browser: Browser, address: str, **how: str) -> Iterator[Page]:
+    """The page, without an error on its console, and without a request to anything else."""
+    context = browser.new_context(viewport={"width": 1280, "height": 800}, **how)  # type: ignore[arg-type]
+    context.set_default_timeout(TIMEOUT_MS)
+    page, wrong = context.new_page(), list[str]()
+    page.on("console", lambda said: wrong.append(said.text) if said.type == "error" else None)
+    page.on("pageerror", lambda error: wrong.append(str(error)))
+
+    def local(route: Route) -> None:
+        if not route.request.url.startswith(address.partition("?")[0]):
+            wrong.append(route.request.url)
+        route.continue_()
+
+    page.route("**/*", local)
+    page.goto(address)
+    yield page
+    assert wrong == []
+    context.close()
+
+
+@pytest.fixture(scope="module")
+def address(recordings: Path) -> Iterator[str]:
+    with serving(*sorted(recordings.rglob("*.mcap"))) as address:
+        yield address
+
+
+def shows_the_end(page: Page) -> None:
+    """The page at the last moment of its recording."""
+    page.get_by_label("Moment shown").wait_for()
+    expect(page.locator("#mode")).to_have_text("replay", timeout=TIMEOUT_MS)
+    page.get_by_role("button", name="Pause").or_(page.get_by_role("button", name="Play")).click()
+    slider = page.get_by_label("Moment shown")
+    for _ in range(12):
+        slider.press("PageUp")
+
+
+def pixels(page: Page, colour: tuple[int, int, int]) -> int:
+    """How many pixels of the map have a colour, nearly."""
+    image = Image.open(io.BytesIO(page.locator("#map").screenshot(timeout=TIMEOUT_MS))).convert("RGB")
+    return sum(
+        count for count, found in image.getcolors(1 << 24) or () if max(abs(a - b) for a, b in zip(found, colour, strict=True)) < 25  # type: ignore[arg-type, call-overload]
+    )  # fmt: skip
+
+
+def test_a_flight_is_shown_with_its_zones_verdicts_and_pictures(browser: Browser, address: str) -> None:
+    with opened(browser, address) as page:
+        page.wait_for_selector("#map[data-map=ready]")
+        assert "token" not in page.url
+        shows_the_end(page)
+        expect(page.locator("#zones")).to_contain_text("school-zone zone, 0 to 30 m above home")
+        expect(page.locator("#zones")).to_contain_text("operation area of Navigator")
+        verdicts = page.locator("#verdicts")
+        expect(verdicts).to_contain_text("corrected to 15.0 m above home", timeout=TIMEOUT_MS)
+        expect(verdicts.locator(".deny")).to_contain_text("inside zone school-zone of policy school")
+        expect(verdicts.locator(".deny")).to_contain_text("policy school")
+        expect(page.locator("#drones")).to_contain_text("controller system · mode LAND")
+        expect(page.locator("#drones")).to_contain_text(re.compile(r"battery \d+ %"))
+        page.wait_for_function("[...document.querySelectorAll('#pictures img')].some(image => image.naturalWidth > 0)")
+        page.wait_for_timeout(1_000)
+        assert pixels(page, ZONE) > 100
+        assert pixels(page, FLOWN) > 600, "the path, not only the drone"
+
+
+def test_everything_is_done_by_the_keyboard(browser: Browser, address: str) -> None:
+    with opened(browser, address) as page:
+        shows_the_end(page)
+        slider = page.get_by_label("Moment shown")
+        end = float(slider.input_value())
+        slider.press("ArrowLeft")
+        assert end - float(slider.input_value()) == pytest.approx(1_000, abs=150)
+        assert re.search(r"UTC, .* of ", slider.get_attribute("aria-valuetext") or "")
+        reached = set()
+        page.keyboard.press("Shift+Tab")
+        page.locator("body").press("Control+Home")
+        page.evaluate("document.activeElement.blur()")
+        for _ in range(40):
+            page.keyboard.press("Tab")
+            reached.add(page.evaluate("document.activeElement.id || document.activeElement.className"))
+        assert {"skip", "play", "speed", "moment", "verdict-filter", "name", "time", "maplibregl-canvas"} <= reached
+        drone = page.get_by_role("button", name="drone-1: show on the map")
+        drone.press("Enter")
+        expect(drone).to_have_attribute("aria-pressed", "true")
+        page.locator(".deny button").press("Enter")
+        assert float(slider.input_value()) < end - 1_000
+        play = page.locator("#play")
+        play.press("Enter")
+        expect(play).to_have_text("Pause")
+        play.press("Space")
+        expect(play).to_have_text("Play")
+
+
+def test_verdicts_are_said_as_they_happen(browser: Browser, address: str) -> None:
+    with opened(browser, address, reduced_motion="reduce") as page:
+        expect(page.locator("#mode")).to_have_text("replay", timeout=TIMEOUT_MS)
+        expect(page.locator("#play")).to_have_text("Play"), "nothing moves by itself"
+        log = page.get_by_role("log", name="New verdicts")
+        expect(log).to_be_empty()
+        for _ in range(12):
+            page.get_by_label("Moment shown").press("PageUp")
+        expect(log).to_contain_text("drone-1: ", timeout=TIMEOUT_MS)
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_accessibility_has_no_violation(browser: Browser, address: str, scheme: str) -> None:
+    with opened(browser, address, color_scheme=scheme) as page:
+        page.wait_for_selector("#map[data-map=ready]")
+        shows_the_end(page)
+        expect(page.locator("#verdicts .deny")).to_be_visible(timeout=TIMEOUT_MS)
+        # The page's policy lets no script in but its own: the debugger's protocol does.
+        found = Axe().run(page)
+        assert found.violations_count == 0, found.generate_report()
+
+
+def test_nothing_is_loaded_from_elsewhere_or_run_inline(browser: Browser, address: str) -> None:
+    context = browser.new_context()
+    page = context.new_page()
+    page.goto(address)
+    blocked = page.evaluate(
+        """() => new Promise(resolve => {
+            const found = [];
+            document.addEventListener('securitypolicyviolation', event => {
+                found.push(event.effectiveDirective);
+                if (found.length === 3) resolve(found.sort());
+            });
+            const add = (tag, name, value) => {
+                const one = document.createElement(tag);
+                one[name] = value;
+                document.body.append(one);
+            };
+            add('script', 'textContent', 'window.ran = true');
+            add('img', 'src', 'http://127.0.0.2:9/x.png');
+            fetch('http://127.0.0.2:9/').catch(() => {});
+        })"""
+    )
+    assert blocked == ["connect-src", "img-src", "script-src-elem"]
+    assert page.evaluate("window.ran") is None
+    context.close()
+
+
+def test_without_the_token_the_page_says_what_to_do(browser: Browser, address: str) -> None:
+    context = browser.new_context()
+    page = context.new_page()
+    answer = page.goto(address.partition("?")[0])
+    assert answer is not None
+    assert answer.status == 401
+    expect(page.locator("body")).to_contain_text("open the address that `fractus view` printed")
+    context.close()
+
+
+def test_without_webgl_the_lists_say_it_all(playwright: Playwright, address: str) -> None:
+    with launched(playwright, "--disable-3d-apis") as blind, opened(blind, address) as page:
+        expect(page.locator("#no-map")).to_have_text(re.compile("no WebGL"), timeout=TIMEOUT_MS)
+        shows_the_end(page)
+        expect(page.locator("#verdicts .deny")).to_be_visible(timeout=TIMEOUT_MS)
+        expect(page.locator("#zones")).to_contain_text("school-zone")
+
+
+def test_what_is_recorded_now_is_shown_live(browser: Browser, recordings: Path, tmp_path: Path) -> None:
+    (source,) = (recordings / "mobility").glob("*.mcap")
+    data, growing = source.read_bytes(), tmp_path / source.name
+    growing.write_bytes(data[: len(data) // 3])
+    with serving("--recordings", tmp_path) as address, opened(browser, address) as page:
+        expect(page.locator("#mode")).to_have_text("live", timeout=TIMEOUT_MS)
+        expect(page.locator("#drones")).to_contain_text("in the air", timeout=TIMEOUT_MS)
+        assert page.locator("#verdicts .deny").count() == 0
+        with growing.open("ab") as file:
+            file.write(data[len(data) // 3 :])
+        expect(page.locator("#verdicts .deny")).to_be_visible(timeout=TIMEOUT_MS)
+        page.get_by_role("button", name="Pause").press("Enter")
+        expect(page.locator("#mode")).to_have_text("paused")
+        page.get_by_role("button", name="Live").press("Enter")
+        expect(page.locator("#mode")).to_have_text("live")

@@ -1,0 +1,203 @@
+"""The web server of the view: it answers GET and HEAD, to who has the token."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hmac
+import mimetypes
+import secrets
+from collections.abc import AsyncIterator, Awaitable, Callable
+from dataclasses import dataclass, field
+from ipaddress import ip_address
+from pathlib import Path
+
+from aiohttp import hdrs, web
+
+from fractus_view.sources import Source
+
+PAGE = Path(__file__).parent / "page"
+"""What `make view` builds of `view/web`."""
+
+HEADERS = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
+        "worker-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+}
+"""Of every answer: the page loads nothing from elsewhere, and no other page shows or reads it."""
+
+WRITE_TIMEOUT_S = 30.0
+"""A page that takes nothing for so long is gone, or as good as gone."""
+
+ALIVE_S = 15.0
+"""A comment is sent when nothing happens for so long, so that a connection that broke is noticed."""
+
+MAX_STREAMS = 64
+
+_Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+
+@dataclass(frozen=True)
+class View:
+    """What is served.
+
+    Attributes:
+        source: of the events and pictures.
+        host: the name or address that it is bound to; it is what browsers may call the server, besides addresses and
+            localhost.
+        token: who knows it may look.
+        page: the directory of the built page.
+    """
+
+    source: Source
+    host: str
+    token: str = field(default_factory=lambda: secrets.token_urlsafe(32))
+    page: Path = PAGE
+    _streams: set[object] = field(default_factory=set)
+
+    def application(self) -> web.Application:
+        """For aiohttp to run.
+
+        Raises:
+            OSError: the page was not built.
+        """
+        application = web.Application(middlewares=[self._only_reads, self._only_our_name, self._only_with_token])
+        application.on_response_prepare.append(_secure)
+        files = {path.relative_to(self.page).as_posix(): path.read_bytes() for path in _files(self.page)}
+        for name, data in files.items():
+            application.router.add_get("/" if name == "index.html" else f"/{name}", _static(name, data))
+        application.router.add_get("/stream", self._stream)
+        application.router.add_get("/pictures/{id}", self._picture)
+        application.cleanup_ctx.append(self._running)
+        return application
+
+    async def _running(self, _application: web.Application) -> AsyncIterator[None]:
+        """Keep the source current while the server runs; without it the page would silently stand still."""
+        task = asyncio.create_task(self.source.run())
+        yield
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+
+    @web.middleware
+    async def _only_reads(self, request: web.Request, handler: _Handler) -> web.StreamResponse:
+        if request.method not in {hdrs.METH_GET, hdrs.METH_HEAD}:
+            text = "this server only reads: use GET or HEAD\n"
+            return web.Response(status=405, text=text, headers={hdrs.ALLOW: "GET, HEAD"})
+        return await handler(request)
+
+    @web.middleware
+    async def _only_our_name(self, request: web.Request, handler: _Handler) -> web.StreamResponse:
+        """A foreign name that leads here is how a web site would read the page from a user's browser (DNS rebinding)."""
+        if not _ours(request.headers.get(hdrs.HOST, ""), self.host):
+            return web.Response(status=421, text="call this server by its address, by localhost, or as --listen says\n")
+        return await handler(request)
+
+    @web.middleware
+    async def _only_with_token(self, request: web.Request, handler: _Handler) -> web.StreamResponse:
+        cookie = _cookie(request)
+        given = request.query.get("token")
+        if request.path == "/" and given is not None and self._right(given):
+            # From here on the token is in no address, which histories and logs keep.
+            response = web.Response(status=303, headers={hdrs.LOCATION: "/"})
+            response.set_cookie(cookie, self.token, httponly=True, samesite="Strict", path="/")
+            return response
+        bearer = request.headers.get(hdrs.AUTHORIZATION, "").removeprefix("Bearer ")
+        if self._right(request.cookies.get(cookie, "")) or self._right(bearer):
+            return await handler(request)
+        return web.Response(status=401, text="open the address that `fractus view` printed: it has the token\n")
+
+    def _right(self, token: str) -> bool:
+        return hmac.compare_digest(token.encode(errors="replace"), self.token.encode())
+
+    async def _picture(self, request: web.Request) -> web.StreamResponse:
+        jpeg = await asyncio.to_thread(self.source.picture, request.match_info["id"])
+        if jpeg is None:
+            return web.Response(
+                status=404, text="there is no such picture, or its recording made room for a newer one\n"
+            )
+        return web.Response(body=jpeg, content_type="image/jpeg", headers={hdrs.CACHE_CONTROL: "private, max-age=3600"})
+
+    async def _stream(self, request: web.Request) -> web.StreamResponse:
+        head = {hdrs.CONTENT_TYPE: "text/event-stream", hdrs.CACHE_CONTROL: "no-store", "X-Accel-Buffering": "no"}
+        if request.method == hdrs.METH_HEAD:
+            return web.Response(headers=head)
+        if len(self._streams) >= MAX_STREAMS:
+            return web.Response(status=503, text=f"{MAX_STREAMS} pages look already: close one\n")
+        response, place = web.StreamResponse(headers=head), object()
+        self._streams.add(place)
+        try:
+            await response.prepare(request)
+            await self._send(response, request.headers.get("Last-Event-ID", ""))
+        except (ConnectionError, TimeoutError):
+            # It is gone, or too slow: it comes back and says what it heard last.
+            if request.transport is not None:
+                request.transport.abort()
+        finally:
+            self._streams.discard(place)
+        return response
+
+    async def _send(self, response: web.StreamResponse, last_id: str) -> None:
+        messages = self.source.stream(last_id)
+        pending = asyncio.ensure_future(anext(messages, None))
+        try:
+            while True:
+                done, _ = await asyncio.wait({pending}, timeout=ALIVE_S)
+                said = pending.result() if done else b":\n\n"
+                if said is None:
+                    return
+                if done:
+                    pending = asyncio.ensure_future(anext(messages, None))
+                async with asyncio.timeout(WRITE_TIMEOUT_S):
+                    await response.write(said)
+        finally:
+            pending.cancel()
+
+
+def _cookie(request: web.Request) -> str:
+    """Its name has the port, for browsers give cookies to all servers of a host."""
+    _, _, port = request.headers.get(hdrs.HOST, "").rpartition(":")
+    return f"fractus-view-{port if port.isdecimal() else 80}"
+
+
+def _ours(host: str, bound: str) -> bool:
+    """Whether a Host header has an address, localhost, or the name that the server was told to bind to."""
+    name = host.rpartition(":")[0] if host.rpartition(":")[2].isdecimal() else host
+    name = name.removeprefix("[").removesuffix("]").lower()
+    if name in {"localhost", bound.lower()}:
+        return True
+    try:
+        ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+async def _secure(_request: web.Request, response: web.StreamResponse) -> None:
+    response.headers.update(HEADERS)
+
+
+def _files(page: Path) -> list[Path]:
+    (page / "index.html").stat()
+    return sorted(path for path in page.rglob("*") if path.is_file())
+
+
+def _static(name: str, data: bytes) -> _Handler:
+    kind = (
+        "text/javascript"
+        if name.endswith((".js", ".mjs"))
+        else mimetypes.guess_type(name)[0] or "application/octet-stream"
+    )
+    # A name below assets has a digest of its content in it.
+    kept = "private, max-age=31536000, immutable" if name.startswith("assets/") else "no-store"
+
+    async def answer(_request: web.Request) -> web.Response:
+        charset = "utf-8" if kind.startswith("text/") else None
+        return web.Response(body=data, content_type=kind, charset=charset, headers={hdrs.CACHE_CONTROL: kept})
+
+    return answer

@@ -30,7 +30,7 @@ from fractus_agent.links.addressing import link_address
 from fractus_agent.links.connector import Connector
 from fractus_agent.links.decisions import Actions, Situation, Traffic, decide
 from fractus_agent.links.evidence import Record, records
-from fractus_agent.links.flows import FULL, WINDOW_S, Flows
+from fractus_agent.links.flows import FULL, MAX_CONFIRMED, WINDOW_S, Flows
 from fractus_agent.links.heuristics import Heuristics
 from fractus_agent.links.lessons import Lessons
 from fractus_agent.links.pairing import Session
@@ -129,9 +129,8 @@ class DroneEnd:
             await asyncio.shield(self._part())
 
     async def _part(self) -> None:
-        back = dict.fromkeys(self._redirector.redirects)
         try:
-            await self._redirector.switch(back, planned=not self._lost.is_set())
+            await self._redirector.switch(dict.fromkeys(self._redirector.redirects), planned=not self._lost.is_set())
         except (NetlinkError, RedirectFailed) as error:
             log.warning("links: traffic is not led back, its redirects end by themselves (error=%s)", error)
         await self._want("")
@@ -239,18 +238,20 @@ class DroneEnd:
         session.told = told
         self._lost.clear()
         rates: deque[float] = deque(maxlen=PROBES)
+        probed, confirmed = 0.0, MAX_CONFIRMED
         try:
             while True:
                 while session.latency_ms is None:  # noqa: ASYNC110 (the session has no event for it)
                     await asyncio.sleep(0.01)
                 peak = self._flows.peak_mbps
-                rates.append(peak if rates and peak >= FULL * max(rates) else await session.probe())
-                rate = max(rates)
-                latency_ms = session.latency_ms
+                confirmed = confirmed + 1 if peak >= FULL * probed else MAX_CONFIRMED + 1
+                if confirmed > MAX_CONFIRMED:
+                    probed, confirmed = await session.probe(), 0
+                rates.append(max(peak, probed))
+                rate, latency_ms = max(rates), session.latency_ms
                 self._direct = PathMetrics(rate, rate, latency_ms, latency_ms, direct=True)
                 self._lessons.delivered(session.peer, self._direct)
-                level = logging.INFO if len(rates) == 1 else logging.DEBUG
-                log.log(level, "links: measured (peer=%s mbps=%.1f latency_ms=%.1f)", session.peer, rate, latency_ms)
+                _log_measured(session.peer, self._direct, first=len(rates) == 1)
                 self._wake.set()
                 await self._watch(PROBE_S)
         finally:
@@ -269,8 +270,7 @@ class DroneEnd:
                 log.debug("links: counters not read (error=%s)", error)
 
     def _link_changed(self, link: Link, reason: str) -> None:
-        now_s = time.monotonic()
-        before, self._before = self._before, link
+        now_s, before, self._before = time.monotonic(), self._before, link
         self._record("link", {"phase": link.phase.value, "peer": link.peer or before.peer, "reason": reason})
         if link.phase is Phase.UP:
             self._lessons.came_up(link.peer, now_s)
@@ -303,6 +303,12 @@ class DroneEnd:
                 flows=self._flows.by_service,
             )
         )
+
+
+def _log_measured(peer: str, path: PathMetrics, *, first: bool) -> None:
+    level = logging.INFO if first else logging.DEBUG
+    mbps, latency_ms = path.ingress_mbps, path.ingress_latency_ms
+    log.log(level, "links: measured (peer=%s mbps=%.1f latency_ms=%.1f)", peer, mbps, latency_ms)
 
 
 def _application(link: DirectLink) -> str:

@@ -13,7 +13,9 @@ WINDOW_S = 0.1
 KEPT = 30
 """Windows that count."""
 FULL = 0.8
-"""Traffic that takes this share of what the link was found to deliver measures it; a probe would only get in its way."""
+"""Traffic that takes this share of what the link was found to deliver confirms it; a probe would only get in its way."""
+MAX_CONFIRMED = 3
+"""Times in a row: traffic that takes less than the link offers looks like a link that offers less."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -71,6 +71,23 @@ class PeerEnd:
 
     async def run(self) -> None:
         """Take drones until cancelled."""
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(self._isolate())
+            tasks.create_task(self._listen())
+
+    async def _isolate(self) -> None:
+        """Have pods isolated as planned, also where the kernel refused at first."""
+        while True:
+            planned = self._planned
+            try:
+                self._serve_routes()
+            except (NetlinkError, RedirectFailed) as error:
+                log.debug("links: pods are not isolated, trying again (error=%s)", error)
+                await asyncio.sleep(LISTEN_RETRY_S)
+            else:
+                await planned.wait()
+
+    async def _listen(self) -> None:
         while True:
             try:
                 await self._acceptor.run(self._address)

@@ -275,6 +275,26 @@ def test_a_climb_to_an_altitude_that_is_allowed_is_let_pass_though_the_link_is_s
     assert correction(monitor(fast, grant, bound_for=higher)) == "AltitudeAboveLimit"
 
 
+def test_a_leg_that_a_new_zone_crosses_is_stopped_at_once() -> None:
+    """Not where it has to be: by then the link may be cut."""
+    leg, climbing, short = goto(180, 0, 12.0).args, goto(180, 0, 30.0).args, goto(60, 0, 12.0).args
+    assert isinstance(leg, GotoArgs)
+    assert isinstance(climbing, GotoArgs)
+    assert isinstance(short, GotoArgs)
+    flying = at(0, 0, 12.0, east_mps=5.0)
+    for action, wanted in (("ignore", ("deny", "hover")), ("returnToLaunch", ("takeover", "returnToLaunch"))):
+        ahead = compiled(exclusion(box(100, -20, 140, 20), action))
+        verdict = monitor(flying, ahead, bound_for=leg, changed=True)
+        assert verdict is not None
+        assert (verdict.action, verdict.takeover) == wanted
+    assert monitor(flying, ahead, bound_for=short, changed=True) is None, "it ends before the zone"
+    above = compiled(exclusion(box(100, -20, 140, 20), lower=20))
+    assert monitor(flying, above, bound_for=leg, changed=True) is None, "it passes below"
+    assert monitor(flying, above, bound_for=climbing, changed=True) is not None
+    around = compiled(exclusion(box(-20, -20, 20, 20)))
+    assert monitor(flying, around, bound_for=leg, changed=True, leaving=True) is None, "it leads out"
+
+
 def test_a_climb_that_ends_by_a_velocity_is_let_pass_though_the_link_is_slow() -> None:
     grant, up, level = compiled(altitude(upperLimit=16)), (0.0, 0.0, -2.6), (1.0, 0.0, 0.0)
     climbing = at(0, 0, 12.5, down_mps=-2.6, latency_s=0.77)

@@ -57,7 +57,8 @@ def monitor(
         leaving: whether the system flies the drone already, or the autopilot by itself, so that only what gets worse
             counts: where it is on the wrong side of a fence, or above a limit, the system's way leads back.
         changed: whether other fences may have been in force when the drone's way was judged. A drone that speeds up is
-            faster before it hears of a stop, and whether there is room for that has not been judged: it is stopped in time.
+            faster before it hears of a stop, and whether there is room for that has not been judged: it is stopped in time;
+            and so is a leg whose rest is not legal any more.
         bound_for: the leg under way, when it was accepted under this grant: the autopilot brakes for its end by itself,
             before it would hear of a stop.
 
@@ -88,6 +89,11 @@ def monitor(
         worst = _worst(_fences(then, grant, further, leaving=True))
         if worst is not None:
             return replace(worst, action="deny", takeover="hover")
+    if changed and bound_for is not None:
+        # A leg that is illegal by now is stopped at once: to stop it when it has to be takes a link at that moment.
+        worst = _worst(_fences(now, grant, _rest_of_leg(now, grant, start, bound_for, margin), leaving=leaving))
+        if worst is not None:
+            return replace(worst, brake_first=worst.action == "takeover" and moving(now))
     told_m = _told_m(now, level_m)
     return _heights(now, grant, start, stop, told_m, sinks_back=leaving) or _speeds(now, grant, start)
 
@@ -174,6 +180,12 @@ def _look_ahead(now: Situation, start: XY, stop: XY, margin: float, rest_m: floa
     # Who lands is not kept in the air by what is below.
     ends_m = max(rest_m, now.altitude_m) if now.vertical else rest_m
     return _Ahead(Air(way, margin, lower, upper), shapely.points(start), shapely.points(stop), now.altitude_m, ends_m)
+
+
+def _rest_of_leg(now: Situation, grant: CompiledGrant, start: XY, leg: GotoArgs, margin: float) -> _Ahead:
+    level_m = None if leg.alt is None else height_m(leg.alt, leg.reference, now.home, grant.flat_terrain)
+    end = grant.frame.xy(leg.lat, leg.lon)
+    return _look_ahead(now, start, end, margin, now.altitude_m if level_m is None else level_m)
 
 
 @dataclass(frozen=True, slots=True)

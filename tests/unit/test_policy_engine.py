@@ -434,6 +434,21 @@ def test_vertical_motions_respect_fences() -> None:
     assert ask(ground, Call("Arm"), at(50, 0, alt=0)).action == "deny"
 
 
+@pytest.mark.parametrize(("lower", "upper", "away", "closer"), [(12.0, 60.0, 9.0, 10.5), (-5.0, 8.0, 11.0, 9.5)])
+def test_from_too_close_below_or_above_a_zone_a_leg_may_sink_or_climb_away(
+    lower: float, upper: float, away: float, closer: float
+) -> None:
+    grant = compiled(exclusion(box(-40, -40, 40, 40), lower=lower, upper=upper))
+    for x in (0.0, 20.0):
+        assert ask(grant, goto(x, 0, away)).action == "allow"
+        assert ask(grant, goto(x, 0, closer)).code == "InsideExclusionZone"
+        assert ask(grant, goto(x, 0, 10.0)).action == "deny", "it stays too close"
+    wall = compiled(
+        exclusion(box(-40, -40, 40, 40), lower=lower, upper=upper), exclusion(box(10, -9, 20, 9), name="wall")
+    )
+    assert ask(wall, goto(15, 0, away)).policies == ("wall",)
+
+
 def test_motors_do_not_stop_in_the_air() -> None:
     assert ask(compiled(), Call("Disarm"), at()).code == "InAir"
     assert ask(compiled(), Call("Disarm"), at(in_air=False)).action == "allow"

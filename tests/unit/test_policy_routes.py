@@ -205,3 +205,23 @@ def test_a_target_behind_a_wall_is_legal_for_a_drone_that_retraces_its_path() ->
     shut = judge(goto(0, 100), retracing, free(exclusion(box(-100, 40, 30, 50)), court))
     assert shut.code == "WayHomeBlocked"
     assert "no legal way is found" in shut.reason
+
+
+def test_from_below_a_zone_too_close_overhead_the_first_leg_sinks() -> None:
+    grant = free(exclusion(box(-200, -200, 200, 200), lower=16), exclusion(box(50, 2, 70, 30), name="wall"))
+    low = replace(RETRACING, return_altitude_m=10.0)
+    now = at(60, 0, alt=14.5, airframe=low)
+    way = route((60, 0), (60, 100), now, grant, 13.0, from_m=14.5)
+    assert way is not None
+    assert judge(goto(*way[0], 13.0), now, grant).action == "allow"
+    legal(grant, way[0], way[1:], at(alt=13.0, airframe=low))
+    assert route((60, 0), (60, 100), now, grant, 14.5) is None, "all of it too close below the zone"
+
+
+def test_only_the_first_leg_is_flown_at_both_altitudes() -> None:
+    grant = free(exclusion(box(30, -60, 40, 10), name="wall"), exclusion(box(80, -60, 90, 60), upper=20))
+    climbing = route((0, 0), (150, 0), at(alt=5, airframe=RETRACING), grant, 30.0, from_m=5.0)
+    level = route((0, 0), (150, 0), at(alt=5, airframe=RETRACING), grant, 5.0)
+    assert level is not None
+    assert climbing is not None
+    assert length((0, 0), climbing) < 155 < length((0, 0), level), "it is above the second zone after its first leg"

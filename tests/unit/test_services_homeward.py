@@ -579,3 +579,23 @@ def test_what_appears_above_a_climbing_drone_is_not_climbed_into(tmp_path: Path)
             assert 6 < max(height for _, _, height in world.plane.trace) < 15
 
     fly(flight)
+
+
+def test_it_flies_home_below_a_zone_that_appears_close_overhead(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            grant = world.grants.put(spec())
+            await world.up(grant, 20.0)
+            await end(world.service.goto(grant, GotoArgs(*at(0, 60), 20.0), 0))
+            overhead = zone("overhead", "ignore", -60.0, -60.0, 60.0, 100.0)
+            overhead["zones"][0]["altitude"] = {"lower": 21.5, "reference": "home"}
+            beside = zone("beside", "ignore", -30.0, 61.5, 30.0, 80.0)
+            grant = world.grants.put(spec(overhead, beside))
+            await drivers.give_back(world.control, grant)
+            await world.until(lambda: not world.plane.vehicle.armed)
+            assert math.hypot(*world.plane.xy) < 2.0
+            assert "NoLegalWay" not in {entry["code"] for entry in world.kinds("control") if "code" in entry}
+            assert max(height for _, _, height in world.plane.trace) < 21.0
+            assert max(y for _, y, _ in world.plane.trace) < 61.5
+
+    fly(flight)

@@ -12,7 +12,7 @@ from fractus_core.policy.values import Airframe
 from fractus_services.mobility.authority import drivers
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from mobility_world import World, area, end, fly, goto, refusal, spec
-from policy_world import altitude, at, box, compiled, speed, zone
+from policy_world import altitude, at, box, compiled, exclusion, speed, zone
 
 OWNED = {"RTL_ALT": 4000.0, "RTL_SPEED": 0.0, "WPNAV_SPEED": 1000.0, "RTL_CLIMB_MIN": 500.0}
 LOW = {"RTL_ALT": 1200.0, "RTL_SPEED": 0.0, "WPNAV_SPEED": 350.0, "RTL_CLIMB_MIN": 0.0}
@@ -55,6 +55,17 @@ def test_a_limit_of_unknown_datum_lets_the_autopilot_climb_nowhere_and_leaves_th
     assert homeward_heights_m(now, both, 100.0)[0] == 20.0
     limited = compiled(altitude(upperLimit=20), floor)
     assert homeward_heights_m(at(alt=10, airframe=Airframe(return_altitude_m=40)), limited, 100.0)[0] == 20.0
+
+
+def test_heights_just_below_zones_overhead_are_the_last_to_be_tried() -> None:
+    now = at(50, 0, alt=33, airframe=Airframe(return_altitude_m=40))
+    zones = [exclusion(box(*where), name=name, lower=low) for name, low, where in (
+        ("above", 35, (20, -20, 80, 20)), ("lower", 20, (0, -5, 10, 5)), ("ground", 3, (0, 5, 10, 15)),
+        ("beyond", 15, (500, 0, 510, 10)), ("higher", 60, (0, 0, 10, 10)),
+    )]  # fmt: skip
+    assert homeward_heights_m(now, compiled(*zones), 150.0) == (40.0, 33.0, 32.5, 17.5)
+    kept_up = compiled(*zones, altitude(lowerLimit=25), limits=None)
+    assert homeward_heights_m(now, kept_up, 150.0) == (40.0, 33.0, 32.5)
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from fractus_core.policy.compiled import (
     band_gap_m,
     band_meets,
 )
-from fractus_core.policy.motion import XY, Leg, earliest_stop, stop_altitude_m
+from fractus_core.policy.motion import XY, Leg, coming_heights_m, earliest_stop
 from fractus_core.policy.values import Situation, Takeover, Verdict, deny, distinct, metres
 
 SEVERITY: dict[GeofenceAction, int] = exhaustive(
@@ -165,14 +165,16 @@ def _exclusions(leg: Leg, now: Situation, grant: CompiledGrant, air: Air) -> Ite
     for zone in grant.exclusions.near(air, now, grant.flat_terrain):
         shape = zone.shape
         clearance_m = _clearance_outside(shape, leg.unavoidable)
-        level = _is_level_with(zone, now, grant)
-        if (
-            shape.dwithin(certain, margin_m)
-            and (level or not _comes_level(zone, leg, now, grant, leg.lower_m - air.lower_m))
-            and _leads_out(shape, leg, margin_m, clearance_m)
-            and _leads_away(shape, leg, certain)
-        ):
-            continue
+        level, height_margin_m = _is_level_with(zone, now, grant), leg.lower_m - air.lower_m
+        if shape.dwithin(certain, margin_m):
+            if not level and _leaves_height(zone, leg, now, grant, height_margin_m):
+                continue
+            if (
+                (level or not _comes_level(zone, leg, now, grant, height_margin_m))
+                and _leads_out(shape, leg, margin_m, clearance_m)
+                and _leads_away(shape, leg, certain)
+            ):
+                continue
         # A drone that is inside already, or cannot stop outside, does not enter by this request: it costs the request only.
         enters = (clearance_m > 0 or not level) and shape.intersects(air.ground)
         yield _exclusion_breach(zone, leg, margin_m, enters)
@@ -189,9 +191,7 @@ def _certain_way(leg: Leg, now: Situation) -> BaseGeometry:
 
 def _is_level_with(zone: PolicyZone, now: Situation, grant: CompiledGrant) -> bool:
     """Whether the drone is, or comes to rest, between the altitudes of a zone."""
-    rest_m = stop_altitude_m(now)
-    low, high = min(now.altitude_m, rest_m), max(now.altitude_m, rest_m)
-    return band_meets(zone.band, low, high, now.home, grant.flat_terrain)
+    return band_meets(zone.band, *coming_heights_m(now), now.home, grant.flat_terrain)
 
 
 def _comes_level(zone: PolicyZone, leg: Leg, now: Situation, grant: CompiledGrant, height_margin_m: float) -> bool:
@@ -200,19 +200,26 @@ def _comes_level(zone: PolicyZone, leg: Leg, now: Situation, grant: CompiledGran
     A drone that is too close already may fly on at its height, as well as that is known: closer by no more than LEVEL_M, and
     never into the nearer half of the margin, however many legs it asks for.
     """
-    rest_m = stop_altitude_m(now)
-    gap_m, present_m = (
-        band_gap_m(zone.band, lower_m, upper_m, now.home, grant.flat_terrain)
-        for lower_m, upper_m in (
-            (leg.lower_m, leg.upper_m),
-            (min(now.altitude_m, rest_m), max(now.altitude_m, rest_m)),
-        )
-    )
+    gap_m = band_gap_m(zone.band, leg.lower_m, leg.upper_m, now.home, grant.flat_terrain)
+    present_m = band_gap_m(zone.band, *coming_heights_m(now), now.home, grant.flat_terrain)
     kept_m = height_margin_m
     if present_m < height_margin_m:
         kept_m = min(present_m, max(present_m - LEVEL_M, height_margin_m / 2))
     # Heights converted between datums differ in their last digits.
     return gap_m <= 0.0 or gap_m < kept_m - 1e-6
+
+
+def _leaves_height(zone: PolicyZone, leg: Leg, now: Situation, grant: CompiledGrant, height_margin_m: float) -> bool:
+    """Whether a leg of a drone too close below or above a zone only sinks or climbs away from it, until it is far enough."""
+    present = coming_heights_m(now)
+
+    def gap_m(lower_m: float, upper_m: float) -> float:
+        return band_gap_m(zone.band, lower_m, upper_m, now.home, grant.flat_terrain)
+
+    # It ends at that of its heights which is further from the zone if it passes all where the drone could come to rest.
+    end_m, rest_m = (max(map(gap_m, heights, heights)) for heights in ((leg.lower_m, leg.upper_m), present))
+    closest_m = gap_m(leg.lower_m, leg.upper_m)
+    return 0.0 < closest_m >= gap_m(*present) - 1e-6 and end_m >= height_margin_m and end_m > rest_m + 1e-6
 
 
 def _exclusion_breach(zone: PolicyZone, leg: Leg, margin_m: float, enters: bool) -> Breach:
@@ -264,8 +271,7 @@ def _leaves_by_height(fence: Inclusion, shape: BaseGeometry, leg: Leg, now: Situ
     """
     if shape.covers(leg.ground):
         return False
-    rest_m = stop_altitude_m(now)
-    present, _ = fence.at(min(now.altitude_m, rest_m), max(now.altitude_m, rest_m), now, grant.flat_terrain)
+    present, _ = fence.at(*coming_heights_m(now), now, grant.flat_terrain)
     return bool(present.covers(leg.unavoidable))
 
 

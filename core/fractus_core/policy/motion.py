@@ -239,6 +239,12 @@ def stop_altitude_m(situation: Situation) -> float:
     return situation.altitude_m + math.copysign(run, climb)
 
 
+def coming_heights_m(situation: Situation) -> tuple[float, float]:
+    """The lowest and the highest altitude above home at which the drone is until it comes to rest."""
+    rest_m = stop_altitude_m(situation)
+    return min(situation.altitude_m, rest_m), max(situation.altitude_m, rest_m)
+
+
 @dataclass(frozen=True)
 class Leg:
     """A motion in frame metres: from where the drone is, by where it can turn, to a target.

@@ -6,19 +6,26 @@ import math
 from dataclasses import dataclass
 
 import shapely
+from shapely.geometry.base import BaseGeometry
 
-from fractus_core.policy.compiled import REACH_M, Air, CompiledGrant
+from fractus_core.policy.compiled import REACH_M, Air, CompiledGrant, height_m
 from fractus_core.policy.fences import breaches
-from fractus_core.policy.limits import altitude_bounds, ceiling_m, speed_bounds
+from fractus_core.policy.limits import MIN_LEG_ALTITUDE_M, altitude_bounds, ceiling_m, speed_bounds
 from fractus_core.policy.motion import XY, Leg, height_margin_m, margin_m, standing, stop_point
 from fractus_core.policy.values import Situation, Verdict, deny
+
+BELOW_M = 0.5
+"""How much lower than it must a drone flies home below a zone: it does not hold its height exactly."""
+
+MAX_BELOW = 4
+"""Below how many zones a way home is looked for: a search that finds none takes a second or two, and the drone waits."""
 
 
 def homeward_heights_m(now: Situation, grant: CompiledGrant, worth_m: float) -> tuple[float, ...]:
     """Altitudes above home at which the system flies home, the best one first.
 
     The return altitude, or the present one if that is higher, as the limits of altitude on the straight way allow it; then
-    as those that hold here, or everywhere, do.
+    as those that hold here, or everywhere, do; then just below the zones around it.
 
     Args:
         now: position, home and airframe; both places are known.
@@ -36,8 +43,18 @@ def homeward_heights_m(now: Situation, grant: CompiledGrant, worth_m: float) -> 
         bounds, unknown = altitude_bounds(grant, now, Air(ground, margin_m(now), -math.inf, math.inf))
         lowest = max((b.lower for b in bounds if b.lower is not None), default=-math.inf)
         highest = ceiling_m(bounds, unknown, now.altitude_m)
-        found += [min(max(height_m, lowest), highest) for height_m in (best, now.altitude_m)]
-    return (*dict.fromkeys(found), now.altitude_m)
+        found += [min(max(wanted, lowest), highest) for wanted in (best, now.altitude_m)]
+    below = [lower for lower in _heights_below_m(lane, now, grant) if lowest <= lower <= min(highest, best)]
+    return (*dict.fromkeys((*found, now.altitude_m, *below[:MAX_BELOW])),)
+
+
+def _heights_below_m(lane: BaseGeometry, now: Situation, grant: CompiledGrant) -> list[float]:
+    """Altitudes above home just below the zones no further off a lane than it is long, the highest first."""
+    room_m, flat = height_margin_m(now) + BELOW_M, grant.flat_terrain
+    around = grant.exclusions.near(Air(lane, lane.length + margin_m(now), -math.inf, math.inf), now, flat)
+    bands = [zone.band for zone in around if zone.band is not None and zone.band.lower is not None]
+    floors = {height_m(band.lower, band.reference, now.home, flat) for band in bands if band.lower is not None}
+    return sorted((f - room_m for f in floors if f is not None and f - room_m >= MIN_LEG_ALTITUDE_M), reverse=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,27 +120,27 @@ def straight_home_blocked(
     if not grant.exclusions.zones and not grant.inclusions:
         return None
     home = grant.frame.xy(now.home.lat, now.home.lon)
-    height_m = max(altitude_m, now.airframe.return_altitude_m)
+    return_m = max(altitude_m, now.airframe.return_altitude_m)
     lane = shapely.linestrings((target, home)) if target != home else shapely.points(home)
-    anything = grant.exclusions.near(Air(lane, margin, -slack, height_m + slack), now, grant.flat_terrain)
+    anything = grant.exclusions.near(Air(lane, margin, -slack, return_m + slack), now, grant.flat_terrain)
     if not grant.inclusions and next(anything, None) is None:
         return None
     parts = (
-        Leg(target, target, target, home, height_m, height_m),
-        standing(target, altitude_m, height_m),
-        standing(home, 0.0, height_m),
+        Leg(target, target, target, home, return_m, return_m),
+        standing(target, altitude_m, return_m),
+        standing(home, 0.0, return_m),
     )
     for part in parts:
         air = Air(part.ground, margin, part.lower_m - slack, part.upper_m + slack)
         for zone in grant.exclusions.near(air, now, grant.flat_terrain):
             return _blocked(
-                f"at {height_m:.1f} m, is blocked by zone {zone.name} of policy {zone.rule.name}", zone.rule.name
+                f"at {return_m:.1f} m, is blocked by zone {zone.name} of policy {zone.rule.name}", zone.rule.name
             )
     for fence in grant.inclusions:
         if fence.rule.in_force(now.time_s):
-            shape, _ = fence.at(height_m, height_m, now, grant.flat_terrain)
+            shape, _ = fence.at(return_m, return_m, now, grant.flat_terrain)
             if not shape.covers(lane):
-                return _blocked(f"at {height_m:.1f} m, leaves the zones of policy {fence.rule.name}", fence.rule.name)
+                return _blocked(f"at {return_m:.1f} m, leaves the zones of policy {fence.rule.name}", fence.rule.name)
     return None
 
 

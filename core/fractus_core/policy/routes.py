@@ -64,7 +64,7 @@ def route(
         now: time, position errors, airframe and home; the position in it is not used.
         grant: whose fences.
         altitude_m: altitude of the whole way, metres above home.
-        from_m: altitude at the start, when it is another; the whole way is then legal at all altitudes between.
+        from_m: altitude at the start, when it is another; the first leg is then legal at all altitudes between.
 
     Returns:
         The waypoints in metres of `grant.frame` (`grant.frame.latlon(x, y)` gives degrees), in order; the last one is the
@@ -81,8 +81,7 @@ def searching(
     figures = (*start, *target, altitude_m, altitude_m if from_m is None else from_m)
     if now.home is None or not now.sound or not all(math.isfinite(figure) for figure in figures):
         return None
-    low, high = sorted(figures[-2:])
-    roomy, narrow = (_Search(start, target, Space.around(now, grant, low, high, room_m)) for room_m in CLEARANCES_M)
+    roomy, narrow = (_Search(start, target, _spaces(now, grant, figures[-2:], room_m)) for room_m in CLEARANCES_M)
     found = yield from roomy.steps()
     if found is not None and _length_m(start, found) <= _MAX_DETOUR * math.dist(start, target):
         return (yield from roomy.rounded(found))
@@ -110,9 +109,16 @@ def quick_route(
     """As `route`, but gives up after `QUICK_MAX_LEGS_TESTED` legs, and keeps no more room than it must."""
     if now.home is None or not now.sound:
         return None
-    low, high = sorted((altitude_m, altitude_m if from_m is None else from_m))
-    space = Space.around(now, grant, low, high, CLEARANCES_M[1])
-    return _finished(_Search(start, target, space, max_excess=max_excess, max_legs=QUICK_MAX_LEGS_TESTED).steps())
+    heights_m = (altitude_m, altitude_m if from_m is None else from_m)
+    spaces = _spaces(now, grant, heights_m, CLEARANCES_M[1])
+    return _finished(_Search(start, target, spaces, max_excess=max_excess, max_legs=QUICK_MAX_LEGS_TESTED).steps())
+
+
+def _spaces(now: Situation, grant: CompiledGrant, heights_m: tuple[float, float], room_m: float) -> tuple[Space, Space]:
+    """The space of a way at the first altitude, and that of its first leg, which comes from the second one."""
+    low, high = sorted(heights_m)
+    cruise = Space.around(now, grant, heights_m[0], heights_m[0], room_m)
+    return cruise, cruise if low == high else Space.around(now, grant, low, high, room_m)
 
 
 def _finished(search: Steps) -> tuple[XY, ...] | None:
@@ -144,9 +150,15 @@ class _Search:
     """A* from start to target over tangents between corners; obstacles are found on the way."""
 
     def __init__(
-        self, start: XY, target: XY, space: Space, *, max_excess: float = MAX_EXCESS, max_legs: int = MAX_LEGS_TESTED
+        self,
+        start: XY,
+        target: XY,
+        spaces: tuple[Space, Space],
+        *,
+        max_excess: float = MAX_EXCESS,
+        max_legs: int = MAX_LEGS_TESTED,
     ) -> None:
-        self._space = space
+        self._space, self._leaving = spaces
         self._max_excess = max_excess
         self._max_legs = max_legs
         self._ends = (start, target)
@@ -156,7 +168,7 @@ class _Search:
         self._parent = [-1, -1]
         self._expanded: list[int] = []
         self._heap: list[tuple[float, int, int, float]] = []
-        self._known: set[int] = set()
+        self._known: set[tuple[int, int]] = set()
         self._clear: dict[tuple[int, int], bool] = {}
         self._returns: dict[int, bool] = {}
         # Ends that are too close to a fence themselves: legs to and from them are judged by the engine's own rules.
@@ -165,16 +177,16 @@ class _Search:
     def steps(self) -> Steps:
         """Look for the way, leg by leg; returns it, or None."""
         if self._ends[0] == self._ends[1]:
-            return (self._ends[1],) if self._space.permits(*self._ends) else None
+            return (self._ends[1],) if self._leaving.permits(*self._ends) else None
         begin = shapely.points(self._ends[0])
-        around, about = self._space.blockers(begin), self._space.blockers(shapely.points(self._ends[1]))
+        around, about = self._leaving.blockers(begin), self._space.blockers(shapely.points(self._ends[1]))
         self._odd = {node for node, found in ((_START, around), (_TARGET, about)) if found}
         if not self._space.returns(self._ends[1]) or (about and not self._space.permits(self._ends[1], self._ends[1])):
             return None
         for obstacle in around:
             # Out of it the nearest way first: no corner need lie there.
-            self._add(self._space.way_out(obstacle, begin))
-            self._learn([obstacle], self._ends[0])
+            self._add(self._leaving.way_out(obstacle, begin))
+            self._learn([obstacle], self._ends[0], self._leaving)
         self._expand(_START)
         while self._heap and not self.exhausted:
             yield
@@ -208,8 +220,9 @@ class _Search:
 
     def _clears(self, a: XY, b: XY) -> bool:
         odd = (_START in self._odd and a == self._ends[0]) or (_TARGET in self._odd and b == self._ends[1])
-        free = not self._space.blockers(shapely.linestrings((a, b))) or (odd and self._space.permits(a, b))
-        return free and self._space.returns(b)
+        space = self._leaving if a == self._ends[0] else self._space
+        free = not space.blockers(shapely.linestrings((a, b))) or (odd and space.permits(a, b))
+        return free and space.returns(b)
 
     def _way(self) -> tuple[XY, ...]:
         at, way = _TARGET, []
@@ -247,9 +260,10 @@ class _Search:
     def _test(self, begin: int, end: int) -> bool:
         """Whether a leg is legal; what blocks it joins the obstacles."""
         a, b = (self._ends[n] if n <= _TARGET else self._place(n) for n in (begin, end))
-        blockers = self._space.blockers(shapely.linestrings((a, b)))
-        if blockers and (self._odd.isdisjoint((begin, end)) or not self._space.permits(a, b)):
-            self._learn(blockers, a)
+        space = self._leaving if begin == _START else self._space
+        blockers = space.blockers(shapely.linestrings((a, b)))
+        if blockers and (self._odd.isdisjoint((begin, end)) or not space.permits(a, b)):
+            self._learn(blockers, a, space)
             return False
         if end > _TARGET and end not in self._returns:
             self._returns[end] = self._space.returns(b)
@@ -259,17 +273,22 @@ class _Search:
         x, y = self._nodes[node, :2]
         return float(x), float(y)
 
-    def _learn(self, obstacles: list[PolicyZone | int], begin: XY) -> None:
+    def _learn(self, obstacles: list[PolicyZone | int], begin: XY, space: Space) -> None:
         """Take in what blocks a leg: areas to stay in, and of the zones the nearest: a way around it meets the next."""
-        new = [o for o in obstacles if (o if isinstance(o, int) else id(o)) not in self._known]
+
+        def key(obstacle: PolicyZone | int) -> tuple[int, int]:
+            # An area to stay in has another shape at other altitudes.
+            return (obstacle, id(space)) if isinstance(obstacle, int) else (id(obstacle), 0)
+
+        new = [o for o in obstacles if key(o) not in self._known]
         if not new:
             return
         here = shapely.points(begin)
         zones = [o for o in new if isinstance(o, PolicyZone)]
         nearest = min(zones, key=lambda o: (o.shape.distance(here), o.rule.name, o.name), default=None)
         new = [o for o in new if o is nearest or isinstance(o, int)]
-        self._known.update(o if isinstance(o, int) else id(o) for o in new)
-        corners = np.vstack([self._space.corners(obstacle) for obstacle in new])
+        self._known.update(key(o) for o in new)
+        corners = np.vstack([space.corners(obstacle) for obstacle in new])
         first = len(self._nodes)
         self._add(corners)
         if self._expanded:

@@ -188,9 +188,16 @@ class Client(Connection):
         params = {"fieldManager": self.field_manager}
         return await self.request("PUT", kind.path(*key_of(body), subresource), body, params=params)
 
-    async def delete(self, kind: Kind, key: Key, uid: str | None = None) -> None:
-        """Delete an object and, in the background, what it owns; one that is gone already is no error."""
-        options: Body = {"propagationPolicy": "Background"}
+    async def delete(self, kind: Kind, key: Key, uid: str | None = None, *, orphan: bool = False) -> None:
+        """Delete an object; one that is gone already is no error.
+
+        Args:
+            kind: Of the object.
+            key: (namespace, name).
+            uid: Delete only the object that has it.
+            orphan: Leave what it owns, which goes in the background otherwise.
+        """
+        options: Body = {"propagationPolicy": "Orphan" if orphan else "Background"}
         if uid is not None:
             options["preconditions"] = {"uid": uid}
         try:

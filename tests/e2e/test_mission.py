@@ -22,6 +22,14 @@ def ready(kube: Kube, name: str) -> bool:
     return condition(kube.get("application.fractus.dev", name), "Ready").get("status") == "True"
 
 
+STILL_AT_WORK = ",!fractus.dev/finished"
+
+
+def all_stopped(pods: list[Object]) -> list[Object]:
+    """Finished pods once no container of theirs runs: their nodes' resources are free."""
+    return pods if pods and all(pod["status"]["phase"] in {"Succeeded", "Failed"} for pod in pods) else []
+
+
 def audit_text(kube: Kube) -> str:
     pod = kube.pod(MOBILITY, SYSTEM, node=DRONE)["metadata"]["name"]
     return kube.must("exec", "-n", SYSTEM, pod, "--", "cat", "/var/lib/fractus/audit/mobility.jsonl")
@@ -31,9 +39,10 @@ def audit_log(kube: Kube) -> list[Object]:
     return [json.loads(line) for line in audit_text(kube).splitlines()]
 
 
-def children(kube: Kube, namespace: str = "default") -> list[str]:
-    kinds = "deployments,replicasets,pods,services,secrets,endpointslices,poddisruptionbudgets"
+def children(kube: Kube, namespace: str = "default", pods: str = "") -> list[str]:
+    kinds = "deployments,replicasets,services,secrets,endpointslices,poddisruptionbudgets"
     found = kube.all(kinds, namespace, "fractus.dev/application")
+    found += kube.all("pods", namespace, f"fractus.dev/application{pods}")
     grants = kube.all("grants.fractus.dev")
     return [f"{o['kind']}/{o['metadata']['name']}" for o in (*found, *grants)]
 
@@ -78,7 +87,12 @@ def test_traffic_monitoring_flies_under_policies(grounded: Kube) -> None:
     assert any(e["action"] == "deny" and "no-fly-hospital" in e["policies"] for e in calls)
     heights = [e["alt"] for e in log if e.get("kind") == "state"]
     assert 45 < max(heights) < 52
-    kube.wait("nothing but the plan is left", lambda: not children(kube), timeout_s=60)
+    kube.wait("only the plan and stopped pods are left", lambda: not children(kube, pods=STILL_AT_WORK), timeout_s=60)
+    application = "fractus.dev/application=traffic-monitoring"
+    stopped = kube.wait("all pods stopped", lambda: all_stopped(kube.all("pods", "default", application)), timeout_s=60)
+    assert len(stopped) >= 7
+    log = kube.must("logs", "-n", "default", "-l", f"{application},fractus.dev/component=Navigator", "--tail=-1")
+    assert "nothing is left to fly" in log
     events = {e["reason"] for e in kube.all("events", "default")}
     assert {"Planned", "MissionComplete"} <= events
 

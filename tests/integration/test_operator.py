@@ -198,6 +198,57 @@ def test_a_complete_mission_leaves_only_its_plan(world: World, operator: Operato
     wait_for(lambda: set(world.children(namespace)) == {"deploymentplans/traffic"}, "children to go")
 
 
+def test_finished_pods_stay_stopped_for_their_logs(world: World, operator: OperatorProcess, namespace: str) -> None:
+    running(world, namespace)
+    before = {pod["metadata"]["uid"] for pod in world.pods(namespace)}
+    end_mission(world, namespace, "Complete", "done")
+    world.phase(namespace, "Completed")
+    uid = (world.application(namespace) or {})["metadata"]["uid"]
+    workloads = [f"/apis/apps/v1/namespaces/{namespace}/{kind}" for kind in ("deployments", "replicasets")]
+    wait_for(lambda: not any(world.api.list(path) for path in workloads), "what would start pods again to go")
+    wait_for(lambda: all("fractus.dev/finished" in labels_of(pod) for pod in world.pods(namespace)), "pods to be kept")
+    kept = world.pods(namespace)
+    assert {pod["metadata"]["uid"] for pod in kept} == before
+    for pod in kept:
+        assert pod["spec"]["activeDeadlineSeconds"] == 1
+        assert [(o["kind"], o["uid"]) for o in pod["metadata"]["ownerReferences"]] == [("Application", uid)]
+    # No label of a finished pod counts for the next mission, which has pods of its own.
+    manifest = traffic(namespace)
+    manifest["spec"]["ttlAfterFinished"] = 0
+    world.put(manifest)
+    wait_for(lambda: len(fresh(world, namespace, before)) == 7, "pods of the next mission")
+    wait_for(
+        lambda: not before & {pod["metadata"]["uid"] for pod in world.pods(namespace)}, "the last one's pods to go"
+    )
+    deployed(world, namespace)
+    end_mission(world, namespace, "Complete", "done")
+    world.phase(namespace, "Completed")
+    wait_for(lambda: not world.pods(namespace), "pods that are not to be kept to go")
+
+
+def test_finished_pods_are_removed_in_time(world: World, operator: OperatorProcess, namespace: str) -> None:
+    manifest = traffic(namespace, "traffic", navigator())
+    manifest["spec"]["ttlAfterFinished"] = 5
+    world.put(manifest)
+    deployed(world, namespace, pods=1)
+    end_mission(world, namespace, "Failed", "driver lost")
+    wait_for(
+        lambda: any("fractus.dev/finished" in labels_of(pod) for pod in world.pods(namespace)), "the pod to be kept"
+    )
+    operator.stop(signal.SIGKILL)
+    operator.start()
+    wait_for(lambda: not world.pods(namespace), "the pod to go")
+    assert world.status(namespace)["phase"] == "Failed"
+
+
+def labels_of(pod: dict[str, Any]) -> dict[str, str]:
+    return dict(pod["metadata"]["labels"])
+
+
+def fresh(world: World, namespace: str, before: set[str]) -> set[str]:
+    return {pod["metadata"]["uid"] for pod in world.pods(namespace)} - before
+
+
 def test_the_phase_is_what_the_drone_does(world: World, operator: OperatorProcess, namespace: str) -> None:
     status = running(world, namespace)
     assert "flies" not in status["message"]

@@ -17,7 +17,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
 from cryptography.x509.oid import NameOID
-from fractus_kube import BlockingClient, KubeError
+from fractus_kube import BlockingClient, ContentType, KubeError
 from operator_world import FRACTUS, SYSTEM, OperatorProcess, World, at, component, navigator, ours, traffic
 
 Body = dict[str, Any]
@@ -376,6 +376,21 @@ def test_the_operator_writes_nothing_that_it_has_not_made(
         denied(lambda: client.apply(theirs, body | {"data": {}}), made)
         denied(lambda: client.delete(theirs), made)
         denied(lambda: client.apply(theirs.replace("theirs", "fresh"), body | {"metadata": {"name": "fresh"}}), made)
+        container = {"name": "main", "image": "registry.test/theirs:1"}
+        pod = {"apiVersion": "v1", "kind": "Pod", "metadata": {"name": "theirs"}, "spec": {"containers": [container]}}
+        pods = f"/api/v1/namespaces/{namespace}/pods"
+        world.api.apply(f"{pods}/theirs", pod)
+        made = made.replace("secrets", "pods")
+        denied(lambda: client.merge(f"{pods}/theirs", {"spec": {"activeDeadlineSeconds": 1}}), made)
+        denied(lambda: client.merge(f"{pods}/theirs", ours_too), made)
+        denied(lambda: client.delete(f"{pods}/theirs"), made)
+        world.api.apply(f"{pods}/ours", pod | {"metadata": {"name": "ours", **ours_too["metadata"]}})
+        other = [{"op": "replace", "path": "/spec/containers/0/image", "value": "registry.test/other:1"}]
+        change = ContentType.JSON_PATCH
+        denied(
+            lambda: client.call("PATCH", f"{pods}/ours", other, content_type=change), "does not change what they run"
+        )
+        client.merge(f"{pods}/ours", {"spec": {"activeDeadlineSeconds": 1}})
         node, labels = "/api/v1/nodes/edge-1", "writes only the location labels of nodes"
         denied(lambda: client.merge(node, {"spec": {"unschedulable": True}}), labels)
         denied(lambda: client.merge(node, {"metadata": {"labels": {"fractus.dev/class": "cloud"}}}), labels)
@@ -417,6 +432,11 @@ def test_the_operator_does_its_work_with_the_chart_s_permissions(
         grant = f"{FRACTUS}/grants/{namespace}.traffic-navigator/status"
         world.api.merge(grant, {"status": {"phase": "Complete"}})
         world.phase(namespace, "Completed")
+        wait_for(
+            lambda: all("fractus.dev/finished" in pod["metadata"]["labels"] for pod in world.pods(namespace)),
+            operator.log,
+        )
+        assert len(world.pods(namespace)) == 7
         world.api.delete(world.path(traffic(namespace)))
         wait_for(lambda: world.application(namespace) is None and not world.children(namespace), operator.log)
     finally:

@@ -53,6 +53,13 @@ class ApplicationSpec(Model):
         description="When a changed manifest is carried out: once the drone is on the ground, or also in flight, which restarts"
         " what changed, such as the driver.",
     )
+    ttl_after_finished: int = Field(
+        default=600,
+        ge=0,
+        le=604_800,
+        description="How long pods are kept once the mission is over, in seconds, for their logs: stopped, and with nothing booked on"
+        " their nodes. Then they are removed.",
+    )
 
     @rule(
         "self.components.all(c, self.components.exists_one(d,"

@@ -22,6 +22,11 @@ DIGEST_ANNOTATION = f"{GROUP}/applied"
 CAUSE_ANNOTATION = f"{GROUP}/cause"
 """On Deployments: DIGEST@NODE, of what the manifest says of the component, and the node that it is made for."""
 
+FINISHED_LABEL = f"{GROUP}/finished"
+"""On pods that are stopped, and kept for their logs: since when, as FINISHED_FORMAT."""
+
+FINISHED_FORMAT = "%Y%m%dT%H%M%SZ"
+
 FINALIZER = f"{GROUP}/teardown"
 DEPOT_LABEL = f"{GROUP}/depot"
 GEOHASH_LABEL = f"{GROUP}/geohash"

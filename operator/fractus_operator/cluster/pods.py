@@ -7,13 +7,21 @@ import sys
 import types
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import UTC, datetime
 
 from fractus_core.planning.inventory import Host
 from fractus_core.planning.quantities import amount_of
 
 from fractus_operator.cluster.kinds import Body, Key
-from fractus_operator.cluster.labels import APPLICATION_LABEL, COMPONENT_LABEL, INSTANCE_LABEL, MANAGED_LABEL
+from fractus_operator.cluster.labels import (
+    APPLICATION_LABEL,
+    COMPONENT_LABEL,
+    FINISHED_FORMAT,
+    FINISHED_LABEL,
+    INSTANCE_LABEL,
+    MANAGED_BY,
+    MANAGED_LABEL,
+)
 
 _MAX_LOG = 400
 """Characters of a failed container's last log lines that are kept."""
@@ -33,6 +41,7 @@ class PodView:
         requests: what it asks of its node, in base units.
         deployment: name of the Deployment that made it, through a ReplicaSet; None for a pod of other making.
         daemon_set: name of the DaemonSet that made it, and `revision`, which of its templates it was made from.
+        finished_at: since when it is stopped, and only kept for its logs; None before.
         failure: how its container failed last: exit code and last log lines; empty if it never did.
         unschedulable_since: since when the scheduler has found no node for it, if so.
         unschedulable_message: what the scheduler said.
@@ -50,6 +59,7 @@ class PodView:
     deployment: str | None = None
     daemon_set: str | None = None
     revision: str = ""
+    finished_at: datetime | None = None
     failure: str = ""
     unschedulable_since: datetime | None = None
     unschedulable_message: str = ""
@@ -63,6 +73,11 @@ class PodView:
     def application(self) -> str | None:
         """The application that the pod belongs to, as its label says."""
         return self.labels.get(APPLICATION_LABEL)
+
+    @property
+    def ours(self) -> bool:
+        """Whether a Deployment of the operator made it, or did before it left its pods alone."""
+        return self.labels.get(MANAGED_LABEL) == MANAGED_BY and self.deployment in {None, self.instance}
 
     @property
     def takes_calls(self) -> bool:
@@ -97,10 +112,21 @@ def read_pod(body: Body) -> PodView:
         deployment=_deployment(metadata),
         daemon_set=daemon_set(metadata),
         revision=revision_hash(metadata),
+        finished_at=_finished_at(labels),
         failure=_failure(status),
         unschedulable_since=datetime.fromisoformat(since) if since else None,
         unschedulable_message=scheduled.get("message", "") if unschedulable else "",
     )
+
+
+def _finished_at(labels: Mapping[str, str]) -> datetime | None:
+    if FINISHED_LABEL not in labels:
+        return None
+    try:
+        return datetime.strptime(labels[FINISHED_LABEL], FINISHED_FORMAT).replace(tzinfo=UTC)
+    except ValueError:
+        # Everyone with access to the namespace may write it: such a pod is not kept.
+        return datetime.min.replace(tzinfo=UTC)
 
 
 def _failure(status: Body) -> str:

@@ -157,9 +157,9 @@ class LiveInventory:
         """Which application has which drone."""
         return self.fleet.claims(self.plans.in_force(), self._grants.values())
 
-    def pods_of(self, key: Key) -> list[PodView]:
-        """The pods of an application."""
-        return list(self._pods.get(labelled(key), {}).values())
+    def pods_of(self, key: Key, *, kept: bool = False) -> list[PodView]:
+        """The pods of an application, or those of its last mission that are only kept for their logs."""
+        return [pod for pod in self._pods.get(labelled(key), {}).values() if (pod.finished_at is not None) == kept]
 
     def grants_of(self, key: Key) -> list[Grant]:
         """The grants of an application, also of one that had its name before."""

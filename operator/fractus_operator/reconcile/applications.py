@@ -19,7 +19,7 @@ from fractus_core.validation import check_application
 from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Key
 from fractus_operator.cluster.labels import FINALIZER
-from fractus_operator.cluster.reading import SETTLED
+from fractus_operator.cluster.reading import SETTLED, Submitted
 from fractus_operator.cluster.store import Backoff, KubeError, Store
 from fractus_operator.inventory.live import LiveInventory
 from fractus_operator.inventory.observed import Observed
@@ -28,6 +28,7 @@ from fractus_operator.metrics import reconciling
 from fractus_operator.reconcile import status
 from fractus_operator.reconcile.children import Children, NameTaken
 from fractus_operator.reconcile.contention import planning_input
+from fractus_operator.reconcile.finished_pods import FinishedPods
 from fractus_operator.reconcile.flight_status import flight
 from fractus_operator.reconcile.grants import REFUSALS, ApplicationGrants
 from fractus_operator.reconcile.missions import mission_outcome
@@ -49,17 +50,15 @@ _REST_FACTOR = 2.0
 EXCLUSION = timedelta(minutes=5)
 """How long a node that the scheduler refused is left out of an application's plans."""
 
-_OF_A_MISSION = (
-    kinds.GRANT,
-    kinds.DIRECT_LINK,
-    kinds.DEPLOYMENT,
+_RIGHTS = (kinds.GRANT, kinds.DIRECT_LINK)
+_BESIDE_PODS = (
     kinds.DISRUPTION_BUDGET,
     kinds.ENDPOINT_SLICE,
     kinds.NETWORK_POLICY,
     kinds.SERVICE,
     kinds.SECRET,
 )
-"""What is removed when a mission is over, in this order. The plan stays, as its record."""
+"""What is removed when a mission is over: first rights, then what runs, then the rest. The plan stays, as its record."""
 
 
 class BeingDeleted(Exception):
@@ -97,6 +96,7 @@ class Applications:
         signer = GrantSigner(authority, clock)
         self._children = Children(store, live.children, signer)
         self._grants = ApplicationGrants(live, self._children, signer, self._settings)
+        self._finished_pods = FinishedPods(store, live, self._children, clock)
         self._rollout = Rollout(self._children, live, authority, clock)
         self._reporter = StatusReporter(store, live.applications, clock)
         self._notes = WayNotes(live.subscriptions.wake, clock)
@@ -192,7 +192,7 @@ class Applications:
             generation = seen.plan.application_generation if seen.plan is not None else None
             update = status.finished(outcome, name, drone, seen.pods)
             await self._reporter.report(submitted, update, generation)
-            await self._clear(seen.key)
+            await self._finish(submitted)
             return RESYNC_S
         present = self._present(seen)
         try:
@@ -212,12 +212,11 @@ class Applications:
         if reported.get("phase") not in SETTLED:
             return None
         if reported.get("observedGeneration") == seen.submitted.metadata.generation:
-            if seen.plan is None:
-                await self._clear(seen.key)
+            again_s = await self._finish(seen.submitted) if seen.plan is None else RESYNC_S
             if reported["phase"] == "Returning":
                 drone = self._live.drone(reported.get("drone") or "")
                 await self._reporter.report(seen.submitted, status.still_over(reported, drone))
-            return RESYNC_S
+            return again_s
         if seen.plan is not None:
             return None
         # An old plan neither claims its drone for the next mission nor excuses it from any check.
@@ -296,17 +295,24 @@ class Applications:
 
     async def _begin_again(self, key: Key) -> bool:
         """Remove all that was made for an application, with its plan; True if there was anything."""
-        removed = await self._clear(key)
-        removed |= await self._children.remove(key, kinds.DEPLOYMENT_PLAN)
+        removed = await self._children.remove(key, *_RIGHTS, kinds.DEPLOYMENT, *_BESIDE_PODS, kinds.DEPLOYMENT_PLAN)
+        removed |= await self._finished_pods.remove(key)
         self._live.forget(key)
         return removed
 
-    async def _clear(self, key: Key) -> bool:
-        """Remove what a mission that is over leaves, but the plan; True if there was anything."""
-        removed = await self._children.remove(key, *_OF_A_MISSION)
+    async def _finish(self, submitted: Submitted) -> float:
+        """Remove what a mission that is over leaves, but the plan, and its pods for as long as they are kept.
+
+        Returns:
+            When to run again.
+        """
+        key = submitted.key
+        removed = await self._children.remove(key, *_RIGHTS)
+        removed |= await self._finished_pods.stop(submitted)
+        removed |= await self._children.remove(key, *_BESIDE_PODS)
         if removed:
             self._live.forget(key)
-        return removed
+        return min(await self._finished_pods.expire(submitted), RESYNC_S)
 
     def _present(self, seen: Observed) -> StatusUpdate | None:
         """What is deployed by the plan in force, if anything."""

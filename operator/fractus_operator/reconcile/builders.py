@@ -191,7 +191,7 @@ def deployment(application: Application, placed: PlannedInstance, drone: Drone |
     described = {**labels_of(application), **_location_labels(component, placed)}
     spec: Body = {
         "replicas": placed.replicas,
-        "revisionHistoryLimit": 1,
+        "revisionHistoryLimit": 0,
         "selector": {"matchLabels": identity},
         "strategy": {"type": "Recreate" if placed.node is not None else "RollingUpdate"},
         "template": {

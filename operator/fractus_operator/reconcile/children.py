@@ -206,15 +206,15 @@ class Children:
                 if child["metadata"]["name"] not in names and _is_child(application, kind, child):
                     await self._delete(kind, child)
 
-    async def remove(self, key: Key, *of: Kind) -> bool:
-        """Delete every child of some kinds, one kind after the other; True if there was any."""
+    async def remove(self, key: Key, *of: Kind, orphan: bool = False) -> bool:
+        """Delete every child of some kinds, one kind after the other, and what it owns unless that is left; True if there was any."""
         removed = False
         for kind in of:
             for child in self.of(key, kind):
                 removed = True
                 self._normalised.pop((kind, key_of(child)), None)
                 self._met.discard((kind, key_of(child)))
-                await self._delete(kind, child)
+                await self._delete(kind, child, orphan=orphan)
         return removed
 
     async def revoke(self, key: Key) -> None:
@@ -224,11 +224,11 @@ class Children:
         for grant in await self._store.list(kinds.GRANT, selectors={"labelSelector": selector}):
             await self._delete(kinds.GRANT, grant)
 
-    async def _delete(self, kind: Kind, body: Body) -> None:
+    async def _delete(self, kind: Kind, body: Body, *, orphan: bool = False) -> None:
         if "deletionTimestamp" in body["metadata"]:
             return
         logger.info("children: removing (kind=%s name=%s)", kind.name, body["metadata"]["name"])
-        await self._store.delete(kind, key_of(body), body["metadata"].get("uid"))
+        await self._store.delete(kind, key_of(body), body["metadata"].get("uid"), orphan=orphan)
 
 
 async def _all(writes: Iterable[Awaitable[None]]) -> None:

@@ -22,7 +22,10 @@ async def watch(period_s: float) -> None:
         while not stop.is_set():
             try:
                 info = await camera.capture()
-                log.info("%s: %d bytes", info.name, len(await camera.retrieve(info.name)))
+                try:
+                    log.info("%s: %d bytes", info.name, len(await camera.retrieve(info.name)))
+                finally:
+                    await camera.delete(info.name)  # the node keeps 200 of a component, and then takes no more
             except fractus.PolicyDenied as refusal:
                 log.info("no picture here: %s", refusal)
             except fractus.FractusError as error:

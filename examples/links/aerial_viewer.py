@@ -65,9 +65,10 @@ async def look(camera: fractus.Camera) -> bytes:
     if size := int(os.environ.get("PICTURE_BYTES", "0")):
         return os.urandom(size)
     info = await camera.capture()
-    picture = await camera.retrieve(info.name)
-    await camera.delete(info.name)  # the node keeps 200 of a component, and then takes no more
-    return picture
+    try:
+        return await camera.retrieve(info.name)
+    finally:
+        await camera.delete(info.name)  # the node keeps 200 of a component, and then takes no more
 
 
 def tell(event: str, number: int, **more: Any) -> None:

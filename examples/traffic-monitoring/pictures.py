@@ -45,7 +45,10 @@ async def look(camera: fractus.Camera, number: int) -> tuple[str, bytes]:
     """A picture from the node's camera, or a test picture where a node has no camera service yet."""
     try:
         info = await camera.capture()
-        return info.name, await camera.retrieve(info.name)
+        try:
+            return info.name, await camera.retrieve(info.name)
+        finally:
+            await camera.delete(info.name)  # the node keeps 200 of a component, and then takes no more
     except fractus.Unavailable:
         return f"test-{number}.png", render(160, 120, number)
 

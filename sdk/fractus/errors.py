@@ -158,13 +158,15 @@ class Busy(FractusError):
     """The service takes no more of this component now: too many calls, or no room for another picture.
 
     Attributes:
-        retry_after_s: in how many seconds to try again; None where waiting alone does not help.
+        retry_after_s: in how many seconds to try again; None where waiting alone does not help: the message says what does.
     """
 
     remedy = "wait for `retry_after_s`, and call less often"
 
     def __init__(self, message: str, retry_after_s: float | None = None) -> None:
         self.retry_after_s = retry_after_s
+        if retry_after_s is None:
+            self.remedy = ""
         super().__init__(message)
 
 

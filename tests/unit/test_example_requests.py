@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 import sys
 from email.message import Message
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import fractus
 import pytest
+import yaml
 from fractus.exchange import Request, Requester, Responder
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "traffic-monitoring"
+EXAMPLES = Path(__file__).parents[2] / "examples"
+EXAMPLE = EXAMPLES / "traffic-monitoring"
 
 
 @pytest.fixture
@@ -51,3 +56,60 @@ async def test_what_is_no_picture_is_refused(programs: dict[str, Any]) -> None:
     for body in (b"", b"not json\nx", programs["pictures"].pack("p", "s", b"no picture")):
         with pytest.raises(ValueError, match=" "):
             await programs["image_checker"].check(Request("r", "check", body))
+
+
+class FullCamera:
+    """A camera that keeps one picture; every other one cannot be fetched."""
+
+    def __init__(self) -> None:
+        self.kept: list[str] = []
+        self.taken = 0
+
+    async def capture(self) -> SimpleNamespace:
+        assert not self.kept, "it takes no more"
+        self.taken += 1
+        self.kept.append(f"picture-{self.taken}")
+        return SimpleNamespace(name=self.kept[-1])
+
+    async def retrieve(self, name: str) -> bytes:
+        if self.taken % 2:
+            raise fractus.PolicyDenied(fractus.Decision(fractus.Action.DENY, reason="not this one"))
+        return name.encode()
+
+    async def delete(self, name: str) -> None:
+        self.kept.remove(name)
+
+
+async def test_examples_leave_no_pictures_on_the_node(programs: dict[str, Any]) -> None:
+    camera = FullCamera()
+    for number in range(4):
+        try:
+            assert (await programs["pictures"].look(camera, number))[1] == f"picture-{camera.taken}".encode()
+        except fractus.PolicyDenied:
+            assert camera.taken % 2
+    assert (camera.kept, camera.taken) == ([], 4)
+
+
+async def test_the_links_example_leaves_no_pictures_on_the_node(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "path", [str(EXAMPLES / "links"), *sys.path])
+    monkeypatch.delitem(sys.modules, "aerial_viewer", raising=False)
+    monkeypatch.delitem(os.environ, "PICTURE_BYTES", raising=False)
+    look, camera = importlib.import_module("aerial_viewer").look, FullCamera()
+    with pytest.raises(fractus.PolicyDenied):
+        await look(camera)
+    assert await look(camera) == b"picture-2"
+    assert not camera.kept
+
+
+def test_components_that_take_pictures_may_delete_them() -> None:
+    taking = 0
+    for path in sorted(EXAMPLES.rglob("*.yaml")):
+        for body in filter(None, yaml.safe_load_all(path.read_text())):
+            if body.get("kind") != "Application":
+                continue
+            for component in body["spec"]["components"]:
+                for service in component.get("services", ()):
+                    if "CaptureImage" in service.get("methods", ()):
+                        taking += 1
+                        assert "DeleteImage" in service["methods"], f"{path}: {component['name']}"
+    assert taking > 3

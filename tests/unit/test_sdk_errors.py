@@ -39,6 +39,7 @@ async def test_who_asks_too_much_learns_when_to_ask_again(again_s: float) -> Non
     assert isinstance(found, Busy)
     assert str(found) == "GetSpeed: more than 50 calls a second; slow down"
     assert found.retry_after_s == (again_s or None)
+    assert bool(found.remedy) == bool(again_s), "where waiting does not help, the message says what does"
 
 
 async def test_a_refusal_carries_who_decided() -> None:

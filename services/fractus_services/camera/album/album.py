@@ -28,6 +28,9 @@ _NAME = re.compile(r"[0-9]{17}-[0-9]{4}\.jpg")
 _FOLDER = re.compile(r"[0-9a-f]{32}")
 
 
+_REMEDY = "delete each picture once it is fetched (camera.delete of the SDK; the component's methods need DeleteImage)"
+
+
 class AlbumFull(ResourceExhausted):
     """A quota is used up."""
 
@@ -99,13 +102,13 @@ class Album:
         sizes = _sizes(self._folder(owner).glob("*.jpg"))
         used = sum(sizes)
         if len(sizes) >= self._keep:
-            return f"{len(sizes)} pictures are kept, as many as allowed; delete some with DeleteImage"
+            return f"{len(sizes)} pictures are kept, as many as allowed; {_REMEDY}"
         if used >= self._keep_bytes:
-            return f"{used / 1e6:.0f} MB of pictures are kept, as much as allowed; delete some with DeleteImage"
+            return f"{used / 1e6:.0f} MB of pictures are kept, as much as allowed; {_REMEDY}"
         if self._total() >= self._keep_total_bytes and not self._make_room():
             return (
-                f"the pictures on this node take {self._keep_total_bytes / 1e6:.0f} MB, as much as allowed; delete some"
-                " with DeleteImage, or let the node's operator raise --keep-total-mb"
+                f"the pictures on this node take {self._keep_total_bytes / 1e6:.0f} MB, as much as allowed; {_REMEDY},"
+                " or let the node's operator raise --keep-total-mb"
             )
         return ""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -597,5 +598,25 @@ def test_it_flies_home_below_a_zone_that_appears_close_overhead(tmp_path: Path) 
             assert "NoLegalWay" not in {entry["code"] for entry in world.kinds("control") if "code" in entry}
             assert max(height for _, _, height in world.plane.trace) < 21.0
             assert max(y for _, y, _ in world.plane.trace) < 61.5
+
+    fly(flight)
+
+
+@pytest.mark.parametrize("how", ["schedule", "validity"])
+def test_a_leg_into_a_zone_that_begins_is_stopped_at_once(tmp_path: Path, how: str) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            began = datetime.fromtimestamp(world.guard.situation().time_s + 25.0, UTC)
+            later = zone("later", "ignore", -30.0, 150.0, 30.0, 170.0)
+            if how == "validity":
+                later["spec"]["validFrom"] = began.isoformat()
+            else:
+                later["zones"][0]["schedule"] = [{"validFrom": began.isoformat()}]
+            grant = world.grants.put(spec(later))
+            await world.up(grant)
+            await world.until(lambda: world.guard.situation().time_s > began.timestamp() - 5.0, 30)
+            stopped = await refusal(end(world.service.goto(grant, GotoArgs(*at(0, 190), 10.0), 0)))
+            assert stopped.verdict.policies == ("later",)
+            assert 10.0 < world.plane.xy[1] < 80.0, "70 m before it has to"
 
     fly(flight)

@@ -36,6 +36,11 @@ class Rule:
     valid_from_s: float
     valid_until_s: float
 
+    @property
+    def limited_in_time(self) -> bool:
+        """Whether the policy has a validity window."""
+        return math.isfinite(self.valid_from_s) or math.isfinite(self.valid_until_s)
+
     def in_force(self, time_s: float) -> bool:
         """Whether the policy is in its validity window."""
         return self.valid_from_s <= time_s and earliest(time_s) < self.valid_until_s
@@ -185,6 +190,7 @@ class CompiledGrant:
         operation: where services may be used; None: anywhere.
         passage: where the instance may fly: operation area and the way between it and home, or under partial control the
             operation area alone; None: anywhere.
+        timed: the zones of geofences that have a schedule, or whose policy has a validity window.
         homeward: where the system flies the drone home: operation area and the way between it and home; None: anywhere.
     """
 
@@ -208,6 +214,11 @@ class CompiledGrant:
     homeward: BaseGeometry | None
     homeward_border: BaseGeometry | None
     flat_terrain: bool
+    timed: tuple[PolicyZone, ...]
+
+    def fences_in_force(self, time_s: float) -> tuple[bool, ...]:
+        """Which of the fences that are limited in time hold at a moment, in seconds since 1970."""
+        return tuple(zone.in_force(time_s) for zone in self.timed)
 
     def locate(self, now: Situation) -> tuple[float, float] | None:
         """Where the drone is, in metres of the frame; None while it is unknown."""
@@ -234,6 +245,9 @@ def compile_grant(spec: GrantSpec, origin: Point | None = None, flat_terrain: bo
     if operation is not None and spec.corridor:
         homeward = shapely.union(operation, _union(frame, spec.corridor))
     passage = operation if spec.control == "partial" else homeward
+    exclusions = _index(frame, zoned, "GeofenceControl", "exclusion")
+    inclusions = tuple(_inclusion(frame, r, p) for r, p in zoned if p.spec.kind == "inclusion")
+    fences = (*exclusions.zones, *(zone for fence in inclusions for zone in fence.zones))
     return CompiledGrant(
         identity=spec.identity,
         frame=frame,
@@ -245,8 +259,8 @@ def compile_grant(spec: GrantSpec, origin: Point | None = None, flat_terrain: bo
         allowances=_by_method(frame, zoned, "grant", methods),
         altitude_limits=_index(frame, zoned, "LimitControl", "altitude"),
         speed_limits=_index(frame, zoned, "LimitControl", "speed"),
-        exclusions=_index(frame, zoned, "GeofenceControl", "exclusion"),
-        inclusions=tuple(_inclusion(frame, r, p) for r, p in zoned if p.spec.kind == "inclusion"),
+        exclusions=exclusions,
+        inclusions=inclusions,
         privacy=_index(frame, zoned, "PrivacyControl", "camera"),
         operation=operation,
         operation_border=_prepared(operation.boundary) if operation is not None else None,
@@ -255,6 +269,7 @@ def compile_grant(spec: GrantSpec, origin: Point | None = None, flat_terrain: bo
         homeward=_prepared(homeward) if homeward is not None else None,
         homeward_border=_prepared(homeward.boundary) if homeward is not None else None,
         flat_terrain=flat_terrain,
+        timed=tuple(zone for zone in fences if zone.schedule or zone.rule.limited_in_time),
     )
 
 

@@ -40,7 +40,7 @@ CORRECT_AGAIN_S = 3.0
 """How long a correction may take effect before the same alarm asks for it again."""
 
 CHANGED_S = 30.0
-"""How long after its grant changed a drone may still speed up on a leg that was judged by the grant before."""
+"""How long after its grant, or what is in force of it, changed a drone may still speed up on a leg that was judged by the grant before."""
 
 START_S = 2.0
 """How long a drone may take to move after it was told to fly; one that keeps its place longer flies nothing."""
@@ -64,6 +64,7 @@ class MotionMonitor:
         self._alarm = ""
         self._alarm_at = 0.0
         self._grant: ActiveGrant | None = None
+        self._in_force: tuple[bool, ...] = ()
         self._changed_at = -math.inf
 
     async def run(self) -> None:
@@ -128,7 +129,7 @@ class MotionMonitor:
     def _judge(self, compiled: CompiledGrant) -> tuple[Verdict | None, bool]:
         """What is wrong, and whether the system flies the drone already, so that there is no driver to take it from."""
         control, now = self._control, self._guard.situation()
-        changed, motion = self._has_changed(self._flown_grant), control.motion
+        changed, motion = self._has_changed(compiled.fences_in_force(now.time_s)), control.motion
         bound_for = motion.leg if motion is not None and motion.under_way and not motion.braking else None
         if control.state.returning or not control.autopilot.vehicle.mode.commanded:
             # The autopilot's own ways were judged by no one, whatever the grant was.
@@ -172,12 +173,12 @@ class MotionMonitor:
 
         control.tasks.spawn(control.tasks.attempt(control.modes.hold, permit))
 
-    def _has_changed(self, grant: ActiveGrant | None) -> bool:
-        """Whether the drone's way may have been judged by another grant than this."""
-        control = self._control
+    def _has_changed(self, in_force: tuple[bool, ...]) -> bool:
+        """Whether the drone's way may have been judged by another grant than now, or before a schedule opened or closed a zone."""
+        control, grant = self._control, self._flown_grant
         autopilot, motion = control.autopilot, control.motion
-        if grant is not self._grant:
-            self._grant, self._changed_at = grant, autopilot.now
+        if grant is not self._grant or in_force != self._in_force:
+            self._grant, self._in_force, self._changed_at = grant, in_force, autopilot.now
         begins = autopilot.now - control.state.motion_began_at < START_S
         if (motion is None or motion.kind == "Takeoff") and not begins and autopilot.vehicle.keeps_place(autopilot.now):
             # Whatever moves it from here is judged by what holds now, or later.

@@ -34,17 +34,17 @@ class Access:
     renew: Callable[[], Awaitable[None]]
 
 
-async def kubeconfig(path: str | Path) -> Access:
-    """Access by the current context of a kubeconfig; several are separated as in KUBECONFIG.
+async def kubeconfig(path: str | Path, context: str | None = None) -> Access:
+    """Access by a context of a kubeconfig, or its current one; several are separated as in KUBECONFIG.
 
     Raises:
-        Unconfigured: there is none, or it has no current context that is whole.
+        Unconfigured: there is none, or it has no such context that is whole.
     """
     configuration = Configuration()
 
     async def load() -> None:
         try:
-            await load_kube_config(str(path), client_configuration=configuration, persist_config=False)
+            await load_kube_config(str(path), context=context, client_configuration=configuration, persist_config=False)
         # The loader does not check types: a kubeconfig of other shapes ends in whatever Python says of them.
         except (ConfigException, OSError, yaml.YAMLError, AttributeError, TypeError, ValueError) as error:
             raise Unconfigured(f"the kubeconfig {path} cannot be used: {error}") from error
@@ -72,18 +72,22 @@ async def in_cluster(directory: Path = SERVICE_ACCOUNT) -> Access:
     return Access(configuration, load)
 
 
-async def from_environment() -> Access:
+async def from_environment(context: str | None = None) -> Access:
     """Access by the service account of this pod or, outside of one, by KUBECONFIG or kubectl's own kubeconfig.
+
+    Args:
+        context: of the kubeconfig; who names one does not mean the pod.
 
     Raises:
         Unconfigured: there is none of them.
     """
+    if context is None:
+        try:
+            return await in_cluster()
+        except Unconfigured:
+            pass
     try:
-        return await in_cluster()
-    except Unconfigured:
-        pass
-    try:
-        return await kubeconfig(os.environ.get("KUBECONFIG") or _KUBECONFIG)
+        return await kubeconfig(os.environ.get("KUBECONFIG") or _KUBECONFIG, context)
     except Unconfigured as error:
         raise Unconfigured(f"no cluster: set KUBECONFIG, or run in a pod ({error})") from error
 

@@ -316,11 +316,15 @@ async def test_every_answer_keeps_the_page_to_itself(served: tuple[str, View]) -
 # The command, and the page that is checked in
 
 
-def test_the_command_says_what_is_wrong(tmp_path: Path, recording: Path) -> None:
+def test_the_command_says_what_is_wrong(tmp_path: Path, recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("KUBECONFIG", str(tmp_path / "nothing"))
+    (tmp_path / "short").write_text("secret\n")
     (tmp_path / "text.mcap").write_text("no recording")
     for arguments, said in (
-        ([], "give recordings to replay"),
-        ([str(recording), "--recordings", str(tmp_path)], "give recordings to replay"),
+        ([], "or give recordings to replay"),
+        ([str(recording), "--recordings", str(tmp_path)], "one of them"),
+        ([str(recording), "--context", "k3s"], "one of them"),
+        ([str(recording), "--token-file", str(tmp_path / "short")], "has no token: write 16"),
         ([str(tmp_path / "text.mcap")], "is no MCAP file"),
         ([str(recording), "--listen", "8650"], "is not HOST:PORT"),
         ([str(recording), "--listen", "203.0.113.1:8650"], "choose another with --listen"),

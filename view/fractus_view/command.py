@@ -4,17 +4,25 @@ from __future__ import annotations
 
 import asyncio
 import signal
+from contextlib import aclosing
 from ipaddress import ip_address
 from pathlib import Path
 
 import click
 from aiohttp import web
+from fractus_kube import Client, KubeError, Unconfigured, from_environment, kubeconfig
 
+from fractus_view.cluster import Cluster
 from fractus_view.mcap_tail import MAGIC
 from fractus_view.server import View
 from fractus_view.sources import Following, Replay, Source
 
 DEFAULT_LISTEN = "127.0.0.1:8650"
+MIN_TOKEN = 16
+_REMEDIES = {
+    0: "check the cluster and --context, or give recordings to replay",
+    404: "install the chart fractus-crds",
+}
 
 
 def _listen(_context: click.Context, _option: click.Parameter, text: str) -> tuple[str, int]:
@@ -35,6 +43,14 @@ def _listen(_context: click.Context, _option: click.Parameter, text: str) -> tup
     metavar="DIRECTORY",
     help="Follow what services record below it now.",
 )
+@click.option("-n", "--namespace", default="", help="Only the applications of this namespace of the cluster.")
+@click.option("--context", help="Of the kubeconfig; else its current one.")
+@click.option(
+    "--kubeconfig",
+    "config",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    help="Which cluster; else KUBECONFIG, then ~/.kube/config.",
+)
 @click.option(
     "--listen",
     callback=_listen,
@@ -43,19 +59,47 @@ def _listen(_context: click.Context, _option: click.Parameter, text: str) -> tup
     metavar="HOST:PORT",
     help="Where to serve; port 0 takes a free one.",
 )
-def view(recordings: tuple[Path, ...], directory: Path | None, listen: tuple[str, int]) -> None:
-    """Show flights on a web page: a replay of RECORDINGs (MCAP files), or what happens now.
+@click.option(
+    "--token-file",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    help="Who knows what is in it may look; else a new token is made at each start.",
+)
+def view(
+    *,
+    recordings: tuple[Path, ...],
+    directory: Path | None,
+    namespace: str,
+    context: str | None,
+    config: Path | None,
+    listen: tuple[str, int],
+    token_file: Path | None,
+) -> None:
+    """Show flights on a web page: those of a cluster, as they happen, or a replay of RECORDINGs (MCAP files).
 
     It prints the page's address, which has a token in it, and serves until interrupted. It changes nothing.
     """
-    asyncio.run(_serve(_source(recordings, directory), *listen))
-
-
-def _source(recordings: tuple[Path, ...], directory: Path | None) -> Source:
-    if bool(recordings) == (directory is not None):
-        raise click.UsageError("give recordings to replay, or --recordings with the directory that services write to")
+    of_cluster = bool(namespace or context or config)
+    if bool(recordings) + (directory is not None) + of_cluster > 1:
+        raise click.UsageError("give recordings to replay, --recordings, or the options of a cluster: one of them")
+    token = None if token_file is None else _token(token_file)
     if directory is not None:
-        return Following(directory)
+        asyncio.run(_serve(Following(directory), *listen, token))
+    elif recordings:
+        asyncio.run(_serve(_replay(recordings), *listen, token))
+    else:
+        asyncio.run(_serve_cluster(config, context, namespace, listen, token))
+
+
+def _token(path: Path) -> str:
+    token = path.read_text().strip()
+    if len(token) < MIN_TOKEN or not token.isascii() or not token.isprintable():
+        raise click.ClickException(
+            f"{path} has no token: write {MIN_TOKEN} ASCII characters or more, of chance, into it"
+        )
+    return token
+
+
+def _replay(recordings: tuple[Path, ...]) -> Source:
     for path in recordings:
         with path.open("rb") as file:
             if file.read(len(MAGIC)) != MAGIC:
@@ -63,12 +107,30 @@ def _source(recordings: tuple[Path, ...], directory: Path | None) -> Source:
     return Replay(recordings)
 
 
-async def _serve(source: Source, host: str, port: int) -> None:
+async def _serve_cluster(
+    config: Path | None, context: str | None, namespace: str, listen: tuple[str, int], token: str | None
+) -> None:
+    try:
+        access = await (kubeconfig(config, context) if config is not None else from_environment(context))
+        client = Client(access, "fractus-view")
+    except Unconfigured as error:
+        raise click.ClickException(f"{error}; or give recordings to replay") from error
+    async with aclosing(client):
+        cluster = Cluster(client, namespace)
+        try:
+            await cluster.check()
+        except KubeError as error:
+            remedy = _REMEDIES.get(error.status, "check your permissions: the role view is enough")
+            raise click.ClickException(f"{error}; {remedy}") from error
+        await _serve(cluster, *listen, token)
+
+
+async def _serve(source: Source, host: str, port: int, token: str | None) -> None:
     stopped = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stopped.set)
-    served = View(source, host)
+    served = View(source, host) if token is None else View(source, host, token)
     runner = web.AppRunner(served.application(), access_log=None, handle_signals=False, shutdown_timeout=1.0)
     await runner.setup()
     try:
@@ -81,7 +143,9 @@ async def _serve(source: Source, host: str, port: int) -> None:
             ) from error
         bound = runner.addresses[0][1]
         name = f"[{host}]" if ":" in host else host
-        click.echo(f"view: open http://{name}:{bound}/?token={served.token}")
+        # A token that was given is known already, and logs are read by more people.
+        said = f"?token={served.token}" if token is None else "?token=..."
+        click.echo(f"view: open http://{name}:{bound}/{said}")
         if not _loopback(host):
             click.echo("view: others on this network can read what is sent, the token too: put TLS before it", err=True)
         await stopped.wait()

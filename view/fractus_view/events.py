@@ -33,7 +33,11 @@ class Fix:
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """What a drone did: altitude above home, speed over ground, share of the battery that is left, and who flies."""
+    """What a drone did: altitude above home, speed over ground, share of the battery that is left, and who flies.
+
+    Attributes:
+        seen_ms: when the drone itself said so; None: then.
+    """
 
     drone: str
     time_ms: int
@@ -43,6 +47,15 @@ class State:
     mode: str
     controller: str
     phase: str
+    seen_ms: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Gone:
+    """A drone is no more: all that was told of it is void."""
+
+    drone: str
+    time_ms: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,14 +87,94 @@ class Note:
 
 @dataclass(frozen=True, slots=True)
 class Areas:
-    """Zones, operation areas, corridors and planned paths of one origin: all that hold from now on, as GeoJSON features.
+    """Zones, areas, planned paths and places of one origin: all that hold from now on, as GeoJSON features.
 
-    Each has `kind` (zone, operationArea, corridor or path) and `name` among its properties, and maybe `altitude`.
+    Each has `kind` (zone, operationArea, corridor, path, depot or edgeNode) and `name` among its properties, and maybe
+    `altitude`, a `component` or an `application` that it is of, and a `state`.
     """
 
     origin: str
     time_ms: int
     features: Sequence[Mapping[str, Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class Application:
+    """Where an application stands; `reason` is for programs, `text` for people."""
+
+    name: str
+    drone: str
+    phase: str
+    reason: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Applications:
+    """All applications that there are from now on."""
+
+    time_ms: int
+    applications: Sequence[Application]
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """A direct link that a drone may have with a node.
+
+    Attributes:
+        lat: degrees, of the node.
+        lon: degrees, of the node.
+        traffic: the path that it takes now, cloud or direct; empty where that is not known.
+    """
+
+    name: str
+    drone: str
+    node: str
+    lat: float
+    lon: float
+    phase: str
+    traffic: str
+    reason: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Links:
+    """All direct links that there may be from now on."""
+
+    time_ms: int
+    links: Sequence[Link]
+
+
+@dataclass(frozen=True, slots=True)
+class Policy:
+    """What a policy says, in a phrase, and where; no zones: everywhere."""
+
+    name: str
+    text: str
+    zones: Sequence[str]
+
+
+@dataclass(frozen=True, slots=True)
+class Policies:
+    """All policies that hold from now on."""
+
+    time_ms: int
+    policies: Sequence[Policy]
+
+
+@dataclass(frozen=True, slots=True)
+class Contact:
+    """Whether what is shown is so now. It is told every second or so, whether anything happens or not.
+
+    Attributes:
+        stale_since_ms: since when nothing is heard of where all this comes from; None: it is heard.
+        text: why, in one sentence.
+    """
+
+    time_ms: int
+    stale_since_ms: int | None
+    text: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +194,7 @@ class Problem:
     text: str
 
 
-Event = Fix | State | Verdict | Note | Areas | Picture | Problem
+Event = Fix | State | Gone | Verdict | Note | Areas | Applications | Links | Policies | Contact | Picture | Problem
 
 RESET = '{"type":"reset"}'
 """What was told before is void: all that holds follows."""

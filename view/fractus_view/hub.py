@@ -7,7 +7,25 @@ import secrets
 from collections import deque
 from collections.abc import AsyncIterator, Iterable, Iterator
 
-from fractus_view.events import LIVE, RESET, Areas, Event, Fix, Note, Picture, Problem, State, Verdict, encode, message
+from fractus_view.events import (
+    LIVE,
+    RESET,
+    Applications,
+    Areas,
+    Contact,
+    Event,
+    Fix,
+    Gone,
+    Links,
+    Note,
+    Picture,
+    Policies,
+    Problem,
+    State,
+    Verdict,
+    encode,
+    message,
+)
 
 RECENT = 4_000
 """Events that are kept for pages: one that falls behind by more, or comes back later, gets what is known by then."""
@@ -78,6 +96,11 @@ class Hub:
                 self._holding[State, event.drone] = event
             case Areas():
                 self._holding[Areas, event.origin] = event
+            case Applications() | Links() | Policies() | Contact():
+                self._holding[type(event), ""] = event
+            case Gone():
+                self._trails.pop(event.drone, None)
+                self._holding.pop((State, event.drone), None)
             case _:
                 self._happened[type(event)].append(event)
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import hmac
+import logging
 import mimetypes
 import secrets
 from collections.abc import AsyncIterator, Awaitable, Callable
@@ -15,6 +15,8 @@ from pathlib import Path
 from aiohttp import hdrs, web
 
 from fractus_view.sources import Source
+
+log = logging.getLogger(__name__)
 
 PAGE = Path(__file__).parent / "page"
 """What `make view` builds of `view/web`."""
@@ -79,10 +81,10 @@ class View:
     async def _running(self, _application: web.Application) -> AsyncIterator[None]:
         """Keep the source current while the server runs; without it the page would silently stand still."""
         task = asyncio.create_task(self.source.run())
+        task.add_done_callback(_ended)
         yield
         task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await task
+        await asyncio.gather(task, return_exceptions=True)
 
     @web.middleware
     async def _only_reads(self, request: web.Request, handler: _Handler) -> web.StreamResponse:
@@ -157,6 +159,11 @@ class View:
                     await response.write(said)
         finally:
             pending.cancel()
+
+
+def _ended(task: asyncio.Task[None]) -> None:
+    if not task.cancelled() and task.exception() is not None:
+        log.error("view: nothing new is shown any more; start it again", exc_info=task.exception())
 
 
 def _cookie(request: web.Request) -> str:

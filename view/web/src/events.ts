@@ -20,6 +20,13 @@ export interface State {
   mode: string;
   controller: string;
   phase: string;
+  seen_ms: number | null;
+}
+
+export interface Gone {
+  type: "gone";
+  drone: string;
+  time_ms: number;
 }
 
 export interface Verdict {
@@ -53,8 +60,16 @@ export interface Band {
 
 export interface Feature {
   type: "Feature";
-  properties: { kind: string; name: string; component?: string; altitude?: Band; description?: string };
-  geometry: GeoJSON.Polygon | GeoJSON.MultiPolygon | GeoJSON.LineString;
+  properties: {
+    kind: string;
+    name: string;
+    application?: string;
+    component?: string;
+    altitude?: Band;
+    description?: string;
+    state?: string;
+  };
+  geometry: GeoJSON.Polygon | GeoJSON.MultiPolygon | GeoJSON.LineString | GeoJSON.MultiLineString | GeoJSON.Point;
 }
 
 export interface Areas {
@@ -62,6 +77,58 @@ export interface Areas {
   origin: string;
   time_ms: number;
   features: Feature[];
+}
+
+export interface Application {
+  name: string;
+  drone: string;
+  phase: string;
+  reason: string;
+  text: string;
+}
+
+export interface Applications {
+  type: "applications";
+  time_ms: number;
+  applications: Application[];
+}
+
+export interface Link {
+  name: string;
+  drone: string;
+  node: string;
+  lat: number;
+  lon: number;
+  phase: string;
+  traffic: string;
+  reason: string;
+  text: string;
+}
+
+export interface Links {
+  type: "links";
+  time_ms: number;
+  links: Link[];
+}
+
+export interface Policy {
+  name: string;
+  text: string;
+  zones: string[];
+}
+
+export interface Policies {
+  type: "policies";
+  time_ms: number;
+  policies: Policy[];
+}
+
+/** Whether what is shown is so now; told every second or so by sources that can lose sight of it. */
+export interface Contact {
+  type: "contact";
+  time_ms: number;
+  stale_since_ms: number | null;
+  text: string;
 }
 
 export interface Picture {
@@ -77,7 +144,19 @@ export interface Problem {
   text: string;
 }
 
-export type Event = Fix | State | Verdict | Note | Areas | Picture | Problem;
+export type Event =
+  | Fix
+  | State
+  | Gone
+  | Verdict
+  | Note
+  | Areas
+  | Applications
+  | Links
+  | Policies
+  | Contact
+  | Picture
+  | Problem;
 
 /** What was told before is void; all up to now was told; a recording has no more. */
 export type Sign = { type: "reset" } | { type: "live" } | { type: "end" };

@@ -1,8 +1,8 @@
 // What the map shows, and more, as lists.
 
-import type { Feature, Note, Verdict } from "./events";
+import type { Application, Feature, Link, Note, Policy, Verdict } from "./events";
 import type { Drone, Model } from "./model";
-import { actionOf, band, clock, decided, kindName, quantity, sentence } from "./words";
+import { actionOf, clock, decided, facts, kindName, quantity, sentence } from "./words";
 
 const MAX_VERDICTS = 200;
 const MAX_NOTES = 200;
@@ -28,6 +28,34 @@ function setText(target: HTMLElement, text: string): void {
   if (target.textContent !== text) target.textContent = text;
 }
 
+function applicationItem(one: Application): HTMLLIElement {
+  const item = element("li");
+  const head = element("p", "head");
+  const phase = element("span", "badge", one.phase);
+  phase.dataset["phase"] = one.phase;
+  head.append(element("span", "name", one.name), phase, element("span", "facts", one.drone));
+  item.append(head, element("p", "facts", [one.reason, one.text].filter(Boolean).join(": ")));
+  return item;
+}
+
+function linkItem(one: Link): HTMLLIElement {
+  const item = element("li");
+  const head = element("p", "head");
+  const phase = element("span", "badge", one.phase);
+  phase.dataset["phase"] = one.phase;
+  head.append(element("span", "name", `${one.drone} – ${one.node}`), phase);
+  const traffic = one.traffic ? `traffic ${one.traffic === "direct" ? "over the link" : "by the cloud"}` : "";
+  item.append(head, element("p", "facts", [traffic, one.text || one.reason].filter(Boolean).join(" · ")));
+  return item;
+}
+
+function policyItem(one: Policy): HTMLLIElement {
+  const item = element("li");
+  const where = one.zones.length > 0 ? `in ${one.zones.join(", ")}` : "everywhere";
+  item.append(element("span", "name", one.name), element("span", "facts", ` ${one.text}; ${where}`));
+  return item;
+}
+
 interface Row {
   item: HTMLLIElement;
   button: HTMLButtonElement;
@@ -44,7 +72,7 @@ export class Lists {
   private readonly filter = byId<HTMLSelectElement>("verdict-filter");
   private readonly announcer = byId("announcer");
   private readonly rows = new Map<string, Row>();
-  private shown = { verdicts: "", zones: "", pictures: "", log: "" };
+  private shown: Record<string, string> = { verdicts: "", zones: "", pictures: "", log: "" };
   private announced = -Infinity;
 
   constructor(
@@ -61,11 +89,23 @@ export class Lists {
     this.showDrones(time, selected);
     this.showVerdicts(time);
     this.showZones(time);
+    const model = this.model;
+    // A cluster tells of no calls, pictures or logs: an empty list would say that there were none.
+    const silent = model.contact !== undefined && model.verdicts.values.length === 0;
+    for (const id of ["verdicts", "pictures", "log"]) byId(`${id}-section`).hidden = silent;
+    this.showSection("applications", model.applications.at(time)?.applications, applicationItem, "No application.");
+    this.showSection("links", model.linksAt(time), linkItem, "No direct link.");
+    this.showSection("policies", model.policies.at(time)?.policies, policyItem, "No policy: without one nothing is allowed.");
     this.showPictures(time);
     this.showLog(time);
   }
 
   private showDrones(time: number, selected: string): void {
+    for (const [name, row] of this.rows) {
+      if (this.model.drones.has(name)) continue;
+      row.item.remove();
+      this.rows.delete(name);
+    }
     for (const drone of this.model.drones.values()) this.showDrone(drone, time, selected);
     if (this.rows.size === 0) this.empty(this.drones, "No drone was heard of yet.");
     else this.drones.querySelector(".empty")?.remove();
@@ -75,16 +115,18 @@ export class Lists {
     const row = this.rows.get(drone.name) ?? this.makeRow(drone.name);
     const state = drone.states.at(time);
     const battery = state?.battery;
-    const facts = [
+    const said = [
       `battery ${quantity(battery === null || battery === undefined ? null : battery * 100, 0, "%")}`,
       `altitude ${quantity(state?.altitude_m, 1, "m")}`,
       `speed ${quantity(state?.speed_mps, 1, "m/s")}`,
       `controller ${state?.controller || "–"}`,
       ...(state?.mode ? [`mode ${state.mode}`] : []),
+      ...(drone.stale(time) ? [`last heard of at ${state?.seen_ms ? clock(state.seen_ms) : "–"}`] : []),
     ];
     setText(row.phase, state?.phase ?? "not heard of");
     row.phase.dataset["phase"] = state?.phase ?? "";
-    setText(row.facts, facts.join(" · "));
+    setText(row.facts, said.join(" · "));
+    row.item.classList.toggle("stale", drone.stale(time));
     const pressed = String(drone.name === selected);
     if (row.button.getAttribute("aria-pressed") !== pressed) row.button.setAttribute("aria-pressed", pressed);
   }
@@ -153,17 +195,27 @@ export class Lists {
       const name = one.properties.name === one.properties.kind ? kindName(one) : one.properties.name;
       lines.set(`${name}${owner}`, one);
     }
-    const key = [...lines].map(([name, one]) => `${name} ${band(one)}`).join("\n");
+    const key = [...lines].map(([name, one]) => `${name} ${facts(one)}`).join("\n");
     if (key === this.shown.zones) return;
     this.shown.zones = key;
     const items = [...lines].map(([name, one]) => {
       const item = element("li");
       const swatch = element("span", `swatch ${one.properties.kind}`);
-      item.append(swatch, element("span", "name", name), element("span", "facts", ` ${kindName(one)}, ${band(one)}`));
+      item.append(swatch, element("span", "name", name), element("span", "facts", ` ${facts(one)}`));
       return item;
     });
     this.zones.replaceChildren(...items);
     if (items.length === 0) this.empty(this.zones, "No zone or area is known.");
+  }
+
+  /** A list that is only there where something tells of such things. */
+  private showSection<T>(id: string, found: T[] | undefined, item: (one: T) => HTMLLIElement, empty: string): void {
+    const key = found === undefined ? "" : JSON.stringify(found);
+    if (key === this.shown[id] || found === undefined) return;
+    this.shown[id] = key;
+    byId(`${id}-section`).hidden = false;
+    if (found.length > 0) byId(id).replaceChildren(...found.map(item));
+    else this.empty(byId(id), empty);
   }
 
   private showPictures(time: number): void {

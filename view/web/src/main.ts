@@ -11,6 +11,8 @@ import { listen } from "./stream";
 import { clock, decided, duration, moment, sentence } from "./words";
 
 const LISTS_PERIOD_MS = 250;
+/** A source that says every second that it is there, and has not for so long, is not. */
+const SILENCE_MS = 10_000;
 
 const still = window.matchMedia("(prefers-reduced-motion: reduce)").matches;
 let model = new Model();
@@ -21,6 +23,10 @@ let lists = new Lists(model, actions);
 let selected = "";
 let live = false;
 let complete = false;
+/** Since when the server does not answer, and what is said of it. */
+let lost: { since: number; text: string } | undefined;
+let heard = performance.now();
+let empty = "";
 
 const play = byId<HTMLButtonElement>("play");
 const liveButton = byId<HTMLButtonElement>("live");
@@ -36,10 +42,13 @@ function colours(): Colours {
     background: colour("map"),
     text: colour("text"),
     flown: colour("flown"),
+    link: colour("link"),
+    place: colour("quiet"),
     zone: colour("zone"),
     operationArea: colour("operation-area"),
     corridor: colour("corridor"),
     path: colour("path"),
+    depot: colour("quiet"),
   };
 }
 
@@ -84,11 +93,31 @@ function take(all: (Event | Sign)[]): void {
         finish();
         break;
       default:
+        if (one.type === "contact") heard = performance.now();
         model.take(one);
     }
   }
-  const problem = model.problems.at(-1);
-  if (problem !== undefined) connection.textContent = problem.text;
+}
+
+/** Since when what is shown may not be so any more, and why; undefined: it is so. */
+function stale(): { since: number; text: string } | undefined {
+  if (complete) return undefined;
+  if (lost !== undefined) return lost;
+  const contact = model.contact;
+  if (contact === undefined) return undefined;
+  if (contact.stale_since_ms !== null) return { since: contact.stale_since_ms, text: contact.text };
+  const silence = performance.now() - heard;
+  return silence > SILENCE_MS ? { since: Date.now() - silence, text: "The server says nothing." } : undefined;
+}
+
+/** What the user should know of what they see. */
+function showConnection(): void {
+  const found = stale();
+  const text = found ? `Stale since ${clock(found.since)} UTC: ${found.text}` : (model.problems.at(-1)?.text ?? empty);
+  if (connection.textContent !== text) connection.textContent = text;
+  document.body.classList.toggle("stale", found !== undefined);
+  const now = playback.following ? "live" : "paused";
+  mode.textContent = complete ? "replay" : found ? "stale" : live ? now : "connecting";
 }
 
 /** Everything is told again: the moment that is shown stays. */
@@ -103,7 +132,7 @@ function restart(): void {
 function finish(): void {
   complete = true;
   if (!Number.isFinite(model.begin)) {
-    connection.textContent = "The recording is empty.";
+    empty = "The recording is empty.";
     return;
   }
   playback.seek(model.begin);
@@ -127,7 +156,7 @@ function showTicks(): void {
 
 function show(): void {
   lists.show(playback.time, selected);
-  mode.textContent = complete ? "replay" : live ? (playback.following ? "live" : "paused") : "connecting";
+  showConnection();
   play.textContent = playback.playing || playback.following ? "Pause" : "Play";
   liveButton.hidden = !live;
   liveButton.setAttribute("aria-pressed", String(playback.following));
@@ -180,11 +209,15 @@ function frame(now: number): void {
 void openMap();
 listen({
   events: take,
-  connected: () => (connection.textContent = ""),
+  connected: () => {
+    lost = undefined;
+    heard = performance.now();
+  },
   lost: (forGood) => {
-    connection.textContent = forGood
-      ? "The server refused the page: open the address that `fractus view` printed again."
-      : "The server does not answer; trying again.";
+    const text = forGood
+      ? "the server refused the page: open the address that `fractus view` printed again."
+      : "the server does not answer; trying again.";
+    lost = { since: lost?.since ?? Date.now(), text };
   },
 });
 requestAnimationFrame(frame);

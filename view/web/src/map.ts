@@ -4,20 +4,18 @@ import { type GeoJSONSource, LngLatBounds, Map as MapLibre, NavigationControl, P
 import "maplibre-gl/dist/maplibre-gl.css";
 import workerUrl from "maplibre-gl/dist/maplibre-gl-worker.mjs?url";
 
-import type { Feature } from "./events";
+import type { Feature, Link } from "./events";
 import { GAP_MS, type Drone, type Model } from "./model";
-import { band, kindName } from "./words";
+import { band, facts } from "./words";
 
 setWorkerUrl(new URL(workerUrl, window.location.href).href);
 
 const PATH_PERIOD_MS = 400;
-/** A drone that was not heard of for so long is drawn pale. */
-const STALE_MS = 30_000;
 const REACH_PX = 18;
 /** A zone that is drawn smaller has its name in the list alone. */
 const MIN_NAMED_PX = 40;
 
-const KINDS = ["operationArea", "corridor", "zone"] as const;
+const KINDS = ["operationArea", "corridor", "depot", "zone"] as const;
 
 export interface Colours {
   background: string;
@@ -27,6 +25,9 @@ export interface Colours {
   operationArea: string;
   corridor: string;
   path: string;
+  depot: string;
+  link: string;
+  place: string;
 }
 
 type Lines = GeoJSON.Feature<GeoJSON.MultiLineString>[];
@@ -190,7 +191,11 @@ export class FlightMap {
     context.clearRect(0, 0, width, height);
     context.font = "600 12px system-ui, sans-serif";
     context.lineJoin = "round";
-    for (const feature of this.features) if (feature.properties.kind === "zone") this.name(context, feature);
+    for (const feature of this.features) {
+      if (feature.properties.kind === "zone") this.name(context, feature);
+      else if (feature.geometry.type === "Point") this.place(context, feature);
+    }
+    for (const link of this.model.linksAt(time)) this.link(context, link, time);
     this.shown = [];
     for (const drone of this.model.drones.values()) {
       const position = drone.position(time);
@@ -198,7 +203,7 @@ export class FlightMap {
       const { x, y } = this.map.project([position.lon, position.lat]);
       if (x < -50 || y < -50 || x > width + 50 || y > height + 50) continue;
       this.shown.push({ x, y, name: drone.name });
-      context.globalAlpha = time - position.seen > STALE_MS ? 0.45 : 1;
+      context.globalAlpha = drone.stale(time) ? 0.45 : 1;
       this.marker(context, x, y, position.heading, drone.name === selected);
       this.label(context, x, y, drone.name);
     }
@@ -223,6 +228,34 @@ export class FlightMap {
     context.lineWidth = selected ? 3 : 2;
     context.stroke();
     context.fill();
+    context.restore();
+  }
+
+  /** An edge node: a square. */
+  private place(context: CanvasRenderingContext2D, feature: Feature): void {
+    const [lon, lat] = (feature.geometry as GeoJSON.Point).coordinates as [number, number];
+    const { x, y } = this.map.project([lon, lat]);
+    context.globalAlpha = feature.properties.state === "ready" ? 1 : 0.55;
+    context.fillStyle = this.colours.place;
+    context.fillRect(x - 5, y - 5, 10, 10);
+    context.textAlign = "left";
+    this.write(context, x + 9, y + 4, feature.properties.name);
+    context.globalAlpha = 1;
+  }
+
+  /** A direct link from drone to node: dashed until it is up, thick while traffic takes it. */
+  private link(context: CanvasRenderingContext2D, link: Link, time: number): void {
+    const drone = this.model.drones.get(link.drone)?.position(time);
+    if (drone === undefined || link.phase === "Idle") return;
+    const [from, to] = [this.map.project([drone.lon, drone.lat]), this.map.project([link.lon, link.lat])];
+    context.save();
+    context.beginPath();
+    context.moveTo(from.x, from.y);
+    context.lineTo(to.x, to.y);
+    context.setLineDash(link.phase === "Up" ? [] : [4, 4]);
+    context.lineWidth = link.traffic === "direct" ? 4 : 1.5;
+    context.strokeStyle = this.colours.link;
+    context.stroke();
     context.restore();
   }
 
@@ -256,7 +289,7 @@ export class FlightMap {
     if (near !== undefined) return this.pick(near.name);
     const layers = KINDS.map((kind) => `${kind}-fill`);
     const found = this.map.queryRenderedFeatures([point.x, point.y], { layers }).map((one) => this.features[Number(one.id)]);
-    const lines = new Set(found.filter((one) => one !== undefined).map((one) => `${one.properties.name} (${kindName(one)}): ${band(one)}`));
+    const lines = new Set(found.filter((one) => one !== undefined).map((one) => `${one.properties.name}: ${facts(one)}`));
     if (lines.size === 0) return void this.popup.remove();
     this.popup.setLngLat(place).setText([...lines].join("\n")).addTo(this.map);
   }

@@ -1,11 +1,13 @@
 // All that was told, in the order of time, so that any moment of it can be shown.
 
-import type { Areas, Event, Feature, Fix, Note, Picture, Problem, State, Verdict } from "./events";
+import type { Applications, Areas, Contact, Event, Feature, Fix, Link, Links, Note, Picture, Policies, Problem, State, Verdict } from "./events";
 
 const MAX_FIXES = 20_000;
 const MAX_OTHERS = 5_000;
 /** Between two positions further apart in time the drone was not seen: no line is drawn. */
 export const GAP_MS = 10_000;
+/** A drone that was not heard of for so long is drawn pale: on the ground it may report every 30 s. */
+const STALE_MS = 45_000;
 
 /** Values in the order of their times; when there are too many, the oldest go, or every second one of the older half. */
 export class Series<T extends { time_ms: number }> {
@@ -55,6 +57,13 @@ export class Drone {
 
   constructor(readonly name: string) {}
 
+  /** Whether nothing was heard of it for long. */
+  stale(time: number): boolean {
+    const state = this.states.at(time);
+    const heard = Math.max(state?.seen_ms ?? state?.time_ms ?? -Infinity, this.fixes.at(time)?.time_ms ?? -Infinity);
+    return time - (state?.seen_ms ?? heard) > STALE_MS;
+  }
+
   /** Where it was at a moment, between the two positions around it. */
   position(time: number): { lat: number; lon: number; heading: number | null; seen: number } | undefined {
     const count = this.fixes.count(time);
@@ -81,6 +90,10 @@ export class Model {
   readonly verdicts = new Series<Verdict>(MAX_OTHERS);
   readonly notes = new Series<Note>(MAX_OTHERS);
   readonly problems: Problem[] = [];
+  readonly applications = new Series<Applications>(1_000);
+  readonly policies = new Series<Policies>(100);
+  private readonly links = new Series<Links>(1_000);
+  contact: Contact | undefined;
   private readonly areas = new Map<string, Series<Areas>>();
   begin = Infinity;
   end = -Infinity;
@@ -98,6 +111,17 @@ export class Model {
         return this.drone(event.drone).fixes.add(event);
       case "state":
         return this.drone(event.drone).states.add(event);
+      case "gone":
+        return void this.drones.delete(event.drone);
+      case "applications":
+        return this.applications.add(event);
+      case "links":
+        return this.links.add(event);
+      case "policies":
+        return this.policies.add(event);
+      case "contact":
+        this.contact = event;
+        return;
       case "picture":
         return this.drone(event.drone).pictures.add(event);
       case "verdict":
@@ -117,6 +141,10 @@ export class Model {
   /** The zones and areas that hold at a moment; before the first were told, those. */
   features(time: number): Feature[] {
     return [...this.areas.values()].flatMap((known) => (known.at(time) ?? known.values[0])?.features ?? []);
+  }
+
+  linksAt(time: number): Link[] {
+    return this.links.at(time)?.links ?? [];
   }
 
   /** All pictures taken by a moment, the newest first. */

@@ -7,7 +7,12 @@ const KIND_NAMES: Record<string, string> = {
   operationArea: "operation area",
   corridor: "corridor",
   path: "planned path",
+  depot: "depot",
+  edgeNode: "edge node",
 };
+
+/** What has heights. */
+const TALL = new Set(["zone", "operationArea", "corridor"]);
 
 const REFERENCES: Record<string, string> = { home: "above home", amsl: "above sea level", terrain: "above ground" };
 
@@ -20,6 +25,12 @@ const ACTIONS: Record<string, string> = {
 
 export function kindName(feature: Feature): string {
   return KIND_NAMES[feature.properties.kind] ?? feature.properties.kind;
+}
+
+/** What is said of something on the map beside its name. */
+export function facts(feature: Feature): string {
+  const { kind, state } = feature.properties;
+  return [kindName(feature), TALL.has(kind) ? band(feature) : "", state ?? ""].filter(Boolean).join(", ");
 }
 
 /** The heights that an area has. */

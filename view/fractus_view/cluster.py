@@ -1,0 +1,172 @@
+"""What a cluster says of its flights now: watches its objects, and says when they are not heard of any more."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import AsyncIterator, Callable, Iterator
+from typing import Any, TypeVar
+
+from fractus_core import api
+from fractus_kube import Body, Client, Key, Kind, KubeError, Reflector
+
+from fractus_view import objects
+from fractus_view.events import Applications, Areas, Contact, Event, Gone, Links, Policies, Problem
+from fractus_view.hub import Hub
+
+GATHER_S = 0.2
+"""How long changes are gathered before they are told."""
+
+CONTACT_S = 1.0
+"""How often the API server is asked whether it is there."""
+
+ANSWER_S = 3.0
+"""An API server that takes longer is not there."""
+
+GRACE_S = 2.0
+"""For so long nothing is said: watches end and begin again all the time."""
+
+T = TypeVar("T", bound=api.Resource)
+
+KINDS: tuple[type[api.Resource], ...] = (
+    api.Drone, api.EdgeNode, api.Depot, api.Zone, api.Policy, api.Application, api.DeploymentPlan, api.DirectLink,
+)  # fmt: skip
+"""What is read."""
+
+
+class Cluster:
+    """The flights of a cluster; of it nothing is changed.
+
+    Args:
+        client: of the API server.
+        namespace: whose applications are shown; empty: all.
+        now_ms: Unix milliseconds.
+    """
+
+    def __init__(
+        self, client: Client, namespace: str = "", now_ms: Callable[[], int] = lambda: round(time.time() * 1000)
+    ) -> None:
+        self._client = client
+        self._now_ms = now_ms
+        self._hub = Hub()
+        self._changed: set[type[api.Resource]] = set()
+        self._drones: set[str] = set()
+        self._heard_ms = now_ms()
+        self._reflectors: dict[type[api.Resource], Reflector[Any]] = {
+            model: self._reflector(model, namespace if model.NAMESPACED else "") for model in KINDS
+        }
+
+    def picture(self, id_: str) -> bytes | None:
+        """None: a cluster keeps no pictures."""
+        del id_
+        return None
+
+    def stream(self, last_id: str) -> AsyncIterator[bytes]:
+        """What holds, then what happens."""
+        return self._hub.stream(last_id)
+
+    async def check(self) -> None:
+        """Ask for everything once.
+
+        Raises:
+            KubeError: the API server cannot be reached, has not our kinds, or refuses them.
+        """
+        for reflector in self._reflectors.values():
+            await self._ask(reflector.kind)
+
+    async def run(self) -> None:
+        """Watch until cancelled."""
+        async with asyncio.TaskGroup() as group:
+            for reflector in self._reflectors.values():
+                group.create_task(reflector.run())
+            group.create_task(self._keep_contact())
+            group.create_task(self._tell())
+
+    # What is so
+
+    def _reflector(self, model: type[T], namespace: str) -> Reflector[T]:
+        def parse(body: Body) -> T:
+            try:
+                return model.from_body(body)
+            except api.InvalidObject as error:
+                self._hub.publish([Problem(self._now_ms(), f"a {model.KIND} cannot be read: {error}")])
+                raise
+
+        def changed(key: Key, _old: T | None, _new: T | None) -> None:
+            self._changed.add(model)
+            if model is api.Drone:
+                self._drones.add(key[1])
+
+        kind = Kind(api.API_VERSION, model.KIND, model.PLURAL, model.NAMESPACED)
+        return Reflector(self._client, kind, parse, changed, namespace=namespace)
+
+    async def _tell(self) -> None:
+        for reflector in self._reflectors.values():
+            await reflector.synced.wait()
+        self._changed = set(KINDS)
+        while True:
+            changed, self._changed = self._changed, set()
+            drones, self._drones = self._drones, set()
+            if changed:
+                self._hub.publish(self._events(changed, drones))
+            await asyncio.sleep(GATHER_S)
+
+    def _events(self, changed: set[type[api.Resource]], drones: set[str]) -> Iterator[Event]:
+        now_ms = self._now_ms()
+        for name in sorted(drones):
+            yield from self._drone(name, now_ms)
+        if api.Zone in changed:
+            yield Areas("zones", now_ms, objects.zones(self._all(api.Zone)))
+        if changed & {api.EdgeNode, api.Depot}:
+            yield Areas("places", now_ms, objects.places(self._all(api.EdgeNode), self._all(api.Depot)))
+        if changed & {api.Application, api.DeploymentPlan}:
+            plans = {
+                (plan.metadata.namespace or "", plan.spec.application): plan for plan in self._all(api.DeploymentPlan)
+            }
+            yield Areas("plans", now_ms, objects.intentions(self._all(api.Application), plans))
+        if api.Application in changed:
+            found = sorted(map(objects.application, self._all(api.Application)), key=lambda each: each.name)
+            yield Applications(now_ms, found)
+        if api.DirectLink in changed:
+            yield Links(now_ms, sorted(map(objects.link, self._all(api.DirectLink)), key=lambda each: each.name))
+        if api.Policy in changed:
+            yield Policies(now_ms, sorted(map(objects.policy, self._all(api.Policy)), key=lambda each: each.name))
+
+    def _drone(self, name: str, now_ms: int) -> Iterator[Event]:
+        drone: api.Drone | None = self._reflectors[api.Drone].get(("", name))
+        if drone is None:
+            yield Gone(name, now_ms)
+            return
+        yield objects.state(drone, now_ms)
+        fix = objects.fix(drone, now_ms)
+        if fix is not None:
+            yield fix
+
+    def _all(self, model: type[T]) -> Iterator[T]:
+        return self._reflectors[model].values()
+
+    # Whether it is so now
+
+    async def _keep_contact(self) -> None:
+        """Ask the API server all the time: a watch that hears nothing looks like one where nothing happens."""
+        while True:
+            problem = await self._problem()
+            now_ms = self._now_ms()
+            if problem is None:
+                self._heard_ms = now_ms
+                self._hub.publish([Contact(now_ms, None, "")])
+            elif now_ms - self._heard_ms > GRACE_S * 1000:
+                self._hub.publish([Contact(now_ms, self._heard_ms, problem)])
+            await asyncio.sleep(CONTACT_S)
+
+    async def _problem(self) -> str | None:
+        """Why what is known may not be so any more; None: it is."""
+        unheard = [each for each in self._reflectors.values() if not (each.watching and each.synced.is_set())]
+        try:
+            await self._ask((unheard or list(self._reflectors.values()))[0].kind)
+        except KubeError as error:
+            return str(error)
+        return f"{unheard[0].kind.plural} are not watched yet" if unheard else None
+
+    async def _ask(self, kind: Kind) -> None:
+        await self._client.request("GET", kind.path(), params={"limit": "1"}, timeout_s=ANSWER_S)

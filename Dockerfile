@@ -1,4 +1,4 @@
-# Images of Fractus: operator, agent, services, component (what applications build on), sim, and the examples.
+# Images of Fractus: operator, agent, services, view, component (what applications build on), sim, and the examples.
 #
 #   docker build --target operator --tag localhost/fractus/operator:dev .
 #
@@ -59,7 +59,7 @@ ENV UV_LINK_MODE=copy UV_PYTHON=/usr/bin/python3 UV_PYTHON_DOWNLOADS=never
 # MCAP files are written with LZ4: zstandard stays out.
 RUN --mount=type=cache,target=/root/.cache/uv \
     set -e; \
-    for name in sdk core operator agent services; do \
+    for name in sdk core operator agent services view; do \
       cd /build; extra="--extra $name"; if [ "$name" = sdk ]; then extra=; fi; \
       uv export --quiet --frozen --no-dev --no-emit-project $extra --output-file /build/$name.txt; \
       uv pip install --quiet --no-deps --require-hashes --target /deps/$name -r /build/$name.txt; \
@@ -74,14 +74,14 @@ RUN --mount=type=cache,target=/root/.cache/uv \
         frozenlist/*.so propcache/*.so 2>/dev/null || true; \
       find . \( -name '*.pyi' -o -name '*.pyx' -o -name '*.pxd' -o -name '*.c' -o -name '*.h' -o -name '*.a' \) -delete; \
     done; \
-    for pair in core:sdk operator:core agent:core services:core; do \
+    for pair in core:sdk operator:core agent:core services:core view:core; do \
       name=${pair%:*}; below=${pair#*:}; cp -a /deps/$name /only-$name; \
       (cd /deps/$below && find . ! -type d -print0) | (cd /only-$name && xargs -0 rm -f); \
       find /only-$name -type d -empty -delete; \
     done; \
     cp -a /deps/sdk /only-sdk; \
     mkdir /only-geometry; cd /only-core; mv numpy* shapely* geographiclib* /only-geometry/; \
-    for name in sdk core geometry operator agent services; do \
+    for name in sdk core geometry operator agent services view; do \
       python3 -m compileall -q --invalidation-mode unchecked-hash -s /only-$name \
         -p /usr/local/lib/python3.11/dist-packages /only-$name; \
     done
@@ -105,6 +105,7 @@ RUN uv build --quiet --wheel --no-build-isolation --out-dir /wheel \
  && assemble operator fractus_core fractus_kube fractus_operator \
  && assemble agent fractus_core fractus_kube fractus_storage fractus_agent \
  && assemble services fractus fractus_cli fractus_core fractus_mavlink fractus_storage fractus_services \
+ && assemble view fractus_core fractus_kube fractus_cli fractus_view \
  && assemble sim fractus_vehicle fractus_world
 
 # ---- python: the common start of all images, with what the SDK needs
@@ -144,6 +145,12 @@ COPY --from=dependencies /only-operator /usr/local/lib/python3.11/dist-packages
 USER 10001:10001
 ENTRYPOINT ["python3", "-m", "fractus_operator"]
 COPY --from=code /images/operator /usr/local/lib/python3.11/dist-packages
+
+FROM domain AS view
+COPY --from=dependencies /only-view /usr/local/lib/python3.11/dist-packages
+USER 10001:10001
+ENTRYPOINT ["fractus", "view"]
+COPY --from=code /images/view /usr/local/lib/python3.11/dist-packages
 
 FROM model AS agent
 COPY --from=nft /out /

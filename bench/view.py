@@ -84,7 +84,7 @@ class Fleet:
 
 async def measure(browser: Browser, count: int, seconds: float) -> dict[str, float]:
     """The map's delay, and frames and scripts' time (ms) while some drones fly."""
-    shown = View(Fleet(count), "127.0.0.1")
+    shown = View(Fleet(count), frozenset())
     runner = web.AppRunner(shown.application(), shutdown_timeout=0.1)
     await runner.setup()
     site = web.TCPSite(runner, "127.0.0.1", 0)

@@ -110,7 +110,7 @@ def checkout(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("changed", "stale"),
     [
-        ("core/module.py", {"operator", "agent", "services", "sim"}),
+        ("core/module.py", {"operator", "agent", "services", "sim", "view"}),
         ("operator/module.py", {"operator"}),
         (
             "sdk/module.py",

@@ -13,6 +13,7 @@ from contextlib import aclosing
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, get_args
+from unittest.mock import AsyncMock
 
 import pytest
 from aiohttp import ClientSession, hdrs, web
@@ -247,7 +248,7 @@ async def test_a_directory_is_followed_while_services_write_to_it(tmp_path: Path
 
 @pytest.fixture
 async def served(recording: Path) -> AsyncIterator[tuple[str, View]]:
-    shown = View(Replay([recording]), "127.0.0.1")
+    shown = View(Replay([recording]), frozenset())
     runner = web.AppRunner(shown.application(), shutdown_timeout=0.1)
     await runner.setup()
     site = web.TCPSite(runner, "127.0.0.1", 0)
@@ -266,6 +267,18 @@ async def test_without_the_token_nothing_is_shown(served: tuple[str, View]) -> N
                     assert "fractus view" in await answer.text()
         async with session.get(address, headers={hdrs.AUTHORIZATION: f"Bearer {shown.token}"}) as answer:
             assert answer.status == 200
+
+
+async def test_whether_it_works_is_told_without_the_token_and_nothing_else(served: tuple[str, View]) -> None:
+    address, shown = served
+    async with ClientSession() as session:
+        async with session.get(f"{address}/healthz") as answer:
+            assert (answer.status, await answer.text()) == (200, "ok\n")
+        broken = shown.source.run = AsyncMock(side_effect=RuntimeError)  # type: ignore[method-assign]
+        shown._running = asyncio.create_task(broken())
+        await asyncio.wait({shown._running})
+        async with session.get(f"{address}/healthz") as answer:
+            assert answer.status == 503
 
 
 async def test_the_token_leaves_the_address_for_a_cookie_that_scripts_do_not_see(served: tuple[str, View]) -> None:

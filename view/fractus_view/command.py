@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import signal
 from contextlib import aclosing
+from dataclasses import dataclass
 from ipaddress import ip_address
 from pathlib import Path
 
@@ -23,6 +24,16 @@ _REMEDIES = {
     0: "check the cluster and --context, or give recordings to replay",
     404: "install the chart fractus-crds",
 }
+
+
+@dataclass(frozen=True, slots=True)
+class Site:
+    """Where to serve, by which further names, and to who knows what token; None: a new one."""
+
+    host: str
+    port: int
+    hostnames: tuple[str, ...]
+    token: str | None
 
 
 def _listen(_context: click.Context, _option: click.Parameter, text: str) -> tuple[str, int]:
@@ -60,6 +71,9 @@ def _listen(_context: click.Context, _option: click.Parameter, text: str) -> tup
     help="Where to serve; port 0 takes a free one.",
 )
 @click.option(
+    "--hostname", "hostnames", multiple=True, metavar="NAME", help="What browsers may call it as well; repeat."
+)
+@click.option(
     "--token-file",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
     help="Who knows what is in it may look; else a new token is made at each start.",
@@ -72,6 +86,7 @@ def view(
     context: str | None,
     config: Path | None,
     listen: tuple[str, int],
+    hostnames: tuple[str, ...],
     token_file: Path | None,
 ) -> None:
     """Show flights on a web page: those of a cluster, as they happen, or a replay of RECORDINGs (MCAP files).
@@ -81,13 +96,13 @@ def view(
     of_cluster = bool(namespace or context or config)
     if bool(recordings) + (directory is not None) + of_cluster > 1:
         raise click.UsageError("give recordings to replay, --recordings, or the options of a cluster: one of them")
-    token = None if token_file is None else _token(token_file)
+    site = Site(*listen, hostnames, None if token_file is None else _token(token_file))
     if directory is not None:
-        asyncio.run(_serve(Following(directory), *listen, token))
+        asyncio.run(_serve(Following(directory), site))
     elif recordings:
-        asyncio.run(_serve(_replay(recordings), *listen, token))
+        asyncio.run(_serve(_replay(recordings), site))
     else:
-        asyncio.run(_serve_cluster(config, context, namespace, listen, token))
+        asyncio.run(_serve_cluster(config, context, namespace, site))
 
 
 def _token(path: Path) -> str:
@@ -107,9 +122,7 @@ def _replay(recordings: tuple[Path, ...]) -> Source:
     return Replay(recordings)
 
 
-async def _serve_cluster(
-    config: Path | None, context: str | None, namespace: str, listen: tuple[str, int], token: str | None
-) -> None:
+async def _serve_cluster(config: Path | None, context: str | None, namespace: str, site: Site) -> None:
     try:
         access = await (kubeconfig(config, context) if config is not None else from_environment(context))
         client = Client(access, "fractus-view")
@@ -122,15 +135,18 @@ async def _serve_cluster(
         except KubeError as error:
             remedy = _REMEDIES.get(error.status, "check your permissions: the role view is enough")
             raise click.ClickException(f"{error}; {remedy}") from error
-        await _serve(cluster, *listen, token)
+        await _serve(cluster, site)
 
 
-async def _serve(source: Source, host: str, port: int, token: str | None) -> None:
+async def _serve(source: Source, where: Site) -> None:
     stopped = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stopped.set)
-    served = View(source, host) if token is None else View(source, host, token)
+    served = View(source, frozenset(name.lower() for name in (where.host, *where.hostnames)))
+    if where.token is not None:
+        served.token = where.token
+    host, port = where.host, where.port
     runner = web.AppRunner(served.application(), access_log=None, handle_signals=False, shutdown_timeout=1.0)
     await runner.setup()
     try:
@@ -144,7 +160,7 @@ async def _serve(source: Source, host: str, port: int, token: str | None) -> Non
         bound = runner.addresses[0][1]
         name = f"[{host}]" if ":" in host else host
         # A token that was given is known already, and logs are read by more people.
-        said = f"?token={served.token}" if token is None else "?token=..."
+        said = f"?token={served.token}" if where.token is None else "?token=..."
         click.echo(f"view: open http://{name}:{bound}/{said}")
         if not _loopback(host):
             click.echo("view: others on this network can read what is sent, the token too: put TLS before it", err=True)

@@ -41,26 +41,29 @@ ALIVE_S = 15.0
 
 MAX_STREAMS = 64
 
+HEALTH = "/healthz"
+"""The one path that needs no token."""
+
 _Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
-@dataclass(frozen=True)
+@dataclass
 class View:
     """What is served.
 
     Attributes:
         source: of the events and pictures.
-        host: the name or address that it is bound to; it is what browsers may call the server, besides addresses and
-            localhost.
+        names: what browsers may call the server, besides addresses and localhost.
         token: who knows it may look.
         page: the directory of the built page.
     """
 
     source: Source
-    host: str
+    names: frozenset[str]
     token: str = field(default_factory=lambda: secrets.token_urlsafe(32))
     page: Path = PAGE
     _streams: set[object] = field(default_factory=set)
+    _running: asyncio.Task[None] | None = None
 
     def application(self) -> web.Application:
         """For aiohttp to run.
@@ -73,18 +76,25 @@ class View:
         files = {path.relative_to(self.page).as_posix(): path.read_bytes() for path in _files(self.page)}
         for name, data in files.items():
             application.router.add_get("/" if name == "index.html" else f"/{name}", _static(name, data))
+        application.router.add_get(HEALTH, self._health)
         application.router.add_get("/stream", self._stream)
         application.router.add_get("/pictures/{id}", self._picture)
-        application.cleanup_ctx.append(self._running)
+        application.cleanup_ctx.append(self._run)
         return application
 
-    async def _running(self, _application: web.Application) -> AsyncIterator[None]:
+    async def _run(self, _application: web.Application) -> AsyncIterator[None]:
         """Keep the source current while the server runs; without it the page would silently stand still."""
-        task = asyncio.create_task(self.source.run())
+        self._running = task = asyncio.create_task(self.source.run())
         task.add_done_callback(_ended)
         yield
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
+
+    async def _health(self, _request: web.Request) -> web.Response:
+        """For who restarts a server that shows nothing new any more; it says nothing of what is shown."""
+        task = self._running
+        ended = task is None or (task.done() and (task.cancelled() or task.exception() is not None))
+        return web.Response(status=503 if ended else 200, text="nothing new is shown any more\n" if ended else "ok\n")
 
     @web.middleware
     async def _only_reads(self, request: web.Request, handler: _Handler) -> web.StreamResponse:
@@ -96,8 +106,10 @@ class View:
     @web.middleware
     async def _only_our_name(self, request: web.Request, handler: _Handler) -> web.StreamResponse:
         """A foreign name that leads here is how a web site would read the page from a user's browser (DNS rebinding)."""
-        if not _ours(request.headers.get(hdrs.HOST, ""), self.host):
-            return web.Response(status=421, text="call this server by its address, by localhost, or as --listen says\n")
+        if not _ours(request.headers.get(hdrs.HOST, ""), self.names):
+            return web.Response(
+                status=421, text="call this server by its address, by localhost, or as --listen or --hostname says\n"
+            )
         return await handler(request)
 
     @web.middleware
@@ -110,7 +122,7 @@ class View:
             response.set_cookie(cookie, self.token, httponly=True, samesite="Strict", path="/")
             return response
         bearer = request.headers.get(hdrs.AUTHORIZATION, "").removeprefix("Bearer ")
-        if self._right(request.cookies.get(cookie, "")) or self._right(bearer):
+        if request.path == HEALTH or self._right(request.cookies.get(cookie, "")) or self._right(bearer):
             return await handler(request)
         return web.Response(status=401, text="open the address that `fractus view` printed: it has the token\n")
 
@@ -172,11 +184,11 @@ def _cookie(request: web.Request) -> str:
     return f"fractus-view-{port if port.isdecimal() else 80}"
 
 
-def _ours(host: str, bound: str) -> bool:
-    """Whether a Host header has an address, localhost, or the name that the server was told to bind to."""
+def _ours(host: str, names: frozenset[str]) -> bool:
+    """Whether a Host header has an address, localhost, or one of some names."""
     name = host.rpartition(":")[0] if host.rpartition(":")[2].isdecimal() else host
     name = name.removeprefix("[").removesuffix("]").lower()
-    if name in {"localhost", bound.lower()}:
+    if name in names | {"localhost"}:
         return True
     try:
         ip_address(name)

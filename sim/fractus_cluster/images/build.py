@@ -30,6 +30,7 @@ _CODE: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "operator": ("core", "kube", "operator", "proto"),
         "agent": ("core", "kube", "storage", "agent", "proto"),
         "services": ("core", "mavlink", "storage", "services", "sdk", "cli", "proto"),
+        "view": ("core", "kube", "cli", "view/fractus_view", "proto"),
         "sim": ("core", "mavlink", "storage", "services", "sdk", "cli", "proto", "sim"),
         "example-traffic-monitoring": ("sdk", "cli", "proto", "examples/traffic-monitoring"),
         "example-field": ("sdk", "cli", "proto", "examples/field"),

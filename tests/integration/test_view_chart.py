@@ -1,0 +1,66 @@
+"""The view as a workload of the chart: what it may do, and what of it is there unless asked for."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import chart as fractus_chart
+import pytest
+from control_plane import ControlPlane
+from fractus_kube import KubeError
+from fractus_view.cluster import KINDS
+from operator_world import FRACTUS, SYSTEM, World
+
+Body = dict[str, Any]
+
+
+def of_view(*arguments: str) -> dict[str, Body]:
+    bodies = fractus_chart.render(*arguments)
+    label = "app.kubernetes.io/component"
+    return {body["kind"]: body for body in bodies if body["metadata"].get("labels", {}).get(label) == "view"}
+
+
+def test_it_is_only_there_when_asked_for_and_may_write_nothing() -> None:
+    assert of_view() == {}
+    found = of_view("--set", "view.enabled=true", "--set", "view.hostnames={view.example.org}")
+    assert set(found) == {
+        "ServiceAccount", "ClusterRole", "ClusterRoleBinding", "Deployment", "Service", "NetworkPolicy",
+    }  # fmt: skip
+    (rule,) = found["ClusterRole"]["rules"]
+    assert set(rule["resources"]) == {kind.PLURAL for kind in KINDS}
+    assert set(rule["verbs"]) == {"list", "watch"}
+    pod = found["Deployment"]["spec"]["template"]["spec"]
+    (container,) = pod["containers"]
+    assert pod["securityContext"]["runAsNonRoot"] is True
+    assert container["securityContext"] == {
+        "allowPrivilegeEscalation": False, "readOnlyRootFilesystem": True, "capabilities": {"drop": ["ALL"]},
+    }  # fmt: skip
+    assert "--hostname=view.example.org" in container["args"]
+    (volume,) = pod["volumes"]
+    assert volume["secret"]["secretName"] == "fractus-view"
+    assert all(container[probe]["httpGet"]["path"] == "/healthz" for probe in ("readinessProbe", "livenessProbe"))
+    (port,) = found["NetworkPolicy"]["spec"]["ingress"][0]["ports"]
+    assert {port["port"], found["Service"]["spec"]["ports"][0]["targetPort"]} == {container["ports"][0]["name"]}
+
+
+def test_the_api_server_lets_it_list_and_nothing_else(control_plane: ControlPlane, world: World) -> None:
+    found = of_view("--set", "view.enabled=true")
+    made = [found[kind] for kind in ("ServiceAccount", "ClusterRole", "ClusterRoleBinding")]
+    for body in made:
+        world.api.apply(fractus_chart.path_of(body), body)
+    try:
+        request = {"apiVersion": "authentication.k8s.io/v1", "kind": "TokenRequest", "spec": {"expirationSeconds": 600}}
+        path = f"/api/v1/namespaces/{SYSTEM}/serviceaccounts/fractus-view/token"
+        api = control_plane.with_token(str(world.api.call("POST", path, request)["status"]["token"]))
+        for kind in KINDS:
+            api.list(f"{FRACTUS}/{kind.PLURAL}")
+        for refused in (f"{FRACTUS}/grants", "/api/v1/secrets", "/api/v1/pods", "/api/v1/nodes"):
+            with pytest.raises(KubeError) as error:
+                api.list(refused)
+            assert error.value.status == 403
+        with pytest.raises(KubeError) as error:
+            api.merge(f"{FRACTUS}/drones/drone-1", {"spec": {"depot": "elsewhere"}})
+        assert error.value.status == 403
+    finally:
+        for body in made:
+            world.api.delete(fractus_chart.path_of(body))

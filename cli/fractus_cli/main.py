@@ -56,6 +56,7 @@ COMMANDS: dict[str, Entry] = {
     "doctor": Entry("fractus_cli.doctor:doctor", "Check a cluster, and say what it lacks to fly.", "operator"),
     "experiment": Entry("fractus_sim.experiment.cli:experiment", "Run experiments with faults, checks and a report.", "sim"),
     "explain": Entry("fractus_cli.explain:explain", "Say why an Application runs where it runs.", "kube"),
+    "forward": Entry("fractus_cli.forward:forward", "Send what an autopilot says to a ground station, read only.", "services"),
     "grants": Entry("fractus_cli.grants:grants", "Sign Grants and make certificates, without Kubernetes.", "operator"),
     "images": Entry("fractus_cluster.images.cli:images", "Build the container images of Fractus with buildah.", "sim"),
     "mobility": Entry("fractus_services.commands:mobility", "The mobility service of a drone.", "services"),

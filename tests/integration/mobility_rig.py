@@ -243,6 +243,10 @@ class Rig:
             "--listen", self.address, "--description", str(self.directory / "none.yaml"), "--driver-grace", "3", *more,
         )  # fmt: skip
 
+    def start(self, name: str, *arguments: str) -> None:
+        """Another program of Python's."""
+        self._start(name, *arguments)
+
     def _start(self, name: str, *arguments: str) -> None:
         with (self.directory / f"{name}.log").open("ab") as log:
             self._processes[name] = subprocess.Popen(

@@ -363,3 +363,14 @@ def test_a_climb_to_below_a_zone_is_let_pass_and_so_is_a_landing() -> None:
 def correction(verdict: Verdict | None) -> str:
     """The code of a correction."""
     return verdict.code if verdict is not None and verdict.action == "correct" else ""
+
+
+def test_a_climb_that_was_never_judged_is_ended_with_half_the_slack_left() -> None:
+    grant = compiled(altitude(upperLimit=10))
+    climbing = at(0, 0, 10.8, down_mps=-0.7)
+    assert correction(monitor(climbing, grant, leaving=True)) == "AltitudeAboveLimit"
+    assert monitor(climbing, grant) is None, "the driver's, which was judged"
+    leg = goto(0, 50, 10.0).args
+    assert isinstance(leg, GotoArgs)
+    assert monitor(climbing, grant, leaving=True, bound_for=leg) is None, "the system's own leg"
+    assert monitor(at(0, 0, 11.4, down_mps=-0.1), grant, leaving=True) is None, "it holds its height"

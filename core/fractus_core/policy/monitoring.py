@@ -34,6 +34,9 @@ SINKING_MPS = 0.5
 """A drone that climbs no faster than this may go on while its altitude limits cannot be worked out; one that the system
 flies, and that sinks faster, is on its way back under a limit."""
 
+CLIMBING_MPS = 0.2
+"""A drone that holds its height climbs no faster than this."""
+
 DEEPER_M = 0.6
 """A drone on the wrong side of a fence is stopped again only when it moves this much further in."""
 
@@ -94,8 +97,11 @@ def monitor(
         worst = _worst(_fences(now, grant, _rest_of_leg(now, grant, start, bound_for, margin), leaving=leaving))
         if worst is not None:
             return replace(worst, brake_first=worst.action == "takeover" and moving(now))
-    told_m = _told_m(now, level_m)
-    return _heights(now, grant, start, stop, told_m, sinks_back=leaving) or _speeds(now, grant, start)
+    rest_m = _told_m(now, level_m)
+    # A climb of the autopilot's own was never judged and may end anywhere, so less than the whole slack is left to it.
+    unasked = leaving and bound_for is None and now.down_mps < -CLIMBING_MPS
+    found = _heights(now, grant, start, stop, rest_m, sinks_back=leaving, share=0.5 if unasked else 1.0)
+    return found or _speeds(now, grant, start)
 
 
 def _worst(found: list[tuple[int, Verdict]]) -> Verdict | None:
@@ -317,11 +323,12 @@ def _reaction(found: _Finding, *, leaving: bool) -> Verdict | None:
 
 
 def _heights(
-    now: Situation, grant: CompiledGrant, start: XY, stop: XY, rest_m: float, *, sinks_back: bool
+    now: Situation, grant: CompiledGrant, start: XY, stop: XY, rest_m: float, *, sinks_back: bool, share: float
 ) -> Verdict | None:
     """The correction of an altitude that breaks limits, when the drone has come to rest at `stop` and `rest_m`.
 
-    Lower limits do not hold for a drone that takes off or lands; `sinks_back`: nor upper ones for one that sinks.
+    Lower limits do not hold for a drone that takes off or lands; `sinks_back`: nor upper ones for one that sinks. `share`: how
+    much of its slack a drone may come to rest above an upper limit by.
     """
     if grant.max_altitude_m is None and not grant.altitude_limits:
         return None
@@ -330,7 +337,7 @@ def _heights(
     sinks_back = sinks_back and now.down_mps > SINKING_MPS
     over, under = strictest(bounds, above=True), strictest(bounds, above=False)
     high, low = max(now.altitude_m, rest_m), min(now.altitude_m, rest_m)
-    if over is not None and over.upper is not None and high > over.upper + slack and not sinks_back:
+    if over is not None and over.upper is not None and high > over.upper + share * slack and not sinks_back:
         reason = f"the drone climbs to {high:.1f} m, above the limit of {over.upper:.1f} m"
         return _changed_height(_Trespass(over, over.upper, "AltitudeAboveLimit", reason), now, grant, stop)
     if unknown:

@@ -21,11 +21,8 @@ async def watch(period_s: float) -> None:
     async with fractus.camera(reconnect_timeout_s=1.0) as camera:
         while not stop.is_set():
             try:
-                info = await camera.capture()
-                try:
-                    log.info("%s: %d bytes", info.name, len(await camera.retrieve(info.name)))
-                finally:
-                    await camera.delete(info.name)  # the node keeps 200 of a component, and then takes no more
+                picture = await camera.take()
+                log.info("%s: %d bytes", picture.info.name, len(picture.data))
             except fractus.PolicyDenied as refusal:
                 log.info("no picture here: %s", refusal)
             except fractus.FractusError as error:

@@ -44,13 +44,10 @@ async def watch(interval_s: float) -> None:
 async def look(camera: fractus.Camera, number: int) -> tuple[str, bytes]:
     """A picture from the node's camera, or a test picture where a node has no camera service yet."""
     try:
-        info = await camera.capture()
-        try:
-            return info.name, await camera.retrieve(info.name)
-        finally:
-            await camera.delete(info.name)  # the node keeps 200 of a component, and then takes no more
+        picture = await camera.take()
     except fractus.Unavailable:
         return f"test-{number}.png", render(160, 120, number)
+    return picture.info.name, picture.data
 
 
 def pack(name: str, source: str, picture: bytes) -> bytes:

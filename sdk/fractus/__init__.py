@@ -60,6 +60,7 @@ from fractus.values import Attitude as Attitude
 from fractus.values import Check as Check
 from fractus.values import Decision as Decision
 from fractus.values import ImageInfo as ImageInfo
+from fractus.values import Picture as Picture
 from fractus.values import Position as Position
 from fractus.values import PositionResult as PositionResult
 from fractus.values import Progress as Progress

@@ -13,7 +13,7 @@ from fractus.channel import CALL_TIMEOUT_S, RECONNECT_TIMEOUT_S, ServiceChannel,
 from fractus.environment import Endpoint, endpoint
 from fractus.errors import Unavailable, translate
 from fractus.requests import capture_request
-from fractus.values import Decision, ImageInfo, Result
+from fractus.values import Decision, ImageInfo, Picture, Result
 
 RETRIEVE_TIMEOUT_S = 60.0
 CAPTURE_TIMEOUT_S = 120.0
@@ -36,6 +36,8 @@ class Camera(ServiceClient):
         Where privacy policies ask for filters, the picture is kept filtered: `corrected` says so, and why. It is blurred as
         a whole where faces are to be hidden but may be too small to be found; come closer, or ask for more pixels.
 
+        The node keeps 200 of a component, and then takes no more: `delete` those that are fetched, or use `take`.
+
         Raises:
             PolicyDenied: no pictures from here, or not of this.
             Unavailable: the camera gives no picture.
@@ -44,8 +46,30 @@ class Camera(ServiceClient):
         reply = await self._channel.unary("CaptureImage", request, timeout_s=timeout_s)
         return ImageInfo.from_proto(reply.image, reply.decision)
 
-    async def every(self, interval_s: float, width: int = 0, height: int = 0) -> AsyncGenerator[ImageInfo, None]:
+    async def take(self, width: int = 0, height: int = 0, *, timeout_s: float = CAPTURE_TIMEOUT_S) -> Picture:
+        """Take a picture, fetch it, and delete it from the node, which keeps 200 of a component and then takes no more.
+
+        Judged twice, when it is taken and when it is fetched. The component needs CaptureImage, RetrieveImage and DeleteImage.
+
+        Args:
+            width: pixels; 0 leaves it to the camera.
+            height: pixels; 0 leaves it to the camera.
+            timeout_s: how long the camera may take.
+
+        Raises:
+            PolicyDenied: no pictures from here, or not of this.
+            Unavailable: the camera gives no picture, or the transfer broke off.
+        """
+        info = await self.capture(width, height, timeout_s=timeout_s)
+        try:
+            return Picture(info, await self.retrieve(info.name))
+        finally:
+            await self.delete(info.name)
+
+    async def every(self, interval_s: float, width: int = 0, height: int = 0) -> AsyncGenerator[Picture, None]:
         """Take a picture each `interval_s` seconds, until the iteration is left; a camera that takes longer is waited for.
+
+        Each is fetched and deleted from the node, as `take` does, so it may go on for as long as the flight.
 
         Args:
             interval_s: seconds from the beginning of one picture to that of the next.
@@ -59,7 +83,7 @@ class Camera(ServiceClient):
         loop = asyncio.get_running_loop()
         while True:
             due = loop.time() + interval_s
-            yield await self.capture(width, height)
+            yield await self.take(width, height)
             await asyncio.sleep(max(due - loop.time(), 0.0))
 
     async def retrieve(self, name: str, *, timeout_s: float = RETRIEVE_TIMEOUT_S) -> bytes:

@@ -274,6 +274,7 @@ class Camera(_Client[_pictures.Camera]):
     def __init__(self, endpoint: Endpoint | None = None) -> None:
         super().__init__(_pictures.camera(endpoint))
 
+    take = _waiting(_pictures.Camera.take)
     capture = _waiting(_pictures.Camera.capture)
     every = _iterating(_pictures.Camera.every)
     retrieve = _waiting(_pictures.Camera.retrieve)

@@ -230,6 +230,19 @@ class Ride:
     reason: str
 
 
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A picture with what is known of it.
+
+    Attributes:
+        info: when, where and how large it was taken, and what policies did to it.
+        data: the file, of `info.media_type`, after privacy filters.
+    """
+
+    info: ImageInfo
+    data: bytes
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImageInfo(Result):
     """A picture in the camera's store."""

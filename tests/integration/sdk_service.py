@@ -173,12 +173,16 @@ class Drone(mobility_pb2_grpc.MobilityServiceServicer):
 
 
 class Pictures(camera_pb2_grpc.CameraServiceServicer):
-    """A camera whose one picture is 600 kB; `cut` makes its transfer end early."""
+    """A camera whose one picture is 600 kB; `cut` makes its transfer end early, `kept` are those that were not deleted."""
 
     picture = bytes(range(256)) * 2400
     cut = False
 
+    def __init__(self) -> None:
+        self.kept: list[str] = []
+
     async def CaptureImage(self, request, context):  # noqa: N802
+        self.kept.append("1.jpg")
         info = camera_pb2.ImageInfo(name="1.jpg", width=request.width or 640, size_bytes=len(self.picture))
         return camera_pb2.CaptureImageResponse(decision=_decision(False), image=info)
 
@@ -190,6 +194,10 @@ class Pictures(camera_pb2_grpc.CameraServiceServicer):
             yield camera_pb2.ImageChunk(
                 image=camera_pb2.ImageInfo(size_bytes=size), data=self.picture[start : start + chunk]
             )
+
+    async def DeleteImage(self, request, context):  # noqa: N802
+        self.kept.remove(request.name)
+        return camera_pb2.DeleteImageResponse(decision=_decision(False))
 
 
 class Server:

@@ -281,7 +281,16 @@ async def test_a_nose_is_turned_on_the_spot(stage: Stage) -> None:
 async def test_pictures_are_taken_again_and_again(stage: Stage) -> None:
     async with Camera(stage.endpoint) as camera, contextlib.aclosing(camera.every(0.0)) as pictures:
         first, second = await anext(pictures), await anext(pictures)
-    assert (first.name, second.name) == ("1.jpg", "1.jpg")
+        assert not stage.pictures.kept
+    assert [(p.info.name, p.data) for p in (first, second)] == [("1.jpg", stage.pictures.picture)] * 2
+
+
+async def test_a_picture_that_cannot_be_fetched_is_deleted(stage: Stage) -> None:
+    stage.pictures.cut = True
+    async with Camera(stage.endpoint) as camera:
+        with pytest.raises(fractus.Unavailable, match="ended after"):
+            await camera.take()
+    assert not stage.pictures.kept
 
 
 async def test_an_error_in_the_body_does_not_return_control(stage: Stage) -> None:

@@ -65,7 +65,10 @@ class FullCamera:
         self.kept: list[str] = []
         self.taken = 0
 
-    async def capture(self) -> SimpleNamespace:
+    take = fractus.Camera.take
+
+    async def capture(self, *_: int, timeout_s: float) -> SimpleNamespace:
+        assert timeout_s > 0
         assert not self.kept, "it takes no more"
         self.taken += 1
         self.kept.append(f"picture-{self.taken}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import os
 import signal
@@ -77,7 +78,8 @@ async def _run(program: Program, endpoint: Endpoint | None, strict: bool, stays:
             raise
         _log.error("%s", _told(error))
     if stays:
-        await asyncio.Event().wait()
+        with contextlib.suppress(asyncio.CancelledError):  # told to stop, with nothing to stop
+            await asyncio.Event().wait()
 
 
 async def fly(program: Program, drone: Mobility) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -13,6 +14,8 @@ import click
 from fractus_cluster.binaries import CLUSTER_PROGRAMS, PROGRAMS, ensure_binaries
 from fractus_cluster.cluster import Cluster, NodeStatus, print_report
 from fractus_cluster.errors import ClusterError
+from fractus_cluster.images.build import find_source
+from fractus_cluster.install import install
 from fractus_cluster.machine import holders
 from fractus_cluster.prerequisites import check_root
 from fractus_cluster.state import known_clusters, state_root
@@ -105,6 +108,29 @@ def kubeconfig(name: str | None, only_path: bool) -> None:
     if not file.exists():
         raise ClusterError("the cluster has not come up yet; run `fractus cluster up FILE` again")
     click.echo(str(file) if only_path else file.read_text(), nl=only_path)
+
+
+@cluster.command()
+@_name_option
+def env(name: str | None) -> None:
+    """Print what a shell evaluates to reach the cluster: eval "$(fractus cluster env)"."""
+    file = Cluster.existing(name).kubeconfig
+    programs = ensure_binaries(("kubectl", "helm"), report=print_report)
+    folders = dict.fromkeys(str(programs[program].parent) for program in ("kubectl", "helm"))
+    click.echo(f"export KUBECONFIG={shlex.quote(str(file))}")
+    click.echo(f'export PATH={shlex.quote(":".join(folders))}:"$PATH"')
+
+
+@cluster.command("install")
+@_name_option
+@click.option(
+    "--source",
+    type=click.Path(path_type=Path, file_okay=False, exists=True),
+    help="Checkout with Dockerfile and charts.",
+)
+def install_(name: str | None, source: Path | None) -> None:
+    """Install or upgrade Fractus: images, charts, until the drones are ready."""
+    install(Cluster.existing(name, report=print_report), source or find_source(), report=print_report)
 
 
 @cluster.command("load-image")

@@ -1,0 +1,49 @@
+"""Installing Fractus on an embedded cluster: its images on every node, then its charts, until the drones are ready."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from fractus_cluster.binaries import ensure_binaries
+from fractus_cluster.cluster import Cluster
+from fractus_cluster.commands import run
+from fractus_cluster.images.build import build_images
+
+NAMESPACE = "fractus-system"
+"""The charts install nowhere else."""
+
+_TARGETS = ("operator", "agent", "services")
+_CHARTS = ("fractus-crds", "fractus")
+_READY_TIMEOUT_S = 180
+
+Report = Callable[[str], None]
+
+
+def install(cluster: Cluster, source: Path, *, report: Report) -> None:
+    """Build what is stale of the images, deliver them, install or upgrade the charts, and wait for the drones.
+
+    Args:
+        cluster: It runs.
+        source: The checkout with Dockerfile and charts.
+        report: Told about progress, a line at a time.
+
+    Raises:
+        ClusterError: A step failed; the message says which, and what was said.
+    """
+    images = build_images(source, targets=_TARGETS, report=report)
+    cluster.load_images(images)
+    programs = ensure_binaries(("kubectl", "helm"), report=report)
+    own = ("--kubeconfig", str(cluster.kubeconfig))
+    for chart in _CHARTS:
+        place = ("--namespace", NAMESPACE, "--create-namespace")
+        run([programs["helm"], "upgrade", "--install", chart, source / "charts" / chart, *own, *place])
+        report(f"installed {chart}")
+    for node in cluster.spec.nodes:
+        if node.node_class != "drone":
+            continue
+        # Its agent registers it first.
+        for state in ("create", "condition=Ready"):
+            waiting = ("wait", f"--for={state}", f"drones.fractus.dev/{node.name}", f"--timeout={_READY_TIMEOUT_S}s")
+            run([programs["kubectl"], *own, *waiting], timeout_s=_READY_TIMEOUT_S + 10)
+        report(f"{node.name} is ready")

@@ -1,0 +1,109 @@
+"""docs/tutorial.md on a cluster, typed as it stands: one's own image flies, an update and a lowered ceiling are survived."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "tutorial.md").read_text()
+NAME = "tutorial-e2e"
+BEGINS, ENDS = "## 6. ", "## When it does not fly"
+TIMEOUT_S = 1500
+pytestmark = [
+    pytest.mark.skipif(
+        os.environ.get("FRACTUS_E2E_CLUSTER") == "current", reason="the tutorial brings its own cluster up"
+    ),
+    pytest.mark.xdist_group("cluster-kills"),  # no third cluster at a time
+]
+
+
+def files(text: str) -> dict[str, str]:
+    """What the page has the reader write, by name."""
+    return dict(re.findall(r"`([\w.]+)`[^`\n]*:\n```\w+\n(.*?)```", text, re.DOTALL))
+
+
+def typed(text: str) -> list[tuple[str, list[str]]]:
+    """Every command of the page, with what it is said to print."""
+    found: list[tuple[str, list[str]]] = []
+    shell: bool | None = None  # None: outside of blocks
+    for line in text.splitlines():
+        if line.startswith("```"):
+            shell = (line == "```") if shell is None else None
+        elif shell and line.startswith("$ "):
+            found.append((line[2:], []))
+        elif shell:
+            found[-1][1].append(line.removeprefix("... "))
+    return found
+
+
+def on_own_cluster(command: str) -> str:
+    """The command for this test's cluster: there may be others on this machine."""
+    return re.sub(r"fractus cluster ([\w-]+)", rf"fractus cluster \1 --name {NAME}", command)
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Iterator[Path]:
+    """A fresh checkout: what is checked in, or about to be."""
+    folder = tmp_path / "checkout"
+    listed = ["git", "ls-files", "--cached", "--others", "--exclude-standard", "-z"]
+    names = subprocess.run(listed, cwd=ROOT, capture_output=True, text=True, check=True, timeout=60).stdout
+    for name in filter(None, names.split("\0")):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(ROOT / name, folder / name, follow_symlinks=False)
+    down = [sys.executable, "-m", "fractus_cli", "cluster", "down", "--name", NAME]
+    subprocess.run(down, check=False, timeout=120)
+    try:
+        yield folder
+    finally:
+        subprocess.run(down, check=False, timeout=120)
+
+
+@pytest.mark.timeout(TIMEOUT_S + 250)
+def test_the_tutorial_flies_on_a_cluster(checkout: Path) -> None:
+    begin, end = PAGE.index(BEGINS), PAGE.index(ENDS)
+    page = PAGE[begin:end]
+    (checkout / "patrol.py").write_text(files(PAGE[:begin])["patrol.py"])
+    written = files(page)
+    assert {"Dockerfile", "application.yaml", "low.yaml"} == written.keys()
+    commands = typed(page)
+    assert sum(command.startswith("fractus ") for command, _ in commands) >= 5
+    script = [
+        "set -e",
+        # Evidence for this test, before what it is of goes.
+        "trap 'kubectl get applications,deploymentplans,pods,events -A -o wide >&2 || true' ERR",
+    ]
+    for command, _ in commands:
+        if command.startswith("fractus cluster down"):
+            script.append("kubectl get events -o json > events.json; kubectl get grants -o json > grants.json")
+        script.append(on_own_cluster(command))
+        if command == "cd patrol":
+            script += [f"cp '../written/{name}' ." for name in written]
+        if "Updated=False" in command:
+            script.append("kubectl get pods -l fractus.dev/application=patrol -o json > waiting.json")
+    (checkout / "written").mkdir()
+    for name, text in written.items():
+        (checkout / "written" / name).write_text(text)
+    done = subprocess.run(
+        ["bash", "-c", "\n".join(script)], cwd=checkout, capture_output=True, text=True, timeout=TIMEOUT_S, check=False,
+        env={**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-6000:]
+    for command, expected in commands:
+        for line in expected:
+            assert line in done.stdout, f"{command} does not print: {line}\n{done.stdout}"
+
+    (pod,) = json.loads((checkout / "patrol" / "waiting.json").read_text())["items"]
+    (container,) = pod["status"]["containerStatuses"]
+    assert (container["image"], container["restartCount"]) == ("localhost/patrol:1", 0), "the update waits"
+    events = json.loads((checkout / "patrol" / "events.json").read_text())["items"]
+    missions = [e for e in events if e["reason"] == "MissionComplete" and e["involvedObject"]["name"] == "patrol"]
+    assert len(missions) == 2, [f"{e['reason']}: {e['message']}" for e in events]

@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import time
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from fractus_core.api.nodes import direct_interface
+from fractus_observe.exposition import Observed, serving, text_of
+from prometheus_client import CollectorRegistry
 
 from fractus_agent.cluster.store import Object, Store
 from fractus_agent.grants.keeper import GrantDirectory, GrantKeeper
 from fractus_agent.grants.verifier import GrantVerifier
 from fractus_agent.identity.identity import Identity
+from fractus_agent.metrics import AgentFigures
 from fractus_agent.registration.evidence import audit_heads, recording_problems
 from fractus_agent.registration.handover import Handover
 from fractus_agent.registration.registration import Registration
-from fractus_agent.registration.status import Observed, StatusReporter
+from fractus_agent.registration.status import Observed as ObservedNode
+from fractus_agent.registration.status import StatusReporter
 from fractus_agent.settings import Settings
 from fractus_agent.supervisor import Supervisor
 from fractus_agent.watchdog import guard
@@ -24,6 +30,7 @@ from fractus_agent.watchdog import guard
 if TYPE_CHECKING:
     from fractus_core.api.nodes import Drone, EdgeNode
     from fractus_core.linking import Seen
+    from prometheus_client.core import Metric
 
     from fractus_agent.links.connectivity import Connectivity
     from fractus_agent.telemetry.feed import TelemetryFeed
@@ -84,7 +91,24 @@ class Agent:
             ExceptionGroup: one of them failed.
         """
         self._changed()
-        await self._supervisor.run()
+        registry = CollectorRegistry()
+        registry.register(Observed(self._figures))
+        async with serving(self._settings.metrics, lambda: text_of(registry)):
+            await self._supervisor.run()
+
+    def _figures(self) -> Iterator[Metric]:
+        """What Prometheus is told."""
+        heads = (head.split(":") for head in audit_heads(self._settings.audit))
+        yield from AgentFigures(
+            expires_s=self._identity.expires_s,
+            heard_s=self._store.heard_s(),
+            reported_s=self._reporter.age_s,
+            telemetry_s=(self._feed.age_s if self._feed else math.inf) if self._has_mobility() else None,
+            grants=self._keeper.counts(),
+            checkpoints={log: int(number) for log, number, _ in heads},
+        ).metrics()
+        if self._links is not None:
+            yield from self._links.figures()
 
     async def _follow_telemetry(self) -> None:
         """Follow telemetry once the node has a mobility service and a certificate."""
@@ -147,9 +171,9 @@ class Agent:
         resource = self._resource()
         return resource is not None and direct_interface(resource.spec.interfaces) is not None
 
-    def _observe(self, body: Object) -> Observed:
+    def _observe(self, body: Object) -> ObservedNode:
         services = (body.get("spec") or {}).get("services") or {}
-        return Observed(
+        return ObservedNode(
             kind=body["kind"],
             has_mobility=self._has_mobility(),
             needs_certificate=bool(services),

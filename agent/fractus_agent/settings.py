@@ -21,6 +21,7 @@ class Settings:
     mobility_address: str
     log_level: str = "INFO"
     direct_links: bool = True
+    metrics: str = ""
 
     @property
     def grants(self) -> Path:
@@ -49,7 +50,7 @@ class Settings:
 
     @classmethod
     def from_environment(cls, environment: Mapping[str, str]) -> Settings:
-        """Read FRACTUS_NODE (needed), and FRACTUS_DESCRIPTION, _STATE_DIR, _MOBILITY, _LOG_LEVEL and _DIRECT_LINKS.
+        """Read FRACTUS_NODE (needed), and FRACTUS_DESCRIPTION, _STATE_DIR, _MOBILITY, _LOG_LEVEL, _DIRECT_LINKS and _METRICS.
 
         Raises:
             MissingSetting: FRACTUS_NODE is not set.
@@ -63,5 +64,6 @@ class Settings:
             state=Path(environment.get("FRACTUS_STATE_DIR", "/var/lib/fractus")),
             mobility_address=environment.get("FRACTUS_MOBILITY", "127.0.0.1:50051"),
             direct_links=environment.get("FRACTUS_DIRECT_LINKS", "true").lower() == "true",
+            metrics=environment.get("FRACTUS_METRICS", ""),
             log_level=environment.get("FRACTUS_LOG_LEVEL", "INFO").upper(),
         )

@@ -15,7 +15,8 @@ from contextlib import AsyncExitStack
 from datetime import UTC, datetime
 from typing import Any
 
-from fractus_core.identity.authority import BrokenAuthority
+from fractus_core.identity.authority import Authority, BrokenAuthority
+from fractus_observe.exposition import serving
 
 from fractus_operator import handlers, metrics
 from fractus_operator.cluster import kinds
@@ -65,12 +66,13 @@ async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
     shown = metrics.Observed(lambda: lease.left_s)
     measuring = AsyncExitStack()
     try:
-        await measuring.enter_async_context(metrics.serving(settings.metrics_port, lambda: shown))
+        listen = f":{settings.metrics_port}" if settings.metrics_port else ""
+        await measuring.enter_async_context(serving(listen, lambda: metrics.text(shown)))
         async with standing_by(settings.health):
             await _leading(lease, keeping)
         authority = await open_authority(store, settings.namespace)
         live = LiveInventory(store, settings.namespace)
-        shown = _observed(lease, live)
+        shown = _observed(lease, live, authority)
         applications = Applications(store, live, authority, _now, settings.planning)
         signing = NodeSigning(store, live.signing_requests.get, authority, settings.agent_user, _now)
         background: list[Coroutine[Any, Any, None]] = [reflector.run() for reflector in live.reflectors()]
@@ -96,13 +98,14 @@ async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
         await store.aclose()
 
 
-def _observed(lease: LeaseThread, live: LiveInventory) -> metrics.Observed:
+def _observed(lease: LeaseThread, live: LiveInventory, authority: Authority) -> metrics.Observed:
     """What the metrics show of a leader."""
     return metrics.Observed(
         lambda: lease.left_s,
         lambda: {r.kind.plural: (r.watching, r.age_s()) for r in live.reflectors() if r.synced.is_set()},
         lambda: ((a.body.get("status") or {}).get("phase", "Pending") for a in live.applications.values()),
         lambda: (d.status.flight_state if d.status else "unknown" for d in live.drones.values() if d is not None),
+        authority.certificate.not_valid_after_utc.timestamp(),
     )
 
 

@@ -163,6 +163,14 @@ class TlsFiles:
         self._stamp = stamp
         return configuration
 
+    def expires_s(self) -> float | None:
+        """Unix time at which the certificate expires; None while there is none that can be read."""
+        try:
+            pem = (self._directory / "tls.crt").read_bytes()
+            return x509.load_pem_x509_certificate(pem).not_valid_after_utc.timestamp()
+        except (OSError, ValueError):
+            return None
+
     def _changed(self) -> Any:
         """Asked by gRPC at every handshake: a new configuration, or None to keep the present one."""
         try:

@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from fractus_services.launch import DIRECTORY, FILE, address, until_signalled
+from fractus_services.launch import DIRECTORY, FILE, address, metrics_address, until_signalled
 from fractus_services.options import CameraOptions, MobilityOptions
 from fractus_services.service_lock import DEFAULT_LOCK_TIMEOUT_S
 
@@ -57,6 +57,13 @@ def _service_options(service: str, port: int, kinds: str, state: str, recorded: 
             DEFAULT_RECORDINGS_MB,
             "Megabytes that recordings may take; the oldest are removed first. 0: none are made.",
             click.IntRange(min=0),
+        ),
+        click.option(
+            "--metrics",
+            envvar="FRACTUS_METRICS",
+            default="",
+            callback=metrics_address,
+            help="HOST:PORT to answer GET /metrics of Prometheus on (docs/metrics.md); nothing is told without it.",
         ),
         click.option(
             "--node", envvar="FRACTUS_NODE", help="Name of this node; by default the description's, else the host's."

@@ -42,6 +42,15 @@ def address(_context: click.Context, _parameter: click.Parameter, value: str) ->
     return value
 
 
+def metrics_address(context: click.Context, parameter: click.Parameter, value: str) -> str:
+    """Check an option that says HOST:PORT, or nothing.
+
+    Raises:
+        click.BadParameter: it is none.
+    """
+    return address(context, parameter, value) if value else ""
+
+
 def until_signalled(
     service: str,
     run: Callable[[_Options, asyncio.Event], Coroutine[Any, Any, None]],

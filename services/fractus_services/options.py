@@ -21,6 +21,7 @@ class ServiceOptions:
     lock_timeout: float
     recordings: Path | None
     recordings_mb: int
+    metrics: str
 
     @property
     def grant_memory(self) -> Path:

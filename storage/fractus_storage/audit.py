@@ -140,6 +140,16 @@ class AuditLog:
             return f"the audit log cannot be written: the disk has not answered for {time.monotonic() - since_s:.0f} s"
         return self._problem
 
+    @property
+    def sequence(self) -> int:
+        """Number of the last entry on disk; 0 while there is none."""
+        return self._end.sequence
+
+    @property
+    def waiting(self) -> int:
+        """Entries that are not on disk yet."""
+        return len(self._waiting)
+
     def append(self, kind: str, content: dict[str, Any], now: bool = True) -> None:
         """Add an entry.
 

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
@@ -20,6 +21,7 @@ import yaml
 from agent_pki import TestAuthority
 from agent_server import FRACTUS, REQUESTS, ApiServer, running
 from control_plane import wait_for
+from exposed import scraped
 from fractus_cluster.ports import free_port
 from fractus_core.api.plans import Grant
 from fractus_core.policy.signatures import sign
@@ -73,7 +75,7 @@ class Node:
         self.plural = {"Drone": "drones", "EdgeNode": "edgenodes"}[kind]
         self.class_ = {"Drone": "drone", "EdgeNode": "edge"}[kind]
         self.mobility = Mobility()
-        self.port = free_port()
+        self.port, self.metrics = free_port(), free_port()
         self.process: subprocess.Popen[bytes] | None = None
         self._grpc: grpc.Server | None = None
         labels = {"fractus.dev/class": self.class_}
@@ -105,6 +107,7 @@ class Node:
             "FRACTUS_DESCRIPTION": str(self.description),
             "FRACTUS_STATE_DIR": str(self.state),
             "FRACTUS_MOBILITY": f"127.0.0.1:{self.port}",
+            "FRACTUS_METRICS": f"127.0.0.1:{self.metrics}",
             "MALLOC_ARENA_MAX": "2",
         }
         log = (self.directory / "agent.log").open("ab")
@@ -214,6 +217,13 @@ def test_a_drones_life(server: ApiServer, drone: Node) -> None:
     assert body is not None
     assert body["status"]["flightState"] == "inactive"
     assert body["status"]["position"]["lat"] == 39.36
+
+    seen = scraped(drone.metrics)
+    assert seen["fractus_agent_grants", "stored"] == 1
+    assert 0 <= seen["fractus_agent_watch_age_seconds", "grants"] < 100
+    assert 0 <= seen["fractus_agent_report_age_seconds",] < 100
+    assert 0 <= seen["fractus_telemetry_age_seconds",] < 100
+    assert seen["fractus_certificate_expiry_timestamp_seconds",] > time.time()
 
     drone.mobility.now.flight_state = "flying"
     drone.mobility.now.in_air = True

@@ -5,12 +5,15 @@ from __future__ import annotations
 import asyncio
 import math
 import signal
+import time
 from collections.abc import AsyncIterator
 from pathlib import Path
 
 import grpc
 import pytest
+from exposed import scraped
 from fractus_agent.registration.handover import Handover
+from fractus_cluster.ports import free_port
 from fractus_core.api.model import API_VERSION
 from fractus_core.api.names import node_identity
 from fractus_core.api.nodes import Drone
@@ -50,7 +53,8 @@ async def rig(tmp_path: Path) -> AsyncIterator[Rig]:
 async def test_a_whole_mission_with_a_correction_and_refusals(rig: Rig) -> None:
     rig.write_grant(grant(altitude_limit(5, 15), fence("no-fly", "exclusion", "ignore", -60, -10, -40, 10)))
     rig.write_grant(passenger_grant())
-    rig.start_service()  # before the vehicle: it waits for it
+    port = free_port()
+    rig.start_service("--metrics", f"127.0.0.1:{port}")  # before the vehicle: it waits for it
     rig.start_vehicle()
     driver = Driver(rig)
     climbed = await driver.up(3.0)
@@ -89,6 +93,17 @@ async def test_a_whole_mission_with_a_correction_and_refusals(rig: Rig) -> None:
     await driver.goto(40, 40)
     code, why = await denied(driver.stub.Disarm(pb.DisarmRequest(), timeout=5))
     assert why.code == "InAir"
+
+    seen = await asyncio.to_thread(scraped, port)
+    assert (
+        seen["fractus_in_air",] == seen["fractus_control_authority", "driver"] == seen["fractus_companion_alive",] == 1
+    )
+    assert seen["fractus_policy_verdicts_total", "correct", "altitudes"] >= 1
+    assert seen["fractus_policy_verdicts_total", "deny", "no-fly"] >= 1
+    assert seen["fractus_verdicts_total", "deny", "NotADriver"] == 1
+    assert 0 <= seen["fractus_telemetry_age_seconds",] < 10
+    assert seen["fractus_audit_sequence",] > 10
+    assert seen["fractus_certificate_expiry_timestamp_seconds",] > time.time()
 
     await _return_and_land(rig, driver)
     _check_audit(rig)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import urllib.request
 from pathlib import Path
 
 from chart import render
 from control_plane import ControlPlane, wait_for
+from exposed import scraped
 from fractus_cluster.ports import free_port
 from operator_world import OperatorProcess, World, traffic
-from prometheus_client.parser import text_string_to_metric_families
 
 
 def test_the_operator_tells_prometheus_what_it_does(
@@ -20,20 +19,13 @@ def test_the_operator_tells_prometheus_what_it_does(
         control_plane.kubeconfig, tmp_path / "operator.log", FRACTUS_METRICS_PORT=str(port), FRACTUS_LEASE="2"
     )
 
-    def told() -> dict[tuple[str, ...], float]:
-        try:
-            with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=5) as answer:
-                text = answer.read().decode()
-        except OSError:
-            return {}
-        families = text_string_to_metric_families(text)
-        return {(s.name, *s.labels.values()): s.value for family in families for s in family.samples}
-
     operator.start()
     try:
         world.put(traffic(namespace))
         world.phase(namespace, "Deploying")
-        seen = wait_for(lambda: (found := told()).get(("fractus_applications", "Deploying")) and found, operator.log)
+        seen = wait_for(
+            lambda: (found := scraped(port)).get(("fractus_applications", "Deploying")) and found, operator.log
+        )
         assert seen["fractus_operator_lease_left_seconds",] > 0
         assert seen["fractus_operator_watch_open", "drones"] == 1
         assert 0 <= seen["fractus_operator_watch_age_seconds", "pods"] < 300
@@ -44,14 +36,30 @@ def test_the_operator_tells_prometheus_what_it_does(
         operator.stop()
 
 
-def test_the_chart_makes_a_pod_monitor_where_it_is_asked_to() -> None:
+def test_the_chart_makes_pod_monitors_where_it_is_asked_to() -> None:
     assert not [body for body in render() if body["kind"] == "PodMonitor"]
     arguments = ("--set", "metrics.podMonitor.enabled=true", "--set", "metrics.podMonitor.labels.release=kube")
     rendered = render(*arguments)
-    (monitor,) = [body for body in rendered if body["kind"] == "PodMonitor"]
-    (operator,) = [body for body in rendered if body["kind"] == "Deployment"]
-    pods = operator["spec"]["template"]
-    assert monitor["metadata"]["labels"]["release"] == "kube"
-    assert monitor["spec"]["selector"]["matchLabels"].items() <= pods["metadata"]["labels"].items()
-    (endpoint,) = monitor["spec"]["podMetricsEndpoints"]
-    assert endpoint["port"] in {p["name"] for p in pods["spec"]["containers"][0]["ports"]}
+    workloads = [body["spec"]["template"] for body in rendered if body["kind"] in {"Deployment", "DaemonSet"}]
+    monitors = [body for body in rendered if body["kind"] == "PodMonitor"]
+    assert len(monitors) == len(workloads) == 4
+    for monitor in monitors:
+        assert monitor["metadata"]["labels"]["release"] == "kube"
+        selected = monitor["spec"]["selector"]["matchLabels"].items()
+        (pods,) = [pods for pods in workloads if selected <= pods["metadata"]["labels"].items()]
+        (container,) = pods["spec"]["containers"]
+        (port,) = [p["containerPort"] for p in container["ports"] if p["name"] == "metrics"]
+        environment = {each["name"]: each.get("value") for each in container["env"]}
+        assert environment.get("FRACTUS_METRICS", environment.get("FRACTUS_METRICS_PORT")).endswith(str(port))
+        (endpoint,) = monitor["spec"]["podMetricsEndpoints"]
+        assert endpoint["port"] == "metrics"
+
+
+def test_nodes_tell_nothing_where_they_are_not_to() -> None:
+    rendered = render("--set", "metrics.podMonitor.enabled=true", "--set", "metrics.nodes.enabled=false")
+    assert [body["metadata"]["name"] for body in rendered if body["kind"] == "PodMonitor"] == ["fractus-operator"]
+    for body in rendered:
+        if body["kind"] == "DaemonSet":
+            (container,) = body["spec"]["template"]["spec"]["containers"]
+            assert "FRACTUS_METRICS" not in {each["name"] for each in container["env"]}
+            assert "metrics" not in {port["name"] for port in container.get("ports", ())}

@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from exposed import get, values
+from fractus_cluster.ports import free_port
 from fractus_services import description
 from fractus_services.camera.rpc import server
 from fractus_services.options import CameraOptions
@@ -34,9 +36,10 @@ async def test_a_node_that_is_described_otherwise_keeps_its_album(
     monkeypatch.setattr(server, "Album", Counted)
     monkeypatch.setattr(description, "POLL_INTERVAL_S", 0.01)
     node = tmp_path / "node.json"
+    port = free_port()
     options = CameraOptions(
         grants=tmp_path / "grants", tls=tmp_path / "tls", state=tmp_path / "state", audit=tmp_path / "audit", node="n",
-        node_object=node, description=tmp_path / "none.yaml", listen="127.0.0.1:0", lock_timeout=0.0, mobility="unix:none", recordings=None,
+        node_object=node, description=tmp_path / "none.yaml", listen="127.0.0.1:0", lock_timeout=0.0, mobility="unix:none", recordings=None, metrics=f"127.0.0.1:{port}",
         recordings_mb=0, keep=10, keep_mb=10, keep_total_mb=10, camera=None, face_model=None, face_px=20.0, relief=0.0,
     )  # fmt: skip
     stop = asyncio.Event()
@@ -48,6 +51,9 @@ async def test_a_node_that_is_described_otherwise_keeps_its_album(
             caplog.clear()
             node.write_text(place % f'{{"lat": {lat}, "lon": 8.0}}')
         await told(caplog, "described=True")
+        first, body = await get(port)
+        assert "200" in first
+        assert values(body)["fractus_audit_failing",] == 0
         stop.set()
         await serving
     assert Counted.made == 1

@@ -115,6 +115,12 @@ class Store:
         self._client = client
         self._node = node
         self._times = times or WatchTimes()
+        self._heard: dict[str, float] = {}
+
+    def heard_s(self) -> dict[str, float]:
+        """Seconds since the API server said anything about a kind that is followed, by its plural."""
+        now_s = time.monotonic()
+        return {plural: now_s - heard_s for plural, heard_s in self._heard.items()}
 
     async def node_labels(self) -> dict[str, str] | None:
         """Labels of the Kubernetes Node; None when there is no such node."""
@@ -209,10 +215,12 @@ class Store:
         list is short, and an API server restored from a backup may count versions from an earlier number.
         """
         backoff = Backoff(self._times.first_retry_s, self._times.longest_retry_s)
+        self._heard.setdefault(kind.plural, time.monotonic())
         while True:
             started_s = time.monotonic()
             try:
                 objects, version = await self._list(kind, selectors)
+                self._heard[kind.plural] = time.monotonic()
                 if backoff.attempts > 1:
                     LOG.info("%s: the API server is back (attempts=%d)", kind.plural, backoff.attempts)
                 yield Listed(objects)
@@ -259,6 +267,7 @@ class Store:
             )
             async for change, body in events:
                 version = body["metadata"]["resourceVersion"]
+                self._heard[kind.plural] = time.monotonic()
                 if change == "DELETED":
                     yield Deleted(body["metadata"]["name"])
                 elif change in ("ADDED", "MODIFIED"):

@@ -148,6 +148,15 @@ class GrantKeeper:
         self._work = asyncio.Event()
         self._reviewed_s = monotonic()
 
+    def counts(self) -> dict[str, int]:
+        """How many grants are stored, or why they are not: unverified, unusable, or the disk does not take them."""
+        return {
+            "stored": len(self._grants) - len(self._unstored),
+            "unverified": len(self._unverified),
+            "unusable": len(self._unusable.keys() - self._unverified.keys()),
+            "unstored": len(self._unstored),
+        }
+
     def missions_changed(self, missions: Mapping[str, Outcome]) -> None:
         """Take the outcomes of missions from the mobility service."""
         if dict(missions) != self._missions:

@@ -102,6 +102,12 @@ class Identity:
         self.serial = 0
         self.condition = Condition("Certified", "False", "Requested", "The node has no certificate yet.")
 
+    @property
+    def expires_s(self) -> float | None:
+        """Unix time at which the certificate expires; None while there is none."""
+        validity = self._known[1] if self._known is not None else None
+        return validity.not_after.timestamp() if validity is not None else None
+
     async def run(self) -> None:
         """Keep the certificate usable until cancelled."""
         asked_s = float("-inf")

@@ -5,16 +5,17 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 
 from fractus_core.api.nodes import Drone, Interface, direct_interface
 from fractus_core.linking import Seen
+from prometheus_client.core import Metric
 
 from fractus_agent.cluster.store import End, Store
-from fractus_agent.links import beacons, metrics, pairing
+from fractus_agent.links import beacons, pairing
 from fractus_agent.links.addressing import link_address
 from fractus_agent.links.beacons import Beacons
 from fractus_agent.links.drone import DroneEnd
@@ -97,6 +98,10 @@ class Connectivity:
     def active(self) -> bool:
         """Whether links are planned for this node."""
         return bool(self._plans.links)
+
+    def figures(self) -> Iterator[Metric]:
+        """What Prometheus is told of the drone's links; nothing on the other end."""
+        return self._metrics.collect() if self._end == "drone" else iter(())
 
     async def run(self) -> None:
         """Run until cancelled."""
@@ -251,7 +256,6 @@ class Connectivity:
                 tasks.create_task(run())
                 if self._drone is not None:
                     tasks.create_task(uplink.run())
-                    tasks.create_task(metrics.serve(self._metrics.text))
         finally:
             self._drone = self._peer = None
             self._say()

@@ -214,9 +214,14 @@ class StatusReporter:
         self._monotonic = monotonic
         self._last: Object | None = None
         self._last_uid: str | None = None
-        self._last_s = 0.0
+        self._last_s = -math.inf
         self._settled_s = monotonic() + SETTLING_S
         self._changed = asyncio.Event()
+
+    @property
+    def age_s(self) -> float:
+        """Seconds since the API server took a status; infinite before that."""
+        return self._monotonic() - self._last_s
 
     def changed(self) -> None:
         """Something may have changed."""

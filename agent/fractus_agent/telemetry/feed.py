@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
+import time
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
@@ -96,8 +98,14 @@ class TelemetryFeed:
         self._serial = serial
         self._changed = changed
         self._interval_s = INTERVAL_S
+        self._heard_s = -math.inf
         self.latest: Snapshot | None = None
         self.problem: str | None = "The mobility service has not answered yet."
+
+    @property
+    def age_s(self) -> float:
+        """Seconds since the mobility service was heard; infinite before that."""
+        return time.monotonic() - self._heard_s
 
     def hasten(self, fast: bool) -> None:
         """Ask for messages often, or as usual."""
@@ -112,6 +120,7 @@ class TelemetryFeed:
                     if self.problem is not None:
                         LOG.info("telemetry: connected (mobility=%s)", self._address)
                     self.latest, self.problem = snapshot(message), None
+                    self._heard_s = time.monotonic()
                     backoff.succeeded()
                     self._changed()
                 self._lost("asking again", expected=True)

@@ -50,6 +50,19 @@ tolerations:
 {{ include "fractus.pullSecrets" .root }}
 {{- end }}
 
+{{/* Where a workload of a node tells its metrics: on the node's own address, out of reach over direct links; takes (dict "root" $ "port" 46812). */}}
+{{- define "fractus.nodeMetricsEnv" -}}
+{{- if .root.Values.metrics.nodes.enabled }}
+- {name: FRACTUS_HOST, valueFrom: {fieldRef: {fieldPath: status.hostIP}}}
+- {name: FRACTUS_METRICS, value: "$(FRACTUS_HOST):{{ .port }}"}
+{{- end }}
+{{- end }}
+{{- define "fractus.nodeMetricsPort" -}}
+{{- if .root.Values.metrics.nodes.enabled }}
+- {name: metrics, containerPort: {{ .port }}, hostPort: {{ .port }}}
+{{- end }}
+{{- end }}
+
 {{/* Root, to write the node's directories, and nothing beyond but what is added; take (dict "privileged" false). */}}
 {{- define "fractus.nodeSecurity" -}}
 {{- if .privileged }}

@@ -109,6 +109,11 @@ class PoseHistory:
         """Measurements that are kept."""
         return len(self._measurements)
 
+    @property
+    def age_s(self) -> float:
+        """Age of the newest position; infinite when there is none."""
+        return self._now() - self._measurements[-1].position_at if self._measurements else math.inf
+
     def add(self, measurement: Measurement) -> None:
         """Append the newest measurement, and forget those that are too old for any exposure."""
         self._measurements.append(measurement)

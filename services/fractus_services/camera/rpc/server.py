@@ -6,14 +6,17 @@ import asyncio
 import logging
 import socket
 import time
-from collections.abc import Coroutine
+from collections.abc import Coroutine, Iterator
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 from fractus_core.api.nodes import Drone, EdgeNode
 from fractus_core.policy.lenses import lens_of
+from fractus_observe.exposition import gauge, serving
 from fractus_proto.v1 import camera_pb2_grpc
 from fractus_storage.audit import AuditLog
+from prometheus_client.core import Metric
 
 from fractus_services.admission import CallAdmission
 from fractus_services.auth import TlsFiles
@@ -36,6 +39,7 @@ from fractus_services.errors import CannotServe
 from fractus_services.grant_verifier import GrantVerifier
 from fractus_services.grants import GrantFiles
 from fractus_services.hosting import run_until, serve_grpc
+from fractus_services.metrics import ServiceMetrics, common_figures
 from fractus_services.options import CameraOptions
 from fractus_services.recording.recorder import Recorder
 from fractus_services.recording.segments import segments_in
@@ -78,7 +82,13 @@ async def run(options: CameraOptions, stop: asyncio.Event) -> None:
         max_waiting=MAX_WAITING_PICTURES,
         told=options.recording_problem,
     )
-    audit = AuditLog(options.audit, clock, tls=options.tls, copied=recorder.take_entry)
+    metrics = ServiceMetrics()
+
+    def recorded(entry: dict[str, Any]) -> None:
+        metrics.take_entry(entry)
+        recorder.take_entry(entry)
+
+    audit = AuditLog(options.audit, clock, tls=options.tls, copied=recorded)
     grants = GrantFiles(
         options.grants, node, GrantVerifier(options.tls, options.grant_memory), refused=audit.refused_grant
     )
@@ -93,11 +103,38 @@ async def run(options: CameraOptions, stop: asyncio.Event) -> None:
         lambda: [owner_of(grant) for grant in grants.active.values()],
         added=recorder.take_picture,
     )
-    while not stop.is_set():
-        audit.append("started", {"node": node})
-        await _serve(options, description, node, stop, tls=tls, grants=grants, clock=clock, judge=judge, album=album)
+    metrics.observe(partial(common_figures, tls, grants, audit, lambda: recorder.problem))
+    watched = _Watched()
+    metrics.observe(watched.figures)
+    async with serving(options.metrics, metrics.text):
+        while not stop.is_set():
+            audit.append("started", {"node": node})
+            await _serve(
+                options,
+                description,
+                node,
+                stop,
+                tls=tls,
+                grants=grants,
+                clock=clock,
+                judge=judge,
+                album=album,
+                watched=watched,
+            )
     await audit.close()
     await recorder.close()
+
+
+@dataclass(slots=True)
+class _Watched:
+    """Where the drone's telemetry goes; None for a camera that stands."""
+
+    history: PoseHistory | None = None
+
+    def figures(self) -> Iterator[Metric]:
+        """What Prometheus is told of it."""
+        if self.history is not None:
+            yield gauge("fractus_telemetry_age_seconds", "Age of the drone's position.", self.history.age_s)
 
 
 async def _serve(
@@ -111,6 +148,7 @@ async def _serve(
     clock: Clock,
     judge: PictureJudge,
     album: Album,
+    watched: _Watched,
 ) -> None:
     """Serve until `stop` is set, or the description changes."""
     described = description.value.spec.services.camera if description.value is not None else None
@@ -124,10 +162,12 @@ async def _serve(
     ended = asyncio.Event()
     parts = [grants.run(), _set_after(stop.wait(), ended), _set_after(description.changed(), ended)]
     poses: PoseProvider
+    watched.history = None
     if isinstance(description.value, EdgeNode):
         poses = FixedPose(description.value.spec, options.relief)
     else:
         poses = history = PoseHistory(time.monotonic, lens=lens_of(described), relief_m=options.relief)
+        watched.history = history
         parts.append(follow_telemetry(options.mobility, node, tls, history.add))
     admission = CallAdmission(grants, clock)
     handlers = CameraHandlers(

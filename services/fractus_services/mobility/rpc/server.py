@@ -9,6 +9,7 @@ from functools import partial
 from typing import Any
 
 from fractus_core.api.nodes import Drone
+from fractus_observe.exposition import serving
 from fractus_proto.v1 import mobility_pb2_grpc
 from fractus_storage.audit import AuditLog
 
@@ -19,12 +20,14 @@ from fractus_services.errors import CannotServe
 from fractus_services.grant_verifier import GrantVerifier
 from fractus_services.grants import GrantFiles
 from fractus_services.hosting import run_until, serve_grpc
+from fractus_services.metrics import ServiceMetrics, common_figures
 from fractus_services.mobility.authority.journal import Journal
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
 from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes
 from fractus_services.mobility.mavlink.fence import MissionFence
 from fractus_services.mobility.mavlink.returning import MavlinkReturn
+from fractus_services.mobility.rpc.figures import flight_figures
 from fractus_services.mobility.rpc.handlers import MobilityHandlers
 from fractus_services.mobility.rpc.wiring import Parts
 from fractus_services.options import MobilityOptions
@@ -70,7 +73,13 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
     node, url = options.node or name, options.autopilot or _link(description)
     tls = TlsFiles(options.tls)
     recorder = Recorder(segments_in(options.recordings, options.recordings_mb), node)
-    audit = AuditLog(options.audit, clock, tls=options.tls, copied=recorder.take_entry)
+    metrics = ServiceMetrics()
+
+    def recorded(entry: dict[str, Any]) -> None:
+        metrics.take_entry(entry)
+        recorder.take_entry(entry)
+
+    audit = AuditLog(options.audit, clock, tls=options.tls, copied=recorded)
     verifier = GrantVerifier(options.tls, options.grant_memory)
     grants = GrantFiles(options.grants, node, verifier, options.flat_terrain, audit.refused_grant)
     heard = asyncio.Event()
@@ -119,12 +128,15 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
     )
 
     register = partial(mobility_pb2_grpc.add_MobilityServiceServicer_to_server, handlers)
-    serving = serve_grpc("mobility", options.listen, tls, register, handlers.admission)
-    running = [autopilot.run(), grants.run(), monitor.run(), monitor.record(), tours.run(), serving]
+    calls = serve_grpc("mobility", options.listen, tls, register, handlers.admission)
+    running = [autopilot.run(), grants.run(), monitor.run(), monitor.record(), tours.run(), calls]
     if not options.autopilot:
         running.append(_follow(description, url, heard))
+    metrics.observe(partial(common_figures, tls, grants, audit, lambda: recorder.problem))
+    metrics.observe(partial(flight_figures, control, parts.supervisor))
     try:
-        await run_until(stop, *running)
+        async with serving(options.metrics, metrics.text):
+            await run_until(stop, *running)
     finally:
         control.close()
     log.info("mobility: stopped, a drone in flight goes home by its autopilot's failsafe")

@@ -1,0 +1,51 @@
+"""What the agent tells Prometheus of its node: what it knows of the API server, the drone and the grants, and how old that is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+from fractus_observe.exposition import CERTIFICATE_EXPIRY, gauge
+from prometheus_client.core import Metric
+
+
+@dataclass(frozen=True, slots=True)
+class AgentFigures:
+    """What holds of a node's agent now.
+
+    Attributes:
+        expires_s: Unix time at which the node's certificate expires; None while there is none.
+        heard_s: by kind, seconds since the API server said anything about it.
+        reported_s: seconds since the API server took the node's status; infinite before that.
+        telemetry_s: seconds since the mobility service was heard; None on a node without one.
+        grants: how many are stored, unverified, unusable or unstored.
+        checkpoints: by name of an audit log, number of the entry that was signed last.
+    """
+
+    expires_s: float | None
+    heard_s: Mapping[str, float]
+    reported_s: float
+    telemetry_s: float | None
+    grants: Mapping[str, int] = field(default_factory=dict)
+    checkpoints: Mapping[str, int] = field(default_factory=dict)
+
+    def metrics(self) -> Iterator[Metric]:
+        """All of it for Prometheus."""
+        if self.expires_s is not None:
+            yield gauge(CERTIFICATE_EXPIRY, "When the node's certificate expires, in Unix time.", self.expires_s)
+        yield gauge(
+            "fractus_agent_watch_age_seconds",
+            "Since the API server said anything about a kind; it does at least about every minute.",
+            self.heard_s,
+            "kind",
+        )
+        yield gauge("fractus_agent_report_age_seconds", "Since the API server took the node's status.", self.reported_s)
+        if self.telemetry_s is not None:
+            yield gauge("fractus_telemetry_age_seconds", "Since the mobility service was heard.", self.telemetry_s)
+        yield gauge("fractus_agent_grants", "Grants of the node, by what became of them.", self.grants, "state")
+        yield gauge(
+            "fractus_audit_checkpoint_sequence",
+            "Number of the entry of an audit log that was signed last.",
+            self.checkpoints,
+            "log",
+        )

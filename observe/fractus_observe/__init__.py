@@ -1,0 +1,1 @@
+"""What a workload tells those who operate it: figures for Prometheus."""

@@ -1,0 +1,153 @@
+"""Answers GET /metrics from an event loop that has a drone to fly: few requests at once, and few a second."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+from collections.abc import AsyncIterator, Callable, Iterable, Mapping
+from contextlib import asynccontextmanager
+from typing import Any
+
+from prometheus_client import CollectorRegistry, disable_created_metrics
+from prometheus_client.core import GaugeMetricFamily, Metric
+from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
+
+LOG = logging.getLogger(__name__)
+
+CERTIFICATE_EXPIRY = "fractus_certificate_expiry_timestamp_seconds"
+"""The one name under which every workload tells of its certificate."""
+
+MAX_CONNECTIONS = 4
+"""Answered at once; others wait in the kernel's queue, or are refused by it."""
+PAUSE_S = 0.05
+"""Between two that are accepted: a client that asks without end gets 20 answers a second, and the loop has the rest of its time."""
+REQUEST_TIMEOUT_S = 5.0
+MAX_REQUEST_BYTES = 8192
+
+# When a figure began says nothing that a restart does not.
+disable_created_metrics()
+
+
+class Observed:
+    """Figures that are read when they are asked for; registers with a registry.
+
+    Args:
+        figures: makes them.
+    """
+
+    def __init__(self, figures: Callable[[], Iterable[Metric]]) -> None:
+        self._figures = figures
+
+    def collect(self) -> Iterable[Metric]:
+        """The figures as they are now."""
+        return self._figures()
+
+
+def gauge(name: str, text: str, value: float | Mapping[str, float], label: str = "") -> Metric:
+    """A figure, or one for each value of a label.
+
+    Args:
+        name: of the metric, with its unit.
+        text: what it is.
+        value: the figure, or figures by the label's values.
+        label: name of the label.
+    """
+    family = GaugeMetricFamily(name, text, labels=[label] if label else None)
+    for key, figure in value.items() if isinstance(value, Mapping) else [("", value)]:
+        family.add_metric([key] if label else [], figure)
+    return family
+
+
+def text_of(*registries: CollectorRegistry) -> bytes:
+    """What registries hold now, in Prometheus' text format."""
+    return b"".join(generate_latest(registry) for registry in registries)
+
+
+@asynccontextmanager
+async def serving(listen: str, text: Callable[[], bytes]) -> AsyncIterator[None]:
+    """Answer GET /metrics meanwhile; an address that cannot be bound costs the metrics and nothing else.
+
+    Args:
+        listen: HOST:PORT, all addresses where the host is empty; empty: nowhere.
+        text: makes the answer, in this event loop, which is where the figures are.
+    """
+    server = _bound(listen) if listen else None
+    if server is None:
+        yield
+        return
+    accepting = asyncio.create_task(_accept(server, text))
+    try:
+        yield
+    finally:
+        accepting.cancel()
+        await asyncio.gather(accepting, return_exceptions=True)
+        server.close()
+
+
+def _bound(listen: str) -> socket.socket | None:
+    host, _, port = listen.rpartition(":")
+    try:
+        if host:
+            family, _, _, _, address = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_STREAM)[0]
+            server = socket.create_server(address, family=family)
+        elif socket.has_dualstack_ipv6():
+            server = socket.create_server(("", int(port)), family=socket.AF_INET6, dualstack_ipv6=True)
+        else:
+            server = socket.create_server(("", int(port)))
+    except (OSError, ValueError) as error:
+        LOG.warning("metrics: not served (address=%s error=%s)", listen, error)
+        return None
+    server.setblocking(False)
+    return server
+
+
+async def _accept(server: socket.socket, text: Callable[[], bytes]) -> None:
+    loop = asyncio.get_running_loop()
+    slots = asyncio.Semaphore(MAX_CONNECTIONS)
+    async with asyncio.TaskGroup() as answers:
+        while True:
+            await slots.acquire()
+            try:
+                connection, _ = await loop.sock_accept(server)
+            except OSError as error:
+                # Out of file descriptors, or a peer that was gone at once.
+                LOG.debug("metrics: not accepted (error=%s)", error)
+                slots.release()
+            else:
+                answers.create_task(_answer(connection, text)).add_done_callback(lambda _: slots.release())
+            await asyncio.sleep(PAUSE_S)
+
+
+async def _answer(connection: socket.socket, text: Callable[[], bytes]) -> None:
+    loop = asyncio.get_running_loop()
+    with connection:
+        connection.setblocking(False)
+        try:
+            async with asyncio.timeout(REQUEST_TIMEOUT_S):
+                request = b""
+                while b"\r\n\r\n" not in request and len(request) < MAX_REQUEST_BYTES:
+                    received = await loop.sock_recv(connection, MAX_REQUEST_BYTES)
+                    if not received:
+                        return
+                    request += received
+                await loop.sock_sendall(connection, _response(request, text))
+        except (OSError, TimeoutError) as error:
+            LOG.debug("metrics: not told (error=%s)", error)
+
+
+def _response(request: bytes, text: Callable[[], bytes]) -> bytes:
+    if not request.startswith((b"GET /metrics ", b"GET /metrics?")):
+        return _http("404 Not Found", b"")
+    try:
+        return _http("200 OK", text())
+    except Exception:
+        # A figure that cannot be had is no reason to end what is observed.
+        LOG.exception("metrics: a figure failed")
+        return _http("500 Internal Server Error", b"")
+
+
+def _http(status: str, body: bytes) -> bytes:
+    fields: dict[str, Any] = {"Content-Type": CONTENT_TYPE_LATEST, "Content-Length": len(body), "Connection": "close"}
+    lines = [f"HTTP/1.1 {status}", *(f"{name}: {value}" for name, value in fields.items())]
+    return "\r\n".join(lines).encode() + b"\r\n\r\n" + body

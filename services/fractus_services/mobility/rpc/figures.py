@@ -1,0 +1,43 @@
+"""What Prometheus is told of the drone: how old what is known of it is, who commands it, and whether its failsafes hold."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from fractus_core.control import Authority
+from fractus_observe.exposition import gauge
+from prometheus_client.core import Metric
+
+from fractus_services.mobility.authority.control import Control
+from fractus_services.mobility.authority.supervisor import Supervisor
+
+
+def flight_figures(control: Control, supervisor: Supervisor) -> Iterator[Metric]:
+    """What holds of the drone now."""
+    autopilot, vehicle = control.autopilot, control.autopilot.vehicle
+    yield gauge(
+        "fractus_telemetry_age_seconds", "Age of the drone's position.", max(autopilot.now - vehicle.position_at, 0.0)
+    )
+    yield gauge(
+        "fractus_autopilot_heartbeat_age_seconds",
+        "Since the autopilot was heard.",
+        max(autopilot.now - vehicle.heartbeat_at, 0.0),
+    )
+    yield gauge("fractus_in_air", "1 while the drone is in the air, or may be.", vehicle.in_air)
+    yield gauge(
+        "fractus_control_authority",
+        "1 for who has control authority.",
+        {authority.value: float(authority is control.authority) for authority in Authority},
+        "authority",
+    )
+    yield gauge(
+        "fractus_companion_alive",
+        "1 while the autopilot gets heartbeats, since a driver, the system or a pilot is responsible for the drone.",
+        supervisor.alive(),
+    )
+    yield gauge(
+        "fractus_failsafes_verified",
+        "1 while the autopilot's failsafes are known to be set.",
+        control.checked is not None,
+    )
+    yield gauge("fractus_battery_ratio", "Charge that is left, 0 to 1; NaN while unknown.", vehicle.battery_remaining)

@@ -1,0 +1,143 @@
+"""What the workloads of a node tell Prometheus: the figures that docs/metrics.md names, and the right ones."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from ipaddress import IPv4Address
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+from exposed import assert_documented, values
+from fractus_agent.links.decisions import Actions
+from fractus_agent.links.flows import Flow
+from fractus_agent.links.metrics import LinkMetrics
+from fractus_agent.links.reports import DroneReport
+from fractus_agent.metrics import AgentFigures
+from fractus_agent.redirector.nft import Endpoint
+from fractus_core.linking import NO_LINK, PathMetrics, Peer
+from fractus_observe.exposition import Observed, text_of
+from fractus_services.auth import TlsFiles
+from fractus_services.grants import GrantFiles
+from fractus_services.metrics import MAX_POLICIES, DecisionMetrics, ServiceMetrics, common_figures
+from fractus_services.mobility.rpc.figures import flight_figures
+from fractus_storage.audit import AuditLog
+from mobility_world import World, fly, spec
+from prometheus_client import CollectorRegistry
+
+
+def text(*figures: Any) -> str:
+    registry = CollectorRegistry()
+    for each in figures:
+        registry.register(Observed(each))
+    return text_of(registry).decode()
+
+
+def entry(kind: str, action: str, *policies: str, **more: str) -> dict[str, Any]:
+    return {"time": "", "kind": kind, "action": action, "code": "Code", "policies": list(policies), **more}
+
+
+def test_decisions_are_counted_as_the_audit_log_has_them() -> None:
+    registry = CollectorRegistry()
+    counted = DecisionMetrics(registry)
+    for each in (
+        entry("call", "allow"),
+        entry("call", "correct", "fence"),
+        entry("call", "deny", "fence", "campus"),
+        entry("check", "deny", "fence"),
+        entry("takeover", "hover", controller="system"),
+        entry("monitor", "deny", "fence"),
+        {"time": "", "kind": "state", "lat": 1.0},
+    ):
+        counted.take_entry(each)
+    seen = values(text_of(registry).decode())
+    assert {key: value for key, value in seen.items() if key[0] == "fractus_verdicts_total"} == {
+        ("fractus_verdicts_total", action, "Code"): 1.0 for action in ("allow", "correct", "deny")
+    }
+    assert seen["fractus_policy_verdicts_total", "correct", "fence"] == 1.0
+    assert seen["fractus_policy_verdicts_total", "deny", "fence"] == 1.0
+    assert seen["fractus_policy_verdicts_total", "deny", "campus"] == 1.0
+    assert seen["fractus_takeovers_total", "Code", "system"] == 1.0
+    assert seen["fractus_monitor_interventions_total", "deny", "Code"] == 1.0
+
+
+def test_policies_without_number_do_not_fill_the_memory() -> None:
+    registry = CollectorRegistry()
+    counted = DecisionMetrics(registry)
+    for number in range(MAX_POLICIES + 10):
+        counted.take_entry(entry("call", "deny", f"policy-{number}"))
+    seen = values(text_of(registry).decode())
+    assert seen["fractus_policy_verdicts_total", "deny", "other"] == 10.0
+    assert len([key for key in seen if key[0] == "fractus_policy_verdicts_total"]) == MAX_POLICIES + 1
+
+
+def test_the_mobility_service_tells_what_is_documented(tmp_path: Path) -> None:
+    metrics = ServiceMetrics()
+    audit = AuditLog(tmp_path / "audit.jsonl", lambda: 1_780_000_000.0, copied=metrics.take_entry)
+    grants = cast(GrantFiles, SimpleNamespace(active={"a": None, "b": None}))
+    tls = cast(TlsFiles, SimpleNamespace(expires_s=lambda: 2e9))
+    problem = [""]
+    metrics.observe(lambda: common_figures(tls, grants, audit, lambda: problem[0]))
+    for kind in ("call", "takeover", "monitor"):
+        audit.append(kind, {"action": "deny", "code": "Code", "policies": ["p"], "controller": "system"})
+    asyncio.run(audit.close())
+    told = []
+
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            told.append(text(lambda: flight_figures(world.control, world.supervisor)))
+            await world.up(world.grants.put(spec()))
+            told.append(text(lambda: flight_figures(world.control, world.supervisor)))
+
+    fly(flight)
+    on_ground = values(told[0])
+    assert on_ground["fractus_in_air",] == 0
+    assert on_ground["fractus_control_authority", "system"] == 1
+    whole = metrics.text().decode() + told[1]
+    assert_documented(whole, "Mobility and camera", "Mobility")
+    seen = values(whole)
+    assert seen["fractus_audit_sequence",] == 3
+    assert seen["fractus_audit_waiting",] == seen["fractus_audit_failing",] == seen["fractus_recording_failing",] == 0
+    assert seen["fractus_grants",] == 2
+    assert seen["fractus_in_air",] == seen["fractus_companion_alive",] == seen["fractus_failsafes_verified",] == 1
+    assert seen["fractus_control_authority", "driver"] == 1
+    assert 0 <= seen["fractus_telemetry_age_seconds",] < 1
+    assert 0 <= seen["fractus_autopilot_heartbeat_age_seconds",] < 3
+    problem[0] = "the disk is full"
+    assert values(metrics.text().decode())["fractus_recording_failing",] == 1
+
+
+def test_the_agent_tells_what_is_documented() -> None:
+    figures = AgentFigures(
+        expires_s=2e9,
+        heard_s={"grants": 3.0},
+        reported_s=math.inf,
+        telemetry_s=0.5,
+        grants={"stored": 2, "unverified": 0},
+        checkpoints={"mobility": 7},
+    )
+    told = text(figures.metrics)
+    assert_documented(told, "Agent")
+    seen = values(told)
+    assert seen["fractus_agent_report_age_seconds",] == math.inf
+    assert seen["fractus_agent_watch_age_seconds", "grants"] == 3.0
+    assert seen["fractus_audit_checkpoint_sequence", "mobility"] == 7.0
+
+
+def test_the_drones_links_tell_what_is_documented() -> None:
+    offers = PathMetrics(8.0, 8.0, 5.0, 5.0, direct=True)
+    peer = Peer("e1", (0.0, 0.0, 0.0), 50.0, offers)
+    service = Endpoint(IPv4Address("10.96.0.5"), 8080)
+    report = DroneReport(
+        links=(), link=NO_LINK, actions=cast(Actions, None), direct=frozenset({service}), measured=None, reaches={}, unknown={},
+        cloud=None, offers={peer: offers}, flows={service: Flow(1.5, 0.5)},
+    )  # fmt: skip
+    metrics = LinkMetrics()
+    metrics.take(report)
+    told = text(metrics.collect)
+    assert_documented(told, "Direct links of a drone")
+    seen = values(told)
+    assert seen["fractus_switches_total",] == seen["fractus_traffic_direct",] == 1
+    assert seen["fractus_path_bandwidth_mbps", "cloud"] == 0
+    assert seen["fractus_path_bandwidth_mbps", "e1"] == 8.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import pytest
 import yaml
 from click.testing import CliRunner
 from fractus_sim.demo import collect, watch
+from fractus_sim.demo import view as demo_view
 from fractus_sim.demo.__main__ import demo
 from fractus_sim.demo.clusters import ROOT, assign
 from fractus_sim.demo.collect import fetch_logs, spread
@@ -237,3 +239,40 @@ def test_a_change_of_path_is_told_once() -> None:
         (4.0, "edge-1", "cloud", "left"),
     ]
     assert said == ["traffic goes by WiFi to edge-1: near", "traffic goes no more by WiFi to edge-1: left"]
+
+
+class Pod:
+    """A drone's pod with recordings in it."""
+
+    def __init__(self, *names: str) -> None:
+        self.names = names
+
+    def run(self, *arguments: str, **_: Any) -> str:
+        return "fractus-mobility-x\n" if "get" in arguments else "\n".join(self.names)
+
+    def fetch(self, pod: str, path: str, to: Path) -> None:
+        to.write_text(f"{pod} {path}")
+
+
+def test_the_recordings_of_the_mission_are_kept_and_the_command_that_replays_them_is_told(tmp_path: Path) -> None:
+    assert demo_view.replay_command(tmp_path) is None
+    began_s = datetime(2026, 6, 1, 12, tzinfo=UTC).timestamp()
+    names = ("mobility/000001-20260531T120000Z.mcap", "mobility/000002-20260601T120001Z.mcap", "camera/x.mcap")
+    found = demo_view.fetch_recordings(Pod(*names), "drone-1", began_s, tmp_path)  # type: ignore[arg-type]
+    assert [path.name for path in found] == ["mobility-000002-20260601T120001Z.mcap"]
+    assert found[0].read_text() == f"fractus-mobility-x /var/lib/fractus/recordings/{names[1]}"
+    assert demo_view.replay_command(tmp_path) == f"fractus view {tmp_path}/recordings/*.mcap"
+
+
+def test_a_page_that_cannot_be_served_stops_no_demo(tmp_path: Path) -> None:
+    said, told = list[str](), threading.Event()
+    (tmp_path / "config").write_text("no kubeconfig")
+
+    def say(line: str) -> None:
+        said.append(line)
+        told.set()
+
+    with demo_view.shown(tmp_path / "config", say):
+        assert told.wait(200)
+    assert len(said) == 1
+    assert said[0].startswith("no live view: fractus: the kubeconfig")

@@ -13,6 +13,7 @@ from rich.markdown import Markdown
 from fractus_sim.demo.clusters import CurrentCluster, EmbeddedCluster
 from fractus_sim.demo.kube import DemoError
 from fractus_sim.demo.runner import ClusterError, Demo, Teller, report_again
+from fractus_sim.demo.view import replay_command
 from fractus_sim.interruption import break_off_on_signals
 
 
@@ -66,7 +67,11 @@ def demo(
         click.echo("demo: interrupted", err=True)
         sys.exit(130)
     console.print(Markdown((out / "summary.md").read_text()))
-    click.echo(f"report: {out}/summary.md, map.png, altitude.png, flight.geojson, plan.yaml, audit/, pictures/")
+    click.echo(
+        f"report: {out}/summary.md, map.png, altitude.png, flight.geojson, plan.yaml, audit/, pictures/, recordings/"
+    )
+    if (replay := replay_command(out)) is not None:
+        click.echo(f"replay: {replay}")
     sys.exit(0 if fine else 1)
 
 

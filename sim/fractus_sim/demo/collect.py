@@ -58,7 +58,7 @@ def _audit(kube: Kube, mission: Mission, folder: Path) -> dict[str, Any]:
     if not mission.drone:
         return {}
     try:
-        fetch_logs(kube, _mobility_pod(kube, mission.drone), folder / AUDIT)
+        fetch_logs(kube, mobility_pod(kube, mission.drone), folder / AUDIT)
     except DemoError as error:
         return {**found, "problem": f"it could not be fetched: {error}"}
 
@@ -106,7 +106,7 @@ def fetch_pictures(kube: Kube, record: Record, folder: Path) -> None:
     """
     if record.drone is None or record.takeoff_s is None:
         return
-    pod = _mobility_pod(kube, record.drone.name)
+    pod = mobility_pod(kube, record.drone.name)
     listed = kube.run("exec", "-n", SYSTEM, pod, "--", "sh", "-c", f"cd {_ALBUMS} && ls -1 */*.jpg || true").split()
     begin_s, end_s = record.samples[0].time_s, record.samples[-1].time_s
     (folder / PICTURES).mkdir(parents=True, exist_ok=True)
@@ -128,7 +128,12 @@ def spread(paths: list[str], begin_s: float, end_s: float) -> list[str]:
     return sorted(chosen, key=lambda path: taken[path])
 
 
-def _mobility_pod(kube: Kube, node: str) -> str:
+def mobility_pod(kube: Kube, node: str) -> str:
+    """Name of the pod of a drone's mobility service.
+
+    Raises:
+        DemoError: there is none.
+    """
     text = kube.run(
         "get", "pods", "-n", SYSTEM, "--field-selector", f"spec.nodeName={node},status.phase=Running", "-o",
         "jsonpath={range .items[*]}{.metadata.name}{\"\\n\"}{end}",

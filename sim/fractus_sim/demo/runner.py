@@ -17,6 +17,7 @@ from rich.console import Console
 from fractus_sim.demo.clusters import EXAMPLE, ROOT, DemoCluster, documents
 from fractus_sim.demo.collect import collect, fetch_pictures
 from fractus_sim.demo.kube import SYSTEM, DemoError, Kube, Object
+from fractus_sim.demo.view import RECORDINGS, fetch_recordings, shown
 from fractus_sim.demo.watch import Mission, follow, wait_ready
 from fractus_sim.interruption import uninterrupted
 from fractus_sim.report import Record, write_report
@@ -98,7 +99,7 @@ class Demo:
         self.out.mkdir(parents=True, exist_ok=True)
         for stale in (PAGE, OBJECTS, "events.json", LOGS):
             (self.out / stale).unlink(missing_ok=True)
-        for folder in (AUDIT, PICTURES):
+        for folder in (AUDIT, PICTURES, RECORDINGS):
             shutil.rmtree(self.out / folder, ignore_errors=True)
         kube: Kube | None = None
         installed: list[str] = []
@@ -140,10 +141,12 @@ class Demo:
             mission.times["applied"] = time.time()
             kube.apply(application)
             try:
-                follow(kube, mission, logs, timeout_s=self.timeout_s, say=self.tell, show=self.tell.show)
+                with shown(kube.kubeconfig, self.tell):
+                    follow(kube, mission, logs, timeout_s=self.timeout_s, say=self.tell, show=self.tell.show)
             finally:
                 collect(kube, mission, self.out, logs)
                 self._fetch_pictures(kube)
+                self._fetch_recordings(kube, mission)
                 record = Record.read(self.out)
                 write_report(record, self.out)
         return _as_promised(record, self.tell)
@@ -153,6 +156,13 @@ class Demo:
             fetch_pictures(kube, Record.read(self.out), self.out)
         except DemoError as error:
             self.tell(f"no pictures of the flight: {error}")
+
+    def _fetch_recordings(self, kube: Kube, mission: Mission) -> None:
+        try:
+            if not fetch_recordings(kube, mission.drone, mission.times["applied"], self.out):
+                self.tell("no recording of the flight: the drone's services make none")
+        except DemoError as error:
+            self.tell(f"no recording of the flight: {error}")
 
     def _clean_up(self, kube: Kube | None, installed: list[str]) -> None:
         if kube is not None and not self.cluster.disposable:

@@ -1,0 +1,78 @@
+"""The mission on a web page: live while it flies, and from its recording afterwards."""
+
+from __future__ import annotations
+
+import contextlib
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+
+from fractus_sim.demo.collect import mobility_pod
+from fractus_sim.demo.kube import SYSTEM, Kube
+
+RECORDINGS = "recordings"
+"""Folder of the report."""
+
+_ON_NODE = "/var/lib/fractus/recordings"
+_END_S = 10.0
+
+
+@contextlib.contextmanager
+def shown(kubeconfig: Path, say: Callable[[str], None]) -> Iterator[None]:
+    """Serve the page of `fractus view`, and say its address; without it the demo goes on."""
+    command = [sys.executable, "-m", "fractus_cli", "view", "--kubeconfig", str(kubeconfig), "--listen", "127.0.0.1:0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
+
+        def tell() -> None:
+            line = process.stdout.readline().strip() if process.stdout is not None else ""
+            _, found, address = line.partition("view: open ")
+            if line:
+                say(f"watch it: {address}" if found else f"no live view: {line}")
+
+        # The mission does not wait for it.
+        telling = threading.Thread(target=tell, daemon=True)
+        telling.start()
+        try:
+            yield
+        finally:
+            process.terminate()
+            try:
+                process.wait(_END_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+            telling.join(_END_S)
+
+
+def fetch_recordings(kube: Kube, drone: str, since_s: float, folder: Path) -> list[Path]:
+    """Copy what the services of a drone recorded since some time (Unix seconds); none where they record nothing.
+
+    Raises:
+        DemoError: they cannot be read.
+    """
+    pod = mobility_pod(kube, drone)
+    script = f"cd {_ON_NODE} 2> /dev/null && ls -1 */*.mcap 2> /dev/null || true"
+    names = kube.run("exec", "-n", SYSTEM, pod, "--", "sh", "-c", script).split()
+    found: list[Path] = []
+    for name in sorted(names):
+        if begun_s(name) >= since_s:
+            to = folder / RECORDINGS / name.replace("/", "-")
+            to.parent.mkdir(parents=True, exist_ok=True)
+            kube.fetch(pod, f"{_ON_NODE}/{name}", to)
+            found.append(to)
+    return found
+
+
+def begun_s(name: str) -> float:
+    """When a recording began, by its name (SERVICE/NUMBER-YYYYMMDDTHHMMSSZ.mcap), in Unix seconds; 0 for other names."""
+    with contextlib.suppress(ValueError):
+        stamp = Path(name).stem.partition("-")[2]
+        return datetime.strptime(stamp, "%Y%m%dT%H%M%SZ").replace(tzinfo=UTC).timestamp()
+    return 0.0
+
+
+def replay_command(folder: Path) -> str | None:
+    """What shows the recordings of a report; None where there are none."""
+    return f"fractus view {folder / RECORDINGS}/*.mcap" if any((folder / RECORDINGS).glob("*.mcap")) else None

@@ -55,7 +55,10 @@ def test_a_mission_is_told_from_apply_to_landing() -> None:
     assert not mission.ended
     mission.see([application("Running"), plan, pod("a", True), flying("flying")], 110.0, said.append)
     assert not mission.grounded
-    mission.see([application("Completed", "done"), plan, flying("landing")], 200.0, said.append)
+    stopped = pod("a", False)
+    stopped["metadata"]["labels"] = {"fractus.dev/finished": "20260101T000000Z"}
+    mission.see([application("Completed", "done"), plan, stopped, flying("landing")], 200.0, said.append)
+    assert mission.pods == {"a": pod("a", True)}, "what is reported of it is how it ran"
     assert mission.ended
     assert not mission.grounded
     mission.see([application("Completed", "done"), plan, flying("inactive")], 230.0, said.append)

@@ -52,7 +52,7 @@ class Mission:
                 self.times["planned"] = now_s
                 placements = body["spec"].get("placements", [])
                 say(f"planned after {now_s - self.times['applied']:.1f} s: {len(placements)} instances, {_drone(body)}")
-            elif kind == "Pod" and "deletionTimestamp" not in body["metadata"]:
+            elif kind == "Pod" and not _ends(body):
                 self.pods[name] = body
             elif kind == "DirectLink" and body["spec"]["application"]["name"] == self.application:
                 self._see_link(body, now_s, say)
@@ -196,6 +196,12 @@ def _tell(logs: Path, start: int, say: Say) -> int:
         if match and match["container"] == b"navigator":
             say("navigator: " + match["text"].decode("utf-8", "replace"))
     return start + end
+
+
+def _ends(pod: Object) -> bool:
+    """Whether a pod's mission is over: what is reported of it is how it ran."""
+    metadata = pod["metadata"]
+    return "deletionTimestamp" in metadata or "fractus.dev/finished" in metadata.get("labels", {})
 
 
 def _ready(pod: Object) -> bool:

@@ -86,7 +86,11 @@ def control_points(env: Mapping[str, str] | None = None) -> tuple[ControlPoint, 
             source = f"FRACTUS_GRANT ({values['FRACTUS_GRANT']})"
             points = json.loads(Path(values["FRACTUS_GRANT"]).read_bytes())["spec"].get("controlPoints") or []
         else:
-            points = json.loads(_needed(values, source))
+            if not values.get(source):
+                raise NotConfigured(
+                    f"{source} is not set; set FRACTUS_GRANT to a signed Grant's file, or see `control.task`"
+                )
+            points = json.loads(values[source])
         return tuple(ControlPoint.from_manifest(point) for point in points)
     except OSError as error:
         raise NotConfigured(f"{source} cannot be read: {error.strerror}; name a signed Grant's file") from None

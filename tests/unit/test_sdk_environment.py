@@ -82,6 +82,8 @@ def test_control_points_of_a_grant_are_those_of_its_driver(tmp_path: Path) -> No
     assert point.region.exterior[1] == fractus.Position(0.0, 1.0)
     with pytest.raises(fractus.NotConfigured, match=r"FRACTUS_GRANT .* cannot be read"):
         control_points({"FRACTUS_GRANT": str(tmp_path / "none.json")})
+    with pytest.raises(fractus.NotConfigured, match="set FRACTUS_GRANT to a signed Grant's file"):
+        control_points({})
 
 
 @pytest.mark.parametrize("text", ["{", "3", '[{"path": []}]', '[{"navigation": "pathBased", "path": [{"lat": 1}]}]'])

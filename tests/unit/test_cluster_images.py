@@ -100,7 +100,7 @@ def checkout(tmp_path: Path) -> Path:
     """A small copy of what images are made of."""
     for name in ("Dockerfile", ".dockerignore", "pyproject.toml", "uv.lock", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, tmp_path / name)
-    for room in ("core", "operator", "agent", "services", "sdk", "proto", "sim"):
+    for room in ("core", "observe", "operator", "agent", "services", "sdk", "proto", "sim"):
         (tmp_path / room).mkdir()
         (tmp_path / room / "module.py").write_text(f"ROOM = {room!r}\n")
     (tmp_path / "examples" / "traffic-monitoring").mkdir(parents=True)
@@ -111,6 +111,7 @@ def checkout(tmp_path: Path) -> Path:
     ("changed", "stale"),
     [
         ("core/module.py", {"operator", "agent", "services", "sim", "view"}),
+        ("observe/module.py", {"operator", "agent", "services", "sim"}),
         ("operator/module.py", {"operator"}),
         (
             "sdk/module.py",

@@ -27,11 +27,11 @@ _RECIPE = ("Dockerfile", ".dockerignore", "pyproject.toml", "uv.lock", "README.m
 _CODE: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "component": ("sdk", "cli", "proto"),
-        "operator": ("core", "kube", "operator", "proto"),
-        "agent": ("core", "kube", "storage", "agent", "proto"),
-        "services": ("core", "mavlink", "storage", "services", "sdk", "cli", "proto"),
+        "operator": ("core", "kube", "observe", "operator", "proto"),
+        "agent": ("core", "kube", "observe", "storage", "agent", "proto"),
+        "services": ("core", "mavlink", "observe", "storage", "services", "sdk", "cli", "proto"),
         "view": ("core", "kube", "cli", "view/fractus_view", "proto"),
-        "sim": ("core", "mavlink", "storage", "services", "sdk", "cli", "proto", "sim"),
+        "sim": ("core", "mavlink", "observe", "storage", "services", "sdk", "cli", "proto", "sim"),
         "example-traffic-monitoring": ("sdk", "cli", "proto", "examples/traffic-monitoring"),
         "example-field": ("sdk", "cli", "proto", "examples/field"),
         "example-links": ("sdk", "cli", "proto", "examples/links"),

@@ -10,7 +10,7 @@ import signal
 import sys
 from collections.abc import Mapping
 
-from fractus_storage import logs
+from fractus_observe import logs
 
 from fractus_agent.cluster.store import Store, Unconfigured, connect
 from fractus_agent.daemon import Agent
@@ -44,7 +44,11 @@ def main(environment: Mapping[str, str] = os.environ) -> int:
     except MissingSetting as error:
         print(error, file=sys.stderr)
         return 2
-    logs.configure(settings.log_level)
+    try:
+        logs.configure(settings.log_level, settings.log_format)
+    except ValueError as error:
+        print(f"FRACTUS_LOG_LEVEL, FRACTUS_LOG_FORMAT: {error}", file=sys.stderr)
+        return 2
     LOG.info("agent: started (node=%s)", settings.node)
     try:
         asyncio.run(serve(settings))

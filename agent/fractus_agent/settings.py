@@ -20,6 +20,7 @@ class Settings:
     state: Path
     mobility_address: str
     log_level: str = "INFO"
+    log_format: str = "text"
     direct_links: bool = True
     metrics: str = ""
 
@@ -50,7 +51,7 @@ class Settings:
 
     @classmethod
     def from_environment(cls, environment: Mapping[str, str]) -> Settings:
-        """Read FRACTUS_NODE (needed), and FRACTUS_DESCRIPTION, _STATE_DIR, _MOBILITY, _LOG_LEVEL, _DIRECT_LINKS and _METRICS.
+        """Read FRACTUS_NODE (needed), and FRACTUS_DESCRIPTION, _STATE_DIR, _MOBILITY, _LOG_LEVEL, _LOG_FORMAT, _DIRECT_LINKS and _METRICS.
 
         Raises:
             MissingSetting: FRACTUS_NODE is not set.
@@ -65,5 +66,6 @@ class Settings:
             mobility_address=environment.get("FRACTUS_MOBILITY", "127.0.0.1:50051"),
             direct_links=environment.get("FRACTUS_DIRECT_LINKS", "true").lower() == "true",
             metrics=environment.get("FRACTUS_METRICS", ""),
+            log_format=environment.get("FRACTUS_LOG_FORMAT") or "text",
             log_level=environment.get("FRACTUS_LOG_LEVEL", "INFO").upper(),
         )

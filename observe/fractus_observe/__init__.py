@@ -1,1 +1,1 @@
-"""What a workload tells those who operate it: figures for Prometheus."""
+"""What a workload tells those who operate it: figures for Prometheus, and logs."""

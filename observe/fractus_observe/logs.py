@@ -1,11 +1,17 @@
-"""Logs that no one can fill the disk with: what a peer, a camera or an autopilot can make us say is limited."""
+"""Logs for people or programs, that no one can fill the disk with: what a peer, a camera or an autopilot can make us say is limited."""
 
 from __future__ import annotations
 
+import json
 import logging
+import math
+import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+from typing import Any
 
+FORMS = ("text", "json")
 BURST = 50
 """Records of one line of the program that are written one after the other."""
 RATE_PER_S = 0.5
@@ -35,13 +41,71 @@ class LogLimit(logging.Filter):
             return False
         line[0] -= 1
         if line[2]:
-            record.msg, record.args = f"{record.getMessage()} (left_out={line[2]:.0f})", None
+            args = record.args if isinstance(record.args, tuple) else (record.args,) if record.args else ()
+            # The number is an argument like others, so that programs find it as a field.
+            record.msg, record.args = f"{record.msg} (left_out=%d)", (*args, int(line[2]))
             line[2] = 0
         return True
 
 
-def configure(level: str | int) -> None:
-    """Write the log to stderr, within the limit."""
+_PLACEHOLDER = re.compile(r"%%|(?:(\w+)=)?%[-#0 +]*\d*(?:\.\d+)?[a-zA-Z]")
+_COMPONENT = re.compile(r"([a-z][a-z ]*): ")
+
+
+class JsonFormatter(logging.Formatter):
+    """One JSON object a line: time, level, logger, message, and what the message says as `name=value` as fields of their own.
+
+    The names are those of the program's text, the values those that it was given: nothing that a peer says can add a field.
+    """
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The line of a record."""
+        template = record.msg if isinstance(record.msg, str) else ""
+        said: dict[str, Any] = {
+            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
+            "level": record.levelname,
+            "logger": record.name,
+            "message": record.getMessage(),
+        }
+        if found := _COMPONENT.match(template):
+            said["component"] = found[1]
+        if fields := dict(_fields(template, record.args)):
+            said["fields"] = fields
+        if record.exc_info:
+            said["exception"] = self.formatException(record.exc_info)
+        return json.dumps(said, ensure_ascii=False, default=str)
+
+
+def _fields(template: str, args: object) -> Iterator[tuple[str, object]]:
+    """The arguments that a template names."""
+    if not isinstance(args, tuple):
+        return
+    names = [found[1] for found in _PLACEHOLDER.finditer(template) if found[0] != "%%"]
+    for name, value in zip(names, args, strict=False):
+        if name is not None:
+            yield name, value if isinstance(value, int | str) or _finite(value) else str(value)
+
+
+def _finite(value: object) -> bool:
+    return isinstance(value, float) and math.isfinite(value)
+
+
+def configure(level: str | int, form: str = "text") -> None:
+    """Write the log to stderr, within the limit.
+
+    Args:
+        level: from which on records are written.
+        form: text or json.
+
+    Raises:
+        ValueError: the level or the form is none.
+    """
+    if form not in FORMS:
+        raise ValueError(f"{form!r} is no form of logs: use {' or '.join(FORMS)}")
     logging.basicConfig(level=level, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     for handler in logging.getLogger().handlers:
         handler.addFilter(LogLimit())
+        if form == "json":
+            handler.setFormatter(JsonFormatter())
+    # Health checks of the kubelet, every few seconds.
+    logging.getLogger("aiohttp.access").setLevel(logging.WARNING)

@@ -16,6 +16,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from fractus_core.identity.authority import Authority, BrokenAuthority
+from fractus_observe import logs
 from fractus_observe.exposition import serving
 
 from fractus_operator import handlers, metrics
@@ -196,9 +197,7 @@ def main() -> int:
     except BadSetting as error:
         print(error, file=sys.stderr)
         return 2
-    logging.basicConfig(
-        level=settings.log_level, format="%(asctime)s %(levelname)-7s %(name)s: %(message)s", stream=sys.stderr
-    )
+    logs.configure(settings.log_level, settings.log_format)
     logging.getLogger("kopf").setLevel(max(settings.log_level, logging.WARNING))
     try:
         asyncio.run(run(settings))

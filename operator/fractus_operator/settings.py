@@ -11,6 +11,7 @@ from fractus_core.api import InvalidObject
 from fractus_core.planning.inventory import PolicyConflicts
 from fractus_core.planning.inventory import Settings as PlanningSettings
 from fractus_core.planning.plugins import UnknownPlugin, load_plugin
+from fractus_observe.logs import FORMS
 
 _PLANNING = {
     "safety_radius_m": "FRACTUS_PLANNING_SAFETY_RADIUS",
@@ -60,6 +61,7 @@ class Settings:
     identity: str = ""
     lease_s: float = DEFAULT_LEASE_S
     log_level: int = logging.INFO
+    log_format: str = "text"
     planning: PlanningSettings = field(default_factory=PlanningSettings)
 
     @property
@@ -69,7 +71,7 @@ class Settings:
 
     @classmethod
     def from_environment(cls, environment: Mapping[str, str]) -> Settings:
-        """Read FRACTUS_SYSTEM_NAMESPACE, FRACTUS_AGENT_ACCOUNT, FRACTUS_HEALTH, FRACTUS_IDENTITY, FRACTUS_LEASE, FRACTUS_METRICS_PORT, FRACTUS_LOG_LEVEL and the FRACTUS_PLANNING_*.
+        """Read FRACTUS_SYSTEM_NAMESPACE, FRACTUS_AGENT_ACCOUNT, FRACTUS_HEALTH, FRACTUS_IDENTITY, FRACTUS_LEASE, FRACTUS_METRICS_PORT, FRACTUS_LOG_LEVEL, FRACTUS_LOG_FORMAT and the FRACTUS_PLANNING_*.
 
         Raises:
             BadSetting: naming the variable.
@@ -77,6 +79,9 @@ class Settings:
         level = environment.get("FRACTUS_LOG_LEVEL", "INFO").upper()
         if level not in logging.getLevelNamesMapping():
             raise BadSetting(f"FRACTUS_LOG_LEVEL: {level} is no level; use DEBUG, INFO, WARNING or ERROR")
+        log_format = environment.get("FRACTUS_LOG_FORMAT") or "text"
+        if log_format not in FORMS:
+            raise BadSetting(f"FRACTUS_LOG_FORMAT: {log_format!r} is no form of logs; use {' or '.join(FORMS)}")
         planning = PlanningSettings(
             score_drone=_plugin(environment, "FRACTUS_PLANNING_RANKING"),
             cover=_plugin(environment, "FRACTUS_PLANNING_COVERING"),
@@ -95,7 +100,9 @@ class Settings:
         texts = {name: environment[variable] for name, variable in _TEXTS.items() if variable in environment}
         log_level = logging.getLevelNamesMapping()[level]
         port = int(_number(environment, "FRACTUS_METRICS_PORT", 0))
-        return cls(**texts, metrics_port=port, lease_s=lease_s, log_level=log_level, planning=planning)
+        return cls(
+            **texts, metrics_port=port, log_format=log_format, lease_s=lease_s, log_level=log_level, planning=planning
+        )
 
 
 def _plugin(environment: Mapping[str, str], name: str) -> Any:

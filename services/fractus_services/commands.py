@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -102,7 +101,7 @@ def serve_mobility(verbose: bool, **given: Any) -> None:
     """Serve until stopped; waits for certificates and for the autopilot."""
     from fractus_services.mobility.rpc.server import run  # noqa: PLC0415 - the command line stays quick
 
-    until_signalled("mobility", run, MobilityOptions(**given), logging.DEBUG if verbose else logging.INFO)
+    until_signalled("mobility", run, MobilityOptions(**given), verbose)
 
 
 @click.group()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 import os
 import signal
 from collections.abc import Callable, Coroutine
@@ -11,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import click
-from fractus_storage import logs
+from fractus_observe import logs
 
 from fractus_services.errors import CannotServe
 from fractus_services.options import ServiceOptions
@@ -55,7 +54,7 @@ def until_signalled(
     service: str,
     run: Callable[[_Options, asyncio.Event], Coroutine[Any, Any, None]],
     options: _Options,
-    level: int = logging.INFO,
+    verbose: bool = False,
 ) -> None:
     """Run a service until SIGTERM or SIGINT, once no other process runs it on this state directory.
 
@@ -63,12 +62,16 @@ def until_signalled(
         service: its name.
         run: serves until the event is set; opens all that only one process may have open.
         options: of the command line.
-        level: of the log.
+        verbose: whether to log more than FRACTUS_LOG_LEVEL says, which is INFO by default.
 
     Raises:
         click.ClickException: the service cannot run as it is told to.
     """
-    logs.configure(level)
+    level = "DEBUG" if verbose else os.environ.get("FRACTUS_LOG_LEVEL") or "INFO"
+    try:
+        logs.configure(level.upper(), os.environ.get("FRACTUS_LOG_FORMAT") or "text")
+    except ValueError as error:
+        raise click.ClickException(f"FRACTUS_LOG_LEVEL, FRACTUS_LOG_FORMAT: {error}") from None
 
     async def main() -> None:
         stop = asyncio.Event()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import urllib.request
 from pathlib import Path
 
 from chart import render
@@ -16,7 +18,11 @@ def test_the_operator_tells_prometheus_what_it_does(
 ) -> None:
     port = free_port()
     operator = OperatorProcess(
-        control_plane.kubeconfig, tmp_path / "operator.log", FRACTUS_METRICS_PORT=str(port), FRACTUS_LEASE="2"
+        control_plane.kubeconfig,
+        tmp_path / "operator.log",
+        FRACTUS_METRICS_PORT=str(port),
+        FRACTUS_LEASE="2",
+        FRACTUS_LOG_FORMAT="json",
     )
 
     operator.start()
@@ -32,6 +38,10 @@ def test_the_operator_tells_prometheus_what_it_does(
         assert seen["fractus_operator_reconcile_seconds_count", "application"] > 0
         assert seen["fractus_operator_plan_phase_seconds_count", "plan"] > 0
         assert seen["fractus_drones", "inactive"] == 1
+        with urllib.request.urlopen(operator.health, timeout=20) as answer:
+            assert answer.status == 200
+        assert json.loads(operator.log().splitlines()[-1])["level"]
+        assert "healthz" not in operator.log()
     finally:
         operator.stop()
 

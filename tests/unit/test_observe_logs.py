@@ -1,11 +1,14 @@
-"""Logs that no one can fill the disk with."""
+"""Logs that no one can fill the disk with, and that programs can read."""
 
 from __future__ import annotations
 
+import json
 import logging
+import math
+from typing import Any
 
 import pytest
-from fractus_storage.logs import BURST, RATE_PER_S, LogLimit
+from fractus_observe.logs import BURST, RATE_PER_S, JsonFormatter, LogLimit, configure
 
 
 class Log:
@@ -37,3 +40,49 @@ def test_a_day_of_a_flood_fits_a_small_disk() -> None:
         kept += log.written(1) is not None
         log.now_s += 86_400 / 100_000
     assert kept == pytest.approx(86_400 * RATE_PER_S + BURST, abs=2)
+
+
+def line(message: str, *args: object, limit: LogLimit | None = None) -> dict[str, Any]:
+    record = logging.LogRecord("fractus", logging.WARNING, "module.py", 1, message, args, None)
+    if limit is not None:
+        limit.filter(record)
+    return dict(json.loads(JsonFormatter().format(record)))
+
+
+def test_programs_read_what_a_message_names() -> None:
+    said = line("links: measured (peer=%s mbps=%.1f share=%d%% odd=%.1f) after %s", "e1", 3.25, 7, math.inf, "a while")
+    assert said["message"] == "links: measured (peer=e1 mbps=3.2 share=7% odd=inf) after a while"
+    assert (said["component"], said["level"], said["logger"]) == ("links", "WARNING", "fractus")
+    assert said["fields"] == {"peer": "e1", "mbps": 3.25, "share": 7, "odd": "inf"}
+    assert said["time"].endswith("+00:00")
+
+
+def test_what_a_peer_says_adds_no_field_and_no_line() -> None:
+    text = JsonFormatter().format(
+        logging.LogRecord("n", 20, "m.py", 1, "call: refused (peer=%s)", ('x) level=ok\n{"a": 1}',), None)
+    )
+    assert "\n" not in text
+    assert json.loads(text)["fields"] == {"peer": 'x) level=ok\n{"a": 1}'}
+
+
+def test_a_message_with_no_or_other_arguments_is_a_line_as_well() -> None:
+    assert line("plain").keys() == {"time", "level", "logger", "message"}
+    assert line("%(a)s", {"a": 1})["message"] == "1"
+    try:
+        raise ValueError("why")
+    except ValueError as error:
+        record = logging.LogRecord("n", 40, "m.py", 1, "failed", (), (ValueError, error, error.__traceback__))
+    assert "ValueError: why" in json.loads(JsonFormatter().format(record))["exception"]
+
+
+def test_how_many_lines_were_left_out_is_a_field() -> None:
+    log = Log()
+    for _ in range(BURST + 3):
+        line("a: b (c=%d)", 1, limit=log.limit)
+    log.now_s += 1 / RATE_PER_S
+    assert line("a: b (c=%d)", 1, limit=log.limit)["fields"] == {"c": 1, "left_out": 3}
+
+
+def test_a_form_that_there_is_not_is_refused() -> None:
+    with pytest.raises(ValueError, match="xml"):
+        configure("INFO", "xml")

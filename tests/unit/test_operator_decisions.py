@@ -356,6 +356,7 @@ def test_settings_come_from_the_environment() -> None:
     "environment",
     [
         {"FRACTUS_LOG_LEVEL": "LOUD"},
+        {"FRACTUS_LOG_FORMAT": "xml"},
         {"FRACTUS_PLANNING_CRUISE_SPEED": "fast"},
         {"FRACTUS_PLANNING_CRUISE_SPEED": "-1"},
         {"FRACTUS_PLANNING_CRUISE_SPEED": "0"},

@@ -50,6 +50,11 @@ tolerations:
 {{ include "fractus.pullSecrets" .root }}
 {{- end }}
 
+{{- define "fractus.logEnv" -}}
+- {name: FRACTUS_LOG_LEVEL, value: {{ .Values.logLevel }}}
+- {name: FRACTUS_LOG_FORMAT, value: {{ .Values.logFormat }}}
+{{- end }}
+
 {{/* Where a workload of a node tells its metrics: on the node's own address, out of reach over direct links; takes (dict "root" $ "port" 46812). */}}
 {{- define "fractus.nodeMetricsEnv" -}}
 {{- if .root.Values.metrics.nodes.enabled }}

@@ -406,6 +406,97 @@ def test_the_operator_writes_nothing_that_it_has_not_made(
         client.close()
 
 
+def test_who_has_the_operator_s_token_gets_no_further(
+    control_plane: ControlPlane, world: World, chart: None, namespace: str
+) -> None:
+    """Pods and Secrets that carry the operator's label, and would give their maker the cluster."""
+    client = control_plane.with_token(operator_token(world))
+    mine = {"app.kubernetes.io/managed-by": "fractus"}
+
+    def deployment(place: str = namespace, container: dict[str, Any] | None = None, **pod: Any) -> Callable[[], object]:
+        restricted = {
+            "allowPrivilegeEscalation": False,
+            "capabilities": {"drop": ["ALL"]},
+            "readOnlyRootFilesystem": True,
+        }
+        main = {"name": "main", "image": "registry.test/theirs:1", "securityContext": restricted} | (container or {})
+        spec = {
+            "automountServiceAccountToken": False,
+            "securityContext": {"runAsNonRoot": True, "runAsUser": 10001, "seccompProfile": {"type": "RuntimeDefault"}},
+            "containers": [main],
+        } | pod
+        body = {
+            "apiVersion": "apps/v1",
+            "kind": "Deployment",
+            "metadata": {"name": "theirs", "namespace": place, "labels": mine},
+            "spec": {
+                "selector": {"matchLabels": {"a": "b"}},
+                "template": {"metadata": {"labels": {"a": "b"}}, "spec": spec},
+            },
+        }
+        return lambda: client.call("POST", f"/apis/apps/v1/namespaces/{place}/deployments?dryRun=All", body)
+
+    def secret(name: str, place: str = namespace, **more: Any) -> Callable[[], object]:
+        data = {"tls.crt": "eA==", "tls.key": "eA=="}
+        body = {"type": "kubernetes.io/tls", "data": data} | more
+        body |= {"apiVersion": "v1", "kind": "Secret"}
+        body["metadata"] = {"name": name, "labels": mine} | more.get("metadata", {})
+        return lambda: client.call("POST", f"/api/v1/namespaces/{place}/secrets?dryRun=All", body)
+
+    account = {"annotations": {"kubernetes.io/service-account.name": "default"}}
+    host = {"name": "host", "hostPath": {"path": "/"}}
+    token = {"name": "token", "projected": {"sources": [{"serviceAccountToken": {"path": "token"}}]}}
+    root = {"runAsNonRoot": True, "runAsUser": 0, "seccompProfile": {"type": "RuntimeDefault"}}
+    try:
+        wait_for(lambda: _probe_refused(client), "the admission policy to be in force")
+        # As it is, it would be let in: what follows is refused for what it says.
+        deployment()()
+        secret("traffic-navigator-tls")()
+        for place in ("kube-system", SYSTEM):
+            denied(deployment(place), "runs nothing in the namespace")
+        for pod in (
+            {"automountServiceAccountToken": True},
+            {"serviceAccountName": "privileged"},
+        ):
+            denied(deployment(**pod), "without an account")
+        for pod in (
+            {"hostNetwork": True},
+            {"hostPID": True},
+            {"nodeName": "cloud-1"},
+            {"priorityClassName": "system-cluster-critical"},
+            {"volumes": [host]},
+            {"volumes": [token]},
+        ):
+            denied(deployment(**pod), "share nothing with their node")
+        for pod in ({"securityContext": root}, {"initContainers": [{"name": "first", "image": "x"}]}):
+            denied(deployment(**pod), "one container without privileges")
+        for given in (
+            {"privileged": True},
+            {"allowPrivilegeEscalation": False},
+            {"allowPrivilegeEscalation": False, "readOnlyRootFilesystem": True, "capabilities": {"drop": ["ALL"], "add": ["NET_RAW"]}},
+            {"allowPrivilegeEscalation": False, "readOnlyRootFilesystem": True, "capabilities": {"drop": ["ALL"]}, "runAsUser": 0},
+        ):  # fmt: skip
+            denied(deployment(container={"securityContext": given}), "one container without privileges")
+        made = "certificates of instances only"
+        denied(secret("theirs-tls", type="kubernetes.io/service-account-token", data={}, metadata=account), made)
+        denied(secret("theirs-tls", type="Opaque"), made)
+        denied(secret("bootstrap-token-abcdef", "kube-system", type="bootstrap.kubernetes.io/token", data={}), made)
+        denied(secret("theirs"), made)
+        denied(secret("fractus-ca"), made)
+        denied(secret("theirs-tls", SYSTEM), made)
+        # Nor does it read or write what gives rights.
+        for path in (
+            f"/api/v1/namespaces/{SYSTEM}/serviceaccounts/fractus-agent/token",
+            "/apis/rbac.authorization.k8s.io/v1/clusterrolebindings",
+            f"/apis/rbac.authorization.k8s.io/v1/namespaces/{namespace}/rolebindings",
+            f"/api/v1/namespaces/{namespace}/pods",
+            f"/api/v1/namespaces/{namespace}/configmaps",
+        ):
+            denied(lambda path=path: client.call("POST", path, {}), "forbidden")
+    finally:
+        client.close()
+
+
 def _probe_refused(client: BlockingClient) -> bool:
     try:
         client.merge("/api/v1/nodes/cloud-1", {"metadata": {"labels": {"probe": uuid.uuid4().hex}}})

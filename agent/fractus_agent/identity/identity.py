@@ -105,7 +105,7 @@ class Identity:
     @property
     def expires_s(self) -> float | None:
         """Unix time at which the certificate expires; None while there is none."""
-        validity = self._known[1] if self._known is not None else None
+        validity = self._validity()
         return validity.not_after.timestamp() if validity is not None else None
 
     async def run(self) -> None:

@@ -105,11 +105,21 @@ bench: env ## Run every benchmark
 	for file in bench/*.py; do $(RUN) python "$$file" --quick; done
 
 .PHONY: release
-release: env ## Set VERSION=X.Y.Z and gather the changelog for it; commit and tag what this leaves
+release: env ## Set VERSION=X.Y.Z of package and charts, and gather the changelog for it; commit and tag what this leaves
 	@[[ "$${VERSION:-}" =~ ^[0-9]+\.[0-9]+\.[0-9]+$$ ]] || { echo "give VERSION=X.Y.Z" >&2; exit 1; }
 	sed -i 's/^version = ".*"/version = "$(VERSION)"/' pyproject.toml
+	sed -i -E 's/^(version|appVersion): .*/\1: $(VERSION)/' charts/*/Chart.yaml
 	$(UV) lock --quiet
 	$(RUN) towncrier build --yes --version "$(VERSION)"
+
+.PHONY: dist
+dist: env ## Build what a release has into dist/: wheel, source archive, charts and the checksums of all
+	rm -rf dist
+	$(UV) build --quiet --out-dir dist
+	$(RUN) fractus cluster binaries
+	helm="$$(command -v helm || ls -t "$${XDG_CACHE_HOME:-$$HOME/.cache}"/fractus/*/bin/helm | head -n 1)"; \
+		for chart in charts/*/; do "$$helm" package "$$chart" --destination dist > /dev/null; done
+	cd dist && sha256sum -- *.whl *.tar.gz *.tgz > SHA256SUMS
 
 .PHONY: packages
 packages: ## Install the Debian packages whose programs are missing (root); nothing is ever removed

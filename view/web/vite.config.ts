@@ -20,8 +20,25 @@ function remember(): Plugin {
   };
 }
 
+/** Lets the browser fetch and compile the map while it reads the rest, though the page does without where there is no WebGL. */
+function early(): Plugin {
+  return {
+    name: "early",
+    transformIndexHtml: {
+      order: "post",
+      handler: (html, context) => {
+        const files = Object.values(context.bundle ?? {}).filter((one) => !html.includes(one.fileName));
+        const chunks = files.filter((one) => one.type === "chunk").map((one) => ({ rel: "modulepreload", href: `/${one.fileName}` }));
+        // A module waits for its style sheet.
+        const styles = files.filter((one) => one.fileName.endsWith(".css")).map((one) => ({ rel: "stylesheet", href: `/${one.fileName}` }));
+        return [...styles, ...chunks].map((attrs) => ({ tag: "link", attrs, injectTo: "head" }));
+      },
+    },
+  };
+}
+
 export default defineConfig({
-  plugins: [remember()],
+  plugins: [remember(), early()],
   build: {
     outDir: "../fractus_view/page",
     emptyOutDir: true,

@@ -52,12 +52,18 @@ function colours(): Colours {
   };
 }
 
+/** Once the first events are here, or none come: a map that begins elsewhere would be drawn twice. */
+let tell: () => void;
+const told = new Promise<void>((resolve) => (tell = resolve));
+const FIRST_TIMEOUT_MS = 1_000;
+
 async function openMap(): Promise<void> {
   try {
-    const module = await import("./map");
-    map = new module.FlightMap(byId("map"), model, colours(), still, select);
+    const [module] = await Promise.all([import("./map"), told]);
+    const time = complete ? model.begin : playback.time;
+    map = new module.FlightMap(byId("map"), model, colours(), still, select, time);
     window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => map?.paint(colours()));
-    if (complete) map.showWhole();
+    if (complete) map?.showWhole();
   } catch (error) {
     byId("map").hidden = true;
     byId("legend").hidden = true;
@@ -207,8 +213,12 @@ function frame(now: number): void {
 }
 
 void openMap();
+setTimeout(() => tell(), FIRST_TIMEOUT_MS);
 listen({
-  events: take,
+  events: (all) => {
+    take(all);
+    if (live || complete) tell();
+  },
   connected: () => {
     lost = undefined;
     heard = performance.now();

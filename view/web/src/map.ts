@@ -1,6 +1,6 @@
 // The map: areas and paths by MapLibre on a plain background, drones on a canvas of their own above it.
 
-import { type GeoJSONSource, LngLatBounds, Map as MapLibre, NavigationControl, Popup, ScaleControl, setWorkerUrl } from "maplibre-gl";
+import { type GeoJSONSource, LngLatBounds, Map as MapLibre, NavigationControl, Popup, ScaleControl, type StyleSpecification, prewarm, setWorkerUrl } from "maplibre-gl";
 import "maplibre-gl/dist/maplibre-gl.css";
 import workerUrl from "maplibre-gl/dist/maplibre-gl-worker.mjs?url";
 
@@ -9,9 +9,16 @@ import { GAP_MS, type Drone, type Model } from "./model";
 import { band, facts } from "./words";
 
 setWorkerUrl(new URL(workerUrl, window.location.href).href);
+// It takes as long to start as the first events take to come.
+prewarm();
 
-const PATH_PERIOD_MS = 400;
+const PERIOD_MS = 400;
+/** MapLibre cuts paths into tiles and draws the whole map again: what was flown since is drawn above it. */
+const PATH_PERIOD_MS = 5_000;
+const MAX_TAIL_MS = 60_000;
 const REACH_PX = 18;
+const PATH_PX = 3;
+const FIT = { padding: 40, maxZoom: 18 };
 /** A zone that is drawn smaller has its name in the list alone. */
 const MIN_NAMED_PX = 40;
 
@@ -36,10 +43,13 @@ export class FlightMap {
   private readonly map: MapLibre;
   private readonly overlay: HTMLCanvasElement;
   private readonly popup = new Popup({ closeButton: false, maxWidth: "320px" });
-  private drawn: [number, number] = [0, 0];
-  private pathsAt = 0;
-  private features: Feature[] = [];
+  private lookedAt = -Infinity;
+  private pathsAt = -Infinity;
+  /** Up to which moment MapLibre draws what was flown. */
+  private drawn = -Infinity;
+  private features: Feature[];
   private ready = false;
+  private whole = false;
   private moved = false;
   private shown: { x: number; y: number; name: string }[] = [];
 
@@ -49,12 +59,16 @@ export class FlightMap {
     private colours: Colours,
     private readonly still: boolean,
     private readonly pick: (drone: string) => void,
+    time: number,
   ) {
+    this.features = model.features(time);
+    const bounds = this.bounds(time);
+    const place = bounds.isEmpty() ? { center: [0, 20] as [number, number], zoom: 1 } : { bounds, fitBoundsOptions: FIT };
     this.map = new MapLibre({
       container: element,
-      style: { version: 8, sources: {}, layers: [{ id: "background", type: "background", paint: { "background-color": colours.background } }] },
-      center: [0, 20],
-      zoom: 1,
+      style: this.style(),
+      validateStyle: false,
+      ...place,
       attributionControl: false,
       fadeDuration: 0,
       maxPitch: 0,
@@ -67,32 +81,39 @@ export class FlightMap {
     this.overlay.className = "overlay";
     this.overlay.setAttribute("aria-hidden", "true");
     this.map.getCanvasContainer().append(this.overlay);
-    this.map.on("load", () => this.loaded());
+    this.map.touchZoomRotate.disableRotation();
+    this.map.keyboard.disableRotation();
+    this.map.on("style.load", () => this.loaded());
     for (const what of ["dragstart", "wheel", "dblclick"] as const) this.map.on(what, () => (this.moved = true));
     element.addEventListener("keydown", () => (this.moved = true));
     this.map.on("click", (event) => this.clicked(event.point, event.lngLat));
   }
 
-  private loaded(): void {
-    for (const name of ["areas", "whole", "flown"]) {
-      this.map.addSource(name, { type: "geojson", data: { type: "FeatureCollection", features: [] }, buffer: 32, tolerance: 0.2 });
-    }
+  /** Sources with what is known by now, so that the first thing drawn is the map. */
+  private style(): StyleSpecification {
+    const source = (features: GeoJSON.Feature[]) =>
+      ({ type: "geojson", data: { type: "FeatureCollection", features }, buffer: 32, tolerance: 0.2 }) as const;
+    const filter = (kind: string) => ["==", ["get", "kind"], kind] as ["==", ["get", string], string];
+    const colours = this.colours;
+    const layers: StyleSpecification["layers"] = [{ id: "background", type: "background", paint: { "background-color": colours.background } }];
     for (const kind of KINDS) {
-      const paint = { "fill-color": this.colours[kind], "fill-opacity": kind === "zone" ? 0.22 : 0.06 };
-      this.map.addLayer({ id: `${kind}-fill`, type: "fill", source: "areas", filter: ["==", ["get", "kind"], kind], paint });
+      const paint = { "fill-color": colours[kind], "fill-opacity": kind === "zone" ? 0.22 : 0.06 };
+      layers.push({ id: `${kind}-fill`, type: "fill", source: "areas", filter: filter(kind), paint });
     }
     for (const kind of [...KINDS, "path" as const]) {
-      const dashes = kind === "zone" ? {} : { "line-dasharray": [3, 2] };
-      const paint = { "line-color": this.colours[kind], "line-width": 2, ...dashes };
-      this.map.addLayer({ id: `${kind}-line`, type: "line", source: "areas", filter: ["==", ["get", "kind"], kind], paint });
+      const paint = { "line-color": colours[kind], "line-width": 2, ...(kind === "zone" ? {} : { "line-dasharray": [3, 2] }) };
+      layers.push({ id: `${kind}-line`, type: "line", source: "areas", filter: filter(kind), paint });
     }
-    for (const [id, width, opacity] of [["whole", 2, 0.3], ["flown", 3, 1]] as const) {
-      const paint = { "line-color": this.colours.flown, "line-width": width, "line-opacity": opacity };
-      this.map.addLayer({ id: `${id}-line`, type: "line", source: id, layout: { "line-join": "round", "line-cap": "round" }, paint });
+    for (const [id, width, opacity] of [["whole", 2, 0.3], ["flown", PATH_PX, 1]] as const) {
+      const paint = { "line-color": colours.flown, "line-width": width, "line-opacity": opacity };
+      layers.push({ id: `${id}-line`, type: "line", source: id, layout: { "line-join": "round", "line-cap": "round" }, paint });
     }
+    return { version: 8, sources: { areas: source(this.shapes()), whole: source([]), flown: source([]) }, layers };
+  }
+
+  private loaded(): void {
     this.ready = true;
-    this.drawn = [0, 0];
-    this.pathsAt = 0;
+    if (this.whole) this.showWhole();
     const rendered = () => {
       if (this.features.length === 0 || !this.map.isSourceLoaded("areas")) return;
       this.map.off("render", rendered);
@@ -105,7 +126,7 @@ export class FlightMap {
   /** Show what another model knows. */
   follow(model: Model): void {
     this.model = model;
-    this.drawn = [0, 0];
+    this.lookedAt = this.pathsAt = this.drawn = -Infinity;
   }
 
   /** Take other colours. */
@@ -121,29 +142,37 @@ export class FlightMap {
   /** Show a moment. */
   draw(time: number, selected: string, now: number): void {
     if (!this.ready || !Number.isFinite(this.model.begin)) return;
-    const state: [number, number] = [this.model.version, time];
-    const changed = state[0] !== this.drawn[0] || state[1] !== this.drawn[1];
-    if (changed && now - this.pathsAt > PATH_PERIOD_MS) {
-      this.pathsAt = now;
-      this.drawn = state;
+    if (now - this.lookedAt > PERIOD_MS) {
+      this.lookedAt = now;
       this.showAreas(time);
+    }
+    const jumped = time < this.drawn || time - this.drawn > MAX_TAIL_MS;
+    if (time !== this.drawn && now - this.pathsAt > (jumped ? PERIOD_MS : PATH_PERIOD_MS)) {
+      this.pathsAt = now;
+      this.drawn = time;
       this.setLines("flown", [...this.model.drones.values()].map((drone) => line(drone, time)));
     }
-    this.drawDrones(time, selected);
+    this.drawAbove(time, selected);
   }
 
   /** Draw the whole of a recording's paths. */
   showWhole(): void {
+    this.whole = true;
     if (this.ready) this.setLines("whole", [...this.model.drones.values()].map((drone) => line(drone, Infinity)));
   }
 
   /** Let all that is known be seen, unless the user chose what to look at. */
   fit(time: number): void {
     if (!this.ready || this.moved) return;
+    const bounds = this.bounds(time);
+    if (!bounds.isEmpty()) this.map.fitBounds(bounds, { ...FIT, animate: false });
+  }
+
+  private bounds(time: number): LngLatBounds {
     const bounds = new LngLatBounds();
     for (const feature of this.model.features(time)) extend(bounds, feature.geometry.coordinates);
     for (const drone of this.model.drones.values()) for (const fix of drone.fixes.values) bounds.extend([fix.lon, fix.lat]);
-    if (!bounds.isEmpty()) this.map.fitBounds(bounds, { padding: 40, maxZoom: 18, animate: false });
+    return bounds;
   }
 
   /** Bring a drone to the middle. */
@@ -161,13 +190,16 @@ export class FlightMap {
     if (features.length === this.features.length && features.every((one, index) => one === this.features[index])) return;
     const first = this.features.length === 0;
     this.features = features;
-    // Components share areas: what lies on itself would be drawn darker.
+    this.source("areas").setData({ type: "FeatureCollection", features: this.shapes() });
+    if (first) this.fit(time);
+  }
+
+  /** Components share areas: what lies on itself would be drawn darker. */
+  private shapes(): GeoJSON.Feature[] {
     const drawn = new Set<string>();
-    const shapes = features
+    return this.features
       .map((feature, id) => ({ ...feature, id }) as GeoJSON.Feature)
       .filter(({ geometry }) => drawn.size < drawn.add(JSON.stringify(geometry)).size);
-    this.source("areas").setData({ type: "FeatureCollection", features: shapes });
-    if (first) this.fit(time);
   }
 
   private setLines(name: string, lines: Lines[]): void {
@@ -178,7 +210,7 @@ export class FlightMap {
     return this.map.getSource(name) as GeoJSONSource;
   }
 
-  private drawDrones(time: number, selected: string): void {
+  private drawAbove(time: number, selected: string): void {
     const canvas = this.map.getCanvas();
     const ratio = window.devicePixelRatio;
     const [width, height] = [canvas.clientWidth, canvas.clientHeight];
@@ -197,6 +229,7 @@ export class FlightMap {
     }
     for (const link of this.model.linksAt(time)) this.link(context, link, time);
     this.shown = [];
+    for (const drone of this.model.drones.values()) this.tail(context, drone, time);
     for (const drone of this.model.drones.values()) {
       const position = drone.position(time);
       if (position === undefined) continue;
@@ -208,6 +241,27 @@ export class FlightMap {
       this.label(context, x, y, drone.name);
     }
     context.globalAlpha = 1;
+  }
+
+  /** What a drone flew since MapLibre was told. */
+  private tail(context: CanvasRenderingContext2D, drone: Drone, time: number): void {
+    const begin = drone.position(this.drawn);
+    const end = drone.position(time);
+    if (begin === undefined || end === undefined || time <= this.drawn || time - end.seen > GAP_MS) return;
+    const fixes = drone.fixes.values.slice(drone.fixes.count(this.drawn), drone.fixes.count(time));
+    let last = begin.seen;
+    context.beginPath();
+    let { x, y } = this.map.project([begin.lon, begin.lat]);
+    context.moveTo(x, y);
+    for (const fix of [...fixes, { ...end, time_ms: time }]) {
+      ({ x, y } = this.map.project([fix.lon, fix.lat]));
+      if (fix.time_ms - last > GAP_MS) context.moveTo(x, y);
+      else context.lineTo(x, y);
+      last = fix.time_ms;
+    }
+    context.strokeStyle = this.colours.flown;
+    context.lineWidth = PATH_PX;
+    context.stroke();
   }
 
   private marker(context: CanvasRenderingContext2D, x: number, y: number, heading: number | null, selected: boolean): void {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import fcntl
 import json
 import logging
 import math
@@ -65,7 +66,7 @@ class _Waiting:
 class AuditLog:
     """Appends entries; a thread writes them, so that a slow disk never delays a flight.
 
-    While the disk is full or does not answer, entries wait; those beyond `MAX_WAITING` are lost, and one entry in their
+    While the disk is full or does not answer, or another process writes the same log, entries wait; those beyond `MAX_WAITING` are lost, and one entry in their
     place records how many.
 
     Args:
@@ -108,29 +109,18 @@ class AuditLog:
         self._busy_since_s: float | None = None
         self._sound_bytes: int | None = None
         path.parent.mkdir(parents=True, exist_ok=True)
+        self._lock: int | None = None
         torn = 0
         with contextlib.suppress(OSError):  # a disk that is read-only is told of when the first entry is written
             whole, size = _whole_lines(path)
             torn = size - whole
             self._sound_bytes = whole if torn else None
             path.touch(0o640)  # so that verification can tell when it is missing
-        self._end = self._found()
+        self._end = _end_of_chain(path)
         self._thread = threading.Thread(target=self._write, name="audit", daemon=True)
         self._thread.start()
         if torn:
             self.append("recovered", {"torn_bytes": torn})
-
-    def _found(self) -> Link:
-        """Where the chain on disk ends."""
-        for path in (self._path, *reversed(segments(self._path))):
-            try:
-                end = last_link(path)
-            except ValueError:
-                log.critical("audit: the last entry cannot be read, a new chain begins after it (file=%s)", path)
-                return Link()
-            if end is not None:
-                return end
-        return Link()
 
     @property
     def failure(self) -> str:
@@ -186,7 +176,15 @@ class AuditLog:
         await asyncio.to_thread(self._thread.join, 5.0)
 
     def _write(self) -> None:
-        """The thread: append in batches, one fsync for each."""
+        """The thread: write until closed; then another process may."""
+        try:
+            self._write_batches()
+        finally:
+            if self._lock is not None:
+                os.close(self._lock)
+
+    def _write_batches(self) -> None:
+        """Append in batches, one fsync for each."""
         while True:
             with self._changed:
                 if self._changed.wait_for(lambda: self._waiting or self._closing, self._until_checkpoint_s()):
@@ -216,16 +214,12 @@ class AuditLog:
 
     def _flush(self, batch: Iterable[_Waiting]) -> bool:
         """Append and sync; what could not be written is tried again with the next batch."""
-        lines, end = [], self._end
-        for waiting in batch:
-            sequence = end.sequence + 1
-            entry = {"seq": sequence, "time": waiting.time, "kind": waiting.kind, **waiting.content, "prev": end.hash}
-            entry["hash"] = digest(entry)
-            end = Link(sequence, entry["hash"])
-            lines.append(canonical(entry) + b"\n")
         self._busy_since_s = time.monotonic()
         try:
-            self._store(b"".join(lines))
+            if self._lock is None:
+                self._lock, self._sound_bytes, self._end = _taken_over(self._path)
+            data, end = _chained(batch, self._end)
+            self._store(data)
         except OSError as error:
             if not self._problem:
                 log.critical("audit: cannot be written (file=%s): %s", self._path, error)
@@ -245,7 +239,7 @@ class AuditLog:
                 self._pruned[0].unlink(missing_ok=True)
                 del self._pruned[0]
             if self._path.stat().st_size >= self._segment_bytes:
-                self._path.rename(segment(self._path, self._first_entry()))
+                self._path.rename(segment(self._path, _first_entry(self._path)))
                 self._path.touch(0o640)
                 self._record_pruning()
         except (OSError, ValueError) as error:
@@ -278,11 +272,6 @@ class AuditLog:
             log.warning("audit: cannot write a checkpoint (file=%s): %s", self._checkpoint, error)
         finally:
             self._busy_since_s = None
-
-    def _first_entry(self) -> int:
-        """The number of the first entry in the present file."""
-        with self._path.open("rb") as file:
-            return int(json.loads(file.readline())["seq"])
 
     def _record_pruning(self) -> None:
         closed = segments(self._path)
@@ -322,6 +311,68 @@ class AuditLog:
             self._sound_bytes = None
         finally:
             os.close(file)
+
+
+def _end_of_chain(log_file: Path) -> Link:
+    """Where the chain on disk ends."""
+    for path in (log_file, *reversed(segments(log_file))):
+        try:
+            end = last_link(path)
+        except ValueError:
+            log.critical("audit: the last entry cannot be read, a new chain begins after it (file=%s)", path)
+            return Link()
+        if end is not None:
+            return end
+    return Link()
+
+
+def _first_entry(path: Path) -> int:
+    """The number of the first entry in a file."""
+    with path.open("rb") as file:
+        return int(json.loads(file.readline())["seq"])
+
+
+def _taken_over(path: Path) -> tuple[int, int | None, Link]:
+    """Become a log's one writer: the lock, how much of the file is whole lines where not all is, and where its chain ends.
+
+    Raises:
+        OSError: another process writes the log, or there can be no lock.
+    """
+    lock = _locked(path.with_name(f".{path.stem}.lock"))
+    try:
+        whole, size = _whole_lines(path)
+        return lock, whole if size > whole else None, _end_of_chain(path)
+    except OSError:
+        os.close(lock)
+        raise
+
+
+def _locked(path: Path) -> int:
+    """A lock file, locked; the lock ends with the process.
+
+    Raises:
+        OSError: another process holds it, or it cannot be made.
+    """
+    lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o640)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        os.close(lock)
+        taken = isinstance(error, BlockingIOError)
+        raise OSError(error.errno, "another process writes it") if taken else error from None
+    return lock
+
+
+def _chained(batch: Iterable[_Waiting], end: Link) -> tuple[bytes, Link]:
+    """Entries as lines that continue a chain, and its new end."""
+    lines = []
+    for waiting in batch:
+        sequence = end.sequence + 1
+        entry = {"seq": sequence, "time": waiting.time, "kind": waiting.kind, **waiting.content, "prev": end.hash}
+        entry["hash"] = digest(entry)
+        end = Link(sequence, entry["hash"])
+        lines.append(canonical(entry) + b"\n")
+    return b"".join(lines), end
 
 
 def _whole_lines(path: Path) -> tuple[int, int]:

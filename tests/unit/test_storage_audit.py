@@ -9,6 +9,7 @@ import json
 import math
 import os
 import re
+import shutil
 import threading
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -48,6 +49,26 @@ async def test_a_sound_chain_goes_on_after_a_restart(tmp_path: Path) -> None:
     assert (finding.entries, finding.problem, finding.torn) == (10, "", False)
     assert [json.loads(line)["n"] for line in lines] == list(range(10))
     assert json.loads(lines[0])["value"] == "nan"
+
+
+async def test_two_processes_that_write_one_log_make_one_chain(tmp_path: Path) -> None:
+    path = tmp_path / "audit.jsonl"
+    first, second = (AuditLog(path, lambda: 0.0) for _ in range(2))
+    for number in range(3):
+        first.append("call", {"by": "first", "n": number})
+    await until(lambda: path.stat().st_size > 0)
+    for number in range(3):
+        second.append("call", {"by": "second", "n": number})
+    await until(lambda: bool(second.failure))
+    assert "another process" in second.failure
+    await first.close()
+    second.append("call", {"by": "second", "n": 3})
+    await second.close()
+    assert not second.failure
+    lines = read(path)
+    assert not verify(lines).problem
+    found = [(entry["by"], entry["n"]) for entry in map(json.loads, lines)]
+    assert found == [("first", n) for n in range(3)] + [("second", n) for n in range(4)]
 
 
 @pytest.mark.parametrize("which", ["change", "remove", "insert", "swap", "reformat", "rehash", "cut head"])
@@ -101,8 +122,7 @@ async def test_a_full_disk_is_told_and_nothing_is_lost_when_there_is_room_again(
     folder = tmp_path / "log"
     path = folder / "audit.jsonl"
     log = AuditLog(path, lambda: 0.0)
-    path.unlink()
-    folder.rmdir()  # any write fails now
+    shutil.rmtree(folder)  # any write fails now
     log.append("call", {"n": 0})
     await until(lambda: log.failure)
     assert "cannot be written" in log.failure

@@ -11,7 +11,8 @@ from ipaddress import IPv4Address
 from pathlib import Path
 
 from fractus_agent.redirector.netlink import NETLINK_NETFILTER, Netlink, in_namespace
-from fractus_agent.redirector.nft import Endpoint, Maps, Ports, Redirect, create
+from fractus_agent.redirector.nft import Callers, Endpoint, Maps, Redirect
+from fractus_agent.redirector.tables import Ports, create
 
 VIP = Endpoint(IPv4Address("10.96.0.5"), 8080)
 DIRECT = Endpoint(IPv4Address("10.77.0.2"), 9000)
@@ -141,7 +142,11 @@ class Rig:
 
     def maps(self, node: str) -> Maps:
         """The maps of a node, whose table is made again when it is gone."""
-        return Maps(self.netlink(node), lambda: create("fxl*", PORTS, self.inside(node), clients=node == "drone"))
+
+        def make_table(callers: Callers) -> None:
+            create("fxl*", PORTS, self.inside(node), clients=node == "drone", callers=callers)
+
+        return Maps(self.netlink(node), make_table)
 
     def netlink(self, node: str, protocol: int = NETLINK_NETFILTER) -> Netlink:
         """A netlink socket in a namespace."""

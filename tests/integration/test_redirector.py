@@ -31,8 +31,9 @@ def world() -> Iterator[Rig]:
 
 
 @pytest.fixture
-def redirector(world: Rig, tmp_path: Path) -> Iterator[Redirector]:
+def redirector(world: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Redirector]:
     """The one of the drone; it sees the namespaces of the drone and of its pod."""
+    monkeypatch.setattr(module, "LEASE_S", 60.0)  # a client may take long to start
     conntrack = Conntrack(world.netlink("drone"))
     (tmp_path / "pod").symlink_to(world.path("dpod"))
     found = Redirector(world.maps("drone"), conntrack, Namespaces(tmp_path, own=world.path("drone")))
@@ -252,7 +253,7 @@ def test_what_the_kernel_forbids_is_told_at_once() -> None:
     program = """
 from fractus_agent.redirector.netlink import NETLINK_NETFILTER, Netlink
 from fractus_agent.redirector.nft import Maps
-Maps(Netlink(NETLINK_NETFILTER), lambda: None).write([], None, 5.0)
+Maps(Netlink(NETLINK_NETFILTER), lambda _: None).write([], None, 5.0)
 """
     done = subprocess.run(
         ["setpriv", "--inh-caps=-net_admin", "--bounding-set=-net_admin", sys.executable, "-c", program],
@@ -284,6 +285,17 @@ def test_only_its_callers_are_led(world: Rig, redirector: Redirector) -> None:
 KUBE_PROXY = {
     "nftables": [["nft", "table ip kube-proxy { chain pre { type nat hook prerouting priority -100; "
                   "ip daddr 10.96.0.9 tcp dport 8080 dnat to 10.88.0.2:8080; }; }"]],
+def test_guards_are_there_from_the_first_moment_of_a_table(world: Rig) -> None:
+    """Nothing can follow by netlink, as in the time between a table and what is written to it."""
+    maps = world.maps("edge")
+    maps.write([], None, 5.0, callers={POD: frozenset({DRONE})})
+    world.sockets[-1].close()
+    maps.remake()
+    for name, element in (("guarded", "10.88.0.2 . tcp . 8080"), ("callers", "10.77.0.1 . 10.88.0.2 . tcp . 8080")):
+        words = [*world.inside("edge"), "nft", "list", "set", "ip", "fractus", name]
+        assert element in subprocess.run(words, capture_output=True, text=True, check=True).stdout
+
+
     "iptables": [["iptables", "-t", "nat", "-A", "PREROUTING", "-d", "10.96.0.9", "-p", "tcp", "--dport", "8080",
                   "-j", "DNAT", "--to-destination", "10.88.0.2:8080"]],
 }  # fmt: skip

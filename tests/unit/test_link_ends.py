@@ -21,7 +21,7 @@ from fractus_agent.links.interfaces.simulated import Plain
 from fractus_agent.links.pairing import LinkLost, Session
 from fractus_agent.links.peer import PeerEnd
 from fractus_agent.links.plans import callers, isolated
-from fractus_agent.redirector import nft
+from fractus_agent.redirector import tables
 from fractus_agent.redirector.netlink import NetlinkError
 from fractus_agent.redirector.nft import Endpoint
 from fractus_agent.redirector.redirector import Namespaces, Redirector
@@ -194,12 +194,12 @@ def test_a_device_with_other_traffic_is_refused(
 
 
 def test_a_node_without_clients_leads_only_what_paired_nodes_send() -> None:
-    text = nft.table("wlan0", nft.Ports(1, 2), clients=False)
+    text = tables.table("wlan0", tables.Ports(1, 2), clients=False)
     assert "hook output" not in text
     leads = [line for line in text.splitlines() if "dnat" in line or "ct mark set" in line]
     assert len(leads) == 2
     assert all(line.strip().startswith('iifname "wlan0" ip saddr @peers ') for line in leads)
-    assert "hook output" in nft.table("wlan0", nft.Ports(1, 2), clients=True)
+    assert "hook output" in tables.table("wlan0", tables.Ports(1, 2), clients=True)
 
 
 @pytest.mark.parametrize(("mbps", "probes"), [(16.0, {2, 3}), (8.5, {2, 3}), (2.0, {5, 6})])

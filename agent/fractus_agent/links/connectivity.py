@@ -25,10 +25,10 @@ from fractus_agent.links.interfaces.simulated import Plain
 from fractus_agent.links.interfaces.wifi import Wifi
 from fractus_agent.links.metrics import LinkMetrics
 from fractus_agent.links.peer import PeerEnd
-from fractus_agent.links.plans import LinkPlans
+from fractus_agent.links.plans import LinkPlans, callers, isolated
 from fractus_agent.links.reports import DroneReport, LinkReports, peer_condition
 from fractus_agent.links.uplink import Node, Uplink
-from fractus_agent.redirector import leftovers, nft
+from fractus_agent.redirector import leftovers, nft, tables
 from fractus_agent.redirector.conntrack import Conntrack
 from fractus_agent.redirector.netlink import NETLINK_NETFILTER, Netlink, NetlinkError
 from fractus_agent.redirector.redirector import Namespaces, Redirector
@@ -178,26 +178,28 @@ class Connectivity:
     async def _serve(self, interface: Interface, record: Record) -> None:
         """Everything that one interface takes, made new at the beginning and removed in the end."""
         assert interface.device is not None
-        ports = nft.Ports(udp=beacons.PORT, tcp=pairing.PORT)
+        ports = tables.Ports(udp=beacons.PORT, tcp=pairing.PORT)
         drone = self._end == "drone"
         controller = _controller(interface, self._node)
         # Closed before it gets an address. One that cannot be used is left alone; instances are isolated without it.
-        device = interface.device if self._usable(controller) else nft.NO_DEVICE
+        device = interface.device if self._usable(controller) else tables.NO_DEVICE
 
-        def make_table() -> None:
-            nft.create(device, ports, clients=drone)
+        def make_table(guards: nft.Callers) -> None:
+            tables.create(device, ports, clients=drone, callers=guards)
 
-        make_table()
+        # With what an agent before this one guarded: its table is replaced.
+        guards = (callers if drone else isolated)(self._plans.links)
+        make_table(guards)
         netlink = Netlink(NETLINK_NETFILTER)
         conntrack = Conntrack(netlink)
         # What an agent before this one led anywhere, that knows where it is to be no more.
         conntrack.forget_all()
-        maps = nft.Maps(netlink, make_table)
+        maps = nft.Maps(netlink, make_table, guards)
         redirector = Redirector(maps, conntrack, Namespaces(self._pods if drone else None))
 
         async def keep_up() -> None:
             nonlocal controller, device
-            while device == nft.NO_DEVICE:
+            while device == tables.NO_DEVICE:
                 await asyncio.sleep(CHECK_S)
                 # Only where it is there can be told whether it is a radio.
                 controller = _controller(interface, self._node)
@@ -219,13 +221,13 @@ class Connectivity:
             redirector.close()
             try:
                 # Before the table goes: what is up without it is open to every radio in reach.
-                if device != nft.NO_DEVICE:
+                if device != tables.NO_DEVICE:
                     await controller.down()
             except InterfaceProblem as problem:
                 log.warning("links: the packet filter stays: %s", problem)
             else:
                 with suppress(nft.RedirectFailed):
-                    nft.remove()
+                    tables.remove()
             finally:
                 # After the table, which would mark new connections.
                 with suppress(NetlinkError):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 import struct
 
-from fractus_agent.redirector import nft
+from fractus_agent.redirector import nft, tables
 from fractus_agent.redirector.conntrack import Conntrack
 from fractus_agent.redirector.netlink import NETLINK_NETFILTER, Netlink, attributes
 
@@ -34,7 +34,7 @@ def remove() -> None:
         RedirectFailed: nft is missing, or refuses.
         NetlinkError: the kernel refused.
     """
-    nft.remove()
+    tables.remove()
     netlink = Netlink(NETLINK_NETFILTER)
     try:
         Conntrack(netlink).forget_all()

@@ -1,14 +1,8 @@
-"""Our nftables table: its text, and swaps of its map by one raw transaction.
+"""Our nftables table: swaps of its maps by one raw transaction.
 
-The table is made once with `nft`; switching then changes map elements only, over netlink: `nft` as a process takes 16 ms
-and libnftables slows down with the rules of kube-proxy, while one transaction takes 0.02 ms, and 0.6 ms with 64 elements.
-
-Our chains hook at priority -150, before those of kube-proxy: on a node with clients on prerouting for pods and on output for
-programs in the host's network, on one that serves them on prerouting for what comes from paired nodes. A connection whose first packet matches an element of `targets` goes to the direct address; without an element it
-falls through to kube-proxy, and so to the cloud path. Elements time out, so that an agent that dies leaves the cloud path.
-
-Every radio in reach can send to a direct interface. So nothing comes in there but beacons and pairing, and what our redirects
-lead from nodes that have paired on to pods; and nothing goes out by it that we did not redirect.
+The table is made with `nft`, as `tables` describes it; switching then changes map elements only, over netlink: `nft` as a
+process takes 16 ms and libnftables slows down with the rules of kube-proxy, while one transaction takes 0.02 ms, and 0.6 ms
+with 64 elements.
 """
 
 from __future__ import annotations
@@ -16,11 +10,11 @@ from __future__ import annotations
 import errno
 import socket
 import struct
-import subprocess
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from ipaddress import IPv4Address
+from types import MappingProxyType
 
 from fractus_agent.redirector.counters import counted
 from fractus_agent.redirector.netlink import (
@@ -35,8 +29,6 @@ from fractus_agent.redirector.netlink import (
 )
 
 TABLE = "fractus"
-NO_DEVICE = "/"
-"""A name that no device can have: of the direct interface while there is none to be used."""
 TARGETS, MARKS, PEERS = "targets", "marks", "peers"
 SENT, RECEIVED = "sent", "received"
 GUARDED, CALLERS = "guarded", "callers"
@@ -45,11 +37,6 @@ MARK_MASK, MARK_BASE = 0xFFF00000, 0xF6A00000
 """Connections that we redirect carry a mark of this range; the lower bits number a service's stay on one path."""
 
 MAX_NUMBER = 0xFFFFF
-
-COMMAND_TIMEOUT_S = 10.0
-
-COUNTED_S = 60
-"""Bytes of a service are counted until nothing has moved for so long."""
 
 _SUBSYSTEM = 10 << 8
 _NEW_ELEMENTS, _DELETE_ELEMENTS, _BEGIN, _END = _SUBSYSTEM | 12, _SUBSYSTEM | 14, 0x10, 0x11
@@ -98,158 +85,13 @@ class Redirect:
     target: Endpoint
 
 
+Callers = Mapping[Endpoint, Collection[IPv4Address]]
+"""By guarded endpoint, who may call it."""
+NO_GUARDS: Callers = MappingProxyType({})
+
+
 class RedirectFailed(RuntimeError):
     """The kernel did not take the rules."""
-
-
-@dataclass(frozen=True, slots=True)
-class Ports:
-    """What a node itself listens to on its direct interfaces.
-
-    Attributes:
-        udp: of beacons.
-        tcp: of pairing.
-    """
-
-    udp: int
-    tcp: int
-
-
-def table(devices: str, ports: Ports, *, clients: bool) -> str:
-    """The text of our tables, for `nft -f`; they replace older ones at once, with all their elements.
-
-    Args:
-        devices: pattern of the names of direct interfaces, such as fxl*.
-        ports: of the node itself that are open there.
-        clients: whether clients on this node are led; otherwise only what paired nodes send over these interfaces is, and
-            guarded pods of this node take nothing else.
-    """
-    key = "ip daddr . meta l4proto . th dport"
-    only = "" if clients else f'iifname "{devices}" ip saddr @{PEERS} '
-    # Who may not call a service is not led there; whether the base instance takes the call is not for this node to say.
-    guard = f"{key} @{GUARDED} ip saddr . {key} != @{CALLERS} return\n\t\t" if clients else ""
-    rules = f"{guard}{only}ct mark set {key} map @{MARKS}\n\t\t{only}dnat ip to {key} map @{TARGETS}"
-    output = f"""
-	chain output {{
-		type nat hook output priority -150; policy accept;
-		{rules}
-	}}"""
-    closed = f"{key} @{GUARDED} ct state new ct mark and 0x{MARK_MASK:08x} != 0x{MARK_BASE:08x} drop\n\t\t"
-    ours = f"ct mark and 0x{MARK_MASK:08x} == 0x{MARK_BASE:08x}"
-    return f"""table ip {TABLE}
-delete table ip {TABLE}
-table ip {TABLE} {{
-	map {TARGETS} {{
-		type ipv4_addr . inet_proto . inet_service : ipv4_addr . inet_service
-		flags timeout
-	}}
-	map {MARKS} {{
-		type ipv4_addr . inet_proto . inet_service : mark
-	}}
-	set {SENT} {{
-		type mark
-		flags dynamic, timeout
-	}}
-	set {RECEIVED} {{
-		type mark
-		flags dynamic, timeout
-	}}
-	set {PEERS} {{
-		type ipv4_addr
-		flags timeout
-	}}
-	set {GUARDED} {{
-		type ipv4_addr . inet_proto . inet_service
-	}}
-	set {CALLERS} {{
-		type ipv4_addr . ipv4_addr . inet_proto . inet_service
-	}}
-	chain prerouting {{
-		type nat hook prerouting priority -150; policy accept;
-		{rules}
-	}}{output if clients else ""}
-	chain postrouting {{
-		# Without it the server would answer over the base path: it knows the client by its pod address.
-		type nat hook postrouting priority 50; policy accept;
-		{ours} oifname "{devices}" masquerade
-	}}
-	chain sending {{
-		type filter hook postrouting priority 150; policy accept;
-		{ours} oifname "{devices}" update @{SENT} {{ ct mark timeout {COUNTED_S}s counter }}
-	}}
-	chain receiving {{
-		type filter hook prerouting priority 0; policy accept;
-		{ours} iifname "{devices}" update @{RECEIVED} {{ ct mark timeout {COUNTED_S}s counter }}
-	}}
-	chain arriving {{
-		type filter hook input priority -5; policy accept;
-		iifname != "{devices}" accept
-		ct state established,related accept
-		udp dport {ports.udp} accept
-		tcp dport {ports.tcp} accept
-		# Of connections whose redirect ended: their clients must not wait for a time-out.
-		meta l4proto tcp reject with tcp reset
-		drop
-	}}
-	chain passing {{
-		type filter hook forward priority -5; policy accept;
-		{"" if clients else closed}iifname != "{devices}" oifname != "{devices}" accept
-		ct state established,related accept
-		{ours} oifname "{devices}" accept
-		{ours} iifname "{devices}" ip saddr @{PEERS} accept
-		drop
-	}}
-}}
-table ip6 {TABLE}
-delete table ip6 {TABLE}
-table ip6 {TABLE} {{
-	chain arriving {{
-		type filter hook input priority -5; policy accept;
-		iifname "{devices}" drop
-	}}
-	chain passing {{
-		type filter hook forward priority -5; policy accept;
-		iifname "{devices}" drop
-		oifname "{devices}" drop
-	}}
-}}
-"""
-
-
-def create(devices: str, ports: Ports, namespace: Sequence[str] = (), *, clients: bool) -> None:
-    """Make our tables, or make them again.
-
-    Args:
-        devices: pattern of the names of direct interfaces.
-        ports: of the node itself that are open there.
-        namespace: command words that run `nft` in another network namespace; for tests.
-        clients: whether clients on this node are led.
-
-    Raises:
-        RedirectFailed: nft is missing, or refuses.
-    """
-    _nft(table(devices, ports, clients=clients), namespace)
-
-
-def remove(namespace: Sequence[str] = ()) -> None:
-    """Remove our tables and all that they do; that there are none is no error."""
-    _nft("".join(f"table {family} {TABLE}\ndelete table {family} {TABLE}\n" for family in ("ip", "ip6")), namespace)
-
-
-def _nft(text: str, namespace: Sequence[str]) -> None:
-    try:
-        done = subprocess.run(
-            [*namespace, "nft", "-f", "-"],
-            input=text,
-            capture_output=True,
-            text=True,
-            timeout=COMMAND_TIMEOUT_S,
-            check=False,
-        )
-    except (OSError, subprocess.TimeoutExpired) as error:
-        raise RedirectFailed(f"nftables: cannot run nft: {error}") from error
-    if done.returncode:
-        raise RedirectFailed(f"nftables: nft refused our table: {done.stderr.strip()}")
 
 
 class Maps:
@@ -257,13 +99,14 @@ class Maps:
 
     Args:
         netlink: a netfilter socket in the node's network namespace.
-        make_table: makes our table again where someone has removed it, as `nft flush ruleset` does.
+        make_table: makes our table, with these guards; again where someone has removed it, as `nft flush ruleset` does.
+        callers: guards that the table has already.
     """
 
-    def __init__(self, netlink: Netlink, make_table: Callable[[], None]) -> None:
+    def __init__(self, netlink: Netlink, make_table: Callable[[Callers], None], callers: Callers = NO_GUARDS) -> None:
         self._netlink = netlink
         self._make_table = make_table
-        self._guards: list[tuple[int, bytes]] = []
+        self._callers = callers
 
     def write(
         self,
@@ -271,7 +114,7 @@ class Maps:
         marks: Iterable[tuple[Endpoint, int]] | None,
         timeout_s: float,
         peers: Iterable[IPv4Address] | None = None,
-        callers: Mapping[Endpoint, Collection[IPv4Address]] | None = None,
+        callers: Callers | None = None,
     ) -> None:
         """Replace the elements in one transaction: every packet sees either the old ones or the new.
 
@@ -296,33 +139,29 @@ class Maps:
             changes += _replaced(MARKS, [_marked(service, number) for service, number in marks])
         if peers is not None:
             changes += _replaced(PEERS, [nested(_LIST_ELEMENT, _address(peer), _lives(timeout_ms)) for peer in peers])
-        guards = self._guards
         if callers is not None:
-            guards = _replaced(GUARDED, [nested(_LIST_ELEMENT, _key(each)) for each in callers])
-            guards += _replaced(
+            changes += _replaced(GUARDED, [nested(_LIST_ELEMENT, _key(each)) for each in callers])
+            changes += _replaced(
                 CALLERS,
                 [nested(_LIST_ELEMENT, _key(to, client)) for to, clients in callers.items() for client in clients],
             )
-            changes += guards
         try:
             self._transact(changes)
         except NetlinkError as error:
             if error.errno != errno.ENOENT:
                 raise
-            self._make_table()
-            self._transact(changes if callers is not None else [*guards, *changes])
-        self._guards = guards
+            self._make_table(self._callers if callers is None else callers)
+            self._transact(changes)
+        if callers is not None:
+            self._callers = dict(callers)
 
     def remake(self) -> None:
         """Make the table again, for another device; guards are in it, all else comes with the next write.
 
         Raises:
             RedirectFailed: nft refuses.
-            NetlinkError: the kernel refused.
         """
-        self._make_table()
-        if self._guards:
-            self._transact(self._guards)
+        self._make_table(self._callers)
 
     def counted(self) -> dict[int, tuple[int, int]]:
         """Bytes sent and received over direct interfaces, by the number that connections carry.

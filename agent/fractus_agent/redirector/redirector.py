@@ -14,12 +14,11 @@ from contextlib import suppress
 from dataclasses import dataclass
 from ipaddress import IPv4Address
 from pathlib import Path
-from types import MappingProxyType
 
 from fractus_agent.redirector.conntrack import Conntrack
 from fractus_agent.redirector.habits import Exchange, Habits
 from fractus_agent.redirector.netlink import NETLINK_SOCK_DIAG, Netlink, NetlinkError, in_namespace
-from fractus_agent.redirector.nft import MAX_NUMBER, Endpoint, Maps, Redirect, RedirectFailed
+from fractus_agent.redirector.nft import MAX_NUMBER, NO_GUARDS, Callers, Endpoint, Maps, Redirect, RedirectFailed
 from fractus_agent.redirector.sockets import Connection, DestroyUnsupported, Sockets
 
 log = logging.getLogger(__name__)
@@ -31,10 +30,6 @@ REFRESH_S = 1.5
 DRAIN_TIMEOUT_S = 1.5
 DRAIN_POLL_S = 0.002
 LEARN_S = 0.1
-
-Callers = Mapping[Endpoint, frozenset[IPv4Address]]
-"""By guarded endpoint, who may call it."""
-NO_GUARDS: Callers = MappingProxyType({})
 
 
 @dataclass(frozen=True, slots=True)

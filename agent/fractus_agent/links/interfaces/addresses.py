@@ -26,8 +26,10 @@ ROUTES = Path("/proc/net/route")
 """The main routing table, of the network namespace that the process is in."""
 LINK_LOCAL = IPv4Network("169.254.0.0/16")
 
-RAISED = b"raised by fractus-agent"
-"""Alias of a device that was brought up here: it stays with the device when the agent is killed, and ends with a reboot."""
+RAISED = b" [raised by fractus-agent]"
+"""Added to the alias of a device that was brought up here: it stays with the device when the agent is killed, and ends with a
+reboot. What its owner wrote there stays before it."""
+_MAX_ALIAS = 255
 
 _NEW_LINK, _LIST_LINKS, _NEW_ADDRESS, _DELETE_ADDRESS, _LIST_ADDRESSES = 16, 18, 20, 21, 22
 _LINK = struct.Struct("=BxHiII")
@@ -80,7 +82,10 @@ class Addresses:
         netlink = Netlink(NETLINK_ROUTE)
         try:
             if not self._is_up():
-                _ask(netlink, _NEW_LINK, 0, _link(index, _IFF_UP) + attribute(_ALIAS, RAISED))
+                alias = _alias(netlink, index).removesuffix(RAISED) + RAISED
+                # Without room for our mark the device stays up in the end.
+                mark = attribute(_ALIAS, alias) if len(alias) <= _MAX_ALIAS else b""
+                _ask(netlink, _NEW_LINK, 0, _link(index, _IFF_UP) + mark)
             _ask(netlink, _NEW_ADDRESS, NLM_F_CREATE | NLM_F_REPLACE, _described(index, address))
             for other in _listed(netlink, index):
                 if other != address:
@@ -102,8 +107,9 @@ class Addresses:
         try:
             for address in list(_listed(netlink, index)):
                 _ask(netlink, _DELETE_ADDRESS, 0, _described(index, address))
-            if _alias(netlink, index) == RAISED:
-                _ask(netlink, _NEW_LINK, 0, _link(index, 0) + attribute(_ALIAS, b""))
+            alias = _alias(netlink, index)
+            if alias.endswith(RAISED):
+                _ask(netlink, _NEW_LINK, 0, _link(index, 0) + attribute(_ALIAS, alias.removesuffix(RAISED)))
         finally:
             netlink.close()
 

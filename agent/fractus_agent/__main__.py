@@ -14,7 +14,7 @@ from fractus_observe import logs
 
 from fractus_agent.cluster.store import Store, Unconfigured, connect
 from fractus_agent.daemon import Agent
-from fractus_agent.settings import MissingSetting, Settings
+from fractus_agent.settings import BadSetting, MissingSetting, Settings
 
 LOG = logging.getLogger("fractus_agent")
 
@@ -41,7 +41,7 @@ def main(environment: Mapping[str, str] = os.environ) -> int:
     """Run the agent of this node; the exit code."""
     try:
         settings = Settings.from_environment(environment)
-    except MissingSetting as error:
+    except (MissingSetting, BadSetting) as error:
         print(error, file=sys.stderr)
         return 2
     try:

@@ -144,6 +144,7 @@ class Agent:
             wall=_now,
             audit=self._settings.audit,
             changed=self._links_changed,
+            drain_s=self._settings.drain_s,
         )
         await self._links.run()
 

@@ -11,9 +11,17 @@ class MissingSetting(Exception):
     """A setting that has no default is not set."""
 
 
+class BadSetting(Exception):
+    """A setting has a value that it cannot have."""
+
+
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What differs between nodes; everything else is a constant of the module that uses it."""
+    """What differs between nodes; everything else is a constant of the module that uses it.
+
+    Attributes:
+        drain_s: how long connections may finish what they do on a path that their service leaves while it works.
+    """
 
     node: str
     description: Path
@@ -23,6 +31,7 @@ class Settings:
     log_format: str = "text"
     direct_links: bool = True
     metrics: str = ""
+    drain_s: float = 30.0
 
     @property
     def grants(self) -> Path:
@@ -51,19 +60,26 @@ class Settings:
 
     @classmethod
     def from_environment(cls, environment: Mapping[str, str]) -> Settings:
-        """Read FRACTUS_NODE (needed), and FRACTUS_DESCRIPTION, _STATE_DIR, _MOBILITY, _LOG_LEVEL, _LOG_FORMAT, _DIRECT_LINKS and _METRICS.
+        """Read FRACTUS_NODE, which is needed, and others.
+
+        These are FRACTUS_DESCRIPTION, _STATE_DIR, _MOBILITY, _LOG_LEVEL, _LOG_FORMAT, _DIRECT_LINKS, _DRAIN_S and _METRICS.
 
         Raises:
             MissingSetting: FRACTUS_NODE is not set.
+            BadSetting: FRACTUS_DRAIN_S is no number of seconds.
         """
         node = environment.get("FRACTUS_NODE", "")
         if not node:
             raise MissingSetting("FRACTUS_NODE is not set: give it the node's name (fieldRef spec.nodeName)")
+        drain = environment.get("FRACTUS_DRAIN_S", "30")
+        if not drain.replace(".", "", 1).isdecimal():
+            raise BadSetting(f"FRACTUS_DRAIN_S is no number of seconds: {drain[:80]}")
         return cls(
             node=node,
             description=Path(environment.get("FRACTUS_DESCRIPTION", "/etc/fractus/node.yaml")),
             state=Path(environment.get("FRACTUS_STATE_DIR", "/var/lib/fractus")),
             mobility_address=environment.get("FRACTUS_MOBILITY", "127.0.0.1:50051"),
+            drain_s=float(drain),
             direct_links=environment.get("FRACTUS_DIRECT_LINKS", "true").lower() == "true",
             metrics=environment.get("FRACTUS_METRICS", ""),
             log_format=environment.get("FRACTUS_LOG_FORMAT") or "text",

@@ -109,11 +109,8 @@ print("then", who, flush=True)
 """
 
 
-async def test_a_long_reply_on_a_slow_path_is_not_closed_midway(
-    world: Rig, redirector: Redirector, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_long_reply_on_a_slow_path_is_not_closed_midway(world: Rig, redirector: Redirector) -> None:
     """The client's window updates and pings between its pieces are no requests."""
-    monkeypatch.setattr(module, "DRAIN_TIMEOUT_S", 200.0)
     world.servers()
     # 20 MB at 24 Mbit/s, with a queue so short that segments are lost and sent again.
     slow = ("rate", "24mbit", "burst", "6kb", "limit", "30kb")
@@ -144,16 +141,22 @@ async def test_after_an_abrupt_loss_the_cloud_answers_at_once(world: Rig, redire
     assert found[-1][1] == "cloud"
 
 
-async def test_a_call_that_takes_longer_than_the_drain_is_cut(world: Rig, redirector: Redirector) -> None:
+@pytest.mark.parametrize(("drain_s", "told"), [(module.DRAIN_S, "cloud"), (1.5, "FAILED")])
+@pytest.mark.parametrize("before", [0, 1])
+async def test_a_call_is_cut_only_where_it_takes_longer_than_the_drain(
+    world: Rig, redirector: Redirector, drain_s: float, told: str, before: int
+) -> None:
+    redirector._drain_s = drain_s
     world.servers(work_s=4.0)
     keeping = asyncio.create_task(redirector.run())
-    client = world.client(2)
-    shown = await asyncio.to_thread(answers, client, 1)
-    await asyncio.sleep(1.0)  # the second call is under way, and takes three times as long as a drain
+    client = world.client(before + 2, pause_s=5.0)
+    shown = await asyncio.to_thread(answers, client, before)
+    await asyncio.sleep(1.0)  # the next call is under way, the first of its connection or another one
     done = await redirector.switch(TO_EDGE, planned=True)
+    shown += await asyncio.to_thread(answers, client)
     keeping.cancel()
-    assert done.drained + done.cut == 1
-    assert [answer[1] for answer in shown + await asyncio.to_thread(answers, client)] == ["cloud", "FAILED"]
+    assert [answer[1] for answer in shown] == ["cloud"] * before + [told, "edge"]
+    assert (done.drained, done.cut) == ((1, 0) if told == "cloud" else (0, 1))
 
 
 async def test_without_an_agent_the_cloud_path_comes_back(
@@ -193,10 +196,8 @@ async def test_services_keep_their_numbers_and_redirects_end_with_them(world: Ri
     assert redirector.redirects == {}
 
 
-async def test_a_connection_opened_during_a_drain_outlives_it(
-    world: Rig, redirector: Redirector, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(module, "DRAIN_TIMEOUT_S", 5.0)
+async def test_a_connection_opened_during_a_drain_outlives_it(world: Rig, redirector: Redirector) -> None:
+    redirector._drain_s = 5.0
     world.servers(work_s=3.0)
     busy = world.client(20, pause_s=0.01)
     await asyncio.to_thread(answers, busy, 1)
@@ -282,9 +283,6 @@ def test_only_its_callers_are_led(world: Rig, redirector: Redirector) -> None:
     assert ask_once(world, other) == "edge"
 
 
-KUBE_PROXY = {
-    "nftables": [["nft", "table ip kube-proxy { chain pre { type nat hook prerouting priority -100; "
-                  "ip daddr 10.96.0.9 tcp dport 8080 dnat to 10.88.0.2:8080; }; }"]],
 def test_guards_are_there_from_the_first_moment_of_a_table(world: Rig) -> None:
     """Nothing can follow by netlink, as in the time between a table and what is written to it."""
     maps = world.maps("edge")
@@ -296,6 +294,9 @@ def test_guards_are_there_from_the_first_moment_of_a_table(world: Rig) -> None:
         assert element in subprocess.run(words, capture_output=True, text=True, check=True).stdout
 
 
+KUBE_PROXY = {
+    "nftables": [["nft", "table ip kube-proxy { chain pre { type nat hook prerouting priority -100; "
+                  "ip daddr 10.96.0.9 tcp dport 8080 dnat to 10.88.0.2:8080; }; }"]],
     "iptables": [["iptables", "-t", "nat", "-A", "PREROUTING", "-d", "10.96.0.9", "-p", "tcp", "--dport", "8080",
                   "-j", "DNAT", "--to-destination", "10.88.0.2:8080"]],
 }  # fmt: skip
@@ -341,14 +342,14 @@ def test_a_device_that_a_killed_agent_raised_is_known_to_the_next(world: Rig, ow
         return done.stdout
 
     address = IPv4Address("169.254.7.7")
-    for was_up in (False, True):
     run(*world.inside("drone"), "ip", "link", "set", "fxl0", "alias", owners)
+    for was_up in (False, True):
         run(*world.inside("drone"), "ip", "link", "set", "fxl0", "up" if was_up else "down")
         for agent in range(2):  # the first one is killed
             in_namespace(world.path("drone"), lambda: Addresses("fxl0").set(address))
             assert "UP" in words(), agent
-        in_namespace(world.path("drone"), lambda: Addresses("fxl0").clear())
             assert owners in words()
+        in_namespace(world.path("drone"), lambda: Addresses("fxl0").clear())
         # Where the owner's alias leaves no room for the mark, it stays up.
         assert ("state UP" in words()) is (was_up or len(owners) == 255)
         alias = words().partition("alias ")[2].strip()

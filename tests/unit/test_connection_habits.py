@@ -45,6 +45,30 @@ def test_a_reply_as_long_as_the_one_before_is_complete_at_once() -> None:
     assert Habits().closable(exchange(*REQUESTED, seen(8, 0, 180, 150)), 1.0)
 
 
+def test_when_time_is_out_any_rest_will_do() -> None:
+    habits = Habits()
+    habits.learn(seen(4, 24, 320, 150))
+    longer_than_usual = exchange(seen(44, 40, 320, 150))
+    assert not habits.closable(longer_than_usual, 1.0), "the next request may come at any time"
+    assert habits.closable(longer_than_usual, 0.0)
+
+
+def test_a_call_that_takes_long_is_waited_for() -> None:
+    """Pings and acknowledgements are no reply, however long the silence, on a connection's first call and on later ones."""
+    pinged = seen(3000, 2990, 120 + PING_BYTES, 150)
+    assert not Habits().closable(exchange(*REQUESTED, pinged), 0.0)
+    opened = seen(2000, 1990, 90, 240)
+    assert not Habits().closable(exchange(opened), 0.0)
+    assert Habits().closable(exchange(opened, seen(4000, 1000, 250, 240)), 1.0)
+    assert Habits().closable(exchange(seen(3000, 2990, 90, 90)), 1.0), "nothing was asked yet"
+
+
+def test_a_stream_on_which_both_talk_is_closed_in_a_rest() -> None:
+    looks = [*REQUESTED, *(seen(20, 16, 120 + 28 * number, 150 + 22 * number) for number in range(1, 600))]
+    assert not exchange(*looks).long
+    assert Habits().closable(exchange(*looks), 0.0)
+
+
 def test_what_acknowledges_a_request_is_no_reply_to_it() -> None:
     """A server's ping and window update come first, and are no longer than the replies may be short."""
     pinged = exchange(*REQUESTED, seen(8, 4, 120 + PING_BYTES, 150))

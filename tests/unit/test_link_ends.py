@@ -25,6 +25,7 @@ from fractus_agent.redirector import tables
 from fractus_agent.redirector.netlink import NetlinkError
 from fractus_agent.redirector.nft import Endpoint
 from fractus_agent.redirector.redirector import Namespaces, Redirector
+from fractus_agent.settings import BadSetting, Settings
 from fractus_core.api.links import DirectLink, LinkedService
 from fractus_core.linking import PathMetrics, UnknownHeuristic
 
@@ -202,6 +203,13 @@ def test_a_node_without_clients_leads_only_what_paired_nodes_send() -> None:
     assert "hook output" in tables.table("wlan0", tables.Ports(1, 2), clients=True)
 
 
+def test_the_time_of_a_drain_is_a_number() -> None:
+    assert Settings.from_environment({"FRACTUS_NODE": "d1", "FRACTUS_DRAIN_S": "2.5"}).drain_s == 2.5
+    for bad in ("soon", "-1", "nan", "1e3"):
+        with pytest.raises(BadSetting, match="no number of seconds"):
+            Settings.from_environment({"FRACTUS_NODE": "d1", "FRACTUS_DRAIN_S": bad})
+
+
 @pytest.mark.parametrize(("mbps", "probes"), [(16.0, {2, 3}), (8.5, {2, 3}), (2.0, {5, 6})])
 def test_a_link_is_probed_only_while_its_traffic_leaves_room(
     mbps: float, probes: set[int], monkeypatch: pytest.MonkeyPatch
@@ -232,6 +240,8 @@ def test_a_link_is_probed_only_while_its_traffic_leaves_room(
             report=lambda _: None, record=lambda *_: None,
         )  # fmt: skip
         using = asyncio.create_task(end._use(cast(Session, session)))
+        await asyncio.sleep(0)
+        session.told({"routes": {}})
         async with asyncio.timeout(30):
             await redirector.enough.wait()
         measured = end._direct

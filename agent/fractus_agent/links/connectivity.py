@@ -31,7 +31,7 @@ from fractus_agent.links.uplink import Node, Uplink
 from fractus_agent.redirector import leftovers, nft, tables
 from fractus_agent.redirector.conntrack import Conntrack
 from fractus_agent.redirector.netlink import NETLINK_NETFILTER, Netlink, NetlinkError
-from fractus_agent.redirector.redirector import Namespaces, Redirector
+from fractus_agent.redirector.redirector import DRAIN_S, Namespaces, Redirector
 
 log = logging.getLogger(__name__)
 
@@ -61,6 +61,7 @@ class Connectivity:
         changed: called when links begin or cease to be planned.
         audit: directory of the node's audit logs.
         pods: directory of the pods' network namespaces.
+        drain_s: how long connections may finish what they do on a path that their service leaves while it works.
     """
 
     def __init__(
@@ -76,7 +77,9 @@ class Connectivity:
         audit: Path,
         changed: Callable[[], None] = lambda: None,
         pods: Path = PODS,
+        drain_s: float = DRAIN_S,
     ) -> None:
+        self._drain_s = drain_s
         self._store = store
         self._node = node
         self._tls = tls
@@ -195,7 +198,7 @@ class Connectivity:
         # What an agent before this one led anywhere, that knows where it is to be no more.
         conntrack.forget_all()
         maps = nft.Maps(netlink, make_table, guards)
-        redirector = Redirector(maps, conntrack, Namespaces(self._pods if drone else None))
+        redirector = Redirector(maps, conntrack, Namespaces(self._pods if drone else None), drain_s=self._drain_s)
 
         async def keep_up() -> None:
             nonlocal controller, device

@@ -7,6 +7,7 @@ import logging
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ from fractus_core.linking import (
 from fractus_agent.links.addressing import link_address
 from fractus_agent.links.connector import Connector
 from fractus_agent.links.decisions import Actions, Situation, Traffic, decide
+from fractus_agent.links.drains import Drains
 from fractus_agent.links.evidence import Record, records
 from fractus_agent.links.flows import FULL, MAX_CONFIRMED, WINDOW_S, Flows
 from fractus_agent.links.heuristics import Heuristics
@@ -48,7 +50,10 @@ PROBE_S = 3.0
 PROBES = 3
 """The best of the last N counts: a probe that meets the components' own traffic shows what is left beside it."""
 LEAVE_S = 2.0
-"""So long before the drone leaves a link's reach its traffic is led back: a drain takes up to 1.5 s, and reaches have soft edges."""
+"""So long before the drone leaves a link's reach its traffic is led back: clients that call all the time are drained within 1.5 s,
+and reaches have soft edges."""
+PART_S = 1.5
+"""Connections have so long to become idle when the agent ends, or no link is planned any more."""
 DIRECT_LATENCY_MS = 5.0
 """What a link is expected to need before it was measured."""
 
@@ -93,8 +98,8 @@ class DroneEnd:
         self._direct: PathMetrics | None = None
         self._flows = Flows()
         self._parting = False
-        self._lost = asyncio.Event()
         self._wake = asyncio.Event()
+        self._drains = Drains(redirector, self._wake.set)
         self._before = NO_LINK
 
     def plan(self, links: tuple[DirectLink, ...]) -> None:
@@ -130,9 +135,15 @@ class DroneEnd:
 
     async def _part(self) -> None:
         try:
-            await self._redirector.switch(dict.fromkeys(self._redirector.redirects), planned=not self._lost.is_set())
+            async with asyncio.timeout(PART_S):
+                back = dict.fromkeys(self._redirector.redirects)
+                await self._redirector.switch(back, planned=self._connector.link.phase is Phase.UP)
+        except TimeoutError:
+            log.info("links: connections were closed that were not idle in time")
         except (NetlinkError, RedirectFailed) as error:
             log.warning("links: traffic is not led back, its redirects end by themselves (error=%s)", error)
+        for on_link in (True, False):
+            await self._drains.cut(on_link=on_link)
         await self._want("")
 
     async def _step(self) -> None:
@@ -140,32 +151,22 @@ class DroneEnd:
         # Those that are not planned any more as well, for as long as their traffic takes the link.
         self._redirector.serve({*virtuals(self._links), *self._redirector.redirects}, callers(self._links))
         situation = self._situation()
+        # What drains on a path that is gone would never end.
+        if situation.link.phase is not Phase.UP:
+            await self._drains.cut(on_link=True)
+        if situation.cloud is None:
+            await self._drains.cut(on_link=False)
         actions = decide(situation, self._settings)
-        self._explain(actions, situation)
         if actions.abrupt:
             await self._redirector.switch(actions.abrupt, planned=False)
         if actions.planned:
-            await self._switch(actions.planned)
+            await self._drains.begin(actions.planned)
+        if self._drains.on_link:  # the link is left, or given to another peer, once nothing needs it any more
+            actions = replace(actions, link=replace(actions.link, changes=False))
+        self._explain(actions, situation)
         if actions.link.changes:
             await self._want(actions.peer)
         self._tell(actions, situation)
-
-    async def _switch(self, targets: Mapping[Endpoint, Endpoint | None]) -> None:
-        """A planned switch, which a loss of the link makes an abrupt one: what drains would never end."""
-        drain = asyncio.create_task(self._redirector.switch(targets, planned=True))
-        lost = asyncio.create_task(self._lost.wait())
-        try:
-            await asyncio.wait({drain, lost}, return_when=asyncio.FIRST_COMPLETED)
-        finally:
-            lost.cancel()
-            if not drain.done():
-                drain.cancel()
-            await asyncio.gather(lost, return_exceptions=True)
-            try:
-                await drain
-            except asyncio.CancelledError:
-                if (task := asyncio.current_task()) is not None and task.cancelling():
-                    raise
 
     async def _want(self, peer: str) -> None:
         self._parting = True
@@ -236,7 +237,6 @@ class DroneEnd:
             self._wake.set()
 
         session.told = told
-        self._lost.clear()
         rates: deque[float] = deque(maxlen=PROBES)
         probed, confirmed = 0.0, MAX_CONFIRMED
         try:
@@ -257,7 +257,6 @@ class DroneEnd:
         finally:
             self._flows = Flows()
             self._said = self._direct = None
-            self._lost.set()
             self._wake.set()
 
     async def _watch(self, seconds: float) -> None:

@@ -23,8 +23,13 @@ learned from its connections all the time."""
 
 MIN_REPLY_BYTES, MIN_REQUEST_BYTES = 35, 31
 """HTTP/2's ping (17) and window update (13) together are shorter; a request of gRPC's has 31 where it says nothing at all."""
+OPENING_BYTES = 128
+"""What each end of an HTTP/2 connection sends before its first request, or reply, is less; with that it is more."""
 CONTROL_SHARE = 1 / 256
 """What a client sends at most while it takes a long reply: two window updates (26) for each frame of data (16,384) are half of it."""
+
+TALK_SHARE = 1 / 16
+"""A client that sends so much while it receives takes no long reply: both talk on a stream, and rest in between."""
 
 LONG_BYTES = 8 * 1024
 LONG_IDLE_MS = 250.0
@@ -47,6 +52,7 @@ class Exchange:
         asked_bytes: of the request.
         previous_bytes: of the reply before; None where that was not seen as a whole, or the request not.
         pause_ms: longest silence within the reply.
+        said_bytes: sent by the client since the request, in pieces too short for another one.
     """
 
     connection: Connection
@@ -56,10 +62,13 @@ class Exchange:
     asked_bytes: int = 0
     previous_bytes: int | None = None
     pause_ms: int = 0
+    said_bytes: int = 0
 
     @classmethod
     def first(cls, connection: Connection) -> Exchange:
-        """A connection that is looked at for the first time."""
+        """A connection that is looked at for the first time; it may be waiting for its first reply."""
+        if connection.received_bytes < OPENING_BYTES <= connection.sent_bytes:
+            return cls(connection, OPENING_BYTES - MIN_REPLY_BYTES, connection, True, connection.sent_bytes)
         return cls(connection, connection.received_bytes, connection)
 
     def then(self, connection: Connection) -> Exchange:
@@ -70,12 +79,12 @@ class Exchange:
         sent = connection.sent_bytes - self.at_send.sent_bytes
         if not sent:
             return now
-        if self.seen and self.reply_bytes < MIN_REPLY_BYTES:
+        if self.waiting:
             # A request in several segments is sent over a time; it is one as long as nothing comes.
             return replace(now, at_send=connection, asked_bytes=self.asked_bytes + sent)
         came = connection.received_bytes - self.at_send.received_bytes
         if sent < max(MIN_REQUEST_BYTES, CONTROL_SHARE * came):
-            return replace(now, at_send=connection)
+            return replace(now, at_send=connection, said_bytes=self.said_bytes + sent)
         previous = self.reply_bytes if self.seen else None
         return Exchange(connection, self.connection.received_bytes, connection, True, sent, previous)
 
@@ -85,9 +94,14 @@ class Exchange:
         return self.connection.received_bytes - self.before_bytes
 
     @property
+    def waiting(self) -> bool:
+        """Whether nothing that can be a reply came since the request, however long ago that was."""
+        return self.seen and self.reply_bytes < MIN_REPLY_BYTES
+
+    @property
     def long(self) -> bool:
         """Whether the reply comes in several segments, so that it may pause within."""
-        return self.reply_bytes >= LONG_BYTES
+        return self.reply_bytes >= LONG_BYTES and self.said_bytes < TALK_SHARE * self.reply_bytes
 
     @property
     def complete(self) -> bool:
@@ -119,10 +133,10 @@ class Habits:
 
         Args:
             exchange: what was seen of it.
-            left: share of the time that is left for it: as it runs out, less is asked for.
+            left: share of the time that it has for becoming idle: as it runs out, less is asked for.
         """
         connection = exchange.connection
-        if not connection.answered:
+        if exchange.waiting or not connection.answered:
             return False
         demand = min(2 * left, 1.0)
         if self._about_to_ask(connection, demand):
@@ -139,6 +153,6 @@ class Habits:
         """Whether too little is left of the rest that clients of this service take."""
         rest_ms = self._rested_ms.get(connection.peer)
         # Who has rested for much longer than before has no habit that tells when the next request comes.
-        if rest_ms is None or connection.received_ms >= MAX_IDLE_MS:
+        if rest_ms is None or connection.received_ms >= MAX_IDLE_MS or not demand:
             return False
         return rest_ms - connection.received_ms < max(NOTICE_MS, rest_ms / 2) * demand

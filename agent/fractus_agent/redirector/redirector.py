@@ -1,7 +1,7 @@
 """Moves the traffic of services between the cloud path and the direct link, and keeps it there while the agent lives.
 
 A planned switch moves new connections at once and lets each old one finish what it does: it is closed when it is idle, so
-that no call is lost, and at the latest when the old path is needed no longer. An abrupt switch, after a link was lost,
+that no call is lost, and at the latest after a time that a long reply should take. An abrupt switch, after a link was lost,
 closes and forgets all old connections at once: they would never recover by themselves.
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -27,8 +28,11 @@ LEASE_S = 5.0
 """Redirects live so long without an agent: then the kernel drops them, and new connections take the cloud path."""
 REFRESH_S = 1.5
 
-DRAIN_TIMEOUT_S = 1.5
-DRAIN_POLL_S = 0.002
+DRAIN_S = 30.0
+"""Connections that are in the middle of something stay on the path that their service has left for so long."""
+BUSY_TIMEOUT_S = 1.5
+"""A client that calls all the time never rests for long: over this time ever less is asked for of its rests between calls."""
+DRAIN_POLL_S, SLOW_POLL_S = 0.002, 0.02
 LEARN_S = 0.1
 
 
@@ -119,9 +123,11 @@ class Redirector:
         maps: our table.
         conntrack: the kernel's connections.
         namespaces: sockets of the pods.
+        drain_s: how long connections may finish what they do on a path that their service has left while it lives.
     """
 
-    def __init__(self, maps: Maps, conntrack: Conntrack, namespaces: Namespaces) -> None:
+    def __init__(self, maps: Maps, conntrack: Conntrack, namespaces: Namespaces, *, drain_s: float = DRAIN_S) -> None:
+        self._drain_s = drain_s
         self._maps = maps
         self._conntrack = conntrack
         self._namespaces = namespaces
@@ -289,10 +295,7 @@ class Redirector:
         return [_Left(service, number, frozenset(found[service])) for service, number in numbers.items()]
 
     def _leave(self, paths: Iterable[_Left]) -> int:
-        """Close the connections that are left on paths, and forget them; how many were closed.
-
-        What fails is tried again with the next refresh.
-        """
+        """Close the connections that are left on paths, and forget them; what fails is tried again. How many were closed."""
         paths = [left for left in paths if left in self._left]
         try:
             cut = self._cut({left.service for left in paths}, {c for left in paths for c in left.connections})
@@ -314,14 +317,13 @@ class Redirector:
 
     async def _drain(self, old: Collection[bytes], moved: Collection[Endpoint]) -> int:
         """Close old connections as they become idle, until the time is over; how many."""
-        loop = asyncio.get_running_loop()
-        begun, drained = loop.time(), 0
+        begun, drained = time.monotonic(), 0
         watched = [
             (sockets, self._exchanges.get(connection.identity) or Exchange.first(connection))
             for sockets, connection in self._namespaces.to(moved)
             if connection.identity in old
         ]
-        while watched and (left := 1 - (loop.time() - begun) / DRAIN_TIMEOUT_S) > 0:
+        while watched and (spent := time.monotonic() - begun) < self._drain_s:
             there = []
             for sockets, exchange in watched:
                 try:
@@ -332,7 +334,8 @@ class Redirector:
                 if connection is None:
                     continue
                 seen = exchange.then(connection)
-                if not self._habits.closable(seen, left):
+                within_s = self._drain_s if seen.long else min(BUSY_TIMEOUT_S, self._drain_s)
+                if not self._habits.closable(seen, max(1 - spent / within_s, 0.0)):
                     there.append((sockets, seen))
                 # At once: the next request comes at some time, and none is to come in between.
                 elif not _destroy(sockets, connection):
@@ -341,7 +344,7 @@ class Redirector:
                     drained += 1
             watched = there
             if watched:
-                await asyncio.sleep(DRAIN_POLL_S)
+                await asyncio.sleep(DRAIN_POLL_S if spent < BUSY_TIMEOUT_S else SLOW_POLL_S)
         return drained
 
     def _cut(self, services: Collection[Endpoint], only: Collection[bytes]) -> int:

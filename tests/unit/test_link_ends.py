@@ -210,6 +210,19 @@ def test_the_time_of_a_drain_is_a_number() -> None:
             Settings.from_environment({"FRACTUS_NODE": "d1", "FRACTUS_DRAIN_S": bad})
 
 
+def test_a_peer_that_serves_nothing_and_says_nothing_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(drone, "PROBE_S", 0.0)
+
+    class Quiet(Calls):
+        latency_ms = 1.0
+
+        async def probe(self) -> float:
+            return 10.0
+
+    with pytest.raises(LinkLost, match="has not said where it takes calls"):
+        asyncio.run(drone_end()._use(cast(Session, Quiet())))
+
+
 @pytest.mark.parametrize(("mbps", "probes"), [(16.0, {2, 3}), (8.5, {2, 3}), (2.0, {5, 6})])
 def test_a_link_is_probed_only_while_its_traffic_leaves_room(
     mbps: float, probes: set[int], monkeypatch: pytest.MonkeyPatch

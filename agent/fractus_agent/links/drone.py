@@ -35,7 +35,7 @@ from fractus_agent.links.evidence import Record, records
 from fractus_agent.links.flows import FULL, MAX_CONFIRMED, WINDOW_S, Flows
 from fractus_agent.links.heuristics import Heuristics
 from fractus_agent.links.lessons import Lessons
-from fractus_agent.links.pairing import Session
+from fractus_agent.links.pairing import LinkLost, Session
 from fractus_agent.links.plans import callers, route_key, virtuals
 from fractus_agent.links.reports import DroneReport
 from fractus_agent.redirector.netlink import NetlinkError
@@ -230,7 +230,11 @@ class DroneEnd:
         return None
 
     async def _use(self, session: Session) -> None:
-        """While a session lasts: hear the peer's routes, and measure."""
+        """While a session lasts: hear the peer's routes, and measure.
+
+        Raises:
+            LinkLost: the peer keeps the session, and serves nothing.
+        """
 
         def told(message: Mapping[str, Any]) -> None:
             self._said = (session.peer, message)
@@ -254,6 +258,8 @@ class DroneEnd:
                 _log_measured(session.peer, self._direct, first=len(rates) == 1)
                 self._wake.set()
                 await self._watch(PROBE_S)
+                if self._said is None:
+                    raise LinkLost(f"{session.peer} has not said where it takes calls")
         finally:
             self._flows = Flows()
             self._said = self._direct = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+from dataclasses import replace
 from ipaddress import IPv4Address
 
 import pytest
@@ -51,6 +52,13 @@ def test_when_time_is_out_any_rest_will_do() -> None:
     longer_than_usual = exchange(seen(44, 40, 320, 150))
     assert not habits.closable(longer_than_usual, 1.0), "the next request may come at any time"
     assert habits.closable(longer_than_usual, 0.0)
+
+
+def test_a_reply_that_the_client_has_not_read_is_not_thrown_away() -> None:
+    """A client on a busy machine comes late to what has arrived for it."""
+    replied = seen(8, 0, 180, 150)
+    assert not Habits().closable(exchange(*REQUESTED, replace(replied, unread=60)), 0.0)
+    assert Habits().closable(exchange(*REQUESTED, replace(replied, unread=60), replied), 1.0)
 
 
 def test_a_call_that_takes_long_is_waited_for() -> None:

@@ -51,6 +51,7 @@ class Connection:
         acknowledged_ms: age of the last ACK received.
         received_bytes: since it was opened.
         sent_bytes: since it was opened, as far as they were acknowledged.
+        unread: bytes that have come and that the client has not read yet; closed, they would be lost.
     """
 
     identity: bytes
@@ -63,11 +64,13 @@ class Connection:
     acknowledged_ms: int = 0
     received_bytes: int = 0
     sent_bytes: int = 0
+    unread: int = 0
 
     @property
     def answered(self) -> bool:
-        """Whether all that was sent has arrived, and something came since."""
-        return self.queued == 0 and self.unacknowledged == 0 and self.received_ms <= self.sent_ms
+        """Whether all that was sent has arrived, and something came since, which the client has read."""
+        through = self.queued == 0 and self.unacknowledged == 0 and self.unread == 0
+        return through and self.received_ms <= self.sent_ms
 
     @property
     def idle_ms(self) -> int:
@@ -169,7 +172,7 @@ def _read(answer: bytes) -> Connection | None:
         if not peer.startswith(_MAPPED):
             return None
         peer = peer[len(_MAPPED) :]
-    _expires, _received, queued = _QUEUES.unpack_from(answer, _ANSWER_HEAD + _ID_BYTES)
+    _expires, unread, queued = _QUEUES.unpack_from(answer, _ANSWER_HEAD + _ID_BYTES)
     rest = answer[_ANSWER_HEAD + _ID_BYTES + _QUEUES.size + 8 :]
     info = next((value for kind, value in attributes(rest) if kind == _TCP_INFO), b"").ljust(_INFO.size, b"\0")
     unacknowledged, sent_ms, _, received_ms, acknowledged_ms, sent_bytes, received_bytes = _INFO.unpack_from(info)
@@ -184,4 +187,5 @@ def _read(answer: bytes) -> Connection | None:
         acknowledged_ms,
         received_bytes,
         sent_bytes,
+        unread,
     )

@@ -5,13 +5,14 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Mapping
 from ipaddress import IPv4Address
-from typing import cast
+from typing import Any, cast
 
 import pytest
 from fractus_agent.links.drains import Drains
+from fractus_agent.redirector.conntrack import Conntrack
 from fractus_agent.redirector.netlink import NetlinkError
-from fractus_agent.redirector.nft import Endpoint
-from fractus_agent.redirector.redirector import Redirector, Switched
+from fractus_agent.redirector.nft import Endpoint, Maps
+from fractus_agent.redirector.redirector import Namespaces, Redirector, Switched
 
 LOADER, ASKER, DIRECT = (Endpoint(IPv4Address(address), 80) for address in ("10.96.0.5", "10.96.0.6", "169.254.1.1"))
 
@@ -80,3 +81,33 @@ async def test_a_switch_that_the_kernel_refuses(refuses: str, caplog: pytest.Log
     async with asyncio.timeout(10):
         await ended.wait()
     assert "not drained" in caplog.text
+
+
+class Kernel:
+    """In place of maps, connection tracking and sockets; it keeps which numbers are forgotten."""
+
+    def __init__(self) -> None:
+        self.forgotten: list[int] = []
+
+    def write(self, *_: object) -> None:
+        return
+
+    def forget(self, number: int) -> None:
+        self.forgotten.append(number)
+
+    def to(self, _services: object) -> list[Any]:
+        return []
+
+    def refresh(self) -> list[Any]:
+        return []
+
+
+def test_connections_on_the_cloud_path_outlive_the_plan_for_their_service() -> None:
+    kernel = Kernel()
+    redirector = Redirector(cast(Maps, kernel), cast(Conntrack, kernel), cast(Namespaces, kernel))
+    redirector.serve([LOADER, ASKER])
+    redirector.lead({ASKER: DIRECT})
+    left = list(kernel.forgotten)
+    redirector.serve([])
+    assert len(kernel.forgotten) == len(left) + 1, "what was led over the link, and nothing else"
+    assert redirector.redirects == {}

@@ -170,7 +170,7 @@ class Redirector:
             raise
 
     def serve(self, services: Iterable[Endpoint], callers: Callers = NO_GUARDS) -> None:
-        """Number the services that clients on this node connect to; redirects of others end.
+        """Number the services that clients on this node connect to; redirects of others end, and what was led by them.
 
         Args:
             services: where clients connect to.
@@ -188,7 +188,8 @@ class Redirector:
         for service in sorted(wanted):
             # A number stays with its service, for connections that are there carry it.
             numbers[service] = self._numbers.get(service) or self._fresh(numbers)
-        ended = self._paths({service: n for service, n in self._numbers.items() if service not in numbers})
+        # On the cloud path, connections to services that are served no more go on.
+        ended = self._paths({service: self._numbers[service] for service in self._redirects.keys() - wanted})
         self._write({virtual: to for virtual, to in self._redirects.items() if virtual in numbers}, numbers, callers)
         self._callers = dict(callers)
         self._left += ended

@@ -113,21 +113,18 @@ class Player:
         self._now_s = monotonic_s
         self._pause = pause
         self._waiting: deque[Frame] = deque()
+        self._problem = ""
         self._lag_s: float | None = None
         """The clock here when a frame is due, less the drone's when it was recorded."""
 
     def run(self) -> None:
-        """Read in a thread, for kubectl takes its time, and send until interrupted.
-
-        Raises:
-            ClickException: recordings cannot be read any more.
-        """
+        """Read in a thread, for kubectl takes its time, and send until interrupted."""
         failed: list[Exception] = []
 
         def feed() -> None:
             try:
-                while not failed:
-                    self.take(self._read())
+                while True:
+                    self.look()
                     time.sleep(POLL_S)
             except Exception as error:  # told by the other thread
                 failed.append(error)
@@ -136,6 +133,18 @@ class Player:
         while not failed:
             self.play()
         raise failed[0]
+
+    def look(self) -> None:
+        """Take what was recorded; that it cannot be read, be it for a lost link to the cluster, is said once."""
+        try:
+            self.take(self._read())
+        except (click.ClickException, OSError) as error:
+            problem = error.message if isinstance(error, click.ClickException) else str(error)
+            if problem != self._problem:
+                click.echo(f"forward: {problem}; trying again", err=True)
+            self._problem = problem
+        else:
+            self._problem = ""
 
     def take(self, frames: list[Frame]) -> None:
         """Let frames wait for their moment."""

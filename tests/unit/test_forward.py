@@ -130,6 +130,28 @@ def test_what_came_too_late_is_sent_at_once_and_a_clock_that_is_set_stops_nothin
     assert len(sent) == 301
 
 
+def test_a_lost_link_is_said_once_and_reading_goes_on(capsys: pytest.CaptureFixture[str]) -> None:
+    lost = click.ClickException("drone-1: no route")
+    answers: list[list[Frame] | Exception] = [lost, lost, [Frame(1.0, b"\xfd")], OSError("gone")]
+    sent: list[bytes] = []
+
+    def read() -> list[Frame]:
+        found = answers.pop(0)
+        if isinstance(found, Exception):
+            raise found
+        return found
+
+    player = Player(read, sent.append, lambda: 0.0, lambda _: None)
+    for _ in range(4):
+        player.look()
+    player.play()
+    assert sent == [b"\xfd"]
+    assert capsys.readouterr().err.splitlines() == [
+        "forward: drone-1: no route; trying again",
+        "forward: gone; trying again",
+    ]
+
+
 def test_nothing_that_a_ground_station_sends_is_read() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ground:
         ground.bind(("127.0.0.1", 0))

@@ -1,4 +1,4 @@
-# Images of Fractus: operator, agent, services, view, component (what applications build on), sim, and the examples.
+# Images of Fractus: operator, agent, mobility, camera, view, component (what applications build on), sim, and the examples.
 #
 #   docker build --target operator --tag localhost/fractus/operator:dev .
 #
@@ -59,7 +59,7 @@ ENV UV_LINK_MODE=copy UV_PYTHON=/usr/bin/python3 UV_PYTHON_DOWNLOADS=never
 # MCAP files are written with LZ4: zstandard stays out.
 RUN --mount=type=cache,target=/root/.cache/uv \
     set -e; \
-    for name in sdk core operator agent services view; do \
+    for name in sdk core operator agent mobility services view; do \
       cd /build; extra="--extra $name"; if [ "$name" = sdk ]; then extra=; fi; \
       uv export --quiet --frozen --no-dev --no-emit-project $extra --output-file /build/$name.txt; \
       uv pip install --quiet --no-deps --require-hashes --target /deps/$name -r /build/$name.txt; \
@@ -71,17 +71,17 @@ RUN --mount=type=cache,target=/root/.cache/uv \
         find kubernetes/aio/client/models kubernetes/aio/client/api -type f ! -name __init__.py -delete; \
         rm -rf certifi* charset_normalizer* durationpy* oauthlib* requests* websocket*; fi; \
       strip --strip-unneeded cryptography/hazmat/bindings/_rust.abi3.so yaml/*.so aiohttp/*.so multidict/*.so \
-        frozenlist/*.so propcache/*.so 2>/dev/null || true; \
+        frozenlist/*.so propcache/*.so lz4/*/*.so watchfiles/*.so 2>/dev/null || true; \
       find . \( -name '*.pyi' -o -name '*.pyx' -o -name '*.pxd' -o -name '*.c' -o -name '*.h' -o -name '*.a' \) -delete; \
     done; \
-    for pair in core:sdk operator:core agent:core services:core view:core; do \
+    for pair in core:sdk operator:core agent:core mobility:core services:mobility view:core; do \
       name=${pair%:*}; below=${pair#*:}; cp -a /deps/$name /only-$name; \
       (cd /deps/$below && find . ! -type d -print0) | (cd /only-$name && xargs -0 rm -f); \
       find /only-$name -type d -empty -delete; \
     done; \
     cp -a /deps/sdk /only-sdk; \
     mkdir /only-geometry; cd /only-core; mv numpy* shapely* geographiclib* /only-geometry/; \
-    for name in sdk core geometry operator agent services view; do \
+    for name in sdk core geometry operator agent mobility services view; do \
       python3 -m compileall -q --invalidation-mode unchecked-hash -s /only-$name \
         -p /usr/local/lib/python3.11/dist-packages /only-$name; \
     done
@@ -158,15 +158,21 @@ COPY --from=dependencies /only-agent /usr/local/lib/python3.11/dist-packages
 ENTRYPOINT ["python3", "-m", "fractus_agent"]
 COPY --from=code /images/agent /usr/local/lib/python3.11/dist-packages
 
-FROM domain AS services-dependencies
-COPY --from=dependencies /only-services /usr/local/lib/python3.11/dist-packages
+# What flies a drone has no libraries for pictures: those are the camera's alone.
+FROM domain AS mobility-dependencies
+COPY --from=dependencies /only-mobility /usr/local/lib/python3.11/dist-packages
 
-FROM services-dependencies AS services
+FROM mobility-dependencies AS mobility
+ENTRYPOINT ["fractus"]
+COPY --from=code /images/services /usr/local/lib/python3.11/dist-packages
+
+FROM mobility-dependencies AS camera
+COPY --from=dependencies /only-services /usr/local/lib/python3.11/dist-packages
 ENTRYPOINT ["fractus"]
 COPY --from=code /images/services /usr/local/lib/python3.11/dist-packages
 
 # ---- sim: the simulated vehicle as a pod, for clusters whose nodes have no hardware beside them
-FROM services AS sim
+FROM camera AS sim
 USER 10001:10001
 ENTRYPOINT ["python3", "-m", "fractus_vehicle"]
 COPY --from=code /images/sim /usr/local/lib/python3.11/dist-packages

@@ -13,7 +13,7 @@ from fractus_cluster.images.build import build_images
 NAMESPACE = "fractus-system"
 """The charts install nowhere else."""
 
-_TARGETS = ("operator", "agent", "services")
+_TARGETS = ("operator", "agent", "mobility", "camera")
 _CHARTS = ("fractus-crds", "fractus")
 _READY_TIMEOUT_S = 180
 

@@ -22,7 +22,7 @@ from kubectl import Kube, Object, condition
 
 ROOT = pathlib.Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "traffic-monitoring"
-TARGETS = ("operator", "agent", "services", "example-traffic-monitoring", "example-links")
+TARGETS = ("operator", "agent", "mobility", "camera", "example-traffic-monitoring", "example-links")
 SYSTEM = "fractus-system"
 DRONE = "drone-1"
 

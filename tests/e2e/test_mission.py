@@ -131,3 +131,15 @@ def test_audit_log_is_an_unbroken_chain(kube: Kube) -> None:
     forged = re.sub(r'"alt":-?[0-9.]+', '"alt":999', log, count=1)
     assert forged != log
     assert verify(line.encode() for line in forged.splitlines(keepends=True)).problem
+
+
+def test_every_workload_tells_its_metrics(kube: Kube) -> None:
+    told = set()
+    for pod in kube.all("pods", SYSTEM):
+        (container,) = pod["spec"]["containers"]
+        ports = {port["name"]: port["containerPort"] for port in container.get("ports", ())}
+        if "metrics" in ports and pod["status"]["phase"] == "Running":
+            path = f"/api/v1/namespaces/{SYSTEM}/pods/{pod['metadata']['name']}:{ports['metrics']}/proxy/metrics"
+            assert "\nfractus_" in kube.must("get", "--raw", path), pod["metadata"]["name"]
+            told.add(container["name"])
+    assert told == {"operator", "agent", "mobility", "camera"}

@@ -14,7 +14,7 @@ import pytest
 import vocabulary
 
 ROOT = Path(__file__).resolve().parents[2]
-ROOMS = ("core", "kube", "mavlink", "operator", "agent", "services", "cli", "view", "sdk", "sim")
+ROOMS = ("core", "kube", "mavlink", "observe", "operator", "agent", "services", "cli", "view", "sdk", "sim")
 
 MAX_FLOORS = 7
 MAX_MODULE_LINES = 400

@@ -20,7 +20,7 @@ from fractus_sim.demo.kube import DemoError, Kube, Object
 
 ROOT = Path(__file__).parents[3]
 EXAMPLE = ROOT / "examples" / "traffic-monitoring"
-TARGETS = ("operator", "agent", "services", "example-traffic-monitoring")
+TARGETS = ("operator", "agent", "mobility", "camera", "example-traffic-monitoring")
 GPU = "fractus.dev/gpu"
 Say = Callable[[str], None]
 

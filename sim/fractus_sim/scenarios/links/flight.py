@@ -26,7 +26,7 @@ from fractus_sim.scenarios.links.evidence import AGENT, CHECKER, VIEWER, Evidenc
 from fractus_sim.scenarios.links.place import DRONE, EXAMPLE, Site
 from fractus_sim.scenarios.links.podlogs import PodLogs
 
-TARGETS = ("operator", "agent", "services", "example-links")
+TARGETS = ("operator", "agent", "mobility", "camera", "example-links")
 RELEASES = ("fractus-crds", "fractus")
 READY_S, MISSION_S = 240.0, 600.0
 LOG, OBJECTS = "lines.jsonl", "links.json"

@@ -60,11 +60,13 @@ def checkout(tmp_path: Path) -> Iterator[Path]:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy2(ROOT / name, folder / name, follow_symlinks=False)
     down = [sys.executable, "-m", "fractus_cli", "cluster", "down", "--name", NAME]
-    subprocess.run(down, check=False, timeout=120)
+    subprocess.run(down, check=False, timeout=300)
     try:
         yield folder
     finally:
-        subprocess.run(down, check=False, timeout=120)
+        subprocess.run(down, check=False, timeout=300)
+        built = [f"localhost/patrol:{version}" for version in (1, 2)]
+        subprocess.run(["buildah", "rmi", *built], check=False, capture_output=True, timeout=60)
 
 
 @pytest.mark.timeout(TIMEOUT_S + 250)

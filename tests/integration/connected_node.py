@@ -57,7 +57,7 @@ class Files:
 
 
 async def main(folder: Path) -> None:
-    logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(relativeCreated)d %(message)s")
+    logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(created).3f %(message)s")
     files = Files(folder)
 
     def resource() -> Drone | EdgeNode:
@@ -84,6 +84,7 @@ async def main(folder: Path) -> None:
         await asyncio.wait({running, reading}, return_when=asyncio.FIRST_COMPLETED)
     running.cancel()
     await asyncio.gather(running, return_exceptions=True)
+    (folder / "modules.txt").write_text("\n".join(sorted(sys.modules)))
 
 
 if __name__ == "__main__":

@@ -11,15 +11,15 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Any
 
 from fractus_agent.links.addressing import link_address
-from fractus_agent.redirector.netlink import in_namespace
+from fractus_agent.redirector.netlink import NETLINK_NETFILTER, NLM_F_ACK, Netlink, in_namespace, message
 from fractus_agent.redirector.nft import Endpoint
 from fractus_core.identity.authority import Authority
 from fractus_core.linking.course import Frame
@@ -49,6 +49,33 @@ def place(east: float, north: float, up: float = 0.0) -> dict[str, Any]:
     return {"lat": lat, "lon": lon, "alt": up, "altitudeReference": "home"}
 
 
+STREAM = """
+import itertools, queue, sys, threading, time
+import grpc
+channel = grpc.insecure_channel(sys.argv[1])
+call = channel.stream_stream("/test/Stream")
+print("ready", flush=True)
+number = 0
+while True:
+    asked = queue.Queue()
+    replies = call(iter(asked.get, None))
+    try:
+        while True:  # one at a time: what was not answered is sent again on the next stream
+            asked.put(f"{number:08d}".encode())
+            print(number, next(replies).decode().split()[0], f"{time.monotonic():.3f}", flush=True)
+            number += 1
+            time.sleep(0.02)
+    except grpc.RpcError as error:
+        print(number, "REOPENED", error.code().name, flush=True)
+"""
+"""A client whose one stream never ends, and is never idle for long."""
+
+FOREIGN = """table ip kube-proxy {
+    chain pre { type nat hook prerouting priority -100; ip daddr 10.97.0.9 tcp dport 80 dnat to 10.88.0.2:8080; }
+}"""
+"""Another program's rules."""
+
+
 class Agent:
     """A node in a network namespace, with a radio, an uplink to the cloud, a pod, and an agent's direct links."""
 
@@ -60,14 +87,12 @@ class Agent:
         self.pods = self.folder / "pods"
         self.pods.mkdir(parents=True)
         world.namespace(name)
-        world.namespace(f"{name}p")
-        (self.pods / "pod").symlink_to(world.path(f"{name}p"))
-        world.cable(name, "pod0", f"10.88.{self.number}.1/24", f"{name}p", "eth0", f"{self.pod}/24")
+        self.add_pod()
         world.cable(name, "lte0", f"10.90.{self.number}.1/24", "cloud", f"to{self.number}", f"10.90.{self.number}.2/24")
-        run(*world.inside(f"{name}p"), "ip", "route", "add", "default", "via", f"10.88.{self.number}.1")
         run(*world.inside(name), "ip", "route", "add", "default", "via", f"10.90.{self.number}.2")
         run(*world.inside("cloud"), "ip", "route", "add", f"10.88.{self.number}.0/24", "via", f"10.90.{self.number}.1")
         self.add_radio()
+        self.run("nft", "-f", "-", text=FOREIGN)
         self.certify(name)
         # So slow that a link is better also where a busy machine hardly gets to carry its frames.
         self.describe(uplink_mbps=1)
@@ -75,6 +100,27 @@ class Agent:
         self._reading: threading.Thread | None = None
         self._said: queue.Queue[str] = queue.Queue()
         self.statuses: dict[str, dict[str, Any]] = {}
+
+    def add_pod(self) -> None:
+        """The namespace of its pod, as the container runtime makes it."""
+        name, net = f"{self.name}p", f"10.88.{self.number}"
+        self.world.namespace(name)
+        (self.pods / "pod").unlink(missing_ok=True)
+        (self.pods / "pod").symlink_to(self.world.path(name))
+        self.world.cable(self.name, "pod0", f"{net}.1/24", name, "eth0", f"{self.pod}/24")
+        run(*self.world.inside(name), "ip", "route", "add", "default", "via", f"{net}.1")
+
+    def lose_power(self) -> None:
+        """Agent and pod end; what is not on disk is gone: pods' namespaces, packet filter, connections, addresses of the device."""
+        self.kill()
+        self.world.end(f"{self.name}p")
+        self.run("ip", "link", "del", "pod0")
+        run("ip", "netns", "del", self.world.name(f"{self.name}p"))
+        run(*self.world.inside(self.name), "nft", "flush", "ruleset")
+        for words in (["addr", "flush", "dev", "wlan0"], ["link", "set", "wlan0", "down", "alias", ""]):
+            run(*self.world.inside(self.name), "ip", *words)
+        in_namespace(self.world.path(self.name), _forget_connections)
+        self.add_pod()
 
     def describe(self, uplink_mbps: float) -> None:
         """What the node's description says."""
@@ -96,10 +142,10 @@ class Agent:
         )
 
     def add_radio(self) -> None:
-        hardware = bytes([2, 0, 0, 0, 0, self.number])
-        tap = Tap(self.world.path(self.name), "wlan0", hardware)
+        self.hardware = bytes([2, 0, 0, 0, 0, self.number])
+        tap = Tap(self.world.path(self.name), "wlan0", self.hardware)
         with self.world.turn:
-            self.world.radio.add_station(self.name, tap, Station((*self.at, 0.0), hardware, "net"))
+            self.world.radio.add_station(self.name, tap, Station((*self.at, 0.0), self.hardware, "net"))
 
     def uplink(self, *, up: bool) -> None:
         """The way to the cloud goes, or comes back."""
@@ -245,6 +291,11 @@ class Agent:
             [*self.world.inside(self.name), *words], capture_output=True, text=True, timeout=30, check=False
         ).stdout
 
+    def cut_at(self) -> list[float]:
+        """When it switched at once, as after the loss of a link, by its own clock: Unix time in seconds."""
+        lines = (line.split(" ", 1) for line in self.log().splitlines() if "redirector: switched" in line)
+        return [float(at) for at, text in lines if "planned=False" in text]
+
     def redirects(self) -> set[str]:
         """Elements of the map, such as `10.96.0.5 . tcp . 8080`."""
         return set(
@@ -252,13 +303,32 @@ class Agent:
         )
 
     def tables(self) -> set[str]:
-        return set(self._show("nft", "list", "tables").split("\n")) - {""}
+        """Ours, and not those of another program."""
+        return set(self._show("nft", "list", "tables").split("\n")) - {"", "table ip kube-proxy"}
 
     def addresses(self) -> list[str]:
         return re.findall(r"169\.254\.[\d.]+/\d+", self._show("ip", "addr", "show", "dev", "wlan0"))
 
     def routes(self) -> list[str]:
         return sorted(self._show("ip", "route").splitlines())
+
+    def run(self, *words: str, text: str = "") -> str:
+        """Run a command in its namespace, with this as its input; its output."""
+        inside = [*self.world.inside(self.name), *words]
+        return subprocess.run(inside, input=text, capture_output=True, text=True, timeout=30, check=True).stdout
+
+    def state(self) -> dict[str, Any]:
+        """All that links may change of a node: packet filter, routes, addresses, its device, and connections of ours."""
+        addresses = re.sub(r"(?m)^\d+: | valid_lft.*", "", self._show("ip", "-o", "-4", "address"))
+        return {
+            "ruleset": self._show("nft", "list", "ruleset"),
+            "rules": self._show("ip", "rule"),
+            "routes": sorted(self._show("ip", "-4", "route", "show", "table", "all").splitlines()),
+            "addresses": sorted(addresses.splitlines()),
+            # A device gets a queue when it is up for the first time, and keeps it.
+            "device": re.sub(r" qdisc \w+", "", self._show("ip", "address", "show", "dev", "wlan0")),
+            "connections": self.world.conntrack(self),
+        }
 
 
 class World:
@@ -272,7 +342,7 @@ class World:
         self.authority = Authority.generate(datetime.now(UTC))
         self.agents: dict[str, Agent] = {}
         self._namespaces: list[str] = []
-        self._processes: list[subprocess.Popen[str]] = []
+        self._processes: list[tuple[str, subprocess.Popen[str]]] = []
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._carry)
         self._thread.start()
@@ -341,21 +411,35 @@ class World:
             "metadata": {"name": f"app-{drone.name}-{edge.name}", "uid": "u", "generation": 1}, "spec": base | spec,
         }  # fmt: skip
 
+    def states(self) -> dict[str, dict[str, Any]]:
+        """All that links may change, by node."""
+        return {name: agent.state() for name, agent in self.agents.items()}
+
     def python(self, node: str, program: str, *arguments: object) -> subprocess.Popen[str]:
         process = subprocess.Popen(
             [*self.inside(node), sys.executable, "-c", program, *map(str, arguments)], stdout=subprocess.PIPE, text=True
         )
-        self._processes.append(process)
+        self._processes.append((node, process))
         assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"
         return process
+
+    def end(self, node: str) -> None:
+        """End the programs that run in a namespace."""
+        for _, process in (each for each in self._processes if each[0] == node):
+            process.kill()
+            process.wait()
 
     def serve(self, work_s: float = 0.005) -> None:
         """Start the base instance in the cloud, and one on each edge node."""
         self.python("cloud", SERVER, "cloud", f"{VIP.address}:{VIP.port}", work_s)
         for agent in self.agents.values():
             if agent.kind == "EdgeNode":
-                self.python(f"{agent.name}p", SERVER, agent.name, f"{agent.pod}:{VIP.port}", work_s)
+                self.serve_at(agent, work_s)
+
+    def serve_at(self, edge: Agent, work_s: float = 0.005) -> None:
+        """Start the instance on an edge node."""
+        self.python(f"{edge.name}p", SERVER, edge.name, f"{edge.pod}:{VIP.port}", work_s)
 
     def client(self, drone: Agent, calls: int, pause_s: float = 0.02, size: int = 10) -> Client:
         return Client(self.python(f"{drone.name}p", CLIENT, f"{VIP.address}:{VIP.port}", calls, pause_s, size))
@@ -368,7 +452,7 @@ class World:
         return len([mark for mark in marks if mark & 0xFFF00000 == 0xF6A00000])
 
     def close(self) -> None:
-        for process in self._processes:
+        for _, process in self._processes:
             process.kill()
             process.wait()
             if process.stdout is not None:
@@ -380,6 +464,17 @@ class World:
         self.radio.close()
         for name in self._namespaces:
             subprocess.run(["ip", "netns", "del", name], capture_output=True, check=False)
+
+
+def _forget_connections() -> None:
+    """Empty the connection tracking of the namespace that this runs in."""
+    netlink = Netlink(NETLINK_NETFILTER)
+    try:
+        sequence = netlink.sequence()
+        netlink.send(message(1 << 8 | 2, NLM_F_ACK, sequence, b"\x02\0\0\0"))
+        netlink.acknowledged({sequence})
+    finally:
+        netlink.close()
 
 
 class Client:
@@ -421,6 +516,39 @@ def until(holds: Callable[[], object], what: str, world: World | None = None, ti
     raise AssertionError(f"not in {timeout_s:g} s: {what}{logs}")
 
 
+def flying(world: World, *edges: Agent) -> Agent:
+    """A drone that has a link to each edge node, with everything running."""
+    drone = world.agents.get("d1") or world.drone()
+    links = [world.link(drone, edge) for edge in edges]
+    world.serve()
+    for edge, link in zip(edges, links, strict=True):
+        edge.plan(link)
+        edge.start()
+    drone.plan(*links)
+    drone.start()
+    return drone
+
+
+def unchanged(world: World, before: Mapping[str, Mapping[str, Any]]) -> None:
+    """Have no link planned any more; then every node is as it was before."""
+
+    def changes() -> list[tuple[str, str, Any, Any]]:
+        now = world.states()
+        return [
+            (name, what, was, now[name][what])
+            for name, all_ in before.items()
+            for what, was in all_.items()
+            if now[name][what] != was
+        ]
+
+    for agent in world.agents.values():
+        agent.plan()
+    with suppress(AssertionError):
+        until(lambda: not changes(), "nodes as they were")
+    left = changes()
+    assert not left, left
+
+
 @contextmanager
 def connected_world(directory: Path) -> Iterator[World]:
     """A world that is removed at the end."""
@@ -431,4 +559,16 @@ def connected_world(directory: Path) -> Iterator[World]:
         found.close()
 
 
-__all__ = ["Agent", "Client", "World", "connected_world", "link_address", "place", "until"]
+__all__ = [
+    "FOREIGN",
+    "STREAM",
+    "Agent",
+    "Client",
+    "World",
+    "connected_world",
+    "flying",
+    "link_address",
+    "place",
+    "unchanged",
+    "until",
+]

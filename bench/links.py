@@ -24,6 +24,8 @@ from connected_world import connected_world, until
 
 TICKS = os.sysconf("SC_CLK_TCK")
 MEMORY_LIMIT_MB, PROCESSOR_LIMIT = 60.0, 1.0
+RADIO_LIBRARIES = {"pyroute2", "nl80211", "iw", "wpa_supplicant", "dbus", "scapy"}
+"""Which no agent is to load on a node without a radio: they take a fifth of its memory."""
 
 
 def private_mb(pid: int) -> float:
@@ -74,7 +76,10 @@ def main() -> None:
         time.sleep(5.0)
         busy, busy_edge = share(drone.pid, seconds), share(edge.pid, seconds)
         memory = private_mb(drone.pid)
+        drone.stop()
+        loaded = {module.partition(".")[0] for module in (drone.folder / "modules.txt").read_text().split()}
     claims = [
+        claim("drone's agent: radio libraries loaded", float(len(loaded & RADIO_LIBRARIES)), 1.0, "libraries"),
         claim("drone's agent: memory of its own with a link in use", memory, MEMORY_LIMIT_MB, "MB"),
         claim("drone: processor while no link is planned", idle, PROCESSOR_LIMIT, "% of a core"),
         claim("drone: processor with a link in use", busy, 10 * PROCESSOR_LIMIT, "% of a core"),

@@ -41,6 +41,9 @@ LATENCY_S = (0.05, 0.8)
 """A link that delays by up to half a second there and back, and what the autopilot takes."""
 COURSE_S = 0.3
 """Accelerations that are told are those of this long ago, so that what was commanded since then is told as well."""
+RESEND_S = 0.2
+"""The service sends a velocity this often while it holds, and then one of zero."""
+STILL = (0.0, 0.0, 0.0)
 HOURS = 12
 """The hour of the day at which all of it happens."""
 NORTH_M, EAST_M = 110_998.6, math.cos(math.radians(HOME.lat)) * 111_457.6
@@ -222,8 +225,8 @@ class Fleet:
         self.beat = rng.uniform(0.05, 0.4, count)
         self.phase = rng.uniform(0, 2 * math.pi, count)
         self.latency = rng.uniform(*LATENCY_S, count)
-        self.sent: list[list[tuple[float, tuple[float, float, float]]]] = [[] for _ in range(count)]
-        """Velocities that each was told of late, in the order in which it hears of them."""
+        self.sent: list[list[tuple[float, float, tuple[float, float, float]]]] = [[] for _ in range(count)]
+        """Velocities that each is told, with when first and when last, in the order in which it hears of them."""
         self.mail: list[tuple[float, int, Verdict]] = []
         self.asked: list[Call | None] = [None] * count
         self.time_s = 0.0
@@ -341,9 +344,9 @@ class Fleet:
 
     def _pending(self, i: int) -> tuple[tuple[float, float, float], ...]:
         """What one was told that its state may not show yet."""
-        since = self.time_s - float(self.latency[i]) - COURSE_S
-        self.sent[i] = [(at, velocity) for at, velocity in self.sent[i] if at >= since]
-        return tuple(dict.fromkeys(velocity for _, velocity in reversed(self.sent[i])))[::-1]
+        now, since = self.time_s, self.time_s - float(self.latency[i]) - COURSE_S
+        self.sent[i] = [told for told in self.sent[i] if told[1] >= since]
+        return tuple(dict.fromkeys(velocity for at, _, velocity in reversed(self.sent[i]) if at <= now))[::-1]
 
     def send(self, i: int, verdict: Verdict, *, returns: bool = False) -> None:
         """Put what the engine made of a request on its way: it comes within the latency, and after those before it.
@@ -351,19 +354,23 @@ class Fleet:
         `returns`: whether the engine has made sure of the way home from the end of a leg.
         """
         self.surely_returns[i] = returns or (self.surely_returns[i] and isinstance(verdict.args, SetSpeedArgs))
-        args, velocity = verdict.args, (0.0, 0.0, 0.0)
+        args, velocity, hold_s = verdict.args, STILL, 0.0
         if isinstance(args, SetSpeedArgs):
             self.mail.append((self.time_s + self.rng.uniform(0, float(self.latency[i])), i, verdict))
             return
         if isinstance(args, VelocityArgs) and not verdict.brake_first:
-            velocity = (args.north_mps, args.east_mps, args.down_mps)
+            velocity, hold_s = (args.north_mps, args.east_mps, args.down_mps), args.hold_s
         elif isinstance(args, GotoArgs) and not verdict.brake_first:
             x, y, z = self.seen[i]
             east, north = (args.lon - HOME.lon) * EAST_M - x, (args.lat - HOME.lat) * NORTH_M - y
             cruise = (args.speed_mps or float(self.setpoint[i])) / max(math.hypot(east, north), 1e-6)
             rise = (args.alt or z) - z
             velocity = (float(north * cruise), float(east * cruise), math.copysign(UP_MPS, -rise))
-        self.sent[i].append((self.time_s, velocity))
+        now = self.time_s
+        self.sent[i] = [(at, min(last, now), was) for at, last, was in self.sent[i] if at < now]
+        self.sent[i].append((now, now + max(hold_s - RESEND_S, 0.0), velocity))
+        if hold_s:
+            self.sent[i].append((now + hold_s, now + hold_s, STILL))
         before = max((due for due, who, _ in self.mail if who == i), default=self.time_s)
         self.mail.append((max(before, self.time_s + self.rng.uniform(0, float(self.latency[i]))), i, verdict))
 

@@ -439,14 +439,14 @@ def test_from_too_close_below_or_above_a_zone_a_leg_may_sink_or_climb_away(
     lower: float, upper: float, away: float, closer: float
 ) -> None:
     grant = compiled(exclusion(box(-40, -40, 40, 40), lower=lower, upper=upper))
-    for x in (0.0, 20.0):
-        assert ask(grant, goto(x, 0, away)).action == "allow"
-        assert ask(grant, goto(x, 0, closer)).code == "InsideExclusionZone"
-        assert ask(grant, goto(x, 0, 10.0)).action == "deny", "it stays too close"
-    wall = compiled(
-        exclusion(box(-40, -40, 40, 40), lower=lower, upper=upper), exclusion(box(10, -9, 20, 9), name="wall")
-    )
-    assert ask(wall, goto(15, 0, away)).policies == ("wall",)
+    for x in (0.0, 39.9, 40.5):
+        beside = at(x, 0, 10.0)
+        assert ask(grant, goto(x, 0, away), beside).action == "allow"
+        assert ask(grant, goto(x, 0, closer), beside).action == "deny"
+        assert ask(grant, goto(x, 0, 10.0), beside).action == "deny", "it stays too close"
+        assert ask(grant, goto(x - 20, 0, away), beside).action == "deny", "it may be over or under it first"
+    moving = at(x=40.5, alt=10.0, east_mps=-8.0)
+    assert ask(grant, goto(40.5, 0, away), moving).action == "deny"
 
 
 def test_motors_do_not_stop_in_the_air() -> None:

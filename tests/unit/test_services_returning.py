@@ -60,7 +60,7 @@ def test_a_limit_of_unknown_datum_lets_the_autopilot_climb_nowhere_and_leaves_th
 def test_heights_just_below_zones_overhead_are_the_last_to_be_tried() -> None:
     now = at(50, 0, alt=33, airframe=Airframe(return_altitude_m=40))
     zones = [exclusion(box(*where), name=name, lower=low) for name, low, where in (
-        ("above", 35, (20, -20, 80, 20)), ("lower", 20, (0, -5, 10, 5)), ("ground", 3, (0, 5, 10, 15)),
+        ("above", 35, (20, -20, 80, 20)), ("lower", 20, (0, -5, 10, 5)), ("ground", 12, (0, 5, 10, 15)),
         ("beyond", 15, (500, 0, 510, 10)), ("higher", 60, (0, 0, 10, 10)),
     )]  # fmt: skip
     assert homeward_heights_m(now, compiled(*zones), 150.0) == (40.0, 33.0, 32.5, 17.5)

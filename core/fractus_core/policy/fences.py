@@ -32,6 +32,9 @@ HOME_RADIUS_M = 5.0
 """A target this near to home is the way home, and a leg that begins this near to it the way from there, wherever the operation
 area lies."""
 
+ON_THE_SPOT_M = 0.5
+"""A leg that covers no more ground than this only changes the height."""
+
 INSIDE_M = 0.25
 """A corrected target keeps this much more than the margin, so that it never lies on a border."""
 
@@ -210,7 +213,13 @@ def _comes_level(zone: PolicyZone, leg: Leg, now: Situation, grant: CompiledGran
 
 
 def _leaves_height(zone: PolicyZone, leg: Leg, now: Situation, grant: CompiledGrant, height_margin_m: float) -> bool:
-    """Whether a leg of a drone too close below or above a zone only sinks or climbs away from it, until it is far enough."""
+    """Whether a leg of a drone too close below or above a zone sinks or climbs away from it on the spot, until it is far enough.
+
+    Not on its way to somewhere else: the axes move independently, so from beside a zone it could be over or under it first.
+    """
+    west, south, east, north = shapely.bounds(leg.ground)
+    if max(east - west, north - south) > ON_THE_SPOT_M:
+        return False
     present = coming_heights_m(now)
 
     def gap_m(lower_m: float, upper_m: float) -> float:
@@ -376,22 +385,3 @@ def signed_depth_m(shape: BaseGeometry, border: BaseGeometry, point: BaseGeometr
     """Distance to the border: positive inside the shape, negative outside."""
     distance = float(border.distance(point)) if not border.is_empty else math.inf
     return distance if shape.covers(point) else -distance
-
-
-def last_legal(leg: Leg, found: list[Breach]) -> XY | None:
-    """The furthest point of a leg that no breached fence objects to, or None when there is none worth flying to."""
-    line = leg.line
-    start = shapely.points(leg.stop)
-    if not isinstance(line, shapely.LineString):
-        return None
-    reach = line.length
-    for breach in found:
-        legal = breach.legal()
-        pieces = [p for p in shapely.get_parts(legal) if p.distance(start) < 1e-6 and isinstance(p, shapely.LineString)]
-        if not pieces:
-            return None
-        reach = min(reach, pieces[0].length)
-    if reach < 0.5:
-        return None
-    point = line.interpolate(reach - 0.01)
-    return (point.x, point.y)

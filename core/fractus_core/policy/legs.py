@@ -9,7 +9,7 @@ import shapely
 
 from fractus_core.policy.compiled import Air, CompiledGrant, height_m
 from fractus_core.policy.corrections import caused
-from fractus_core.policy.fences import breaches, broken, last_legal
+from fractus_core.policy.fences import Breach, breaches, broken
 from fractus_core.policy.limits import (
     MIN_LEG_ALTITUDE_M,
     SLACK,
@@ -154,7 +154,7 @@ def _fly_leg(request: _Request, aim: _Aim, notes: list[Clamped], adjusting: bool
     leg = _leg(request.at, aim.target, now, within.altitude_m)
     found = breaches(leg, now, grant, margin_m(now), height_margin_m(now))
     adjustable = adjusting and bool(found) and all(b.action == "adjust" for b in found)
-    shorter = last_legal(leg, found) if adjustable else None
+    shorter = _last_legal(leg, found) if adjustable else None
     if shorter is None:
         problem = broken(found) if found else way_home_blocked(aim.target, within.altitude_m, now, grant)
         if problem is None or within.altitude_m == aim.altitude_m:
@@ -228,6 +228,25 @@ def way_home_blocked(target: XY, altitude_m: float, now: Situation, grant: Compi
     if leads(target, home, now, system, altitude_m):
         return None
     return replace(problem, reason=f"{problem.reason}, and no legal way is found around it")
+
+
+def _last_legal(leg: Leg, found: list[Breach]) -> XY | None:
+    """The furthest point of a leg that no breached fence objects to, or None when there is none worth flying to."""
+    line = leg.line
+    start = shapely.points(leg.stop)
+    if not isinstance(line, shapely.LineString):
+        return None
+    reach = line.length
+    for breach in found:
+        legal = breach.legal()
+        pieces = [p for p in shapely.get_parts(legal) if p.distance(start) < 1e-6 and isinstance(p, shapely.LineString)]
+        if not pieces:
+            return None
+        reach = min(reach, pieces[0].length)
+    if reach < 0.5:
+        return None
+    point = line.interpolate(reach - 0.01)
+    return (point.x, point.y)
 
 
 def _outcome(args: GotoArgs, flown: _Aim, notes: list[Clamped], grant: CompiledGrant) -> Verdict:

@@ -10,9 +10,12 @@ from shapely.geometry.base import BaseGeometry
 
 from fractus_core.policy.compiled import REACH_M, Air, CompiledGrant, height_m
 from fractus_core.policy.fences import breaches
-from fractus_core.policy.limits import MIN_LEG_ALTITUDE_M, altitude_bounds, ceiling_m, speed_bounds
+from fractus_core.policy.limits import altitude_bounds, ceiling_m, speed_bounds
 from fractus_core.policy.motion import XY, Leg, height_margin_m, margin_m, standing, stop_point
 from fractus_core.policy.values import Situation, Verdict, deny
+
+MIN_HOMEWARD_M = 10.0
+"""No way home below a zone is looked for lower than this above home, for the terrain is not known."""
 
 BELOW_M = 0.5
 """How much lower than it must a drone flies home below a zone: it does not hold its height exactly."""
@@ -54,7 +57,7 @@ def _heights_below_m(lane: BaseGeometry, now: Situation, grant: CompiledGrant) -
     around = grant.exclusions.near(Air(lane, lane.length + margin_m(now), -math.inf, math.inf), now, flat)
     bands = [zone.band for zone in around if zone.band is not None and zone.band.lower is not None]
     floors = {height_m(band.lower, band.reference, now.home, flat) for band in bands if band.lower is not None}
-    return sorted((f - room_m for f in floors if f is not None and f - room_m >= MIN_LEG_ALTITUDE_M), reverse=True)
+    return sorted((f - room_m for f in floors if f is not None and f - room_m >= MIN_HOMEWARD_M), reverse=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,12 +83,15 @@ def return_bounds(now: Situation, grant: CompiledGrant) -> ReturnBounds:
 
 
 def may_change_height(now: Situation, grant: CompiledGrant, altitude_m: float) -> bool:
-    """Whether the drone may climb or sink to an altitude where it is."""
+    """Whether the drone may climb or sink to an altitude where it is: it comes too close to no zone but those beside it already."""
     at = grant.locate(now)
     if at is None:
         return False
     column = standing(at, min(now.altitude_m, altitude_m), max(now.altitude_m, altitude_m))
-    return not breaches(column, now, grant, margin_m(now), height_margin_m(now))
+    here = standing(at, now.altitude_m, now.altitude_m)
+    # Zones overhead count as such, however close, and what a zone's breach is called depends on the ground alone.
+    beside = {breach.reason for breach in breaches(here, now, grant, margin_m(now), 0.0)}
+    return {breach.reason for breach in breaches(column, now, grant, margin_m(now), height_margin_m(now))} <= beside
 
 
 def descent_enters(now: Situation, grant: CompiledGrant) -> bool:

@@ -41,9 +41,12 @@ class LogLimit(logging.Filter):
             return False
         line[0] -= 1
         if line[2]:
-            args = record.args if isinstance(record.args, tuple) else (record.args,) if record.args else ()
-            # The number is an argument like others, so that programs find it as a field.
-            record.msg, record.args = f"{record.msg} (left_out=%d)", (*args, int(line[2]))
+            # The number is an argument like others, so that programs find it as a field. Without arguments the text is no
+            # template, and a mapping takes no further ones.
+            template = isinstance(record.args, tuple) and bool(record.args)
+            text = str(record.msg) if template else record.getMessage().replace("%", "%%")
+            args = record.args if template and isinstance(record.args, tuple) else ()
+            record.msg, record.args = f"{text} (left_out=%d)", (*args, int(line[2]))
             line[2] = 0
         return True
 

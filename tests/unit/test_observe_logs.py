@@ -34,6 +34,17 @@ def test_a_line_is_written_so_often_at_most_and_tells_what_was_left_out() -> Non
     assert [log.written(1) for _ in range(BURST + 1)] == ["peer a (left_out=1)", *["peer a"] * (BURST - 1), None]
 
 
+@pytest.mark.parametrize(("text", "args", "told"), [
+    ("disk 100% full", (), "disk 100% full (left_out=1)"), ("disk %(share)d%% full", ({"share": 9},), "disk 9% full (left_out=1)"),
+])  # fmt: skip
+def test_texts_that_are_no_templates_tell_it_too(text: str, args: tuple[object, ...], told: str) -> None:
+    limit, lines = LogLimit(lambda: 10.0 + (len(lines) > BURST) * 1e6), list[str]()
+    for _ in range(BURST + 2):
+        record = logging.LogRecord("n", logging.ERROR, "module.py", 1, text, args, None)
+        lines.append(record.getMessage() if limit.filter(record) else "")
+    assert lines[-2:] == ["", told]
+
+
 def test_a_day_of_a_flood_fits_a_small_disk() -> None:
     log, kept = Log(), 0
     for _ in range(100_000):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import AsyncGenerator
 
 import grpc
@@ -11,9 +12,11 @@ from fractus_proto.v1 import camera_pb2, camera_pb2_grpc, types_pb2
 
 from fractus.channel import CALL_TIMEOUT_S, RECONNECT_TIMEOUT_S, ServiceChannel, ServiceClient
 from fractus.environment import Endpoint, endpoint
-from fractus.errors import Unavailable, translate
+from fractus.errors import FractusError, Unavailable, translate
 from fractus.requests import capture_request
 from fractus.values import Decision, ImageInfo, Picture, Result
+
+log = logging.getLogger(__name__)
 
 RETRIEVE_TIMEOUT_S = 60.0
 CAPTURE_TIMEOUT_S = 120.0
@@ -64,7 +67,11 @@ class Camera(ServiceClient):
         try:
             return Picture(info, await self.retrieve(info.name))
         finally:
-            await self.delete(info.name)
+            # A failure here neither loses a picture that was fetched nor hides why one was not.
+            try:
+                await self.delete(info.name)
+            except FractusError as error:
+                log.warning("camera: picture stays on the node (name=%s error=%s)", info.name, error)
 
     async def every(self, interval_s: float, width: int = 0, height: int = 0) -> AsyncGenerator[Picture, None]:
         """Take a picture each `interval_s` seconds, until the iteration is left; a camera that takes longer is waited for.

@@ -47,6 +47,7 @@ class Cluster:
         self, client: Client, namespace: str = "", now_ms: Callable[[], int] = lambda: round(time.time() * 1000)
     ) -> None:
         self._client = client
+        self._namespace = namespace
         self._now_ms = now_ms
         self._hub = Hub()
         self._changed: set[type[api.Resource]] = set()
@@ -169,4 +170,4 @@ class Cluster:
         return f"{unheard[0].kind.plural} are not watched yet" if unheard else None
 
     async def _ask(self, kind: Kind) -> None:
-        await self._client.request("GET", kind.path(), params={"limit": "1"}, timeout_s=ANSWER_S)
+        await self._client.request("GET", kind.path(self._namespace), params={"limit": "1"}, timeout_s=ANSWER_S)

@@ -83,15 +83,22 @@ def return_bounds(now: Situation, grant: CompiledGrant) -> ReturnBounds:
 
 
 def may_change_height(now: Situation, grant: CompiledGrant, altitude_m: float) -> bool:
-    """Whether the drone may climb or sink to an altitude where it is: it comes too close to no zone but those beside it already."""
+    """Whether the drone may climb or sink to an altitude where it is.
+
+    From too close below or above a zone it leaves that first, also beside another one: it comes no closer to that.
+    """
     at = grant.locate(now)
     if at is None:
         return False
     column = standing(at, min(now.altitude_m, altitude_m), max(now.altitude_m, altitude_m))
     here = standing(at, now.altitude_m, now.altitude_m)
-    # Zones overhead count as such, however close, and what a zone's breach is called depends on the ground alone.
-    beside = {breach.reason for breach in breaches(here, now, grant, margin_m(now), 0.0)}
-    return {breach.reason for breach in breaches(column, now, grant, margin_m(now), height_margin_m(now))} <= beside
+
+    def broken(leg: Leg, room_m: float) -> set[str]:
+        # What a zone's breach is called depends on the ground alone, which is the same.
+        return {breach.reason for breach in breaches(leg, now, grant, margin_m(now), room_m)}
+
+    left = broken(column, height_margin_m(now))
+    return not left or left <= broken(here, 0.0) < broken(here, height_margin_m(now))
 
 
 def descent_enters(now: Situation, grant: CompiledGrant) -> bool:

@@ -289,20 +289,6 @@ def test_unknown_fields_are_refused(control_plane: ControlPlane) -> None:
         control_plane.admin.call("POST", f"{API}/zones", zone(colour="red"), params={"fieldValidation": "Strict"})
 
 
-def test_how_long_pods_are_kept_cannot_be_changed(control_plane: ControlPlane) -> None:
-    """A changed manifest is carried out: an edit to keep logs for longer would remove them, and the drone would fly again."""
-    kept = app(CLOUD)
-    kept["metadata"]["name"] = "kept"
-    path = f"{API}/namespaces/default/applications/kept"
-    control_plane.admin.apply(path, kept)
-    try:
-        with pytest.raises(KubeError, match="ttlAfterFinished cannot be changed"):
-            control_plane.admin.merge(path, {"spec": {"ttlAfterFinished": 3600}})
-        control_plane.admin.merge(path, {"spec": {"ttlAfterFinished": 600, "updatePolicy": "Immediate"}})
-    finally:
-        control_plane.admin.delete(path)
-
-
 GOOD = [
     app(DRIVER | {"egress": ["Checker"]}, PASSENGER, EDGE, HYBRID | {"ingress": ["Navigator"]}, CLOUD | {"replicas": 2}),
     app(GUIDED, HYBRID | {"hybridTo": ["Viewer"], "heuristic": {"kind": "max", "metric": "ingress-bandwidth"}}),

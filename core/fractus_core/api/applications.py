@@ -8,17 +8,7 @@ from typing import Any, Literal
 from pydantic import Field
 
 from fractus_core.api.components import Component, Placement, PointsOfInterest, Reference
-from fractus_core.api.model import (
-    AGE,
-    READY,
-    VALIDATIONS,
-    Conditions,
-    Model,
-    ObservedGeneration,
-    OpenModel,
-    Resource,
-    keyed,
-)
+from fractus_core.api.model import AGE, READY, Conditions, Model, ObservedGeneration, OpenModel, Resource, keyed
 from fractus_core.api.rules import Broken, rule
 
 
@@ -49,9 +39,6 @@ def _other(field: Reference) -> Any:
     return _each(field, "n != c.name", "names the component itself; remove it", lambda _, c, name: name != c.name)
 
 
-KEPT_TTL = "ttlAfterFinished cannot be changed, for a changed manifest begins another mission; delete the Application and create it again"
-
-
 class ApplicationSpec(Model):
     """The components of an application and how they interact."""
 
@@ -70,10 +57,8 @@ class ApplicationSpec(Model):
         default=600,
         ge=0,
         le=604_800,
-        # A changed manifest is carried out: an edit to keep logs longer would remove them and fly the mission again.
-        json_schema_extra={VALIDATIONS: [{"rule": "self == oldSelf", "message": KEPT_TTL}]},
         description="How long pods are kept once the mission is over, in seconds, for their logs: stopped, and with nothing booked on"
-        " their nodes. Then they are removed. It cannot be changed: any changed manifest begins another mission.",
+        " their nodes. Then they are removed.",
     )
 
     @rule(

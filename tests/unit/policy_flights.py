@@ -18,6 +18,7 @@ from fractus_core.policy.compiled import CompiledGrant
 from fractus_core.policy.engine import judge
 from fractus_core.policy.monitoring import monitor
 from fractus_core.policy.values import Airframe, Call, GotoArgs, SetSpeedArgs, Situation, VelocityArgs, Verdict
+from fractus_services.mobility.mavlink.orders import turns
 from numpy.typing import NDArray
 from policy_world import HOME, METHODS, NOW, compiled, policy, ring
 
@@ -345,7 +346,10 @@ class Fleet:
     def _pending(self, i: int) -> tuple[tuple[float, float, float], ...]:
         """What one was told that its state may not show yet."""
         now, since = self.time_s, self.time_s - float(self.latency[i]) - COURSE_S
-        self.sent[i] = [told for told in self.sent[i] if told[1] >= since]
+        late = [told for told in self.sent[i] if told[1] >= since]
+        before = [told for told in self.sent[i] if told[1] < since][-1:]
+        east, north, up = (float(v) for v in self.speed[i])
+        self.sent[i] = [told for told in before if turns((north, east, -up), told[2])] + late
         return tuple(dict.fromkeys(velocity for at, _, velocity in reversed(self.sent[i]) if at <= now))[::-1]
 
     def send(self, i: int, verdict: Verdict, *, returns: bool = False) -> None:

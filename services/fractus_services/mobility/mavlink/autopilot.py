@@ -113,8 +113,9 @@ class MavlinkAutopilot(Link):
 
     @property
     def pending(self) -> tuple[Velocity, ...]:
-        """What the vehicle was told of late; its acceleration is known from velocities that go back further."""
-        return self._orders.since(self.now - (self.latency_s + COURSE_S) / self.pace)
+        """What the vehicle was told of late, or turns onto; how fast it speeds up is known from velocities that go back further."""
+        vehicle, moment = self.vehicle, self.now - (self.latency_s + COURSE_S) / self.pace
+        return self._orders.since(moment, (vehicle.north_mps, vehicle.east_mps, vehicle.down_mps))
 
     @property
     def at_rest(self) -> bool:

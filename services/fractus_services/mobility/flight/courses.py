@@ -25,7 +25,7 @@ from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.leases import FlightConstraints, Motion
 from fractus_services.mobility.autopilot import Permit
 from fractus_services.mobility.flight.guard import Guard
-from fractus_services.mobility.flight.motions import REACHED_M, Step, come_to_rest, fly_to
+from fractus_services.mobility.flight.motions import HEIGHT_REACHED_M, REACHED_M, Step, come_to_rest, fly_to
 
 log = logging.getLogger(__name__)
 
@@ -161,8 +161,9 @@ async def _first_leg(
     for height in heights_m:
         way = await in_slices(searching(begin, end, now, grant, height, from_m=now.altitude_m))
         if way is not None:
-            # From a place this near to a waypoint the next leg is legal, and this one would change nothing.
-            first = min(math.dist(begin, way[0]) <= NEAR_M, len(way) - 1)
+            # From a place this near to a waypoint the next leg is legal, and this one would change nothing but the height.
+            there = math.dist(begin, way[0]) <= NEAR_M and abs(now.altitude_m - height) <= HEIGHT_REACHED_M
+            first = min(there, len(way) - 1)
             return GotoArgs(*frame.latlon(*way[first]), height), len(way) == first + 1, height
     return None
 

@@ -1,0 +1,37 @@
+"""The first leg of a way, as the system flies it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from fractus_services.grants import ActiveGrant
+from fractus_services.mobility.authority.leases import FlightConstraints
+from fractus_services.mobility.flight import courses
+from policy_world import at, compiled, spec
+
+
+def unused(_motion: Any) -> Any:
+    raise AssertionError("nothing is flown")
+
+
+def way(*_: Any, **__: Any) -> Iterator[None]:
+    """Begins beside the drone."""
+    yield from ()
+    return ((0.2, 0.0), (100.0, 50.0))
+
+
+@pytest.mark.parametrize(("altitude_m", "waypoint"), [(5.0, (0.2, 0.0)), (30.0, (100.0, 50.0))])
+async def test_a_first_waypoint_beside_the_drone_is_left_out_only_at_its_altitude(
+    monkeypatch: pytest.MonkeyPatch, altitude_m: float, waypoint: tuple[float, float]
+) -> None:
+    monkeypatch.setattr(courses, "searching", way)
+    grant = compiled(operationArea=[])
+    trip = courses.Trip(FlightConstraints(ActiveGrant("", "", spec(), grant), grant), "Transit", unused)
+    found = await courses.first_leg(grant.frame.latlon(100.0, 50.0), (30.0,), at(0, 0, alt=altitude_m), trip)
+    assert found is not None
+    leg, last, _ = found
+    assert grant.frame.xy(leg.lat, leg.lon) == pytest.approx(waypoint, abs=0.01)
+    assert leg.alt == 30.0
+    assert last == (altitude_m == 30.0)

@@ -215,6 +215,7 @@ def test_finished_pods_stay_stopped_for_their_logs(world: World, operator: Opera
     # No label of a finished pod counts for the next mission, which has pods of its own.
     manifest = traffic(namespace)
     manifest["spec"]["ttlAfterFinished"] = 0
+    manifest["spec"]["components"][0]["container"]["env"] = [{"name": "COLOUR", "value": "red"}]
     world.put(manifest)
     wait_for(lambda: len(fresh(world, namespace, before)) == 7, "pods of the next mission")
     wait_for(
@@ -224,6 +225,45 @@ def test_finished_pods_stay_stopped_for_their_logs(world: World, operator: Opera
     end_mission(world, namespace, "Complete", "done")
     world.phase(namespace, "Completed")
     wait_for(lambda: not world.pods(namespace), "pods that are not to be kept to go")
+
+
+def test_how_long_pods_are_kept_begins_no_other_mission(
+    world: World, operator: OperatorProcess, namespace: str
+) -> None:
+    manifest = traffic(namespace, "traffic", navigator())
+    world.put(manifest)
+    deployed(world, namespace, pods=1)
+    world.drone_status("drone-1", "flying")
+    world.phase(namespace, "Flying")
+    before = versions(world, namespace)
+
+    def keep_for(seconds: int) -> None:
+        manifest["spec"]["ttlAfterFinished"] = seconds
+        world.put(manifest)
+        wait_for(lambda: world.status(namespace)["observedGeneration"] == generation(), "the change to be noted")
+
+    def generation() -> int:
+        return int((world.application(namespace) or {})["metadata"]["generation"])
+
+    keep_for(3600)
+    assert not world.condition(namespace, "Updated"), "nothing waits for the landing"
+    after = versions(world, namespace) | {"application": before["application"]}
+    assert after == before, "nothing restarts in flight"
+    end_mission(world, namespace, "Complete", "done")
+    world.phase(namespace, "Returning")
+    keep_for(1800)
+    world.drone_status("drone-1", "inactive")
+    world.phase(namespace, "Completed")
+    keep_for(3)
+    wait_for(lambda: not world.pods(namespace), "the pods to go")
+    operator.stop(signal.SIGKILL)
+    operator.start()
+    keep_for(600)
+    assert world.status(namespace)["phase"] == "Completed"
+    assert set(world.children(namespace)) == {"deploymentplans/traffic"}
+    manifest["spec"]["components"][0]["container"]["env"] = [{"name": "COLOUR", "value": "red"}]
+    world.put(manifest)
+    deployed(world, namespace, pods=1)
 
 
 def test_finished_pods_are_removed_in_time(world: World, operator: OperatorProcess, namespace: str) -> None:

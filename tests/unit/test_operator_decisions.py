@@ -117,6 +117,8 @@ def test_a_plan_stands_while_its_nodes_exist() -> None:
 def test_a_new_plan_is_made_for_a_reason() -> None:
     assert replan_reason(application(), None, INVENTORY, {}) == "NoPlanYet"
     assert replan_reason(application(2), PLAN, INVENTORY, {}) == "SpecChanged"
+    same = PLAN.model_copy(update={"application_digest": application().spec.mission_digest})
+    assert replan_reason(application(2), same, INVENTORY, {}) is None
     assert replan_reason(application(), PLAN, replace(INVENTORY, hosts={}), {}) == "NodeGone"
     assert replan_reason(application(), PLAN, replace(INVENTORY, edge_nodes={}), {}) == "NodeGone"
     assert replan_reason(application(), PLAN, INVENTORY, {"edge-1": "full"}) == "NodeUnusable"
@@ -390,3 +392,13 @@ async def test_an_edge_node_that_becomes_ready_wakes_applications_and_one_that_s
         assert not await inputs.changed(0)
         live.edge_nodes.note(("", "e"), edge_body(3, "True"))
         assert await inputs.changed(1)
+
+
+def test_only_how_it_is_carried_out_and_kept_is_no_part_of_the_mission() -> None:
+    spec = application().spec
+    kept = spec.model_copy(update={"ttl_after_finished": 5, "update_policy": "Immediate"})
+    assert kept.mission_digest == spec.mission_digest
+    renamed = tuple(c.model_copy(update={"name": f"{c.name}2"}) for c in spec.components)
+    assert spec.model_copy(update={"components": renamed}).mission_digest != spec.mission_digest
+    # A field that is said is the same mission as one that is left to its default.
+    assert type(spec).model_validate(spec.model_dump(by_alias=True)).mission_digest == spec.mission_digest

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Callable, Iterator
 from typing import Any, Literal
 
@@ -37,6 +39,10 @@ def _known(field: Reference) -> Any:
 
 def _other(field: Reference) -> Any:
     return _each(field, "n != c.name", "names the component itself; remove it", lambda _, c, name: name != c.name)
+
+
+_NOT_MISSION = {"update_policy", "ttl_after_finished"}
+"""Fields that may change while a mission goes on, or after it, without being another mission."""
 
 
 class ApplicationSpec(Model):
@@ -128,6 +134,12 @@ class ApplicationSpec(Model):
 
     def _where(self, test: Callable[[Component], bool]) -> list[int]:
         return [i for i, component in enumerate(self.components) if test(component)]
+
+    @property
+    def mission_digest(self) -> str:
+        """Tells what is to be flown and run apart: a hash of all but how updates are carried out and how long pods are kept."""
+        said = self.model_dump(mode="json", by_alias=True, exclude_defaults=True, exclude=_NOT_MISSION)
+        return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
 
     @property
     def driver(self) -> Component | None:

@@ -123,6 +123,9 @@ class DeploymentPlanSpec(Model):
 
     application: str = Field(description="Name of the application, in this namespace.")
     application_generation: int | None = Field(default=None, description="metadata.generation of it that was planned.")
+    application_digest: str | None = Field(
+        default=None, description="Hash of what it says of the mission: a change elsewhere needs no other plan."
+    )
     operation_area: GeoJson | None = Field(default=None, description="GeoJSON (lon, lat) MultiPolygon.")
     drone: DroneChoice | None = None
     placements: tuple[PlannedInstance, ...] = Field(default=(), description="Which instance runs where.")

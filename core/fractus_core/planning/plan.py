@@ -108,6 +108,7 @@ def _drafted(draft: Draft) -> Generator[str, None, DeploymentPlanSpec]:
     decided = DeploymentPlanSpec(
         application=application.name,
         application_generation=application.metadata.generation,
+        application_digest=application.spec.mission_digest,
         operation_area=geojson(area.frame, area.shape.simplify(_ROUNDING_M)) if area is not None else None,
         drone=choice,
         placements=tuple(draft.placements),

@@ -32,8 +32,13 @@ class Plans:
 
     def get(self, key: Key, uid: str) -> DeploymentPlanSpec | None:
         """The plan of the application with this uid, unless the mission it was made for is over."""
-        plan = self._decided.get(key) or self._stored.get(key)
-        return plan.spec if plan is not None and plan.uid == uid and self._is_in_force(key, plan) else None
+        plan = self._last(key, uid)
+        return plan.spec if plan is not None and self._is_in_force(key, plan) else None
+
+    def last(self, key: Key, uid: str) -> DeploymentPlanSpec | None:
+        """The plan of the application with this uid that was made last, also when its mission is over."""
+        plan = self._last(key, uid)
+        return plan.spec if plan is not None else None
 
     def host_of(self, plan: DeploymentPlanSpec | None) -> tuple[Submitted | None, DeploymentPlanSpec | None]:
         """The application whose flight a plan shares, and that one's plan; None each, if there is none any more."""
@@ -73,6 +78,10 @@ class Plans:
             if known is None or known[0] is not plan or known[1] is not submitted:
                 known = self._requests[key] = (plan, submitted, tuple(_requests(key, plan, submitted)))
             yield from known[2]
+
+    def _last(self, key: Key, uid: str) -> OwnedPlan | None:
+        plan = self._decided.get(key) or self._stored.get(key)
+        return plan if plan is not None and plan.uid == uid else None
 
     def _is_in_force(self, key: Key, plan: OwnedPlan) -> bool:
         submitted = self._applications.get(key)

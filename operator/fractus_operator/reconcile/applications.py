@@ -32,7 +32,7 @@ from fractus_operator.reconcile.finished_pods import FinishedPods
 from fractus_operator.reconcile.flight_status import flight
 from fractus_operator.reconcile.grants import REFUSALS, ApplicationGrants
 from fractus_operator.reconcile.missions import mission_outcome
-from fractus_operator.reconcile.replanning import choose_plan, stuck_nodes, waits_for_landing
+from fractus_operator.reconcile.replanning import choose_plan, mission_changed, stuck_nodes, waits_for_landing
 from fractus_operator.reconcile.reporting import StatusReporter
 from fractus_operator.reconcile.rollout import Rollout
 from fractus_operator.reconcile.shared_flights import shared_flight_outcome
@@ -189,7 +189,8 @@ class Applications:
             name = flown.node if flown is not None else self._reporter.last(submitted).get("drone")
             drone = self._live.drone(name) if name is not None else None
             # A change that still waits for the landing is another mission.
-            generation = seen.plan.application_generation if seen.plan is not None else None
+            waits = seen.plan is not None and mission_changed(submitted.application, seen.plan)
+            generation = seen.plan.application_generation if seen.plan is not None and waits else None
             update = status.finished(outcome, name, drone, seen.pods)
             await self._reporter.report(submitted, update, generation)
             await self._finish(submitted)
@@ -211,11 +212,14 @@ class Applications:
         reported = self._reporter.last(seen.submitted)
         if reported.get("phase") not in SETTLED:
             return None
-        if reported.get("observedGeneration") == seen.submitted.metadata.generation:
-            again_s = await self._finish(seen.submitted) if seen.plan is None else RESYNC_S
-            if reported["phase"] == "Returning":
+        submitted = seen.submitted
+        known = reported.get("observedGeneration") == submitted.metadata.generation
+        flown = self._live.plans.last(seen.key, seen.uid)
+        if known or (seen.plan is None and not mission_changed(submitted.application, flown)):
+            again_s = await self._finish(submitted) if seen.plan is None else RESYNC_S
+            if reported["phase"] == "Returning" or not known:
                 drone = self._live.drone(reported.get("drone") or "")
-                await self._reporter.report(seen.submitted, status.still_over(reported, drone))
+                await self._reporter.report(submitted, status.still_over(reported, drone))
             return again_s
         if seen.plan is not None:
             return None

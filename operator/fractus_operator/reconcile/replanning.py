@@ -84,6 +84,15 @@ def choose_plan(
     return Choice(decided, reason)
 
 
+def mission_changed(application: Application | None, plan: DeploymentPlanSpec | None) -> bool:
+    """Whether an application says something else of its mission than what was planned; one that cannot be read does."""
+    if application is None or plan is None:
+        return True
+    if plan.application_generation == application.metadata.generation:
+        return False
+    return plan.application_digest is None or plan.application_digest != application.spec.mission_digest
+
+
 def waits_for_landing(application: Application, plan: DeploymentPlanSpec, in_flight: str | None) -> bool:
     """Whether a changed manifest is not carried out yet, because it would change what flies.
 
@@ -92,7 +101,7 @@ def waits_for_landing(application: Application, plan: DeploymentPlanSpec, in_fli
         plan: In force.
         in_flight: Its drone while it flies.
     """
-    changed = plan.application_generation != application.metadata.generation
+    changed = mission_changed(application, plan)
     return changed and in_flight is not None and application.spec.update_policy == "OnGround"
 
 
@@ -131,7 +140,7 @@ def replan_reason(
     """
     if plan is None:
         return "NoPlanYet"
-    if plan.application_generation != application.metadata.generation:
+    if mission_changed(application, plan):
         return "SpecChanged"
     for placed in plan.placements:
         if placed.node is None or placed.node == in_flight:

@@ -12,6 +12,7 @@ from fractus_core.planning.inventory import Flight
 
 from fractus_operator.cluster.reading import Submitted
 from fractus_operator.inventory.claims import Flown
+from fractus_operator.reconcile.replanning import mission_changed
 
 
 def may_share(application: Application | None) -> bool:
@@ -39,7 +40,7 @@ def offered_flights(
     shared = choice.node if choice is not None and choice.shared_with is not None else None
     found: dict[str, Flight] = {}
     for host in flown:
-        if host.plan.application_generation != host.application.metadata.generation:
+        if mission_changed(host.application, host.plan):
             continue
         try:
             flight: Flight | None = flight_of(host.application, depots)

@@ -314,7 +314,8 @@ class Oracle:
         for wall in self.rules.walls:
             if wall.since_s > severed_at - self._late_s():
                 self._excuse(wall)
-        if self.rules.since_s > severed_at:
+        # A limit of this flight does not bind the path flown before it, on which a drone alone flies back.
+        if math.isfinite(self.rules.since_s):
             self.rules.since_s = self._sky.time()
 
     def _late_s(self) -> float:

@@ -94,7 +94,7 @@ def _finite(value: object) -> bool:
 
 
 def configure(level: str | int, form: str = "text") -> None:
-    """Write the log to stderr, within the limit.
+    """Write the log to stderr, within the limit, unless the program that this is a part of writes its log already.
 
     Args:
         level: from which on records are written.
@@ -105,10 +105,12 @@ def configure(level: str | int, form: str = "text") -> None:
     """
     if form not in FORMS:
         raise ValueError(f"{form!r} is no form of logs: use {' or '.join(FORMS)}")
-    logging.basicConfig(level=level, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
-    for handler in logging.getLogger().handlers:
-        handler.addFilter(LogLimit())
-        if form == "json":
-            handler.setFormatter(JsonFormatter())
+    handler = logging.StreamHandler()
+    handler.addFilter(LogLimit())
+    if form == "json":
+        handler.setFormatter(JsonFormatter())
+    else:
+        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    logging.basicConfig(level=level, handlers=[handler])
     # Health checks of the kubelet, every few seconds.
     logging.getLogger("aiohttp.access").setLevel(logging.WARNING)

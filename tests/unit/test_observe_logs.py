@@ -94,6 +94,13 @@ def test_how_many_lines_were_left_out_is_a_field() -> None:
     assert line("a: b (c=%d)", 1, limit=log.limit)["fields"] == {"c": 1, "left_out": 3}
 
 
+def test_handlers_of_others_are_left_as_they_are(caplog: pytest.LogCaptureFixture) -> None:
+    configure("INFO", "json")
+    for number in range(2 * BURST):
+        logging.getLogger("fractus").warning("peer %d", number)
+    assert caplog.messages == [f"peer {number}" for number in range(2 * BURST)]
+
+
 def test_a_form_that_there_is_not_is_refused() -> None:
     with pytest.raises(ValueError, match="xml"):
         configure("INFO", "xml")

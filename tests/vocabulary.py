@@ -18,7 +18,8 @@ WORDS = Path(__file__).with_name("vocabulary.txt")
 READ = frozenset({".py", ".md", ".yaml", ".yml", ".proto", ".toml", ".tpl", ".txt", ".ts", ".html", ".css", ".sh", ""})
 SKIPPED = re.compile(
     r"(^|/)(\.[a-z_]+|out|dist|node_modules|__pycache__|fractus_view/page)/|_pb2|(^|/)(uv\.lock|LICENSE|vocabulary\.(txt|py)|test_structure\.py|package-lock\.json)$"
-    r"|^docs/glossary\.md$|^CHANGELOG\.md$"
+    # The file .git of a worktree has the name of its branch.
+    r"|^docs/glossary\.md$|^CHANGELOG\.md$|^\.git$"
 )
 
 MAVLINK = re.compile(r"^(services/fractus_services/mobility|sim/fractus_vehicle|mavlink/fractus_mavlink)/")

@@ -107,6 +107,12 @@ def test_the_lint_finds_words_and_numbers() -> None:
     ]  # fmt: skip
 
 
+def test_the_lint_reads_sources_and_nothing_of_git() -> None:
+    read = {path.relative_to(ROOT).as_posix() for path in vocabulary.files([ROOT])}
+    assert {"Makefile", "README.md", "core/fractus_core/policy/engine.py"} <= read
+    assert not {name for name in read if name.split("/")[0] == ".git"}
+
+
 DOCUMENTS = ("README.md", "CONTRIBUTING.md", "SECURITY.md", "docs")
 FILE = re.compile(
     r"`((?:core|storage|kube|mavlink|operator|agent|services|cli|view|sdk|sim|proto|tests|bench|docs|charts|crds|examples)/[\w./-]+)`"

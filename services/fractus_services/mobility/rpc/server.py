@@ -60,29 +60,17 @@ async def _follow(description: NodeDescription, url: str, heard: asyncio.Event) 
         log.warning("mobility: another autopilot is described, used after a restart (url=%s)", _link(description))
 
 
-async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
-    """Serve until `stop` is set, or a part of the service fails.
-
-    Raises:
-        CannotServe: an option is wrong; also within an ExceptionGroup.
-    """
-    # The log has its times from the clock, and is looked up when that is stepped.
-    clock = Clock(lambda step_s, trusted: audit.clock_stepped(step_s, trusted))  # noqa: PLW0108
-    description = NodeDescription(options.node, options.node_object, options.description, Drone)
-    name = description.value.name if description.value is not None else socket.gethostname()
-    node, url = options.node or name, options.autopilot or _link(description)
-    tls = TlsFiles(options.tls)
-    recorder = Recorder(segments_in(options.recordings, options.recordings_mb), node)
-    metrics = ServiceMetrics()
-
-    def recorded(entry: dict[str, Any]) -> None:
-        metrics.take_entry(entry)
-        recorder.take_entry(entry)
-
-    audit = AuditLog(options.audit, clock, tls=options.tls, copied=recorded)
-    verifier = GrantVerifier(options.tls, options.grant_memory)
-    grants = GrantFiles(options.grants, node, verifier, options.flat_terrain, audit.refused_grant)
-    heard = asyncio.Event()
+def _linked(
+    options: MobilityOptions,
+    url: str,
+    heard: asyncio.Event,
+    *,
+    recorder: Recorder,
+    grants: GrantFiles,
+    audit: AuditLog,
+    clock: Clock,
+) -> tuple[MavlinkAutopilot, Parts]:
+    """The autopilot's link, and the parts that command it; `heard` is set once there is a vehicle on the link."""
 
     def found() -> None:
         heard.set()
@@ -111,6 +99,33 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
         grace_s=options.driver_grace,
         boarding_s=options.boarding,
     )
+    return autopilot, parts
+
+
+async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
+    """Serve until `stop` is set, or a part of the service fails.
+
+    Raises:
+        CannotServe: an option is wrong; also within an ExceptionGroup.
+    """
+    # The log has its times from the clock, and is looked up when that is stepped.
+    clock = Clock(lambda step_s, trusted: audit.clock_stepped(step_s, trusted))  # noqa: PLW0108
+    description = NodeDescription(options.node, options.node_object, options.description, Drone)
+    name = description.value.name if description.value is not None else socket.gethostname()
+    node, url = options.node or name, options.autopilot or _link(description)
+    tls = TlsFiles(options.tls)
+    recorder = Recorder(segments_in(options.recordings, options.recordings_mb), node)
+    metrics = ServiceMetrics()
+
+    def recorded(entry: dict[str, Any]) -> None:
+        metrics.take_entry(entry)
+        recorder.take_entry(entry)
+
+    audit = AuditLog(options.audit, clock, tls=options.tls, copied=recorded)
+    verifier = GrantVerifier(options.tls, options.grant_memory)
+    grants = GrantFiles(options.grants, node, verifier, options.flat_terrain, audit.refused_grant)
+    heard = asyncio.Event()
+    autopilot, parts = _linked(options, url, heard, recorder=recorder, grants=grants, audit=audit, clock=clock)
     control, monitor, tours = parts.control, parts.monitor, parts.tours
     audit.append("started", {"node": node, "autopilot": url})
     grants.listen(lambda old, new: _record_grant(audit, old, new))

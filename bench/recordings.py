@@ -13,6 +13,11 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from fractus_mavlink import Endpoint
+    from fractus_services.recording.flight_writer import FlightWriter
 
 MAX_CPU, MAX_MB = 2.0, 16.0
 """Percent of a core and megabytes that recording may add."""
@@ -31,6 +36,32 @@ def resident_mb() -> float:
     return int(found[1]) / 1e3 if found else 0.0
 
 
+GIVEN = {
+    "HEARTBEAT": {"autopilot": 3, "base_mode": 128},
+    "GLOBAL_POSITION_INT": {"lat": 393600000, "lon": 229500000},
+}
+STATE = {
+    "kind": "state", "time": "2026-06-01T12:00:00.000+00:00", "lat": 39.36, "lon": 22.95, "alt": 20.0, "amsl": 30.0,
+}  # fmt: skip
+
+
+def record(writer: FlightWriter, seconds: int, vehicle: Endpoint, companion: Endpoint) -> None:
+    """Give the writer what the service would in a flight."""
+    for second in range(seconds):
+        now_ns = (1_780_000_000 + second) * 1_000_000_000
+        for name, rate in RATES.items():
+            for _ in range(rate):
+                writer.received(now_ns, vehicle.encode(name, GIVEN.get(name, {})))
+        for name, rate in SENT.items():
+            for _ in range(rate):
+                writer.sent(now_ns, companion.encode(name, {}))
+        for _ in range(STATES):
+            writer.entry(now_ns, STATE)
+        if second % 3 == 0:
+            writer.flush()
+        writer.tick()
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="a flight of 20 s")
@@ -46,35 +77,11 @@ def main() -> int:
     vehicle, companion, before_mb = Endpoint(1, 1), Endpoint(244, 191), resident_mb()
     from fractus_services.recording.flight_writer import FlightWriter  # noqa: PLC0415
 
-    given = {
-        "HEARTBEAT": {"autopilot": 3, "base_mode": 128},
-        "GLOBAL_POSITION_INT": {"lat": 393600000, "lon": 229500000},
-    }
-    state = {
-        "kind": "state",
-        "time": "2026-06-01T12:00:00.000+00:00",
-        "lat": 39.36,
-        "lon": 22.95,
-        "alt": 20.0,
-        "amsl": 30.0,
-    }
     with tempfile.TemporaryDirectory() as directory:
         writer = FlightWriter(Segments(Path(directory), 500_000_000, reserve_bytes=0), "drone-1")
         writer.begin()
         begun_s = time.process_time()
-        for second in range(seconds):
-            now_ns = (1_780_000_000 + second) * 1_000_000_000
-            for name, rate in RATES.items():
-                for _ in range(rate):
-                    writer.received(now_ns, vehicle.encode(name, given.get(name, {})))
-            for name, rate in SENT.items():
-                for _ in range(rate):
-                    writer.sent(now_ns, companion.encode(name, {}))
-            for _ in range(STATES):
-                writer.entry(now_ns, state)
-            if second % 3 == 0:
-                writer.flush()
-            writer.tick()
+        record(writer, seconds, vehicle, companion)
         writer.close()
         cpu = (time.process_time() - begun_s) / seconds * 100
         rate_kb = sum(path.stat().st_size for path in Path(directory).iterdir()) / seconds / 1e3

@@ -7,24 +7,25 @@ carry fractus.dev/class labels, with one worker; otherwise an embedded cluster c
 
 from __future__ import annotations
 
+import json
 import os
 import pathlib
 import shutil
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import pytest
 import yaml
 from fractus_cluster.binaries import ensure_binaries
 from fractus_cluster.cluster import Cluster
 from fractus_cluster.images.build import build_images
+from fractus_sim.demo.clusters import EXAMPLE_NODES, assign
 from kubectl import Kube, Object, condition
 
 ROOT = pathlib.Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "traffic-monitoring"
 TARGETS = ("operator", "agent", "mobility", "camera", "example-traffic-monitoring", "example-links")
 SYSTEM = "fractus-system"
-DRONE = "drone-1"
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -40,6 +41,18 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def _current() -> bool:
     return os.environ.get("FRACTUS_E2E_CLUSTER", "embedded") == "current"
+
+
+def _nodes() -> Mapping[str, str]:
+    """The cluster's nodes, by the names that they have in the example."""
+    if not _current():
+        return {name: name for name in EXAMPLE_NODES}
+    done = subprocess.run(["kubectl", "get", "nodes", "-o", "json"], capture_output=True, timeout=60, check=True)
+    return assign(json.loads(done.stdout)["items"], {})
+
+
+NODES = _nodes()
+DRONE = NODES["drone-1"]
 
 
 def say(line: str) -> None:
@@ -77,7 +90,7 @@ def kube(cluster: Cluster | None) -> Kube:
         kubectl, helm = (pathlib.Path(shutil.which(name) or name) for name in ("kubectl", "helm"))
         kubeconfig = pathlib.Path(os.environ.get("KUBECONFIG", "~/.kube/config")).expanduser()
     kube = Kube(kubectl, kubeconfig)
-    for release in ("fractus-crds", "fractus"):
+    for release in ("fractus-crds", "fractus") if cluster is not None else ("fractus-crds", "fractus", "fractus-demo"):
         chart = ROOT / "charts" / release
         done = subprocess.run(
             [helm, "upgrade", "--install", release, chart, "-n", SYSTEM, "--create-namespace"],
@@ -88,11 +101,7 @@ def kube(cluster: Cluster | None) -> Kube:
             check=False,
         )
         assert done.returncode == 0, done.stderr
-    if cluster is None:
-        kube.must("apply", "-f", str(ROOT / "examples" / "simulated-hardware.yaml"))
-        for name in ("drone.yaml", "edge-nodes.yaml"):
-            kube.must("apply", "-f", str(EXAMPLE / name))
-    for name in ("depot.yaml", "zones.yaml", "policies.yaml"):
+    for name in ("depot.yaml", "zones.yaml", "policies.yaml") if cluster is not None else ():
         kube.must("apply", "-f", str(EXAMPLE / name))
     kube.wait(
         "the drone is Ready",

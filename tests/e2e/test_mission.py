@@ -6,7 +6,7 @@ import json
 import re
 import time
 
-from conftest import DRONE, SYSTEM, example, flight_state, short_flight
+from conftest import DRONE, NODES, SYSTEM, example, flight_state, short_flight
 from fractus_storage.chain import verify
 from kubectl import Kube, Object, condition
 
@@ -60,18 +60,18 @@ def test_traffic_monitoring_flies_under_policies(grounded: Kube) -> None:
     assert {
         ("Navigator", DRONE),
         ("AerialViewer", DRONE),
-        ("GroundViewer", "edge-1"),
-        ("GroundViewer", "edge-2"),
+        ("GroundViewer", NODES["edge-1"]),
+        ("GroundViewer", NODES["edge-2"]),
     } <= placed
     assert ("ImageChecker", None) in placed
-    assert {n for c, n in placed if c == "ImageChecker"} >= {"edge-1", "edge-2"}
+    assert {n for c, n in placed if c == "ImageChecker"} >= {NODES["edge-1"], NODES["edge-2"]}
     dropped = {(r["component"], r["node"]): r["reason"] for r in plan["spec"]["rejected"]}
-    assert dropped["ImageChecker", "edge-3"] == "NoCoverage"
+    assert dropped["ImageChecker", NODES["edge-3"]] == "NoCoverage"
     for pod in kube.all("pods", "default", "fractus.dev/application=traffic-monitoring"):
         labels = pod["metadata"]["labels"]
         assert {"fractus.dev/component", "fractus.dev/instance", "fractus.dev/placement"} <= labels.keys()
         node = pod["spec"]["nodeName"]
-        assert node == "cloud-1" if labels["fractus.dev/placement"] == "cloud" else node
+        assert node == NODES["cloud-1"] if labels["fractus.dev/placement"] == "cloud" else node
 
     kube.wait("the drone flies", lambda: flight_state(kube) == "flying", timeout_s=90)
     kube.wait(

@@ -33,11 +33,15 @@ def uninstall(world: World) -> None:
 
 def render(*arguments: str) -> list[Body]:
     """The objects of the chart, rendered by helm."""
-    caches = sorted((Path.home() / ".cache" / "fractus").glob("*/bin/helm"), reverse=True)
-    helm = str(caches[0]) if caches else "helm"
-    argv = [helm, "template", "fractus", str(CHARTS / "fractus"), "--namespace", SYSTEM, "--kube-version", "1.35.4"]
+    argv = [helm(), "template", "fractus", str(CHARTS / "fractus"), "--namespace", SYSTEM, "--kube-version", "1.35.4"]
     done = subprocess.run([*argv, *arguments], capture_output=True, text=True, timeout=60, check=True)
     return [body for body in yaml.safe_load_all(done.stdout) if body]
+
+
+def helm() -> str:
+    """The program, as the embedded cluster has it, or from the PATH."""
+    caches = sorted((Path.home() / ".cache" / "fractus").glob("*/bin/helm"), reverse=True)
+    return str(caches[0]) if caches else "helm"
 
 
 def operator_token(world: World) -> str:

@@ -214,15 +214,15 @@ def test_a_report_without_a_record_says_so(tmp_path: Path) -> None:
 
 
 def test_the_simulated_hardware_stands_where_the_drone_is_kept() -> None:
-    (hardware,) = yaml.safe_load_all((ROOT / "examples" / "simulated-hardware.yaml").read_text())
-    pod_spec = hardware["spec"]["template"]["spec"]
-    arguments = pod_spec["containers"][0]["args"]
-    lat, lon, _ = (float(part) for part in arguments[arguments.index("--home") + 1].split(","))
+    chart = ROOT / "charts" / "fractus-demo"
+    home = yaml.safe_load((chart / "values.yaml").read_text())["vehicle"]["home"]
+    lat, lon, _ = (float(part) for part in home.split(","))
     depot = demo_flight.documents("depot.yaml")[0]["spec"]["location"]
     assert (lat, lon) == (depot["lat"], depot["lon"])
     drone = demo_flight.documents("drone.yaml")[0]["spec"]["services"]["mobility"]
-    assert drone["connection"] in arguments
-    assert pod_spec["hostNetwork"] is True
+    vehicle = (chart / "templates" / "vehicle.yaml").read_text()
+    assert f'"{drone["connection"]}"' in vehicle
+    assert "hostNetwork: true" in vehicle
 
 
 def test_a_change_of_path_is_told_once() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections.abc import Callable, Mapping, Sequence
@@ -21,7 +20,8 @@ from fractus_sim.demo.kube import DemoError, Kube, Object
 ROOT = Path(__file__).parents[3]
 EXAMPLE = ROOT / "examples" / "traffic-monitoring"
 TARGETS = ("operator", "agent", "mobility", "camera", "example-traffic-monitoring")
-GPU = "fractus.dev/gpu"
+EXAMPLE_NODES = ("drone-1", "edge-1", "edge-2", "edge-3", "cloud-1")
+DEMO_CHART = "fractus-demo"
 Say = Callable[[str], None]
 
 
@@ -54,8 +54,12 @@ class DemoCluster(Protocol):
     def up(self) -> Kube:
         """Bring it up, with images on its nodes and nodes labelled."""
 
-    def hardware(self, kube: Kube) -> list[Object]:
-        """Objects that describe nodes and stand for their hardware, where the nodes do not bring them."""
+    def surroundings(self, kube: Kube) -> list[str]:
+        """Make what the example flies in: a depot, zones, policies, and nodes' descriptions and hardware where they bring none.
+
+        Returns:
+            The releases of charts that were not there before.
+        """
 
     def down(self) -> None:
         """Leave it as it was found."""
@@ -83,8 +87,11 @@ class EmbeddedCluster:
         programs = ensure_binaries(("kubectl", "helm"), report=self.say)
         return Kube(programs["kubectl"], programs["helm"], self._cluster.kubeconfig)
 
-    def hardware(self, kube: Kube) -> list[Object]:
-        """Nothing: vehicles stand beside the nodes, and agents register them."""
+    def surroundings(self, kube: Kube) -> list[str]:
+        """Depot, zones and policies: vehicles stand beside the nodes, and agents register them."""
+        kube.apply(
+            [body for name in ("depot.yaml", "zones.yaml", "policies.yaml") for body in documents(EXAMPLE / name)]
+        )
         return []
 
     def down(self) -> None:
@@ -117,21 +124,14 @@ class CurrentCluster:
         self._assigned = assign(nodes, self.given)
         for example, node in self._assigned.items():
             kube.run("label", "node", node, f"{CLASS_LABEL}={class_of(example)}", "--overwrite")
-            capacity = next(n for n in nodes if n["metadata"]["name"] == node)["status"].get("capacity", {})
-            if class_of(example) != "drone" and GPU not in capacity:
-                path = "/status/capacity/" + GPU.replace("/", "~1")
-                patch = json.dumps([{"op": "add", "path": path, "value": "1"}])
-                kube.run("patch", "node", node, "--subresource=status", "--type=json", "-p", patch)
             self.say(f"{example} is {node}")
         return kube
 
-    def hardware(self, kube: Kube) -> list[Object]:
-        """Drone and edge nodes under the names of this cluster's nodes, and a simulated vehicle on each drone node."""
-        described = [*documents(EXAMPLE / "drone.yaml"), *documents(EXAMPLE / "edge-nodes.yaml")]
-        kept = [body for body in described if body["metadata"]["name"] in self._assigned]
-        for body in kept:
-            body["metadata"]["name"] = self._assigned[body["metadata"]["name"]]
-        return [*documents(ROOT / "examples" / "simulated-hardware.yaml"), *kept]
+    def surroundings(self, kube: Kube) -> list[str]:
+        """The chart fractus-demo, with nodes as they are assigned."""
+        edges = ",".join(node for example, node in sorted(self._assigned.items()) if class_of(example) == "edge")
+        named = (f"drone={self._assigned['drone-1']}", f"edgeNodes={{{edges}}}")
+        return [DEMO_CHART] if kube.install(DEMO_CHART, ROOT / "charts" / DEMO_CHART, named) else []
 
     def down(self) -> None:
         """Nothing: labels stay, for the next time."""
@@ -156,11 +156,10 @@ def assign(nodes: Sequence[Object], given: Mapping[str, str]) -> dict[str, str]:
     if unknown:
         raise DemoError(f"--assign: the cluster has no node {unknown[0]}; it has {', '.join(sorted(names))}")
     assigned = dict(given)
-    wanted = ("drone-1", "edge-1", "edge-2", "edge-3", "cloud-1")
-    for example in wanted:
+    for example in EXAMPLE_NODES:
         if example not in assigned and example in names:
             assigned[example] = example
-    for example in wanted:
+    for example in EXAMPLE_NODES:
         if example in assigned:
             continue
         free = sorted(

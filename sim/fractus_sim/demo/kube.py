@@ -71,10 +71,11 @@ class Kube:
             "delete", "-f", "-", "--ignore-not-found", f"--timeout={timeout_s:.0f}s", stdin=text, timeout_s=timeout_s + 10
         )  # fmt: skip
 
-    def install(self, release: str, chart: Path) -> bool:
-        """Install or upgrade a chart; True when it was not there before."""
+    def install(self, release: str, chart: Path, values: Sequence[str] = ()) -> bool:
+        """Install or upgrade a chart with some values (`key=value`); True when it was not there before."""
         listed = self._run(self.release_tool, ["list", "-n", SYSTEM, "-q", "-f", f"^{release}$"], None, 60.0)
         arguments = ["upgrade", "--install", release, str(chart), "-n", SYSTEM, "--create-namespace"]
+        arguments += [f"--set={value}" for value in values]
         self._run(self.release_tool, arguments, None, 120.0)
         return not listed.strip()
 

@@ -16,7 +16,7 @@ from rich.console import Console
 
 from fractus_sim.demo.clusters import EXAMPLE, ROOT, DemoCluster, documents
 from fractus_sim.demo.collect import collect, fetch_pictures
-from fractus_sim.demo.kube import SYSTEM, DemoError, Kube, Object
+from fractus_sim.demo.kube import SYSTEM, DemoError, Kube
 from fractus_sim.demo.view import RECORDINGS, fetch_recordings, shown
 from fractus_sim.demo.watch import Mission, follow, wait_ready
 from fractus_sim.interruption import uninterrupted
@@ -124,14 +124,8 @@ class Demo:
             kube.run(
                 "delete", "pods", "-n", SYSTEM, "-l", "app.kubernetes.io/name=fractus", "--timeout=60s", timeout_s=90
             )
-        hardware = self.cluster.hardware(kube)
-        if hardware:
-            kube.apply(hardware)
-        kube.apply(self._surroundings())
+        installed.extend(self.cluster.surroundings(kube))
         wait_ready(kube, READY_TIMEOUT_S, self.tell.show)
-
-    def _surroundings(self) -> list[Object]:
-        return [body for name in ("depot.yaml", "zones.yaml", "policies.yaml") for body in documents(EXAMPLE / name)]
 
     def _fly(self, kube: Kube) -> bool:
         application = documents(EXAMPLE / "application.yaml")
@@ -189,8 +183,6 @@ class Demo:
 
     def _remove(self, kube: Kube, installed: list[str]) -> None:
         self._remove_application(kube)
-        if "fractus" in installed:
-            kube.delete([*self._surroundings(), *self.cluster.hardware(kube)], 60.0)
         for release in reversed(installed):
             kube.uninstall(release)
 

@@ -198,6 +198,11 @@ def test_nothing_is_loaded_from_elsewhere_or_run_inline(browser: Browser, addres
     context.close()
 
 
+def test_a_map_without_areas_is_seen(browser: Browser, tmp_path: Path) -> None:
+    with serving("--recordings", tmp_path) as address, opened(browser, address) as page:
+        expect(page.locator("#map .maplibregl-canvas")).to_be_visible(timeout=TIMEOUT_MS)
+
+
 def test_without_the_token_the_page_says_what_to_do(browser: Browser, address: str) -> None:
     context = browser.new_context()
     page = context.new_page()

@@ -75,6 +75,8 @@ export class FlightMap {
       dragRotate: false,
       locale: { "Map.Title": "Map of zones, areas and drones; the lists say the same" },
     });
+    // Where there is no graphics processor, each frame that is seen is copied: none is before there is something to see.
+    this.map.getCanvasContainer().style.visibility = "hidden";
     this.map.addControl(new NavigationControl({ showCompass: false }), "top-right");
     this.map.addControl(new ScaleControl({}), "bottom-left");
     this.overlay = document.createElement("canvas");
@@ -83,7 +85,7 @@ export class FlightMap {
     this.map.getCanvasContainer().append(this.overlay);
     this.map.touchZoomRotate.disableRotation();
     this.map.keyboard.disableRotation();
-    this.map.on("style.load", () => this.loaded());
+    this.map.on("style.load", () => this.map.on("render", this.rendered));
     for (const what of ["dragstart", "wheel", "dblclick"] as const) this.map.on(what, () => (this.moved = true));
     element.addEventListener("keydown", () => (this.moved = true));
     this.map.on("click", (event) => this.clicked(event.point, event.lngLat));
@@ -97,7 +99,8 @@ export class FlightMap {
     const colours = this.colours;
     const layers: StyleSpecification["layers"] = [{ id: "background", type: "background", paint: { "background-color": colours.background } }];
     for (const kind of KINDS) {
-      const paint = { "fill-color": colours[kind], "fill-opacity": kind === "zone" ? 0.22 : 0.06 };
+      // Each has a line of its own around it.
+      const paint = { "fill-antialias": false, "fill-color": colours[kind], "fill-opacity": kind === "zone" ? 0.22 : 0.06 };
       layers.push({ id: `${kind}-fill`, type: "fill", source: "areas", filter: filter(kind), paint });
     }
     for (const kind of [...KINDS, "path" as const]) {
@@ -111,17 +114,19 @@ export class FlightMap {
     return { version: 8, sources: { areas: source(this.shapes()), whole: source([]), flown: source([]) }, layers };
   }
 
-  private loaded(): void {
-    this.ready = true;
-    if (this.whole) this.showWhole();
-    const rendered = () => {
-      if (this.features.length === 0 || !this.map.isSourceLoaded("areas")) return;
-      this.map.off("render", rendered);
-      this.element.dataset["map"] = "ready";
-      performance.mark("map shown");
-    };
-    this.map.on("render", rendered);
-  }
+  /** The first picture that is seen has all areas in it. */
+  private readonly rendered = (): void => {
+    if (!this.map.isSourceLoaded("areas")) return;
+    if (!this.ready) {
+      this.ready = true;
+      this.map.getCanvasContainer().style.visibility = "";
+      if (this.whole) this.showWhole();
+    }
+    if (this.features.length === 0) return;
+    this.map.off("render", this.rendered);
+    this.element.dataset["map"] = "ready";
+    performance.mark("map shown");
+  };
 
   /** Show what another model knows. */
   follow(model: Model): void {

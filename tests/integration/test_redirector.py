@@ -222,18 +222,19 @@ async def test_a_drain_that_is_cancelled_leaves_nothing_on_the_old_path(world: R
     assert (await asyncio.to_thread(answers, client))[-1][1] == "edge"
 
 
-async def test_an_abrupt_switch_waits_for_no_drain(world: Rig, redirector: Redirector) -> None:
+async def test_an_abrupt_switch_waits_for_no_drain_and_cuts_none_on_the_other_path(world: Rig, redirector: Redirector) -> None:
     world.servers(work_s=3.0)
     client = world.client(1)
     await asyncio.sleep(1.5)
     drain = asyncio.create_task(redirector.switch(TO_EDGE, planned=True))
     await asyncio.sleep(0.05)
     begun = time.monotonic()
-    await redirector.switch(TO_CLOUD, planned=False)
+    lost = await redirector.switch(TO_CLOUD, planned=False)
     assert time.monotonic() - begun < 0.5
     assert redirector.redirects == {}
+    assert lost.cut == 0, "the call is on the cloud path still, which lives"
+    assert [answer[1] for answer in await asyncio.to_thread(answers, client)] == ["cloud"]
     await drain
-    await asyncio.to_thread(answers, client)
 
 
 async def test_a_table_that_was_flushed_is_made_again(world: Rig, redirector: Redirector) -> None:

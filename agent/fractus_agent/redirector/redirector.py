@@ -105,7 +105,7 @@ class _Left:
     Attributes:
         service: where clients connect to.
         number: carried by the connections that were opened on it, and by no others.
-        connections: those that were there when it was left.
+        connections: those that were on it when it was left, and on no path that was left before.
     """
 
     service: Endpoint
@@ -291,8 +291,11 @@ class Redirector:
     def _paths(self, numbers: Mapping[Endpoint, int]) -> list[_Left]:
         """What is left of services with these numbers, as it is now; without connections where the kernel does not tell."""
         found: dict[Endpoint, set[bytes]] = {service: set() for service in numbers}
+        # Those of a path that was left before are on that one still, which may be well.
+        older = frozenset[bytes]().union(*(left.connections for left in self._left))
         for _, connection in self._namespaces.to(found):
-            found[connection.peer].add(connection.identity)
+            if connection.identity not in older:
+                found[connection.peer].add(connection.identity)
         return [_Left(service, number, frozenset(found[service])) for service, number in numbers.items()]
 
     def _leave(self, paths: Iterable[_Left]) -> int:

@@ -39,6 +39,30 @@ COMMAND_TIMEOUT_S = 10.0
 COUNTED_S = 60
 """Bytes of a service are counted until nothing has moved for so long."""
 
+_KEY = "ip daddr . meta l4proto . th dport"
+_OURS = f"ct mark and 0x{MARK_MASK:08x} == 0x{MARK_BASE:08x}"
+
+_SETS = f"""	map {TARGETS} {{
+		type ipv4_addr . inet_proto . inet_service : ipv4_addr . inet_service
+		flags timeout
+	}}
+	map {MARKS} {{
+		type ipv4_addr . inet_proto . inet_service : mark
+	}}
+	set {SENT} {{
+		type mark
+		flags dynamic, timeout
+	}}
+	set {RECEIVED} {{
+		type mark
+		flags dynamic, timeout
+	}}
+	set {PEERS} {{
+		type ipv4_addr
+		flags timeout
+	}}
+"""
+
 
 @dataclass(frozen=True, slots=True)
 class Ports:
@@ -63,41 +87,22 @@ def table(devices: str, ports: Ports, *, clients: bool, callers: Callers = NO_GU
             guarded pods of this node take nothing else.
         callers: by guarded endpoint, which clients are led; with the table, so that it is never there without.
     """
-    key = "ip daddr . meta l4proto . th dport"
-    only = "" if clients else f'iifname "{devices}" ip saddr @{PEERS} '
-    # Who may not call a service is not led there; whether the base instance takes the call is not for this node to say.
-    guard = f"{key} @{GUARDED} ip saddr . {key} != @{CALLERS} return\n\t\t" if clients else ""
-    rules = f"{guard}{only}ct mark set {key} map @{MARKS}\n\t\t{only}dnat ip to {key} map @{TARGETS}"
-    output = f"""
-	chain output {{
-		type nat hook output priority -150; policy accept;
-		{rules}
-	}}"""
-    closed = f"{key} @{GUARDED} ct state new ct mark and 0x{MARK_MASK:08x} != 0x{MARK_BASE:08x} drop\n\t\t"
-    ours = f"ct mark and 0x{MARK_MASK:08x} == 0x{MARK_BASE:08x}"
+    chains = (
+        _leading(devices, clients=clients),
+        _counting(devices),
+        _arriving(devices, ports),
+        _passing(devices, clients=clients),
+    )
     return f"""table ip {TABLE}
 delete table ip {TABLE}
 table ip {TABLE} {{
-	map {TARGETS} {{
-		type ipv4_addr . inet_proto . inet_service : ipv4_addr . inet_service
-		flags timeout
-	}}
-	map {MARKS} {{
-		type ipv4_addr . inet_proto . inet_service : mark
-	}}
-	set {SENT} {{
-		type mark
-		flags dynamic, timeout
-	}}
-	set {RECEIVED} {{
-		type mark
-		flags dynamic, timeout
-	}}
-	set {PEERS} {{
-		type ipv4_addr
-		flags timeout
-	}}
-	set {GUARDED} {{
+{_SETS}{_guards(callers)}{"".join(chains)}}}
+{_ip6(devices)}"""
+
+
+def _guards(callers: Callers) -> str:
+    """Who may call what; in the text, so that no table is ever there without."""
+    return f"""	set {GUARDED} {{
 		type ipv4_addr . inet_proto . inet_service
 		{_elements(_text(each) for each in callers)}
 	}}
@@ -105,24 +110,48 @@ table ip {TABLE} {{
 		type ipv4_addr . ipv4_addr . inet_proto . inet_service
 		{_elements(f"{client} . {_text(to)}" for to, clients in callers.items() for client in clients)}
 	}}
-	chain prerouting {{
+"""
+
+
+def _leading(devices: str, *, clients: bool) -> str:
+    """What leads connections elsewhere, and numbers them."""
+    only = "" if clients else f'iifname "{devices}" ip saddr @{PEERS} '
+    # Who may not call a service is not led there; whether the base instance takes the call is not for this node to say.
+    guard = f"{_KEY} @{GUARDED} ip saddr . {_KEY} != @{CALLERS} return\n\t\t" if clients else ""
+    rules = f"{guard}{only}ct mark set {_KEY} map @{MARKS}\n\t\t{only}dnat ip to {_KEY} map @{TARGETS}"
+    output = f"""
+	chain output {{
+		type nat hook output priority -150; policy accept;
+		{rules}
+	}}"""
+    return f"""	chain prerouting {{
 		type nat hook prerouting priority -150; policy accept;
 		{rules}
 	}}{output if clients else ""}
 	chain postrouting {{
 		# Without it the server would answer over the base path: it knows the client by its pod address.
 		type nat hook postrouting priority 50; policy accept;
-		{ours} oifname "{devices}" masquerade
+		{_OURS} oifname "{devices}" masquerade
 	}}
-	chain sending {{
+"""
+
+
+def _counting(devices: str) -> str:
+    """What counts bytes, by number."""
+    return f"""	chain sending {{
 		type filter hook postrouting priority 150; policy accept;
-		{ours} oifname "{devices}" update @{SENT} {{ ct mark timeout {COUNTED_S}s counter }}
+		{_OURS} oifname "{devices}" update @{SENT} {{ ct mark timeout {COUNTED_S}s counter }}
 	}}
 	chain receiving {{
 		type filter hook prerouting priority 0; policy accept;
-		{ours} iifname "{devices}" update @{RECEIVED} {{ ct mark timeout {COUNTED_S}s counter }}
+		{_OURS} iifname "{devices}" update @{RECEIVED} {{ ct mark timeout {COUNTED_S}s counter }}
 	}}
-	chain arriving {{
+"""
+
+
+def _arriving(devices: str, ports: Ports) -> str:
+    """What the node itself takes from direct interfaces."""
+    return f"""	chain arriving {{
 		type filter hook input priority -5; policy accept;
 		iifname != "{devices}" accept
 		ct state established,related accept
@@ -132,16 +161,26 @@ table ip {TABLE} {{
 		meta l4proto tcp reject with tcp reset
 		drop
 	}}
-	chain passing {{
+"""
+
+
+def _passing(devices: str, *, clients: bool) -> str:
+    """What the node forwards to and from direct interfaces, and to guarded pods."""
+    closed = f"{_KEY} @{GUARDED} ct state new ct mark and 0x{MARK_MASK:08x} != 0x{MARK_BASE:08x} drop\n\t\t"
+    return f"""	chain passing {{
 		type filter hook forward priority -5; policy accept;
 		{"" if clients else closed}iifname != "{devices}" oifname != "{devices}" accept
 		ct state established,related accept
-		{ours} oifname "{devices}" accept
-		{ours} iifname "{devices}" ip saddr @{PEERS} accept
+		{_OURS} oifname "{devices}" accept
+		{_OURS} iifname "{devices}" ip saddr @{PEERS} accept
 		drop
 	}}
-}}
-table ip6 {TABLE}
+"""
+
+
+def _ip6(devices: str) -> str:
+    """Links have no IPv6: nothing of it comes in or goes out."""
+    return f"""table ip6 {TABLE}
 delete table ip6 {TABLE}
 table ip6 {TABLE} {{
 	chain arriving {{

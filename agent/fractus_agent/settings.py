@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+
+MAX_DRAIN_S = 600.0
+"""A drone stays on a link for as long as something drains on it."""
 
 
 class MissingSetting(Exception):
@@ -66,22 +70,35 @@ class Settings:
 
         Raises:
             MissingSetting: FRACTUS_NODE is not set.
-            BadSetting: FRACTUS_DRAIN_S is no number of seconds.
+            BadSetting: FRACTUS_DRAIN_S is no number of seconds, or too many.
         """
         node = environment.get("FRACTUS_NODE", "")
         if not node:
             raise MissingSetting("FRACTUS_NODE is not set: give it the node's name (fieldRef spec.nodeName)")
-        drain = environment.get("FRACTUS_DRAIN_S", "30")
-        if not drain.replace(".", "", 1).isdecimal():
-            raise BadSetting(f"FRACTUS_DRAIN_S is no number of seconds: {drain[:80]}")
+        drain_s = _seconds("FRACTUS_DRAIN_S", environment.get("FRACTUS_DRAIN_S", "30"), MAX_DRAIN_S)
         return cls(
             node=node,
             description=Path(environment.get("FRACTUS_DESCRIPTION", "/etc/fractus/node.yaml")),
             state=Path(environment.get("FRACTUS_STATE_DIR", "/var/lib/fractus")),
             mobility_address=environment.get("FRACTUS_MOBILITY", "127.0.0.1:50051"),
-            drain_s=float(drain),
+            drain_s=drain_s,
             direct_links=environment.get("FRACTUS_DIRECT_LINKS", "true").lower() == "true",
             metrics=environment.get("FRACTUS_METRICS", ""),
             log_format=environment.get("FRACTUS_LOG_FORMAT") or "text",
             log_level=environment.get("FRACTUS_LOG_LEVEL", "INFO").upper(),
         )
+
+
+def _seconds(name: str, text: str, most: float) -> float:
+    """A time.
+
+    Raises:
+        BadSetting: the text is no number, or one out of bounds.
+    """
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not 0 <= seconds <= most:
+        raise BadSetting(f"{name} is {text[:80]!r}: give it a number of seconds from 0 to {most:g}")
+    return seconds

@@ -222,7 +222,9 @@ async def test_a_drain_that_is_cancelled_leaves_nothing_on_the_old_path(world: R
     assert (await asyncio.to_thread(answers, client))[-1][1] == "edge"
 
 
-async def test_an_abrupt_switch_waits_for_no_drain_and_cuts_none_on_the_other_path(world: Rig, redirector: Redirector) -> None:
+async def test_an_abrupt_switch_waits_for_no_drain_and_cuts_none_on_the_other_path(
+    world: Rig, redirector: Redirector
+) -> None:
     world.servers(work_s=3.0)
     client = world.client(1)
     await asyncio.sleep(1.5)

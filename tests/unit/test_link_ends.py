@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import time
 from collections.abc import Callable
 from importlib.metadata import EntryPoint
@@ -25,7 +26,7 @@ from fractus_agent.redirector import tables
 from fractus_agent.redirector.netlink import NetlinkError
 from fractus_agent.redirector.nft import Endpoint
 from fractus_agent.redirector.redirector import Namespaces, Redirector
-from fractus_agent.settings import BadSetting, Settings
+from fractus_agent.settings import MAX_DRAIN_S, BadSetting, Settings
 from fractus_core.api.links import DirectLink, LinkedService
 from fractus_core.linking import PathMetrics, UnknownHeuristic
 
@@ -205,9 +206,14 @@ def test_a_node_without_clients_leads_only_what_paired_nodes_send() -> None:
 
 def test_the_time_of_a_drain_is_a_number() -> None:
     assert Settings.from_environment({"FRACTUS_NODE": "d1", "FRACTUS_DRAIN_S": "2.5"}).drain_s == 2.5
-    for bad in ("soon", "-1", "nan", "1e3"):
-        with pytest.raises(BadSetting, match="no number of seconds"):
+    for bad in ("", " ", "soon", "-1", "nan", "inf", "601", "9" * 400):
+        with pytest.raises(
+            BadSetting, match=r"^FRACTUS_DRAIN_S is '.{0,80}': give it a number of seconds from 0 to 600$"
+        ):
             Settings.from_environment({"FRACTUS_NODE": "d1", "FRACTUS_DRAIN_S": bad})
+    schema = json.loads((Path(__file__).parents[2] / "charts/fractus/values.schema.json").read_text())
+    drain = schema["properties"]["directLinks"]["properties"]["drainSeconds"]
+    assert (drain["type"], drain["minimum"], drain["maximum"]) == ("number", 0, MAX_DRAIN_S)
 
 
 def test_a_peer_that_serves_nothing_and_says_nothing_is_left(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -98,8 +98,8 @@ class Kernel:
     def to(self, _services: object) -> list[Any]:
         return []
 
-    def refresh(self) -> list[Any]:
-        return []
+    def cut(self, *_: object) -> int:
+        return 0
 
 
 def test_connections_on_the_cloud_path_outlive_the_plan_for_their_service() -> None:

@@ -91,6 +91,21 @@ class Namespaces:
             for connection in found:
                 yield sockets, connection
 
+    def cut(self, services: Collection[Endpoint], only: Collection[bytes]) -> int:
+        """Close these of the connections to some services, whatever they do; how many there were.
+
+        Raises:
+            NetlinkError: the kernel does not tell.
+        """
+        cut = 0
+        for sockets in self.refresh():
+            for connection in sockets.to(services):
+                if connection.identity in only:
+                    if not _destroy(sockets, connection):
+                        return cut
+                    cut += 1
+        return cut
+
     def close(self) -> None:
         """Close all sockets."""
         for sockets in self._open.values():
@@ -302,7 +317,7 @@ class Redirector:
         """Close the connections that are left on paths, and forget them; what fails is tried again. How many were closed."""
         paths = [left for left in paths if left in self._left]
         try:
-            cut = self._cut({left.service for left in paths}, {c for left in paths for c in left.connections})
+            cut = self._namespaces.cut({p.service for p in paths}, {c for p in paths for c in p.connections})
             for left in paths:
                 self._conntrack.forget(left.number)
                 self._left.remove(left)
@@ -350,17 +365,6 @@ class Redirector:
             if watched:
                 await asyncio.sleep(DRAIN_POLL_S if spent < BUSY_TIMEOUT_S else SLOW_POLL_S)
         return drained
-
-    def _cut(self, services: Collection[Endpoint], only: Collection[bytes]) -> int:
-        """Close connections, whatever they do."""
-        cut = 0
-        for sockets in self._namespaces.refresh():
-            for connection in sockets.to(services):
-                if connection.identity in only:
-                    if not _destroy(sockets, connection):
-                        return cut
-                    cut += 1
-        return cut
 
     def close(self) -> None:
         """Close the sockets of the pods' namespaces."""

@@ -189,7 +189,7 @@ def test_a_peer_that_hears_and_never_answers(air: Air) -> None:
     drone = air.node("d1")
     air.command(station="e1", silent=True)
     drone.tell("want e1")
-    assert "does_not_answer" in drone.expect("link none -")
+    assert "e1_does_not_answer:_time-out" in drone.expect("link none -")
 
 
 @pytest.mark.parametrize("fault", ["other name", "other authority", "component", "expired"])

@@ -11,6 +11,7 @@ from fractus_agent.links.evidence import records
 from fractus_agent.links.lessons import Lessons
 from fractus_agent.redirector.nft import Endpoint
 from fractus_core.linking import NO_LINK, Link, PathMetrics, Peer, Phase, Reach, Settings, Track, heuristic
+from fractus_core.linking.learning import retry_s
 
 CLOUD = PathMetrics(8.0, 8.0, 60.0, 60.0)
 WIFI = PathMetrics(12.0, 12.0, 5.0, 5.0, direct=True)
@@ -197,7 +198,7 @@ def test_links_that_break_near_say_nothing_of_the_reach() -> None:
 def test_a_link_that_broke_where_its_peer_is_still_heard_did_not_break_for_the_distance() -> None:
     found = lessons(64.0)
     found.broke("e1", NOW_S)
-    assert found.reaches["e1"].retry_s > NOW_S
+    assert found.reaches["e1"].failed_s == NOW_S
     found.peers = {"e1": replace(NEAR, position=(50.0, 0.0, 0.0))}
     found.beacon("e1", NOW_S + 0.5)
     assert found.reaches["e1"].range_factor == pytest.approx(0.8 / 1.02)
@@ -218,7 +219,7 @@ def test_attempts_that_fail_are_repeated_later_and_later() -> None:
     found = lessons(10.0)
     found.not_paired("e1", NOW_S)
     found.not_paired("e1", NOW_S)
-    assert found.reaches["e1"].retry_s == NOW_S + 2.0
+    assert retry_s(found.reaches["e1"], linked=False) == NOW_S + 2.0
     found.came_up("e1", NOW_S)
     assert found.reaches["e1"].failures == 0
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 import random
@@ -26,7 +27,7 @@ from fractus_core.linking import (
     plan_link,
 )
 from fractus_core.linking.horizon import UNREACHABLE, Horizon, solve
-from fractus_core.linking.learning import connected, expected, failed, heard, lost
+from fractus_core.linking.learning import connected, expected, failed, heard, lost, retry_s
 from fractus_core.linking.prediction import predict
 from fractus_core.linking.values import Position
 from fractus_sim.scenarios.links.rules import Scene, along, carried, oracle, ours, thesis
@@ -144,12 +145,22 @@ def test_a_link_that_comes_up_is_waited_for_unless_it_is_of_no_use() -> None:
 
 def test_a_peer_that_did_not_answer_waits_for_its_turn() -> None:
     reach = failed(failed(Reach(), 98.0), 99.5)
-    assert reach.retry_s == 101.5
     at = Track((0.0, 0.0, 0.0))
     assert decide(at, [peer("e1", 0.0)], reaches={"e1": reach}).peer == ""
     assert decide(at, [peer("e1", 0.0)], reaches={"e1": reach}, now_s=101.5).peer == "e1"
     assert decide(at, [peer("e1", 0.0), peer("e2", 50.0)], reaches={"e1": reach}).peer == "e2"
-    assert connected(reach).retry_s == -math.inf
+    assert retry_s(reach, linked=False) == 101.5
+    assert retry_s(connected(reach), linked=False) == -math.inf
+
+
+def test_a_peer_that_never_answers_is_tried_often_only_while_there_is_no_other_link() -> None:
+    reach = functools.reduce(failed, [100.0] * 9, Reach())
+    at, both = Track((0.0, 0.0, 0.0)), [peer("e1", 0.0), peer("e2", 78.0)]
+    assert decide(at, both[:1], reaches={"e1": reach}, now_s=103.9).peer == ""
+    assert decide(at, both[:1], reaches={"e1": reach}, now_s=104.0).peer == "e1"
+    up = Link(Phase.UP, "e2", 40.0)
+    assert decide(at, both, up, reaches={"e1": reach}, now_s=159.0).peer == "e2"
+    assert decide(at, both, up, reaches={"e1": reach}, now_s=160.0).peer == "e1"
 
 
 def test_one_lost_link_teaches_the_reach_of_all() -> None:

@@ -13,9 +13,14 @@ from typing import Any
 from fractus_core.linking import NO_LINK, Link, Phase
 
 from fractus_agent.links.addressing import link_address
+from fractus_agent.links.interfaces import neighbours
 from fractus_agent.links.pairing import LinkLost, PairingFailed, Session, ask
+from fractus_agent.redirector.netlink import NetlinkError
 
 log = logging.getLogger(__name__)
+
+SILENT_S = 0.8
+"""Who does not answer for so long may be asked at hardware that had its address before; TCP asks again after a second."""
 
 
 class Connector:
@@ -78,11 +83,15 @@ class Connector:
         self._changed(link, reason)
 
     async def _connect(self, peer: str, about: Mapping[str, Any]) -> None:
+        address = self._address_of(peer)
+        silent = asyncio.get_running_loop().call_later(SILENT_S, _ask_again, address)
         try:
-            session = await ask(self._node, peer, self._address_of(peer), self._directory, about)
+            session = await ask(self._node, peer, address, self._directory, about)
         except (PairingFailed, OSError) as error:
             self._set(NO_LINK, str(error))
             return
+        finally:
+            silent.cancel()
         try:
             self._set(Link(Phase.UP, peer, time.monotonic()), "paired")
             # Told before the farewell: over a link that is lost it takes a while, and traffic must not wait for it.
@@ -108,3 +117,10 @@ class Connector:
                 task.cancel()
             await asyncio.gather(work, keep, return_exceptions=True)
         return "the link's traffic is over"
+
+
+def _ask_again(address: IPv4Address) -> None:
+    try:
+        neighbours.forget(address)
+    except NetlinkError as error:
+        log.warning("links: the kernel does not ask again who has an address (address=%s error=%s)", address, error)

@@ -107,7 +107,7 @@ class Session:
             async with asyncio.timeout(LOSS_TIMEOUT_S):
                 await self._writer.drain()
         except (OSError, TimeoutError) as error:
-            raise LinkLost(f"the link to {self.peer} does not take messages ({error or 'time-out'})") from error
+            raise LinkLost(f"the link to {self.peer} does not take messages ({str(error) or 'time-out'})") from error
 
     async def receive(self, timeout_s: float) -> dict[str, Any]:
         """The next message.
@@ -230,7 +230,7 @@ async def ask(node: str, peer: str, address: IPv4Address, directory: Path, link:
     except ssl.SSLCertVerificationError as error:
         raise PairingFailed(f"who answers for {peer} does not have its certificate: {error.verify_message}") from error
     except (OSError, TimeoutError) as error:
-        raise PairingFailed(f"{peer} does not answer: {error or 'time-out'}") from error
+        raise PairingFailed(f"{peer} does not answer: {str(error) or 'time-out'}") from error
     session = Session(reader, writer, peer)
     try:
         if proven_node(writer) != peer:

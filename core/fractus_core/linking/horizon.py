@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from fractus_core.linking.heuristics import TargetHeuristic
-from fractus_core.linking.learning import expected
+from fractus_core.linking.learning import expected, retry_s
 from fractus_core.linking.prediction import offered, predict
 from fractus_core.linking.values import (
     Link,
@@ -125,7 +125,9 @@ def plan_link(
         The decision; the same inputs give the same one.
     """
     present = link.peer if link.phase is not Phase.NONE else ""
-    usable = [p for p in peers if p.name == present or expected(reaches, p.name).retry_s <= now_s]
+    usable = [
+        p for p in peers if p.name == present or retry_s(expected(reaches, p.name), linked=bool(present)) <= now_s
+    ]
     names = ["", *(peer.name for peer in usable)]
     positions = predict(track, settings)
     rows = [[offered(peer, expected(reaches, peer.name), at, settings) for at in positions] for peer in usable]

@@ -17,6 +17,8 @@ MARGIN = 1.02
 
 FIRST_RETRY_S, MAX_RETRY_S = 1.0, 60.0
 """A peer that does not answer is tried again after this long, doubled for each failure, and at most this long."""
+MAX_IDLE_RETRY_S = 4.0
+"""At most this long without a link: an attempt costs nothing then, and what kept the peer from answering may be gone."""
 
 
 def heard(reach: Reach, distance: float, now_s: float) -> Reach:
@@ -32,13 +34,25 @@ def lost(reach: Reach, distance: float) -> Reach:
 
 def connected(reach: Reach) -> Reach:
     """The link came up."""
-    return replace(reach, failures=0, retry_s=float("-inf"))
+    return replace(reach, failures=0)
 
 
 def failed(reach: Reach, now_s: float) -> Reach:
     """An attempt to connect failed, though the peer should be in reach."""
-    wait_s = min(FIRST_RETRY_S * 2.0 ** min(reach.failures, 16), MAX_RETRY_S)
-    return replace(reach, failures=reach.failures + 1, retry_s=now_s + wait_s)
+    return replace(reach, failures=reach.failures + 1, failed_s=now_s)
+
+
+def retry_s(reach: Reach, *, linked: bool) -> float:
+    """When the next attempt to connect may be made.
+
+    Args:
+        reach: of the peer.
+        linked: whether there is a link to another peer, or one comes up, which the attempt would end.
+    """
+    if not reach.failures:
+        return float("-inf")
+    wait_s = FIRST_RETRY_S * 2.0 ** min(reach.failures - 1, 16)
+    return reach.failed_s + min(wait_s, MAX_RETRY_S if linked else MAX_IDLE_RETRY_S)
 
 
 def measured(reach: Reach, rate: float) -> Reach:

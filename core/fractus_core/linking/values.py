@@ -97,14 +97,14 @@ class Reach:
         rate_factor: measured by offered bandwidth, well inside the reach.
         heard_s: when the peer was last heard, on the clock of `now_s`; negative infinity before.
         failures: attempts to connect that failed since the link last worked.
-        retry_s: when the next attempt may be made.
+        failed_s: when the last of them did, on the same clock.
     """
 
     range_factor: float = 1.0
     rate_factor: float = 1.0
     heard_s: float = float("-inf")
     failures: int = 0
-    retry_s: float = float("-inf")
+    failed_s: float = float("-inf")
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import socket
 import ssl
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, contextmanager
@@ -24,6 +25,8 @@ REQUEST_TIMEOUT_S = 15.0
 MAX_CONNECTIONS = 100
 _KEPT_OPEN_S = 60.0
 """Connections stay open between two changes, for less than the API server's 90 s: each costs a TLS handshake."""
+_KEEPALIVE = {"TCP_KEEPIDLE": 10, "TCP_KEEPINTVL": 5, "TCP_KEEPCNT": 3}
+"""A connection whose other side is gone without a word is found dead after 25 s."""
 _FAILURES = (aiohttp.ClientError, TimeoutError, OSError, ConfigException, Unconfigured)
 
 
@@ -186,12 +189,25 @@ class Connection:
             self._rest.pool_manager = aiohttp.ClientSession(
                 trace_configs=[no_redirects],
                 connector=aiohttp.TCPConnector(
-                    ssl=self._rest.ssl_context, limit=MAX_CONNECTIONS, keepalive_timeout=_KEPT_OPEN_S
+                    ssl=self._rest.ssl_context,
+                    limit=MAX_CONNECTIONS,
+                    keepalive_timeout=_KEPT_OPEN_S,
+                    socket_factory=_socket,
                 ),
                 cookie_jar=aiohttp.DummyCookieJar(),
                 # Looking for proxies takes a request as long as all else, so not where there are none.
                 trust_env=self._trust_env and bool(getproxies_environment()),
             )
+
+
+def _socket(address: aiohttp.AddrInfoType) -> socket.socket:
+    """One that asks the other side whether it is there: a watch sends nothing, and would not notice that it is gone."""
+    made = socket.socket(*address[:3])
+    made.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for option, value in _KEEPALIVE.items():
+        if hasattr(socket, option):
+            made.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
+    return made
 
 
 async def _refuse_redirect(

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import gzip
 import json
+import socket
 import ssl
 import sys
 from collections.abc import AsyncIterator
@@ -26,6 +27,7 @@ from fractus_kube import (
     KubeError,
     NotFound,
     Unconfigured,
+    connection,
     from_environment,
     in_cluster,
     kubeconfig,
@@ -60,6 +62,19 @@ async def test_a_request_arrives_as_it_is_and_connections_are_kept() -> None:
     assert parse_qs(target.query) == {"labelSelector": ["a=b/c,d"], "fieldManager": ["x"]}
     assert request.header("content-length") == "8"
     assert json.loads(request.body) == {"b": 2}
+
+
+async def test_a_connection_whose_other_side_is_gone_is_found_dead(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A watch sends nothing: only keepalives of TCP notice that a cable was pulled."""
+    made, real = list[socket.socket](), connection._socket
+    monkeypatch.setattr(connection, "_socket", lambda address: made.append(real(address)) or made[-1])
+    async with client_of(Server(answer({}))) as client:
+        await client.request("GET", "/apis/one")
+        (used,) = made
+        assert used.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE) == 1
+        times = [getattr(socket, f"TCP_KEEP{name}") for name in ("IDLE", "INTVL", "CNT")]
+        idle_s, interval_s, count = (used.getsockopt(socket.IPPROTO_TCP, option) for option in times)
+        assert idle_s + interval_s * count <= 30
 
 
 async def test_writes_say_who_they_are_from_and_how_they_are_meant() -> None:

@@ -8,7 +8,7 @@ import io
 import itertools
 import json
 import re
-from collections.abc import AsyncIterator, Iterable
+from collections.abc import AsyncIterator, Callable, Iterable
 from contextlib import aclosing
 from dataclasses import fields
 from pathlib import Path
@@ -21,6 +21,7 @@ from click.testing import CliRunner
 from fractus_services.recording import messages
 from fractus_services.recording.mcap_file import McapFile
 from fractus_services.recording.messages import Record
+from fractus_view import command, server
 from fractus_view.command import view
 from fractus_view.events import Event, Fix, Problem, State, Verdict
 from fractus_view.hub import RECENT, TRAIL, Hub, Trail
@@ -291,6 +292,65 @@ async def test_the_token_leaves_the_address_for_a_cookie_that_scripts_do_not_see
         assert "SameSite=Strict" in cookie
         async with session.get(address, headers={hdrs.COOKIE: cookie.partition(";")[0]}) as answer:
             assert answer.status == 200
+
+
+async def test_behind_tls_the_cookie_is_for_tls_alone(served: tuple[str, View]) -> None:
+    address, shown = served
+    async with ClientSession() as session:
+        for proto, secure in (("https", True), ("http", False)):
+            headers = {"X-Forwarded-Proto": proto}
+            async with session.get(f"{address}/?token={shown.token}", headers=headers, allow_redirects=False) as answer:
+                assert ("Secure" in answer.headers["Set-Cookie"]) is secure
+
+
+async def test_an_open_page_is_closed_to_who_knows_an_old_token(
+    served: tuple[str, View], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    address, shown = served
+    hub = shown.source = Hub()  # type: ignore[assignment]
+    monkeypatch.setattr(server, "ALIVE_S", 0.05)
+    async with ClientSession(headers={hdrs.AUTHORIZATION: f"Bearer {shown.token}"}) as session:
+        async with asyncio.timeout(20), session.get(f"{address}/stream") as answer:
+            await answer.content.readuntil(b"\n\n")
+            shown.token = "another one of chance"
+            hub.publish([fix("a", 1)])
+            assert b"fix" not in await answer.read()
+        async with session.get(f"{address}/stream") as answer:
+            assert answer.status == 401
+
+
+async def test_the_token_is_what_its_file_holds_now(
+    served: tuple[str, View], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _, shown = served
+    file = tmp_path / "token"
+    file.write_text("the first of chance\n")
+    monkeypatch.setattr(command, "TOKEN_PERIOD_S", 0.01)
+    task = asyncio.create_task(command._follow_token(file, shown))
+
+    said = ""
+
+    async def until(wanted: Callable[[], bool]) -> None:
+        nonlocal said
+        async with asyncio.timeout(20):
+            while not wanted():
+                await asyncio.sleep(0.01)
+                said += capsys.readouterr().err
+
+    try:
+        await until(lambda: shown.token == "the first of chance")
+        file.write_text("the second of chance\n")
+        await until(lambda: shown.token == "the second of chance")
+        file.write_bytes(b"\xff" * 32)
+        await until(lambda: "no one may look: " in said and "has no token" in said)
+        assert shown.token != "the second of chance"
+        file.unlink()
+        await until(lambda: "cannot be read" in said)
+        file.write_text("the third of chance\n")
+        await until(lambda: shown.token == "the third of chance")
+        await until(lambda: said.endswith("has a token again\n"))
+    finally:
+        task.cancel()
 
 
 async def test_it_only_reads_and_answers_to_no_foreign_name(served: tuple[str, View]) -> None:

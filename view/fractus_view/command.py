@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import secrets
 import signal
 from contextlib import aclosing
 from dataclasses import dataclass
@@ -20,6 +21,9 @@ from fractus_view.sources import Following, Replay, Source
 
 DEFAULT_LISTEN = "127.0.0.1:8650"
 MIN_TOKEN = 16
+TOKEN_PERIOD_S = 1.0
+"""How often a token's file is read again."""
+
 _REMEDIES = {
     0: "check the cluster and --context, or give recordings to replay",
     404: "install the chart fractus-crds",
@@ -28,12 +32,12 @@ _REMEDIES = {
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """Where to serve, by which further names, and to who knows what token; None: a new one."""
+    """Where to serve, by which further names, and to who knows the token in a file; None: a new one."""
 
     host: str
     port: int
     hostnames: tuple[str, ...]
-    token: str | None
+    token_file: Path | None
 
 
 def _listen(_context: click.Context, _option: click.Parameter, text: str) -> tuple[str, int]:
@@ -76,7 +80,7 @@ def _listen(_context: click.Context, _option: click.Parameter, text: str) -> tup
 @click.option(
     "--token-file",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="Who knows what is in it may look; else a new token is made at each start.",
+    help="Who knows what is in it now may look; else a new token is made at each start.",
 )
 def view(
     *,
@@ -96,7 +100,7 @@ def view(
     of_cluster = bool(namespace or context or config)
     if bool(recordings) + (directory is not None) + of_cluster > 1:
         raise click.UsageError("give recordings to replay, --recordings, or the options of a cluster: one of them")
-    site = Site(*listen, hostnames, None if token_file is None else _token(token_file))
+    site = Site(*listen, hostnames, token_file)
     if directory is not None:
         asyncio.run(_serve(Following(directory), site))
     elif recordings:
@@ -106,12 +110,30 @@ def view(
 
 
 def _token(path: Path) -> str:
-    token = path.read_text().strip()
+    try:
+        token = path.read_bytes().decode(errors="replace").strip()
+    except OSError as error:
+        raise click.ClickException(f"{path} cannot be read: {error.strerror or error}") from error
     if len(token) < MIN_TOKEN or not token.isascii() or not token.isprintable():
         raise click.ClickException(
             f"{path} has no token: write {MIN_TOKEN} ASCII characters or more, of chance, into it"
         )
     return token
+
+
+async def _follow_token(path: Path, shown: View) -> None:
+    """Take what the file holds now: who knows an earlier token may look no more."""
+    told = ""
+    while True:
+        await asyncio.sleep(TOKEN_PERIOD_S)
+        try:
+            shown.token, problem = _token(path), ""
+        except click.ClickException as error:
+            # None that anyone knows.
+            shown.token, problem = secrets.token_urlsafe(32), error.message
+        if problem != told:
+            click.echo(f"view: no one may look: {problem}" if problem else f"view: {path} has a token again", err=True)
+        told = problem
 
 
 def _replay(recordings: tuple[Path, ...]) -> Source:
@@ -144,8 +166,9 @@ async def _serve(source: Source, where: Site) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stopped.set)
     served = View(source, frozenset(name.lower() for name in (where.host, *where.hostnames)))
-    if where.token is not None:
-        served.token = where.token
+    given = where.token_file
+    if given is not None:
+        served.token = _token(given)
     host, port = where.host, where.port
     runner = web.AppRunner(served.application(), access_log=None, handle_signals=False, shutdown_timeout=1.0)
     await runner.setup()
@@ -160,11 +183,14 @@ async def _serve(source: Source, where: Site) -> None:
         bound = runner.addresses[0][1]
         name = f"[{host}]" if ":" in host else host
         # A token that was given is known already, and logs are read by more people.
-        said = f"?token={served.token}" if where.token is None else "?token=..."
+        said = f"?token={served.token}" if given is None else "?token=..."
         click.echo(f"view: open http://{name}:{bound}/{said}")
         if not _loopback(host):
             click.echo("view: others on this network can read what is sent, the token too: put TLS before it", err=True)
+        following = None if given is None else asyncio.create_task(_follow_token(given, served))
         await stopped.wait()
+        if following is not None:
+            following.cancel()
     finally:
         await runner.cleanup()
 

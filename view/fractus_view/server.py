@@ -54,7 +54,7 @@ class View:
     Attributes:
         source: of the events and pictures.
         names: what browsers may call the server, besides addresses and localhost.
-        token: who knows it may look.
+        token: who knows it may look; where it changes, who knows the old one may no more, on open pages within `ALIVE_S`.
         page: the directory of the built page.
     """
 
@@ -114,17 +114,21 @@ class View:
 
     @web.middleware
     async def _only_with_token(self, request: web.Request, handler: _Handler) -> web.StreamResponse:
-        cookie = _cookie(request)
         given = request.query.get("token")
         if request.path == "/" and given is not None and self._right(given):
             # From here on the token is in no address, which histories and logs keep.
             response = web.Response(status=303, headers={hdrs.LOCATION: "/"})
-            response.set_cookie(cookie, self.token, httponly=True, samesite="Strict", path="/")
+            response.set_cookie(
+                _cookie(request), self.token, httponly=True, secure=_by_tls(request), samesite="Strict", path="/"
+            )
             return response
-        bearer = request.headers.get(hdrs.AUTHORIZATION, "").removeprefix("Bearer ")
-        if request.path == HEALTH or self._right(request.cookies.get(cookie, "")) or self._right(bearer):
+        if request.path == HEALTH or self._may_look(request):
             return await handler(request)
         return web.Response(status=401, text="open the address that `fractus view` printed: it has the token\n")
+
+    def _may_look(self, request: web.Request) -> bool:
+        bearer = request.headers.get(hdrs.AUTHORIZATION, "").removeprefix("Bearer ")
+        return self._right(request.cookies.get(_cookie(request), "")) or self._right(bearer)
 
     def _right(self, token: str) -> bool:
         return hmac.compare_digest(token.encode(errors="replace"), self.token.encode())
@@ -147,7 +151,7 @@ class View:
         self._streams.add(place)
         try:
             await response.prepare(request)
-            await self._send(response, request.headers.get("Last-Event-ID", ""))
+            await self._send(request, response)
         except (ConnectionError, TimeoutError):
             # It is gone, or too slow: it comes back and says what it heard last.
             if request.transport is not None:
@@ -156,14 +160,14 @@ class View:
             self._streams.discard(place)
         return response
 
-    async def _send(self, response: web.StreamResponse, last_id: str) -> None:
-        messages = self.source.stream(last_id)
+    async def _send(self, request: web.Request, response: web.StreamResponse) -> None:
+        messages = self.source.stream(request.headers.get("Last-Event-ID", ""))
         pending = asyncio.ensure_future(anext(messages, None))
         try:
             while True:
                 done, _ = await asyncio.wait({pending}, timeout=ALIVE_S)
                 said = pending.result() if done else b":\n\n"
-                if said is None:
+                if said is None or not self._may_look(request):
                     return
                 if done:
                     pending = asyncio.ensure_future(anext(messages, None))
@@ -182,6 +186,11 @@ def _cookie(request: web.Request) -> str:
     """Its name has the port, for browsers give cookies to all servers of a host."""
     _, _, port = request.headers.get(hdrs.HOST, "").rpartition(":")
     return f"fractus-view-{port if port.isdecimal() else 80}"
+
+
+def _by_tls(request: web.Request) -> bool:
+    """Whether the browser speaks TLS with who stands before this server; who says so wrongly spoils its own cookie."""
+    return request.secure or request.headers.get("X-Forwarded-Proto", "").lower() == "https"
 
 
 def _ours(host: str, names: frozenset[str]) -> bool:

@@ -7,10 +7,11 @@ import math
 import time
 from collections.abc import Iterator
 from datetime import UTC, datetime
+from functools import partial
 from typing import TYPE_CHECKING
 
 from fractus_core.api.nodes import direct_interface
-from fractus_observe.exposition import Observed, serving, text_of
+from fractus_observe.exposition import LastRead, Observed, serving, text_of
 from prometheus_client import CollectorRegistry
 
 from fractus_agent.cluster.store import Object, Store
@@ -73,6 +74,7 @@ class Agent:
             wall=_now,
             monotonic=time.monotonic,
         )
+        self._heads = LastRead(partial(audit_heads, settings.audit))
         self._supervisor = Supervisor()
         self._supervisor.add("watchdog", guard)
         self._supervisor.add("grants", self._keeper.follow)
@@ -98,7 +100,7 @@ class Agent:
 
     def _figures(self) -> Iterator[Metric]:
         """What Prometheus is told."""
-        heads = (head.split(":") for head in audit_heads(self._settings.audit))
+        heads = (head.split(":") for head in self._heads())
         yield from AgentFigures(
             expires_s=self._identity.expires_s,
             heard_s=self._store.heard_s(),

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import socket
+import threading
 from collections.abc import AsyncIterator, Callable, Iterable, Mapping
 from contextlib import asynccontextmanager
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 from prometheus_client import CollectorRegistry, disable_created_metrics
 from prometheus_client.core import GaugeMetricFamily, Metric
@@ -23,6 +25,9 @@ MAX_CONNECTIONS = 4
 PAUSE_S = 0.05
 """Between two that are accepted: a client that asks without end gets 20 answers a second, and the loop has the rest of its time."""
 REQUEST_TIMEOUT_S = 5.0
+RETRY_S = 1.0
+"""After which an address that was taken is tried again; twice as long each time, up to the next."""
+MAX_RETRY_S = 60.0
 MAX_REQUEST_BYTES = 8192
 
 # When a figure began says nothing that a restart does not.
@@ -42,6 +47,35 @@ class Observed:
     def collect(self) -> Iterable[Metric]:
         """The figures as they are now."""
         return self._figures()
+
+
+T = TypeVar("T")
+
+
+class LastRead(Generic[T]):
+    """A figure on disk, for an event loop that must not wait for one: a call tells what was read last, and has it read again.
+
+    Args:
+        read: reads it; called in a thread, and here once.
+    """
+
+    def __init__(self, read: Callable[[], T]) -> None:
+        self._read = read
+        self._last = read()
+        self._reading: threading.Thread | None = None
+
+    def __call__(self) -> T:
+        """What was read last; a reading that hangs is not begun a second time."""
+        if self._reading is None or not self._reading.is_alive():
+            self._reading = threading.Thread(target=self._again, name="figures", daemon=True)
+            self._reading.start()
+        return self._last
+
+    def _again(self) -> None:
+        try:
+            self._last = self._read()
+        except Exception:
+            LOG.exception("metrics: a figure cannot be read")
 
 
 def gauge(name: str, text: str, value: float | Mapping[str, float], label: str = "") -> Metric:
@@ -66,40 +100,64 @@ def text_of(*registries: CollectorRegistry) -> bytes:
 
 @asynccontextmanager
 async def serving(listen: str, text: Callable[[], bytes]) -> AsyncIterator[None]:
-    """Answer GET /metrics meanwhile; an address that cannot be bound costs the metrics and nothing else.
+    """Answer GET /metrics meanwhile; an address that is taken is tried again, and costs the metrics and nothing else.
 
     Args:
         listen: HOST:PORT, all addresses where the host is empty; empty: nowhere.
         text: makes the answer, in this event loop, which is where the figures are.
     """
-    server = _bound(listen) if listen else None
-    if server is None:
+    if not listen:
         yield
         return
-    accepting = asyncio.create_task(_accept(server, text))
+    server = None
+    try:
+        server = _bound(listen)
+    except ValueError as error:
+        LOG.warning("metrics: not served (address=%s error=%s)", listen, error)
+        yield
+        return
+    except OSError as error:
+        LOG.warning("metrics: not served until the address can be bound (address=%s error=%s)", listen, error)
+    answering = asyncio.create_task(_answer_all(server, listen, text))
     try:
         yield
     finally:
-        accepting.cancel()
-        await asyncio.gather(accepting, return_exceptions=True)
-        server.close()
+        answering.cancel()
+        await asyncio.gather(answering, return_exceptions=True)
+        if server is not None:
+            server.close()
 
 
-def _bound(listen: str) -> socket.socket | None:
+def _bound(listen: str) -> socket.socket:
+    """A socket that listens.
+
+    Raises:
+        OSError: the address cannot be bound now.
+        ValueError: it is none.
+    """
     host, _, port = listen.rpartition(":")
-    try:
-        if host:
-            family, _, _, _, address = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_STREAM)[0]
-            server = socket.create_server(address, family=family)
-        elif socket.has_dualstack_ipv6():
-            server = socket.create_server(("", int(port)), family=socket.AF_INET6, dualstack_ipv6=True)
-        else:
-            server = socket.create_server(("", int(port)))
-    except (OSError, ValueError) as error:
-        LOG.warning("metrics: not served (address=%s error=%s)", listen, error)
-        return None
+    if host:
+        family, _, _, _, address = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_STREAM)[0]
+        server = socket.create_server(address, family=family)
+    elif socket.has_dualstack_ipv6():
+        server = socket.create_server(("", int(port)), family=socket.AF_INET6, dualstack_ipv6=True)
+    else:
+        server = socket.create_server(("", int(port)))
     server.setblocking(False)
     return server
+
+
+async def _answer_all(server: socket.socket | None, listen: str, text: Callable[[], bytes]) -> None:
+    """Answer at a socket, or at the address once it can be bound."""
+    delay_s = RETRY_S
+    while server is None:
+        await asyncio.sleep(delay_s)
+        delay_s = min(2 * delay_s, MAX_RETRY_S)
+        with contextlib.suppress(OSError):
+            server = _bound(listen)
+            LOG.info("metrics: served (address=%s)", listen)
+    with server:
+        await _accept(server, text)
 
 
 async def _accept(server: socket.socket, text: Callable[[], bytes]) -> None:

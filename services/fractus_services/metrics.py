@@ -10,7 +10,6 @@ from fractus_storage.audit import AuditLog
 from prometheus_client import CollectorRegistry, Counter
 from prometheus_client.core import Metric
 
-from fractus_services.auth import TlsFiles
 from fractus_services.grants import GrantFiles
 
 MAX_POLICIES = 200
@@ -88,17 +87,17 @@ class ServiceMetrics:
 
 
 def common_figures(
-    tls: TlsFiles, grants: GrantFiles, audit: AuditLog, recording_problem: Callable[[], str]
+    expiry: Callable[[], float | None], grants: GrantFiles, audit: AuditLog, recording_problem: Callable[[], str]
 ) -> Iterator[Metric]:
     """What holds of any service now.
 
     Args:
-        tls: its certificate.
+        expiry: Unix time at which its certificate expires; None while that is not known.
         grants: of its node.
         audit: its audit log.
         recording_problem: why nothing is recorded that should be; empty while it is.
     """
-    expires_s = tls.expires_s()
+    expires_s = expiry()
     if expires_s is not None:
         yield gauge(CERTIFICATE_EXPIRY, "When the node's certificate expires, in Unix time.", expires_s)
     yield gauge("fractus_grants", "Grants in force.", len(grants.active))

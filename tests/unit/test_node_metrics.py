@@ -18,7 +18,6 @@ from fractus_agent.metrics import AgentFigures
 from fractus_agent.redirector.nft import Endpoint
 from fractus_core.linking import NO_LINK, PathMetrics, Peer
 from fractus_observe.exposition import Observed, text_of
-from fractus_services.auth import TlsFiles
 from fractus_services.grants import GrantFiles
 from fractus_services.metrics import MAX_POLICIES, DecisionMetrics, ServiceMetrics, common_figures
 from fractus_services.mobility.rpc.figures import flight_figures
@@ -76,9 +75,8 @@ def test_the_mobility_service_tells_what_is_documented(tmp_path: Path) -> None:
     metrics = ServiceMetrics()
     audit = AuditLog(tmp_path / "audit.jsonl", lambda: 1_780_000_000.0, copied=metrics.take_entry)
     grants = cast(GrantFiles, SimpleNamespace(active={"a": None, "b": None}))
-    tls = cast(TlsFiles, SimpleNamespace(expires_s=lambda: 2e9))
     problem = [""]
-    metrics.observe(lambda: common_figures(tls, grants, audit, lambda: problem[0]))
+    metrics.observe(lambda: common_figures(lambda: 2e9, grants, audit, lambda: problem[0]))
     for kind in ("call", "takeover", "monitor"):
         audit.append(kind, {"action": "deny", "code": "Code", "policies": ["p"], "controller": "system"})
     asyncio.run(audit.close())

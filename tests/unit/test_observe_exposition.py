@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import socket
+import threading
+import time
 from collections.abc import Iterator
 
 import pytest
 from exposed import get, values
 from fractus_cluster.ports import free_port
 from fractus_observe import exposition
-from fractus_observe.exposition import MAX_CONNECTIONS, Observed, gauge, serving, text_of
+from fractus_observe.exposition import MAX_CONNECTIONS, LastRead, Observed, gauge, serving, text_of
 from prometheus_client import CollectorRegistry
 from prometheus_client.core import Metric
 
@@ -75,3 +79,50 @@ async def test_an_address_that_cannot_be_bound_costs_the_metrics_alone(
 async def test_without_an_address_nothing_is_served() -> None:
     async with serving("", text):
         assert len(asyncio.all_tasks()) == 1
+
+
+async def test_a_taken_address_is_tried_again_and_told_of_once(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(exposition, "RETRY_S", 0.05)
+    monkeypatch.setattr(exposition, "MAX_RETRY_S", 0.05)
+    port = free_port()
+    taken = socket.create_server(("127.0.0.1", port))
+    async with serving(f"127.0.0.1:{port}", text):
+        await asyncio.sleep(0.3)
+        taken.close()
+        async with asyncio.timeout(10):
+            while True:
+                with contextlib.suppress(ConnectionError):
+                    assert "200" in (await get(port))[0]
+                    break
+                await asyncio.sleep(0.05)
+    assert len([record for record in caplog.records if record.levelname == "WARNING"]) == 1
+
+
+async def test_no_address_is_told_of_and_left_alone(caplog: pytest.LogCaptureFixture) -> None:
+    async with serving("nowhere:at-all", text):
+        assert "not served" in caplog.text
+
+
+def test_a_figure_on_disk_keeps_no_one_waiting() -> None:
+    hangs, found = threading.Event(), [1.0]
+
+    def read() -> float:
+        hangs.wait(10)
+        return found[0]
+
+    hangs.set()
+    figure = LastRead(read)
+    assert figure() == 1.0
+    hangs.clear()
+    found[0] = 2.0
+    before = threading.active_count()
+    for _ in range(5):
+        figure()
+    assert threading.active_count() <= before + 1
+    hangs.set()
+    deadline = time.monotonic() + 10
+    while figure() != 2.0 and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert figure() == 2.0

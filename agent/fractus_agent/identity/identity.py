@@ -104,8 +104,8 @@ class Identity:
 
     @property
     def expires_s(self) -> float | None:
-        """Unix time at which the certificate expires; None while there is none."""
-        validity = self._validity()
+        """Unix time at which the certificate expires, as last seen by what keeps it usable; None while there is none."""
+        validity = self._known[1] if self._known is not None else None
         return validity.not_after.timestamp() if validity is not None else None
 
     async def run(self) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 
 from fractus_core.api.nodes import Drone, EdgeNode
 from fractus_core.policy.lenses import lens_of
-from fractus_observe.exposition import gauge, serving
+from fractus_observe.exposition import LastRead, gauge, serving
 from fractus_proto.v1 import camera_pb2_grpc
 from fractus_storage.audit import AuditLog
 from prometheus_client.core import Metric
@@ -103,7 +103,7 @@ async def run(options: CameraOptions, stop: asyncio.Event) -> None:
         lambda: [owner_of(grant) for grant in grants.active.values()],
         added=recorder.take_picture,
     )
-    metrics.observe(partial(common_figures, tls, grants, audit, lambda: recorder.problem))
+    metrics.observe(partial(common_figures, LastRead(tls.expires_s), grants, audit, lambda: recorder.problem))
     watched = _Watched()
     metrics.observe(watched.figures)
     async with serving(options.metrics, metrics.text):

@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any
 
 from fractus_core.api.nodes import Drone
-from fractus_observe.exposition import serving
+from fractus_observe.exposition import LastRead, serving
 from fractus_proto.v1 import mobility_pb2_grpc
 from fractus_storage.audit import AuditLog
 
@@ -147,7 +147,7 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
     running = [autopilot.run(), grants.run(), monitor.run(), monitor.record(), tours.run(), calls]
     if not options.autopilot:
         running.append(_follow(description, url, heard))
-    metrics.observe(partial(common_figures, tls, grants, audit, lambda: recorder.problem))
+    metrics.observe(partial(common_figures, LastRead(tls.expires_s), grants, audit, lambda: recorder.problem))
     metrics.observe(partial(flight_figures, control, parts.supervisor))
     try:
         async with serving(options.metrics, metrics.text):

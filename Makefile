@@ -40,6 +40,13 @@ scenario-field: env ## Fly the field experiment and leave its report in out/fiel
 scenario-links: packages uv ## Fly past edge nodes with WiFi on an embedded cluster and leave the report in out/links (FACTOR=1: real by declared range)
 	$(UV) run --frozen --extra sim python -m fractus_sim.scenarios.links --out $(OUT)/links --factor $(or $(FACTOR),1)
 
+SEEDS ?= 1
+MINUTES ?= 5
+.PHONY: chaos
+chaos: packages uv ## Fly missions on an embedded cluster while its parts fail (SEEDS=20 MINUTES=30 FIRST=1), report in out/chaos
+	$(UV) run --frozen --extra sim python -m fractus_sim.chaos --seeds $(SEEDS) --minutes $(MINUTES) \
+		--first-seed $(or $(FIRST),1) --out $(OUT)/chaos
+
 .PHONY: compare-vehicle
 compare-vehicle: env ## Play the script of a real ArduCopter's answers on the simulated vehicle (AUTOPILOT=tcp:HOST:PORT: on that one)
 	PYTHONPATH=tests/unit $(RUN) python tests/unit/vehicle_script.py --all $(if $(AUTOPILOT),--autopilot $(AUTOPILOT))

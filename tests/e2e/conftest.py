@@ -19,6 +19,7 @@ import yaml
 from fractus_cluster.binaries import ensure_binaries
 from fractus_cluster.cluster import Cluster
 from fractus_cluster.images.build import build_images
+from fractus_sim.chaos.missions import flight
 from fractus_sim.demo.clusters import EXAMPLE_NODES, assign
 from kubectl import Kube, Object, condition
 
@@ -133,14 +134,4 @@ def example(name: str) -> list[Object]:
 
 def short_flight(name: str, namespace: str = "default") -> Object:
     """The example's Navigator alone, on a short path that stays near the depot: about a minute in the air."""
-    app = example("application.yaml")[0]
-    navigator = next(c for c in app["spec"]["components"] if c["name"] == "Navigator")
-    navigator["controlPoints"][0]["path"] = [
-        {"lat": 50.864239, "lon": 4.679068, "alt": 12},
-        {"lat": 50.864800, "lon": 4.679300, "alt": 12},
-        {"lat": 50.865228, "lon": 4.679352, "alt": 12},
-    ]
-    navigator["container"].pop("env", None)
-    app["metadata"] = {"name": name, "namespace": namespace}
-    app["spec"]["components"] = [navigator]
-    return app
+    return flight(name, namespace)

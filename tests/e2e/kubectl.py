@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import yaml
+from fractus_sim.chaos import processes
 
 Object = dict[str, Any]
 
@@ -109,34 +110,8 @@ class Kube:
 
     def kill_pod(self, pod: Object) -> None:
         """SIGKILL every process of a pod's containers, as a crash would; the sandbox stays."""
-        killed = [pid for pid in processes_of(pod["metadata"]["uid"]) if _killed(pid)]
-        if not killed:
+        if not processes.tell(processes.of_pod(pod["metadata"]["uid"]), signal.SIGKILL):
             raise CommandFailed(f"pod {pod['metadata']['name']} has no processes to kill")
-
-
-def processes_of(pod_uid: str) -> list[int]:
-    """Processes on this machine that belong to a pod's containers, without its pause process."""
-    marks = (pod_uid, pod_uid.replace("-", "_"))
-    found = []
-    for entry in pathlib.Path("/proc").iterdir():
-        if not entry.name.isdigit():
-            continue
-        try:
-            cgroups = (entry / "cgroup").read_text()
-            command = (entry / "cmdline").read_bytes()
-        except OSError:
-            continue
-        if any(mark in cgroups for mark in marks) and command and not command.split(b"\0")[0].endswith(b"pause"):
-            found.append(int(entry.name))
-    return found
-
-
-def _killed(pid: int) -> bool:
-    try:
-        os.kill(pid, signal.SIGKILL)
-    except ProcessLookupError:
-        return False
-    return True
 
 
 def condition(obj: Object | None, type_: str) -> Mapping[str, Any]:

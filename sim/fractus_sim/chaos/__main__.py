@@ -1,0 +1,96 @@
+"""`python -m fractus_sim.chaos`: missions on an embedded cluster while its parts fail."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import click
+from fractus_cluster.binaries import ensure_binaries
+from fractus_cluster.cluster import Cluster
+from fractus_cluster.errors import ClusterError
+from fractus_cluster.images.build import build_images
+
+from fractus_sim.chaos.faults import FAULTS
+from fractus_sim.chaos.report import page
+from fractus_sim.chaos.run import Run, Task, fly
+from fractus_sim.chaos.stage import Stage
+from fractus_sim.chaos.watching import Watch
+from fractus_sim.demo.clusters import EXAMPLE, ROOT, TARGETS, documents
+from fractus_sim.demo.kube import DemoError, Kube
+from fractus_sim.demo.watch import wait_ready
+from fractus_sim.experiment.errors import ExperimentError
+from fractus_sim.interruption import break_off_on_signals, uninterrupted
+from fractus_sim.report.page import write_page
+
+CLUSTER = "chaos"
+DRONE = "drone-1"
+VEHICLE_PORT = 5760
+READY_TIMEOUT_S = 180.0
+
+
+def say(line: str) -> None:
+    """Tell what happens, a line at a time."""
+    click.echo(line, err=True)
+
+
+@contextmanager
+def embedded(keep: bool) -> Iterator[Stage]:
+    """A cluster of its own with Fractus and a drone that is ready; taken down at the end.
+
+    Raises:
+        ClusterError: it does not come up.
+        DemoError: Fractus does not.
+    """
+    images = build_images(ROOT, targets=TARGETS, report=say)
+    cluster = Cluster.load(ROOT / "examples" / "clusters" / "demo.yaml", name=CLUSTER, report=say)
+    try:
+        cluster.up(images=images)
+        programs = ensure_binaries(("kubectl", "helm"), report=say)
+        kube = Kube(programs["kubectl"], programs["helm"], cluster.kubeconfig)
+        for release in ("fractus-crds", "fractus"):
+            kube.install(release, ROOT / "charts" / release)
+        kube.apply(
+            [body for name in ("depot.yaml", "zones.yaml", "policies.yaml") for body in documents(EXAMPLE / name)]
+        )
+        wait_ready(kube, READY_TIMEOUT_S, lambda _line: None)
+        yield Stage(cluster, kube, DRONE)
+    finally:
+        if not keep:
+            with uninterrupted():
+                cluster.down()
+
+
+@click.command()
+@click.option("--seeds", default=1, show_default=True, help="How many runs.")
+@click.option("--first-seed", default=1, show_default=True, help="Seed of the first; each other has the next.")
+@click.option("--minutes", default=5.0, show_default=True, help="How long faults happen in each.")
+@click.option("--fault", "kinds", multiple=True, type=click.Choice(sorted(FAULTS)), help="Only these; all by default.")
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("out/chaos"), show_default=True)
+@click.option("--keep", is_flag=True, help="Leave the cluster as it is at the end.")
+def chaos(*, seeds: int, first_seed: int, minutes: float, kinds: tuple[str, ...], out: Path, keep: bool) -> None:
+    """Fly missions while the cluster's parts fail by the schedule of a seed, and judge what must hold."""
+    break_off_on_signals()
+    out.mkdir(parents=True, exist_ok=True)
+    runs: list[Run] = []
+    try:
+        with embedded(keep) as stage:
+            namespace = stage.node.wiring.namespace_path(DRONE)
+            with Watch(namespace, VEHICLE_PORT, stage.state / "grants") as watch:
+                for seed in range(first_seed, first_seed + seeds):
+                    runs.append(fly(stage, watch, Task(seed, minutes * 60, kinds or sorted(FAULTS)), say))
+                    write_page(out, page(runs, minutes * 60))
+    except (ClusterError, DemoError, ExperimentError) as error:
+        click.echo(f"chaos: {error}", err=True)
+        sys.exit(1)
+    broken = [(run.seed, each) for run in runs for each in run.broken]
+    for seed, each in broken:
+        click.echo(f"seed {seed}: {each.invariant}: {each.found}")
+    click.echo(f"{len(runs)} runs, {len(broken)} times an invariant was broken; report: {out}/summary.md")
+    sys.exit(1 if broken else 0)
+
+
+if __name__ == "__main__":
+    chaos(prog_name="python -m fractus_sim.chaos")

@@ -1,0 +1,123 @@
+"""An API server that is refused, silent, slow, or has too much to do."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from fractus_cluster.controlplane import API_PORT
+from fractus_core.documents import dump_documents
+
+from fractus_sim.chaos import processes
+
+SLOW_S = 2.0
+_QUICK_S = 0.4
+_TIMEOUT_S = 20.0
+_NAME = "fractus-chaos"
+RULES = (
+    f"flowschemas.flowcontrol.apiserver.k8s.io/{_NAME}",
+    f"prioritylevelconfigurations.flowcontrol.apiserver.k8s.io/{_NAME}",
+)
+"""The objects of `too_many_requests`, as kubectl names them."""
+
+
+def too_many_requests() -> str:
+    """Manifests after which the API server answers 429 to every account of Fractus."""
+    api = "flowcontrol.apiserver.k8s.io/v1"
+    level = {
+        "apiVersion": api, "kind": "PriorityLevelConfiguration", "metadata": {"name": _NAME},
+        "spec": {"type": "Limited", "limited": {
+            "nominalConcurrencyShares": 0, "lendablePercent": 0, "borrowingLimitPercent": 0,
+            "limitResponse": {"type": "Reject"},
+        }},
+    }  # fmt: skip
+    who = {"kind": "Group", "group": {"name": "system:serviceaccounts:fractus-system"}}
+    every = {
+        "verbs": ["*"], "apiGroups": ["*"], "resources": ["*"], "clusterScope": True, "namespaces": ["*"]
+    }  # fmt: skip
+    flow = {
+        "apiVersion": api, "kind": "FlowSchema", "metadata": {"name": _NAME},
+        "spec": {
+            "priorityLevelConfiguration": {"name": _NAME}, "matchingPrecedence": 1,
+            "rules": [{"subjects": [who], "resourceRules": [every]}],
+        },
+    }  # fmt: skip
+    return dump_documents([level, flow])
+
+
+@contextmanager
+def refused(namespace: Path) -> Iterator[None]:
+    """Every connection to the API server is reset."""
+    rule = f"tcp dport {API_PORT} reject with tcp reset"
+    with _table(namespace, "fractus_chaos_down", f"chain c {{ type filter hook input priority -300; {rule}; }}"):
+        yield
+
+
+@contextmanager
+def silenced(namespace: Path) -> Iterator[int]:
+    """The connections of now get no more answers, new ones do; yields how many they are."""
+    peers = sorted(_peers(namespace))
+    if not peers:
+        yield 0
+        return
+    rule = f"tcp sport {API_PORT} ip daddr . tcp dport @peers drop"
+    content = (
+        f"set peers {{ type ipv4_addr . inet_service; elements = {{ {', '.join(peers)} }}; }}\n"
+        f"chain c {{ type filter hook output priority -300; {rule}; }}"
+    )
+    with _table(namespace, "fractus_chaos_silent", content):
+        yield len(peers)
+
+
+@contextmanager
+def slowed(pids: Callable[[], list[int]]) -> Iterator[None]:
+    """Stop the API server for two seconds again and again."""
+    over = threading.Event()
+
+    def hold() -> None:
+        while not over.is_set():
+            processes.tell(pids(), signal.SIGSTOP)
+            over.wait(SLOW_S)
+            processes.tell(pids(), signal.SIGCONT)
+            over.wait(_QUICK_S)
+
+    holder = threading.Thread(target=hold, daemon=True)
+    holder.start()
+    try:
+        yield
+    finally:
+        over.set()
+        holder.join(_TIMEOUT_S)
+        processes.tell(pids(), signal.SIGCONT)
+
+
+@contextmanager
+def _table(namespace: Path, name: str, content: str) -> Iterator[None]:
+    _run(namespace, ["nft", "-f", "-"], f"table inet {name} {{\n{content}\n}}\n")
+    try:
+        yield
+    finally:
+        _run(namespace, ["nft", "delete", "table", "inet", name])
+
+
+def _peers(namespace: Path) -> set[str]:
+    """Established connections to the API server, as elements of a set: address . port."""
+    listed = _run(namespace, ["ss", "-Htn", "state", "established", f"( sport = :{API_PORT} )"])
+    found = set()
+    for line in listed.splitlines():
+        address, _, port = line.split()[-1].rpartition(":")
+        address = address.strip("[]").removeprefix("::ffff:")
+        if ":" not in address:
+            found.add(f"{address} . {port}")
+    return found
+
+
+def _run(namespace: Path, command: list[str], text: str = "") -> str:
+    done = subprocess.run(
+        ["nsenter", f"--net={namespace}", *command], input=text, capture_output=True, text=True, timeout=_TIMEOUT_S, check=True
+    )  # fmt: skip
+    return done.stdout

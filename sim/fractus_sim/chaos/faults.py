@@ -1,0 +1,248 @@
+"""The faults: each breaks something, says what, and makes it good again when it is left."""
+
+from __future__ import annotations
+
+import random
+import resource
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Generator, Mapping
+from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import dataclass
+
+from fractus_core.api.names import CLASS_LABEL
+
+from fractus_sim.chaos import apiserver, processes
+from fractus_sim.chaos.stage import Stage
+from fractus_sim.demo.kube import NAMESPACE, SYSTEM, DemoError
+
+Breaking = Generator[str, None, None]
+
+_HEAL_TIMEOUT_S = 180.0
+_RETRY_S = 1.0
+_RECONCILE_S = 4.0
+_JOIN_S = 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """A kind of fault.
+
+    Attributes:
+        breaks: breaks a stage, yields what it did, and heals it afterwards.
+        shortest_s: of its duration; 0 for what is over at once.
+        longest_s: the same.
+    """
+
+    breaks: Callable[[Stage, random.Random], Breaking]
+    shortest_s: float = 0.0
+    longest_s: float = 0.0
+
+
+def broken(fault: Fault, stage: Stage, chance: random.Random) -> AbstractContextManager[str]:
+    """The fault as a context.
+
+    Raises:
+        DemoError: there is nothing to break, or the API server refuses it.
+    """
+    return contextmanager(fault.breaks)(stage, chance)
+
+
+def _kill_operator(stage: Stage, chance: random.Random) -> Breaking:
+    """SIGKILL of who leads; every other time at a random step after the next Application is there."""
+    when = "at a random moment"
+    if chance.random() < 0.5 and stage.applied.wait(20.0):
+        time.sleep(chance.uniform(0, _RECONCILE_S))
+        when = "while it reconciles"
+    pod = stage.leader()
+    processes.tell(processes.of_pod(pod["metadata"]["uid"]), signal.SIGKILL)
+    yield f"killed {pod['metadata']['name']} {when}"
+
+
+def _kill_process(stage: Stage, chance: random.Random) -> Breaking:
+    component = chance.choice(["agent", "mobility", "camera", "driver"])
+    if component == "driver":
+        pods = stage.objects("pods", "-n", NAMESPACE, "-l", "fractus.dev/component=Navigator")
+        running = [pod for pod in pods if pod["status"].get("phase") == "Running"]
+        if not running:
+            raise DemoError("no driver runs")
+        pod = running[0]
+    else:
+        pod = stage.system_pod(component, stage.drone)
+    processes.tell(processes.of_pod(pod["metadata"]["uid"]), signal.SIGKILL)
+    yield f"killed {pod['metadata']['name']}"
+
+
+def _api_down(stage: Stage, _chance: random.Random) -> Breaking:
+    with apiserver.refused(stage.control_plane):
+        processes.tell(stage.program("kube-apiserver"), signal.SIGKILL)
+        yield "the API server is down"
+
+
+def _silent_watches(stage: Stage, _chance: random.Random) -> Breaking:
+    with apiserver.silenced(stage.control_plane) as count:
+        yield f"{count} connections to the API server are silent"
+
+
+def _slow_api(stage: Stage, _chance: random.Random) -> Breaking:
+    with apiserver.slowed(lambda: stage.program("kube-apiserver")):
+        yield f"the API server answers after {apiserver.SLOW_S:g} s"
+
+
+def _too_many_requests(stage: Stage, _chance: random.Random) -> Breaking:
+    try:
+        stage.kube.run("apply", "-f", "-", stdin=apiserver.too_many_requests(), timeout_s=20.0)
+        yield "the API server answers 429 to Fractus"
+    finally:
+        _until_done(lambda: stage.kubectl("delete", "--ignore-not-found", *apiserver.RULES))
+
+
+def _conflicts(stage: Stage, _chance: random.Random) -> Breaking:
+    """Writes all the time what others write, so that their writes meet a newer version: 409."""
+    over = threading.Event()
+    kinds = "applications.fractus.dev,deploymentplans.fractus.dev,grants.fractus.dev,drones.fractus.dev"
+
+    def write() -> None:
+        count = 0
+        while not over.is_set():
+            count += 1
+            with suppress(DemoError):
+                stage.kubectl("annotate", kinds, "--all", "-A", f"fractus-chaos={count}", "--overwrite")
+
+    writer = threading.Thread(target=write, daemon=True)
+    writer.start()
+    try:
+        yield "every object of Fractus is written all the time"
+    finally:
+        over.set()
+        writer.join(_JOIN_S)
+
+
+def _restart_etcd(stage: Stage, _chance: random.Random) -> Breaking:
+    processes.tell(stage.program("etcd"), signal.SIGKILL)
+    yield "killed etcd, which starts again"
+
+
+def _stop_kubelet(stage: Stage, chance: random.Random) -> Breaking:
+    node = _some_node(stage, chance)
+    processes.tell(stage.program("kubelet", node), signal.SIGSTOP)
+    try:
+        yield f"the kubelet of {node} hangs"
+    finally:
+        processes.tell(stage.program("kubelet", node), signal.SIGCONT)
+
+
+def _power_off(stage: Stage, chance: random.Random) -> Breaking:
+    node = _some_node(stage, chance)
+    stage.cluster.set_power(node, on=False)
+    try:
+        yield f"{node} has no power"
+    finally:
+        stage.cluster.set_power(node, on=True)
+
+
+def _cut_link(stage: Stage, chance: random.Random) -> Breaking:
+    node = stage.cluster.node(_some_node(stage, chance))
+    node.cut_link()
+    try:
+        yield f"the link of {node.name} is cut"
+    finally:
+        node.heal_link()
+
+
+def _delete_pod(stage: Stage, chance: random.Random) -> Breaking:
+    pods = [*stage.objects("pods", "-n", NAMESPACE), *stage.objects("pods", "-n", SYSTEM)]
+    pod = chance.choice(sorted(pods, key=lambda body: str(body["metadata"]["name"])))["metadata"]
+    stage.kubectl("delete", "pod", pod["name"], "-n", pod["namespace"], "--force", "--grace-period=0", "--wait=false")
+    yield f"deleted pod {pod['name']} by force"
+
+
+def _drain(stage: Stage, chance: random.Random) -> Breaking:
+    node = _some_node(stage, chance)
+    try:
+        drained = "drained"
+        try:
+            stage.kube.run(
+                "drain",
+                node,
+                "--ignore-daemonsets",
+                "--delete-emptydir-data",
+                "--force",
+                "--timeout=10s",
+                timeout_s=30.0,
+            )
+        except DemoError as error:
+            drained = f"tried to drain ({str(error)[-120:]})"
+        yield f"{drained} {node}"
+    finally:
+        _until_done(lambda: stage.kubectl("uncordon", node))
+
+
+def _take_label(stage: Stage, _chance: random.Random) -> Breaking:
+    stage.kubectl("label", "node", stage.drone, f"{CLASS_LABEL}-")
+    try:
+        yield f"{stage.drone} lost its label {CLASS_LABEL}"
+    finally:
+        _until_done(lambda: stage.kubectl("label", "node", stage.drone, f"{CLASS_LABEL}=drone", "--overwrite"))
+
+
+def _fill_disk(stage: Stage, _chance: random.Random) -> Breaking:
+    """No file of agent and services may grow: what they write fails, as on a full disk, with another error number."""
+    pods = [stage.system_pod(component, stage.drone) for component in ("agent", "mobility", "camera")]
+    pids = [pid for pod in pods for pid in processes.of_pod(pod["metadata"]["uid"])]
+    _limit_files(pids, 0)
+    try:
+        yield "the disk takes nothing from agent and services of the drone"
+    finally:
+        _limit_files(pids, resource.RLIM_INFINITY)
+
+
+def _limit_files(pids: list[int], size: int) -> None:
+    for pid in pids:
+        with suppress(ProcessLookupError):
+            resource.prlimit(pid, resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
+
+
+def _some_node(stage: Stage, chance: random.Random) -> str:
+    """The drone's node as often as any other."""
+    others = [node.name for node in stage.cluster.spec.nodes if node.name != stage.drone]
+    return stage.drone if chance.random() < 0.5 else chance.choice(others)
+
+
+def _until_done(heal: Callable[[], object]) -> None:
+    """Try again while the API server cannot be had, for another fault may have taken it.
+
+    Raises:
+        DemoError: it could not be done in time.
+    """
+    deadline = time.monotonic() + _HEAL_TIMEOUT_S
+    while True:
+        try:
+            heal()
+        except (DemoError, subprocess.SubprocessError):
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(_RETRY_S)
+        else:
+            return
+
+
+FAULTS: Mapping[str, Fault] = {
+    "operator-kill": Fault(_kill_operator),
+    "process-kill": Fault(_kill_process),
+    "api-down": Fault(_api_down, 10, 600),
+    "api-slow": Fault(_slow_api, 10, 120),
+    "api-429": Fault(_too_many_requests, 10, 120),
+    "api-409": Fault(_conflicts, 10, 60),
+    "watch-silent": Fault(_silent_watches, 20, 300),
+    "etcd-restart": Fault(_restart_etcd),
+    "kubelet-hang": Fault(_stop_kubelet, 10, 120),
+    "power-off": Fault(_power_off, 5, 60),
+    "link-cut": Fault(_cut_link, 10, 300),
+    "pod-delete": Fault(_delete_pod),
+    "drain": Fault(_drain, 5, 30),
+    "label-removal": Fault(_take_label, 5, 30),
+    "disk-full": Fault(_fill_disk, 10, 60),
+}

@@ -1,0 +1,64 @@
+"""Processes on this machine by what they belong to: the containers of a pod, or a program of the embedded cluster."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+
+def of_pod(uid: str) -> list[int]:
+    """Processes of a pod's containers, without its pause process."""
+    marks = (uid, uid.replace("-", "_"))
+    return [
+        pid
+        for pid, folder, command in _all()
+        if not command.endswith(b"pause") and any(mark in _text(folder / "cgroup") for mark in marks)
+    ]
+
+
+def of_program(name: str, namespace: Path) -> list[int]:
+    """Processes of a program in a network namespace, such as the kubelet in a node's."""
+    inode = namespace.stat().st_ino
+    found = []
+    for pid, folder, command in _all():
+        if command.rpartition(b"/")[2].decode(errors="replace") == name:
+            try:
+                own = (folder / "ns" / "net").stat().st_ino
+            except OSError:
+                continue
+            if own == inode:
+                found.append(pid)
+    return found
+
+
+def tell(pids: Iterable[int], number: signal.Signals) -> int:
+    """Send a signal; returns how many processes there were to get it."""
+    reached = 0
+    for pid in pids:
+        try:
+            os.kill(pid, number)
+        except ProcessLookupError:
+            continue
+        reached += 1
+    return reached
+
+
+def _all() -> Iterator[tuple[int, Path, bytes]]:
+    """Each process with its folder in /proc and its program."""
+    for folder in Path("/proc").iterdir():
+        if folder.name.isdigit():
+            try:
+                command = (folder / "cmdline").read_bytes().split(b"\0")[0]
+            except OSError:
+                continue
+            if command:
+                yield int(folder.name), folder, command
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text()
+    except OSError:
+        return ""

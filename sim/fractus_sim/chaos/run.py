@@ -1,0 +1,182 @@
+"""One run: missions, faults by the schedule of a seed, and what must hold, judged at the end."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import random
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from fractus_cluster.errors import ClusterError
+from fractus_storage.chain import lines_of, logs, verify
+
+from fractus_sim.chaos import invariants
+from fractus_sim.chaos.faults import FAULTS, broken
+from fractus_sim.chaos.invariants import Broken
+from fractus_sim.chaos.missions import Missions
+from fractus_sim.chaos.schedule import Planned, schedule
+from fractus_sim.chaos.stage import Stage
+from fractus_sim.chaos.watching import Watch
+from fractus_sim.demo.kube import NAMESPACE, DemoError
+
+END_TIMEOUT_S = 480.0
+CLEAN_TIMEOUT_S = 120.0
+RECOVER_TIMEOUT_S = 120.0
+_STEP_S = 0.5
+_ERRORS = (DemoError, ClusterError, subprocess.SubprocessError, OSError)
+
+
+@dataclass
+class Run:
+    """What happened in a run.
+
+    Attributes:
+        timeline: seconds after its beginning, and what happened.
+        ended: phase and message of its missions.
+        broken: invariants that did not hold.
+        flown_s: how long the drone was in the air.
+        entries: of all audit logs.
+    """
+
+    seed: int
+    began_s: float
+    say: Callable[[str], None]
+    timeline: list[tuple[float, str]] = field(default_factory=list)
+    ended: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    broken: list[Broken] = field(default_factory=list)
+    flown_s: float = 0.0
+    entries: int = 0
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def note(self, text: str) -> None:
+        """Write a line of the timeline, and say it."""
+        at_s = time.time() - self.began_s
+        with self._lock:
+            self.timeline.append((at_s, text))
+        self.say(f"seed {self.seed}, {at_s:.1f} s: {text}")
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """What a run is to do: the seed of its schedule, how long faults happen (seconds), and which."""
+
+    seed: int
+    run_s: float
+    kinds: Sequence[str]
+
+
+def fly(stage: Stage, watch: Watch, task: Task, say: Callable[[str], None]) -> Run:
+    """Run the schedule of a seed and judge what came of it."""
+    run = Run(task.seed, time.time(), say)
+    durations = {kind: (FAULTS[kind].shortest_s, FAULTS[kind].longest_s) for kind in task.kinds}
+    planned = schedule(task.seed, task.run_s, durations)
+    missions = Missions(stage, f"chaos-{task.seed}", run.note)
+    threads = [
+        threading.Thread(target=_happen, args=(stage, each, random.Random(f"{task.seed}/{at}"), run))  # noqa: S311
+        for at, each in enumerate(planned)
+    ]
+    for thread in threads:
+        thread.start()
+    while time.time() < run.began_s + task.run_s or any(thread.is_alive() for thread in threads):
+        missions.step(more=time.time() < run.began_s + task.run_s)
+        time.sleep(_STEP_S)
+    run.note("all faults are over")
+    missions.finish(END_TIMEOUT_S)
+    run.ended = {**missions.ended, **missions.present}
+    run.broken += _settle(stage, missions)
+    run.broken += _judge(stage, watch, run)
+    return run
+
+
+def _happen(stage: Stage, planned: Planned, chance: random.Random, run: Run) -> None:
+    """One fault, from its moment to its end."""
+    time.sleep(max(run.began_s + planned.at_s - time.time(), 0.0))
+    begun = False
+    try:
+        with broken(FAULTS[planned.fault], stage, chance) as said:
+            begun = True
+            run.note(f"{planned.fault}: {said}" + (f" for {planned.duration_s:g} s" if planned.duration_s else ""))
+            time.sleep(planned.duration_s)
+    except _ERRORS as error:
+        run.note(f"{planned.fault}: {'not healed' if begun else 'not done'}: {str(error)[-200:]}")
+        if begun:
+            run.broken.append(Broken("all recovers", time.time(), f"{planned.fault} was not healed: {error}"))
+    else:
+        if planned.duration_s:
+            run.note(f"{planned.fault}: over")
+
+
+def _settle(stage: Stage, missions: Missions) -> list[Broken]:
+    """Wait until nothing is left of what was deleted and all is well again; what is not is broken."""
+    _tried(lambda: stage.kubectl("delete", "applications.fractus.dev", "--all", "-n", NAMESPACE, "--wait=false"))
+    left = _awaited(lambda: not missions.left_over(), CLEAN_TIMEOUT_S)
+    found = invariants.left_over(missions.left_over()) if not left else []
+    for what, holds in (
+        ("every node is Ready", lambda: all(_is_ready(body) for body in stage.objects("nodes"))),
+        ("the drone is Ready", lambda: all(_is_ready(body) for body in stage.objects("drones.fractus.dev"))),
+    ):
+        if not _awaited(holds, RECOVER_TIMEOUT_S):
+            found.append(Broken("all recovers", 0.0, f"not so after {RECOVER_TIMEOUT_S:.0f} s: {what}"))
+    return found
+
+
+def _judge(stage: Stage, watch: Watch, run: Run) -> list[Broken]:
+    """All invariants, over what services wrote and the vehicle said since the run began."""
+    seen = [sample for sample in watch.seen if sample.time_s >= run.began_s]
+    run.flown_s = sum(b.time_s - a.time_s for a, b in itertools.pairwise(seen) if a.flying)
+    found = list(invariants.not_ended(run.ended))
+    if watch.home is None or watch.failure:
+        found.append(Broken("watched", 0.0, f"the vehicle was not seen: {watch.failure or 'it has no position'}"))
+    else:
+        found += invariants.landed_elsewhere(seen, watch.home)
+    for node in stage.cluster.nodes:
+        folder = node.directory / "var-lib" / "fractus" / "audit"
+        for log, files in logs([folder] if folder.is_dir() else []).items():
+            lines = [line for _, _, line in lines_of(files)]
+            finding = verify(lines)
+            run.entries += finding.entries
+            if finding.problem:
+                what = f"{node.name}/{log.name}: line {finding.line} {finding.problem}"
+                found.append(Broken("one writer of each audit log", 0.0, what))
+            entries = list(_entries(lines))
+            if log.stem == "mobility":
+                found += invariants.without_authority(seen, entries)
+                found += invariants.in_two_applications(entries, watch.grants)
+            if node.name == stage.drone:
+                found += invariants.forbidden_calls(entries, watch.grants, watch.home)
+    return [each for each in found if not each.time_s or each.time_s >= run.began_s]
+
+
+def _entries(lines: Sequence[bytes]) -> Iterator[Mapping[str, Any]]:
+    for line in lines:
+        try:
+            yield json.loads(line)
+        except ValueError:  # verification tells of it
+            continue
+
+
+def _is_ready(body: Mapping[str, Any]) -> bool:
+    conditions = (body.get("status") or {}).get("conditions") or ()
+    return any(each["type"] == "Ready" and each["status"] == "True" for each in conditions)
+
+
+def _awaited(holds: Callable[[], bool], timeout_s: float) -> bool:
+    """Whether something comes to hold in time."""
+    deadline = time.monotonic() + timeout_s
+    while time.monotonic() < deadline:
+        if _tried(holds):
+            return True
+        time.sleep(_STEP_S)
+    return False
+
+
+def _tried(ask: Callable[[], object]) -> bool:
+    try:
+        return bool(ask())
+    except _ERRORS:
+        return False

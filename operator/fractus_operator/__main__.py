@@ -35,7 +35,7 @@ from fractus_operator.reconcile.on_mission import OnMission
 from fractus_operator.reconcile.orphans import Orphans
 from fractus_operator.reconcile.readiness import Readiness
 from fractus_operator.reconcile.service_rollout import ServiceRollout
-from fractus_operator.reconcile.silence import HearingClock, SilenceWatch
+from fractus_operator.reconcile.silence import HearingClock, SilenceWatch, shown_state
 from fractus_operator.reconcile.worklist import Worklist, regularly
 from fractus_operator.settings import BadSetting, Settings
 from fractus_operator.standby import standing_by
@@ -105,7 +105,7 @@ def _observed(lease: LeaseThread, live: LiveInventory, authority: Authority) -> 
         lambda: lease.left_s,
         lambda: {r.kind.plural: (r.watching, r.age_s()) for r in live.reflectors() if r.synced.is_set()},
         lambda: ((a.body.get("status") or {}).get("phase", "Pending") for a in live.applications.values()),
-        lambda: (d.status.flight_state if d.status else "unknown" for d in live.drones.values() if d is not None),
+        lambda: (shown_state(drone) for drone in live.drones.values() if drone is not None),
         authority.certificate.not_valid_after_utc.timestamp(),
     )
 

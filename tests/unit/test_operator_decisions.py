@@ -22,6 +22,7 @@ from fractus_operator.reconcile.flight_status import flight
 from fractus_operator.reconcile.location import geohash, location_labels
 from fractus_operator.reconcile.missions import mission_outcome
 from fractus_operator.reconcile.replanning import _with_names_of, replan_reason, stuck_nodes, waits_for_landing
+from fractus_operator.reconcile.silence import shown_state
 from fractus_operator.reconcile.status import Blocked
 from fractus_operator.settings import BadSetting, Settings
 
@@ -331,6 +332,48 @@ def test_a_pod_asks_for_the_larger_of_its_phases() -> None:
     pod = read_pod(body)
     assert pod.requests["cpu"] == pytest.approx(1.05)
     assert (pod.instance, pod.ready, pod.labels) == ("i", False, {"fractus.dev/instance": "i"})
+
+
+@pytest.mark.parametrize(
+    ("spec", "phase", "kept"),
+    [({}, "Running", False), ({}, "Failed", True), ({"activeDeadlineSeconds": 1}, "Running", True),
+     ({"activeDeadlineSeconds": 2**31}, "Running", False)],
+)  # fmt: skip
+def test_a_label_alone_hides_no_pod_that_runs(spec: dict, phase: str, kept: bool) -> None:
+    metadata = {"name": "p", "namespace": "ns", "labels": {"fractus.dev/finished": "20260601T120000Z"}}
+    pod = read_pod({"metadata": metadata, "spec": spec, "status": {"phase": phase}})
+    assert (pod.finished_at is not None) == kept
+
+
+@pytest.mark.parametrize(
+    ("state", "last", "mission", "shown"),
+    [
+        ("inactive", None, None, "inactive"),
+        ("unknown", "inactive", None, "offline"),
+        ("unknown", "charging", "False", "offline"),
+        ("unknown", "inactive", "True", "unknown"),
+        ("unknown", "inactive", "Unknown", "unknown"),
+        ("unknown", "flying", None, "unknown"),
+        ("unknown", None, None, "unknown"),
+    ],
+)
+def test_only_a_drone_that_may_be_in_the_air_is_unknown(state: str, last: str, mission: str, shown: str) -> None:
+    told: dict[str, Any] = {"flightState": state, "lastSeen": "2026-06-01T12:00:00Z"}
+    if last is not None:
+        told["lastFlightState"] = last
+    if mission is not None:
+        told["conditions"] = [
+            {
+                "type": "OnMission",
+                "status": mission,
+                "reason": "R",
+                "message": "m",
+                "lastTransitionTime": "2026-06-01T12:00:00Z",
+            }
+        ]
+    body = {"apiVersion": V1, "kind": "Drone", "metadata": {"name": "d"}, "spec": {}}
+    assert shown_state(Drone.from_body({**body, "status": told})) == shown
+    assert shown_state(Drone.from_body(body)) == "offline"
 
 
 def test_a_node_s_heartbeat_changes_nothing() -> None:

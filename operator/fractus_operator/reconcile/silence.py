@@ -8,7 +8,7 @@ from datetime import datetime
 from typing import Any
 
 from fractus_core.api import Drone, EdgeNode
-from fractus_core.api.nodes import DRONE_REPORT_S, EDGE_REPORT_S, FLIGHT_REPORT_S
+from fractus_core.api.nodes import DRONE_REPORT_S, EDGE_REPORT_S, FLIGHT_REPORT_S, GROUNDED, ON_MISSION
 from fractus_core.planning.candidates import readiness
 from pydantic import TypeAdapter, ValidationError
 
@@ -64,6 +64,21 @@ def patience_s(node: Drone | EdgeNode) -> float:
     if isinstance(node, EdgeNode):
         return _MISSED * EDGE_REPORT_S
     return _MISSED * (FLIGHT_REPORT_S if node.in_air else DRONE_REPORT_S)
+
+
+def shown_state(drone: Drone) -> str:
+    """A drone's flight state for figures: unknown only where it may be in the air.
+
+    Offline: it never reported, or it was on the ground when it was last heard of, and no application may fly it since.
+    """
+    status = drone.status
+    if status is None or status.last_seen is None:
+        return "offline"
+    if status.flight_state != "unknown":
+        return status.flight_state
+    mission = next((each for each in status.conditions if each.type == ON_MISSION), None)
+    parked = status.last_flight_state in GROUNDED and (mission is None or mission.status == "False")
+    return "offline" if parked else "unknown"
 
 
 class Silence:

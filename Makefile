@@ -123,14 +123,26 @@ release: env ## Set VERSION=X.Y.Z of package and charts, and gather the changelo
 	$(UV) lock --quiet
 	$(RUN) towncrier build --yes --version "$(VERSION)"
 
+# What a user installs, without what only builds and tests it.
+SHIPPED := --frozen --no-dev --extra operator --extra agent --extra services --extra view
+
 .PHONY: dist
-dist: env ## Build what a release has into dist/: wheel, source archive, charts and the checksums of all
+dist: env ## Build what a release has into dist/: wheel, source archive, charts, dependencies and their licences, checksums
 	rm -rf dist
 	$(UV) build --quiet --out-dir dist
 	$(RUN) fractus cluster binaries
 	helm="$$(command -v helm || ls -t "$${XDG_CACHE_HOME:-$$HOME/.cache}"/fractus/*/bin/helm | head -n 1)"; \
 		for chart in charts/*/; do "$$helm" package "$$chart" --destination dist > /dev/null; done
-	cd dist && sha256sum -- *.whl *.tar.gz *.tgz > SHA256SUMS
+	$(UV) export --quiet $(SHIPPED) --no-emit-project --format cyclonedx1.5 > dist/dependencies.cdx.json
+	# A licence that asks more than to be named would bind what is built on Fractus.
+	$(UV) run --quiet --isolated $(SHIPPED) --with pip-licenses==5.5.5 pip-licenses --ignore-packages fractus-drones \
+		--format=markdown --with-urls --order=license --partial-match --fail-on=GPL --output-file=dist/LICENSES.md > /dev/null
+	cd dist && sha256sum -- *.whl *.tar.gz *.tgz *.json *.md > SHA256SUMS
+
+.PHONY: audit
+audit: env ## Look for known vulnerabilities in what is shipped (asks PyPI's advisories)
+	$(UV) export --quiet $(SHIPPED) --no-emit-project --output-file .venv/shipped.txt > /dev/null
+	$(UV) tool run pip-audit==2.10.1 --strict --disable-pip --require-hashes --requirement .venv/shipped.txt
 
 .PHONY: packages
 packages: ## Install the Debian packages whose programs are missing (root); nothing is ever removed

@@ -326,6 +326,27 @@ def test_a_failed_mission_is_reported(
     wait_for(lambda: not world.grants(namespace), "grants to go")
 
 
+def test_a_component_that_fails_is_told_with_its_last_words(
+    world: World, operator: OperatorProcess, namespace: str
+) -> None:
+    running(world, namespace)
+    pod = next(pod for pod in world.pods(namespace) if labels_of(pod)["fractus.dev/component"] == "Navigator")
+    (container,) = pod["spec"]["containers"]
+    assert container["terminationMessagePolicy"] == "FallbackToLogsOnError", "the kubelet says what was printed last"
+    ended = {"exitCode": 1, "reason": "Error", "message": "flies\nno route to the river\n"}
+    told = {
+        "name": container["name"], "image": container["image"], "imageID": "", "ready": False, "restartCount": 1,
+        "state": {"waiting": {"reason": "CrashLoopBackOff"}}, "lastState": {"terminated": ended},
+    }  # fmt: skip
+    status = {"conditions": [{"type": "Ready", "status": "False"}], "containerStatuses": [told]}
+    world.api.merge(f"/api/v1/namespaces/{namespace}/pods/{pod['metadata']['name']}/status", {"status": status})
+    wait_for(lambda: world.condition(namespace, "Ready")["reason"] == "ComponentFailed", "the failure in the status")
+    last_words = "traffic-navigator failed with exit code 1: flies | no route to the river"
+    assert last_words in world.condition(namespace, "Ready")["message"]
+    path = f"/api/v1/namespaces/{namespace}/events"
+    wait_for(lambda: any(last_words in event["message"] for event in world.api.list(path)), "the Event")
+
+
 def test_a_changed_spec_flies_again_after_completion(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     end_mission(world, namespace, "Complete", "done")

@@ -76,6 +76,10 @@ test-e2e: packages env ## End-to-end tests only, on the embedded cluster or on F
 	[ "$${FRACTUS_E2E_CLUSTER:-embedded}" = current ] || $(RUN) fractus cluster binaries
 	$(RUN) pytest tests/e2e
 
+.PHONY: test-kind
+test-kind: env ## The charts, a mission's end-to-end tests and the demo on a cluster of kind (docker, kind, kubectl and helm on the PATH)
+	tests/kind/run.sh
+
 .PHONY: lint
 lint: env ## Style, types and the direction of imports
 	$(RUN) ruff check

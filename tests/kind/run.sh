@@ -1,0 +1,66 @@
+#!/usr/bin/env bash
+# Everything on a cluster that kind makes: images by Docker, the charts, the end-to-end tests of a mission, the demo.
+# Needs docker, kind, kubectl and helm on the PATH.
+#
+#   STEPS="cluster"       only these steps, of: images cluster load charts tests demo
+#   KEEP=1                leaves the cluster
+#   KIND_NODE_IMAGE=NAME  the nodes' image; kind's own by default
+#   BUILD_OPTIONS="..."   for `docker build`
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/../.."
+
+name=fractus
+targets=(operator agent mobility camera sim example-traffic-monitoring)
+state=$(mktemp -d)
+export KUBECONFIG=$state/kubeconfig FRACTUS_E2E_CLUSTER=current
+
+images() {
+  for target in "${targets[@]}"; do
+    # shellcheck disable=SC2086 # several words
+    docker build --quiet ${BUILD_OPTIONS:-} --target "$target" --tag "localhost/fractus/$target:dev" .
+  done
+}
+
+cluster() {
+  kind create cluster --name "$name" --config tests/kind/cluster.yaml --wait 300s ${KIND_NODE_IMAGE:+--image "$KIND_NODE_IMAGE"}
+  kubectl wait --for=condition=Ready node --all --timeout=300s
+  for class in drone edge; do
+    kubectl taint node --selector "fractus.dev/class=$class" "fractus.dev/class=$class:NoExecute"
+  done
+  kubectl get nodes --output wide --label-columns fractus.dev/class
+}
+
+load() {
+  kind load docker-image --name "$name" $(printf "localhost/fractus/%s:dev " "${targets[@]}")
+}
+
+charts() {
+  bash -e <(grep '^helm install' README.md)
+  kubectl wait --for=condition=Ready pod --all --namespace fractus-system --timeout=300s
+  kubectl wait --for=condition=Ready drone --all --timeout=120s
+  kubectl get pods --namespace fractus-system --output wide
+}
+
+tests() {
+  .venv/bin/pytest tests/e2e/test_mission.py tests/e2e/test_refusals.py
+}
+
+demo() {
+  make demo CLUSTER=current
+}
+
+leave() {
+  code=$?
+  if [ "$code" != 0 ]; then
+    kubectl get nodes,pods --all-namespaces --output wide || true
+    kubectl get events --all-namespaces --sort-by=.lastTimestamp | tail -n 30 || true
+  fi
+  [ -n "${KEEP:-}" ] || { kind delete cluster --name "$name"; rm -rf "$state"; }
+  exit "$code"
+} >&2
+trap leave EXIT
+
+for step in ${STEPS:-images cluster load charts tests demo}; do
+  echo "== $step ($(date +%T))"
+  "$step"
+done

@@ -1,6 +1,9 @@
 """How many examples property-based tests try: few by default, all of them where `FRACTUS_DEEP` is set (`make test-deep`)."""
 
 import os
+from collections.abc import Iterable
+from itertools import product
+from typing import Any
 
 DEEP = bool(os.environ.get("FRACTUS_DEEP"))
 
@@ -8,3 +11,10 @@ DEEP = bool(os.environ.get("FRACTUS_DEEP"))
 def examples(deep: int, quick: int | None = None) -> int:
     """The number of examples of a test: `deep` in a deep run; else `quick`, or a quarter of `deep`."""
     return deep if DEEP else quick or max(deep // 4, 10)
+
+
+def cells(*axes: Iterable[Any], quick: list[Any]) -> list[Any]:
+    """The cells of a table that a test tries: all of them in a deep run; else those of `quick`, which must be among them."""
+    table = list(product(*axes)) if len(axes) > 1 else list(*axes)
+    assert all(cell in table for cell in quick)
+    return table if DEEP else quick

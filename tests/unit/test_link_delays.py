@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from closed_loop import Weather
+from depth import cells
 from fractus_services.mobility.mavlink.timing import Timing
 from link_flights import Attempt, appears, as_fast_as_let, attempt, both, straight
 
@@ -36,9 +37,18 @@ def flown_at_once(wind_mps: float, error_m: float) -> Attempt:
     return attempt(as_fast_as_let, 7, weather(0.0, wind_mps, error_m=error_m))
 
 
-@pytest.mark.parametrize(("wind_mps", "error_m"), [(0.0, 0.5), (6.0, 0.5), (0.0, 2.0), (6.0, 5.0)])
-@pytest.mark.parametrize("delay_s", [0.0, 0.1, 0.25, 0.5])
-def test_velocities_keep_their_distance(delay_s: float, wind_mps: float, error_m: float) -> None:
+CALM, WINDY = (0.0, 0.5), (6.0, 5.0)
+"""Wind in m/s, and how far from the truth a position is, in metres."""
+
+
+@pytest.mark.parametrize(
+    ("delay_s", "air"),
+    cells(
+        [0.0, 0.1, 0.25, 0.5], [CALM, (6.0, 0.5), (0.0, 2.0), WINDY], quick=[(0.0, CALM), (0.5, CALM), (0.25, WINDY)]
+    ),
+)
+def test_velocities_keep_their_distance(delay_s: float, air: tuple[float, float]) -> None:
+    wind_mps, error_m = air
     first = flown_at_once(wind_mps, error_m)
     flown = attempt(as_fast_as_let, 7, weather(delay_s, wind_mps, error_m=error_m)) if delay_s else first
     assert flown.kept_m >= max(KEPT_M, first.kept_m - COSTS_M)
@@ -65,14 +75,16 @@ def test_velocities_keep_their_distance_where_frames_are_lost() -> None:
     assert flown.permitted > 50
 
 
-@pytest.mark.parametrize("speedup", [2, 3, 5])
+@pytest.mark.parametrize("speedup", cells([2, 3, 5], quick=[5]))
 def test_velocities_keep_their_distance_from_a_simulator_that_runs_faster(speedup: int) -> None:
     flown = attempt(both, 9, weather(0.02, speedup=speedup))
     assert flown.kept_m >= KEPT_M
     assert flown.permitted > 30
 
 
-@pytest.mark.parametrize(("who", "speedup"), [("vehicle", 3), ("service", 5), ("vehicle", 5)])
+@pytest.mark.parametrize(
+    ("who", "speedup"), cells([("vehicle", 3), ("service", 5), ("vehicle", 5)], quick=[("service", 5), ("vehicle", 5)])
+)
 def test_velocities_keep_their_distance_on_a_machine_that_stalls_one_side(who: str, speedup: int) -> None:
     """For a third of a second: of a fast vehicle's time more than a second, in which its position is not known."""
     flown = attempt(straight, 10, replace(weather(0.02, speedup=speedup), stall=(who, 0.35)))
@@ -87,9 +99,16 @@ AHEAD_M = {0.0: (12.0, 31.0), 0.1: (13.0, 32.0), 0.25: (13.0, 33.0), 0.5: (15.0,
 """How far ahead a zone may appear by the delay, at 5 and at 10 m/s: the last columns of the table."""
 
 
-@pytest.mark.parametrize(("speed_mps", "error_m"), [(5.0, 0.5), (10.0, 0.5), (10.0, 5.0), (10.0, -5.0)])
-@pytest.mark.parametrize("delay_s", AHEAD_M)
-def test_a_zone_that_appears_far_enough_ahead_is_not_entered(delay_s: float, speed_mps: float, error_m: float) -> None:
+SLOW, FAST, AHEAD, BEHIND = (5.0, 0.5), (10.0, 0.5), (10.0, 5.0), (10.0, -5.0)
+"""Speed in m/s, and how far ahead of where it believes to be the drone is, in metres."""
+
+
+@pytest.mark.parametrize(
+    ("delay_s", "motion"),
+    cells(AHEAD_M, [SLOW, FAST, AHEAD, BEHIND], quick=[(0.0, BEHIND), (0.1, SLOW), (0.25, FAST), (0.5, AHEAD)]),
+)
+def test_a_zone_that_appears_far_enough_ahead_is_not_entered(delay_s: float, motion: tuple[float, float]) -> None:
+    speed_mps, error_m = motion
     ahead_m = AHEAD_M[delay_s][speed_mps == 10.0]
     flown = attempt(appears(ahead_m, speed_mps), 1 + list(AHEAD_M).index(delay_s), weather(delay_s, error_m=error_m))
     assert 0.0 < flown.kept_m < 16.0

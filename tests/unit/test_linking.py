@@ -259,7 +259,7 @@ def test_most_of_what_an_oracle_gains_is_gained(factor: float) -> None:
 def test_more_is_gained_with_fewer_links_than_by_the_thesis_rule() -> None:
     totals = {"best": 0.0, "ours": 0.0, "thesis": 0.0}
     links = {"ours": 0, "thesis": 0}
-    for seed in range(examples(40, 8)):
+    for seed in range(examples(40, 4)):
         scene = random_scene(seed)
         totals["best"] += oracle(scene)
         for name, rule in (("ours", ours), ("thesis", thesis)):
@@ -281,8 +281,9 @@ def test_the_oracle_is_the_most() -> None:
 
     for seed in range(2):
         scene = random_scene(seed)
+        best = oracle(scene)
         for rule in (ours, thesis, chance):
-            assert carried(scene, rule)[0] <= oracle(scene) + 1e-6
+            assert carried(scene, rule)[0] <= best + 1e-6
 
 
 def test_decisions_repeat() -> None:

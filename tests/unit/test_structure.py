@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+import tomllib
 from collections.abc import Iterator
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
@@ -14,7 +15,7 @@ import pytest
 import vocabulary
 
 ROOT = Path(__file__).resolve().parents[2]
-ROOMS = ("core", "kube", "mavlink", "observe", "operator", "agent", "services", "cli", "view", "sdk", "sim")
+ROOMS = ("core", "kube", "mavlink", "observe", "operator", "agent", "services", "cli", "view", "sdk", "sim", "storage")
 
 MAX_FLOORS = 7
 MAX_MODULE_LINES = 400
@@ -54,6 +55,16 @@ def floors(package: str) -> dict[str, int]:
             0 if face or not inside[module] else 1
         )
     return found
+
+
+def test_every_package_is_described_and_has_contracts() -> None:
+    found = {path.parent.name: path.parts[-3] for path in ROOT.glob("*/fractus*/__init__.py")}
+    assert set(found.values()) == {*ROOMS, "proto"}
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    assert set(project["tool"]["importlinter"]["root_packages"]) == set(found)
+    for document in ("CONTRIBUTING.md", "docs/architecture.md"):
+        text = (ROOT / document).read_text()
+        assert not [package for package in found if not re.search(rf"\b{package}\b", text)], document
 
 
 def test_no_modules_import_each_other_in_a_circle() -> None:

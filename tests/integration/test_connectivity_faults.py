@@ -86,6 +86,7 @@ asyncio.run(main())
 @pytest.mark.parametrize("fault", ["silent", "no routes", "no probes"])
 def test_a_peer_that_pairs_and_then_leaves_it_at_that(world: World, fault: str) -> None:
     bad, other, drone = world.edge("e1", 5.0), world.edge("e2", 30.0), world.drone()
+    before = {name: state for name, state in world.states().items() if name != "e1"}
     # The bad one promises more, and so it is asked first.
     links = [world.link(drone, bad, bandwidth=13.0), world.link(drone, other)]
     world.serve()
@@ -101,6 +102,7 @@ def test_a_peer_that_pairs_and_then_leaves_it_at_that(world: World, fault: str) 
     until(lambda: client.by == "e2", "an answer over the link to the honest node", world)
     assert "e1" not in {answer[1] for answer in client.answers}
     assert not client.failed
+    unchanged(world, before)
 
 
 STRANGER = """
@@ -119,6 +121,7 @@ while True:  # "that address is here"
 
 def test_a_stranger_with_the_address_of_the_paired_node(world: World) -> None:
     edge, drone, stranger = world.edge("e1", 20.0), world.drone(), world.edge("e9", 5.0)
+    before = {name: state for name, state in world.states().items() if name != "e9"}
     flying(world, edge)
     client = world.client(drone, 100_000, 0.05)
     until(lambda: client.by == "e1", "an answer over the link", world)
@@ -138,13 +141,16 @@ def test_a_stranger_with_the_address_of_the_paired_node(world: World) -> None:
     # Gone, it is not asked any more, though the drone was told that the address is there.
     world.end("e9")
     stranger.run("ip", "link", "set", "wlan0", "down")
-    until(lambda: client.by == "e1", "an answer over the link", world, timeout_s=20.0)
+    took_s = until(lambda: client.by == "e1", "an answer over the link", world, timeout_s=20.0)
+    print("from the stranger's end to the first answer:", took_s)
+    unchanged(world, before)
 
 
 @pytest.mark.parametrize("loss", ["planned", "abrupt"])
 def test_a_long_stream_is_reopened_and_answers_each_once(world: World, loss: str) -> None:
-    edge = world.edge("e1", 20.0)
-    drone = flying(world, edge)
+    edge, drone = world.edge("e1", 20.0), world.drone()
+    before = world.states()
+    flying(world, edge)
     stream = Client(world.python("d1p", STREAM, f"{VIP.address}:{VIP.port}"))
     until(lambda: stream.by == "e1", "an answer over the link", world)
     for _ in range(2):
@@ -161,3 +167,4 @@ def test_a_long_stream_is_reopened_and_answers_each_once(world: World, loss: str
     ends = [answer[2] for answer in stream.answers if answer[1] == "REOPENED"]
     assert ends
     assert set(ends) <= {"UNAVAILABLE"}, "a status after which gRPC's clients try again"
+    unchanged(world, before)

@@ -1,4 +1,4 @@
-"""Watches the drone from outside: what its vehicle says, and which Grants lie on its disk."""
+"""Stands beside the drone: hears what its vehicle says, sees which Grants lie on its disk, and changes its battery."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from types import TracebackType
 from fractus_core.api import Grant
 from fractus_core.api.plans import GrantSpec
 from fractus_core.policy.values import Home
+from fractus_mavlink.enums import MAV_CMD
 
 from fractus_sim.chaos.invariants import Seen
 from fractus_sim.experiment.errors import ExperimentError
@@ -18,6 +19,9 @@ from fractus_sim.experiment.netns import connect_in
 from fractus_sim.experiment.station import OBSERVER_ID, Station, TcpLink
 
 POLL_S = 0.2
+MIN_BATTERY = 0.7
+"""Share of charge below which a drone on the ground gets a full battery: a long run takes many."""
+_EVERY_BATTERY = 0xFFFF
 _CONNECT_S = 10.0
 _JOIN_S = 10.0
 
@@ -73,6 +77,8 @@ class Watch:
         now_s = time.time()
         messages = self._station.poll(time.monotonic(), int(now_s * 1e6))
         state = self._station.state
+        if state.heard and not (state.armed or state.flying) and state.battery < MIN_BATTERY:
+            self._station.command(MAV_CMD.BATTERY_RESET, _EVERY_BATTERY, 100)
         if any(message.name == "GLOBAL_POSITION_INT" for message in messages) and (state.lat or state.lon):
             if self.home is None:
                 self.home = Home(state.lat, state.lon, state.amsl_m - state.alt_m)

@@ -77,8 +77,8 @@ test-e2e: packages env ## End-to-end tests only, on the embedded cluster or on F
 	$(RUN) pytest tests/e2e
 
 .PHONY: test-kind
-test-kind: env ## The charts, a mission's end-to-end tests and the demo on a cluster of kind (docker, kind, kubectl and helm on the PATH)
-	tests/kind/run.sh
+test-kind: env ## The charts, a mission's end-to-end tests and the demo on a cluster of kind (without Docker: on one made here, as root)
+	if docker info > /dev/null 2>&1; then tests/kind/run.sh; else tests/kind/machine.sh tests/kind/run.sh; fi
 
 .PHONY: lint
 lint: env ## Style, types and the direction of imports

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Everything on a cluster that kind makes: images by Docker, the charts, the end-to-end tests of a mission, the demo.
-# Needs docker, kind, kubectl and helm on the PATH.
+# Needs docker, kind, kubectl and helm on the PATH; tests/kind/machine.sh brings them where they are missing.
 #
 #   STEPS="cluster"       only these steps, of: images cluster load charts tests demo
 #   KEEP=1                leaves the cluster

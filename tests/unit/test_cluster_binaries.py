@@ -23,6 +23,8 @@ REQUIRED = {
     "kwok": "sigs.k8s.io/kwok",
     "crane": "github.com/google/go-containerregistry",
     "kubelet": "k8s.io/kubernetes",
+    "kubeadm": "k8s.io/kubernetes",
+    "kind": "sigs.k8s.io/kind",
 }
 
 
@@ -47,8 +49,9 @@ def test_sources_are_pinned_by_checksum(module: str) -> None:
     assert (GOMOD / module / "go.sum").read_text().count("h1:") > 20
 
 
-def test_staging_modules_match_kubernetes() -> None:
-    text = (GOMOD / "kubernetes" / "go.mod").read_text()
+@pytest.mark.parametrize("module", ["kubernetes", "kubeadm"])
+def test_staging_modules_match_kubernetes(module: str) -> None:
+    text = (GOMOD / module / "go.mod").read_text()
     versions = set(re.findall(r"=> k8s\.io/\S+ v(\S+)", text))
     assert versions == {"0" + KUBERNETES_VERSION[1:]}
 

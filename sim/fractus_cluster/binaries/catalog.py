@@ -12,6 +12,7 @@ COREDNS_VERSION = "1.14.2"
 HELM_VERSION = "3.21.0"
 KWOK_VERSION = "0.8.0"
 CRANE_VERSION = "0.22.1"
+KIND_VERSION = "0.32.0"
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +84,9 @@ PROGRAMS: Mapping[str, Program] = MappingProxyType(
             _kubernetes("kubelet"),
             _kubernetes("kube-proxy"),
             _kubernetes("kubectl", "version", "--client"),
+            # In a module of its own: what the others share does not change with what kubeadm alone needs.
+            Program("kubeadm", "kubeadm", "k8s.io/kubernetes/cmd/kubeadm", KUBERNETES_VERSION, ("version",)),
+            Program("kind", "kind", "sigs.k8s.io/kind", KIND_VERSION),
             Program("etcd", "etcd", ".", ETCD_VERSION, accepts="3."),
             Program("coredns", "coredns", ".", COREDNS_VERSION, ("-version",), accepts="1."),
             Program("helm", "helm", "helm.sh/helm/v3/cmd/helm", HELM_VERSION, ("version", "--short"), accepts="3."),
@@ -103,6 +107,8 @@ PROGRAMS: Mapping[str, Program] = MappingProxyType(
 MODULES: Mapping[str, Module] = MappingProxyType(
     {
         "kubernetes": Module("kubernetes", _kubernetes_link_variables(KUBERNETES_VERSION)),
+        "kubeadm": Module("kubeadm", _kubernetes_link_variables(KUBERNETES_VERSION)),
+        "kind": Module("kind"),
         "etcd": Module("etcd"),
         "coredns": Module("coredns"),
         "helm": Module("helm", {"helm.sh/helm/v3/internal/version.version": f"v{HELM_VERSION}"}),

@@ -21,7 +21,13 @@ from fractus_operator.reconcile.difference import contains, is_current, stamped
 from fractus_operator.reconcile.flight_status import flight
 from fractus_operator.reconcile.location import geohash, location_labels
 from fractus_operator.reconcile.missions import mission_outcome
-from fractus_operator.reconcile.replanning import _with_names_of, replan_reason, stuck_nodes, waits_for_landing
+from fractus_operator.reconcile.replanning import (
+    _with_names_of,
+    of_generation,
+    replan_reason,
+    stuck_nodes,
+    waits_for_landing,
+)
 from fractus_operator.reconcile.silence import shown_state
 from fractus_operator.reconcile.status import Blocked
 from fractus_operator.settings import BadSetting, Settings
@@ -445,3 +451,10 @@ def test_only_how_it_is_carried_out_and_kept_is_no_part_of_the_mission() -> None
     assert spec.model_copy(update={"components": renamed}).mission_digest != spec.mission_digest
     # A field that is said is the same mission as one that is left to its default.
     assert type(spec).model_validate(spec.model_dump(by_alias=True)).mission_digest == spec.mission_digest
+
+
+def test_a_plan_follows_the_generation_while_the_mission_is_the_same() -> None:
+    stamped = of_generation(application(), PLAN)
+    assert stamped.application_digest == application().spec.mission_digest
+    assert of_generation(application(), stamped) is stamped
+    assert of_generation(application(2), stamped).application_generation == 2

@@ -32,7 +32,14 @@ from fractus_operator.reconcile.finished_pods import FinishedPods
 from fractus_operator.reconcile.flight_status import flight
 from fractus_operator.reconcile.grants import REFUSALS, ApplicationGrants
 from fractus_operator.reconcile.missions import mission_outcome
-from fractus_operator.reconcile.replanning import choose_plan, mission_changed, stuck_nodes, waits_for_landing
+from fractus_operator.reconcile.replanning import (
+    choose_plan,
+    flown_generation,
+    mission_changed,
+    present_plan,
+    stuck_nodes,
+    waits_for_landing,
+)
 from fractus_operator.reconcile.reporting import StatusReporter
 from fractus_operator.reconcile.rollout import Rollout
 from fractus_operator.reconcile.shared_flights import shared_flight_outcome
@@ -188,11 +195,8 @@ class Applications:
             flown = seen.plan.drone if seen.plan is not None else None
             name = flown.node if flown is not None else self._reporter.last(submitted).get("drone")
             drone = self._live.drone(name) if name is not None else None
-            # A change that still waits for the landing is another mission.
-            waits = seen.plan is not None and mission_changed(submitted.application, seen.plan)
-            generation = seen.plan.application_generation if seen.plan is not None and waits else None
             update = status.finished(outcome, name, drone, seen.pods)
-            await self._reporter.report(submitted, update, generation)
+            await self._reporter.report(submitted, update, flown_generation(submitted.application, seen.plan))
             await self._finish(submitted)
             return RESYNC_S
         present = self._present(seen)
@@ -212,21 +216,25 @@ class Applications:
         reported = self._reporter.last(seen.submitted)
         if reported.get("phase") not in SETTLED:
             return None
-        submitted = seen.submitted
+        submitted, application = seen.submitted, seen.submitted.application
         known = reported.get("observedGeneration") == submitted.metadata.generation
         flown = self._live.plans.last(seen.key, seen.uid)
-        if known or (seen.plan is None and not mission_changed(submitted.application, flown)):
+        # What cannot be read says of no other mission: the record of this one stays until something can be.
+        same = seen.plan is None and (application is None or not mission_changed(application, flown))
+        if known or same:
             again_s = await self._finish(submitted) if seen.plan is None else RESYNC_S
+            if known and seen.plan is None and application is not None and flown is not None:
+                await self._rollout.keep(application, flown)
             if reported["phase"] == "Returning" or not known:
-                drone = self._live.drone(reported.get("drone") or "")
+                # A drone that has come home may fly for another by now.
+                drone = self._live.drone(reported.get("drone") or "") if reported["phase"] == "Returning" else None
                 await self._reporter.report(submitted, status.still_over(reported, drone))
             return again_s
         if seen.plan is not None:
             return None
         # An old plan neither claims its drone for the next mission nor excuses it from any check.
         left_over = await self._begin_again(seen.key)
-        # The last mission's grants must be gone before a new one begins.
-        return 1.0 if left_over else None
+        return 1.0 if left_over else None  # The last mission's grants must be gone before a new one begins.
 
     async def _deploy(self, seen: Observed, memory: _Memory) -> tuple[StatusUpdate, float]:
         """Plan, compile and roll out; nothing is awaited between reading the inventory and the decision.
@@ -282,7 +290,7 @@ class Applications:
         stuck, recheck_s = stuck_nodes(seen.plan, seen.pods, now)
         stuck = {node: why for node, why in stuck.items() if node != seen.in_flight}
         settings = replace(self._settings, excluded=memory.exclude(stuck, now), time_s=now.timestamp())
-        present = seen.plan
+        present = known = present_plan(application, seen.plan)
         if present is not None:
             present = self._notes.noted(
                 seen.key, application, present, rules=seen.rules, inventory=inventory, settings=settings
@@ -291,6 +299,7 @@ class Applications:
         drone = choice.plan.drone
         if choice.plan is not seen.plan:
             self._live.plans.decide(seen.key, seen.uid, choice.plan)
+        if choice.plan is not known:
             why, node = choice.reason or "PoliciesChanged", drone.node if drone is not None else "none"
             logger.info("applications: planned (application=%s/%s reason=%s drone=%s)", *seen.key, why, node)
         if choice.reason is not None:
@@ -300,9 +309,9 @@ class Applications:
     async def _begin_again(self, key: Key) -> bool:
         """Remove all that was made for an application, with its plan; True if there was anything."""
         removed = await self._children.remove(key, *_RIGHTS, kinds.DEPLOYMENT, *_BESIDE_PODS, kinds.DEPLOYMENT_PLAN)
-        removed |= await self._finished_pods.remove(key)
+        pods = await self._finished_pods.remove(key)
         self._live.forget(key)
-        return removed
+        return removed or pods
 
     async def _finish(self, submitted: Submitted) -> float:
         """Remove what a mission that is over leaves, but the plan, and its pods for as long as they are kept.
@@ -311,10 +320,8 @@ class Applications:
             When to run again.
         """
         key = submitted.key
-        removed = await self._children.remove(key, *_RIGHTS)
-        removed |= await self._finished_pods.stop(submitted)
-        removed |= await self._children.remove(key, *_BESIDE_PODS)
-        if removed:
+        removed = await self._children.remove(key, *_RIGHTS) | await self._finished_pods.stop(submitted)
+        if removed | await self._children.remove(key, *_BESIDE_PODS):
             self._live.forget(key)
         return min(await self._finished_pods.expire(submitted), RESYNC_S)
 

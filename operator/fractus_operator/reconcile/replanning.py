@@ -93,6 +93,28 @@ def mission_changed(application: Application | None, plan: DeploymentPlanSpec | 
     return plan.application_digest is None or plan.application_digest != application.spec.mission_digest
 
 
+def flown_generation(application: Application | None, plan: DeploymentPlanSpec | None) -> int | None:
+    """The generation whose mission a plan is of, where the present one is another mission, which still waits; else None."""
+    return plan.application_generation if plan is not None and mission_changed(application, plan) else None
+
+
+def present_plan(application: Application, plan: DeploymentPlanSpec | None) -> DeploymentPlanSpec | None:
+    """A plan as that of the application's present generation, if that says the same of its mission; else as it is."""
+    return plan if plan is None or mission_changed(application, plan) else of_generation(application, plan)
+
+
+def of_generation(application: Application, plan: DeploymentPlanSpec) -> DeploymentPlanSpec:
+    """A plan as that of an application's present generation, which is known to say the same of the mission.
+
+    Other releases tell missions apart by the generation alone, or hash them otherwise: what they find is kept up to date.
+    """
+    said = {
+        "application_generation": application.metadata.generation,
+        "application_digest": application.spec.mission_digest,
+    }
+    return plan if plan.model_dump(include=set(said)) == said else plan.model_copy(update=said)
+
+
 def waits_for_landing(application: Application, plan: DeploymentPlanSpec, in_flight: str | None) -> bool:
     """Whether a changed manifest is not carried out yet, because it would change what flies.
 

@@ -24,6 +24,7 @@ from fractus_operator.reconcile.children import Children
 from fractus_operator.reconcile.difference import contains
 from fractus_operator.reconcile.isolation import network_policies
 from fractus_operator.reconcile.links import direct_links, retargeted
+from fractus_operator.reconcile.replanning import of_generation
 
 _HEAD_START_S = 0.5
 """How long Deployments go first at most, where there are new ones: neither a webhook that holds them up nor pods that no node
@@ -107,6 +108,20 @@ class Rollout:
             if isinstance(result, BaseException):
                 raise result
         return results[2] is True
+
+    async def keep(self, application: Application, plan: DeploymentPlanSpec) -> None:
+        """Keep the plan of a mission that is over as that of the application's present generation.
+
+        Raises:
+            NameTaken: another's object has its name.
+            KubeError: the API server refuses it, or cannot be reached.
+        """
+        kept = of_generation(application, plan)
+        if kept is not plan:
+            self._live.plans.decide(application.key, application.metadata.uid or "", kept)
+            await self._children.apply(
+                application, {kinds.DEPLOYMENT_PLAN: [builders.deployment_plan(application, kept)]}
+            )
 
     def _is_there(self, kind: Kind, body: Body) -> bool:
         return self._children.get(kind, key_of(body)) is not None

@@ -26,6 +26,10 @@ from fractus_operator.reconcile.children import Children
 _DEFAULT_TTL_S: int = ApplicationSpec.model_fields["ttl_after_finished"].default
 
 
+_CLOCKS_DIFFER = timedelta(minutes=2)
+"""How far ahead the clock of an operator that acted before may have been."""
+
+
 class FinishedPods:
     """Keeps the pods of missions that are over, as a Job keeps its own: stopped, with their logs, until they are removed.
 
@@ -73,9 +77,9 @@ class FinishedPods:
         kept_since = now - _ttl(submitted)
         for pod in _present(self._live.pods_of(submitted.key, kept=True)):
             assert pod.finished_at is not None
+            left_s = (pod.finished_at - kept_since).total_seconds()
             # Who may write the label of a pod does not keep it longer by a time that has not come.
-            left_s = (min(pod.finished_at, now) - kept_since).total_seconds()
-            if left_s <= 0:
+            if left_s <= 0 or pod.finished_at > now + _CLOCKS_DIFFER:
                 await self._store.delete(kinds.POD, (pod.namespace, pod.name))
             else:
                 next_s = min(next_s, left_s)

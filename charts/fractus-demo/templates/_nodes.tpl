@@ -9,14 +9,25 @@
 {{- toJson (sortAlpha $names) }}
 {{- end }}
 
+{{/* Name of the node that this release made the drone, also while other nodes come and go: hardware does not move. */}}
+{{- define "fractus-demo.earlier" -}}
+{{- if .Release.IsUpgrade }}
+{{- dig "metadata" "annotations" "fractus.dev/node" "" (lookup "apps/v1" "DaemonSet" .Release.Namespace (printf "%s-vehicle" .Release.Name)) }}
+{{- end }}
+{{- end }}
+
 {{/* Name of the node that is the drone. */}}
 {{- define "fractus-demo.drone" -}}
-{{- $found := include "fractus-demo.nodes" "drone" | fromJsonArray }}
-{{- if .Values.drone }}
-{{- .Values.drone }}
-{{- else if $found }}
-{{- first $found }}
+{{- $earlier := include "fractus-demo.earlier" . }}
+{{- if and $earlier .Values.drone (ne $earlier .Values.drone) }}
+{{- fail (printf "drone: %s is the drone of this release; to make %s the drone, uninstall it and install it again" $earlier .Values.drone) }}
+{{- else if or .Values.drone $earlier }}
+{{- .Values.drone | default $earlier }}
 {{- else }}
+{{- $found := include "fractus-demo.nodes" "drone" | fromJsonArray }}
+{{- if not $found }}
 {{- fail "no node has the label fractus.dev/class=drone; label one (kubectl label node NODE fractus.dev/class=drone) or name it: --set drone=NODE" }}
+{{- end }}
+{{- first $found }}
 {{- end }}
 {{- end }}

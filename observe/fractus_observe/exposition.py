@@ -111,8 +111,8 @@ async def serving(listen: str, text: Callable[[], bytes]) -> AsyncIterator[None]
         return
     server = None
     try:
-        server = _bound(listen)
-    except ValueError as error:
+        server = await _bound(listen)
+    except (OverflowError, ValueError) as error:
         LOG.warning("metrics: not served (address=%s error=%s)", listen, error)
         yield
         return
@@ -128,16 +128,19 @@ async def serving(listen: str, text: Callable[[], bytes]) -> AsyncIterator[None]
             server.close()
 
 
-def _bound(listen: str) -> socket.socket:
+async def _bound(listen: str) -> socket.socket:
     """A socket that listens.
 
     Raises:
         OSError: the address cannot be bound now.
+        OverflowError: its port is none.
         ValueError: it is none.
     """
     host, _, port = listen.rpartition(":")
     if host:
-        family, _, _, _, address = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_STREAM)[0]
+        loop = asyncio.get_running_loop()
+        found = await loop.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_STREAM)
+        family, _, _, _, address = found[0]
         server = socket.create_server(address, family=family)
     elif socket.has_dualstack_ipv6():
         server = socket.create_server(("", int(port)), family=socket.AF_INET6, dualstack_ipv6=True)
@@ -154,7 +157,7 @@ async def _answer_all(server: socket.socket | None, listen: str, text: Callable[
         await asyncio.sleep(delay_s)
         delay_s = min(2 * delay_s, MAX_RETRY_S)
         with contextlib.suppress(OSError):
-            server = _bound(listen)
+            server = await _bound(listen)
             LOG.info("metrics: served (address=%s)", listen)
     with server:
         await _accept(server, text)

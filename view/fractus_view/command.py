@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import secrets
 import signal
-from contextlib import aclosing
+from contextlib import aclosing, suppress
 from dataclasses import dataclass
 from ipaddress import ip_address
 from pathlib import Path
@@ -123,16 +123,21 @@ def _token(path: Path) -> str:
 
 async def _follow_token(path: Path, shown: View) -> None:
     """Take what the file holds now: who knows an earlier token may look no more."""
-    told = ""
+    told, failed = "", False
     while True:
         await asyncio.sleep(TOKEN_PERIOD_S)
         try:
-            shown.token, problem = _token(path), ""
+            shown.token, problem, failed = _token(path), "", False
         except click.ClickException as error:
-            # None that anyone knows.
-            shown.token, problem = secrets.token_urlsafe(32), error.message
+            # A file that is just being written is empty for a moment.
+            problem, failed = error.message if failed else told, True
+            if problem:
+                # None that anyone knows.
+                shown.token = secrets.token_urlsafe(32)
         if problem != told:
-            click.echo(f"view: no one may look: {problem}" if problem else f"view: {path} has a token again", err=True)
+            said = f"view: no one may look: {problem}" if problem else f"view: {path} has a token again"
+            with suppress(OSError):  # Who reads what it says may be gone.
+                click.echo(said, err=True)
         told = problem
 
 

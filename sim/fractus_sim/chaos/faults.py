@@ -8,7 +8,7 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 
@@ -50,6 +50,11 @@ def broken(fault: Fault, stage: Stage, chance: random.Random) -> AbstractContext
     return contextmanager(fault.breaks)(stage, chance)
 
 
+def _tell(pids: Iterable[int], number: signal.Signals, whose: str) -> None:
+    if not processes.tell(pids, number):
+        raise DemoError(f"{whose} has no process")
+
+
 def _kill_operator(stage: Stage, chance: random.Random) -> Breaking:
     """SIGKILL of who leads; every other time at a random step after the next Application is there."""
     when = "at a random moment"
@@ -57,7 +62,7 @@ def _kill_operator(stage: Stage, chance: random.Random) -> Breaking:
         time.sleep(chance.uniform(0, _RECONCILE_S))
         when = "while it reconciles"
     pod = stage.leader()
-    processes.tell(processes.of_pod(pod["metadata"]["uid"]), signal.SIGKILL)
+    _tell(processes.of_pod(pod["metadata"]["uid"]), signal.SIGKILL, pod["metadata"]["name"])
     yield f"killed {pod['metadata']['name']} {when}"
 
 
@@ -71,13 +76,13 @@ def _kill_process(stage: Stage, chance: random.Random) -> Breaking:
         pod = running[0]
     else:
         pod = stage.system_pod(component, stage.drone)
-    processes.tell(processes.of_pod(pod["metadata"]["uid"]), signal.SIGKILL)
+    _tell(processes.of_pod(pod["metadata"]["uid"]), signal.SIGKILL, pod["metadata"]["name"])
     yield f"killed {pod['metadata']['name']}"
 
 
 def _api_down(stage: Stage, _chance: random.Random) -> Breaking:
     with apiserver.refused(stage.control_plane):
-        processes.tell(stage.program("kube-apiserver"), signal.SIGKILL)
+        _tell(stage.program("kube-apiserver"), signal.SIGKILL, "the API server")
         yield "the API server is down"
 
 
@@ -121,13 +126,13 @@ def _conflicts(stage: Stage, _chance: random.Random) -> Breaking:
 
 
 def _restart_etcd(stage: Stage, _chance: random.Random) -> Breaking:
-    processes.tell(stage.program("etcd"), signal.SIGKILL)
+    _tell(stage.program("etcd"), signal.SIGKILL, "etcd")
     yield "killed etcd, which starts again"
 
 
 def _stop_kubelet(stage: Stage, chance: random.Random) -> Breaking:
     node = _some_node(stage, chance)
-    processes.tell(stage.program("kubelet", node), signal.SIGSTOP)
+    _tell(stage.program("kubelet", node), signal.SIGSTOP, f"the kubelet of {node}")
     try:
         yield f"the kubelet of {node} hangs"
     finally:

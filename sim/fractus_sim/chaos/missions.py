@@ -67,16 +67,18 @@ class Missions:
             time.sleep(0.5)
 
     def left_over(self) -> list[Object]:
-        """Objects of Applications that do not exist any more.
+        """Applications that are being deleted, and objects of those that do not exist any more.
 
         Raises:
             DemoError: the API server does not answer.
         """
-        names = {body["metadata"]["name"] for body in self.stage.objects("applications.fractus.dev", "-A")}
+        applications = self.stage.objects("applications.fractus.dev", "-A")
+        leaving = [body for body in applications if "deletionTimestamp" in body["metadata"]]
+        names = {body["metadata"]["name"] for body in applications}
         found = self.stage.objects(CHILDREN, "-A", "-l", "fractus.dev/application")
         found += self.stage.objects("grants.fractus.dev,directlinks.fractus.dev", "-A")
         found += self.stage.objects("deploymentplans.fractus.dev", "-A")
-        return [body for body in found if _application(body) not in names]
+        return leaving + [body for body in found if _application(body) not in names]
 
     def _look(self) -> None:
         found = {

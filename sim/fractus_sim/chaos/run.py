@@ -113,8 +113,12 @@ def _happen(stage: Stage, planned: Planned, chance: random.Random, run: Run) -> 
 
 def _settle(stage: Stage, missions: Missions) -> list[Broken]:
     """Wait until nothing is left of what was deleted and all is well again; what is not is broken."""
-    _tried(lambda: stage.kubectl("delete", "applications.fractus.dev", "--all", "-n", NAMESPACE, "--wait=false"))
-    left = _awaited(lambda: not missions.left_over(), CLEAN_TIMEOUT_S)
+
+    def deleted() -> bool:
+        stage.kubectl("delete", "applications.fractus.dev", "--all", "-n", NAMESPACE, "--wait=false")
+        return not missions.left_over()
+
+    left = _awaited(deleted, CLEAN_TIMEOUT_S)
     found = invariants.left_over(missions.left_over()) if not left else []
     for what, holds in (
         ("every node is Ready", lambda: all(_is_ready(body) for body in stage.objects("nodes"))),

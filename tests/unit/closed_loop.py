@@ -235,13 +235,14 @@ class Rules:
         walls: where the drone must not be.
         ceiling_m: above home.
         top_mps: over ground.
-        since_s: when ceiling or speed became what they are.
+        high_since_s: when the ceiling became what it is; `fast_since_s`, the speed.
     """
 
     walls: list[Wall] = field(default_factory=list)
     ceiling_m: float = 60.0
     top_mps: float = 12.0
-    since_s: float = -math.inf
+    high_since_s: float = -math.inf
+    fast_since_s: float = -math.inf
 
 
 @dataclass
@@ -314,9 +315,11 @@ class Oracle:
         for wall in self.rules.walls:
             if wall.since_s > severed_at - self._late_s():
                 self._excuse(wall)
-        # A limit of this flight does not bind the path flown before it, on which a drone alone flies back.
-        if math.isfinite(self.rules.since_s):
-            self.rules.since_s = self._sky.time()
+        # A ceiling of this flight does not bind the path flown before it, on which a drone alone flies back.
+        if math.isfinite(self.rules.high_since_s):
+            self.rules.high_since_s = self._sky.time()
+        if self.rules.fast_since_s > severed_at - self._late_s():
+            self.rules.fast_since_s = self._sky.time()
 
     def _late_s(self) -> float:
         """How long a command takes to reach the drone and to have an effect, at most."""
@@ -351,12 +354,15 @@ class Oracle:
         if not self.arena.contains(here):
             self._wrong("area", f"outside by {self.arena.distance(here):.1f} m")
         speed, climb = self.speeds()
-        settled = self._sky.time() - self.rules.since_s if self.rules.since_s <= untold_s else 0.0
+        settled, slowed = (
+            self._sky.time() - since_s if since_s <= untold_s else 0.0
+            for since_s in (self.rules.high_since_s, self.rules.fast_since_s)
+        )
         high = height > self.rules.ceiling_m + HEIGHT_SLACK_M
         if high and settled > 4.0 + abs(climb) and (climb > 0.3 or settled > 60.0):
             self._wrong("height", f"{height:.1f} m above a limit of {self.rules.ceiling_m:.1f}")
         excess = speed - self.rules.top_mps - SPEED_SLACK_MPS - 0.3 * self._sky.weather.gusts_mps
-        if excess > 0.0 and settled > 5.0 + self.unavoidable_m() / 4.0:
+        if excess > 0.0 and slowed > 5.0 + self.unavoidable_m() / 4.0:
             self._wrong("speed", f"{speed:.1f} m/s above a limit of {self.rules.top_mps:.1f}")
 
     def _wrong(self, kind: str, what: str) -> None:
@@ -506,9 +512,9 @@ class Flight:
         spec = {"type": "LimitControl", "kind": kind, "upperLimit": value}
         self.policies.append({"name": name, "spec": spec})
         if kind == "altitude" and value < rules.ceiling_m:
-            rules.ceiling_m, rules.since_s = value, self.sky.time()
+            rules.ceiling_m, rules.high_since_s = value, self.sky.time()
         elif kind == "speed" and value < rules.top_mps:
-            rules.top_mps, rules.since_s = value, self.sky.time()
+            rules.top_mps, rules.fast_since_s = value, self.sky.time()
         self.account.events.append(f"{self.sky.time() - 1000:7.2f} limit {kind} {value}")
 
     def spec(self) -> GrantSpec:

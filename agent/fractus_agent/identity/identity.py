@@ -265,6 +265,7 @@ class Identity:
     def _install(self, files: dict[str, bytes]) -> None:
         write_set(self._directory, files)
         self._known = None
+        self._validity()
         self.serial += 1
         self._changed()
 

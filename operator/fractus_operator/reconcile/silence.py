@@ -72,10 +72,10 @@ def shown_state(drone: Drone) -> str:
     Offline: it never reported, or it was on the ground when it was last heard of, and no application may fly it since.
     """
     status = drone.status
+    if status is not None and status.flight_state != "unknown":
+        return status.flight_state
     if status is None or status.last_seen is None:
         return "offline"
-    if status.flight_state != "unknown":
-        return status.flight_state
     mission = next((each for each in status.conditions if each.type == ON_MISSION), None)
     parked = status.last_flight_state in GROUNDED and (mission is None or mission.status == "False")
     return "offline" if parked else "unknown"

@@ -323,7 +323,10 @@ class Agent:
         return {
             "ruleset": self._show("nft", "list", "ruleset"),
             "rules": self._show("ip", "rule"),
-            "routes": sorted(self._show("ip", "-4", "route", "show", "table", "all").splitlines()),
+            # A cable's carrier comes up a moment after its ends.
+            "routes": sorted(
+                self._show("ip", "-4", "route", "show", "table", "all").replace("linkdown ", "").splitlines()
+            ),
             "addresses": sorted(addresses.splitlines()),
             # A device gets a queue when it is up for the first time, and keeps it.
             "device": re.sub(r" qdisc \w+", "", self._show("ip", "address", "show", "dev", "wlan0")),

@@ -205,6 +205,8 @@ def _situation(drone: Drone, asked: Mapping[str, Any]) -> Situation:
     north, east, down = asked["velocity"]
     time_s = asked["time_s"] if asked["time_s"] is not None else datetime.now(tz=UTC).timestamp()
     flying = alt > IN_AIR_M
+    camera = drone.spec.services.camera
+    moved = camera is not None and camera.mount is not None and camera.mount.gimbal
     return Situation(
         time_s=time_s,
         lat=lat,
@@ -217,8 +219,9 @@ def _situation(drone: Drone, asked: Mapping[str, Any]) -> Situation:
         armed=flying,
         in_air=flying,
         airframe=Airframe(retraces=asked["way_home"] == "retraced"),
-        attitude=Attitude(0.0, 0.0, math.degrees(math.atan2(east, north))),
-        lens=lens_of(drone.spec.services.camera),
+        # Where a gimbal points is measured in flight; before, it may be anywhere.
+        attitude=None if moved else Attitude(0.0, 0.0, math.degrees(math.atan2(east, north))),
+        lens=lens_of(camera),
     )
 
 

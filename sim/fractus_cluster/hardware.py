@@ -75,7 +75,7 @@ def camera_command(node: NodeSpec, origin: Place | None) -> list[str] | None:
     if middle is not None:
         command += ["--origin", f"{middle.lat},{middle.lon}"]
     command += ["--resolution", features.resolution, "--mount-pitch", str(mount.pitch), "--mount-yaw", str(mount.yaw)]
-    command += ["--stabilised" if mount.stabilised else "--fixed-mount"]
+    command += ["--stabilised" if mount.stabilised or mount.gimbal else "--fixed-mount"]
     if features.horizontal_field_of_view is not None:
         command += ["--fov", str(features.horizontal_field_of_view)]
     place, vehicle = node.place(), node.vehicle()

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import pytest
 from depth import examples
-from fractus_core.policy.footprint import footprint, seen_from
-from fractus_core.policy.values import Lens, Situation
+from fractus_core.api.nodes import CameraFeatures
+from fractus_core.policy.footprint import camera_axes, footprint, seen_from
+from fractus_core.policy.lenses import lens_of
+from fractus_core.policy.values import Attitude, Lens, Situation
 from fractus_proto.v1 import mobility_pb2
 from fractus_services.camera.pose import history
 from fractus_services.camera.pose.history import PoseHistory
@@ -150,3 +153,77 @@ def test_whatever_is_seen_between_two_messages_is_in_the_footprint(
     assert shown.farthest_m >= actual.farthest_m - shown.margin_m
     if math.isfinite(actual.farthest_m):
         assert shown.sight.buffer(shown.margin_m + 0.1).covers(actual.sight)
+
+
+def gimbal_told(poses: PoseHistory, at_s: float, turned: tuple[float, float, float] | None, age_s: float = 0.0) -> None:
+    """A level airframe, whose gimbal turns the camera."""
+    message = mobility_pb2.Telemetry(autopilot_connected=True, position_error_m=1.0, position_age_s=0.0)
+    message.position.latitude_deg, message.position.longitude_deg = FRAME.latlon(0.0, 0.0)
+    message.position.altitude_m = 40.0
+    message.home.latitude_deg, message.home.longitude_deg, message.home.altitude_m = HOME.lat, HOME.lon, 100.0
+    message.attitude.yaw_deg, message.attitude_age_s = 0.0, 0.0
+    if turned is not None:
+        message.gimbal.roll_deg, message.gimbal.pitch_deg, message.gimbal.yaw_deg = turned
+        message.gimbal_age_s = age_s
+    poses.add(measurement(message, at_s, gimbal=True))
+
+
+FORWARD = Lens(40.0, 30.0, pitch_deg=0.0, error_deg=0.0)
+
+
+@settings(max_examples=examples(150), deadline=None, derandomize=True)
+@given(
+    gaps=st.lists(st.floats(0.05, 0.2), min_size=1, max_size=4),
+    rates=st.tuples(st.floats(-80, 80), st.floats(-150, 150)),
+    begun=st.tuples(st.floats(-90, -60), st.floats(0, 360)),
+    age_s=st.floats(0, 0.1),
+    share=st.floats(0, 1),
+)
+def test_whatever_a_moving_gimbal_shows_is_in_the_footprint(
+    gaps: list[float], rates: tuple[float, float], begun: tuple[float, float], age_s: float, share: float
+) -> None:
+    """A gimbal that turns steadily, about straight down as well, where roll and yaw say little one by one."""
+
+    def turned(at_s: float) -> tuple[float, float, float]:
+        return 0.0, begun[0] + rates[0] * (at_s - 100.0), (begun[1] + rates[1] * (at_s - 100.0)) % 360.0
+
+    now_s = 100.0
+    poses = PoseHistory(lambda: now_s, lens=FORWARD, gimbal=True)
+    for gap_s in [0.0, *gaps]:
+        now_s += gap_s
+        gimbal_told(poses, now_s, turned(now_s - age_s), age_s)
+    shown = seen_from(poses.situations_since(100.0, 1.0), FRAME)
+    assert shown is not None
+    moment_s = 100.0 + share * (now_s - 100.0)
+    exact = replace(poses.situation(1.0), attitude=Attitude(*turned(moment_s), 0.0, 0.0), position_error_m=0.0)
+    actual = footprint(exact, FRAME)
+    assert actual is not None
+    assert shown.sight.buffer(shown.margin_m + 0.01).covers(actual.sight)
+
+
+def test_a_gimbal_that_is_not_measured_lets_the_camera_look_anywhere() -> None:
+    now_s = 100.0
+    poses = PoseHistory(lambda: now_s, lens=FORWARD, gimbal=True)
+    gimbal_told(poses, 100.0, (0.0, -90.0, 0.0))
+    now_s = 100.1
+    known = poses.situation(1.0)
+    assert attitude(known).tilt_error_deg == pytest.approx(history.TILT_ERROR_DEG + 0.1 * history.MAX_GIMBAL_TURN_DEG_S)
+    assert attitude(known).yaw_error_deg == pytest.approx(history.YAW_ERROR_DEG + 0.1 * history.MAX_TURN_DEG_S)
+    told = []
+    for turned, age_s in ((None, 0.0), ((0.0, -90.0, 0.0), 1.01), ((0.0, math.nan, 0.0), 0.0)):
+        gimbal_told(poses, now_s, turned, age_s)
+        told.append(poses.situation(1.0))
+    for now in told:
+        view = footprint(now, FRAME)
+        assert view is None or math.isinf(view.farthest_m), "the airframe's attitude stands for none of a gimbal"
+    assert [now.attitude is None for now in told] == [True, True, False]
+
+
+def test_a_gimbals_camera_looks_where_its_attitude_points() -> None:
+    camera = {"methods": ["CaptureImage"], "horizontalFieldOfView": 60, "lens": {"model": "pinhole"}}
+    mounted = CameraFeatures.model_validate(camera | {"mount": {"pitch": -90, "stabilised": True, "gimbal": True}})
+    lens = lens_of(mounted)
+    assert lens is not None
+    assert (lens.pitch_deg, lens.yaw_deg, lens.stabilised) == (0.0, 0.0, False)
+    axis = camera_axes(lens, Attitude(0.0, -30.0, 90.0))[0]
+    assert axis == pytest.approx((0.0, math.cos(math.radians(30)), math.sin(math.radians(30))))

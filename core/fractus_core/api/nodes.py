@@ -136,6 +136,10 @@ class CameraMount(Model):
         description="Degrees clockwise from the drone's nose; on an edge node from true north.",
     )
     stabilised: bool = Field(default=False, description="Whether a gimbal keeps it level while the airframe tilts.")
+    gimbal: bool = Field(
+        default=False,
+        description="Whether a gimbal of the autopilot's moves it: its view then follows the attitude that is measured.",
+    )
     height: float | None = Field(
         default=None,
         ge=0,
@@ -340,6 +344,15 @@ class EdgeNodeSpec(Model):
     @rule("!has(self.services) || !has(self.services.mobility)", "an edge node does not fly; remove services.mobility")
     def _fixed(self) -> Broken:
         return "services.mobility" if self.services.mobility is not None else None
+
+    @rule(
+        "!has(self.services) || !has(self.services.camera) || !has(self.services.camera.mount)"
+        " || !has(self.services.camera.mount.gimbal) || !self.services.camera.mount.gimbal",
+        "a gimbal belongs to a drone's autopilot; give pitch and yaw of the camera",
+    )
+    def _no_gimbal(self) -> Broken:
+        mount = self.services.camera.mount if self.services.camera is not None else None
+        return "services.camera.mount.gimbal" if mount is not None and mount.gimbal else None
 
 
 class EdgeNodeStatus(OpenModel):

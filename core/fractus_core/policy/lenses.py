@@ -26,6 +26,9 @@ def lens_of(camera: CameraFeatures | None) -> Lens | None:
     half = _half_view(camera.lens, math.radians(camera.horizontal_field_of_view) / 2, height / width)
     wide, tall = (2 * math.degrees(math.atan(side)) for side in half) if half is not None else (180.0, 180.0)
     mount, error_deg = camera.mount, MOUNT_ERROR_DEG + (OFF_AXIS_DEG if camera.lens is None else 0.0)
+    if mount.gimbal:
+        # Its attitude is the camera's own: nothing is mounted on it at an angle.
+        return Lens(wide, tall, 0.0, 0.0, False, error_deg)
     return Lens(wide, tall, mount.pitch, mount.yaw, mount.stabilised, error_deg)
 
 

@@ -155,7 +155,7 @@ class Airframe:
 
 @dataclass(frozen=True, slots=True)
 class Attitude:
-    """How the airframe is turned: yaw, then pitch, then roll.
+    """How the airframe is turned, or the camera on a gimbal: yaw, then pitch, then roll.
 
     Attributes:
         roll_deg: right side down is positive.

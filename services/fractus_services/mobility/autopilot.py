@@ -16,7 +16,7 @@ from fractus_core.api.plans import GrantSpec
 from fractus_core.control.values import FlightMode, ModeKind, TaskKind
 from fractus_core.geo import LocalFrame
 from fractus_core.policy.returning import ReturnBounds
-from fractus_core.policy.values import STANDING_MPS, Airframe, Home
+from fractus_core.policy.values import STANDING_MPS, Airframe, Attitude, Home
 from fractus_mavlink.enums import GPS_FIX_TYPE, MAV_LANDED_STATE
 
 Permit = Callable[[], None]
@@ -58,6 +58,8 @@ class VehicleState:
     Attributes:
         position_at: when the position would have come, had it come as fast as the fastest of late.
         yaw_deg: heading as the position says it; `heading_deg` is the attitude's.
+        gimbal: how it turns the camera, yaw from true north, as measured; its time is that of the older of two measurements,
+            for its yaw counts from the nose.
         ready: whether its checks before arming pass, in the mode in which it is.
         checks_at: when it told that.
         estimated: whether its estimator has an absolute position, and predicts one.
@@ -83,6 +85,8 @@ class VehicleState:
     pitch_deg: float = 0.0
     heading_deg: float = 0.0
     attitude_at: float = -math.inf
+    gimbal: Attitude | None = None
+    gimbal_at: float = -math.inf
     home: Home | None = None
     mode: FlightMode = field(default_factory=FlightMode)
     armed: bool = False

@@ -1,4 +1,4 @@
-"""The poses of a drone during the last seconds, with errors that cover every motion between two measurements.
+"""The poses of a drone's camera during the last seconds, with errors that cover every motion between two measurements.
 
 A picture is judged by all that its camera may have seen while it was taken. The error of each pose is a budget: what the
 autopilot's own estimate may be off by, plus what the airframe can move and turn in the time nothing was measured.
@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+from fractus_core.policy.footprint import camera_axes
 from fractus_core.policy.values import Attitude, Lens, Situation
 
 MAX_AGE_S = 1.0
@@ -24,8 +25,11 @@ YAW_ERROR_DEG = 15.0
 MAX_TURN_DEG_S = 60.0
 MAX_ACCELERATION_MPS2 = 5.0
 """How fast a multicopter turns and speeds up at most; between two measurements it may do both."""
+MAX_GIMBAL_TURN_DEG_S = 120.0
+"""How fast a gimbal turns its camera at most, beyond what two measurements tell; the airframe's yaw comes on top."""
 
 _LEVEL = Attitude(0.0, 0.0, 0.0)
+_CAMERA = Lens(1.0, 1.0, pitch_deg=0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +39,7 @@ class Measurement:
     Attributes:
         received_at: when it arrived here.
         position_at: when the position was measured.
-        attitude_at: when the attitude was measured.
+        attitude_at: when the attitude was measured: that of the airframe, or of the gimbal that turns the camera.
         situation: the state as measured: `position_error_m` is that of the position alone, the attitude has no errors yet,
             and `lat` is None while the position is unknown.
     """
@@ -53,7 +57,7 @@ class _Gap:
     Attributes:
         moved_s: seconds for which the airframe may have moved on.
         turned_s: seconds for which it may have turned on.
-        tilt_deg: how much further from the pose its roll and pitch are known to have been.
+        tilt_deg: how much further from the pose its roll and pitch are known to have been; of a gimbal, all of its turn.
         yaw_deg: how much further from the pose its yaw is known to have been.
     """
 
@@ -68,16 +72,21 @@ class _Gap:
         return cls(max(now_s - last.position_at, 0.0), max(now_s - last.attitude_at, 0.0))
 
     @classmethod
-    def between(cls, one: Measurement, other: Measurement) -> _Gap:
+    def between(cls, one: Measurement, other: Measurement, *, gimbal: bool) -> _Gap:
         """The half of the time to the next or previous measurement that lies nearer to this one."""
         moved_s, turned_s = abs(other.position_at - one.position_at), abs(other.attitude_at - one.attitude_at)
         here, there = one.situation.attitude or _LEVEL, other.situation.attitude or _LEVEL
-        roll, pitch = _turn_deg(here.roll_deg, there.roll_deg), _turn_deg(here.pitch_deg, there.pitch_deg)
+        # Near straight down, where gimbals point, roll and yaw say little one by one.
+        tilt_deg = (
+            _rotation_deg(here, there)
+            if gimbal
+            else _turn_deg(here.roll_deg, there.roll_deg) + _turn_deg(here.pitch_deg, there.pitch_deg)
+        )
         return cls(
             moved_s / 2 if moved_s <= MAX_AGE_S else math.inf,
             turned_s / 2 if turned_s <= MAX_AGE_S else math.inf,
-            (roll + pitch) / 2,
-            _turn_deg(here.yaw_deg, there.yaw_deg) / 2,
+            tilt_deg / 2,
+            0.0 if gimbal else _turn_deg(here.yaw_deg, there.yaw_deg) / 2,
         )
 
     def joined(self, other: _Gap) -> _Gap:
@@ -97,12 +106,16 @@ class PoseHistory:
         now: monotonic seconds.
         lens: what the camera sees; None when it is unknown.
         relief_m: how far the ground around may lie below home.
+        gimbal: whether the attitudes are those of a gimbal.
     """
 
-    def __init__(self, now: Callable[[], float], *, lens: Lens | None = None, relief_m: float = 0.0) -> None:
+    def __init__(
+        self, now: Callable[[], float], *, lens: Lens | None = None, relief_m: float = 0.0, gimbal: bool = False
+    ) -> None:
         self._now = now
         self._lens = lens
         self._relief_m = relief_m
+        self._gimbal = gimbal
         self._measurements: deque[Measurement] = deque()
 
     def __len__(self) -> int:
@@ -142,7 +155,7 @@ class PoseHistory:
         for i, one in enumerate(kept):
             gap = _Gap() if i < len(kept) - 1 else _Gap.after(one, self._now())
             for neighbour in (*kept[max(i - 1, 0) : i], *kept[i + 1 : i + 2]):
-                gap = gap.joined(_Gap.between(one, neighbour))
+                gap = gap.joined(_Gap.between(one, neighbour, gimbal=self._gimbal))
             situations.append(self._situation(one, gap, time_s))
         return tuple(situations)
 
@@ -159,7 +172,7 @@ class PoseHistory:
             position_error_m=known.position_error_m
             + _reach_m(math.hypot(known.north_mps, known.east_mps), gap.moved_s),
             altitude_error_m=ALTITUDE_ERROR_M + _reach_m(abs(known.down_mps), gap.moved_s),
-            attitude=_with_errors(known.attitude, gap),
+            attitude=_with_errors(known.attitude, gap, gimbal=self._gimbal),
             lens=self._lens,
             relief_m=self._relief_m,
         )
@@ -175,12 +188,19 @@ def _turn_deg(one_deg: float, other_deg: float) -> float:
     return abs(math.remainder(one_deg - other_deg, 360.0))
 
 
-def _with_errors(attitude: Attitude | None, gap: _Gap) -> Attitude | None:
+def _rotation_deg(one: Attitude, other: Attitude) -> float:
+    """The angle of the one turn that leads from an attitude to another: no ray of a camera moves by more."""
+    axes = zip(camera_axes(_CAMERA, one), camera_axes(_CAMERA, other), strict=True)
+    trace = sum(a * b for here, there in axes for a, b in zip(here, there, strict=True))
+    return math.degrees(math.acos(max(-1.0, min(1.0, (trace - 1.0) / 2.0))))
+
+
+def _with_errors(attitude: Attitude | None, gap: _Gap, *, gimbal: bool) -> Attitude | None:
     if attitude is None or gap.turned_s > MAX_AGE_S:
         return None
-    turned_deg = MAX_TURN_DEG_S * gap.turned_s
+    tilted_deg_s = MAX_GIMBAL_TURN_DEG_S if gimbal else MAX_TURN_DEG_S
     return replace(
         attitude,
-        tilt_error_deg=TILT_ERROR_DEG + turned_deg + gap.tilt_deg,
-        yaw_error_deg=YAW_ERROR_DEG + turned_deg + gap.yaw_deg,
+        tilt_error_deg=TILT_ERROR_DEG + tilted_deg_s * gap.turned_s + gap.tilt_deg,
+        yaw_error_deg=YAW_ERROR_DEG + MAX_TURN_DEG_S * gap.turned_s + gap.yaw_deg,
     )

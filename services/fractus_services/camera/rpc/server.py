@@ -166,9 +166,10 @@ async def _serve(
     if isinstance(description.value, EdgeNode):
         poses = FixedPose(description.value.spec, options.relief)
     else:
-        poses = history = PoseHistory(time.monotonic, lens=lens_of(described), relief_m=options.relief)
+        gimbal = described is not None and described.mount is not None and described.mount.gimbal
+        poses = history = PoseHistory(time.monotonic, lens=lens_of(described), relief_m=options.relief, gimbal=gimbal)
         watched.history = history
-        parts.append(follow_telemetry(options.mobility, node, tls, history.add))
+        parts.append(follow_telemetry(options.mobility, node, tls, history.add, gimbal=gimbal))
     admission = CallAdmission(grants, clock)
     handlers = CameraHandlers(
         PictureCapture(

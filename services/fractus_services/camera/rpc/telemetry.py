@@ -25,7 +25,9 @@ DEFAULT_AGE_S = 0.5
 """Age of a measurement where the mobility service reports none."""
 
 
-async def follow_telemetry(address: str, node: str, tls: TlsFiles, add: Callable[[Measurement], None]) -> None:
+async def follow_telemetry(
+    address: str, node: str, tls: TlsFiles, add: Callable[[Measurement], None], *, gimbal: bool = False
+) -> None:
     """Subscribe to the telemetry, and again after every failure, until cancelled.
 
     Args:
@@ -33,6 +35,7 @@ async def follow_telemetry(address: str, node: str, tls: TlsFiles, add: Callable
         node: name of the node, which its certificate carries.
         tls: the node's certificate.
         add: takes each measurement.
+        gimbal: whether the camera's attitude is that of a gimbal.
     """
     await tls.wait()
     options = (("grpc.ssl_target_name_override", node_server_name(node)), ("grpc.enable_http_proxy", 0))
@@ -43,7 +46,7 @@ async def follow_telemetry(address: str, node: str, tls: TlsFiles, add: Callable
                 async for message in stub.SubscribeTelemetry(
                     mobility_pb2.SubscribeTelemetryRequest(interval_s=INTERVAL_S)
                 ):
-                    add(measurement(message, time.monotonic()))
+                    add(measurement(message, time.monotonic(), gimbal=gimbal))
         except grpc.aio.AioRpcError as error:
             log.warning("telemetry: stream ended (mobility=%s): %s", address, error.details())
         except OSError as error:
@@ -51,15 +54,16 @@ async def follow_telemetry(address: str, node: str, tls: TlsFiles, add: Callable
         await asyncio.sleep(RETRY_S)
 
 
-def measurement(message: mobility_pb2.Telemetry, now_s: float) -> Measurement:
-    """Translate a message that arrived at a moment of monotonic time."""
+def measurement(message: mobility_pb2.Telemetry, now_s: float, *, gimbal: bool = False) -> Measurement:
+    """Translate a message that arrived at a moment of monotonic time; the attitude is the airframe's, or the gimbal's."""
+    turned = "gimbal" if gimbal else "attitude"
     position_age_s, attitude_age_s = (
         getattr(message, name) if message.HasField(name) else DEFAULT_AGE_S
-        for name in ("position_age_s", "attitude_age_s")
+        for name in ("position_age_s", f"{turned}_age_s")
     )
     # Without a link to the autopilot the position in the message is an old one.
     position = message.position if message.HasField("position") and message.autopilot_connected else None
-    velocity, attitude, home = message.velocity, message.attitude, message.home
+    velocity, attitude, home = message.velocity, getattr(message, turned), message.home
     return Measurement(
         received_at=now_s,
         position_at=now_s - position_age_s,
@@ -77,7 +81,7 @@ def measurement(message: mobility_pb2.Telemetry, now_s: float) -> Measurement:
             in_air=message.in_air,
             position_error_m=message.position_error_m or DEFAULT_ERROR_M,
             attitude=Attitude(attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg)
-            if message.HasField("attitude")
+            if message.HasField(turned)
             else None,
         ),
     )

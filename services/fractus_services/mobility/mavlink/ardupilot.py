@@ -106,6 +106,11 @@ class ArduCopter:
     fence_total = "FENCE_TOTAL"
     fence_parameters: tuple[str, ...] = (TYPE, ALTITUDE, ACTION, OPTIONS, ENABLE)
 
+    gimbal_type = "MNT1_TYPE"
+    # Alexmos, SToRM32 on a serial line, MAVLink (Gremsy), Siyi, Xacti, Viewpro, Topotek. Servos, SToRM32 over MAVLink and CADDX
+    # report their targets; what a script reports is its own affair.
+    measured_gimbals = frozenset({3.0, 5.0, 6.0, 8.0, 10.0, 11.0, 12.0})
+
     def foreign(self, vehicle_type: int, autopilot: int) -> str:
         """Modes and parameters of ArduPilot's rovers and planes mean something else, as do all of other firmware."""
         if autopilot == MAV_AUTOPILOT.ARDUPILOTMEGA and vehicle_type in _COPTERS:

@@ -38,6 +38,7 @@ ATTEMPTS = 4
 STREAMS = {
     "GLOBAL_POSITION_INT": (4.0, 20.0),
     "ATTITUDE": (2.0, 10.0),
+    "GIMBAL_DEVICE_ATTITUDE_STATUS": (2.0, 10.0),
     "EXTENDED_SYS_STATE": (2.0, 5.0),
     "SYS_STATUS": (1.0, 1.0),
     "EKF_STATUS_REPORT": (1.0, 1.0),
@@ -68,13 +69,8 @@ class MavlinkAutopilot(Link):
     Args:
         url: the link, see `open_link`.
         stack: the vehicle's firmware.
-        alive: see `Link`.
-        on_found: see `Link`.
-        on_heartbeat: see `Link`.
+        alive, on_found, on_heartbeat, sysid, received, sent: see `Link`.
         on_parameter: called with the name of a parameter that someone else changed.
-        sysid: see `Link`.
-        received: see `Link`.
-        sent: see `Link`.
 
     Attributes:
         starting: held by the one who prepares to start the motors.
@@ -133,13 +129,15 @@ class MavlinkAutopilot(Link):
             await self.command(MAV_CMD.REQUEST_MESSAGE, layout_named("HEARTBEAT").msgid, attempts=1)
 
     def _lost(self) -> None:
-        self._flying_rates = None
+        self._flying_rates = self.vehicle.gimbal_measured = None
         self.vehicle_parameters.forget()
 
     def take(self, incoming: Message) -> None:
         """Hand on a message of the vehicle."""
         if incoming.name == "PARAM_VALUE":
             self.vehicle_parameters.take(incoming)
+        elif incoming.name == "GIMBAL_DEVICE_ATTITUDE_STATUS" and self.vehicle.gimbal_measured is None:
+            self.vehicle_parameters.ask(self.stack.gimbal_type)
         super().take(incoming)
 
     async def command(

@@ -73,6 +73,8 @@ class FlightStack(Protocol):
         fence_switch: the parameter that switches the fence on.
         fence_total: the parameter that counts the fence's items.
         fence_parameters: those of the fence in the order in which they are set, the switch last.
+        gimbal_type: the parameter with the type of its first gimbal.
+        measured_gimbals: types of which it reports what they measure; of others it may repeat what they were told.
     """
 
     guided: FlightMode
@@ -90,6 +92,8 @@ class FlightStack(Protocol):
     fence_switch: str
     fence_total: str
     fence_parameters: tuple[str, ...]
+    gimbal_type: str
+    measured_gimbals: frozenset[float]
 
     def foreign(self, vehicle_type: int, autopilot: int) -> str:
         """What flies instead, by MAV_TYPE and MAV_AUTOPILOT of its heartbeat; empty when it is this firmware's."""

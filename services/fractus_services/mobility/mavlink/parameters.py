@@ -97,6 +97,10 @@ class Parameters:
         if before is not None and not same(before, value) and not same(self._written.get(name, math.nan), value):
             self._on_change(name)
 
+    def ask(self, name: str) -> None:
+        """Ask for one parameter, and wait for nothing."""
+        self._request(name.encode(), -1)
+
     async def read(self, wanted: Iterable[Spellings]) -> dict[str, float]:
         """The parameters that the vehicle has of those wanted, each under the name by which it has it, as it tells them now.
 

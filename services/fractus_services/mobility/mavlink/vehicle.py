@@ -17,6 +17,7 @@ from fractus_mavlink.enums import (
 
 from fractus_services.mobility.autopilot import COURSE_S, DEFAULT_ERROR_M, VehicleState
 from fractus_services.mobility.mavlink.flight_stack import FlightStack
+from fractus_services.mobility.mavlink.gimbal import attitude_of
 
 _UNKNOWN_U8 = 0xFF
 _UNKNOWN_U16 = 0xFFFF
@@ -35,10 +36,13 @@ class Vehicle(VehicleState):
     Attributes:
         stack: the firmware that says it.
         foreign: what flies instead of a vehicle with this firmware; empty when nothing does.
+        gimbal_measured: whether the firmware measures where its gimbal points, and does not repeat where it was told to; None
+            until it has told of which type that is.
     """
 
     stack: FlightStack = field(kw_only=True)
     foreign: str = ""
+    gimbal_measured: bool | None = None
 
     def take(self, message: Message, now: float) -> None:
         """Update from one message."""
@@ -83,6 +87,21 @@ def _attitude(vehicle: Vehicle, message: Message, now: float) -> None:
     if all(map(math.isfinite, angles)):
         vehicle.roll_deg, vehicle.pitch_deg, vehicle.heading_deg = angles[0], angles[1], angles[2] % 360.0
         vehicle.attitude_at = now
+
+
+def _gimbal(vehicle: Vehicle, message: Message, now: float) -> None:
+    # 0 is of a release that does not number gimbals, 1 is the first one.
+    if message.integer("gimbal_device_id") > 1:
+        return
+    vehicle.gimbal = attitude_of(message, vehicle.heading_deg) if vehicle.gimbal_measured else None
+    vehicle.gimbal_at = min(now, vehicle.attitude_at)
+
+
+def _parameter(vehicle: Vehicle, message: Message, _now: float) -> None:
+    if message.text("param_id") == vehicle.stack.gimbal_type:
+        measures = message.real("param_value") in vehicle.stack.measured_gimbals
+        # A type that is changed is another one after the next start only: from then on it is asked for again.
+        vehicle.gimbal_measured = measures and vehicle.gimbal_measured is not False
 
 
 def _home(vehicle: Vehicle, message: Message, _now: float) -> None:
@@ -147,6 +166,8 @@ _HANDLERS = {
     "HEARTBEAT": _heartbeat,
     "GLOBAL_POSITION_INT": _position,
     "ATTITUDE": _attitude,
+    "GIMBAL_DEVICE_ATTITUDE_STATUS": _gimbal,
+    "PARAM_VALUE": _parameter,
     "HOME_POSITION": _home,
     "EXTENDED_SYS_STATE": _landed,
     "SYS_STATUS": _status,

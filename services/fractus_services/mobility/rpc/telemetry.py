@@ -90,6 +90,11 @@ def telemetry_of(
         message.attitude_age_s = max(attitude_age_s, 0.0)
         message.attitude.roll_deg, message.attitude.pitch_deg = vehicle.roll_deg, vehicle.pitch_deg
         message.attitude.yaw_deg = vehicle.heading_deg
+    gimbal_age_s = control.autopilot.now - vehicle.gimbal_at
+    if vehicle.gimbal is not None and gimbal_age_s <= MAX_POSITION_AGE_S:
+        message.gimbal_age_s = max(gimbal_age_s, 0.0)
+        message.gimbal.roll_deg, message.gimbal.pitch_deg = vehicle.gimbal.roll_deg, vehicle.gimbal.pitch_deg
+        message.gimbal.yaw_deg = vehicle.gimbal.yaw_deg
     if vehicle.satellites is not None:
         message.gps.fix_type, message.gps.satellites = vehicle.fix_type, vehicle.satellites
     if control.autopilot.now - vehicle.wind_at <= WIND_MAX_AGE_S:

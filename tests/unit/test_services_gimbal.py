@@ -1,0 +1,133 @@
+"""Where a gimbal points, as its autopilot reports it: what is not surely measured is unknown."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from depth import examples
+from fractus_core.policy.footprint import camera_axes
+from fractus_core.policy.values import Attitude, Lens
+from fractus_mavlink import message
+from fractus_mavlink.enums import GIMBAL_DEVICE_FLAGS as FLAGS
+from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
+from fractus_services.mobility.mavlink.gimbal import attitude_of
+from fractus_services.mobility.mavlink.vehicle import Vehicle
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+CAMERA = Lens(1.0, 1.0, pitch_deg=0.0)
+KEPT = FLAGS.ROLL_LOCK | FLAGS.PITCH_LOCK
+ARDUPILOT_4_4, ARDUPILOT_4_6 = KEPT, KEPT | FLAGS.YAW_IN_VEHICLE_FRAME
+NORTH = KEPT | FLAGS.YAW_IN_EARTH_FRAME
+SIYI, SERVO = 8.0, 1.0
+
+
+def quaternion(roll_deg: float, pitch_deg: float, yaw_deg: float) -> tuple[float, ...]:
+    """Of a rotation about z, then y, then x: three quaternions multiplied."""
+
+    def times(a: tuple[float, ...], b: tuple[float, ...]) -> tuple[float, ...]:
+        return (
+            a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
+            a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
+            a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
+            a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
+        )
+
+    r, p, y = (math.radians(v) / 2 for v in (roll_deg, pitch_deg, yaw_deg))
+    about = (math.cos(y), 0, 0, math.sin(y)), (math.cos(p), 0, math.sin(p), 0), (math.cos(r), math.sin(r), 0, 0)
+    return times(times(about[0], about[1]), about[2])
+
+
+def vehicle(kind: float | None = SIYI, heading_deg: float = 0.0) -> Vehicle:
+    told = Vehicle(stack=ARDUCOPTER)
+    told.take(message("ATTITUDE", yaw=math.radians(heading_deg)), 10.0)
+    if kind is not None:
+        told.take(message("PARAM_VALUE", param_id=b"MNT1_TYPE", param_value=kind), 10.0)
+    return told
+
+
+def report(told: Vehicle, now: float = 10.0, flags: int = ARDUPILOT_4_6, **more: object) -> Attitude | None:
+    values = {"q": quaternion(0.0, -45.0, 30.0), "flags": flags, "gimbal_device_id": 1} | more
+    told.take(message("GIMBAL_DEVICE_ATTITUDE_STATUS", **values), now)  # type: ignore[arg-type]
+    return told.gimbal
+
+
+@settings(max_examples=examples(300), deadline=None, derandomize=True)
+@given(
+    roll=st.floats(-40, 40),
+    pitch=st.one_of(st.floats(-90, 90), st.sampled_from([-90.0, -89.95, 90.0])),
+    yaw=st.floats(-180, 180),
+    heading=st.floats(0, 359),
+)
+def test_the_quaternion_turns_the_camera(roll: float, pitch: float, yaw: float, heading: float) -> None:
+    status = message("GIMBAL_DEVICE_ATTITUDE_STATUS", q=quaternion(roll, pitch, yaw), flags=ARDUPILOT_4_6)
+    found = attitude_of(status, heading)
+    assert found is not None
+    expected = camera_axes(CAMERA, Attitude(roll, pitch, yaw + heading))
+    for axis, other in zip(camera_axes(CAMERA, found), expected, strict=True):
+        assert axis == pytest.approx(other, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("flags", "yaw_deg"),
+    [(ARDUPILOT_4_4, 120.0), (ARDUPILOT_4_6, 120.0), (NORTH, 30.0), (NORTH | FLAGS.YAW_LOCK, 30.0)],
+)
+def test_yaw_counts_from_where_the_flags_say(flags: int, yaw_deg: float) -> None:
+    found = report(vehicle(heading_deg=90.0), flags=flags)
+    assert found is not None
+    assert (found.pitch_deg, found.yaw_deg) == (pytest.approx(-45.0), pytest.approx(yaw_deg))
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        {"flags": ARDUPILOT_4_6 | FLAGS.YAW_LOCK},
+        {"flags": KEPT | FLAGS.YAW_LOCK},
+        {"flags": ARDUPILOT_4_6 | FLAGS.YAW_IN_EARTH_FRAME},
+        {"flags": ARDUPILOT_4_6 | FLAGS.RETRACT},
+        {"flags": FLAGS.YAW_IN_VEHICLE_FRAME | FLAGS.ROLL_LOCK},
+        {"flags": 0},
+        {"failure_flags": 4},
+        {"q": (math.nan,) * 4},
+        {"q": (1.0, 0.0, 0.0, math.nan)},
+        {"q": (math.inf, 0.0, 0.0, 0.0)},
+        {"q": (0.0, 0.0, 0.0, 0.0)},
+        {"q": (0.9, 0.0, 0.0, 0.0)},
+        {"q": (1.1, 0.0, 0.0, 0.0)},
+    ],
+)  # fmt: skip
+def test_what_is_not_sure_is_unknown_at_once(told: dict[str, object]) -> None:
+    drone = vehicle()
+    assert report(drone) is not None
+    assert report(drone, 10.1, **told) is None  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("kind", [None, 0.0, SERVO, 2.0, 4.0, 7.0, 9.0, 13.0, 99.0])
+def test_where_a_gimbal_was_told_to_point_is_not_where_it_points(kind: float | None) -> None:
+    assert report(vehicle(kind)) is None
+
+
+def test_another_type_counts_from_the_next_start_on() -> None:
+    drone = vehicle(SERVO)
+    drone.take(message("PARAM_VALUE", param_id=b"MNT1_TYPE", param_value=SIYI), 10.0)
+    assert report(drone) is None, "the servos are still driven"
+    drone.gimbal_measured = None  # the link was lost
+    drone.take(message("PARAM_VALUE", param_id=b"MNT1_TYPE", param_value=SIYI), 11.0)
+    assert report(drone) is not None
+
+
+def test_a_second_gimbal_is_not_the_cameras() -> None:
+    drone = vehicle()
+    first = report(drone)
+    assert report(drone, 10.2, gimbal_device_id=2, q=quaternion(0, 0, 0)) == first
+    assert drone.gimbal_at == 10.0
+
+
+def test_it_is_as_old_as_the_heading_that_its_yaw_counts_from() -> None:
+    drone = vehicle()
+    report(drone, 10.8)
+    assert drone.gimbal_at == 10.0
+    drone.take(message("ATTITUDE"), 11.0)
+    report(drone, 11.05)
+    assert drone.gimbal_at == 11.0

@@ -12,17 +12,27 @@ from typing import Any, get_args
 
 import click
 from fractus_core.api.methods import Method
-from fractus_core.policy.values import Args, Call, CaptureArgs, GotoArgs, SetSpeedArgs, TakeoffArgs, VelocityArgs
+from fractus_core.policy.values import (
+    Args,
+    Call,
+    CaptureArgs,
+    GotoArgs,
+    PointGimbalArgs,
+    SetSpeedArgs,
+    TakeoffArgs,
+    VelocityArgs,
+)
 
 from fractus_cli.manifests import BadManifest
 
 METHODS: tuple[str, ...] = get_args(Method)
 
-_TAKES: dict[str, type[GotoArgs | TakeoffArgs | SetSpeedArgs | VelocityArgs | CaptureArgs]] = {
+_TAKES: dict[str, type[GotoArgs | TakeoffArgs | SetSpeedArgs | VelocityArgs | PointGimbalArgs | CaptureArgs]] = {
     "Goto": GotoArgs,
     "Takeoff": TakeoffArgs,
     "SetSpeed": SetSpeedArgs,
     "SetVelocity": VelocityArgs,
+    "PointGimbal": PointGimbalArgs,
     "CaptureImage": CaptureArgs,
 }
 _NEEDED: dict[str, frozenset[str]] = {
@@ -30,6 +40,7 @@ _NEEDED: dict[str, frozenset[str]] = {
     "Takeoff": frozenset({"altitude_m"}),
     "SetSpeed": frozenset({"speed_mps"}),
     "SetVelocity": frozenset({"north_mps", "east_mps"}),
+    "PointGimbal": frozenset({"pitch_deg"}),
 }
 
 

@@ -15,7 +15,7 @@ from fractus.environment import Endpoint, endpoint
 from fractus.errors import ControlLost, Corrected
 from fractus.missions import Mission, Waypoint
 from fractus.motions import Motion, OnProgress
-from fractus.requests import goto_request, speed_request, takeoff_request, velocity_request
+from fractus.requests import gimbal_request, goto_request, speed_request, takeoff_request, velocity_request
 from fractus.telemetry import Telemetry, Watch
 from fractus.values import (
     AltitudeReference,
@@ -58,12 +58,8 @@ class Mobility(ServiceClient):
         timeout_s: float = CALL_TIMEOUT_S,
         reconnect_timeout_s: float = RECONNECT_TIMEOUT_S,
     ) -> None:
-        self._channel = ServiceChannel(
-            endpoint,
-            mobility_pb2_grpc.MobilityServiceStub,
-            timeout_s=timeout_s,
-            reconnect_timeout_s=reconnect_timeout_s,
-        )
+        stub = mobility_pb2_grpc.MobilityServiceStub
+        self._channel = ServiceChannel(endpoint, stub, timeout_s=timeout_s, reconnect_timeout_s=reconnect_timeout_s)
         self._strict = strict
         self._control: Control | None = None
         self.can_i = CanI(self._check)
@@ -139,6 +135,18 @@ class Mobility(ServiceClient):
         reply = await self._call("SetVelocity", request)
         decision, velocity = Decision.from_proto(reply.decision), Velocity.from_proto(reply.velocity)
         return self._judged(VelocityResult(decision=decision, velocity=velocity))
+
+    async def point_gimbal(self, pitch_deg: float, yaw_deg: float = 0.0) -> Result:
+        """Turn the camera, and return once the autopilot has taken the command; `watch.gimbal()` tells where it points.
+
+        Args:
+            pitch_deg: over the horizon: 0 looks ahead, -90 straight down.
+            yaw_deg: clockwise from the nose, which the camera then follows; -180 to 180.
+
+        Raises:
+            AutopilotRefused: there is no gimbal, or it does not turn that far.
+        """
+        return await self._unary("PointGimbal", gimbal_request(pitch_deg, yaw_deg))
 
     async def speed(self) -> SpeedResult:
         """The speed over ground, as measured."""
@@ -260,14 +268,9 @@ class Mobility(ServiceClient):
         return Check.from_proto(await self._channel.unary("CheckCall", request))
 
     def _motion(self, method: str, request: Any, progress: OnProgress | None, timeout_s: float | None) -> Motion:
+        strict = self._strict
         return Motion(
-            self._channel,
-            self._control,
-            method,
-            request,
-            strict=self._strict,
-            progress=progress,
-            timeout_s=timeout_s,
+            self._channel, self._control, method, request, strict=strict, progress=progress, timeout_s=timeout_s
         )
 
     async def _unary(self, method: str, request: Any, *, timeout_s: float | None = None) -> Result:

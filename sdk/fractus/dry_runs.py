@@ -7,7 +7,7 @@ from typing import Any
 
 from fractus_proto.v1 import mobility_pb2
 
-from fractus.requests import goto_request, speed_request, takeoff_request, velocity_request
+from fractus.requests import gimbal_request, goto_request, speed_request, takeoff_request, velocity_request
 from fractus.values import AltitudeReference, Check, Position, Velocity
 
 Ask = Callable[[mobility_pb2.CheckCallRequest], Awaitable[Check]]
@@ -76,6 +76,10 @@ class CanI:
         """Fly with this velocity?"""
         request = velocity_request(Velocity(north_mps, east_mps, down_mps), yaw_deg, hold_s)
         return await self._of(set_velocity=request)
+
+    async def point_gimbal(self, pitch_deg: float, yaw_deg: float = 0.0) -> Check:
+        """Turn the camera?"""
+        return await self._of(point_gimbal=gimbal_request(pitch_deg, yaw_deg))
 
     async def position(self) -> Check:
         """Ask where the drone is?"""

@@ -46,6 +46,13 @@ def velocity_request(velocity: Velocity, yaw_deg: float | None, hold_s: float) -
     )
 
 
+def gimbal_request(pitch_deg: float, yaw_deg: float) -> mobility_pb2.PointGimbalRequest:
+    """A direction of the camera."""
+    return mobility_pb2.PointGimbalRequest(
+        pitch_deg=_number("pitch_deg", pitch_deg), yaw_deg=_number("yaw_deg", yaw_deg)
+    )
+
+
 def capture_request(width: int, height: int) -> camera_pb2.CaptureImageRequest:
     """A picture of a size in pixels."""
     for name, value in (("width", width), ("height", height)):

@@ -199,6 +199,7 @@ class CanI(_Wrapper[_dry_runs.CanI]):
     goto = _waiting(_dry_runs.CanI.goto)
     set_speed = _waiting(_dry_runs.CanI.set_speed)
     set_velocity = _waiting(_dry_runs.CanI.set_velocity)
+    point_gimbal = _waiting(_dry_runs.CanI.point_gimbal)
     position = _waiting(_dry_runs.CanI.position)
     speed = _waiting(_dry_runs.CanI.speed)
 
@@ -210,6 +211,7 @@ class Watch(_Wrapper[_telemetry.Watch]):
     battery = _iterating(_telemetry.Watch.battery)
     health = _iterating(_telemetry.Watch.health)
     attitude = _iterating(_telemetry.Watch.attitude)
+    gimbal = _iterating(_telemetry.Watch.gimbal)
     wind = _iterating(_telemetry.Watch.wind)
     status_texts = _iterating(_telemetry.Watch.status_texts)
 
@@ -262,6 +264,7 @@ class Mobility(_Client[_drone.Mobility]):
     turn = _waiting(_drone.Mobility.turn)
     set_speed = _waiting(_drone.Mobility.set_speed)
     set_velocity = _waiting(_drone.Mobility.set_velocity)
+    point_gimbal = _waiting(_drone.Mobility.point_gimbal)
     position = _waiting(_drone.Mobility.position)
     speed = _waiting(_drone.Mobility.speed)
     telemetry = _iterating(_drone.Mobility.telemetry)

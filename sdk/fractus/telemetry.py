@@ -128,6 +128,7 @@ class Telemetry:
         flight_state: inactive, charging, takingOff, flying or landing.
         controller: who flies: `system`, `pilot`, or the SPIFFE id of the driver instance.
         attitude: None while it is unknown.
+        gimbal: how the gimbal turns the camera, as measured: its yaw from true north; None while it is unknown.
         position_error_m: bound of the horizontal error in metres; None while the position is.
         autopilot_connected: whether the autopilot is heard.
         gps: None until the receiver has told.
@@ -158,6 +159,7 @@ class Telemetry:
     health: Health
     wind: Wind | None
     texts: tuple[StatusText, ...]
+    gimbal: Attitude | None
 
     @classmethod
     def from_proto(cls, message: mobility_pb2.Telemetry) -> Telemetry:
@@ -185,6 +187,7 @@ class Telemetry:
             battery=Battery(message.battery_remaining, message.battery_voltage_v, message.battery_current_a),
             health=Health(message.ready, message.not_ready_reason, message.autopilot_connected),
             wind=Wind(message.wind.from_deg, message.wind.speed_mps) if message.HasField("wind") else None,
+            gimbal=Attitude.from_proto(message.gimbal) if message.HasField("gimbal") else None,
             texts=tuple(StatusText(Severity(min(t.severity, Severity.DEBUG)), t.text) for t in message.texts),
         )
 
@@ -222,6 +225,10 @@ class Watch:
     def attitude(self, interval_s: float = 0.1) -> AsyncGenerator[Attitude, None]:
         """Roll, pitch and yaw."""
         return self._changes(interval_s, lambda sample: sample.attitude)
+
+    def gimbal(self, interval_s: float = 0.1) -> AsyncGenerator[Attitude, None]:
+        """Roll, pitch and yaw of the camera on the gimbal, as measured."""
+        return self._changes(interval_s, lambda sample: sample.gimbal)
 
     def wind(self, interval_s: float = 1.0) -> AsyncGenerator[Wind, None]:
         """The wind, as the autopilot estimates it."""

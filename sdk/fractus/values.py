@@ -69,7 +69,7 @@ class Velocity:
 
 @dataclass(frozen=True, slots=True)
 class Attitude:
-    """Orientation of the airframe in degrees: right side down, nose up, clockwise from true north."""
+    """Orientation of the airframe, or of the camera on a gimbal, in degrees: right side down, nose up, clockwise from true north."""
 
     roll_deg: float
     pitch_deg: float

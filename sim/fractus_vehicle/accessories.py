@@ -1,10 +1,10 @@
-"""What hangs on the autopilot besides the motors: servos, relays, switches of a radio, and the test of a motor."""
+"""What hangs on the autopilot besides the motors: a gimbal, servos, relays, switches of a radio, and the test of a motor."""
 
 from __future__ import annotations
 
 import math
 
-from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_RESULT, MAV_SEVERITY
+from fractus_mavlink.enums import COPTER_MODE, GIMBAL_DEVICE_FLAGS, MAV_CMD, MAV_RESULT, MAV_SEVERITY
 
 from fractus_vehicle.state import VehicleState
 
@@ -36,7 +36,6 @@ ABSENT = (
     MAV_CMD.DO_GRIPPER,
     MAV_CMD.DO_MOUNT_CONFIGURE,
     MAV_CMD.DO_MOUNT_CONTROL,
-    MAV_CMD.DO_GIMBAL_MANAGER_PITCHYAW,
     MAV_CMD.DO_GIMBAL_MANAGER_CONFIGURE,
     MAV_CMD.IMAGE_START_CAPTURE,
     MAV_CMD.IMAGE_STOP_CAPTURE,
@@ -59,6 +58,16 @@ TAKEN = (
     MAV_CMD.AIRFRAME_CONFIGURATION,
     MAV_CMD.FIXED_MAG_CAL_YAW,
 )
+
+
+def point_gimbal(v: VehicleState, pitch_deg: float, yaw_deg: float, flags: int) -> MAV_RESULT:
+    """DO_GIMBAL_MANAGER_PITCHYAW with angles; rates and the yaw that is locked to north are not simulated."""
+    if not v.gimbal.kind or flags & GIMBAL_DEVICE_FLAGS.YAW_LOCK:
+        return MAV_RESULT.FAILED
+    if not (math.isfinite(pitch_deg) and math.isfinite(yaw_deg)):
+        return MAV_RESULT.FAILED
+    v.gimbal.point(pitch_deg, yaw_deg)
+    return MAV_RESULT.ACCEPTED
 
 
 def set_servo(v: VehicleState, channel: float, pwm_us: float) -> MAV_RESULT:

@@ -5,14 +5,16 @@ from __future__ import annotations
 import math
 
 from fractus_mavlink import Value
-from fractus_mavlink.enums import COPTER_MODE, MAV_AUTOPILOT, MAV_FRAME, MAV_TYPE
+from fractus_mavlink.enums import COPTER_MODE, GIMBAL_DEVICE_FLAGS, MAV_AUTOPILOT, MAV_FRAME, MAV_TYPE
 
 from fractus_vehicle.control import Axis
 from fractus_vehicle.copter import GLOBAL_TARGET_ONLY, POSITION_ONLY, VELOCITY_ONLY
 from fractus_vehicle.earth import Place
+from fractus_vehicle.gimbal import PITCH_DEG, ROLL_DEG, YAW_DEG
 from fractus_vehicle.report_units import UNKNOWN_U16, Values, boot_ms, boot_us, centi
 from fractus_vehicle.state import VehicleState
 
+ENDS = ("min", "max")
 _AUTOMATIC = frozenset({COPTER_MODE.GUIDED, COPTER_MODE.AUTO, COPTER_MODE.RTL, COPTER_MODE.SMART_RTL})
 
 
@@ -74,6 +76,26 @@ def attitude_target(v: VehicleState) -> Values:
         cr * cp * sy - sr * sp * cy,
     )
     return {"time_boot_ms": boot_ms(v), "q": q, "thrust": v.control.thrust_share}
+
+
+def gimbal_device_attitude_status(v: VehicleState) -> Values | None:
+    """GIMBAL_DEVICE_ATTITUDE_STATUS, where there is a gimbal: over the horizon, and from the nose."""
+    if not v.gimbal.kind:
+        return None
+    flags = GIMBAL_DEVICE_FLAGS.ROLL_LOCK | GIMBAL_DEVICE_FLAGS.PITCH_LOCK | GIMBAL_DEVICE_FLAGS.YAW_IN_VEHICLE_FRAME
+    unknown = {f"angular_velocity_{axis}": math.nan for axis in "xyz"}
+    return {"time_boot_ms": boot_ms(v), "flags": int(flags), "q": v.gimbal.told, "gimbal_device_id": 1, **unknown}
+
+
+def gimbal_manager_information(v: VehicleState) -> Values | None:
+    """GIMBAL_MANAGER_INFORMATION, where there is a gimbal: how far it turns."""
+    if not v.gimbal.kind:
+        return None
+    ranges = {"roll": ROLL_DEG, "pitch": PITCH_DEG, "yaw": YAW_DEG}
+    ends = {
+        f"{axis}_{end}": math.radians(deg) for axis, pair in ranges.items() for end, deg in zip(ENDS, pair, strict=True)
+    }
+    return {"time_boot_ms": boot_ms(v), "gimbal_device_id": 1, **ends}
 
 
 def vfr_hud(v: VehicleState) -> Values:

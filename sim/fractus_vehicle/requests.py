@@ -8,7 +8,15 @@ from collections.abc import Callable
 from fractus_mavlink import layout_of
 from fractus_mavlink.enums import MAV_CMD, MAV_RESULT, MAV_SEVERITY
 
-from fractus_vehicle.accessories import ABSENT, TAKEN, reset_battery, set_relay, set_servo, start_motor_test
+from fractus_vehicle.accessories import (
+    ABSENT,
+    TAKEN,
+    point_gimbal,
+    reset_battery,
+    set_relay,
+    set_servo,
+    start_motor_test,
+)
 from fractus_vehicle.channel import Channel
 from fractus_vehicle.copter import VERSION_TEXT
 from fractus_vehicle.orders import Order
@@ -128,6 +136,7 @@ ANSWERS: dict[int, Answer] = {
     MAV_CMD.CONTROL_HIGH_LATENCY: _high_latency,
     MAV_CMD.SET_EKF_SOURCE_SET: _ekf_sources,
     MAV_CMD.DEBUG_TRAP: _always(MAV_RESULT.DENIED),
+    MAV_CMD.DO_GIMBAL_MANAGER_PITCHYAW: lambda v, o, _c: point_gimbal(v, *o.params[:2], o.x),
     MAV_CMD.DO_SET_SERVO: lambda v, o, _c: set_servo(v, *o.params[:2]),
     MAV_CMD.DO_REPEAT_SERVO: lambda v, o, _c: set_servo(v, *o.params[:2]),
     MAV_CMD.DO_SET_RELAY: lambda v, o, _c: set_relay(v, o.params[0]),

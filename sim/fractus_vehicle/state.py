@@ -19,6 +19,7 @@ from fractus_vehicle.copter import ABSOLUTE_FRAMES, GLOBAL_FRAMES, TERRAIN_FRAME
 from fractus_vehicle.earth import Place
 from fractus_vehicle.estimator import FULL_START_S, Estimator
 from fractus_vehicle.fence import Fence
+from fractus_vehicle.gimbal import Gimbal
 from fractus_vehicle.heading import Heading
 from fractus_vehicle.mission import Mission
 from fractus_vehicle.mission_items import ItemStore
@@ -101,6 +102,7 @@ class VehicleState:
         self.rally = ItemStore(MAV_MISSION_TYPE.RALLY)
         self.breadcrumbs = Breadcrumbs(self.params, self.say)
         self.heading = Heading(self.control, self.params)
+        self.gimbal = Gimbal(int(self.params["MNT1_TYPE"]))
         self.item_reached: int | None = None  # of the mission, to be told at the end of a step: the last one counts
         self.impacts_told = 0
         self.impact_told_s = -math.inf

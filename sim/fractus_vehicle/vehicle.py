@@ -15,7 +15,7 @@ from fractus_vehicle.plans import clear_items, replace_items, stores_of
 from fractus_vehicle.readiness import arming_refusals
 from fractus_vehicle.report_units import UNKNOWN_U16
 from fractus_vehicle.settings import LIMIT_PREFIXES, set_battery, set_fence, set_limits, set_wind
-from fractus_vehicle.state import VehicleConfig, VehicleState
+from fractus_vehicle.state import CONTROL_STEP_S, VehicleConfig, VehicleState
 from fractus_vehicle.telemetry import attach, follow_rate, send_parameter, serve
 from fractus_vehicle.transfers import Transfers
 
@@ -93,6 +93,7 @@ class Vehicle:
             v.broadcast("MISSION_ITEM_REACHED", {"seq": v.item_reached})
             v.item_reached = None
         move(v)
+        v.gimbal.step(CONTROL_STEP_S)
         if self.transfers.uploads:
             self.transfers.step(v.time_s)
         for channel in v.channels:

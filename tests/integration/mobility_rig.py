@@ -62,7 +62,7 @@ VIEWER_MISSION = (
 
 ALL = [
     "Arm", "Disarm", "Takeoff", "Land", "SetSpeed", "GetSpeed", "SetVelocity", "Goto", "Hover", "GetPosition",
-    "ReturnToLaunch",
+    "ReturnToLaunch", "PointGimbal",
 ]  # fmt: skip
 
 

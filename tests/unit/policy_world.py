@@ -14,7 +14,19 @@ from fractus_core.policy.values import Call, GotoArgs, Home, Lens, Situation, Ve
 HOME = Home(39.36, 22.95, 100.0)
 FRAME = LocalFrame(HOME.lat, HOME.lon)
 NOW = datetime(2026, 6, 1, 12, tzinfo=UTC).timestamp()
-METHODS = ["Arm", "Disarm", "Takeoff", "Land", "SetSpeed", "GetSpeed", "Goto", "Hover", "GetPosition", "ReturnToLaunch"]
+METHODS = [
+    "Arm",
+    "Disarm",
+    "Takeoff",
+    "Land",
+    "SetSpeed",
+    "GetSpeed",
+    "Goto",
+    "Hover",
+    "GetPosition",
+    "ReturnToLaunch",
+    "PointGimbal",
+]
 CAMERA = ["CaptureImage", "RetrieveImage"]
 DOWN = Lens(90.0, 90.0, stabilised=True, error_deg=0.0)
 """Straight down; while the yaw is unknown it sees a disc of altitude times the root of two."""

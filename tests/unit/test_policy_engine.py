@@ -7,7 +7,17 @@ from typing import Any
 
 import pytest
 from fractus_core.policy.motion import stopping_distance_m
-from fractus_core.policy.values import Airframe, Call, CaptureArgs, Filter, GotoArgs, Home, SetSpeedArgs, TakeoffArgs
+from fractus_core.policy.values import (
+    Airframe,
+    Call,
+    CaptureArgs,
+    Filter,
+    GotoArgs,
+    Home,
+    PointGimbalArgs,
+    SetSpeedArgs,
+    TakeoffArgs,
+)
 from policy_world import (
     CAMERA,
     FRAME,
@@ -129,7 +139,8 @@ def test_goto_with_impossible_arguments(args: GotoArgs | None) -> None:
     [
         Call("Takeoff", TakeoffArgs(NAN)), Call("Takeoff", TakeoffArgs(-5)), Call("Takeoff", TakeoffArgs(INF)), Call("Takeoff"),
         Call("SetSpeed", SetSpeedArgs(NAN)), Call("SetSpeed", SetSpeedArgs(0)), Call("SetSpeed", SetSpeedArgs(-3)),
-        Call("SetSpeed"), Call("CaptureImage", CaptureArgs(-1, 0)), Call("CaptureImage", CaptureArgs(0, 10**9)),
+        Call("PointGimbal"), Call("PointGimbal", PointGimbalArgs(NAN)), Call("PointGimbal", PointGimbalArgs(-91)),
+        Call("PointGimbal", PointGimbalArgs(0, 181)), Call("SetSpeed"), Call("CaptureImage", CaptureArgs(-1, 0)), Call("CaptureImage", CaptureArgs(0, 10**9)),
     ],
 )  # fmt: skip
 def test_other_impossible_arguments(call: Call) -> None:
@@ -147,6 +158,8 @@ def test_without_position_nothing_moves() -> None:
         assert ask(compiled(), call, _lost()).code == "PositionUnknown"
         assert ask(compiled(), call, at(north_mps=NAN)).code == "PositionUnknown"
     assert ask(compiled(), Call("Hover"), _lost()).action == "allow"
+    down = Call("PointGimbal", PointGimbalArgs(-90))
+    assert (ask(compiled(), down, _lost()).action, ask(compiled(), down, _lost()).args) == ("allow", down.args)
     assert ask(compiled(), goto(5, 5), at(home=None)).code == "HomeUnknown"
 
 

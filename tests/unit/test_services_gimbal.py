@@ -10,8 +10,12 @@ from fractus_core.policy.footprint import camera_axes
 from fractus_core.policy.values import Attitude, Lens
 from fractus_mavlink import message
 from fractus_mavlink.enums import GIMBAL_DEVICE_FLAGS as FLAGS
+from fractus_mavlink.enums import MAV_CMD
+from fractus_services.errors import AutopilotError, PreconditionFailed
+from fractus_services.mobility.autopilot import Permit, always
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.gimbal import attitude_of
+from fractus_services.mobility.mavlink.pointing import point
 from fractus_services.mobility.mavlink.vehicle import Vehicle
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -131,3 +135,64 @@ def test_it_is_as_old_as_the_heading_that_its_yaw_counts_from() -> None:
     drone.take(message("ATTITUDE"), 11.0)
     report(drone, 11.05)
     assert drone.gimbal_at == 11.0
+
+
+class Commanded:
+    """An autopilot that acknowledges, refuses, or is silent; and tells how far its gimbal turns, or does not."""
+
+    def __init__(self, error: AutopilotError | None = None, limits: dict[str, float] | None = None) -> None:
+        self.vehicle = vehicle()
+        self.sent: list[tuple[float, ...]] = []
+        self._error, self._limits = error, limits
+
+    async def command(self, command: MAV_CMD, *params: float, permit: Permit = always, attempts: int = 4) -> None:
+        del attempts
+        permit()
+        if command == MAV_CMD.REQUEST_MESSAGE:
+            if self._limits is not None:
+                told = {end: math.radians(deg) for end, deg in self._limits.items()}
+                self.vehicle.take(message("GIMBAL_MANAGER_INFORMATION", gimbal_device_id=1, **told), 10.0)
+            return
+        if self._error is not None:
+            raise self._error
+        self.sent.append((command, *params))
+
+
+LIMITS = {"pitch_min": -90.0, "pitch_max": 20.0, "yaw_min": -180.0, "yaw_max": 180.0}
+
+
+@pytest.mark.parametrize("limits", [None, LIMITS])
+async def test_it_is_pointed_without_rates(limits: dict[str, float] | None) -> None:
+    autopilot = Commanded(limits=limits)
+    await point(autopilot, -90.0, 180.0, always)
+    assert autopilot.sent[0][:3] == (MAV_CMD.DO_GIMBAL_MANAGER_PITCHYAW, -90.0, 180.0)
+    assert all(math.isnan(rate) for rate in autopilot.sent[0][3:])
+
+
+async def test_a_gimbal_that_does_not_turn_that_far_is_not_asked() -> None:
+    autopilot = Commanded(limits=LIMITS)
+    with pytest.raises(PreconditionFailed, match="from -90 to 20 degrees of pitch, not to 45"):
+        await point(autopilot, 45.0, 0.0, always)
+    assert autopilot.sent == []
+
+
+@pytest.mark.parametrize(
+    ("error", "raised", "said"),
+    [
+        (AutopilotError("failed", refused=True), PreconditionFailed, "no gimbal"),
+        (AutopilotError("no answer", link=True), AutopilotError, "no answer"),
+    ],
+)
+async def test_what_goes_wrong_is_told(error: AutopilotError, raised: type[Exception], said: str) -> None:
+    with pytest.raises(raised, match=said):
+        await point(Commanded(error), -45.0, 0.0, always)
+
+
+async def test_a_driver_that_has_lost_the_drone_points_nothing() -> None:
+    def refused() -> None:
+        raise PreconditionFailed("ControlLost", "gone")
+
+    autopilot = Commanded(limits=LIMITS)
+    with pytest.raises(PreconditionFailed, match="gone"):
+        await point(autopilot, -45.0, 0.0, refused)
+    assert autopilot.sent == []

@@ -6,7 +6,7 @@ from typing import Literal, get_args
 
 MobilityMethod = Literal[
     "Arm", "Disarm", "Takeoff", "Land", "SetSpeed", "GetSpeed", "Goto", "SetVelocity", "Hover", "GetPosition",
-    "ReturnToLaunch",
+    "ReturnToLaunch", "PointGimbal",
 ]  # fmt: skip
 CameraMethod = Literal["CaptureImage", "RetrieveImage", "ListImages", "DeleteImage"]
 ControlMethod = Literal["GetControl", "ReturnControl"]

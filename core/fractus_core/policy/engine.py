@@ -22,6 +22,7 @@ from fractus_core.policy.values import (
     Call,
     CaptureArgs,
     GotoArgs,
+    PointGimbalArgs,
     SetSpeedArgs,
     Situation,
     TakeoffArgs,
@@ -113,7 +114,7 @@ def _check_arguments(call: Call) -> Verdict | None:
 _Figure = tuple[str, float | None, float, float, str]
 
 
-def _figures(call: Call) -> tuple[_Figure, ...]:
+def _figures(call: Call) -> tuple[_Figure, ...]:  # noqa: PLR0911 - one line a method
     """The figures among the arguments, each with its bounds and unit."""
     match call.args:
         case TakeoffArgs(altitude_m):
@@ -136,6 +137,8 @@ def _figures(call: Call) -> tuple[_Figure, ...]:
                 ("yaw", yaw_deg, -360, 360, "degrees"),
                 ("hold", hold_s, *HOLD_S, "s"),
             )
+        case PointGimbalArgs(pitch_deg, yaw_deg):
+            return (("pitch", pitch_deg, -90, 90, "degrees"), ("yaw", yaw_deg, -180, 180, "degrees"))
         case CaptureArgs(width, height):
             return (("width", width, 0, MAX_PIXELS, "pixels"), ("height", height, 0, MAX_PIXELS, "pixels"))
         case _:
@@ -151,6 +154,7 @@ _ARGS: dict[str, type] = {
     "Goto": GotoArgs,
     "SetSpeed": SetSpeedArgs,
     "SetVelocity": VelocityArgs,
+    "PointGimbal": PointGimbalArgs,
 }
 
 
@@ -165,7 +169,10 @@ def _judge_picture(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
 
 
 def _judge_access_only(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
-    """A method that stops the drone, brings it home, or moves nothing: access to it is enough."""
+    """A method that stops the drone, brings it home, or moves nothing of it: access to it is enough.
+
+    Where a gimbal points is no matter of the call: pictures are judged by what it measures, no matter who moved it.
+    """
     return Verdict("allow", call.args)
 
 
@@ -182,7 +189,16 @@ _RULES: dict[str, Callable[[Call, Situation, CompiledGrant], Verdict]] = exhaust
         "CaptureImage": _judge_picture,
         "RetrieveImage": _judge_picture,
         **dict.fromkeys(
-            ("Hover", "GetSpeed", "GetPosition", "ReturnToLaunch", "ListImages", "DeleteImage", *CONTROL_METHODS),
+            (
+                "Hover",
+                "GetSpeed",
+                "GetPosition",
+                "ReturnToLaunch",
+                "ListImages",
+                "DeleteImage",
+                "PointGimbal",
+                *CONTROL_METHODS,
+            ),
             _judge_access_only,
         ),
     },

@@ -77,6 +77,19 @@ class VelocityArgs:
 
 
 @dataclass(frozen=True, slots=True)
+class PointGimbalArgs:
+    """Turn the camera by the gimbal.
+
+    Attributes:
+        pitch_deg: over the horizon: 0 looks ahead, -90 straight down.
+        yaw_deg: clockwise from the nose, which the camera follows.
+    """
+
+    pitch_deg: float
+    yaw_deg: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class CaptureArgs:
     """Take a picture of this size in pixels; 0 means the camera's default."""
 
@@ -104,7 +117,7 @@ def earliest(time_s: float) -> float:
     return time_s.earliest if isinstance(time_s, Moment) else time_s
 
 
-Args = TakeoffArgs | GotoArgs | SetSpeedArgs | VelocityArgs | CaptureArgs | None
+Args = TakeoffArgs | GotoArgs | SetSpeedArgs | VelocityArgs | PointGimbalArgs | CaptureArgs | None
 
 
 @dataclass(frozen=True, slots=True)

@@ -165,6 +165,20 @@ class SetVelocityResponse(_message.Message):
     velocity: _types_pb2.Velocity
     def __init__(self, decision: _Optional[_Union[_types_pb2.Decision, _Mapping]] = ..., velocity: _Optional[_Union[_types_pb2.Velocity, _Mapping]] = ...) -> None: ...
 
+class PointGimbalRequest(_message.Message):
+    __slots__ = ("pitch_deg", "yaw_deg")
+    PITCH_DEG_FIELD_NUMBER: _ClassVar[int]
+    YAW_DEG_FIELD_NUMBER: _ClassVar[int]
+    pitch_deg: float
+    yaw_deg: float
+    def __init__(self, pitch_deg: _Optional[float] = ..., yaw_deg: _Optional[float] = ...) -> None: ...
+
+class PointGimbalResponse(_message.Message):
+    __slots__ = ("decision",)
+    DECISION_FIELD_NUMBER: _ClassVar[int]
+    decision: _types_pb2.Decision
+    def __init__(self, decision: _Optional[_Union[_types_pb2.Decision, _Mapping]] = ...) -> None: ...
+
 class GetSpeedRequest(_message.Message):
     __slots__ = ()
     def __init__(self) -> None: ...
@@ -192,7 +206,7 @@ class GetPositionResponse(_message.Message):
     def __init__(self, decision: _Optional[_Union[_types_pb2.Decision, _Mapping]] = ..., position: _Optional[_Union[_types_pb2.Position, _Mapping]] = ..., velocity: _Optional[_Union[_types_pb2.Velocity, _Mapping]] = ...) -> None: ...
 
 class CheckCallRequest(_message.Message):
-    __slots__ = ("arm", "disarm", "takeoff", "land", "goto", "return_to_launch", "hover", "set_speed", "set_velocity", "get_speed", "get_position", "get_control", "return_control")
+    __slots__ = ("arm", "disarm", "takeoff", "land", "goto", "return_to_launch", "hover", "set_speed", "set_velocity", "get_speed", "get_position", "get_control", "return_control", "point_gimbal")
     ARM_FIELD_NUMBER: _ClassVar[int]
     DISARM_FIELD_NUMBER: _ClassVar[int]
     TAKEOFF_FIELD_NUMBER: _ClassVar[int]
@@ -206,6 +220,7 @@ class CheckCallRequest(_message.Message):
     GET_POSITION_FIELD_NUMBER: _ClassVar[int]
     GET_CONTROL_FIELD_NUMBER: _ClassVar[int]
     RETURN_CONTROL_FIELD_NUMBER: _ClassVar[int]
+    POINT_GIMBAL_FIELD_NUMBER: _ClassVar[int]
     arm: ArmRequest
     disarm: DisarmRequest
     takeoff: TakeoffRequest
@@ -219,7 +234,8 @@ class CheckCallRequest(_message.Message):
     get_position: GetPositionRequest
     get_control: GetControlRequest
     return_control: ReturnControlRequest
-    def __init__(self, arm: _Optional[_Union[ArmRequest, _Mapping]] = ..., disarm: _Optional[_Union[DisarmRequest, _Mapping]] = ..., takeoff: _Optional[_Union[TakeoffRequest, _Mapping]] = ..., land: _Optional[_Union[LandRequest, _Mapping]] = ..., goto: _Optional[_Union[GotoRequest, _Mapping]] = ..., return_to_launch: _Optional[_Union[ReturnToLaunchRequest, _Mapping]] = ..., hover: _Optional[_Union[HoverRequest, _Mapping]] = ..., set_speed: _Optional[_Union[SetSpeedRequest, _Mapping]] = ..., set_velocity: _Optional[_Union[SetVelocityRequest, _Mapping]] = ..., get_speed: _Optional[_Union[GetSpeedRequest, _Mapping]] = ..., get_position: _Optional[_Union[GetPositionRequest, _Mapping]] = ..., get_control: _Optional[_Union[GetControlRequest, _Mapping]] = ..., return_control: _Optional[_Union[ReturnControlRequest, _Mapping]] = ...) -> None: ...
+    point_gimbal: PointGimbalRequest
+    def __init__(self, arm: _Optional[_Union[ArmRequest, _Mapping]] = ..., disarm: _Optional[_Union[DisarmRequest, _Mapping]] = ..., takeoff: _Optional[_Union[TakeoffRequest, _Mapping]] = ..., land: _Optional[_Union[LandRequest, _Mapping]] = ..., goto: _Optional[_Union[GotoRequest, _Mapping]] = ..., return_to_launch: _Optional[_Union[ReturnToLaunchRequest, _Mapping]] = ..., hover: _Optional[_Union[HoverRequest, _Mapping]] = ..., set_speed: _Optional[_Union[SetSpeedRequest, _Mapping]] = ..., set_velocity: _Optional[_Union[SetVelocityRequest, _Mapping]] = ..., get_speed: _Optional[_Union[GetSpeedRequest, _Mapping]] = ..., get_position: _Optional[_Union[GetPositionRequest, _Mapping]] = ..., get_control: _Optional[_Union[GetControlRequest, _Mapping]] = ..., return_control: _Optional[_Union[ReturnControlRequest, _Mapping]] = ..., point_gimbal: _Optional[_Union[PointGimbalRequest, _Mapping]] = ...) -> None: ...
 
 class CheckCallResponse(_message.Message):
     __slots__ = ("decision", "takeoff", "goto", "set_speed", "set_velocity", "takeover", "brake_first")

@@ -99,6 +99,11 @@ class MobilityServiceStub(object):
                 request_serializer=fractus__proto_dot_v1_dot_mobility__pb2.SetVelocityRequest.SerializeToString,
                 response_deserializer=fractus__proto_dot_v1_dot_mobility__pb2.SetVelocityResponse.FromString,
                 _registered_method=True)
+        self.PointGimbal = channel.unary_unary(
+                '/fractus.v1.MobilityService/PointGimbal',
+                request_serializer=fractus__proto_dot_v1_dot_mobility__pb2.PointGimbalRequest.SerializeToString,
+                response_deserializer=fractus__proto_dot_v1_dot_mobility__pb2.PointGimbalResponse.FromString,
+                _registered_method=True)
         self.GetPosition = channel.unary_unary(
                 '/fractus.v1.MobilityService/GetPosition',
                 request_serializer=fractus__proto_dot_v1_dot_mobility__pb2.GetPositionRequest.SerializeToString,
@@ -203,6 +208,13 @@ class MobilityServiceServicer(object):
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def PointGimbal(self, request, context):
+        """Turns the camera by the gimbal, and returns once the autopilot has taken the command; telemetry tells where it points.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
     def GetPosition(self, request, context):
         """Missing associated documentation comment in .proto file."""
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
@@ -290,6 +302,11 @@ def add_MobilityServiceServicer_to_server(servicer, server):
                     servicer.SetVelocity,
                     request_deserializer=fractus__proto_dot_v1_dot_mobility__pb2.SetVelocityRequest.FromString,
                     response_serializer=fractus__proto_dot_v1_dot_mobility__pb2.SetVelocityResponse.SerializeToString,
+            ),
+            'PointGimbal': grpc.unary_unary_rpc_method_handler(
+                    servicer.PointGimbal,
+                    request_deserializer=fractus__proto_dot_v1_dot_mobility__pb2.PointGimbalRequest.FromString,
+                    response_serializer=fractus__proto_dot_v1_dot_mobility__pb2.PointGimbalResponse.SerializeToString,
             ),
             'GetPosition': grpc.unary_unary_rpc_method_handler(
                     servicer.GetPosition,
@@ -658,6 +675,33 @@ class MobilityService(object):
             '/fractus.v1.MobilityService/SetVelocity',
             fractus__proto_dot_v1_dot_mobility__pb2.SetVelocityRequest.SerializeToString,
             fractus__proto_dot_v1_dot_mobility__pb2.SetVelocityResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def PointGimbal(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/fractus.v1.MobilityService/PointGimbal',
+            fractus__proto_dot_v1_dot_mobility__pb2.PointGimbalRequest.SerializeToString,
+            fractus__proto_dot_v1_dot_mobility__pb2.PointGimbalResponse.FromString,
             options,
             channel_credentials,
             insecure,

@@ -321,6 +321,9 @@ class Autopilot(Protocol):
     async def turn(self, yaw_deg: float, permit: Permit = ...) -> None:
         """Point the nose, on the leg under way."""
 
+    async def point_gimbal(self, pitch_deg: float, yaw_deg: float, permit: Permit = ...) -> None:
+        """Turn the camera: pitch over the horizon, yaw clockwise from the nose."""
+
     def stop(self) -> None:
         """Brake and hold."""
 

@@ -21,7 +21,19 @@ RETRY_AFTER_S = 0.5
 """When a call is tried again whose drone has no position at the moment."""
 
 MOVING = frozenset(
-    {"Arm", "Disarm", "Takeoff", "Land", "Goto", "ReturnToLaunch", "Hover", "SetSpeed", "SetVelocity", "ReturnControl"}
+    {
+        "Arm",
+        "Disarm",
+        "Takeoff",
+        "Land",
+        "Goto",
+        "ReturnToLaunch",
+        "Hover",
+        "SetSpeed",
+        "SetVelocity",
+        "ReturnControl",
+        "PointGimbal",
+    }
 )
 """Methods that only a driver may call."""
 

@@ -25,6 +25,7 @@ from fractus_services.mobility.mavlink.flight_stack import FlightStack
 from fractus_services.mobility.mavlink.link import SYSTEM_ID, Link, ignore
 from fractus_services.mobility.mavlink.orders import Orders, Velocity, moves
 from fractus_services.mobility.mavlink.parameters import Parameters
+from fractus_services.mobility.mavlink.pointing import point
 
 log = logging.getLogger(__name__)
 
@@ -129,7 +130,7 @@ class MavlinkAutopilot(Link):
             await self.command(MAV_CMD.REQUEST_MESSAGE, layout_named("HEARTBEAT").msgid, attempts=1)
 
     def _lost(self) -> None:
-        self._flying_rates = self.vehicle.gimbal_measured = None
+        self._flying_rates = self.vehicle.gimbal_measured = self.vehicle.gimbal_limits = None
         self.vehicle_parameters.forget()
 
     def take(self, incoming: Message) -> None:
@@ -266,6 +267,10 @@ class MavlinkAutopilot(Link):
     async def set_speed(self, speed_mps: float, permit: Permit = always) -> None:
         """Fly the leg under way with this horizontal speed over ground; one to a place may begin with the default again."""
         await self.command(MAV_CMD.DO_CHANGE_SPEED, SPEED_TYPE.GROUNDSPEED, speed_mps, -1, permit=permit)
+
+    async def point_gimbal(self, pitch_deg: float, yaw_deg: float, permit: Permit = always) -> None:
+        """Turn the camera: pitch over the horizon, yaw clockwise from the nose."""
+        await point(self, pitch_deg, yaw_deg, permit)
 
     def stop(self) -> None:
         """Brake and hold: a velocity of zero; GUIDED keeps the position when it times out."""

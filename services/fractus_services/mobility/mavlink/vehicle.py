@@ -38,11 +38,13 @@ class Vehicle(VehicleState):
         foreign: what flies instead of a vehicle with this firmware; empty when nothing does.
         gimbal_measured: whether the firmware measures where its gimbal points, and does not repeat where it was told to; None
             until it has told of which type that is.
+        gimbal_limits: the least and the greatest pitch and yaw of its gimbal, degrees; None until it has told.
     """
 
     stack: FlightStack = field(kw_only=True)
     foreign: str = ""
     gimbal_measured: bool | None = None
+    gimbal_limits: tuple[tuple[float, float], ...] | None = None
 
     def take(self, message: Message, now: float) -> None:
         """Update from one message."""
@@ -95,6 +97,16 @@ def _gimbal(vehicle: Vehicle, message: Message, now: float) -> None:
         return
     vehicle.gimbal = attitude_of(message, vehicle.heading_deg) if vehicle.gimbal_measured else None
     vehicle.gimbal_at = min(now, vehicle.attitude_at)
+
+
+def _gimbal_limits(vehicle: Vehicle, message: Message, _now: float) -> None:
+    if message.integer("gimbal_device_id") <= 1:
+        least, most = (
+            [math.degrees(message.real(f"{axis}_{end}")) for axis in ("pitch", "yaw")] for end in ("min", "max")
+        )
+        # A float32 of radians is a little off the degrees that it stands for.
+        limits = tuple((round(low, 3), round(high, 3)) for low, high in zip(least, most, strict=True))
+        vehicle.gimbal_limits = limits if all(low < high for low, high in limits) else None
 
 
 def _parameter(vehicle: Vehicle, message: Message, _now: float) -> None:
@@ -167,6 +179,7 @@ _HANDLERS = {
     "GLOBAL_POSITION_INT": _position,
     "ATTITUDE": _attitude,
     "GIMBAL_DEVICE_ATTITUDE_STATUS": _gimbal,
+    "GIMBAL_MANAGER_INFORMATION": _gimbal_limits,
     "PARAM_VALUE": _parameter,
     "HOME_POSITION": _home,
     "EXTENDED_SYS_STATE": _landed,

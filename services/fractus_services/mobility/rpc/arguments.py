@@ -16,6 +16,7 @@ from fractus_core.policy.values import (
     Call,
     CaptureArgs,
     GotoArgs,
+    PointGimbalArgs,
     SetSpeedArgs,
     TakeoffArgs,
     VelocityArgs,
@@ -121,7 +122,7 @@ def checked(verdict: Verdict) -> mobility_pb2.CheckCallResponse:
             _write_goto(reply.goto, args)
         case VelocityArgs() as args:
             _write_velocity(reply.set_velocity, args)
-        case CaptureArgs() | None:
+        case PointGimbalArgs() | CaptureArgs() | None:
             pass
         case never:
             assert_never(never)
@@ -229,6 +230,7 @@ _ARGUMENTS: dict[str, Callable[[Any], Args]] = {
     "goto": goto_args,
     "set_speed": lambda request: SetSpeedArgs(request.speed_mps),
     "set_velocity": velocity_args,
+    "point_gimbal": lambda request: PointGimbalArgs(request.pitch_deg, request.yaw_deg),
 }
 _METHODS: dict[str, Method] = {to_snake(method): method for method in (*MOBILITY_METHODS, *CONTROL_METHODS)}
 """Methods by the field of a CheckCallRequest that holds their request."""

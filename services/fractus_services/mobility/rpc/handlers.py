@@ -10,7 +10,7 @@ from typing import Any
 
 from fractus_core.api.names import node_identity
 from fractus_core.control import Authority
-from fractus_core.policy.values import Call, SetSpeedArgs, TakeoffArgs, Verdict
+from fractus_core.policy.values import Call, PointGimbalArgs, SetSpeedArgs, TakeoffArgs, Verdict
 from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc
 
 from fractus_services.admission import CallAdmission
@@ -21,6 +21,7 @@ from fractus_services.grants import ActiveGrant, GrantFiles
 from fractus_services.mobility.authority import drivers
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.readiness import arming_problem
+from fractus_services.mobility.flight.pointing import point_gimbal
 from fractus_services.mobility.flight.service import MobilityService, Progress
 from fractus_services.mobility.rpc.arguments import (
     acceptance_radius_m,
@@ -149,6 +150,14 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
             await self._service.calls.turn(self._grant_of(caller))
             verdict, speed = await self._service.set_speed(self._grant_of(caller), SetSpeedArgs(request.speed_mps))
             return mobility_pb2.SetSpeedResponse(decision=decision(verdict), speed_mps=speed)
+
+    async def PointGimbal(self, request: Any, context: Any) -> Any:  # noqa: N802
+        """See mobility.proto."""
+        async with self.admission.call(context) as caller:
+            calls, args = self._service.calls, PointGimbalArgs(request.pitch_deg, request.yaw_deg)
+            await calls.turn(self._grant_of(caller))
+            verdict = await point_gimbal(self._control, calls, self._grant_of(caller), args)
+            return mobility_pb2.PointGimbalResponse(decision=decision(verdict))
 
     async def GetSpeed(self, _request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""

@@ -1,0 +1,22 @@
+"""Points the camera for the driver that has the drone."""
+
+from __future__ import annotations
+
+from fractus_core.policy.values import Call, PointGimbalArgs, Verdict
+
+from fractus_services.grants import ActiveGrant
+from fractus_services.mobility.authority.control import Control
+from fractus_services.mobility.authority.drivers import driver_permit
+from fractus_services.mobility.flight.calls import CallJudge
+
+
+async def point_gimbal(control: Control, calls: CallJudge, grant: ActiveGrant, args: PointGimbalArgs) -> Verdict:
+    """Turn the camera by the gimbal, on the ground and in the air; the motion under way goes on.
+
+    Raises:
+        Refused: by policy, or the caller does not have the drone, or there is no gimbal that turns that far.
+        AutopilotError: the autopilot does not answer.
+    """
+    verdict = calls.allow_motion(Call("PointGimbal", args), grant)
+    await control.autopilot.point_gimbal(args.pitch_deg, args.yaw_deg, driver_permit(control, grant))
+    return verdict

@@ -1,0 +1,186 @@
+"""A camera on a gimbal: pictures are judged by where it points as it is measured, no matter who turned it."""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import socket
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import grpc
+import numpy as np
+import pytest
+import yaml
+from fractus_cluster.ports import free_port
+from fractus_mavlink import Endpoint
+from fractus_mavlink.enums import MAV_CMD, MAV_PARAM_TYPE
+from fractus_proto.v1 import camera_pb2, camera_pb2_grpc, types_pb2
+from fractus_proto.v1 import mobility_pb2 as pb
+from mobility_rig import HOME, NODE, PASSENGER, Driver, Rig, area, denied, grant, passenger_grant
+from PIL import Image
+
+SIYI, SERVOS = 8, 1
+METHODS = ["CaptureImage", "RetrieveImage", "DeleteImage"]
+ALLOW, CORRECT = types_pb2.Decision.ACTION_ALLOW, types_pb2.Decision.ACTION_CORRECT
+GPS, DIRECTION = 0x8825, 17
+NORTH = {
+    "name": "north",
+    "spec": {"type": "PrivacyControl", "kind": "camera", "action": "black", "selector": {"zones": ["yard"]}},
+    "zones": [{"name": "yard", "area": area(-60, 40, 60, 80)}],
+}
+TIMEOUT_S = 90.0
+
+
+class Station:
+    """A ground station on a link of its own, which the service does not hear."""
+
+    def __init__(self, port: int) -> None:
+        self._link, self._endpoint = socket.create_connection(("127.0.0.1", port), timeout=10), Endpoint(255, 190)
+
+    def _send(self, name: str, **values: Any) -> None:
+        self._link.sendall(self._endpoint.encode(name, {"target_system": 1, "target_component": 1, **values}))
+
+    def point(self, pitch_deg: float, yaw_deg: float) -> None:
+        nan = float("nan")
+        angles = {"param1": pitch_deg, "param2": yaw_deg, "param3": nan, "param4": nan}
+        self._send("COMMAND_LONG", command=MAV_CMD.DO_GIMBAL_MANAGER_PITCHYAW, **angles)
+
+    def set_type(self, kind: int) -> None:
+        self._send("PARAM_SET", param_id=b"MNT1_TYPE", param_value=kind, param_type=MAV_PARAM_TYPE.INT8)
+
+    def close(self) -> None:
+        self._link.close()
+
+
+class Stage:
+    """A drone in flight with a camera on a gimbal, and a passenger that takes pictures north of which people live."""
+
+    def __init__(self, rig: Rig, station: Station, driver: Driver, camera: Any) -> None:
+        self.rig, self.station, self.driver, self.camera = rig, station, driver, camera
+
+    async def taken(self) -> tuple[Any, bytes]:
+        """The decision on a picture, and the picture; waits for the camera and for a position."""
+        async with asyncio.timeout(TIMEOUT_S):
+            while True:
+                try:
+                    shot = await self.camera.CaptureImage(
+                        camera_pb2.CaptureImageRequest(), wait_for_ready=True, timeout=60
+                    )
+                except grpc.aio.AioRpcError as error:
+                    assert error.code() in {grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.PERMISSION_DENIED}, error
+                    await asyncio.sleep(0.2)
+                    continue
+                request = camera_pb2.RetrieveImageRequest(name=shot.image.name)
+                chunks = [chunk async for chunk in self.camera.RetrieveImage(request, timeout=20)]
+                await self.camera.DeleteImage(camera_pb2.DeleteImageRequest(name=shot.image.name), timeout=5)
+                return chunks[0].decision, b"".join(chunk.data for chunk in chunks)
+
+    async def until(self, action: int) -> tuple[Any, bytes]:
+        """Pictures until one is decided on like that: what was seen while the gimbal turned counts for a moment."""
+        async with asyncio.timeout(TIMEOUT_S):
+            while True:
+                decision, data = await self.taken()
+                if decision.action == action:
+                    return decision, data
+
+    async def points(self, pitch_deg: float, yaw_deg: float) -> pb.Telemetry:
+        """Wait until the gimbal is measured there."""
+
+        def there(state: pb.Telemetry) -> bool:
+            turned = abs((state.gimbal.yaw_deg - yaw_deg + 180) % 360 - 180)
+            return state.HasField("gimbal") and abs(state.gimbal.pitch_deg - pitch_deg) < 3 and turned < 10
+
+        return await self.rig.until(there, what=f"gimbal at {pitch_deg:g}, {yaw_deg:g}")
+
+
+@pytest.fixture
+async def stage(tmp_path: Path) -> AsyncIterator[Stage]:
+    rig = Rig(tmp_path)
+    rig.write_grant(grant())
+    rig.write_grant(passenger_grant(NORTH, services=[{"service": "camera", "methods": METHODS}]))
+    rig.start_service()
+    ports = [free_port() for _ in range(3)]
+    links = [part for port in ports[:2] for part in ("--listen", f"tcp:127.0.0.1:{port}")]
+    rig.start_vehicle(1.0, *links, "--param", f"MNT1_TYPE={SIYI}")
+    rig.start(
+        "world", "-m", "fractus_world", "--listen", f"127.0.0.1:{ports[2]}", "--vehicle", f"tcp:127.0.0.1:{ports[0]}",
+        "--origin", f"{HOME[0]},{HOME[1]}", "--resolution", "320x240", "--fov", "30",
+    )  # fmt: skip
+    camera = {
+        "connection": f"http://127.0.0.1:{ports[2]}/snapshot.jpg", "resolution": "320x240", "methods": METHODS,
+        "horizontalFieldOfView": 30, "lens": {"model": "pinhole"}, "mount": {"gimbal": True},
+    }  # fmt: skip
+    node = {"apiVersion": "fractus.dev/v1alpha1", "kind": "Drone", "metadata": {"name": NODE}, "spec": {"services": {"camera": camera}}}  # fmt: skip
+    address = rig.start_camera(description=yaml.safe_dump(node))
+    driver = Driver(rig)
+    station = None
+    try:
+        await driver.up()
+        station = Station(ports[1])
+        yield Stage(rig, station, driver, camera_pb2_grpc.CameraServiceStub(rig.channel(PASSENGER, address=address)))
+    finally:
+        if station is not None:
+            station.close()
+        await rig.close()
+
+
+def brightness(data: bytes) -> float:
+    return float(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE).mean())
+
+
+async def point(driver: Driver, pitch_deg: float, yaw_deg: float = 0.0) -> pb.PointGimbalResponse:
+    return await driver.stub.PointGimbal(pb.PointGimbalRequest(pitch_deg=pitch_deg, yaw_deg=yaw_deg), timeout=10)
+
+
+async def test_what_the_gimbal_shows_is_judged_by_where_it_points(stage: Stage) -> None:
+    driver = stage.driver
+    assert (await point(driver, -90.0)).decision.action == ALLOW
+    await stage.points(-90.0, 0.0)
+    _, below = await stage.until(ALLOW)
+    assert brightness(below) > 10
+
+    # The driver turns it to the people's yard.
+    await point(driver, -10.0)
+    await stage.points(-10.0, 0.0)
+    decision, ahead = await stage.taken()
+    assert (decision.action, decision.code, list(decision.policies)) == (CORRECT, "PrivacyFilter", ["north"])
+    assert brightness(ahead) < 1
+
+    # Turned around it shows as much, and not that.
+    await point(driver, -10.0, 180.0)
+    await stage.points(-10.0, 180.0)
+    _, behind = await stage.until(ALLOW)
+    assert brightness(behind) > 10
+    direction = Image.open(io.BytesIO(behind)).getexif().get_ifd(GPS)[DIRECTION]
+    assert abs(float(direction) - 180.0) < 10.0
+
+    # A pilot who turns it back asks no one.
+    stage.station.point(-10.0, 0.0)
+    await stage.points(-10.0, 0.0)
+    assert (await stage.taken())[0].action == CORRECT
+    stage.station.point(-90.0, 0.0)
+    await stage.points(-90.0, 0.0)
+    await stage.until(ALLOW)
+
+    # Straight down, but nothing measures that any more.
+    stage.station.set_type(SERVOS)
+    await stage.rig.until(lambda state: not state.HasField("gimbal"), what="a gimbal that is not measured")
+    decision, hidden = await stage.until(CORRECT)
+    assert decision.code == "PrivacyFilter"
+    assert brightness(hidden) < 1
+
+
+async def test_what_is_no_drivers_or_no_direction_is_refused(stage: Stage) -> None:
+    refused = [
+        (stage.driver.stub, 45.0, grpc.StatusCode.FAILED_PRECONDITION, "AutopilotRefused"),
+        (stage.driver.stub, 95.0, grpc.StatusCode.INVALID_ARGUMENT, "InvalidArgument"),
+        (stage.rig.stub(PASSENGER), -45.0, grpc.StatusCode.PERMISSION_DENIED, "NotADriver"),
+    ]
+    for stub, pitch_deg, status, code in refused:
+        found = await denied(stub.PointGimbal(pb.PointGimbalRequest(pitch_deg=pitch_deg), timeout=10))
+        assert (found[0], found[1].code) == (status, code)
+    calls = [entry for entry in stage.rig.entries("call") if "PointGimbal" in str(entry)]
+    assert len(calls) >= len(refused), "each was judged, and the audit log has it"

@@ -1,0 +1,54 @@
+"""The simulated vehicle's gimbal: turns at its rate, and tells where it points."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from fractus_mavlink import message
+from fractus_mavlink.enums import MAV_CMD, MAV_RESULT
+from fractus_services.mobility.mavlink.gimbal import attitude_of
+from fractus_vehicle.motion_reports import gimbal_device_attitude_status, gimbal_manager_information
+from vehicle_world import alone
+
+SIYI, SERVOS = 8.0, 1.0
+PITCHYAW = MAV_CMD.DO_GIMBAL_MANAGER_PITCHYAW
+
+
+def test_a_vehicle_without_a_gimbal_has_none() -> None:
+    vehicle, pilot = alone()
+    assert pilot.command(PITCHYAW, -45.0, 0.0, math.nan, math.nan) == MAV_RESULT.FAILED
+    assert gimbal_device_attitude_status(vehicle) is None
+    assert gimbal_manager_information(vehicle) is None
+
+
+def test_it_turns_at_its_rate_and_tells_where_it_is() -> None:
+    vehicle, pilot = alone(MNT1_TYPE=SIYI)
+    assert pilot.command(PITCHYAW, -90.0, 120.0, math.nan, math.nan) == MAV_RESULT.ACCEPTED
+    begun_s, angles = vehicle.time_s, []
+
+    def turned() -> bool:
+        report = gimbal_device_attitude_status(vehicle)
+        assert report is not None
+        found = attitude_of(message("GIMBAL_DEVICE_ATTITUDE_STATUS", **report), 0.0)
+        assert found is not None
+        angles.append(found.pitch_deg)
+        return found.pitch_deg < -89.0 and vehicle.gimbal.yaw_deg == 120.0
+
+    pilot.wait(turned, 5.0)
+    assert 1.7 < vehicle.time_s - begun_s < 2.5, "120 degrees at 60 a second"
+    assert any(-60 < angle < -30 for angle in angles), "it passes what is between"
+
+
+@pytest.mark.parametrize("wanted", [(-120.0, 0.0, -90.0), (60.0, 0.0, 20.0)])
+def test_it_turns_as_far_as_it_can(wanted: tuple[float, float, float]) -> None:
+    vehicle, pilot = alone(MNT1_TYPE=SIYI)
+    pilot.command(PITCHYAW, *wanted[:2], math.nan, math.nan)
+    pilot.wait(lambda: vehicle.gimbal.pitch_deg == wanted[2], 3.0)
+
+
+def test_servos_tell_what_they_were_told() -> None:
+    vehicle, pilot = alone(MNT1_TYPE=SERVOS)
+    pilot.command(PITCHYAW, -90.0, 0.0, math.nan, math.nan)
+    assert vehicle.gimbal.pitch_deg > -20.0
+    assert vehicle.gimbal.told[2] == pytest.approx(-math.sqrt(0.5))

@@ -96,30 +96,48 @@ class Stage:
         return await self.rig.until(there, what=f"gimbal at {pitch_deg:g}, {yaw_deg:g}")
 
 
+async def take_off(driver: Driver) -> None:
+    """In flight; a busy machine may lose a position meanwhile, and then it is asked for again."""
+    await driver.take()
+    await driver.arm()
+    async with asyncio.timeout(TIMEOUT_S):
+        while True:
+            try:
+                await driver.take_off()
+            except grpc.aio.AioRpcError as error:
+                assert error.code() == grpc.StatusCode.UNAVAILABLE, error
+                await asyncio.sleep(0.5)
+            else:
+                return
+
+
 @pytest.fixture
 async def stage(tmp_path: Path) -> AsyncIterator[Stage]:
     rig = Rig(tmp_path)
     rig.write_grant(grant())
     rig.write_grant(passenger_grant(NORTH, services=[{"service": "camera", "methods": METHODS}]))
-    rig.start_service()
     ports = [free_port() for _ in range(3)]
-    links = [part for port in ports[:2] for part in ("--listen", f"tcp:127.0.0.1:{port}")]
-    rig.start_vehicle(1.0, *links, "--param", f"MNT1_TYPE={SIYI}")
-    rig.start(
-        "world", "-m", "fractus_world", "--listen", f"127.0.0.1:{ports[2]}", "--vehicle", f"tcp:127.0.0.1:{ports[0]}",
-        "--origin", f"{HOME[0]},{HOME[1]}", "--resolution", "320x240", "--fov", "30",
-    )  # fmt: skip
     camera = {
         "connection": f"http://127.0.0.1:{ports[2]}/snapshot.jpg", "resolution": "320x240", "methods": METHODS,
         "horizontalFieldOfView": 30, "lens": {"model": "pinhole"}, "mount": {"gimbal": True},
     }  # fmt: skip
-    node = {"apiVersion": "fractus.dev/v1alpha1", "kind": "Drone", "metadata": {"name": NODE}, "spec": {"services": {"camera": camera}}}  # fmt: skip
-    address = rig.start_camera(description=yaml.safe_dump(node))
-    driver = Driver(rig)
-    station = None
+    metadata, spec = {"name": NODE}, {"services": {"camera": camera}}
+    described = yaml.safe_dump(
+        {"apiVersion": "fractus.dev/v1alpha1", "kind": "Drone", "metadata": metadata, "spec": spec}
+    )
+    (rig.directory / "node.yaml").write_text(described)
+    rig.start_service("--description", str(rig.directory / "node.yaml"))
+    links = [part for port in ports[:2] for part in ("--listen", f"tcp:127.0.0.1:{port}")]
+    rig.start_vehicle(1.0, *links, "--param", f"MNT1_TYPE={SIYI}")
+    driver, station = Driver(rig), None
     try:
-        await driver.up()
+        await take_off(driver)
         station = Station(ports[1])
+        rig.start(
+            "world", "-m", "fractus_world", "--listen", f"127.0.0.1:{ports[2]}", "--vehicle",
+            f"tcp:127.0.0.1:{ports[0]}", "--origin", f"{HOME[0]},{HOME[1]}", "--resolution", "320x240", "--fov", "30",
+        )  # fmt: skip
+        address = rig.start_camera()
         yield Stage(rig, station, driver, camera_pb2_grpc.CameraServiceStub(rig.channel(PASSENGER, address=address)))
     finally:
         if station is not None:
@@ -184,3 +202,16 @@ async def test_what_is_no_drivers_or_no_direction_is_refused(stage: Stage) -> No
         assert (found[0], found[1].code) == (status, code)
     calls = [entry for entry in stage.rig.entries("call") if "PointGimbal" in str(entry)]
     assert len(calls) >= len(refused), "each was judged, and the audit log has it"
+
+
+async def test_a_camera_that_is_described_as_fixed_is_not_moved(stage: Stage) -> None:
+    """Its pictures are judged by the mount that is described, from the moment on at which that is."""
+    assert (await point(stage.driver, -45.0)).decision.action == ALLOW
+    path = stage.rig.directory / "node.yaml"
+    described = yaml.safe_load(path.read_text())
+    described["spec"]["services"]["camera"]["mount"] = {"pitch": -90, "stabilised": True}
+    path.write_text(yaml.safe_dump(described))
+    await stage.rig.until_logged("service", "description: changed")
+    code, why = await denied(point(stage.driver, -90.0))
+    assert (code, why.code) == (grpc.StatusCode.FAILED_PRECONDITION, "CameraFixed")
+    assert "services.camera.mount.gimbal" in why.reason

@@ -55,6 +55,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         node: its name.
         clock: Unix time.
         heard: told whose grant each call is made under.
+        fixed_camera: whether the node's description says that its camera does not move.
         recording_problem: why flights are not recorded though they should be; empty when nothing is wrong.
     """
 
@@ -68,9 +69,10 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         node: str,
         clock: Clock,
         heard: Callable[[ActiveGrant], None] = lambda _grant: None,
+        fixed_camera: Callable[[], bool] = bool,
         recording_problem: Callable[[], str] = str,
     ) -> None:
-        self._recording_problem = recording_problem
+        self._fixed_camera, self._recording_problem = fixed_camera, recording_problem
         self._service = service
         self._control = control
         self._streams = streams
@@ -156,7 +158,8 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         async with self.admission.call(context) as caller:
             calls, args = self._service.calls, PointGimbalArgs(request.pitch_deg, request.yaw_deg)
             await calls.turn(self._grant_of(caller))
-            verdict = await point_gimbal(self._control, calls, self._grant_of(caller), args)
+            fixed, grant = self._fixed_camera(), self._grant_of(caller)
+            verdict = await point_gimbal(self._control, calls, grant, args, fixed_camera=fixed)
             return mobility_pb2.PointGimbalResponse(decision=decision(verdict))
 
     async def GetSpeed(self, _request: Any, context: Any) -> Any:  # noqa: N802

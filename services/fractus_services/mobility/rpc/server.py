@@ -45,15 +45,21 @@ def _link(description: NodeDescription) -> str:
     return features.connection if features is not None else DEFAULT_LINK
 
 
-async def _follow(description: NodeDescription, url: str, heard: asyncio.Event) -> None:
-    """Watch for a description with another link.
+def _fixed_camera(description: NodeDescription) -> bool:
+    """Whether pictures are judged by a mount that does not move; one that is not described counts as seeing everything."""
+    camera = description.value.spec.services.camera if description.value is not None else None
+    return camera is not None and camera.mount is not None and not camera.mount.gimbal
+
+
+async def _follow(description: NodeDescription, url: str, heard: asyncio.Event, *, told: bool) -> None:
+    """Follow the description, and watch for one with another link, where the command line does not tell it.
 
     Raises:
         CannotServe: there is one, and no vehicle was ever heard on the present link.
     """
     while True:
         await description.changed()
-        if _link(description) == url:
+        if told or _link(description) == url:
             continue
         if not heard.is_set():
             raise CannotServe(f"the node's description tells another autopilot ({_link(description)}); starting again")
@@ -139,14 +145,14 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
         node=node,
         clock=clock,
         heard=tours.heard,
+        fixed_camera=partial(_fixed_camera, description),
         recording_problem=lambda: recorder.problem,
     )
 
     register = partial(mobility_pb2_grpc.add_MobilityServiceServicer_to_server, handlers)
     calls = serve_grpc("mobility", options.listen, tls, register, handlers.admission)
     running = [autopilot.run(), grants.run(), monitor.run(), monitor.record(), tours.run(), calls]
-    if not options.autopilot:
-        running.append(_follow(description, url, heard))
+    running.append(_follow(description, url, heard, told=bool(options.autopilot)))
     metrics.observe(partial(common_figures, LastRead(tls.expires_s), grants, audit, lambda: recorder.problem))
     metrics.observe(partial(flight_figures, control, parts.supervisor))
     try:

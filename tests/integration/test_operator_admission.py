@@ -406,6 +406,14 @@ def test_the_operator_writes_nothing_that_it_has_not_made(
         client.close()
 
 
+_MADE = {
+    "Service": ("v1", "services"),
+    "EndpointSlice": ("discovery.k8s.io/v1", "endpointslices"),
+    "NetworkPolicy": ("networking.k8s.io/v1", "networkpolicies"),
+    "PodDisruptionBudget": ("policy/v1", "poddisruptionbudgets"),
+}
+
+
 def test_who_has_the_operator_s_token_gets_no_further(
     control_plane: ControlPlane, world: World, chart: None, namespace: str
 ) -> None:
@@ -477,13 +485,17 @@ def test_who_has_the_operator_s_token_gets_no_further(
             {"allowPrivilegeEscalation": False, "readOnlyRootFilesystem": True, "capabilities": {"drop": ["ALL"]}, "runAsUser": 0},
         ):  # fmt: skip
             denied(deployment(container={"securityContext": given}), "one container without privileges")
-        made = "certificates of instances only"
-        denied(secret("theirs-tls", type="kubernetes.io/service-account-token", data={}, metadata=account), made)
-        denied(secret("theirs-tls", type="Opaque"), made)
-        denied(secret("bootstrap-token-abcdef", "kube-system", type="bootstrap.kubernetes.io/token", data={}), made)
-        denied(secret("theirs"), made)
-        denied(secret("fractus-ca"), made)
-        denied(secret("theirs-tls", SYSTEM), made)
+        certificates = "certificates of instances only"
+        denied(
+            secret("theirs-tls", type="kubernetes.io/service-account-token", data={}, metadata=account), certificates
+        )
+        denied(secret("theirs-tls", type="Opaque"), certificates)
+        denied(
+            secret("bootstrap-token-abcdef", "kube-system", type="bootstrap.kubernetes.io/token", data={}), certificates
+        )
+        denied(secret("theirs"), certificates)
+        denied(secret("fractus-ca"), certificates)
+        denied(secret("theirs-tls", SYSTEM), certificates)
         # Nor does it read or write what gives rights.
         for path in (
             f"/api/v1/namespaces/{SYSTEM}/serviceaccounts/fractus-agent/token",
@@ -493,6 +505,73 @@ def test_who_has_the_operator_s_token_gets_no_further(
             f"/api/v1/namespaces/{namespace}/configmaps",
         ):
             denied(lambda path=path: client.call("POST", path, {}), "forbidden")
+    finally:
+        client.close()
+
+
+def test_who_has_the_operator_s_token_moves_no_traffic(
+    control_plane: ControlPlane, world: World, chart: None, namespace: str
+) -> None:
+    """Objects that carry the operator's label, and would give their maker the traffic of others."""
+    client = control_plane.with_token(operator_token(world))
+    mine = {"app.kubernetes.io/managed-by": "fractus"}
+
+    def made(kind: str, spec: dict[str, Any], place: str = namespace, **more: Any) -> Callable[[], object]:
+        api, plural = _MADE[kind]
+        labels = mine | {"fractus.dev/application": "a"} | more.pop("labels", {})
+        body = {"apiVersion": api, "kind": kind, "metadata": {"name": "theirs", "labels": labels}, **more}
+        body |= {"spec": spec} if spec else {}
+        group = f"/apis/{api}" if "/" in api else f"/api/{api}"
+        return lambda: client.call("POST", f"{group}/namespaces/{place}/{plural}?dryRun=All", body)
+
+    def endpoints(**changed: Any) -> Callable[[], object]:
+        target = {"kind": "Pod", "name": "p", "namespace": namespace} | changed.pop("target", {})
+        names = {
+            "kubernetes.io/service-name": "theirs",
+            "endpointslice.kubernetes.io/managed-by": "operator.fractus.dev",
+        } | changed
+        found = [{"addresses": ["10.1.2.3"], "targetRef": target}]
+        return made("EndpointSlice", {}, addressType="IPv4", endpoints=found, labels=names)
+
+    own = {"fractus.dev/application": "a"}
+    try:
+        wait_for(lambda: _probe_refused(client), "the admission policy to be in force")
+        ports = [{"port": 80}]
+        for selector in ({"selector": own}, {}):
+            made("Service", {"ports": ports, **selector})()
+        for spec in (
+            {"ports": ports, "selector": {"app": "bank"}},
+            {"ports": ports, "selector": own, "type": "LoadBalancer"},
+            {"ports": ports, "selector": own, "type": "NodePort"},
+            {"ports": ports, "selector": own, "externalIPs": ["192.0.2.1"]},
+            {"type": "ExternalName", "externalName": "bank.test"},
+        ):
+            denied(made("Service", spec), "inside the cluster, for pods of applications")
+        endpoints()()
+        names = {
+            "kubernetes.io/service-name": "theirs",
+            "endpointslice.kubernetes.io/managed-by": "operator.fractus.dev",
+        }
+        for no_pods in ([], None):
+            made("EndpointSlice", {}, addressType="IPv4", endpoints=no_pods, labels=names)()
+        for changed in (
+            {"kubernetes.io/service-name": "bank"},
+            {"endpointslice.kubernetes.io/managed-by": "endpointslice-controller.k8s.io"},
+            {"target": {"kind": "Node"}},
+            {"target": {"namespace": "elsewhere"}},
+        ):
+            denied(endpoints(**changed), "EndpointSlices of pods of applications")
+        made("NetworkPolicy", {"podSelector": {"matchLabels": own}, "policyTypes": ["Ingress"]})()
+        for spec in (
+            {"podSelector": {}, "policyTypes": ["Ingress"]},
+            {"podSelector": {"matchLabels": {"app": "bank"}}, "policyTypes": ["Ingress"]},
+            {"podSelector": {"matchLabels": own}, "policyTypes": ["Egress"]},
+        ):
+            denied(made("NetworkPolicy", spec), "NetworkPolicies for pods of applications")
+        made("PodDisruptionBudget", {"maxUnavailable": 0, "selector": {"matchLabels": own}})()
+        every = {"maxUnavailable": 0, "selector": {"matchLabels": {"app": "bank"}}}
+        denied(made("PodDisruptionBudget", every), "PodDisruptionBudgets for pods of applications")
+        denied(made("Service", {"ports": ports, "selector": own}, "kube-system"), "runs nothing in the namespace")
     finally:
         client.close()
 

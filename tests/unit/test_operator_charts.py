@@ -45,3 +45,8 @@ def test_the_charts_have_the_version_of_the_package() -> None:
     version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
     for chart in ("fractus", "fractus-crds"):
         assert yaml.safe_load((CHARTS / chart / "Chart.yaml").read_text())["appVersion"] == version
+
+
+def test_the_templates_know_the_defaults() -> None:
+    known = (CHARTS / "fractus" / "files" / "values.yaml").read_text()
+    assert known == (CHARTS / "fractus" / "values.yaml").read_text(), "run `make generate`"

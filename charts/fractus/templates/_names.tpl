@@ -1,3 +1,21 @@
+{{/*
+Gives values that are missing their defaults. `helm upgrade --reuse-values` keeps the values of the release before, which does
+not have those that a newer chart has added. Each template starts with it, for they are rendered in no order.
+*/}}
+{{- define "fractus.defaults" }}
+{{- include "fractus.fill" (dict "values" .Values "defaults" (.Files.Get "files/values.yaml" | fromYaml)) }}
+{{- end }}
+{{- define "fractus.fill" }}
+{{- range $key, $default := .defaults }}
+{{- if not (hasKey $.values $key) }}
+{{- $_ := set $.values $key $default }}
+{{- /* Who leaves a limit or a label out means it. */}}
+{{- else if and (kindIs "map" $default) (not (has $key (list "resources" "labels"))) }}
+{{- include "fractus.fill" (dict "values" (index $.values $key) "defaults" $default) }}
+{{- end }}
+{{- end }}
+{{- end }}
+
 {{/* Labels of every object of this release; take (dict "root" $ "part" "agent"). */}}
 {{- define "fractus.labels" -}}
 app.kubernetes.io/name: fractus

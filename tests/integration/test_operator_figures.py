@@ -65,6 +65,30 @@ def test_the_chart_makes_pod_monitors_where_it_is_asked_to() -> None:
         assert endpoint["port"] == "metrics"
 
 
+def node_addresses(*arguments: str) -> set[tuple[str, bool]]:
+    """Where the workloads of nodes tell their metrics, and whether their pods say so."""
+    bodies = [body for body in render(*arguments) if body["kind"] == "DaemonSet"]
+    assert len(bodies) == 3
+    containers = [body["spec"]["template"]["spec"]["containers"][0] for body in bodies]
+    return {
+        (
+            next(each["value"] for each in container["env"] if each["name"] == "FRACTUS_METRICS").rsplit(":", 1)[0],
+            "metrics" in {port["name"] for port in container.get("ports", ())},
+        )
+        for container in containers
+    }
+
+
+def test_nodes_are_open_to_the_network_only_where_prometheus_is_to_reach_them() -> None:
+    assert node_addresses() == {("127.0.0.1", False)}
+    open_to_all = {("$(FRACTUS_HOST)", True)}
+    assert node_addresses("--set=metrics.podMonitor.enabled=true") == open_to_all
+    assert node_addresses("--set=metrics.nodes.address=node") == open_to_all
+    local = ("--set=metrics.podMonitor.enabled=true", "--set=metrics.nodes.address=localhost")
+    assert node_addresses(*local) == {("127.0.0.1", False)}
+    assert [body["metadata"]["name"] for body in render(*local) if body["kind"] == "PodMonitor"] == ["fractus-operator"]
+
+
 def test_nodes_tell_nothing_where_they_are_not_to() -> None:
     rendered = render("--set", "metrics.podMonitor.enabled=true", "--set", "metrics.nodes.enabled=false")
     assert [body["metadata"]["name"] for body in rendered if body["kind"] == "PodMonitor"] == ["fractus-operator"]

@@ -73,15 +73,25 @@ tolerations:
 - {name: FRACTUS_LOG_FORMAT, value: {{ .Values.logFormat }}}
 {{- end }}
 
-{{/* Where a workload of a node tells its metrics: on the node's own address, out of reach over direct links; takes (dict "root" $ "port" 46812). */}}
+{{/* Where nodes tell their metrics: localhost, node (their own address, out of reach over direct links), or nothing. */}}
+{{- define "fractus.nodeMetrics" -}}
+{{- with .Values.metrics }}
+{{- if .nodes.enabled }}{{ ternary (ternary "node" "localhost" .podMonitor.enabled) .nodes.address (eq .nodes.address "auto") }}{{ end }}
+{{- end }}
+{{- end }}
+
+{{/* The same for a workload; takes (dict "root" $ "port" 46812). */}}
 {{- define "fractus.nodeMetricsEnv" -}}
-{{- if .root.Values.metrics.nodes.enabled }}
+{{- $where := include "fractus.nodeMetrics" .root }}
+{{- if eq $where "node" }}
 - {name: FRACTUS_HOST, valueFrom: {fieldRef: {fieldPath: status.hostIP}}}
 - {name: FRACTUS_METRICS, value: "$(FRACTUS_HOST):{{ .port }}"}
+{{- else if $where }}
+- {name: FRACTUS_METRICS, value: "127.0.0.1:{{ .port }}"}
 {{- end }}
 {{- end }}
 {{- define "fractus.nodeMetricsPort" -}}
-{{- if .root.Values.metrics.nodes.enabled }}
+{{- if eq (include "fractus.nodeMetrics" .root) "node" }}
 - {name: metrics, containerPort: {{ .port }}, hostPort: {{ .port }}}
 {{- end }}
 {{- end }}

@@ -80,6 +80,16 @@ test-e2e: packages env ## End-to-end tests only, on the embedded cluster or on F
 test-kind: env ## The charts, a mission's end-to-end tests and the demo on a cluster of kind (without Docker: on one made here, as root)
 	if docker info > /dev/null 2>&1; then tests/kind/run.sh; else tests/kind/machine.sh tests/kind/run.sh; fi
 
+# libFuzzer's own options; what it finds is left in out/fuzz. The examples are where manifests start from.
+SECONDS ?= 600
+.PHONY: fuzz
+fuzz: env ## Fuzz manifests, calls and MAVLink for SECONDS=600 each
+	mkdir -p $(OUT)/fuzz/{manifests,calls,mavlink} && cp examples/traffic-monitoring/*.yaml $(OUT)/fuzz/manifests
+	for name in manifests calls mavlink; do \
+		PYTHONPATH=tests/unit $(RUN) --with atheris==3.0.0 python tests/fuzz/$$name.py -max_total_time=$(SECONDS) -len_control=0 \
+			-max_len=2048 -artifact_prefix=$(OUT)/fuzz/$$name- $(OUT)/fuzz/$$name; \
+	done
+
 .PHONY: lint
 lint: env ## Style, types and the direction of imports
 	$(RUN) ruff check

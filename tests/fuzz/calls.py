@@ -1,0 +1,72 @@
+"""Requests from the wire, as any component may send them: they are refused with a reason, or judged."""
+
+from __future__ import annotations
+
+import sys
+
+import atheris
+
+with atheris.instrument_imports(include=["fractus_services.mobility.rpc", "fractus_core.policy"]):
+    from fractus_core.policy.engine import judge
+    from fractus_core.policy.values import Call
+    from fractus_services.errors import Refused
+    from fractus_services.mobility.rpc import arguments
+from fractus_proto.v1 import mobility_pb2
+from google.protobuf.message import DecodeError
+from policy_world import HOME, altitude, at, box, compiled, exclusion, speed
+
+GRANT = compiled(exclusion(box(20, 20, 60, 60)), altitude(upperLimit=60), speed(upperLimit=8))
+SITUATIONS = (at(), at(40, 10, 30.0), at(40, 40, 30.0))
+REPLIES = {"allow", "correct", "deny"}
+
+
+def wire(message: bytes) -> Call:
+    """What a message asks for."""
+    return arguments.call_of(mobility_pb2.CheckCallRequest.FromString(message))
+
+
+def number(given: atheris.FuzzedDataProvider, bound: float) -> float:
+    """One of a size that is flown, or any: infinity, a thousand digits, none at all."""
+    return given.ConsumeFloatInRange(-bound, bound) if given.ConsumeBool() else given.ConsumeFloat()
+
+
+def numbers(given: atheris.FuzzedDataProvider) -> Call:
+    """A call with any numbers, also such as are none."""
+    which = given.ConsumeIntInRange(0, 2)
+    if which == 0:
+        request = mobility_pb2.GotoRequest(acceptance_radius_m=number(given, 10), speed_mps=number(given, 20))
+        request.target.altitude_reference = given.ConsumeIntInRange(0, 5)
+        request.target.latitude_deg = HOME.lat + number(given, 0.002)
+        request.target.longitude_deg = HOME.lon + number(given, 0.002)
+        request.target.altitude_m = number(given, 100)
+        if given.ConsumeBool():
+            request.yaw_deg = number(given, 360)
+        arguments.acceptance_radius_m(request)
+        return Call("Goto", arguments.goto_args(request))
+    if which == 1:
+        velocity = mobility_pb2.SetVelocityRequest(hold_s=number(given, 2))
+        velocity.velocity.north_mps = number(given, 20)
+        velocity.velocity.east_mps = number(given, 20)
+        velocity.velocity.down_mps = number(given, 5)
+        return Call("SetVelocity", arguments.velocity_args(velocity))
+    check = mobility_pb2.CheckCallRequest()
+    check.takeoff.altitude_m = number(given, 100)
+    return arguments.call_of(check)
+
+
+def one(data: bytes) -> None:
+    """One request: of these bytes, or of numbers that they give."""
+    try:
+        call = wire(data[1:]) if data[:1] < b"\x40" else numbers(atheris.FuzzedDataProvider(data[1:]))
+    except (DecodeError, Refused):
+        return
+    for situation in SITUATIONS:
+        verdict = judge(call, situation, GRANT)
+        assert verdict.action in REPLIES
+        assert verdict.code != "InternalError", verdict
+        arguments.checked(verdict).SerializeToString()
+
+
+if __name__ == "__main__":
+    atheris.Setup(sys.argv, one)
+    atheris.Fuzz()

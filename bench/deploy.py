@@ -49,7 +49,7 @@ READY = {"type": "Ready", "status": "True", "reason": "Simulated", "lastTransiti
 AT_DEPOT = 40
 AT_ONCE = 50
 SEED = 5000
-NODE = {"cpu": "64", "memory": "64Gi", "pods": "500", "fractus.dev/gpu": "500"}
+NODE = {"cpu": "64", "memory": "64Gi", "pods": "500"}
 
 Body = dict[str, Any]
 PODS = Kind("v1", "Pod", "pods", namespaced=True)

@@ -25,10 +25,12 @@ from fractus_cluster.ports import free_port
 from fractus_mavlink import Endpoint
 from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_COMPONENT, MAV_MODE_FLAG
 from fractus_vehicle.earth import Place
-from fractus_vehicle.pilot import Pilot
 from fractus_vehicle.readiness import arming_refusals
 from fractus_vehicle.simulation import Simulation, formation
 from fractus_vehicle.state import CONTROL_STEP_S, VehicleConfig
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "unit"))
+from vehicle_pilot import Pilot
 
 START = Place.from_degrees(48.2, 16.37, 150.0)
 

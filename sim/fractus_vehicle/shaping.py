@@ -25,11 +25,6 @@ def wrap_pi(angle_rad: float) -> float:
     return (angle_rad + math.pi) % (2.0 * math.pi) - math.pi
 
 
-def wrap_degrees(angle_deg: float) -> float:
-    """The angle in [0, 360)."""
-    return angle_deg % 360.0
-
-
 def sqrt_controller(error: float, gain: float, limit: float, dt: float) -> float:
     """Proportional near zero, square root beyond, so that the correction's own rate never exceeds `limit`."""
     linear = limit / (gain * gain)
@@ -116,10 +111,3 @@ def shape_position_xy(
     return shape_velocity_xy(
         (target_n, target_e), velocity, acceleration, accel_max=accel_max, jerk_max=jerk_max, dt=dt
     )
-
-
-def stopping_distance(speed_mps: float, gain: float, accel_mps2: float) -> float:
-    """Distance a square-root controller needs to stop (ArduPilot's own formula)."""
-    if speed_mps < accel_mps2 / gain:
-        return speed_mps / gain
-    return accel_mps2 / (2.0 * gain * gain) + speed_mps * speed_mps / (2.0 * accel_mps2)

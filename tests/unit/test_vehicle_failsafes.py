@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_RESULT
-from fractus_vehicle.pilot import Pilot
 from fractus_vehicle.state import VehicleState
+from vehicle_pilot import Pilot
 from vehicle_world import START, airborne, alone, distance_m, upload
 
 

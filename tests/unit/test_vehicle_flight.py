@@ -6,11 +6,12 @@ import itertools
 import math
 
 import pytest
+from fractus_core.policy.motion import stopping_distance_m
 from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_LANDED_STATE, MAV_RESULT
-from fractus_vehicle.pilot import Pilot
 from fractus_vehicle.readiness import arming_refusals
-from fractus_vehicle.shaping import sqrt_controller, stopping_distance, wrap_pi
+from fractus_vehicle.shaping import sqrt_controller, wrap_pi
 from fractus_vehicle.state import VehicleState
+from vehicle_pilot import Pilot
 from vehicle_world import START, airborne, alone, distance_m
 
 
@@ -305,7 +306,7 @@ def test_stops_about_as_fast_as_the_autopilots_own_formula(mode: COPTER_MODE):
         assert pilot.mode(mode) is MAV_RESULT.ACCEPTED
     pilot.fly_on(10.0)
     assert abs(vehicle.body.vn) < 0.2
-    assert vehicle.body.north - at < stopping_distance(speed, 1.0, 2.5) + 2.0
+    assert vehicle.body.north - at < stopping_distance_m(speed, 2.5, 1.0) + 2.0
     assert vehicle.altitude_m == pytest.approx(10.0, abs=0.5)
 
 
@@ -357,8 +358,8 @@ def test_sqrt_controller_is_monotonic_and_bounded():
 def _fly_pattern(seed: int) -> bytes:
     from dataclasses import replace
 
-    from fractus_vehicle.pilot import Pilot
     from fractus_vehicle.simulation import Simulation
+    from vehicle_pilot import Pilot
     from vehicle_world import CONFIG
 
     class Log:

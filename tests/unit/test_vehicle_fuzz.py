@@ -13,8 +13,8 @@ from fractus_vehicle.commands import HANDLERS as COMMAND_HANDLERS
 from fractus_vehicle.copter import SUPPORTED_MODES
 from fractus_vehicle.dispatch import HANDLERS
 from fractus_vehicle.mission_items import SUPPORTED
-from fractus_vehicle.pilot import Pilot
 from fractus_vehicle.state import VehicleState
+from vehicle_pilot import Pilot
 from vehicle_world import airborne, alone
 
 WILD = (math.nan, math.inf, -math.inf, 0.0, 1.0, -1.0, 2.0, 255.0, 1e38, -1e38, 1e-40, 21196.0, 400.0, 48.2)

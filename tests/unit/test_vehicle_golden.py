@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
-from fractus_vehicle.pilot import Pilot
 from vehicle_flights import at_random, breaches, by_hand, failing, mission, pilot_of, smart_return
+from vehicle_pilot import Pilot
 
 FLIGHTS: tuple[tuple[Callable[[Pilot], None], int, dict[str, float], str], ...] = (
     (mission, 2, {"SIM_WIND_SPD": 5.0, "SIM_WIND_TURB": 1.5, "WP_YAW_BEHAVIOR": 0.0}, "148c5aaf26fb501a"),

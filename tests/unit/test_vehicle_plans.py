@@ -7,10 +7,10 @@ import math
 
 import pytest
 from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_MISSION_RESULT, MAV_RESULT
-from fractus_vehicle.pilot import Pilot
 from fractus_vehicle.profile import Profile
 from fractus_vehicle.readiness import arming_refusals
 from fractus_vehicle.state import VehicleState
+from vehicle_pilot import Pilot
 from vehicle_world import START, airborne, alone, distance_m, upload
 
 HOME = {"command": 16, "frame": 0, "x": START.lat_e7, "y": START.lon_e7, "z": 150.0}

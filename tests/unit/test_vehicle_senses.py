@@ -12,9 +12,9 @@ import pytest
 from fractus_mavlink import Message, Parser
 from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_RESULT
 from fractus_vehicle.noise import gaussian
-from fractus_vehicle.pilot import Pilot
 from fractus_vehicle.state import VehicleState
 from fractus_vehicle.telemetry import send
+from vehicle_pilot import Pilot
 from vehicle_world import CONFIG, START, airborne, alone, distance_m, upload
 
 

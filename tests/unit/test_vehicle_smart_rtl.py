@@ -9,8 +9,8 @@ import random
 import pytest
 from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_RESULT
 from fractus_vehicle.breadcrumbs import Breadcrumbs, Point, distance_to_segment, segment_gap
-from fractus_vehicle.pilot import Pilot
 from fractus_vehicle.state import VehicleState
+from vehicle_pilot import Pilot
 from vehicle_world import airborne, alone, distance_m
 
 

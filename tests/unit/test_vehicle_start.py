@@ -13,8 +13,8 @@ from fractus_mavlink.enums import (
     MAV_STATE,
     MAV_SYS_STATUS_SENSOR,
 )
-from fractus_vehicle.pilot import Pilot
 from fractus_vehicle.state import VehicleConfig, VehicleState
+from vehicle_pilot import Pilot
 from vehicle_world import START, alone
 
 COLD = VehicleConfig(start=replace(START, alt_m=0.1))

@@ -11,8 +11,8 @@ from dataclasses import replace
 from fractus_mavlink import Message
 from fractus_mavlink.enums import COPTER_MODE, MAV_CMD
 from fractus_vehicle.copter import SUPPORTED_MODES
-from fractus_vehicle.pilot import Pilot, PilotTimeoutError
 from fractus_vehicle.simulation import Simulation
+from vehicle_pilot import Pilot, PilotTimeoutError
 from vehicle_world import CONFIG, START, upload
 
 TARGET = {"target_system": 1, "target_component": 1}

@@ -6,9 +6,9 @@ import math
 from dataclasses import replace
 
 from fractus_vehicle.earth import Place
-from fractus_vehicle.pilot import Pilot
 from fractus_vehicle.simulation import Simulation
 from fractus_vehicle.state import VehicleConfig, VehicleState
+from vehicle_pilot import Pilot
 
 START = Place.from_degrees(48.2, 16.37, 150.0)
 CONFIG = VehicleConfig(start=START, ready_after_s=2.0, position_noise_m=0.05)

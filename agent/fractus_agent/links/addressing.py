@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 from ipaddress import IPv4Address
 
-NETWORK_BITS = 16
 _FIRST = int(IPv4Address("169.254.1.0"))
 _COUNT = 254 * 256
 """RFC 3927 reserves the first and last 256 addresses of 169.254.0.0/16."""

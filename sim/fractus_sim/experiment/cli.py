@@ -19,7 +19,6 @@ from fractus_sim.experiment.runner import Progress, run
 from fractus_sim.interruption import break_off_on_signals
 
 _FAILED = 2
-_BAD_INPUT = 1
 
 
 @click.group()

@@ -16,8 +16,6 @@ from fractus_core.geo.areas import geojson, middle, polygon
 from fractus_core.geo.formats.properties import says_height_or_time
 from fractus_core.geo.frames import LocalFrame
 
-LonLat = Sequence[float]
-
 DESCRIPTION_LENGTH = 1024
 """Characters that the description of a zone takes."""
 

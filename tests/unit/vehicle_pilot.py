@@ -1,4 +1,4 @@
-"""A ground station in the same process: flies a vehicle in lockstep, for experiments, benchmarks and tests."""
+"""A ground station in the same process: flies a vehicle in lockstep, for tests and benchmarks."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from fractus_mavlink.enums import (
     MAV_RESULT,
     MAV_TYPE,
 )
-
 from fractus_vehicle.copter import POSITION_ONLY
 from fractus_vehicle.readiness import arming_refusals
 from fractus_vehicle.simulation import Craft, Simulation

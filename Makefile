@@ -60,6 +60,7 @@ SECOND_TRY := $(RUN) pytest --last-failed --last-failed-no-failures none
 test: packages env lint ## Everything: lint, types, unit, integration and end-to-end tests
 	$(RUN) fractus cluster binaries
 	$(RUN) pytest -q -n 2 --dist loadfile tests/unit
+	FRACTUS_DEEP=1 $(RUN) pytest -q -n 2 tests/unit/test_control_golden.py
 	$(RUN) pytest -n 3 --dist loadgroup $(INTEGRATION) || $(SECOND_TRY) $(INTEGRATION)
 	$(RUN) pytest $(if $(filter current,$(FRACTUS_E2E_CLUSTER)),,-n 2 --dist loadgroup) $(E2E) || $(SECOND_TRY) $(E2E)
 

@@ -7,7 +7,7 @@ from plan_oracle import Undecided, deviation
 
 @pytest.mark.parametrize("batch", range(4))
 def test_plans_are_those_of_the_oracle(batch):
-    count = examples(1500, 60)
+    count = examples(1500, 30)
     undecided = 0
     for seed in range(batch * count, (batch + 1) * count):
         try:

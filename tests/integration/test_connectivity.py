@@ -78,7 +78,7 @@ def test_an_abrupt_loss_is_over_within_a_second(world: World) -> None:
     who = [answer[1] for answer in client.answers]
     assert "FAILED" not in who, "the planned switch onto the link costs none"
     switched, gaps = [], []
-    # 0.4 s until the loss is noticed, a millisecond for the switch; several losses, for a machine that is busy with other work.
+    # 0.6 s until the loss is noticed, a millisecond for the switch; several losses, for a machine that is busy with other work.
     while len(gaps) < 5 and not (gaps and min(switched) < 1.0 and min(gaps) < 1.0):
         begun, lost_at = len(client.answers) - 1, time.time()
         world.command(station="d1", off=True)

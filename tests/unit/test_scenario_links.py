@@ -101,7 +101,7 @@ def test_a_link_that_is_left_and_lost_for_another(site: Site) -> None:
             agent(5.0, "links: decided (on=default/links peer=edge-1): BetterPath: the cloud path scores 8, the present path 2"),
             agent(7.0, "links: decided (on=default/links peer=edge-1): BetterPath: the direct link scores 12, the present path 8"),
             agent(9.0, "links: decided (on=link peer=edge-3): BetterPeer: edge-3, 60 m away, is better than edge-1 from here on"),
-            agent(9.1, "links: none (peer=edge-1 reason=edge-1 has been silent for 0.4 s)"),
+            agent(9.1, "links: none (peer=edge-1 reason=edge-1 has been silent for 0.6 s)"),
             agent(9.2, "links: connecting (peer=edge-3 reason=pairing)"),
             agent(9.9, "links: up (peer=edge-3 reason=paired)"),
             *picture(1, 8.0, "edge-1"), *picture(2, 10.0, "cloud-1"), *picture(3, 11.0, "cloud-1"),
@@ -121,7 +121,7 @@ def test_a_loss_is_known_by_the_decision_as_well(site: Site) -> None:
         agent(30.0, "links: up (peer=edge-3 reason=paired)"),
         agent(30.1, "links: decided (on=default/links peer=edge-3): BetterPath: the direct link scores 12, the present path 8"),
         agent(42.0, "links: decided (on=default/links peer=edge-3): NoDirectLink: there is no direct link"),
-        agent(42.1, "links: none (peer=edge-3 reason=edge-3 has been silent for 0.4 s)"),
+        agent(42.1, "links: none (peer=edge-3 reason=edge-3 has been silent for 0.6 s)"),
     ]  # fmt: skip
     run = run_of(
         site, agent(29.9, "links: connecting (peer=edge-3 reason=pairing)"), *lost, *picture(41, 42.5, "cloud-1")

@@ -11,6 +11,7 @@ from fractus.environment import egress as egress
 from fractus.environment import endpoint as endpoint
 from fractus.errors import AutopilotRefused as AutopilotRefused
 from fractus.errors import Busy as Busy
+from fractus.errors import CameraFixed as CameraFixed
 from fractus.errors import ControlHeld as ControlHeld
 from fractus.errors import ControlLost as ControlLost
 from fractus.errors import Corrected as Corrected

@@ -145,6 +145,7 @@ class Mobility(ServiceClient):
 
         Raises:
             AutopilotRefused: there is no gimbal, or it does not turn that far.
+            CameraFixed: the node's description says that its camera does not move.
         """
         return await self._unary("PointGimbal", gimbal_request(pitch_deg, yaw_deg))
 

@@ -82,6 +82,12 @@ class AutopilotRefused(StateError):
     remedy = "see the reason; `drone.telemetry()` has its texts"
 
 
+class CameraFixed(StateError):
+    """The node's description says that its camera does not move."""
+
+    remedy = "set services.camera.mount.gimbal of the Drone, if a gimbal turns its camera"
+
+
 class PolicyDenied(FractusError):
     """Policies forbid the call and nothing of it was carried out: the drone hovers, and is still yours.
 
@@ -269,6 +275,7 @@ _STATE_ERRORS: dict[str, type[StateError]] = {
     "NotArmed": NotArmed,
     "NotFlying": NotFlying,
     "ControlHeld": ControlHeld,
+    "CameraFixed": CameraFixed,
     "AutopilotRefused": AutopilotRefused,
 }  # fmt: skip
 """Refusals by the state of the drone, by their code."""

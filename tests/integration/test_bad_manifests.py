@@ -169,6 +169,7 @@ BAD: list[tuple[str, Body, str]] = [
     ("volume of the pod", volume(claim="c", name="tls"), "the pod has volumes tls and tmp of its own"),
     ("volumes at one place", app(CLOUD | {"container": CONTAINER | {"volumes": [{"name": n, "mountPath": "/v", "claim": "c"} for n in "vw"]}}), "each volume needs a mountPath of its own"),
     ("edge node that flies", body("EdgeNode", {"location": HERE, "services": {"mobility": {"maxAltitude": 1, "maxFlightTime": 1, "maxSpeed": 1, "methods": ["Arm"]}}}), "an edge node does not fly"),
+    ("gimbal on a mast", body("EdgeNode", {"location": HERE, "services": {"camera": {"methods": ["CaptureImage"], "mount": {"gimbal": True}}}}), "a gimbal belongs to a drone's autopilot"),
     ("drone on a mast", body("Drone", {"services": {"camera": {"methods": ["CaptureImage"], "mount": {"height": 5}}}}), "height is for the camera of an edge node"),
     ("fisheye with polynomials", body("Drone", {"services": {"camera": {"methods": ["CaptureImage"], "lens": {"model": "equidistant", "k1": 0.1}}}}), "distortion coefficients belong to model brownConrady"),
     ("depot that no one can name", body("Depot", {"location": HERE}) | {"metadata": {"name": "a.b"}}, "the name of a Depot has at most 63"),
@@ -302,7 +303,7 @@ GOOD = [
     policy("PrivacyControl", "camera", action="blurFaces", faces="gaussian", fallback="black"),
     selecting({"key": "mtom", "operator": "Gt", "values": ["1.5"]}, {"key": "class", "operator": "Exists"}),
     app(CLOUD | {"container": CONTAINER | {"env": [{"name": "A", "value": "b"}], "resources": {"requests": {"cpu": 1, "a.b/c": 2}, "limits": {"cpu": "1", "a.b/c": 2}}, "volumes": [{"name": "v", "mountPath": "/v", "emptyDir": {"sizeLimit": "1Gi"}}, {"name": "w", "mountPath": "/w", "claim": "c"}]}}, MUTE),
-    body("Drone", {"class": "C2", "physicalFeatures": {"mtom": 900}, "interfaces": [{"technology": "WiFi", "range": 100, "pairing": {"networkId": "n"}}], "services": {"mobility": {"maxAltitude": 120, "maxFlightTime": 20, "maxSpeed": 10, "methods": ["Arm"]}, "camera": {"methods": ["CaptureImage"], "resolution": "640x480", "mount": {"pitch": -45}}}, "depot": "base", "home": HERE}),
+    body("Drone", {"class": "C2", "physicalFeatures": {"mtom": 900}, "interfaces": [{"technology": "WiFi", "range": 100, "pairing": {"networkId": "n"}}], "services": {"mobility": {"maxAltitude": 120, "maxFlightTime": 20, "maxSpeed": 10, "methods": ["Arm"]}, "camera": {"methods": ["CaptureImage"], "resolution": "640x480", "mount": {"pitch": -45, "gimbal": True}}}, "depot": "base", "home": HERE}),
     body("EdgeNode", {"location": HERE, "services": {"camera": {"methods": ["CaptureImage"], "mount": {"height": 5}}}}),
     body("Depot", {"location": HERE, "radius": 20}),
     zone(altitude={"lower": 1, "upper": 2}, schedule=[{"start": "08:00", "end": "17:00", "days": ["Mon"]}]),
@@ -341,7 +342,7 @@ CHOICES: dict[str, list[Any]] = {
     "ports": [[{"port": 80}, {"port": 80, "protocol": "UDP"}], [{"port": 1, "name": "a"}, {"port": 2, "name": "a"}]],
     "requests": [{"cpu": 2}, {"cpu": "1500m", "memory": "1Gi"}, {"disk": "1"}, {"a.b/c": 1}, {"cpu": "x"}, {"cpu": 0.5}],
     "limits": [{"cpu": "1.5"}, {"cpu": 1}, {"a.b/c": "1"}, {"a.b/c": "0.5"}, {"memory": "1G"}],
-    "mount": [{"height": 5}, {"pitch": -90}], "mobility": [{"maxSpeed": 5}], "resolution": ["640x480", "640"],
+    "mount": [{"height": 5}, {"pitch": -90}, {"gimbal": True}], "mobility": [{"maxSpeed": 5}], "resolution": ["640x480", "640"],
 }  # fmt: skip
 """What a field may become: allowed or not, alone or with what is beside it."""
 

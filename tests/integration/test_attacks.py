@@ -216,6 +216,7 @@ async def test_a_step_of_the_clock_cuts_off_no_caller_and_revives_no_certificate
             code, why = await denied(rig.stub(DRIVER).GetSpeed(ASK, timeout=5))
             assert (code, why.code) == (Status.UNAUTHENTICATED, "NotAuthenticated"), "who was not known before"
             assert "expired" in why.reason
+    await until(lambda: len(rig.entries("clock")) >= 3, "the steps in the audit log")
     assert [round(entry["step_s"] / 86_400, 2) for entry in rig.entries("clock")][:3] == [400.0, 0.0, -0.04]
 
     async def watched() -> None:

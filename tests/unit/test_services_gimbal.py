@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 from depth import examples
@@ -51,9 +52,9 @@ def vehicle(kind: float | None = SIYI, heading_deg: float = 0.0) -> Vehicle:
     return told
 
 
-def report(told: Vehicle, now: float = 10.0, flags: int = ARDUPILOT_4_6, **more: object) -> Attitude | None:
+def report(told: Vehicle, now: float = 10.0, flags: int = ARDUPILOT_4_6, **more: Any) -> Attitude | None:
     values = {"q": quaternion(0.0, -45.0, 30.0), "flags": flags, "gimbal_device_id": 1} | more
-    told.take(message("GIMBAL_DEVICE_ATTITUDE_STATUS", **values), now)  # type: ignore[arg-type]
+    told.take(message("GIMBAL_DEVICE_ATTITUDE_STATUS", **values), now)
     return told.gimbal
 
 
@@ -101,10 +102,10 @@ def test_yaw_counts_from_where_the_flags_say(flags: int, yaw_deg: float) -> None
         {"q": (1.1, 0.0, 0.0, 0.0)},
     ],
 )  # fmt: skip
-def test_what_is_not_sure_is_unknown_at_once(told: dict[str, object]) -> None:
+def test_what_is_not_sure_is_unknown_at_once(told: dict[str, Any]) -> None:
     drone = vehicle()
     assert report(drone) is not None
-    assert report(drone, 10.1, **told) is None  # type: ignore[arg-type]
+    assert report(drone, 10.1, **told) is None
 
 
 @pytest.mark.parametrize("kind", [None, 0.0, SERVO, 2.0, 4.0, 7.0, 9.0, 13.0, 99.0])

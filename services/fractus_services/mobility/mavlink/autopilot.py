@@ -39,13 +39,14 @@ ATTEMPTS = 4
 STREAMS = {
     "GLOBAL_POSITION_INT": (4.0, 20.0),
     "ATTITUDE": (2.0, 10.0),
-    "GIMBAL_DEVICE_ATTITUDE_STATUS": (2.0, 10.0),
     "EXTENDED_SYS_STATE": (2.0, 5.0),
     "SYS_STATUS": (1.0, 1.0),
     "EKF_STATUS_REPORT": (1.0, 1.0),
     "GPS_RAW_INT": (1.0, 2.0),
     "HOME_POSITION": (0.2, 1.0),
     "WIND": (0.2, 1.0),
+    # Last: many have no gimbal, and what flight needs waits for no answer about one.
+    "GIMBAL_DEVICE_ATTITUDE_STATUS": (2.0, 10.0),
 }
 
 _RESULTS: dict[int, str] = {
@@ -308,7 +309,8 @@ class MavlinkAutopilot(Link):
             except AutopilotError as error:
                 if error.link and self._flying_rates is flying:
                     self._flying_rates = None
-                log.warning("autopilot: a stream keeps its own rate (message=%s, error=%s)", name, error)
+                told = log.warning if error.link else log.info  # A refusal is no fault: many have no gimbal.
+                told("autopilot: a stream keeps its own rate (message=%s, error=%s)", name, error)
 
     async def ask_home(self) -> None:
         """Ask for the home position now."""

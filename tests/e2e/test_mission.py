@@ -109,6 +109,24 @@ def test_deleting_the_application_in_flight_brings_the_drone_home(grounded: Kube
     assert any(e.get("code") == "GrantRevoked" for e in takeovers)
 
 
+def test_a_component_that_fails_is_told_with_its_last_words(grounded: Kube) -> None:
+    kube = grounded
+    app = short_flight("failing")
+    container = app["spec"]["components"][0]["container"]
+    container["command"] = ["python3", "-c", "raise SystemExit('no route to the river')"]
+    kube.apply(app)
+
+    def failed() -> Object | None:
+        found = condition(kube.get("application.fractus.dev", "failing"), "Ready")
+        return found if found.get("reason") == "ComponentFailed" else None
+
+    told = kube.wait("its failure is told", failed, timeout_s=120)
+    last_words = "failed with exit code 1: no route to the river"
+    assert last_words in told["message"]
+    messages = [e["message"] for e in kube.all("events", "default") if e["reason"] == "ComponentFailed"]
+    assert any(last_words in message for message in messages)
+
+
 def test_deleting_while_the_operator_is_down_leaves_nothing(grounded: Kube) -> None:
     kube = grounded
     kube.apply(short_flight("orphan"))

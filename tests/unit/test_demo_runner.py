@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import threading
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,6 +13,8 @@ import demo_flight
 import pytest
 import yaml
 from click.testing import CliRunner
+from fractus_services.recording import messages
+from fractus_services.recording.tape import Tape
 from fractus_sim.demo import collect, watch
 from fractus_sim.demo import view as demo_view
 from fractus_sim.demo.__main__ import demo
@@ -174,31 +177,28 @@ def test_a_file_is_fetched_whole_or_not_at_all(tmp_path: Path) -> None:
 
 def test_pictures_are_spread_over_the_flight() -> None:
     start_s = datetime(2026, 11, 21, 11, 0, tzinfo=UTC).timestamp()
-    every = [f"{'a' * 32}/202611211100{second:02d}000-0001.jpg" for second in range(0, 60, 2)]
+    every = [f"202611211100{second:02d}000-0001.jpg" for second in range(0, 60, 2)]
     chosen = spread(every, start_s + 10, start_s + 50)
     assert [path[-14:-12] for path in chosen] == ["20", "30", "40"]
     assert spread(every, start_s + 100, start_s + 200) == []
 
 
-def test_pictures_of_the_flight_come_from_the_node_s_album(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    kubectl = tmp_path / "kubectl"
-    kubectl.write_text('#!/bin/sh\nif [ "$1" = get ]; then echo fractus-mobility-x; else shift 5; exec "$@"; fi\n')
-    kubectl.chmod(0o755)
-    album = tmp_path / "node" / ("a" * 32)
-    album.mkdir(parents=True)
-    monkeypatch.setattr(collect, "_ALBUMS", str(album.parent))
+@pytest.mark.parametrize("whole", [True, False])
+def test_pictures_of_the_flight_come_from_the_camera_s_recording(tmp_path: Path, whole: bool) -> None:
     record = Record.of(demo_flight.content(), demo_flight.audit())
-    kube = Kube(kubectl, kubectl, tmp_path)
-    collect.fetch_pictures(kube, record, tmp_path / "out")
-    assert not list((tmp_path / "out" / "pictures").iterdir()), "none were taken"
+    paths = [tmp_path / f"{service}-000001-20260601T120000Z.mcap" for service in ("camera", "mobility")]
+    tape = Tape(paths[0].with_suffix(""), "drone-1")
     for seconds in range(-100, 300, 5):
-        taken = datetime.fromtimestamp(demo_flight.TAKEOFF_S + seconds, UTC).strftime("%Y%m%d%H%M%S%f")[:17]
-        (album / f"{taken}-0001.jpg").write_bytes(b"\xff\xd8")
-        (album / f"{taken}-0001.json").touch()
-    collect.fetch_pictures(kube, record, tmp_path / "out")
-    copied = sorted((tmp_path / "out" / "pictures").iterdir())
-    assert [round(taken_s(path.name) - demo_flight.TAKEOFF_S) for path in copied] == [25, 50, 80]
-    assert {path.read_bytes() for path in copied} == {b"\xff\xd8"}
+        at_ns = int((demo_flight.TAKEOFF_S + seconds) * 1e9)
+        tape.write(at_ns, b"", (messages.picture(at_ns, "drone-1", b"\xff\xd8%d" % seconds),))
+    tape.flush()
+    if whole:
+        tape.close()
+    paths[1].write_bytes(b"not read")
+    collect.keep_pictures(paths, record, tmp_path / "out")
+    kept = sorted((tmp_path / "out" / "pictures").iterdir())
+    assert [round(taken_s(path.name) - demo_flight.TAKEOFF_S) for path in kept] == [25, 50, 80]
+    assert [path.read_bytes() for path in kept] == [b"\xff\xd825", b"\xff\xd850", b"\xff\xd880"]
 
 
 def test_a_wrong_assignment_is_refused() -> None:
@@ -244,26 +244,24 @@ def test_a_change_of_path_is_told_once() -> None:
     assert said == ["traffic goes by WiFi to edge-1: near", "traffic goes no more by WiFi to edge-1: left"]
 
 
-class Pod:
-    """A drone's pod with recordings in it."""
-
-    def __init__(self, *names: str) -> None:
-        self.names = names
-
-    def run(self, *arguments: str, **_: Any) -> str:
-        return "fractus-mobility-x\n" if "get" in arguments else "\n".join(self.names)
-
-    def fetch(self, pod: str, path: str, to: Path) -> None:
-        to.write_text(f"{pod} {path}")
-
-
-def test_the_recordings_of_the_mission_are_kept_and_the_command_that_replays_them_is_told(tmp_path: Path) -> None:
+@pytest.mark.parametrize("began", ["20260601T115955Z", "20260601T120001Z"])
+def test_the_recordings_of_the_mission_are_kept_and_the_command_that_replays_them_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, began: str
+) -> None:
     assert demo_view.replay_command(tmp_path) is None
-    began_s = datetime(2026, 6, 1, 12, tzinfo=UTC).timestamp()
-    names = ("mobility/000001-20260531T120000Z.mcap", "mobility/000002-20260601T120001Z.mcap", "camera/x.mcap")
-    found = demo_view.fetch_recordings(Pod(*names), "drone-1", began_s, tmp_path)  # type: ignore[arg-type]
-    assert [path.name for path in found] == ["mobility-000002-20260601T120001Z.mcap"]
-    assert found[0].read_text() == f"fractus-mobility-x /var/lib/fractus/recordings/{names[1]}"
+    kubectl = tmp_path / "kubectl"
+    kubectl.write_text('#!/bin/sh\nif [ "$1" = get ]; then echo fractus-mobility-x; else shift 5; exec "$@"; fi\n')
+    kubectl.chmod(0o755)
+    monkeypatch.setattr(demo_view, "_ON_NODE", str(tmp_path / "node"))
+    applied_s = datetime(2026, 6, 1, 12, tzinfo=UTC).timestamp()
+    for name, written_s in (("000001-20260531T120000Z", applied_s - 1), (f"000002-{began}", applied_s + 60)):
+        path = tmp_path / "node" / "mobility" / f"{name}.mcap"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(name)
+        os.utime(path, (written_s, written_s))
+    found = demo_view.fetch_recordings(Kube(kubectl, kubectl, tmp_path), "drone-1", applied_s, tmp_path)
+    assert [path.name for path in found] == [f"mobility-000002-{began}.mcap"]
+    assert found[0].read_text() == f"000002-{began}"
     assert demo_view.replay_command(tmp_path) == f"fractus view {tmp_path}/recordings/*.mcap"
 
 

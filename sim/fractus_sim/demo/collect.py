@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
-from collections.abc import Iterator
+from base64 import b64decode
+from collections.abc import Iterable, Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from fractus_storage.chain import lines_of, logs, verify
+from mcap.exceptions import McapError
+from mcap.reader import NonSeekingReader
 
 from fractus_sim.demo.kube import NAMESPACE, SYSTEM, DemoError, Kube, Object
 from fractus_sim.demo.watch import Mission
 from fractus_sim.report.record import AUDIT, OBJECTS, PICTURES, Record, of_mission, taken_s
 
 _AUDIT = "/var/lib/fractus/audit"
-_ALBUMS = "/var/lib/fractus/camera"
 _AUDIT_FILE = re.compile(r"(mobility|camera|links)(\.\d{12})?\.jsonl")
-_PICTURE = re.compile(r"[0-9a-f]{32}/\d{17}-\d{4}\.jpg")
 _TRIES = 5
 _SHARES = (0.25, 0.5, 0.75)
 _KINDS = "applications,deploymentplans,depots,drones,edgenodes,policies,zones"
@@ -98,34 +101,42 @@ def _audit_files(kube: Kube, pod: str) -> list[str]:
     return sorted(name for name in names if _AUDIT_FILE.fullmatch(name))
 
 
-def fetch_pictures(kube: Kube, record: Record, folder: Path) -> None:
-    """Copy a few of the pictures that were taken in flight, as policies had them kept.
+def keep_pictures(recordings: Iterable[Path], record: Record, folder: Path) -> None:
+    """Keep a few of the pictures that were taken in flight, after privacy filters, from the camera service's recordings.
 
-    Raises:
-        DemoError: they cannot be read.
+    Components delete the pictures of their albums once they have them.
     """
-    if record.drone is None or record.takeoff_s is None:
+    if record.takeoff_s is None:
         return
-    pod = mobility_pod(kube, record.drone.name)
-    listed = kube.run("exec", "-n", SYSTEM, pod, "--", "sh", "-c", f"cd {_ALBUMS} && ls -1 */*.jpg || true").split()
+    taken = {name: jpeg for path in recordings if path.name.startswith("camera-") for name, jpeg in _pictures(path)}
     begin_s, end_s = record.samples[0].time_s, record.samples[-1].time_s
     (folder / PICTURES).mkdir(parents=True, exist_ok=True)
-    for path in spread([path for path in listed if _PICTURE.fullmatch(path)], begin_s, end_s):
-        kube.fetch(pod, f"{_ALBUMS}/{path}", folder / PICTURES / Path(path).name)
+    for name in spread(list(taken), begin_s, end_s):
+        (folder / PICTURES / name).write_bytes(taken[name])
 
 
-def spread(paths: list[str], begin_s: float, end_s: float) -> list[str]:
+def _pictures(recording: Path) -> Iterator[tuple[str, bytes]]:
+    """Names, by when they were taken, and contents, up to where a recording that is still written breaks off."""
+    with recording.open("rb") as file, contextlib.suppress(McapError):
+        for schema, _, message in NonSeekingReader(file).iter_messages(log_time_order=False):
+            if schema is not None and schema.name == "foxglove.CompressedImage":
+                moment = datetime.fromtimestamp(message.log_time / 1e9, UTC)
+                name = f"{moment:%Y%m%d%H%M%S}{moment.microsecond // 1000:03d}-{message.sequence:04d}.jpg"
+                yield name, b64decode(json.loads(message.data)["data"])
+
+
+def spread(names: list[str], begin_s: float, end_s: float) -> list[str]:
     """Those pictures that were taken nearest to a quarter, half and three quarters of a time; oldest first."""
-    taken = {path: taken_s(Path(path).name) for path in paths}
-    inside = [path for path in paths if begin_s <= taken[path] <= end_s]
+    taken = {name: taken_s(name) for name in names}
+    inside = [name for name in names if begin_s <= taken[name] <= end_s]
     if not inside:
         return []
 
     def nearest(at_s: float) -> str:
-        return min(inside, key=lambda path: abs(taken[path] - at_s))
+        return min(inside, key=lambda name: abs(taken[name] - at_s))
 
     chosen = {nearest(begin_s + share * (end_s - begin_s)) for share in _SHARES}
-    return sorted(chosen, key=lambda path: taken[path])
+    return sorted(chosen, key=lambda name: taken[name])
 
 
 def mobility_pod(kube: Kube, node: str) -> str:

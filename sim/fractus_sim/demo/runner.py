@@ -15,7 +15,7 @@ from fractus_core.api.nodes import GROUNDED
 from rich.console import Console
 
 from fractus_sim.demo.clusters import EXAMPLE, ROOT, DemoCluster, documents
-from fractus_sim.demo.collect import collect, fetch_pictures
+from fractus_sim.demo.collect import collect, keep_pictures
 from fractus_sim.demo.kube import SYSTEM, DemoError, Kube
 from fractus_sim.demo.view import RECORDINGS, fetch_recordings, shown
 from fractus_sim.demo.watch import Mission, follow, wait_ready
@@ -28,6 +28,8 @@ from fractus_sim.report.summary import figures
 READY_TIMEOUT_S = 180.0
 HOME_TIMEOUT_S = 180.0
 RELEASES = ("fractus-crds", "fractus")
+_OWN_VALUES = {"fractus": ("camera.recordings.enabled=true",)}
+"""Of a cluster of the demo's own: its report shows pictures, and components delete theirs."""
 LOGS = "components.log"
 
 
@@ -119,7 +121,10 @@ class Demo:
                     self._clean_up(kube, installed)
 
     def _install(self, kube: Kube, installed: list[str]) -> None:
-        installed.extend(release for release in RELEASES if kube.install(release, ROOT / "charts" / release))
+        for release in RELEASES:
+            # On another's cluster the values are theirs.
+            values = _OWN_VALUES.get(release, ()) if self.cluster.disposable else ()
+            installed.extend([release] if kube.install(release, ROOT / "charts" / release, values) else [])
         if self.cluster.disposable and "fractus" not in installed:  # images of the same name may have new content
             kube.run(
                 "delete", "pods", "-n", SYSTEM, "-l", "app.kubernetes.io/name=fractus", "--timeout=60s", timeout_s=90
@@ -139,24 +144,24 @@ class Demo:
                     follow(kube, mission, logs, timeout_s=self.timeout_s, say=self.tell, show=self.tell.show)
             finally:
                 collect(kube, mission, self.out, logs)
-                self._fetch_pictures(kube)
                 self._fetch_recordings(kube, mission)
                 record = Record.read(self.out)
                 write_report(record, self.out)
         return _as_promised(record, self.tell)
 
-    def _fetch_pictures(self, kube: Kube) -> None:
-        try:
-            fetch_pictures(kube, Record.read(self.out), self.out)
-        except DemoError as error:
-            self.tell(f"no pictures of the flight: {error}")
-
     def _fetch_recordings(self, kube: Kube, mission: Mission) -> None:
         try:
-            if not fetch_recordings(kube, mission.drone, mission.times["applied"], self.out):
-                self.tell("no recording of the flight: the drone's services make none")
+            recordings = fetch_recordings(kube, mission.drone, mission.times["applied"], self.out)
+            keep_pictures(recordings, Record.read(self.out), self.out)
         except DemoError as error:
             self.tell(f"no recording of the flight: {error}")
+            return
+        if not recordings:
+            self.tell("no recording of the flight: the drone's services make none")
+        elif not any((self.out / PICTURES).glob("*")):
+            self.tell(
+                "no pictures of the flight: the camera service records none (chart value camera.recordings.enabled)"
+            )
 
     def _clean_up(self, kube: Kube | None, installed: list[str]) -> None:
         if kube is not None and not self.cluster.disposable:

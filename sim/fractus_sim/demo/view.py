@@ -7,7 +7,6 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from datetime import UTC, datetime
 from pathlib import Path
 
 from fractus_sim.demo.collect import mobility_pod
@@ -17,6 +16,7 @@ RECORDINGS = "recordings"
 """Folder of the report."""
 
 _ON_NODE = "/var/lib/fractus/recordings"
+_LIST = "import sys, pathlib as p; r = p.Path(sys.argv[1]); [print(f.stat().st_mtime, f.relative_to(r)) for f in r.glob('*/*.mcap')]"
 _END_S = 10.0
 
 
@@ -47,30 +47,23 @@ def shown(kubeconfig: Path, say: Callable[[str], None]) -> Iterator[None]:
 
 
 def fetch_recordings(kube: Kube, drone: str, since_s: float, folder: Path) -> list[Path]:
-    """Copy what the services of a drone recorded since some time (Unix seconds); none where they record nothing.
+    """Copy what the services of a drone wrote into recordings since some time (Unix seconds); none where they record nothing.
+
+    A recording of the mission may have begun before it: seconds before the motors were armed are in it, too.
 
     Raises:
         DemoError: they cannot be read.
     """
     pod = mobility_pod(kube, drone)
-    script = f"cd {_ON_NODE} 2> /dev/null && ls -1 */*.mcap 2> /dev/null || true"
-    names = kube.run("exec", "-n", SYSTEM, pod, "--", "sh", "-c", script).split()
     found: list[Path] = []
-    for name in sorted(names):
-        if begun_s(name) >= since_s:
+    for line in sorted(kube.run("exec", "-n", SYSTEM, pod, "--", "python3", "-c", _LIST, _ON_NODE).splitlines()):
+        written_s, _, name = line.partition(" ")
+        if float(written_s) >= since_s:
             to = folder / RECORDINGS / name.replace("/", "-")
             to.parent.mkdir(parents=True, exist_ok=True)
             kube.fetch(pod, f"{_ON_NODE}/{name}", to)
             found.append(to)
     return found
-
-
-def begun_s(name: str) -> float:
-    """When a recording began, by its name (SERVICE/NUMBER-YYYYMMDDTHHMMSSZ.mcap), in Unix seconds; 0 for other names."""
-    with contextlib.suppress(ValueError):
-        stamp = Path(name).stem.partition("-")[2]
-        return datetime.strptime(stamp, "%Y%m%dT%H%M%SZ").replace(tzinfo=UTC).timestamp()
-    return 0.0
 
 
 def replay_command(folder: Path) -> str | None:

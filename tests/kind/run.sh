@@ -2,7 +2,7 @@
 # Everything on a cluster that kind makes: images by Docker, the charts, the end-to-end tests of a mission, the demo.
 # Needs docker, kind, kubectl and helm on the PATH; tests/kind/machine.sh brings them where they are missing.
 #
-#   STEPS="cluster"       only these steps, of: images cluster load charts tests demo
+#   STEPS="cluster"       only these steps, of: images cluster load charts tests demo uninstall
 #   KEEP=1                leaves the cluster
 #   KIND_NODE_IMAGE=NAME  the nodes' image; kind's own by default
 #   BUILD_OPTIONS="..."   for `docker build`
@@ -42,11 +42,21 @@ charts() {
 }
 
 tests() {
-  .venv/bin/pytest tests/e2e/test_mission.py tests/e2e/test_refusals.py
+  .venv/bin/pytest tests/e2e/test_{mission,refusals,upgrade,uninstall}.py
 }
 
 demo() {
   make demo CLUSTER=current
+  ls out/demo/recordings/mobility-*.mcap
+}
+
+# What docs/upgrades.md tells to type; nothing of Fractus is left that Kubernetes would run, ask or refuse by.
+uninstall() {
+  helm -n fractus-system uninstall fractus-demo
+  bash -e <(sed -n '/^## Uninstalling/,/^## /s/^    \(kubectl delete app.*\|helm .*\)/\1/p' docs/upgrades.md)
+  kinds=$(kubectl api-resources --verbs=list --output=name | grep -v '^events')
+  left=$(kubectl get "$(echo $kinds | tr ' ' ',')" --all-namespaces --selector app.kubernetes.io/name=fractus --output name)
+  [ -z "$left" ] && [ -z "$(kubectl get pods --all-namespaces --output name | grep fractus)" ] || { echo "left: $left" >&2; return 1; }
 }
 
 leave() {
@@ -60,7 +70,7 @@ leave() {
 } >&2
 trap leave EXIT
 
-for step in ${STEPS:-images cluster load charts tests demo}; do
+for step in ${STEPS:-images cluster load charts tests demo uninstall}; do
   echo "== $step ($(date +%T))"
   "$step"
 done

@@ -12,6 +12,8 @@ from typing import Literal
 import click
 from cryptography import x509
 from fractus_core.api import KINDS
+from fractus_core.api.names import CLASS_LABEL as CLASS
+from fractus_core.api.names import CLOUD_LABEL
 
 from fractus_cli.output import output_option
 from fractus_cli.reading import (
@@ -27,7 +29,6 @@ from fractus_cli.reading import (
 
 MIN_VERSION = (1, 32)
 """The oldest Kubernetes that the charts take."""
-CLASS = "fractus.dev/class"
 SERVICES = ("fractus-agent", "fractus-mobility", "fractus-camera")
 POLICIES = (
     "fractus-agent",
@@ -208,18 +209,18 @@ def _nodes(found: Cluster) -> Iterator[Finding]:
         "drone": {body["metadata"]["name"]: body for body in found.list(f"{GROUP}/drones")},
         "edge": {body["metadata"]["name"]: body for body in found.list(f"{GROUP}/edgenodes")},
     }
-    classes: dict[str, int] = {}
+    classes: set[str] = set()
     for node in found.list("/api/v1/nodes"):
         name, labels = node["metadata"]["name"], node["metadata"].get("labels") or {}
         of_class = labels.get(CLASS, "")
-        classes[of_class] = classes.get(of_class, 0) + 1
+        classes |= {of_class, "cloud"} if labels.get(CLOUD_LABEL) == "true" else {of_class}
         if of_class not in {"", "drone", "edge", "cloud"}:
             remedy = f"kubectl label node {name} {CLASS}=drone --overwrite (or edge, or cloud)"
             yield Finding("error", "nodes", f"{name}: the class {of_class} means nothing", remedy)
         elif of_class in described:
             yield from _node(node, of_class, described[of_class].get(name))
     for of_class in ("drone", "cloud"):
-        if not classes.get(of_class):
+        if of_class not in classes:
             remedy = f"kubectl label node NODE {CLASS}={of_class}"
             level: Literal["warning", "error"] = "error" if of_class == "drone" else "warning"
             yield Finding(level, "nodes", f"no node has the label {CLASS}={of_class}", remedy)
@@ -230,8 +231,12 @@ def _node(node: Body, of_class: str, body: Body | None) -> Iterator[Finding]:
     name, before = node["metadata"]["name"], []
     if conditions_of(node).get("Ready", {}).get("status") != "True":
         before.append(Finding("warning", "nodes", f"{name} is out of reach", "check its power, link and kubelet"))
-    taints = (node.get("spec") or {}).get("taints") or ()
-    if not any(t["key"] == CLASS for t in taints):
+    tainted = any(t["key"] == CLASS for t in (node.get("spec") or {}).get("taints") or ())
+    if (node["metadata"].get("labels") or {}).get(CLOUD_LABEL) == "true":
+        if tainted:
+            message = f"{name} has the label {CLOUD_LABEL}, but its taint {CLASS} keeps the cloud's pods away"
+            before.append(Finding("warning", "nodes", message, f"kubectl taint node {name} {CLASS}-"))
+    elif not tainted:
         remedy = f"kubectl taint node {name} {CLASS}={of_class}:NoExecute"
         before.append(Finding("warning", "nodes", f"{name} has no taint {CLASS}: other pods may run there", remedy))
     if body is None:

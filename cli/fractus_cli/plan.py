@@ -77,9 +77,9 @@ def plan(
     Reads Applications, Drones, EdgeNodes, Depots, Zones, Policies, DeploymentPlans (in force: what still fits stays)
     and Nodes, in any mix, and passes over all other kinds. Prints the DeploymentPlans that the operator would write.
 
-    Nodes give resources (status.allocatable), readiness and, by the label fractus.dev/class=cloud, the cloud. Without
-    any Node object, every Drone and EdgeNode has a Node of unlimited resources, and there is a cloud. A Drone whose
-    manifest has no Ready condition counts as Ready, and as full if it has no battery status.
+    Nodes give resources (status.allocatable), readiness and, by the label fractus.dev/class=cloud or fractus.dev/cloud=true,
+    the cloud. Without any Node object, every Drone and EdgeNode has a Node of unlimited resources, and there is a cloud.
+    A Drone whose manifest has no Ready condition counts as Ready, and as full if it has no battery status.
 
     Several Applications are planned one after the other, those with a driver first, then by name; each takes its drone
     and its resources.

@@ -753,7 +753,9 @@ def _compare_nodes(oracle: Oracle, found: DeploymentPlanSpec | None, problem: In
     if problem is not None and problem.reason == "NoEdgeNode":
         assert oracle.check_statics(None), "a location can have an instance"
         return
-    clouds = [n for n, h in oracle.stock.hosts.items() if h.node_class == "cloud" and oracle.host_is_fine(n)]
+    clouds = [
+        n for n, h in oracle.stock.hosts.items() if h.labels["fractus.dev/class"] == "cloud" and oracle.host_is_fine(n)
+    ]
     assert (found is None) == (not clouds), f"cloud {clouds}, {problem}"
     if found is None:
         return

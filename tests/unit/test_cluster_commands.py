@@ -190,10 +190,10 @@ def authority(days: float) -> Body:
     return {"data": {"ca.crt": pem.decode()}}
 
 
-def node(name: str, of_class: str, *, tainted: bool = True, ready: str = "True") -> Body:
+def node(name: str, of_class: str, *, tainted: bool = True, ready: str = "True", cloud: bool = False) -> Body:
     taints = [{"key": "fractus.dev/class", "effect": "NoExecute"}] if tainted else []
     body = named(name, spec={"taints": taints}, status={"conditions": [condition("Ready", ready)]})
-    body["metadata"]["labels"] = {"fractus.dev/class": of_class}
+    body["metadata"]["labels"] = {"fractus.dev/class": of_class} | ({"fractus.dev/cloud": "true"} if cloud else {})
     return body
 
 
@@ -233,6 +233,13 @@ def test_doctor_finds_nothing_in_a_cluster_that_lacks_nothing(run: Run, healthy:
     assert {line.split()[0] for line in said.splitlines()} == {"ok"}
 
 
+def test_doctor_finds_nothing_in_a_cluster_of_one_node(run: Run, healthy: Body) -> None:
+    healthy["/api/v1/nodes"] = [node("drone-1", "drone", tainted=False, cloud=True)]
+    code, said = run("doctor")
+    assert code == 0, said
+    assert {line.split()[0] for line in said.splitlines()} == {"ok"}
+
+
 SYSTEM_APPS = "/apis/apps/v1/namespaces/fractus-system"
 WAITING = {
     "metadata": {"name": "fractus-camera-x"},
@@ -267,6 +274,12 @@ LACKS: list[tuple[str, Any, str, str]] = [
     ("/api/v1/nodes", MISTYPED, "error", "kubectl label node b fractus.dev/class=drone --overwrite"),
     ("/api/v1/nodes", [node("cloud-1", "cloud")], "error", "kubectl label node NODE fractus.dev/class=drone"),
     ("/api/v1/nodes", [node("drone-1", "drone")], "warning", "kubectl label node NODE fractus.dev/class=cloud"),
+    (
+        "/api/v1/nodes",
+        [node("drone-1", "drone", cloud=True)],
+        "warning",
+        "kubectl taint node drone-1 fractus.dev/class-",
+    ),
     (
         "/api/v1/nodes",
         [node("drone-1", "drone", tainted=False), node("c", "cloud")],

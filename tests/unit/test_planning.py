@@ -335,6 +335,17 @@ def test_cloud_needs_a_node():
     assert plan(application(STORE), inventory()).placements[0].replicas == 3
 
 
+@pytest.mark.parametrize(("value", "takes"), [("true", True), ("false", False), ("", False)])
+def test_a_node_of_another_class_may_be_of_the_cloud(value, takes):
+    both = host("w", "drone")
+    both.labels["fractus.dev/cloud"] = value
+    if takes:
+        assert plan(application(STORE), Inventory(hosts={"w": both})).placements[0].replicas == 3
+    else:
+        with pytest.raises(Infeasible, match="no cloud node can host"):
+            plan(application(STORE), Inventory(hosts={"w": both}))
+
+
 def test_a_plan_books_what_it_places():
     greedy = component("GroundViewer", "edge", locations=[{"center": at(0, 0), "radius": 5}])
     greedy["container"]["resources"] = {"requests": {"cpu": "3"}}

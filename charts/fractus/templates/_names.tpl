@@ -115,7 +115,7 @@ seccompProfile: {type: RuntimeDefault}
 {{ . }}.spec.?tolerations.orValue([]).exists(t, t.?key.orValue("") in ["", "fractus.dev/class"])
 {{- end }}
 
-{{/* Where the operator's image runs: on nodes that are neither drones nor at the edge. */}}
+{{/* Where the operator's image runs: on nodes that are neither drones nor at the edge, or are of the cloud as well. */}}
 {{- define "fractus.cloudPod" -}}
 affinity:
   nodeAffinity:
@@ -125,6 +125,8 @@ affinity:
             - key: fractus.dev/class
               operator: NotIn
               values: [drone, edge]
+        - matchExpressions:
+            - {key: fractus.dev/cloud, operator: In, values: ["true"]}
   podAntiAffinity:
     preferredDuringSchedulingIgnoredDuringExecution:
       - weight: 100

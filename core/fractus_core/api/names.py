@@ -15,6 +15,9 @@ SPIFFE_SCHEME = "spiffe://"
 CLASS_LABEL = f"{TRUST_DOMAIN}/class"
 """On Nodes, and the key of their taint: drone, edge or cloud."""
 
+CLOUD_LABEL = f"{TRUST_DOMAIN}/cloud"
+"""On Nodes of another class: "true" makes them take the cloud's pods, too."""
+
 NODE_SIGNER = f"{TRUST_DOMAIN}/node"
 """The signer that agents ask for the certificates of their nodes."""
 

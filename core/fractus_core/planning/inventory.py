@@ -9,7 +9,7 @@ from typing import Literal
 
 from fractus_core.api.geometry import Position
 from fractus_core.api.model import InvalidObject
-from fractus_core.api.names import CLASS_LABEL
+from fractus_core.api.names import CLASS_LABEL, CLOUD_LABEL
 from fractus_core.api.nodes import Depot, Drone, EdgeNode
 from fractus_core.api.policies import Policy, Zone
 from fractus_core.planning.coverage import CoverStrategy
@@ -33,9 +33,9 @@ class Host:
     schedulable: bool = True
 
     @property
-    def node_class(self) -> str | None:
-        """drone, edge or cloud; None for a node that Fractus does not use."""
-        return self.labels.get(CLASS_LABEL)
+    def is_cloud(self) -> bool:
+        """Whether it takes the cloud's pods, as a node of that class or beside another one."""
+        return self.labels.get(CLASS_LABEL) == "cloud" or self.labels.get(CLOUD_LABEL) == "true"
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +83,7 @@ class Inventory:
         if self.locations is not None:
             return self.locations
         if not self._built:
-            cloud = (host.name for host in self.hosts.values() if host.node_class == "cloud")
+            cloud = (host.name for host in self.hosts.values() if host.is_cloud)
             self._built.append(
                 NodeLocations.of(edge_nodes=self.edge_nodes, drones=self.drones, depots=self.depots, cloud=cloud)
             )

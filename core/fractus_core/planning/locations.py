@@ -84,9 +84,9 @@ class NodeLocations:
         self.depots.remove(name)
         self._place_all(name)
 
-    def upsert_host(self, name: str, node_class: str | None) -> None:
-        """Note the class of a Kubernetes Node."""
-        if node_class == "cloud":
+    def upsert_host(self, name: str, is_cloud: bool) -> None:
+        """Note whether a Kubernetes Node takes the cloud's pods."""
+        if is_cloud:
             self.cloud.add(name)
         else:
             self.cloud.discard(name)

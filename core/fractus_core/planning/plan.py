@@ -156,5 +156,5 @@ def _place_cloud(draft: Draft, component: Component, replicas: int) -> None:
         component,
         "NoCloudNode",
         f"no cloud node can host {component.name}",
-        "no Node has the label fractus.dev/class=cloud",
+        "no Node has the label fractus.dev/class=cloud, or fractus.dev/cloud=true beside another class",
     )

@@ -181,7 +181,7 @@ class LiveInventory:
         if new is None:
             self._locations.remove_host(key[1])
         else:
-            self._locations.upsert_host(new.name, new.node_class)
+            self._locations.upsert_host(new.name, new.is_cloud)
         self.subscriptions.wake_all()
 
     def _pod_changed(self, key: Key, old: PodView | None, new: PodView | None) -> None:

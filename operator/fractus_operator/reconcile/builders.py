@@ -9,7 +9,7 @@ from typing import Any, assert_never
 
 from fractus_core.api import API_VERSION, Application, Component, Drone
 from fractus_core.api.containers import TLS_DIR
-from fractus_core.api.names import CLASS_LABEL, address_variable
+from fractus_core.api.names import CLASS_LABEL, CLOUD_LABEL, address_variable
 from fractus_core.api.plans import DeploymentPlanSpec, GrantSpec, PlannedInstance
 
 from fractus_operator.cluster import kinds, labels
@@ -304,11 +304,13 @@ def _environment(application: Application, component: Component, placed: Planned
 
 
 def _affinity(placed: PlannedInstance) -> Body:
+    terms: list[Body]
     if placed.node is not None:
-        term = {"matchFields": [{"key": "metadata.name", "operator": "In", "values": [placed.node]}]}
+        terms = [{"matchFields": [{"key": "metadata.name", "operator": "In", "values": [placed.node]}]}]
     else:
-        term = {"matchExpressions": [{"key": CLASS_LABEL, "operator": "In", "values": ["cloud"]}]}
-    return {"requiredDuringSchedulingIgnoredDuringExecution": {"nodeSelectorTerms": [term]}}
+        cloud = ((CLASS_LABEL, "cloud"), (CLOUD_LABEL, "true"))
+        terms = [{"matchExpressions": [{"key": key, "operator": "In", "values": [value]}]} for key, value in cloud]
+    return {"requiredDuringSchedulingIgnoredDuringExecution": {"nodeSelectorTerms": terms}}
 
 
 def _tolerations(placed: PlannedInstance, drone: Drone | None) -> list[Body]:

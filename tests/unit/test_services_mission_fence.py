@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import shapely
+from depth import examples
 from fractus_core.api.plans import GrantSpec
 from fractus_core.geo import LocalFrame
 from fractus_mavlink import Message
@@ -18,10 +19,10 @@ from fractus_services.mobility.mavlink import fence as module
 from fractus_services.mobility.mavlink.bounds import ROOM_M, Item, bounds_of
 from fractus_services.mobility.mavlink.fence import MissionFence
 from fractus_services.mobility.mavlink.itemlists import NoLists, NoSpace
-from hypothesis import given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from mobility_world import Loop
 from parameter_vehicle import ParameterVehicle
+from virtual_time import Loop
 
 FRAME = LocalFrame(39.36, 22.95)
 
@@ -106,6 +107,8 @@ def test_a_round_area_has_few_vertices() -> None:
     assert outline(bounds.items).contains(shapely.Point(0, 0).buffer(5000))
 
 
+@settings(max_examples=examples(200, 6))
+@example([(0.0, 0.0, 6.0), (0.0, 6.0, 6.0)], 8)
 @given(
     st.lists(st.tuples(st.floats(-300, 300), st.floats(-300, 300), st.floats(5, 200)), min_size=1, max_size=5),
     st.sampled_from([60, 30, 15, 8, 4]),

@@ -77,9 +77,11 @@ def _outline(whole: shapely.Geometry, vertices: int) -> shapely.Polygon:
     """A polygon around a geometry with the room that it needs, of a number of vertices at most: the smallest of several."""
     found: list[shapely.Geometry] = []
     for simpler_m in _SIMPLER_M:
-        # What is simplified comes nearer by that much at most, so it is grown by that much before.
+        # What is simplified comes nearer by about that much, so it is grown by that much before.
         grown = whole.buffer(ROOM_M + simpler_m, join_style="mitre", mitre_limit=2.0).simplify(simpler_m)
         found += [grown, grown.convex_hull]
     box = whole.buffer(ROOM_M + _SIMPLER_M[0]).minimum_rotated_rectangle
     rings = [shapely.Polygon(each.exterior) for each in (*found, box) if isinstance(each, shapely.Polygon)]
-    return min((ring for ring in rings if len(ring.exterior.coords) - 1 <= vertices), key=lambda ring: float(ring.area))
+    # GEOS may simplify a ring's first corner away as well, and come nearer by more.
+    roomy = (ring for ring in rings if ring.exterior.distance(whole) >= ROOM_M)
+    return min((ring for ring in roomy if len(ring.exterior.coords) - 1 <= vertices), key=lambda ring: float(ring.area))

@@ -47,22 +47,25 @@ def rules() -> list[tuple[re.Pattern[str], str]]:
 
 @cache
 def any_rule() -> re.Pattern[str]:
-    """Finds out at once whether a line has any of the words."""
-    return re.compile("|".join(f"(?{'i' if p.flags & re.IGNORECASE else ''}:{p.pattern})" for p, _ in rules()))
+    """Finds out at once whether a text has any of the words."""
+    each = "|".join(f"(?{'i' if p.flags & re.IGNORECASE else ''}:{p.pattern})" for p, _ in rules())
+    # Where a word begins alone: four of five letters are passed over.
+    return re.compile(rf"(?<![A-Za-z])(?:{each})")
 
 
 def files(paths: list[Path]) -> Iterator[Path]:
     """The sources below some paths, in order."""
     for path in paths:
-        for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
-            name = file.relative_to(ROOT).as_posix()
-            if file.is_file() and file.suffix in READ and not SKIPPED.search(name):
-                yield file
+        name = path.relative_to(ROOT).as_posix()
+        if path.is_dir() and not SKIPPED.search(f"{name}/"):
+            yield from files(sorted(path.iterdir()))
+        elif path.is_file() and path.suffix in READ and not SKIPPED.search(name):
+            yield path
 
 
 def words(text: str) -> Iterator[tuple[int, str, str]]:
     """Line, word and remedy of each word that the field does not use."""
-    for number, line in enumerate(text.splitlines(), 1):
+    for number, line in enumerate(text.splitlines(), 1) if any_rule().search(text) else ():
         if any_rule().search(line):
             found = [(match, instead) for pattern, instead in rules() for match in pattern.finditer(line)]
             yield from (

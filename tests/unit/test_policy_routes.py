@@ -163,7 +163,7 @@ def _shortest(zones: list[Corners], start: tuple[float, float], to: tuple[float,
                 costs[n] = cost
 
 
-@pytest.mark.parametrize("seed", cells(range(4), quick=[0, 1]))
+@pytest.mark.parametrize("seed", cells(range(4), quick=[1]))
 def test_no_way_is_much_longer_than_the_shortest(seed: int) -> None:
     draw = random.Random(seed)
     zones: list[Corners] = []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
+from depth import examples
 from fractus_core.policy.engine import judge
 from fractus_core.policy.values import Airframe, Call, Situation, VelocityArgs
 from hypothesis import given, settings
@@ -14,7 +15,7 @@ from policy_world import at, box, compiled, exclusion, goto, policy, zone
 RETRACES = Airframe(retraces=True)
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=examples(400), deadline=None)
 @given(
     thick=st.floats(0.2, 8.0),
     speed=st.floats(0.5, 14.0),
@@ -56,7 +57,7 @@ def test_a_drone_inside_a_thin_zone_may_leave_it() -> None:
         assert judge(goto(0, end), at(0, math.copysign(0.2, end), airframe=RETRACES), grant).permits
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=examples(200), deadline=None)
 @given(
     gap=st.floats(0.2, 6.0),
     speed=st.floats(0.5, 14.0),

@@ -49,7 +49,11 @@ chaos: packages uv ## Fly missions on an embedded cluster while its parts fail (
 
 .PHONY: compare-vehicle
 compare-vehicle: env ## Play the script of a real ArduCopter's answers on the simulated vehicle (AUTOPILOT=tcp:HOST:PORT: on that one)
-	PYTHONPATH=tests/unit $(RUN) python tests/unit/vehicle_script.py --all $(if $(AUTOPILOT),--autopilot $(AUTOPILOT))
+	PYTHONPATH=tests/component $(RUN) python tests/component/vehicle_script.py --all $(if $(AUTOPILOT),--autopilot $(AUTOPILOT))
+
+QUICK := $(RUN) pytest -q -n 2 --dist loadfile
+# `make test` flies all of the recorded flights: they alone show that no change of the code changed a flight.
+GOLDEN := tests/component/test_control_golden.py
 
 # Many of these tests fly in real time, which a machine that stalls can fail: what fails gets a second try, alone.
 INTEGRATION := tests/integration tests/e2e/test_cluster.py
@@ -57,20 +61,24 @@ E2E := tests/e2e --ignore tests/e2e/test_cluster.py
 SECOND_TRY := $(RUN) pytest --last-failed --last-failed-no-failures none
 
 .PHONY: test
-test: packages env lint ## Everything: lint, types, unit, integration and end-to-end tests
+test: packages env lint ## Everything: lint, types, unit, component, integration and end-to-end tests
 	$(RUN) fractus cluster binaries
-	$(RUN) pytest -q -n 2 --dist loadfile tests/unit
-	FRACTUS_DEEP=1 $(RUN) pytest -q -n 2 tests/unit/test_control_golden.py
+	$(QUICK) tests/unit tests/component --ignore $(GOLDEN)
+	FRACTUS_DEEP=1 $(RUN) pytest -q -n 2 $(GOLDEN)
 	$(RUN) pytest -n 3 --dist loadgroup $(INTEGRATION) || $(SECOND_TRY) $(INTEGRATION)
 	$(RUN) pytest $(if $(filter current,$(FRACTUS_E2E_CLUSTER)),,-n 2 --dist loadgroup) $(E2E) || $(SECOND_TRY) $(E2E)
 
 .PHONY: test-fast
 test-fast: env lint ## The inner loop: lint, types and unit tests
-	$(RUN) pytest -q -n 2 --dist loadfile tests/unit
+	$(QUICK) tests/unit
+
+.PHONY: test-component
+test-component: env ## Component tests: flights of whole services in virtual time, processes, servers
+	$(QUICK) tests/component
 
 .PHONY: test-deep
-test-deep: env ## Unit tests with all examples of the property-based ones
-	FRACTUS_DEEP=1 $(RUN) pytest -q -n 2 --dist loadfile tests/unit
+test-deep: env ## Unit and component tests with all examples of the property-based ones
+	FRACTUS_DEEP=1 $(QUICK) tests/unit tests/component
 
 .PHONY: test-e2e
 test-e2e: packages env ## End-to-end tests only, on the embedded cluster or on FRACTUS_E2E_CLUSTER=current
@@ -87,7 +95,7 @@ SECONDS ?= 600
 fuzz: env ## Fuzz manifests, calls and MAVLink for SECONDS=600 each
 	mkdir -p $(OUT)/fuzz/{manifests,calls,mavlink} && cp examples/traffic-monitoring/*.yaml $(OUT)/fuzz/manifests
 	for name in manifests calls mavlink; do \
-		PYTHONPATH=tests/unit $(RUN) --with atheris==3.0.0 python tests/fuzz/$$name.py -max_total_time=$(SECONDS) -len_control=0 \
+		PYTHONPATH=tests $(RUN) --with atheris==3.0.0 python tests/fuzz/$$name.py -max_total_time=$(SECONDS) -len_control=0 \
 			-max_len=2048 -artifact_prefix=$(OUT)/fuzz/$$name- $(OUT)/fuzz/$$name; \
 	done
 

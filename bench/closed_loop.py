@@ -1,6 +1,6 @@
 """The whole mobility service on the simulated vehicle, in virtual time: random flights on bad links, watched by an oracle.
 
-Each seed is a flight (tests/unit/closed_loop.py): zones and limits, some of which appear at any moment of the driver's flight
+Each seed is a flight (tests/component/closed_loop.py): zones and limits, some of which appear at any moment of the driver's flight
 and of the way home, another owner's vehicle, wind, up to 0.25 s of delay each way with jitter, up to 10 % of lost frames, a
 link that is cut. The oracle knows the vehicle's true position. What it reports is a breach outside of the documented guarantee.
 """
@@ -16,7 +16,8 @@ import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "unit"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "component"))
 
 from closed_loop import Account, flight, parameters_of, weather_of
 

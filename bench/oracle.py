@@ -1,13 +1,13 @@
 """The policy engine against an independent oracle: random policies, vehicles, states and requests, every permitted one flown.
 
-The oracle (tests/unit/policy_flights.py) integrates jerk-limited motion in steps of 50 ms, with wind, latency and position
+The oracle (tests/component/policy_flights.py) integrates jerk-limited motion in steps of 50 ms, with wind, latency and position
 errors inside the bounds that the engine is told, and looks for drones where a policy forbids them and for corrections that are
 not allowed as they are, or lie inside a margin. Vehicles have accelerations and return altitudes of their own, which other
 stations change in flight. Afterwards the system flies some drones home, as the service decides it, and the autopilots of others
-return alone (tests/unit/homeward_flights.py). The motion monitor looks at one flight in twelve, which it must let pass.
+return alone (tests/component/homeward_flights.py). The motion monitor looks at one flight in twelve, which it must let pass.
 
 A case is one request of one drone to one set of policies; each drone has three, the later ones in flight. Beside them,
-vehicles with lost, absent and odd parameters are asked to arm (tests/unit/parameter_faults.py).
+vehicles with lost, absent and odd parameters are asked to arm (tests/component/parameter_faults.py).
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ import sys
 import time
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "unit"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "component"))
 
 from homeward_flights import WaysHome
 from parameter_faults import parameter_faults

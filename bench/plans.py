@@ -1,6 +1,6 @@
 """Plans against a brute-force oracle: random fleets, applications, shared flights and policies, every plan worked out twice.
 
-The oracle (tests/unit/plan_oracle.py) knows neither index nor search: it looks at every drone and node, tries all assignments
+The oracle (tests/component/plan_oracle.py) knows neither index nor search: it looks at every drone and node, tries all assignments
 of instances, samples flights, and floods a grid for ways around zones. Compared are the drone that flies, the first rule that
 each other one fails, and the node of every instance.
 """
@@ -13,7 +13,7 @@ import sys
 import time
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "unit"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "component"))
 
 from plan_oracle import Undecided, deviation
 

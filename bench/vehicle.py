@@ -29,7 +29,7 @@ from fractus_vehicle.readiness import arming_refusals
 from fractus_vehicle.simulation import Simulation, formation
 from fractus_vehicle.state import CONTROL_STEP_S, VehicleConfig
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "unit"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "component"))
 from vehicle_pilot import Pilot
 
 START = Place.from_degrees(48.2, 16.37, 150.0)

@@ -7,28 +7,32 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Literal
 
-from fractus_observe.exposition import CERTIFICATE_EXPIRY
-from fractus_observe.figures import Counter, Figure, Histogram, gauge, text_of
+from fractus_observe.exposition import CERTIFICATE_EXPIRY, gauge, text_of
+from prometheus_client import CollectorRegistry, Counter, Histogram
+from prometheus_client.core import Metric
 
+REGISTRY = CollectorRegistry()
 _SECONDS = (0.001, 0.005, 0.02, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
 
 RECONCILES = Histogram(
     "fractus_operator_reconcile_seconds",
     "How long one step of reconciliation took, waiting for the API server included.",
-    "kind",
-    _SECONDS,
+    ["kind"],
+    buckets=_SECONDS,
+    registry=REGISTRY,
 )
 ERRORS = Counter(
-    "fractus_operator_reconcile_errors_total",
+    "fractus_operator_reconcile_errors",
     "Steps of reconciliation that failed and are tried again, by why (a reason of the API server, or Bug).",
-    "kind",
-    "reason",
+    ["kind", "reason"],
+    registry=REGISTRY,
 )
 PHASES = Histogram(
     "fractus_operator_plan_phase_seconds",
     "How long a phase of deploying an Application took: observe, plan, grants, rollout; ways: what policies say of its way.",
-    "phase",
-    _SECONDS,
+    ["phase"],
+    buckets=_SECONDS,
+    registry=REGISTRY,
 )
 
 Phase = Literal["observe", "plan", "grants", "rollout", "ways"]
@@ -41,18 +45,18 @@ def reconciling(kind: str) -> Iterator[None]:
     Args:
         kind: Of what is reconciled.
     """
-    with RECONCILES.timed(kind):
+    with RECONCILES.labels(kind).time():
         try:
             yield
         except Exception as error:
-            ERRORS.count(kind, str(getattr(error, "reason", None) or "Bug"))
+            ERRORS.labels(kind, str(getattr(error, "reason", None) or "Bug")).inc()
             raise
 
 
 @contextmanager
 def phase(name: Phase) -> Iterator[None]:
     """Measure a phase of deploying an Application."""
-    with PHASES.timed(name):
+    with PHASES.labels(name).time():
         yield
 
 
@@ -81,7 +85,7 @@ class Observed:
         self._states = states
         self._expires_s = expires_s
 
-    def collect(self) -> Iterator[Figure]:
+    def collect(self) -> Iterator[Metric]:
         """The figures as they are now."""
         watches = self._watches()
         yield gauge(
@@ -109,4 +113,6 @@ class Observed:
 
 def text(observed: Observed) -> bytes:
     """All metrics in Prometheus' text format."""
-    return text_of((RECONCILES.figure(), ERRORS.figure(), PHASES.figure(), *observed.collect()))
+    now = CollectorRegistry()
+    now.register(observed)
+    return text_of(REGISTRY, now)

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from fractus_observe.exposition import CERTIFICATE_EXPIRY
-from fractus_observe.figures import Counter, Figure, gauge, text_of
+from fractus_observe.exposition import CERTIFICATE_EXPIRY, Observed, gauge, text_of
 from fractus_storage.audit import AuditLog
+from prometheus_client import CollectorRegistry, Counter
+from prometheus_client.core import Metric
 
 from fractus_services.grants import GrantFiles
 
@@ -16,26 +17,33 @@ MAX_POLICIES = 200
 
 
 class DecisionMetrics:
-    """Counts the decisions of a service from the entries of its audit log."""
+    """Counts the decisions of a service from the entries of its audit log.
 
-    def __init__(self) -> None:
+    Args:
+        registry: where they are counted.
+    """
+
+    def __init__(self, registry: CollectorRegistry) -> None:
         self._verdicts = Counter(
-            "fractus_verdicts_total", "Verdicts on calls, as the audit log has them.", "action", "code"
+            "fractus_verdicts", "Verdicts on calls, as the audit log has them.", ["action", "code"], registry=registry
         )
         self._by_policy = Counter(
-            "fractus_policy_verdicts_total",
+            "fractus_policy_verdicts",
             "Verdicts on calls that a policy decided; one that several decided counts for each.",
-            "policy",
-            "action",
+            ["policy", "action"],
+            registry=registry,
         )
         self._takeovers = Counter(
-            "fractus_takeovers_total", "Changes of control authority that no driver asked for.", "controller", "code"
+            "fractus_takeovers",
+            "Changes of control authority that no driver asked for.",
+            ["controller", "code"],
+            registry=registry,
         )
         self._interventions = Counter(
-            "fractus_monitor_interventions_total",
+            "fractus_monitor_interventions",
             "What the motion monitor did about a drone in flight.",
-            "action",
-            "code",
+            ["action", "code"],
+            registry=registry,
         )
         self._named: set[str] = set()
 
@@ -43,18 +51,13 @@ class DecisionMetrics:
         """Count an entry, if it is of a decision."""
         match entry:
             case {"kind": "call", "action": str(action), "code": str(code), "policies": policies}:
-                self._verdicts.count(action, code)
+                self._verdicts.labels(action, code).inc()
                 for policy in policies:
-                    self._by_policy.count(self._name(policy), action)
+                    self._by_policy.labels(self._name(policy), action).inc()
             case {"kind": "takeover", "controller": str(controller), "code": str(code)}:
-                self._takeovers.count(controller, code)
+                self._takeovers.labels(controller, code).inc()
             case {"kind": "monitor", "action": str(action), "code": str(code)}:
-                self._interventions.count(action, code)
-
-    def figures(self) -> Iterator[Figure]:
-        """The counts as they are now."""
-        for counter in (self._verdicts, self._by_policy, self._takeovers, self._interventions):
-            yield counter.figure()
+                self._interventions.labels(action, code).inc()
 
     def _name(self, policy: str) -> str:
         if len(self._named) < MAX_POLICIES:
@@ -71,22 +74,21 @@ class ServiceMetrics:
     """
 
     def __init__(self) -> None:
-        decisions = DecisionMetrics()
-        self.take_entry = decisions.take_entry
-        self._figures: list[Callable[[], Iterator[Figure]]] = [decisions.figures]
+        self._registry = CollectorRegistry()
+        self.take_entry = DecisionMetrics(self._registry).take_entry
 
-    def observe(self, figures: Callable[[], Iterator[Figure]]) -> None:
+    def observe(self, figures: Callable[[], Iterator[Metric]]) -> None:
         """Add figures that are read when they are asked for."""
-        self._figures.append(figures)
+        self._registry.register(Observed(figures))
 
     def text(self) -> bytes:
         """All metrics in Prometheus' text format."""
-        return text_of(figure for figures in self._figures for figure in figures())
+        return text_of(self._registry)
 
 
 def common_figures(
     expiry: Callable[[], float | None], grants: GrantFiles, audit: AuditLog, recording_problem: Callable[[], str]
-) -> Iterator[Figure]:
+) -> Iterator[Metric]:
     """What holds of any service now.
 
     Args:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import importlib.metadata
 import importlib.util
 import json
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -116,16 +114,6 @@ def test_the_list_names_commands_that_are_there(name: str) -> None:
     # Looked for in the source: to import every command takes seconds.
     source = Path(spec.submodule_search_locations[0], *below).with_suffix(".py")
     assert f"\ndef {attribute}(" in source.read_text()
-
-
-def test_help_imports_no_command() -> None:
-    program = "import sys; from fractus_cli.main import run; run(['--help']); print(*sys.modules, file=sys.stderr)"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    for name in cli.COMMANDS:
-        assert f"\n  {name} " in done.stdout
-    imported = {module.partition(".")[0] for module in done.stderr.split()}
-    assert {module for module in imported if module.startswith("fractus")} == {"fractus_cli"}
-    assert not imported & {"grpc", "numpy", "shapely", "pydantic", "yaml"}
 
 
 def test_errors_of_clusters_read_like_all_others(

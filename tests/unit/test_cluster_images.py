@@ -6,8 +6,6 @@ import io
 import json
 import re
 import shutil
-import subprocess
-import sys
 import tarfile
 from pathlib import Path
 
@@ -145,14 +143,3 @@ def test_unknown_target_is_refused(checkout: Path) -> None:
 
 def test_names() -> None:
     assert image_name("agent") == "localhost/fractus/agent:dev"
-
-
-def test_what_flies_needs_no_library_of_pictures() -> None:
-    """The mobility image has none: importing the service with all that it may use later must not ask for one."""
-    program = (
-        "import sys\n"
-        "import fractus_services.commands, fractus_services.mobility.rpc.server, fractus_services.recording.flight_writer\n"
-        "print([name for name in ('cv2', 'PIL', 'scipy', 'matplotlib', 'kubernetes', 'aiohttp') if name in sys.modules])\n"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=120)
-    assert done.stdout.strip() == "[]"

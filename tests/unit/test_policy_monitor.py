@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 from fractus_core.policy.engine import judge
 from fractus_core.policy.monitoring import monitor
-from fractus_core.policy.motion import stop_point
-from fractus_core.policy.values import Airframe, GotoArgs, SetSpeedArgs, Verdict
+from fractus_core.policy.values import GotoArgs, SetSpeedArgs, Verdict
 from policy_world import NOW, altitude, at, box, compiled, exclusion, goto, inclusion, speed
 
 WALL = box(-50, 50, 50, 90)
@@ -189,73 +188,6 @@ def test_a_zone_that_appears_around_a_flying_drone() -> None:
     deeper = monitor(at(0, 60, north_mps=6), compiled(exclusion(WALL, "adjust")))
     assert deeper is not None
     assert (deeper.action, deeper.takeover) == ("deny", "hover")
-
-
-@pytest.mark.parametrize("speed_mps", [2.0, 5.0, 8.0, 12.0])
-def test_what_is_permitted_never_alarms(speed_mps: float) -> None:
-    """A drone that flies a permitted leg to the edge of a zone's margin, as ArduPilot brakes for it."""
-    import numpy as np
-    from policy_flights import STEP_S, Fleet, scene
-    from policy_world import ask, goto
-
-    grant = compiled(exclusion(WALL, "revoke"), operationArea=[])
-    assert ask(grant, goto(0, 47.4, speed_mps=speed_mps)).permits
-    rng = np.random.default_rng(1)
-    fleet = Fleet(rng, [scene(rng)])
-    fleet.airframes = [Airframe()]
-    fleet.learn()
-    fleet.place[:], fleet.speed[:], fleet.gust[:], fleet.error[:] = [0, 0, 10], 0.0, 0.0, 0.0
-    fleet.goal[:], fleet.cruise[:], fleet.setpoint[:], fleet.held[:] = [0, 47.4, 10], speed_mps, speed_mps, False
-    for _ in range(int(60 / STEP_S)):
-        fleet.step()
-        x, y, z = fleet.place[0]
-        east, north, up = fleet.speed[0]
-        now = at(
-            x, y, z, east_mps=east, north_mps=north, down_mps=-up, speed_setpoint_mps=speed_mps,
-            forward_mps2=fleet.accel[0, 1],
-        )  # fmt: skip
-        assert monitor(now, grant) is None, (y, north)
-    assert fleet.place[0, 1] == pytest.approx(47.4, abs=0.1)
-
-
-@pytest.mark.parametrize("appears_s", [0.5, 1.0, 1.5, 2.0, 2.5, 3.0])
-def test_a_zone_that_appears_while_a_drone_speeds_up_stops_it_in_time(appears_s: float) -> None:
-    import numpy as np
-    from policy_flights import STEP_S, Fleet, scene
-
-    rng = np.random.default_rng(1)
-    fleet = Fleet(rng, [scene(rng)])
-    fleet.airframes = [Airframe()]
-    fleet.learn()
-    fleet.place[:], fleet.speed[:], fleet.gust[:], fleet.error[:] = [0, 0, 10], 0.0, 0.0, 0.0
-    fleet.goal[:], fleet.cruise[:], fleet.setpoint[:], fleet.held[:] = [0, 300, 10], 12.0, 12.0, False
-    while fleet.time_s < appears_s:
-        fleet.step()
-    assert fleet.accel[0, 1] > 0.8 * fleet.accels[0]
-    coasting = stop_point(at(north_mps=fleet.speed[0, 1], forward_mps2=0.0), (0.0, 0.0))[1]
-    wall_m = fleet.place[0, 1] + coasting + 16.0
-    grant = compiled(exclusion(box(-50, wall_m, 50, wall_m + 40), "revoke"))
-    looks = 0
-    while True:
-        x, y, z = fleet.place[0]
-        now = at(x, y, z, north_mps=fleet.speed[0, 1], speed_setpoint_mps=12.0, forward_mps2=fleet.accel[0, 1])
-        verdict = monitor(now, grant, changed=True)
-        if verdict is not None:
-            break
-        assert monitor(now, grant) is None
-        fleet.step()
-        looks += 1
-    assert looks > 2, "there was room to fly on"
-    assert (verdict.action, verdict.takeover) == ("deny", "hover"), "whether it would go in is not sure"
-    assert monitor(now, grant) is None, "on a way that was judged by these fences it has room"
-    for _ in range(int(now.latency_s / STEP_S)):
-        fleet.step()
-    # Told, as it is by the service, to fly with no velocity.
-    fleet.held[:], fleet.wanted[:], fleet.until[:] = True, 0.0, math.inf
-    for _ in range(int(20 / STEP_S)):
-        fleet.step()
-    rest_m = wall_m - fleet.place[0, 1]
-    assert now.position_error_m < rest_m < 5.0, "neither inside for all that is known, nor needlessly far"
 
 
 def test_a_climb_to_an_altitude_that_is_allowed_is_let_pass_though_the_link_is_slow() -> None:

@@ -13,8 +13,8 @@ from fractus_mavlink import message
 from fractus_services.mobility.autopilot import Checked
 from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes
 from fractus_services.mobility.mavlink.link import SYSTEM_ID
-from mobility_world import Loop
 from parameter_vehicle import MOVEMENT, ParameterVehicle
+from virtual_time import Loop
 
 SOUND = {
     "FS_GCS_ENABLE": 1.0, "FS_GCS_TIMEOUT": 5.0, "BATT_FS_LOW_ACT": 2.0, "BATT_FS_CRT_ACT": 1.0, "FS_EKF_ACTION": 1.0,

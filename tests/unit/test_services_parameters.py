@@ -8,14 +8,15 @@ from dataclasses import replace
 from typing import Any, TypeVar
 
 import pytest
+from depth import examples
 from fractus_core.policy.values import Airframe
 from fractus_mavlink import message
 from fractus_services.mobility.autopilot import Checked
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes, Reader
 from fractus_services.mobility.mavlink.parameters import ParameterLost
-from mobility_world import Loop
 from parameter_vehicle import BY_NAME, ParameterVehicle
+from virtual_time import Loop
 
 T = TypeVar("T")
 
@@ -63,7 +64,7 @@ def rounded(airframe: Airframe) -> Airframe:
 
 
 @pytest.mark.parametrize("release", [AS_4_6, AS_4_7])
-@pytest.mark.parametrize(("loss", "starts"), [(0.1, 60), (0.3, 40)])
+@pytest.mark.parametrize(("loss", "starts"), [(0.1, examples(60)), (0.3, examples(40, 20))])
 def test_no_start_takes_a_figure_that_is_not_the_vehicles(loss: float, starts: int, release: dict[str, float]) -> None:
     verified = 0
     for seed in range(starts):

@@ -124,6 +124,18 @@ def test_the_lint_reads_sources_and_nothing_of_git() -> None:
     assert not {name for name in read if name.split("/")[0] == ".git"}
 
 
+WHOLE = re.compile(
+    r"^\s*(from|import) (fractus_vehicle|fractus_services\.mobility\.rpc\.(wiring|server))\b", re.MULTILINE
+)
+
+
+def test_unit_tests_fly_nothing() -> None:
+    """What wires a whole mobility service or has a vehicle is a component test; conftest.py sees processes and connections."""
+    files = [*(ROOT / "tests").glob("*.py"), *(ROOT / "tests" / "unit").glob("*.py")]
+    assert Path(__file__) in files
+    assert [path.name for path in files if WHOLE.search(path.read_text())] == []
+
+
 DOCUMENTS = ("README.md", "CONTRIBUTING.md", "SECURITY.md", "docs")
 FILE = re.compile(
     r"`((?:core|storage|kube|mavlink|operator|agent|services|cli|view|sdk|sim|proto|tests|bench|docs|charts|crds|examples)/[\w./-]+)`"

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from fractus_core.api.policies import FaceMethod
 
 from fractus_services.camera.imaging.faces import Box
-from fractus_services.camera.imaging.pixels import Pixels, opencv, reduced, resized
+from fractus_services.camera.imaging.pixels import Pixels, opencv, reduced
 
 Mask = npt.NDArray[np.bool_]
 
@@ -39,7 +39,8 @@ def black(picture: Pixels) -> Pixels:
 
 def blur_average(picture: Pixels) -> Pixels:
     """Averages over squares, 16 along the longer side, with soft transitions."""
-    return _grown(resized(picture, *_cells(picture)), picture)
+    cv2 = opencv()
+    return _grown(cv2.resize(picture, _cells(picture), interpolation=cv2.INTER_AREA), picture)
 
 
 def blur_median(picture: Pixels) -> Pixels:
@@ -59,8 +60,9 @@ def _cells(picture: Pixels) -> tuple[int, int]:
 
 
 def _grown(cells: Pixels, picture: Pixels) -> Pixels:
+    cv2 = opencv()
     rows, columns = picture.shape[:2]
-    return resized(cells, columns, rows)
+    return np.asarray(cv2.resize(cells, (columns, rows), interpolation=cv2.INTER_LINEAR), np.uint8)
 
 
 def hide_faces(picture: Pixels, boxes: Sequence[Box], method: FaceMethod) -> Pixels:

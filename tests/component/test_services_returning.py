@@ -11,8 +11,9 @@ from fractus_core.policy.returning import ReturnBounds, homeward_heights_m, retu
 from fractus_core.policy.values import Airframe
 from fractus_services.mobility.authority import drivers
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
-from mobility_world import World, area, end, fly, goto, refusal, spec
+from mobility_world import World, area, end, goto, refusal, spec
 from policy_world import altitude, at, box, compiled, exclusion, speed, zone
+from virtual_time import fly
 
 OWNED = {"RTL_ALT": 4000.0, "RTL_SPEED": 0.0, "WPNAV_SPEED": 1000.0, "RTL_CLIMB_MIN": 500.0}
 LOW = {"RTL_ALT": 1200.0, "RTL_SPEED": 0.0, "WPNAV_SPEED": 350.0, "RTL_CLIMB_MIN": 0.0}

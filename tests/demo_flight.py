@@ -13,7 +13,7 @@ import yaml
 from fractus_core.api import Application, Depot, Drone, EdgeNode, Policy, Zone
 from fractus_core.planning import Host, Inventory, plan
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "traffic-monitoring"
+EXAMPLE = Path(__file__).parents[1] / "examples" / "traffic-monitoring"
 APPLIED_S = 1_800_000_000.0
 TAKEOFF_S = APPLIED_S + 14.0
 HOME = (50.8637, 4.6785)
@@ -21,6 +21,28 @@ DRIVER = (
     "spiffe://fractus.dev/ns/default/app/traffic-monitoring/component/Navigator/instance/traffic-monitoring-navigator"
 )
 VIEWER = DRIVER.replace("Navigator", "AerialViewer").replace("navigator", "aerial-viewer")
+
+GRANT = """
+apiVersion: fractus.dev/v1alpha1
+kind: Grant
+metadata: {name: default.survey-navigator, uid: flight-1}
+spec:
+  node: drone-1
+  application: {namespace: default, name: survey, uid: survey-1}
+  component: Navigator
+  instance: survey-navigator
+  class: driver
+  control: full
+  services:
+    - {service: mobility, methods: [Arm, Goto]}
+  operationArea:
+    - circle: {center: {lat: 39.36, lon: 22.95}, radius: 200}
+  policies:
+    - name: pool
+      spec: {type: GeofenceControl, kind: exclusion, selector: {zones: [pool]}}
+      zones:
+        - {name: pool, area: {circle: {center: {lat: 39.3610, lon: 22.9510}, radius: 20}}}
+"""
 
 
 def stamp(seconds: float) -> str:

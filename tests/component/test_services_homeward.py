@@ -24,13 +24,13 @@ from mobility_world import (
     at,
     clear_m,
     end,
-    fly,
     partial,
     refusal,
     spec,
     touring,
     zone,
 )
+from virtual_time import fly
 
 WALL = (-40.0, 25.0, 40.0, 40.0)
 REPOSITION = 192

@@ -15,7 +15,8 @@ from fractus_services.errors import Unavailable
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority import drivers
 from fractus_services.mobility.rpc.telemetry import located
-from mobility_world import FRAME, GROUND_M, GUIDED, LOITER, SMART_RTL, World, at, end, fly, refusal, spec
+from mobility_world import FRAME, GROUND_M, GUIDED, LOITER, SMART_RTL, World, at, end, refusal, spec
+from virtual_time import fly
 
 AWAY = (0.0, 100.0, 0.0)
 UP = (0.0, 0.0, 60.0)

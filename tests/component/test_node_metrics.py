@@ -17,16 +17,21 @@ from fractus_agent.links.reports import DroneReport
 from fractus_agent.metrics import AgentFigures
 from fractus_agent.redirector.nft import Endpoint
 from fractus_core.linking import NO_LINK, PathMetrics, Peer
-from fractus_observe.figures import text_of
+from fractus_observe.exposition import Observed, text_of
 from fractus_services.grants import GrantFiles
 from fractus_services.metrics import MAX_POLICIES, DecisionMetrics, ServiceMetrics, common_figures
 from fractus_services.mobility.rpc.figures import flight_figures
 from fractus_storage.audit import AuditLog
-from mobility_world import World, fly, spec
+from mobility_world import World, spec
+from prometheus_client import CollectorRegistry
+from virtual_time import fly
 
 
 def text(*figures: Any) -> str:
-    return text_of(figure for each in figures for figure in each()).decode()
+    registry = CollectorRegistry()
+    for each in figures:
+        registry.register(Observed(each))
+    return text_of(registry).decode()
 
 
 def entry(kind: str, action: str, *policies: str, **more: str) -> dict[str, Any]:
@@ -34,7 +39,8 @@ def entry(kind: str, action: str, *policies: str, **more: str) -> dict[str, Any]
 
 
 def test_decisions_are_counted_as_the_audit_log_has_them() -> None:
-    counted = DecisionMetrics()
+    registry = CollectorRegistry()
+    counted = DecisionMetrics(registry)
     for each in (
         entry("call", "allow"),
         entry("call", "correct", "fence"),
@@ -45,7 +51,7 @@ def test_decisions_are_counted_as_the_audit_log_has_them() -> None:
         {"time": "", "kind": "state", "lat": 1.0},
     ):
         counted.take_entry(each)
-    seen = values(text(counted.figures))
+    seen = values(text_of(registry).decode())
     assert {key: value for key, value in seen.items() if key[0] == "fractus_verdicts_total"} == {
         ("fractus_verdicts_total", action, "Code"): 1.0 for action in ("allow", "correct", "deny")
     }
@@ -57,10 +63,11 @@ def test_decisions_are_counted_as_the_audit_log_has_them() -> None:
 
 
 def test_policies_without_number_do_not_fill_the_memory() -> None:
-    counted = DecisionMetrics()
+    registry = CollectorRegistry()
+    counted = DecisionMetrics(registry)
     for number in range(MAX_POLICIES + 10):
         counted.take_entry(entry("call", "deny", f"policy-{number}"))
-    seen = values(text(counted.figures))
+    seen = values(text_of(registry).decode())
     assert seen["fractus_policy_verdicts_total", "deny", "other"] == 10.0
     assert len([key for key in seen if key[0] == "fractus_policy_verdicts_total"]) == MAX_POLICIES + 1
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 from dataclasses import replace
@@ -153,6 +154,7 @@ def _run(name: str, samples: tuple[Sample, ...], calls: list[Call], *, policies:
 UP = (0.0, 0.0, 10.0, "GUIDED")
 
 
+@functools.cache
 def _normal() -> Evidence:
     samples = _samples(
         [UP, _at("CTRL1"), *[_at(f"WP{n}") for n in range(1, 5)], _at("CTRL2"), *[_at(f"WP{n}") for n in range(5, 10)]]
@@ -161,6 +163,7 @@ def _normal() -> Evidence:
     return _run("normal", samples, [*calls, *_pictures(samples)])
 
 
+@functools.cache
 def _guarded() -> Evidence:
     stops = [
         UP,
@@ -188,6 +191,7 @@ def _guarded() -> Evidence:
     return _run("guarded", samples, [*calls, *_pictures(samples)])
 
 
+@functools.cache
 def _unguarded() -> Evidence:
     stops = [
         UP,

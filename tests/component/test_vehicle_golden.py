@@ -1,6 +1,6 @@
 """What the vehicle sends in known flights, against digests: a change of structure must not change a message.
 
-A change of behaviour does; then `python tests/unit/test_vehicle_golden.py` prints the new digests.
+A change of behaviour does; then `python tests/component/test_vehicle_golden.py` prints the new digests.
 """
 
 from __future__ import annotations

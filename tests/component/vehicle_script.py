@@ -1,6 +1,6 @@
 """One script of MAVLink exchanges, played on any autopilot, beside what a real ArduCopter 4.6.3 answered.
 
-    python tests/unit/vehicle_script.py [--autopilot tcp:HOST:PORT] [--all] [--steps FILE]
+    python tests/component/vehicle_script.py [--autopilot tcp:HOST:PORT] [--all] [--steps FILE]
 
 The steps and the real one's answers are in `tests/golden/vehicle/arducopter-4.6.3.tsv`: name, what to do, the answer, and a
 note where the simulated vehicle is meant to differ or where the step cannot be repeated. A number `4.2~10%` holds within 10 %,

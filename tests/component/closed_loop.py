@@ -35,7 +35,8 @@ from fractus_services.mobility.rpc.wiring import Parts
 from fractus_vehicle.earth import Place
 from fractus_vehicle.simulation import Simulation
 from fractus_vehicle.state import CONTROL_STEP_S, VehicleConfig, VehicleState
-from mobility_world import FRAME, Grants, Loop, area, goto, spec, zone
+from mobility_world import FRAME, Grants, area, goto, spec, zone
+from virtual_time import Loop
 
 LIMIT_S = 400.0
 """No flight takes longer."""

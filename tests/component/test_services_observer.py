@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.authority import observer
-from mobility_world import World, fly, spec
+from mobility_world import World, spec
+from virtual_time import fly
 
 
 async def heard(world: World, condition: Callable[[], object], timeout_s: float) -> None:

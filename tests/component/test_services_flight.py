@@ -23,7 +23,6 @@ from mobility_world import (
     World,
     clear_m,
     end,
-    fly,
     goto,
     partial,
     refusal,
@@ -31,6 +30,7 @@ from mobility_world import (
     touring,
     zone,
 )
+from virtual_time import fly
 
 WALL = (-40.0, 25.0, 40.0, 40.0)
 

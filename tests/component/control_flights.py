@@ -1,7 +1,8 @@
 """Flights whose course is pinned: who had the drone when, what streams were told, and what the autopilot was commanded.
 
 Each flight acts from outside only, through streams, calls, grants and what pilots and the autopilot do, so that the same flight
-can be flown by any version of the service. `python tests/unit/test_control_golden.py` records them again.
+can be flown by any version of the service. `PYTHONPATH=tests python
+tests/component/test_control_golden.py` records them again.
 """
 
 from __future__ import annotations
@@ -17,9 +18,11 @@ from fractus_core.control.values import FlightMode
 from fractus_core.policy.values import TakeoffArgs
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority import drivers
-from mobility_world import World, fly, goto
+from mobility_world import World, goto
+from virtual_time import fly
 
 BEAT_S = 0.5
+RECORDED_STEP_S = 0.05
 SAMPLE_S = 5.0
 
 Trace = dict[str, list[str]]
@@ -48,10 +51,10 @@ class Flight:
         self.trace: Trace = {"authority": [], "streams": [], "commands": [], "calls": [], "path": [], "missions": []}
         self.texts: list[str] = []
         self._directory = directory
-        self._options = options
+        self._options = {"step_s": RECORDED_STEP_S} | options
         self._tasks: list[asyncio.Task[None]] = []
         self._grants: list[tuple[Any, str]] = []
-        self.world = self._wired(World(directory, **options))
+        self.world = self._wired(World(directory, **self._options))
 
     def _wired(self, world: World) -> World:
         world.plane.parameters |= {"SYSID_MYGCS": 244.0}

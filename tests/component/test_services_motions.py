@@ -20,7 +20,8 @@ from fractus_services.mobility.authority.leases import FlightConstraints
 from fractus_services.mobility.authority.readiness import not_ready_reason
 from fractus_services.mobility.flight import monitor as monitoring
 from fractus_services.mobility.flight.courses import Courses, Trip
-from mobility_world import GUIDED, LOITER, World, area, clear_m, end, fly, goto, partial, refusal, spec, zone
+from mobility_world import GUIDED, LOITER, World, area, clear_m, end, goto, partial, refusal, spec, zone
+from virtual_time import fly
 
 WALL = (-40.0, 25.0, 40.0, 40.0)
 

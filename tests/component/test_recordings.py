@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from demo_flight import GRANT
 from fractus_agent.conditions import Condition
 from fractus_agent.registration.evidence import recording_problems
 from fractus_agent.registration.status import Observed, node_status
@@ -35,7 +36,6 @@ from fractus_services.recording.segments import MIN_SEGMENT_BYTES, Segments, seg
 from fractus_storage.audit import AuditLog
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.writer import MCAP0_MAGIC
-from test_audit_export import GRANT
 
 S = 1_000_000_000
 T0 = 1_780_000_000 * S

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-import selectors
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -28,6 +27,7 @@ from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
 from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes
 from fractus_services.mobility.mavlink.returning import MavlinkReturn
+from fractus_services.mobility.mavlink.timing import PROBE_S
 from fractus_services.mobility.rpc.wiring import Parts
 from parameter_vehicle import FAILSAFES, MOVEMENT, told
 
@@ -35,7 +35,8 @@ FRAME = LocalFrame(39.36, 22.95)
 BRAKE, GUIDED, LAND, LOITER, RTL, SMART_RTL = (
     ARDUCOPTER.mode(COPTER_MODE[name]) for name in ("BRAKE", "GUIDED", "LAND", "LOITER", "RTL", "SMART_RTL")
 )
-STEP_S = 0.05
+STEP_S = 0.1
+"""Between two positions of the vehicle, unless a test is of what happens in between."""
 GROUND_M = 10.0
 """Of the ground, above mean sea level."""
 ACCEL, CLIMB = 2.5, 2.0
@@ -46,58 +47,11 @@ ALL = (
 )  # fmt: skip
 
 
-class _Hurried(selectors.DefaultSelector):
-    """Never waits: what others wait for is there at once."""
-
-    def __init__(self, hurry: Callable[[float], None]) -> None:
-        super().__init__()
-        self._hurry = hurry
-
-    def select(self, timeout: float | None = None) -> list[Any]:
-        found = super().select(0.001 if timeout is None else 0)
-        if not found and timeout:
-            self._hurry(timeout)
-        return found
-
-
-class Loop(asyncio.SelectorEventLoop):
-    """An event loop that jumps to the moment of the next event."""
-
-    def __init__(self) -> None:
-        self._now = 1000.0
-        super().__init__(_Hurried(self._hurry))
-
-    def _hurry(self, seconds: float) -> None:
-        self._now += seconds
-
-    def time(self) -> float:
-        return self._now
-
-    def run_in_executor(self, _executor: Any, work: Callable[..., Any], *args: Any) -> asyncio.Future[Any]:  # type: ignore[override]
-        """What goes to a thread is done at once: no thread sees this loop's time."""
-        done = self.create_future()
-        try:
-            done.set_result(work(*args))
-        except OSError as error:
-            done.set_exception(error)
-        return done
-
-
-def fly(flight: Callable[[], Coroutine[Any, Any, None]]) -> None:
-    """Run a flight to its end; ten minutes of its time are the most."""
-
-    async def bounded() -> None:
-        async with asyncio.timeout(600):
-            await flight()
-
-    with asyncio.Runner(loop_factory=Loop) as runner:
-        runner.run(bounded())
-
-
 class Plane(MavlinkAutopilot):
     """An autopilot of few words: it acknowledges, and moves as ArduCopter does, roughly."""
 
-    def __init__(self) -> None:
+    def __init__(self, step_s: float = STEP_S) -> None:
+        self.step_s = step_s
         self.on_parameter: Callable[[str], None] = lambda _name: None
         super().__init__("tcp:nowhere:1", ARDUCOPTER, on_parameter=lambda name: self.on_parameter(name))  # noqa: PLW0108
         self.target = (1, 1)
@@ -129,10 +83,10 @@ class Plane(MavlinkAutopilot):
         turn = 0
         while True:
             self._step()
-            if turn % 4 == 0:
+            if turn % round(PROBE_S / self.step_s) == 0:
                 self._probe(self.now)
             turn += 1
-            await asyncio.sleep(STEP_S)
+            await asyncio.sleep(self.step_s)
 
     def send(self, outgoing: Message) -> None:
         if not self.deaf:
@@ -228,13 +182,13 @@ class Plane(MavlinkAutopilot):
     def _move(self) -> None:
         east, north, up = self._command()
         change = math.hypot(east - self.velocity[0], north - self.velocity[1])
-        share = min(ACCEL * STEP_S / change, 1.0) if change > 0 else 0.0
+        share = min(ACCEL * self.step_s / change, 1.0) if change > 0 else 0.0
         self.velocity[0] += (east - self.velocity[0]) * share
         self.velocity[1] += (north - self.velocity[1]) * share
         self.climb = up
-        self.xy[0] += self.velocity[0] * STEP_S
-        self.xy[1] += self.velocity[1] * STEP_S
-        self.height = max(self.height + self.climb * STEP_S, 0.0)
+        self.xy[0] += self.velocity[0] * self.step_s
+        self.xy[1] += self.velocity[1] * self.step_s
+        self.height = max(self.height + self.climb * self.step_s, 0.0)
         if self.height > 0.3:
             self.trace.append((self.xy[0], self.xy[1], self.height))
         if self.vehicle.mode in {LAND, RTL, SMART_RTL} and self.height <= 0.0:
@@ -353,8 +307,9 @@ class World:
         boarding_s: float = 0.0,
         after: World | None = None,
         known: bool = True,
+        step_s: float = STEP_S,
     ) -> None:
-        self.plane = after.plane if after is not None else Plane()
+        self.plane = after.plane if after is not None else Plane(step_s)
         if retraces:
             self.plane.parameters |= {"FS_GCS_ENABLE": 3.0, "BATT_FS_LOW_ACT": 3.0, "SRTL_POINTS": 300.0}
         self.grants = Grants()

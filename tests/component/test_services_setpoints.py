@@ -11,7 +11,8 @@ import pytest
 from fractus_core.policy.motion import surge
 from fractus_core.policy.values import VelocityArgs
 from fractus_services.errors import AutopilotError
-from mobility_world import World, clear_m, end, fly, goto, refusal, spec, zone
+from mobility_world import World, clear_m, end, goto, refusal, spec, zone
+from virtual_time import fly
 
 WALL = (-40.0, 25.0, 40.0, 40.0)
 

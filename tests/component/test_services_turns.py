@@ -20,7 +20,8 @@ from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.flight import calls, courses
 from fractus_services.mobility.rpc.handlers import MobilityHandlers
 from google.rpc import error_details_pb2, status_pb2
-from mobility_world import World, at, fly, partial, refusal, spec, zone
+from mobility_world import World, at, partial, refusal, spec, zone
+from virtual_time import fly
 
 WALL = (-40.0, 25.0, 40.0, 40.0)
 

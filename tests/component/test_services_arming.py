@@ -14,7 +14,8 @@ from fractus_mavlink.enums import MAV_CMD
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.authority import drivers
 from fractus_services.mobility.autopilot import Checked
-from mobility_world import BRAKE, World, end, fly, partial, refusal, spec
+from mobility_world import BRAKE, World, end, partial, refusal, spec
+from virtual_time import fly
 
 
 class Slow:

@@ -1,0 +1,21 @@
+"""Unit tests are of one room's logic: they start no process and open no connection. What does is in tests/component."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+
+import pytest
+
+BEYOND = {"subprocess.Popen", "os.fork", "os.posix_spawn", "socket.bind", "socket.connect"}
+"""Python's audit events of what leaves the process."""
+seen: list[str] = []
+
+sys.addaudithook(lambda event, args: seen.append(f"{event}{args[:2]}") if event in BEYOND else None)
+
+
+@pytest.fixture(autouse=True)
+def _within_the_process() -> Iterator[None]:
+    seen.clear()
+    yield
+    assert not seen, "a component test: move it to tests/component"

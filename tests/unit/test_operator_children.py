@@ -16,6 +16,8 @@ from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Body, Key, Kind
 from fractus_operator.cluster.store import Conflict, KubeError, NotFound
+from fractus_operator.inventory.grouped import Made
+from fractus_operator.reconcile.builders import child
 from fractus_operator.reconcile.children import Children, NameTaken
 
 INPUT = yaml.safe_load((Path(__file__).parents[1] / "golden" / "operator" / "input.yaml").read_text())
@@ -152,3 +154,28 @@ async def test_the_grant_of_another_application_is_left_alone() -> None:
     with pytest.raises(NameTaken):
         await made_on(store).apply(APPLICATION, {kinds.GRANT: [{**kinds.GRANT.header("one", labels={}), "spec": spec}]})
     assert store.said == ["create Grant refused", "get Grant"]
+
+
+class Spelling(Webhooks):
+    """An API server that spells what it is given in its own way."""
+
+    async def written(self, how: str, kind: Kind, body: Body) -> Body:
+        written = await super().written(how, kind, body)
+        return {**written, "spec": {"cpu": "500m"}, "metadata": {**written["metadata"], "resourceVersion": "1"}}
+
+    async def delete(self, kind: Kind, _key: Key, _uid: str | None, *, orphan: bool = False) -> None:
+        self.said.append(f"delete {kind.name}")
+
+
+async def test_what_is_removed_is_not_remembered_how_it_was_spelled() -> None:
+    store = Spelling(None)
+    copies = {kind: Made(cast(Any, store), kind, lambda body: body, lambda *_: None) for kind in kinds.CHILDREN}
+    children = Children(cast(Any, store), copies, cast(Any, None))
+    one = child(kinds.DEPLOYMENT, APPLICATION, "one", {}, spec={"cpu": 0.5})
+    for _ in range(2):
+        await children.apply(APPLICATION, {kinds.DEPLOYMENT: [one]})
+    assert store.said == ["create Deployment"], "the same, spelled differently, is not written again"
+    nothing: dict[Kind, list[Body]] = {kind: [] for kind in kinds.CHILDREN}
+    await children.prune(APPLICATION, nothing, keep_secrets=())
+    assert store.said[1:] == ["delete Deployment"]
+    assert not children._normalised

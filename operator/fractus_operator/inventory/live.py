@@ -13,12 +13,13 @@ from fractus_core.planning.locations import NodeLocations
 
 from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Body, Key, Kind
-from fractus_operator.cluster.labels import APPLICATION_LABEL, MANAGED_SELECTOR, NAMESPACE_LABEL, labelled
+from fractus_operator.cluster.labels import labelled
 from fractus_operator.cluster.pods import PodView, read_host, read_pod
 from fractus_operator.cluster.reading import PartPool, Submitted, Unreadable, read_submitted, reader, tolerant_reader
 from fractus_operator.cluster.store import Reflector, Store
 from fractus_operator.inventory.bookings import BookedHosts, Bookings, ByName, corrections
 from fractus_operator.inventory.claims import Claim, Fleet
+from fractus_operator.inventory.grouped import Grouped, Made, application_of
 from fractus_operator.inventory.node_services import NodeServices, read_revision
 from fractus_operator.inventory.observed import Observed
 from fractus_operator.inventory.plans import Plans
@@ -56,26 +57,23 @@ class LiveInventory:
             lambda key, _old, _new: self._report(kinds.SIGNING_REQUEST, key),
             selectors={"fieldSelector": f"spec.signerName={NODE_SIGNER}"},
         )
-        self.children: dict[Kind, Reflector[Body]] = {
-            kind: Reflector(
-                store,
-                kind,
-                _without_status if kind in _REPORTED_ON else _as_is,
-                self._child_changed,
-                selectors={"labelSelector": MANAGED_SELECTOR},
-            )
+        self.children: dict[Kind, Made] = {
+            kind: Made(store, kind, _without_status if kind in _REPORTED_ON else _as_is, self._child_changed)
             for kind in kinds.CHILDREN
         }
         self.subscriptions = Subscriptions()
         self.plans = Plans(self.applications)
         self.fleet = Fleet(self.drones, self.applications)
+        self.torn_down: dict[Key, str] = {}
+        """The uids of applications whose teardown has begun, until they are gone: nothing more is made for them."""
         self.rules_revision = 0
         """Counts the changes of what grants are compiled from: zones, policies, depots, and specs of nodes."""
         self._listeners: dict[Kind, list[Callable[[Key], None]]] = {}
-        self._grants: dict[Key, Grant] = {}
+        self._grants: Grouped[Grant] = Grouped()
+        self._holders: dict[Key, Key] = {}
         self._areas = PartPool(parts=64)
         self._bookings = Bookings()
-        self._pods: dict[Key, dict[Key, PodView]] = {}
+        self._pods: Grouped[PodView] = Grouped()
         self._locations = NodeLocations()
 
     # -- running --
@@ -130,9 +128,9 @@ class LiveInventory:
             held: The claims, if they are known already.
         """
         held = self.claims() if held is None else held
-        pods = (pod for pods in self._pods.values() for pod in pods.values())
+        booked = corrections(self.plans.requests(), self._pods.values(), labelled(key))
         return Inventory(
-            hosts=BookedHosts(self.hosts, self._bookings, corrections(self.plans.requests(), pods, labelled(key))),
+            hosts=BookedHosts(self.hosts, self._bookings, booked),
             drones=ByName(self.drones),
             edge_nodes=ByName(self.edge_nodes),
             depots=self.depots_by_name(),
@@ -159,20 +157,16 @@ class LiveInventory:
 
     def pods_of(self, key: Key, *, kept: bool = False) -> list[PodView]:
         """The pods of an application, or those of its last mission that are only kept for their logs."""
-        return [pod for pod in self._pods.get(labelled(key), {}).values() if (pod.finished_at is not None) == kept]
+        return [pod for pod in self._pods.of(labelled(key)) if (pod.finished_at is not None) == kept]
 
     def grants_of(self, key: Key) -> list[Grant]:
         """The grants of an application, also of one that had its name before."""
-        return [
-            grant
-            for grant in self._grants.values()
-            if (grant.spec.application.namespace, grant.spec.application.name) == key
-        ]
+        return list(self._grants.of(key))
 
     def forget(self, key: Key) -> None:
         """Drop the plan of an application that is over; its drone is free once it is home."""
         if self.plans.forget(key):
-            self.subscriptions.wake_all()
+            self.subscriptions.wake_waiting()
 
     # -- what reflectors report --
 
@@ -190,11 +184,10 @@ class LiveInventory:
         for pod in (old, new):
             if pod is not None and pod.application is not None:
                 owner = (pod.namespace, pod.application)
-                pods = self._pods.setdefault(owner, {})
                 if pod is new:
-                    pods[key] = pod
-                elif pods.pop(key, None) is not None and not pods:
-                    del self._pods[owner]
+                    self._pods.put(owner, key, pod)
+                else:
+                    self._pods.drop(owner, key)
                 self.subscriptions.wake(owner)
 
     def _drone_changed(self, key: Key, old: Drone | None, new: Drone | None) -> None:
@@ -208,11 +201,16 @@ class LiveInventory:
         if _rules_differ(old, new):
             self._rules_changed()
         elif old is not None and new is not None and _planning_view(old) != _planning_view(new):
-            self.subscriptions.wake_all()
+            self.subscriptions.wake_waiting()
+            self._wake_flyers(new.name)
         elif old is not None and new is not None and _flight_view(old) != _flight_view(new):
-            for application, plan in self.plans.in_force().items():
-                if plan.spec.drone is not None and plan.spec.drone.node == new.name:
-                    self.subscriptions.wake(application)
+            self._wake_flyers(new.name)
+
+    def _wake_flyers(self, drone: str) -> None:
+        """Wake the applications on a drone, also those that share its flight."""
+        for application, plan in self.plans.in_force().items():
+            if plan.spec.drone is not None and plan.spec.drone.node == drone:
+                self.subscriptions.wake(application)
 
     def _edge_node_changed(self, key: Key, old: EdgeNode | None, new: EdgeNode | None) -> None:
         self._report(kinds.EDGE_NODE, key)
@@ -248,10 +246,12 @@ class LiveInventory:
         self._report(kinds.APPLICATION, key)
         if new is None:
             self.plans.forget(key)
+            self.torn_down.pop(key, None)
         if old is None or new is None or old.settled_generation != new.settled_generation:
-            self.subscriptions.wake_all()
-        else:
-            self.subscriptions.wake(key)
+            self.subscriptions.wake_waiting()
+            for sharing in self.plans.sharing(key):
+                self.subscriptions.wake(sharing)
+        self.subscriptions.wake(key)
 
     def _child_changed(self, key: Key, old: Body | None, new: Body | None) -> None:
         body = new or old or {}
@@ -261,17 +261,18 @@ class LiveInventory:
             self.plans.stored(key, new)
         elif body.get("kind") == DirectLink.KIND:
             self._report(kinds.DIRECT_LINK, key)
-        labels = body.get("metadata", {}).get("labels", {})
-        if APPLICATION_LABEL in labels:
-            self.subscriptions.wake((key[0] or labels.get(NAMESPACE_LABEL, ""), labels[APPLICATION_LABEL]))
+        self.subscriptions.wake(application_of(body))
 
     def _grant_changed(self, key: Key, new: Body | None) -> None:
         grant = self._areas.grant(new) if new is not None else None
+        holder = self._holders.pop(key, None)
+        if holder is not None:
+            self._grants.drop(holder, key)
         if grant is None:
-            self._grants.pop(key, None)
-            self.subscriptions.wake_all()
+            self.subscriptions.wake_waiting()
         else:
-            self._grants[key] = grant
+            self._holders[key] = holder = grant.spec.application.namespace, grant.spec.application.name
+            self._grants.put(holder, key, grant)
         self._report(kinds.GRANT, key)
 
     def _report(self, kind: Kind, key: Key) -> None:

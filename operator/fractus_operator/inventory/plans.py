@@ -49,6 +49,13 @@ class Plans:
         host = self._applications.get(key)
         return host, self.get(key, host.uid) if host is not None else None
 
+    def sharing(self, host: Key) -> Iterator[Key]:
+        """The applications that share the flight of another one, by their plans."""
+        name = "/".join(host)
+        for key, plan in (self._stored | self._decided).items():
+            if plan.spec.drone is not None and plan.spec.drone.shared_with == name:
+                yield key
+
     def decide(self, key: Key, uid: str, plan: DeploymentPlanSpec) -> None:
         """Note a plan as soon as it is made, so that the next one already sees its claims and bookings."""
         self._decided[key] = OwnedPlan(uid, plan)

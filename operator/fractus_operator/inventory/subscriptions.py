@@ -48,6 +48,7 @@ class Subscriptions:
 
     def __init__(self) -> None:
         self._of: dict[Key, list[Subscription]] = {}
+        self._placed: set[Key] = set()
 
     @contextmanager
     def subscribe(self, key: Key) -> Iterator[Subscription]:
@@ -60,11 +61,22 @@ class Subscriptions:
             self._of[label].remove(subscription)
             if not self._of[label]:
                 del self._of[label]
+                self._placed.discard(label)
+
+    def placed(self, key: Key, *, placed: bool) -> None:
+        """Note whether an application has a plan that fits: what others leave or take is nothing to it then."""
+        (self._placed.add if placed else self._placed.discard)(labelled(key))
 
     def wake(self, key: Key) -> None:
         """Wake one application."""
         for subscription in self._of.get(labelled(key), ()):
             subscription.wake()
+
+    def wake_waiting(self) -> None:
+        """Wake every application without a plan that fits: another one left something that it may wait for."""
+        for label in self._of.keys() - self._placed:
+            for subscription in self._of[label]:
+                subscription.wake()
 
     def wake_all(self, *, urgent: bool = False) -> None:
         """Wake every application: something that all depend on changed."""

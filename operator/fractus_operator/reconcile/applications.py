@@ -108,7 +108,6 @@ class Applications:
         self._reporter = StatusReporter(store, live.applications, clock)
         self._notes = WayNotes(live.subscriptions.wake, clock)
         self._memories: dict[Key, _Memory] = {}
-        self._torn_down: set[str] = set()
 
     async def follow(self, key: Key, stopped: Callable[[], bool]) -> None:
         """Reconcile an application whenever one of its inputs changes, until it is deleted."""
@@ -156,7 +155,7 @@ class Applications:
             return RESYNC_S
         memory = self._memories.setdefault(key, _Memory())
         async with memory.lock:
-            if metadata.uid in self._torn_down:
+            if metadata.uid == self._live.torn_down.get(key):
                 raise BeingDeleted
             return min(await self._advance(self._live.observe(submitted), memory), RESYNC_S)
 
@@ -170,7 +169,7 @@ class Applications:
             KubeError: the API server refused a delete, or could not be reached.
         """
         await self._live.synced()
-        self._torn_down.add(uid)
+        self._live.torn_down[key] = uid
         memory = self._memories.setdefault(key, _Memory())
         async with memory.lock:
             await self._children.revoke(key)
@@ -186,6 +185,7 @@ class Applications:
     async def _advance(self, seen: Observed, memory: _Memory) -> float:
         """One step; returns when to run again."""
         submitted = seen.submitted
+        self._live.subscriptions.placed(seen.key, placed=False)
         again_s = await self._settle(seen)
         if again_s is not None:
             return again_s
@@ -204,6 +204,8 @@ class Applications:
             await self._grants.refresh(seen)
             update, again_s = await self._deploy(self._live.observe(submitted), memory)
         except Blocked as blocked:
+            # Before anything is awaited: what another application leaves from now on is a reason to look again.
+            self._live.subscriptions.placed(seen.key, placed=False)
             await self._reporter.report(submitted, status.blocked(blocked, present))
             if seen.plan is not None:
                 await self._rollout.follow_pods(seen.key, seen.plan, seen.pods)
@@ -296,6 +298,7 @@ class Applications:
                 seen.key, application, present, rules=seen.rules, inventory=inventory, settings=settings
             )
         choice = choose_plan(application, present, inventory, settings, stuck=stuck, in_flight=seen.in_flight)
+        self._live.subscriptions.placed(seen.key, placed=choice.fits or choice.reason is not None)
         drone = choice.plan.drone
         if choice.plan is not seen.plan:
             self._live.plans.decide(seen.key, seen.uid, choice.plan)
@@ -314,11 +317,7 @@ class Applications:
         return removed or pods
 
     async def _finish(self, submitted: Submitted) -> float:
-        """Remove what a mission that is over leaves, but the plan, and its pods for as long as they are kept.
-
-        Returns:
-            When to run again.
-        """
+        """Remove what a mission leaves, but the plan, and its pods for as long as they are kept; returns when to run again."""
         key = submitted.key
         removed = await self._children.remove(key, *_RIGHTS) | await self._finished_pods.stop(submitted)
         if removed | await self._children.remove(key, *_BESIDE_PODS):

@@ -15,7 +15,8 @@ from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Body, Key, Kind, key_of
 from fractus_operator.cluster.labels import APPLICATION_LABEL, MANAGED_SELECTOR, NAMESPACE_LABEL, label_value
 from fractus_operator.cluster.reading import read
-from fractus_operator.cluster.store import Conflict, ContentType, KubeError, NotFound, Reflector, Store
+from fractus_operator.cluster.store import Conflict, ContentType, KubeError, NotFound, Store
+from fractus_operator.inventory.grouped import Made
 from fractus_operator.reconcile import builders
 from fractus_operator.reconcile.difference import contains, digest, is_current, stamped
 
@@ -44,7 +45,7 @@ class Children:
         signer: Signs Grants.
     """
 
-    def __init__(self, store: Store, copies: Mapping[Kind, Reflector[Body]], signer: GrantSigner) -> None:
+    def __init__(self, store: Store, copies: Mapping[Kind, Made], signer: GrantSigner) -> None:
         self._store = store
         self._copies = copies
         self._signer = signer
@@ -62,13 +63,7 @@ class Children:
 
     def of(self, key: Key, kind: Kind) -> list[Body]:
         """What was made of a kind for an application."""
-        namespace, name = key
-        return [
-            body
-            for body in self._copies[kind].values()
-            if body["metadata"]["labels"][APPLICATION_LABEL] == label_value(name)
-            and (body["metadata"].get("namespace") or body["metadata"]["labels"].get(NAMESPACE_LABEL)) == namespace
-        ]
+        return self._copies[kind].of(key)
 
     # -- applying --
 
@@ -212,8 +207,6 @@ class Children:
         for kind in of:
             for child in self.of(key, kind):
                 removed = True
-                self._normalised.pop((kind, key_of(child)), None)
-                self._met.discard((kind, key_of(child)))
                 await self._delete(kind, child, orphan=orphan)
         return removed
 
@@ -228,6 +221,8 @@ class Children:
         if "deletionTimestamp" in body["metadata"]:
             return
         logger.info("children: removing (kind=%s name=%s)", kind.name, body["metadata"]["name"])
+        self._normalised.pop((kind, key_of(body)), None)
+        self._met.discard((kind, key_of(body)))
         await self._store.delete(kind, key_of(body), body["metadata"].get("uid"), orphan=orphan)
 
 

@@ -11,8 +11,8 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from fractus_core.api.nodes import direct_interface
-from fractus_observe.exposition import LastRead, Observed, serving, text_of
-from prometheus_client import CollectorRegistry
+from fractus_observe.exposition import LastRead, serving
+from fractus_observe.figures import text_of
 
 from fractus_agent.cluster.store import Object, Store
 from fractus_agent.grants.keeper import GrantDirectory, GrantKeeper
@@ -31,7 +31,7 @@ from fractus_agent.watchdog import guard
 if TYPE_CHECKING:
     from fractus_core.api.nodes import Drone, EdgeNode
     from fractus_core.linking import Seen
-    from prometheus_client.core import Metric
+    from fractus_observe.figures import Figure
 
     from fractus_agent.links.connectivity import Connectivity
     from fractus_agent.telemetry.feed import TelemetryFeed
@@ -93,12 +93,10 @@ class Agent:
             ExceptionGroup: one of them failed.
         """
         self._changed()
-        registry = CollectorRegistry()
-        registry.register(Observed(self._figures))
-        async with serving(self._settings.metrics, lambda: text_of(registry)):
+        async with serving(self._settings.metrics, lambda: text_of(self._figures())):
             await self._supervisor.run()
 
-    def _figures(self) -> Iterator[Metric]:
+    def _figures(self) -> Iterator[Figure]:
         """What Prometheus is told."""
         heads = (head.split(":") for head in self._heads())
         yield from AgentFigures(

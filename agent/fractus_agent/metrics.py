@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
-from fractus_observe.exposition import CERTIFICATE_EXPIRY, gauge
-from prometheus_client.core import Metric
+from fractus_observe.exposition import CERTIFICATE_EXPIRY
+from fractus_observe.figures import Figure, gauge
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +29,7 @@ class AgentFigures:
     grants: Mapping[str, int] = field(default_factory=dict)
     checkpoints: Mapping[str, int] = field(default_factory=dict)
 
-    def metrics(self) -> Iterator[Metric]:
+    def metrics(self) -> Iterator[Figure]:
         """All of it for Prometheus."""
         if self.expires_s is not None:
             yield gauge(CERTIFICATE_EXPIRY, "When the node's certificate expires, in Unix time.", self.expires_s)

@@ -7,13 +7,11 @@ import contextlib
 import logging
 import socket
 import threading
-from collections.abc import AsyncIterator, Callable, Iterable, Mapping
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Any, Generic, TypeVar
 
-from prometheus_client import CollectorRegistry, disable_created_metrics
-from prometheus_client.core import GaugeMetricFamily, Metric
-from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
+from fractus_observe.figures import CONTENT_TYPE
 
 LOG = logging.getLogger(__name__)
 
@@ -29,25 +27,6 @@ RETRY_S = 1.0
 """After which an address that was taken is tried again; twice as long each time, up to the next."""
 MAX_RETRY_S = 60.0
 MAX_REQUEST_BYTES = 8192
-
-# When a figure began says nothing that a restart does not.
-disable_created_metrics()
-
-
-class Observed:
-    """Figures that are read when they are asked for; registers with a registry.
-
-    Args:
-        figures: makes them.
-    """
-
-    def __init__(self, figures: Callable[[], Iterable[Metric]]) -> None:
-        self._figures = figures
-
-    def collect(self) -> Iterable[Metric]:
-        """The figures as they are now."""
-        return self._figures()
-
 
 T = TypeVar("T")
 
@@ -76,26 +55,6 @@ class LastRead(Generic[T]):
             self._last = self._read()
         except Exception:
             LOG.exception("metrics: a figure cannot be read")
-
-
-def gauge(name: str, text: str, value: float | Mapping[str, float], label: str = "") -> Metric:
-    """A figure, or one for each value of a label.
-
-    Args:
-        name: of the metric, with its unit.
-        text: what it is.
-        value: the figure, or figures by the label's values.
-        label: name of the label.
-    """
-    family = GaugeMetricFamily(name, text, labels=[label] if label else None)
-    for key, figure in value.items() if isinstance(value, Mapping) else [("", value)]:
-        family.add_metric([key] if label else [], figure)
-    return family
-
-
-def text_of(*registries: CollectorRegistry) -> bytes:
-    """What registries hold now, in Prometheus' text format."""
-    return b"".join(generate_latest(registry) for registry in registries)
 
 
 @asynccontextmanager
@@ -209,6 +168,6 @@ def _response(request: bytes, text: Callable[[], bytes]) -> bytes:
 
 
 def _http(status: str, body: bytes) -> bytes:
-    fields: dict[str, Any] = {"Content-Type": CONTENT_TYPE_LATEST, "Content-Length": len(body), "Connection": "close"}
+    fields: dict[str, Any] = {"Content-Type": CONTENT_TYPE, "Content-Length": len(body), "Connection": "close"}
     lines = [f"HTTP/1.1 {status}", *(f"{name}: {value}" for name, value in fields.items())]
     return "\r\n".join(lines).encode() + b"\r\n\r\n" + body

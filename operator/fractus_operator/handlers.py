@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import dataclasses
 import os
 from collections.abc import Callable
@@ -62,12 +63,24 @@ def _register(registry: kopf.OperatorRegistry, applications: Service, silence_s:
         """
         return round(silence_s(), 1)
 
-    @kopf.daemon(group, version, APPLICATION.plural, registry=registry, backoff=_RETRY_S, cancellation_timeout=5.0)
+    # With ids of our own: kopf notes progress under them in annotations, and those it makes up for nested functions are no
+    # names that the API server takes, so that one failure would leave an application undeletable.
+    @kopf.daemon(
+        group,
+        version,
+        APPLICATION.plural,
+        id="follow",
+        registry=registry,
+        backoff=_RETRY_S,
+        cancellation_timeout=5.0,
+    )
     async def application(namespace: str | None, name: str, stopped: kopf.DaemonStopped, **_: object) -> None:
         """Keep an application where its spec wants it: reconcile, then wait for an input to change."""
-        await applications.follow((namespace or "", name), lambda: bool(stopped))
+        # Cancelling is how kopf ends it at each deletion; it would log a warning if that came through.
+        with contextlib.suppress(asyncio.CancelledError):
+            await applications.follow((namespace or "", name), lambda: bool(stopped))
 
-    @kopf.on.delete(group, version, APPLICATION.plural, registry=registry, backoff=_RETRY_S)
+    @kopf.on.delete(group, version, APPLICATION.plural, id="teardown", registry=registry, backoff=_RETRY_S)
     async def application_deleted(namespace: str | None, name: str, uid: str, **_: object) -> None:
         """Take an application down before its object is removed."""
         try:

@@ -7,32 +7,28 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Literal
 
-from fractus_observe.exposition import CERTIFICATE_EXPIRY, gauge, text_of
-from prometheus_client import CollectorRegistry, Counter, Histogram
-from prometheus_client.core import Metric
+from fractus_observe.exposition import CERTIFICATE_EXPIRY
+from fractus_observe.figures import Counter, Figure, Histogram, gauge, text_of
 
-REGISTRY = CollectorRegistry()
 _SECONDS = (0.001, 0.005, 0.02, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
 
 RECONCILES = Histogram(
     "fractus_operator_reconcile_seconds",
     "How long one step of reconciliation took, waiting for the API server included.",
-    ["kind"],
-    buckets=_SECONDS,
-    registry=REGISTRY,
+    "kind",
+    _SECONDS,
 )
 ERRORS = Counter(
-    "fractus_operator_reconcile_errors",
+    "fractus_operator_reconcile_errors_total",
     "Steps of reconciliation that failed and are tried again, by why (a reason of the API server, or Bug).",
-    ["kind", "reason"],
-    registry=REGISTRY,
+    "kind",
+    "reason",
 )
 PHASES = Histogram(
     "fractus_operator_plan_phase_seconds",
     "How long a phase of deploying an Application took: observe, plan, grants, rollout; ways: what policies say of its way.",
-    ["phase"],
-    buckets=_SECONDS,
-    registry=REGISTRY,
+    "phase",
+    _SECONDS,
 )
 
 Phase = Literal["observe", "plan", "grants", "rollout", "ways"]
@@ -45,18 +41,18 @@ def reconciling(kind: str) -> Iterator[None]:
     Args:
         kind: Of what is reconciled.
     """
-    with RECONCILES.labels(kind).time():
+    with RECONCILES.timed(kind):
         try:
             yield
         except Exception as error:
-            ERRORS.labels(kind, str(getattr(error, "reason", None) or "Bug")).inc()
+            ERRORS.count(kind, str(getattr(error, "reason", None) or "Bug"))
             raise
 
 
 @contextmanager
 def phase(name: Phase) -> Iterator[None]:
     """Measure a phase of deploying an Application."""
-    with PHASES.labels(name).time():
+    with PHASES.timed(name):
         yield
 
 
@@ -85,7 +81,7 @@ class Observed:
         self._states = states
         self._expires_s = expires_s
 
-    def collect(self) -> Iterator[Metric]:
+    def collect(self) -> Iterator[Figure]:
         """The figures as they are now."""
         watches = self._watches()
         yield gauge(
@@ -113,6 +109,4 @@ class Observed:
 
 def text(observed: Observed) -> bytes:
     """All metrics in Prometheus' text format."""
-    now = CollectorRegistry()
-    now.register(observed)
-    return text_of(REGISTRY, now)
+    return text_of((RECONCILES.figure(), ERRORS.figure(), PHASES.figure(), *observed.collect()))

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from fractus_observe.exposition import CERTIFICATE_EXPIRY, Observed, gauge, text_of
+from fractus_observe.exposition import CERTIFICATE_EXPIRY
+from fractus_observe.figures import Counter, Figure, gauge, text_of
 from fractus_storage.audit import AuditLog
-from prometheus_client import CollectorRegistry, Counter
-from prometheus_client.core import Metric
 
 from fractus_services.grants import GrantFiles
 
@@ -17,33 +16,26 @@ MAX_POLICIES = 200
 
 
 class DecisionMetrics:
-    """Counts the decisions of a service from the entries of its audit log.
+    """Counts the decisions of a service from the entries of its audit log."""
 
-    Args:
-        registry: where they are counted.
-    """
-
-    def __init__(self, registry: CollectorRegistry) -> None:
+    def __init__(self) -> None:
         self._verdicts = Counter(
-            "fractus_verdicts", "Verdicts on calls, as the audit log has them.", ["action", "code"], registry=registry
+            "fractus_verdicts_total", "Verdicts on calls, as the audit log has them.", "action", "code"
         )
         self._by_policy = Counter(
-            "fractus_policy_verdicts",
+            "fractus_policy_verdicts_total",
             "Verdicts on calls that a policy decided; one that several decided counts for each.",
-            ["policy", "action"],
-            registry=registry,
+            "policy",
+            "action",
         )
         self._takeovers = Counter(
-            "fractus_takeovers",
-            "Changes of control authority that no driver asked for.",
-            ["controller", "code"],
-            registry=registry,
+            "fractus_takeovers_total", "Changes of control authority that no driver asked for.", "controller", "code"
         )
         self._interventions = Counter(
-            "fractus_monitor_interventions",
+            "fractus_monitor_interventions_total",
             "What the motion monitor did about a drone in flight.",
-            ["action", "code"],
-            registry=registry,
+            "action",
+            "code",
         )
         self._named: set[str] = set()
 
@@ -51,13 +43,18 @@ class DecisionMetrics:
         """Count an entry, if it is of a decision."""
         match entry:
             case {"kind": "call", "action": str(action), "code": str(code), "policies": policies}:
-                self._verdicts.labels(action, code).inc()
+                self._verdicts.count(action, code)
                 for policy in policies:
-                    self._by_policy.labels(self._name(policy), action).inc()
+                    self._by_policy.count(self._name(policy), action)
             case {"kind": "takeover", "controller": str(controller), "code": str(code)}:
-                self._takeovers.labels(controller, code).inc()
+                self._takeovers.count(controller, code)
             case {"kind": "monitor", "action": str(action), "code": str(code)}:
-                self._interventions.labels(action, code).inc()
+                self._interventions.count(action, code)
+
+    def figures(self) -> Iterator[Figure]:
+        """The counts as they are now."""
+        for counter in (self._verdicts, self._by_policy, self._takeovers, self._interventions):
+            yield counter.figure()
 
     def _name(self, policy: str) -> str:
         if len(self._named) < MAX_POLICIES:
@@ -74,21 +71,22 @@ class ServiceMetrics:
     """
 
     def __init__(self) -> None:
-        self._registry = CollectorRegistry()
-        self.take_entry = DecisionMetrics(self._registry).take_entry
+        decisions = DecisionMetrics()
+        self.take_entry = decisions.take_entry
+        self._figures: list[Callable[[], Iterator[Figure]]] = [decisions.figures]
 
-    def observe(self, figures: Callable[[], Iterator[Metric]]) -> None:
+    def observe(self, figures: Callable[[], Iterator[Figure]]) -> None:
         """Add figures that are read when they are asked for."""
-        self._registry.register(Observed(figures))
+        self._figures.append(figures)
 
     def text(self) -> bytes:
         """All metrics in Prometheus' text format."""
-        return text_of(self._registry)
+        return text_of(figure for figures in self._figures for figure in figures())
 
 
 def common_figures(
     expiry: Callable[[], float | None], grants: GrantFiles, audit: AuditLog, recording_problem: Callable[[], str]
-) -> Iterator[Metric]:
+) -> Iterator[Figure]:
     """What holds of any service now.
 
     Args:

@@ -17,21 +17,17 @@ from fractus_agent.links.reports import DroneReport
 from fractus_agent.metrics import AgentFigures
 from fractus_agent.redirector.nft import Endpoint
 from fractus_core.linking import NO_LINK, PathMetrics, Peer
-from fractus_observe.exposition import Observed, text_of
+from fractus_observe.figures import text_of
 from fractus_services.grants import GrantFiles
 from fractus_services.metrics import MAX_POLICIES, DecisionMetrics, ServiceMetrics, common_figures
 from fractus_services.mobility.rpc.figures import flight_figures
 from fractus_storage.audit import AuditLog
 from mobility_world import World, spec
-from prometheus_client import CollectorRegistry
 from virtual_time import fly
 
 
 def text(*figures: Any) -> str:
-    registry = CollectorRegistry()
-    for each in figures:
-        registry.register(Observed(each))
-    return text_of(registry).decode()
+    return text_of(figure for each in figures for figure in each()).decode()
 
 
 def entry(kind: str, action: str, *policies: str, **more: str) -> dict[str, Any]:
@@ -39,8 +35,7 @@ def entry(kind: str, action: str, *policies: str, **more: str) -> dict[str, Any]
 
 
 def test_decisions_are_counted_as_the_audit_log_has_them() -> None:
-    registry = CollectorRegistry()
-    counted = DecisionMetrics(registry)
+    counted = DecisionMetrics()
     for each in (
         entry("call", "allow"),
         entry("call", "correct", "fence"),
@@ -51,7 +46,7 @@ def test_decisions_are_counted_as_the_audit_log_has_them() -> None:
         {"time": "", "kind": "state", "lat": 1.0},
     ):
         counted.take_entry(each)
-    seen = values(text_of(registry).decode())
+    seen = values(text(counted.figures))
     assert {key: value for key, value in seen.items() if key[0] == "fractus_verdicts_total"} == {
         ("fractus_verdicts_total", action, "Code"): 1.0 for action in ("allow", "correct", "deny")
     }
@@ -63,11 +58,10 @@ def test_decisions_are_counted_as_the_audit_log_has_them() -> None:
 
 
 def test_policies_without_number_do_not_fill_the_memory() -> None:
-    registry = CollectorRegistry()
-    counted = DecisionMetrics(registry)
+    counted = DecisionMetrics()
     for number in range(MAX_POLICIES + 10):
         counted.take_entry(entry("call", "deny", f"policy-{number}"))
-    seen = values(text_of(registry).decode())
+    seen = values(text(counted.figures))
     assert seen["fractus_policy_verdicts_total", "deny", "other"] == 10.0
     assert len([key for key in seen if key[0] == "fractus_policy_verdicts_total"]) == MAX_POLICIES + 1
 

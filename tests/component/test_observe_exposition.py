@@ -7,25 +7,17 @@ import contextlib
 import socket
 import threading
 import time
-from collections.abc import Iterator
 
 import pytest
 from exposed import get, values
 from fractus_cluster.ports import free_port
 from fractus_observe import exposition
-from fractus_observe.exposition import MAX_CONNECTIONS, LastRead, Observed, gauge, serving, text_of
-from prometheus_client import CollectorRegistry
-from prometheus_client.core import Metric
+from fractus_observe.exposition import MAX_CONNECTIONS, LastRead, serving
+from fractus_observe.figures import gauge, text_of
 
 
 def text() -> bytes:
-    def figures() -> Iterator[Metric]:
-        yield gauge("a", "Alone.", 1)
-        yield gauge("b", "By colour.", {"red": 2.0, "blue": 3.0}, "colour")
-
-    registry = CollectorRegistry()
-    registry.register(Observed(figures))
-    return text_of(registry)
+    return text_of([gauge("a", "Alone.", 1), gauge("b", "By colour.", {"red": 2.0, "blue": 3.0}, "colour")])
 
 
 @pytest.mark.parametrize("host", ["", "127.0.0.1"])

@@ -19,8 +19,8 @@ from fractus_agent.cluster.store import End, Event, KubeError, Listed
 from fractus_agent.links.connectivity import Connectivity
 from fractus_core.api.nodes import Drone, EdgeNode
 from fractus_core.linking import Seen
-from fractus_observe.exposition import Observed, serving, text_of
-from prometheus_client import CollectorRegistry
+from fractus_observe.exposition import serving
+from fractus_observe.figures import text_of
 
 POLL_S = 0.2
 
@@ -78,9 +78,7 @@ async def main(folder: Path) -> None:
     over = asyncio.StreamReader()
     await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(over), sys.stdin)
     reading = asyncio.create_task(over.read())
-    registry = CollectorRegistry()
-    registry.register(Observed(links.figures))
-    async with serving("127.0.0.1:46812", lambda: text_of(registry)):
+    async with serving("127.0.0.1:46812", lambda: text_of(links.figures())):
         await asyncio.wait({running, reading}, return_when=asyncio.FIRST_COMPLETED)
     running.cancel()
     await asyncio.gather(running, return_exceptions=True)

@@ -54,6 +54,41 @@ def older_policies(world: World) -> Iterator[None]:
         world.api.merge(path, {"spec": present["spec"]})
 
 
+@contextmanager
+def undeletable_secrets(world: World, namespace: str) -> Iterator[None]:
+    """Let the API server refuse to delete the Secrets of a namespace."""
+    root, name = "/apis/admissionregistration.k8s.io/v1", "keep-secrets"
+    rule = {"apiGroups": [""], "apiVersions": ["v1"], "resources": ["secrets"], "operations": ["DELETE"]}
+    place = {"namespaceSelector": {"matchLabels": {"kubernetes.io/metadata.name": namespace}}}
+    objects = {
+        f"{root}/validatingadmissionpolicies/{name}": (
+            "ValidatingAdmissionPolicy",
+            {"matchConstraints": {"resourceRules": [rule]}, "validations": [{"expression": "false"}]},
+        ),
+        f"{root}/validatingadmissionpolicybindings/{name}": (
+            "ValidatingAdmissionPolicyBinding",
+            {"policyName": name, "validationActions": ["Deny"], "matchResources": place},
+        ),
+    }
+    for path, (kind, spec) in objects.items():
+        about = {"apiVersion": "admissionregistration.k8s.io/v1", "kind": kind, "metadata": {"name": name}}
+        world.api.apply(path, about | {"spec": spec})
+    try:
+        wait_for(lambda: not deletable(world, namespace), "the API server to refuse it")
+        yield
+    finally:
+        for path in objects:
+            world.api.delete(path)
+
+
+def deletable(world: World, namespace: str) -> bool:
+    try:
+        world.api.call("DELETE", f"/api/v1/namespaces/{namespace}/secrets/traffic-navigator-tls?dryRun=All")
+    except KubeError:
+        return False
+    return True
+
+
 def policy_ready(world: World, name: str) -> Body:
     status = (world.api.get(f"{FRACTUS}/policies/{name}") or {}).get("status") or {}
     return next((c for c in status.get("conditions") or () if c["type"] == "Ready"), {})
@@ -222,3 +257,14 @@ def test_a_pod_with_our_labels_does_not_move_a_plan(world: World, operator: Oper
     reconciled(world, namespace)
     assert "deployments/traffic-ground-viewer-edge-2" in world.children(namespace)
     assert "deployments/traffic-ground-viewer-edge-1" not in world.children(namespace)
+
+
+def test_a_teardown_that_is_refused_is_made_again(world: World, operator: OperatorProcess, namespace: str) -> None:
+    running(world, namespace)
+    with undeletable_secrets(world, namespace):
+        world.api.delete(f"{FRACTUS}/namespaces/{namespace}/applications/traffic")
+        wait_for(lambda: "failed temporarily" in operator.log(), "the teardown to fail")
+        assert not world.grants(namespace), "rights go first"
+        assert world.application(namespace) is not None
+    wait_for(lambda: world.application(namespace) is None, lambda: f"the end: {operator.log()[-3000:]}")
+    assert "is cancelled" not in operator.log(), "the end of what follows an application is no reason for a warning"

@@ -13,7 +13,7 @@ from fractus_operator.cluster.kinds import Key
 from fractus_operator.cluster.store import KubeError
 from fractus_operator.inventory.live import LiveInventory
 from fractus_operator.inventory.subscriptions import Subscriptions
-from fractus_operator.metrics import REGISTRY, Observed
+from fractus_operator.metrics import ERRORS, Observed
 from fractus_operator.reconcile.applications import Applications, BeingDeleted
 from fractus_operator.reconcile.worklist import Worklist
 
@@ -45,10 +45,7 @@ async def test_a_step_that_fails_is_counted(error: Exception, reason: str) -> No
         raise error
 
     def count() -> float:
-        return (
-            REGISTRY.get_sample_value("fractus_operator_reconcile_errors_total", {"kind": "thing", "reason": reason})
-            or 0.0
-        )
+        return ERRORS.counted("thing", reason)
 
     before = count()
     worklist = Worklist("thing", reconcile)
@@ -74,9 +71,8 @@ async def test_an_application_that_is_being_deleted_is_no_failure() -> None:
         async def reconcile(self, key: Key) -> float:
             raise BeingDeleted
 
-    def count() -> float | None:
-        labels = {"kind": "application", "reason": "Bug"}
-        return REGISTRY.get_sample_value("fractus_operator_reconcile_errors_total", labels)
+    def count() -> float:
+        return ERRORS.counted("application", "Bug")
 
     before = count()
     await Leaving().follow(("ns", "a"), lambda: False)

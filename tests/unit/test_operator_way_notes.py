@@ -12,7 +12,7 @@ import pytest
 from fractus_core.api import Application
 from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.planning.inventory import Inventory, Settings
-from fractus_operator.metrics import REGISTRY
+from fractus_operator.metrics import ERRORS
 from fractus_operator.reconcile import way_notes
 from fractus_operator.reconcile.way_notes import WayNotes
 
@@ -120,8 +120,7 @@ async def test_what_cannot_be_judged_is_counted_and_not_tried_at_each_reconcile(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def count() -> float:
-        labels = {"kind": "ways", "reason": "Bug"}
-        return REGISTRY.get_sample_value("fractus_operator_reconcile_errors_total", labels) or 0.0
+        return ERRORS.counted("ways", "Bug")
 
     def broken(*_: Any) -> DeploymentPlanSpec:
         raise KeyError("a zone that is none")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import subprocess
 import sys
 import types
 from pathlib import Path
@@ -205,6 +206,51 @@ def test_the_middle_is_kept() -> None:
 def test_what_is_no_picture_is_said_so(data: bytes) -> None:
     with pytest.raises(NotAPicture):
         decoded(data)
+
+
+@pytest.mark.parametrize("shape", [(40, 60), (40, 60, 3), (40, 60, 4)])
+@pytest.mark.parametrize(
+    ("suffix", "kind"), [("png", np.uint8), ("png", np.uint16), ("tiff", np.uint8), ("bmp", np.uint8)]
+)
+def test_pictures_are_read_as_opencv_reads_them(shape: tuple[int, ...], suffix: str, kind: Any) -> None:
+    made = np.random.default_rng(3).integers(0, np.iinfo(kind).max, shape, kind)
+    data = cv2.imencode(f".{suffix}", made)[1].tobytes()
+    expected = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    assert np.abs(decoded(data).astype(int) - expected).max() <= 1
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_pictures_are_turned_upright(photo: Pixels, orientation: int) -> None:
+    exif, out = Image.Exif(), io.BytesIO()
+    exif[0x0112] = orientation
+    Image.fromarray(photo[:100, :60, ::-1]).save(out, "JPEG", quality=95, exif=exif)
+    expected = cv2.imdecode(np.frombuffer(out.getvalue(), np.uint8), cv2.IMREAD_COLOR)
+    assert decoded(out.getvalue()).shape == expected.shape
+    assert np.abs(decoded(out.getvalue()).astype(int) - expected).mean() < 2
+
+
+def test_half_a_picture_is_none(photo: Pixels) -> None:
+    data = encoded(photo)
+    with pytest.raises(NotAPicture):
+        decoded(data[: len(data) // 2])
+
+
+def test_more_pixels_than_a_camera_has_are_not_read() -> None:
+    out = io.BytesIO()
+    Image.new("1", (10_000, 5_001)).save(out, "PNG")
+    with pytest.raises(NotAPicture, match="too many"):
+        decoded(out.getvalue())
+
+
+def test_plain_pictures_need_no_opencv() -> None:
+    code = (
+        "import sys, numpy as np;"
+        "from fractus_services.camera.imaging.pixels import decoded, encoded, fitted;"
+        "from fractus_services.camera.imaging.filters import blur_average;"
+        "decoded(encoded(blur_average(fitted(np.zeros((90, 120, 3), np.uint8), 50, 40))));"
+        "assert 'cv2' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
 
 
 def test_pictures_tell_where_they_were_taken(photo: Pixels) -> None:

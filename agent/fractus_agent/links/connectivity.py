@@ -12,7 +12,7 @@ from pathlib import Path
 
 from fractus_core.api.nodes import Drone, Interface, direct_interface
 from fractus_core.linking import Seen
-from prometheus_client.core import Metric
+from fractus_observe.figures import Figure
 
 from fractus_agent.cluster.store import End, Store
 from fractus_agent.links import beacons, pairing
@@ -102,7 +102,7 @@ class Connectivity:
         """Whether links are planned for this node."""
         return bool(self._plans.links)
 
-    def figures(self) -> Iterator[Metric]:
+    def figures(self) -> Iterator[Figure]:
         """What Prometheus is told of the drone's links; nothing on the other end."""
         return self._metrics.collect() if self._end == "drone" else iter(())
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from fractus_core.linking import PathMetrics, Phase
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from fractus_observe.figures import Figure, gauge
 
 from fractus_agent.links.plans import route_key
 from fractus_agent.links.reports import DroneReport
@@ -41,17 +41,16 @@ class LinkMetrics:
         self._switches += len(before ^ report.direct)
         self._report = report
 
-    def collect(self) -> Iterator[Metric]:
+    def collect(self) -> Iterator[Figure]:
         """All metrics."""
-        yield CounterMetricFamily(
-            "fractus_switches", "Changes of services' paths since the agent started.", self._switches
-        )
-        families: dict[str, GaugeMetricFamily] = {}
+        what = "Changes of services' paths since the agent started."
+        yield Figure("fractus_switches_total", what, "counter", [("", {}, self._switches)])
+        found: dict[str, dict[str, float]] = {}
         for name, key, value in self._samples():
+            found.setdefault(name, {})[key] = value
+        for name, values in found.items():
             label, what = _GAUGES[name]
-            family = families.setdefault(name, GaugeMetricFamily(name, what, labels=[label] if label else None))
-            family.add_metric([key] if label else [], value)
-        yield from families.values()
+            yield gauge(name, what, values, label)
 
     def _samples(self) -> Iterator[tuple[str, str, float]]:
         if (report := self._report) is None:

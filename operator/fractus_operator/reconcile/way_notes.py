@@ -108,7 +108,7 @@ class WayNotes:
                 noted = plan
             except Exception:
                 # Noted, too: what failed is tried again when notes are due, not at each reconcile.
-                ERRORS.labels("ways", "Bug").inc()
+                ERRORS.count("ways", "Bug")
                 logger.exception("way notes: not judged (application=%s/%s)", *key)
                 noted = plan
         if self._judged.get(key) is not before:

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from fractus_core.api.policies import FaceMethod
 
 from fractus_services.camera.imaging.faces import Box
-from fractus_services.camera.imaging.pixels import Pixels, opencv, reduced
+from fractus_services.camera.imaging.pixels import Pixels, opencv, reduced, resized
 
 Mask = npt.NDArray[np.bool_]
 
@@ -39,8 +39,7 @@ def black(picture: Pixels) -> Pixels:
 
 def blur_average(picture: Pixels) -> Pixels:
     """Averages over squares, 16 along the longer side, with soft transitions."""
-    cv2 = opencv()
-    return _grown(cv2.resize(picture, _cells(picture), interpolation=cv2.INTER_AREA), picture)
+    return _grown(resized(picture, *_cells(picture)), picture)
 
 
 def blur_median(picture: Pixels) -> Pixels:
@@ -60,9 +59,8 @@ def _cells(picture: Pixels) -> tuple[int, int]:
 
 
 def _grown(cells: Pixels, picture: Pixels) -> Pixels:
-    cv2 = opencv()
     rows, columns = picture.shape[:2]
-    return np.asarray(cv2.resize(cells, (columns, rows), interpolation=cv2.INTER_LINEAR), np.uint8)
+    return resized(cells, columns, rows)
 
 
 def hide_faces(picture: Pixels, boxes: Sequence[Box], method: FaceMethod) -> Pixels:

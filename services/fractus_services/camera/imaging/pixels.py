@@ -1,11 +1,11 @@
-"""Pictures as arrays: OpenCV on demand, decoding with bounds, cropping, JPEG."""
+"""Pictures as arrays: Pillow and OpenCV on demand, decoding with bounds, cropping, JPEG."""
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
 import functools
-import os
+import io
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,8 @@ _OWN_PAGES_BYTES = 1_000_000
 """Larger blocks get pages of their own, which glibc gives back to the system at once: a third less memory at peak."""
 MAX_PIXELS = 50_000_000
 MAX_BYTES = 64_000_000
+FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
+"""What is read; Pillow has readers for many others, which no camera needs and which strangers could feed."""
 
 
 class NotAPicture(PreconditionFailed):
@@ -32,14 +34,21 @@ class NotAPicture(PreconditionFailed):
 
 
 @functools.cache
+def pillow() -> Any:
+    """Pillow, which reads, resizes and writes pictures: a service which takes none does without it."""
+    from PIL import Image  # noqa: PLC0415 - see above
+
+    with contextlib.suppress(OSError, AttributeError):  # of glibc; others give memory back by themselves
+        ctypes.CDLL(None).mallopt(_M_MMAP_THRESHOLD, _OWN_PAGES_BYTES)
+    return Image
+
+
+@functools.cache
 def opencv() -> Any:
-    """OpenCV, on one thread: 30 MB that a service which takes no picture does without."""
-    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_PIXELS))
+    """OpenCV, on one thread: 20 MB that a service does without as long as no filter looks into a picture."""
     import cv2  # noqa: PLC0415 - see above
 
     cv2.setNumThreads(1)
-    with contextlib.suppress(OSError, AttributeError):  # of glibc; others give memory back by themselves
-        ctypes.CDLL(None).mallopt(_M_MMAP_THRESHOLD, _OWN_PAGES_BYTES)
     return cv2
 
 
@@ -47,18 +56,25 @@ def decoded(data: bytes) -> Pixels:
     """The pixels of a JPEG, PNG or the like, turned upright; all metadata is dropped.
 
     Raises:
-        NotAPicture: it cannot be decoded.
+        NotAPicture: it cannot be decoded, or not to its end.
     """
-    cv2 = opencv()
     if not data or len(data) > MAX_BYTES:
         raise NotAPicture(f"{len(data)} bytes are no picture; at most {MAX_BYTES // 1_000_000} MB are read")
+    image = pillow()
+    from PIL import ImageOps  # noqa: PLC0415 - as above
+
     try:
-        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    except cv2.error as error:
-        raise NotAPicture(f"the picture cannot be decoded: {error.err}") from None
-    if picture is None:
-        raise NotAPicture(f"the {len(data)} bytes are not a picture in a format that OpenCV reads")
-    return np.asarray(picture, np.uint8)
+        with image.open(io.BytesIO(data), formats=FORMATS) as source:
+            if source.width * source.height > MAX_PIXELS:
+                raise NotAPicture(f"{source.width}x{source.height} pixels are too many; at most {MAX_PIXELS} are read")
+            ImageOps.exif_transpose(source, in_place=True)
+            deep = source.mode.startswith("I;16")
+            shallow = image.fromarray((np.asarray(source) >> 8).astype(np.uint8)) if deep else source
+            return np.ascontiguousarray(np.asarray(shallow.convert("RGB"))[..., ::-1])
+    except NotAPicture:
+        raise
+    except Exception as error:
+        raise NotAPicture(f"the {len(data)} bytes cannot be decoded as {' or '.join(FORMATS)}: {error}") from None
 
 
 def encoded(picture: Pixels) -> bytes:
@@ -67,11 +83,19 @@ def encoded(picture: Pixels) -> bytes:
     Raises:
         NotAPicture: it cannot be encoded.
     """
-    cv2 = opencv()
-    done, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
-    if not done:
-        raise NotAPicture(f"a picture of {picture.shape[1]}x{picture.shape[0]} pixels cannot be encoded")
-    return bytes(data)
+    out = io.BytesIO()
+    try:
+        pillow().fromarray(np.ascontiguousarray(picture[..., ::-1])).save(out, "JPEG", quality=QUALITY)
+    except (OSError, SystemError, ValueError):
+        raise NotAPicture(f"a picture of {picture.shape[1]}x{picture.shape[0]} pixels cannot be encoded") from None
+    return out.getvalue()
+
+
+def resized(picture: Pixels, width: int, height: int) -> Pixels:
+    """The picture in another size: averages where it gets smaller, blends where it gets larger."""
+    image = pillow()
+    how = image.Resampling.BOX if picture.shape[1] > width else image.Resampling.BILINEAR
+    return np.array(image.fromarray(np.ascontiguousarray(picture)).resize((width, height), how))
 
 
 def source_size(width: int, height: int, native: tuple[int, int]) -> tuple[int, int]:
@@ -91,12 +115,8 @@ def cropped(picture: Pixels, width: int, height: int) -> Pixels:
 
 def fitted(picture: Pixels, width: int, height: int) -> Pixels:
     """The middle of a picture in other proportions and of another size; never more than it shows."""
-    cv2 = opencv()
     middle = cropped(picture, width, height)
-    if middle.shape[:2] == (height, width):
-        return np.ascontiguousarray(middle)
-    how = cv2.INTER_AREA if middle.shape[1] > width else cv2.INTER_LINEAR
-    return np.asarray(cv2.resize(middle, (width, height), interpolation=how), np.uint8)
+    return np.ascontiguousarray(middle) if middle.shape[:2] == (height, width) else resized(middle, width, height)
 
 
 def reduced(picture: Pixels, width: int) -> Pixels:
@@ -104,6 +124,4 @@ def reduced(picture: Pixels, width: int) -> Pixels:
     rows, columns = picture.shape[:2]
     if columns <= width:
         return picture
-    cv2 = opencv()
-    size = (width, max(round(rows * width / columns), 1))
-    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return resized(picture, width, max(round(rows * width / columns), 1))

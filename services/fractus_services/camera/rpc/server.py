@@ -13,10 +13,10 @@ from typing import Any
 
 from fractus_core.api.nodes import Drone, EdgeNode
 from fractus_core.policy.lenses import lens_of
-from fractus_observe.exposition import LastRead, gauge, serving
+from fractus_observe.exposition import LastRead, serving
+from fractus_observe.figures import Figure, gauge
 from fractus_proto.v1 import camera_pb2_grpc
 from fractus_storage.audit import AuditLog
-from prometheus_client.core import Metric
 
 from fractus_services.admission import CallAdmission
 from fractus_services.auth import TlsFiles
@@ -131,7 +131,7 @@ class _Watched:
 
     history: PoseHistory | None = None
 
-    def figures(self) -> Iterator[Metric]:
+    def figures(self) -> Iterator[Figure]:
         """What Prometheus is told of it."""
         if self.history is not None:
             yield gauge("fractus_telemetry_age_seconds", "Age of the drone's position.", self.history.age_s)

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from fractus_core.control import Authority
-from fractus_observe.exposition import gauge
-from prometheus_client.core import Metric
+from fractus_observe.figures import Figure, gauge
 
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.supervisor import Supervisor
 
 
-def flight_figures(control: Control, supervisor: Supervisor) -> Iterator[Metric]:
+def flight_figures(control: Control, supervisor: Supervisor) -> Iterator[Figure]:
     """What holds of the drone now."""
     autopilot, vehicle = control.autopilot, control.autopilot.vehicle
     yield gauge(

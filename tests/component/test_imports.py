@@ -36,3 +36,13 @@ def test_what_flies_needs_no_library_of_pictures() -> None:
     )
     assert "fractus_services" in imported
     assert not imported & {"cv2", "PIL", "scipy", "matplotlib", "kubernetes", "aiohttp"}
+
+
+def test_plain_pictures_need_no_opencv() -> None:
+    _, imported = after(
+        "import numpy as np; from fractus_services.camera.imaging.pixels import decoded, encoded, fitted; "
+        "from fractus_services.camera.imaging.filters import blur_average; "
+        "decoded(encoded(blur_average(fitted(np.zeros((90, 120, 3), np.uint8), 50, 40))))"
+    )
+    assert "PIL" in imported
+    assert "cv2" not in imported

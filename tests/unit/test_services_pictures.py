@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import subprocess
 import sys
 import types
 from pathlib import Path
@@ -240,17 +239,6 @@ def test_more_pixels_than_a_camera_has_are_not_read() -> None:
     Image.new("1", (10_000, 5_001)).save(out, "PNG")
     with pytest.raises(NotAPicture, match="too many"):
         decoded(out.getvalue())
-
-
-def test_plain_pictures_need_no_opencv() -> None:
-    code = (
-        "import sys, numpy as np;"
-        "from fractus_services.camera.imaging.pixels import decoded, encoded, fitted;"
-        "from fractus_services.camera.imaging.filters import blur_average;"
-        "decoded(encoded(blur_average(fitted(np.zeros((90, 120, 3), np.uint8), 50, 40))));"
-        "assert 'cv2' not in sys.modules"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
 
 
 def test_pictures_tell_where_they_were_taken(photo: Pixels) -> None:

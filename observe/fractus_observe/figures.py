@@ -6,6 +6,7 @@ Prometheus' own library for Python loads two web servers, which takes each workl
 from __future__ import annotations
 
 import bisect
+import math
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -138,5 +139,5 @@ def _escaped(content: str) -> str:
 
 
 def _number(value: float) -> str:
-    """As Prometheus reads it; it takes Python's `inf` and `nan` as well."""
-    return repr(float(value))
+    """As the text format spells it: +Inf, -Inf and NaN have forms of their own."""
+    return repr(float(value)) if math.isfinite(value) else "NaN" if math.isnan(value) else f"{value:+}".title()

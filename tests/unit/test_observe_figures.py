@@ -49,7 +49,7 @@ def test_a_histogram_counts_what_is_not_longer(monkeypatch: pytest.MonkeyPatch) 
     assert values(text_of([histogram.figure()]).decode()) == {
         ("step_seconds_bucket", "a", "0.5"): 1.0,
         ("step_seconds_bucket", "a", "2.0"): 2.0,
-        ("step_seconds_bucket", "a", "inf"): 3.0,
+        ("step_seconds_bucket", "a", "+Inf"): 3.0,
         ("step_seconds_count", "a"): 3.0,
         ("step_seconds_sum", "a"): 10.5,
     }

@@ -15,7 +15,7 @@ CHART = str(ROOT / "charts" / "fractus")
 def services(kube: Kube) -> dict[str, str]:
     """The drone's service pods and how often their containers started."""
     found = {}
-    for pod in kube.all("pods", SYSTEM):
+    for pod in kube.all("pods", SYSTEM, "app.kubernetes.io/component in (agent,mobility,camera)"):
         if pod["spec"].get("nodeName") == DRONE and "deletionTimestamp" not in pod["metadata"]:
             restarts = sum(c["restartCount"] for c in pod["status"].get("containerStatuses", ()))
             found[pod["metadata"]["name"]] = f"{pod['metadata']['uid']} {restarts}"

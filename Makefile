@@ -58,6 +58,8 @@ GOLDEN := tests/component/test_control_golden.py
 # Many of these tests fly in real time, which a machine that stalls can fail: what fails gets a second try, alone.
 INTEGRATION := tests/integration tests/e2e/test_cluster.py
 E2E := tests/e2e --ignore tests/e2e/test_cluster.py
+# These are of the charts on a cluster that is not ours: `make test` runs them on kind.
+ON_KIND := $(patsubst %,tests/e2e/test_%.py,mission refusals upgrade uninstall)
 SECOND_TRY := $(RUN) pytest --last-failed --last-failed-no-failures none
 
 .PHONY: test
@@ -66,7 +68,12 @@ test: packages env lint ## Everything: lint, types, unit, component, integration
 	$(QUICK) tests/unit tests/component --ignore $(GOLDEN)
 	FRACTUS_DEEP=1 $(RUN) pytest -q -n 2 $(GOLDEN)
 	$(RUN) pytest -n 3 --dist loadgroup $(INTEGRATION) || $(SECOND_TRY) $(INTEGRATION)
-	$(RUN) pytest $(if $(filter current,$(FRACTUS_E2E_CLUSTER)),,-n 2 --dist loadgroup) $(E2E) || $(SECOND_TRY) $(E2E)
+ifeq ($(FRACTUS_E2E_CLUSTER),current)
+	$(RUN) pytest $(E2E) || $(SECOND_TRY) $(E2E)
+else
+	$(RUN) pytest -n 2 --dist loadgroup $(E2E) $(ON_KIND:%=--ignore %) || $(SECOND_TRY) $(E2E) $(ON_KIND:%=--ignore %)
+	STEPS="images cluster load charts tests uninstall" $(MAKE) test-kind
+endif
 
 .PHONY: test-fast
 test-fast: env lint ## The inner loop: lint, types and unit tests
@@ -87,7 +94,7 @@ test-e2e: packages env ## End-to-end tests only, on the embedded cluster or on F
 
 .PHONY: test-kind
 test-kind: env ## The charts, a mission's end-to-end tests and the demo on a cluster of kind (without Docker: on one made here, as root)
-	if docker info > /dev/null 2>&1; then tests/kind/run.sh; else tests/kind/machine.sh tests/kind/run.sh; fi
+	export ON_KIND="$(ON_KIND)"; if docker info > /dev/null 2>&1; then tests/kind/run.sh; else tests/kind/machine.sh tests/kind/run.sh; fi
 
 # libFuzzer's own options; what it finds is left in out/fuzz. The examples are where manifests start from.
 SECONDS ?= 600

@@ -3,6 +3,7 @@
 # Needs docker, kind, kubectl and helm on the PATH; tests/kind/machine.sh brings them where they are missing.
 #
 #   STEPS="cluster"       only these steps, of: images cluster load charts tests demo uninstall
+#   ON_KIND="FILES..."    the tests, as `make test-kind` gives them
 #   KEEP=1                leaves the cluster
 #   KIND_NODE_IMAGE=NAME  the nodes' image; kind's own by default
 #   BUILD_OPTIONS="..."   for `docker build`
@@ -42,7 +43,9 @@ charts() {
 }
 
 tests() {
-  .venv/bin/pytest tests/e2e/test_{mission,refusals,upgrade,uninstall}.py
+  # What fails gets a second try, as in `make test`: these tests fly in real time.
+  # shellcheck disable=SC2086 # several words
+  .venv/bin/pytest $ON_KIND || .venv/bin/pytest --last-failed --last-failed-no-failures none $ON_KIND
 }
 
 demo() {
@@ -53,7 +56,7 @@ demo() {
 # What docs/upgrades.md tells to type; nothing of Fractus is left that Kubernetes would run, ask or refuse by.
 uninstall() {
   helm -n fractus-system uninstall fractus-demo
-  bash -e <(sed -n '/^## Uninstalling/,/^## /s/^    \(kubectl delete app.*\|helm .*\)/\1/p' docs/upgrades.md)
+  bash -e <(sed -n '/^## Uninstalling/,/^## /s/^    \(kubectl delete app.*\|helm .* uninstall .*\)/\1/p' docs/upgrades.md)
   kinds=$(kubectl api-resources --verbs=list --output=name | grep -v '^events')
   left=$(kubectl get "$(echo $kinds | tr ' ' ',')" --all-namespaces --selector app.kubernetes.io/name=fractus --output name)
   [ -z "$left" ] && [ -z "$(kubectl get pods --all-namespaces --output name | grep fractus)" ] || { echo "left: $left" >&2; return 1; }

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from functools import partial
 
 from fractus_kube.connection import Connection, ContentType, translated
 from fractus_kube.errors import Conflict, NotFound, from_status
@@ -73,13 +74,19 @@ class Client(Connection):
         return (await self.list_whole(kind, selectors=selectors)).items
 
     async def list_whole(
-        self, kind: Kind, *, selectors: Mapping[str, str] | None = None, timeout_s: float = LIST_TIMEOUT_S
+        self,
+        kind: Kind,
+        *,
+        namespace: str = "",
+        selectors: Mapping[str, str] | None = None,
+        timeout_s: float = LIST_TIMEOUT_S,
     ) -> Page:
-        """Read a whole collection over all namespaces as one page; the time-out is for each part of it."""
-        page = await self.list_page(kind, selectors=selectors, timeout_s=timeout_s)
+        """Read a whole collection as one page, over all namespaces or of one; the time-out is for each part of it."""
+        read = partial(self.list_page, kind, namespace=namespace, selectors=selectors, timeout_s=timeout_s)
+        page = await read()
         items = page.items
         while page.continue_:
-            page = await self.list_page(kind, selectors=selectors, continue_=page.continue_, timeout_s=timeout_s)
+            page = await read(continue_=page.continue_)
             items += page.items
         page.items = items
         return page

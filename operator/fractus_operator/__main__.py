@@ -22,6 +22,7 @@ from fractus_observe.exposition import serving
 from fractus_operator import handlers, metrics
 from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Key, Kind
+from fractus_operator.cluster.labels import LEASE_NAME
 from fractus_operator.cluster.store import KubeError, LeaseThread, LostLease, Store, Unconfigured
 from fractus_operator.identity.ca_secret import open_authority
 from fractus_operator.identity.node_requests import NodeSigning
@@ -41,8 +42,6 @@ from fractus_operator.settings import BadSetting, Settings
 from fractus_operator.standby import standing_by
 
 logger = logging.getLogger("fractus_operator")
-
-LEASE_NAME = "fractus-operator"
 
 _GC_THRESHOLD = 20_000
 """Containers that are not freed at once before the garbage collector looks for cycles: a deployment makes a few thousand."""

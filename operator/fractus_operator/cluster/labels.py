@@ -32,6 +32,14 @@ DEPOT_LABEL = f"{GROUP}/depot"
 GEOHASH_LABEL = f"{GROUP}/geohash"
 INTERFACE_LABEL = f"{GROUP}/interface-"
 
+LEASE_NAME = "fractus-operator"
+"""Of the Lease by which one operator acts."""
+
+
+def is_location_label(name: str) -> bool:
+    """Whether a label of a Node says where it is: the operator's own."""
+    return name in {DEPOT_LABEL, GEOHASH_LABEL} or name.startswith(INTERFACE_LABEL)
+
 
 def service_name(application: str, component: Component) -> str:
     """Name of the Service of a component."""

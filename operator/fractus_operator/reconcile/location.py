@@ -8,7 +8,7 @@ from fractus_core.api import Drone, EdgeNode
 from fractus_core.api.geometry import Point
 
 from fractus_operator.cluster.kinds import NODE, Key
-from fractus_operator.cluster.labels import DEPOT_LABEL, GEOHASH_LABEL, INTERFACE_LABEL
+from fractus_operator.cluster.labels import DEPOT_LABEL, GEOHASH_LABEL, INTERFACE_LABEL, is_location_label
 from fractus_operator.cluster.store import NotFound, Store
 from fractus_operator.inventory.live import LiveInventory
 
@@ -60,11 +60,6 @@ def location_labels(node: Drone | EdgeNode, home: Point | None = None) -> dict[s
     if place is not None:
         labels[GEOHASH_LABEL] = geohash(place.lat, place.lon)
     return labels
-
-
-def is_location_label(name: str) -> bool:
-    """Whether a label is one of those that location_labels gives."""
-    return name in {DEPOT_LABEL, GEOHASH_LABEL} or name.startswith(INTERFACE_LABEL)
 
 
 class Locations:

@@ -1,0 +1,157 @@
+"""helm uninstall: what its hooks are, when they wipe nodes, and what they remove on a real API server, with the account they have."""
+
+from __future__ import annotations
+
+import base64
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from chart import path_of, render
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import NameOID
+from operator_world import SYSTEM, World
+
+Body = dict[str, Any]
+WIPE = "--set=uninstall.wipeNodes=true"
+CORE, LEASES = f"/api/v1/namespaces/{SYSTEM}", f"/apis/coordination.k8s.io/v1/namespaces/{SYSTEM}/leases"
+REQUESTS = "/apis/certificates.k8s.io/v1/certificatesigningrequests"
+
+
+def is_hook(body: Body) -> bool:
+    """Whether it is made after the rest was deleted."""
+    return (body["metadata"].get("annotations") or {}).get("helm.sh/hook") == "post-delete"
+
+
+def hooks(*arguments: str) -> list[Body]:
+    """What is made after the rest was deleted, in the order in which helm makes it."""
+    found = [body for body in render(*arguments) if is_hook(body)]
+    return sorted(found, key=lambda body: int(body["metadata"]["annotations"]["helm.sh/hook-weight"]))
+
+
+def test_nodes_are_wiped_only_where_it_is_asked_for_and_only_by_an_uninstall() -> None:
+    plain, asked, made = render(), render(WIPE), hooks(WIPE)
+    assert not [body for body in plain if "wipe" in str(body)]
+    same = [body for body in plain if not is_hook(body)]
+    assert [body for body in asked if not is_hook(body)] == same, "the switch changes nothing that runs"
+    assert [body["kind"] for body in made][-2:] == ["DaemonSet", "Job"]
+    for body in made:
+        assert body["metadata"]["annotations"]["helm.sh/hook-delete-policy"] == "before-hook-creation,hook-succeeded"
+
+
+def test_the_wiping_pod_reaches_the_nodes_data_and_no_more() -> None:
+    (body,) = (body for body in hooks(WIPE, "--set=host.state=/data/fractus") if body["kind"] == "DaemonSet")
+    pod = body["spec"]["template"]["spec"]
+    sets = {b["metadata"]["name"]: b["spec"]["template"] for b in render() if b["kind"] == "DaemonSet"}
+    theirs = sets["fractus-agent"]["spec"]
+    assert pod["affinity"]["nodeAffinity"] == theirs["affinity"]["nodeAffinity"]
+    assert pod["tolerations"] == theirs["tolerations"]
+    assert pod["volumes"] == [{"name": "state", "hostPath": {"path": "/data/fractus", "type": "DirectoryOrCreate"}}]
+    (apart,) = pod["affinity"]["podAntiAffinity"]["requiredDuringSchedulingIgnoredDuringExecution"]
+    services = {template["metadata"]["labels"]["app.kubernetes.io/component"] for template in sets.values()}
+    assert set(apart["labelSelector"]["matchExpressions"][1]["values"]) == services
+    for key in ("hostNetwork", "hostPID", "hostIPC", "priorityClassName"):
+        assert key not in pod  # the PriorityClass is gone by then
+    assert not pod["automountServiceAccountToken"]
+    for container in pod["initContainers"] + pod["containers"]:
+        assert not container["securityContext"]["allowPrivilegeEscalation"]
+        assert container["securityContext"]["capabilities"] == {"drop": ["ALL"]}
+
+
+@pytest.mark.parametrize("path", ["/data", "/var/lib", "/fractus", "/data/fractus/..", "/", "var/lib/fractus", ""])
+def test_a_directory_that_is_not_plainly_ours_is_not_wiped(path: str) -> None:
+    with pytest.raises(subprocess.CalledProcessError) as refused:
+        render(WIPE, f"--set=host.state={path}")
+    assert "host" in refused.value.stderr
+    assert "state" in refused.value.stderr
+
+
+@pytest.fixture
+def left(world: World) -> Iterator[list[str]]:
+    """What the operator and an agent leave, by path; and beside it what is others'."""
+    for body in hooks():
+        if body["kind"] != "Job":
+            world.api.apply(path_of(body), body)
+    authority = {"apiVersion": "v1", "kind": "Secret", "metadata": {"name": "fractus-ca", "namespace": SYSTEM}}
+    world.api.apply(f"{CORE}/secrets/fractus-ca", authority)
+    world.api.apply(f"{CORE}/secrets/other", authority | {"metadata": {"name": "other", "namespace": SYSTEM}})
+    public = authority | {"kind": "ConfigMap"}
+    world.api.apply(f"{CORE}/configmaps/fractus-ca", public)
+    lease = {"apiVersion": "coordination.k8s.io/v1", "kind": "Lease", "metadata": {"name": "fractus-operator", "namespace": SYSTEM}}  # fmt: skip
+    world.api.apply(f"{LEASES}/fractus-operator", lease)
+    labels = {"fractus.dev/depot": "base", "fractus.dev/geohash": "swbb5f", "fractus.dev/interface-wifi": "true"}
+    world.api.merge("/api/v1/nodes/drone-1", {"metadata": {"labels": labels | {"example.com/mine": "yes"}}})
+    for name, signer in (("ours", "fractus.dev/node"), ("theirs", "example.com/other")):
+        spec = {
+            "request": base64.b64encode(signing_request()).decode(),
+            "signerName": signer,
+            "usages": ["client auth"],
+        }
+        head = {"apiVersion": "certificates.k8s.io/v1", "kind": "CertificateSigningRequest", "metadata": {"name": name}}
+        if not world.api.get(f"{REQUESTS}/{name}"):
+            world.api.call("POST", REQUESTS, head | {"spec": spec})
+    made = [f"{CORE}/secrets/fractus-ca", f"{CORE}/configmaps/fractus-ca", f"{LEASES}/fractus-operator"]
+    yield [*made, f"{REQUESTS}/ours"]
+    for path in (f"{CORE}/secrets/other", f"{REQUESTS}/theirs", *made, *map(path_of, hooks())):
+        if world.api.get(path):
+            world.api.delete(path)
+
+
+def signing_request() -> bytes:
+    """A request in PEM."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "drone-1")])
+    signed = x509.CertificateSigningRequestBuilder().subject_name(name).sign(key, hashes.SHA256())
+    return signed.public_bytes(serialization.Encoding.PEM)
+
+
+def remove(world: World, tmp_path: Path) -> subprocess.CompletedProcess[str]:
+    """Run the Job's program with its own account."""
+    request = {"apiVersion": "authentication.k8s.io/v1", "kind": "TokenRequest", "spec": {"expirationSeconds": 600}}
+    made = world.api.call("POST", f"{CORE}/serviceaccounts/fractus-removal/token", request)
+    config = {
+        "apiVersion": "v1",
+        "kind": "Config",
+        "current-context": "removal",
+        "clusters": [
+            {"name": "test", "cluster": {"server": world.plane.server, "certificate-authority": str(world.plane.ca)}}
+        ],
+        "users": [{"name": "removal", "user": {"token": made["status"]["token"]}}],
+        "contexts": [{"name": "removal", "context": {"cluster": "test", "user": "removal"}}],
+    }
+    kubeconfig = tmp_path / "kubeconfig"
+    kubeconfig.write_text(yaml.safe_dump(config))
+    (job,) = (body for body in hooks() if body["kind"] == "Job")
+    (container,) = job["spec"]["template"]["spec"]["containers"]
+    command = [sys.executable, *container["command"][1:], *container["args"]]
+    return subprocess.run(
+        command, env={**os.environ, "KUBECONFIG": str(kubeconfig)}, capture_output=True, text=True, timeout=120, check=False
+    )  # fmt: skip
+
+
+def test_what_the_operator_made_is_removed_and_nothing_else(world: World, left: list[str], tmp_path: Path) -> None:
+    for again in (False, True):
+        done = remove(world, tmp_path)
+        assert done.returncode == 0, (again, done.stderr)
+        assert not [path for path in left if world.api.get(path)]
+    node = world.api.get("/api/v1/nodes/drone-1") or {}
+    ours = {label: value for label, value in node["metadata"]["labels"].items() if "fractus.dev" in label}
+    assert ours == {"fractus.dev/class": "drone"}
+    assert node["metadata"]["labels"]["example.com/mine"] == "yes"
+    assert world.api.get(f"{CORE}/secrets/other")
+    assert world.api.get(f"{REQUESTS}/theirs")
+
+
+def test_what_is_refused_is_told(world: World, left: list[str], tmp_path: Path) -> None:
+    role = next(path_of(body) for body in hooks() if body["kind"] == "Role")
+    world.api.delete(role)
+    done = remove(world, tmp_path)
+    assert done.returncode == 1
+    assert "not all that Fractus made in the cluster was removed" in done.stderr

@@ -51,7 +51,8 @@ chaos: packages uv ## Fly missions on an embedded cluster while its parts fail (
 compare-vehicle: env ## Play the script of a real ArduCopter's answers on the simulated vehicle (AUTOPILOT=tcp:HOST:PORT: on that one)
 	PYTHONPATH=tests/component $(RUN) python tests/component/vehicle_script.py --all $(if $(AUTOPILOT),--autopilot $(AUTOPILOT))
 
-QUICK := $(RUN) pytest -q -n 2 --dist loadfile
+# In order, by which the longest flights are not what is left for one of two processes at the end.
+QUICK := $(RUN) pytest -q -n 2 --dist loadfile --no-loadscope-reorder
 # `make test` flies all of the recorded flights: they alone show that no change of the code changed a flight.
 GOLDEN := tests/component/test_control_golden.py
 
@@ -65,7 +66,7 @@ SECOND_TRY := $(RUN) pytest --last-failed --last-failed-no-failures none
 .PHONY: test
 test: packages env lint ## Everything: lint, types, unit, component, integration and end-to-end tests
 	$(RUN) fractus cluster binaries
-	$(QUICK) tests/unit tests/component --ignore $(GOLDEN)
+	$(QUICK) tests/component tests/unit --ignore $(GOLDEN)
 	FRACTUS_DEEP=1 $(RUN) pytest -q -n 2 $(GOLDEN)
 	$(RUN) pytest -n 3 --dist loadgroup $(INTEGRATION) || $(SECOND_TRY) $(INTEGRATION)
 ifeq ($(FRACTUS_E2E_CLUSTER),current)
@@ -85,7 +86,7 @@ test-component: env ## Component tests: flights of whole services in virtual tim
 
 .PHONY: test-deep
 test-deep: env ## Unit and component tests with all examples of the property-based ones
-	FRACTUS_DEEP=1 $(QUICK) tests/unit tests/component
+	FRACTUS_DEEP=1 $(QUICK) tests/component tests/unit
 
 .PHONY: test-e2e
 test-e2e: packages env ## End-to-end tests only, on the embedded cluster or on FRACTUS_E2E_CLUSTER=current

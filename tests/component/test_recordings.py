@@ -235,11 +235,11 @@ def test_decisions_texts_and_zones_are_in_the_mcap(tmp_path: Path) -> None:
 def test_the_oldest_make_room_and_no_other_user_reads_them(tmp_path: Path) -> None:
     directory, limit_mb = tmp_path / "deep" / "r", 1.5
     writer, vehicle = writer_in(directory, limit_mb), Vehicle()
-    seen: set[int] = set()
+    seen, said = set[int](), vehicle.heartbeat(True) + vehicle.position(39.0, 22.0, 100.0)
     for second in range(3000):
         now = T0 + second * S
         for _ in range(5):
-            writer.received(now, vehicle.heartbeat(True) + vehicle.position(39.0, 22.0, 100.0) + os.urandom(30))
+            writer.received(now, said + os.urandom(30))
             writer.sent(now, os.urandom(200))
         if second % 5 == 0:
             writer._flush_due_s = 0.0

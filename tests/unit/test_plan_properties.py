@@ -205,7 +205,7 @@ def test_locations_that_followed_every_change_plan_the_same(seed):
     for depot in stock.depots.values():
         followed.upsert_depot(depot)
     for one in stock.hosts.values():
-        followed.upsert_host(one.name, one.node_class)
+        followed.upsert_host(one.name, one.is_cloud)
     assert plan(TRAFFIC, dataclasses.replace(stock, locations=followed)) == plan(TRAFFIC, stock)
 
 

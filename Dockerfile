@@ -17,6 +17,7 @@ RUN apt-get update -q \
       python3 python3-pip busybox binutils media-types netbase >/dev/null \
  && rm -rf /var/lib/apt/lists/*
 RUN python3 -m pip install --quiet --no-cache-dir --break-system-packages --root-user-action=ignore uv==${UV_VERSION}
+COPY sim/fractus_cluster/images/bytecode.py /usr/local/bin/
 
 # ---- root: Python, the libraries it links to, a shell; no package manager, no documentation
 FROM tools AS root
@@ -38,7 +39,7 @@ RUN mkdir -p /out/usr/bin /out/usr/sbin /out/usr/lib /out/usr/lib64 /out/etc /ou
  && printf 'hosts: files dns\npasswd: files\ngroup: files\nprotocols: files\nservices: files\n' > /out/etc/nsswitch.conf \
  && printf '#!/usr/bin/python3\nimport sys\nfrom fractus_cli.main import main\nsys.exit(main())\n' > /out/usr/local/bin/fractus \
  && chmod 755 /out/usr/local/bin/fractus && chown 10001:10001 /out/home/fractus && mkdir -m 700 /out/root \
- && python3 -m compileall -q --invalidation-mode unchecked-hash -s /out /out/usr/lib/python3.11
+ && python3 /usr/local/bin/bytecode.py /out/usr/lib/python3.11 /usr/lib/python3.11
 
 # ---- nft: the program that makes the table of direct links, and the libraries that nothing else needs
 FROM tools AS nft
@@ -59,7 +60,7 @@ ENV UV_LINK_MODE=copy UV_PYTHON=/usr/bin/python3 UV_PYTHON_DOWNLOADS=never
 # MCAP files are written with LZ4: zstandard stays out.
 RUN --mount=type=cache,target=/root/.cache/uv \
     set -e; \
-    for name in sdk core operator agent mobility services view; do \
+    for name in sdk core keys operator agent mobility services view; do \
       cd /build; extra="--extra $name"; if [ "$name" = sdk ]; then extra=; fi; \
       uv export --quiet --frozen --no-dev --no-emit-project $extra --output-file /build/$name.txt; \
       uv pip install --quiet --no-deps --require-hashes --target /deps/$name -r /build/$name.txt; \
@@ -74,16 +75,15 @@ RUN --mount=type=cache,target=/root/.cache/uv \
         frozenlist/*.so propcache/*.so lz4/*/*.so watchfiles/*.so 2>/dev/null || true; \
       find . \( -name '*.pyi' -o -name '*.pyx' -o -name '*.pxd' -o -name '*.c' -o -name '*.h' -o -name '*.a' \) -delete; \
     done; \
-    for pair in core:sdk operator:core agent:core mobility:core services:mobility view:core; do \
+    for pair in core:sdk keys:core operator:keys agent:keys mobility:keys services:mobility view:core; do \
       name=${pair%:*}; below=${pair#*:}; cp -a /deps/$name /only-$name; \
       (cd /deps/$below && find . ! -type d -print0) | (cd /only-$name && xargs -0 rm -f); \
       find /only-$name -type d -empty -delete; \
     done; \
     cp -a /deps/sdk /only-sdk; \
     mkdir /only-geometry; cd /only-core; mv numpy* shapely* geographiclib* /only-geometry/; \
-    for name in sdk core geometry operator agent mobility services view; do \
-      python3 -m compileall -q --invalidation-mode unchecked-hash -s /only-$name \
-        -p /usr/local/lib/python3.11/dist-packages /only-$name; \
+    for name in sdk core keys geometry operator agent mobility services view; do \
+      python3 /usr/local/bin/bytecode.py /only-$name /usr/local/lib/python3.11/dist-packages; \
     done
 
 # ---- code: the packages and what tells Python their name, version and commands
@@ -118,7 +118,11 @@ ENV PATH=/usr/local/bin:/usr/bin:/bin LANG=C.UTF-8 PYTHONUNBUFFERED=1 PYTHONDONT
 FROM python AS model
 COPY --from=dependencies /only-core /usr/local/lib/python3.11/dist-packages
 
-FROM model AS domain
+# Who signs or verifies; what agent and services of a node map of it is in memory once, as long as it is in one layer.
+FROM model AS keys
+COPY --from=dependencies /only-keys /usr/local/lib/python3.11/dist-packages
+
+FROM keys AS domain
 COPY --from=dependencies /only-geometry /usr/local/lib/python3.11/dist-packages
 
 # ---- component: what applications' components start from
@@ -146,13 +150,14 @@ USER 10001:10001
 ENTRYPOINT ["python3", "-m", "fractus_operator"]
 COPY --from=code /images/operator /usr/local/lib/python3.11/dist-packages
 
-FROM domain AS view
+FROM model AS view
+COPY --from=dependencies /only-geometry /usr/local/lib/python3.11/dist-packages
 COPY --from=dependencies /only-view /usr/local/lib/python3.11/dist-packages
 USER 10001:10001
 ENTRYPOINT ["fractus", "view"]
 COPY --from=code /images/view /usr/local/lib/python3.11/dist-packages
 
-FROM model AS agent
+FROM keys AS agent
 COPY --from=nft /out /
 COPY --from=dependencies /only-agent /usr/local/lib/python3.11/dist-packages
 ENTRYPOINT ["python3", "-m", "fractus_agent"]

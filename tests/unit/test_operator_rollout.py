@@ -212,3 +212,15 @@ async def test_deployments_that_hang_hold_up_no_grant(scene: Scene, monkeypatch:
     with pytest.raises(asyncio.CancelledError):
         await stuck
     assert scene.recorder.gave_up, "nothing is written any more when the next look begins"
+
+
+async def test_where_calls_lead_is_said_once_they_lead_anywhere(scene: Scene) -> None:
+    component = next(c for c in APPLICATION.spec.components if c.placement == "hybrid")
+    await scene.deploy()
+    assert "apply EndpointSlice" not in scene.recorder.said
+    empty = builders.endpoint_slice(APPLICATION, component, ())
+    scene.live.children[kinds.ENDPOINT_SLICE][kinds.key_of(empty)] = empty
+    await scene.deploy()
+    assert scene.recorder.said.count("apply EndpointSlice") == 1, (
+        "one that is there is told that it leads nowhere any more"
+    )

@@ -156,15 +156,15 @@ class Scene:
 class Operator:
     """The operator as a process."""
 
-    cluster: LoopbackCluster
+    kubeconfig: pathlib.Path
     log: pathlib.Path
+    settings: dict[str, str] = field(default_factory=dict)
     started: float = 0.0
     _process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
         """Start it."""
-        env = {**os.environ, "KUBECONFIG": str(self.cluster.kubeconfig)}
-        env["FRACTUS_IDENTITY"] = "bench"
+        env = {**os.environ, "KUBECONFIG": str(self.kubeconfig), "FRACTUS_IDENTITY": "bench", **self.settings}
         env["FRACTUS_HEALTH"] = f"http://127.0.0.1:{free_port()}/healthz"
         self.started = time.monotonic()
         with self.log.open("ab") as log:
@@ -184,6 +184,12 @@ class Operator:
         assert self._process is not None
         fields = pathlib.Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(")")[2].split()
         return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+    def proportional_mb(self) -> float:
+        """Its proportional set size."""
+        assert self._process is not None
+        text = pathlib.Path(f"/proc/{self._process.pid}/smaps_rollup").read_text()
+        return next(int(line.split()[1]) / 1024 for line in text.splitlines() if line.startswith("Pss:"))
 
     def memory_mb(self, what: str = "VmRSS") -> float:
         """Resident memory, or its peak (VmHWM)."""
@@ -248,7 +254,7 @@ class Bench:
             self._api.apply(f"/apis/apiextensions.k8s.io/v1/customresourcedefinitions/{body['metadata']['name']}", body)
         wait_until(self._kinds_served, "the kinds to be served", timeout_s=60)
         self.scene = Scene(self._api)
-        self.operator = Operator(cluster, directory / "operator.log")
+        self.operator = Operator(cluster.kubeconfig, directory / "operator.log")
         self._bound = Bound(self._api)
         self._count = 0
         self._templates: list[Body] = []

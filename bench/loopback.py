@@ -41,20 +41,23 @@ Body = dict[str, Any]
 class LoopbackCluster:
     """etcd, API server, controller manager, scheduler and kwok as processes of this user."""
 
-    def __init__(self, directory: Path, *, report: Report) -> None:
+    def __init__(self, directory: Path, *, report: Report, audited: str = "") -> None:
         """Make a handle; nothing happens yet.
 
         Args:
             directory: For keys, data and logs; the caller removes it.
             report: Told about programs that have to be built.
+            audited: A user whose requests the API server records in `audit_log`, one JSON object a line.
         """
         self._directory = directory
+        self._audited = audited
+        self.audit_log = directory / "audit.log"
         self._binaries: Binaries = ensure_binaries(PROGRAMS, report=report)
         self._processes: list[subprocess.Popen[bytes]] = []
         self._authority = Authority(directory / "pki")
         self._port = free_port()
         self.server = f"https://127.0.0.1:{self._port}"
-        self.kubeconfig = self._kubeconfig("admin", "admin", ("system:masters",))
+        self.kubeconfig = self.kubeconfig_of("admin")
 
     @property
     def ca(self) -> Path:
@@ -127,9 +130,10 @@ class LoopbackCluster:
                 program = Path(str(process.args[0])).name  # type: ignore[index]
                 raise ClusterError(f"{program} has ended; see {self._directory / program}.log")
 
-    def _kubeconfig(self, name: str, user: str, groups: tuple[str, ...]) -> Path:
-        credential = self._authority.issue(name, common_name=user, organizations=groups)
-        path = self._directory / f"{name}.kubeconfig"
+    def kubeconfig_of(self, user: str) -> Path:
+        """The kubeconfig of a user who may do everything."""
+        credential = self._authority.issue(user, common_name=user, organizations=("system:masters",))
+        path = self._directory / f"{user}.kubeconfig"
         write_private(path, self._authority.kubeconfig(credential, server=self.server, cluster="loopback"))
         return path
 
@@ -173,6 +177,20 @@ class LoopbackCluster:
             f"--service-account-key-file={accounts.certificate}",
             f"--service-account-signing-key-file={accounts.key}",
             "--endpoint-reconciler-type=none",
+            *self._audit(),
+        ]
+
+    def _audit(self) -> list[str]:
+        if not self._audited:
+            return []
+        policy = self._directory / "audit-policy.yaml"
+        rules = [{"level": "Metadata", "users": [self._audited], "omitStages": ["RequestReceived"]}, {"level": "None"}]
+        policy.write_text(yaml.safe_dump({"apiVersion": "audit.k8s.io/v1", "kind": "Policy", "rules": rules}))
+        # In one file: what is rotated away would not be counted.
+        return [
+            f"--audit-policy-file={policy}",
+            f"--audit-log-path={self.audit_log}",
+            "--audit-log-maxsize=10000",
         ]
 
 

@@ -17,7 +17,6 @@ RUN apt-get update -q \
       python3 python3-pip busybox binutils media-types netbase >/dev/null \
  && rm -rf /var/lib/apt/lists/*
 RUN python3 -m pip install --quiet --no-cache-dir --break-system-packages --root-user-action=ignore uv==${UV_VERSION}
-COPY sim/fractus_cluster/images/bytecode.py /usr/local/bin/
 
 # ---- root: Python, the libraries it links to, a shell; no package manager, no documentation
 FROM tools AS root
@@ -39,7 +38,7 @@ RUN mkdir -p /out/usr/bin /out/usr/sbin /out/usr/lib /out/usr/lib64 /out/etc /ou
  && printf 'hosts: files dns\npasswd: files\ngroup: files\nprotocols: files\nservices: files\n' > /out/etc/nsswitch.conf \
  && printf '#!/usr/bin/python3\nimport sys\nfrom fractus_cli.main import main\nsys.exit(main())\n' > /out/usr/local/bin/fractus \
  && chmod 755 /out/usr/local/bin/fractus && chown 10001:10001 /out/home/fractus && mkdir -m 700 /out/root \
- && python3 /usr/local/bin/bytecode.py /out/usr/lib/python3.11 /usr/lib/python3.11
+ && python3 -m compileall -q --invalidation-mode unchecked-hash -s /out /out/usr/lib/python3.11
 
 # ---- nft: the program that makes the table of direct links, and the libraries that nothing else needs
 FROM tools AS nft
@@ -83,7 +82,8 @@ RUN --mount=type=cache,target=/root/.cache/uv \
     cp -a /deps/sdk /only-sdk; \
     mkdir /only-geometry; cd /only-core; mv numpy* shapely* geographiclib* /only-geometry/; \
     for name in sdk core keys geometry operator agent mobility services view; do \
-      python3 /usr/local/bin/bytecode.py /only-$name /usr/local/lib/python3.11/dist-packages; \
+      python3 -m compileall -q --invalidation-mode unchecked-hash -s /only-$name \
+        -p /usr/local/lib/python3.11/dist-packages /only-$name; \
     done
 
 # ---- code: the packages and what tells Python their name, version and commands

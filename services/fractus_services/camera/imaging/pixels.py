@@ -22,6 +22,7 @@ _OWN_PAGES_BYTES = 1_000_000
 """Larger blocks get pages of their own, which glibc gives back to the system at once: a third less memory at peak."""
 MAX_PIXELS = 50_000_000
 MAX_BYTES = 64_000_000
+_STRIP_ROWS = 256
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
 """What is read; Pillow has readers for many others, which no camera needs and which strangers could feed."""
 
@@ -70,11 +71,20 @@ def decoded(data: bytes) -> Pixels:
             ImageOps.exif_transpose(source, in_place=True)
             deep = source.mode.startswith("I;16")
             shallow = image.fromarray((np.asarray(source) >> 8).astype(np.uint8)) if deep else source
-            return np.ascontiguousarray(np.asarray(shallow.convert("RGB"))[..., ::-1])
+            return _pixels(shallow if shallow.mode == "RGB" else shallow.convert("RGB"))
     except NotAPicture:
         raise
     except Exception as error:
         raise NotAPicture(f"the {len(data)} bytes cannot be decoded as {' or '.join(FORMATS)}: {error}") from None
+
+
+def _pixels(image: Any) -> Pixels:
+    """A picture of Pillow's as an array: in strips, or there would be three copies of a large one at a time."""
+    pixels = np.empty((image.height, image.width, 3), np.uint8)
+    for top in range(0, image.height, _STRIP_ROWS):
+        strip = image.crop((0, top, image.width, min(top + _STRIP_ROWS, image.height)))
+        pixels[top : top + _STRIP_ROWS] = np.asarray(strip)[..., ::-1]
+    return pixels
 
 
 def encoded(picture: Pixels) -> bytes:
@@ -85,7 +95,9 @@ def encoded(picture: Pixels) -> bytes:
     """
     out = io.BytesIO()
     try:
-        pillow().fromarray(np.ascontiguousarray(picture[..., ::-1])).save(out, "JPEG", quality=QUALITY)
+        size = (picture.shape[1], picture.shape[0])
+        image = pillow().frombuffer("RGB", size, np.ascontiguousarray(picture), "raw", "BGR", 0, 1)
+        image.save(out, "JPEG", quality=QUALITY)
     except (OSError, SystemError, ValueError):
         raise NotAPicture(f"a picture of {picture.shape[1]}x{picture.shape[0]} pixels cannot be encoded") from None
     return out.getvalue()

@@ -236,6 +236,11 @@ def _node(node: Body, of_class: str, body: Body | None) -> Iterator[Finding]:
         if tainted:
             message = f"{name} has the label {CLOUD_LABEL}, but its taint {CLASS} keeps the cloud's pods away"
             before.append(Finding("warning", "nodes", message, f"kubectl taint node {name} {CLASS}-"))
+        elif of_class == "drone":
+            message = f"{name} is of the cloud, too: any pod there can reach its autopilot"
+            before.append(
+                Finding("warning", "nodes", message, "only for a simulated drone; else give it a node of its own")
+            )
     elif not tainted:
         remedy = f"kubectl taint node {name} {CLASS}={of_class}:NoExecute"
         before.append(Finding("warning", "nodes", f"{name} has no taint {CLASS}: other pods may run there", remedy))

@@ -23,6 +23,8 @@ images() {
 }
 
 cluster() {
+  ! kind get clusters 2> /dev/null | grep -qx "$name" || { echo "there is a cluster $name already: kind delete cluster --name $name" >&2; return 1; }
+  made=1
   kind create cluster --name "$name" --config tests/kind/cluster.yaml --wait 300s ${KIND_NODE_IMAGE:+--image "$KIND_NODE_IMAGE"}
   kubectl wait --for=condition=Ready node --all --timeout=300s
   for class in drone edge; do
@@ -68,7 +70,8 @@ leave() {
     kubectl get nodes,pods --all-namespaces --output wide || true
     kubectl get events --all-namespaces --sort-by=.lastTimestamp | tail -n 30 || true
   fi
-  [ -n "${KEEP:-}" ] || { kind delete cluster --name "$name"; rm -rf "$state"; }
+  [ -n "${KEEP:-}" ] || [ -z "${made:-}" ] || kind delete cluster --name "$name"
+  [ -n "${KEEP:-}" ] || rm -rf "$state"
   exit "$code"
 } >&2
 trap leave EXIT

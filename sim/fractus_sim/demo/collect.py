@@ -117,7 +117,8 @@ def keep_pictures(recordings: Iterable[Path], record: Record, folder: Path) -> N
 
 def _pictures(recording: Path) -> Iterator[tuple[str, bytes]]:
     """Names, by when they were taken, and contents, up to where a recording that is still written breaks off."""
-    with recording.open("rb") as file, contextlib.suppress(McapError):
+    # Whatever it is damaged by, the report goes on without the rest.
+    with recording.open("rb") as file, contextlib.suppress(McapError, KeyError, RuntimeError, ValueError):
         for schema, _, message in NonSeekingReader(file).iter_messages(log_time_order=False):
             if schema is not None and schema.name == "foxglove.CompressedImage":
                 moment = datetime.fromtimestamp(message.log_time / 1e9, UTC)

@@ -73,7 +73,7 @@ ifeq ($(FRACTUS_E2E_CLUSTER),current)
 	$(RUN) pytest $(E2E) || $(SECOND_TRY) $(E2E)
 else
 	$(RUN) pytest -n 2 --dist loadgroup $(E2E) $(ON_KIND:%=--ignore %) || $(SECOND_TRY) $(E2E) $(ON_KIND:%=--ignore %)
-	STEPS="images cluster load charts tests uninstall" $(MAKE) test-kind
+	$(if $(WITHOUT_KIND),,STEPS="images cluster load charts tests uninstall" $(MAKE) test-kind)
 endif
 
 .PHONY: test-fast

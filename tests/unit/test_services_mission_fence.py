@@ -107,7 +107,7 @@ def test_a_round_area_has_few_vertices() -> None:
     assert outline(bounds.items).contains(shapely.Point(0, 0).buffer(5000))
 
 
-@settings(max_examples=examples(200, 6))
+@settings(max_examples=examples(200, 60))
 @example([(0.0, 0.0, 6.0), (0.0, 6.0, 6.0)], 8)
 @given(
     st.lists(st.tuples(st.floats(-300, 300), st.floats(-300, 300), st.floats(5, 200)), min_size=1, max_size=5),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import sys
@@ -13,22 +14,33 @@ def wipe(directory: Path) -> list[Path]:
     """Remove all that is in a directory, not the directory itself. What links lead to stays, and the links go.
 
     Returns:
-        The files that are left, which could not be removed; why is said on standard error.
+        What is left, for it could not be removed, or not even be read; why is said on standard error. Empty directories where
+        disks are mounted stay, and are not among it.
     """
-    for entry in os.scandir(directory):
+    left: set[Path] = set()
+
+    def refused(path: str, error: BaseException) -> None:
+        print(f"wipe: {path} is not removed: {error}", file=sys.stderr)
+        # Of a directory that is not empty, what is in it counts.
+        if not (isinstance(error, OSError) and error.errno in {errno.EBUSY, errno.ENOTEMPTY}):
+            left.add(Path(path))
+
+    try:
+        entries = list(os.scandir(directory))
+    except OSError as error:
+        refused(str(directory), error)
+        return sorted(left)
+    for entry in entries:
         if entry.is_dir(follow_symlinks=False):
-            shutil.rmtree(entry.path, onerror=lambda _, path, raised: _tell(path, raised[1]))
+            shutil.rmtree(entry.path, onerror=lambda _, path, raised: refused(path, raised[1]))
         else:
             try:
                 Path(entry.path).unlink()
             except OSError as error:
-                _tell(entry.path, error)
-    # An empty directory may be where a disk is mounted: it stays, and says nothing of anyone.
-    return sorted(Path(folder, name) for folder, _, names in os.walk(directory) for name in names)
-
-
-def _tell(path: str, error: BaseException) -> None:
-    print(f"wipe: {path} is not removed: {error}", file=sys.stderr)
+                refused(entry.path, error)
+    for folder, _, names in os.walk(directory, onerror=lambda error: left.add(Path(error.filename))):
+        left.update(Path(folder, name) for name in names)
+    return sorted(left)
 
 
 def main(arguments: Sequence[str] = sys.argv[1:]) -> int:
@@ -37,7 +49,7 @@ def main(arguments: Sequence[str] = sys.argv[1:]) -> int:
         print("usage: python -m fractus_agent.wipe DIRECTORY", file=sys.stderr)
         return 2
     left = wipe(Path(arguments[0]))
-    print(f"wipe: {arguments[0]}: {len(left)} files are left" if left else f"wipe: {arguments[0]} is empty")
+    print(f"wipe: {arguments[0]}: {len(left)} files or folders are left" if left else f"wipe: {arguments[0]} is empty")
     return 1 if left else 0
 
 

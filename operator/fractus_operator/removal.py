@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 from fractus_core.api.names import CLASS_LABEL, NODE_SIGNER
 from fractus_kube import LEASE
@@ -42,78 +44,113 @@ def unwiped(nodes: Sequence[Body], pods: Sequence[Body]) -> list[str]:
     return sorted(node["metadata"]["name"] for node in nodes if node["metadata"]["name"] not in wiped)
 
 
-async def remove(store: Store, namespace: str) -> None:
+@contextmanager
+def _noting(problems: list[str], what: str) -> Iterator[None]:
+    """Keep what is refused, so that the rest is removed all the same."""
+    try:
+        yield
+    except KubeError as error:
+        problems.append(f"{what}: {error}")
+
+
+async def remove(store: Store, namespace: str, *, keep_authority: bool = False) -> list[str]:
     """Remove what the operator and the agents made in the cluster; what is gone already is no error.
 
-    Raises:
-        KubeError: the API server refused, or could not be reached.
+    Args:
+        store: Kubernetes.
+        namespace: Where the system lived.
+        keep_authority: Leave its Secret, which was there before.
+
+    Returns:
+        What could not be removed, and why.
     """
-    for kind, name in ((SECRET, AUTHORITY), (CONFIG_MAP, AUTHORITY), (LEASE, LEASE_NAME)):
-        await _delete(store, kind, (namespace, name))
-    # Of an agent that ended while it waited for one.
-    for request in await store.list(SIGNING_REQUEST, selectors={"fieldSelector": f"spec.signerName={NODE_SIGNER}"}):
-        await _delete(store, SIGNING_REQUEST, ("", request["metadata"]["name"]))
-    for node in await store.list(NODE):
-        ours = [label for label in node["metadata"].get("labels") or {} if is_location_label(label)]
-        if ours:
-            name = node["metadata"]["name"]
-            await store.label(NODE, name, dict.fromkeys(ours))
-            print(f"removed the location labels of the node {name}")
+    problems: list[str] = []
 
+    async def delete(kind: Kind, key: tuple[str, str]) -> None:
+        what = f"{kind.name} {'/'.join(filter(None, key))}"
+        with _noting(problems, what):
+            await store.delete(kind, key)
+            print(f"removed {what}")
 
-async def _delete(store: Store, kind: Kind, key: tuple[str, str]) -> None:
-    await store.delete(kind, key)
-    print(f"removed {kind.name} {'/'.join(filter(None, key))}")
+    if not keep_authority:
+        await delete(SECRET, (namespace, AUTHORITY))
+    await delete(CONFIG_MAP, (namespace, AUTHORITY))
+    await delete(LEASE, (namespace, LEASE_NAME))
+    with _noting(problems, "requests for certificates"):
+        # Of an agent that ended while it waited for one.
+        for request in await store.list(SIGNING_REQUEST, selectors={"fieldSelector": f"spec.signerName={NODE_SIGNER}"}):
+            await delete(SIGNING_REQUEST, ("", request["metadata"]["name"]))
+    with _noting(problems, "location labels of nodes"):
+        for node in await store.list(NODE):
+            ours = [label for label in node["metadata"].get("labels") or {} if is_location_label(label)]
+            if ours:
+                what = f"location labels of the node {node['metadata']['name']}"
+                with _noting(problems, what):
+                    await store.label(NODE, node["metadata"]["name"], dict.fromkeys(ours))
+                    print(f"removed the {what}")
+    return problems
 
 
 async def await_wiped(store: Store, namespace: str, timeout_s: float = _WIPING_S) -> list[str]:
-    """Wait until the data of all nodes is gone, and remove the DaemonSet, whatever came of it.
+    """Wait until the data of all nodes is gone; an API server that does not answer is asked again until the end.
 
     Returns:
         The names of the nodes whose data is not known to be gone.
 
     Raises:
-        KubeError: the API server refused, or could not be reached.
+        KubeError: the API server did not answer at the end either.
     """
     end = time.monotonic() + timeout_s
-    try:
-        while True:
+    while True:
+        late = time.monotonic() > end
+        try:
             nodes = await store.list(NODE, selectors={"labelSelector": f"{CLASS_LABEL} in (drone, edge)"})
             ours = {"labelSelector": "app.kubernetes.io/component=wipe"}
             left = unwiped(nodes, (await store.list_whole(POD, namespace=namespace, selectors=ours)).items)
-            if not left or time.monotonic() > end:
+            if late or not left:
                 return left
-            await asyncio.sleep(_PERIOD_S)
-    finally:
-        await store.delete(DAEMON_SET, (namespace, WIPE))
+        except KubeError:
+            if late:
+                raise
+        await asyncio.sleep(_PERIOD_S)
 
 
-async def run(namespace: str, wiped: str) -> str:
-    """Remove all of it.
+async def run(namespace: str, wiped: str, *, keep_authority: bool = False, timeout_s: float = _WIPING_S) -> str:
+    """Remove all of it. The DaemonSet that wipes goes in any case: it would wipe what is installed next.
 
     Args:
         namespace: where the system lived.
         wiped: the directory of nodes that is wiped; empty: none is.
+        keep_authority: leave the Secret of the authority, which was there before.
+        timeout_s: how long nodes get.
 
     Returns:
         What was not removed and what to do, in a sentence; empty when nothing is left.
 
     Raises:
         Unconfigured: there are no credentials.
-        KubeError: the API server refused, or could not be reached.
     """
     store = await Store.connect()
+    problems: list[str] = []
     try:
-        problems = []
-        try:
-            await remove(store, namespace)
-        except KubeError as error:
-            problems.append(f"not all that Fractus made in the cluster was removed: {error}")
-        left = await await_wiped(store, namespace) if wiped else []
+        refused = await remove(store, namespace, keep_authority=keep_authority)
+        if refused:
+            problems.append(f"not all that Fractus made in the cluster was removed: {', '.join(refused)}")
+        if wiped:
+            try:
+                left = await await_wiped(store, namespace, timeout_s)
+            except KubeError as error:
+                problems.append(
+                    f"it is not known on which nodes {wiped} was wiped ({error}): see to it there (rm -rf {wiped})"
+                )
+            else:
+                if left:
+                    problems.append(f"{wiped} was not wiped on {', '.join(left)}: remove it there (rm -rf {wiped})")
     finally:
+        if wiped:
+            with _noting(problems, f"kubectl -n {namespace} delete daemonset {WIPE}, before anything is installed"):
+                await store.delete(DAEMON_SET, (namespace, WIPE))
         await store.aclose()
-    if left:
-        problems.append(f"{wiped} was not wiped on {', '.join(left)}: remove it there (rm -rf {wiped})")
     return "; ".join(problems)
 
 
@@ -122,10 +159,13 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="fractus_operator.removal")
     parser.add_argument("--namespace", required=True)
     parser.add_argument("--wiped", default="", metavar="DIRECTORY", help="wait until nodes have wiped it")
+    parser.add_argument("--keep-authority", action="store_true", help="leave the Secret of the authority")
     arguments = parser.parse_args()
+    # The Job's deadline, or a drained node.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit("ended before all was removed"))
     try:
-        left = asyncio.run(run(arguments.namespace, arguments.wiped))
-    except (Unconfigured, KubeError) as error:
+        left = asyncio.run(run(arguments.namespace, arguments.wiped, keep_authority=arguments.keep_authority))
+    except Unconfigured as error:
         left = f"what Fractus made was not removed: {error}"
     if left:
         print(left, file=sys.stderr)

@@ -20,7 +20,8 @@ from cryptography.x509.oid import NameOID
 from operator_world import SYSTEM, World
 
 Body = dict[str, Any]
-WIPE = "--set=uninstall.wipeNodes=true"
+WIPES = "--set=uninstall.wipeNodes=true"
+WIPE = (WIPES, "--is-upgrade")
 CORE, LEASES = f"/api/v1/namespaces/{SYSTEM}", f"/apis/coordination.k8s.io/v1/namespaces/{SYSTEM}/leases"
 REQUESTS = "/apis/certificates.k8s.io/v1/certificatesigningrequests"
 
@@ -37,7 +38,7 @@ def hooks(*arguments: str) -> list[Body]:
 
 
 def test_nodes_are_wiped_only_where_it_is_asked_for_and_only_by_an_uninstall() -> None:
-    plain, asked, made = render(), render(WIPE), hooks(WIPE)
+    plain, asked, made = render(), render(*WIPE), hooks(*WIPE)
     assert not [body for body in plain if "wipe" in str(body)]
     same = [body for body in plain if not is_hook(body)]
     assert [body for body in asked if not is_hook(body)] == same, "the switch changes nothing that runs"
@@ -47,7 +48,7 @@ def test_nodes_are_wiped_only_where_it_is_asked_for_and_only_by_an_uninstall() -
 
 
 def test_the_wiping_pod_reaches_the_nodes_data_and_no_more() -> None:
-    (body,) = (body for body in hooks(WIPE, "--set=host.state=/data/fractus") if body["kind"] == "DaemonSet")
+    (body,) = (body for body in hooks(*WIPE, "--set=host.state=/data/fractus") if body["kind"] == "DaemonSet")
     pod = body["spec"]["template"]["spec"]
     sets = {b["metadata"]["name"]: b["spec"]["template"] for b in render() if b["kind"] == "DaemonSet"}
     theirs = sets["fractus-agent"]["spec"]
@@ -65,12 +66,63 @@ def test_the_wiping_pod_reaches_the_nodes_data_and_no_more() -> None:
         assert container["securityContext"]["capabilities"] == {"drop": ["ALL"]}
 
 
-@pytest.mark.parametrize("path", ["/data", "/var/lib", "/fractus", "/data/fractus/..", "/", "var/lib/fractus", ""])
+@pytest.mark.parametrize(
+    "path",
+    [
+        *("/data", "/var/lib", "/fractus", "/data/fractus/..", "/", "var/lib/fractus", "", "/fractus/"),
+        *("/home/fractus", "/home/fractus/data", "/root/fractus", "/var/lib/fractusd-shared", "/data/my-fractus"),
+    ],
+)
 def test_a_directory_that_is_not_plainly_ours_is_not_wiped(path: str) -> None:
     with pytest.raises(subprocess.CalledProcessError) as refused:
-        render(WIPE, f"--set=host.state={path}")
+        render(*WIPE, f"--set=host.state={path}")
     assert "host" in refused.value.stderr
     assert "state" in refused.value.stderr
+
+
+@pytest.mark.parametrize("path", ["/var/lib/fractus", "/data/fractus/", "/opt/fractus/state"])
+def test_a_directory_of_ours_is(path: str) -> None:
+    assert render(*WIPE, f"--set=host.state={path}")
+
+
+def test_an_installation_cannot_be_told_to_wipe() -> None:
+    """`helm install --atomic` that fails uninstalls, on nodes that may have been there before."""
+    with pytest.raises(subprocess.CalledProcessError) as refused:
+        render(WIPES)
+    assert "set it by an upgrade just before uninstalling" in refused.value.stderr
+
+
+def on(world: World, *arguments: str) -> tuple[str, ...]:
+    """To render with what the API server has."""
+    return (*arguments, "--dry-run=server", f"--kubeconfig={world.plane.kubeconfig}")
+
+
+@pytest.mark.parametrize("how", [(), ("--is-upgrade",)])
+def test_a_wiping_that_was_left_is_not_installed_beside(world: World, how: tuple[str, ...]) -> None:
+    """It keeps agents off its nodes, or wipes a node that is in use."""
+    assert render(*on(world, *how))
+    (body,) = (body for body in hooks(*WIPE) if body["kind"] == "DaemonSet")
+    world.api.apply(path_of(body), body)
+    try:
+        with pytest.raises(subprocess.CalledProcessError) as refused:
+            render(*on(world, *how))
+    finally:
+        world.api.delete(path_of(body))
+    assert f"kubectl -n {SYSTEM} delete daemonset fractus-wipe" in refused.value.stderr
+
+
+def test_an_authority_that_was_there_before_stays(world: World, left: list[str], tmp_path: Path) -> None:
+    """One that was restored from a backup: an installation that fails, and is undone, has not made it."""
+    upgraded = hooks(*on(world, "--is-upgrade"))
+    made = hooks(*on(world))
+    assert "keep" not in str(upgraded)
+    for body in made:
+        if body["kind"] == "Role":
+            assert not [rule for rule in body["rules"] if "secrets" in rule["resources"]]
+            world.api.apply(path_of(body), body)
+    done = remove(world, tmp_path, made)
+    assert done.returncode == 0, done.stderr
+    assert [path for path in left if world.api.get(path)] == [f"{CORE}/secrets/fractus-ca"]
 
 
 @pytest.fixture
@@ -112,10 +164,10 @@ def signing_request() -> bytes:
     return signed.public_bytes(serialization.Encoding.PEM)
 
 
-def remove(world: World, tmp_path: Path) -> subprocess.CompletedProcess[str]:
+def remove(world: World, tmp_path: Path, made: list[Body] | None = None) -> subprocess.CompletedProcess[str]:
     """Run the Job's program with its own account."""
     request = {"apiVersion": "authentication.k8s.io/v1", "kind": "TokenRequest", "spec": {"expirationSeconds": 600}}
-    made = world.api.call("POST", f"{CORE}/serviceaccounts/fractus-removal/token", request)
+    token = world.api.call("POST", f"{CORE}/serviceaccounts/fractus-removal/token", request)["status"]["token"]
     config = {
         "apiVersion": "v1",
         "kind": "Config",
@@ -123,12 +175,12 @@ def remove(world: World, tmp_path: Path) -> subprocess.CompletedProcess[str]:
         "clusters": [
             {"name": "test", "cluster": {"server": world.plane.server, "certificate-authority": str(world.plane.ca)}}
         ],
-        "users": [{"name": "removal", "user": {"token": made["status"]["token"]}}],
+        "users": [{"name": "removal", "user": {"token": token}}],
         "contexts": [{"name": "removal", "context": {"cluster": "test", "user": "removal"}}],
     }
     kubeconfig = tmp_path / "kubeconfig"
     kubeconfig.write_text(yaml.safe_dump(config))
-    (job,) = (body for body in hooks() if body["kind"] == "Job")
+    (job,) = (body for body in made or hooks() if body["kind"] == "Job")
     (container,) = job["spec"]["template"]["spec"]["containers"]
     command = [sys.executable, *container["command"][1:], *container["args"]]
     return subprocess.run(
@@ -155,3 +207,5 @@ def test_what_is_refused_is_told(world: World, left: list[str], tmp_path: Path) 
     done = remove(world, tmp_path)
     assert done.returncode == 1
     assert "not all that Fractus made in the cluster was removed" in done.stderr
+    assert f"Secret {SYSTEM}/fractus-ca" in done.stderr
+    assert [path for path in left if world.api.get(path)] == [path for path in left if SYSTEM in path]

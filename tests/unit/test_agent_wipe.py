@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -44,7 +46,56 @@ def test_what_cannot_be_removed_is_told(
     said = capsys.readouterr()
     assert "tls.key is not removed" in said.err
     assert ".hidden is not removed" in said.err
-    assert "files are left" in said.out
+    assert "are left" in said.out
+
+
+@pytest.fixture
+def unprivileged(state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """As the pod runs: no right to read what is others'."""
+    monkeypatch.chdir(tmp_path)  # no other user reaches it from the root
+    (state / "tls").chmod(0o700)
+    if os.geteuid() != 0:
+        yield
+        return
+    for path in (tmp_path, *tmp_path.rglob("*")):
+        os.lchown(path, 65534, 65534)
+    os.seteuid(65534)
+    try:
+        yield
+    finally:
+        os.seteuid(0)
+
+
+@pytest.mark.parametrize("folder", ["tls", "camera/albums", "."])
+def test_a_folder_that_cannot_be_read_is_not_empty(
+    state: Path, folder: str, unprivileged: None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A folder of another user, mode 0700."""
+    (state.relative_to(Path.cwd()) / folder).chmod(0)
+    try:
+        assert main(["fractus"]) == 1
+        said = capsys.readouterr()
+        assert f"fractus/{folder}".removesuffix("/.") + " is not removed" in said.err
+        assert "is empty" not in said.out
+    finally:
+        (Path("fractus") / folder).chmod(0o700)
+
+
+@pytest.mark.parametrize(("number", "code"), [(errno.EBUSY, 0), (errno.EPERM, 1)])
+def test_a_folder_that_stays_counts_unless_a_disk_is_mounted_there(
+    state: Path, monkeypatch: pytest.MonkeyPatch, number: int, code: int
+) -> None:
+    """A disk's data goes, and the empty folder where it is mounted cannot."""
+    rmdir = os.rmdir
+
+    def refused(path: str, *, dir_fd: int | None = None) -> None:
+        if Path(path).name == "albums":
+            raise OSError(number, os.strerror(number), path)
+        rmdir(path, dir_fd=dir_fd)
+
+    monkeypatch.setattr(module.os, "rmdir", refused)
+    assert main([str(state)]) == code
+    assert [path for path in state.rglob("*") if not path.is_dir()] == []
 
 
 def test_it_takes_a_directory(tmp_path: Path) -> None:

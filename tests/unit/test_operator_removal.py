@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import asyncio
+import os
+import signal
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
 from fractus_kube import KubeError
 from fractus_operator import removal
-from fractus_operator.cluster.kinds import NODE, POD
+from fractus_operator.cluster.kinds import POD, SIGNING_REQUEST
 from fractus_operator.cluster.store import Store
-from fractus_operator.removal import await_wiped, run, unwiped
+from fractus_operator.removal import await_wiped, main, remove, run, unwiped
 
 NODES = [{"metadata": {"name": name}} for name in ("drone-2", "drone-1", "edge-1")]
 
@@ -29,21 +33,30 @@ def test_a_node_is_wiped_once_its_pod_is_ready() -> None:
 
 
 class Cluster:
-    """Answers as the API server would; each look at the pods finds one more that is ready."""
+    """Answers as the API server would; each look at the pods finds one more that is ready.
 
-    def __init__(self) -> None:
+    Attributes:
+        fails: The looks that it answers with an error.
+        refuses: The names of objects that it does not delete.
+    """
+
+    def __init__(self, fails: range = range(0), refuses: tuple[str, ...] = ()) -> None:
         self.ready = [pod("edge-1", "True"), pod("drone-1", "True")]
         self.looks = 0
         self.deleted: list[str] = []
+        self.labelled: list[str] = []
+        self.fails, self.refuses = fails, refuses
 
-    async def list(self, kind: object, **_: object) -> list[Any]:
-        if kind is not NODE:
-            raise KubeError(403, "Forbidden", "no")
-        return NODES
+    async def list(self, kind: Any, **_: object) -> list[Any]:
+        if kind is SIGNING_REQUEST:
+            return [{"metadata": {"name": "one"}}, {"metadata": {"name": "two"}}]
+        return [{"metadata": {**node["metadata"], "labels": {"fractus.dev/depot": "base"}}} for node in NODES]
 
     async def list_whole(self, kind: object, **_: object) -> Any:
         assert kind is POD
         self.looks += 1
+        if self.looks in self.fails:
+            raise KubeError(503, "ServiceUnavailable", "the server is busy")
 
         class Page:
             items = self.ready[: self.looks]
@@ -51,32 +64,109 @@ class Cluster:
         return Page
 
     async def delete(self, kind: Any, key: tuple[str, str]) -> None:
+        if key[1] in self.refuses:
+            raise KubeError(403, "Forbidden", f"{key[1]} may not be deleted")
         self.deleted.append(f"{kind.name} {key[1]}")
+
+    async def label(self, kind: Any, name: str, labels: object) -> None:
+        if name in self.refuses:
+            raise KubeError(403, "Forbidden", f"{name} may not be changed")
+        self.labelled.append(name)
 
     async def aclose(self) -> None:
         pass
 
 
-async def test_nodes_out_of_reach_are_named_and_the_daemon_set_goes(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(autouse=True)
+def fast(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(removal, "_PERIOD_S", 0.0)
+
+
+def connect(monkeypatch: pytest.MonkeyPatch, cluster: Cluster) -> Any:
+    """Let the removal find this cluster."""
+
+    async def found() -> Cluster:
+        return cluster
+
+    monkeypatch.setattr(Store, "connect", found)
+    return cluster
+
+
+async def test_nodes_out_of_reach_are_named() -> None:
     cluster: Any = Cluster()
     assert await await_wiped(cluster, "fractus-system", timeout_s=0.05) == ["drone-2"]
     assert cluster.looks >= 2
-    assert cluster.deleted == ["DaemonSet fractus-wipe"]
 
 
-async def test_a_removal_that_is_refused_does_not_hide_which_nodes_are_left(monkeypatch: pytest.MonkeyPatch) -> None:
-    cluster = Cluster()
+@pytest.mark.parametrize("cluster", [Cluster(), Cluster(fails=range(1, 2)), Cluster(fails=range(2, 3))])
+async def test_one_error_does_not_end_the_wait(cluster: Any) -> None:
+    cluster.ready.append(pod("drone-2", "True"))
+    assert await await_wiped(cluster, "fractus-system", timeout_s=30.0) == []
 
-    async def connect() -> Cluster:
-        return cluster
 
-    async def waited(*_: object) -> list[str]:
-        return ["drone-2"]
+async def test_without_an_answer_it_is_not_known_which_nodes_are_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    cluster = connect(monkeypatch, Cluster(fails=range(1, 1_000_000)))
+    said = await run("fractus-system", "/data/fractus", timeout_s=0.05)
+    assert "it is not known on which nodes /data/fractus was wiped (the server is busy)" in said
+    assert "rm -rf /data/fractus" in said
+    assert "DaemonSet fractus-wipe" in cluster.deleted
 
-    monkeypatch.setattr(Store, "connect", connect)
-    monkeypatch.setattr(removal, "await_wiped", waited)
-    said = await run("fractus-system", "/data/fractus")
+
+async def test_what_is_refused_does_not_keep_the_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    cluster = connect(monkeypatch, Cluster(refuses=("fractus-ca", "one", "drone-2")))
+    said = await run("fractus-system", "/data/fractus", timeout_s=0.05)
     assert "not all that Fractus made in the cluster was removed" in said
+    for what in (
+        "Secret fractus-system/fractus-ca",
+        "ConfigMap fractus-system/fractus-ca",
+        "one may not",
+        "drone-2 may not",
+    ):
+        assert what in said
     assert "/data/fractus was not wiped on drone-2: remove it there (rm -rf /data/fractus)" in said
+    assert cluster.deleted == ["Lease fractus-operator", "CertificateSigningRequest two", "DaemonSet fractus-wipe"]
+    assert cluster.labelled == ["drone-1", "edge-1"]
     assert "wiped" not in await run("fractus-system", "")
+
+
+async def test_a_wiping_that_stays_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    connect(monkeypatch, Cluster(refuses=("fractus-wipe",)))
+    assert "kubectl -n fractus-system delete daemonset fractus-wipe" in await run(
+        "fractus-system", "/data/fractus", timeout_s=0.05
+    )
+
+
+async def test_an_authority_of_before_stays() -> None:
+    cluster: Any = Cluster()
+    assert await remove(cluster, "fractus-system", keep_authority=True) == []
+    assert "Secret fractus-ca" not in cluster.deleted
+    assert "ConfigMap fractus-ca" in cluster.deleted
+
+
+@pytest.fixture
+def terminable() -> Iterator[None]:
+    """This process outlives a SIGTERM, and has its handler back in the end."""
+    before = signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    yield
+    signal.signal(signal.SIGTERM, before)
+
+
+@pytest.mark.parametrize("at", ["delete", "list_whole"])
+def test_an_end_from_outside_ends_the_wiping(terminable: None, monkeypatch: pytest.MonkeyPatch, at: str) -> None:
+    """The Job's deadline, or a drained node: with the DaemonSet left, the next installation would be wiped."""
+    cluster = connect(monkeypatch, Cluster())
+    cluster.ready.append(pod("drone-2", "True"))  # so that it ends by itself, too
+    answer = getattr(cluster, at)
+
+    async def interrupted(*args: Any, **selectors: Any) -> Any:
+        monkeypatch.setattr(cluster, at, answer)
+        os.kill(os.getpid(), signal.SIGTERM)
+        await asyncio.sleep(0.01)
+        return await answer(*args, **selectors)
+
+    monkeypatch.setattr(cluster, at, interrupted)
+    monkeypatch.setattr("sys.argv", ["removal", "--namespace=fractus-system", "--wiped=/data/fractus"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code not in {0, None}
+    assert cluster.deleted[-1] == "DaemonSet fractus-wipe"

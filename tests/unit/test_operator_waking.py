@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
 from typing import Any, cast
 
+import pytest
 from fractus_core.api.plans import DeploymentPlanSpec
+from fractus_core.identity.authority import Authority
+from fractus_operator.cluster import kinds
+from fractus_operator.cluster.reading import read_submitted
 from fractus_operator.cluster.store import Store
 from fractus_operator.inventory.grouped import Grouped
 from fractus_operator.inventory.live import LiveInventory
+from fractus_operator.reconcile.applications import Applications, _Memory
+from test_planning import at, component, edge, inventory, manifest
 
 V1 = "fractus.dev/v1alpha1"
+NOW = datetime(2026, 6, 1, 12, 0, tzinfo=UTC)
 
 
 def drone_body(version: int, state: str) -> dict[str, Any]:
@@ -31,22 +39,106 @@ async def test_what_another_application_leaves_wakes_only_those_without_a_plan_t
         assert await placed.changed(1)
 
 
-async def test_an_application_hears_of_its_own_drone_and_of_the_flight_that_it_shares() -> None:
+APPLICATION = {"apiVersion": V1, "kind": "Application", "spec": {}}
+HOST, SHARING = ("ns", "host"), ("ns", "sharing")
+
+
+def plan_body(node: str, version: int) -> dict[str, Any]:
+    owner = {"apiVersion": V1, "kind": "Application", "name": "host", "uid": "host"}
+    labels = {"app.kubernetes.io/managed-by": "fractus", "fractus.dev/application": "host"}
+    return {
+        "apiVersion": V1,
+        "kind": "DeploymentPlan",
+        "metadata": {
+            "namespace": "ns",
+            "name": "host",
+            "uid": "plan",
+            "resourceVersion": str(version),
+            "labels": labels,
+            "ownerReferences": [owner],
+        },
+        "spec": {"application": "host", "applicationGeneration": 1, "drone": {"node": node, "score": 1.0}},
+    }
+
+
+def decide(live: LiveInventory, key: tuple[str, str], **drone: Any) -> None:
+    plan = {"application": key[1], "applicationGeneration": 1, "drone": {"score": 1.0, **drone}}
+    live.plans.decide(key, key[1], DeploymentPlanSpec.model_validate(plan))
+
+
+@pytest.fixture
+def shared() -> LiveInventory:
+    """Two applications on one drone."""
     live = LiveInventory(cast(Store, None))
     live.drones.note(("", "d"), drone_body(1, "flying"))
-    plan = {"application": "guest", "drone": {"node": "d", "score": 1.0, "sharedWith": "ns/host"}}
-    submitted_body = {"apiVersion": V1, "kind": "Application", "spec": {}}
-    for name in ("guest", "host"):
-        metadata = {"namespace": "ns", "name": name, "uid": name, "resourceVersion": "1", "generation": 1}
-        live.applications.note(("ns", name), submitted_body | {"metadata": metadata})
-    live.plans.decide(("ns", "guest"), "guest", DeploymentPlanSpec.model_validate(plan | {"applicationGeneration": 1}))
-    with live.subscriptions.subscribe(("ns", "guest")) as guest:
-        live.subscriptions.placed(("ns", "guest"), placed=True)
-        live.drones.note(("", "d"), drone_body(2, "inactive"))
-        assert await guest.changed(1)
-        over = submitted_body | {"metadata": {"namespace": "ns", "name": "host", "uid": "host", "resourceVersion": "2"}}
-        live.applications.note(("ns", "host"), over | {"status": {"phase": "Completed", "observedGeneration": 1}})
-        assert await guest.changed(1)
+    for namespace, name in (HOST, SHARING):
+        metadata = {"namespace": namespace, "name": name, "uid": name, "resourceVersion": "1", "generation": 1}
+        live.applications.note((namespace, name), APPLICATION | {"metadata": metadata})
+    decide(live, HOST, node="d")
+    decide(live, SHARING, node="d", sharedWith="ns/host")
+    live.subscriptions.placed(SHARING, placed=True)
+    return live
+
+
+async def test_an_application_hears_of_its_own_drone_and_of_the_flight_that_it_shares(shared: LiveInventory) -> None:
+    with shared.subscriptions.subscribe(SHARING) as sharing:
+        shared.drones.note(("", "d"), drone_body(2, "inactive"))
+        assert await sharing.changed(1)
+        over = APPLICATION | {"metadata": {"namespace": "ns", "name": "host", "uid": "host", "resourceVersion": "2"}}
+        shared.applications.note(HOST, over | {"status": {"phase": "Completed", "observedGeneration": 1}})
+        assert await sharing.changed(1)
+
+
+async def test_who_shares_a_flight_hears_at_once_when_its_plan_changes_or_goes(shared: LiveInventory) -> None:
+    stored = shared.children[kinds.DEPLOYMENT_PLAN]
+    with shared.subscriptions.subscribe(SHARING) as sharing:
+        decide(shared, HOST, node="other")
+        assert await sharing.changed(0), "decided"
+        shared.forget(HOST)
+        assert await sharing.changed(0), "forgotten"
+        stored.note(HOST, plan_body("d", 1))
+        assert await sharing.changed(0), "stored"
+        stored.note(HOST, plan_body("other", 2))
+        assert await sharing.changed(0), "stored for another drone"
+        stored._drop(HOST)
+        assert await sharing.changed(0), "removed"
+        decide(shared, ("ns", "stranger"), node="e")
+        shared.forget(("ns", "stranger"))
+        assert not await sharing.changed(0)
+
+
+async def test_a_stored_plan_that_goes_wakes_those_who_wait_for_what_it_had(shared: LiveInventory) -> None:
+    stored = shared.children[kinds.DEPLOYMENT_PLAN]
+    shared.drones.note(("", "d"), drone_body(2, "inactive"))
+    stored.note(HOST, plan_body("d", 1))
+    with shared.subscriptions.subscribe(("ns", "waiting")) as waiting:
+        # What was decided is dropped before the watch shows that the object is gone, which still claims the drone until then.
+        shared.forget(HOST)
+        assert await waiting.changed(0)
+        assert "d" in shared.claims()
+        stored._drop(HOST)
+        assert await waiting.changed(0)
+        assert "d" not in shared.claims()
+
+
+@pytest.mark.parametrize(("instances", "listens"), [(1, False), (2, True), ("*", True)])
+async def test_an_application_that_could_have_more_instances_hears_of_what_others_leave(
+    instances: int | str, listens: bool
+) -> None:
+    live = LiveInventory(cast(Store, None))
+    applications = Applications(cast(Store, None), live, Authority.generate(NOW), lambda: NOW)
+    viewer = component("Viewer", "edge", locations=[{"center": at(0, 0), "radius": 100, "instances": instances}])
+    body = {**manifest("Application", "grows", {"components": [viewer]}), "status": {}}
+    submitted = read_submitted(body)
+    live.applications.note(submitted.key, body)
+    assert submitted.application is not None
+    stock = inventory([], [edge("e1", (0, 0))])
+    with live.subscriptions.subscribe(submitted.key) as grows:
+        for _new_plan_then_kept in range(2):
+            seen = live.observe(submitted)
+            applications._plan(submitted.application, seen, stock, _Memory())
+            live.subscriptions.wake_waiting()
+            assert await grows.changed(0) is listens
 
 
 def test_objects_are_found_by_their_group_alone() -> None:

@@ -2,10 +2,26 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterator
+
 from fractus_core.api.applications import Application
+from fractus_core.api.components import Component, EdgeLocation
 from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.planning.draft import Draft
 from fractus_core.planning.inventory import Inventory, Settings
+
+
+def with_too_few(application: Application, present: DeploymentPlanSpec) -> Iterator[tuple[Component, EdgeLocation]]:
+    """The locations that could have more instances than a plan has there, if there were nodes: each with its component.
+
+    Those are one that takes every suitable node (`instances: "*"`), and one that found fewer than it asks for.
+    """
+    counts = Counter((placed.component, placed.location) for placed in present.placements)
+    for component in application.spec.on("edge"):
+        for i, spot in enumerate(component.locations):
+            if spot.instances == "*" or counts[component.name, i] < spot.instances:
+                yield component, spot
 
 
 def room_to_grow(
@@ -13,22 +29,14 @@ def room_to_grow(
 ) -> str | None:
     """The first node that a location with too few instances could have beside what the plan has; None: there is none.
 
-    Too few has a location that takes every suitable node (`instances: "*"`), or one that found fewer than it asks for.
     Costs a look at the nodes in such locations only.
     """
     draft = Draft(application, inventory, settings, present)
-    counts: dict[tuple[str, int | None], int] = {}
-    for placed in present.placements:
-        key = (placed.component, placed.location)
-        counts[key] = counts.get(key, 0) + 1
-    for component in application.spec.on("edge"):
-        for i, spot in enumerate(component.locations):
-            if spot.instances != "*" and counts.get((component.name, i), 0) >= spot.instances:
+    for component, spot in with_too_few(application, present):
+        for name, _ in draft.located.edge_nodes.within(spot.center, spot.radius):
+            node = inventory.edge_nodes.get(name)
+            if node is None or draft.had(component, name):
                 continue
-            for name, _ in draft.located.edge_nodes.within(spot.center, spot.radius):
-                node = inventory.edge_nodes.get(name)
-                if node is None or draft.had(component, name):
-                    continue
-                if draft.check_edge(node, component):
-                    return name
+            if draft.check_edge(node, component):
+                return name
     return None

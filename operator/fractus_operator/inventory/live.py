@@ -62,7 +62,7 @@ class LiveInventory:
             for kind in kinds.CHILDREN
         }
         self.subscriptions = Subscriptions()
-        self.plans = Plans(self.applications)
+        self.plans = Plans(self.applications, self.subscriptions.wake)
         self.fleet = Fleet(self.drones, self.applications)
         self.torn_down: dict[Key, str] = {}
         """The uids of applications whose teardown has begun, until they are gone: nothing more is made for them."""
@@ -249,8 +249,7 @@ class LiveInventory:
             self.torn_down.pop(key, None)
         if old is None or new is None or old.settled_generation != new.settled_generation:
             self.subscriptions.wake_waiting()
-            for sharing in self.plans.sharing(key):
-                self.subscriptions.wake(sharing)
+            self.plans.wake_sharing(key)
         self.subscriptions.wake(key)
 
     def _child_changed(self, key: Key, old: Body | None, new: Body | None) -> None:
@@ -259,6 +258,8 @@ class LiveInventory:
             self._grant_changed(key, new)
         elif body.get("kind") == DeploymentPlan.KIND:
             self.plans.stored(key, new)
+            if new is None:
+                self.subscriptions.wake_waiting()
         elif body.get("kind") == DirectLink.KIND:
             self._report(kinds.DIRECT_LINK, key)
         self.subscriptions.wake(application_of(body))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.planning.candidates import requests
@@ -18,10 +18,12 @@ class Plans:
 
     Args:
         applications: All Applications.
+        wake: Wakes an application: it shares the flight of one whose plan changed or went.
     """
 
-    def __init__(self, applications: Copies[Submitted]) -> None:
+    def __init__(self, applications: Copies[Submitted], wake: Callable[[Key], None]) -> None:
         self._applications = applications
+        self._wake = wake
         self._decided: dict[Key, OwnedPlan] = {}
         self._stored: dict[Key, OwnedPlan] = {}
         self._requests: dict[Key, tuple[OwnedPlan, Submitted, tuple[PlannedRequest, ...]]] = {}
@@ -49,20 +51,24 @@ class Plans:
         host = self._applications.get(key)
         return host, self.get(key, host.uid) if host is not None else None
 
-    def sharing(self, host: Key) -> Iterator[Key]:
-        """The applications that share the flight of another one, by their plans."""
+    def wake_sharing(self, host: Key) -> None:
+        """Wake the applications that share the flight of another one, by their plans: they may have lost it."""
         name = "/".join(host)
         for key, plan in (self._stored | self._decided).items():
             if plan.spec.drone is not None and plan.spec.drone.shared_with == name:
-                yield key
+                self._wake(key)
 
     def decide(self, key: Key, uid: str, plan: DeploymentPlanSpec) -> None:
         """Note a plan as soon as it is made, so that the next one already sees its claims and bookings."""
         self._decided[key] = OwnedPlan(uid, plan)
+        self.wake_sharing(key)
 
     def forget(self, key: Key) -> bool:
         """Drop what was decided for an application; True if there was anything."""
-        return self._decided.pop(key, None) is not None
+        known = self._decided.pop(key, None) is not None
+        if known:
+            self.wake_sharing(key)
+        return known
 
     def stored(self, key: Key, body: Body | None) -> None:
         """Follow a DeploymentPlan object that appeared, changed or went (None)."""
@@ -71,6 +77,7 @@ class Plans:
             self._stored.pop(key, None)
         else:
             self._stored[key] = plan
+        self.wake_sharing(key)
 
     def requests(self) -> Iterator[PlannedRequest]:
         """Each planned instance on a node, with what it asks for; computed again only where a plan changed."""

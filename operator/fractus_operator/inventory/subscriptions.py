@@ -64,7 +64,7 @@ class Subscriptions:
                 self._placed.discard(label)
 
     def placed(self, key: Key, *, placed: bool) -> None:
-        """Note whether an application has a plan that fits: what others leave or take is nothing to it then."""
+        """Note whether an application has all that it could have: what others leave or take is nothing to it then."""
         (self._placed.add if placed else self._placed.discard)(labelled(key))
 
     def wake(self, key: Key) -> None:
@@ -73,7 +73,7 @@ class Subscriptions:
             subscription.wake()
 
     def wake_waiting(self) -> None:
-        """Wake every application without a plan that fits: another one left something that it may wait for."""
+        """Wake every application that could have more than it has: another one left something that it may wait for."""
         for label in self._of.keys() - self._placed:
             for subscription in self._of[label]:
                 subscription.wake()

@@ -35,6 +35,7 @@ from fractus_operator.reconcile.missions import mission_outcome
 from fractus_operator.reconcile.replanning import (
     choose_plan,
     flown_generation,
+    has_all,
     mission_changed,
     present_plan,
     stuck_nodes,
@@ -298,7 +299,7 @@ class Applications:
                 seen.key, application, present, rules=seen.rules, inventory=inventory, settings=settings
             )
         choice = choose_plan(application, present, inventory, settings, stuck=stuck, in_flight=seen.in_flight)
-        self._live.subscriptions.placed(seen.key, placed=choice.fits or choice.reason is not None)
+        self._live.subscriptions.placed(seen.key, placed=has_all(application, choice))
         drone = choice.plan.drone
         if choice.plan is not seen.plan:
             self._live.plans.decide(seen.key, seen.uid, choice.plan)

@@ -214,7 +214,8 @@ async def test_deployments_that_hang_hold_up_no_grant(scene: Scene, monkeypatch:
     assert scene.recorder.gave_up, "nothing is written any more when the next look begins"
 
 
-async def test_where_calls_lead_is_said_once_they_lead_anywhere(scene: Scene) -> None:
+async def test_where_calls_lead_is_said_once_they_lead_anywhere(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rollout, "_HEAD_START_S", 0.05)
     component = next(c for c in APPLICATION.spec.components if c.placement == "hybrid")
     await scene.deploy()
     assert "apply EndpointSlice" not in scene.recorder.said

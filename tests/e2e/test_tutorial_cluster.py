@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from fractus_cluster.cluster import Cluster
+from fractus_cluster.state import state_root
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "tutorial.md").read_text()
@@ -89,8 +89,7 @@ def test_the_tutorial_flies_on_a_cluster(checkout: Path) -> None:
     written = files(page)
     assert {"Dockerfile", "application.yaml", "low.yaml"} == written.keys()
     commands = typed(page)
-    kept = Cluster.load(ROOT / "examples" / "clusters" / "demo.yaml", name=NAME).node("drone-1").directory
-    state = kept / "var-lib" / "fractus"
+    state = state_root() / NAME / "nodes" / "drone-1" / "var-lib" / "fractus"
     assert sum(command.startswith("fractus ") for command, _ in commands) >= 5
     script = [
         "set -e",

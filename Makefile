@@ -59,7 +59,7 @@ GOLDEN := tests/component/test_control_golden.py
 # Many of these tests fly in real time, which a machine that stalls can fail: what fails gets a second try, alone.
 INTEGRATION := tests/integration tests/e2e/test_cluster.py
 E2E := tests/e2e --ignore tests/e2e/test_cluster.py
-# These are of the charts on a cluster that is not ours: `make test` runs them on kind.
+# These are of the charts on a cluster that is not ours: `make test-kind` runs them on kind.
 ON_KIND := $(patsubst %,tests/e2e/test_%.py,mission refusals upgrade uninstall)
 SECOND_TRY := $(RUN) pytest --last-failed --last-failed-no-failures none
 
@@ -69,12 +69,7 @@ test: packages env lint ## Everything: lint, types, unit, component, integration
 	$(QUICK) tests/component tests/unit --ignore $(GOLDEN)
 	FRACTUS_DEEP=1 $(RUN) pytest -q -n 2 $(GOLDEN)
 	$(RUN) pytest -n 3 --dist loadgroup $(INTEGRATION) || $(SECOND_TRY) $(INTEGRATION)
-ifeq ($(FRACTUS_E2E_CLUSTER),current)
-	$(RUN) pytest $(E2E) || $(SECOND_TRY) $(E2E)
-else
-	$(RUN) pytest -n 2 --dist loadgroup $(E2E) $(ON_KIND:%=--ignore %) || $(SECOND_TRY) $(E2E) $(ON_KIND:%=--ignore %)
-	$(if $(WITHOUT_KIND),,STEPS="images cluster load charts tests uninstall" $(MAKE) test-kind)
-endif
+	$(RUN) pytest $(if $(filter current,$(FRACTUS_E2E_CLUSTER)),,-n 2 --dist loadgroup) $(E2E) || $(SECOND_TRY) $(E2E)
 
 .PHONY: test-fast
 test-fast: env lint ## The inner loop: lint, types and unit tests

@@ -1,7 +1,4 @@
-"""docs/tutorial.md on a cluster, typed as it stands: one's own image flies, an update and a lowered ceiling are survived.
-
-The cluster is of this test alone, so that Fractus is uninstalled from it in the end, nodes' data and all.
-"""
+"""docs/tutorial.md on a cluster, typed as it stands: one's own image flies, an update and a lowered ceiling are survived."""
 
 from __future__ import annotations
 
@@ -15,21 +12,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from fractus_cluster.state import state_root
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "tutorial.md").read_text()
 NAME = "tutorial-e2e"
 BEGINS, ENDS = "## 6. ", "## When it does not fly"
-TIMEOUT_S = 1800
-UNINSTALL = f"""
-kubectl delete applications.fractus.dev --all -A --timeout=120s
-helm -n fractus-system upgrade fractus {ROOT}/charts/fractus --reuse-values --set uninstall.wipeNodes=true
-helm -n fractus-system uninstall fractus
-kubectl get secrets,configmaps,leases,serviceaccounts,roles,daemonsets,deployments,jobs -n fractus-system -o name > left.txt
-kubectl get clusterroles,clusterrolebindings,validatingadmissionpolicies,priorityclasses,csr -o name >> left.txt
-kubectl get nodes -o json > nodes.json
-"""
+TIMEOUT_S = 1500
 pytestmark = [
     pytest.mark.skipif(
         os.environ.get("FRACTUS_E2E_CLUSTER") == "current", reason="the tutorial brings its own cluster up"
@@ -89,7 +77,6 @@ def test_the_tutorial_flies_on_a_cluster(checkout: Path) -> None:
     written = files(page)
     assert {"Dockerfile", "application.yaml", "low.yaml"} == written.keys()
     commands = typed(page)
-    state = state_root() / NAME / "nodes" / "drone-1" / "var-lib" / "fractus"
     assert sum(command.startswith("fractus ") for command, _ in commands) >= 5
     script = [
         "set -e",
@@ -99,7 +86,6 @@ def test_the_tutorial_flies_on_a_cluster(checkout: Path) -> None:
     for command, _ in commands:
         if command.startswith("fractus cluster down"):
             script.append("kubectl get events -o json > events.json; kubectl get grants -o json > grants.json")
-            script += [f"find {state} -type f > before.txt", UNINSTALL, f"find {state} -mindepth 1 > after.txt"]
         script.append(on_own_cluster(command))
         if command == "cd patrol":
             script += [f"cp '../written/{name}' ." for name in written]
@@ -123,12 +109,3 @@ def test_the_tutorial_flies_on_a_cluster(checkout: Path) -> None:
     events = json.loads((checkout / "patrol" / "events.json").read_text())["items"]
     missions = [e for e in events if e["reason"] == "MissionComplete" and e["involvedObject"]["name"] == "patrol"]
     assert len(missions) == 2, [f"{e['reason']}: {e['message']}" for e in events]
-
-    # Uninstalled: what is not in the list of docs/upgrades.md is gone.
-    assert "tls.key" in (checkout / "patrol" / "before.txt").read_text()
-    assert (checkout / "patrol" / "after.txt").read_text() == ""
-    left = (checkout / "patrol" / "left.txt").read_text().split()
-    assert [name for name in left if "/fractus" in name and "/fractus-sim:" not in name] == []
-    nodes = json.loads((checkout / "patrol" / "nodes.json").read_text())["items"]
-    labels = {label for node in nodes for label in node["metadata"]["labels"] if label.startswith("fractus.dev/")}
-    assert labels == {"fractus.dev/class"}

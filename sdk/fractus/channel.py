@@ -15,6 +15,7 @@ import grpc.aio
 
 from fractus.environment import Endpoint
 from fractus.errors import NotConfigured, Unavailable, translate
+from fractus.tracing import traced
 
 CALL_TIMEOUT_S = 10.0
 RECONNECT_TIMEOUT_S = 30.0
@@ -187,7 +188,7 @@ class ServiceChannel:
         credentials = grpc.ssl_channel_credentials(ca, key, chain)
         options = (*_OPTIONS, ("grpc.ssl_target_name_override", self._endpoint.server_name))
         channel = grpc.aio.secure_channel(self.address, credentials, options=options)
-        return _Connection(channel, self._make_stub(channel), stamp)
+        return _Connection(channel, self._make_stub(traced(channel)), stamp)
 
 
 class Retries:

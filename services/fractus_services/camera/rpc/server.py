@@ -179,7 +179,7 @@ async def _serve(
         admission,
     )
     register = partial(camera_pb2_grpc.add_CameraServiceServicer_to_server, handlers)
-    await run_until(ended, *parts, serve_grpc("camera", options.listen, tls, register, admission))
+    await run_until(ended, *parts, serve_grpc("camera", options.listen, tls, register, admission, node=node))
     shutter.close()
 
 

@@ -27,6 +27,7 @@ from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
 from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes
 from fractus_services.mobility.mavlink.fence import MissionFence
 from fractus_services.mobility.mavlink.returning import MavlinkReturn
+from fractus_services.mobility.mavlink.traced import TracedAutopilot
 from fractus_services.mobility.rpc.figures import flight_figures
 from fractus_services.mobility.rpc.handlers import MobilityHandlers
 from fractus_services.mobility.rpc.wiring import Parts
@@ -82,7 +83,7 @@ def _linked(
         heard.set()
         parts.observer.found()
 
-    autopilot = MavlinkAutopilot(
+    autopilot = TracedAutopilot(
         url,
         ARDUCOPTER,
         # The parts need the autopilot first: they are looked up when it calls.
@@ -150,7 +151,7 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
     )
 
     register = partial(mobility_pb2_grpc.add_MobilityServiceServicer_to_server, handlers)
-    calls = serve_grpc("mobility", options.listen, tls, register, handlers.admission)
+    calls = serve_grpc("mobility", options.listen, tls, register, handlers.admission, node=node)
     running = [autopilot.run(), grants.run(), monitor.run(), monitor.record(), tours.run(), calls]
     running.append(_follow(description, url, heard, told=bool(options.autopilot)))
     metrics.observe(partial(common_figures, LastRead(tls.expires_s), grants, audit, lambda: recorder.problem))

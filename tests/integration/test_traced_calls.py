@@ -1,0 +1,252 @@
+"""Traces from the SDK's call to the autopilot's acknowledgement, on real gRPC, with a collector that is there or not."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import fractus.tracing
+import grpc
+import pytest
+from collector import Collector, Seen, collecting
+from fractus.drone import Mobility
+from fractus.environment import Endpoint
+from fractus.errors import InvalidRequest, PolicyDenied
+from fractus.pictures import Camera
+from fractus_cluster.ports import free_port
+from fractus_core.api.names import node_server_name
+from fractus_proto.v1 import mobility_pb2 as pb
+from mobility_rig import DRIVER, FRAME, HOME, NODE, Rig, altitude_limit, area, fence, grant
+from opentelemetry.proto.trace.v1.trace_pb2 import Span, Status
+
+pytestmark = pytest.mark.timeout(240)
+CLIENT, SERVER, INTERNAL = Span.SPAN_KIND_CLIENT, Span.SPAN_KIND_SERVER, Span.SPAN_KIND_INTERNAL
+MOBILITY, CAMERA = "fractus.v1.MobilityService", "fractus.v1.CameraService"
+EDGE = f"""
+apiVersion: fractus.dev/v1alpha1
+kind: EdgeNode
+metadata: {{name: {NODE}}}
+spec:
+  location: {{lat: {HOME[0]}, lon: {HOME[1]}, alt: {HOME[2]}, altitudeReference: amsl}}
+  services:
+    camera:
+      resolution: 640x480
+      horizontalFieldOfView: 60
+      lens: {{model: pinhole}}
+      mount: {{pitch: -90, height: 4}}
+      methods: [CaptureImage, RetrieveImage]
+"""
+
+
+@pytest.fixture
+async def rig(tmp_path: Path) -> AsyncIterator[Rig]:
+    rig = Rig(tmp_path)
+    try:
+        yield rig
+    finally:
+        await rig.close()
+
+
+@pytest.fixture
+def sdk(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """An SDK that reads the environment of this test, and ends with it."""
+    logger, closers = logging.getLogger("opentelemetry"), []
+    before = logger.propagate, logger.handlers
+    monkeypatch.setattr(fractus.tracing, "atexit", SimpleNamespace(register=closers.append))
+    fractus.tracing._exporting.cache_clear()
+    yield
+    for close in closers:
+        close()
+    fractus.tracing._exporting.cache_clear()
+    logger.propagate, logger.handlers = before
+
+
+@pytest.fixture
+def collector(monkeypatch: pytest.MonkeyPatch, sdk: None) -> Iterator[Collector]:
+    with collecting() as collector:
+        for name, value in collector.environment.items():
+            monkeypatch.setenv(name, value)
+        yield collector
+
+
+def endpoint(rig: Rig, address: str = "") -> Endpoint:
+    folder = rig.directory / "tls-driver"
+    folder.mkdir(exist_ok=True)
+    key, certificate = rig.authority.issue(DRIVER)
+    for name, data in (("tls.key", key), ("tls.crt", certificate), ("ca.crt", rig.authority.pem)):
+        (folder / name).write_bytes(data)
+    return Endpoint(address or rig.address, node_server_name(NODE), folder)
+
+
+def parts(collector: Collector, whole: Seen, *names: str) -> dict[str, list[Seen]]:
+    """The parts of a call by name, once there are all of these."""
+
+    def found(spans: list[Seen]) -> dict[str, list[Seen]]:
+        by_name: dict[str, list[Seen]] = {}
+        for one in spans:
+            if one.span.parent_span_id == whole.span.span_id:
+                by_name.setdefault(one.name, []).append(one)
+        return by_name if set(names) <= set(by_name) else {}
+
+    return dict(collector.wait(found))
+
+
+def served(collector: Collector, count: int) -> list[Seen]:
+    """The calls that were served, once they are that number."""
+
+    def found(spans: list[Seen]) -> list[Seen]:
+        calls = [one for one in spans if one.span.kind == SERVER]
+        return calls if len(calls) == count else []
+
+    return list(collector.wait(found))
+
+
+async def test_a_corrected_goto_is_one_trace_from_the_sdk_to_the_autopilot(rig: Rig, collector: Collector) -> None:
+    rig.write_grant(grant(altitude_limit(5, 7), fence("no-fly", "exclusion", "ignore", -60, -10, -40, 10)))
+    rig.start_service()
+    rig.start_vehicle(1.0)
+    async with Mobility(endpoint(rig)) as drone, drone.control():
+        await drone.arm()
+        await drone.takeoff(6)
+        there = await drone.goto(*FRAME.latlon(0, 8), 20)
+        assert there.corrected
+        with pytest.raises(PolicyDenied):
+            await drone.goto(*FRAME.latlon(-50, 0), 7)
+        await drone.set_velocity(0.5, 0.0, 0.0)
+
+    call = collector.one(f"{MOBILITY}/Goto", SERVER, fractus__verdict__action="correct")
+    asked = collector.wait(lambda spans: [s for s in spans if s.span.span_id == call.span.parent_span_id])[0]
+    assert (asked.name, asked.span.kind, asked.span.parent_span_id) == (call.name, CLIENT, b"")
+    method = {"rpc.system": "grpc", "rpc.service": MOBILITY, "rpc.method": "Goto"}
+    cancelled = {"rpc.grpc.status_code": 1}  # by the SDK, once the motion is complete
+    assert asked.told == method | cancelled
+    assert asked.span.status.code == Status.STATUS_CODE_UNSET
+    code, policies = there.decision.code, list(there.decision.policies)
+    assert call.told | cancelled == asked.told | {
+        "fractus.caller": DRIVER, "fractus.verdict.action": "correct", "fractus.verdict.code": code,
+        "fractus.verdict.policies": policies,
+    }  # fmt: skip
+    assert (call.service, call.node) == ("fractus-mobility", NODE)
+    found = parts(collector, call, "policy.judge", "autopilot.DO_REPOSITION")
+    judged, flown = found["policy.judge"][0], found["autopilot.DO_REPOSITION"][0]
+    assert {s.span.trace_id for s in (asked, call, judged, flown)} == {asked.span.trace_id}
+    assert judged.told["fractus.verdict.code"] == code
+    assert judged.span.end_time_unix_nano <= flown.span.start_time_unix_nano
+    assert flown.span.end_time_unix_nano <= call.span.end_time_unix_nano
+
+    refused = collector.one(f"{MOBILITY}/Goto", SERVER, fractus__verdict__action="deny")
+    assert refused.told["fractus.verdict.code"] == "InsideExclusionZone"
+    assert refused.told["fractus.verdict.policies"] == ["no-fly"]
+    assert refused.told["rpc.grpc.status_code"] == 7
+    assert refused.span.status.code == Status.STATUS_CODE_UNSET, "a refusal is an answer"
+    failed = collector.one(f"{MOBILITY}/Goto", CLIENT, rpc__grpc__status_code=7)
+    assert failed.span.status.code == Status.STATUS_CODE_ERROR
+
+    steered = collector.one(f"{MOBILITY}/SetVelocity", SERVER)
+    assert parts(collector, steered, "autopilot.SET_POSITION_TARGET_LOCAL_NED")
+    kept = collector.one(f"{MOBILITY}/GetControl", SERVER)
+    assert kept.told["rpc.grpc.status_code"] in {0, 1}
+    armed = collector.one(f"{MOBILITY}/Arm", SERVER)
+    assert parts(collector, armed, "autopilot.COMPONENT_ARM_DISARM")
+    lat, lon = (f"{value:.3f}" for value in FRAME.latlon(0, 8))
+    told = "".join(str(s.span) for s in collector.spans)
+    assert lat not in told and lon not in told, "no span tells a position"
+
+
+async def test_a_picture_is_traced_with_its_filters(rig: Rig, collector: Collector) -> None:
+    privacy = {"type": "PrivacyControl", "kind": "camera", "action": "blurMedian", "selector": {"zones": ["private"]}}
+    policy = {"name": "privacy", "spec": privacy, "zones": [{"name": "private", "area": area(-20, -20, 20, 20)}]}
+    services = [{"service": "camera", "methods": ["CaptureImage", "RetrieveImage", "ListImages"]}]
+    rig.write_grant(grant(policy, services=services, operationArea=[], **{"class": None}))
+    address = rig.start_camera(description=EDGE)
+    await rig.until_logged("camera", "serving", 60)
+    async with Camera(endpoint(rig, address)) as camera:
+        taken = await camera.capture()
+        await camera.retrieve(taken.name)
+    call = collector.one(f"{CAMERA}/CaptureImage", SERVER)
+    assert (call.service, call.told["fractus.verdict.policies"]) == ("fractus-camera", ["privacy"])
+    found = parts(collector, call, "policy.judge", "camera.capture", "camera.filters")
+    assert found["camera.filters"][0].told["fractus.filters"] == ["blurMedian"]
+    retrieved = collector.one(f"{CAMERA}/RetrieveImage", SERVER)
+    asked = collector.one(f"{CAMERA}/RetrieveImage", CLIENT)
+    assert retrieved.span.parent_span_id == asked.span.span_id
+
+
+HOSTILE: tuple[tuple[tuple[str, str], ...], ...] = (
+    (("traceparent", "nonsense"),),
+    (("traceparent", f"00-{'0' * 32}-00f067aa0ba902b7-01"),),
+    (("traceparent", "ff-4bf92f3577b34da6a3ce929d0e0e4736-00f067aa0ba902b7-01"),),
+    (("traceparent", "00-4BF92F3577B34DA6A3CE929D0E0E4736-00f067aa0ba902b7-01"),),
+    (("traceparent", f"00-4bf92f3577b34da6a3ce929d0e0e4736-00f067aa0ba902b7-01{'-x' * 1000}"),),
+    (("tracestate", f"a={'b' * 3000}"), ("baggage", f"secret={'c' * 3000}")),
+)
+
+
+async def test_headers_that_are_none_are_ignored(rig: Rig, collector: Collector) -> None:
+    rig.write_grant(grant())
+    rig.start_service(link="udpin:127.0.0.1:0")
+    stub = rig.stub()
+    for headers in HOSTILE:
+        with pytest.raises(grpc.aio.AioRpcError, match="position is not known yet"):
+            await stub.GetPosition(pb.GetPositionRequest(), timeout=60, wait_for_ready=True, metadata=headers)
+    for one in served(collector, len(HOSTILE)):
+        assert (one.span.parent_span_id, one.span.trace_state) == (b"", "")
+        assert one.told["rpc.grpc.status_code"] == 14
+        assert one.span.status.code == Status.STATUS_CODE_ERROR
+        assert "secret" not in str(one.span)
+
+
+async def test_a_span_is_the_parent_of_one_call_only(rig: Rig, collector: Collector) -> None:
+    rig.write_grant(grant())
+    rig.start_service(link="udpin:127.0.0.1:0")
+    parent = ("traceparent", "00-4bf92f3577b34da6a3ce929d0e0e4736-00f067aa0ba902b7-01")
+    stub = rig.stub()
+    for _ in range(2):
+        with pytest.raises(grpc.aio.AioRpcError, match="position is not known yet"):
+            await stub.GetPosition(pb.GetPositionRequest(), timeout=60, wait_for_ready=True, metadata=(parent,))
+    spans = served(collector, 2)
+    assert [s.span.parent_span_id.hex() for s in spans] == ["00f067aa0ba902b7", ""]
+    assert spans[0].span.trace_id.hex() == "4bf92f3577b34da6a3ce929d0e0e4736" != spans[1].span.trace_id.hex()
+
+
+async def test_a_collector_out_of_reach_costs_a_line_in_the_log(
+    rig: Rig, sdk: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("OTEL_EXPORTER_OTLP_ENDPOINT", f"http://127.0.0.1:{free_port()}")
+    monkeypatch.setenv("OTEL_BSP_SCHEDULE_DELAY", "20")
+    monkeypatch.setenv("OTEL_BSP_MAX_QUEUE_SIZE", "8")
+    monkeypatch.setenv("OTEL_BSP_MAX_EXPORT_BATCH_SIZE", "4")
+    monkeypatch.setenv("OTEL_EXPORTER_OTLP_TIMEOUT", "1")
+    rig.write_grant(grant())
+    rig.start_service()
+    rig.start_vehicle(1.0)
+    async with Mobility(endpoint(rig)) as drone, drone.control():
+        await drone.arm()
+        await drone.takeoff(6)
+        for _ in range(100):
+            await drone.position()
+            await asyncio.sleep(0.02)  # Not to be refused for haste.
+        await rig.until_logged("service", "tracing: ")
+        with pytest.raises(InvalidRequest):
+            await drone.goto(float("nan"), 0.0, 6)
+    said = [line for line in rig.log("service").splitlines() if "UNAVAILABLE" in line or "Queue full" in line]
+    assert len(said) == 1, said
+    assert len([r for r in caplog.records if r.name == "fractus" and "tracing" in r.getMessage()]) <= 1
+    assert not [r for r in caplog.records if r.name.startswith("opentelemetry")]
+
+
+async def test_without_a_collector_nothing_of_opentelemetry_is_imported(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PYTHONPROFILEIMPORTTIME", "1")
+    rig.write_grant(grant())
+    rig.start_service(link="udpin:127.0.0.1:0")
+    with pytest.raises(grpc.aio.AioRpcError, match="position is not known yet"):
+        await rig.stub().GetPosition(pb.GetPositionRequest(), timeout=60, wait_for_ready=True)
+    imported = (rig.directory / "service.log").read_text()
+    assert "| " in imported and "fractus_observe.tracing" in imported
+    assert "opentelemetry" not in imported
+    assert "fractus_observe.span_export" not in imported

@@ -82,6 +82,7 @@ class Parser:
     ) -> None:
         self._buffer = bytearray()
         self._unknown = unknown
+        self._told = False
         self._signing = signing
         self.bad = 0
         self.lost = 0
@@ -112,14 +113,25 @@ class Parser:
             if isinstance(verdict, Message):
                 messages.append(verdict)
                 at = after
+            elif verdict is _Refusal.UNKNOWN and after == end:
+                # Only the byte behind it shows whether messages have to be looked for inside, and may come much later.
+                self._tell(bytes(buffer[at:after]))
+                self._told = True
+                break
             else:
                 self.bad += 1
-                framed = verdict is _Refusal.UNKNOWN and (after == end or buffer[after] in _MAGICS)
+                framed = verdict is _Refusal.UNKNOWN and buffer[after] in _MAGICS
                 if framed:
-                    self._unknown(bytes(buffer[at:after]))
+                    self._tell(bytes(buffer[at:after]))
+                self._told = False
                 at = after if framed or verdict is _Refusal.SIGNATURE else at + 1
         del buffer[:at]
         return messages
+
+    def _tell(self, frame: bytes) -> None:
+        """Tell of a frame of another dialect, once."""
+        if not self._told:
+            self._unknown(frame)
 
     def _decode(self, frame: bytes) -> Message | _Refusal:
         length = frame[1]

@@ -37,7 +37,8 @@ TIMEOUT_S, ATTEMPT_TIMEOUT_S = 30.0, 5.0
 MAX_DELAY_S = 0.5
 CONNECTION_AGE_S, CONNECTION_GRACE_S = 30.0, 10.0
 KEPT_ANSWERS, KEPT_BYTES = 4096, 16 * 2**20
-_MAX_ID = 200
+_MAX_ID, _MAX_ATTEMPT = 200, 9
+"""Characters of what a request says of itself."""
 
 _REPEATED = frozenset(
     {
@@ -301,7 +302,8 @@ class Responder:
             request_id, attempt = str(told.get(ID, "")), str(told.get(ATTEMPT, ""))
             if not 0 < len(request_id) <= _MAX_ID:
                 await context.abort(grpc.StatusCode.INVALID_ARGUMENT, f"{ID} is missing, or too long")
-            request = Request(request_id, name, body, int(attempt) if attempt.isdecimal() else 1)
+            counted = attempt.isdecimal() and len(attempt) <= _MAX_ATTEMPT
+            request = Request(request_id, name, body, int(attempt) if counted else 1)
             try:
                 return await self.answers.once(request, handler)
             except ValueError as error:

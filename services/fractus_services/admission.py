@@ -11,6 +11,7 @@ from typing import Any
 
 import grpc
 from fractus_core.policy.values import Verdict
+from fractus_observe import spans
 from google.protobuf.message import DecodeError
 
 from fractus_services.auth import Caller, Callers
@@ -94,6 +95,7 @@ class CallAdmission:
         admitted = ""
         try:
             caller = self._callers.of(context.auth_context(), urgent)
+            spans.call().note("fractus.caller", caller.identity)
             self._admit(caller.identity, self._urgent if urgent else self._allowance, urgent)
             admitted = caller.identity
             self._open[admitted] += 1

@@ -7,6 +7,7 @@ from typing import Any, NoReturn
 import grpc
 from fractus_core.exhaustive import exhaustive
 from fractus_core.policy.values import Action, Verdict
+from fractus_observe import spans
 from fractus_proto.v1 import types_pb2
 from google.protobuf import any_pb2
 from google.rpc import code_pb2, error_details_pb2, status_pb2
@@ -54,6 +55,7 @@ STATUS: dict[type[Refused], grpc.StatusCode] = {
 
 def decision(verdict: Verdict) -> types_pb2.Decision:
     """The verdict as replies carry it."""
+    spans.call().verdict(verdict.action, verdict.code, verdict.policies)
     return types_pb2.Decision(
         action=_ACTIONS[verdict.action], reason=verdict.reason, code=verdict.code, policies=verdict.policies
     )
@@ -68,6 +70,7 @@ async def abort(context: Any, refusal: Refused) -> NoReturn:
         details.append(again)
     status = next(STATUS[kind] for kind in type(refusal).__mro__ if kind in STATUS)
     number = code_pb2.Code.Value(status.name)
+    spans.call().note(spans.STATUS, number)
     rich = rpc_status.to_status(
         status_pb2.Status(code=number, message=refusal.verdict.reason, details=map(_packed, details))
     )

@@ -9,7 +9,7 @@ from contextlib import asynccontextmanager, suppress
 import grpc
 import pytest
 from fractus.errors import InvalidRequest, Unavailable
-from fractus.exchange import ID, SERVICE, Answers, Request, Requester, Responder
+from fractus.exchange import ATTEMPT, ID, SERVICE, Answers, Request, Requester, Responder
 
 
 class Worker:
@@ -177,3 +177,12 @@ async def test_answers_are_forgotten_oldest_first() -> None:
             assert await answers.once(Request(name, "echo", b"x" * size), echo) == b"x" * size
             await asyncio.sleep(0)
         assert calls == ["a", "b", "c", "a"]
+
+
+async def test_an_attempt_that_is_no_number_counts_as_the_first() -> None:
+    worker = Worker()
+    async with worker.serving() as responder, grpc.aio.insecure_channel(f"127.0.0.1:{responder.port}") as channel:
+        for number, attempt in enumerate(("9" * 5000, "x", "-1", "")):
+            metadata = ((ID, str(number)), (ATTEMPT, attempt))
+            assert await channel.unary_unary(f"/{SERVICE}/work")(b"x", metadata=metadata) == b"did x"
+    assert worker.done == ["0", "1", "2", "3"]

@@ -139,12 +139,36 @@ def test_a_pilot_may_move_home_and_who_hands_the_drone_back_finds_it_where_it_wa
             await end(world.service.goto(grant, GotoArgs(*at(0, 50), 12.0), 0))
             world.plane.set_to(LOITER)
             await world.until(lambda: world.control.state.controller == "pilot")
+            assert located(world.control)
             move(world, AWAY)
             await asyncio.sleep(5.0)
             assert not at_home(world)
+            assert not located(world.control), "no picture is judged by a height above it"
             world.plane.set_to(GUIDED)
             await world.until(lambda: at_home(world), 5)
             await world.until(lambda: not world.plane.vehicle.armed)
             assert abs(world.plane.xy[1]) < 3
+
+    fly(flight)
+
+
+def test_no_picture_is_judged_by_a_height_above_a_home_that_was_moved_while_a_pilot_flies(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            world.grants.put(spec())
+            plane = world.plane
+            move(world, (3.0, 0.0, 0.5))
+            plane.set_to(LOITER)
+            plane.vehicle.armed, plane.goal, plane.goal_height = True, (0.0, 0.0), 60.0
+            world.observer.heartbeat()
+            await world.until(lambda: plane.vehicle.altitude_m > 50)
+            assert world.control.state.controller == "pilot"
+            assert located(world.control)
+            move(world, UP)
+            await asyncio.sleep(1.0)
+            assert not located(world.control)
+            move(world, (3.0, 0.0, 0.5))
+            await asyncio.sleep(1.0)
+            assert located(world.control)
 
     fly(flight)

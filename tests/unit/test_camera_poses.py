@@ -20,6 +20,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from policy_world import FRAME, HOME
 
+NOW_S = 1_800_000_000.0
+"""Unix time at the zero of the tests' monotonic clock."""
 LENS = Lens(40.0, 30.0, pitch_deg=-60.0, error_deg=0.0)
 
 
@@ -40,6 +42,7 @@ class Drone:
         speed: tuple[float, float] = (0.0, 0.0),
         ages: tuple[float, float] | None = (0.0, 0.0),
         connected: bool = True,
+        late_s: float = 0.0,
     ) -> None:
         self.now_s = at_s
         lat, lon = FRAME.latlon(x, 0.0)
@@ -50,7 +53,8 @@ class Drone:
         message.home.latitude_deg, message.home.longitude_deg, message.home.altitude_m = HOME.lat, HOME.lon, 100.0
         if ages is not None:
             message.position_age_s, message.attitude_age_s = ages
-        self.poses.add(measurement(message, at_s))
+        message.time.FromNanoseconds(round((NOW_S + at_s - late_s) * 1e9))
+        self.poses.add(measurement(message, at_s, NOW_S + at_s))
 
     def way(self, begun_s: float) -> tuple[Situation, ...]:
         return self.poses.situations_since(begun_s, 1.0)
@@ -90,6 +94,17 @@ def test_errors_grow_with_the_age_of_what_they_belong_to(drone: Drone) -> None:
     assert now.attitude is None, "measured more than a second ago"
     drone.now_s = 100.85
     assert drone.poses.situation(1.0).lat is None
+
+
+def test_a_message_that_waited_tells_where_the_drone_was_when_it_was_made(drone: Drone) -> None:
+    drone.tell(100.0, speed=(8.0, 0.0), late_s=0.4)
+    now = drone.poses.situation(1.0)
+    assert now.position_error_m == pytest.approx(1.0 + 8.0 * 0.4 + 2.5 * 0.16, abs=1e-4)
+    assert attitude(now).tilt_error_deg == pytest.approx(history.TILT_ERROR_DEG + 60.0 * 0.4, abs=1e-4)
+    drone.tell(100.1, late_s=3.0)
+    assert drone.poses.situation(1.0).lat is None
+    drone.tell(100.2, late_s=-3600.0)
+    assert drone.poses.situation(1.0).lat is not None, "the clock was set back meanwhile"
 
 
 def test_an_age_that_is_not_told_is_not_none(drone: Drone) -> None:
@@ -165,7 +180,7 @@ def gimbal_told(poses: PoseHistory, at_s: float, turned: tuple[float, float, flo
     if turned is not None:
         message.gimbal.roll_deg, message.gimbal.pitch_deg, message.gimbal.yaw_deg = turned
         message.gimbal_age_s = age_s
-    poses.add(measurement(message, at_s, gimbal=True))
+    poses.add(measurement(message, at_s, NOW_S + at_s, gimbal=True))
 
 
 FORWARD = Lens(40.0, 30.0, pitch_deg=0.0, error_deg=0.0)

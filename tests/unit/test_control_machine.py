@@ -266,7 +266,8 @@ def told_of(*events: told.Event, state: ControlState = FOUND) -> tuple[ControlSt
 
 
 ASKS = (told.GrantChanged(None, DRIVER), told.StreamOpened(1, "a", "A"), told.GrantControl(1))
-FLIES = (*ASKS, told.VehicleObserved(FLYING), told.Heartbeat(), told.Airborne())
+ARMS = (told.MotorStart(begins=True), told.VehicleObserved(ARMED), told.Heartbeat(), told.MotorStart(begins=False))
+FLIES = (*ASKS, *ARMS, told.VehicleObserved(FLYING), told.Heartbeat(), told.Airborne())
 
 
 def test_control_is_granted_and_returned() -> None:
@@ -412,6 +413,24 @@ def test_a_second_stream_that_leaves_while_it_waits_leaves_no_authority_behind()
     assert armed.authority is Authority.PILOT, "who arms it is no driver"
 
 
+@pytest.mark.parametrize("mode", [GUIDED, LOITER])
+def test_a_vehicle_that_others_arm_is_no_drivers(mode: FlightMode) -> None:
+    chosen = told.VehicleObserved(replace(GROUND, mode=mode)), told.Heartbeat()
+    state, _ = told_of(*ASKS, *chosen)
+    assert state.controller == "A", "on the ground a mode is no one's"
+    state, actions = told_of(told.VehicleObserved(replace(ARMED, mode=mode)), told.Heartbeat(), state=state)
+    assert state.authority is Authority.PILOT
+    assert state.lease is None
+    assert [action.event.state for action in actions if isinstance(action, SendEvent)] == [StreamState.LOST]
+    for flown in (LOITER, GUIDED):
+        state, _ = told_of(told.VehicleObserved(replace(FLYING, mode=flown)), told.Heartbeat(), *ASKS[1:], state=state)
+        assert state.authority is Authority.PILOT, (
+            "no fence, home or limits of a mission: it cannot be handed over in flight"
+        )
+    landed, _ = told_of(told.VehicleObserved(GROUND), told.Heartbeat(), *ASKS[1:], state=state)
+    assert landed.controller == "A", "nothing was flown for the mission: it goes on"
+
+
 def test_a_cancelled_motion_hovers_for_a_driver_that_is_still_there() -> None:
     state, _ = told_of(*FLIES, told.MotionBegan(7, "Land"), told.MotionCancelled(7))
     assert state.motion == ActiveMotion(7, "Land", hover_at=0.3)
@@ -441,6 +460,40 @@ def test_a_mode_that_the_system_did_not_ask_for_is_a_pilots() -> None:
     assert foreign.authority is Authority.PILOT
     failsafe, _ = told_of(*FLIES, told.VehicleObserved(replace(FLYING, mode=RTL, failsafe=True)), told.Heartbeat())
     assert (failsafe.authority, failsafe.returning) == (Authority.SYSTEM, True)
+
+
+def test_a_failsafe_that_brakes_leaves_the_vehicle_to_no_pilot() -> None:
+    braking = replace(FLYING, mode=FlightMode("BRAKE", ModeKind.BRAKING))
+    chosen, _ = told_of(*FLIES, told.VehicleObserved(braking), told.Heartbeat())
+    assert chosen.authority is Authority.PILOT
+    for facts in (
+        replace(braking, failsafe=True),
+        replace(braking, failsafe_text="Fence breached", failsafe_text_at=-1.0),
+    ):
+        failed, _ = told_of(*FLIES, told.VehicleObserved(facts), told.Heartbeat())
+        assert failed.authority is Authority.SYSTEM
+        assert failed.task == SystemTask(1, TaskKind.RETURN)
+        assert str(failed.missions["a"].outcome).startswith("failed: the autopilot's own failsafe")
+        later, _ = told_of(told.VehicleObserved(facts), told.Heartbeat(), state=chosen)
+        assert later.authority is Authority.PILOT, "who has chosen it has the vehicle"
+
+
+def test_a_vehicle_that_is_found_braked_by_a_failsafe_comes_home() -> None:
+    braking = replace(FLYING, mode=FlightMode("BRAKE", ModeKind.BRAKING))
+    for facts, authority, task in (
+        (replace(braking, failsafe=True), Authority.SYSTEM, TaskKind.RETURN),
+        (braking, Authority.PILOT, None),
+    ):
+        found, _ = told_of(told.VehicleFound(), state=ControlState(vehicle=facts))
+        assert (found.authority, found.task.kind if found.task is not None else None) == (authority, task)
+
+
+def test_motors_that_were_asked_for_are_ours_whenever_they_are_seen() -> None:
+    late = (*ARMS[:2], ARMS[3], told.Heartbeat())
+    state, _ = told_of(*ASKS, *late)
+    assert (state.authority, state.armed_by_others) == (Authority.DRIVER, False)
+    others, _ = told_of(*ASKS, told.VehicleObserved(ARMED), told.Heartbeat())
+    assert (others.authority, others.armed_by_others) == (Authority.PILOT, True)
 
 
 def test_a_mode_change_whose_answers_were_lost_is_the_systems() -> None:

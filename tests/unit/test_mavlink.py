@@ -235,6 +235,22 @@ def test_signatures_interoperate_with_pymavlink():
     assert parser.feed(forged) == []
 
 
+@pytest.mark.parametrize("behind", [b"", b"\x00", b"noise"])
+def test_a_message_inside_of_what_looked_like_a_frame_is_found_however_bytes_arrive(behind):
+    inner = encode(layout_named("HEARTBEAT"), {"custom_mode": 7}, sequence=0, sysid=1, compid=1)
+    # A MAVLink 1 header of a message that is in no dialect, as noise has it.
+    noise = bytes((0xFE, len(inner), 0, 1, 1, 60)) + inner + b"\x00\x00"
+    other = encode(layout_named("ATTITUDE"), {}, sequence=1, sysid=1, compid=1)
+    for cut in range(1, len(noise) + len(behind)):
+        heard = []
+        parser = Parser(unknown=heard.append)
+        data = noise + behind
+        found = parser.feed(data[:cut]) + parser.feed(data[cut:]) + parser.feed(other)
+        assert [message.name for message in found] == (["HEARTBEAT"] if behind else []) + ["ATTITUDE"], cut
+        assert heard == ([noise] if not behind or cut == len(noise) else []), cut
+        assert parser.bad >= 1
+
+
 def test_a_refused_frame_does_not_delay_the_next():
     key = hashlib.sha256(b"secret").digest()
     signing = Signing(key, 1000)

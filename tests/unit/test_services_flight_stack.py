@@ -14,6 +14,7 @@ def test_each_mode_means_what_the_vehicle_does_in_it() -> None:
     kinds = {mode: ARDUCOPTER.mode(mode).kind for mode in COPTER_MODE}
     assert kinds.pop(COPTER_MODE.GUIDED) is ModeKind.COMMANDED
     assert kinds.pop(COPTER_MODE.LAND) is ModeKind.LANDING
+    assert kinds.pop(COPTER_MODE.BRAKE) is ModeKind.BRAKING
     for mode in (COPTER_MODE.RTL, COPTER_MODE.SMART_RTL, COPTER_MODE.AUTO_RTL):
         assert kinds.pop(mode) is ModeKind.RETURNING
     assert set(kinds.values()) == {ModeKind.OTHER}, "in every other mode a pilot flies"
@@ -35,6 +36,8 @@ def test_modes_are_asked_for_by_their_numbers() -> None:
         ("GCS Failsafe Cleared", False),
         ("EKF Failsafe: changed to LAND Mode", True),
         ("Mission: 3 WP", False),
+        ("Fence enabled", False),
+        ("Radio Failsafe - Continuing Auto Mode", False),
     ],
 )
 def test_texts_of_failsafes_are_told_from_others(text: str, tells: bool) -> None:

@@ -13,6 +13,7 @@ from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
 from fractus_services.mobility.mavlink.bounds import Item
 from fractus_services.mobility.mavlink.itemlists import NoLists, NoSpace, download, upload
+from fractus_services.mobility.mavlink.link import COMPONENT_ID, SYSTEM_ID
 
 ITEMS = tuple(Item(5001, 3.0, 393600000 + i, 229500000 - i) for i in range(3))
 
@@ -52,7 +53,8 @@ class Keeper(MavlinkAutopilot):
         elif kind == "MISSION_REQUEST_LIST":
             return message("MISSION_COUNT", count=len(self.items), mission_type=MAV_MISSION_TYPE.FENCE)
         elif kind == "MISSION_REQUEST_INT":
-            return self.items[outgoing.integer("seq")]
+            back = {"target_system": SYSTEM_ID, "target_component": COMPONENT_ID}
+            return message("MISSION_ITEM_INT", **self.items[outgoing.integer("seq")].values | back)
         elif kind == "MISSION_ACK":
             return None
         if len(self.items) < self.wanted:
@@ -127,3 +129,27 @@ async def test_a_lost_answer_to_the_last_item_is_no_refusal() -> None:
     keeper = Finished(8)
     await upload(keeper, ITEMS)
     assert await download(keeper) == ITEMS
+
+
+async def test_an_item_that_came_twice_ends_no_upload() -> None:
+    class Impatient(Keeper):
+        """It asks for the second item again before that has come, and tells that the copy is out of order."""
+
+        def _answer(self, outgoing: Message) -> Message | None:
+            if outgoing.name == "MISSION_ITEM_INT" and outgoing.integer("seq") < len(self.items):
+                return message(
+                    "MISSION_ACK", type=MAV_MISSION_RESULT.INVALID_SEQUENCE, mission_type=MAV_MISSION_TYPE.FENCE
+                )
+            answer = super()._answer(outgoing)
+            if answer is not None and answer.name == "MISSION_REQUEST" and answer.integer("seq") == 1:
+                self.take(answer)
+            return answer
+
+    keeper = Impatient()
+    await upload(keeper, ITEMS)
+    assert await download(keeper) == ITEMS
+
+
+async def test_a_vehicle_that_finds_everything_out_of_order_ends_it() -> None:
+    with pytest.raises(AutopilotError, match="stopped answering"):
+        await upload(Keeper(result=MAV_MISSION_RESULT.INVALID_SEQUENCE), ITEMS)

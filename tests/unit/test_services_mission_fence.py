@@ -194,6 +194,18 @@ async def test_the_owners_own_fence_stays_in_force(vehicle: Vehicle, tmp_path: P
     assert vehicle.values["FENCE_OPTIONS"] == 1.0, "a union of inclusion areas would weaken both"
 
 
+@pytest.mark.parametrize("action", [0.0, 4.0])
+async def test_an_owners_fence_that_brings_no_drone_down_does_so_for_the_mission(
+    vehicle: Vehicle, tmp_path: Path, action: float
+) -> None:
+    vehicle.values |= {"FENCE_ENABLE": 1.0, "FENCE_ACTION": action}
+    fence = MissionFence(vehicle, tmp_path)
+    await fence.raise_around(spec(area(-50, -50, 50, 50), **LIMITS), retraces=True)
+    assert vehicle.values["FENCE_ACTION"] == 3.0
+    await fence.lower(lambda: True)
+    assert vehicle.values["FENCE_ACTION"] == action
+
+
 def test_a_vehicle_without_fences_is_left_alone_and_one_that_is_silent_is_none(
     vehicle: Vehicle, tmp_path: Path
 ) -> None:

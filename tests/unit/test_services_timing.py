@@ -245,12 +245,44 @@ def test_a_restart_of_the_vehicle_begins_again() -> None:
     boot = 0.0
     bench = Bench(steady(0.05), steady(0.05), clock=lambda t: t - boot + 100.0)
     bench.fly(5)
+    assert not bench.timing.restarted
     boot = bench.now + 100.0
     bench.fly(0.2)
+    assert bench.timing.restarted
     bench.worst = -math.inf
     bench.fly(10)
     assert bench.worst <= -REACTION_S + 0.01
     assert math.isfinite(bench.timing.latency_s(bench.now))
+
+
+@pytest.mark.parametrize(
+    ("stamps", "told"),
+    [
+        ((102_000, 110_050, 110_100), [False, False, False]),
+        ((1_000, 1_050, 1_100), [False, True, True]),
+    ],
+)
+def test_an_old_position_that_comes_late_is_no_restart(stamps: tuple[int, ...], told: list[bool]) -> None:
+    timing = Timing()
+    for i in range(200):
+        timing.sampled(100_000 + 50 * i, 50.0 + 0.05 * i)
+    restarted = []
+    for i, stamp in enumerate(stamps):
+        timing.sampled(stamp, 60.0 + 0.05 * i)
+        restarted.append(timing.restarted)
+    assert restarted == told
+
+
+def test_a_restart_shows_in_replies_alone() -> None:
+    bench = Bench(steady(0.02), steady(0.02), answers=False)
+    bench.fly(3)
+    for seconds, restarted in (1000, False), (1001, False), (998, False), (10, True), (11, True):
+        number = bench.timing.request(bench.now)
+        assert number is not None
+        bench.timing.replied(seconds * 10**9, number, bench.now)
+        assert bench.timing.restarted is restarted
+    bench.timing.reset()
+    assert not bench.timing.restarted
 
 
 def test_a_vehicle_that_freezes_is_not_known_and_then_known_again() -> None:

@@ -19,12 +19,14 @@ class Authority(Enum):
 class ModeKind(Enum):
     """What a flight mode of the autopilot means for control, whatever its number is.
 
-    COMMANDED obeys the companion; RETURNING and LANDING bring the vehicle down by themselves; in any OTHER a human pilot flies.
+    COMMANDED obeys the companion; RETURNING and LANDING bring the vehicle down by themselves; BRAKING stops it and lets it hover, by a
+    pilot's or a failsafe's choice; in any OTHER a human pilot flies.
     """
 
     COMMANDED = "commanded"
     RETURNING = "returning"
     LANDING = "landing"
+    BRAKING = "braking"
     OTHER = "other"
 
 
@@ -251,6 +253,7 @@ class ControlState:
         speed_mps: of legs that name none, as the driver set it.
         decided: whether it is settled who has the vehicle.
         armed_seen: whether the motors ran at the last heartbeat; None before the first.
+        armed_by_others: whether others started the motors that run: no flight of a mission was prepared.
         expected_mode: the mode that the vehicle is in by the system's doing, or that is known; another one is foreign.
         unconfirmed: a mode that the system asked for without an answer, and until when it may still be obeyed.
         failsafe_seen: whether a failsafe acted at the last heartbeat already.
@@ -279,6 +282,7 @@ class ControlState:
     speed_mps: float | None = None
     decided: bool = False
     armed_seen: bool | None = None
+    armed_by_others: bool = False
     expected_mode: FlightMode | None = None
     unconfirmed: tuple[FlightMode, float] | None = None
     failsafe_seen: bool = False

@@ -72,6 +72,10 @@ def on_arming(step: Step, event: ArmingEvent) -> None:
             step.set(preparing=max(step.state.preparing + (1 if begins else -1), 0))
         case MotorStart(begins):
             step.set(starting_motors=begins)
+            if not begins and step.state.vehicle.armed and step.state.armed_seen is False:
+                # They run by the system's doing, whenever the heartbeat is looked at that shows it.
+                step.set(armed_seen=True, armed_by_others=False)
+                step.act(SetStreamRates(flying=True))
         case _:
             assert_never(event)
 
@@ -92,7 +96,9 @@ def _found(step: Step) -> None:
             step.begin_grace(mission, DRIVER_LOST)
         return
     commanded, comes_down = vehicle.mode.commanded, vehicle.mode.comes_down
-    if not (commanded or comes_down) or (mission is None and not commanded and not vehicle.failsafe):
+    if vehicle.mode.kind is ModeKind.BRAKING and vehicle.failsafe:
+        step.seize(TaskKind.RETURN, "AutopilotFailsafe", "found the drone braked by a failsafe", (), OutcomeKind.FAILED)
+    elif not (commanded or comes_down) or (mission is None and not commanded and not vehicle.failsafe):
         step.give_to_pilot(f"is flying in {vehicle.mode.name}")
     elif mission is None and comes_down:
         step.audit("takeover", "homeward", "system", f"found the drone in {vehicle.mode.name}, and no mission")
@@ -139,7 +145,9 @@ def _heartbeat(step: Step) -> None:
 
 
 def _armed(step: Step) -> None:
-    if step.state.authority is not Authority.DRIVER and not step.state.starting_motors:
+    # Nothing was prepared for a flight of others: neither failsafes nor fence, home or limits. A driver on the ground loses it, too.
+    step.set(armed_by_others=not step.state.starting_motors)
+    if step.state.armed_by_others:
         step.give_to_pilot("armed the drone")
     step.act(SetStreamRates(flying=True))
 
@@ -176,13 +184,19 @@ def _foreign_mode(step: Step) -> None:
     said = vehicle.failsafe_text if step.now - vehicle.failsafe_text_at < FAILSAFE_TEXT_S else ""
     if vehicle.silent_s >= CUT_S and vehicle.mode.kind is ModeKind.RETURNING and not said:
         said = f"{vehicle.mode.name}, while the link was cut"
-    if (begins or said) and vehicle.mode.comes_down and not piloted:
-        reason = f"the autopilot's own failsafe took the drone ({said or vehicle.mode.name})"
+    failed, reason = (
+        (begins or said) and not piloted,
+        f"the autopilot's own failsafe took the drone ({said or vehicle.mode.name})",
+    )
+    if failed and vehicle.mode.kind is ModeKind.BRAKING:
+        # No pilot has it, and it would hover until its battery is low.
+        step.seize(TaskKind.RETURN, "AutopilotFailsafe", reason, (), OutcomeKind.FAILED)
+    elif failed and vehicle.mode.comes_down:
         step.audit("takeover", vehicle.mode.name, "system", reason, "AutopilotFailsafe")
         step.end_mission(mission, OutcomeKind.FAILED, reason)
         step.lose_lease(reason)
         step.follow_descent(_descent(vehicle.mode))
-    elif piloted and vehicle.mode.commanded and mission is not None:
+    elif piloted and vehicle.mode.commanded and mission is not None and not state.armed_by_others:
         step.audit("takeover", TaskKind.HOVER.value, "system", "the pilot handed the drone back")
         step.set(authority=Authority.SYSTEM)
         step.take_back(mission)

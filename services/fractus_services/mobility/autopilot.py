@@ -60,6 +60,7 @@ class VehicleState:
         yaw_deg: heading as the position says it; `heading_deg` is the attitude's.
         gimbal: how it turns the camera, yaw from true north, as measured; its time is that of the older of two measurements,
             for its yaw counts from the nose.
+        ground_home: home as it was told last while the vehicle did not fly.
         ready: whether its checks before arming pass, in the mode in which it is.
         checks_at: when it told that.
         estimated: whether its estimator has an absolute position, and predicts one.
@@ -68,6 +69,7 @@ class VehicleState:
         satellites: that the receiver sees; None until it has told.
         wind_at: when the autopilot told of the wind.
         reports: number, MAV_SEVERITY and text of what the autopilot said of late.
+        unclear: why it is not certain that this is the drone's own; empty when it is.
         silent_s: how long before its last heartbeat came the one before that.
         located: whether GPS has a three-dimensional fix of some accuracy; positions without one are not taken.
     """
@@ -88,6 +90,7 @@ class VehicleState:
     gimbal: Attitude | None = None
     gimbal_at: float = -math.inf
     home: Home | None = None
+    ground_home: Home | None = None
     mode: FlightMode = field(default_factory=FlightMode)
     armed: bool = False
     failsafe: bool = False
@@ -114,17 +117,14 @@ class VehicleState:
     path_lost: bool = False
     failsafe_text: str = ""
     failsafe_text_at: float = -math.inf
+    unclear: str = ""
     silent_s: float = 0.0
 
     @property
-    def _landed_told(self) -> bool:
-        """Whether the landed state is as fresh as the rest."""
-        return max(self.heartbeat_at, self.position_at) - self.landed_at <= LANDED_MAX_AGE_S
-
-    @property
     def standing(self) -> bool:
-        """Whether the autopilot says, now, that it stands on the ground."""
-        return self._landed_told and self.landed_state == MAV_LANDED_STATE.ON_GROUND
+        """Whether the autopilot says, as lately as it says the rest, that it stands on the ground."""
+        told = max(self.heartbeat_at, self.position_at) - self.landed_at <= LANDED_MAX_AGE_S
+        return told and self.landed_state == MAV_LANDED_STATE.ON_GROUND
 
     @property
     def in_air(self) -> bool:
@@ -153,7 +153,7 @@ class VehicleState:
             return "it does not tell whether it knows its position (EKF_STATUS_REPORT)"
         if not self.estimated:
             return "it does not know its position well enough yet (EKF_STATUS_REPORT)"
-        return "" if self.home is not None else "it has no home yet (HOME_POSITION)"
+        return self.unclear if self.home is not None else "it has no home yet (HOME_POSITION)"
 
     def position_fresh(self, now: float) -> bool:
         """Whether the position is recent enough to judge and to fly by; `now` is monotonic, as `position_at` is."""

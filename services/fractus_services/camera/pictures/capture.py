@@ -13,6 +13,7 @@ from datetime import UTC, datetime
 from fractus_core.policy.footprint import seen_from
 from fractus_core.policy.privacy import judge_privacy
 from fractus_core.policy.values import Call, CaptureArgs, Moment, Situation, Verdict, earliest
+from fractus_observe import spans
 
 from fractus_services.background import Background
 from fractus_services.camera.album.album import Album, AlbumFull, owner_of
@@ -142,7 +143,8 @@ class PictureCapture:
             problem = await asyncio.to_thread(self._album.quota_problem, owner)
             if problem:
                 raise AlbumFull(problem)
-            frames = await self._shutter.expose(*self._wanted(args, grant, before, verdict))
+            with spans.call().child("camera.capture"):
+                frames = await self._shutter.expose(*self._wanted(args, grant, before, verdict))
             if before.lens is not None:
                 # It is judged by a view in these proportions, whatever the camera gave.
                 frames = [cropped(one, *self._camera.resolution) for one in frames]
@@ -201,7 +203,9 @@ class PictureCapture:
                 return data
             return with_metadata(data, poses[-1], time_s=moment_s, camera=camera.model, view_width_px=view_px)
 
-        data = await asyncio.to_thread(work)
+        with spans.call().child("camera.filters") as span:
+            span.note("fractus.filters", [one.action for one in plan.filters])
+            data = await asyncio.to_thread(work)
         shot = Shot(exposure.name, moment_s, args.width, args.height, len(data), poses, face_px, plan.filters)
         await asyncio.to_thread(self._album.add, owner_of(grant), shot, data)
         return verdict, shot

@@ -9,6 +9,7 @@ from dataclasses import asdict, replace
 from fractus_core.policy.engine import judge
 from fractus_core.policy.privacy import compose, judge_privacy
 from fractus_core.policy.values import Call, Situation, Verdict
+from fractus_observe import spans
 from fractus_storage.audit import AuditLog
 
 from fractus_services.camera.imaging.faces import Detector
@@ -44,11 +45,13 @@ class PictureJudge:
         Raises:
             Refused: it is denied, or the engine failed.
         """
-        try:
-            verdict = judge(call, now, grant.compiled)
-        except Exception:
-            log.exception("policy: the engine failed, call refused (method=%s)", call.method)
-            verdict = Verdict("deny", None, "InternalError", f"the policy engine failed on {call.method}")
+        with spans.call().child("policy.judge") as span:
+            try:
+                verdict = judge(call, now, grant.compiled)
+            except Exception:
+                log.exception("policy: the engine failed, call refused (method=%s)", call.method)
+                verdict = Verdict("deny", None, "InternalError", f"the policy engine failed on {call.method}")
+            span.verdict(verdict.action, verdict.code, verdict.policies)
         return self.require(call, grant, verdict, now, record=record)
 
     def judge_view(self, call: Call, grant: ActiveGrant, seen: Situation) -> Verdict:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from fractus_core.policy.privacy import remaining
 from fractus_core.policy.values import Call, Situation, Verdict
+from fractus_observe import spans
 
 from fractus_services.background import Background
 from fractus_services.camera.album.album import Album, owner_of
@@ -114,7 +115,9 @@ class PictureLibrary:
             return encoded(apply_filters([picture], plan, self._detector, shot.face_px, upright=upright))
 
         async with self._filter_queue.turn(owner):
-            return await asyncio.to_thread(work)
+            with spans.call().child("camera.filters") as span:
+                span.note("fractus.filters", [one.action for one in plan.filters])
+                return await asyncio.to_thread(work)
 
     async def list(self, grant: ActiveGrant) -> tuple[Verdict, tuple[Shot, ...]]:
         """The pictures of the caller."""

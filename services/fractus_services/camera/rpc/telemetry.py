@@ -46,7 +46,7 @@ async def follow_telemetry(
                 async for message in stub.SubscribeTelemetry(
                     mobility_pb2.SubscribeTelemetryRequest(interval_s=INTERVAL_S)
                 ):
-                    add(measurement(message, time.monotonic(), gimbal=gimbal))
+                    add(measurement(message, time.monotonic(), time.time(), gimbal=gimbal))
         except grpc.aio.AioRpcError as error:
             log.warning("telemetry: stream ended (mobility=%s): %s", address, error.details())
         except OSError as error:
@@ -54,11 +54,22 @@ async def follow_telemetry(
         await asyncio.sleep(RETRY_S)
 
 
-def measurement(message: mobility_pb2.Telemetry, now_s: float, *, gimbal: bool = False) -> Measurement:
-    """Translate a message that arrived at a moment of monotonic time; the attitude is the airframe's, or the gimbal's."""
+def measurement(message: mobility_pb2.Telemetry, now_s: float, time_s: float, *, gimbal: bool = False) -> Measurement:
+    """Translate a message that arrived at a moment; the attitude is the airframe's, or the gimbal's.
+
+    Ages count from when the message was made: those that wait while one of the two processes is stalled arrive all at once. Both
+    read the same clock, and where that is stepped meanwhile a message counts as older, never as younger.
+
+    Args:
+        message: of the mobility service of this node.
+        now_s: monotonic seconds.
+        time_s: Unix time.
+        gimbal: whether the camera's attitude is that of a gimbal.
+    """
     turned = "gimbal" if gimbal else "attitude"
+    late_s = max(time_s - message.time.ToNanoseconds() / 1e9, 0.0) if message.HasField("time") else 0.0
     position_age_s, attitude_age_s = (
-        getattr(message, name) if message.HasField(name) else DEFAULT_AGE_S
+        late_s + (getattr(message, name) if message.HasField(name) else DEFAULT_AGE_S)
         for name in ("position_age_s", f"{turned}_age_s")
     )
     # Without a link to the autopilot the position in the message is an old one.

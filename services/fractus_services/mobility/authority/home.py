@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 from fractus_core.control import Authority, ControlState
 from fractus_core.geo import LocalFrame
+from fractus_core.policy.values import Home
 
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.autopilot import Autopilot, VehicleState
@@ -27,7 +28,20 @@ def home_moved(state: ControlState, vehicle: VehicleState) -> bool:
         return False
     if not vehicle.in_air or state.authority is Authority.PILOT:
         return False
-    lat, lon, amsl_m = mission.home
+    return _apart(home, mission.home)
+
+
+def heights_mislead(state: ControlState, vehicle: VehicleState) -> bool:
+    """Whether home is not where the flight began, also where a pilot moved it: altitudes do not count from the ground then."""
+    home, mission, ground = vehicle.home, state.mission, vehicle.ground_home
+    began = mission.home if mission is not None and not state.armed_by_others else None
+    if began is None and ground is not None:
+        began = ground.lat, ground.lon, ground.amsl_m
+    return home is not None and began is not None and vehicle.in_air and _apart(home, began)
+
+
+def _apart(home: Home, began: tuple[float, float, float]) -> bool:
+    lat, lon, amsl_m = began
     return math.hypot(*LocalFrame(lat, lon).xy(home.lat, home.lon), home.amsl_m - amsl_m) > MOVED_M
 
 

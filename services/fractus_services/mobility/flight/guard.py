@@ -9,6 +9,7 @@ from dataclasses import asdict
 from fractus_core.policy.compiled import CompiledGrant
 from fractus_core.policy.engine import judge
 from fractus_core.policy.values import Call, Situation, Verdict
+from fractus_observe import spans
 from fractus_storage.audit import AuditLog
 
 from fractus_services.grants import ActiveGrant
@@ -52,12 +53,14 @@ class Guard:
             known: the verdict that was written down a moment ago; the same again is not.
         """
         now = self.situation()
-        try:
-            verdict = judge(call, now, compiled or grant.compiled)
-        except Exception:
-            log.exception("guard: policy engine failed, call refused (method=%s)", call.method)
-            reason = f"the policy engine failed on {call.method}; nothing was done"
-            verdict = Verdict("deny", None, "InternalError", reason, (), "hover")
+        with spans.call().child("policy.judge") as span:
+            try:
+                verdict = judge(call, now, compiled or grant.compiled)
+            except Exception:
+                log.exception("guard: policy engine failed, call refused (method=%s)", call.method)
+                reason = f"the policy engine failed on {call.method}; nothing was done"
+                verdict = Verdict("deny", None, "InternalError", reason, (), "hover")
+            span.verdict(verdict.action, verdict.code, verdict.policies)
         if verdict != known and (call.method not in QUIET or not verdict.permits):
             self.record(call, grant.identity, verdict, now, kind=kind)
         return verdict

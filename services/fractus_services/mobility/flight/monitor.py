@@ -130,6 +130,10 @@ class MotionMonitor:
         """What is wrong, and whether the system flies the drone already, so that there is no driver to take it from."""
         control, now = self._control, self._guard.situation()
         changed, motion = self._has_changed(compiled.fences_in_force(now.time_s)), control.motion
+        # What moves a drone without a motion was judged by no one: another station commands it, or a motion has just ended. One that
+        # keeps its place is pushed by gusts alone, which its margin counts.
+        vehicle = control.autopilot.vehicle
+        changed = changed or (motion is None and not vehicle.keeps_place(control.autopilot.now))
         bound_for = motion.leg if motion is not None and motion.under_way and not motion.braking else None
         if control.state.returning or not control.autopilot.vehicle.mode.commanded:
             # The autopilot's own ways were judged by no one, whatever the grant was.

@@ -19,6 +19,7 @@ _KINDS = {
     COPTER_MODE.SMART_RTL: ModeKind.RETURNING,
     COPTER_MODE.AUTO_RTL: ModeKind.RETURNING,
     COPTER_MODE.LAND: ModeKind.LANDING,
+    COPTER_MODE.BRAKE: ModeKind.BRAKING,
 }
 _MODES = {int(mode): FlightMode(mode.name, _KINDS.get(mode, ModeKind.OTHER)) for mode in COPTER_MODE}
 _COPTERS = frozenset(
@@ -37,6 +38,9 @@ _LISTENS_TO_ONE = Setting(
 
 # FS_GCS_ENABLE and FENCE_ACTION: returns, or goes back on its path. BATT_FS_LOW_ACT numbers them otherwise.
 _RETURN, _RETRACE = 1.0, 3.0
+
+_COMES_DOWN = frozenset({1.0, 2.0, 3.0, 5.0})
+"""FENCE_ACTION; others only report, or let the drone hover until its battery is low."""
 
 ENABLE, TYPE, ALTITUDE, ACTION, OPTIONS = "FENCE_ENABLE", "FENCE_TYPE", "FENCE_ALT_MAX", "FENCE_ACTION", "FENCE_OPTIONS"
 AUTOENABLE, MARGIN = "FENCE_AUTOENABLE", "FENCE_MARGIN"
@@ -130,8 +134,10 @@ class ArduCopter:
         return text.startswith(("Arm", "PreArm", "Mode", "Takeoff"))
 
     def tells_failsafe(self, text: str) -> bool:
-        """`GCS Failsafe`, `Battery 1 is low ... failsafe`, `Fence breached`; not `Failsafe Cleared`."""
-        return ("ailsafe" in text or "fence" in text.lower()) and "leared" not in text
+        """`GCS Failsafe`, `Battery 1 is low ... failsafe`, `Fence breached`; not `Failsafe Cleared`, `Failsafe - Continuing`, `Fence enabled`."""
+        lower = text.lower()
+        acts = "failsafe" in lower or ("fence" in lower and "breach" in lower)
+        return acts and "cleared" not in lower and "continuing" not in lower
 
     def tells_path_lost(self, text: str) -> bool:
         """SmartRTL ran out of memory, or of time to simplify the path."""
@@ -180,14 +186,14 @@ class ArduCopter:
     def fence_values(
         self, owned: Mapping[str, float], *, ceiling_m: float | None, polygon: bool, retraces: bool
     ) -> dict[str, float]:
-        """The lower ceiling, both kinds of fence, the owner's action; and inside every polygon, not only inside one."""
+        """The lower ceiling, both kinds of fence, the owner's action if it brings the drone down; and inside every polygon, not only inside one."""
         action = _RETRACE if retraces else _RETURN
         kinds = (FENCE_TYPE.ALT_MAX if ceiling_m is not None else 0) | (FENCE_TYPE.POLYGON if polygon else 0)
         values = {ENABLE: 1.0, TYPE: float(kinds), ACTION: action}
         if owned.get(ENABLE, 0.0) != 0.0:
             before = int(owned.get(TYPE, 0))
             values[TYPE] = float(before | kinds)
-            values[ACTION] = owned.get(ACTION, 0.0) or action
+            values[ACTION] = owned[ACTION] if owned.get(ACTION) in _COMES_DOWN else action
             if before & FENCE_TYPE.ALT_MAX and ALTITUDE in owned:
                 ceiling_m = owned[ALTITUDE] if ceiling_m is None else min(ceiling_m, owned[ALTITUDE])
         if ceiling_m is not None:

@@ -26,6 +26,7 @@ from fractus_services.mobility.mavlink.link import SYSTEM_ID, Link, ignore
 from fractus_services.mobility.mavlink.orders import Orders, Velocity, moves
 from fractus_services.mobility.mavlink.parameters import Parameters
 from fractus_services.mobility.mavlink.pointing import point
+from fractus_services.mobility.mavlink.streams import Streams
 
 log = logging.getLogger(__name__)
 
@@ -34,20 +35,6 @@ MODE_TIMEOUT_S = 2.0
 REJECTED_RETRY_S = 0.3
 TAKEOFF_TIMEOUT_S = 3.0
 ATTEMPTS = 4
-
-# Messages and their rates in Hz on the ground and in the air.
-STREAMS = {
-    "GLOBAL_POSITION_INT": (4.0, 20.0),
-    "ATTITUDE": (2.0, 10.0),
-    "EXTENDED_SYS_STATE": (2.0, 5.0),
-    "SYS_STATUS": (1.0, 1.0),
-    "EKF_STATUS_REPORT": (1.0, 1.0),
-    "GPS_RAW_INT": (1.0, 2.0),
-    "HOME_POSITION": (0.2, 1.0),
-    "WIND": (0.2, 1.0),
-    # Last: many have no gimbal, and what flight needs waits for no answer about one.
-    "GIMBAL_DEVICE_ATTITUDE_STATUS": (2.0, 10.0),
-}
 
 _RESULTS: dict[int, str] = {
     MAV_RESULT.TEMPORARILY_REJECTED: "temporarily rejected",
@@ -105,7 +92,7 @@ class MavlinkAutopilot(Link):
         self.starting = asyncio.Lock()
         self.vehicle_parameters = Parameters(self, on_parameter)
         self._locks: dict[int, asyncio.Lock] = {}
-        self._flying_rates: bool | None = None
+        self._streams = Streams()
         self._probing: asyncio.Task[None] | None = None
         self._orders = Orders()
 
@@ -131,11 +118,13 @@ class MavlinkAutopilot(Link):
             await self.command(MAV_CMD.REQUEST_MESSAGE, layout_named("HEARTBEAT").msgid, attempts=1)
 
     def _lost(self) -> None:
-        self._flying_rates = self.vehicle.gimbal_measured = self.vehicle.gimbal_limits = None
+        self.vehicle.gimbal_measured = self.vehicle.gimbal_limits = None
+        self._streams.forget()
         self.vehicle_parameters.forget()
 
     def take(self, incoming: Message) -> None:
         """Hand on a message of the vehicle."""
+        self._streams.take(incoming.name)
         if incoming.name == "PARAM_VALUE":
             self.vehicle_parameters.take(incoming)
         elif incoming.name == "GIMBAL_DEVICE_ATTITUDE_STATUS" and self.vehicle.gimbal_measured is None:
@@ -295,22 +284,8 @@ class MavlinkAutopilot(Link):
             )
 
     async def set_rates(self, flying: bool) -> None:
-        """Ask for the streams, more often in the air; one that is refused comes at the autopilot's own rate.
-
-        When an answer was lost, the next call asks again.
-        """
-        if self._flying_rates is flying:
-            return
-        self._flying_rates = flying
-        for name, rates in STREAMS.items():
-            try:
-                interval_us = 1e6 / rates[flying]
-                await self.command(MAV_CMD.SET_MESSAGE_INTERVAL, layout_named(name).msgid, interval_us, attempts=2)
-            except AutopilotError as error:
-                if error.link and self._flying_rates is flying:
-                    self._flying_rates = None
-                told = log.warning if error.link else log.info  # A refusal is no fault: many have no gimbal.
-                told("autopilot: a stream keeps its own rate (message=%s, error=%s)", name, error)
+        """Ask for the streams, more often in the air, and again for those that do not come."""
+        await self._streams.ask(self, flying)
 
     async def ask_home(self) -> None:
         """Ask for the home position now."""

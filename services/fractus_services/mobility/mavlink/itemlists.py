@@ -48,12 +48,15 @@ async def upload(
     begin = message("MISSION_COUNT", count=len(items), mission_type=kind, **autopilot.address())
     kinds = "MISSION_REQUEST", "MISSION_REQUEST_INT", "MISSION_ACK"
     with autopilot.listening(*kinds) as answers, autopilot.listening("STATUSTEXT") as texts:
-        outgoing, silent, ended = begin, 0, 0
+        outgoing, silent, ended, repeated = begin, 0, 0, False
         while True:
-            autopilot.send(outgoing)
-            ended += outgoing.values.get("seq") == len(items) - 1
+            if not repeated:
+                autopilot.send(outgoing)
+                ended += outgoing.values.get("seq") == len(items) - 1
             answer = await _answer(answers, kind)
-            if answer is None:
+            # It has an item already that it asked for twice, for the first one was late: it goes on with the next.
+            repeated = answer is not None and _is_repeated(answer) and silent + 1 < ATTEMPTS
+            if answer is None or repeated:
                 silent += 1
                 if silent == ATTEMPTS:
                     raise AutopilotError("the autopilot stopped answering while its fence was written", link=True)
@@ -68,6 +71,10 @@ async def upload(
             elif (seq := answer.integer("seq")) < len(items):
                 silent = 0
                 outgoing = _item(autopilot, items[seq], seq, kind)
+
+
+def _is_repeated(answer: Message) -> bool:
+    return answer.name == "MISSION_ACK" and answer.integer("type") == MAV_MISSION_RESULT.INVALID_SEQUENCE
 
 
 async def download(autopilot: MavlinkAutopilot, kind: MAV_MISSION_TYPE = MAV_MISSION_TYPE.FENCE) -> tuple[Item, ...]:

@@ -6,14 +6,16 @@ import asyncio
 import logging
 import math
 import random
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 
 from fractus_mavlink import Endpoint, Message, message
 from fractus_mavlink.enums import MAV_AUTOPILOT, MAV_COMPONENT, MAV_STATE, MAV_TYPE
 
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.mavlink.flight_stack import FlightStack
+from fractus_services.mobility.mavlink.listeners import Listeners
+from fractus_services.mobility.mavlink.neighbours import Neighbours, Source
 from fractus_services.mobility.mavlink.timing import PROBE_S, Timing
 from fractus_services.mobility.mavlink.transport import BadUrl, Transport, open_link
 from fractus_services.mobility.mavlink.vehicle import Vehicle
@@ -78,10 +80,11 @@ class Link:
         self.timing = Timing()
         self._endpoint = Endpoint(sysid, COMPONENT_ID)
         self._transport: Transport | None = None
-        self.target: tuple[int, int] | None = None
+        self.target: Source | None = None
+        self._neighbours = Neighbours()
         self._broken = asyncio.Event()
         self._updated = asyncio.Event()
-        self._listeners: list[tuple[frozenset[str], asyncio.Queue[Message]]] = []
+        self._listeners = Listeners(sysid)
 
     @property
     def now(self) -> float:
@@ -211,13 +214,12 @@ class Link:
         self._copy_received(data)
         for incoming in self._endpoint.decode(data):
             source = (incoming.sysid, incoming.compid)
-            if self.target is None:
-                # Cameras, gimbals and ground stations have heartbeats, too, and no autopilot.
-                if incoming.name != "HEARTBEAT" or incoming.integer("autopilot") == MAV_AUTOPILOT.INVALID:
-                    continue
+            if self.target is None and self._neighbours.finds(incoming, self.now, flying=self.vehicle.armed):
                 self.target = source
                 self.vehicle.take(incoming, self.now)
                 self._on_found()
+            if incoming.name == "HEARTBEAT":
+                self.vehicle.unclear = self._neighbours.problem(incoming, self.now)
             if source == self.target:
                 self.take(incoming)
 
@@ -226,19 +228,26 @@ class Link:
         at = self.now
         if incoming.name == "GLOBAL_POSITION_INT":
             late_s = self.timing.sampled(incoming.integer("time_boot_ms"), at)
-            if late_s is None:
+            if late_s is None or self._restarted():
                 return
             at -= late_s
         elif incoming.name == "TIMESYNC":
             self.timing.replied(incoming.integer("tc1"), incoming.integer("ts1"), at)
+            if self._restarted():
+                return
         self.vehicle.take(incoming, at)
-        for kinds, queue in self._listeners:
-            if incoming.name in kinds:
-                queue.put_nowait(incoming)
+        self._listeners.take(incoming)
         if incoming.name == "HEARTBEAT":
             self._on_heartbeat()
         if incoming.name in {"GLOBAL_POSITION_INT", "HEARTBEAT", "EXTENDED_SYS_STATE"}:
             self.notify()
+
+    def _restarted(self) -> bool:
+        """Whether the vehicle has restarted: streams, parameters and what else was agreed with it begin as on a new connection."""
+        if self.timing.restarted and not self._broken.is_set():
+            log.warning("link: the autopilot has restarted, connecting again (url=%s)", self.url)
+            self._broken.set()
+        return self.timing.restarted
 
     def notify(self) -> None:
         """Wake those that wait for an update of the vehicle's state."""
@@ -255,15 +264,9 @@ class Link:
             return False
         return True
 
-    @contextmanager
-    def listening(self, *kinds: str) -> Iterator[asyncio.Queue[Message]]:
+    def listening(self, *kinds: str) -> AbstractContextManager[asyncio.Queue[Message]]:
         """The vehicle's messages of some kinds, from now until the block ends."""
-        listener = frozenset(kinds), asyncio.Queue[Message]()
-        self._listeners.append(listener)
-        try:
-            yield listener[1]
-        finally:
-            self._listeners.remove(listener)
+        return self._listeners.listening(*kinds)
 
     def recipient(self) -> dict[str, int]:
         """The vehicle, as messages name their target, even if it is silent at the moment.

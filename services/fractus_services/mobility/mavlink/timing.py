@@ -52,7 +52,12 @@ _SLACK_S = 0.5
 
 
 class Timing:
-    """Measures one link; times are our monotonic seconds unless they are said to be the vehicle's."""
+    """Measures one link; times are our monotonic seconds unless they are said to be the vehicle's.
+
+    Attributes:
+        pace: how many of the vehicle's seconds go by in one of ours.
+        restarted: whether the vehicle's clock has begun again since the last reset.
+    """
 
     def __init__(self) -> None:
         self.reset()
@@ -66,8 +71,9 @@ class Timing:
         self._asked: dict[int, tuple[float, float]] = {}
         self._delays: deque[tuple[float, float]] = deque()
         self._unanswered = 0
-        self._heard_at = -math.inf
+        self._heard_at = self._read_at_ns = -math.inf
         self.pace = 1.0
+        self.restarted = self._begun_again = False
 
     def sampled(self, boot_ms: int, now: float) -> float | None:
         """Take the time stamp of a position.
@@ -86,6 +92,9 @@ class Timing:
                 return None
             if later_s <= 0.0 or self._present(now) + OVERTAKEN_S < self._sampled + later_s:
                 self.reset()
+                self._begun_again = later_s <= 0.0
+            elif self._begun_again:
+                self.restarted = True  # the next position goes on from there: it was no old one that came late
         if now - self._arrived_at > MAX_POSITION_AGE_S:
             # What was sent while nothing came measures the gap, not the link that is back. And what a connection kept
             # meanwhile comes all at once: nothing of it says how fast the vehicle's clock runs.
@@ -151,6 +160,8 @@ class Timing:
         asked = self._asked.pop(ts1, None) if tc1_ns != 0 else None
         if asked is None or not self._samples:
             return
+        self.restarted = self.restarted or tc1_ns < self._read_at_ns - OVERTAKEN_S * 1e9
+        self._read_at_ns = tc1_ns
         sent, present = asked
         heard = self._sampled + self._since(tc1_ns / 1e6)
         delay_s = heard - present

@@ -14,7 +14,8 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from fractus_mavlink import Parser
-from fractus_mavlink.enums import MAV_AUTOPILOT
+
+from fractus_services.mobility.mavlink.neighbours import tells_vehicle
 
 Receive = Callable[[bytes], None]
 Closed = Callable[[Exception | None], None]
@@ -110,8 +111,7 @@ class _Datagrams(asyncio.DatagramProtocol):
 
 def _from_autopilot(data: bytes) -> bool:
     """Whether a datagram holds a sound heartbeat of a flight controller."""
-    heard = Parser().feed(data)
-    return any(m.name == "HEARTBEAT" and m.integer("autopilot") != MAV_AUTOPILOT.INVALID for m in heard)
+    return any(map(tells_vehicle, Parser().feed(data)))
 
 
 def _loopback(host: str) -> bool:

@@ -121,6 +121,8 @@ def _home(vehicle: Vehicle, message: Message, _now: float) -> None:
     if lat == 0.0 and lon == 0.0:
         return  # as of the position: home is not set
     vehicle.home = Home(lat, lon, message.integer("altitude") / 1e3)
+    if not vehicle.in_air:
+        vehicle.ground_home = vehicle.home
 
 
 def _landed(vehicle: Vehicle, message: Message, now: float) -> None:

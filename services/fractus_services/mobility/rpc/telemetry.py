@@ -8,7 +8,7 @@ from fractus_core.control import Outcome, OutcomeKind
 from fractus_proto.v1 import mobility_pb2, types_pb2
 
 from fractus_services.mobility.authority.control import Control
-from fractus_services.mobility.authority.home import home_moved
+from fractus_services.mobility.authority.home import heights_mislead
 from fractus_services.mobility.autopilot import MAX_POSITION_AGE_S, WIND_MAX_AGE_S, VehicleState
 
 
@@ -30,12 +30,15 @@ def position_age_s(control: Control) -> float:
 
 
 def located(control: Control) -> bool:
-    """Whether the position is known and fresh, and its altitude counts from where home was fixed."""
+    """Whether the position is known and fresh, and its altitude counts from where home was when the flight began.
+
+    Pictures are judged by it, also while a pilot flies.
+    """
     vehicle = control.autopilot.vehicle
     return (
         vehicle.lat is not None
         and vehicle.position_fresh(control.autopilot.now)
-        and not home_moved(control.state, vehicle)
+        and not heights_mislead(control.state, vehicle)
     )
 
 

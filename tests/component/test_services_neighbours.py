@@ -1,0 +1,119 @@
+"""Others on the drone's link that have heartbeats: none of them is taken for the drone's own autopilot, least of all in flight."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from pathlib import Path
+from typing import Any
+
+import pytest
+from closed_loop import Sky, Wire
+from fractus_core.control import StreamState
+from fractus_core.policy.values import TakeoffArgs
+from fractus_mavlink import Endpoint, Parser
+from fractus_mavlink.enums import COPTER_MODE, MAV_AUTOPILOT, MAV_CMD, MAV_COMPONENT, MAV_STATE, MAV_TYPE
+from fractus_services.errors import Refused
+from mobility_world import goto
+from sky_drone import fly, ready, until
+
+
+def heartbeat(sysid: int, compid: int, kind: MAV_TYPE, autopilot: MAV_AUTOPILOT) -> bytes:
+    values = {"type": kind, "autopilot": autopilot, "system_status": MAV_STATE.STANDBY, "mavlink_version": 3}
+    return Endpoint(sysid, compid).encode("HEARTBEAT", values)
+
+
+GIMBAL = heartbeat(1, MAV_COMPONENT.GIMBAL, MAV_TYPE.GIMBAL, MAV_AUTOPILOT.GENERIC)
+TRACKER = heartbeat(9, MAV_COMPONENT.AUTOPILOT1, MAV_TYPE.ANTENNA_TRACKER, MAV_AUTOPILOT.ARDUPILOTMEGA)
+OTHER = heartbeat(2, MAV_COMPONENT.AUTOPILOT1, MAV_TYPE.QUADROTOR, MAV_AUTOPILOT.ARDUPILOTMEGA)
+
+
+def heard_first(sky: Sky, *frames: bytes) -> None:
+    """Let each connection begin with these."""
+    connect = sky.create_connection
+
+    async def create_connection(*args: Any, **kwargs: Any) -> Any:
+        wire, protocol = await connect(*args, **kwargs)
+        sky.call_soon(protocol.data_received, b"".join(frames))
+        return wire, protocol
+
+    sky.create_connection = create_connection  # type: ignore[method-assign]
+
+
+@pytest.mark.parametrize("stranger", [GIMBAL, TRACKER, OTHER], ids=["gimbal", "tracker", "other"])
+def test_in_flight_no_one_else_takes_the_place_of_the_autopilot_whose_link_broke(
+    stranger: bytes, tmp_path: Path
+) -> None:
+    async def work(sky: Sky, directory: Path) -> None:
+        async with ready(sky, directory) as (drone, grant):
+            await drone.service.arm(grant, 120.0)
+            async with contextlib.aclosing(drone.service.take_off(grant, TakeoffArgs(15.0))) as climbing:
+                async for _ in climbing:
+                    pass
+            heard_first(sky, stranger)
+            (wire,) = sky.wires
+            wire._protocol.connection_lost(None)
+            await until(lambda: drone.autopilot._broken.is_set() or sky.wires != [wire])
+            await until(lambda: drone.autopilot.connected and sky.wires != [wire])
+            assert drone.autopilot.target == (1, 1)
+            assert drone.autopilot.vehicle.armed
+            await asyncio.sleep(5.0)
+            async with contextlib.aclosing(drone.service.goto(grant, goto(20, 0, 15), 0.0)) as flying:
+                async for _ in flying:
+                    pass
+            assert drone.state is StreamState.GRANTED
+            assert sky.truth.mode is COPTER_MODE.GUIDED
+
+    fly(work, tmp_path)
+
+
+def test_nothing_arms_while_two_vehicles_are_heard(tmp_path: Path) -> None:
+    async def work(sky: Sky, directory: Path) -> None:
+        async with ready(sky, directory) as (drone, grant):
+            assert not drone.autopilot.vehicle.unready(drone.autopilot.now)
+
+            async def speak(wire: Wire) -> None:
+                while True:
+                    wire._protocol.data_received(OTHER + GIMBAL + TRACKER)
+                    await asyncio.sleep(1.0)
+
+            speaking = asyncio.ensure_future(speak(sky.wires[0]))
+            await until(lambda: drone.autopilot.vehicle.unclear)
+            with pytest.raises(Refused, match=r"other vehicles are heard on its link, too \(MAVLink systems 2\)"):
+                await drone.service.arm(grant)
+            assert not sky.truth.armed
+            speaking.cancel()
+            await drone.service.arm(grant, 120.0)
+            assert sky.truth.armed
+
+    fly(work, tmp_path)
+
+
+def test_what_another_station_is_answered_acknowledges_no_command_of_ours(tmp_path: Path) -> None:
+    async def work(sky: Sky, directory: Path) -> None:
+        async with ready(sky, directory) as (drone, _):
+            (wire,) = sky.wires
+            write, parser, arrived = wire.write, Parser(), []
+            theirs = {
+                "target_system": 1,
+                "target_component": 1,
+                "command": MAV_CMD.SET_MESSAGE_INTERVAL,
+                "param1": 147.0,
+            }
+            station = Endpoint(255, MAV_COMPONENT.MISSIONPLANNER).encode("COMMAND_LONG", theirs | {"param2": 1e6})
+
+            def lose_the_first(data: Any) -> None:
+                for sent in parser.feed(bytes(data)):
+                    if sent.name == "COMMAND_LONG" and sent.integer("command") == MAV_CMD.SET_MESSAGE_INTERVAL:
+                        if not arrived:
+                            write(station)
+                        arrived.append(sent.real("param2"))
+                        if len(arrived) == 1:
+                            return
+                write(data)
+
+            wire.write = lose_the_first  # type: ignore[method-assign]
+            await drone.autopilot.command(MAV_CMD.SET_MESSAGE_INTERVAL, 147.0, 2e6)
+            assert arrived == [2e6, 2e6]
+
+    fly(work, tmp_path)

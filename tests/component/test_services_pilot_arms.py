@@ -1,0 +1,44 @@
+"""A drone that others arm while a driver waits on the ground with it: nothing was prepared for its flight, and it is a pilot's."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+import pytest
+from closed_loop import Sky
+from fractus_core.control import Authority, StreamState
+from fractus_core.policy.values import TakeoffArgs
+from fractus_mavlink import Endpoint
+from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_COMPONENT, MAV_MODE_FLAG
+from fractus_services.errors import Refused
+from sky_drone import fly, ready, until
+
+
+@pytest.mark.parametrize("mode", [COPTER_MODE.LOITER, COPTER_MODE.GUIDED])
+def test_a_driver_does_not_fly_what_others_have_armed(mode: COPTER_MODE, tmp_path: Path) -> None:
+    async def work(sky: Sky, directory: Path) -> None:
+        station = Endpoint(255, MAV_COMPONENT.MISSIONPLANNER)
+
+        def tell(command: MAV_CMD, *params: float) -> None:
+            values = {f"param{i}": value for i, value in enumerate(params, 1)}
+            values |= {"target_system": 1, "target_component": 1, "command": command}
+            sky.craft.receive(sky.wires[0]._channel, station.encode("COMMAND_LONG", values))
+
+        async with ready(sky, directory) as (drone, grant):
+            tell(MAV_CMD.DO_SET_MODE, MAV_MODE_FLAG.CUSTOM_MODE_ENABLED, mode)
+            await until(lambda: drone.autopilot.vehicle.mode.name == mode.name)
+            tell(MAV_CMD.COMPONENT_ARM_DISARM, 1)
+            await until(lambda: drone.autopilot.vehicle.armed)
+            await until(lambda: drone.state is StreamState.LOST)
+            assert drone.control.authority is Authority.PILOT
+            with pytest.raises(Refused):
+                async for _ in drone.service.take_off(grant, TakeoffArgs(15.0)):
+                    pass
+            with pytest.raises(Refused):
+                await drone.service.arm(grant)
+            await asyncio.sleep(2.0)
+            assert sky.truth.mode is mode
+            assert sky.truth.body.down > -0.5
+
+    fly(work, tmp_path)

@@ -7,7 +7,7 @@ import contextlib
 import dataclasses
 import os
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import kopf
 
@@ -97,6 +97,39 @@ def _by_address(info: kopf.ConnectionInfo | None) -> kopf.ConnectionInfo | None:
     return dataclasses.replace(info, server=f"https://{f'[{host}]' if ':' in host else host}:{port}")
 
 
+class Progress(kopf.AnnotationsProgressStorage):
+    """Remembers which handlers failed, and when they are tried again.
+
+    It is noted in annotations, whose changes wake kopf, but never read from them: who may edit an Application can write them, and
+    would skip its teardown or put it off indefinitely. An operator that starts tries at once.
+    """
+
+    def __init__(self, prefix: str) -> None:
+        super().__init__(prefix=prefix)
+        self._known: dict[tuple[str, kopf.HandlerId], kopf.ProgressRecord] = {}
+
+    def fetch(self, *, key: kopf.HandlerId, body: kopf.Body) -> kopf.ProgressRecord | None:
+        """What this operator knows of a handler."""
+        return self._known.get((_uid(body), key))
+
+    def store(self, *, key: kopf.HandlerId, record: kopf.ProgressRecord, body: kopf.Body, patch: kopf.Patch) -> None:
+        """Remember a handler."""
+        # As annotations would give it back, without what is None: what compares unequal is stored at every look, and kopf then
+        # waits for the event of a patch that changes nothing instead of for the time of the next try.
+        kept = {name: value for name, value in record.items() if value is not None}
+        self._known[_uid(body), key] = cast(kopf.ProgressRecord, kept)
+        super().store(key=key, record=record, body=body, patch=patch)
+
+    def purge(self, *, key: kopf.HandlerId, body: kopf.Body, patch: kopf.Patch) -> None:
+        """Forget a handler that is done."""
+        self._known.pop((_uid(body), key), None)
+        super().purge(key=key, body=body, patch=patch)
+
+
+def _uid(body: kopf.Body) -> str:
+    return str(body["metadata"].get("uid", ""))
+
+
 class _Unchanged(kopf.DiffBaseStorage):
     """Tells kopf that nothing changed: no handler uses the difference, and its annotation would cost a write."""
 
@@ -111,7 +144,7 @@ class _Unchanged(kopf.DiffBaseStorage):
 def _configure(settings: kopf.OperatorSettings) -> None:
     """Set kopf up: our names on objects, no Events of its own, watches that cannot go silent."""
     settings.persistence.finalizer = FINALIZER
-    settings.persistence.progress_storage = kopf.AnnotationsProgressStorage(prefix="kopf.fractus.dev")
+    settings.persistence.progress_storage = Progress("kopf.fractus.dev")
     settings.persistence.diffbase_storage = _Unchanged()
     settings.posting.enabled = False
     settings.peering.standalone = True

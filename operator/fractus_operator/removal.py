@@ -12,21 +12,36 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from http import HTTPStatus
 
 from fractus_core.api.names import CLASS_LABEL, NODE_SIGNER
 from fractus_kube import LEASE
 
-from fractus_operator.cluster.kinds import CONFIG_MAP, DAEMON_SET, NODE, POD, SECRET, SIGNING_REQUEST, Body, Kind
+from fractus_operator.cluster.kinds import (
+    CONFIG_MAP,
+    DAEMON_SET,
+    DEPLOYMENT,
+    NODE,
+    POD,
+    SECRET,
+    SIGNING_REQUEST,
+    Body,
+    Kind,
+)
 from fractus_operator.cluster.labels import LEASE_NAME, is_location_label
-from fractus_operator.cluster.store import KubeError, Store, Unconfigured
+from fractus_operator.cluster.store import KubeError, NotFound, Store, Unconfigured
 from fractus_operator.identity.ca_secret import NAME as AUTHORITY
 
 WIPE = "fractus-wipe"
 """The chart's DaemonSet whose pods are ready once their node's data is gone."""
+OPERATOR = "fractus-operator"
+"""The chart's Deployment of the operator."""
 
 _WIPING_S = 120.0
 """How long nodes get to remove their data; the chart's Job has 240 s in all."""
 _PERIOD_S = 2.0
+_ASKING_S = 30.0
+"""How long an API server that does not answer is asked whether the operator is still installed."""
 
 
 def unwiped(nodes: Sequence[Body], pods: Sequence[Body]) -> list[str]:
@@ -51,6 +66,44 @@ def _noting(problems: list[str], what: str) -> Iterator[None]:
         yield
     except KubeError as error:
         problems.append(f"{what}: {error}")
+
+
+async def still_installed(store: Store, namespace: str, timeout_s: float = _ASKING_S) -> str:
+    """Return why nothing may be removed, in a sentence; empty once the operator is uninstalled.
+
+    An API server that does not answer, or has no time, is asked again until the end.
+
+    What renders the chart and knows no hooks of helm (helm template, kustomize) makes this Job along with what it would take down.
+    """
+    try:
+        operator = await _operator(store, namespace, timeout_s)
+    except NotFound:
+        return ""
+    except KubeError as error:
+        # The right to look comes in one Role with those to remove what this protects.
+        if error.status == HTTPStatus.FORBIDDEN:
+            return ""
+        return f"nothing was removed, for it is not known whether Fractus is still installed ({error})"
+    if "deletionTimestamp" in operator["metadata"]:
+        return ""
+    return (
+        f"nothing was removed: Fractus is installed in {namespace}, and this Job is for helm uninstall only; leave hooks out "
+        "where you render the chart (helm template --no-hooks)"
+    )
+
+
+async def _operator(store: Store, namespace: str, timeout_s: float) -> Body:
+    end = time.monotonic() + timeout_s
+    while True:
+        try:
+            return await store.get(DEPLOYMENT, OPERATOR, namespace)
+        except KubeError as error:
+            passes = (
+                error.status in {0, HTTPStatus.TOO_MANY_REQUESTS} or error.status >= HTTPStatus.INTERNAL_SERVER_ERROR
+            )
+            if not passes or time.monotonic() > end:
+                raise
+        await asyncio.sleep(_PERIOD_S)
 
 
 async def remove(store: Store, namespace: str, *, keep_authority: bool = False) -> list[str]:
@@ -115,6 +168,24 @@ async def await_wiped(store: Store, namespace: str, timeout_s: float = _WIPING_S
         await asyncio.sleep(_PERIOD_S)
 
 
+async def _removed(store: Store, namespace: str, wiped: str, keep_authority: bool, timeout_s: float) -> list[str]:
+    problems: list[str] = []
+    refused = await remove(store, namespace, keep_authority=keep_authority)
+    if refused:
+        problems.append(f"not all that Fractus made in the cluster was removed: {', '.join(refused)}")
+    if wiped:
+        try:
+            left = await await_wiped(store, namespace, timeout_s)
+        except KubeError as error:
+            problems.append(
+                f"it is not known on which nodes {wiped} was wiped ({error}): see to it there (rm -rf {wiped})"
+            )
+        else:
+            if left:
+                problems.append(f"{wiped} was not wiped on {', '.join(left)}: remove it there (rm -rf {wiped})")
+    return problems
+
+
 async def run(namespace: str, wiped: str, *, keep_authority: bool = False, timeout_s: float = _WIPING_S) -> str:
     """Remove all of it. The DaemonSet that wipes goes in any case: it would wipe what is installed next.
 
@@ -133,19 +204,8 @@ async def run(namespace: str, wiped: str, *, keep_authority: bool = False, timeo
     store = await Store.connect()
     problems: list[str] = []
     try:
-        refused = await remove(store, namespace, keep_authority=keep_authority)
-        if refused:
-            problems.append(f"not all that Fractus made in the cluster was removed: {', '.join(refused)}")
-        if wiped:
-            try:
-                left = await await_wiped(store, namespace, timeout_s)
-            except KubeError as error:
-                problems.append(
-                    f"it is not known on which nodes {wiped} was wiped ({error}): see to it there (rm -rf {wiped})"
-                )
-            else:
-                if left:
-                    problems.append(f"{wiped} was not wiped on {', '.join(left)}: remove it there (rm -rf {wiped})")
+        installed = await still_installed(store, namespace, min(_ASKING_S, timeout_s))
+        problems += [installed] if installed else await _removed(store, namespace, wiped, keep_authority, timeout_s)
     finally:
         if wiped:
             with _noting(problems, f"kubectl -n {namespace} delete daemonset {WIPE}, before anything is installed"):

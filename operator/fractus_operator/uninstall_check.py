@@ -8,9 +8,9 @@ from collections.abc import Sequence
 
 from fractus_core.api.nodes import DRONE_REPORT_S, GROUNDED_ANNOTATION, ON_MISSION, is_airborne
 
-from fractus_operator.cluster.kinds import APPLICATION, DRONE, Body, key_of
+from fractus_operator.cluster.kinds import APPLICATION, DRONE, Body, Kind, key_of
 from fractus_operator.cluster.labels import FINALIZER
-from fractus_operator.cluster.store import KubeError, Store, Unconfigured
+from fractus_operator.cluster.store import KubeError, NotFound, Store, Unconfigured
 
 NOT_REPORTED = "its last report"
 _REPORTS_S = 3 * DRONE_REPORT_S
@@ -79,7 +79,7 @@ async def check() -> str:
     try:
         async with asyncio.timeout(_REPORTS_S) as waited:
             while True:
-                found = objection(await store.list(APPLICATION), await store.list(DRONE))
+                found = objection(await _all(store, APPLICATION), await _all(store, DRONE))
                 if NOT_REPORTED not in found:
                     return found
                 await asyncio.sleep(_PERIOD_S)
@@ -89,6 +89,14 @@ async def check() -> str:
         return found
     finally:
         await store.aclose()
+
+
+async def _all(store: Store, kind: Kind) -> list[Body]:
+    """All objects of a kind; none where the kind itself is gone, so that Fractus can be removed after it."""
+    try:
+        return await store.list(kind)
+    except NotFound:
+        return []
 
 
 def main() -> int:

@@ -52,3 +52,19 @@ def test_a_limit_that_is_left_out_stays_out() -> None:
         if b["metadata"]["name"] == "fractus-agent" and b["kind"] == "DaemonSet"
     )
     assert set(agent["spec"]["template"]["spec"]["containers"][0]["resources"]) == {"requests"}
+
+
+def test_services_get_further_variables() -> None:
+    said = [
+        "--set=mobility.extraEnv[0].name=OTEL_EXPORTER_OTLP_ENDPOINT",
+        "--set=mobility.extraEnv[0].value=http://c:4317",
+    ]
+    bodies = {b["metadata"]["name"]: b for b in render(*said) if b["kind"] == "DaemonSet"}
+    variables = {
+        name: bodies[name]["spec"]["template"]["spec"]["containers"][0]["env"]
+        for name in ("fractus-mobility", "fractus-camera")
+    }
+    added = {"name": "OTEL_EXPORTER_OTLP_ENDPOINT", "value": "http://c:4317"}
+    assert variables["fractus-mobility"][-1] == added
+    assert added not in variables["fractus-camera"]
+    assert "FRACTUS_NODE" in {one["name"] for one in variables["fractus-mobility"]}

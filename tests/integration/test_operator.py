@@ -95,8 +95,11 @@ def test_a_manifest_becomes_a_plan_grants_and_pods(world: World, operator: Opera
         [base["status"]["podIP"]]
     ]
     assert "selector" not in children["services/traffic-image-checker"]["spec"]
-    told = ["Deployed", "Granted", "Planned", "PodsReady"]
-    wait_for(lambda: events(world, namespace) == told, "one Event for each step")
+    wait_for(lambda: events(world, namespace) == ["Planned", "PodsReady"], "one Event for what comes together")
+    found = world.api.list(f"/api/v1/namespaces/{namespace}/events")
+    (planned,) = (e["message"] for e in found if e["reason"] == "Planned")
+    for stage in ("Planned", "Granted", "Deployed"):
+        assert world.condition(namespace, stage)["message"] in planned, "nothing that the conditions say is lost"
 
 
 def events(world: World, namespace: str) -> list[str]:
@@ -361,6 +364,25 @@ def test_a_component_that_fails_is_told_with_its_last_words(
     wait_for(lambda: any(last_words in event["message"] for event in world.api.list(path)), "the Event")
 
 
+def test_pods_that_the_namespace_does_not_let_be_made_are_told(
+    world: World, operator: OperatorProcess, namespace: str
+) -> None:
+    """As where it has a quota or limits, or enforces Pod Security: no pod is there that could say why."""
+    path = f"/api/v1/namespaces/{namespace}/limitranges/small"
+    limits = {"limits": [{"type": "Container", "max": {"cpu": "50m"}}]}
+    head = {"apiVersion": "v1", "kind": "LimitRange", "metadata": {"name": "small", "namespace": namespace}}
+    world.api.apply(path, head | {"spec": limits})
+    world.put(traffic(namespace))
+    wait_for(lambda: world.condition(namespace, "Ready").get("reason") == "PodsRefused", "the refusal in the status")
+    message = world.condition(namespace, "Ready")["message"]
+    assert "no pod of traffic-" in message
+    assert "50m" in message
+    assert "50m" in world.status(namespace)["message"]
+    world.api.delete(path)
+    wait_for(lambda: world.condition(namespace, "Ready")["reason"] == "PodsNotReady", "all pods to be made")
+    deployed(world, namespace)
+
+
 def test_a_changed_spec_flies_again_after_completion(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     end_mission(world, namespace, "Complete", "done")
@@ -463,9 +485,34 @@ def test_an_upgraded_operator_restarts_nothing_in_the_air(
     wait_for(lambda: grace_s("traffic-navigator") == 10, "the drone's pods to be renewed on the ground")
 
 
+def test_a_name_as_long_as_kubernetes_lets_it_be_is_deployed_and_told(
+    world: World, operator: OperatorProcess, namespace: str
+) -> None:
+    name = "a" + ".b" * 126
+    assert len(name) == 253
+    world.put(traffic(namespace, name))
+    deployed(world, namespace, name)
+    wait_for(lambda: "PodsReady" in events(world, namespace), "the Events")
+    world.api.delete(world.path(traffic(namespace, name)))
+    wait_for(lambda: world.application(namespace, name) is None and not world.children(namespace), "everything to go")
+
+
 def test_deleting_leaves_nothing(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     world.api.delete(world.path(traffic(namespace)))
+    wait_for(lambda: gone(world, namespace), "everything to go")
+    assert not world.grants(namespace)
+
+
+@pytest.mark.parametrize("noted", ['{"success":true}', '{"delayed":"9999-12-31T00:00:00+00:00"}', "no JSON"])
+def test_who_may_edit_an_application_cannot_keep_its_drone(
+    world: World, operator: OperatorProcess, namespace: str, noted: str
+) -> None:
+    """By the annotations in which kopf notes how far a deletion is; another, such as the fleet's operator, deletes it."""
+    running(world, namespace)
+    path = world.path(traffic(namespace))
+    world.api.merge(path, {"metadata": {"annotations": {"kopf.fractus.dev/teardown": noted}}})
+    world.api.delete(path)
     wait_for(lambda: gone(world, namespace), "everything to go")
     assert not world.grants(namespace)
 

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
-from contextlib import contextmanager
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
 import pytest
 from control_plane import wait_for
 from fractus_kube import KubeError
-from operator_world import FRACTUS, OperatorProcess, World, at, ours, traffic
-from test_operator import end_mission, gone, running
+from operator_world import FRACTUS, OperatorProcess, World, at, navigator, ours, traffic
+from test_operator import deployed, end_mission, gone, running
 
 Body = dict[str, Any]
 LOW = {"type": "LimitControl", "kind": "altitude", "upperLimit": 15}
@@ -55,38 +56,59 @@ def older_policies(world: World) -> Iterator[None]:
 
 
 @contextmanager
-def undeletable_secrets(world: World, namespace: str) -> Iterator[None]:
-    """Let the API server refuse to delete the Secrets of a namespace."""
-    root, name = "/apis/admissionregistration.k8s.io/v1", "keep-secrets"
-    rule = {"apiGroups": [""], "apiVersions": ["v1"], "resources": ["secrets"], "operations": ["DELETE"]}
+def refusing(
+    world: World, namespace: str, resource: str, operation: str, unless: str, probe: Callable[[], object]
+) -> Iterator[None]:
+    """Let the API server refuse an operation on what a namespace has of a resource.
+
+    Args:
+        unless: A CEL expression that is true of what it is to let through.
+        probe: A dry run that it is to refuse.
+    """
+    root, name = "/apis/admissionregistration.k8s.io/v1", f"refuse-{operation.lower()}-{resource}"
+    rule = {"apiGroups": [""], "apiVersions": ["v1"], "resources": [resource], "operations": [operation]}
     place = {"namespaceSelector": {"matchLabels": {"kubernetes.io/metadata.name": namespace}}}
     objects = {
         f"{root}/validatingadmissionpolicies/{name}": (
             "ValidatingAdmissionPolicy",
-            {"matchConstraints": {"resourceRules": [rule]}, "validations": [{"expression": "false"}]},
+            {"matchConstraints": {"resourceRules": [rule]}, "validations": [{"expression": unless}]},
         ),
         f"{root}/validatingadmissionpolicybindings/{name}": (
             "ValidatingAdmissionPolicyBinding",
             {"policyName": name, "validationActions": ["Deny"], "matchResources": place},
         ),
     }
+
+    def refused() -> bool:
+        try:
+            probe()
+        except KubeError:
+            return True
+        return False
+
     for path, (kind, spec) in objects.items():
         about = {"apiVersion": "admissionregistration.k8s.io/v1", "kind": kind, "metadata": {"name": name}}
         world.api.apply(path, about | {"spec": spec})
     try:
-        wait_for(lambda: not deletable(world, namespace), "the API server to refuse it")
+        wait_for(refused, "the API server to refuse it")
         yield
     finally:
         for path in objects:
             world.api.delete(path)
 
 
-def deletable(world: World, namespace: str) -> bool:
-    try:
-        world.api.call("DELETE", f"/api/v1/namespaces/{namespace}/secrets/traffic-navigator-tls?dryRun=All")
-    except KubeError:
-        return False
-    return True
+def undeletable_secrets(world: World, namespace: str) -> AbstractContextManager[None]:
+    """Let the API server refuse to delete the Secrets of a namespace."""
+    path = f"/api/v1/namespaces/{namespace}/secrets/traffic-navigator-tls?dryRun=All"
+    return refusing(world, namespace, "secrets", "DELETE", "false", lambda: world.api.call("DELETE", path))
+
+
+def unstoppable_pods(world: World, namespace: str) -> AbstractContextManager[None]:
+    """Let the API server refuse to give the pods of a namespace a deadline."""
+    path = f"/api/v1/namespaces/{namespace}/pods/{world.pods(namespace)[0]['metadata']['name']}?dryRun=All"
+    stopped = {"spec": {"activeDeadlineSeconds": 1}}
+    without = "!has(object.spec.activeDeadlineSeconds)"
+    return refusing(world, namespace, "pods", "UPDATE", without, lambda: world.api.merge(path, stopped))
 
 
 def policy_ready(world: World, name: str) -> Body:
@@ -268,3 +290,25 @@ def test_a_teardown_that_is_refused_is_made_again(world: World, operator: Operat
         assert world.application(namespace) is not None
     wait_for(lambda: world.application(namespace) is None, lambda: f"the end: {operator.log()[-3000:]}")
     assert "is cancelled" not in operator.log(), "the end of what follows an application is no reason for a warning"
+
+
+@pytest.mark.parametrize("restarted", [False, True], ids=["running", "restarted"])
+def test_deleted_while_its_mission_is_wound_up_it_leaves_no_pod(
+    world: World, operator: OperatorProcess, namespace: str, *, restarted: bool
+) -> None:
+    """As by who deletes an application once it reads Completed: its pods have lost one owner, and have no other yet."""
+    world.put(traffic(namespace, "traffic", navigator()))
+    deployed(world, namespace, pods=1)
+    with unstoppable_pods(world, namespace):
+        end_mission(world, namespace, "Complete", "done")
+        wait_for(
+            lambda: all(not pod["metadata"].get("ownerReferences") for pod in world.pods(namespace)),
+            "the pod to lose its owner",
+        )
+        if restarted:
+            operator.stop(signal.SIGKILL)
+        world.api.delete(f"{FRACTUS}/namespaces/{namespace}/applications/traffic")
+        if restarted:
+            operator.start()
+        wait_for(lambda: world.application(namespace) is None, "the application to go")
+        assert not world.pods(namespace)

@@ -85,10 +85,32 @@ def test_a_directory_of_ours_is(path: str) -> None:
     assert render(*WIPE, f"--set=host.state={path}")
 
 
-def test_an_installation_cannot_be_told_to_wipe() -> None:
+@pytest.mark.parametrize(
+    ("state", "config"),
+    [
+        ("/var/lib/fractus", "/var/lib/fractus/etc"),
+        ("/etc/fractus", "/etc/fractus"),
+        ("/data/fractus/", "/data//x/../fractus/./etc/"),
+    ],
+)
+def test_descriptions_of_nodes_are_not_wiped(state: str, config: str) -> None:
+    set_ = (f"--set=host.state={state}", f"--set=host.config={config}")
+    assert render(*set_)
+    with pytest.raises(subprocess.CalledProcessError) as refused:
+        render(*WIPE, *set_)
+    assert f"host.config, {config}, with the nodes' descriptions, is in host.state, {state}" in refused.value.stderr
+    assert render(*WIPE, "--set=host.state=/data/fractus", "--set=host.config=/data/fractus-config")
+
+
+def test_what_renders_without_a_cluster_wipes_nothing() -> None:
+    """Such as Argo CD, which says of all that it is an installation: a value that is left there refuses no change of others."""
+    assert render(WIPES) == render()
+
+
+def test_an_installation_cannot_be_told_to_wipe(world: World) -> None:
     """`helm install --atomic` that fails uninstalls, on nodes that may have been there before."""
     with pytest.raises(subprocess.CalledProcessError) as refused:
-        render(WIPES)
+        render(*on(world, WIPES))
     assert "set it by an upgrade just before uninstalling" in refused.value.stderr
 
 
@@ -209,3 +231,17 @@ def test_what_is_refused_is_told(world: World, left: list[str], tmp_path: Path) 
     assert "not all that Fractus made in the cluster was removed" in done.stderr
     assert f"Secret {SYSTEM}/fractus-ca" in done.stderr
     assert [path for path in left if world.api.get(path)] == [path for path in left if SYSTEM in path]
+
+
+def test_an_installed_system_stays_as_it_is(world: World, left: list[str], tmp_path: Path) -> None:
+    """Tools that render the chart and know no hooks make the Job along with what it would remove."""
+    (operator,) = (body for body in render() if body["kind"] == "Deployment" and "operator" in body["metadata"]["name"])
+    world.api.apply(path_of(operator), operator)
+    try:
+        done = remove(world, tmp_path)
+    finally:
+        world.api.delete(path_of(operator))
+    assert done.returncode == 1
+    assert f"nothing was removed: Fractus is installed in {SYSTEM}" in done.stderr
+    assert [path for path in left if world.api.get(path)] == left
+    assert remove(world, tmp_path).returncode == 0

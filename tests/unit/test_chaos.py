@@ -161,4 +161,12 @@ def test_drones_land_at_home() -> None:
 def test_nothing_is_left_over() -> None:
     assert not left_over([])
     (found,) = left_over([{"kind": "Secret", "metadata": {"name": "one-navigator"}}])
-    assert "Secret/one-navigator" in found.found
+    assert "Secret/one-navigator (there)" in found.found
+    ends = {
+        "name": "one",
+        "deletionTimestamp": "12:00",
+        "finalizers": ["orphan"],
+        "ownerReferences": [{"kind": "D", "name": "d"}],
+    }
+    (found,) = left_over([{"kind": "ReplicaSet", "metadata": ends}])
+    assert "ReplicaSet/one (there; ends since 12:00; owned by D/d; held by orphan)" in found.found

@@ -19,6 +19,8 @@ from fractus_operator.cluster.store import Conflict, KubeError, NotFound
 from fractus_operator.inventory.grouped import Made
 from fractus_operator.reconcile.builders import child
 from fractus_operator.reconcile.children import Children, NameTaken
+from fractus_operator.reconcile.finished_pods import FinishedPods
+from fractus_operator.reconcile.rollout import Rollout
 
 INPUT = yaml.safe_load((Path(__file__).parents[1] / "golden" / "operator" / "input.yaml").read_text())
 APPLICATION = Application.from_body(INPUT["application"])
@@ -135,6 +137,27 @@ async def test_what_may_not_be_said_any_more_is_replaced_first() -> None:
     assert store.said[2:] == ["count Deployment", "apply Deployment", "count Deployment", "apply Deployment"]
 
 
+async def test_plans_and_links_that_change_take_one_request_each() -> None:
+    store = Webhooks(None)
+    children = made_on(store)
+    owner = {"uid": APPLICATION.metadata.uid, "controller": True}
+    link = {"application": {"uid": APPLICATION.metadata.uid}}
+    store.there[kinds.DIRECT_LINK, "one"] = {**kinds.DIRECT_LINK.header("one", uid="1"), "spec": link}
+    store.there[kinds.DEPLOYMENT_PLAN, "one"] = standing(kinds.DEPLOYMENT_PLAN, ownerReferences=[owner])
+    wanted: dict[Kind, list[Body]] = {
+        kinds.DIRECT_LINK: [{**kinds.DIRECT_LINK.header("one"), "spec": link | {"node": "n"}}],
+        kinds.DEPLOYMENT_PLAN: [{**kinds.DEPLOYMENT_PLAN.header("one", "city", ownerReferences=[owner]), "spec": {}}],
+    }
+    for kind, bodies in wanted.items():
+        await children.apply(APPLICATION, {kind: bodies})
+        assert store.said[2:] == [f"rewrite {kind.name}"], "but for the look at what has its name"
+        store.said.clear()
+    # An owner that someone changed is put right, which takes an apply.
+    store.there[kinds.DEPLOYMENT_PLAN, "one"]["metadata"]["ownerReferences"][0] = {"uid": owner["uid"]}
+    await children.apply(APPLICATION, {kinds.DEPLOYMENT_PLAN: wanted[kinds.DEPLOYMENT_PLAN]})
+    assert store.said[-1] == "apply DeploymentPlan"
+
+
 @pytest.mark.parametrize(
     ("node", "then"), [("n1", ["rewrite Grant"]), ("n2", ["delete Grant", "create Grant"])], ids=["stays", "moved"]
 )
@@ -156,6 +179,93 @@ async def test_the_grant_of_another_application_is_left_alone() -> None:
     assert store.said == ["create Grant refused", "get Grant"]
 
 
+async def test_what_a_controller_made_with_our_labels_is_left_to_it() -> None:
+    """EndpointSlices have the labels of their Service: one that is removed before it comes back."""
+    store = Spelling(None)
+    copies = {kind: Made(cast(Any, store), kind, lambda body: body, lambda *_: None) for kind in kinds.CHILDREN}
+    children = Children(cast(Any, store), copies, cast(Any, None))
+    for name, owner, by in (
+        ("ours", "Application", "operator.fractus.dev"),
+        ("theirs", "Service", "endpointslice-controller.k8s.io"),
+    ):
+        body = child(kinds.ENDPOINT_SLICE, APPLICATION, name, {"endpointslice.kubernetes.io/managed-by": by})
+        body["metadata"]["ownerReferences"][0]["kind"] = owner
+        copies[kinds.ENDPOINT_SLICE].note((APPLICATION.key[0], name), body)
+    assert await children.remove(APPLICATION.key, kinds.ENDPOINT_SLICE)
+    assert store.said == ["delete EndpointSlice"]
+
+
+async def test_pods_are_followed_in_slices_of_the_operator_only() -> None:
+    """Kubernetes says itself where a Service with a selector leads, and admission refuses what another writes there."""
+    store = Spelling(None)
+    copies = {kind: Made(cast(Any, store), kind, lambda body: body, lambda *_: None) for kind in kinds.CHILDREN}
+    children = Children(cast(Any, store), copies, cast(Any, None))
+    for name, by in (("ours", "operator.fractus.dev"), ("theirs", "endpointslice-controller.k8s.io")):
+        made = child(kinds.ENDPOINT_SLICE, APPLICATION, name, {"endpointslice.kubernetes.io/managed-by": by})
+        made["endpoints"] = [{"addresses": ["10.0.0.7"]}]
+        copies[kinds.ENDPOINT_SLICE].note((APPLICATION.key[0], name), made)
+    rollout = Rollout(children, cast(Any, None), cast(Any, None), lambda: NOW)
+    await rollout.follow_pods(APPLICATION.key, PLAN, [])
+    assert store.said == ["patch EndpointSlice ours"]
+
+
+@pytest.mark.parametrize("owner", ["Application", "Service"])
+async def test_a_deployment_with_another_owner_is_removed(owner: str) -> None:
+    """Who may edit a namespace may give it another owner: it would outlive its application."""
+    store = Spelling(None)
+    copies = {kind: Made(cast(Any, store), kind, lambda body: body, lambda *_: None) for kind in kinds.CHILDREN}
+    body = child(kinds.DEPLOYMENT, APPLICATION, "one", {})
+    body["metadata"]["ownerReferences"][0]["kind"] = owner
+    copies[kinds.DEPLOYMENT].note((APPLICATION.key[0], "one"), body)
+    assert await Children(cast(Any, store), copies, cast(Any, None)).remove(APPLICATION.key, kinds.DEPLOYMENT)
+    assert store.said == ["delete Deployment"]
+
+
+@pytest.mark.parametrize("kept", [True, False])
+async def test_a_deployment_that_a_finalizer_keeps_takes_no_pods_along(kept: bool) -> None:
+    """So they are removed one by one; those of one that is gone are left to the garbage collector."""
+    store = Spelling(None)
+    labels = {"app.kubernetes.io/managed-by": "fractus", "fractus.dev/instance": "one"}
+
+    def made(kind: Kind, uid: str, owner: str) -> Body:
+        return kind.header("one", "city", uid=uid, labels=labels, ownerReferences=[{"uid": owner}]) | {"spec": {}}
+
+    deployment = made(kinds.DEPLOYMENT, "d", "app")
+    listed = {
+        kinds.DEPLOYMENT: [deployment] if kept else [],
+        kinds.REPLICA_SET: [made(kinds.REPLICA_SET, "r", "d")],
+        kinds.POD: [made(kinds.POD, "p", "r")],
+    }
+
+    async def list_whole(kind: Kind, **_: object) -> Any:
+        return SimpleNamespace(items=listed[kind])
+
+    cast(Any, store).list_whole = list_whole
+    copies = {kind: Made(cast(Any, store), kind, lambda body: body, lambda *_: None) for kind in kinds.CHILDREN}
+    deployment["metadata"]["labels"] = labels | {"fractus.dev/application": "a"}
+    copies[kinds.DEPLOYMENT].note(("city", "one"), deployment)
+    live = SimpleNamespace(applications={("city", "a"): SimpleNamespace(settled_generation=None)})
+    children = Children(cast(Any, store), copies, cast(Any, None))
+    await FinishedPods(cast(Any, store), cast(Any, live), children, lambda: NOW).tear_down(("city", "a"))
+    assert store.said == ["delete Deployment", *(["delete ReplicaSet", "delete Pod"] if kept else [])]
+
+
+async def test_a_pod_that_was_kept_is_left_to_no_garbage_collector() -> None:
+    store = Spelling(None)
+    labels = {"app.kubernetes.io/managed-by": "fractus", "fractus.dev/instance": "one"}
+    kept = kinds.POD.header("one-x", "city", uid="p", labels=labels, ownerReferences=[{"uid": "app"}]) | {"spec": {}}
+
+    async def list_whole(kind: Kind, **_: object) -> Any:
+        return SimpleNamespace(items=[kept] if kind is kinds.POD else [])
+
+    cast(Any, store).list_whole = list_whole
+    copies = {kind: Made(cast(Any, store), kind, lambda body: body, lambda *_: None) for kind in kinds.CHILDREN}
+    live = SimpleNamespace(applications={("city", "a"): SimpleNamespace(settled_generation=1)})
+    children = Children(cast(Any, store), copies, cast(Any, None))
+    await FinishedPods(cast(Any, store), cast(Any, live), children, lambda: NOW).tear_down(("city", "a"))
+    assert store.said == ["delete Pod"]
+
+
 class Spelling(Webhooks):
     """An API server that spells what it is given in its own way."""
 
@@ -165,6 +275,10 @@ class Spelling(Webhooks):
 
     async def delete(self, kind: Kind, _key: Key, _uid: str | None, *, orphan: bool = False) -> None:
         self.said.append(f"delete {kind.name}")
+
+    async def patch(self, kind: Kind, key: Key, changes: Body, _type: object) -> Body:
+        self.said.append(f"patch {kind.name} {key[1]}")
+        return {"metadata": {"name": key[1], "namespace": key[0]}, **changes}
 
 
 async def test_what_is_removed_is_not_remembered_how_it_was_spelled() -> None:

@@ -12,7 +12,7 @@ from fractus_core.api.plans import DeploymentPlanSpec, PlannedInstance
 from fractus_core.control import Outcome, OutcomeKind
 from fractus_core.planning.inventory import Host, Inventory
 from fractus_core.planning.quantities import amount_of
-from fractus_operator.cluster.pods import PodView, read_host, read_pod
+from fractus_operator.cluster.pods import PodView, read_host, read_pod, refusals
 from fractus_operator.cluster.store import Store
 from fractus_operator.inventory.live import LiveInventory
 from fractus_operator.reconcile import status
@@ -28,6 +28,7 @@ from fractus_operator.reconcile.replanning import (
     stuck_nodes,
     waits_for_landing,
 )
+from fractus_operator.reconcile.reporting import announced
 from fractus_operator.reconcile.silence import shown_state
 from fractus_operator.reconcile.status import Blocked
 from fractus_operator.settings import BadSetting, Settings
@@ -51,6 +52,20 @@ def test_a_transition_is_reported_and_moves_the_time() -> None:
     assert other[0].last_transition_time == NOW
     true, _ = merge(other, [ConditionUpdate("Ready", "True", "PodsReady")], 2, later)
     assert true[0].last_transition_time == later
+
+
+def test_stages_that_are_reached_together_are_told_by_one_event() -> None:
+    stages = [ConditionUpdate(stage, "True", stage, f"{stage} it is") for stage in ("Planned", "Granted", "Deployed")]
+    ready = ConditionUpdate("Ready", "True", "PodsReady", "all pods are ready")
+    waiting = ConditionUpdate("Ready", "False", "PodsNotReady", "one to go", progress=True)
+    (only,) = announced([*stages, waiting])
+    assert (only.reason, only.message) == ("Planned", "Planned it is; Granted it is; Deployed it is")
+    assert [update.reason for update in announced([*stages, ready])] == ["Planned", "PodsReady"]
+    assert list(announced([stages[2], ready])) == [stages[2], ready], "one alone is told as it is"
+    refused = ConditionUpdate("Deployed", "False", "NameTaken", "a Secret is in the way")
+    not_ready = ConditionUpdate("Ready", "False", "NameTaken", "a Secret is in the way")
+    told = list(announced([*stages[:2], refused, not_ready]))
+    assert [(update.reason, update.warning) for update in told] == [("Planned", False), ("NameTaken", True)]
 
 
 def test_only_a_problem_is_a_warning() -> None:
@@ -195,6 +210,22 @@ def test_readiness_counts_each_instance_up_to_its_replicas() -> None:
     assert (done.phase, done.pods) == ("Running", "3/3")
     old = status.deployed(PLAN, [view("a-1", terminating=True), view("a-c"), view("a-c")], 0)
     assert old.pods == "2/3"
+
+
+def test_a_pod_that_may_not_be_made_is_told_with_the_reason() -> None:
+    why = 'pods "a-1-5d8f-" is forbidden: exceeded quota: compute'
+    pods = [view("a-c"), view("a-c")]
+    update = status.deployed(PLAN, pods, 0, refused={"a-1": why, "a-c": "of its last rollout"})
+    ready = next(c for c in update.conditions if c.type == "Ready")
+    assert (ready.reason, ready.warning) == ("PodsRefused", True)
+    assert update.message == ready.message == f"waiting for a-1; no pod of a-1 can be made: {why}"
+    assert status.deployed(PLAN, [*pods, view("a-1")], 0, refused={"a-1": why}).phase == "Running"
+    failure = {"type": "ReplicaFailure", "status": "True", "reason": "FailedCreate", "message": why}
+    scaled = {"type": "Available", "status": "False", "message": "no"}
+    conditions = {"a": [scaled, failure], "b": [scaled, failure | {"status": "False"}], "c": []}
+    conditions["e"] = [failure | {"reason": "FailedDelete"}]
+    bodies = [{"metadata": {"name": name}, "status": {"conditions": found}} for name, found in conditions.items()]
+    assert refusals([*bodies, {"metadata": {"name": "d"}}]) == {"a": why}
 
 
 def test_a_failed_component_is_named_with_its_exit_code_and_last_lines() -> None:

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from fractus_kube import KubeError
+from fractus_kube import KubeError, NotFound
 from fractus_operator import removal
 from fractus_operator.cluster.kinds import POD, SIGNING_REQUEST
 from fractus_operator.cluster.store import Store
@@ -38,14 +38,22 @@ class Cluster:
     Attributes:
         fails: The looks that it answers with an error.
         refuses: The names of objects that it does not delete.
+        operator: The Deployment of the operator, or the error that asking for it gives.
     """
 
     def __init__(self, fails: range = range(0), refuses: tuple[str, ...] = ()) -> None:
+        self.operator: Any = NotFound(404, "NotFound", "there is none")
         self.ready = [pod("edge-1", "True"), pod("drone-1", "True")]
         self.looks = 0
         self.deleted: list[str] = []
         self.labelled: list[str] = []
         self.fails, self.refuses = fails, refuses
+
+    async def get(self, kind: Any, name: str, namespace: str) -> Any:
+        assert (kind.name, name, namespace) == ("Deployment", "fractus-operator", "fractus-system")
+        if isinstance(self.operator, KubeError):
+            raise self.operator
+        return self.operator
 
     async def list(self, kind: Any, **_: object) -> list[Any]:
         if kind is SIGNING_REQUEST:
@@ -141,6 +149,44 @@ async def test_an_authority_of_before_stays() -> None:
     assert await remove(cluster, "fractus-system", keep_authority=True) == []
     assert "Secret fractus-ca" not in cluster.deleted
     assert "ConfigMap fractus-ca" in cluster.deleted
+
+
+@pytest.mark.parametrize(
+    ("operator", "why"),
+    [
+        ({"metadata": {"name": "fractus-operator"}}, "Fractus is installed in fractus-system"),
+        (KubeError(0, "", "it did not answer in time"), "not known whether Fractus is still installed (it did not"),
+    ],
+)
+async def test_nothing_of_an_installed_system_is_removed(
+    monkeypatch: pytest.MonkeyPatch, operator: object, why: str
+) -> None:
+    """Rendered by helm template, the Job is made with the rest: without its authority the fleet could not be granted anything."""
+    cluster = connect(monkeypatch, Cluster())
+    cluster.operator = operator
+    said = await run("fractus-system", "/data/fractus", timeout_s=0.05)
+    assert said.startswith("nothing was removed")
+    assert why in said
+    assert cluster.deleted == ["DaemonSet fractus-wipe"], "which would wipe nodes in use"
+    assert not cluster.labelled
+    cluster.operator = {"metadata": {"name": "fractus-operator", "deletionTimestamp": "2026-01-01T00:00:00Z"}}
+    await run("fractus-system", "/data/fractus", timeout_s=0.05)
+    assert "Secret fractus-ca" in cluster.deleted
+
+
+@pytest.mark.parametrize("status", [0, 429, 503])
+async def test_an_api_server_that_is_away_for_a_moment_is_asked_again(
+    status: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cluster = connect(monkeypatch, Cluster())
+    answers = [KubeError(status, "", "not now"), KubeError(status, "", "not now"), NotFound(404, "NotFound", "none")]
+
+    async def get(*_: object) -> Any:
+        raise answers.pop(0)
+
+    monkeypatch.setattr(cluster, "get", get)
+    assert await run("fractus-system", "") == ""
+    assert "Secret fractus-ca" in cluster.deleted
 
 
 @pytest.fixture

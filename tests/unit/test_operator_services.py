@@ -240,6 +240,12 @@ class Api(Store):
             raise KubeError(422, "Invalid", f"{name} is refused")
         if method == "PUT":
             self.objects[name] = body
+        if method == "PATCH":
+            # As an apply of a list whose items are told apart by their type.
+            status = self.objects[name].setdefault("status", {})
+            new = {condition["type"]: condition for condition in body["status"]["conditions"]}
+            others = [each for each in status.get("conditions", ()) if each["type"] not in new]
+            status["conditions"] = [*others, *new.values()]
         return json.loads(json.dumps(self.objects.get(name, {})))
 
 
@@ -394,6 +400,7 @@ async def test_a_drone_may_take_off_until_it_reports_after_its_last_grant(live: 
     assert await said() == "", "nothing was ever granted"
     granted(live, "ns.a", "d1")
     assert await said() == "Granted"
+    assert api.asked == [("PATCH", "d1")], "it takes one request, and no look before"
     assert live.drones.get(("", "d1")).may_take_off  # type: ignore[union-attr]
     granted(live, "ns.a", None)
     assert await said() == "NotHeardOf"
@@ -406,6 +413,17 @@ async def test_a_drone_may_take_off_until_it_reports_after_its_last_grant(live: 
         )
     assert await said(lastSeen=at(59)) == "NoGrant"
     assert not live.drones.get(("", "d1")).may_take_off  # type: ignore[union-attr]
+
+
+async def test_what_was_said_of_a_drone_is_not_said_again_before_the_watch_shows_it(live: LiveInventory) -> None:
+    """Grants of an application come one by one."""
+    api = Api()
+    missions = OnMission(api, live, reported(live, api), lambda: datetime(2026, 1, 1, tzinfo=UTC))
+    live.listen(GRANT, lambda key: bool(missions.grant_changed(key)))
+    for name in ("ns.a", "ns.b", "ns.c"):
+        granted(live, name, "d1")
+        await missions.reconcile(("", "d1"))
+    assert api.asked == [("PATCH", "d1")]
 
 
 def test_a_drone_that_someone_saw_on_the_ground_is_there_until_its_next_report() -> None:

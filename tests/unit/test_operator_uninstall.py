@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from fractus_operator import uninstall_check
-from fractus_operator.cluster.store import Store
+from fractus_operator.cluster.store import KubeError, NotFound, Store
 from fractus_operator.uninstall_check import check, objection
 
 
@@ -80,3 +80,36 @@ async def test_an_api_server_that_does_not_answer_is_an_objection(monkeypatch: p
     monkeypatch.setattr(Store, "connect", connect)
     monkeypatch.setattr(uninstall_check, "_REPORTS_S", 0.05)
     assert "the API server did not answer" in await check()
+
+
+class Answers:
+    """An API server that answers a list of each kind with what it is told, an error among it."""
+
+    def __init__(self, **of: Any) -> None:
+        self.of = of
+
+    async def list(self, kind: Any) -> list[Any]:
+        answer = self.of[kind.name]
+        if isinstance(answer, KubeError):
+            raise answer
+        return list(answer)
+
+    async def aclose(self) -> None:
+        pass
+
+
+async def test_kinds_that_are_gone_keep_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Removed before the chart that makes use of them, they would keep it indefinitely."""
+    gone = NotFound(404, "NotFound", "the server could not find the requested resource")
+    answers = Answers(Application=gone, Drone=gone)
+
+    async def connect() -> Answers:
+        return answers
+
+    monkeypatch.setattr(Store, "connect", connect)
+    assert await check() == ""
+    answers.of["Drone"] = [drone("drone-1", "flying")]
+    assert "drone-1 (flying)" in await check()
+    answers.of["Drone"] = KubeError(403, "Forbidden", "it may not list drones")
+    with pytest.raises(KubeError):
+        await check()

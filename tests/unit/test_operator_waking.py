@@ -8,13 +8,15 @@ from typing import Any, cast
 import pytest
 from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.identity.authority import Authority
+from fractus_core.planning.inventory import Inventory
 from fractus_operator.cluster import kinds
 from fractus_operator.cluster.reading import read_submitted
 from fractus_operator.cluster.store import Store
 from fractus_operator.inventory.grouped import Grouped
 from fractus_operator.inventory.live import LiveInventory
 from fractus_operator.reconcile.applications import Applications, _Memory
-from test_planning import at, component, edge, inventory, manifest
+from fractus_operator.reconcile.status import StatusUpdate
+from test_planning import at, component, edge, host, inventory, manifest
 
 V1 = "fractus.dev/v1alpha1"
 NOW = datetime(2026, 6, 1, 12, 0, tzinfo=UTC)
@@ -36,7 +38,67 @@ async def test_what_another_application_leaves_wakes_only_those_without_a_plan_t
         assert not await placed.changed(0)
         live.subscriptions.placed(("ns", "placed"), placed=False)
         live.drones.note(("", "d"), drone_body(3, "flying"))
+        assert not await placed.changed(0), "a drone that takes off leaves nothing"
+        assert not await new.changed(0)
+        live.drones.note(("", "d"), drone_body(4, "inactive"))
         assert await placed.changed(1)
+
+
+def pod_body(version: int, node: str | None, phase: str = "Running") -> dict[str, Any]:
+    metadata = {"namespace": "ns", "name": "p", "uid": "p", "resourceVersion": str(version)}
+    return {"metadata": metadata, "spec": {"nodeName": node, "containers": []}, "status": {"phase": phase}}
+
+
+async def test_what_leaves_a_node_wakes_those_alone_who_want_room_on_it() -> None:
+    live = LiveInventory(cast(Store, None))
+    key = ("ns", "p")
+    with live.subscriptions.subscribe(("ns", "here")) as here, live.subscriptions.subscribe(("ns", "there")) as there:
+        live.subscriptions.placed(("ns", "here"), placed=False, full={"n", "m"})
+        live.subscriptions.placed(("ns", "there"), placed=False, full={"m"})
+        live.pods.note(key, pod_body(1, None, "Pending"))
+        live.pods.note(key, pod_body(2, "n"))
+        assert not await here.changed(0), "what comes leaves no room"
+        live.pods.note(key, pod_body(3, "n", "Succeeded"))
+        assert await here.changed(0)
+        live.pods._drop(key)
+        assert not await here.changed(0), "it had no room any more"
+        live.pods.note(key, pod_body(4, "n"))
+        live.pods._drop(key)
+        assert await here.changed(0), "who is killed leaves room as well"
+        live.subscriptions.placed(("ns", "here"), placed=True)
+        live.pods.note(key, pod_body(5, "n"))
+        live.pods._drop(key)
+        assert not await here.changed(0), "it has all it wants by now"
+        assert not await there.changed(0)
+    assert not live.subscriptions._full
+
+
+def full_node() -> Inventory:
+    """An edge node with too little left for the components of tests."""
+    return inventory([], [edge("e1", (0, 0))], [host("e1", "edge", cpu=0.01)])
+
+
+async def test_who_finds_no_room_is_woken_by_what_leaves_the_node(monkeypatch: pytest.MonkeyPatch) -> None:
+    live = LiveInventory(cast(Store, None))
+    applications = Applications(cast(Store, None), live, Authority.generate(NOW), lambda: NOW)
+    viewer = component("Viewer", "edge", locations=[{"center": at(0, 0), "radius": 100}])
+    body = {**manifest("Application", "waits", {"components": [viewer]}), "status": {}}
+    submitted = read_submitted(body)
+    live.applications.note(submitted.key, body)
+    monkeypatch.setattr(live, "snapshot", lambda *_: full_node())
+    said: list[StatusUpdate] = []
+
+    async def report(_submitted: object, update: StatusUpdate, *_: object) -> None:
+        said.append(update)
+
+    monkeypatch.setattr(applications._reporter, "report", report)
+    with live.subscriptions.subscribe(submitted.key) as waits:
+        await applications._advance(live.observe(submitted), _Memory())
+        assert [update.phase for update in said] == ["Pending"]
+        live.subscriptions.wake_for_room("e2")
+        assert not await waits.changed(0)
+        live.subscriptions.wake_for_room("e1")
+        assert await waits.changed(0)
 
 
 APPLICATION = {"apiVersion": V1, "kind": "Application", "spec": {}}

@@ -4,7 +4,7 @@ import pytest
 from fractus_core.api.geometry import Position
 from fractus_core.planning import Infeasible, Settings, flight_of, plan
 from fractus_core.planning.flight import ahead, misses
-from fractus_core.planning.growth import room_to_grow
+from fractus_core.planning.growth import room_to_grow, without_room
 from test_plan_properties import flown_by_other, passenger, shared, where
 from test_planning import PATH, application, at, component, drone, edge, host, inventory, navigator
 
@@ -41,7 +41,9 @@ def test_a_node_that_does_not_suit_is_no_room():
     full = host("e2", "edge", cpu=0.01)
     stock = inventory([drone("d")], [edge("e1", (0, 0)), edge("e2", (50, 0))], [full])
     assert room_to_grow(app, stock, Settings(), before) is None
+    assert without_room(app, stock, Settings(), before) == {"e2"}
     stock = inventory([drone("d")], [edge("e1", (0, 0)), edge("e2", (50, 0))])
+    assert not without_room(app, stock, Settings(excluded={"e2": "refused"}), before)
     assert room_to_grow(app, stock, Settings(excluded={"e2": "refused"}), before) is None
     assert room_to_grow(app, stock, Settings(), before) == "e2"
 

@@ -11,6 +11,9 @@ from fractus_core.api.nodes import DroneStatus, EdgeNodeStatus, Interface, NodeS
 from fractus_core.api.plans import Rejection
 from fractus_core.planning.inventory import Host, Settings
 
+INSUFFICIENT = "InsufficientResources"
+"""Why a node is rejected that would do, once others leave enough room on it."""
+
 
 class Ledger:
     """What hosts have left while a plan is made: allocatable minus requested minus what the plan already placed.
@@ -130,7 +133,7 @@ def check_resources(ledger: Ledger, node: str, components: Iterable[Component]) 
         shortage = ledger.shortage(node, wanted, asking)
         if shortage is not None:
             fit = "does not fit" if len(asking) == 1 else "do not fit together"
-            return Check("InsufficientResources", f"{', '.join(asking)} {fit} ({shortage})")
+            return Check(INSUFFICIENT, f"{', '.join(asking)} {fit} ({shortage})")
     return SUITABLE
 
 

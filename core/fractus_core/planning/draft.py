@@ -10,6 +10,7 @@ from fractus_core.api.names import object_name
 from fractus_core.api.nodes import EdgeNode
 from fractus_core.api.plans import DeploymentPlanSpec, PlannedInstance, Rejection, Role, Serves
 from fractus_core.planning.candidates import (
+    INSUFFICIENT,
     SUITABLE,
     Check,
     Ledger,
@@ -29,6 +30,7 @@ class Infeasible(Exception):
 
     Attributes:
         omitted: how many nodes that were too far away are not among those rejected.
+        full: nodes that would do, were there room on them.
     """
 
     def __init__(
@@ -39,6 +41,7 @@ class Infeasible(Exception):
         self.message = message
         self.rejected = tuple(rejected)
         self.omitted = omitted
+        self.full = frozenset(each.node for each in self.rejected if each.reason == INSUFFICIENT)
         super().__init__(message)
 
 

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from fractus_core.api.applications import Application
 from fractus_core.api.components import Component, EdgeLocation
 from fractus_core.api.plans import DeploymentPlanSpec
+from fractus_core.planning.candidates import INSUFFICIENT, Check
 from fractus_core.planning.draft import Draft
 from fractus_core.planning.inventory import Inventory, Settings
 
@@ -31,12 +32,25 @@ def room_to_grow(
 
     Costs a look at the nodes in such locations only.
     """
-    draft = Draft(application, inventory, settings, present)
+    return next((name for name, check in _looked_at(application, inventory, settings, present) if check), None)
+
+
+def without_room(
+    application: Application, inventory: Inventory, settings: Settings, present: DeploymentPlanSpec
+) -> frozenset[str]:
+    """The nodes that a location with too few instances could have, were there room on them."""
+    checks = _looked_at(application, inventory, settings, present)
+    return frozenset(name for name, check in checks if check.reason == INSUFFICIENT)
+
+
+def _looked_at(
+    application: Application, inventory: Inventory, settings: Settings, present: DeploymentPlanSpec
+) -> Iterator[tuple[str, Check]]:
+    """Each node in a location with too few instances that has none of them, and whether it does."""
+    draft: Draft | None = None
     for component, spot in with_too_few(application, present):
+        draft = draft or Draft(application, inventory, settings, present)
         for name, _ in draft.located.edge_nodes.within(spot.center, spot.radius):
             node = inventory.edge_nodes.get(name)
-            if node is None or draft.had(component, name):
-                continue
-            if draft.check_edge(node, component):
-                return name
-    return None
+            if node is not None and not draft.had(component, name):
+                yield name, draft.check_edge(node, component)

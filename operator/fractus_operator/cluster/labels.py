@@ -16,6 +16,10 @@ MANAGED_LABEL = "app.kubernetes.io/managed-by"
 MANAGED_BY = "fractus"
 MANAGED_SELECTOR = f"{MANAGED_LABEL}={MANAGED_BY},{APPLICATION_LABEL}"
 
+SLICE_LABEL = "endpointslice.kubernetes.io/managed-by"
+SLICES_BY = "operator.fractus.dev"
+"""On EndpointSlices: who sees to them. Kubernetes leaves those alone that have another value than its own."""
+
 DIGEST_ANNOTATION = f"{GROUP}/applied"
 """Digest of what was applied last, so that an unchanged object is not written again."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import sys
 import types
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
@@ -24,10 +24,13 @@ from fractus_operator.cluster.labels import (
 )
 
 _MAX_LOG = 400
-"""Characters of a failed container's last log lines that are kept."""
+"""Characters of a failed container's last log lines, or of a refusal, that are kept."""
 FINISHED_DEADLINE_S = 1
 """The shortest `activeDeadlineSeconds` that a pod takes, counted from its start: the kubelet stops a pod that runs."""
 _CANNOT_START = frozenset({"ImagePullBackOff", "ErrImagePull", "InvalidImageName", "CreateContainerConfigError"})
+REPLICA_FAILURE = "ReplicaFailure"
+"""The condition of a Deployment whose pods cannot be made, with the reason REFUSED, or cannot be deleted."""
+REFUSED = "FailedCreate"
 _ENDED = frozenset({"Succeeded", "Failed"})
 _KEPT_LABELS = (APPLICATION_LABEL, COMPONENT_LABEL, INSTANCE_LABEL, MANAGED_LABEL)
 
@@ -165,6 +168,20 @@ def daemon_set(metadata: Body) -> str | None:
 def revision_hash(metadata: Body) -> str:
     """Which of its controller's templates a pod was made from, or a ControllerRevision keeps."""
     return str((metadata.get("labels") or {}).get("controller-revision-hash", ""))
+
+
+def refusal_of(deployment: Body) -> str:
+    """Why the API server refuses pods of a Deployment, such as a quota or Pod Security; empty where it does not."""
+    for condition in (deployment.get("status") or {}).get("conditions") or ():
+        if (condition["type"], condition["status"], condition.get("reason")) == (REPLICA_FAILURE, "True", REFUSED):
+            return str(condition.get("message") or REFUSED)[:_MAX_LOG]
+    return ""
+
+
+def refusals(deployments: Iterable[Body]) -> dict[str, str]:
+    """The same by name, of those Deployments whose pods are refused."""
+    found = ((body["metadata"]["name"], refusal_of(body)) for body in deployments)
+    return {name: why for name, why in found if why}
 
 
 def _controller(metadata: Body, kind: str) -> str | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from typing import Self
@@ -40,6 +41,7 @@ __all__ = [
 
 FIELD_MANAGER = "fractus-operator"
 _TRIES = 3
+_MAX_NAME = 253
 
 
 class Store(Client):
@@ -144,7 +146,8 @@ class Store(Client):
             reference["namespace"] = namespace
         stamp = now.strftime("%Y-%m-%dT%H:%M:%SZ")
         body = {
-            **EVENT.header(name, namespace),
+            # An object's name may be as long as any name.
+            **EVENT.header(name if len(name) <= _MAX_NAME else hashlib.sha256(name.encode()).hexdigest(), namespace),
             "involvedObject": reference,
             "reason": reason,
             "message": message[:1024],

@@ -14,7 +14,7 @@ from fractus_core.planning.locations import NodeLocations
 from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Body, Key, Kind
 from fractus_operator.cluster.labels import labelled
-from fractus_operator.cluster.pods import PodView, read_host, read_pod
+from fractus_operator.cluster.pods import REFUSED, REPLICA_FAILURE, PodView, read_host, read_pod, refusal_of
 from fractus_operator.cluster.reading import PartPool, Submitted, Unreadable, read_submitted, reader, tolerant_reader
 from fractus_operator.cluster.store import Reflector, Store
 from fractus_operator.inventory.bookings import BookedHosts, Bookings, ByName, corrections
@@ -36,11 +36,7 @@ class LiveInventory:
         parts = PartPool()
         self.services = NodeServices(namespace)
         self.revisions = Reflector(
-            store,
-            kinds.CONTROLLER_REVISION,
-            read_revision,
-            self.services.revision_changed,
-            namespace=namespace,
+            store, kinds.CONTROLLER_REVISION, read_revision, self.services.revision_changed, namespace=namespace
         )
         self.hosts = Reflector(store, kinds.NODE, read_host, self._host_changed)
         self.pods = Reflector(store, kinds.POD, read_pod, self._pod_changed)
@@ -189,6 +185,8 @@ class LiveInventory:
                 else:
                     self._pods.drop(owner, key)
                 self.subscriptions.wake(owner)
+        if (held := _held(old)) is not None and held != _held(new):
+            self.subscriptions.wake_for_room(held[0])
 
     def _drone_changed(self, key: Key, old: Drone | None, new: Drone | None) -> None:
         self._report(kinds.DRONE, key)
@@ -201,7 +199,9 @@ class LiveInventory:
         if _rules_differ(old, new):
             self._rules_changed()
         elif old is not None and new is not None and _planning_view(old) != _planning_view(new):
-            self.subscriptions.wake_waiting()
+            # What takes off leaves nothing to who waits: neither itself, nor more of a flight to share than before.
+            if not (new.in_air and not old.in_air and _ready(old) == _ready(new)):
+                self.subscriptions.wake_waiting()
             self._wake_flyers(new.name)
         elif old is not None and new is not None and _flight_view(old) != _flight_view(new):
             self._wake_flyers(new.name)
@@ -281,6 +281,11 @@ class LiveInventory:
             listener(key)
 
 
+def _held(pod: PodView | None) -> tuple[str, Mapping[str, float]] | None:
+    """The node that a pod takes room on, and how much; None while it takes none."""
+    return (pod.node, pod.requests) if pod is not None and pod.node is not None and not pod.finished else None
+
+
 def _rules_differ(old: Drone | EdgeNode | None, new: Drone | EdgeNode | None) -> bool:
     """Whether a node appeared, went, or changed in what policies select it by and what grants take from it."""
     return old is None or new is None or old.spec != new.spec or old.metadata.labels != new.metadata.labels
@@ -302,8 +307,12 @@ def _ready(node: Drone | EdgeNode) -> str | None:
 
 
 def _without_status(body: Body) -> Body:
-    """A child without what others say of it."""
+    """A child without what others say of it, but for why pods of a Deployment cannot be made."""
     kept = {name: value for name, value in body.items() if name != "status"}
+    refused = refusal_of(body)
+    if refused:
+        failure = {"type": REPLICA_FAILURE, "status": "True", "reason": REFUSED, "message": refused}
+        kept["status"] = {"conditions": [failure]}
     kept["metadata"] = {n: v for n, v in body["metadata"].items() if n != "resourceVersion"}
     annotations = dict(kept["metadata"].get("annotations") or {})
     annotations.pop("deployment.kubernetes.io/revision", None)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 
 from fractus_operator.cluster.kinds import Key
@@ -49,6 +49,7 @@ class Subscriptions:
     def __init__(self) -> None:
         self._of: dict[Key, list[Subscription]] = {}
         self._placed: set[Key] = set()
+        self._full: dict[Key, Collection[str]] = {}
 
     @contextmanager
     def subscribe(self, key: Key) -> Iterator[Subscription]:
@@ -62,10 +63,21 @@ class Subscriptions:
             if not self._of[label]:
                 del self._of[label]
                 self._placed.discard(label)
+                self._full.pop(label, None)
 
-    def placed(self, key: Key, *, placed: bool) -> None:
-        """Note whether an application has all that it could have: what others leave or take is nothing to it then."""
-        (self._placed.add if placed else self._placed.discard)(labelled(key))
+    def placed(self, key: Key, *, placed: bool, full: Collection[str] = frozenset()) -> None:
+        """Note whether an application has all that it could have: what others leave or take is nothing to it then.
+
+        Args:
+            key: The application.
+            placed: Whether it has.
+            full: Nodes that it would use, were there room on them.
+        """
+        label = labelled(key)
+        (self._placed.add if placed else self._placed.discard)(label)
+        self._full.pop(label, None)
+        if full:
+            self._full[label] = full
 
     def wake(self, key: Key) -> None:
         """Wake one application."""
@@ -77,6 +89,13 @@ class Subscriptions:
         for label in self._of.keys() - self._placed:
             for subscription in self._of[label]:
                 subscription.wake()
+
+    def wake_for_room(self, node: str) -> None:
+        """Wake every application that would use a node, were there room on it: something has left it."""
+        for label, full in self._full.items():
+            if node in full:
+                for subscription in self._of.get(label, ()):
+                    subscription.wake()
 
     def wake_all(self, *, urgent: bool = False) -> None:
         """Wake every application: something that all depend on changed."""

@@ -19,6 +19,7 @@ from fractus_core.validation import check_application
 from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Key
 from fractus_operator.cluster.labels import FINALIZER
+from fractus_operator.cluster.pods import refusals
 from fractus_operator.cluster.reading import SETTLED, Submitted
 from fractus_operator.cluster.store import Backoff, KubeError, Store
 from fractus_operator.inventory.live import LiveInventory
@@ -164,7 +165,7 @@ class Applications:
         """Revoke every grant of an application that is being deleted, then remove what was made for it.
 
         The drone is brought home by its own services once its grant is gone. What a stale watch hides
-        here, the garbage collector finds by its owner.
+        here, the garbage collector finds by its owner; pods that have none are looked for.
 
         Raises:
             KubeError: the API server refused a delete, or could not be reached.
@@ -174,7 +175,7 @@ class Applications:
         memory = self._memories.setdefault(key, _Memory())
         async with memory.lock:
             await self._children.revoke(key)
-            await self._children.remove(key, *reversed(kinds.CHILDREN))
+            await self._finished_pods.tear_down(key)
         self._memories.pop(key, None)
         self._grants.forget(key)
         self._notes.forget(key)
@@ -206,7 +207,7 @@ class Applications:
             update, again_s = await self._deploy(self._live.observe(submitted), memory)
         except Blocked as blocked:
             # Before anything is awaited: what another application leaves from now on is a reason to look again.
-            self._live.subscriptions.placed(seen.key, placed=False)
+            self._live.subscriptions.placed(seen.key, placed=False, full=blocked.full)
             await self._reporter.report(submitted, status.blocked(blocked, present))
             if seen.plan is not None:
                 await self._rollout.follow_pods(seen.key, seen.plan, seen.pods)
@@ -268,12 +269,13 @@ class Applications:
             raise Blocked("Invalid", "Planned", "Invalid", str(error)) from error
         except Infeasible as none:
             phase: Phase = "Queued" if none.reason == "DroneBusy" else "Pending"
-            raise Blocked(phase, "Planned", none.reason, none.message) from none
+            raise Blocked(phase, "Planned", none.reason, none.message, full=none.full) from none
         try:
             with timed("grants"):
                 grants = self._grants.compile(application, plan, seen, inventory)
         except InvalidObject as error:
             raise Blocked("Pending", "Granted", "PolicyInvalid", str(error)) from error
+        await self._reporter.planned(seen.submitted, plan, self._rollout.under_way)
         try:
             with timed("rollout"):
                 complete = await self._rollout.carry_out(application, plan, grants, seen.pods, seen.rules)
@@ -299,7 +301,7 @@ class Applications:
                 seen.key, application, present, rules=seen.rules, inventory=inventory, settings=settings
             )
         choice = choose_plan(application, present, inventory, settings, stuck=stuck, in_flight=seen.in_flight)
-        self._live.subscriptions.placed(seen.key, placed=has_all(application, choice))
+        self._live.subscriptions.placed(seen.key, placed=has_all(application, choice), full=choice.full)
         drone = choice.plan.drone
         if choice.plan is not seen.plan:
             self._live.plans.decide(seen.key, seen.uid, choice.plan)
@@ -335,4 +337,4 @@ class Applications:
         node = plan.drone.node if plan.drone is not None else None
         reported = self._reporter.last(seen.submitted)
         flown = flight(node, self._live.drone(node), reported) if node is not None else None
-        return status.deployed(plan, seen.pods, granted, flown)
+        return status.deployed(plan, seen.pods, granted, flown, refusals(self._children.of(seen.key, kinds.DEPLOYMENT)))

@@ -138,7 +138,7 @@ def endpoint_slice(application: Application, component: Component, pods: Iterabl
     described = {
         labels.COMPONENT_LABEL: component.name,
         "kubernetes.io/service-name": name,
-        "endpointslice.kubernetes.io/managed-by": "operator.fractus.dev",
+        labels.SLICE_LABEL: labels.SLICES_BY,
     }
     return child(
         kinds.ENDPOINT_SLICE,

@@ -13,7 +13,14 @@ from fractus_core.identity.grant_signer import GrantSigner
 
 from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Body, Key, Kind, key_of
-from fractus_operator.cluster.labels import APPLICATION_LABEL, MANAGED_SELECTOR, NAMESPACE_LABEL, label_value
+from fractus_operator.cluster.labels import (
+    APPLICATION_LABEL,
+    MANAGED_SELECTOR,
+    NAMESPACE_LABEL,
+    SLICE_LABEL,
+    SLICES_BY,
+    label_value,
+)
 from fractus_operator.cluster.reading import read
 from fractus_operator.cluster.store import Conflict, ContentType, KubeError, NotFound, Store
 from fractus_operator.inventory.grouped import Made
@@ -27,6 +34,9 @@ _MAX_BESIDE = 2
 """Objects that are applied at a time and that a pod merely waits for: what schedules pods needs the API server more."""
 _FIRST = frozenset({kinds.DEPLOYMENT_PLAN, kinds.GRANT})
 """Kinds that wait for no other, so that a webhook which holds up Secrets or Deployments delays neither plans nor grants."""
+
+_WHOLE = frozenset({kinds.DEPLOYMENT_PLAN, kinds.DIRECT_LINK})
+"""Kinds of which no one else says anything: they are given their spec as it is, which takes a third of an apply's requests."""
 
 _EXISTS = "AlreadyExists"
 _INADMISSIBLE = frozenset({403, 422})
@@ -62,8 +72,9 @@ class Children:
         return self._copies[kind].get(key)
 
     def of(self, key: Key, kind: Kind) -> list[Body]:
-        """What was made of a kind for an application."""
-        return self._copies[kind].of(key)
+        """What was made of a kind for an application; no EndpointSlices by which Kubernetes itself follows one of its Services."""
+        made = self._copies[kind].of(key)
+        return [body for body in made if _is_ours(body)] if kind is kinds.ENDPOINT_SLICE else made
 
     # -- applying --
 
@@ -139,6 +150,12 @@ class Children:
         if observed is None or self._is_as_desired(kind, desired, observed):
             return
         _check_own(application, kind, observed)
+        owners = "ownerReferences"
+        if kind in _WHOLE and contains(observed["metadata"].get(owners), desired["metadata"].get(owners, [])):
+            # One that is gone, which the watch has yet to show, is made again by the apply.
+            with contextlib.suppress(NotFound):
+                self._note(kind, desired, await self._store.rewrite(kind, observed, desired))
+                return
         try:
             await self._store.count_as_applied(kind, key)
         except KubeError as error:
@@ -256,6 +273,11 @@ def _is_child(application: Application, kind: Kind, body: Body) -> bool:
         return bool(owner.get("uid") == application.metadata.uid)
     owners = body["metadata"].get("ownerReferences") or ()
     return any(owner.get("uid") == application.metadata.uid for owner in owners)
+
+
+def _is_ours(endpoint_slice: Body) -> bool:
+    """Whether the operator made an EndpointSlice: those of Kubernetes have all labels of their Service, and go with it."""
+    return bool(endpoint_slice["metadata"]["labels"].get(SLICE_LABEL) == SLICES_BY)
 
 
 def _readable(observed: Body) -> Grant | None:

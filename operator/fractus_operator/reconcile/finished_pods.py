@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from datetime import datetime, timedelta
 
 from fractus_core.api import API_VERSION, Application
 from fractus_core.api.applications import ApplicationSpec
 
 from fractus_operator.cluster import kinds
-from fractus_operator.cluster.kinds import Body, Key, key_of
+from fractus_operator.cluster.kinds import Body, Key, Kind, key_of
 from fractus_operator.cluster.labels import (
     APPLICATION_LABEL,
     FINISHED_FORMAT,
@@ -17,7 +17,7 @@ from fractus_operator.cluster.labels import (
     MANAGED_SELECTOR,
     label_value,
 )
-from fractus_operator.cluster.pods import FINISHED_DEADLINE_S, PodView
+from fractus_operator.cluster.pods import FINISHED_DEADLINE_S, PodView, read_pod
 from fractus_operator.cluster.reading import Submitted
 from fractus_operator.cluster.store import ContentType, NotFound, Store
 from fractus_operator.inventory.live import LiveInventory
@@ -100,12 +100,46 @@ class FinishedPods:
             await self._store.delete(kinds.POD, (pod.namespace, pod.name))
         return bool(pods)
 
+    async def tear_down(self, key: Key) -> None:
+        """Remove all that was made for an application that is being deleted: also pods that nothing owns any more.
+
+        Who deletes an application as soon as its mission is over interrupts `stop`. What that has taken from its owners, and
+        given no other, no garbage collector finds, and the watch may not show it yet: so the API server is asked.
+
+        Args:
+            key: The application.
+
+        Raises:
+            KubeError: the API server refuses a delete, or cannot be reached.
+        """
+        submitted = self._live.applications.get(key)
+        interrupted = submitted is None or submitted.settled_generation is not None
+        deployments = [] if interrupted else self._children.of(key, kinds.DEPLOYMENT)
+        owners = {body["metadata"]["uid"] for body in deployments if "deletionTimestamp" not in body["metadata"]}
+        await self._children.remove(key, *reversed(kinds.CHILDREN))
+        if owners:
+            # One that another's finalizer keeps takes nothing with it.
+            owners -= {body["metadata"]["uid"] for body in await self._made(kinds.DEPLOYMENT, key)}
+        collected: set[str] = set()
+        for body in await self._made(kinds.REPLICA_SET, key):
+            if _owned_by(owners, body) and "deletionTimestamp" not in body["metadata"]:
+                collected.add(body["metadata"]["uid"])
+            else:
+                await self._store.delete(kinds.REPLICA_SET, key_of(body), body["metadata"]["uid"])
+        for body in await self._made(kinds.POD, key):
+            # Also those that were kept, which the application owns: the garbage collector comes to them late, or not at all.
+            if _present([read_pod(body)]) and not _owned_by(collected, body):
+                await self._store.delete(kinds.POD, key_of(body), body["metadata"]["uid"])
+
     async def _remove_replica_sets(self, key: Key) -> None:
+        for body in await self._made(kinds.REPLICA_SET, key):
+            await self._store.delete(kinds.REPLICA_SET, key_of(body), body["metadata"]["uid"], orphan=True)
+
+    async def _made(self, kind: Kind, key: Key) -> list[Body]:
+        """What there is of a kind for an application, as the API server has it."""
         namespace, name = key
         selectors = {"labelSelector": f"{MANAGED_SELECTOR},{APPLICATION_LABEL}={label_value(name)}"}
-        for body in await self._store.list(kinds.REPLICA_SET, selectors=selectors):
-            if body["metadata"]["namespace"] == namespace:
-                await self._store.delete(kinds.REPLICA_SET, key_of(body), body["metadata"]["uid"], orphan=True)
+        return (await self._store.list_whole(kind, namespace=namespace, selectors=selectors)).items
 
     async def _stop_one(self, pod: PodView, submitted: Submitted) -> None:
         owner = {"apiVersion": API_VERSION, "kind": Application.KIND, "name": submitted.key[1], "uid": submitted.uid}
@@ -131,3 +165,7 @@ def _ttl(submitted: Submitted) -> timedelta:
 
 def _present(pods: Iterable[PodView]) -> list[PodView]:
     return [pod for pod in pods if pod.ours and not pod.terminating]
+
+
+def _owned_by(uids: Collection[str], body: Body) -> bool:
+    return any(owner["uid"] in uids for owner in body["metadata"].get("ownerReferences") or ())

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import datetime
+from typing import Any
 
 from fractus_core.api import Condition, Drone, EdgeNode
 
 from fractus_operator.cluster.kinds import DRONE, EDGE_NODE, Body, Kind
-from fractus_operator.cluster.store import Conflict, NotFound, Store
+from fractus_operator.cluster.store import Conflict, NotFound, Reflector, Store
 from fractus_operator.inventory.live import LiveInventory
 from fractus_operator.reconcile.conditions import ConditionUpdate, merge
 from fractus_operator.reconcile.reporting import record_events
@@ -28,13 +29,14 @@ class NodeReports:
         conditions = node.status.conditions if node is not None and node.status is not None else ()
         return next((c for c in conditions if c.type == type_), None)
 
-    async def say(self, name: str, update: ConditionUpdate, change: Callable[[Body], bool] = lambda _: True) -> None:
+    async def say(self, name: str, update: ConditionUpdate, change: Callable[[Body], bool] | None = None) -> None:
         """Write a condition where it is not so already; a warning gets an Event.
 
         Args:
             name: Of the drone or edge node.
             update: The condition.
-            change: Changes more of the status as it is now; whether the condition is true of that.
+            change: Changes more of the status as it is now; whether the condition is true of that. None: the condition
+                does not depend on the rest, and is written alone, which takes one request.
 
         Raises:
             KubeError: the API server refused it, or cannot be reached.
@@ -45,20 +47,47 @@ class NodeReports:
             return
         now = self._clock()
         try:
-            body = await self._store.get(kind, name)
-            status = body.setdefault("status", {})
-            if not change(status):
-                return
-            before = [Condition.model_validate(c) for c in status.get("conditions") or () if c["type"] == update.type]
-            others = [c for c in status.get("conditions") or () if c["type"] != update.type]
-            conditions, transitions = merge(before, [update], body["metadata"].get("generation"), now)
-            status["conditions"] = [*others, *(c.to_dict() for c in conditions)]
-            await self._store.replace(kind, body, subresource="status")
+            if change is None:
+                transitions = await self._say_alone(kind, node, known, update, now)
+            else:
+                transitions = await self._say_with(kind, name, update, change, now)
         except (Conflict, NotFound):
-            # Its agent was quicker: what is to be said then, the next step tells.
+            # Its agent was quicker, or it is gone: what is to be said then, the next step tells.
             return
         regarding = kind.header(name, uid=node.metadata.uid)
         await record_events(self._store, regarding, (update for update in transitions if update.warning), now)
+
+    async def _say_alone(
+        self, kind: Kind, node: Drone | EdgeNode, known: Condition | None, update: ConditionUpdate, now: datetime
+    ) -> Sequence[ConditionUpdate]:
+        """Write a condition that only the operator writes; returns the transitions."""
+        before = [known] if known is not None else []
+        conditions, transitions = merge(before, [update], node.metadata.generation, now)
+        # With the uid: nothing is written to a later one of its name. A manager for each type: an apply that does not
+        # mention a condition of its manager removes it.
+        body = kind.header(node.name, uid=node.metadata.uid)
+        body["status"] = {"conditions": [condition.to_dict() for condition in conditions]}
+        manager = f"{self._store.field_manager}-{update.type.lower()}"
+        applied = await self._store.apply(kind, body, subresource="status", field_manager=manager)
+        # Ahead of the watch, so that what comes meanwhile does not have it written again.
+        copies: Reflector[Any] = self._live.drones if kind is DRONE else self._live.edge_nodes
+        copies.note(("", node.name), applied)
+        return transitions
+
+    async def _say_with(
+        self, kind: Kind, name: str, update: ConditionUpdate, change: Callable[[Body], bool], now: datetime
+    ) -> Sequence[ConditionUpdate]:
+        """Write a condition with what else it is true of; returns the transitions."""
+        body = await self._store.get(kind, name)
+        status = body.setdefault("status", {})
+        if not change(status):
+            return ()
+        before = [Condition.model_validate(c) for c in status.get("conditions") or () if c["type"] == update.type]
+        others = [c for c in status.get("conditions") or () if c["type"] != update.type]
+        conditions, transitions = merge(before, [update], body["metadata"].get("generation"), now)
+        status["conditions"] = [*others, *(c.to_dict() for c in conditions)]
+        await self._store.replace(kind, body, subresource="status")
+        return transitions
 
     def _node(self, name: str) -> tuple[Kind, Drone | EdgeNode | None]:
         drone = self._live.drone(name)

@@ -8,7 +8,7 @@ from datetime import datetime, timedelta
 
 from fractus_core.api import Application
 from fractus_core.api.plans import DeploymentPlanSpec
-from fractus_core.planning.growth import room_to_grow, with_too_few
+from fractus_core.planning.growth import room_to_grow, with_too_few, without_room
 from fractus_core.planning.inventory import Inventory, Settings
 from fractus_core.planning.plan import Infeasible, plan
 
@@ -29,11 +29,13 @@ class Choice:
         plan: the one in force, or a new one.
         reason: why there is a new one; None while the one in force is kept.
         fits: whether the one in force is kept because it fits, rather than for want of another.
+        full: nodes on which the plan would have more instances, were there room on them.
     """
 
     plan: DeploymentPlanSpec
     reason: str | None = None
     fits: bool = False
+    full: frozenset[str] = frozenset()
 
 
 def choose_plan(
@@ -59,6 +61,19 @@ def choose_plan(
         Infeasible: there is no plan, and the one in force does not fit either.
         InvalidObject: the application contradicts itself.
     """
+    choice = _choose(application, previous, inventory, settings, stuck=stuck, in_flight=in_flight)
+    return replace(choice, full=without_room(application, inventory, settings, choice.plan))
+
+
+def _choose(
+    application: Application,
+    previous: DeploymentPlanSpec | None,
+    inventory: Inventory,
+    settings: Settings,
+    *,
+    stuck: Mapping[str, str],
+    in_flight: str | None,
+) -> Choice:
     if in_flight is not None:
         # What flies is judged call by call; no plan takes its drone away.
         settings = replace(settings, policy_conflicts="warn")

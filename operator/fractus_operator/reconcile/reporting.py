@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from datetime import datetime
 
 from fractus_core.api import Condition
+from fractus_core.api.plans import DeploymentPlanSpec
 
 from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Body, Key, key_of
 from fractus_operator.cluster.reading import Submitted
 from fractus_operator.cluster.store import Conflict, KubeError, Reflector, Store
 from fractus_operator.reconcile.conditions import ConditionUpdate, merge
-from fractus_operator.reconcile.status import StatusUpdate
+from fractus_operator.reconcile.status import STAGES, StatusUpdate, in_queue
 
 logger = logging.getLogger(__name__)
 
-_SILENT = frozenset({"MissionWaiting", "PodsNotReady"})
+_MANY = 5
+"""Applications that are rolled out at a time, from which on a further one waits for seconds until all it needs is there."""
+_SILENT = frozenset({"MissionWaiting", "PodsNotReady", "OperatorBusy"})
 """Reasons without an Event: what is merely in progress is in the status."""
 
 
@@ -38,6 +42,22 @@ class StatusReporter:
     def forget(self, key: Key) -> None:
         """Drop what is remembered of an application."""
         self._written.pop(key, None)
+
+    async def planned(self, submitted: Submitted, plan: DeploymentPlanSpec, before: int) -> None:
+        """Say of an application that has no status yet that it is planned, where many others are rolled out before.
+
+        Where few are, its first status comes soon enough, and the request is saved. One that fails stops nothing.
+
+        Args:
+            submitted: The application.
+            plan: Its plan.
+            before: How many others are being rolled out.
+        """
+        if before >= _MANY and not self.last(submitted):
+            try:
+                await self.report(submitted, in_queue(plan, before))
+            except KubeError as error:
+                logger.warning("reporting: status not written (application=%s/%s): %s", *submitted.key, error)
 
     async def report(self, submitted: Submitted, update: StatusUpdate, generation: int | None = None) -> None:
         """Write the status if it differs from the present one, then an Event for each transition.
@@ -68,10 +88,14 @@ class StatusReporter:
         try:
             applied = await self._store.apply(kinds.APPLICATION, body, subresource="status")
         except Conflict:
+            present = self._applications.get(submitted.key)
+            if present is not None and present.uid == submitted.uid:
+                # What the caller does next may rely on it: the outcome of a mission has no other record.
+                raise
             return
         self._applications.note(key_of(applied), applied)
         self._written[submitted.key] = (submitted.uid, status)
-        await record_events(self._store, submitted.body, _announced(transitions), now)
+        await record_events(self._store, submitted.body, announced(transitions), now)
 
 
 async def record_events(store: Store, regarding: Body, updates: Iterable[ConditionUpdate], now: datetime) -> None:
@@ -92,9 +116,16 @@ async def record_events(store: Store, regarding: Body, updates: Iterable[Conditi
             logger.warning("reporting: Event not written (kind=%s namespace=%s name=%s reason=%s): %s", *where, error)
 
 
-def _announced(transitions: Sequence[ConditionUpdate]) -> Iterator[ConditionUpdate]:
-    """The first transition for each reason: several conditions often share one."""
+def announced(transitions: Sequence[ConditionUpdate]) -> Iterator[ConditionUpdate]:
+    """What Events tell: the first transition for each reason, for several conditions often share one.
+
+    Stages that are reached together are told together, under the first one's reason: each Event is a request.
+    """
     seen = set(_SILENT)
+    reached = [update for update in transitions if update.type in STAGES and not update.warning and not update.progress]
+    if len(reached) > 1:
+        seen |= {update.reason for update in reached}
+        yield replace(reached[0], message="; ".join(update.message for update in reached if update.message))
     for update in transitions:
         if update.reason not in seen:
             seen.add(update.reason)

@@ -47,6 +47,8 @@ class Rollout:
         self._live = live
         self._authority = authority
         self._clock = clock
+        self.under_way = 0
+        """How many applications are being rolled out."""
 
     async def carry_out(
         self,
@@ -72,6 +74,20 @@ class Rollout:
             NameTaken: another's object has the name of a child.
             KubeError: the API server refuses one, or cannot be reached.
         """
+        self.under_way += 1
+        try:
+            return await self._carry_out(application, decided, grants, pods, rules)
+        finally:
+            self.under_way -= 1
+
+    async def _carry_out(
+        self,
+        application: Application,
+        decided: DeploymentPlanSpec,
+        grants: Sequence[GrantSpec],
+        pods: Sequence[PodView],
+        rules: int,
+    ) -> bool:
         wanted = builders.children(application, decided, grants, pods, self._live.drone)
         wanted[kinds.NETWORK_POLICY] = network_policies(application, decided)
         wanted[kinds.DIRECT_LINK] = self._links(application, decided, pods)

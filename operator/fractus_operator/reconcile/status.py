@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any, Literal
 
 from fractus_core.api import Condition, Drone
@@ -19,7 +20,8 @@ _REASONS = {
     OutcomeKind.REVOKED: "MissionRevoked",
     OutcomeKind.FAILED: "MissionFailed",
 }
-_STAGES = ("Planned", "Granted", "Deployed")
+STAGES = ("Planned", "Granted", "Deployed")
+"""Conditions that an application reaches one after the other."""
 _NAMED = 3
 """Instances that a message names; the others are counted."""
 
@@ -52,19 +54,34 @@ class Blocked(Exception):
         reason: CamelCase.
         message: one sentence.
         retry_s: when to run again even if no input changes.
+        full: nodes that would do, were there room on them.
     """
 
-    def __init__(self, phase: Phase, stage: str, reason: str, message: str, *, retry_s: float = 30.0) -> None:
+    def __init__(
+        self,
+        phase: Phase,
+        stage: str,
+        reason: str,
+        message: str,
+        *,
+        retry_s: float = 30.0,
+        full: Collection[str] = frozenset(),
+    ) -> None:
         self.phase = phase
         self.stage = stage
         self.reason = reason
         self.message = message
         self.retry_s = retry_s
+        self.full = full
         super().__init__(message)
 
 
 def deployed(
-    plan: DeploymentPlanSpec, pods: Sequence[PodView], granted: int, flown: Flight | None = None
+    plan: DeploymentPlanSpec,
+    pods: Sequence[PodView],
+    granted: int,
+    flown: Flight | None = None,
+    refused: Mapping[str, str] = MappingProxyType({}),
 ) -> StatusUpdate:
     """The status of an application whose children are all applied.
 
@@ -73,6 +90,7 @@ def deployed(
         pods: Its pods as they are.
         granted: How many instances have Grants.
         flown: How far the flight is, where the plan has a drone.
+        refused: Why pods of instances cannot be made, where they cannot.
     """
     alive = [pod for pod in pods if not pod.terminating and not pod.finished]
     missing: list[str] = []
@@ -88,9 +106,10 @@ def deployed(
         more = f" and {len(missing) - _NAMED} more" if len(missing) > _NAMED else ""
         message = f"waiting for {', '.join(missing[:_NAMED])}{more}"
         failed = _failures(pod for pod in alive if pod.instance in missing and not pod.ready)
-        message += f"; {failed}" if failed else ""
-        reason = "ComponentFailed" if failed else "PodsNotReady"
-        readiness = ConditionUpdate("Ready", "False", reason, message, progress=not failed)
+        not_made = _refusals({name: refused[name] for name in missing if name in refused})
+        message += "".join(f"; {why}" for why in (not_made, failed) if why)
+        reason = "PodsRefused" if not_made else "ComponentFailed" if failed else "PodsNotReady"
+        readiness = ConditionUpdate("Ready", "False", reason, message, progress=not failed and not not_made)
     else:
         message = f"all {wanted} pods are ready"
         readiness = ConditionUpdate("Ready", "True", "PodsReady", message)
@@ -113,6 +132,14 @@ def deployed(
         conditions.append(mission_condition(flown))
     controller = flown.controller if flown is not None else None
     return StatusUpdate(phase, message, tuple(conditions), drone, f"{ready}/{wanted}", controller)
+
+
+def in_queue(plan: DeploymentPlanSpec, before: int) -> StatusUpdate:
+    """The status of an application that is planned, while the operator rolls out many others."""
+    message = f"{_plan_sentence(plan)}; {before} other applications are rolled out at the moment"
+    return StatusUpdate(
+        "Pending", message, (ConditionUpdate("Ready", "False", "OperatorBusy", message, progress=True),)
+    )
 
 
 def waiting(present: StatusUpdate, drone: str) -> StatusUpdate:
@@ -156,6 +183,10 @@ def _failures(pods: Iterable[PodView]) -> str:
     return "; ".join(sorted(f"{pod.instance} failed with {pod.failure}" for pod in pods if pod.failure)[:_NAMED])
 
 
+def _refusals(refused: Mapping[str, str]) -> str:
+    return "; ".join(f"no pod of {name} can be made: {why}" for name, why in sorted(refused.items())[:_NAMED])
+
+
 def still_over(reported: Mapping[str, Any], drone: Drone | None) -> StatusUpdate:
     """The status of an application whose mission was reported to be over: its drone may have come home since."""
     kept = (Condition.model_validate(c) for c in reported.get("conditions") or ())
@@ -181,7 +212,7 @@ def blocked(by: Blocked, present: StatusUpdate | None) -> StatusUpdate:
     """The status of an application that cannot go on, with what still runs of it."""
     queued = by.phase == "Queued"
     conditions = (
-        *(ConditionUpdate(stage, "True", stage) for stage in _STAGES[: _STAGES.index(by.stage)]),
+        *(ConditionUpdate(stage, "True", stage) for stage in STAGES[: STAGES.index(by.stage)]),
         ConditionUpdate(by.stage, "False", by.reason, by.message, progress=queued),
         ConditionUpdate("Ready", "False", by.reason, by.message, progress=queued),
     )

@@ -190,5 +190,15 @@ def landed_elsewhere(seen: Sequence[Seen], home: Home) -> list[Broken]:
 
 def left_over(objects: Iterable[Mapping[str, Any]]) -> list[Broken]:
     """Objects of applications that were deleted."""
-    names = sorted(f"{body['kind']}/{body['metadata']['name']}" for body in objects)
+    names = sorted(map(_described, objects))
     return [Broken("no orphans", 0.0, f"left behind: {', '.join(names)}")] if names else []
+
+
+def _described(body: Mapping[str, Any]) -> str:
+    """An object, and what keeps it."""
+    meta = body["metadata"]
+    owners = [f"{owner['kind']}/{owner['name']}" for owner in meta.get("ownerReferences") or ()]
+    ends = [f"ends since {meta['deletionTimestamp']}"] if "deletionTimestamp" in meta else []
+    kept = [f"owned by {' and '.join(owners)}"] if owners else []
+    held = [f"held by {' and '.join(meta['finalizers'])}"] if meta.get("finalizers") else []
+    return f"{body['kind']}/{meta['name']} ({'; '.join(['there', *ends, *kept, *held])})"

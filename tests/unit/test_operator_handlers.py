@@ -1,0 +1,56 @@
+"""What kopf is told of an Application's teardown: what the operator knows, not what the Application says."""
+
+from __future__ import annotations
+
+import json
+from types import SimpleNamespace
+from typing import Any
+
+import kopf
+import pytest
+from fractus_operator.handlers import Progress
+from kopf._core.actions.execution import Outcome
+from kopf._core.actions.progression import State
+
+TEARDOWN = kopf.HandlerId("teardown")
+NOTE = "kopf.fractus.dev/teardown"
+
+
+def body(uid: str = "1", **annotations: str) -> kopf.Body:
+    return kopf.Body({"metadata": {"name": "patrol", "uid": uid, "annotations": annotations}})
+
+
+@pytest.mark.parametrize(
+    "noted", ['{"success":true}', '{"delayed":"9999-12-31T00:00:00+00:00"}', "5", "no JSON", "[]", ""]
+)
+def test_annotations_neither_skip_a_teardown_nor_put_it_off(noted: str) -> None:
+    """Who may edit an Application writes them, and another may want its drone home."""
+    assert Progress("kopf.fractus.dev").fetch(key=TEARDOWN, body=body(**{NOTE: noted})) is None
+
+
+def test_a_teardown_that_failed_is_tried_again_in_time() -> None:
+    progress, patch = Progress("kopf.fractus.dev"), kopf.Patch()
+    record: Any = {"started": "2026-01-01T00:00:00+00:00", "delayed": "2026-01-01T00:00:05+00:00", "retries": 1}
+    progress.store(key=TEARDOWN, record=record, body=body(), patch=patch)
+    assert json.loads(patch["metadata"]["annotations"][NOTE]) == record, "whose change wakes kopf"
+    assert progress.fetch(key=TEARDOWN, body=body()) == record
+    assert progress.fetch(key=TEARDOWN, body=body(uid="2")) is None, "another one of its name"
+    patch = kopf.Patch()
+    progress.purge(key=TEARDOWN, body=body(**{NOTE: json.dumps(record)}), patch=patch)
+    assert patch["metadata"]["annotations"] == {NOTE: None}
+    assert progress.fetch(key=TEARDOWN, body=body()) is None
+
+
+async def test_what_is_remembered_is_not_stored_again_as_long_as_it_is_the_same() -> None:
+    """Else kopf waits for the event of a patch that changes nothing, and never tries again."""
+    progress, patch = Progress("kopf.fractus.dev"), kopf.Patch()
+    handler: Any = SimpleNamespace(id=TEARDOWN)
+    failed = Outcome(final=False, delay=5.0, exception=kopf.TemporaryError("later"))
+    state = State.from_scratch().with_purpose("delete").with_handlers([handler]).with_outcomes({TEARDOWN: failed})
+    state.store(body=body(), patch=patch, storage=progress)
+    assert patch
+    again = kopf.Patch()
+    State.from_storage(body=body(), storage=progress, handlers=[handler]).store(
+        body=body(), patch=again, storage=progress
+    )
+    assert not again

@@ -1,0 +1,81 @@
+"""What the operator says of applications, and when it does without."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+import yaml
+from fractus_core.api.plans import DeploymentPlanSpec
+from fractus_operator.cluster.kinds import Body, Kind
+from fractus_operator.cluster.reading import Submitted, read_submitted
+from fractus_operator.cluster.store import Conflict, KubeError, Store
+from fractus_operator.inventory.live import LiveInventory
+from fractus_operator.reconcile.conditions import ConditionUpdate
+from fractus_operator.reconcile.reporting import StatusReporter
+from fractus_operator.reconcile.status import StatusUpdate
+
+INPUT = yaml.safe_load((Path(__file__).parents[1] / "golden" / "operator" / "input.yaml").read_text())
+PLAN = DeploymentPlanSpec.model_validate(INPUT["plan"])
+NOW = datetime(2026, 6, 1, 12, 0, tzinfo=UTC)
+DONE = StatusUpdate("Completed", "done", (ConditionUpdate("Ready", "False", "MissionComplete", "done", progress=True),))
+
+
+class Statuses:
+    """An API server that takes the status of applications and Events, or refuses them all."""
+
+    def __init__(self) -> None:
+        self.refusal: KubeError | None = None
+        self.written: list[Body] = []
+        self.events: list[str] = []
+
+    async def apply(self, _kind: Kind, body: Body, *, subresource: str) -> Body:
+        assert subresource == "status"
+        if self.refusal is not None:
+            raise self.refusal
+        self.written.append(body["status"])
+        return {**INPUT["application"], **body, "metadata": {**INPUT["application"]["metadata"], **body["metadata"]}}
+
+    async def record_event(self, _regarding: Body, *, reason: str, **_: Any) -> None:
+        self.events.append(reason)
+
+
+def new() -> tuple[Statuses, LiveInventory, StatusReporter, Submitted]:
+    """An application without a status."""
+    api, live = Statuses(), LiveInventory(cast(Store, None))
+    submitted = read_submitted({k: v for k, v in INPUT["application"].items() if k != "status"})
+    live.applications.note(submitted.key, submitted.body)
+    return api, live, StatusReporter(cast(Any, api), live.applications, lambda: NOW), submitted
+
+
+async def test_who_waits_for_many_others_is_told_that_it_is_planned() -> None:
+    api, _, reporter, submitted = new()
+    await reporter.planned(submitted, PLAN, 1)
+    assert not api.written, "its first status comes soon enough"
+    await reporter.planned(submitted, PLAN, 20)
+    (said,) = api.written
+    assert (said["phase"], said["conditions"][0]["reason"]) == ("Pending", "OperatorBusy")
+    assert "20 other applications" in said["message"]
+    assert not api.events, "an Event would be another request"
+    await reporter.planned(submitted, PLAN, 21)
+    assert len(api.written) == 1, "who has a status is not told"
+
+
+async def test_a_first_status_that_is_refused_stops_nothing() -> None:
+    api, _, reporter, submitted = new()
+    api.refusal = KubeError(429, "TooManyRequests", "later")
+    await reporter.planned(submitted, PLAN, 20)
+    assert not reporter.last(submitted)
+
+
+async def test_an_outcome_that_conflicts_is_not_taken_for_recorded() -> None:
+    """What follows removes the grants, the only other record of it: the mission would be flown again."""
+    api, live, reporter, submitted = new()
+    api.refusal = Conflict(409, "Conflict", "it changed meanwhile")
+    with pytest.raises(Conflict):
+        await reporter.report(submitted, DONE)
+    live.applications._drop(submitted.key)
+    await reporter.report(submitted, DONE)
+    assert not reporter.last(submitted)

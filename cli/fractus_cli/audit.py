@@ -12,7 +12,7 @@ import click
 from fractus_services.recording.messages import moment_ns, sentence
 
 from fractus_cli.audit_logs import Window, decided, entries, found_logs, judged
-from fractus_cli.output import output_option
+from fractus_cli.output import output_option, printable
 
 if TYPE_CHECKING:
     from fractus_storage.checkpoints import Checkpoint
@@ -103,7 +103,7 @@ def show(paths: tuple[Path, ...], after: int | None, before: int | None, every: 
             own = {key: value for key, value in entry.items() if key != "time_ns"}
             click.echo(json.dumps(own, sort_keys=True, ensure_ascii=False))
         else:
-            click.echo(f"{entry['time']}  {entry['node']}/{entry['log']}  {_line(entry)}")
+            click.echo(printable(f"{entry['time']}  {entry['node']}/{entry['log']}  {_line(entry)}"))
 
 
 def _line(entry: dict[str, Any]) -> str:

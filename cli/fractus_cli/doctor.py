@@ -12,10 +12,11 @@ from typing import Literal
 import click
 from cryptography import x509
 from fractus_core.api import KINDS
+from fractus_core.api.crd import crd
 from fractus_core.api.names import CLASS_LABEL as CLASS
 from fractus_core.api.names import CLOUD_LABEL
 
-from fractus_cli.output import output_option
+from fractus_cli.output import output_option, printable
 from fractus_cli.reading import (
     EXIT_PROBLEM,
     GROUP,
@@ -42,8 +43,10 @@ POLICIES = (
     "fractus-flight-kinds",
 )
 EXPIRY = timedelta(days=30)
+_LISTED = 5
 _HELM = f"helm upgrade --install fractus charts/fractus -n {SYSTEM}"
 _APPS = f"/apis/apps/v1/namespaces/{SYSTEM}"
+_CRDS = f"helm upgrade --install fractus-crds charts/fractus-crds -n {SYSTEM} --create-namespace"
 _ADMISSION = "/apis/admissionregistration.k8s.io/v1"
 
 
@@ -78,8 +81,9 @@ def doctor(output: str, config: str | None) -> int:
         click.echo(json.dumps([asdict(finding) for finding in findings]))
     else:
         for finding in findings:
-            remedy = f"\n         {finding.remedy}" if finding.remedy else ""
-            click.echo(f"{finding.level:8} {finding.check}: {finding.message}{remedy}")
+            click.echo(printable(f"{finding.level:8} {finding.check}: {finding.message}"))
+            if finding.remedy:
+                click.echo(printable(f"         {finding.remedy}"))
     return EXIT_PROBLEM if any(finding.level == "error" for finding in findings) else 0
 
 
@@ -95,6 +99,7 @@ def examine(found: Cluster, now: datetime) -> Iterator[Finding]:
         lambda: _operator(found),
         lambda: _services(found),
         lambda: _admission(found),
+        lambda: _strangers(found),
         lambda: _pods(found.list(f"/api/v1/namespaces/{SYSTEM}/pods")),
         lambda: _authority(found.get(f"/api/v1/namespaces/{SYSTEM}/configmaps/fractus-ca"), now),
         lambda: _nodes(found),
@@ -119,10 +124,38 @@ def _kinds(found: Cluster) -> Iterator[Finding]:
     known = {body["metadata"]["name"]: conditions_of(body).get("Established", {}).get("status") for body in bodies}
     missing = [f"{k.PLURAL}.fractus.dev" for k in KINDS if known.get(f"{k.PLURAL}.fractus.dev") != "True"]
     if missing:
-        remedy = f"helm upgrade --install fractus-crds charts/fractus-crds -n {SYSTEM} --create-namespace"
-        yield Finding("error", "kinds", f"{', '.join(missing)}: not there", remedy)
-    else:
+        yield Finding("error", "kinds", f"{', '.join(missing)}: not there", _CRDS)
+    schemas = {body["metadata"]["name"]: _schema(body) for body in bodies}
+    lacking = [
+        f"{kind.KIND} has no {field}"
+        for kind in KINDS
+        if f"{kind.PLURAL}.fractus.dev" not in missing
+        for field in _lacking(_schema(crd(kind)), schemas[f"{kind.PLURAL}.fractus.dev"])
+    ]
+    if lacking:
+        more = f" and {len(lacking) - _LISTED} more" if len(lacking) > _LISTED else ""
+        yield Finding("error", "kinds", f"of another release: {', '.join(lacking[:_LISTED])}{more}", _CRDS)
+    elif not missing:
         yield Finding("ok", "kinds", f"all {len(KINDS)} are there")
+
+
+def _schema(definition: Body) -> Body:
+    """What the served version of a kind consists of."""
+    version: Body = next((v for v in definition["spec"]["versions"] if v.get("served")), {})
+    found: Body = (version.get("schema") or {}).get("openAPIV3Schema") or {}
+    return found
+
+
+def _lacking(ours: Body, theirs: Body, above: str = "") -> Iterator[str]:
+    """The fields of a schema that another one does not have: the API server would drop them."""
+    for name, field in (ours.get("properties") or {}).items():
+        known = (theirs.get("properties") or {}).get(name)
+        if known is None:
+            yield f"{above}{name}"
+        else:
+            yield from _lacking(field, known, f"{above}{name}.")
+    if isinstance(ours.get("items"), dict):
+        yield from _lacking(ours["items"], theirs.get("items") or {}, above)
 
 
 def _operator(found: Cluster) -> Iterator[Finding]:
@@ -134,7 +167,10 @@ def _operator(found: Cluster) -> Iterator[Finding]:
     lease = found.get(f"/apis/coordination.k8s.io/v1/namespaces/{SYSTEM}/leases/fractus-operator") or {}
     leader = (lease.get("spec") or {}).get("holderIdentity")
     logs = f"kubectl -n {SYSTEM} logs deployment/fractus-operator"
-    if not ready or not leader:
+    failed = conditions_of(deployment).get("ReplicaFailure", {})
+    if failed.get("status") == "True" and failed.get("reason") == "FailedCreate":
+        yield Finding("error", "operator", f"its pods cannot be made: {failed.get('message')}", _cure(failed))
+    elif not ready or not leader:
         yield Finding("error", "operator", f"{ready} of {wanted} ready, leader: {leader or 'none'}", logs)
     elif ready < wanted:
         yield Finding("warning", "operator", f"{ready} of {wanted} ready, {leader} leads", logs)
@@ -150,27 +186,77 @@ def _services(found: Cluster) -> Iterator[Finding]:
             continue
         status = body.get("status") or {}
         ready, wanted = status.get("numberReady", 0), status.get("desiredNumberScheduled", 0)
-        if ready < wanted:
+        if status.get("currentNumberScheduled", 0) < wanted:
+            failed = _not_made(found, name)
+            message = f"pods of {name} cannot be made: {failed.get('message', 'nothing says why')}"
+            yield Finding("error", "services", message, _cure(failed))
+        elif ready < wanted:
             remedy = f"kubectl -n {SYSTEM} describe pods -l app.kubernetes.io/component={name.removeprefix('fractus-')}"
             yield Finding("warning", "services", f"{name} is ready on {ready} of {wanted} nodes", remedy)
         else:
             yield Finding("ok", "services", f"{name} is ready on all {wanted} nodes")
 
 
+def _not_made(found: Cluster, daemon_set: str) -> Body:
+    """The last event that says why a DaemonSet's pods are not made; empty where none does."""
+    selector = f"reason=FailedCreate,involvedObject.kind=DaemonSet,involvedObject.name={daemon_set}"
+    events = found.list(f"/api/v1/namespaces/{SYSTEM}/events", fieldSelector=selector)
+    return max(events, key=lambda event: str(event.get("lastTimestamp") or ""), default={})
+
+
+def _cure(failed: Body) -> str:
+    """What to do where the API server refuses pods of the system."""
+    if "PodSecurity" in str(failed.get("message")):
+        return f"kubectl label namespace {SYSTEM} pod-security.kubernetes.io/enforce=privileged --overwrite"
+    return f"kubectl -n {SYSTEM} get events --field-selector reason=FailedCreate; see its ResourceQuota and LimitRange, too"
+
+
 def _admission(found: Cluster) -> Iterator[Finding]:
-    missing = {
-        name
-        for plural in ("validatingadmissionpolicies", "validatingadmissionpolicybindings")
-        for name in set(POLICIES) - {body["metadata"]["name"] for body in found.list(f"{_ADMISSION}/{plural}")}
-    }
+    policies = found.list(f"{_ADMISSION}/validatingadmissionpolicies")
+    bindings = found.list(f"{_ADMISSION}/validatingadmissionpolicybindings")
+    denied = {b["spec"]["policyName"] for b in bindings if "Deny" in (b["spec"].get("validationActions") or ())}
+    missing = set(POLICIES) - denied.intersection(body["metadata"]["name"] for body in policies)
     if missing:
         yield Finding("error", "admission", f"{', '.join(sorted(missing))}: not in force", _HELM)
     else:
         yield Finding("ok", "admission", f"all {len(POLICIES)} policies are in force")
 
 
+def _strangers(found: Cluster) -> Iterator[Finding]:
+    """Pods such as those of a network plugin, that were there before the policies that keep them off drones and edge nodes."""
+    judged = found.get(f"{_ADMISSION}/validatingadmissionpolicies/fractus-pods") or {}
+    selector = ((judged.get("spec") or {}).get("matchConstraints") or {}).get("namespaceSelector") or {}
+    exempt = [name for e in selector.get("matchExpressions") or () for name in e.get("values") or ()]
+    nodes = found.list("/api/v1/nodes", labelSelector=f"{CLASS} in (drone, edge)")
+    guarded = {node["metadata"]["name"] for node in nodes}
+    pods = found.list("/api/v1/pods", fieldSelector="spec.hostNetwork=true") if exempt and guarded else ()
+    refused = {
+        pod["metadata"]["namespace"]: f"{pod['metadata']['name']} on {pod['spec']['nodeName']}"
+        for pod in pods
+        if pod["spec"].get("nodeName") in guarded and pod["metadata"]["namespace"] not in exempt and _is_judged(pod)
+    }
+    # The value replaces the one before: each remedy is that for all.
+    listed = ",".join(n for n in (*exempt, *sorted(refused)) if n != SYSTEM)
+    remedy = f"where they are the cluster's own: {_HELM} --reuse-values --set 'admission.exemptNamespaces={{{listed}}}'"
+    for namespace, name in sorted(refused.items()):
+        message = f"{namespace}: pods in the node's network, such as {name}, are refused when they are made again"
+        yield Finding("warning", "admission", message, remedy)
+
+
+def _is_judged(pod: Body) -> bool:
+    """Whether the policy `fractus-pods` judges such a pod when it is made again: one that tolerates the taint, by no kubelet."""
+    ended = (pod.get("status") or {}).get("phase") in {"Succeeded", "Failed"}
+    mirror = "kubernetes.io/config.mirror" in (pod["metadata"].get("annotations") or {})
+    tolerates = any(t.get("key", "") in {"", CLASS} for t in pod["spec"].get("tolerations") or ())
+    return tolerates and not ended and not mirror
+
+
 def _pods(pods: Sequence[Body]) -> Iterator[Finding]:
     for pod in pods:
+        scheduled = conditions_of(pod).get("PodScheduled", {})
+        if scheduled.get("status") == "False":
+            message = f"{pod['metadata']['name']} has no node: {scheduled.get('message', '')}".rstrip(": ")
+            yield Finding("error", "pods", message, _places(pod))
         name, containers = pod["metadata"]["name"], (pod.get("status") or {}).get("containerStatuses") or ()
         waiting = [c["state"]["waiting"] for c in containers if "waiting" in (c.get("state") or {})]
         for why in waiting:
@@ -182,6 +268,16 @@ def _pods(pods: Sequence[Body]) -> Iterator[Finding]:
                 where = (pod.get("spec") or {}).get("nodeName", "no node")
                 message = f"{name} on {where}: {reason}: {why.get('message', '')}".rstrip(": ")
                 yield Finding("error", "images" if image else "pods", message, remedy)
+
+
+def _places(pod: Body) -> str:
+    """What to do for a pod that no node takes."""
+    if (pod["metadata"].get("labels") or {}).get("app.kubernetes.io/component") not in {"operator", "view"}:
+        return f"kubectl -n {SYSTEM} describe pod {pod['metadata']['name']}"
+    return (
+        f"it needs a node that is neither a drone nor an edge node, or has {CLOUD_LABEL}=true; where that has taints, set"
+        " operator.tolerations of the chart"
+    )
 
 
 def _authority(secret: Body | None, now: datetime) -> Iterator[Finding]:
@@ -210,7 +306,14 @@ def _nodes(found: Cluster) -> Iterator[Finding]:
         "edge": {body["metadata"]["name"]: body for body in found.list(f"{GROUP}/edgenodes")},
     }
     classes: set[str] = set()
-    for node in found.list("/api/v1/nodes"):
+    nodes = found.list("/api/v1/nodes")
+    names = {node["metadata"]["name"] for node in nodes}
+    for of_class, bodies in described.items():
+        for name in sorted(set(bodies) - names):
+            kind = "drone" if of_class == "drone" else "edgenode"
+            message = f"there is no node of the name of {kind} {name}: it was renamed or removed"
+            yield Finding("warning", "nodes", message, f"where it does not come back: kubectl delete {kind} {name}")
+    for node in nodes:
         name, labels = node["metadata"]["name"], node["metadata"].get("labels") or {}
         of_class = labels.get(CLASS, "")
         classes |= {of_class, "cloud"} if labels.get(CLOUD_LABEL) == "true" else {of_class}
@@ -231,9 +334,16 @@ def _node(node: Body, of_class: str, body: Body | None) -> Iterator[Finding]:
     name, before = node["metadata"]["name"], []
     if conditions_of(node).get("Ready", {}).get("status") != "True":
         before.append(Finding("warning", "nodes", f"{name} is out of reach", "check its power, link and kubelet"))
-    tainted = any(t["key"] == CLASS for t in (node.get("spec") or {}).get("taints") or ())
+    addresses = (node.get("status") or {}).get("addresses") or ()
+    address = next((str(a.get("address")) for a in addresses if a.get("type") == "InternalIP"), "")
+    if ":" in address:
+        message = f"{name} has the address {address} first, and its services listen on IPv4"
+        before.append(
+            Finding("error", "nodes", message, "give the node an IPv4 address first (--node-ip of its kubelet)")
+        )
+    effects = {t["effect"] for t in (node.get("spec") or {}).get("taints") or () if t["key"] == CLASS}
     if (node["metadata"].get("labels") or {}).get(CLOUD_LABEL) == "true":
-        if tainted:
+        if effects:
             message = f"{name} has the label {CLOUD_LABEL}, but its taint {CLASS} keeps the cloud's pods away"
             before.append(Finding("warning", "nodes", message, f"kubectl taint node {name} {CLASS}-"))
         elif of_class == "drone":
@@ -241,9 +351,12 @@ def _node(node: Body, of_class: str, body: Body | None) -> Iterator[Finding]:
             before.append(
                 Finding("warning", "nodes", message, "only for a simulated drone; else give it a node of its own")
             )
-    elif not tainted:
+    elif "NoExecute" not in effects:
         remedy = f"kubectl taint node {name} {CLASS}={of_class}:NoExecute"
-        before.append(Finding("warning", "nodes", f"{name} has no taint {CLASS}: other pods may run there", remedy))
+        message = (
+            f"{name} has no taint {CLASS} with the effect NoExecute: other pods may run there, also with its network"
+        )
+        before.append(Finding("warning", "nodes", message, remedy))
     if body is None:
         kind = "Drone" if of_class == "drone" else "EdgeNode"
         remedy = (

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from fractus_cli.output import output_option
+from fractus_cli.output import output_option, printable
 from fractus_cli.reading import EXIT_PROBLEM, GROUP, Body, Cluster, cluster, kubeconfig_option
 
 _LISTED = 5
@@ -27,7 +27,8 @@ def explain(application: str, namespace: str, everything: bool, output: str, con
     """
     with cluster(config) as found:
         seen = look(found, namespace, application)
-    click.echo(json.dumps(seen) if output == "json" else "\n".join(lines(seen, None if everything else _LISTED)))
+    shown = map(printable, lines(seen, None if everything else _LISTED))
+    click.echo(json.dumps(seen) if output == "json" else "\n".join(shown))
     conflict = (seen["drone"] or {}).get("policyConflict")
     return EXIT_PROBLEM if not seen["placements"] or conflict else 0
 
@@ -44,9 +45,10 @@ def look(found: Cluster, namespace: str, name: str) -> dict[str, Any]:
         raise click.ClickException(f"there is no Application {namespace}/{name}; see fractus status")
     plans = [p for p in found.list(f"{scope}/deploymentplans") if p["spec"]["application"] == name]
     plan: Body = plans[0]["spec"] if plans else {}
+    listed = found.list_permitted(f"{GROUP}/grants")
     grants = [
         grant["spec"]
-        for grant in found.list(f"{GROUP}/grants")
+        for grant in listed or ()
         if (grant["spec"]["application"]["namespace"], grant["spec"]["application"]["name"]) == (namespace, name)
     ]
     events = found.list(
@@ -71,6 +73,7 @@ def look(found: Cluster, namespace: str, name: str) -> dict[str, Any]:
             ]
             for grant in sorted(grants, key=lambda grant: str(grant["instance"]))
         },
+        "forbidden": ["grants"] if listed is None else [],
         "events": [
             {k: event.get(k) for k in ("lastTimestamp", "type", "reason", "message")}
             for event in sorted(events, key=lambda event: str(event.get("lastTimestamp")), reverse=True)
@@ -96,6 +99,8 @@ def lines(seen: dict[str, Any], most: int | None) -> Iterator[str]:
         yield from _placement(placed)
     yield from _rejections(seen, most)
     yield from _policies(seen["policies"])
+    if seen["forbidden"]:
+        yield f"You may not list {' and '.join(seen['forbidden'])} of this cluster: which policies hold is in them."
     if seen["events"]:
         yield "Events, the newest first:"
         for event in seen["events"][:most]:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import click
 
 from fractus_cli import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK
+from fractus_cli.output import printable
 
 _MARKERS = {
     "core": "shapely",
@@ -170,7 +171,7 @@ def _sentence(error: Exception) -> str:
 
 
 def _complain(message: str, code: int) -> int:
-    click.echo(f"fractus: {' '.join(message.split())}", err=True)
+    click.echo(printable(f"fractus: {' '.join(message.split())}"), err=True)
     return code
 
 

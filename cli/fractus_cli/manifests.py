@@ -32,6 +32,8 @@ from fractus_core.planning import Host, Inventory
 from fractus_core.planning.quantities import amount_of
 from fractus_core.validation import check_policy, check_zone
 
+from fractus_cli.output import printable
+
 R = TypeVar("R", bound=Resource)
 
 _SUFFIXES = frozenset({".yaml", ".yml", ".json"})
@@ -50,6 +52,9 @@ _METADATA = frozenset(
 
 class BadManifest(Exception):
     """A manifest cannot be used; one sentence that names the file, the line, the object and the field."""
+
+    def __init__(self, sentence: str) -> None:
+        super().__init__(printable(sentence))
 
 
 @dataclass(frozen=True, slots=True)

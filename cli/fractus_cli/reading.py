@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from http import HTTPStatus
 from typing import Any
 
 import click
@@ -48,6 +49,19 @@ class Cluster:
             return self._client.list(path, **selectors)
         except NotFound:
             return ()
+
+    def list_permitted(self, path: str) -> Sequence[Body] | None:
+        """A collection; None where the user may not list it, as those of no namespace with rights in one only.
+
+        Raises:
+            KubeError: the API server could not be reached, or failed.
+        """
+        try:
+            return self.list(path)
+        except KubeError as error:
+            if error.status != HTTPStatus.FORBIDDEN:
+                raise
+            return None
 
 
 @contextmanager

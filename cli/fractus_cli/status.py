@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from fractus_cli.output import output_option
+from fractus_cli.output import output_option, printable
 from fractus_cli.reading import GROUP, Body, Cluster, cluster, conditions_of, kubeconfig_option, table
 
 PERIOD_S = 2.0
@@ -21,29 +21,43 @@ PERIOD_S = 2.0
 @output_option
 @kubeconfig_option
 def status(namespace: str, watch: bool, output: str, config: str | None) -> None:
-    """Show the drones, edge nodes and applications of a cluster."""
+    """Show the drones, edge nodes and applications of a cluster.
+
+    Who has rights in one namespace only sees its applications (--namespace).
+    """
     with cluster(config) as found:
         while True:
             seen = look(found, namespace)
             if watch and output == "text":
                 click.clear()
-            click.echo(json.dumps(seen) if output == "json" else "\n".join(lines(seen)))
+            click.echo(json.dumps(seen) if output == "json" else "\n".join(map(printable, lines(seen))))
             if not watch:
                 return
             time.sleep(PERIOD_S)
 
 
-def look(found: Cluster, namespace: str) -> dict[str, list[dict[str, Any]]]:
-    """What is shown of a cluster: drones, edge nodes and applications, each by name."""
+def look(found: Cluster, namespace: str) -> dict[str, Any]:
+    """What is shown of a cluster: drones, edge nodes and applications, each by name, and what the user may not list.
+
+    Raises:
+        ClickException: the user may not list these Applications.
+    """
     scope = f"/namespaces/{namespace}" if namespace else ""
+    applications = found.list_permitted(f"{GROUP}{scope}/applications")
+    if applications is None:
+        remedy = "check your permissions there" if namespace else "give one with --namespace"
+        raise click.ClickException(f"you may not list the Applications of {namespace or 'all namespaces'}; {remedy}")
+    drones = found.list_permitted(f"{GROUP}/drones")
+    edge_nodes = found.list_permitted(f"{GROUP}/edgenodes")
     return {
-        "drones": [_drone(body) for body in _by_name(found.list(f"{GROUP}/drones"))],
-        "edgeNodes": [_node(body) for body in _by_name(found.list(f"{GROUP}/edgenodes"))],
-        "applications": [_application(body) for body in _by_name(found.list(f"{GROUP}{scope}/applications"))],
+        "drones": [_drone(body) for body in _by_name(drones or ())],
+        "edgeNodes": [_node(body) for body in _by_name(edge_nodes or ())],
+        "applications": [_application(body) for body in _by_name(applications)],
+        "forbidden": [name for name, listed in (("drones", drones), ("edgeNodes", edge_nodes)) if listed is None],
     }
 
 
-def lines(seen: dict[str, list[dict[str, Any]]]) -> list[str]:
+def lines(seen: dict[str, Any]) -> list[str]:
     """The same for people."""
     drones = [
         (d["name"], d["state"], d["controller"], d["battery"], d["ready"], d["services"], d["lastSeen"], d["message"])
@@ -53,12 +67,15 @@ def lines(seen: dict[str, list[dict[str, Any]]]) -> list[str]:
     applications = [
         (f"{a['namespace']}/{a['name']}", a["phase"], a["drone"], a["pods"], a["message"]) for a in seen["applications"]
     ]
+    shown = table(("APPLICATION", "PHASE", "DRONE", "PODS", "MESSAGE"), applications)
+    if seen["forbidden"]:
+        return [*shown, "", f"You may not list {' and '.join(seen['forbidden'])} of this cluster."]
     return [
         *table(("DRONE", "STATE", "CONTROLLER", "BATTERY", "READY", "SERVICES", "LAST SEEN", "MESSAGE"), drones),
         "",
         *table(("EDGE NODE", "READY", "SERVICES", "LAST SEEN", "MESSAGE"), edges),
         "",
-        *table(("APPLICATION", "PHASE", "DRONE", "PODS", "MESSAGE"), applications),
+        *shown,
     ]
 
 

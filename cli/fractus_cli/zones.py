@@ -13,6 +13,7 @@ from fractus_core.geo import formats
 from fractus_core.validation import check_zone
 
 from fractus_cli.manifests import BadManifest, read_file, read_manifests
+from fractus_cli.output import printable
 
 _READERS: dict[str, Callable[[str, Collection[str]], formats.Imported]] = {
     "geojson": formats.read_geojson,
@@ -120,4 +121,4 @@ def _manifest(zone: Zone) -> dict[str, object]:
 
 def _tell(notes: Iterable[str]) -> None:
     for note in notes:
-        click.echo(note, err=True)
+        click.echo(printable(note), err=True)

@@ -17,6 +17,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from fractus_cli import doctor, explain, main, status
 from fractus_core.api import KINDS
+from fractus_core.api.crd import crd
 
 V1 = "/apis/fractus.dev/v1alpha1"
 DOCS = Path(__file__).parents[2] / "docs" / "cli.md"
@@ -201,8 +202,9 @@ def node(name: str, of_class: str, *, tainted: bool = True, ready: str = "True",
 def healthy(monkeypatch: pytest.MonkeyPatch) -> Body:
     """A cluster that lacks nothing."""
     system = "/apis/apps/v1/namespaces/fractus-system"
-    kinds = [named(f"{k.PLURAL}.fractus.dev", status={"conditions": [condition("Established", "True")]}) for k in KINDS]
+    kinds = [crd(kind) | {"status": {"conditions": [condition("Established", "True")]}} for kind in KINDS]
     policies = [named(name) for name in doctor.POLICIES]
+    bindings = [named(name, spec={"policyName": name, "validationActions": ["Deny"]}) for name in doctor.POLICIES]
     objects: Body = {
         "/version": {"major": "1", "minor": "35+", "gitVersion": "v1.35.4"},
         "/apis/apiextensions.k8s.io/v1/customresourcedefinitions": kinds,
@@ -211,7 +213,7 @@ def healthy(monkeypatch: pytest.MonkeyPatch) -> Body:
             "spec": {"holderIdentity": "operator-a"}
         },
         "/apis/admissionregistration.k8s.io/v1/validatingadmissionpolicies": policies,
-        "/apis/admissionregistration.k8s.io/v1/validatingadmissionpolicybindings": list(policies),
+        "/apis/admissionregistration.k8s.io/v1/validatingadmissionpolicybindings": bindings,
         "/api/v1/namespaces/fractus-system/pods": [],
         "/api/v1/namespaces/fractus-system/configmaps/fractus-ca": authority(400),
         "/api/v1/nodes": [node("drone-1", "drone"), node("edge-1", "edge"), node("cloud-1", "cloud")],
@@ -222,7 +224,8 @@ def healthy(monkeypatch: pytest.MonkeyPatch) -> Body:
         f"{V1}/depots": [named("base")],
     }
     for name in doctor.SERVICES:
-        objects[f"{system}/daemonsets/{name}"] = {"status": {"numberReady": 2, "desiredNumberScheduled": 2}}
+        counts = {"numberReady": 2, "desiredNumberScheduled": 2, "currentNumberScheduled": 2}
+        objects[f"{system}/daemonsets/{name}"] = {"status": counts}
     show(monkeypatch, doctor, objects)
     return objects
 
@@ -235,6 +238,7 @@ def test_doctor_finds_nothing_in_a_cluster_that_lacks_nothing(run: Run, healthy:
 
 def test_doctor_finds_nothing_in_a_cluster_of_one_node(run: Run, healthy: Body) -> None:
     healthy["/api/v1/nodes"] = [node("drone-1", "drone", tainted=False, cloud=True)]
+    healthy[f"{V1}/edgenodes"] = []
     code, said = run("doctor", "-o", "json")
     assert code == 0, said
     (warned,) = [found["message"] for found in json.loads(said) if found["level"] != "ok"]
@@ -260,7 +264,7 @@ LACKS: list[tuple[str, Any, str, str]] = [
     (f"{SYSTEM_APPS}/daemonsets/fractus-camera", None, "warning", "fractus-camera is not installed"),
     (
         f"{SYSTEM_APPS}/daemonsets/fractus-camera",
-        {"status": {"numberReady": 1, "desiredNumberScheduled": 2}},
+        {"status": {"numberReady": 1, "desiredNumberScheduled": 2, "currentNumberScheduled": 2}},
         "warning",
         "component=camera",
     ),

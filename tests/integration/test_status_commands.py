@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
+from chart import path_of, render
 from control_plane import ControlPlane, wait_for
 from fractus_cli import main
 from operator_world import OperatorProcess, World, traffic
@@ -49,3 +50,28 @@ def test_a_cluster_without_the_charts_is_told_how_to_get_them(
     assert ("kinds", "ok") in findings
     assert "helm upgrade --install fractus " in findings["operator", "error"]["remedy"]
     assert any("has no taint fractus.dev/class" in f["message"] for f in findings.values())
+
+
+def test_pods_that_a_policy_would_not_let_be_made_again_are_told(
+    control_plane: ControlPlane, world: World, namespace: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Such as those of a network plugin that was there before Fractus; and why pods of services cannot be made."""
+    bare: dict[str, object] = {"nodeName": "drone-1", "hostNetwork": True, "tolerations": [{"operator": "Exists"}]}
+    bare |= {"containers": [{"name": "cni", "image": "registry.test/cni:1"}]}
+    plugin = {"apiVersion": "v1", "kind": "Pod", "metadata": {"name": "cni", "namespace": namespace}, "spec": bare}
+    (guard,) = (
+        body
+        for body in render()
+        if (body["kind"], body["metadata"]["name"]) == ("ValidatingAdmissionPolicy", "fractus-pods")
+    )
+    world.api.apply(f"/api/v1/namespaces/{namespace}/pods/cni", plugin)
+    world.api.apply(path_of(guard), guard)
+    try:
+        main.run(["doctor", "-o", "json", "--kubeconfig", str(control_plane.kubeconfig)])
+    finally:
+        world.api.delete(path_of(guard))
+        world.api.delete(f"/api/v1/namespaces/{namespace}/pods/cni", grace_s=0)
+    found = [f for f in json.loads(capsys.readouterr().out) if f["message"].startswith(f"{namespace}: ")]
+    assert [f["level"] for f in found] == ["warning"]
+    assert "cni on drone-1" in found[0]["message"]
+    assert f"admission.exemptNamespaces={{kube-system,{namespace}}}" in found[0]["remedy"]

@@ -34,6 +34,8 @@ def probe(how: str) -> None:
         open("/no/such/file")  # noqa: PTH123, SIM115
     if how == "bad":
         raise click.ClickException("latitude must be -90 to 90, not 95")
+    if how == "escape":
+        raise click.ClickException("there is no zone \x1b[2J\u202etown")
     if how == "stop":
         raise KeyboardInterrupt
     click.echo(how)
@@ -66,6 +68,7 @@ def fractus(commands: None, capsys: pytest.CaptureFixture[str]) -> Callable[...,
         (["probe", "file"], 1, "fractus: /no/such/file: No such file or directory\n"),
         (["probe", "task"], 1, "fractus: no port in tcp:x\n"),
         (["probe", "bad"], 1, "fractus: latitude must be -90 to 90, not 95\n"),
+        (["probe", "escape"], 1, "fractus: there is no zone \\x1b[2J\\u202etown\n"),
         (["probe", "stop"], 130, "\nfractus: interrupted\n"),
         (["probe"], 1, "fractus: Missing argument 'HOW'. (see `fractus probe --help`)\n"),
         (["prob"], 1, "fractus: there is no command prob; did you mean probe?\n"),

@@ -672,3 +672,16 @@ def test_the_command_imports_and_exports(tmp_path):
     wrong = CliRunner().invoke(command, ["import", str(source), "--from", "kml"])
     assert wrong.exit_code == 1
     assert f"{source}: this is not XML" in wrong.stderr
+
+
+def test_notes_have_no_characters_that_a_terminal_acts_on(tmp_path):
+    source = tmp_path / "town.geojson"
+    square = {"type": "Polygon", "coordinates": [[[4.0, 50.0], [4.01, 50.0], [4.01, 50.01], [4.0, 50.0]]]}
+    features = [
+        {"type": "Feature", "properties": {"name": name}, "geometry": square} for name in ("school", "a\x1b[2J")
+    ]
+    source.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    told = CliRunner().invoke(command, ["import", str(source), "--from", "geojson", "--leave-out", "a\x1b[2J"])
+    assert told.exit_code == 0
+    assert "a\\x1b[2J" in told.stderr
+    assert "\x1b" not in told.output

@@ -1,0 +1,203 @@
+"""`fractus doctor`: what is found where one thing is missing, and what it says to do."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+import pytest
+from fractus_cli.doctor import POLICIES, SERVICES, Finding, examine
+from fractus_core.api import KINDS
+from fractus_core.api.crd import crd
+from fractus_core.identity.authority import Authority
+
+NOW = datetime(2026, 6, 1, tzinfo=UTC)
+SYSTEM = "/namespaces/fractus-system"
+OPERATOR = f"/apis/apps/v1{SYSTEM}/deployments/fractus-operator"
+AGENT = f"/apis/apps/v1{SYSTEM}/daemonsets/fractus-agent"
+PODS = f"/api/v1{SYSTEM}/pods"
+EVENTS = f"/api/v1{SYSTEM}/events"
+CRDS = "/apis/apiextensions.k8s.io/v1/customresourcedefinitions"
+GUARD = "/apis/admissionregistration.k8s.io/v1/validatingadmissionpolicies/fractus-pods"
+BINDINGS = "/apis/admissionregistration.k8s.io/v1/validatingadmissionpolicybindings"
+
+Body = dict[str, Any]
+
+
+class Cluster:
+    """A cluster in which all is as it should be, by path; tests take something away."""
+
+    def __init__(self) -> None:
+        ready = {"readyReplicas": 2, "conditions": [{"type": "ReplicaFailure", "status": "False", "reason": "x"}]}
+        counts = {"numberReady": 1, "desiredNumberScheduled": 1, "currentNumberScheduled": 1}
+        established = {"status": {"conditions": [{"type": "Established", "status": "True"}]}}
+        public = Authority.generate(NOW - timedelta(days=1)).certificate_pem.decode()
+        fine = {"conditions": [{"type": "Ready", "status": "True", "reason": "Ready"}]}
+        taint = {"taints": [{"key": "fractus.dev/class", "effect": "NoExecute"}]}
+        exempt = {
+            "key": "kubernetes.io/metadata.name",
+            "operator": "NotIn",
+            "values": ["kube-system", "fractus-system"],
+        }
+        guard = {"spec": {"matchConstraints": {"namespaceSelector": {"matchExpressions": [exempt]}}}}
+        self.objects: dict[str, Body] = {
+            "/version": {"major": "1", "minor": "35+", "gitVersion": "v1.35.4"},
+            OPERATOR: {"spec": {"replicas": 2}, "status": ready},
+            f"/apis/coordination.k8s.io/v1{SYSTEM}/leases/fractus-operator": {"spec": {"holderIdentity": "operator-1"}},
+            **{f"/apis/apps/v1{SYSTEM}/daemonsets/{name}": {"status": dict(counts)} for name in SERVICES},
+            f"/api/v1{SYSTEM}/configmaps/fractus-ca": {"data": {"ca.crt": public}},
+            GUARD: guard,
+        }
+        node = {
+            "metadata": {"name": "drone-1", "labels": {"fractus.dev/class": "drone"}},
+            "spec": taint,
+            "status": fine,
+        }
+        cloud = {"metadata": {"name": "cloud-1", "labels": {"fractus.dev/class": "cloud"}}, "status": fine}
+        self.lists: dict[str, list[Body]] = {
+            CRDS: [copy.deepcopy(crd(kind)) | established for kind in KINDS],
+            "/apis/admissionregistration.k8s.io/v1/validatingadmissionpolicies": [
+                {"metadata": {"name": p}} for p in POLICIES
+            ],
+            BINDINGS: [
+                {"metadata": {"name": p}, "spec": {"policyName": p, "validationActions": ["Deny"]}} for p in POLICIES
+            ],
+            "/api/v1/nodes": [node, cloud],
+            "/apis/fractus.dev/v1alpha1/drones": [{"metadata": {"name": "drone-1"}, "status": fine}],
+            "/apis/fractus.dev/v1alpha1/depots": [{"metadata": {"name": "base"}}],
+        }
+
+    def get(self, path: str) -> Body | None:
+        return self.objects.get(path)
+
+    def list(self, path: str, **selectors: str) -> Sequence[Body]:
+        found = self.lists.get(path, [])
+        wanted = selectors.get("fieldSelector", "")
+        if wanted == "spec.hostNetwork=true":
+            return [body for body in found if body["spec"].get("hostNetwork")]
+        if "labelSelector" in selectors:
+            return [b for b in found if b["metadata"]["labels"].get("fractus.dev/class") in {"drone", "edge"}]
+        name = wanted.partition("involvedObject.name=")[2]
+        return [body for body in found if not name or body["involvedObject"]["name"] == name]
+
+
+def findings(cluster: Any) -> list[Finding]:
+    return list(examine(cluster, NOW))
+
+
+def test_a_cluster_that_lacks_nothing_is_fine() -> None:
+    assert {finding.level for finding in findings(Cluster())} == {"ok"}
+
+
+def pod(name: str, namespace: str, **spec: Any) -> Body:
+    return {"metadata": {"name": name, "namespace": namespace, "labels": {}}, "spec": spec}
+
+
+def unscheduled(cluster: Cluster) -> None:
+    waiting = pod("fractus-operator-1", "fractus-system")
+    waiting["metadata"]["labels"] = {"app.kubernetes.io/component": "operator"}
+    why = "0/2 nodes are available: 1 node(s) had untolerated taint {node-role.kubernetes.io/control-plane: }"
+    waiting["status"] = {"conditions": [{"type": "PodScheduled", "status": "False", "message": why}]}
+    cluster.lists[PODS] = [waiting]
+
+
+def refused_service(cluster: Cluster) -> None:
+    cluster.objects[AGENT]["status"].update(currentNumberScheduled=0, numberReady=0)
+    event = {"involvedObject": {"name": "fractus-agent"}, "lastTimestamp": "2026-06-01T00:00:00Z"}
+    old = {"involvedObject": {"name": "fractus-agent"}, "lastTimestamp": None, "message": "long gone"}
+    other = {"involvedObject": {"name": "other"}, "lastTimestamp": "2026-06-01T01:00:00Z", "message": "of another"}
+    why = 'pods "fractus-agent-" is forbidden: violates PodSecurity "restricted:latest": host namespaces'
+    cluster.lists[EVENTS] = [old, event | {"message": why}, other]
+
+
+def refused_operator(cluster: Cluster) -> None:
+    why = "exceeded quota: compute"
+    failed = {"type": "ReplicaFailure", "status": "True", "reason": "FailedCreate", "message": why}
+    cluster.objects[OPERATOR]["status"] = {"conditions": [failed]}
+
+
+def stranger(cluster: Cluster) -> None:
+    everywhere: Body = {"hostNetwork": True, "tolerations": [{"operator": "Exists"}]}
+    mirror = pod("static-drone-1", "mirrors", nodeName="drone-1", **everywhere)
+    mirror["metadata"]["annotations"] = {"kubernetes.io/config.mirror": "5d8f"}
+    other = {"tolerations": [{"key": "node.kubernetes.io/not-ready", "operator": "Exists"}]}
+    cluster.lists["/api/v1/pods"] = [
+        pod("kube-flannel-ds-x", "kube-flannel", nodeName="drone-1", **everywhere),
+        pod("kube-proxy-x", "kube-system", nodeName="drone-1", **everywhere),
+        pod("fractus-agent-x", "fractus-system", nodeName="drone-1", **everywhere),
+        pod("elsewhere", "calico-system", nodeName="cloud-1", **everywhere),
+        pod("own-network", "default", nodeName="drone-1"),
+        pod("job-x", "ended", nodeName="drone-1", **everywhere) | {"status": {"phase": "Succeeded"}},
+        pod("other-x", "intolerant", nodeName="drone-1", **everywhere | other),
+        mirror,
+    ]
+
+
+def older_kinds(cluster: Cluster) -> None:
+    (drone,) = (body for body in cluster.lists[CRDS] if body["metadata"]["name"] == "drones.fractus.dev")
+    schema = drone["spec"]["versions"][0]["schema"]["openAPIV3Schema"]["properties"]
+    del schema["spec"]["properties"]["interfaces"]["items"]["properties"]["range"]
+
+
+def renamed(cluster: Cluster) -> None:
+    cluster.lists["/apis/fractus.dev/v1alpha1/drones"].append({"metadata": {"name": "drone-0"}, "status": {}})
+
+
+def ipv6(cluster: Cluster) -> None:
+    kinds = (("Hostname", "drone-1"), ("InternalIP", "fd00::7"), ("InternalIP", "10.0.0.7"))
+    addresses = [{"type": type_, "address": address} for type_, address in kinds]
+    node = cluster.lists["/api/v1/nodes"][0]
+    node["status"] = node["status"] | {"addresses": addresses}
+
+
+def weakly_tainted(cluster: Cluster) -> None:
+    """Who names the node in a pod passes by the scheduler, and kubelets look at NoExecute only."""
+    cluster.lists["/api/v1/nodes"][0]["spec"] = {"taints": [{"key": "fractus.dev/class", "effect": "NoSchedule"}]}
+
+
+def audited(cluster: Cluster) -> None:
+    cluster.lists[BINDINGS][0]["spec"]["validationActions"] = ["Audit"]
+
+
+def test_one_command_lets_the_pods_of_all_namespaces_be_made() -> None:
+    cluster = Cluster()
+    stranger(cluster)
+    plugin = cluster.lists["/api/v1/pods"][0]
+    cluster.lists["/api/v1/pods"].append(plugin | {"metadata": {"name": "cni", "namespace": "cilium"}})
+    remedies = {finding.remedy for finding in findings(cluster) if finding.level != "ok"}
+    assert len(remedies) == 1, "the second of two would undo the first"
+    assert "exemptNamespaces={kube-system,cilium,kube-flannel}" in remedies.pop()
+
+
+def test_an_operator_whose_pods_cannot_be_deleted_is_well() -> None:
+    cluster = Cluster()
+    failed = {"type": "ReplicaFailure", "status": "True", "reason": "FailedDelete", "message": "no"}
+    cluster.objects[OPERATOR]["status"]["conditions"] = [failed]
+    assert {finding.level for finding in findings(cluster)} == {"ok"}
+
+
+@pytest.mark.parametrize(
+    ("takes", "level", "check", "message", "remedy"),
+    [
+        (unscheduled, "error", "pods", "fractus-operator-1 has no node: 0/2 nodes", "fractus.dev/cloud=true"),
+        (refused_service, "error", "services", "violates PodSecurity", "pod-security.kubernetes.io/enforce=privileged"),
+        (refused_operator, "error", "operator", "cannot be made: exceeded quota", "ResourceQuota"),
+        (stranger, "warning", "admission", "kube-flannel: pods in the node's", "exemptNamespaces={kube-system,kube-flannel}"),
+        (older_kinds, "error", "kinds", "Drone has no spec.interfaces.range", "helm upgrade --install fractus-crds"),
+        (renamed, "warning", "nodes", "no node of the name of drone drone-0", "kubectl delete drone drone-0"),
+        (ipv6, "error", "nodes", "drone-1 has the address fd00::7 first", "--node-ip"),
+        (weakly_tainted, "warning", "nodes", "drone-1 has no taint fractus.dev/class with the effect NoExecute", "=drone:NoExecute"),
+        (audited, "error", "admission", f"{POLICIES[0]}: not in force", "helm upgrade --install fractus "),
+    ],
+)  # fmt: skip
+def test_what_is_missing_is_found_with_what_to_do(
+    takes: Callable[[Cluster], None], level: str, check: str, message: str, remedy: str
+) -> None:
+    cluster = Cluster()
+    takes(cluster)
+    found = [finding for finding in findings(cluster) if finding.level != "ok"]
+    assert [(f.level, f.check) for f in found] == [(level, check)]
+    assert message in found[0].message
+    assert remedy in found[0].remedy

@@ -14,6 +14,7 @@ with atheris.instrument_imports(include=["fractus_services.mobility.rpc", "fract
 from fractus_proto.v1 import mobility_pb2
 from google.protobuf.message import DecodeError
 from policy_world import HOME, altitude, at, box, compiled, exclusion, speed
+from wire import number
 
 GRANT = compiled(exclusion(box(20, 20, 60, 60)), altitude(upperLimit=60), speed(upperLimit=8))
 SITUATIONS = (at(), at(40, 10, 30.0), at(40, 40, 30.0))
@@ -23,11 +24,6 @@ REPLIES = {"allow", "correct", "deny"}
 def wire(message: bytes) -> Call:
     """What a message asks for."""
     return arguments.call_of(mobility_pb2.CheckCallRequest.FromString(message))
-
-
-def number(given: atheris.FuzzedDataProvider, bound: float) -> float:
-    """One of a size that is flown, or any: infinity, a thousand digits, none at all."""
-    return given.ConsumeFloatInRange(-bound, bound) if given.ConsumeBool() else given.ConsumeFloat()
 
 
 def numbers(given: atheris.FuzzedDataProvider) -> Call:

@@ -1,5 +1,6 @@
 """The corpus of manifests as `fractus plan` judges it; tests/integration has the API server's verdicts."""
 
+import json
 import re
 
 import pytest
@@ -27,6 +28,15 @@ def test_the_corpus_has_both_verdicts():
     refused = [case for case in CASES if case.refused]
     assert len(refused) > 90
     assert len(CASES) - len(refused) >= 10
+
+
+def test_a_sentence_has_no_characters_that_a_terminal_acts_on(tmp_path):
+    file = tmp_path / "m.json"
+    body = {"apiVersion": "fractus.dev/v1alpha1", "kind": "Policy", "metadata": {"name": "a\n\x1b[2J\x7f"}, "spec": {}}
+    file.write_text(json.dumps(body))
+    with pytest.raises(BadManifest, match=re.escape(r"Policy a\n\x1b[2J\x7f: ")) as refused:
+        read_manifests([file])
+    assert str(refused.value).isprintable()
 
 
 def test_an_object_that_etcd_does_not_take_is_refused():

@@ -1,0 +1,182 @@
+"""Sequences of calls, as any components may make them, through the handlers of the camera service.
+
+Whatever is called, by any caller: no handler fails, no picture is taken in the private zone, none is returned to anyone but its
+owner, and no other file is read or removed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import logging
+import os
+import shutil
+import sys
+import tempfile
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import atheris
+
+with atheris.instrument_imports(
+    include=["fractus_services.camera.rpc", "fractus_services.camera.pictures", "fractus_services.camera.album"]
+):
+    from fractus_services.camera.album.album import Album
+    from fractus_services.camera.pictures.capture import MAX_FILTERING, PictureCapture
+    from fractus_services.camera.pictures.fair_queue import MAX_PER_OWNER, FairQueue
+    from fractus_services.camera.pictures.judge import PictureJudge
+    from fractus_services.camera.pictures.library import PictureLibrary
+    from fractus_services.camera.rpc.handlers import CameraHandlers
+import numpy as np
+from camera_world import Drone, Finder, active_grant, private
+from fractus_proto.v1 import camera_pb2, camera_pb2_grpc
+from fractus_services.admission import CallAdmission
+from fractus_services.camera.capture.driver import CameraFailed, Wanted
+from fractus_services.camera.capture.properties import CameraProperties
+from fractus_services.camera.imaging.pixels import Pixels, reduced
+from fractus_services.grants import ActiveGrant
+from mobility_world import Grants
+from policy_world import NOW
+from virtual_time import fly
+from wire import DEADLINES_S, STRANGE, Context, Registry, called, certificate, request
+
+FOLDER = Path(tempfile.mkdtemp())
+OTHERS = FOLDER / "other.jpg"
+METHODS = camera_pb2.DESCRIPTOR.services_by_name["CameraService"].methods
+TYPES = {method.name: getattr(camera_pb2, method.input_type.name) for method in METHODS}
+NAMES = sorted(TYPES)
+FIRST, SECOND = active_grant(), active_grant(private("blurFaces"), uid="u2", instance="app-viewer")
+PLACES_M = [80.0, 0.0, 21.0]
+"""North of home; the private zone reaches 20 m."""
+PATHS = ["../../other.jpg", "../other.json", "/etc/passwd", "20260601120000000-0000.jpg/..", "a" * 20_000, "\0", ".jpg"]
+logging.disable(logging.CRITICAL)
+os.fsync = os.fdatasync = lambda _file: None  # a power cut is not what is looked for
+
+
+class Shutter:
+    """A camera that gives noise at once, or nothing."""
+
+    latency_s = 0.0
+
+    def __init__(self) -> None:
+        self.broken = False
+
+    async def expose(self, wanted: Wanted, count: int = 1, apart_s: float = 0.0) -> list[Pixels]:
+        await asyncio.sleep(count * apart_s)
+        if self.broken:
+            raise CameraFailed("the camera gave no picture; check it and its connection")
+        picture = np.full((wanted.height, wanted.width, 3), 128, np.uint8)
+        return [picture if i == count // 2 else reduced(picture, 64) for i in range(count)]
+
+
+class Service:
+    """A camera service of two components, on a drone that stands where it is told to."""
+
+    def __init__(self) -> None:
+        self.drone, self.shutter, self.grants = Drone(), Shutter(), Grants()
+        self.names: dict[str, list[str]] = {}
+        for grant in (FIRST, SECOND):
+            self.grants.active[grant.identity] = grant
+        shutil.rmtree(FOLDER / "album", ignore_errors=True)
+        album = Album(FOLDER / "album", 5, 10**6)
+        audit: Any = SimpleNamespace(append=lambda _kind, _content: None)
+        finder = Finder()
+        shared: Any = {
+            "detector": finder, "filter_queue": FairQueue(MAX_PER_OWNER, MAX_FILTERING), "album": album,
+            "judge": PictureJudge(audit, finder), "clock": lambda: NOW,
+        }  # fmt: skip
+        admission = CallAdmission(self.grants, time.time)  # type: ignore[arg-type]
+        handlers = CameraHandlers(
+            PictureCapture(self.drone, self.shutter, CameraProperties((64, 48)), **shared),  # type: ignore[arg-type]
+            PictureLibrary(self.drone, **shared), admission,
+        )  # fmt: skip
+        registry = Registry(admission)
+        camera_pb2_grpc.add_CameraServiceServicer_to_server(handlers, registry)
+        self.handlers = registry.handlers
+
+
+@functools.cache
+def of(identity: str, days: int = 36500) -> bytes:
+    """The certificate of one caller, which is made once."""
+    return certificate(identity, days=days)
+
+
+async def calls(given: atheris.FuzzedDataProvider) -> None:
+    """Up to a dozen calls, one after the other or at once."""
+    service = Service()
+    chains = [(of(FIRST.identity),), (of(SECOND.identity),), *STRANGE, (of(FIRST.identity, 1),)]
+    running: list[asyncio.Task[None]] = []
+    for _ in range(12):
+        if not given.remaining_bytes():
+            break
+        if not running:
+            service.drone.y, service.shutter.broken = given.PickValueInList(PLACES_M), not given.ConsumeIntInRange(0, 9)
+        which = given.ConsumeIntInRange(0, 3 * len(chains) - 1)
+        chain = chains[which if which < len(chains) else which % 2]
+        name = given.PickValueInList(NAMES)
+        body = _named(given, service, name) if given.ConsumeBool() else request(given, TYPES[name])
+        deadline_s = given.PickValueInList(DEADLINES_S) if not given.ConsumeIntInRange(0, 7) else DEADLINES_S[0]
+        caller = {chains[0]: FIRST, chains[1]: SECOND}.get(chain)
+        call = asyncio.ensure_future(one_call(service, name, body, Context(chain, deadline_s), caller))
+        running.append(call)
+        if not given.ConsumeIntInRange(0, 7):
+            call.cancel()
+        if given.ConsumeBool():
+            await _ended(running)
+    await _ended(running)
+    assert OTHERS.read_bytes() == b"other"
+
+
+async def _ended(running: list[asyncio.Task[None]]) -> None:
+    for outcome in await asyncio.gather(*running, return_exceptions=True):
+        if isinstance(outcome, Exception):
+            raise outcome
+    running.clear()
+
+
+def _named(given: atheris.FuzzedDataProvider, service: Service, name: str) -> bytes:
+    """A request for a size that there is, or a picture that there is, for its owner and for others."""
+    if name == "CaptureImage":
+        sizes = [0, 16, 48, 64, 2**32 - 1]
+        return bytes(
+            camera_pb2.CaptureImageRequest(
+                width=given.PickValueInList(sizes), height=given.PickValueInList(sizes)
+            ).SerializeToString()
+        )
+    message = TYPES[name]()
+    if hasattr(message, "name"):
+        known = [name for names in service.names.values() for name in names]
+        message.name = given.PickValueInList(known or PATHS) if given.ConsumeBool() else given.PickValueInList(PATHS)
+    return bytes(message.SerializeToString())
+
+
+async def one_call(service: Service, name: str, body: bytes, context: Context, caller: ActiveGrant | None) -> None:
+    """Make it, and look at what is answered."""
+    answer = await called(service.handlers[name], body, context)
+    if answer is None and not context.written:
+        assert context.code is not None, f"{name} has no answer"
+        return
+    assert caller is not None, f"{name} of a stranger is answered"
+    own = service.names.setdefault(caller.identity, [])
+    if name == "CaptureImage":
+        private_here = abs(service.drone.y) < 20
+        assert not (private_here and caller is FIRST), "a picture of the private zone"
+        own.append(answer.image.name)
+    elif name == "RetrieveImage":
+        assert context.written[0].image.name in own, context.written[0].image.name
+        assert b"".join(part.data for part in context.written)[:2] == b"\xff\xd8"
+    elif name == "ListImages":
+        assert {image.name for image in answer.images} <= set(own)
+
+
+def one(data: bytes) -> None:
+    """One sequence."""
+    OTHERS.write_bytes(b"other")
+    fly(lambda: calls(atheris.FuzzedDataProvider(data)))
+
+
+if __name__ == "__main__":
+    atheris.Setup(sys.argv, one)
+    atheris.Fuzz()

@@ -1,0 +1,146 @@
+"""Sequences of calls, as any components may make them, through the handlers of the mobility service to a vehicle that flies.
+
+Time is virtual. Whatever is called, by any caller: no handler fails, the vehicle does not move without a call of its driver, and it
+stays in its operation area and out of the zone.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import logging
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import atheris
+
+# First what flies: instrumented, it would be several times slower.
+from mobility_world import World, spec, touring, zone
+
+with atheris.instrument_imports(include=["fractus_services.mobility.rpc", "fractus_services.admission"]):
+    from fractus_services.mobility.rpc.handlers import MobilityHandlers
+from fractus_mavlink import Message, layout_named, layout_of
+from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc
+from virtual_time import fly
+from wire import DEADLINES_S, STRANGE, Context, Registry, called, certificate, request
+
+FOLDER = Path(tempfile.mkdtemp())
+WALL = (-40.0, 25.0, 40.0, 40.0)
+AREA_M, NEAR_M = 200.0, 2.0
+METHODS = (
+    "Arm", "Disarm", "Takeoff", "Land", "SetSpeed", "GetSpeed", "SetVelocity", "Goto", "Hover", "GetPosition",
+    "ReturnToLaunch", "PointGimbal",
+)  # fmt: skip
+_SERVICES = [{"service": "mobility", "methods": METHODS}]
+DRIVER = spec(zone("wall", "ignore", *WALL), services=_SERVICES)
+PASSENGER = spec(**{"class": "passenger", "control": None, "controlPoints": [], "instance": "app-viewer"})
+TOURIST = touring(zone("wall", "ignore", *WALL), tour=((30.0, 10.0),), instance="app-tourist")
+WAITS_S = [0.0, 0.1, 0.5, 2.0]
+TYPES = {
+    method.name: getattr(mobility_pb2, method.input_type.name)
+    for method in mobility_pb2.DESCRIPTOR.services_by_name["MobilityService"].methods
+}
+NAMES = sorted(TYPES)
+SAID = [
+    "HEARTBEAT", "GLOBAL_POSITION_INT", "EXTENDED_SYS_STATE", "SYS_STATUS", "HOME_POSITION", "ATTITUDE", "GPS_RAW_INT",
+    "EKF_STATUS_REPORT", "STATUSTEXT", "COMMAND_ACK", "PARAM_VALUE", "TIMESYNC", "MISSION_REQUEST_INT", "MISSION_ACK",
+]  # fmt: skip
+LAYOUTS = [layout for layout in map(layout_of, range(1 << 16)) if layout is not None]
+logging.disable(logging.CRITICAL)
+
+
+@functools.cache
+def of(identity: str, days: int = 36500) -> bytes:
+    """The certificate of one caller, which is made once."""
+    return certificate(identity, days=days)
+
+
+class Flight:
+    """One vehicle, its service, and who may call it."""
+
+    def __init__(self, given: atheris.FuzzedDataProvider) -> None:
+        self._given = given
+        self._running: list[asyncio.Task[Any]] = []
+        self._driven = False
+
+    async def fly(self) -> None:
+        """Make the calls, then look at what came of them."""
+        given = self._given
+        # Most flights are short, as those of many seconds take a hundred times longer.
+        waits_s = WAITS_S if not given.ConsumeIntInRange(0, 7) else WAITS_S[:1]
+        async with World(FOLDER, step_s=0.2) as world:
+            active = world.grants.put(DRIVER)
+            known = [active, world.grants.put(PASSENGER, "m2")]
+            toured = not given.ConsumeIntInRange(0, 7)
+            if toured:
+                known.append(world.grants.put(TOURIST, "m3"))
+            chains = [(of(one.identity),) for one in known]
+            chains += [*STRANGE, (of(active.identity, 1),)]
+            handlers = MobilityHandlers(
+                world.service, world.control, world.streams, grants=world.grants, node="drone-1", clock=time.time,  # type: ignore[arg-type]
+                heard=world.tours.heard,
+            )  # fmt: skip
+            registry = Registry(handlers.admission)
+            mobility_pb2_grpc.add_MobilityServiceServicer_to_server(handlers, registry)
+            in_flight = not given.ConsumeIntInRange(0, 7)
+            if in_flight:
+                self._driven = True
+                await world.up(active, 3.0)
+            lied = await self._calls(world, registry, chains, waits_s)
+            for task in self._running:
+                task.cancel()
+            for outcome in await asyncio.gather(*self._running, return_exceptions=True):
+                if isinstance(outcome, Exception):
+                    raise outcome
+            for task in world._tasks:
+                if task.done() and not task.cancelled() and task.exception() is not None:
+                    raise AssertionError("a part of the service ended") from task.exception()
+            if lied:
+                return
+            assert self._driven or toured or not world.plane.vehicle.armed, "no one drove"
+            for x, y, _ in world.plane.trace:
+                assert max(abs(x), abs(y)) < AREA_M + NEAR_M, (x, y)
+                assert not (WALL[0] + NEAR_M < x < WALL[2] - NEAR_M and WALL[1] + NEAR_M < y < WALL[3] - NEAR_M), (x, y)
+
+    async def _calls(
+        self, world: World, registry: Registry, chains: list[tuple[bytes, ...]], waits_s: list[float]
+    ) -> bool:
+        """Up to a dozen; whether the vehicle said what it pleased in between."""
+        given, lied = self._given, False
+        for _ in range(12):
+            if not given.remaining_bytes():
+                break
+            if not given.ConsumeIntInRange(0, 9):
+                lied = True
+                world.plane.take(_said(given))
+                continue
+            name = given.PickValueInList(NAMES)
+            which = given.ConsumeIntInRange(0, 4 * len(chains) - 1)
+            chain = chains[which if which < len(chains) else 0]
+            self._driven = self._driven or chain == chains[0]
+            deadline_s = given.PickValueInList(DEADLINES_S) if given.ConsumeBool() else DEADLINES_S[0]
+            context = Context(chain, deadline_s)
+            call = called(registry.handlers[name], request(given, TYPES[name]), context)
+            self._running.append(asyncio.ensure_future(call))
+            await asyncio.sleep(given.PickValueInList(waits_s))
+        return lied
+
+
+def _said(given: atheris.FuzzedDataProvider) -> Message:
+    """Any message of the vehicle."""
+    layout = layout_named(given.PickValueInList(SAID)) if given.ConsumeBool() else given.PickValueInList(LAYOUTS)
+    values = layout.unpack(given.ConsumeBytes(layout.packer.size))
+    return Message(layout.name, layout.msgid, 1, 1, values)
+
+
+def one(data: bytes) -> None:
+    """One flight."""
+    fly(Flight(atheris.FuzzedDataProvider(data)).fly)
+
+
+if __name__ == "__main__":
+    atheris.Setup(sys.argv, one)
+    atheris.Fuzz()

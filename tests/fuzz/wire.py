@@ -1,0 +1,137 @@
+"""Requests as the fuzzers make them: any bytes, or messages with any values; and the call that carries them."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+import atheris
+import grpc
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import NameOID
+from google.protobuf.descriptor import FieldDescriptor
+from policy_world import HOME
+
+CENTRE = {"latitude_deg": HOME.lat, "longitude_deg": HOME.lon}
+MAX_METADATA_BYTES = 8 * 1024
+"""Of a reply: clients take no more by default, and would see another error."""
+DEADLINES_S = [5.0, None, 0.0, 0.4, 1e300, float("inf"), -1.0]
+
+_KEY = ec.generate_private_key(ec.SECP256R1())
+_BEGIN = datetime(2020, 1, 1, tzinfo=UTC)
+
+
+def certificate(*uris: str, days: int = 36500) -> bytes:
+    """A certificate that names these identities."""
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "fuzz")])
+    builder = (
+        x509.CertificateBuilder().subject_name(name).issuer_name(name).public_key(_KEY.public_key()).serial_number(1)
+        .not_valid_before(_BEGIN).not_valid_after(_BEGIN + timedelta(days=days))
+    )  # fmt: skip
+    if uris:
+        names = x509.SubjectAlternativeName([x509.UniformResourceIdentifier(uri) for uri in uris])
+        builder = builder.add_extension(names, critical=False)
+    return builder.sign(_KEY, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)
+
+
+STRANGE = (
+    (),
+    (b"",),
+    (b"-----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----\n",),
+    (certificate(),),
+    (certificate("spiffe://fractus.dev/none"),),
+    (certificate("spiffe://fractus.dev/a", "spiffe://fractus.dev/b"),),
+    (certificate("https://fractus.dev/a"),),
+)
+"""Certificate chains of no one who has a grant."""
+
+
+def number(given: atheris.FuzzedDataProvider, bound: float) -> float:
+    """One of a size that is flown, or any: infinity, a thousand digits, none at all."""
+    return given.ConsumeFloatInRange(-bound, bound) if given.ConsumeBool() else given.ConsumeFloat()
+
+
+def fill(given: atheris.FuzzedDataProvider, message: Any) -> None:
+    """Give some fields of a message a value of their type."""
+    for field in message.DESCRIPTOR.fields:
+        if field.is_repeated or not given.ConsumeIntInRange(0, 3):
+            continue
+        if field.type == FieldDescriptor.TYPE_MESSAGE:
+            getattr(message, field.name).SetInParent()
+            fill(given, getattr(message, field.name))
+        elif field.type in {FieldDescriptor.TYPE_DOUBLE, FieldDescriptor.TYPE_FLOAT}:
+            centre = CENTRE.get(field.name)
+            value = number(given, 120.0) if centre is None else centre + number(given, 0.002)
+            setattr(message, field.name, value)
+        elif field.type == FieldDescriptor.TYPE_STRING:
+            setattr(message, field.name, given.ConsumeUnicodeNoSurrogates(40))
+        elif field.type == FieldDescriptor.TYPE_BOOL:
+            setattr(message, field.name, given.ConsumeBool())
+        elif field.type == FieldDescriptor.TYPE_ENUM:
+            setattr(message, field.name, given.ConsumeIntInRange(0, 7))
+        else:
+            setattr(message, field.name, given.ConsumeIntInRange(0, 100 if given.ConsumeBool() else 2**32 - 1))
+
+
+def request(given: atheris.FuzzedDataProvider, kind: Any) -> bytes:
+    """A request for a method that takes messages of a kind."""
+    if not given.ConsumeIntInRange(0, 3):
+        return given.ConsumeBytes(given.ConsumeIntInRange(0, 64))
+    message = kind()
+    fill(given, message)
+    return bytes(message.SerializeToString())
+
+
+class Registry:
+    """What generated code adds handlers to; kept here by their names."""
+
+    def __init__(self, admission: Any) -> None:
+        self._admission = admission
+        self.handlers: dict[str, grpc.RpcMethodHandler] = {}
+
+    def add_generic_rpc_handlers(self, _handlers: object) -> None:
+        """The same handlers once more."""
+
+    def add_registered_method_handlers(self, _service: str, handlers: dict[str, grpc.RpcMethodHandler]) -> None:
+        """As they are served: decoded once their caller is let in."""
+        self.handlers |= {name: self._admission.decoded(handler) for name, handler in handlers.items()}
+
+
+class Context:
+    """gRPC's context of one call, which checks what the service answers."""
+
+    def __init__(self, chain: tuple[bytes, ...], remaining_s: float | None) -> None:
+        self._chain, self._remaining_s = chain, remaining_s
+        self.code: grpc.StatusCode | None = None
+        self.written: list[Any] = []
+
+    def auth_context(self) -> dict[str, Any]:
+        return {"x509_pem_cert": list(self._chain)}
+
+    def time_remaining(self) -> float | None:
+        return self._remaining_s
+
+    async def write(self, message: Any) -> None:
+        message.SerializeToString()
+        self.written.append(message)
+
+    async def abort(self, code: grpc.StatusCode, text: str, metadata: Any) -> None:
+        assert code not in {grpc.StatusCode.INTERNAL, grpc.StatusCode.UNKNOWN, grpc.StatusCode.OK}, text
+        size = sum(len(name) + len(value) + 32 for name, value in metadata) + len(text.encode())
+        assert size <= MAX_METADATA_BYTES, f"{size} bytes: {text[:200]}"
+        self.code = code
+        raise grpc.aio.AbortError
+
+
+async def called(handler: grpc.RpcMethodHandler, body: bytes, context: Context) -> Any:
+    """The answer of a handler; None if it refuses or streams."""
+    handle = handler.unary_unary or handler.unary_stream
+    try:
+        answer = await handle(handler.request_deserializer(body), context)
+    except grpc.aio.AbortError:
+        return None
+    if answer is not None:
+        handler.response_serializer(answer)
+    return answer

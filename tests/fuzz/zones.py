@@ -1,0 +1,85 @@
+"""Zones in the formats of others, as anyone may write them: a reason why one is refused, or zones that are read as the same again."""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+from pathlib import Path
+
+import atheris
+
+with atheris.instrument_imports(
+    include=["fractus_core.geo.formats", "fractus_core.api.geometry", "fractus_core.validation"]
+):
+    from fractus_core.api import InvalidObject, Zone
+    from fractus_core.documents import dump_documents, parse_documents
+    from fractus_core.geo import formats
+    from fractus_core.validation import check_zone
+
+READERS = [formats.read_geojson, formats.read_kml, formats.read_qgc_plan, formats.read_ed269]
+WRITERS = [formats.write_geojson, formats.write_kml, formats.write_qgc_plan, formats.write_ed269]
+EXAMPLE = Path(__file__).parents[2] / "examples" / "traffic-monitoring" / "zones.yaml"
+ZONES = [Zone.from_body(body) for body in parse_documents(EXAMPLE.read_bytes(), EXAMPLE.name).values]
+HELD = {
+    "apiVersion": "fractus.dev/v1alpha1", "kind": "Zone", "metadata": {"name": "held"},
+    "spec": {
+        "area": {"circle": {"center": {"lat": 39.36, "lon": 22.95}, "radius": 50.0}}, "altitude": {"lower": 10.0, "upper": 60.0, "reference": "amsl"},
+        "schedule": [{"days": ["Mon"], "start": "08:00", "end": "17:00"}],
+    },
+}  # fmt: skip
+TEXTS = [write([*ZONES, Zone.from_body(HELD)]).text for write in WRITERS]
+"""The example's zones in each format."""
+
+SPLICES = [
+    "", "0", "-", "1e999", "NaN", "null", "true", "[]", "{}", '""', "180", "-180", "90", "9" * 20, "<", "&amp;", "&x;",
+    "2026-01-01T00:00:00Z", "FOREVER", "AGL", "AMSL", "FT", "M", "H24", "<when>", "\u00e9", "\U0001f600", "\0", "1000000",
+]  # fmt: skip
+logging.disable(logging.CRITICAL)
+
+
+def text_of(given: atheris.FuzzedDataProvider, which: int) -> str:
+    """A file with some places changed, or any."""
+    if not given.ConsumeIntInRange(0, 7):
+        return given.ConsumeUnicodeNoSurrogates(given.remaining_bytes())
+    text = TEXTS[which]
+    for _ in range(given.ConsumeIntInRange(0, 6)):
+        begin = given.ConsumeIntInRange(0, max(len(text) - 1, 0))
+        end = begin + given.ConsumeIntInRange(0, 12)
+        put = given.PickValueInList(SPLICES) if given.ConsumeBool() else given.ConsumeUnicodeNoSurrogates(6)
+        if not given.ConsumeIntInRange(0, 3):
+            put = text[begin : begin + given.ConsumeIntInRange(0, 200)] + put
+            end = begin
+        text = text[:begin] + put + text[end:]
+    return text
+
+
+def one(data: bytes) -> None:
+    """One file: what is read from it is written and read again."""
+    given = atheris.FuzzedDataProvider(data)
+    which = given.ConsumeIntInRange(0, len(READERS) - 1)
+    try:
+        found = READERS[which](text_of(given, which))
+        for zone in found.zones:
+            check_zone(zone)
+    except InvalidObject as error:
+        assert str(error)
+        return
+    for zone in found.zones:
+        body = zone.to_dict()
+        body["spec"] = {key: part for key, part in body["spec"].items() if part not in ("", [])}
+        (read,) = parse_documents(dump_documents([body]).encode(), "zone").values
+        assert Zone.from_body(read).spec == zone.spec, zone
+        json.dumps(read)
+    for write in WRITERS:
+        try:
+            exported = write(found.zones)
+        except InvalidObject as error:
+            assert str(error)
+            continue
+        exported.text.encode()
+
+
+if __name__ == "__main__":
+    atheris.Setup(sys.argv, one)
+    atheris.Fuzz()

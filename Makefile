@@ -59,7 +59,7 @@ GOLDEN := tests/component/test_control_golden.py
 # Many of these tests fly in real time, which a machine that stalls can fail: what fails gets a second try, alone.
 INTEGRATION := tests/integration tests/e2e/test_cluster.py
 E2E := tests/e2e --ignore tests/e2e/test_cluster.py
-# These are of the charts on a cluster that is not ours: `make test-kind` runs them on kind.
+# These are of the charts on a cluster that is not ours: they run on kind, or on FRACTUS_E2E_CLUSTER=current.
 ON_KIND := $(patsubst %,tests/e2e/test_%.py,mission refusals upgrade uninstall)
 SECOND_TRY := $(RUN) pytest --last-failed --last-failed-no-failures none
 
@@ -69,7 +69,12 @@ test: packages env lint ## Everything: lint, types, unit, component, integration
 	$(QUICK) tests/component tests/unit --ignore $(GOLDEN)
 	FRACTUS_DEEP=1 $(RUN) pytest -q -n 2 $(GOLDEN)
 	$(RUN) pytest -n 3 --dist loadgroup $(INTEGRATION) || $(SECOND_TRY) $(INTEGRATION)
-	$(RUN) pytest $(if $(filter current,$(FRACTUS_E2E_CLUSTER)),,-n 2 --dist loadgroup) $(E2E) || $(SECOND_TRY) $(E2E)
+ifeq ($(FRACTUS_E2E_CLUSTER),current)
+	$(RUN) pytest $(E2E) || $(SECOND_TRY) $(E2E)
+else
+	$(RUN) pytest -n 2 --dist loadgroup $(E2E) $(ON_KIND:%=--ignore %) || $(SECOND_TRY) $(E2E) $(ON_KIND:%=--ignore %)
+	STEPS="images cluster load charts tests uninstall" $(MAKE) test-kind
+endif
 
 .PHONY: test-fast
 test-fast: env lint ## The inner loop: lint, types and unit tests
@@ -89,17 +94,18 @@ test-e2e: packages env ## End-to-end tests only, on the embedded cluster or on F
 	$(RUN) pytest tests/e2e
 
 .PHONY: test-kind
-test-kind: env ## The charts, a mission's end-to-end tests and the demo on a cluster of kind (without Docker: on one made here, as root)
-	export ON_KIND="$(ON_KIND)"; if docker info > /dev/null 2>&1; then tests/kind/run.sh; else tests/kind/machine.sh tests/kind/run.sh; fi
+test-kind: env ## The charts, a mission's end-to-end tests and the demo on a cluster of kind (without Docker, kind, kubectl or helm: with those made here, as root)
+	export ON_KIND="$(ON_KIND)"; if docker info > /dev/null 2>&1 && type kind kubectl helm > /dev/null; then tests/kind/run.sh; else tests/kind/machine.sh tests/kind/run.sh; fi
 
 # libFuzzer's own options; what it finds is left in out/fuzz. The examples are where manifests start from.
 SECONDS ?= 600
+FUZZERS := manifests zones calls mobility camera exchange mavlink
 .PHONY: fuzz
-fuzz: env ## Fuzz manifests, calls and MAVLink for SECONDS=600 each
-	mkdir -p $(OUT)/fuzz/{manifests,calls,mavlink} && cp examples/traffic-monitoring/*.yaml $(OUT)/fuzz/manifests
-	for name in manifests calls mavlink; do \
-		PYTHONPATH=tests $(RUN) --with atheris==3.0.0 python tests/fuzz/$$name.py -max_total_time=$(SECONDS) -len_control=0 \
-			-max_len=2048 -artifact_prefix=$(OUT)/fuzz/$$name- $(OUT)/fuzz/$$name; \
+fuzz: env ## Fuzz manifests, zones, calls, both services and MAVLink for SECONDS=600 each
+	mkdir -p $(addprefix $(OUT)/fuzz/,$(FUZZERS)) && cp examples/traffic-monitoring/*.yaml $(OUT)/fuzz/manifests
+	for name in $(FUZZERS); do \
+		PYTHONPATH=tests:tests/component:tests/unit $(RUN) --with atheris==3.0.0 python tests/fuzz/$$name.py \
+			-max_total_time=$(SECONDS) -len_control=0 -max_len=2048 -artifact_prefix=$(OUT)/fuzz/$$name- $(OUT)/fuzz/$$name; \
 	done
 
 .PHONY: lint
@@ -151,7 +157,7 @@ release: env ## Set VERSION=X.Y.Z of package and charts, and gather the changelo
 	$(RUN) towncrier build --yes --version "$(VERSION)"
 
 # What a user installs, without what only builds and tests it.
-SHIPPED := --frozen --no-dev --extra operator --extra agent --extra services --extra view
+SHIPPED := --frozen --no-dev --extra operator --extra agent --extra services --extra view --extra tracing
 
 .PHONY: dist
 dist: env ## Build what a release has into dist/: wheel, source archive, charts, dependencies and their licences, checksums

@@ -77,9 +77,11 @@ engine() {
     runtime
     options+=(--add-runtime "bounded=$home/bin/runc-bounded" --default-runtime bounded)
   fi
-  # This one process is the whole engine: with it go its containers and their mounts.
+  # This one process is the whole engine: with it go its containers and their mounts. It would take a containerd that it
+  # finds in /run, which is of the machine.
   setsid nsenter --net="/run/netns/$network" unshare --mount --pid --fork --kill-child --mount-proc \
-    dockerd "${options[@]}" > "$home/dockerd.log" 2>&1 &
+    sh -c 'mkdir -p /run/containerd && mount -t tmpfs tmpfs /run/containerd && exec dockerd "$@"' dockerd "${options[@]}" \
+    > "$home/dockerd.log" 2>&1 &
   engine=$!
   export DOCKER_HOST="unix://$home/docker.sock" DOCKER_BUILDKIT=1
   for _ in $(seq 600); do

@@ -2,9 +2,9 @@
 # Everything on a cluster that kind makes: images by Docker, the charts, the end-to-end tests of a mission, the demo.
 # Needs docker, kind, kubectl and helm on the PATH; tests/kind/machine.sh brings them where they are missing.
 #
-#   STEPS="cluster"       only these steps, of: images cluster load charts tests demo uninstall
+#   STEPS="cluster"       only these steps, of: images cluster load charts tests demo uninstall one_node
 #   ON_KIND="FILES..."    the tests, as `make test-kind` gives them
-#   KEEP=1                leaves the cluster
+#   KEEP=1                leaves the clusters
 #   KIND_NODE_IMAGE=NAME  the nodes' image; kind's own by default
 #   BUILD_OPTIONS="..."   for `docker build`
 set -euo pipefail
@@ -12,6 +12,7 @@ cd "$(dirname "${BASH_SOURCE[0]}")/../.."
 
 name=fractus
 targets=(operator agent mobility camera sim example-traffic-monitoring)
+made=()
 state=$(mktemp -d)
 export KUBECONFIG=$state/kubeconfig FRACTUS_E2E_CLUSTER=current
 
@@ -22,11 +23,16 @@ images() {
   done
 }
 
-cluster() {
-  ! kind get clusters 2> /dev/null | grep -qx "$name" || { echo "there is a cluster $name already: kind delete cluster --name $name" >&2; return 1; }
-  made=1
-  kind create cluster --name "$name" --config tests/kind/cluster.yaml --wait 300s ${KIND_NODE_IMAGE:+--image "$KIND_NODE_IMAGE"}
+# create NAME [OPTION...]: a cluster of that name, whose nodes are ready.
+create() {
+  ! kind get clusters 2> /dev/null | grep -qx "$1" || { echo "there is a cluster $1 already: kind delete cluster --name $1" >&2; return 1; }
+  made+=("$1")
+  kind create cluster --name "$@" --wait 300s ${KIND_NODE_IMAGE:+--image "$KIND_NODE_IMAGE"}
   kubectl wait --for=condition=Ready node --all --timeout=300s
+}
+
+cluster() {
+  create "$name" --config tests/kind/cluster.yaml
   for class in drone edge; do
     kubectl taint node --selector "fractus.dev/class=$class" "fractus.dev/class=$class:NoExecute"
   done
@@ -34,7 +40,7 @@ cluster() {
 }
 
 load() {
-  kind load docker-image --name "$name" $(printf "localhost/fractus/%s:dev " "${targets[@]}")
+  kind load docker-image --name "${1:-$name}" $(printf "localhost/fractus/%s:dev " "${targets[@]}")
 }
 
 charts() {
@@ -55,13 +61,33 @@ demo() {
   ls out/demo/recordings/mobility-*.mcap
 }
 
-# What docs/upgrades.md tells to type; nothing of Fractus is left that Kubernetes would run, ask or refuse by.
+# What docs/upgrades.md tells to type; nothing of Fractus is left that Kubernetes would run, ask or refuse by, nor on nodes.
 uninstall() {
-  helm -n fractus-system uninstall fractus-demo
+  bash -e <(sed -n '/^### What stays, and wiping/,/^## /s/^    \(helm .* upgrade .*\)/\1/p' docs/upgrades.md)
   bash -e <(sed -n '/^## Uninstalling/,/^## /s/^    \(kubectl delete app.*\|helm .* uninstall .*\)/\1/p' docs/upgrades.md)
+  kubectl wait --for=delete pod --all --namespace fractus-system --timeout=120s
   kinds=$(kubectl api-resources --verbs=list --output=name | grep -v '^events')
   left=$(kubectl get "$(echo $kinds | tr ' ' ',')" --all-namespaces --selector app.kubernetes.io/name=fractus --output name)
-  [ -z "$left" ] && [ -z "$(kubectl get pods --all-namespaces --output name | grep fractus)" ] || { echo "left: $left" >&2; return 1; }
+  [ -z "$left" ] || { echo "left: $left" >&2; return 1; }
+  nodes=$(kind get nodes --name "$name")
+  [ -n "$nodes" ] || { echo "there are no nodes of $name to look at" >&2; return 1; }
+  for node in $nodes; do
+    left=$(docker exec "$node" sh -c 'ls -A /var/lib/fractus 2> /dev/null || true')
+    [ -z "$left" ] || { echo "left on $node: $left" >&2; return 1; }
+  done
+}
+
+# docs/clusters.md, "One node": the same charts, and a mission that needs no edge nodes.
+one_node() {
+  # One of them at a time is enough for a small machine; what someone else made, or wants to look at, stays.
+  [ -n "${KEEP:-}" ] || [[ " ${made[*]} " != *" $name "* ]] || kind delete cluster --name "$name"
+  create "$name-one" --config <(sed '/^nodes:/,$d' tests/kind/cluster.yaml)
+  kubectl label node --all fractus.dev/class=drone fractus.dev/cloud=true
+  load "$name-one"
+  charts
+  kubectl apply --filename examples/traffic-monitoring/passenger-only.yaml
+  kubectl wait --for=jsonpath='{.status.phase}'=Completed application.fractus.dev/road-pictures --timeout=600s
+  kubectl get fractus --all-namespaces
 }
 
 leave() {
@@ -70,13 +96,13 @@ leave() {
     kubectl get nodes,pods --all-namespaces --output wide || true
     kubectl get events --all-namespaces --sort-by=.lastTimestamp | tail -n 30 || true
   fi
-  [ -n "${KEEP:-}" ] || [ -z "${made:-}" ] || kind delete cluster --name "$name"
+  [ -n "${KEEP:-}" ] || for cluster in "${made[@]}"; do kind delete cluster --name "$cluster"; done
   [ -n "${KEEP:-}" ] || rm -rf "$state"
   exit "$code"
 } >&2
 trap leave EXIT
 
-for step in ${STEPS:-images cluster load charts tests demo uninstall}; do
+for step in ${STEPS:-images cluster load charts tests demo uninstall one_node}; do
   echo "== $step ($(date +%T))"
   "$step"
 done

@@ -294,6 +294,9 @@ class OperatorProcess:
 def fresh_namespace(world: World, name: str) -> Iterator[str]:
     """A namespace for one test, deleted with its Applications afterwards."""
     world.api.apply(f"/api/v1/namespaces/{name}", _namespace(name))
+    # Until the controller manager has made it, no pod is admitted.
+    account = f"/api/v1/namespaces/{name}/serviceaccounts/default"
+    wait_for(lambda: world.api.get(account), "the namespace's service account")
     try:
         yield name
     finally:

@@ -105,6 +105,15 @@ def lines_of(files: Iterable[Path]) -> Iterator[tuple[Path, int, bytes]]:
                 yield path, number, line
 
 
+def entries(lines: Iterable[bytes]) -> Iterator[dict[str, Any]]:
+    """The entries of an audit log; a line that is none, of which `verify` tells, is passed over."""
+    for line in lines:
+        try:
+            yield json.loads(line)
+        except ValueError:
+            continue
+
+
 @dataclass(frozen=True, slots=True)
 class Finding:
     """What verification found.

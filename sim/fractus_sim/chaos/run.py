@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import itertools
-import json
 import random
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any
 
 from fractus_cluster.errors import ClusterError
-from fractus_storage.chain import lines_of, logs, verify
+from fractus_cluster.manifests import is_ready
+from fractus_storage.chain import entries, lines_of, logs, verify
 
 from fractus_sim.chaos import invariants
 from fractus_sim.chaos.faults import FAULTS, broken
@@ -121,8 +121,8 @@ def _settle(stage: Stage, missions: Missions) -> list[Broken]:
     left = _awaited(deleted, CLEAN_TIMEOUT_S)
     found = invariants.left_over(missions.left_over()) if not left else []
     for what, holds in (
-        ("every node is Ready", lambda: all(_is_ready(body) for body in stage.objects("nodes"))),
-        ("the drone is Ready", lambda: all(_is_ready(body) for body in stage.objects("drones.fractus.dev"))),
+        ("every node is Ready", lambda: all(map(is_ready, stage.objects("nodes")))),
+        ("the drone is Ready", lambda: all(map(is_ready, stage.objects("drones.fractus.dev")))),
     ):
         if not _awaited(holds, RECOVER_TIMEOUT_S):
             found.append(Broken("all recovers", 0.0, f"not so after {RECOVER_TIMEOUT_S:.0f} s: {what}"))
@@ -147,40 +147,21 @@ def _judge(stage: Stage, watch: Watch, run: Run) -> list[Broken]:
             if finding.problem:
                 what = f"{node.name}/{log.name}: line {finding.line} {finding.problem}"
                 found.append(Broken("one writer of each audit log", 0.0, what))
-            entries = list(_entries(lines))
+            said = list(entries(lines))
             if log.stem == "mobility":
-                found += invariants.without_authority(seen, entries)
-                found += invariants.in_two_applications(entries, watch.grants)
+                found += invariants.without_authority(seen, said)
+                found += invariants.in_two_applications(said, watch.grants)
             if node.name == stage.drone:
-                found += invariants.forbidden_calls(entries, watch.grants, watch.home)
+                found += invariants.forbidden_calls(said, watch.grants, watch.home)
     return [each for each in found if not each.time_s or each.time_s >= run.began_s]
-
-
-def _entries(lines: Sequence[bytes]) -> Iterator[Mapping[str, Any]]:
-    for line in lines:
-        try:
-            yield json.loads(line)
-        except ValueError:  # verification tells of it
-            continue
-
-
-def _is_ready(body: Mapping[str, Any]) -> bool:
-    conditions = (body.get("status") or {}).get("conditions") or ()
-    return any(each["type"] == "Ready" and each["status"] == "True" for each in conditions)
 
 
 def _awaited(holds: Callable[[], bool], timeout_s: float) -> bool:
     """Whether something comes to hold in time."""
     deadline = time.monotonic() + timeout_s
     while time.monotonic() < deadline:
-        if _tried(holds):
-            return True
+        with suppress(*_ERRORS):
+            if holds():
+                return True
         time.sleep(_STEP_S)
     return False
-
-
-def _tried(ask: Callable[[], object]) -> bool:
-    try:
-        return bool(ask())
-    except _ERRORS:
-        return False

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from fractus_cluster.manifests import is_ready
 from fractus_core.api.nodes import GROUNDED
 
 from fractus_sim.demo.kube import NAMESPACE, SYSTEM, DemoError, Kube, Object
@@ -100,7 +101,7 @@ class Mission:
             say(f"traffic goes {to}: {why}")
 
     def _see_pods(self, now_s: float, say: Say) -> None:
-        running = sum(_ready(body) for body in self.pods.values())
+        running = sum(map(is_ready, self.pods.values()))
         if running > self._running:
             say(f"pods Running: {running} of {len(self.pods)}")
         self._running = running
@@ -202,10 +203,6 @@ def _ends(pod: Object) -> bool:
     """Whether a pod's mission is over: what is reported of it is how it ran."""
     metadata = pod["metadata"]
     return "deletionTimestamp" in metadata or "fractus.dev/finished" in metadata.get("labels", {})
-
-
-def _ready(pod: Object) -> bool:
-    return any(c["type"] == "Ready" and c["status"] == "True" for c in pod.get("status", {}).get("conditions", ()))
 
 
 def _drone(plan: Object) -> str:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
-from fractus_storage.chain import lines_of, logs, verify
+from fractus_storage.chain import entries, lines_of, logs, verify
 
 from fractus_sim.experiment.findings import Findings
 
@@ -17,10 +16,4 @@ def read_audit(path: Path, name: str, findings: Findings) -> None:
     lines = [line for _, _, line in lines_of(logs([path])[path])]
     finding = verify(lines)
     findings.audit_problems[name] = f"line {finding.line} {finding.problem}" if finding.problem else ""
-    for line in lines:
-        try:
-            entry = json.loads(line)
-        except ValueError:  # what verify has found wrong already
-            continue
-        if entry.get("kind") in JUDGED:
-            findings.calls.append(entry)
+    findings.calls += [entry for entry in entries(lines) if entry.get("kind") in JUDGED]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import bisect
-import json
 import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -13,6 +12,7 @@ from typing import Any
 
 from fractus_mavlink import Message, Parser, frame_length
 from fractus_mavlink.enums import COPTER_MODE, MAV_COMPONENT, MAV_MODE_FLAG
+from fractus_storage.chain import entries
 
 from fractus_sim.experiment.station import FLYING_STATES
 from fractus_sim.report.track import Place, Sample, Track
@@ -88,7 +88,12 @@ def read_evidence(name: str, title: str, *, policies: bool, tlog: Path, audits: 
         ValueError: the tlog has nothing of a flight.
     """
     samples, clock, texts = _flight(tlog)
-    calls = [call for path in audits for entry in _entries(path) if (call := _call(entry, clock)) is not None]
+    calls = [
+        call
+        for path in audits
+        for entry in entries(path.read_bytes().splitlines())
+        if (call := _call(entry, clock)) is not None
+    ]
     return Evidence(
         name, title, policies, Track(title, samples), tuple(sorted(calls, key=lambda c: c.time_s)), tuple(texts)
     )
@@ -161,17 +166,9 @@ def _flight(path: Path) -> tuple[tuple[Sample, ...], _Clock, list[str]]:
     return tuple(samples), clock, texts
 
 
-def _entries(path: Path) -> Iterator[Mapping[str, Any]]:
-    for line in path.read_text().splitlines():
-        try:
-            entry = json.loads(line)
-        except ValueError:  # the last line of a service that was stopped
-            continue
-        if entry.get("kind") in ("call", "takeover", "control"):
-            yield entry
-
-
 def _call(entry: Mapping[str, Any], clock: _Clock) -> Call | None:
+    if entry.get("kind") not in ("call", "takeover", "control"):
+        return None
     mine = entry["kind"] == "call"
     caller = str(entry.get("caller", ""))
     who = caller.split("/component/", 1)[-1].split("/", 1)[0] if mine and caller else SYSTEM

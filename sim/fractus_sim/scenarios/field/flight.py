@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
+from fractus_storage.chain import entries
 from fractus_vehicle.estimator import FULL_START_S
 
 from fractus_sim.experiment.errors import ExperimentError
@@ -123,12 +122,13 @@ def _wait_home(ground: Standalone, drone: RunningDrone, autopilot: Autopilot, te
     """
     began_s, said, flown = time.monotonic(), 0, False
     while True:
-        entries = [e for e in _lines(drone.audit) if e.get("kind") in ("control", "takeover")]
-        for entry in entries[said:]:
+        log = list(entries(drone.audit.read_bytes().splitlines() if drone.audit.exists() else ()))
+        control = [e for e in log if e.get("kind") in ("control", "takeover")]
+        for entry in control[said:]:
             tell(f"{entry.get('action')}{': ' + entry['reason'] if entry.get('reason') else ''}")
-        said = len(entries)
-        flown = flown or any(e.get("in_air") for e in _lines(drone.audit) if e.get("kind") == "state")
-        if flown and any(e.get("action") == "landed" for e in entries):
+        said = len(control)
+        flown = flown or any(e.get("in_air") for e in log if e.get("kind") == "state")
+        if flown and any(e.get("action") == "landed" for e in control):
             return
         waited_s = time.monotonic() - began_s
         if not flown and waited_s > READY_TIMEOUT_S:
@@ -136,16 +136,6 @@ def _wait_home(ground: Standalone, drone: RunningDrone, autopilot: Autopilot, te
                 f"the drone did not take off within {READY_TIMEOUT_S:.0f} s: {ground.processes.log_tail('navigator')}"
             )
         if waited_s > READY_TIMEOUT_S + FLIGHT_TIMEOUT_S / autopilot.speedup:
-            raise ExperimentError(f"the drone was not home within {waited_s:.0f} s; its last word: {entries[-1:]}")
+            raise ExperimentError(f"the drone was not home within {waited_s:.0f} s; its last word: {control[-1:]}")
         ground.check()
         time.sleep(POLL_S)
-
-
-def _lines(path: Path) -> list[dict[str, Any]]:
-    found = []
-    for line in path.read_text().splitlines() if path.exists() else ():
-        try:
-            found.append(json.loads(line))
-        except ValueError:  # a line that is being written
-            break
-    return found

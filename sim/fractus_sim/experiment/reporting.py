@@ -18,7 +18,7 @@ from fractus_sim.report.drawing import save
 from fractus_sim.report.flightmap import draw_map
 from fractus_sim.report.geojson import feature, lonlat, path, point
 from fractus_sim.report.mission import marks_of, requests_of
-from fractus_sim.report.page import PAGE, clock, table, write_page
+from fractus_sim.report.page import PAGE, clock, rounded, table, write_page
 from fractus_sim.report.profile import Limit, Profile, Span, draw_profile
 from fractus_sim.report.scene import DrawnZone, Mark, Scene
 from fractus_sim.report.summary import judged
@@ -236,13 +236,13 @@ def _checks(outcome: Outcome) -> str:
 
 def _vehicle(track: Track, outcome: Outcome) -> dict[str, Any]:
     return {
-        "takeoff_s": _rounded(track.takeoff_s),
-        "landing_s": _rounded(track.landing_s),
-        "distance_m": _rounded(track.distance_m),
-        "max_altitude_m": _rounded(track.max_altitude_m),
-        "max_speed_mps": _rounded(track.max_speed_mps),
-        "landed_from_takeoff_m": _rounded(track.miss_m),
-        "battery": _rounded(track.samples[-1].battery) if track.samples else None,
+        "takeoff_s": rounded(track.takeoff_s),
+        "landing_s": rounded(track.landing_s),
+        "distance_m": rounded(track.distance_m),
+        "max_altitude_m": rounded(track.max_altitude_m),
+        "max_speed_mps": rounded(track.max_speed_mps),
+        "landed_from_takeoff_m": rounded(track.miss_m),
+        "battery": rounded(track.samples[-1].battery) if track.samples else None,
         "modes": [[round(at, 2), mode] for at, mode in outcome.flights[track.name].modes],
         "task": outcome.flights[track.name].task or None,
     }
@@ -301,7 +301,3 @@ def _files(outcome: Outcome) -> str:
     if logs:
         listed.append(f"logs/*.tlog ({len(list(logs))} files): MAVLink of each link, for MAVProxy and Mission Planner")
     return "\n".join(["## Files", "", *(f"- {line}" for line in listed)])
-
-
-def _rounded(value: float | None) -> float | None:
-    return None if value is None else round(value, 2)

@@ -23,6 +23,11 @@ def clock(seconds: float | None) -> str:
     return f"{seconds:.1f} s" if whole < 60 else f"{whole // 60} min {whole % 60:02d} s"
 
 
+def rounded(value: float | None) -> float | None:
+    """A figure for programs, to two places."""
+    return None if value is None else round(value, 2)
+
+
 def write_page(folder: Path, text: str) -> None:
     """Write the page, whole or not at all; the last of a report, so that where there is a page there is all of it."""
     scratch = folder / f".{PAGE}"

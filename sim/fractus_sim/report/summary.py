@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
-from fractus_sim.report.page import clock, table
+from fractus_sim.report.page import clock, rounded, table
 from fractus_sim.report.record import PICTURES, Judgement, Record, taken_s
 
 _ROLES = {
@@ -48,13 +48,13 @@ def figures(record: Record) -> dict[str, Any]:
         "pictures": record.results,
         "corrected": sum(j.count for j in record.judgements if not j.refused),
         "refused": sum(j.count for j in record.judgements if j.refused),
-        "flight_s": _round(_span(record.takeoff_s, record.landing_s)),
-        "distance_m": _round(record.track.distance_m),
-        "max_altitude_m": _round(record.track.max_altitude_m),
-        "max_speed_mps": _round(record.track.max_speed_mps),
+        "flight_s": rounded(_span(record.takeoff_s, record.landing_s)),
+        "distance_m": rounded(record.track.distance_m),
+        "max_altitude_m": rounded(record.track.max_altitude_m),
+        "max_speed_mps": rounded(record.track.max_speed_mps),
         "landed": record.landing_s is not None,
-        "landed_from_home_m": _round(record.track.miss_m),
-        "times": {name: _round(seconds) for name, seconds in _durations(record)},
+        "landed_from_home_m": rounded(record.track.miss_m),
+        "times": {name: rounded(seconds) for name, seconds in _durations(record)},
         "judgements": [
             {
                 "time": _stamp(j.time_s),
@@ -204,7 +204,3 @@ def _utc(time_s: float) -> str:
 
 def _stamp(time_s: float) -> str:
     return datetime.fromtimestamp(time_s, UTC).isoformat(timespec="milliseconds")
-
-
-def _round(value: float | None) -> float | None:
-    return None if value is None else round(value, 2)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from fractus_sim.report.page import clock, table
+from fractus_sim.report.page import clock, rounded, table
 from fractus_sim.scenarios.field.evidence import Call, Evidence
 from fractus_sim.scenarios.field.expectations import Check
 from fractus_sim.scenarios.field.place import NAVIGATOR, Field
@@ -49,11 +49,11 @@ def _figures(run: Evidence) -> dict[str, Any]:
         "name": run.name,
         "title": run.title,
         "policies": run.policies,
-        "flight_s": _round(_flight_s(run)),
-        "distance_m": _round(run.track.distance_m),
-        "max_altitude_m": _round(run.track.max_altitude_m),
-        "max_speed_mps": _round(run.track.max_speed_mps),
-        "landed_from_takeoff_m": _round(run.track.miss_m),
+        "flight_s": rounded(_flight_s(run)),
+        "distance_m": rounded(run.track.distance_m),
+        "max_altitude_m": rounded(run.track.max_altitude_m),
+        "max_speed_mps": rounded(run.track.max_speed_mps),
+        "landed_from_takeoff_m": rounded(run.track.miss_m),
         "pictures_taken": len(run.pictures(taken=True)),
         "pictures_refused": len(run.pictures(taken=False)),
         "corrected": sum(c.action == "correct" and _altered(c) for c in _mine(run)),
@@ -125,7 +125,3 @@ def _name(field: Field, call: Call) -> str:
 def _flight_s(run: Evidence) -> float | None:
     begin, end = run.track.takeoff_s, run.track.landing_s
     return None if begin is None or end is None else end - begin
-
-
-def _round(value: float | None) -> float | None:
-    return None if value is None else round(value, 2)

@@ -10,13 +10,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from fractus_cluster.binaries import ensure_binaries
 from fractus_cluster.cluster import Cluster
 from fractus_cluster.errors import ClusterError
 from fractus_cluster.images.build import build_images
 from fractus_cluster.spec import ClusterSpec, NodeSpec, VehicleHardware, load_spec
 
-from fractus_sim.demo.clusters import ROOT, documents
+from fractus_sim.demo.clusters import ROOT, documents, install_fractus, kube_of
 from fractus_sim.demo.kube import DemoError, Kube
 from fractus_sim.demo.watch import wait_ready
 from fractus_sim.experiment.audits import read_audit
@@ -24,9 +23,8 @@ from fractus_sim.experiment.errors import ExperimentError
 from fractus_sim.experiment.linktap import LinkTap
 from fractus_sim.experiment.model import ClusterPart, Experiment, VehicleSetup
 from fractus_sim.experiment.netns import connect_in, listen_in
-from fractus_sim.experiment.station import OBSERVER_ID, Station, TcpLink
+from fractus_sim.experiment.station import TcpLink
 from fractus_sim.experiment.testbed import Moment, Testbed
-from fractus_sim.experiment.tlog import TlogWriter
 from fractus_sim.interruption import uninterrupted
 
 TICK_S = 0.05
@@ -35,7 +33,6 @@ CONNECT_S = 10.0
 DRONE_READY_S = 180.0
 BEHIND_TAP_PORT = 5770
 OWN_TARGETS = ("operator", "agent", "mobility", "camera")
-RELEASES = ("fractus-crds", "fractus")
 ENDED = frozenset({"Completed", "Failed", "Invalid"})
 MAX_NAME = 30
 AUDIT_LOGS = ("mobility.jsonl", "camera.jsonl")
@@ -69,12 +66,10 @@ class ClusterTestbed(Testbed):
         with _explained():
             images = build_images(ROOT, targets=(*OWN_TARGETS, *self._part.images), report=self.tell)
             self._cluster.up(images=images)
-            programs = ensure_binaries(("kubectl", "helm"), report=self.tell)
-            self._kube = Kube(programs["kubectl"], programs["helm"], self._cluster.kubeconfig)
+            self._kube = kube_of(self._cluster, self.tell)
             for setup in self.experiment.setups():
                 self._attach(setup)
-            for release in RELEASES:
-                self._kube.install(release, ROOT / "charts" / release)
+            install_fractus(self._kube)
             self._kube.apply(self._surroundings)
             wait_ready(self._kube, DRONE_READY_S, lambda _line: None)
         self._began_s = time.monotonic()
@@ -152,9 +147,7 @@ class ClusterTestbed(Testbed):
         guest = socket.create_server(("127.0.0.1", 0))
         self.keep(LinkTap(guest, connect, logs / f"{setup.name}-guest.tlog"))
         self.endpoints[setup.name] = f"tcp:127.0.0.1:{guest.getsockname()[1]}"
-        watch = self.keep(TlogWriter(logs / f"{setup.name}-observer.tlog"))
-        link = TcpLink(connect(), f"to the vehicle of {setup.name}")
-        self.observers[setup.name] = self.keep(Station(link, setup.system_id, watch, own_id=OBSERVER_ID, beats=False))
+        self.observe(setup, TcpLink(connect(), f"to the vehicle of {setup.name}"))
 
     def _watch(self) -> None:
         """Follow the Applications' phases; what the API server does not answer is asked again."""

@@ -5,5 +5,3 @@ from __future__ import annotations
 
 class ExperimentError(Exception):
     """The experiment cannot be run, or not to its end; the text says what to do."""
-
-    exit_code = 1

@@ -3,31 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, replace
 
 from fractus_sim.experiment.errors import ExperimentError
 from fractus_sim.experiment.faults import Fault, LinkLoss, NodePowerOff
 from fractus_sim.experiment.station import Station
+from fractus_sim.experiment.testbed import Testbed
 
 ANSWER_S = 1.0
 ATTEMPTS = 5
-
-
-class Breaker(Protocol):
-    """What can be cut on a testbed besides parameters."""
-
-    def cut_link(self, vehicle: str) -> None:
-        """Let nothing pass on the vehicle's link of this mode."""
-
-    def heal_link(self, vehicle: str) -> None:
-        """Let everything pass again."""
-
-    def power_off(self, node: str) -> None:
-        """Pull a node's power."""
-
-    def power_on(self, node: str) -> None:
-        """Give it back."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,21 +44,14 @@ class Injector:
 
     Args:
         faults: What is to happen.
-        observers: For each vehicle, a link that no fault cuts.
-        breaker: Cuts links and power.
+        testbed: Its links and power are cut; its observers are what no fault cuts.
         tell: Gets a sentence when a fault begins or ends.
     """
 
-    def __init__(
-        self,
-        faults: Sequence[Fault],
-        observers: dict[str, Station],
-        breaker: Breaker,
-        tell: Callable[[str], None],
-    ) -> None:
+    def __init__(self, faults: Sequence[Fault], testbed: Testbed, tell: Callable[[str], None]) -> None:
         self.occurrences: list[Occurrence] = []
         self.takeoffs_s: dict[str, float] = {}
-        self._observers, self._breaker, self._tell = observers, breaker, tell
+        self._testbed, self._observers, self._tell = testbed, testbed.observers, tell
         self._now_s = 0.0
         self._running = [self._prepare(fault, vehicle) for fault in faults for vehicle in self._victims(fault)]
 
@@ -127,8 +104,10 @@ class Injector:
         self.occurrences.append(Occurrence(fault.fault, fault.title, running.vehicle, self._now_s))
         self._tell(f"{running.vehicle or 'cluster'}: {fault.title}")
         before: dict[str, float] = {}
-        if isinstance(fault, LinkLoss | NodePowerOff):
-            self._break(fault, running.vehicle)
+        if isinstance(fault, LinkLoss):
+            self._testbed.cut_link(running.vehicle)
+        elif isinstance(fault, NodePowerOff):
+            self._testbed.power_off(fault.node or running.vehicle)
         for after_s, values in fault.steps():
             while self._now_s < begin_s + after_s:
                 yield
@@ -140,25 +119,14 @@ class Injector:
             return
         while self._now_s < begin_s + fault.duration:
             yield
-        if isinstance(fault, LinkLoss | NodePowerOff):
-            self._repair(fault, running.vehicle)
+        if isinstance(fault, LinkLoss):
+            self._testbed.heal_link(running.vehicle)
+        elif isinstance(fault, NodePowerOff):
+            self._testbed.power_on(fault.node or running.vehicle)
         for name, value in before.items():
             yield from self._set(running.vehicle, name, value)
-        found = self.occurrences[running.index]
-        self.occurrences[running.index] = Occurrence(found.kind, found.title, found.vehicle, found.begin_s, self._now_s)
+        self.occurrences[running.index] = replace(self.occurrences[running.index], end_s=self._now_s)
         self._tell(f"{running.vehicle or 'cluster'}: {fault.title} is over")
-
-    def _break(self, fault: LinkLoss | NodePowerOff, vehicle: str) -> None:
-        if isinstance(fault, LinkLoss):
-            self._breaker.cut_link(vehicle)
-        else:
-            self._breaker.power_off(fault.node or vehicle)
-
-    def _repair(self, fault: LinkLoss | NodePowerOff, vehicle: str) -> None:
-        if isinstance(fault, LinkLoss):
-            self._breaker.heal_link(vehicle)
-        else:
-            self._breaker.power_on(fault.node or vehicle)
 
     def _read(self, vehicle: str, name: str) -> Generator[None, None, float]:
         observer = self._observers[vehicle]

@@ -174,7 +174,7 @@ def _run_session(session: _Session) -> str:
         progress.tell(f"{name}: QGroundControl, Mission Planner or MAVProxy can attach to {endpoint}")
     _wait_ready(session)
     session.start, session.begun = session.moment, True
-    session.injector = Injector(experiment.faults, testbed.observers, testbed, lambda text: _tell_fault(session, text))
+    session.injector = Injector(experiment.faults, testbed, lambda text: _tell_fault(session, text))
     for setup in experiment.setups():
         if setup.entry.task:
             session.tasks[setup.name] = fly(testbed.pilots[setup.name], setup.entry.task, _teller(session, setup))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +21,8 @@ from fractus_sim.experiment.errors import ExperimentError
 from fractus_sim.experiment.model import Experiment, Program, VehicleSetup
 from fractus_sim.experiment.standalone import Standalone
 from fractus_sim.experiment.standalone_drone import CameraSetup, DroneSetup
-from fractus_sim.experiment.station import OBSERVER_ID, Station, TcpLink
+from fractus_sim.experiment.station import TcpLink
 from fractus_sim.experiment.testbed import Moment, Testbed
-from fractus_sim.experiment.tlog import TlogWriter
 from fractus_sim.experiment.vehicles import command_of
 
 TICK_S = 0.02
@@ -39,7 +38,7 @@ class ServiceTestbed(Testbed):
             shutil.rmtree(folder / name, ignore_errors=True)
         for log in (folder / "logs").glob("*.log"):
             log.unlink()
-        self._manifests = _read(experiment, base)
+        self._manifests = read([base / path for path in experiment.manifests])
         self._ground = self.keep(Standalone(folder))
         self._identities: dict[str, str] = {}
         self._watches: list[TruthWatch] = []
@@ -53,23 +52,19 @@ class ServiceTestbed(Testbed):
         Raises:
             ExperimentError: an application cannot be planned, or a process did not come up.
         """
-        grants = list(_grants(self._manifests))
+        grants = list(granted(self._manifests))
         described = self._manifests.of(Drone)
         for setup in self.experiment.setups():
             drone = self._ground.add_drone(self._setup(setup, described.get(setup.name)))
             host, port = drone.station_link.split(":")[1:]
-            watch = self.keep(TlogWriter(self.folder / "logs" / f"{setup.name}-observer.tlog"))
-            link = TcpLink.connect(host, int(port), CONNECT_S)
-            self.observers[setup.name] = self.keep(
-                Station(link, setup.system_id, watch, own_id=OBSERVER_ID, beats=False)
-            )
+            self.observe(setup, TcpLink.connect(host, int(port), CONNECT_S))
             self.endpoints[setup.name] = drone.guest_link
             if drone.world_url is not None:
                 truths = self.folder / "logs" / f"{setup.name}-truth.jsonl"
                 self._watches.append(self.keep(TruthWatch(drone.world_url, truths)))
         for spec in grants:
             if spec.node in self._ground.drones:
-                self._identities[spec.component] = self._ground.grant(_manifest(spec))
+                self._identities[spec.component] = self._ground.grant(grant_manifest(spec))
         self._began_s = time.monotonic()
 
     def tick(self) -> Moment:
@@ -175,14 +170,19 @@ class ServiceTestbed(Testbed):
         )
 
 
-def _read(experiment: Experiment, base: Path) -> Manifests:
+def read(paths: Sequence[Path]) -> Manifests:
+    """Manifests of files and directories.
+
+    Raises:
+        ExperimentError: they cannot be read.
+    """
     try:
-        return read_manifests([base / path for path in experiment.manifests])
+        return read_manifests(paths)
     except BadManifest as error:
         raise ExperimentError(str(error)) from None
 
 
-def _grants(manifests: Manifests) -> Iterable[GrantSpec]:
+def granted(manifests: Manifests) -> Iterable[GrantSpec]:
     """What the operator would grant.
 
     Raises:
@@ -200,6 +200,7 @@ def _grants(manifests: Manifests) -> Iterable[GrantSpec]:
         yield from compile_grants(answer.application, answer.plan, manifests.inventory(), settings)
 
 
-def _manifest(spec: GrantSpec) -> dict[str, Any]:
+def grant_manifest(spec: GrantSpec) -> dict[str, Any]:
+    """The Grant as the operator would write it."""
     metadata = {"name": spec.instance, "uid": f"uid-{spec.instance}"}
     return {"apiVersion": API_VERSION, "kind": "Grant", "metadata": metadata, "spec": spec.to_dict()}

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Protocol, TypeVar
 
 from fractus_sim.experiment.findings import Findings
-from fractus_sim.experiment.model import Experiment
-from fractus_sim.experiment.station import Station
+from fractus_sim.experiment.model import Experiment, VehicleSetup
+from fractus_sim.experiment.station import OBSERVER_ID, Link, Station
+from fractus_sim.experiment.tlog import TlogWriter
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +58,11 @@ class Testbed(ABC):
     def at_end(self, action: Callable[[], object]) -> None:
         """Have something done when the testbed is closed."""
         self._kept.callback(action)
+
+    def observe(self, setup: VehicleSetup, link: Link) -> None:
+        """Have a vehicle recorded by a link of its own."""
+        log = self.keep(TlogWriter(self.folder / "logs" / f"{setup.name}-observer.tlog"))
+        self.observers[setup.name] = self.keep(Station(link, setup.system_id, log, own_id=OBSERVER_ID, beats=False))
 
     def close(self) -> None:
         """End everything that was started, the last first; what fails or is interrupted keeps nothing else from its end."""

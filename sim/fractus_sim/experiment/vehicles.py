@@ -19,7 +19,7 @@ from fractus_sim.experiment.errors import ExperimentError
 from fractus_sim.experiment.linktap import LinkTap
 from fractus_sim.experiment.model import Experiment, Program, VehicleSetup
 from fractus_sim.experiment.processes import Processes
-from fractus_sim.experiment.station import OBSERVER_ID, ChannelLink, Link, Station, TcpLink
+from fractus_sim.experiment.station import ChannelLink, Link, Station, TcpLink
 from fractus_sim.experiment.testbed import Moment, Testbed
 from fractus_sim.experiment.tlog import TlogWriter
 
@@ -144,15 +144,9 @@ class VehicleTestbed(Testbed):
 
     def _stations(self, setup: VehicleSetup, pilot: Link, observer: Link) -> None:
         log = self.keep(TlogWriter(self._logs / f"{setup.name}.tlog"))
-        beats = not self._has_program(setup.name)
+        beats = all(program.vehicle != setup.name for program in self.experiment.programs)
         self.pilots[setup.name] = self.keep(Station(pilot, setup.system_id, log, beats=beats))
-        watch = self.keep(TlogWriter(self._logs / f"{setup.name}-observer.tlog"))
-        self.observers[setup.name] = self.keep(
-            Station(observer, setup.system_id, watch, own_id=OBSERVER_ID, beats=False)
-        )
-
-    def _has_program(self, vehicle: str) -> bool:
-        return any(program.vehicle == vehicle for program in self.experiment.programs)
+        self.observe(setup, observer)
 
     def _open(self, craft: Craft) -> str:
         link = f"tcp:127.0.0.1:{free_port()}"

@@ -12,16 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import shapely
-from fractus_cli.manifests import BadManifest, read_manifests
-from fractus_cli.planning import plan_all
-from fractus_core.api import API_VERSION, Application, Drone, Policy, Zone
+from fractus_core.api import Application, Drone, Policy, Zone
 from fractus_core.api.plans import GrantSpec
 from fractus_core.documents import BadDocument, dump_documents, parse_documents
 from fractus_core.geo import LocalFrame, polygon
-from fractus_core.planning import Settings
-from fractus_core.planning.grants import compile_grants
 
 from fractus_sim.experiment.errors import ExperimentError
+from fractus_sim.experiment.services import grant_manifest, granted, read
 
 EXAMPLE = Path("examples/field")
 NAVIGATOR, VIEWER = "Navigator", "AerialViewer"
@@ -146,16 +143,7 @@ class Field:
         Raises:
             ExperimentError: the application cannot be planned.
         """
-        settings = Settings()
-        try:
-            read = read_manifests([manifests])
-            (answer,) = plan_all(read, settings)
-        except BadManifest as error:
-            raise ExperimentError(str(error)) from None
-        if answer.plan is None:
-            raise ExperimentError(f"the application cannot be planned: {answer.refusal}")
-        specs = compile_grants(answer.application, answer.plan, read.inventory(), settings)
-        return [_manifest(spec if policies else self._unbound(spec)) for spec in specs]
+        return [grant_manifest(spec if policies else self._unbound(spec)) for spec in granted(read([manifests]))]
 
     def operation_area(self, grants: Sequence[Mapping[str, Any]]) -> list[Any]:
         """Shapes of the operation area that the Grants name, in metres."""
@@ -167,11 +155,6 @@ class Field:
         everywhere = [{"circle": {"center": {"lat": self.home[0], "lon": self.home[1]}, "radius": EVERYWHERE_M}}]
         body |= {"policies": [], "operationArea": everywhere, "corridor": everywhere}
         return GrantSpec.model_validate(body)
-
-
-def _manifest(spec: GrantSpec) -> dict[str, Any]:
-    metadata = {"name": spec.instance, "uid": f"uid-{spec.instance}"}
-    return {"apiVersion": API_VERSION, "kind": "Grant", "metadata": metadata, "spec": spec.to_dict()}
 
 
 @dataclass(frozen=True, slots=True)

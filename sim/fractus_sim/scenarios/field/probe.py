@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from fractus_mavlink import Endpoint, Message, Value, layout_named
 from fractus_mavlink.enums import GPS_FIX_TYPE, MAV_AUTOPILOT, MAV_CMD, MAV_COMPONENT, MAV_MODE_FLAG
+from fractus_radio.follower import parse_address
 
 from fractus_sim.experiment.errors import ExperimentError
 from fractus_sim.experiment.station import OBSERVER_ID, STATION_COMPONENT, TcpLink
@@ -33,11 +34,10 @@ def parse_link(text: str) -> tuple[str, int]:
     Raises:
         ExperimentError: the text is something else.
     """
-    kind, _, rest = text.partition(":")
-    host, _, port = rest.rpartition(":")
-    if kind != "tcp" or not host or not port.isdigit() or not 0 < int(port) < 65536:
-        raise ExperimentError(f"autopilot {text!r}: expected tcp:HOST:PORT")
-    return host, int(port)
+    try:
+        return parse_address(text)
+    except ValueError:
+        raise ExperimentError(f"autopilot {text!r}: expected tcp:HOST:PORT") from None
 
 
 def look(link: str, tell: Callable[[str], None]) -> ParkedVehicle:

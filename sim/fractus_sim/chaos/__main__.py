@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import click
-from fractus_cluster.binaries import ensure_binaries
 from fractus_cluster.cluster import Cluster
 from fractus_cluster.errors import ClusterError
 from fractus_cluster.images.build import build_images
@@ -18,8 +17,8 @@ from fractus_sim.chaos.report import page
 from fractus_sim.chaos.run import Run, Task, fly
 from fractus_sim.chaos.stage import Stage
 from fractus_sim.chaos.watching import Watch
-from fractus_sim.demo.clusters import EXAMPLE, ROOT, TARGETS, documents
-from fractus_sim.demo.kube import DemoError, Kube
+from fractus_sim.demo.clusters import ROOT, TARGETS, install_fractus, kube_of, surroundings
+from fractus_sim.demo.kube import DemoError
 from fractus_sim.demo.watch import wait_ready
 from fractus_sim.experiment.errors import ExperimentError
 from fractus_sim.interruption import break_off_on_signals, uninterrupted
@@ -48,13 +47,9 @@ def embedded(keep: bool) -> Iterator[Stage]:
     cluster = Cluster.load(ROOT / "examples" / "clusters" / "demo.yaml", name=CLUSTER, report=say)
     try:
         cluster.up(images=images)
-        programs = ensure_binaries(("kubectl", "helm"), report=say)
-        kube = Kube(programs["kubectl"], programs["helm"], cluster.kubeconfig)
-        for release in ("fractus-crds", "fractus"):
-            kube.install(release, ROOT / "charts" / release)
-        kube.apply(
-            [body for name in ("depot.yaml", "zones.yaml", "policies.yaml") for body in documents(EXAMPLE / name)]
-        )
+        kube = kube_of(cluster, say)
+        install_fractus(kube)
+        kube.apply(surroundings())
         wait_ready(kube, READY_TIMEOUT_S, lambda _line: None)
         yield Stage(cluster, kube, DRONE)
     finally:

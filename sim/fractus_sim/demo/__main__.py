@@ -7,12 +7,13 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import click
+from fractus_cluster.errors import ClusterError
 from rich.console import Console
 from rich.markdown import Markdown
 
 from fractus_sim.demo.clusters import CurrentCluster, EmbeddedCluster
 from fractus_sim.demo.kube import DemoError
-from fractus_sim.demo.runner import ClusterError, Demo, Teller, report_again
+from fractus_sim.demo.runner import Demo, Teller, report_again
 from fractus_sim.demo.view import replay_command
 from fractus_sim.interruption import break_off_on_signals
 

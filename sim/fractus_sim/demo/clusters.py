@@ -21,6 +21,7 @@ ROOT = Path(__file__).parents[3]
 EXAMPLE = ROOT / "examples" / "traffic-monitoring"
 TARGETS = ("operator", "agent", "mobility", "camera", "example-traffic-monitoring")
 EXAMPLE_NODES = ("drone-1", "edge-1", "edge-2", "edge-3", "cloud-1")
+RELEASES = ("fractus-crds", "fractus")
 DEMO_CHART = "fractus-demo"
 Say = Callable[[str], None]
 
@@ -37,6 +38,23 @@ def documents(path: Path) -> list[Object]:
         raise DemoError(f"cannot read {path}: {error.strerror}; run this in a checkout of Fractus") from None
     except BadDocument as error:
         raise DemoError(str(error)) from None
+
+
+def surroundings() -> list[Object]:
+    """What the example flies in on an embedded cluster: depot, zones and policies."""
+    return [body for name in ("depot.yaml", "zones.yaml", "policies.yaml") for body in documents(EXAMPLE / name)]
+
+
+def kube_of(cluster: Cluster, report: Say) -> Kube:
+    """Kubectl and helm on an embedded cluster."""
+    programs = ensure_binaries(("kubectl", "helm"), report=report)
+    return Kube(programs["kubectl"], programs["helm"], cluster.kubeconfig)
+
+
+def install_fractus(kube: Kube) -> None:
+    """Install or upgrade the charts of this checkout."""
+    for release in RELEASES:
+        kube.install(release, ROOT / "charts" / release)
 
 
 class DemoCluster(Protocol):
@@ -84,14 +102,11 @@ class EmbeddedCluster:
         self._cluster = Cluster.load(ROOT / "examples" / "clusters" / "demo.yaml", report=self.say)
         self._was_running = self._cluster.running
         self._cluster.up(images=self.built)
-        programs = ensure_binaries(("kubectl", "helm"), report=self.say)
-        return Kube(programs["kubectl"], programs["helm"], self._cluster.kubeconfig)
+        return kube_of(self._cluster, self.say)
 
     def surroundings(self, kube: Kube) -> list[str]:
         """Depot, zones and policies: vehicles stand beside the nodes, and agents register them."""
-        kube.apply(
-            [body for name in ("depot.yaml", "zones.yaml", "policies.yaml") for body in documents(EXAMPLE / name)]
-        )
+        kube.apply(surroundings())
         return []
 
     def down(self) -> None:

@@ -20,8 +20,6 @@ NAMESPACE = "default"
 class DemoError(Exception):
     """The demo cannot go on; the text says what to do."""
 
-    exit_code = 1
-
 
 @dataclass(frozen=True, slots=True)
 class Kube:

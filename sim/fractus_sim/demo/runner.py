@@ -10,11 +10,10 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from fractus_cluster.errors import ClusterError
 from fractus_core.api.nodes import GROUNDED
 from rich.console import Console
 
-from fractus_sim.demo.clusters import EXAMPLE, ROOT, DemoCluster, documents
+from fractus_sim.demo.clusters import EXAMPLE, RELEASES, ROOT, DemoCluster, documents
 from fractus_sim.demo.collect import collect, keep_pictures
 from fractus_sim.demo.kube import SYSTEM, DemoError, Kube
 from fractus_sim.demo.view import RECORDINGS, fetch_recordings, shown
@@ -27,7 +26,6 @@ from fractus_sim.report.summary import figures
 
 READY_TIMEOUT_S = 180.0
 HOME_TIMEOUT_S = 180.0
-RELEASES = ("fractus-crds", "fractus")
 _OWN_VALUES = {"fractus": ("camera.recordings.enabled=true",)}
 """Of a cluster of the demo's own: its report shows pictures, and components delete theirs."""
 LOGS = "components.log"
@@ -220,6 +218,3 @@ def report_again(out: Path) -> None:
         write_report(Record.read(out), out)
     except (OSError, json.JSONDecodeError) as error:
         raise DemoError(f"no record of a flight in {out}: {error}") from None
-
-
-__all__ = ["ClusterError", "Demo", "Teller", "report_again"]

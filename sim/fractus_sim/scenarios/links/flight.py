@@ -9,7 +9,6 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from fractus_cluster.binaries import ensure_binaries
 from fractus_cluster.cluster import Cluster
 from fractus_cluster.errors import ClusterError
 from fractus_cluster.hardware import RADIO_LINK
@@ -17,7 +16,7 @@ from fractus_cluster.images.build import build_images
 from fractus_core.linking.values import Position
 from fractus_radio.follower import Follower, parse_address
 
-from fractus_sim.demo.clusters import ROOT, documents
+from fractus_sim.demo.clusters import ROOT, documents, install_fractus, kube_of
 from fractus_sim.demo.kube import DemoError, Kube
 from fractus_sim.demo.watch import Mission, follow, wait_ready
 from fractus_sim.experiment.errors import ExperimentError
@@ -27,7 +26,6 @@ from fractus_sim.scenarios.links.place import DRONE, EXAMPLE, Site
 from fractus_sim.scenarios.links.podlogs import PodLogs
 
 TARGETS = ("operator", "agent", "mobility", "camera", "example-links")
-RELEASES = ("fractus-crds", "fractus")
 READY_S, MISSION_S = 240.0, 600.0
 LOG, OBJECTS = "lines.jsonl", "links.json"
 _KEPT = frozenset({VIEWER, CHECKER, AGENT, "navigator"})
@@ -47,8 +45,7 @@ def fly(site: Site, out: Path, tell: Tell) -> Evidence:
             if not cluster.running:
                 stack.callback(_down, cluster)
             cluster.up(images=images)
-            programs = ensure_binaries(("kubectl", "helm"), report=tell)
-            return _mission(site, cluster, Kube(programs["kubectl"], programs["helm"], cluster.kubeconfig), out, tell)
+            return _mission(site, cluster, kube_of(cluster, tell), out, tell)
     except (ClusterError, DemoError) as error:
         raise ExperimentError(str(error)) from None
 
@@ -59,8 +56,7 @@ def _down(cluster: Cluster) -> None:
 
 
 def _mission(site: Site, cluster: Cluster, kube: Kube, out: Path, tell: Tell) -> Evidence:
-    for release in RELEASES:
-        kube.install(release, ROOT / "charts" / release)
+    install_fractus(kube)
     kube.apply(documents(EXAMPLE / "depot.yaml"))
     wait_ready(kube, READY_S, lambda _line: None)
     track: list[tuple[float, Position]] = []
@@ -77,14 +73,8 @@ def _mission(site: Site, cluster: Cluster, kube: Kube, out: Path, tell: Tell) ->
     kube.apply(application)
     links: list[dict[str, Any]] = []
     try:
-        follow(
-            kube,
-            mission,
-            out / "components.log",
-            timeout_s=MISSION_S,
-            say=tell,
-            show=lambda _line: _note(kube, links),
-        )
+        log = out / "components.log"
+        follow(kube, mission, log, timeout_s=MISSION_S, say=tell, show=lambda _line: _note(kube, links))
     finally:
         lines = logs.close()
         (out / LOG).write_text("".join(json.dumps([x.at_s, x.node, x.container, x.text]) + "\n" for x in lines))

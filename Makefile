@@ -56,23 +56,24 @@ QUICK := $(RUN) pytest -q -n 2 --dist loadfile --no-loadscope-reorder
 # `make test` flies all of the recorded flights: they alone show that no change of the code changed a flight.
 GOLDEN := tests/component/test_control_golden.py
 
-# Many of these tests fly in real time, which a machine that stalls can fail: what fails gets a second try, alone.
+# Many of these tests fly in real time, which a machine that stalls can fail: what fails gets a second try, alone. Any other code
+# than 1 tells of no failed test but of a run that was cut short, of which a second try would know nothing.
 INTEGRATION := tests/integration tests/e2e/test_cluster.py
 E2E := tests/e2e --ignore tests/e2e/test_cluster.py
 # These are of the charts on a cluster that is not ours: they run on kind, or on FRACTUS_E2E_CLUSTER=current.
 ON_KIND := $(patsubst %,tests/e2e/test_%.py,mission refusals upgrade uninstall)
-SECOND_TRY := $(RUN) pytest --last-failed --last-failed-no-failures none
+second_try = || { code=$$?; [ $$code -eq 1 ] || exit $$code; $(RUN) pytest --last-failed --last-failed-no-failures none $(1); }
 
 .PHONY: test
 test: packages env lint ## Everything: lint, types, unit, component, integration and end-to-end tests
 	$(RUN) fractus cluster binaries
 	$(QUICK) tests/component tests/unit --ignore $(GOLDEN)
 	FRACTUS_DEEP=1 $(RUN) pytest -q -n 2 $(GOLDEN)
-	$(RUN) pytest -n 3 --dist loadgroup $(INTEGRATION) || $(SECOND_TRY) $(INTEGRATION)
+	$(RUN) pytest -n 3 --dist loadgroup $(INTEGRATION) $(call second_try,$(INTEGRATION))
 ifeq ($(FRACTUS_E2E_CLUSTER),current)
-	$(RUN) pytest $(E2E) || $(SECOND_TRY) $(E2E)
+	$(RUN) pytest $(E2E) $(call second_try,$(E2E))
 else
-	$(RUN) pytest -n 2 --dist loadgroup $(E2E) $(ON_KIND:%=--ignore %) || $(SECOND_TRY) $(E2E) $(ON_KIND:%=--ignore %)
+	$(RUN) pytest -n 2 --dist loadgroup $(E2E) $(ON_KIND:%=--ignore %) $(call second_try,$(E2E) $(ON_KIND:%=--ignore %))
 	STEPS="images cluster load charts tests uninstall" $(MAKE) test-kind
 endif
 

@@ -37,6 +37,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from deploy import API, NODE, READY, SYSTEM, Api, Body, Operator, documents, path_of
+from fractus_cluster.errors import ClusterError
 from fractus_core.api import KINDS, Application, DeploymentPlan
 from fractus_core.api.crd import crd
 from fractus_kube import Client, Kind, KubeError
@@ -558,8 +559,11 @@ class Bench:
     def _converge(self) -> float:
         """Seconds until everything is as it is to be; goes on without that where it takes too long."""
         began = time.monotonic()
-        with contextlib.suppress(Exception):
+        try:
             wait_until(self._load.converged, "rest", timeout_s=CONVERGE_TIMEOUT_S, pause_s=1.0)
+        except ClusterError as late:
+            # What is not as it is to be at the end is named there; here it may come right yet.
+            print(f"{late}: {', '.join(self._load.differences()[:5])}", flush=True)
         return time.monotonic() - began
 
     def _alone(self) -> None:

@@ -230,6 +230,7 @@ class Api(Store):
         self.field_manager = "test"
         self.objects: dict[str, dict[str, Any]] = {}
         self.refused: set[str] = set()
+        self.forbidden: set[str] = set()
         self.asked: list[tuple[str, str]] = []
 
     async def request(self, method: str, path: str, body: Any = None, **_: Any) -> Any:
@@ -238,6 +239,8 @@ class Api(Store):
             self.asked.append((method, name))
         if name in self.refused:
             raise KubeError(422, "Invalid", f"{name} is refused")
+        if method in self.forbidden:
+            raise KubeError(403, "Forbidden", f"the account cannot {method} {path}")
         if method == "PUT":
             self.objects[name] = body
         if method == "PATCH":
@@ -436,3 +439,24 @@ def test_a_drone_that_someone_saw_on_the_ground_is_there_until_its_next_report()
     assert not in_air("2026-01-01T00:00:00Z")
     for other in ("2026-01-01T00:00:01Z", "2026-01-01T00:00:00", "yes", ""):
         assert in_air(other)
+
+
+async def test_a_role_of_an_earlier_release_keeps_no_condition_from_a_drone(
+    live: LiveInventory, caplog: pytest.LogCaptureFixture
+) -> None:
+    """After `helm rollback` it allows updates only: admission goes by OnMission, and would take the drone for idle."""
+    api = Api()
+    api.forbidden = {"PATCH"}
+    missions = OnMission(api, live, reported(live, api), lambda: datetime(2026, 1, 1, tzinfo=UTC))
+    live.listen(GRANT, lambda key: bool(missions.grant_changed(key)))
+    for name, reason in (("ns.a", "Granted"), (None, "NotHeardOf"), (None, "NotHeardOf")):
+        granted(live, "ns.a", "d1" if name else None)
+        await missions.reconcile(("", "d1"))
+        assert told(api, "d1", "OnMission") == reason
+    assert api.asked == [("PATCH", "d1"), ("PUT", "d1")] * 2, "nothing is tried again and again"
+    (said,) = (record.getMessage() for record in caplog.records if record.levelname == "WARNING")
+    assert "its ClusterRole is of another release, upgrade the chart fractus" in said
+    api.forbidden = {"PATCH", "PUT"}
+    granted(live, "ns.c", "d2")
+    with pytest.raises(KubeError, match="cannot PUT"):
+        await missions.reconcile(("", "d2"))

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from datetime import datetime
+from http import HTTPStatus
 from typing import Any
 
 from fractus_core.api import Condition, Drone, EdgeNode
 
-from fractus_operator.cluster.kinds import DRONE, EDGE_NODE, Body, Kind
-from fractus_operator.cluster.store import Conflict, NotFound, Reflector, Store
+from fractus_operator.cluster.kinds import DRONE, EDGE_NODE, Body, Kind, key_of
+from fractus_operator.cluster.store import Conflict, KubeError, NotFound, Reflector, Store
 from fractus_operator.inventory.live import LiveInventory
 from fractus_operator.reconcile.conditions import ConditionUpdate, merge
 from fractus_operator.reconcile.reporting import record_events
+
+logger = logging.getLogger(__name__)
 
 
 class NodeReports:
@@ -22,6 +26,7 @@ class NodeReports:
         self._store = store
         self._live = live
         self._clock = clock
+        self._warned = False
 
     def condition(self, name: str, type_: str) -> Condition | None:
         """A condition of a drone or edge node; None where it has none, or does not exist."""
@@ -68,10 +73,17 @@ class NodeReports:
         body = kind.header(node.name, uid=node.metadata.uid)
         body["status"] = {"conditions": [condition.to_dict() for condition in conditions]}
         manager = f"{self._store.field_manager}-{update.type.lower()}"
-        applied = await self._store.apply(kind, body, subresource="status", field_manager=manager)
-        # Ahead of the watch, so that what comes meanwhile does not have it written again.
-        copies: Reflector[Any] = self._live.drones if kind is DRONE else self._live.edge_nodes
-        copies.note(("", node.name), applied)
+        try:
+            self._note(kind, await self._store.apply(kind, body, subresource="status", field_manager=manager))
+        except KubeError as error:
+            # The ClusterRole of a release that was rolled back to allows updates only.
+            if error.status != HTTPStatus.FORBIDDEN:
+                raise
+            if not self._warned:
+                remedy = "its ClusterRole is of another release, upgrade the chart fractus"
+                logger.warning("node reports: status is updated, as it may not be patched; %s: %s", remedy, error)
+            self._warned = True
+            return await self._say_with(kind, node.name, update, lambda _: True, now)
         return transitions
 
     async def _say_with(
@@ -86,8 +98,13 @@ class NodeReports:
         others = [c for c in status.get("conditions") or () if c["type"] != update.type]
         conditions, transitions = merge(before, [update], body["metadata"].get("generation"), now)
         status["conditions"] = [*others, *(c.to_dict() for c in conditions)]
-        await self._store.replace(kind, body, subresource="status")
+        self._note(kind, await self._store.replace(kind, body, subresource="status"))
         return transitions
+
+    def _note(self, kind: Kind, written: Body) -> None:
+        """Take what a write returned, ahead of the watch, so that what comes meanwhile does not have it written again."""
+        copies: Reflector[Any] = self._live.drones if kind is DRONE else self._live.edge_nodes
+        copies.note(key_of(written), written)
 
     def _node(self, name: str) -> tuple[Kind, Drone | EdgeNode | None]:
         drone = self._live.drone(name)

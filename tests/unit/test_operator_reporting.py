@@ -79,3 +79,40 @@ async def test_an_outcome_that_conflicts_is_not_taken_for_recorded() -> None:
     live.applications._drop(submitted.key)
     await reporter.report(submitted, DONE)
     assert not reporter.last(submitted)
+
+
+async def test_what_fails_for_long_is_not_left_at_a_sentence_that_is_not_true_any_more() -> None:
+    """Such as that many others come first, while a webhook refuses each of its Deployments."""
+    api, _, reporter, submitted = new()
+    await reporter.planned(submitted, PLAN, 20)
+    error = KubeError(500, "InternalError", "failed calling webhook")
+    for attempts in (1, 2):
+        await reporter.failed(submitted, attempts, error)
+    assert len(api.written) == 1, "a moment's failure costs no request"
+    for attempts in (3, 4):
+        await reporter.failed(
+            submitted, attempts, KubeError(500, "InternalError", f"failed calling webhook in {attempts} s")
+        )
+    _, said = api.written
+    assert (said["phase"], [(c["type"], c["reason"]) for c in said["conditions"]]) == (
+        "Pending",
+        [("Deployed", "InternalError"), ("Ready", "InternalError")],
+    )
+    assert "failed calling webhook" in said["message"]
+    assert api.events == ["InternalError"]
+
+
+async def test_a_flight_goes_on_while_its_application_cannot_be_reconciled() -> None:
+    api, _, reporter, submitted = new()
+    ready = (ConditionUpdate("Ready", "True", "PodsReady"), ConditionUpdate("Deployed", "True", "Deployed"))
+    await reporter.report(submitted, StatusUpdate("Flying", "it flies", ready, drone="drone-1", pods="3/3"))
+    api.refusal = error = KubeError(429, "TooManyRequests", "later")
+    await reporter.failed(submitted, 3, error)
+    api.refusal = None
+    await reporter.failed(submitted, 4, error)
+    assert (api.written[1]["phase"], api.written[1]["drone"], api.written[1]["pods"]) == ("Flying", "drone-1", "3/3")
+    assert [c["status"] for c in api.written[1]["conditions"]] == ["True", "False"]
+    await reporter.report(submitted, DONE)
+    await reporter.failed(submitted, 5, error)
+    await reporter.failed(None, 5, error)
+    assert len(api.written) == 3, "the outcome of a mission has no other record"

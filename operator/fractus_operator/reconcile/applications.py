@@ -131,6 +131,7 @@ class Applications:
                     logger.warning(
                         "applications: reconcile failed (application=%s/%s retry_s=%.1f): %s", *key, next_s, error
                     )
+                    await self._reporter.failed(self._live.applications.get(key), backoff.attempts, error)
                 took_s = loop.time() - started
                 if await inputs.changed(next_s):
                     # Changes come in bursts, such as the pods of a plan: one reconcile for all. Zones and policies do not wait.
@@ -177,10 +178,8 @@ class Applications:
             await self._children.revoke(key)
             await self._finished_pods.tear_down(key)
         self._memories.pop(key, None)
-        self._grants.forget(key)
-        self._notes.forget(key)
-        self._reporter.forget(key)
-        self._live.forget(key)
+        for part in (self._grants, self._notes, self._reporter, self._live):
+            part.forget(key)
 
     # -- steps --
 

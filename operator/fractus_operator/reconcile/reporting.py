@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -12,15 +13,18 @@ from fractus_core.api.plans import DeploymentPlanSpec
 
 from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Body, Key, key_of
-from fractus_operator.cluster.reading import Submitted
+from fractus_operator.cluster.reading import SETTLED, Submitted
 from fractus_operator.cluster.store import Conflict, KubeError, Reflector, Store
 from fractus_operator.reconcile.conditions import ConditionUpdate, merge
-from fractus_operator.reconcile.status import STAGES, StatusUpdate, in_queue
+from fractus_operator.reconcile.status import STAGES, StatusUpdate, in_queue, stalled
 
 logger = logging.getLogger(__name__)
 
 _MANY = 5
 """Applications that are rolled out at a time, from which on a further one waits for seconds until all it needs is there."""
+_TOLD_AFTER = 3
+"""Reconciles that fail one after the other, from which on the status says so: an API server that is busy for a moment gets no more
+to do, but a webhook that does not answer is told of."""
 _SILENT = frozenset({"MissionWaiting", "PodsNotReady", "OperatorBusy"})
 """Reasons without an Event: what is merely in progress is in the status."""
 
@@ -58,6 +62,24 @@ class StatusReporter:
                 await self.report(submitted, in_queue(plan, before))
             except KubeError as error:
                 logger.warning("reporting: status not written (application=%s/%s): %s", *submitted.key, error)
+
+    async def failed(self, submitted: Submitted | None, attempts: int, error: KubeError) -> None:
+        """Say of an application that it cannot be reconciled, where that lasts; what fails here is said the next time.
+
+        Args:
+            submitted: The application; None where it is gone.
+            attempts: How often it failed in a row.
+            error: Why.
+        """
+        if submitted is None or submitted.metadata.deletion_timestamp or attempts < _TOLD_AFTER:
+            return
+        last = self.last(submitted)
+        # Said once: each change of the status is a reason to reconcile at once, and the API server's words may differ each time.
+        said = any((c["type"], c["status"]) == ("Deployed", "False") for c in last.get("conditions") or ())
+        if said or last.get("phase") in SETTLED:
+            return
+        with contextlib.suppress(KubeError):
+            await self.report(submitted, stalled(last, error.reason, str(error)))
 
     async def report(self, submitted: Submitted, update: StatusUpdate, generation: int | None = None) -> None:
         """Write the status if it differs from the present one, then an Event for each transition.

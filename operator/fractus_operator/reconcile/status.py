@@ -142,6 +142,30 @@ def in_queue(plan: DeploymentPlanSpec, before: int) -> StatusUpdate:
     )
 
 
+def stalled(reported: Mapping[str, Any], reason: str, error: str) -> StatusUpdate:
+    """The status of an application that the API server takes no change for: as it was reported, and that.
+
+    Args:
+        reported: What was last said of it; empty where nothing was.
+        reason: CamelCase.
+        error: What the API server answered.
+    """
+    message = f"the API server refuses, or does not answer, what is to be made; it is tried again: {error}"
+    known = (Condition.model_validate(c) for c in reported.get("conditions") or ())
+    # What it was waiting for may be there by now; what it had reached, it has.
+    kept = [
+        ConditionUpdate(c.type, c.status, c.reason, c.message)
+        for c in known
+        if c.type != "Deployed" and (c.status != "False" or c.type not in {*STAGES, "Ready"})
+    ]
+    failing = [ConditionUpdate("Deployed", "False", reason, message)]
+    if all(each.type != "Ready" for each in kept):
+        failing.append(ConditionUpdate("Ready", "False", reason, message))
+    present = {name: reported.get(name) for name in ("drone", "pods", "controller")}
+    phase: Phase = "Pending" if reported.get("phase") in {None, "Queued", "Invalid"} else reported["phase"]
+    return StatusUpdate(phase, message, (*kept, *failing), **present)
+
+
 def waiting(present: StatusUpdate, drone: str) -> StatusUpdate:
     """The status of an application whose changed manifest waits until its drone has landed."""
     why = f"the changed manifest is carried out once {drone} has landed; spec.updatePolicy: Immediate does not wait"

@@ -16,14 +16,14 @@ BY_NAME = 65535
 MOVEMENT = {
     "WPNAV_ACCEL": 250.0, "PSC_POSXY_P": 1.0, "WPNAV_ACCEL_Z": 100.0, "PSC_JERK_XY": 5.0, "RTL_ALT": 1500.0, "RTL_SPEED": 0.0,
     "RTL_CLIMB_MIN": 0.0, "WPNAV_SPEED": 1000.0, "FENCE_ENABLE": 0.0, "FENCE_AUTOENABLE": 0.0, "FENCE_TYPE": 7.0, "FENCE_ALT_MAX": 100.0,
-    "FENCE_MARGIN": 2.0, "FENCE_ACTION": 1.0, "FENCE_OPTIONS": 0.0,
+    "FENCE_MARGIN": 2.0, "FENCE_ACTION": 1.0, "FENCE_OPTIONS": 0.0, "ANGLE_MAX": 3000.0, "PSC_ANGLE_MAX": 0.0,
 }  # fmt: skip
 """What tells how a vehicle moves, as releases before 4.7 spell it."""
 
 FAILSAFES = {
     "SYSID_MYGCS": 244.0, "FS_GCS_ENABLE": 1.0, "FS_GCS_TIMEOUT": 5.0, "GUID_TIMEOUT": 1.0, "BATT_FS_CRT_ACT": 1.0,
     "BATT_FS_LOW_ACT": 2.0, "FS_EKF_ACTION": 1.0, "SRTL_POINTS": 0.0, "RTL_ALT_TYPE": 0.0, "RTL_ALT_FINAL": 0.0,
-    "RALLY_LIMIT_KM": 2.0**-10,
+    "RALLY_LIMIT_KM": 2.0**-10, "GUID_OPTIONS": 0.0,
 }  # fmt: skip
 """Failsafes that hold, of a vehicle that does not remember its path."""
 

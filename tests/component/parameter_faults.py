@@ -29,7 +29,7 @@ OTHERS = {
     "SYSID_MYGCS": 255.0, "FS_GCS_ENABLE": 0.0, "FS_GCS_TIMEOUT": 5.0, "GUID_TIMEOUT": 3.0, "BATT_FS_LOW_ACT": 0.0,
     "BATT_FS_CRT_ACT": 0.0, "FS_EKF_ACTION": 1.0, "SRTL_POINTS": 300.0, "FENCE_ENABLE": 0.0, "FENCE_AUTOENABLE": 0.0,
     "FENCE_TYPE": 7.0, "FENCE_ALT_MAX": 100.0, "FENCE_MARGIN": 2.0, "FENCE_ACTION": 1.0, "FENCE_OPTIONS": 0.0,
-    "RTL_SPEED": 0.0, "RTL_CLIMB_MIN": 0.0,
+    "RTL_SPEED": 0.0, "RTL_CLIMB_MIN": 0.0, "GUID_OPTIONS": 0.0,
 }  # fmt: skip
 
 
@@ -89,6 +89,12 @@ async def _wrong(rng: random.Random) -> str:
             case _:
                 values[name] = value
         expected[figure] = max(value * scale, least)
+    name, scale, lean_deg = rng.choice(
+        (("ANGLE_MAX", 0.01, 10.0), ("ANGLE_MAX", 0.01, 30.0), ("ATC_ANGLE_MAX", 1.0, 20.0))
+    )
+    values |= {name: lean_deg / scale, "PSC_ANGLE_MAX": rng.choice((0.0, 15.0))}
+    braking_deg = (values["PSC_ANGLE_MAX"] or lean_deg) - 4.0
+    expected["accel_mps2"] = min(expected["accel_mps2"], 9.81 * math.tan(math.radians(braking_deg)))
     parameters = _Parameters(values, lost)
     autopilot: Any = SimpleNamespace(
         stack=ARDUCOPTER, vehicle_parameters=parameters, vehicle=SimpleNamespace(foreign="")

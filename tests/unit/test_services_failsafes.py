@@ -143,6 +143,33 @@ def test_a_velocity_ends_soon_without_another() -> None:
     assert "GUID_TIMEOUT" in configured(Parameters({"SYSID_MYGCS": SYSTEM_ID})).missing
 
 
+@pytest.mark.parametrize(("options", "after"), [(0.0, 0.0), (4.0, 4.0), (192.0, 192.0), (16.0, 0.0), (36.0, 0.0)])
+def test_a_vehicle_follows_the_velocities_that_stop_it(options: float, after: float) -> None:
+    vehicle = Parameters({"SYSID_MYGCS": SYSTEM_ID, "GUID_OPTIONS": options})
+    assert not configured(vehicle).problem
+    assert vehicle.values["GUID_OPTIONS"] == after
+    stubborn = Parameters({"SYSID_MYGCS": SYSTEM_ID, "GUID_OPTIONS": 32.0}, ("GUID_OPTIONS",))
+    assert "GUID_OPTIONS is 32" in configured(stubborn).problem
+
+
+@pytest.mark.parametrize(
+    ("lean", "accel_mps2"),
+    [
+        ({}, 2.5), ({"ANGLE_MAX": 1000.0}, 1.03), ({"PSC_ANGLE_MAX": 12.0}, 1.38),
+        ({"ANGLE_MAX": 1000.0, "PSC_ANGLE_MAX": 30.0}, 2.5), ({"PSC_ANGLE_MAX": 3.0}, 0.1),
+    ],
+)  # fmt: skip
+def test_a_vehicle_brakes_no_harder_than_it_leans_in_wind(lean: dict[str, float], accel_mps2: float) -> None:
+    checked = configured(Parameters({"SYSID_MYGCS": SYSTEM_ID, **lean}))
+    assert checked.airframe.accel_mps2 == pytest.approx(accel_mps2, abs=0.01)
+
+
+def test_the_lean_is_known_by_its_name_of_release_4_7() -> None:
+    vehicle = Parameters({"SYSID_MYGCS": SYSTEM_ID, "ATC_ANGLE_MAX": 10.0})
+    del vehicle.values["ANGLE_MAX"]
+    assert configured(vehicle).airframe.accel_mps2 == pytest.approx(1.03, abs=0.01)
+
+
 def test_the_vehicles_own_fence_caps_its_way_home() -> None:
     fence = {"FENCE_ENABLE": 1.0, "FENCE_TYPE": 7.0, "FENCE_ALT_MAX": 40.0, "FENCE_MARGIN": 3.0}
 

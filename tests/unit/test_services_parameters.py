@@ -29,13 +29,13 @@ AS_4_6 = {
     "FENCE_ALT_MAX": 100.0, "FENCE_ACTION": 1.0, "FENCE_MARGIN": 2.0, "FENCE_AUTOENABLE": 0.0, "FENCE_OPTIONS": 0.0,
     "WPNAV_ACCEL": 100.0, "PSC_POSXY_P": 0.6, "WPNAV_ACCEL_Z": 70.0, "PSC_JERK_XY": 3.0, "RTL_ALT": 4200.0,
     "WPNAV_SPEED": 700.0, "RTL_SPEED": 0.0, "RTL_CLIMB_MIN": 0.0, "RTL_ALT_TYPE": 1.0, "RTL_ALT_FINAL": 500.0,
-    "RALLY_LIMIT_KM": 0.25,
+    "RALLY_LIMIT_KM": 0.25, "GUID_OPTIONS": 0.0, "ANGLE_MAX": 3000.0, "PSC_ANGLE_MAX": 0.0,
 }  # fmt: skip
 SPELT_4_7 = {
     "SYSID_MYGCS": ("MAV_GCS_SYSID", 1.0), "WPNAV_ACCEL": ("WP_ACC", 0.01), "PSC_POSXY_P": ("PSC_NE_POS_P", 1.0),
     "WPNAV_ACCEL_Z": ("WP_ACC_Z", 0.01), "PSC_JERK_XY": ("PSC_JERK_NE", 1.0), "RTL_ALT": ("RTL_ALT_M", 0.01),
     "WPNAV_SPEED": ("WP_SPD", 0.01), "RTL_SPEED": ("RTL_SPEED_MS", 0.01), "RTL_CLIMB_MIN": ("RTL_CLIMB_MIN_M", 0.01),
-    "RTL_ALT_FINAL": ("RTL_ALT_FINAL_M", 0.01),
+    "RTL_ALT_FINAL": ("RTL_ALT_FINAL_M", 0.01), "ANGLE_MAX": ("ATC_ANGLE_MAX", 0.01),
 }  # fmt: skip
 AS_4_7 = {
     SPELT_4_7.get(name, (name, 1.0))[0]: value * SPELT_4_7.get(name, (name, 1.0))[1] for name, value in AS_4_6.items()

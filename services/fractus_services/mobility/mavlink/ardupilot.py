@@ -36,6 +36,10 @@ _LISTENS_TO_ONE = Setting(
     ("MAV_GCS_SYSID_HI",), 0, frozenset(float(n) for n in range(1, SYSTEM_ID + 1)), False, _LISTENS
 )
 
+_UNSTEERED = 1 << 4 | 1 << 5
+"""Bits of GUID_OPTIONS: it corrects neither position nor velocity, and flies on when it is told to stop."""
+_STEERED = frozenset(float(options) for options in range(256) if not options & _UNSTEERED)
+
 # FS_GCS_ENABLE and FENCE_ACTION: returns, or goes back on its path. BATT_FS_LOW_ACT numbers them otherwise.
 _RETURN, _RETRACE = 1.0, 3.0
 
@@ -53,11 +57,20 @@ _ACCEL: Names = (("WPNAV_ACCEL", 0.01), ("WP_ACC", 1.0))
 _GAIN: Names = (("PSC_POSXY_P", 1.0), ("PSC_NE_POS_P", 1.0))
 _CLIMB: Names = (("WPNAV_ACCEL_Z", 0.01), ("WP_ACC_Z", 1.0))
 _JERK: Names = (("PSC_JERK_XY", 1.0), ("PSC_JERK_NE", 1.0))
+# Of the position controller in degrees, where it is not 0, and of the vehicle.
+_OWN_LEAN: Names = (("PSC_ANGLE_MAX", 1.0),)
+_LEAN: Names = (("ANGLE_MAX", 0.01), ("ATC_ANGLE_MAX", 1.0))
+_MAX_LEAN_DEG = 80.0
+_GRAVITY_MPS2 = 9.81
+_WIND_LEAN_DEG = 4.0
+"""What 6 m/s of wind take of the lean, which a vehicle then does not have for braking."""
 _RETURN_ALTITUDE: Names = (("RTL_ALT", 0.01), ("RTL_ALT_M", 1.0))
 _SPEED: Names = (("WPNAV_SPEED", 0.01), ("WP_SPD", 1.0))
+_MOVEMENT = (_ACCEL, _GAIN, _CLIMB, _JERK, _OWN_LEAN, _LEAN, _RETURN_ALTITUDE, _SPEED)
 _RETURN_SPEED: Names = (("RTL_SPEED", 0.01), ("RTL_SPEED_MS", 1.0))
 _RETURN_CLIMB: Names = (("RTL_CLIMB_MIN", 0.01), ("RTL_CLIMB_MIN_M", 1.0))
 _MIN_SPEED_MPS = 0.2
+_MIN_ACCEL_MPS2 = 0.1
 _NO_RALLY_KM = 2.0**-10
 """Rally points further away than that, a metre, do not count; 0 would let all of them. A number that a float32 holds."""
 
@@ -77,6 +90,7 @@ class ArduCopter:
         ),
         Setting(("FS_GCS_TIMEOUT",), 5, frozenset(), False, "after five seconds of silence"),
         Setting(("GUID_TIMEOUT",), 1, frozenset(), False, "gives a velocity up after a second without another"),
+        Setting(("GUID_OPTIONS",), 0, _STEERED, False, "follows velocities, so that it stops when it is told to"),
         Setting(("BATT_FS_CRT_ACT",), 1, frozenset({1.0}), False, "lands on a critical battery"),
         Setting(("FS_EKF_ACTION",), 1, frozenset({1.0, 3.0}), False, "lands when it no longer knows where it is"),
         Setting(
@@ -97,7 +111,7 @@ class ArduCopter:
     )  # fmt: skip
     path_memory = ("SRTL_POINTS", 100.0)
     movement: tuple[tuple[str, ...], ...] = (
-        *(tuple(name for name, _ in names) for names in (_ACCEL, _GAIN, _CLIMB, _JERK, _RETURN_ALTITUDE, _SPEED)),
+        *(tuple(name for name, _ in names) for names in _MOVEMENT),
         *((name,) for name in (ENABLE, AUTOENABLE, TYPE, ALTITUDE, MARGIN)),
     )
 
@@ -159,10 +173,10 @@ class ArduCopter:
         return found
 
     def airframe(self, reader: ParameterReader, known: Airframe, speed_mps: float) -> tuple[Airframe, float]:
-        """Accelerations and gains of its position controller; releases before 4.7 have centimetres, later ones metres."""
+        """Accelerations, as far as it may lean for them, and gains; releases before 4.7 have centimetres, later ones metres."""
         read = reader.read
         airframe = Airframe(
-            accel_mps2=max(read(_ACCEL, known.accel_mps2), 0.1),
+            accel_mps2=max(min(read(_ACCEL, known.accel_mps2), _leant_mps2(reader)), _MIN_ACCEL_MPS2),
             position_gain=max(read(_GAIN, known.position_gain), 0.1),
             climb_accel_mps2=max(read(_CLIMB, known.climb_accel_mps2), 0.1),
             jerk_mps3=max(read(_JERK, known.jerk_mps3), 0.5),
@@ -201,6 +215,14 @@ class ArduCopter:
         if int(owned.get(OPTIONS, 0)) & _UNION:
             values[OPTIONS] = float(int(owned[OPTIONS]) & ~_UNION)
         return {name: value for name, value in values.items() if name in owned or name == ENABLE}
+
+
+def _leant_mps2(reader: ParameterReader) -> float:
+    """The horizontal acceleration that the vehicle surely reaches, however much it is told to brake with."""
+    lean_deg = reader.read(_OWN_LEAN, 0.0, needed=False)
+    if lean_deg <= 0.0:
+        lean_deg = reader.read(_LEAN, _MAX_LEAN_DEG, needed=False)
+    return _GRAVITY_MPS2 * math.tan(math.radians(min(lean_deg, _MAX_LEAN_DEG) - _WIND_LEAN_DEG))
 
 
 ARDUCOPTER = ArduCopter()

@@ -15,7 +15,7 @@ from fractus_core.policy.compiled import compile_grant
 from fractus_core.policy.engine import judge
 from fractus_core.policy.values import Airframe, Call, GotoArgs, Home, Situation
 from test_grants import FENCE, guide, policy, zone
-from test_plan_properties import flown_by_other, shared
+from test_plan_drones import flown_by_other, shared
 from test_planning import PATH, application, at, drone, inventory, manifest, navigator
 
 NOW = 1_780_000_000.0

@@ -9,7 +9,6 @@ import yaml
 from click.testing import CliRunner
 from fractus_cli.zones import zones as command
 from fractus_core.api import InvalidObject, Zone
-from fractus_core.api.schedules import active_at
 from fractus_core.geo import LocalFrame, formats, middle, polygon
 from fractus_core.geo.formats import drafts
 from test_planning import manifest
@@ -44,6 +43,14 @@ WRITERS = {
 
 def shape(spec):
     return polygon(LocalFrame(50.0, 4.0), spec.area)
+
+
+def kml(inside, around=""):
+    ring = " ".join(f"{lon},{lat}" for lon, lat in SQUARE)
+    edge = f"<outerBoundaryIs><LinearRing><coordinates>{ring}</coordinates></LinearRing></outerBoundaryIs>"
+    return (
+        f"<kml><Document>{around}<Placemark><name>p</name>{inside.replace('EDGE', edge)}</Placemark></Document></kml>"
+    )
 
 
 @pytest.mark.parametrize("name", WRITERS)
@@ -110,182 +117,6 @@ def test_geojson_of_others():
         "Old Town: no place for properties owner; left out",
         "road: a geometry of type LineString is not a zone; left out",
     )
-
-
-def test_kml_of_others():
-    ring = " ".join(f"{lon},{lat},30" for lon, lat in SQUARE)
-    text = f"""<?xml version="1.0" encoding="UTF-8"?><kml xmlns="http://www.opengis.net/kml/2.2"><Document><Folder>
-    <Placemark><name>School &amp; yard</name><description>no pictures</description><ExtendedData><Data name="owner"><value>x</value></Data></ExtendedData><styleUrl/><Polygon>
-    <altitudeMode>clampToGround</altitudeMode><outerBoundaryIs><LinearRing><coordinates>{ring}</coordinates></LinearRing></outerBoundaryIs></Polygon></Placemark>
-    <Placemark><name>pin</name><Point><coordinates>4,50</coordinates></Point></Placemark></Folder></Document></kml>"""
-    found = formats.read_kml(text)
-    assert [(z.name, z.spec.description) for z in found.zones] == [("school-yard", "no pictures")]
-    assert len(found.zones[0].spec.area.polygon.exterior) == 4
-    assert found.notes == (
-        "School & yard: no place for properties owner; left out",
-        "pin: Point is not a zone; left out",
-    )
-
-
-def test_qgc_plan_of_others():
-    fence = {
-        "version": 2,
-        "polygons": [{"inclusion": True, "version": 1, "polygon": [[lat, lon] for lon, lat in SQUARE[:-1]]}],
-        "circles": [{"inclusion": False, "version": 1, "circle": {"center": [50.0, 4.0], "radius": 100}}],
-    }
-    plan = {"fileType": "Plan", "geoFence": fence, "mission": {"items": [{}]}, "rallyPoints": {"points": [[1, 2, 3]]}}
-    found = formats.read_qgc_plan(json.dumps(plan))
-    assert [z.name for z in found.zones] == ["inclusion-polygon-1", "exclusion-circle-1"]
-    assert middle(found.zones[1].spec.area).lat == 50.0
-    assert len(found.notes) == 4
-    assert (
-        json.loads(formats.write_qgc_plan([ROUND], inclusion=True).text)["geoFence"]["circles"][0]["inclusion"] is True
-    )
-
-
-def ed269(applicability, **volume):
-    geometry = {
-        "uomDimensions": "M", "lowerLimit": 0, "lowerVerticalReference": "AGL", "upperLimit": 120, "upperVerticalReference": "AGL",
-        "horizontalProjection": {"type": "Circle", "center": [4.0, 50.0], "radius": 500}, **volume,
-    }  # fmt: skip
-    one = {
-        "identifier": "BEL0001",
-        "country": "BEL",
-        "name": "Hospital",
-        "restriction": "PROHIBITED",
-        "message": "keep out",
-        "applicability": applicability,
-        "geometry": [geometry],
-    }
-    found = formats.read_ed269(json.dumps({"title": "t", "features": [one]}))
-    return found.zones[0].spec, found.notes
-
-
-def test_ed269_of_others():
-    spec, notes = ed269([{"permanent": "YES"}])
-    assert (spec.altitude.lower, spec.altitude.upper, spec.altitude.reference) == (None, 120, "terrain")
-    assert spec.description == "Hospital: PROHIBITED: keep out"
-    assert notes == (
-        "BEL0001: no place for country; left out",
-        "BEL0001: a Zone forbids nothing by itself; add a policy for restriction PROHIBITED",
-    )
-    square = {"type": "Polygon", "coordinates": [SQUARE]}
-    feet = {"uomDimensions": "FT", "horizontalProjection": square, "upperLimit": 400, "upperVerticalReference": "AMSL"}
-    spec, _ = ed269([], **feet)
-    assert (spec.altitude.upper, spec.altitude.reference) == (121.92, "amsl")
-
-
-def daily(day, start, end):
-    return {"day": day, "startTime": start, "endTime": end}
-
-
-WEEK = ("Mon", "Tue", "Wed", "Thu", "Fri", "Sat", "Sun")
-
-
-@pytest.mark.parametrize(
-    ("day", "days", "start", "end"),
-    [
-        (daily(["MON", "FRI"], "08:00:00.00Z", "23:59:59.00Z"), ("Mon", "Fri"), "08:00", "00:00"),
-        (daily(["MON"], "00:30+02:00", "10:00+02:00"), ("Sun",), "22:30", "08:00"),
-        (daily(["MON", "SUN"], "22:00-0500", "06:00-0500"), ("Mon", "Tue"), "03:00", "11:00"),
-        (daily(["SUN"], "22:00-05:00", "23:00-05:00"), ("Mon",), "03:00", "04:00"),
-        (daily(["ANY"], "22:00:00Z", "06:00:00.5Z"), (), "22:00", "06:00"),
-        (daily(["FRI"], "00:00Z", "24:00Z"), ("Fri",), None, None),
-        (daily(list(map(str.upper, WEEK)), "12:00Z", "13:00Z"), (), "12:00", "13:00"),
-    ],
-)
-def test_ed269_times_of_day_are_kept_in_utc(day, days, start, end):
-    spec, _ = ed269([{"permanent": "NO", "startDateTime": "2026-03-01T00:00:00+01:00", "schedule": [day]}])
-    (time,) = spec.schedule
-    assert (time.days, time.start, time.end) == (days, start, end)
-    assert time.valid_from.isoformat() == "2026-03-01T00:00:00+01:00"
-
-
-@pytest.mark.parametrize(
-    "applicability",
-    [
-        [],
-        [{}],
-        [{"permanent": "YES"}],
-        [{"permanent": "YES", "schedule": [daily(["ANY"], "00:00:00.00Z", "23:59:59.00Z")]}],
-        [{"permanent": "NO", "schedule": [daily(["MON"], "08:00Z", "09:00Z")]}, {"permanent": "NO"}],
-        [{"permanent": "NO", "schedule": [daily(["MON"], "08:00Z", "09:00Z"), {"day": ["ANY"]}]}],
-    ],
-)
-def test_ed269_zones_that_are_always_active(applicability):
-    assert ed269(applicability)[0].schedule == ()
-
-
-@pytest.mark.parametrize("offset_h", range(-12, 15))
-def test_ed269_offsets_mean_the_same_moments(offset_h):
-    zone_text = f"{'-' if offset_h < 0 else '+'}{abs(offset_h):02d}:30"
-    offset_s = (abs(offset_h) * 3600 + 1800) * (-1 if offset_h < 0 else 1)
-    spec, _ = ed269([{"schedule": [daily(["MON"], f"06:00{zone_text}", f"03:00{zone_text}")]}])
-    monday_s = 4 * 86_400
-    for minute in range(0, 14 * 1440, 7):
-        local_s = minute * 60 % (7 * 86_400)
-        meant = monday_s + 6 * 3600 <= local_s < monday_s + 27 * 3600
-        assert active_at(spec.schedule, 7 * 86_400 + minute * 60 - offset_s) == meant
-
-
-NO = {"permanent": "NO"}
-
-
-@pytest.mark.parametrize(
-    ("applicability", "volume", "sentence"),
-    [
-        ([], {"uomDimensions": "FL"}, "geometry[0].uomDimensions: must be M or FT, not 'FL'; convert the limits"),
-        ([], {"uomDimensions": "FT"}, "geometry[0].horizontalProjection.radius: may be metres or feet; give"),
-        ([], {"upperLimit": "120"}, "geometry[0].upperLimit: must be a number, not '120'"),
-        ([], {"upperVerticalReference": "WGS84"}, "geometry[0].upperVerticalReference: must be AGL or AMSL, not 'WGS84'"),
-        ([], {"upperVerticalReference": None}, "geometry[0].upperVerticalReference: must be AGL or AMSL, not None"),
-        ([], {"lowerLimit": 30, "upperVerticalReference": "AMSL"}, "geometry[0].lowerVerticalReference: differs from"),
-        ([], {"upperLimit": 1e6}, "geometry[0]: altitude.upper: must be less than or equal to 20000"),
-        ([], {"layer": 3}, "geometry[0].layer: a Zone has no place for it; remove it if it means nothing"),
-        (
-            [],
-            {"horizontalProjection": {"type": "Circle", "center": [4, 50], "radius": 5, "from": 90}},
-            "geometry[0].horizontalProjection.from: a Zone has no place for it",
-        ),
-        (
-            [],
-            {"horizontalProjection": {"type": "Polygon", "coordinates": [[[4, 50, 9], [5, 50, 9], [5, 51, 9]]]}},
-            "geometry[0].horizontalProjection.coordinates[0][0]: has a height; say how high",
-        ),
-        ([NO | {"schedule": [{"day": ["MON", "HOL"]}]}], {}, "applicability[0].schedule[0].day: 'HOL' is not MON to SUN or ANY"),
-        ([NO | {"schedule": [{"day": [{}]}]}], {}, "applicability[0].schedule[0].day: {} is not MON to SUN"),
-        ([NO | {"schedule": [{"startEvent": "BMCT"}]}], {}, "applicability[0].schedule[0].startEvent: a Zone has no place"),
-        ([NO | {"schedule": [daily([], "dawn", "dusk")]}], {}, "applicability[0].schedule[0].startTime: must be a time of day"),
-        ([NO | {"schedule": [daily([], "08:00", "09:00")]}], {}, "applicability[0].schedule[0].startTime: must be a time of day"),
-        ([NO | {"schedule": [daily([], "24:00Z", "09:00Z")]}], {}, "applicability[0].schedule[0].startTime: must be a time of"),
-        ([NO | {"schedule": [daily([], "08:00Z", "25:00Z")]}], {}, "applicability[0].schedule[0].endTime: must be a time of"),
-        ([NO | {"schedule": [daily([], "08:00Z", "")]}], {}, "applicability[0].schedule[0].endTime: must be a time of day"),
-        ([NO | {"schedule": [daily([], "08:00:30Z", "09:00Z")]}], {}, "applicability[0].schedule[0].startTime: must be a whole"),
-        ([NO | {"startDateTime": "2026-03-01T00:00:00"}], {}, "geometry[0]: schedule[0].validFrom: must be a time with its zone"),
-        ([{"permanent": "MAYBE"}], {}, "applicability[0].permanent: must be YES or NO, not 'MAYBE'"),
-        ([{"permanent": "YES", "endDateTime": "2026-03-01T00:00:00Z"}], {}, "applicability[0].permanent: is YES, but there are"),
-        ([NO | {"season": "winter"}], {}, "applicability[0].season: a Zone has no place for it"),
-    ],
-)  # fmt: skip
-def test_ed269_refuses_what_a_zone_cannot_keep(applicability, volume, sentence):
-    with pytest.raises(InvalidObject) as refused:
-        ed269(applicability, **volume)
-    assert str(refused.value).startswith(f"features[0].{sentence}")
-    assert str(refused.value).endswith(" (in BEL0001)")
-
-
-def test_ed269_refuses_features_without_geometry_and_says_what_it_cuts():
-    with pytest.raises(InvalidObject, match=r"features\[0\].geometry: is missing; give at least one volume \(in A\)"):
-        formats.read_ed269('{"features": [{"identifier": "A"}]}')
-    written = json.loads(formats.write_ed269([ROUND]).text)
-    written["features"][0] |= {"identifier": "A", "message": "x" * 1100}
-    assert "A: its description is cut after 1024 characters" in formats.read_ed269(json.dumps(written)).notes
-
-
-def test_ed269_has_no_altitude_above_home():
-    low = zone("low", {"circle": {"center": {"lat": 50.0, "lon": 4.0}, "radius": 3}}, altitude={"upper": 50})
-    with pytest.raises(InvalidObject, match=r"low: spec\.altitude\.reference: ED-269 has no altitudes above home"):
-        formats.write_ed269([low])
 
 
 def test_geojson_is_cut_at_the_antimeridian():
@@ -400,75 +231,6 @@ LAMBERT = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::31370"}
 def test_geojson_refuses_what_a_zone_cannot_keep(whole, sentence):
     with pytest.raises(InvalidObject) as refused:
         formats.read_geojson(json.dumps(whole))
-    assert str(refused.value).startswith(sentence)
-
-
-def kml(inside, around=""):
-    ring = " ".join(f"{lon},{lat}" for lon, lat in SQUARE)
-    edge = f"<outerBoundaryIs><LinearRing><coordinates>{ring}</coordinates></LinearRing></outerBoundaryIs>"
-    return (
-        f"<kml><Document>{around}<Placemark><name>p</name>{inside.replace('EDGE', edge)}</Placemark></Document></kml>"
-    )
-
-
-def test_kml_keeps_all_holes_and_every_polygon_of_a_multigeometry():
-    rings = [[[lon + shift, lat] for lon, lat in HOLE] for shift in (0, -0.003)]
-    texts = [
-        f"<LinearRing><coordinates>{' '.join(f'{x},{y},99' for x, y in r)}</coordinates></LinearRing>" for r in rings
-    ]
-    both = f"<Polygon>EDGE<innerBoundaryIs>{''.join(texts)}</innerBoundaryIs></Polygon>"
-    found = formats.read_kml(
-        kml(f"<MultiGeometry>{both}<MultiGeometry><Polygon>EDGE</Polygon></MultiGeometry></MultiGeometry>")
-    )
-    assert [len(z.spec.area.polygon.holes) for z in found.zones] == [2, 0]
-    assert found.notes == ()
-
-
-@pytest.mark.parametrize(
-    ("text", "sentence"),
-    [
-        (
-            kml("<Polygon><altitudeMode>absolute</altitudeMode>EDGE</Polygon>"),
-            "Polygon[0].altitudeMode: absolute has heights",
-        ),
-        (
-            kml("<TimeSpan><begin>2026</begin></TimeSpan><Polygon>EDGE</Polygon>"),
-            "has a time, which a Zone says otherwise",
-        ),
-        (kml("<Polygon>EDGE</Polygon>", "<Folder><name>f</name><TimeStamp/></Folder>"), "f: has a time, which"),
-        (
-            kml("<Polygon>EDGE</Polygon>", "<NetworkLink><name>n</name></NetworkLink>"),
-            "n: a NetworkLink leads to another file",
-        ),
-        (kml("<Polygon>EDGEEDGE</Polygon>"), "Polygon[0].outerBoundaryIs: a polygon has exactly one"),
-        (kml("<Polygon/>"), "Polygon[0].outerBoundaryIs: a polygon has exactly one"),
-    ],
-)
-def test_kml_refuses_what_a_zone_cannot_keep(text, sentence):
-    with pytest.raises(InvalidObject) as refused:
-        formats.read_kml(text)
-    assert str(refused.value).startswith(sentence)
-
-
-@pytest.mark.parametrize(
-    ("fence", "sentence"),
-    [
-        ({"polygons": [{"polygon": SQUARE}]}, "geoFence.polygons[0].inclusion: must be true or false, not None"),
-        (
-            {"polygons": [{"polygon": SQUARE, "inclusion": True, "maxAltitude": 50}]},
-            "geoFence.polygons[0].maxAltitude: a Zone has",
-        ),
-        ({"polygons": [{"polygon": [[1, 2, 3]], "inclusion": True}]}, "geoFence.polygons[0].polygon[0]: has a height"),
-        (
-            {"circles": [{"circle": {"center": [1, 2], "radius": 3, "units": "ft"}, "inclusion": True}]},
-            "geoFence.circles[0].circle.units: a Zone has no place for it",
-        ),
-        ({"corridors": [1]}, "geoFence.corridors: a Zone has no place for it"),
-    ],
-)
-def test_qgc_plan_refuses_what_a_zone_cannot_keep(fence, sentence):
-    with pytest.raises(InvalidObject) as refused:
-        formats.read_qgc_plan(json.dumps({"fileType": "Plan", "geoFence": {"version": 2, **fence}}))
     assert str(refused.value).startswith(sentence)
 
 

@@ -1,0 +1,133 @@
+"""Which drone an application gets: one that flies already and may be shared, or one that is there for it."""
+
+import dataclasses
+
+import pytest
+from fractus_core.planning import Infeasible, Settings, flight_of, plan
+from test_planning import (
+    FRAME,
+    PATH,
+    VIEWER,
+    application,
+    at,
+    drone,
+    inventory,
+    navigator,
+    reasons,
+)
+
+# -- sharing a flying drone --
+
+OTHER = ("default", "other")
+
+
+def passenger(points, ordered=True):
+    return application(VIEWER | {"egress": [], "pointsOfInterest": {"points": points, "ordered": ordered}})
+
+
+def shared(fleet, flights, **more):
+    return inventory(fleet, claimed={n: f.holder for n, f in flights.items()}, flights=flights, **more)
+
+
+def flown_by_other():
+    app = application(navigator(PATH)).model_copy(deep=True)
+    return dataclasses.replace(flight_of(app, inventory().depots), holder=OTHER)
+
+
+def test_passengers_come_along_with_a_drone_that_flies_by():
+    stock = shared([drone("busy", battery=0.5), drone("idle")], {"busy": flown_by_other()})
+    result = plan(passenger([at(120, 0), at(250, 3)]), stock)
+    assert (result.drone.node, result.drone.shared_with) == ("busy", "default/other")
+    assert result.drone.mission is None
+    assert [a.node for a in result.drone.alternatives] == ["idle"]
+    assert result.drone.transit == ()
+
+
+def test_passengers_do_not_come_along_against_the_order():
+    stock = shared([drone("busy"), drone("idle")], {"busy": flown_by_other()})
+    result = plan(passenger([at(250, 3), at(120, 0)]), stock)
+    assert (result.drone.node, result.drone.shared_with) == ("idle", None)
+    assert len(result.drone.transit) == 3
+    busy = next(r for r in result.rejected if r.node == "busy")
+    assert busy.reason == "Claimed"
+    assert "does not visit pointsOfInterest.points[1] in this order" in busy.message
+    elsewhere = shared([drone("busy", home=(9000, 0), depot=None), drone("idle")], {"busy": flown_by_other()})
+    result = plan(passenger([at(250, 3), at(120, 0)]), elsewhere)
+    assert reasons(result)["AerialViewer", "busy"] == "PathMissesPoint"
+    assert plan(passenger([at(250, 3), at(120, 0)], ordered=False), stock).drone.node == "busy"
+
+
+def test_a_driver_never_shares():
+    with pytest.raises(Infeasible) as caught:
+        plan(application(navigator(PATH)), shared([drone("busy")], {"busy": flown_by_other()}))
+    assert caught.value.reason == "DroneBusy"
+
+
+def test_a_passenger_that_came_along_stays_aboard():
+    app = passenger([at(120, 0), at(250, 3)])
+    stock = shared([drone("b"), drone("c")], {"b": flown_by_other(), "c": flown_by_other()})
+    first = plan(app, stock)
+    assert first.drone.node == "b"
+    tired = shared([drone("b", battery=0.3), drone("c")], {"b": flown_by_other(), "c": flown_by_other()})
+    assert plan(app, tired, previous=first).drone.node == "b"
+    assert plan(app, tired).drone.node == "c"
+
+
+# -- which drones are there --
+
+
+def test_partial_control_takes_drones_of_depots_nearby():
+    start = {"position": at(900, 0)}
+    fleet = [drone("near", home=(0, 0)), drone("far", home=(9000, 0))]
+    partial = application(navigator([at(950, 0, 10)], point=start, control="partial"))
+    result = plan(partial, inventory(fleet))
+    assert result.drone.node == "near"
+    assert [round(FRAME.xy(leg.end.lat, leg.end.lon)[0]) for leg in result.drone.transit] == [900, 0]
+    assert reasons(result) == {("Navigator", "far"): "TooFar"}
+    with pytest.raises(Infeasible):
+        plan(application(navigator([at(950, 0, 10)], point=start)), inventory(fleet))
+
+
+def test_partial_control_from_a_named_depot_takes_its_drones_and_those_near_it():
+    fleet = [
+        drone("away", home=(2500, 0), minutes=60),
+        drone("far", home=(2500, 10), depot="other", minutes=60),
+        drone("near", home=(1900, 0), depot="other", minutes=60),
+    ]
+    app = application(navigator(PATH, control="partial"))
+    result = plan(app, inventory(fleet))
+    assert {result.drone.node, *(a.node for a in result.drone.alternatives)} == {"away", "near"}
+    assert reasons(result) == {("Navigator", "far"): "TooFar"}
+    with pytest.raises(Infeasible, match="near is 1900 m from the start, more than 1000 m"):
+        plan(app, inventory(fleet[1:]), Settings(depot_radius_m=1000))
+    assert reasons(plan(application(navigator(PATH)), inventory(fleet)))["Navigator", "near"] == "OtherDepot"
+
+
+def test_full_control_at_a_position_takes_the_drones_of_the_depot_there():
+    start = {"position": at(15, 0)}
+    fleet = [drone("kept", home=(400, 0)), drone("stray", home=(60, 0), depot=None)]
+    result = plan(application(navigator(PATH, point=start)), inventory(fleet))
+    assert result.drone.node == "kept"
+    assert reasons(result) == {("Navigator", "stray"): "TooFar"}
+
+
+def test_a_drone_that_cannot_climb_so_high_is_rejected_with_the_figures():
+    with pytest.raises(Infeasible) as caught:
+        plan(application(navigator([at(100, 0, 95)])), inventory([drone("d")]))
+    assert [r.reason for r in caught.value.rejected] == ["TooHigh"]
+    assert "climbs to 80 m; the path goes up to 95 m" in caught.value.message
+
+
+def test_a_drone_that_could_never_fly_it_does_not_make_the_application_wait():
+    with pytest.raises(Infeasible) as caught:
+        plan(application(navigator(PATH)), inventory([drone("d", minutes=2)], claimed={"d": OTHER}))
+    assert caught.value.reason == "NoDrone"
+    assert "even with a full battery" in caught.value.message
+
+
+def test_flight_time_message_has_its_figures():
+    with pytest.raises(
+        Infeasible,
+        match=r"can fly 0\.8 min with its reserve kept, with its battery at 25%; the mission takes 2\.\d min for \d+ m",
+    ):
+        plan(application(navigator(PATH)), inventory([drone("d", battery=0.25)]))

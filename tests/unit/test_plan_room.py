@@ -1,0 +1,196 @@
+"""What fits on nodes: components together, and locations that compete for them."""
+
+import itertools
+
+import pytest
+from depth import examples
+from fractus_core.geo import geodesic_m
+from fractus_core.planning import Infeasible, plan
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_planning import (
+    PATH,
+    VIEWER,
+    application,
+    at,
+    component,
+    drone,
+    edge,
+    host,
+    inventory,
+    navigator,
+)
+
+# -- what fits together --
+
+
+def asking(name, placement, milli, **more):
+    made = component(name, placement, **more)
+    return made | {"container": made["container"] | {"resources": {"requests": {"cpu": f"{milli}m"}}}}
+
+
+millis = st.integers(1, 12).map(lambda tenths: 100 * tenths)
+
+
+@given(millis, st.lists(millis, max_size=3), millis)
+@settings(max_examples=examples(60), deadline=None)
+def test_a_drone_flies_what_fits_on_it_together(driver, passengers, free):
+    aboard = [navigator(PATH) | {"container": asking("Navigator", "drone", driver)["container"]}]
+    aboard += [
+        asking(f"P{i}", "drone", milli, services=VIEWER["services"], **{"class": "passenger"})
+        for i, milli in enumerate(passengers)
+    ]
+    stock = inventory([drone("d")], hosts=[host("d", "drone", cpu=free / 1000)])
+    try:
+        flown = plan(application(*aboard), stock).drone.node
+    except Infeasible as error:
+        flown = None
+        assert [r.reason for r in error.rejected] == ["InsufficientResources"]
+    assert flown == ("d" if driver + sum(passengers) <= free else None)
+
+
+def test_two_components_that_fit_one_by_one_but_not_together_are_named():
+    aboard = [navigator(PATH) | {"container": asking("x", "drone", 600)["container"]}]
+    aboard.append(asking("P", "drone", 600, services=VIEWER["services"], **{"class": "passenger"}))
+    stock = inventory([drone("d")], hosts=[host("d", "drone", cpu=1.0)])
+    with pytest.raises(Infeasible, match=r"Navigator, P do not fit together \(cpu: 1\.2 asked, 1 free\)"):
+        plan(application(*aboard), stock)
+
+
+@given(st.lists(st.tuples(millis, st.booleans()), min_size=1, max_size=4), st.lists(millis, min_size=1, max_size=4))
+@settings(max_examples=examples(60), deadline=None)
+def test_no_edge_node_gets_more_than_it_has_and_none_is_refused_that_has_room(wanted, rooms):
+    statics = [(f"S{i}", milli) for i, (milli, _) in enumerate(wanted)]
+    hybrids = [(f"H{i}", 200, f"S{i}") for i, (_, beside) in enumerate(wanted) if beside]
+    where_to = {"locations": [{"center": at(0, 0), "radius": 50, "instances": "*"}]}
+    spec = [asking(name, "edge", milli, **where_to) for name, milli in statics]
+    spec += [asking(name, "hybrid", milli, hybridTo=[other]) for name, milli, other in hybrids]
+    edges = [edge(f"e{i}", (i, 0)) for i in range(len(rooms))]
+    hosts = [host(f"e{i}", "edge", cpu=milli / 1000) for i, milli in enumerate(rooms)]
+    result = plan(application(*spec), inventory(edges=edges, hosts=hosts))
+    asked = dict(statics) | {name: milli for name, milli, _ in hybrids}
+    left = {f"e{i}": milli for i, milli in enumerate(rooms)}
+    for placed in result.placements:
+        if placed.node is not None:
+            left[placed.node] -= asked[placed.component]
+    assert min(left.values()) >= 0
+    for r in result.rejected:
+        assert r.reason == "InsufficientResources"
+        assert asked[r.component] > left[r.node]
+    # Each component is asked for on every node: what has room at the end had room then.
+    placed = {(p.component, p.node) for p in result.placements}
+    for name, milli in statics:
+        assert all((name, node) in placed or milli > room for node, room in left.items())
+
+
+# -- locations that compete for nodes --
+
+
+def wanting(name, *locations, milli=100):
+    """A static component with locations: middle, radius, and the number of instances."""
+    spots = [
+        {"center": at(*middle), "radius": radius, "instances": instances} for middle, radius, instances in locations
+    ]
+    return asking(name, "edge", milli, locations=spots)
+
+
+def hosted(app, stock):
+    """The nodes of each location of each component, or the component that has none at some location."""
+    try:
+        result = plan(app, stock)
+    except Infeasible as error:
+        return error.component
+    found = {(c.name, i): [] for c in app.spec.components for i in range(len(c.locations))}
+    for placed in result.placements:
+        found[placed.component, placed.location].append(placed.node)
+    return found
+
+
+def most_that_can_be_hosted(app, stock, rooms):
+    """By trying all: the most instances that all locations can have, each at least one; None if some gets none.
+
+    Instances ask for a share of the rooms that is the same for all.
+    """
+    slots = [(c.name, spot) for c in app.spec.components for spot in c.locations]
+    inside = [
+        [n.name for n in stock.edge_nodes.values() if geodesic_m(spot.center, n.spec.location) <= spot.radius]
+        for _, spot in slots
+    ]
+
+    def best(i, used):
+        if i == len(slots):
+            return 0
+        name, spot = slots[i]
+        free = [n for n in inside[i] if (name, n) not in used and sum(m == n for _, m in used) < rooms[n]]
+        found = None
+        for count in range(1, spot.instances + 1):
+            for chosen in itertools.combinations(free, count):
+                rest = best(i + 1, used | {(name, n) for n in chosen})
+                if rest is not None:
+                    found = max(found or 0, count + rest)
+        return found
+
+    return best(0, frozenset())
+
+
+spots = st.tuples(st.tuples(st.integers(0, 4).map(lambda i: 10 * i), st.just(0)), st.sampled_from([4, 11, 21, 60]))
+
+
+@given(
+    st.lists(st.lists(st.tuples(spots, st.integers(1, 2)), min_size=1, max_size=3), min_size=1, max_size=2), st.data()
+)
+@settings(max_examples=examples(600), deadline=None)
+def test_no_location_starves_another(wanted, data):
+    edges = [edge(f"e{i}", (10 * i, 0)) for i in range(5)]
+    rooms = {e.name: data.draw(st.integers(0, 2)) for e in edges}
+    stock = inventory(edges=edges, hosts=[host(n, "edge", cpu=room / 10) for n, room in rooms.items()])
+    app = application(*(wanting(f"S{i}", *[(*spot, k) for spot, k in some]) for i, some in enumerate(wanted)))
+    found = hosted(app, stock)
+    most = most_that_can_be_hosted(app, stock, rooms)
+    if most is None:
+        assert isinstance(found, str)
+        return
+    assert sum(map(len, found.values())) == most
+    for name, room in rooms.items():
+        used = [owner for (owner, _), nodes in found.items() for node in nodes if node == name]
+        assert len(used) == len(set(used)) <= room
+    for (owner, i), nodes in found.items():
+        spot = app.spec.component(owner).locations[i]
+        assert 1 <= len(nodes) <= spot.instances
+        assert all(geodesic_m(spot.center, stock.edge_nodes[n].spec.location) <= spot.radius for n in nodes)
+
+
+def test_a_location_yields_the_node_that_another_one_needs():
+    edges = [edge("a", (0, 0)), edge("b", (30, 0))]
+    both, only = ((0, 0), 50, 1), ((0, 0), 10, 1)
+    found = hosted(application(wanting("S", both, only)), inventory(edges=edges))
+    assert found == {("S", 0): ["b"], ("S", 1): ["a"]}
+    assert hosted(application(wanting("S", both), wanting("T", only)), inventory(edges=edges))["S", 0] == ["a"]
+    small = [host(e.name, "edge", cpu=0.1) for e in edges]
+    found = hosted(application(wanting("S", both), wanting("T", only)), inventory(edges=edges, hosts=small))
+    assert found == {("S", 0): ["b"], ("T", 0): ["a"]}
+
+
+def test_a_location_of_all_nodes_leaves_others_their_node():
+    edges = [edge("a", (0, 0)), edge("b", (30, 0))]
+    found = hosted(application(wanting("S", ((0, 0), 50, "*"), ((0, 0), 10, 1))), inventory(edges=edges))
+    assert found == {("S", 0): ["b"], ("S", 1): ["a"]}
+
+
+def test_a_further_instance_moves_nothing_that_runs():
+    app = application(wanting("S", ((0, 0), 50, 1), ((0, 0), 10, 2)))
+    few = [edge("a", (0, 0)), edge("c", (1, 0))]
+    before = plan(app, inventory(edges=few))
+    assert {(p.location, p.node) for p in before.placements} == {(0, "a"), (1, "c")}
+    stock = inventory(edges=[*few, edge("b", (30, 0))])
+    assert plan(app, stock, previous=before).placements == before.placements
+    assert hosted(app, stock) == {("S", 0): ["b"], ("S", 1): ["a", "c"]}
+
+
+def test_a_location_that_cannot_have_a_node_says_who_needs_them():
+    only = ((0, 0), 10, 1)
+    with pytest.raises(Infeasible) as caught:
+        plan(application(wanting("S", only, only)), inventory(edges=[edge("a", (0, 0))]))
+    assert caught.value.message == (
+        "no node can host S at locations[1]: a hosts S for locations[0], which has no other node"
+    )

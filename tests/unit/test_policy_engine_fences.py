@@ -1,0 +1,274 @@
+"""The engine's fences: operation areas, exclusion and inclusion zones, near and on the other side of the globe."""
+
+from __future__ import annotations
+
+import pytest
+from fractus_core.policy.motion import stopping_distance_m
+from fractus_core.policy.values import (
+    Airframe,
+    Call,
+    GotoArgs,
+    Home,
+    TakeoffArgs,
+)
+from policy_world import (
+    ask,
+    at,
+    box,
+    compiled,
+    exclusion,
+    goto,
+    inclusion,
+    policy,
+    ring,
+    target,
+    zone,
+)
+
+# Fences
+
+
+def test_targets_outside_the_operation_area_are_refused() -> None:
+    verdict = ask(compiled(), goto(0, 230))
+    assert (verdict.action, verdict.code, verdict.takeover) == ("deny", "OutsideOperationArea", None)
+    assert "30.0 m outside" in verdict.reason
+    assert ask(compiled(), goto(0, 198)).code == "OutsideOperationArea", "within the margin of the border"
+    assert ask(compiled(), goto(0, 197)).action == "allow"
+    assert ask(compiled(operationArea=[]), goto(0, 230)).action == "allow"
+
+
+def test_a_leg_that_cuts_a_corner_of_the_operation_area_is_refused() -> None:
+    corner = [ring([(-20, -20), (100, -20), (100, 20), (20, 20), (20, 100), (-20, 100)])]
+    grant = compiled(operationArea=corner)
+    assert ask(grant, goto(0, 90), at(0, 0)).action == "allow"
+    assert ask(grant, goto(90, 0), at(0, 90)).code == "OutsideOperationArea"
+
+
+def test_the_way_to_the_operation_area_and_home() -> None:
+    grant = compiled(operationArea=[box(50, -20, 150, 20)], corridor=[box(-30, -30, 150, 30)])
+    assert ask(grant, goto(100, 0), at(0, 0)).action == "allow"
+    assert ask(grant, goto(20, 0), at(0, 0)).code == "OutsideOperationArea", "the way is not a place to work"
+    assert ask(grant, goto(0, 0), at(100, 0)).action == "allow", "home"
+    assert ask(grant, Call("Takeoff", TakeoffArgs(10)), at(0, 0, 0)).action == "allow"
+    partial = compiled(operationArea=[box(50, -20, 150, 20)], corridor=[box(-30, -30, 150, 30)], control="partial")
+    assert ask(partial, goto(100, 0), at(0, 0)).action == "allow", "leading in"
+    assert ask(partial, Call("Arm"), at(0, 0, 0)).code == "OutsideOperationArea"
+
+
+def test_the_way_from_home_is_not_bound_to_an_operation_area_that_home_happens_to_lie_in() -> None:
+    bend = ring([(-10, -5), (60, -5), (60, 60), (50, 60), (50, 5), (-10, 5)])
+    grant = compiled(operationArea=[bend], corridor=[box(-30, -30, 100, 100)])
+    assert ask(grant, goto(55, 50), at(0, 0)).action == "allow"
+    assert ask(grant, goto(55, 50), at(20, 0)).code == "OutsideOperationArea", "at work it stays inside"
+    partial = compiled(operationArea=[bend], corridor=[box(-30, -30, 100, 100)], control="partial")
+    assert ask(partial, goto(55, 50), at(0, 0)).code == "OutsideOperationArea", "the system flies there"
+
+
+def test_a_driver_with_partial_control_works_where_the_system_can_fly_home_around_a_zone() -> None:
+    fields = {"operationArea": [box(50, -20, 150, 20)], "corridor": [box(-30, -60, 150, 60)], "control": "partial"}
+    retracing = at(60, 0, airframe=Airframe(retraces=True))
+    beside, across = exclusion(box(20, -10, 40, 10)), exclusion(box(20, -70, 40, 70))
+    assert ask(compiled(beside, **fields), goto(100, 0), retracing).action == "allow"
+    assert ask(compiled(across, **fields), goto(100, 0), retracing).code == "WayHomeBlocked"
+    assert ask(compiled(beside, **fields), goto(100, 0), at(60, 0)).code == "WayHomeBlocked", "it flies home straight"
+
+
+def test_exclusion_zones() -> None:
+    grant = compiled(exclusion(box(50, -20, 80, 20)))
+    inside, through, near = ask(grant, goto(60, 0)), ask(grant, goto(150, 0)), ask(grant, goto(48, 0))
+    assert (inside.action, inside.code) == ("deny", "InsideExclusionZone")
+    assert "10.0 m inside" in inside.reason
+    assert through.code == "LegThroughExclusionZone"
+    assert "30.0 m" in through.reason
+    assert near.code == "TooCloseToExclusionZone"
+    assert ask(grant, goto(47, 0)).action == "allow"
+    assert ask(grant, goto(47, 0), at(position_error_m=3)).code == "TooCloseToExclusionZone"
+
+
+def test_distances_that_round_to_nothing_are_told_as_such() -> None:
+    zone_at = exclusion(box(50, -20, 80, 20))
+    told = [
+        ask(compiled(exclusion(ring([(50, 0.01), (40, -20), (60, -20)]))), goto(100, 0)),
+        ask(compiled(zone_at), goto(50.01, 0)),
+        ask(compiled(zone_at), goto(49.99, 0)),
+        ask(compiled(inclusion(box(-50, -50, 50, 50))), goto(50.01, 0)),
+        ask(compiled(inclusion(box(-50, -50, 50, 50))), goto(49.99, 0)),
+        ask(compiled(), goto(0, 199.99)),
+        ask(compiled(), goto(0, 200.01)),
+        ask(compiled(), Call("CaptureImage"), at(0, 200.01)),
+    ]
+    for verdict in told:
+        assert not verdict.permits
+        assert " 0.0 m" not in verdict.reason, verdict
+    assert "touches zone no-fly-zone" in told[0].reason
+    assert "less than 0.1 m inside zone no-fly-zone" in told[1].reason
+    assert "comes within 0.1 m of zone no-fly-zone" in told[2].reason
+
+
+def test_a_turn_that_sweeps_a_zone_beside_the_leg_is_told_apart() -> None:
+    verdict = ask(compiled(exclusion(box(1, 5, 3, 9))), goto(0, 60), at(east_mps=5.0, north_mps=0.0))
+    assert verdict.code == "LegThroughExclusionZone"
+    assert "turn onto the leg touches zone no-fly-zone" in verdict.reason
+
+
+def test_a_zone_in_a_band_of_altitudes_may_be_overflown() -> None:
+    grant = compiled(exclusion(box(50, -20, 80, 20), upper=20))
+    assert ask(grant, goto(150, 0, 30), at(alt=30)).action == "allow"
+    assert ask(grant, goto(150, 0, 30), at(alt=10)).code == "LegThroughExclusionZone", "it may climb too late"
+    assert ask(grant, goto(150, 0, 21), at(alt=21)).code == "LegThroughExclusionZone", "within the altitude margin"
+    high = compiled(exclusion(box(50, -20, 80, 20), lower=140, reference="amsl"))
+    assert ask(high, goto(60, 0, 20)).action == "allow"
+    assert ask(high, goto(60, 0, 39)).code == "InsideExclusionZone"
+    unknown = compiled(exclusion(box(50, -20, 80, 20), upper=20, reference="terrain"))
+    assert ask(unknown, goto(60, 0, 90), at(alt=90)).code == "InsideExclusionZone", "unknown terrain reaches to the sky"
+
+
+@pytest.mark.parametrize("action", ["hover", "land", "returnToLaunch", "revoke"])
+def test_takeovers(action: str) -> None:
+    grant = compiled(exclusion(box(50, -20, 80, 20), action))
+    verdict = ask(grant, goto(60, 0))
+    assert (verdict.action, verdict.takeover, verdict.policies) == ("takeover", action, ("no-fly",))
+    assert ask(grant, goto(150, 0)).takeover == action, "a leg through it breaks it too"
+    assert ask(grant, goto(48, 0)).action == "deny", "coming close costs no more than the request"
+
+
+def test_the_strictest_fence_decides() -> None:
+    actions = ("adjust", "hover", "ignore", "land", "returnToLaunch")
+    zones = [exclusion(box(50, -20, 80, 20), a, f"p-{a.lower()}") for a in actions]
+    verdict = ask(compiled(*zones), goto(60, 0))
+    assert (verdict.action, verdict.takeover) == ("takeover", "land")
+    assert verdict.policies == ("p-land", "p-returntolaunch", "p-hover", "p-ignore", "p-adjust")
+
+
+def test_adjusting_shortens_the_leg() -> None:
+    grant = compiled(exclusion(box(50, -20, 80, 20), "adjust"))
+    verdict = ask(grant, goto(150, 0))
+    assert (verdict.action, verdict.code) == ("correct", "LegShortened")
+    x, y = target(verdict)
+    assert y == pytest.approx(0, abs=1e-3)
+    assert 46.5 < x < 47.5
+    assert ask(grant, Call("Goto", verdict.args)).action == "allow", "what is corrected is legal by itself"
+    assert ask(grant, goto(150, 0), at(47, 0)).action == "deny", "nothing is left of the leg"
+    both = compiled(exclusion(box(50, -20, 80, 20), "adjust"), exclusion(box(20, -20, 30, 20), "ignore", "other"))
+    assert ask(both, goto(150, 0)).action == "deny"
+
+
+def test_adjusting_inside_an_inclusion_zone() -> None:
+    grant = compiled(inclusion(box(-30, -30, 60, 60), "adjust"))
+    verdict = ask(grant, goto(0, 100))
+    assert verdict.action == "correct"
+    assert 56 < target(verdict)[1] < 57.5
+    assert ask(compiled(inclusion(box(-30, -30, 60, 60))), goto(0, 100)).code == "OutsideInclusionZone"
+    assert ask(compiled(inclusion(box(-30, -30, 60, 60), "land")), goto(0, 100)).takeover == "land"
+    assert ask(compiled(inclusion(box(-30, -30, 60, 60))), goto(0, 59)).code == "TooCloseToInclusionBorder"
+
+
+def test_inclusion_is_the_union_of_a_policys_zones() -> None:
+    two = policy(
+        "keep-in", "GeofenceControl", "inclusion",
+        [zone("a", box(-30, -30, 50, 30)), zone("b", box(49, -30, 120, 30))],
+    )  # fmt: skip
+    assert ask(compiled(two), goto(100, 0)).action == "allow"
+    apart = (inclusion(box(-30, -30, 50, 30), name="a"), inclusion(box(49, -30, 120, 30), name="b"))
+    assert ask(compiled(*apart), goto(100, 0)).action == "deny", "two policies hold both"
+
+
+def test_a_moving_drone_needs_room_to_turn() -> None:
+    grant = compiled(exclusion(box(10, 15, 30, 30)))
+    assert ask(grant, goto(0, 60), at(0, 0)).action == "allow"
+    assert ask(grant, goto(0, 60), at(0, 0, east_mps=9)).code == "LegThroughExclusionZone"
+    ahead = compiled(exclusion(box(15, -20, 30, 20)))
+    assert ask(ahead, goto(0, 60), at(0, 0, east_mps=9)).action == "allow", "it leads away from what cannot be avoided"
+    assert ask(ahead, goto(60, 60), at(0, 0, east_mps=9)).action == "deny"
+    assert stopping_distance_m(9, 2.5, 1.0) == pytest.approx(2.5 / 2 + 81 / 5)
+    assert stopping_distance_m(2, 2.5, 1.0) == pytest.approx(2.0)
+
+
+def test_from_inside_a_zone_only_out() -> None:
+    grant = compiled(exclusion(box(50, -50, 90, 50), "land"))
+    inside = at(60, 0)
+    assert ask(grant, goto(40, 0), inside).action == "allow"
+    assert ask(grant, goto(80, 0), inside).action != "allow"
+    assert ask(grant, goto(100, 0), inside).action != "allow", "the long way out leads deeper first"
+    assert ask(grant, goto(49, 0), inside).action != "allow", "out, but not far enough"
+    assert ask(grant, goto(80, 0), inside).action == "deny", "no second takeover for what the monitor handles"
+
+
+def test_from_outside_only_in() -> None:
+    grant = compiled(operationArea=[box(50, -50, 150, 50)])
+    outside = at(20, 0)
+    assert ask(grant, goto(100, 0), outside).action == "allow"
+    assert ask(grant, goto(10, 0), outside).action == "deny"
+    keep = compiled(inclusion(box(-5, -50, 150, 50)), operationArea=[])
+    assert ask(keep, goto(50, 0), at(-20, 0)).action == "allow"
+    assert ask(keep, goto(-10, 0), at(-20, 0)).action == "deny"
+
+
+def test_the_way_home_must_stay_legal() -> None:
+    wall = exclusion(box(-100, 40, 60, 50), name="wall")
+    grant = compiled(wall)
+    behind = at(100, 60)
+    assert ask(grant, goto(0, 80), behind).code == "WayHomeBlocked"
+    assert ask(grant, goto(150, 60), behind).action == "allow"
+    low = compiled(exclusion(box(-100, 40, 60, 50), name="wall", upper=12))
+    assert ask(low, goto(0, 80, 10), behind).action == "allow", "it returns at 15 m, above the wall"
+    assert ask(compiled(inclusion(box(20, -50, 150, 150))), goto(100, 50), at(80, 50)).code == "WayHomeBlocked"
+
+
+def test_vertical_motions_respect_fences() -> None:
+    grant = compiled(exclusion(box(-10, -10, 10, 10), "land", lower=20))
+    assert ask(grant, Call("Takeoff", TakeoffArgs(10)), at(alt=0)).action == "allow"
+    assert ask(grant, Call("Takeoff", TakeoffArgs(30)), at(alt=0)).action == "deny"
+    ground = compiled(exclusion(box(40, -10, 60, 10), upper=30))
+    assert ask(ground, Call("Land"), at(50, 0, alt=50)).code == "InsideExclusionZone"
+    assert ask(ground, Call("Land"), at(30, 0, east_mps=8)).action == "deny", "it would come down inside"
+    assert ask(ground, Call("Land"), at(0, 0)).action == "allow"
+    assert ask(ground, Call("Arm"), at(50, 0, alt=0)).action == "deny"
+
+
+@pytest.mark.parametrize(("lower", "upper", "away", "closer"), [(12.0, 60.0, 9.0, 10.5), (-5.0, 8.0, 11.0, 9.5)])
+def test_from_too_close_below_or_above_a_zone_a_leg_may_sink_or_climb_away(
+    lower: float, upper: float, away: float, closer: float
+) -> None:
+    grant = compiled(exclusion(box(-40, -40, 40, 40), lower=lower, upper=upper))
+    for x in (0.0, 39.9, 40.5):
+        beside = at(x, 0, 10.0)
+        assert ask(grant, goto(x, 0, away), beside).action == "allow"
+        assert ask(grant, goto(x, 0, closer), beside).action == "deny"
+        assert ask(grant, goto(x, 0, 10.0), beside).action == "deny", "it stays too close"
+        assert ask(grant, goto(x - 20, 0, away), beside).action == "deny", "it may be over or under it first"
+    moving = at(x=40.5, alt=10.0, east_mps=-8.0)
+    assert ask(grant, goto(40.5, 0, away), moving).action == "deny"
+
+
+def test_motors_do_not_stop_in_the_air() -> None:
+    assert ask(compiled(), Call("Disarm"), at()).code == "InAir"
+    assert ask(compiled(), Call("Disarm"), at(in_air=False)).action == "allow"
+
+
+# Geometry far away
+
+
+def test_zones_on_the_other_side_of_the_globe_do_not_matter() -> None:
+    far = [{"lat": lat, "lon": lon} for lat, lon in ((-39.3, -157.1), (-39.4, -157.1), (-39.4, -157.0))]
+    grant = compiled(exclusion({"polygon": {"exterior": far}}))
+    assert ask(grant, goto(50, 0)).action == "allow"
+
+
+def test_the_antimeridian_is_nothing_special() -> None:
+    from fractus_core.geo import LocalFrame
+    from fractus_core.policy.engine import judge
+    from fractus_core.policy.values import Situation
+
+    frame = LocalFrame(-17.0, 179.9999)
+    corners = [
+        dict(zip(("lat", "lon"), frame.latlon(x, y), strict=True))
+        for x, y in ((50, -20), (80, -20), (80, 20), (50, 20))
+    ]
+    grant = compiled(
+        exclusion({"polygon": {"exterior": corners}}), operationArea=[],
+        home={"lat": -17.0, "lon": 179.9999, "alt": 0, "altitudeReference": "amsl"},
+    )  # fmt: skip
+    now = Situation(time_s=0, lat=-17.0, lon=179.9999, altitude_m=10, home=Home(-17.0, 179.9999, 0), in_air=True)
+    for x, code in ((60, "InsideExclusionZone"), (150, "LegThroughExclusionZone"), (40, "")):
+        assert judge(Call("Goto", GotoArgs(*frame.latlon(x, 0), 10)), now, grant).code == code

@@ -1,0 +1,100 @@
+"""Zones from KML and QGroundControl plans of others: what is kept, and what a zone cannot keep."""
+
+import json
+
+import pytest
+from fractus_core.api import InvalidObject
+from fractus_core.geo import formats, middle
+from test_zone_formats import HOLE, ROUND, SQUARE, kml
+
+
+def test_kml_of_others():
+    ring = " ".join(f"{lon},{lat},30" for lon, lat in SQUARE)
+    text = f"""<?xml version="1.0" encoding="UTF-8"?><kml xmlns="http://www.opengis.net/kml/2.2"><Document><Folder>
+    <Placemark><name>School &amp; yard</name><description>no pictures</description><ExtendedData><Data name="owner"><value>x</value></Data></ExtendedData><styleUrl/><Polygon>
+    <altitudeMode>clampToGround</altitudeMode><outerBoundaryIs><LinearRing><coordinates>{ring}</coordinates></LinearRing></outerBoundaryIs></Polygon></Placemark>
+    <Placemark><name>pin</name><Point><coordinates>4,50</coordinates></Point></Placemark></Folder></Document></kml>"""
+    found = formats.read_kml(text)
+    assert [(z.name, z.spec.description) for z in found.zones] == [("school-yard", "no pictures")]
+    assert len(found.zones[0].spec.area.polygon.exterior) == 4
+    assert found.notes == (
+        "School & yard: no place for properties owner; left out",
+        "pin: Point is not a zone; left out",
+    )
+
+
+def test_qgc_plan_of_others():
+    fence = {
+        "version": 2,
+        "polygons": [{"inclusion": True, "version": 1, "polygon": [[lat, lon] for lon, lat in SQUARE[:-1]]}],
+        "circles": [{"inclusion": False, "version": 1, "circle": {"center": [50.0, 4.0], "radius": 100}}],
+    }
+    plan = {"fileType": "Plan", "geoFence": fence, "mission": {"items": [{}]}, "rallyPoints": {"points": [[1, 2, 3]]}}
+    found = formats.read_qgc_plan(json.dumps(plan))
+    assert [z.name for z in found.zones] == ["inclusion-polygon-1", "exclusion-circle-1"]
+    assert middle(found.zones[1].spec.area).lat == 50.0
+    assert len(found.notes) == 4
+    assert (
+        json.loads(formats.write_qgc_plan([ROUND], inclusion=True).text)["geoFence"]["circles"][0]["inclusion"] is True
+    )
+
+
+def test_kml_keeps_all_holes_and_every_polygon_of_a_multigeometry():
+    rings = [[[lon + shift, lat] for lon, lat in HOLE] for shift in (0, -0.003)]
+    texts = [
+        f"<LinearRing><coordinates>{' '.join(f'{x},{y},99' for x, y in r)}</coordinates></LinearRing>" for r in rings
+    ]
+    both = f"<Polygon>EDGE<innerBoundaryIs>{''.join(texts)}</innerBoundaryIs></Polygon>"
+    found = formats.read_kml(
+        kml(f"<MultiGeometry>{both}<MultiGeometry><Polygon>EDGE</Polygon></MultiGeometry></MultiGeometry>")
+    )
+    assert [len(z.spec.area.polygon.holes) for z in found.zones] == [2, 0]
+    assert found.notes == ()
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        (
+            kml("<Polygon><altitudeMode>absolute</altitudeMode>EDGE</Polygon>"),
+            "Polygon[0].altitudeMode: absolute has heights",
+        ),
+        (
+            kml("<TimeSpan><begin>2026</begin></TimeSpan><Polygon>EDGE</Polygon>"),
+            "has a time, which a Zone says otherwise",
+        ),
+        (kml("<Polygon>EDGE</Polygon>", "<Folder><name>f</name><TimeStamp/></Folder>"), "f: has a time, which"),
+        (
+            kml("<Polygon>EDGE</Polygon>", "<NetworkLink><name>n</name></NetworkLink>"),
+            "n: a NetworkLink leads to another file",
+        ),
+        (kml("<Polygon>EDGEEDGE</Polygon>"), "Polygon[0].outerBoundaryIs: a polygon has exactly one"),
+        (kml("<Polygon/>"), "Polygon[0].outerBoundaryIs: a polygon has exactly one"),
+    ],
+)
+def test_kml_refuses_what_a_zone_cannot_keep(text, sentence):
+    with pytest.raises(InvalidObject) as refused:
+        formats.read_kml(text)
+    assert str(refused.value).startswith(sentence)
+
+
+@pytest.mark.parametrize(
+    ("fence", "sentence"),
+    [
+        ({"polygons": [{"polygon": SQUARE}]}, "geoFence.polygons[0].inclusion: must be true or false, not None"),
+        (
+            {"polygons": [{"polygon": SQUARE, "inclusion": True, "maxAltitude": 50}]},
+            "geoFence.polygons[0].maxAltitude: a Zone has",
+        ),
+        ({"polygons": [{"polygon": [[1, 2, 3]], "inclusion": True}]}, "geoFence.polygons[0].polygon[0]: has a height"),
+        (
+            {"circles": [{"circle": {"center": [1, 2], "radius": 3, "units": "ft"}, "inclusion": True}]},
+            "geoFence.circles[0].circle.units: a Zone has no place for it",
+        ),
+        ({"corridors": [1]}, "geoFence.corridors: a Zone has no place for it"),
+    ],
+)
+def test_qgc_plan_refuses_what_a_zone_cannot_keep(fence, sentence):
+    with pytest.raises(InvalidObject) as refused:
+        formats.read_qgc_plan(json.dumps({"fileType": "Plan", "geoFence": {"version": 2, **fence}}))
+    assert str(refused.value).startswith(sentence)

@@ -21,30 +21,31 @@ _TEXTS = {"type": "array", "items": _TEXT}
 _TIME = {"type": "object", "title": "time", "properties": {"sec": _INTEGER, "nsec": _INTEGER}}
 
 
-def _schema(title: str, /, **properties: Mapping[str, Any]) -> tuple[str, bytes]:
+def schema(title: str, /, **properties: Mapping[str, Any]) -> tuple[str, bytes]:
+    """The name and the JSON schema of a kind of messages."""
     return title, json.dumps({"title": title, "type": "object", "properties": properties}).encode()
 
 
 SCHEMAS = dict(
     (
-        _schema(
+        schema(
             "foxglove.LocationFix", timestamp=_TIME, frame_id=_TEXT, latitude=_NUMBER, longitude=_NUMBER, altitude=_NUMBER,
             position_covariance={"type": "array", "items": _NUMBER}, position_covariance_type=_INTEGER,
         ),
-        _schema(
+        schema(
             "foxglove.Log", timestamp=_TIME, level=_INTEGER, message=_TEXT, name=_TEXT, file=_TEXT, line=_INTEGER
         ),
-        _schema("foxglove.GeoJSON", geojson=_TEXT),
-        _schema(
+        schema("foxglove.GeoJSON", geojson=_TEXT),
+        schema(
             "foxglove.CompressedImage", timestamp=_TIME, frame_id=_TEXT,
             data={"type": "string", "contentEncoding": "base64"}, format=_TEXT,
         ),
-        _schema("fractus.Attitude", roll_rad=_NUMBER, pitch_rad=_NUMBER, yaw_rad=_NUMBER),
-        _schema(
+        schema("fractus.Attitude", roll_rad=_NUMBER, pitch_rad=_NUMBER, yaw_rad=_NUMBER),
+        schema(
             "fractus.State", altitude_m=_NUMBER, amsl_m=_NUMBER, speed_mps=_NUMBER, battery=_NUMBER, mode=_TEXT,
             controller=_TEXT, in_air=_FLAG,
         ),
-        _schema(
+        schema(
             "fractus.Decision", kind=_TEXT, caller=_TEXT, method=_TEXT, action=_TEXT, code=_TEXT, reason=_TEXT,
             policies=_TEXTS, takeover=_TEXT, controller=_TEXT, latitude=_NUMBER, longitude=_NUMBER, altitude_m=_NUMBER,
         ),

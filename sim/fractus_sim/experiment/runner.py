@@ -69,7 +69,8 @@ class _Session:
     def tell(self, vehicle: str, text: str) -> None:
         self.events.append((self.now_s, vehicle, text))
         self.progress.tell(f"{self.now_s:6.1f} s  {vehicle + ': ' if vehicle else ''}{text}")
-        self.log.write("/events", "event", self.moment.unix_us, {"time_s": round(self.now_s, 3), "text": text})
+        content = {"time_s": round(self.now_s, 3), "text": text}
+        self.log.write("/events", "fractus.Event", self.moment.unix_us * 1000, content)
 
     def poll(self) -> None:
         """Let a little time pass, and take in what vehicles say."""

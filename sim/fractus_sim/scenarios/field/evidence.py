@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import bisect
-import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from fractus_mavlink import Message, Parser, frame_length
+from fractus_cli.tlog_tail import split
+from fractus_mavlink import Message, Parser
 from fractus_mavlink.enums import COPTER_MODE, MAV_COMPONENT, MAV_MODE_FLAG
 from fractus_storage.chain import entries
 
 from fractus_sim.experiment.station import FLYING_STATES
 from fractus_sim.report.track import Place, Sample, Track
 
-_STAMP = struct.Struct(">Q")
 _SAMPLE_S = 0.2
 SYSTEM = "system"
 
@@ -124,14 +123,10 @@ class _Clock:
 
 def _frames(path: Path) -> Iterator[tuple[float, Message]]:
     """The messages of a tlog with their Unix times."""
-    data = path.read_bytes()
-    at, parser = 0, Parser()
-    while at + _STAMP.size + 3 <= len(data):
-        (stamp_us,) = _STAMP.unpack_from(data, at)
-        begin = at + _STAMP.size
-        at = begin + frame_length(data, begin)
-        for message in parser.feed(data[begin:at]):
-            yield stamp_us / 1e6, message
+    parser = Parser()
+    for frame in split(path.read_bytes())[0]:
+        for message in parser.feed(frame.data):
+            yield frame.time_s, message
 
 
 def _flight(path: Path) -> tuple[tuple[Sample, ...], _Clock, list[str]]:

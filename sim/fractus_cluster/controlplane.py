@@ -10,6 +10,7 @@ from fractus_cluster.addressing import API_SERVICE, SERVICE_NETWORK, Addressing
 from fractus_cluster.binaries import Binaries
 from fractus_cluster.manifests import DNS_USER
 from fractus_cluster.pki import Authority, Credential, write_private
+from fractus_cluster.supervisor import ENVIRONMENT
 
 API_PORT = 6443
 DNS_READY_PORT = 8181
@@ -114,7 +115,6 @@ def control_plane_units(
     binaries: Binaries, authority: Authority, addressing: Addressing, files: ControlPlaneFiles
 ) -> list[dict[str, Any]]:
     """Return the units of the control plane, in the order in which they start."""
-    env = {"PATH": "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin", "HOME": "/root", "LANG": "C.UTF-8"}
     argvs = {
         "etcd": _etcd(files),
         "kube-apiserver": _api_server(authority, addressing),
@@ -132,7 +132,7 @@ def control_plane_units(
             "name": name,
             "argv": [str(binaries[name]), *argv],
             "log": str(files.logs / f"{name}.log"),
-            "env": env,
+            "env": ENVIRONMENT,
             "needs": needs.get(name, ""),
         }
         for name, argv in argvs.items()

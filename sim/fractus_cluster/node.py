@@ -26,14 +26,10 @@ from fractus_cluster.prerequisites import machine, plugin_directory
 from fractus_cluster.processes import kill_recorded, running, spawn, write_record
 from fractus_cluster.spec import NodeSpec, Place
 from fractus_cluster.state import StateDirectory
+from fractus_cluster.supervisor import ENVIRONMENT
 
 _PROGRAMS = ("kubelet", "kube-proxy")
 _FOLDERS = ("etc", "etc-work", "var-lib", "var-log", "config")
-ENVIRONMENT = {
-    "PATH": "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin",
-    "HOME": "/root",
-    "LANG": "C.UTF-8",
-}
 
 
 def init_command(config: Path, namespace: Path) -> list[str]:

@@ -12,6 +12,7 @@ import yaml
 from fractus_cluster.addressing import DNS_SERVICE, Addressing
 from fractus_cluster.node_init import RUN
 from fractus_cluster.spec import NodeSpec, parse_quantity
+from fractus_cluster.supervisor import ENVIRONMENT
 
 SANDBOX_IMAGE = "localhost/fractus/pause:1"
 CONTAINERD_SOCKET = "/run/containerd/containerd.sock"
@@ -210,7 +211,6 @@ def resolver_file(addressing: Addressing) -> str:
 def node_units(node: NodeSpec, *, address: str) -> list[dict[str, Any]]:
     """Return what the node's first program has to keep running."""
     logs = RUN / "logs"
-    env = {"PATH": "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin", "HOME": "/root", "LANG": "C.UTF-8"}
     # kubelet gives up when the container runtime is not there yet.
     wait = f'i=0; while [ ! -S {CONTAINERD_SOCKET} ] && [ $i -lt 400 ]; do sleep 0.05; i=$((i+1)); done; exec "$@"'
     kubelet = [
@@ -226,4 +226,6 @@ def node_units(node: NodeSpec, *, address: str) -> list[dict[str, Any]]:
         "kubelet": ["/bin/sh", "-c", wait, "sh", *kubelet],
         "kube-proxy": [f"{RUN}/bin/kube-proxy", f"--config={CONFIG}/kube-proxy.yaml", "--v=1"],
     }
-    return [{"name": name, "argv": argv, "log": f"{logs}/{name}.log", "env": env} for name, argv in argvs.items()]
+    return [
+        {"name": name, "argv": argv, "log": f"{logs}/{name}.log", "env": ENVIRONMENT} for name, argv in argvs.items()
+    ]

@@ -31,11 +31,12 @@ from fractus_cluster.errors import ClusterError
 from fractus_cluster.images.layout import Image
 from fractus_cluster.images.store import ImageStore
 from fractus_cluster.images.template import has_storage
-from fractus_cluster.node import ENVIRONMENT, Node, init_command
+from fractus_cluster.node import Node, init_command
 from fractus_cluster.pki import Authority, write_private
 from fractus_cluster.processes import kill_recorded, running, spawn, write_record
 from fractus_cluster.spec import ClusterSpec
 from fractus_cluster.state import Memory, StateDirectory
+from fractus_cluster.supervisor import ENVIRONMENT
 
 _READY_TIMEOUT_S = 90.0
 _DNS_TIMEOUT_S = 90.0

@@ -23,6 +23,13 @@ _LOG_LIMIT_BYTES = 20_000_000
 _LOG_CHECK_S = 600.0
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None, use_errno=True)
+ENVIRONMENT = {
+    "PATH": "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin",
+    "HOME": "/root",
+    "LANG": "C.UTF-8",
+}
+"""Of the daemons of nodes and control planes."""
+
 _HANDLED = {signal.SIGCHLD, signal.SIGTERM}
 
 

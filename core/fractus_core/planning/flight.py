@@ -170,7 +170,7 @@ def transit_legs(
     ]
 
 
-def flight_of(application: Application, depots: Mapping[str, Depot], reached: int = 0) -> Flight:
+def flight_of(application: Application, depots: Mapping[str, Depot]) -> Flight:
     """What a drone flies for an application: its driver's paths, or its points of interest.
 
     Raises:
@@ -193,7 +193,7 @@ def flight_of(application: Application, depots: Mapping[str, Depot], reached: in
         legs.append(tuple(open_leg))
     elif spec.points_of_interest is not None:
         legs.append(tuple(spec.points_of_interest.points))
-    return Flight(application.key, tuple(leg for leg in legs if leg), reached)
+    return Flight(application.key, tuple(leg for leg in legs if leg))
 
 
 def ahead(flight: Flight, place: Position, radius_m: float) -> Flight | None:

@@ -97,10 +97,6 @@ class Layout:
         manifest = json.loads(self.blob(image.digest).read_text())
         return str(manifest["config"]["digest"]).removeprefix("sha256:")
 
-    def size_bytes(self, image: Image) -> int:
-        """Return the size of an image: the sum of its layers."""
-        return sum(self.blob(digest).stat().st_size for digest in self.digests(image))
-
     def remove_unused(self) -> None:
         """Remove blobs that no image refers to."""
         used = {digest for image in self.images().values() for digest in self.digests(image)}
@@ -128,17 +124,16 @@ class Layout:
             "config": _descriptor(CONFIG_TYPE, self._add_blob(config_bytes), len(config_bytes)),
             "layers": [_descriptor(LAYER_TYPE, layer_digest, len(layer))],
         }
-        self.add_manifest(name, json.dumps(manifest, sort_keys=True).encode(), MANIFEST_TYPE)
+        self.add_manifest(name, manifest)
         return self.image(name)
 
-    def add_manifest(self, name: str, content: bytes, media_type: str) -> str:
-        """Give a name to a manifest whose layers are there already, and return its digest."""
-        digest = self._add_blob(content)
-        entry = _descriptor(media_type, digest, len(content))
+    def add_manifest(self, name: str, manifest: Json) -> None:
+        """Give a name to a manifest whose layers are there already."""
+        content = json.dumps(manifest, sort_keys=True).encode()
+        entry = _descriptor(MANIFEST_TYPE, self._add_blob(content), len(content))
         entry["annotations"] = {_REF_ANNOTATION: name}
         others = [other for other in self._index() if other.get("annotations", {}).get(_REF_ANNOTATION) != name]
         self._write_index([*others, entry])
-        return digest
 
     def write_archive(self, images: Iterable[Image], *, without: Collection[str], out: IO[bytes]) -> None:
         """Write an archive that `ctr images import` reads.

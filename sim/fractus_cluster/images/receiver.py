@@ -84,7 +84,7 @@ class _Server(ThreadingHTTPServer):
             layer["mediaType"] = LAYER_TYPE
         manifest["mediaType"] = MANIFEST_TYPE
         manifest["config"]["mediaType"] = CONFIG_TYPE
-        self.layout.add_manifest(name, json.dumps(manifest, sort_keys=True).encode(), MANIFEST_TYPE)
+        self.layout.add_manifest(name, manifest)
 
 
 class _Handler(BaseHTTPRequestHandler):

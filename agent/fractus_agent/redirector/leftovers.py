@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import struct
+from contextlib import closing
 
 from fractus_agent.redirector import nft, tables
 from fractus_agent.redirector.conntrack import Conntrack
@@ -18,11 +19,8 @@ def table_is_left() -> bool:
     Raises:
         NetlinkError: the kernel does not tell.
     """
-    netlink = Netlink(NETLINK_NETFILTER)
-    try:
+    with closing(Netlink(NETLINK_NETFILTER)) as netlink:
         answers = list(netlink.dump(_LIST_TABLES, struct.pack(">BBH", socket.AF_INET, 0, 0)))
-    finally:
-        netlink.close()
     names = [value for answer in answers for kind, value in attributes(answer[4:]) if kind == _NAME]
     return nft.TABLE.encode() + b"\0" in names
 
@@ -35,8 +33,5 @@ def remove() -> None:
         NetlinkError: the kernel refused.
     """
     tables.remove()
-    netlink = Netlink(NETLINK_NETFILTER)
-    try:
+    with closing(Netlink(NETLINK_NETFILTER)) as netlink:
         Conntrack(netlink).forget_all()
-    finally:
-        netlink.close()

@@ -6,7 +6,6 @@ import json
 import threading
 import time
 from pathlib import Path
-from types import TracebackType
 
 from fractus_core.api import Grant
 from fractus_core.api.plans import GrantSpec
@@ -57,9 +56,7 @@ class Watch:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._over.set()
         self._thread.join(_JOIN_S)
         self._station.close()

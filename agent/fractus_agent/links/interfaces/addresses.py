@@ -7,6 +7,7 @@ import fcntl
 import socket
 import struct
 from collections.abc import Iterator
+from contextlib import closing
 from ipaddress import IPv4Address, IPv4Network
 from pathlib import Path
 
@@ -62,13 +63,10 @@ class Addresses:
             NetlinkError: the kernel refused.
         """
         index = self._index()
-        netlink = Netlink(NETLINK_ROUTE)
-        try:
+        with closing(Netlink(NETLINK_ROUTE)) as netlink:
             for address in _all(netlink, index):
                 if address not in LINK_LOCAL:
                     return f"it has the address {address}"
-        finally:
-            netlink.close()
         return "a default route leads over it" if _default_route(ROUTES.read_text(), self._device) else ""
 
     def set(self, address: IPv4Address) -> None:
@@ -79,8 +77,7 @@ class Addresses:
             NetlinkError: the kernel refused.
         """
         index = self._index()
-        netlink = Netlink(NETLINK_ROUTE)
-        try:
+        with closing(Netlink(NETLINK_ROUTE)) as netlink:
             if not self._is_up():
                 alias = _alias(netlink, index).removesuffix(RAISED) + RAISED
                 # Without room for our mark the device stays up in the end.
@@ -90,8 +87,6 @@ class Addresses:
             for other in _listed(netlink, index):
                 if other != address:
                     _ask(netlink, _DELETE_ADDRESS, 0, _described(index, other))
-        finally:
-            netlink.close()
 
     def clear(self) -> None:
         """Take all link-local addresses away, and have the device down again where it was not up before, by an earlier agent too.
@@ -103,15 +98,12 @@ class Addresses:
             index = self._index()
         except NoDevice:
             return
-        netlink = Netlink(NETLINK_ROUTE)
-        try:
+        with closing(Netlink(NETLINK_ROUTE)) as netlink:
             for address in list(_listed(netlink, index)):
                 _ask(netlink, _DELETE_ADDRESS, 0, _described(index, address))
             alias = _alias(netlink, index)
             if alias.endswith(RAISED):
                 _ask(netlink, _NEW_LINK, 0, _link(index, 0) + attribute(_ALIAS, alias.removesuffix(RAISED)))
-        finally:
-            netlink.close()
 
     def _is_up(self) -> bool:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import socket
 import struct
+from contextlib import closing
 from ipaddress import IPv4Address
 
 from fractus_agent.redirector.netlink import (
@@ -30,8 +31,7 @@ def forget(address: IPv4Address) -> None:
     Raises:
         NetlinkError: the kernel refused.
     """
-    netlink = Netlink(NETLINK_ROUTE)
-    try:
+    with closing(Netlink(NETLINK_ROUTE)) as netlink:
         wanted = attribute(_DESTINATION, address.packed)
         for body in list(netlink.dump(_LIST_NEIGHBOURS, _NEIGHBOUR.pack(socket.AF_INET, 0, 0, 0, 0))):
             _, index, state, _, _ = _NEIGHBOUR.unpack_from(body)
@@ -42,5 +42,3 @@ def forget(address: IPv4Address) -> None:
             described = _NEIGHBOUR.pack(socket.AF_INET, index, 0, 0, 0) + wanted
             netlink.send(message(_DELETE_NEIGHBOUR, NLM_F_ACK, sequence, described))
             netlink.acknowledged({sequence}, ignore=frozenset({errno.ENOENT}))
-    finally:
-        netlink.close()

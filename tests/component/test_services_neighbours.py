@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from fractus_core.policy.values import TakeoffArgs
 from fractus_mavlink import Endpoint, Parser
 from fractus_mavlink.enums import COPTER_MODE, MAV_AUTOPILOT, MAV_CMD, MAV_COMPONENT, MAV_STATE, MAV_TYPE
 from fractus_services.errors import Refused
-from mobility_world import goto
+from mobility_world import end, goto
 from sky_drone import fly, ready, until
 
 
@@ -47,9 +46,7 @@ def test_in_flight_no_one_else_takes_the_place_of_the_autopilot_whose_link_broke
     async def work(sky: Sky, directory: Path) -> None:
         async with ready(sky, directory) as (drone, grant):
             await drone.service.arm(grant, 120.0)
-            async with contextlib.aclosing(drone.service.take_off(grant, TakeoffArgs(15.0))) as climbing:
-                async for _ in climbing:
-                    pass
+            await end(drone.service.take_off(grant, TakeoffArgs(15.0)))
             heard_first(sky, stranger)
             (wire,) = sky.wires
             wire._protocol.connection_lost(None)
@@ -58,9 +55,7 @@ def test_in_flight_no_one_else_takes_the_place_of_the_autopilot_whose_link_broke
             assert drone.autopilot.target == (1, 1)
             assert drone.autopilot.vehicle.armed
             await asyncio.sleep(5.0)
-            async with contextlib.aclosing(drone.service.goto(grant, goto(20, 0, 15), 0.0)) as flying:
-                async for _ in flying:
-                    pass
+            await end(drone.service.goto(grant, goto(20, 0, 15), 0.0))
             assert drone.state is StreamState.GRANTED
             assert sky.truth.mode is COPTER_MODE.GUIDED
 

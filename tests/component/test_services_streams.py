@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 from pathlib import Path
 
 from closed_loop import Sky
@@ -11,7 +10,7 @@ from fractus_core.control import StreamState
 from fractus_core.policy.values import TakeoffArgs
 from fractus_mavlink import Endpoint
 from fractus_mavlink.enums import COPTER_MODE, MAV_COMPONENT, MAV_DATA_STREAM
-from mobility_world import goto
+from mobility_world import end, goto
 from sky_drone import fly, ready, until
 
 STATION = 255
@@ -40,9 +39,7 @@ def test_streams_that_another_station_stopped_come_again(tmp_path: Path) -> None
     async def work(sky: Sky, directory: Path) -> None:
         async with ready(sky, directory) as (drone, grant):
             await drone.service.arm(grant, 120.0)
-            async with contextlib.aclosing(drone.service.take_off(grant, TakeoffArgs(15.0))) as climbing:
-                async for _ in climbing:
-                    pass
+            await end(drone.service.take_off(grant, TakeoffArgs(15.0)))
             frame = Endpoint(STATION, MAV_COMPONENT.MISSIONPLANNER).encode(
                 "REQUEST_DATA_STREAM",
                 {
@@ -53,9 +50,7 @@ def test_streams_that_another_station_stopped_come_again(tmp_path: Path) -> None
             for wire in sky.wires:
                 sky.craft.receive(wire._channel, frame)
             await asyncio.sleep(10.0)
-            async with contextlib.aclosing(drone.service.goto(grant, goto(20, 0, 15), 0.0)) as flying:
-                async for _ in flying:
-                    pass
+            await end(drone.service.goto(grant, goto(20, 0, 15), 0.0))
             assert drone.state is StreamState.GRANTED
             assert sky.truth.mode is COPTER_MODE.GUIDED
 

@@ -1,16 +1,17 @@
-"""What integration tests share: a bare control plane, and the operator as a process on it."""
+"""What integration tests share: a bare control plane, the operator as a process on it, and a drone's services."""
 
 from __future__ import annotations
 
 import hashlib
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
 import chart as fractus_chart
 import pytest
 from control_plane import ControlPlane, programs
+from mobility_rig import Rig
 from operator_world import OperatorProcess, World, fresh_namespace
 
 # A shell's background jobs ignore the one, what nohup starts the other; and so would every program that they start.
@@ -29,6 +30,16 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             half = "operator" if item.path.stem == "test_operator" else "others"
             item.add_marker(pytest.mark.xdist_group(f"control-plane-{half}"))
     items.sort(key=lambda item: item.path.stem not in LONG)
+
+
+@pytest.fixture
+async def rig(tmp_path: Path) -> AsyncIterator[Rig]:
+    """A drone's services and its vehicle, as processes that a test starts."""
+    rig = Rig(tmp_path)
+    try:
+        yield rig
+    finally:
+        await rig.close()
 
 
 @pytest.fixture(scope="session")

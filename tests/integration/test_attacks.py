@@ -10,7 +10,7 @@ import ssl
 import sys
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -44,15 +44,6 @@ Status = grpc.StatusCode
 ASK = pb.GetSpeedRequest()
 LOST = pb.ControlEvent.STATE_LOST
 FLOOD_PER_S = 500.0
-
-
-@pytest.fixture
-async def rig(tmp_path: Path) -> AsyncIterator[Rig]:
-    rig = Rig(tmp_path)
-    try:
-        yield rig
-    finally:
-        await rig.close()
 
 
 async def served(rig: Rig, identity: str = DRIVER) -> mobility_pb2_grpc.MobilityServiceStub:

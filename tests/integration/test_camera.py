@@ -8,7 +8,7 @@ import io
 import json
 import threading
 import urllib.request
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -67,15 +67,6 @@ spec:
       mount: {{pitch: -90, stabilised: true}}
       methods: [CaptureImage, RetrieveImage]
 """
-
-
-@pytest.fixture
-async def rig(tmp_path: Path) -> AsyncIterator[Rig]:
-    rig = Rig(tmp_path)
-    try:
-        yield rig
-    finally:
-        await rig.close()
 
 
 def privacy(action: str, *box: float) -> dict[str, Any]:

@@ -6,7 +6,6 @@ import asyncio
 import math
 import signal
 import time
-from collections.abc import AsyncIterator
 from pathlib import Path
 
 import grpc
@@ -39,15 +38,6 @@ from mobility_rig import (
 )
 
 Decision = types_pb2.Decision
-
-
-@pytest.fixture
-async def rig(tmp_path: Path) -> AsyncIterator[Rig]:
-    rig = Rig(tmp_path)
-    try:
-        yield rig
-    finally:
-        await rig.close()
 
 
 async def test_a_whole_mission_with_a_correction_and_refusals(rig: Rig) -> None:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import AsyncIterator
-from pathlib import Path
 from typing import Any
 
 import grpc
@@ -39,15 +37,6 @@ from mobility_rig import (
 
 WALL = (-40.0, 25.0, 40.0, 40.0)
 """A zone between home and everything in the north."""
-
-
-@pytest.fixture
-async def rig(tmp_path: Path) -> AsyncIterator[Rig]:
-    rig = Rig(tmp_path)
-    try:
-        yield rig
-    finally:
-        await rig.close()
 
 
 class Trace:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import asyncio
 import math
 import signal
-from collections.abc import AsyncIterator
-from pathlib import Path
 from typing import Any
 
 import grpc
@@ -19,15 +17,6 @@ from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
 from mobility_rig import DRIVER, FRAME, NAVIGATOR_MISSION, Driver, Rig, denied, fence, flown, grant, outcomes, xy
 
 LOST = pb.ControlEvent.STATE_LOST
-
-
-@pytest.fixture
-async def rig(tmp_path: Path) -> AsyncIterator[Rig]:
-    rig = Rig(tmp_path)
-    try:
-        yield rig
-    finally:
-        await rig.close()
 
 
 async def flying(rig: Rig, *policies: dict[str, Any], speedup: float = 3.0, **changes: Any) -> Driver:

@@ -7,7 +7,6 @@ import contextlib
 import math
 import signal
 from collections.abc import AsyncIterator, Callable
-from pathlib import Path
 from typing import TypeVar
 
 import pytest
@@ -31,15 +30,6 @@ from mobility_rig import (
 )
 
 T = TypeVar("T")
-
-
-@pytest.fixture
-async def rig(tmp_path: Path) -> AsyncIterator[Rig]:
-    rig = Rig(tmp_path)
-    try:
-        yield rig
-    finally:
-        await rig.close()
 
 
 def endpoint(rig: Rig, identity: str = DRIVER) -> Endpoint:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import signal
-from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
@@ -19,15 +18,6 @@ from mcap.reader import make_reader
 from mcap.writer import MCAP0_MAGIC
 from mobility_rig import HOME, NODE, PASSENGER, Driver, Rig, altitude_limit, fence, grant, passenger_grant
 from pymavlink import mavutil
-
-
-@pytest.fixture
-async def rig(tmp_path: Path) -> AsyncIterator[Rig]:
-    rig = Rig(tmp_path)
-    try:
-        yield rig
-    finally:
-        await rig.close()
 
 
 def messages(directory: Path) -> dict[str, list[Any]]:

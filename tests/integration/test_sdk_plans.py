@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import math
-from collections.abc import AsyncIterator
 from pathlib import Path
 
 import fractus
@@ -16,15 +15,6 @@ from test_mobility_sdk import endpoint
 pytestmark = pytest.mark.timeout(300)
 
 MIDDLE, RADIUS_M, ALTITUDE_M = FRAME.latlon(30.0, 0.0), 20.0, 12.0
-
-
-@pytest.fixture
-async def rig(tmp_path: Path) -> AsyncIterator[Rig]:
-    rig = Rig(tmp_path)
-    try:
-        yield rig
-    finally:
-        await rig.close()
 
 
 def saved_plan(path: Path) -> Path:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import AsyncIterator, Callable
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -12,15 +12,6 @@ from fractus_storage.chain import verify
 from mobility_rig import Driver, Rig, grant, passenger_grant
 from test_camera import CAMERA, EDGE, capture, stub
 from test_mobility_lost import until_mode
-
-
-@pytest.fixture
-async def rig(tmp_path: Path) -> AsyncIterator[Rig]:
-    rig = Rig(tmp_path)
-    try:
-        yield rig
-    finally:
-        await rig.close()
 
 
 def opened(rig: Rig, name: str) -> set[str]:

@@ -16,7 +16,7 @@ from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Body, Key, Kind
 from fractus_operator.cluster.store import Conflict, KubeError, NotFound
-from fractus_operator.inventory.grouped import Made
+from fractus_operator.inventory.made import Made
 from fractus_operator.reconcile.builders import child
 from fractus_operator.reconcile.children import Children, NameTaken
 from fractus_operator.reconcile.finished_pods import FinishedPods

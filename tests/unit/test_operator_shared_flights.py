@@ -12,9 +12,9 @@ from fractus_core.api.plans import DeploymentPlanSpec, DroneChoice
 from fractus_core.control import OutcomeKind
 from fractus_core.planning import flight_of, plan
 from fractus_core.planning.flight import Flight
-from fractus_operator.cluster.pods import PodView
+from fractus_operator.cluster.pods import PlannedRequest, PodView
 from fractus_operator.cluster.reading import OwnedPlan, PartPool, read_submitted
-from fractus_operator.inventory.bookings import Bookings, corrections
+from fractus_operator.inventory.bookings import Bookings
 from fractus_operator.inventory.claims import Flown, claims
 from fractus_operator.reconcile.shared_flights import offered_flights, shared_flight_lost, shared_flight_outcome
 from test_planning import PATH, VIEWER, application, at, drone, inventory, manifest, navigator
@@ -146,7 +146,7 @@ def test_bookings_follow_pods_one_at_a_time() -> None:
         name = f"p{rng.randrange(20)}"
         new = pod(name, rng.choice([None, "a", "b"]), rng.choice([0.25, 0.5]), finished=rng.random() < 0.2)
         new = None if rng.random() < 0.2 else new
-        bookings.changed(pods.get(name), new)
+        bookings.pod_changed(pods.get(name), new)
         pods[name] = new
         for node in "ab":
             there = [p for p in pods.values() if p is not None and p.node == node and not p.finished]
@@ -154,14 +154,16 @@ def test_bookings_follow_pods_one_at_a_time() -> None:
 
 
 def test_what_is_planned_is_booked_once_and_own_pods_are_free() -> None:
-    pods = [pod("mine", "a", 1.0, app="me"), pod("theirs", "a", 2.0, app="them"), pod("bare", "a", 4.0)]
-    planned = [
-        (("ns", "me"), "mine-2", "b", {"cpu": 8.0}),
-        (("ns", "them"), "theirs", "a", {"cpu": 2.0}),
-        (("ns", "them"), "theirs-2", "a", {"cpu": 16.0}),
-    ]
-    assert corrections(planned, pods, ("ns", "me")) == {"a": {"cpu": 15.0}}
-    assert corrections(planned, pods, None) == {"a": {"cpu": 16.0}, "b": {"cpu": 8.0}}
+    bookings, mine = Bookings(), pod("mine", "a", 1.0, app="me")
+    for each in (mine, pod("theirs", "a", 2.0, app="them"), pod("bare", "a", 4.0)):
+        bookings.pod_changed(None, each)
+    bookings.planned(("ns", "me"), [PlannedRequest("mine-2", "b", {"cpu": 8.0})])
+    theirs = [PlannedRequest("theirs", "a", {"cpu": 2.0}), PlannedRequest("theirs-2", "a", {"cpu": 16.0})]
+    bookings.planned(("ns", "them"), theirs)
+    assert bookings.on("a", ("ns", "me"), [mine])["cpu"] == 2.0 + 4.0 + 16.0
+    assert bookings.on("b", ("ns", "me")).get("cpu", 0.0) == 0.0
+    assert bookings.on("a")["cpu"] == 1.0 + 2.0 + 4.0 + 16.0
+    assert bookings.on("b")["cpu"] == 8.0
 
 
 def test_a_flight_that_a_guest_was_planned_on_is_the_one_it_is_judged_by() -> None:

@@ -177,14 +177,14 @@ async def test_a_stored_plan_that_goes_wakes_those_who_wait_for_what_it_had(shar
         # What was decided is dropped before the watch shows that the object is gone, which still claims the drone until then.
         shared.forget(HOST)
         assert await waiting.changed(0)
-        assert "d" in shared.claims()
+        assert "d" in shared.fleet.claims()
         stored._drop(HOST)
         assert await waiting.changed(0)
-        assert "d" not in shared.claims()
+        assert "d" not in shared.fleet.claims()
 
 
 @pytest.mark.parametrize(("instances", "listens"), [(1, False), (2, True), ("*", True)])
-async def test_an_application_that_could_have_more_instances_hears_of_what_others_leave(
+async def test_an_application_that_could_have_more_instances_hears_of_room_alone(
     instances: int | str, listens: bool
 ) -> None:
     live = LiveInventory(cast(Store, None))
@@ -194,13 +194,41 @@ async def test_an_application_that_could_have_more_instances_hears_of_what_other
     submitted = read_submitted(body)
     live.applications.note(submitted.key, body)
     assert submitted.application is not None
-    stock = inventory([], [edge("e1", (0, 0))])
+    hosts = [host("e1", "edge"), host("e2", "edge", cpu=0.01)]
+    stock = inventory([], [edge("e1", (0, 0)), edge("e2", (0, 0))], hosts)
     with live.subscriptions.subscribe(submitted.key) as grows:
         for _new_plan_then_kept in range(2):
             seen = live.observe(submitted)
             applications._plan(submitted.application, seen, stock, _Memory())
             live.subscriptions.wake_waiting()
+            assert not await grows.changed(0)
+            live.subscriptions.wake_for_room("e2")
             assert await grows.changed(0) is listens
+
+
+async def test_a_plan_that_goes_before_its_pods_came_leaves_room() -> None:
+    live = LiveInventory(cast(Store, None))
+    spec = {"components": [component("Viewer", "edge", locations=[{"center": at(0, 0), "radius": 9}])]}
+    metadata = {"namespace": "ns", "name": "gone", "uid": "gone", "resourceVersion": "1"}
+    live.applications.note(("ns", "gone"), {**manifest("Application", "gone", spec), "metadata": metadata})
+    placement = {"component": "Viewer", "instance": "viewer-1", "node": "n", "placement": "edge", "role": "static"}
+    plan = DeploymentPlanSpec.model_validate({"application": "gone", "placements": [placement]})
+    with live.subscriptions.subscribe(("ns", "waits")) as waits:
+        live.subscriptions.placed(("ns", "waits"), placed=True, full={"n"})
+        live.plans.decide(("ns", "gone"), "gone", plan)
+        assert not await waits.changed(0)
+        live.plans.decide(("ns", "gone"), "gone", plan.model_copy(update={"placements": ()}))
+        assert await waits.changed(0)
+
+
+async def test_an_application_that_appears_wakes_no_other() -> None:
+    live = LiveInventory(cast(Store, None))
+    with live.subscriptions.subscribe(("ns", "waits")) as waits:
+        metadata = {"namespace": "ns", "name": "new", "uid": "new", "resourceVersion": "1"}
+        live.applications.note(("ns", "new"), APPLICATION | {"metadata": metadata})
+        assert not await waits.changed(0)
+        live.applications._drop(("ns", "new"))
+        assert await waits.changed(0)
 
 
 def test_objects_are_found_by_their_group_alone() -> None:
@@ -208,10 +236,11 @@ def test_objects_are_found_by_their_group_alone() -> None:
     grouped.put(("a", "x"), ("a", "1"), "old")
     grouped.put(("a", "x"), ("a", "1"), "one")
     grouped.put(("a", "y"), ("a", "2"), "two")
-    assert (list(grouped.of(("a", "x"))), list(grouped.values())) == (["one"], ["one", "two"])
+    assert (list(grouped.of(("a", "x"))), list(grouped.of(("a", "y")))) == (["one"], ["two"])
     grouped.drop(("a", "y"), ("a", "1"))
     grouped.drop(("a", "x"), ("a", "1"))
-    assert (list(grouped.of(("a", "x"))), list(grouped.values())) == ([], ["two"])
+    assert (list(grouped.of(("a", "x"))), list(grouped.of(("a", "y")))) == ([], ["two"])
+    assert list(grouped._groups) == [("a", "y")]
 
 
 def test_what_is_remembered_of_a_teardown_goes_with_the_application() -> None:

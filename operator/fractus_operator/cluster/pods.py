@@ -8,11 +8,12 @@ import types
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from typing import NamedTuple
 
 from fractus_core.planning.inventory import Host
 from fractus_core.planning.quantities import amount_of
 
-from fractus_operator.cluster.kinds import Body, Key
+from fractus_operator.cluster.kinds import Body
 from fractus_operator.cluster.labels import (
     APPLICATION_LABEL,
     COMPONENT_LABEL,
@@ -35,8 +36,12 @@ _ENDED = frozenset({"Succeeded", "Failed"})
 _KEPT_LABELS = (APPLICATION_LABEL, COMPONENT_LABEL, INSTANCE_LABEL, MANAGED_LABEL)
 
 
-PlannedRequest = tuple[Key, str, str, Mapping[str, float]]
-"""A planned instance: its application as labels name it, its name, its node, and what it asks of it."""
+class PlannedRequest(NamedTuple):
+    """A planned instance: its name, its node, and what it asks of it."""
+
+    instance: str
+    node: str
+    amounts: Mapping[str, float]
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import TypeVar
 
 from fractus_core.planning.inventory import Host
@@ -10,6 +11,7 @@ from fractus_core.planning.inventory import Host
 from fractus_operator.cluster.kinds import Key
 from fractus_operator.cluster.pods import PlannedRequest, PodView
 from fractus_operator.cluster.reading import Copies
+from fractus_operator.inventory.grouped import Grouped
 
 T = TypeVar("T")
 
@@ -17,23 +19,66 @@ Amounts = dict[str, float]
 
 
 class Bookings:
-    """What pods have asked for, by node; kept current one pod at a time."""
+    """What pods have asked for, and plans whose pods are yet to come, by node; kept current one pod and one plan at a time."""
 
     def __init__(self) -> None:
         self._booked: dict[str, Amounts] = {}
+        self._bound: Counter[tuple[str, str, str]] = Counter()
+        """Pods of applications by namespace, instance and node."""
+        self._planned: Grouped[Sequence[PlannedRequest]] = Grouped()
+        self._nodes: dict[Key, set[str]] = {}
 
-    def changed(self, old: PodView | None, new: PodView | None) -> None:
+    def pod_changed(self, old: PodView | None, new: PodView | None) -> None:
         """Follow a change of a pod."""
-        for pod, sign in ((old, -1.0), (new, 1.0)):
-            if pod is not None and pod.node is not None and not pod.finished:
-                add(self._booked.setdefault(pod.node, {}), pod.requests, sign)
+        for pod, change in ((old, -1), (new, 1)):
+            if pod is None or pod.node is None or pod.finished:
+                continue
+            add(self._booked.setdefault(pod.node, {}), pod.requests, change)
+            if pod.application is not None and pod.instance is not None:
+                slot = (pod.namespace, pod.instance, pod.node)
+                self._bound[slot] += change
+                if not self._bound[slot]:
+                    del self._bound[slot]
 
-    def on(self, node: str) -> Mapping[str, float]:
-        """What is booked on a node."""
-        return self._booked.get(node, {})
+    def planned(self, application: Key, requests: Sequence[PlannedRequest]) -> Collection[str]:
+        """Follow the plan in force of an application, by its key as labels spell it; returns the nodes that it leaves room on."""
+        before: dict[str, Sequence[PlannedRequest]] = {}
+        for node in self._nodes.pop(application, ()):
+            before[node] = self._planned.members(("", node))[application]
+            self._planned.drop(("", node), application)
+        by_node: dict[str, list[PlannedRequest]] = {}
+        for request in requests:
+            by_node.setdefault(request.node, []).append(request)
+        for node, there in by_node.items():
+            self._planned.put(("", node), application, there)
+        if by_node:
+            self._nodes[application] = set(by_node)
+        return [node for node, asked in before.items() if asked != by_node.get(node)]
+
+    def on(self, node: str, own: Key | None = None, pods: Iterable[PodView] = ()) -> Amounts:
+        """What is booked on a node for a plan of the application `own`.
+
+        Planned instances whose pods are not bound yet count as if they were; the application's own do not count.
+
+        Args:
+            node: Its name.
+            own: (namespace, application label) of who is planned.
+            pods: Its pods on the node.
+        """
+        extra: Amounts = {}
+        for pod in pods:
+            if not pod.finished:
+                add(extra, pod.requests, -1)
+        for application, requests in self._planned.members(("", node)).items():
+            for request in requests if application != own else ():
+                if (application[0], request.instance, node) not in self._bound:
+                    add(extra, request.amounts)
+        booked = {**self._booked.get(node, {})}
+        add(booked, extra)
+        return booked
 
 
-def add(total: Amounts, amounts: Mapping[str, float], sign: float = 1.0) -> None:
+def add(total: Amounts, amounts: Mapping[str, float], sign: int = 1) -> None:
     """Add amounts of resources to a total, or take them off."""
     for resource, amount in amounts.items():
         total[resource] = total.get(resource, 0.0) + sign * amount
@@ -44,14 +89,19 @@ class BookedHosts(Mapping[str, Host]):
 
     Args:
         hosts: Nodes.
-        bookings: What pods have asked for.
-        corrections: What is to be added to the bookings of a node.
+        bookings: What is booked on them.
+        own: (namespace, application label) of who is planned: what it has booked itself is free for it.
+        pods: Its pods.
     """
 
-    def __init__(self, hosts: Copies[Host], bookings: Bookings, corrections: Mapping[str, Amounts]) -> None:
+    def __init__(self, hosts: Copies[Host], bookings: Bookings, own: Key | None, pods: Iterable[PodView]) -> None:
         self._hosts = hosts
         self._bookings = bookings
-        self._corrections = corrections
+        self._own = own
+        self._pods: dict[str, list[PodView]] = {}
+        for pod in pods:
+            if pod.node is not None:
+                self._pods.setdefault(pod.node, []).append(pod)
 
     def __getitem__(self, name: str) -> Host:
         """The node of that name.
@@ -62,11 +112,7 @@ class BookedHosts(Mapping[str, Host]):
         host = self._hosts.get(("", name))
         if host is None:
             raise KeyError(name)
-        booked = self._bookings.on(name)
-        extra = self._corrections.get(name)
-        if extra is not None:
-            booked = {**booked}
-            add(booked, extra)
+        booked = self._bookings.on(name, self._own, self._pods.get(name, ()))
         return Host(host.name, host.labels, host.allocatable, booked, ready=host.ready, schedulable=host.schedulable)
 
     def __iter__(self) -> Iterator[str]:
@@ -106,28 +152,3 @@ class ByName(Mapping[str, T]):
     def __len__(self) -> int:
         """How many can be read."""
         return sum(value is not None for value in self._objects.values())
-
-
-def corrections(planned: Iterable[PlannedRequest], pods: Iterable[PodView], own: Key | None) -> dict[str, Amounts]:
-    """What to add to the bookings of nodes for a plan of the application `own`.
-
-    Planned instances whose pods are not bound yet count as if they were; the application's own pods do not count.
-
-    Args:
-        planned: Every planned instance on a node.
-        pods: The pods of applications.
-        own: (namespace, application label) of who is planned.
-    """
-    found: dict[str, Amounts] = {}
-    bound: set[tuple[str, str | None, str]] = set()
-    for pod in pods:
-        if pod.node is None or pod.finished:
-            continue
-        if pod.instance is not None:
-            bound.add((pod.namespace, pod.instance, pod.node))
-        if (pod.namespace, pod.application) == own:
-            add(found.setdefault(pod.node, {}), pod.requests, -1.0)
-    for key, instance, node, amounts in planned:
-        if key != own and (key[0], instance, node) not in bound:
-            add(found.setdefault(node, {}), amounts)
-    return found

@@ -11,6 +11,7 @@ from fractus_core.api.plans import DeploymentPlanSpec
 
 from fractus_operator.cluster.kinds import Key
 from fractus_operator.cluster.reading import Copies, OwnedPlan, Submitted
+from fractus_operator.inventory.grouped import Grouped
 
 _LATEST = datetime.max.replace(tzinfo=UTC)
 
@@ -83,8 +84,34 @@ def claims(plans: Mapping[Key, OwnedPlan], grants: Iterable[Grant]) -> dict[str,
     return found | {node: Claim(key, uid) for node, (_, _, key, uid) in first.items()}
 
 
+class HolderNames(Mapping[str, Key]):
+    """Who has each drone, as the application with the uid `asking` should see it. Good until the next change."""
+
+    def __init__(self, held: Mapping[str, Claim], asking: str | None) -> None:
+        self._held = held
+        self._asking = asking
+
+    def __getitem__(self, node: str) -> Key:
+        """Who has the drone.
+
+        Raises:
+            KeyError: no application has it.
+        """
+        return self._held[node].holder(self._asking)
+
+    def __iter__(self) -> Iterator[str]:
+        """Names of the drones that applications have."""
+        return iter(self._held)
+
+    def __len__(self) -> int:
+        """How many these are."""
+        return len(self._held)
+
+
 class Fleet:
     """The drones: which fly, and which application has each, also while they come home.
+
+    Kept current one plan, grant and drone at a time: who has a drone depends on the plans and grants for that drone alone.
 
     Args:
         drones: All Drones.
@@ -94,12 +121,41 @@ class Fleet:
     def __init__(self, drones: Copies[Drone | None], applications: Copies[Submitted]) -> None:
         self._drones = drones
         self._applications = applications
-        self._last_claims: dict[str, Claim] = {}
         self._in_flight: set[str] = set()
+        self._plans: Grouped[OwnedPlan] = Grouped()
+        self._grants: Grouped[Grant] = Grouped()
+        self._claims: dict[str, Claim] = {}
+        self._last_claims: dict[str, Claim] = {}
+        self._changed: set[str] = set()
+        """Drones whose claims have to be looked at again."""
 
-    def changed(self, drone: Drone) -> None:
-        """Follow a drone's flight state."""
-        (self._in_flight.add if drone.in_air else self._in_flight.discard)(drone.name)
+    def drone_changed(self, name: str, drone: Drone | None) -> None:
+        """Follow a drone's flight state; one whose object went while it flew still does, for all that is known."""
+        self._changed.add(name)
+        if drone is not None:
+            (self._in_flight.add if drone.in_air else self._in_flight.discard)(name)
+
+    def plan_changed(self, key: Key, old: OwnedPlan | None, new: OwnedPlan | None) -> None:
+        """Follow the plan in force of an application."""
+        for plan in (old, new):
+            if plan is not None and plan.spec.drone is not None:
+                node = plan.spec.drone.node
+                self._changed.add(node)
+                if plan is new:
+                    self._plans.put(("", node), key, plan)
+                else:
+                    self._plans.drop(("", node), key)
+
+    def grant_changed(self, key: Key, old: Grant | None, new: Grant | None) -> None:
+        """Follow a grant."""
+        for grant in (old, new):
+            if grant is not None:
+                node = grant.spec.node
+                self._changed.add(node)
+                if grant is new:
+                    self._grants.put(("", node), key, grant)
+                else:
+                    self._grants.drop(("", node), key)
 
     def is_in_flight(self, node: str) -> bool:
         """Whether a drone flies; one whose object went while it flew still does, for all that is known."""
@@ -111,26 +167,45 @@ class Fleet:
         drone = plan.drone.node if plan is not None and plan.drone is not None else None
         return drone if drone is not None and self.is_in_flight(drone) else None
 
-    def claims(self, plans: Mapping[Key, OwnedPlan], grants: Iterable[Grant]) -> dict[str, Claim]:
-        """Which application has which drone: from the plan on, until its grants are gone and the drone has come home."""
-        found = claims(plans, grants)
-        for drone in self._drones.values():
-            if drone is not None and drone.name not in found and drone.in_air:
-                last = self._last_claims.get(drone.name) or self._claim_on_record(drone.name)
-                found[drone.name] = replace(last, over=True)
-        self._last_claims.update(found)
-        return found
+    def on(self, node: str) -> list[Key]:
+        """The applications with a plan in force for a drone, also those that share its flight."""
+        return list(self._plans.members(("", node)))
 
-    def flown(self, plans: Mapping[Key, OwnedPlan], held: Mapping[str, Claim]) -> Iterator[Flown]:
+    def claims(self) -> Mapping[str, Claim]:
+        """Which application has which drone: from the plan on, until its grants are gone and the drone has come home.
+
+        Good until the next change.
+        """
+        while self._changed:
+            node = next(iter(self._changed))
+            claim = self._claim(node)
+            if claim is None:
+                self._claims.pop(node, None)
+            else:
+                self._claims[node] = self._last_claims[node] = claim
+            self._changed.discard(node)
+        return self._claims
+
+    def flown(self) -> Iterator[Flown]:
         """The applications that have a drone of their own, each by a plan in force."""
-        owners = {(claim.uid, node) for node, claim in held.items() if not claim.over}
-        for key, plan in plans.items():
-            submitted, choice = self._applications.get(key), plan.spec.drone
-            if choice is None or choice.shared_with is not None or (plan.uid, choice.node) not in owners:
+        for node, claim in self.claims().items():
+            plan, drone = self._plans.members(("", node)).get(claim.key), self._drones.get(("", node))
+            submitted = self._applications.get(claim.key)
+            if claim.over or plan is None or plan.uid != claim.uid or drone is None or submitted is None:
                 continue
-            drone = self._drones.get(("", choice.node))
-            if drone is not None and submitted is not None and submitted.application is not None:
+            if (
+                plan.spec.drone is not None
+                and plan.spec.drone.shared_with is None
+                and submitted.application is not None
+            ):
                 yield Flown(submitted.application, plan.spec, drone, drone.in_air)
+
+    def _claim(self, node: str) -> Claim | None:
+        found = claims(self._plans.members(("", node)), self._grants.of(("", node))).get(node)
+        drone = self._drones.get(("", node))
+        if found is not None or drone is None or not drone.in_air:
+            return found
+        return replace(self._last_claims.get(node) or self._claim_on_record(node), over=True)
 
     def _claim_on_record(self, drone: str) -> Claim:
         """The application that flew the drone last, from the applications' statuses: an operator that restarted has no other."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from fractus_core.api import DeploymentPlan, Depot, DirectLink, Drone, EdgeNode, Grant, Policy, Zone
@@ -14,12 +14,21 @@ from fractus_core.planning.locations import NodeLocations
 from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Body, Key, Kind
 from fractus_operator.cluster.labels import labelled
-from fractus_operator.cluster.pods import REFUSED, REPLICA_FAILURE, PodView, read_host, read_pod, refusal_of
+from fractus_operator.cluster.pods import (
+    REFUSED,
+    REPLICA_FAILURE,
+    PlannedRequest,
+    PodView,
+    read_host,
+    read_pod,
+    refusal_of,
+)
 from fractus_operator.cluster.reading import PartPool, Submitted, Unreadable, read_submitted, reader, tolerant_reader
 from fractus_operator.cluster.store import Reflector, Store
-from fractus_operator.inventory.bookings import BookedHosts, Bookings, ByName, corrections
-from fractus_operator.inventory.claims import Claim, Fleet
-from fractus_operator.inventory.grouped import Grouped, Made, application_of
+from fractus_operator.inventory.bookings import BookedHosts, Bookings, ByName
+from fractus_operator.inventory.claims import Fleet, HolderNames
+from fractus_operator.inventory.grouped import Grouped
+from fractus_operator.inventory.made import Made, application_of
 from fractus_operator.inventory.node_services import NodeServices, read_revision
 from fractus_operator.inventory.observed import Observed
 from fractus_operator.inventory.plans import Plans
@@ -58,17 +67,17 @@ class LiveInventory:
             for kind in kinds.CHILDREN
         }
         self.subscriptions = Subscriptions()
-        self.plans = Plans(self.applications, self.subscriptions.wake)
         self.fleet = Fleet(self.drones, self.applications)
+        self._bookings = Bookings()
+        self.plans = Plans(self.applications, self.subscriptions.wake, self.fleet, self._planned)
         self.torn_down: dict[Key, str] = {}
         """The uids of applications whose teardown has begun, until they are gone: nothing more is made for them."""
         self.rules_revision = 0
         """Counts the changes of what grants are compiled from: zones, policies, depots, and specs of nodes."""
         self._listeners: dict[Kind, list[Callable[[Key], None]]] = {}
         self._grants: Grouped[Grant] = Grouped()
-        self._holders: dict[Key, Key] = {}
+        self._known_grants: dict[Key, Grant] = {}
         self._areas = PartPool(parts=64)
-        self._bookings = Bookings()
         self._pods: Grouped[PodView] = Grouped()
         self._locations = NodeLocations()
 
@@ -113,7 +122,6 @@ class LiveInventory:
         key: Key,
         uid: str,
         flights: Mapping[str, Flight] | None = None,
-        held: Mapping[str, Claim] | None = None,
     ) -> Inventory:
         """The input of planning and of grants, as of now; good until something is awaited.
 
@@ -121,12 +129,10 @@ class LiveInventory:
             key: The application that asks: what its own pods have is free for it.
             uid: Its uid: claims under its name that are not its own show another holder.
             flights: What drones that are claimed fly, for an application that may share a flight.
-            held: The claims, if they are known already.
         """
-        held = self.claims() if held is None else held
-        booked = corrections(self.plans.requests(), self._pods.values(), labelled(key))
+        own = labelled(key)
         return Inventory(
-            hosts=BookedHosts(self.hosts, self._bookings, booked),
+            hosts=BookedHosts(self.hosts, self._bookings, own, self._pods.of(own)),
             drones=ByName(self.drones),
             edge_nodes=ByName(self.edge_nodes),
             depots=self.depots_by_name(),
@@ -134,7 +140,7 @@ class LiveInventory:
             policies={p.name: p for p in self.policies.values() if isinstance(p, Policy)},
             unreadable_zones={z.name: z.problem for z in self.zones.values() if isinstance(z, Unreadable)},
             unreadable_policies={p.name: p.problem for p in self.policies.values() if isinstance(p, Unreadable)},
-            claimed={node: claim.holder(uid) for node, claim in held.items()},
+            claimed=HolderNames(self.fleet.claims(), uid),
             flights=flights or {},
             locations=self._locations,
         )
@@ -146,10 +152,6 @@ class LiveInventory:
     def depots_by_name(self) -> Mapping[str, Depot]:
         """The depots."""
         return ByName(self.depots)
-
-    def claims(self) -> dict[str, Claim]:
-        """Which application has which drone."""
-        return self.fleet.claims(self.plans.in_force(), self._grants.values())
 
     def pods_of(self, key: Key, *, kept: bool = False) -> list[PodView]:
         """The pods of an application, or those of its last mission that are only kept for their logs."""
@@ -175,7 +177,7 @@ class LiveInventory:
         self.subscriptions.wake_all()
 
     def _pod_changed(self, key: Key, old: PodView | None, new: PodView | None) -> None:
-        self._bookings.changed(old, new)
+        self._bookings.pod_changed(old, new)
         self.services.pod_changed(key, old, new)
         for pod in (old, new):
             if pod is not None and pod.application is not None:
@@ -189,13 +191,12 @@ class LiveInventory:
             self.subscriptions.wake_for_room(held[0])
 
     def _drone_changed(self, key: Key, old: Drone | None, new: Drone | None) -> None:
+        self.fleet.drone_changed(key[1], new)
         self._report(kinds.DRONE, key)
         if new is None:
             self._locations.remove_drone(key[1])
-        else:
-            self.fleet.changed(new)
-            if old is None or (old.spec.depot, old.spec.home) != (new.spec.depot, new.spec.home):
-                self._locations.upsert_drone(new)
+        elif old is None or (old.spec.depot, old.spec.home) != (new.spec.depot, new.spec.home):
+            self._locations.upsert_drone(new)
         if _rules_differ(old, new):
             self._rules_changed()
         elif old is not None and new is not None and _planning_view(old) != _planning_view(new):
@@ -206,11 +207,14 @@ class LiveInventory:
         elif old is not None and new is not None and _flight_view(old) != _flight_view(new):
             self._wake_flyers(new.name)
 
+    def _planned(self, application: Key, requests: Sequence[PlannedRequest]) -> None:
+        for node in self._bookings.planned(application, requests):
+            self.subscriptions.wake_for_room(node)
+
     def _wake_flyers(self, drone: str) -> None:
         """Wake the applications on a drone, also those that share its flight."""
-        for application, plan in self.plans.in_force().items():
-            if plan.spec.drone is not None and plan.spec.drone.node == drone:
-                self.subscriptions.wake(application)
+        for application in self.fleet.on(drone):
+            self.subscriptions.wake(application)
 
     def _edge_node_changed(self, key: Key, old: EdgeNode | None, new: EdgeNode | None) -> None:
         self._report(kinds.EDGE_NODE, key)
@@ -243,13 +247,16 @@ class LiveInventory:
         self.subscriptions.wake_all(urgent=urgent)
 
     def _application_changed(self, key: Key, old: Submitted | None, new: Submitted | None) -> None:
+        self.plans.application_changed(key)
         self._report(kinds.APPLICATION, key)
         if new is None:
             self.plans.forget(key)
             self.torn_down.pop(key, None)
         if old is None or new is None or old.settled_generation != new.settled_generation:
-            self.subscriptions.wake_waiting()
             self.plans.wake_sharing(key)
+            # What is new leaves nothing to others.
+            if old is not None:
+                self.subscriptions.wake_waiting()
         self.subscriptions.wake(key)
 
     def _child_changed(self, key: Key, old: Body | None, new: Body | None) -> None:
@@ -266,14 +273,15 @@ class LiveInventory:
 
     def _grant_changed(self, key: Key, new: Body | None) -> None:
         grant = self._areas.grant(new) if new is not None else None
-        holder = self._holders.pop(key, None)
-        if holder is not None:
-            self._grants.drop(holder, key)
+        known = self._known_grants.pop(key, None)
+        if known is not None:
+            self._grants.drop(_holder(known), key)
+        if grant is not None:
+            self._known_grants[key] = grant
+            self._grants.put(_holder(grant), key, grant)
+        self.fleet.grant_changed(key, known, grant)
         if grant is None:
             self.subscriptions.wake_waiting()
-        else:
-            self._holders[key] = holder = grant.spec.application.namespace, grant.spec.application.name
-            self._grants.put(holder, key, grant)
         self._report(kinds.GRANT, key)
 
     def _report(self, kind: Kind, key: Key) -> None:
@@ -284,6 +292,10 @@ class LiveInventory:
 def _held(pod: PodView | None) -> tuple[str, Mapping[str, float]] | None:
     """The node that a pod takes room on, and how much; None while it takes none."""
     return (pod.node, pod.requests) if pod is not None and pod.node is not None and not pod.finished else None
+
+
+def _holder(grant: Grant) -> Key:
+    return grant.spec.application.namespace, grant.spec.application.name
 
 
 def _rules_differ(old: Drone | EdgeNode | None, new: Drone | EdgeNode | None) -> bool:

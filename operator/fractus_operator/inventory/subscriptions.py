@@ -66,7 +66,7 @@ class Subscriptions:
                 self._full.pop(label, None)
 
     def placed(self, key: Key, *, placed: bool, full: Collection[str] = frozenset()) -> None:
-        """Note whether an application has all that it could have: what others leave or take is nothing to it then.
+        """Note whether an application has a plan that suits it: of what others leave it wants nothing then but room.
 
         Args:
             key: The application.
@@ -85,7 +85,7 @@ class Subscriptions:
             subscription.wake()
 
     def wake_waiting(self) -> None:
-        """Wake every application that could have more than it has: another one left something that it may wait for."""
+        """Wake every application without a plan that suits it: another one left something that it may wait for."""
         for label in self._of.keys() - self._placed:
             for subscription in self._of[label]:
                 subscription.wake()

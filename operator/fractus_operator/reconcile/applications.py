@@ -36,7 +36,6 @@ from fractus_operator.reconcile.missions import mission_outcome
 from fractus_operator.reconcile.replanning import (
     choose_plan,
     flown_generation,
-    has_all,
     mission_changed,
     present_plan,
     stuck_nodes,
@@ -300,7 +299,7 @@ class Applications:
                 seen.key, application, present, rules=seen.rules, inventory=inventory, settings=settings
             )
         choice = choose_plan(application, present, inventory, settings, stuck=stuck, in_flight=seen.in_flight)
-        self._live.subscriptions.placed(seen.key, placed=has_all(application, choice), full=choice.full)
+        self._live.subscriptions.placed(seen.key, placed=choice.suits, full=choice.full)
         drone = choice.plan.drone
         if choice.plan is not seen.plan:
             self._live.plans.decide(seen.key, seen.uid, choice.plan)

@@ -23,7 +23,7 @@ from fractus_operator.cluster.labels import (
 )
 from fractus_operator.cluster.reading import read
 from fractus_operator.cluster.store import Conflict, ContentType, KubeError, NotFound, Store
-from fractus_operator.inventory.grouped import Made
+from fractus_operator.inventory.made import Made
 from fractus_operator.reconcile import builders
 from fractus_operator.reconcile.difference import contains, digest, is_current, stamped
 

@@ -24,17 +24,16 @@ def planning_input(live: LiveInventory, seen: Observed, radius_m: float) -> tupl
         it shared is over or leads elsewhere.
     """
     application, plan = seen.submitted.application, seen.plan
-    held = live.claims()
     flights: Mapping[str, Flight] = {}
     if may_share(application):
-        others = (f for f in live.fleet.flown(live.plans.in_force(), held) if f.application.key != seen.key)
+        others = (f for f in live.fleet.flown() if f.application.key != seen.key)
         flights = offered_flights(others, live.depots_by_name(), radius_m, plan)
-    inventory = live.snapshot(seen.key, seen.uid, flights, held)
+    inventory = live.snapshot(seen.key, seen.uid, flights)
     if plan is None or plan.drone is None:
         return inventory, None
     node = plan.drone.node
     if plan.drone.shared_with is None:
-        claim = held.get(node)
+        claim = live.fleet.claims().get(node)
         lost = claim is not None and claim.uid != seen.uid
         return inventory, ("DroneBusy", f"another application has {node}") if lost else None
     if application is None:

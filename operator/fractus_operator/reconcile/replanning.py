@@ -8,7 +8,7 @@ from datetime import datetime, timedelta
 
 from fractus_core.api import Application
 from fractus_core.api.plans import DeploymentPlanSpec
-from fractus_core.planning.growth import room_to_grow, with_too_few, without_room
+from fractus_core.planning.growth import room_to_grow, without_room
 from fractus_core.planning.inventory import Inventory, Settings
 from fractus_core.planning.plan import Infeasible, plan
 
@@ -36,6 +36,11 @@ class Choice:
     reason: str | None = None
     fits: bool = False
     full: frozenset[str] = frozenset()
+
+    @property
+    def suits(self) -> bool:
+        """Whether the plan is what the application asks for: of others it waits for nothing but room on the nodes that are full."""
+        return self.fits or self.reason is not None
 
 
 def choose_plan(
@@ -97,12 +102,6 @@ def _choose(
     if previous is not None and in_flight is not None:
         decided = _with_names_of(previous, decided)
     return Choice(decided, reason)
-
-
-def has_all(application: Application, choice: Choice) -> bool:
-    """Whether an application has all that it could have by the plan that was chosen: it waits for nothing of others."""
-    suits = choice.fits or choice.reason is not None
-    return suits and next(with_too_few(application, choice.plan), None) is None
 
 
 def mission_changed(application: Application | None, plan: DeploymentPlanSpec | None) -> bool:

@@ -136,7 +136,7 @@ class ServiceRollout:
         await self._report(said)
 
     def _observe(self) -> Iterable[ServicesOfNode]:
-        held, services = self._live.claims(), self._live.services
+        held, services = self._live.fleet.claims(), self._live.services
         for node in sorted(self._unsettled):
             pods = services.on(node)
             outdated = tuple(p for p in pods if not p.terminating and not services.is_current(p))

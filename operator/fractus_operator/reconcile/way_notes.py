@@ -128,6 +128,7 @@ def _frozen(inventory: Inventory, plan: DeploymentPlanSpec) -> Inventory:
         drones={node: drone} if drone is not None else {},
         edge_nodes={},
         depots=dict(inventory.depots.items()),
+        claimed={},
         flights={},
         locations=None,
     )

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import math
 from pathlib import Path
 
 import pytest
@@ -11,7 +13,7 @@ from fractus_core.control import Authority, StreamState
 from fractus_core.policy.values import TakeoffArgs
 from fractus_mavlink import Endpoint
 from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_COMPONENT, MAV_MODE_FLAG
-from fractus_services.errors import Refused
+from fractus_services.errors import AutopilotError, Refused
 from sky_drone import fly, ready, until
 
 
@@ -40,5 +42,38 @@ def test_a_driver_does_not_fly_what_others_have_armed(mode: COPTER_MODE, tmp_pat
             await asyncio.sleep(2.0)
             assert sky.truth.mode is mode
             assert sky.truth.body.down > -0.5
+
+    fly(work, tmp_path)
+
+
+def test_motors_whose_start_the_broken_link_did_not_confirm_are_the_drivers(tmp_path: Path) -> None:
+    """The autopilot obeys, the link is cut at that moment, and the heartbeat that shows running motors comes seconds later."""
+
+    async def work(sky: Sky, directory: Path) -> None:
+        async with ready(sky, directory) as (drone, grant):
+
+            def cut() -> None:
+                if sky.truth.armed and not cuts:
+                    cuts.append(sky.time())
+                    sky.severed_at = sky.time()
+                    sky.call_later(3.5, mend)
+
+            def mend() -> None:
+                sky.severed_at = math.inf
+
+            cuts: list[float] = []
+            sky.witnesses.append(cut)
+            arming = asyncio.ensure_future(drone.service.arm(grant, 0.0))
+            await until(lambda: arming.done() or (cuts and not sky.severed and drone.autopilot.vehicle.armed))
+            with contextlib.suppress(AutopilotError, Refused):
+                await arming
+            await until(lambda: drone.autopilot.vehicle.armed or not sky.truth.armed)
+            assert sky.truth.armed
+            await asyncio.sleep(1.0)
+            assert (drone.control.authority, drone.state) == (Authority.DRIVER, StreamState.GRANTED)
+            await drone.service.arm(grant, 60.0)
+            async for _ in drone.service.take_off(grant, TakeoffArgs(15.0)):
+                pass
+            assert sky.truth.body.down < -10.0
 
     fly(work, tmp_path)

@@ -31,6 +31,7 @@ from fractus_core.control.values import (
     VehicleFacts,
     ended_refusal,
 )
+from fractus_core.control.vehicles import UNCONFIRMED_S
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -494,6 +495,25 @@ def test_motors_that_were_asked_for_are_ours_whenever_they_are_seen() -> None:
     assert (state.authority, state.armed_by_others) == (Authority.DRIVER, False)
     others, _ = told_of(*ASKS, told.VehicleObserved(ARMED), told.Heartbeat())
     assert (others.authority, others.armed_by_others) == (Authority.PILOT, True)
+
+
+@pytest.mark.parametrize(
+    ("facts", "late_s", "unanswered", "authority"),
+    [
+        (ARMED, UNCONFIRMED_S - 0.1, True, Authority.DRIVER),
+        (ARMED, UNCONFIRMED_S + 0.1, True, Authority.PILOT),
+        (replace(ARMED, mode=LOITER), 1.0, True, Authority.PILOT),
+        (ARMED, 1.0, False, Authority.PILOT),
+    ],
+)
+def test_motors_that_show_after_a_start_without_answers_are_ours_for_a_while(
+    facts: VehicleFacts, late_s: float, unanswered: bool, authority: Authority
+) -> None:
+    start = told.MotorStart(begins=True), told.MotorStart(begins=False, unanswered=unanswered)
+    state, _ = told_of(*ASKS, *start, told.VehicleObserved(replace(facts, armed=False)), told.Heartbeat())
+    for event in (told.VehicleObserved(facts), told.Heartbeat()):
+        state, _ = transition(state, event, late_s)
+    assert (state.authority, state.armed_by_others) == (authority, authority is Authority.PILOT)
 
 
 def test_a_mode_change_whose_answers_were_lost_is_the_systems() -> None:

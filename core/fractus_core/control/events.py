@@ -252,9 +252,14 @@ class ArmingPrepared:
 
 @dataclass(frozen=True, slots=True)
 class MotorStart:
-    """Starting the motors begins, or is over."""
+    """Starting the motors begins, or is over.
+
+    Attributes:
+        unanswered: whether the autopilot was asked to and has not refused: only its answers may have been lost.
+    """
 
     begins: bool
+    unanswered: bool = False
 
 
 # The system

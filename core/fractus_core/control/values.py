@@ -259,6 +259,7 @@ class ControlState:
         failsafe_seen: whether a failsafe acted at the last heartbeat already.
         mode_changes: how many changes of mode by the system are under way.
         starting_motors: whether the system starts the motors at this moment.
+        start_unconfirmed_until: until when motors that run may do so for a start by the system whose answers were lost.
         preparing: how many attempts to arm are under way, from the fence that is raised first to running motors.
         unattended_since: when the armed vehicle was first found without authority over it.
         unattended: how many times the system took such a vehicle, since it had a driver or stood.
@@ -288,6 +289,7 @@ class ControlState:
     failsafe_seen: bool = False
     mode_changes: int = 0
     starting_motors: bool = False
+    start_unconfirmed_until: float = -math.inf
     preparing: int = 0
     unattended_since: float | None = None
     unattended: int = 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import assert_never
 
 from fractus_core.control.actions import SaveJournal, SetStreamRates, WakeWaiters
@@ -29,7 +30,8 @@ CUT_S = 4.0
 and cleared as soon as the companion is heard again. Nothing but the mode tells of it."""
 
 UNCONFIRMED_S = 10.0
-"""A mode that the system asked for may show this long after its answer was given up: only the answers may have been lost."""
+"""A mode, or motors, that the system asked for may show this long after the answer was given up: only the answers may have been
+lost."""
 
 FLEW_HOME_ALONE = "the autopilot flew home by itself while the mobility service was away"
 
@@ -70,8 +72,9 @@ def on_arming(step: Step, event: ArmingEvent) -> None:
             step.set(active=key)
         case ArmingPrepared(begins):
             step.set(preparing=max(step.state.preparing + (1 if begins else -1), 0))
-        case MotorStart(begins):
-            step.set(starting_motors=begins)
+        case MotorStart(begins, unanswered):
+            until = step.now + UNCONFIRMED_S if unanswered else -math.inf
+            step.set(starting_motors=begins, start_unconfirmed_until=until)
             if not begins and step.state.vehicle.armed and step.state.armed_seen is False:
                 # They run by the system's doing, whenever the heartbeat is looked at that shows it.
                 step.set(armed_seen=True, armed_by_others=False)
@@ -146,7 +149,10 @@ def _heartbeat(step: Step) -> None:
 
 def _armed(step: Step) -> None:
     # Nothing was prepared for a flight of others: neither failsafes nor fence, home or limits. A driver on the ground loses it, too.
-    step.set(armed_by_others=not step.state.starting_motors)
+    state = step.state
+    # In a mode of a pilot's they are a pilot's, whatever was asked for.
+    late = step.now < state.start_unconfirmed_until and state.vehicle.mode.commanded
+    step.set(armed_by_others=not (state.starting_motors or late), start_unconfirmed_until=-math.inf)
     if step.state.armed_by_others:
         step.give_to_pilot("armed the drone")
     step.act(SetStreamRates(flying=True))

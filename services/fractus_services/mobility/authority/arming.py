@@ -127,9 +127,11 @@ class Arming:
         """Start the motors; stop them again when anything fails before the drone flies."""
         autopilot, modes = self._control.autopilot, self._control.modes
         self._control.dispatch(MotorStart(begins=True))
+        unanswered = False
         try:
             await modes.enter_guided(permit)
             try:
+                unanswered = True
                 await autopilot.arm(permit)
                 deadline = autopilot.now + ARMING_TIMEOUT_S
                 while not autopilot.vehicle.armed:
@@ -139,12 +141,13 @@ class Arming:
                 await autopilot.set_home(*home)
                 await self._control.tasks.attempt(autopilot.ask_home)
                 permit()
-            except Exception:
+            except Exception as error:
+                unanswered = not (isinstance(error, AutopilotError) and error.refused)
                 if not autopilot.vehicle.in_air:
                     await self._control.tasks.attempt(autopilot.disarm)
                 raise
         finally:
-            self._control.dispatch(MotorStart(begins=False))
+            self._control.dispatch(MotorStart(begins=False, unanswered=unanswered))
 
     async def _prepare_ways_home(self, grant: ActiveGrant, home: tuple[float, float, float]) -> Checked:
         """Choose how the autopilot comes home by itself, raise its own fence around the mission, and learn how high it returns.

@@ -8,12 +8,15 @@ import math
 from pathlib import Path
 
 import pytest
+import virtual_time
 from closed_loop import Sky
 from fractus_core.control import Authority, StreamState
+from fractus_core.control.values import FlightMode
 from fractus_core.policy.values import TakeoffArgs
 from fractus_mavlink import Endpoint
 from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_COMPONENT, MAV_MODE_FLAG
 from fractus_services.errors import AutopilotError, Refused
+from mobility_world import GUIDED, RTL, World, spec
 from sky_drone import fly, ready, until
 
 
@@ -77,3 +80,26 @@ def test_motors_whose_start_the_broken_link_did_not_confirm_are_the_drivers(tmp_
             assert sky.truth.body.down < -10.0
 
     fly(work, tmp_path)
+
+
+@pytest.mark.parametrize("mode", [GUIDED, RTL])
+def test_what_others_have_armed_is_theirs_also_after_a_restart_of_the_service(mode: FlightMode, tmp_path: Path) -> None:
+    async def work() -> None:
+        async with World(tmp_path) as world:
+            world.grants.put(spec())
+            world.plane.vehicle.armed = True
+            world.observer.heartbeat()
+            assert world.control.authority is Authority.PILOT
+        world.plane.height = 20.0
+        world.plane.set_to(mode)
+        async with World(tmp_path, after=world, known=False) as again:
+            world.plane.commands.clear()
+            again.observer.found()
+            assert (again.control.authority, again.control.state.armed_by_others) == (Authority.PILOT, True)
+            await again.plane.update(5.0)
+            assert MAV_CMD.DO_SET_MODE not in again.plane.commands
+            again.plane.vehicle.armed = False
+            again.observer.heartbeat()
+            assert (again.control.authority, again.journal.record.armed_by_others) == (Authority.SYSTEM, False)
+
+    virtual_time.fly(work)

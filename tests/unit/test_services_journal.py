@@ -83,6 +83,14 @@ async def test_what_a_newer_release_wrote_is_left_out(tmp_path: Path) -> None:
     assert Journal(tmp_path).record.missions["k"].points_done == 2
 
 
+async def test_who_armed_is_kept(tmp_path: Path) -> None:
+    journal = Journal(tmp_path)
+    await journal.save(replace(record(), armed_by_others=True))
+    assert Journal(tmp_path).record.armed_by_others
+    await journal.save(record())
+    assert not Journal(tmp_path).record.armed_by_others
+
+
 async def test_a_disk_that_fails_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     journal = await kept(tmp_path)
     with monkeypatch.context() as broken:

@@ -33,6 +33,7 @@ UNCONFIRMED_S = 10.0
 """A mode, or motors, that the system asked for may show this long after the answer was given up: only the answers may have been
 lost."""
 
+ARMED_BY_OTHERS = "armed the drone"
 FLEW_HOME_ALONE = "the autopilot flew home by itself while the mobility service was away"
 
 
@@ -95,8 +96,12 @@ def _found(step: Step) -> None:
     if vehicle.armed and step.state.authority is Authority.PILOT:
         return
     if not vehicle.armed:
+        step.set(armed_by_others=False)
         if mission is not None and mission.flown and mission.outcome is None:
             step.begin_grace(mission, DRIVER_LOST)
+        return
+    if step.state.armed_by_others:
+        step.give_to_pilot(ARMED_BY_OTHERS)
         return
     commanded, comes_down = vehicle.mode.commanded, vehicle.mode.comes_down
     if vehicle.mode.kind is ModeKind.BRAKING and vehicle.failsafe:
@@ -154,7 +159,8 @@ def _armed(step: Step) -> None:
     late = step.now < state.start_unconfirmed_until and state.vehicle.mode.commanded
     step.set(armed_by_others=not (state.starting_motors or late), start_unconfirmed_until=-math.inf)
     if step.state.armed_by_others:
-        step.give_to_pilot("armed the drone")
+        step.give_to_pilot(ARMED_BY_OTHERS)
+        step.act(SaveJournal())
     step.act(SetStreamRates(flying=True))
 
 
@@ -162,7 +168,7 @@ def _disarmed(step: Step) -> None:
     """The motors stopped; a driver that has the vehicle keeps it."""
     mission = step.state.mission
     step.stop_task()
-    step.set(returning=False, unattended=0)
+    step.set(returning=False, unattended=0, armed_by_others=False)
     if step.state.authority is Authority.PILOT and mission is not None and mission.flown:
         mission = step.end_mission(mission, OutcomeKind.FAILED, "a human pilot took the drone and landed it")
     if not step.state.granted:

@@ -33,7 +33,7 @@ from fractus_core.policy.values import Verdict
 from fractus_storage.audit import AuditLog
 
 from fractus_services.grants import ActiveGrant, GrantFiles
-from fractus_services.mobility.authority.journal import Journal, Record
+from fractus_services.mobility.authority.journal import Journal, record_of
 from fractus_services.mobility.authority.leases import FlightConstraints, Lease, Motion
 from fractus_services.mobility.authority.machine import Machine
 from fractus_services.mobility.authority.performer import ModeCommands, Performer
@@ -57,7 +57,7 @@ class Control:
         grants: grants of this node.
         audit: where takeovers are written.
         grace_s: how long a lost driver may take to come back.
-        state: to begin with; by default the missions that the journal remembers, and nothing else.
+        state: to begin with; by default what the journal remembers, and nothing else.
 
     Attributes:
         leases: streams of drivers by lease, while they are open.
@@ -90,6 +90,7 @@ class Control:
             grace_s=grace_s,
             missions=journal.record.missions,
             active=journal.record.active,
+            armed_by_others=journal.record.armed_by_others,
             grants=frozenset(grant.key for grant in grants.active.values()),
         )
         self._constraints: FlightConstraints | None = None
@@ -199,7 +200,7 @@ class Control:
 
     async def save(self, timeout_s: float | None = None) -> str:
         """Write the missions to disk; why that failed, or nothing."""
-        await self._journal.save(Record(self._machine.known.missions, self._machine.known.active), timeout_s)
+        await self._journal.save(record_of(self._machine.known), timeout_s)
         return self._journal.failure
 
     # The system flies for an application

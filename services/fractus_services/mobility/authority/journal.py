@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from fractus_core.control import Mission, Outcome, OutcomeKind
+from fractus_core.control import ControlState, Mission, Outcome, OutcomeKind
 from fractus_storage import remove_temporary, write_file
 
 log = logging.getLogger(__name__)
@@ -25,10 +25,12 @@ class Record:
     Attributes:
         missions: by key, the oldest first.
         active: key of the mission that the drone is armed or in the air for.
+        armed_by_others: whether others started the motors that run.
     """
 
     missions: Mapping[str, Mission] = field(default_factory=dict)
     active: str | None = None
+    armed_by_others: bool = False
 
 
 def _outcome(stored: Any) -> Outcome:
@@ -69,7 +71,14 @@ def _read(path: Path) -> Record:
         stored = json.loads(path.read_bytes())
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
-    return Record({m["key"]: _mission(m) for m in stored["missions"]}, stored["active"])
+    missions = {m["key"]: _mission(m) for m in stored["missions"]}
+    # Earlier releases did not tell who had armed.
+    return Record(missions, stored["active"], bool(stored.get("armed_by_others", False)))
+
+
+def record_of(state: ControlState) -> Record:
+    """What is to be remembered of control."""
+    return Record(state.missions, state.active, state.armed_by_others)
 
 
 class Journal:
@@ -138,6 +147,7 @@ class Journal:
             self._queued = None
             missions = [_stored(mission) for mission in self.record.missions.values()]
             stored = {"version": 2, "active": self.record.active, "missions": missions}
+            stored["armed_by_others"] = self.record.armed_by_others
             try:
                 await asyncio.to_thread(self._write, json.dumps(stored, indent=1).encode())
             except OSError as error:

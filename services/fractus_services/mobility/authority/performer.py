@@ -30,7 +30,7 @@ from fractus_storage.audit import AuditLog
 
 from fractus_services.background import Background
 from fractus_services.errors import Aborted, AutopilotError, PreconditionFailed, Refused, Unavailable
-from fractus_services.mobility.authority.journal import Journal, Record
+from fractus_services.mobility.authority.journal import Journal, record_of
 from fractus_services.mobility.authority.leases import Lease, Motion
 from fractus_services.mobility.autopilot import Approach, Autopilot, Permit
 
@@ -139,7 +139,7 @@ class Performer:
             case RecordAudit():
                 self._record(action)
             case SaveJournal():
-                self._journal.save_soon(Record(self._machine.state.missions, self._machine.state.active))
+                self._journal.save_soon(record_of(self._machine.state))
             case WakeWaiters():
                 self.wake()
             case SetStreamRates(flying):

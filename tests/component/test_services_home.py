@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fractus_core.control import Authority
 from fractus_core.policy.values import GotoArgs
-from fractus_mavlink.enums import MAV_CMD
+from fractus_mavlink import message
+from fractus_mavlink.enums import COPTER_MODE, MAV_AUTOPILOT, MAV_CMD, MAV_MODE_FLAG, MAV_TYPE
 from fractus_services.errors import Unavailable
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority import drivers
@@ -170,5 +172,58 @@ def test_no_picture_is_judged_by_a_height_above_a_home_that_was_moved_while_a_pi
             move(world, (3.0, 0.0, 0.5))
             await asyncio.sleep(1.0)
             assert located(world.control)
+
+    fly(flight)
+
+
+def heartbeat(world: World, *, armed: bool) -> None:
+    """As the vehicle sends it in a pilot's mode."""
+    world.plane.take(
+        message(
+            "HEARTBEAT", type=MAV_TYPE.QUADROTOR, autopilot=MAV_AUTOPILOT.ARDUPILOTMEGA, custom_mode=COPTER_MODE.LOITER,
+            base_mode=MAV_MODE_FLAG.SAFETY_ARMED if armed else 0,
+        )
+    )  # fmt: skip
+    world.observer.heartbeat()
+
+
+def test_heights_count_from_where_a_pilot_armed_also_when_the_first_home_was_lost(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            plane = world.plane
+            move(world, (0.0, 0.0, 0.0))
+            plane.xy[:] = [0.0, 50.0]
+            heartbeat(world, armed=True)
+            plane.goal, plane.goal_height = (0.0, 50.0), 60.0
+            await world.until(lambda: plane.vehicle.in_air)
+            assert not located(world.control), "home was not told since it armed"
+            move(world, (0.0, 50.0, 0.0))
+            await world.until(lambda: plane.vehicle.altitude_m > 20)
+            assert located(world.control)
+            move(world, (0.0, 50.0, 60.0))
+            await asyncio.sleep(1.0)
+            assert not located(world.control)
+
+    fly(flight)
+
+
+def test_a_pilots_flight_from_where_a_mission_landed_counts_from_there(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world, flying(world) as grant:
+            plane = world.plane
+            await end(world.service.goto(grant, GotoArgs(*at(0, 50), 12.0), 0))
+            await end(world.service.land(grant))
+            await world.until(lambda: not plane.vehicle.armed)
+            heartbeat(world, armed=False)
+            heartbeat(world, armed=True)
+            move(world, (0.0, 50.0, 0.0))
+            assert (world.control.authority, world.control.state.armed_by_others) == (Authority.PILOT, True)
+            plane.goal, plane.goal_height = (0.0, 50.0), 20.0
+            await world.until(lambda: plane.vehicle.altitude_m > 10)
+            assert world.control.state.mission is not None
+            assert located(world.control), "the mission's home is not this flight's"
+            move(world, (0.0, 0.0, 0.0))
+            await asyncio.sleep(1.0)
+            assert not located(world.control)
 
     fly(flight)

@@ -60,7 +60,7 @@ class VehicleState:
         yaw_deg: heading as the position says it; `heading_deg` is the attitude's.
         gimbal: how it turns the camera, yaw from true north, as measured; its time is that of the older of two measurements,
             for its yaw counts from the nose.
-        ground_home: home as it was told last while the vehicle did not fly.
+        ground_home: home as it was told last while the vehicle did not fly, or first after it was armed; None until then.
         ready: whether its checks before arming pass, in the mode in which it is.
         checks_at: when it told that.
         estimated: whether its estimator has an absolute position, and predicts one.

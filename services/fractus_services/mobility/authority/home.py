@@ -32,12 +32,17 @@ def home_moved(state: ControlState, vehicle: VehicleState) -> bool:
 
 
 def heights_mislead(state: ControlState, vehicle: VehicleState) -> bool:
-    """Whether home is not where the flight began, also where a pilot moved it: altitudes do not count from the ground then."""
+    """Whether home is not where the flight began, also where a pilot moved it: altitudes do not count from the ground then.
+
+    So it is with a home that was not told since the vehicle was armed.
+    """
     home, mission, ground = vehicle.home, state.mission, vehicle.ground_home
+    if home is None or not vehicle.in_air:
+        return False
     began = mission.home if mission is not None and not state.armed_by_others else None
     if began is None and ground is not None:
         began = ground.lat, ground.lon, ground.amsl_m
-    return home is not None and began is not None and vehicle.in_air and _apart(home, began)
+    return began is None or _apart(home, began)
 
 
 def _apart(home: Home, began: tuple[float, float, float]) -> bool:

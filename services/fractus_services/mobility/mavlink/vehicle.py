@@ -58,7 +58,11 @@ def _heartbeat(vehicle: Vehicle, message: Message, now: float) -> None:
     vehicle.heartbeat_at = now
     vehicle.foreign = vehicle.stack.foreign(message.integer("type"), message.integer("autopilot"))
     vehicle.mode = vehicle.stack.mode(message.integer("custom_mode"))
-    vehicle.armed = bool(message.integer("base_mode") & MAV_MODE_FLAG.SAFETY_ARMED)
+    armed = bool(message.integer("base_mode") & MAV_MODE_FLAG.SAFETY_ARMED)
+    if armed and not vehicle.armed:
+        # Arming moves home to where the vehicle stands; what it told before says nothing of this flight.
+        vehicle.ground_home = None
+    vehicle.armed = armed
     vehicle.path_lost = vehicle.path_lost and vehicle.armed
     vehicle.failsafe = message.integer("system_status") in {MAV_STATE.CRITICAL, MAV_STATE.EMERGENCY}
 
@@ -121,7 +125,8 @@ def _home(vehicle: Vehicle, message: Message, _now: float) -> None:
     if lat == 0.0 and lon == 0.0:
         return  # as of the position: home is not set
     vehicle.home = Home(lat, lon, message.integer("altitude") / 1e3)
-    if not vehicle.in_air:
+    # The first one after arming may have been lost: the next then counts, wherever the vehicle is by now.
+    if not vehicle.in_air or vehicle.ground_home is None:
         vehicle.ground_home = vehicle.home
 
 

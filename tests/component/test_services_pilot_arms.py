@@ -59,9 +59,9 @@ def test_motors_whose_start_the_broken_link_did_not_confirm_are_the_drivers(tmp_
                 if sky.truth.armed and not cuts:
                     cuts.append(sky.time())
                     sky.severed_at = sky.time()
-                    sky.call_later(3.5, mend)
+                    sky.call_later(3.5, repair)
 
-            def mend() -> None:
+            def repair() -> None:
                 sky.severed_at = math.inf
 
             cuts: list[float] = []

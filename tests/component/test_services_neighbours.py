@@ -7,24 +7,31 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from closed_loop import Sky, Wire
+from closed_loop import Account, Drone, Sky, Wire
 from fractus_core.control import StreamState
 from fractus_core.policy.values import TakeoffArgs
 from fractus_mavlink import Endpoint, Parser
-from fractus_mavlink.enums import COPTER_MODE, MAV_AUTOPILOT, MAV_CMD, MAV_COMPONENT, MAV_STATE, MAV_TYPE
+from fractus_mavlink.enums import COPTER_MODE, MAV_AUTOPILOT, MAV_CMD, MAV_COMPONENT, MAV_MODE_FLAG, MAV_STATE, MAV_TYPE
 from fractus_services.errors import Refused
+from fractus_services.mobility.authority.readiness import arming_problem
+from fractus_services.mobility.mavlink.neighbours import SURE_S, Memory
 from mobility_world import end, goto
 from sky_drone import fly, ready, until
 
 
-def heartbeat(sysid: int, compid: int, kind: MAV_TYPE, autopilot: MAV_AUTOPILOT) -> bytes:
-    values = {"type": kind, "autopilot": autopilot, "system_status": MAV_STATE.STANDBY, "mavlink_version": 3}
+def heartbeat(sysid: int, compid: int, kind: MAV_TYPE, autopilot: MAV_AUTOPILOT, **more: int) -> bytes:
+    values = {"type": kind, "autopilot": autopilot, "system_status": MAV_STATE.STANDBY, "mavlink_version": 3, **more}
     return Endpoint(sysid, compid).encode("HEARTBEAT", values)
 
 
 GIMBAL = heartbeat(1, MAV_COMPONENT.GIMBAL, MAV_TYPE.GIMBAL, MAV_AUTOPILOT.GENERIC)
 TRACKER = heartbeat(9, MAV_COMPONENT.AUTOPILOT1, MAV_TYPE.ANTENNA_TRACKER, MAV_AUTOPILOT.ARDUPILOTMEGA)
 OTHER = heartbeat(2, MAV_COMPONENT.AUTOPILOT1, MAV_TYPE.QUADROTOR, MAV_AUTOPILOT.ARDUPILOTMEGA)
+
+FLYING = heartbeat(
+    2, MAV_COMPONENT.AUTOPILOT1, MAV_TYPE.QUADROTOR, MAV_AUTOPILOT.ARDUPILOTMEGA,
+    base_mode=MAV_MODE_FLAG.SAFETY_ARMED | MAV_MODE_FLAG.CUSTOM_MODE_ENABLED, custom_mode=COPTER_MODE.GUIDED,
+)  # fmt: skip
 
 
 def heard_first(sky: Sky, *frames: bytes) -> None:
@@ -110,5 +117,69 @@ def test_what_another_station_is_answered_acknowledges_no_command_of_ours(tmp_pa
             wire.write = lose_the_first  # type: ignore[method-assign]
             await drone.autopilot.command(MAV_CMD.SET_MESSAGE_INTERVAL, 147.0, 2e6)
             assert arrived == [2e6, 2e6]
+
+    fly(work, tmp_path)
+
+
+def told_to(sky: Sky, system: int) -> list[str]:
+    """Messages to a system, as they are sent from now on."""
+    found: list[str] = []
+    connect = sky.create_connection
+
+    async def create_connection(*args: Any, **kwargs: Any) -> Any:
+        wire, protocol = await connect(*args, **kwargs)
+        write, parser = wire.write, Parser()
+
+        def noted(data: Any) -> None:
+            found.extend(sent.name for sent in parser.feed(bytes(data)) if sent.values.get("target_system") == system)
+            write(data)
+
+        wire.write = noted
+        return wire, protocol
+
+    sky.create_connection = create_connection  # type: ignore[method-assign]
+    return found
+
+
+@pytest.mark.parametrize("stranger", [OTHER, FLYING], ids=["standing", "flying"])
+def test_a_service_that_starts_again_leaves_a_stranger_alone_and_finds_its_own(stranger: bytes, tmp_path: Path) -> None:
+    async def work(sky: Sky, directory: Path) -> None:
+        turning = asyncio.ensure_future(sky.turn())
+
+        def started() -> Drone:
+            return Drone(directory, Account(0), memory=Memory(directory / "vehicle.json", "tcp:vehicle:1"))
+
+        first = started()
+        await until(lambda: first.autopilot.connected)
+        await asyncio.sleep(SURE_S + 2.0)
+        await first.close()
+        for wire in sky.wires:
+            wire.close()
+        heard_first(sky, stranger)
+        told = told_to(sky, 2)
+        again = started()
+        await until(lambda: again.autopilot.connected)
+        assert again.autopilot.target == (1, 1)
+        await asyncio.sleep(5.0)
+        assert not told
+        await again.close()
+        turning.cancel()
+
+    fly(work, tmp_path)
+
+
+def test_a_stranger_on_a_new_link_is_neither_prepared_nor_brought_home(tmp_path: Path) -> None:
+    async def work(sky: Sky, directory: Path) -> None:
+        sky.craft.receive = lambda *_: None  # type: ignore[method-assign]
+        told = told_to(sky, 2)
+        drone = Drone(directory, Account(0), memory=Memory(directory / "vehicle.json", "tcp:vehicle:1"))
+        for _ in range(20):
+            for wire in sky.wires:
+                wire._protocol.data_received(FLYING)
+            await asyncio.sleep(1.0)
+        assert not told
+        assert not drone.autopilot.found
+        assert "unknown vehicle with running motors is heard (MAVLink system 2)" in arming_problem(drone.control)
+        await drone.close()
 
     fly(work, tmp_path)

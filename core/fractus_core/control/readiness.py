@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 from fractus_core.control.values import Authority, ControlState
 
+NOT_CONNECTED = "the autopilot is not connected"
+
 
 @dataclass(frozen=True, slots=True)
 class Readiness:
@@ -16,19 +18,21 @@ class Readiness:
         unready: why the autopilot would not arm; empty when it would.
         located: whether position and home are known.
         link: what is wrong with the link to the autopilot; empty when nothing is.
+        absent: why what is heard is not the autopilot, while that is not connected; empty when nothing is heard.
     """
 
     unverified: str
     unready: str
     located: bool
     link: str = ""
+    absent: str = ""
 
 
 def not_ready_reason(state: ControlState, key: str, readiness: Readiness) -> str | None:
     """Why the vehicle cannot fly for a mission now; None when it can."""
     vehicle = state.vehicle
     reasons = (
-        (not vehicle.connected, "the autopilot is not connected"),
+        (not vehicle.connected, readiness.absent or NOT_CONNECTED),
         (not state.decided, "it is not known yet what the drone does"),
         (state.taken(key), "another application has the drone"),
         (bool(readiness.unverified), f"the autopilot's failsafes are not verified: {readiness.unverified}"),

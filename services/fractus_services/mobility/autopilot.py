@@ -69,7 +69,7 @@ class VehicleState:
         satellites: that the receiver sees; None until it has told.
         wind_at: when the autopilot told of the wind.
         reports: number, MAV_SEVERITY and text of what the autopilot said of late.
-        unclear: why it is not certain that this is the drone's own; empty when it is.
+        unclear: why it is not certain which vehicle on the link is the drone's own; empty when it is.
         silent_s: how long before its last heartbeat came the one before that.
         located: whether GPS has a three-dimensional fix of some accuracy; positions without one are not taken.
     """

@@ -23,6 +23,7 @@ from fractus_services.errors import AutopilotError
 from fractus_services.mobility.autopilot import COURSE_S, Permit, always
 from fractus_services.mobility.mavlink.flight_stack import FlightStack
 from fractus_services.mobility.mavlink.link import SYSTEM_ID, Link, ignore
+from fractus_services.mobility.mavlink.neighbours import Memory
 from fractus_services.mobility.mavlink.orders import Orders, Velocity, moves
 from fractus_services.mobility.mavlink.parameters import Parameters
 from fractus_services.mobility.mavlink.pointing import point
@@ -58,7 +59,7 @@ class MavlinkAutopilot(Link):
     Args:
         url: the link, see `open_link`.
         stack: the vehicle's firmware.
-        alive, on_found, on_heartbeat, sysid, received, sent: see `Link`.
+        alive, on_found, on_heartbeat, sysid, memory, received, sent: see `Link`.
         on_parameter: called with the name of a parameter that someone else changed.
 
     Attributes:
@@ -76,6 +77,7 @@ class MavlinkAutopilot(Link):
         on_heartbeat: Callable[[], None] = lambda: None,
         on_parameter: Callable[[str], None] = lambda _name: None,
         sysid: int = SYSTEM_ID,
+        memory: Memory | None = None,
         received: Callable[[bytes], None] = ignore,
         sent: Callable[[bytes], None] = ignore,
     ) -> None:
@@ -86,6 +88,7 @@ class MavlinkAutopilot(Link):
             on_found=on_found,
             on_heartbeat=on_heartbeat,
             sysid=sysid,
+            memory=memory,
             received=received,
             sent=sent,
         )
@@ -119,6 +122,7 @@ class MavlinkAutopilot(Link):
 
     def _lost(self) -> None:
         self.vehicle.gimbal_measured = self.vehicle.gimbal_limits = None
+        self.vehicle.unclear = ""
         self._streams.forget()
         self.vehicle_parameters.forget()
 

@@ -15,7 +15,7 @@ from fractus_mavlink.enums import MAV_AUTOPILOT, MAV_COMPONENT, MAV_STATE, MAV_T
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.mavlink.flight_stack import FlightStack
 from fractus_services.mobility.mavlink.listeners import Listeners
-from fractus_services.mobility.mavlink.neighbours import Neighbours, Source
+from fractus_services.mobility.mavlink.neighbours import Memory, Neighbours, Source
 from fractus_services.mobility.mavlink.timing import PROBE_S, Timing
 from fractus_services.mobility.mavlink.transport import BadUrl, Transport, open_link
 from fractus_services.mobility.mavlink.vehicle import Vehicle
@@ -48,6 +48,7 @@ class Link:
         on_found: called when the vehicle is heard first, again after each reconnection.
         on_heartbeat: called for every heartbeat after the state took it.
         sysid: the system that speaks at this end.
+        memory: keeps which vehicle is the drone's own; without it the one that is heard first is.
         received: takes a copy of all bytes that come; returns at once and raises nothing, and so does the next.
         sent: takes a copy of each frame that goes.
 
@@ -66,6 +67,7 @@ class Link:
         on_found: Callable[[], None] = lambda: None,
         on_heartbeat: Callable[[], None] = lambda: None,
         sysid: int = SYSTEM_ID,
+        memory: Memory | None = None,
         received: Callable[[bytes], None] = ignore,
         sent: Callable[[bytes], None] = ignore,
     ) -> None:
@@ -73,15 +75,13 @@ class Link:
         self.url = url
         self._sysid = sysid
         self.stack = stack
-        self._alive = alive
-        self._on_found = on_found
-        self._on_heartbeat = on_heartbeat
+        self._alive, self._on_found, self._on_heartbeat = alive, on_found, on_heartbeat
         self.vehicle = Vehicle(stack=stack)
         self.timing = Timing()
         self._endpoint = Endpoint(sysid, COMPONENT_ID)
         self._transport: Transport | None = None
         self.target: Source | None = None
-        self._neighbours = Neighbours()
+        self._neighbours = Neighbours(memory)
         self._broken = asyncio.Event()
         self._updated = asyncio.Event()
         self._listeners = Listeners(sysid)

@@ -2,21 +2,35 @@
 
 from __future__ import annotations
 
+import asyncio
+import json
 import logging
 import math
+from pathlib import Path
 
 from fractus_mavlink import Message
-from fractus_mavlink.enums import MAV_AUTOPILOT, MAV_COMPONENT, MAV_TYPE
+from fractus_mavlink.enums import MAV_AUTOPILOT, MAV_COMPONENT, MAV_MODE_FLAG, MAV_TYPE
+from fractus_storage import write_file
 
 log = logging.getLogger(__name__)
 
 GONE_S = 10.0
 """A vehicle that has not been heard for so long is not on the link any more."""
 
-MAX_FLIGHT_S = 3600.0
-"""A vehicle that flew when it was heard last, and has not been for so long, is down: another one may have its place."""
+CHOICE_S = 3.0
+"""A vehicle that no one knows is heard alone for so long before it is taken for the drone's own: three heartbeats of another one."""
+
+SURE_S = 10.0
+"""One that has been alone for so long after that is the drone's own."""
 
 _NO_VEHICLES = frozenset({MAV_TYPE.ANTENNA_TRACKER, MAV_TYPE.GCS})
+_VEHICLES = frozenset(
+    {
+        MAV_TYPE.FIXED_WING, MAV_TYPE.QUADROTOR, MAV_TYPE.COAXIAL, MAV_TYPE.HELICOPTER, MAV_TYPE.GROUND_ROVER, MAV_TYPE.HEXAROTOR,
+        MAV_TYPE.OCTOROTOR, MAV_TYPE.TRICOPTER, MAV_TYPE.DODECAROTOR, MAV_TYPE.DECAROTOR, MAV_TYPE.GENERIC_MULTIROTOR,
+    }
+)  # fmt: skip
+"""What no camera or gimbal says that it is."""
 
 Source = tuple[int, int]
 """System and component of a sender."""
@@ -27,24 +41,68 @@ def tells_vehicle(message: Message) -> bool:
 
     Components beside it should say that they have no autopilot, and some do not.
     """
+    return _tells_autopilot(message) and message.compid == MAV_COMPONENT.AUTOPILOT1
+
+
+def _tells_autopilot(message: Message) -> bool:
     return (
         message.name == "HEARTBEAT"
-        and message.compid == MAV_COMPONENT.AUTOPILOT1
         and message.integer("autopilot") != MAV_AUTOPILOT.INVALID
         and message.integer("type") not in _NO_VEHICLES
     )
 
 
-class Neighbours:
-    """The vehicles that are heard on a link: a radio, a router or the autopilot itself may pass on what others say."""
+class Memory:
+    """The drone's own vehicle on disk: after a restart in flight there is no time to find out which one it is.
 
-    def __init__(self) -> None:
-        self._own: Source | None = None
-        self._heard_at: dict[Source, float] = {}
-        self._refused: Source | None = None
-        self._own_at = -math.inf
+    Args:
+        path: of the file.
+        url: the link on which it was heard; on another one it may be another vehicle.
+    """
+
+    def __init__(self, path: Path, url: str) -> None:
+        self._path, self._url = path, url
+        self._storing: asyncio.Future[None] | None = None
+        self.own: Source | None = None
+        try:
+            stored = json.loads(path.read_bytes())
+            if stored["link"] == url:
+                self.own = int(stored["system"]), int(stored["component"])
+        except FileNotFoundError:
+            return
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            log.critical("link: which vehicle is the drone's own is forgotten (path=%s, error=%s)", path, error)
+
+    def keep(self, own: Source) -> None:
+        """Write it in the background, once."""
+        if own != self.own:
+            self.own = own
+            self._storing = asyncio.ensure_future(self._store(own))
+
+    async def _store(self, own: Source) -> None:
+        content = json.dumps({"link": self._url, "system": own[0], "component": own[1]}).encode()
+        try:
+            await asyncio.to_thread(write_file, self._path, content)
+        except OSError as error:
+            log.critical(
+                "link: which vehicle is the drone's own cannot be stored (path=%s, error=%s)", self._path, error
+            )
+
+
+class Neighbours:
+    """The vehicles that are heard on a link: a radio, a router or the autopilot itself may pass on what others say.
+
+    Args:
+        memory: keeps the drone's own over restarts; without one the vehicle that is heard first is taken, whatever it does.
+    """
+
+    def __init__(self, memory: Memory | None = None) -> None:
+        self._memory = memory
+        self._own: Source | None = memory.own if memory is not None else None
+        self._sure = self._own is not None
+        self._heard: dict[Source, tuple[float, float]] = {}
         self._found_at = math.inf
-        self._sure = False
+        self._waits = ""
 
     def finds(self, message: Message, now: float, *, flying: bool) -> bool:
         """Whether a message is the first of the drone's own autopilot on a connection.
@@ -54,36 +112,89 @@ class Neighbours:
             now: monotonic seconds.
             flying: whether the motors ran when it was heard last: then no other one can take its place.
         """
-        source = message.sysid, message.compid
         if not tells_vehicle(message):
+            self._note_misplaced(message)
             return False
-        self._heard_at[source] = now
-        lost = flying and self._sure and now - self._own_at < MAX_FLIGHT_S
-        if lost and source != self._own:
-            if source != self._refused:
-                log.error("link: another vehicle is heard, the one that flies is waited for (system=%d)", source[0])
-            self._refused = source
+        source = message.sysid, message.compid
+        self._hear(source, now)
+        known = self._own is not None and (self._sure or flying)
+        doubt = (
+            self._stranger(source)
+            if known and source != self._own
+            else ""
+            if known
+            else self._doubt(message, source, now)
+        )
+        if doubt is None:
+            return False
+        self._wait(doubt)
+        if doubt:
             return False
         if source != self._own:
-            self._found_at, self._sure = now, False
-        self._own, self._own_at, self._refused = source, now, None
+            self._found_at = now
+        self._own = source
         return True
 
     def problem(self, message: Message, now: float) -> str:
-        """Hear a message on a connection on which the vehicle was found.
+        """Hear a message on a connection.
 
         Returns:
             Why it is not certain which vehicle is the drone's own; empty when one is heard alone.
         """
         if tells_vehicle(message):
-            source = message.sysid, message.compid
-            self._heard_at[source] = now
-            self._own_at = now if source == self._own else self._own_at
-        self._heard_at = {source: at for source, at in self._heard_at.items() if now - at < GONE_S}
-        others = sorted({system for system, _ in self._heard_at} - {self._own[0] if self._own is not None else 0})
+            self._hear((message.sysid, message.compid), now)
+        if self._waits:
+            return self._waits
+        others = self._others(self._own, now)
         if not others:
-            # One that has been alone for a time is ours; of two, either may be the one that was heard first.
-            self._sure = self._sure or now - self._found_at > GONE_S
+            # One that has been alone for a time is ours, or has been armed here; of two, either may be the one that was heard first.
+            self._sure = self._sure or now - self._found_at > SURE_S or (self._tells_own(message) and _armed(message))
+            if self._sure and self._own is not None and self._memory is not None:
+                self._memory.keep(self._own)
             return ""
-        systems = ", ".join(map(str, others))
-        return f"other vehicles are heard on its link, too (MAVLink systems {systems}); let only its own messages pass there"
+        return f"other vehicles are heard on its link, too (MAVLink systems {others}); let only its own messages pass there"
+
+    def _tells_own(self, message: Message) -> bool:
+        return tells_vehicle(message) and (message.sysid, message.compid) == self._own
+
+    def _hear(self, source: Source, now: float) -> None:
+        first_at, last_at = self._heard.get(source, (now, now))
+        self._heard[source] = first_at if now - last_at < GONE_S else now, now
+
+    def _others(self, source: Source | None, now: float) -> str:
+        self._heard = {other: at for other, at in self._heard.items() if now - at[1] < GONE_S}
+        systems = {system for system, _ in self._heard} - ({source[0]} if source is not None else set())
+        return ", ".join(map(str, sorted(systems)))
+
+    def _stranger(self, source: Source) -> str:
+        own = self._own[0] if self._own is not None else 0
+        return (
+            f"another vehicle is heard on its link (MAVLink system {source[0]}), the drone's own (system {own}) is waited for;"
+            " if it has another number by now, stop the service and remove vehicle.json from its state directory"
+        )
+
+    def _doubt(self, message: Message, source: Source, now: float) -> str | None:
+        """Why a vehicle is not taken for the drone's own; None: it is not heard for long enough to say."""
+        if self._memory is None:
+            return ""
+        if self._others(source, now):
+            systems = self._others(None, now)
+            return f"several vehicles are heard, and none is known (MAVLink systems {systems}); let only the drone's own messages pass"
+        if _armed(message):
+            return f"an unknown vehicle with running motors is heard (MAVLink system {source[0]}); it is left alone until they stand"
+        return "" if now - self._heard[source][0] >= CHOICE_S else None
+
+    def _note_misplaced(self, message: Message) -> None:
+        told = _tells_autopilot(message) and message.integer("type") in _VEHICLES
+        if told and (message.sysid, MAV_COMPONENT.AUTOPILOT1) not in self._heard:
+            where = f"component {message.compid} of MAVLink system {message.sysid}"
+            self._wait(f"an autopilot is heard as {where}, and only component 1 (MAV_COMP_ID_AUTOPILOT1) counts as one")
+
+    def _wait(self, why: str) -> None:
+        if why and why != self._waits:
+            log.error("link: the drone's autopilot is not found (reason=%s)", why)
+        self._waits = why
+
+
+def _armed(message: Message) -> bool:
+    return bool(message.integer("base_mode") & MAV_MODE_FLAG.SAFETY_ARMED)

@@ -26,6 +26,7 @@ from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
 from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes
 from fractus_services.mobility.mavlink.fence import MissionFence
+from fractus_services.mobility.mavlink.neighbours import Memory
 from fractus_services.mobility.mavlink.returning import MavlinkReturn
 from fractus_services.mobility.mavlink.traced import TracedAutopilot
 from fractus_services.mobility.rpc.figures import flight_figures
@@ -91,6 +92,7 @@ def _linked(
         on_found=found,
         on_heartbeat=lambda: parts.observer.heartbeat(),  # noqa: PLW0108
         on_parameter=lambda name: parts.observer.parameter(name),  # noqa: PLW0108
+        memory=Memory(options.state / "vehicle.json", url),
         received=recorder.take_received,
         sent=recorder.take_sent,
     )

@@ -15,7 +15,7 @@ from fractus_core.policy.values import Attitude, Lens, Situation
 from fractus_proto.v1 import mobility_pb2
 from fractus_services.camera.pose import history
 from fractus_services.camera.pose.history import PoseHistory
-from fractus_services.camera.rpc.telemetry import measurement
+from fractus_services.camera.rpc.telemetry import STEP_S, ArrivalClock, measurement
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from policy_world import FRAME, HOME
@@ -104,7 +104,7 @@ def test_a_message_that_waited_tells_where_the_drone_was_when_it_was_made(drone:
     drone.tell(100.1, late_s=3.0)
     assert drone.poses.situation(1.0).lat is None
     drone.tell(100.2, late_s=-3600.0)
-    assert drone.poses.situation(1.0).lat is not None, "the clock was set back meanwhile"
+    assert drone.poses.situation(1.0).lat is None, "the clock was set back meanwhile: nothing tells how late it is"
 
 
 def test_an_age_that_is_not_told_is_not_none(drone: Drone) -> None:
@@ -181,6 +181,26 @@ def gimbal_told(poses: PoseHistory, at_s: float, turned: tuple[float, float, flo
         message.gimbal.roll_deg, message.gimbal.pitch_deg, message.gimbal.yaw_deg = turned
         message.gimbal_age_s = age_s
     poses.add(measurement(message, at_s, NOW_S + at_s, gimbal=True))
+
+
+def test_a_message_from_the_future_says_nothing(drone: Drone) -> None:
+    drone.tell(0.0, late_s=-1.0)
+    drone.tell(0.1, late_s=-1.0)
+    assert all(there.lat is None and there.attitude is None for there in drone.way(0.05))
+    drone.tell(0.2, late_s=-0.01)
+    assert drone.poses.situation(1.0).lat is not None, "what rounding makes of its time"
+
+
+def test_a_clock_that_is_stepped_back_makes_no_late_message_younger() -> None:
+    now_s, step_s = 0.0, 0.0
+    arrival = ArrivalClock(lambda: NOW_S + now_s + step_s, lambda: now_s)
+    assert arrival() == NOW_S
+    now_s, step_s = 2.0, -0.9
+    assert arrival() == NOW_S + 2.0, "a message that was made at 1 s has waited for a second"
+    now_s = 2.1 + STEP_S
+    assert arrival() == pytest.approx(NOW_S + now_s - 0.9)
+    step_s = 30.0
+    assert arrival() == pytest.approx(NOW_S + now_s + 30.0)
 
 
 FORWARD = Lens(40.0, 30.0, pitch_deg=0.0, error_deg=0.0)

@@ -169,7 +169,7 @@ async def _serve(
         gimbal = described is not None and described.mount is not None and described.mount.gimbal
         poses = history = PoseHistory(time.monotonic, lens=lens_of(described), relief_m=options.relief, gimbal=gimbal)
         watched.history = history
-        parts.append(follow_telemetry(options.mobility, node, tls, history.add, gimbal=gimbal))
+        parts.append(follow_telemetry(options.mobility, node, tls, history.add, clock=clock, gimbal=gimbal))
     admission = CallAdmission(grants, clock)
     handlers = CameraHandlers(
         PictureCapture(

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import time
+from collections import deque
 from collections.abc import Callable
 
 import grpc
@@ -23,10 +25,42 @@ DEFAULT_ERROR_M = 10.0
 """Position error where the mobility service reports none."""
 DEFAULT_AGE_S = 0.5
 """Age of a measurement where the mobility service reports none."""
+STEP_S = 10.0
+"""A step of the clock counts against the messages that arrive for so long after it: they may have been made before."""
+MAX_AHEAD_S = 0.05
+"""A message that is made later than it arrives, by more, has its time from another clock."""
+
+
+class ArrivalClock:
+    """Unix time as messages arrive, by the latest reading of late: a clock that is stepped back makes no message younger.
+
+    Args:
+        clock: Unix time; where that is in doubt, the later reading.
+        now: monotonic seconds.
+    """
+
+    def __init__(self, clock: Callable[[], float], now: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._now = now
+        self._offsets: deque[tuple[float, float]] = deque()
+
+    def __call__(self) -> float:
+        """Now."""
+        now = self._now()
+        self._offsets.append((now, self._clock() - now))
+        while now - self._offsets[0][0] > STEP_S:
+            self._offsets.popleft()
+        return now + max(offset_s for _, offset_s in self._offsets)
 
 
 async def follow_telemetry(
-    address: str, node: str, tls: TlsFiles, add: Callable[[Measurement], None], *, gimbal: bool = False
+    address: str,
+    node: str,
+    tls: TlsFiles,
+    add: Callable[[Measurement], None],
+    *,
+    clock: Callable[[], float],
+    gimbal: bool = False,
 ) -> None:
     """Subscribe to the telemetry, and again after every failure, until cancelled.
 
@@ -35,9 +69,11 @@ async def follow_telemetry(
         node: name of the node, which its certificate carries.
         tls: the node's certificate.
         add: takes each measurement.
+        clock: Unix time as the mobility service has it, also while the clock's steps are in doubt.
         gimbal: whether the camera's attitude is that of a gimbal.
     """
     await tls.wait()
+    arrival = ArrivalClock(clock)
     options = (("grpc.ssl_target_name_override", node_server_name(node)), ("grpc.enable_http_proxy", 0))
     while True:
         try:
@@ -46,7 +82,7 @@ async def follow_telemetry(
                 async for message in stub.SubscribeTelemetry(
                     mobility_pb2.SubscribeTelemetryRequest(interval_s=INTERVAL_S)
                 ):
-                    add(measurement(message, time.monotonic(), time.time(), gimbal=gimbal))
+                    add(measurement(message, time.monotonic(), arrival(), gimbal=gimbal))
         except grpc.aio.AioRpcError as error:
             log.warning("telemetry: stream ended (mobility=%s): %s", address, error.details())
         except OSError as error:
@@ -58,16 +94,18 @@ def measurement(message: mobility_pb2.Telemetry, now_s: float, time_s: float, *,
     """Translate a message that arrived at a moment; the attitude is the airframe's, or the gimbal's.
 
     Ages count from when the message was made: those that wait while one of the two processes is stalled arrive all at once. Both
-    read the same clock, and where that is stepped meanwhile a message counts as older, never as younger.
+    read the same clock, and where that is stepped meanwhile a message counts as older, never as younger; how old one is that would
+    arrive before it was made is not known.
 
     Args:
         message: of the mobility service of this node.
         now_s: monotonic seconds.
-        time_s: Unix time.
+        time_s: Unix time, see `ArrivalClock`.
         gimbal: whether the camera's attitude is that of a gimbal.
     """
     turned = "gimbal" if gimbal else "attitude"
-    late_s = max(time_s - message.time.ToNanoseconds() / 1e9, 0.0) if message.HasField("time") else 0.0
+    late_s = time_s - message.time.ToNanoseconds() / 1e9 if message.HasField("time") else 0.0
+    late_s = max(late_s, 0.0) if late_s >= -MAX_AHEAD_S else math.inf
     position_age_s, attitude_age_s = (
         late_s + (getattr(message, name) if message.HasField(name) else DEFAULT_AGE_S)
         for name in ("position_age_s", f"{turned}_age_s")

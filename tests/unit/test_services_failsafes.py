@@ -18,6 +18,7 @@ from virtual_time import Loop
 
 SOUND = {
     "FS_GCS_ENABLE": 1.0, "FS_GCS_TIMEOUT": 5.0, "BATT_FS_LOW_ACT": 2.0, "BATT_FS_CRT_ACT": 1.0, "FS_EKF_ACTION": 1.0,
+    "FS_EKF_THRESH": 0.8,
 }  # fmt: skip
 
 
@@ -51,6 +52,15 @@ def test_the_failsafe_listens_to_the_companion_alone() -> None:
         assert not configured(vehicle).problem
         assert vehicle.values[name] == SYSTEM_ID
     assert vehicle.values["MAV_GCS_SYSID_HI"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("owned", "holds"), [(0.0, False), (-1.0, False), (0.8, True), (0.6, True), (1.0, True), (50.0, False)]
+)
+def test_the_estimators_failsafe_is_not_left_switched_off(owned: float, holds: bool) -> None:
+    vehicle = Parameters({"SYSID_MYGCS": 244.0, "FS_EKF_THRESH": owned})
+    assert not configured(vehicle).problem
+    assert vehicle.values["FS_EKF_THRESH"] == (owned if holds else 0.75)
 
 
 def test_a_failsafe_that_listens_to_others_forbids_arming() -> None:

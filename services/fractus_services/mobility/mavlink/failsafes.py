@@ -92,7 +92,7 @@ class _Settings:
 
     async def _set(self, name: str, setting: Setting) -> None:
         found = self.told[name]
-        if found == setting.value or found in setting.accepted:
+        if setting.holds(found):
             return
         self.told[name] = await self._parameters.write(name, setting.value)
         if not same(self.told[name], setting.value):

@@ -23,6 +23,7 @@ class Setting:
         names: its name, and older or newer spellings of it.
         value: what it is set to.
         accepted: values that may stay as they are.
+        span: values above the first and up to the second may stay, too.
         needed: whether arming is refused when the vehicle does not have it.
         why: what it does, for people.
         also: what else must hold where the vehicle has it under one of its names.
@@ -34,6 +35,12 @@ class Setting:
     needed: bool
     why: str
     also: Mapping[str, Setting] = field(default_factory=dict)
+    span: tuple[float, float] | None = None
+
+    def holds(self, value: float) -> bool:
+        """Whether a value may stay as it is."""
+        within = self.span is not None and self.span[0] < value <= self.span[1]
+        return value == self.value or value in self.accepted or within
 
 
 Names = tuple[tuple[str, float], ...]

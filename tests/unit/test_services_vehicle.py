@@ -38,6 +38,30 @@ def test_it_tells_how_it_speeds_up(vx: tuple[int, int], forward_mps2: float) -> 
     assert len(vehicle.courses) < 10, "old ones are forgotten"
 
 
+@pytest.mark.parametrize(
+    ("unplaced_s", "told", "lost"), [(11, True, False), (14, True, True), (11, False, False), (14, False, True)]
+)
+def test_a_path_is_lost_with_the_position_also_when_its_text_is(unplaced_s: int, told: bool, lost: bool) -> None:
+    vehicle = Vehicle(stack=ARDUCOPTER, armed=True, placed_at=0.0)
+    for at in range(1, unplaced_s):
+        if told:
+            vehicle.take(message("EKF_STATUS_REPORT", flags=BOOTED), float(at))
+    vehicle.take(message("EKF_STATUS_REPORT", flags=POSITIONED), float(unplaced_s))
+    assert vehicle.path_lost is lost
+    vehicle.take(message("HEARTBEAT"), 20.0)
+    assert not vehicle.path_lost, "the next flight remembers its own"
+
+
+def test_a_vehicle_that_stands_without_a_position_loses_no_path() -> None:
+    vehicle = Vehicle(stack=ARDUCOPTER)
+    for at in range(40):
+        vehicle.take(message("EKF_STATUS_REPORT", flags=BOOTED), float(at))
+    vehicle.take(message("EKF_STATUS_REPORT", flags=POSITIONED), 41.0)
+    vehicle.armed = True
+    vehicle.take(message("EKF_STATUS_REPORT", flags=POSITIONED), 42.0)
+    assert not vehicle.path_lost
+
+
 HEALTHY = {"onboard_control_sensors_present": 1 << 28, "onboard_control_sensors_health": 1 << 28}
 BOOTED, POSITIONED = 167, 831
 """Flags of EKF_STATUS_REPORT of a real ArduCopter, after 22 s and after 41 s."""

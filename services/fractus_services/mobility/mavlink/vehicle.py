@@ -28,6 +28,10 @@ _POSITIONED = EKF_STATUS_FLAGS.POS_HORIZ_ABS | EKF_STATUS_FLAGS.PRED_POS_HORIZ_A
 MIN_ERROR_M, MAX_ERROR_M = 0.5, 10.0
 """A GPS that says it is better is not believed; one that is worse gives no position."""
 
+PATH_KEPT_S = 12.0
+"""ArduCopter gives the path up, and says so once, when it had no position for 15 s: a little less is waited, for that text may be
+lost. One that tells nothing for so long may have given it up meanwhile."""
+
 
 @dataclass(slots=True)
 class Vehicle(VehicleState):
@@ -38,6 +42,7 @@ class Vehicle(VehicleState):
         foreign: what flies instead of a vehicle with this firmware; empty when nothing does.
         gimbal_measured: whether the firmware measures where its gimbal points, and does not repeat where it was told to; None
             until it has told of which type that is.
+        placed_at: when its estimator had a position last.
         gimbal_limits: the least and the greatest pitch and yaw of its gimbal, degrees; None until it has told.
     """
 
@@ -45,6 +50,7 @@ class Vehicle(VehicleState):
     foreign: str = ""
     gimbal_measured: bool | None = None
     gimbal_limits: tuple[tuple[float, float], ...] | None = None
+    placed_at: float = -math.inf
 
     def take(self, message: Message, now: float) -> None:
         """Update from one message."""
@@ -150,6 +156,9 @@ def _status(vehicle: Vehicle, message: Message, now: float) -> None:
 def _estimator(vehicle: Vehicle, message: Message, now: float) -> None:
     # The checks pass without a position in modes that need none; the flags tell whether GUIDED has what it needs.
     vehicle.estimated = message.integer("flags") & _POSITIONED == _POSITIONED
+    vehicle.path_lost = vehicle.path_lost or (vehicle.armed and now - vehicle.placed_at > PATH_KEPT_S)
+    if vehicle.estimated:
+        vehicle.placed_at = now
     vehicle.estimated_at = now
 
 

@@ -8,11 +8,13 @@ from pathlib import Path
 
 import pytest
 import shapely
+import virtual_time
 from closed_loop import Account, Oracle, Sky
 from fractus_core.policy.values import TakeoffArgs
 from fractus_mavlink import Endpoint
 from fractus_mavlink.enums import MAV_CMD, MAV_COMPONENT, MAV_FRAME, SPEED_TYPE
-from mobility_world import FRAME, spec, zone
+from fractus_services.mobility.autopilot import COURSE_S
+from mobility_world import FRAME, World, end, goto, spec, zone
 from sky_drone import fly, ready, until
 
 WALL = shapely.box(-100.0, 40.0, 100.0, 70.0)
@@ -50,3 +52,25 @@ def test_a_drone_that_another_station_sends_into_a_zone_is_stopped_before_it(act
             assert KEPT_M <= min(kept_m) < 15.0
 
     fly(work, tmp_path)
+
+
+@pytest.mark.parametrize(("speed_mps", "stopped"), [(0.45, False), (0.6, True)])
+def test_a_gust_stops_no_drone_that_keeps_its_place_beside_a_fence(
+    speed_mps: float, stopped: bool, tmp_path: Path
+) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            grant = world.grants.put(spec(zone("wall", "ignore", *WALL.bounds)))
+            await world.up(grant)
+            await end(world.service.goto(grant, goto(0.0, 37.5), 0.0))
+            await asyncio.sleep(35.0)
+            plane = world.plane
+            plane.commands.clear()
+            plane.vehicle.north_mps = speed_mps
+            plane.vehicle.courses.clear()
+            plane.vehicle.courses.extend([(0.0, -speed_mps, 0.0), (COURSE_S, speed_mps, 0.0)])
+            assert plane.vehicle.keeps_place(plane.now) is not stopped
+            world.monitor.look()
+            assert bool(plane.commands) is stopped
+
+    virtual_time.fly(flight)

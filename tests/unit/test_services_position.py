@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from fractus_core.control import ControlState, Mission, Outcome, OutcomeKind
-from fractus_mavlink import message
+from fractus_mavlink import Message, Value, message
 from fractus_proto.v1.mobility_pb2 import MissionOutcome
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
+from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
 from fractus_services.mobility.mavlink.vehicle import Vehicle
 from fractus_services.mobility.rpc.telemetry import telemetry_of
+from virtual_time import Loop
 
 
 def place(vehicle: Vehicle, lat: float, now: float) -> None:
@@ -43,8 +46,8 @@ def test_an_accuracy_that_is_not_told_any_more_is_not_the_last_one() -> None:
     assert vehicle.position_error_m == 1.5
 
 
-def told(vehicle: Vehicle, now: float, missions: bool = False, heard: int = 0) -> Any:
-    autopilot = SimpleNamespace(vehicle=vehicle, now=now, connected=True)
+def told(vehicle: Vehicle, now: float, missions: bool = False, heard: int = 0, way_s: float = 0.0) -> Any:
+    autopilot = SimpleNamespace(vehicle=vehicle, now=now, connected=True, way_s=way_s)
     ended = Mission("uid", "identity", outcome=Outcome(OutcomeKind.REVOKED, "why"))
     state = ControlState(missions={"uid": ended, "other": Mission("other", "identity")})
     control: Any = SimpleNamespace(autopilot=autopilot, checked=None, state=state)
@@ -73,6 +76,40 @@ def test_telemetry_tells_how_old_the_attitude_is() -> None:
     stale = told(vehicle, 11.1)
     assert not stale.HasField("attitude")
     assert not stale.HasField("attitude_age_s")
+
+
+@pytest.mark.parametrize("way_s", [0.3, math.inf])
+def test_ages_count_the_way_that_messages_take(way_s: float) -> None:
+    vehicle = Vehicle(stack=ARDUCOPTER)
+    fix(vehicle, 3)
+    place(vehicle, 39.0, 10.0)
+    vehicle.take(message("ATTITUDE", yaw=1.0), 10.1)
+    fresh = told(vehicle, 10.2, way_s=way_s)
+    assert fresh.position_age_s == pytest.approx(0.2 + way_s)
+    assert fresh.attitude_age_s == pytest.approx(0.1 + way_s)
+    assert fresh.position_error_m == pytest.approx(0.6 + 3.0 * 0.2)
+
+
+def heard(name: str, boot_s: float, **values: float) -> Message:
+    fields: dict[str, Value] = {"time_boot_ms": round(boot_s * 1e3), **values}
+    return message(name, **fields)
+
+
+def test_an_attitude_is_as_old_as_its_time_stamp_says() -> None:
+    async def hears() -> None:
+        autopilot = MavlinkAutopilot("tcp:127.0.0.1:1", ARDUCOPTER)
+        for boot_s in (100.0, 100.5):
+            autopilot.take(heard("GLOBAL_POSITION_INT", boot_s))
+            await asyncio.sleep(0.5)
+        vehicle, now = autopilot.vehicle, autopilot.now
+        autopilot.take(heard("ATTITUDE", 100.6, yaw=0.5))  # it waited on its way for 0.4 s
+        assert vehicle.attitude_at == pytest.approx(now - 0.4, abs=1e-3)
+        autopilot.take(heard("ATTITUDE", 100.2, yaw=2.0))  # and this one was overtaken
+        assert vehicle.attitude_at == pytest.approx(now - 0.4, abs=1e-3)
+        assert vehicle.heading_deg == pytest.approx(math.degrees(0.5))
+
+    with asyncio.Runner(loop_factory=Loop) as runner:
+        runner.run(hears())
 
 
 def test_missions_are_for_the_node_alone() -> None:

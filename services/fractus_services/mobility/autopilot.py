@@ -261,10 +261,11 @@ class Autopilot(Protocol):
 
     @property
     def latency_s(self) -> float:
-        """The vehicle's seconds from the state that is known to the effect of a command that is sent now, at most.
+        """The vehicle's seconds from the state that is known to the effect of a command sent now, at most; infinite: too long to fly by."""
 
-        Infinite while that is not known, or too long to fly by.
-        """
+    @property
+    def way_s(self) -> float:
+        """Seconds that a message takes here, at most; infinite while that is not known."""
 
     @property
     def pending(self) -> tuple[tuple[float, float, float], ...]:

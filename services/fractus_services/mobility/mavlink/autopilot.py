@@ -100,6 +100,11 @@ class MavlinkAutopilot(Link):
         self._orders = Orders()
 
     @property
+    def way_s(self) -> float:
+        """See `Autopilot`."""
+        return self.timing.way_s(self.now)
+
+    @property
     def pending(self) -> tuple[Velocity, ...]:
         """What the vehicle was told of late, or turns onto; how fast it speeds up is known from velocities that go back further."""
         vehicle, moment = self.vehicle, self.now - (self.latency_s + COURSE_S) / self.pace

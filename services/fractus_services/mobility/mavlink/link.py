@@ -82,8 +82,7 @@ class Link:
         self._transport: Transport | None = None
         self.target: Source | None = None
         self._neighbours = Neighbours(memory)
-        self._broken = asyncio.Event()
-        self._updated = asyncio.Event()
+        self._broken, self._updated = asyncio.Event(), asyncio.Event()
         self._listeners = Listeners(sysid)
 
     @property
@@ -231,6 +230,8 @@ class Link:
             if late_s is None or self._restarted():
                 return
             at -= late_s
+        elif incoming.has("time_boot_ms"):
+            at -= self.timing.age_s(incoming.integer("time_boot_ms"), at)
         elif incoming.name == "TIMESYNC":
             self.timing.replied(incoming.integer("tc1"), incoming.integer("ts1"), at)
             if self._restarted():

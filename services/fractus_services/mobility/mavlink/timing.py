@@ -112,6 +112,12 @@ class Timing:
         self._compare(now)
         return (self._present(now) - self._sampled) / self.pace
 
+    def age_s(self, boot_ms: int, now: float) -> float:
+        """How much later a message with a time stamp came than the fastest of the last positions, in our seconds; 0 while there are none."""
+        if not self._samples:
+            return 0.0
+        return max(self._present(now) - self._sampled - self._since(boot_ms), 0.0) / self.pace
+
     def _since(self, boot_ms: float) -> float:
         """The vehicle's seconds from the last position to a reading of its clock, which may have wrapped between."""
         return ((boot_ms - self._boot_ms + _WRAP_MS / 2) % _WRAP_MS - _WRAP_MS / 2) / 1e3
@@ -193,6 +199,10 @@ class Timing:
     def delay_s(self) -> float:
         """The longest delay of late, there and back, in the vehicle's seconds; infinite while there is none."""
         return max((delay_s for _, delay_s in self._delays), default=math.inf)
+
+    def way_s(self, now: float) -> float:
+        """Our seconds that any message takes at most, by the longest delay of late there and back; infinite: not known."""
+        return math.inf if now - self._heard_at > STALE_S else self.delay_s / self.pace
 
     def latency_s(self, now: float) -> float:
         """The vehicle's seconds from its last position to the effect of a command that is sent now; infinite: not known."""

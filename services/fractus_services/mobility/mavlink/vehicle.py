@@ -96,14 +96,15 @@ def _position(vehicle: Vehicle, message: Message, now: float) -> None:
 
 def _attitude(vehicle: Vehicle, message: Message, now: float) -> None:
     angles = [math.degrees(message.real(name)) for name in ("roll", "pitch", "yaw")]
-    if all(map(math.isfinite, angles)):
+    # One that a later one has overtaken says nothing of now.
+    if all(map(math.isfinite, angles)) and now >= vehicle.attitude_at:
         vehicle.roll_deg, vehicle.pitch_deg, vehicle.heading_deg = angles[0], angles[1], angles[2] % 360.0
         vehicle.attitude_at = now
 
 
 def _gimbal(vehicle: Vehicle, message: Message, now: float) -> None:
     # 0 is of a release that does not number gimbals, 1 is the first one.
-    if message.integer("gimbal_device_id") > 1:
+    if message.integer("gimbal_device_id") > 1 or now < vehicle.gimbal_at:
         return
     vehicle.gimbal = attitude_of(message, vehicle.heading_deg) if vehicle.gimbal_measured else None
     vehicle.gimbal_at = min(now, vehicle.attitude_at)

@@ -83,19 +83,22 @@ def telemetry_of(
         missions={key: _ended(outcome) for key, outcome in control.state.outcomes.items()} if missions else {},
     )
     message.time.FromNanoseconds(int(time_s * 1e9))
+    # Ages count from when the fastest messages came; on their way they were for as long as this, at most.
+    way_s = control.autopilot.way_s
     if located(control):
         message.position.CopyFrom(position_of(vehicle))
         message.velocity.CopyFrom(velocity_of(vehicle))
-        message.position_age_s = max(position_age_s(control), 0.0)
-        message.position_error_m = vehicle.position_error_m + vehicle.speed_mps * message.position_age_s
+        age_s = max(position_age_s(control), 0.0)
+        message.position_age_s = age_s + way_s
+        message.position_error_m = vehicle.position_error_m + vehicle.speed_mps * age_s
     attitude_age_s = control.autopilot.now - vehicle.attitude_at
     if attitude_age_s <= MAX_POSITION_AGE_S:
-        message.attitude_age_s = max(attitude_age_s, 0.0)
+        message.attitude_age_s = max(attitude_age_s, 0.0) + way_s
         message.attitude.roll_deg, message.attitude.pitch_deg = vehicle.roll_deg, vehicle.pitch_deg
         message.attitude.yaw_deg = vehicle.heading_deg
     gimbal_age_s = control.autopilot.now - vehicle.gimbal_at
     if vehicle.gimbal is not None and gimbal_age_s <= MAX_POSITION_AGE_S:
-        message.gimbal_age_s = max(gimbal_age_s, 0.0)
+        message.gimbal_age_s = max(gimbal_age_s, 0.0) + way_s
         message.gimbal.roll_deg, message.gimbal.pitch_deg = vehicle.gimbal.roll_deg, vehicle.gimbal.pitch_deg
         message.gimbal.yaw_deg = vehicle.gimbal.yaw_deg
     if vehicle.satellites is not None:

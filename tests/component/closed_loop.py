@@ -30,7 +30,6 @@ from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
 from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes
 from fractus_services.mobility.mavlink.fence import MissionFence
-from fractus_services.mobility.mavlink.neighbours import Memory
 from fractus_services.mobility.mavlink.returning import MavlinkReturn
 from fractus_services.mobility.rpc.wiring import Parts
 from fractus_vehicle.earth import Place
@@ -39,8 +38,11 @@ from fractus_vehicle.state import CONTROL_STEP_S, VehicleConfig, VehicleState
 from mobility_world import FRAME, Grants, area, goto, spec, zone
 from virtual_time import Loop
 
-LIMIT_S = 400.0
-"""No flight takes longer."""
+PROGRAMME_S = 400.0
+"""A driver that has not finished by then, as under a low limit of speed, gives up."""
+
+HOME_S = 250.0
+"""No way home takes longer, the grace time included."""
 
 HALF_M = 130.0
 """The operation area reaches this far from home, to each side."""
@@ -378,9 +380,7 @@ class Oracle:
 class Drone:
     """The mobility service of one drone, without its gRPC server."""
 
-    def __init__(
-        self, directory: Path, account: Account, *, grace_s: float = 10.0, memory: Memory | None = None
-    ) -> None:
+    def __init__(self, directory: Path, account: Account, *, grace_s: float = 10.0) -> None:
         self.grants = Grants()
         self._account = account
         self.audit = SimpleNamespace(append=self._append, failure="")
@@ -392,7 +392,6 @@ class Drone:
             on_found=lambda: self.parts.observer.found(),  # noqa: PLW0108
             on_heartbeat=lambda: self.parts.observer.heartbeat(),  # noqa: PLW0108
             on_parameter=lambda name: self.parts.observer.parameter(name),  # noqa: PLW0108
-            memory=memory,
         )
         self.journal = Journal(directory)
         self.journal._write = lambda _data: None  # type: ignore[method-assign]
@@ -544,12 +543,15 @@ class Flight:
         trouble = asyncio.ensure_future(self._trouble())
         try:
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(LIMIT_S):
+                async with asyncio.timeout(PROGRAMME_S):
                     await self._drive(following)
+            following.cancel()  # A driver that dies, or has landed: the system brings home what still flies.
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(HOME_S):
                     await self._landed()
                     self.account.down = True
             if not self.account.down:
-                self.account.wrong.append(f"not down after {LIMIT_S:.0f} s, in {self.sky.truth.mode.name}")
+                self.account.wrong.append(f"not down after {HOME_S:.0f} s, in {self.sky.truth.mode.name}")
         finally:
             for task in (following, trouble, *turning):
                 task.cancel()
@@ -593,7 +595,6 @@ class Flight:
             with contextlib.suppress(Refused, AutopilotError):
                 if chance.random() < 0.5:
                     await self._finish(drone.service.return_to_launch(self.grant))
-        following.cancel()  # A driver that dies, or has landed: the system brings home what still flies.
 
     async def _leg(self) -> None:
         chance, service = self.chance, self.drone.service

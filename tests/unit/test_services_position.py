@@ -38,6 +38,15 @@ def test_without_a_good_fix_no_position_is_taken(fix_type: int, h_acc: int) -> N
     assert (vehicle.lat, vehicle.position_at) == (39.1, 2.0)
 
 
+@pytest.mark.parametrize(("lat_e7", "lon_e7"), [(0, 0), (2**31 - 1, 229500000), (393600000, -(2**31)), (900000001, 0)])
+def test_what_is_no_place_is_taken_for_none(lat_e7: int, lon_e7: int) -> None:
+    vehicle = Vehicle(stack=ARDUCOPTER)
+    fix(vehicle, 3)
+    vehicle.take(message("GLOBAL_POSITION_INT", lat=lat_e7, lon=lon_e7), 1.0)
+    vehicle.take(message("HOME_POSITION", latitude=lat_e7, longitude=lon_e7), 1.0)
+    assert (vehicle.lat, vehicle.home, vehicle.position_at) == (None, None, -math.inf)
+
+
 def test_an_accuracy_that_is_not_told_any_more_is_not_the_last_one() -> None:
     vehicle = Vehicle(stack=ARDUCOPTER)
     fix(vehicle, 3, 9_000)

@@ -73,14 +73,20 @@ def _heartbeat(vehicle: Vehicle, message: Message, now: float) -> None:
     vehicle.failsafe = message.integer("system_status") in {MAV_STATE.CRITICAL, MAV_STATE.EMERGENCY}
 
 
+def _place(lat_e7: int, lon_e7: int) -> tuple[float, float] | None:
+    """Degrees; None for what is no place, and for the zeroes that ArduPilot sends until its estimator has an origin and home is set."""
+    if (lat_e7 == 0 and lon_e7 == 0) or abs(lat_e7) > 90 * 10**7 or abs(lon_e7) > 180 * 10**7:
+        return None
+    return lat_e7 / 1e7, lon_e7 / 1e7
+
+
 def _position(vehicle: Vehicle, message: Message, now: float) -> None:
     if not vehicle.located:
         return
-    lat_e7, lon_e7 = message.integer("lat"), message.integer("lon")
-    # ArduPilot sends zeroes until its estimator has an origin.
-    if lat_e7 == 0 and lon_e7 == 0:
+    place = _place(message.integer("lat"), message.integer("lon"))
+    if place is None:
         return
-    vehicle.lat, vehicle.lon = lat_e7 / 1e7, lon_e7 / 1e7
+    vehicle.lat, vehicle.lon = place
     vehicle.altitude_m, vehicle.amsl_m = message.integer("relative_alt") / 1e3, message.integer("alt") / 1e3
     vehicle.north_mps, vehicle.east_mps, vehicle.down_mps = (message.integer(name) / 100 for name in ("vx", "vy", "vz"))
     told_s = message.integer("time_boot_ms") / 1e3
@@ -128,10 +134,10 @@ def _parameter(vehicle: Vehicle, message: Message, _now: float) -> None:
 
 
 def _home(vehicle: Vehicle, message: Message, _now: float) -> None:
-    lat, lon = message.integer("latitude") / 1e7, message.integer("longitude") / 1e7
-    if lat == 0.0 and lon == 0.0:
-        return  # as of the position: home is not set
-    vehicle.home = Home(lat, lon, message.integer("altitude") / 1e3)
+    place = _place(message.integer("latitude"), message.integer("longitude"))
+    if place is None:
+        return
+    vehicle.home = Home(*place, message.integer("altitude") / 1e3)
     # The first one after arming may have been lost: the next then counts, wherever the vehicle is by now.
     if not vehicle.in_air or vehicle.ground_home is None:
         vehicle.ground_home = vehicle.home

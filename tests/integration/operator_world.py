@@ -6,11 +6,12 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import pytest
 from control_plane import ControlPlane, wait_for
 from fractus_cluster.ports import free_port
 from fractus_kube import BlockingClient, KubeError
@@ -309,3 +310,11 @@ def fresh_namespace(world: World, name: str) -> Iterator[str]:
                 if error.status != 404:
                     raise
         world.api.delete(f"/api/v1/namespaces/{name}")
+
+
+def denied(attempt: Callable[[], object], words: str) -> None:
+    """Have the API server refuse what is attempted, with these words."""
+    with pytest.raises(KubeError) as refusal:
+        attempt()
+    assert refusal.value.status == 403, refusal.value
+    assert words in str(refusal.value)

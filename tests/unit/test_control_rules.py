@@ -1,0 +1,415 @@
+"""The rules of the control machine, one by one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from fractus_core.control import Authority, ControlState, Outcome, OutcomeKind, StreamState, transition
+from fractus_core.control import events as told
+from fractus_core.control.actions import (
+    Action,
+    RecordAudit,
+    RefuseStream,
+    SendEvent,
+    StartSystemTask,
+)
+from fractus_core.control.values import (
+    ActiveMotion,
+    FlightMode,
+    Grace,
+    ModeKind,
+    SystemTask,
+    TaskKind,
+    VehicleFacts,
+    ended_refusal,
+)
+from fractus_core.control.vehicles import UNCONFIRMED_S
+from test_control_machine import ARMED, DRIVER, FLYING, FOUND, GROUND, GUIDED, LATE_S, LOITER, RTL
+
+
+def told_of(*events: told.Event, state: ControlState = FOUND) -> tuple[ControlState, tuple[Action, ...]]:
+    """A history at one moment, and the actions of its last event."""
+    actions: tuple[Action, ...] = ()
+    for event in events:
+        state, actions = transition(state, event, 0.0)
+    return state, actions
+
+
+ASKS = (told.GrantChanged(None, DRIVER), told.StreamOpened(1, "a", "A"), told.GrantControl(1))
+ARMS = (told.MotorStart(begins=True), told.VehicleObserved(ARMED), told.Heartbeat(), told.MotorStart(begins=False))
+FLIES = (*ASKS, *ARMS, told.VehicleObserved(FLYING), told.Heartbeat(), told.Airborne())
+
+
+def test_control_is_granted_and_returned() -> None:
+    state, actions = told_of(*FLIES)
+    assert state.controller == "A"
+    state, actions = told_of(told.ControlReturned("a", 1), state=state)
+    assert state.missions["a"].outcome == Outcome(OutcomeKind.COMPLETE)
+    assert state.returning
+    assert [action.event.state for action in actions if isinstance(action, SendEvent)] == [StreamState.COMPLETE]
+    _, actions = told_of(told.StreamOpened(2, "a", "A"), state=state)
+    assert actions == (RefuseStream(2, "MissionComplete", "the mission is complete"),)
+
+
+@pytest.mark.parametrize(
+    ("done", "kind"),
+    [
+        ((), OutcomeKind.FAILED),
+        ((told.WaypointsDone("a", 2),), OutcomeKind.FAILED),
+        ((told.WaypointsDone("a", 0, leg=True),), OutcomeKind.COMPLETE),
+        (
+            (told.WaypointsDone("a", 1, leg=True), told.ControlReturned("a", 2, paths=True), *ASKS[1:]),
+            OutcomeKind.COMPLETE,
+        ),
+    ],
+)
+def test_a_mission_that_flew_nothing_of_its_path_is_not_complete(
+    done: tuple[told.Event, ...], kind: OutcomeKind
+) -> None:
+    state, _ = told_of(*FLIES, *done, told.ControlReturned("a", 1, paths=True))
+    outcome = state.missions["a"].outcome
+    assert outcome is not None
+    assert outcome.kind is kind
+    assert state.returning, "the drone comes home all the same"
+
+
+@pytest.mark.parametrize("action", ["hover", "land", "returnToLaunch", "revoke"])
+def test_a_takeover_ends_the_mission_unless_it_only_hovers(action: Any) -> None:
+    state, _ = told_of(*FLIES, told.TakeoverDemanded(action, "Code", "why"))
+    kinds = {
+        "hover": None,
+        "land": OutcomeKind.FAILED,
+        "returnToLaunch": OutcomeKind.FAILED,
+        "revoke": OutcomeKind.REVOKED,
+    }
+    outcome = state.missions["a"].outcome
+    assert (outcome.kind if outcome is not None else None) is kinds[action]
+    assert (state.grace is not None) is (action == "hover")
+    assert state.lease is None
+
+
+def test_a_lost_driver_has_its_grace_and_then_the_vehicle_comes_home() -> None:
+    state, _ = told_of(*FLIES, told.StreamClosed(1))
+    assert state.task == SystemTask(1, TaskKind.HOVER)
+    assert state.grace == Grace(5.0, "a", "driver lost")
+    assert transition(state, told.Tick(), 4.9)[0].task == state.task
+    home, actions = transition(state, told.Tick(), 5.0)
+    assert [action.code for action in actions if isinstance(action, RecordAudit)] == ["DriverLost"], (
+        "by the deadline alone"
+    )
+    assert home.task == SystemTask(2, TaskKind.RETURN)
+    assert home.missions["a"].outcome == Outcome(OutcomeKind.FAILED, "driver lost")
+
+
+def refused_transit(state: ControlState, lease_id: int, begins: float, ends: float) -> ControlState:
+    """A waiting driver for which the system flies until the way is refused, and its stream ends."""
+    for event in (
+        told.StreamOpened(lease_id, "a", "A"),
+        told.TransitRequested(lease_id),
+        told.TransitBegan(lease_id, "a", "A"),
+    ):
+        state, _ = transition(state, event, begins)
+    for event in (told.SystemFlightEnded(lease_id), told.StreamClosed(lease_id)):
+        state, _ = transition(state, event, ends)
+    return state
+
+
+def test_transits_that_are_refused_begin_no_grace_again() -> None:
+    state, _ = told_of(*FLIES, told.StreamClosed(1))
+    for attempt in range(3):
+        state = refused_transit(state, 2 + attempt, 1.0 + attempt, 1.5 + attempt)
+        assert state.grace == Grace(5.0, "a", "driver lost")
+    home, _ = transition(state, told.Tick(), 5.0)
+    assert home.task is not None
+    assert home.task.kind is TaskKind.RETURN
+
+
+@pytest.mark.parametrize("again", [told.VehicleFound(), told.TakeoverDemanded("hover", "Code", "why")])
+def test_what_is_found_or_taken_again_and_again_gets_no_more_time_for_its_driver(again: told.Event) -> None:
+    state, _ = told_of(*FLIES, told.StreamClosed(1))
+    for now in (1.0, 3.0, 4.5):
+        state, _ = transition(state, again, now)
+        assert state.deadline == 5.0
+    home, _ = transition(state, told.Tick(), 5.0)
+    assert home.task is not None
+    assert home.task.kind is TaskKind.RETURN
+    assert home.missions["a"].outcome is not None
+
+
+def test_a_driver_that_waits_for_anothers_vehicle_takes_none_of_its_time() -> None:
+    other = told.GrantRef("b", leads=True)
+    waits = (told.GrantChanged(None, other), told.StreamOpened(2, "b", "B"))
+    landed = (told.VehicleObserved(GROUND), told.Heartbeat(), told.StreamClosed(1))
+    waiting, _ = told_of(*FLIES, *landed, *waits)
+    assert (waiting.lease is not None, waiting.deadline) == (True, 5.0)
+    gone, _ = transition(waiting, told.GrantChanged(other, None), 1.0)
+    assert (gone.lease, gone.deadline) == (None, 5.0)
+
+
+def test_a_grace_waits_for_the_end_of_a_transit_and_a_driver_that_gets_the_vehicle_ends_it() -> None:
+    state, _ = told_of(*FLIES, told.StreamClosed(1))
+    asks = (told.StreamOpened(2, "a", "A"), told.TransitRequested(2), told.TransitBegan(9, "a", "A"))
+    flying, _ = told_of(*asks, state=state)
+    assert flying.deadline is None
+    later, _ = transition(flying, told.Tick(), 50.0)
+    assert later.missions["a"].outcome is None
+    arrived, _ = told_of(told.SystemFlightEnded(9), told.GrantControl(2), state=later)
+    assert (arrived.grace, arrived.drives) == (None, True)
+    refused, _ = transition(later, told.SystemFlightEnded(9), 50.0)
+    assert refused.deadline == 5.0
+    home, _ = transition(refused, told.Tick(), 50.0)
+    assert home.missions["a"].outcome == Outcome(OutcomeKind.FAILED, "driver lost")
+
+
+def test_a_way_home_that_fails_each_time_is_left_to_the_autopilot() -> None:
+    state = replace(ControlState(), decided=True, armed_seen=True, vehicle=FLYING)
+    takes = 0
+    for tick in range(100):
+        state, actions = transition(state, told.Tick(), tick * 0.05)
+        takes += any(isinstance(action, RecordAudit) for action in actions)
+        if state.task is not None:
+            state, _ = transition(state, told.SystemTaskEnded(state.task.task_id, finished=False), tick * 0.05)
+    assert takes == 3
+    assert state.unattended_since == 0.0, "so that the heartbeats end"
+    landed, _ = told_of(told.VehicleObserved(replace(FLYING, armed=False, in_air=False)), told.Heartbeat(), state=state)
+    assert (landed.unattended, landed.attended) == (0, True)
+
+
+def test_a_second_stream_that_leaves_while_it_waits_leaves_no_authority_behind() -> None:
+    second = (told.StreamOpened(2, "a", "A"), told.StreamClosed(2))
+    state, _ = told_of(*ASKS, *second)
+    assert state.authority is Authority.SYSTEM
+    armed, _ = told_of(told.VehicleObserved(ARMED), told.Heartbeat(), state=state)
+    assert armed.authority is Authority.PILOT, "who arms it is no driver"
+
+
+@pytest.mark.parametrize("mode", [GUIDED, LOITER])
+def test_a_vehicle_that_others_arm_is_no_drivers(mode: FlightMode) -> None:
+    chosen = told.VehicleObserved(replace(GROUND, mode=mode)), told.Heartbeat()
+    state, _ = told_of(*ASKS, *chosen)
+    assert state.controller == "A", "on the ground a mode is no one's"
+    state, actions = told_of(told.VehicleObserved(replace(ARMED, mode=mode)), told.Heartbeat(), state=state)
+    assert state.authority is Authority.PILOT
+    assert state.lease is None
+    assert [action.event.state for action in actions if isinstance(action, SendEvent)] == [StreamState.LOST]
+    for flown in (LOITER, GUIDED):
+        state, _ = told_of(told.VehicleObserved(replace(FLYING, mode=flown)), told.Heartbeat(), *ASKS[1:], state=state)
+        assert state.authority is Authority.PILOT, (
+            "no fence, home or limits of a mission: it cannot be handed over in flight"
+        )
+    landed, _ = told_of(told.VehicleObserved(GROUND), told.Heartbeat(), *ASKS[1:], state=state)
+    assert landed.controller == "A", "nothing was flown for the mission: it goes on"
+
+
+def test_a_cancelled_motion_hovers_for_a_driver_that_is_still_there() -> None:
+    state, _ = told_of(*FLIES, told.MotionBegan(7, "Land"), told.MotionCancelled(7))
+    assert state.motion == ActiveMotion(7, "Land", hover_at=0.3)
+    assert not transition(state, told.Tick(), 0.2)[1]
+    gone, _ = transition(state, told.StreamClosed(1), 0.2)
+    assert gone.motion is None
+    _, actions = transition(state, told.Tick(), 0.3)
+    assert [type(action).__name__ for action in actions] == ["StopMotion", "HoldPosition"]
+
+
+def test_a_vehicle_that_a_pilot_hands_back_waits_for_its_driver() -> None:
+    loiter, guided = (told.VehicleObserved(replace(FLYING, mode=mode)) for mode in (LOITER, GUIDED))
+    state, _ = told_of(*FLIES, loiter, told.Heartbeat(), guided, told.Heartbeat())
+    assert state.authority is Authority.SYSTEM
+    assert state.task == SystemTask(1, TaskKind.HOVER)
+    assert state.grace == Grace(5.0, "a", "driver lost")
+
+
+def test_a_mode_that_the_system_did_not_ask_for_is_a_pilots() -> None:
+    asked = told.VehicleObserved(replace(FLYING, mode=RTL))
+    ours, _ = told_of(
+        *FLIES, told.ModeChangeBegan(RTL), asked, told.Heartbeat(), told.ModeChangeEnded(RTL, GUIDED, True)
+    )
+    assert ours.authority is Authority.DRIVER
+    assert told_of(told.Heartbeat(), state=ours)[0].authority is Authority.DRIVER
+    foreign, _ = told_of(*FLIES, asked, told.Heartbeat())
+    assert foreign.authority is Authority.PILOT
+    failsafe, _ = told_of(*FLIES, told.VehicleObserved(replace(FLYING, mode=RTL, failsafe=True)), told.Heartbeat())
+    assert (failsafe.authority, failsafe.returning) == (Authority.SYSTEM, True)
+
+
+def test_a_failsafe_that_brakes_leaves_the_vehicle_to_no_pilot() -> None:
+    braking = replace(FLYING, mode=FlightMode("BRAKE", ModeKind.BRAKING))
+    chosen, _ = told_of(*FLIES, told.VehicleObserved(braking), told.Heartbeat())
+    assert chosen.authority is Authority.PILOT
+    for facts in (
+        replace(braking, failsafe=True),
+        replace(braking, failsafe_text="Fence breached", failsafe_text_at=-1.0),
+    ):
+        failed, _ = told_of(*FLIES, told.VehicleObserved(facts), told.Heartbeat())
+        assert failed.authority is Authority.SYSTEM
+        assert failed.task == SystemTask(1, TaskKind.RETURN)
+        assert str(failed.missions["a"].outcome).startswith("failed: the autopilot's own failsafe")
+        later, _ = told_of(told.VehicleObserved(facts), told.Heartbeat(), state=chosen)
+        assert later.authority is Authority.PILOT, "who has chosen it has the vehicle"
+
+
+def test_a_vehicle_that_is_found_braked_by_a_failsafe_comes_home() -> None:
+    braking = replace(FLYING, mode=FlightMode("BRAKE", ModeKind.BRAKING))
+    for facts, authority, task in (
+        (replace(braking, failsafe=True), Authority.SYSTEM, TaskKind.RETURN),
+        (braking, Authority.PILOT, None),
+    ):
+        found, _ = told_of(told.VehicleFound(), state=ControlState(vehicle=facts))
+        assert (found.authority, found.task.kind if found.task is not None else None) == (authority, task)
+
+
+def test_motors_that_were_asked_for_are_ours_whenever_they_are_seen() -> None:
+    late = (*ARMS[:2], ARMS[3], told.Heartbeat())
+    state, _ = told_of(*ASKS, *late)
+    assert (state.authority, state.armed_by_others) == (Authority.DRIVER, False)
+    others, _ = told_of(*ASKS, told.VehicleObserved(ARMED), told.Heartbeat())
+    assert (others.authority, others.armed_by_others) == (Authority.PILOT, True)
+
+
+@pytest.mark.parametrize(
+    ("facts", "late_s", "unanswered", "authority"),
+    [
+        (ARMED, UNCONFIRMED_S - 0.1, True, Authority.DRIVER),
+        (ARMED, UNCONFIRMED_S + 0.1, True, Authority.PILOT),
+        (replace(ARMED, mode=LOITER), 1.0, True, Authority.PILOT),
+        (ARMED, 1.0, False, Authority.PILOT),
+    ],
+)
+def test_motors_that_show_after_a_start_without_answers_are_ours_for_a_while(
+    facts: VehicleFacts, late_s: float, unanswered: bool, authority: Authority
+) -> None:
+    start = told.MotorStart(begins=True), told.MotorStart(begins=False, unanswered=unanswered)
+    state, _ = told_of(*ASKS, *start, told.VehicleObserved(replace(facts, armed=False)), told.Heartbeat())
+    for event in (told.VehicleObserved(facts), told.Heartbeat()):
+        state, _ = transition(state, event, late_s)
+    assert (state.authority, state.armed_by_others) == (authority, authority is Authority.PILOT)
+
+
+def test_a_mode_change_whose_answers_were_lost_is_the_systems() -> None:
+    flies = replace(FLYING, mode=RTL)
+    ours, _ = told_of(*FLIES, told.VehicleObserved(replace(flies, failsafe=True)), told.Heartbeat())
+    given_up, _ = told_of(told.ModeChangeBegan(GUIDED), told.ModeChangeEnded(GUIDED, RTL, done=False), state=ours)
+    shown = (told.VehicleObserved(FLYING), told.Heartbeat())
+    obeyed, _ = told_of(*shown, state=given_up)
+    assert (obeyed.authority, obeyed.task, obeyed.returning) == (Authority.SYSTEM, ours.task, True)
+    other, _ = told_of(told.VehicleObserved(replace(FLYING, mode=LOITER)), told.Heartbeat(), state=given_up)
+    assert other.authority is Authority.PILOT
+    observed, _ = told_of(shown[0], state=given_up)
+    assert transition(observed, shown[1], LATE_S)[0].authority is Authority.PILOT, "too late to be ours"
+
+
+def test_a_mode_that_the_autopilot_refused_is_not_the_systems() -> None:
+    refused = (told.ModeChangeBegan(RTL), told.ModeChangeEnded(RTL, GUIDED, done=False, refused=True))
+    state, _ = told_of(*FLIES, *refused)
+    returns = replace(FLYING, mode=RTL)
+    assert told_of(told.VehicleObserved(returns), told.Heartbeat(), state=state)[0].authority is Authority.PILOT
+    failsafe, _ = told_of(told.VehicleObserved(replace(returns, failsafe=True)), told.Heartbeat(), state=state)
+    assert (failsafe.task, failsafe.returning) == (SystemTask(1, TaskKind.RETURN), True)
+    assert failsafe.missions["a"].outcome is not None
+
+
+def test_a_return_that_is_obeyed_late_is_watched_by_the_system() -> None:
+    given_up = (told.ModeChangeBegan(RTL), told.ModeChangeEnded(RTL, GUIDED, done=False))
+    shown = (told.VehicleObserved(replace(FLYING, mode=RTL)), told.Heartbeat())
+    alone, _ = told_of(*FLIES, *given_up, told.StreamClosed(1), *shown)
+    assert (alone.task, alone.returning, alone.deadline) == (SystemTask(2, TaskKind.RETURN), True, 5.0)
+    driven, _ = told_of(*FLIES, *given_up, *shown)
+    assert (driven.authority, driven.task) == (Authority.DRIVER, None)
+
+
+@pytest.mark.parametrize("mode", [GUIDED, RTL])
+def test_a_driver_that_is_lost_on_its_way_home_may_come_back_on_it(mode: FlightMode) -> None:
+    homeward = (told.MotionBegan(1, "ReturnToLaunch"), told.ModeChangeBegan(mode))
+    turns = (
+        told.VehicleObserved(replace(FLYING, mode=mode)),
+        told.Heartbeat(),
+        told.ModeChangeEnded(mode, GUIDED, True),
+    )
+    lost, _ = told_of(*FLIES, *homeward, *turns, told.StreamClosed(1))
+    assert (lost.task, lost.returning, lost.deadline) == (SystemTask(1, TaskKind.RETURN), True, 5.0)
+    back, _ = told_of(told.StreamOpened(2, "a", "A"), told.GrantControl(2), state=lost)
+    assert (back.drives, back.returning, back.task, back.grace) == (True, False, None, None)
+    late, actions = transition(lost, told.Tick(), 5.0)
+    assert late.missions["a"].outcome == Outcome(OutcomeKind.FAILED, "driver lost")
+    assert not any(isinstance(action, StartSystemTask) for action in actions), "it is on its way already"
+    assert told_of(told.StreamOpened(2, "a", "A"), state=late)[1][0] == RefuseStream(
+        2, *ended_refusal(late.outcomes["a"])
+    )
+
+
+def test_a_return_that_a_pilot_chooses_after_a_failsafe_is_the_pilots() -> None:
+    flies = replace(FLYING, failsafe=True)
+    heard = [(told.VehicleObserved(replace(flies, mode=mode)), told.Heartbeat()) for mode in (RTL, GUIDED, RTL)]
+    taken = (told.ModeChangeBegan(GUIDED), *heard[1], told.ModeChangeEnded(GUIDED, RTL, done=True))
+    ours, _ = told_of(*FLIES, *heard[0], *taken, told.Heartbeat())
+    assert ours.authority is Authority.SYSTEM
+    assert told_of(*heard[2], state=ours)[0].authority is Authority.PILOT
+
+
+@pytest.mark.parametrize(("silent_s", "mode", "authority"), [
+    (5.1, RTL, Authority.SYSTEM), (2.0, RTL, Authority.PILOT), (5.1, LOITER, Authority.PILOT),
+])  # fmt: skip
+def test_a_return_that_began_while_the_link_was_cut_is_the_failsafes(
+    silent_s: float, mode: FlightMode, authority: Authority
+) -> None:
+    heard = told.VehicleObserved(replace(FLYING, mode=mode, silent_s=silent_s))
+    state, _ = told_of(*FLIES, heard, told.Heartbeat())
+    assert state.authority is authority
+    assert state.returning is (authority is Authority.SYSTEM)
+
+
+def test_a_return_that_is_found_is_told_from_one_of_the_system() -> None:
+    known, _ = told_of(told.ArmingRequested("a", "A", (1.0, 2.0, 3.0)), told.VehicleObserved(replace(FLYING, mode=RTL)))
+    found, _ = told_of(told.VehicleFound(), state=replace(known, expected_mode=None))
+    assert found.task is not None and found.task.found
+    again, _ = told_of(told.VehicleFound(), state=found)
+    assert again.task is not None and again.task.found, "a broken link makes it no one else's"
+    begun, _ = told_of(told.TakeoverDemanded("returnToLaunch", "X", "x"), state=replace(known, expected_mode=RTL))
+    again, _ = told_of(told.VehicleFound(), state=begun)
+    assert again.task is not None and not again.task.found
+
+
+def test_a_failsafe_that_is_found_without_a_mission_is_the_systems() -> None:
+    for failsafe, authority in ((True, Authority.SYSTEM), (False, Authority.PILOT)):
+        flies = replace(FLYING, mode=RTL, failsafe=failsafe)
+        found, _ = told_of(told.VehicleFound(), state=ControlState(vehicle=flies))
+        assert found.authority is authority
+        assert found.attended
+        assert found.returning is failsafe
+
+
+def test_a_mission_that_a_pilot_landed_is_not_granted_again() -> None:
+    pilots = FlightMode("LOITER", ModeKind.OTHER)
+    taken = (told.VehicleObserved(replace(FLYING, mode=pilots)), told.Heartbeat(), told.StreamOpened(2, "a", "A"))
+    waiting, _ = told_of(*FLIES, *taken)
+    assert waiting.authority is Authority.PILOT
+    assert waiting.lease is not None
+    landed, actions = told_of(
+        told.VehicleObserved(replace(FLYING, mode=pilots, armed=False, in_air=False)), told.Heartbeat(), state=waiting
+    )
+    assert landed.missions["a"].outcome is not None
+    assert landed.lease is None
+    assert [action.event.state for action in actions if isinstance(action, SendEvent)] == [StreamState.LOST]
+    again, _ = told_of(told.GrantControl(2), told.TransitBegan(1, "a", "A"), state=landed)
+    assert not again.drives
+    assert again.flight is None
+
+
+def test_a_waiting_driver_that_loses_its_grant_ends_no_other_mission() -> None:
+    other = told.GrantRef("b", leads=True)
+    grounded = (*ASKS, told.StreamClosed(1), told.GrantChanged(None, other), told.StreamOpened(2, "b", "B"))
+    state, _ = told_of(*grounded)
+    assert (state.active, state.lease is not None) == ("a", True)
+    after_, actions = told_of(told.GrantChanged(other, None), state=state)
+    assert after_.missions["a"].outcome is None
+    assert after_.missions["b"].outcome == Outcome(OutcomeKind.REVOKED, "the grant was removed")
+    assert (after_.active, after_.lease, after_.removed) == ("a", None, None)
+    assert [action.event.state for action in actions if isinstance(action, SendEvent)] == [StreamState.LOST]
+
+
+def test_a_mission_that_is_over_is_refused_with_what_begins_another() -> None:
+    code, reason = ended_refusal(Outcome(OutcomeKind.FAILED, "the driver did not come back"))
+    assert code == "MissionEnded"
+    assert reason.endswith("; another flight needs a Grant with another uid")

@@ -304,7 +304,7 @@ def _granted(
         base, reach_m = bounds
         if beyond is None and _regards_pictures(policy.spec):
             reach_m += MAX_SIGHT_M
-        near = [zone for zone in zones if _distance_m(zone.area, base) <= reach_m]
+        near = [z for z in zones if not _circle_beyond(z.area, base, reach_m) and _distance_m(z.area, base) <= reach_m]
     if named and not near:
         return None
     # What is left out is not selected either, so that a node can tell a zone that is far from one that is missing.
@@ -357,12 +357,17 @@ def _zone(policy: Policy, index: int, name: str, inventory: Inventory) -> Grante
 def _surely_beyond(zone: Zone | None, base: Point, reach_m: float) -> bool:
     """Whether a zone is out of reach, told in microseconds; False where that needs a closer look."""
     if zone is None or zone.spec.area.polygon is None:
-        circle = zone.spec.area.circle if zone is not None else None
-        return circle is not None and distance_m(circle.center, base) > (reach_m + circle.radius) * _GENEROUS
+        return zone is not None and _circle_beyond(zone.spec.area, base, reach_m)
     ring = zone.spec.area.polygon.exterior
     # No point of a polygon is further from a corner than half its outline.
     outline_m = sum(distance_m(a, b) for a, b in itertools.pairwise((*ring, ring[0])))
     return distance_m(ring[0], base) > (reach_m + outline_m / 2) * _GENEROUS
+
+
+def _circle_beyond(area: Area, base: Point, reach_m: float) -> bool:
+    """Whether an area is a circle that is surely out of reach."""
+    circle = area.circle
+    return circle is not None and distance_m(circle.center, base) > (reach_m + circle.radius) * _GENEROUS
 
 
 @lru_cache(maxsize=256)

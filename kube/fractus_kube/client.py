@@ -195,7 +195,7 @@ class Client(Connection):
         params = {"fieldManager": self.field_manager}
         return await self.request("PUT", kind.path(*key_of(body), subresource), body, params=params)
 
-    async def delete(self, kind: Kind, key: Key, uid: str | None = None, *, orphan: bool = False) -> None:
+    async def delete(self, kind: Kind, key: Key, uid: str | None = None, *, orphan: bool = False) -> bool:
         """Delete an object; one that is gone already is no error.
 
         Args:
@@ -203,14 +203,19 @@ class Client(Connection):
             key: (namespace, name).
             uid: Delete only the object that has it.
             orphan: Leave what it owns, which goes in the background otherwise.
+
+        Returns:
+            Whether this request removed it; not so while a finalizer or a grace period keeps it.
         """
         options: Body = {"propagationPolicy": "Orphan" if orphan else "Background"}
         if uid is not None:
             options["preconditions"] = {"uid": uid}
         try:
-            await self.request("DELETE", kind.path(*key), options)
+            # A Status is the answer where it is gone, else the object as it is kept.
+            return (await self.request("DELETE", kind.path(*key), options)).get("kind") == "Status"
         except NotFound:
-            return
+            return False
         except Conflict:
             if uid is None:
                 raise
+            return False

@@ -33,7 +33,7 @@ from fractus_operator.reconcile.link_events import LinkEvents
 from fractus_operator.reconcile.location import Locations
 from fractus_operator.reconcile.node_reports import NodeReports
 from fractus_operator.reconcile.on_mission import OnMission
-from fractus_operator.reconcile.orphans import Orphans
+from fractus_operator.reconcile.orphans import LOST_PODS_PERIOD_S, LostPods, Orphans
 from fractus_operator.reconcile.readiness import Readiness
 from fractus_operator.reconcile.service_rollout import ServiceRollout
 from fractus_operator.reconcile.silence import HearingClock, SilenceWatch, shown_state
@@ -85,6 +85,7 @@ async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
         rollout = ServiceRollout(store, live, reports, time.monotonic)
         background += [regularly("silence", watch.step, silence.PERIOD_S)]
         background += [regularly("services", rollout.step, service_rollout.PERIOD_S)]
+        background += [regularly("lost pods", LostPods(store, live).step, LOST_PODS_PERIOD_S)]
         links = LinkEvents(store, _now)
         background += [links.reflector.run(), links.worklist.run()]
         # Cancelling what waits for the lease must not cancel the lease: the last writes need it.

@@ -15,11 +15,13 @@ from fractus_core.api import Application
 from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Body, Key, Kind
-from fractus_operator.cluster.store import Conflict, KubeError, NotFound
+from fractus_operator.cluster.store import Conflict, KubeError, NotFound, Store
+from fractus_operator.inventory.live import LiveInventory
 from fractus_operator.inventory.made import Made
 from fractus_operator.reconcile.builders import child
 from fractus_operator.reconcile.children import Children, NameTaken
 from fractus_operator.reconcile.finished_pods import FinishedPods
+from fractus_operator.reconcile.orphans import LostPods
 from fractus_operator.reconcile.rollout import Rollout
 
 INPUT = yaml.safe_load((Path(__file__).parents[1] / "golden" / "operator" / "input.yaml").read_text())
@@ -231,8 +233,10 @@ async def test_a_deployment_that_a_finalizer_keeps_takes_no_pods_along(kept: boo
         return kind.header("one", "city", uid=uid, labels=labels, ownerReferences=[{"uid": owner}]) | {"spec": {}}
 
     deployment = made(kinds.DEPLOYMENT, "d", "app")
+    # Not even by its label is it found again: that may have been taken off, too.
+    store.kept = frozenset({(kinds.DEPLOYMENT, "one")} if kept else ())
     listed = {
-        kinds.DEPLOYMENT: [deployment] if kept else [],
+        kinds.DEPLOYMENT: [],
         kinds.REPLICA_SET: [made(kinds.REPLICA_SET, "r", "d")],
         kinds.POD: [made(kinds.POD, "p", "r")],
     }
@@ -266,15 +270,102 @@ async def test_a_pod_that_was_kept_is_left_to_no_garbage_collector() -> None:
     assert store.said == ["delete Pod"]
 
 
+class Late(Store):
+    """An API server that carries out some requests after they had no answer, with what its controllers make of that."""
+
+    def __init__(self) -> None:
+        self.there: dict[tuple[str, Key], Body] = {}
+
+    def put(self, kind: Kind, name: str, *owners: Body, **metadata: Any) -> Body:
+        labels = {
+            "app.kubernetes.io/managed-by": "fractus",
+            "fractus.dev/application": "a",
+            "fractus.dev/instance": "one",
+        }
+        owning = [{"kind": o["kind"], "apiVersion": o["apiVersion"], "name": o["metadata"]["name"]} for o in owners]
+        references = [
+            {**o, "uid": owner["metadata"]["uid"], "controller": True} for o, owner in zip(owning, owners, strict=True)
+        ]
+        known = {"uid": f"{kind.name}/{name}", "resourceVersion": "1", "labels": labels, **metadata}
+        if references:
+            known["ownerReferences"] = references
+        body = kind.header(name, "city", **known) | {"spec": {}}
+        self.there[kind.path("city"), ("city", name)] = body
+        return body
+
+    async def request(self, method: str, path: str, body: Any = None, **_: Any) -> Body:
+        collection, _, name = path.rpartition("/")
+        if method == "DELETE":
+            if self.there.pop((collection, ("city", name)), None) is None:
+                raise NotFound(404, "NotFound", name)
+            return {"kind": "Status"}
+        return {"items": [found for (of, _), found in self.there.items() if of == path], "metadata": {}}
+
+    def names(self) -> set[str]:
+        return {f"{body['kind']}/{body['metadata']['name']}" for body in self.there.values()}
+
+
+def seen_by(store: Late) -> LiveInventory:
+    """What the watch of pods shows."""
+    live = LiveInventory(store)
+    for reflector in live.reflectors():
+        reflector.synced.set()
+    for (_, key), body in store.there.items():
+        if body["kind"] == "Pod":
+            live.pods.note(key, body)
+    return live
+
+
+async def test_what_is_made_after_a_teardown_is_removed_though_no_garbage_collector_finds_it() -> None:
+    """A deletion that leaves pods to be kept was carried out late, while a controller made what it had just seen removed again."""
+    store = Late()
+    live = seen_by(store)
+    children = Children(store, live.children, cast(Any, None))
+    await FinishedPods(store, live, children, lambda: NOW).tear_down(("city", "a"))
+    owned = store.put(kinds.REPLICA_SET, "one-7f")
+    store.put(kinds.POD, "one-7f-x", owned)
+    lost = LostPods(store, live := seen_by(store))
+    await lost.step()
+    assert store.names() == {"ReplicaSet/one-7f", "Pod/one-7f-x"}, "the garbage collector has its time"
+    store.put(kinds.APPLICATION, "a")
+    await lost.step()
+    assert {"ReplicaSet/one-7f", "Pod/one-7f-x"} < store.names(), "the watch of Applications is behind"
+    await store.delete(kinds.APPLICATION, ("city", "a"))
+    await lost.step()
+    assert store.names() == set()
+
+
+async def test_a_creation_that_was_carried_out_late_is_undone() -> None:
+    store = Late()
+    deployment = store.put(kinds.DEPLOYMENT, "one", kinds.APPLICATION.header("a", "city", uid="gone"))
+    store.put(kinds.POD, "one-7f-x", store.put(kinds.REPLICA_SET, "one-7f", deployment))
+    lost = LostPods(store, seen_by(store))
+    for _ in range(2):
+        await lost.step()
+    assert store.names() == set()
+
+
+async def test_a_copy_of_a_deployment_is_who_made_it_s() -> None:
+    store = Late()
+    store.put(kinds.POD, "one-7f-x", store.put(kinds.REPLICA_SET, "one-7f", store.put(kinds.DEPLOYMENT, "one")))
+    lost = LostPods(store, seen_by(store))
+    for _ in range(3):
+        await lost.step()
+    assert len(store.there) == 3
+
+
 class Spelling(Webhooks):
-    """An API server that spells what it is given in its own way."""
+    """An API server that spells what it is given in its own way; finalizers keep some of it."""
+
+    kept: frozenset[tuple[Kind, str]] = frozenset()
 
     async def written(self, how: str, kind: Kind, body: Body) -> Body:
         written = await super().written(how, kind, body)
         return {**written, "spec": {"cpu": "500m"}, "metadata": {**written["metadata"], "resourceVersion": "1"}}
 
-    async def delete(self, kind: Kind, _key: Key, _uid: str | None, *, orphan: bool = False) -> None:
+    async def delete(self, kind: Kind, key: Key, _uid: str | None, *, orphan: bool = False) -> bool:
         self.said.append(f"delete {kind.name}")
+        return (kind, key[1]) not in self.kept
 
     async def patch(self, kind: Kind, key: Key, changes: Body, _type: object) -> Body:
         self.said.append(f"patch {kind.name} {key[1]}")

@@ -227,6 +227,11 @@ class Children:
                 await self._delete(kind, child, orphan=orphan)
         return removed
 
+    async def remove_at_once(self, key: Key, kind: Kind) -> set[str]:
+        """Delete every child of a kind, and what it owns; the uids of those that no finalizer of another keeps."""
+        found = [body for body in self.of(key, kind) if "uid" in body["metadata"]]
+        return {body["metadata"]["uid"] for body in found if await self._delete(kind, body)}
+
     async def revoke(self, key: Key) -> None:
         """Delete every Grant of an application, also those that the watch has not shown yet."""
         namespace, name = key
@@ -234,13 +239,14 @@ class Children:
         for grant in await self._store.list(kinds.GRANT, selectors={"labelSelector": selector}):
             await self._delete(kinds.GRANT, grant)
 
-    async def _delete(self, kind: Kind, body: Body, *, orphan: bool = False) -> None:
+    async def _delete(self, kind: Kind, body: Body, *, orphan: bool = False) -> bool:
+        """Delete a child; whether it is gone now."""
         if "deletionTimestamp" in body["metadata"]:
-            return
+            return False
         logger.info("children: removing (kind=%s name=%s)", kind.name, body["metadata"]["name"])
         self._normalised.pop((kind, key_of(body)), None)
         self._met.discard((kind, key_of(body)))
-        await self._store.delete(kind, key_of(body), body["metadata"].get("uid"), orphan=orphan)
+        return await self._store.delete(kind, key_of(body), body["metadata"].get("uid"), orphan=orphan)
 
 
 async def _all(writes: Iterable[Awaitable[None]]) -> None:

@@ -114,32 +114,23 @@ class FinishedPods:
         """
         submitted = self._live.applications.get(key)
         interrupted = submitted is None or submitted.settled_generation is not None
-        deployments = [] if interrupted else self._children.of(key, kinds.DEPLOYMENT)
-        owners = {body["metadata"]["uid"] for body in deployments if "deletionTimestamp" not in body["metadata"]}
-        await self._children.remove(key, *reversed(kinds.CHILDREN))
-        if owners:
-            # One that another's finalizer keeps takes nothing with it.
-            owners -= {body["metadata"]["uid"] for body in await self._made(kinds.DEPLOYMENT, key)}
+        # One that another's finalizer keeps takes nothing with it: its answer says so, whatever labels it has by now.
+        owners = await self._children.remove_at_once(key, kinds.DEPLOYMENT)
+        await self._children.remove(key, *(kind for kind in reversed(kinds.CHILDREN) if kind is not kinds.DEPLOYMENT))
         collected: set[str] = set()
-        for body in await self._made(kinds.REPLICA_SET, key):
-            if _owned_by(owners, body) and "deletionTimestamp" not in body["metadata"]:
+        for body in await made_for(self._store, kinds.REPLICA_SET, key):
+            if not interrupted and owned_by(owners, body) and "deletionTimestamp" not in body["metadata"]:
                 collected.add(body["metadata"]["uid"])
             else:
                 await self._store.delete(kinds.REPLICA_SET, key_of(body), body["metadata"]["uid"])
-        for body in await self._made(kinds.POD, key):
+        for body in await made_for(self._store, kinds.POD, key):
             # Also those that were kept, which the application owns: the garbage collector comes to them late, or not at all.
-            if _present([read_pod(body)]) and not _owned_by(collected, body):
+            if _present([read_pod(body)]) and not owned_by(collected, body):
                 await self._store.delete(kinds.POD, key_of(body), body["metadata"]["uid"])
 
     async def _remove_replica_sets(self, key: Key) -> None:
-        for body in await self._made(kinds.REPLICA_SET, key):
+        for body in await made_for(self._store, kinds.REPLICA_SET, key):
             await self._store.delete(kinds.REPLICA_SET, key_of(body), body["metadata"]["uid"], orphan=True)
-
-    async def _made(self, kind: Kind, key: Key) -> list[Body]:
-        """What there is of a kind for an application, as the API server has it."""
-        namespace, name = key
-        selectors = {"labelSelector": f"{MANAGED_SELECTOR},{APPLICATION_LABEL}={label_value(name)}"}
-        return (await self._store.list_whole(kind, namespace=namespace, selectors=selectors)).items
 
     async def _stop_one(self, pod: PodView, submitted: Submitted) -> None:
         owner = {"apiVersion": API_VERSION, "kind": Application.KIND, "name": submitted.key[1], "uid": submitted.uid}
@@ -167,5 +158,13 @@ def _present(pods: Iterable[PodView]) -> list[PodView]:
     return [pod for pod in pods if pod.ours and not pod.terminating]
 
 
-def _owned_by(uids: Collection[str], body: Body) -> bool:
+async def made_for(store: Store, kind: Kind, key: Key) -> list[Body]:
+    """What there is of a kind for an application, as the API server has it."""
+    namespace, name = key
+    selectors = {"labelSelector": f"{MANAGED_SELECTOR},{APPLICATION_LABEL}={label_value(name)}"}
+    return (await store.list_whole(kind, namespace=namespace, selectors=selectors)).items
+
+
+def owned_by(uids: Collection[str], body: Body) -> bool:
+    """Whether one of some objects owns another."""
     return any(owner["uid"] in uids for owner in body["metadata"].get("ownerReferences") or ())

@@ -35,6 +35,7 @@ POLICIES = (
     "fractus-agent",
     "fractus-agent-kind",
     "fractus-pods",
+    "fractus-pod-nodes",
     "fractus-operator",
     "fractus-flight-pods",
     "fractus-flight-nodes",

@@ -139,6 +139,37 @@ def test_a_corrected_application_is_deployed(world: World, operator: OperatorPro
     world.phase(namespace, "Deploying")
 
 
+# -- what runs on drones and edge nodes --
+
+
+def test_no_pod_gets_to_a_drone_by_naming_it(world: World, chart: None, namespace: str) -> None:
+    """A kubelet heeds only taints with the effect NoExecute, and what tolerates none was not judged at all."""
+    drone = "/api/v1/nodes/drone-1"
+    pods = f"/api/v1/namespaces/{namespace}/pods?dryRun=All"
+
+    def named(node: str) -> Callable[[], object]:
+        spec = {"nodeName": node, "hostNetwork": True, "containers": [{"name": "a", "image": "a"}]}
+        pod = {"apiVersion": "v1", "kind": "Pod", "metadata": {"name": "named"}, "spec": spec}
+        return lambda: world.api.call("POST", pods, pod)
+
+    def refused(node: str) -> bool:
+        try:
+            named(node)()
+        except KubeError as error:
+            return "instead of nodeName" in str(error)
+        return False
+
+    wait_for(lambda: refused("drone-1"), "the admission policy to be in force")
+    denied(named("edge-1"), "edge-1 is a drone or an edge node, for which the scheduler places pods")
+    named("cloud-1")()
+    # One machine that is all at once, to try it out.
+    world.api.merge(drone, {"metadata": {"labels": {"fractus.dev/cloud": "true"}}})
+    try:
+        wait_for(lambda: not refused("drone-1"), "the node's label to be known")
+    finally:
+        world.api.merge(drone, {"metadata": {"labels": {"fractus.dev/cloud": None}}})
+
+
 # -- the operator's own permissions --
 
 

@@ -30,6 +30,7 @@ from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
 from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes
 from fractus_services.mobility.mavlink.fence import MissionFence
+from fractus_services.mobility.mavlink.neighbours import Memory
 from fractus_services.mobility.mavlink.returning import MavlinkReturn
 from fractus_services.mobility.rpc.wiring import Parts
 from fractus_vehicle.earth import Place
@@ -380,7 +381,9 @@ class Oracle:
 class Drone:
     """The mobility service of one drone, without its gRPC server."""
 
-    def __init__(self, directory: Path, account: Account, *, grace_s: float = 10.0) -> None:
+    def __init__(
+        self, directory: Path, account: Account, *, grace_s: float = 10.0, memory: Memory | None = None
+    ) -> None:
         self.grants = Grants()
         self._account = account
         self.audit = SimpleNamespace(append=self._append, failure="")
@@ -392,6 +395,7 @@ class Drone:
             on_found=lambda: self.parts.observer.found(),  # noqa: PLW0108
             on_heartbeat=lambda: self.parts.observer.heartbeat(),  # noqa: PLW0108
             on_parameter=lambda name: self.parts.observer.parameter(name),  # noqa: PLW0108
+            memory=memory,
         )
         self.journal = Journal(directory)
         self.journal._write = lambda _data: None  # type: ignore[method-assign]

@@ -71,7 +71,7 @@ def test_pods_that_a_policy_would_not_let_be_made_again_are_told(
             world.api.apply(f"/api/v1/namespaces/{namespace}/pods/cni", plugin)
         except KubeError as error:
             # The API server goes by the policy of an earlier test for a moment after that is deleted.
-            assert "fractus-pods" in str(error), error
+            assert "fractus-pod" in str(error), error
             return False
         return True
 

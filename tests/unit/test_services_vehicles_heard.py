@@ -57,6 +57,7 @@ async def test_a_vehicle_is_chosen_and_remembered_after_it_was_alone(tmp_path: P
     known = memory(tmp_path)
     link = Neighbours(known)
     assert not link.finds(heartbeat(7), 0.0, flying=False)
+    assert not link.problem(heartbeat(7), 0.0), "it is no other one than the drone's own"
     assert not link.finds(heartbeat(7), CHOICE_S - 0.1, flying=False)
     assert link.finds(heartbeat(7), CHOICE_S, flying=False)
     assert not link.problem(heartbeat(7), CHOICE_S + SURE_S)

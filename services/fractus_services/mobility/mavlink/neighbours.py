@@ -143,7 +143,7 @@ class Neighbours:
         """
         if tells_vehicle(message):
             self._hear((message.sysid, message.compid), now)
-        if self._waits:
+        if self._waits or self._own is None:
             return self._waits
         others = self._others(self._own, now)
         if not others:

@@ -284,15 +284,20 @@ def test_sigterm_stops_the_navigator_and_the_system_brings_the_drone_home(short:
 
 
 def test_telemetry_reads_as_json_lines_with_the_node_s_certificate(short: Stage) -> None:
-    done = subprocess.run(
-        [
-            sys.executable, "-m", "fractus_cli", "telemetry", "--node", "drone-1", "--address", short.address,
-            "--tls", str(short.folder / "node-tls"), "--interval", "0.1", "--count", "3", "-o", "json",
-        ],
-        capture_output=True, text=True, timeout=40, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    lines = [json.loads(line) for line in done.stdout.splitlines()]
+    def read() -> list[dict[str, Any]]:
+        done = subprocess.run(
+            [
+                sys.executable, "-m", "fractus_cli", "telemetry", "--node", "drone-1", "--address", short.address,
+                "--tls", str(short.folder / "node-tls"), "--interval", "0.1", "--count", "3", "-o", "json",
+            ],
+            capture_output=True, text=True, timeout=40, check=False,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        return [json.loads(line) for line in done.stdout.splitlines()]
+
+    # A vehicle that the service has never heard before is heard for some seconds before it is the drone's own.
+    short.wait("position", lambda: read()[-1]["position"] is not None)
+    lines = read()
     assert len(lines) == 3
     assert lines[-1]["flight_state"] == "inactive"
     assert lines[-1]["position"]["reference"] == "home"

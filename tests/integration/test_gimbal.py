@@ -33,6 +33,8 @@ NORTH = {
     "zones": [{"name": "yard", "area": area(-60, 40, 60, 80)}],
 }
 TIMEOUT_S = 90.0
+PACE_S = 0.2
+"""Between two pictures: a component that calls more often than fifty times a second is told to slow down."""
 
 
 class Station:
@@ -72,7 +74,7 @@ class Stage:
                     )
                 except grpc.aio.AioRpcError as error:
                     assert error.code() in {grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.PERMISSION_DENIED}, error
-                    await asyncio.sleep(0.2)
+                    await asyncio.sleep(PACE_S)
                     continue
                 request = camera_pb2.RetrieveImageRequest(name=shot.image.name)
                 try:
@@ -80,6 +82,7 @@ class Stage:
                 except grpc.aio.AioRpcError as error:
                     # What it shows was measured otherwise when it was taken.
                     assert "ask again" in (error.details() or ""), error
+                    await asyncio.sleep(PACE_S)
                     continue
                 await self.camera.DeleteImage(camera_pb2.DeleteImageRequest(name=shot.image.name), timeout=5)
                 return chunks[0].decision, b"".join(chunk.data for chunk in chunks)
@@ -91,6 +94,7 @@ class Stage:
                 decision, data = await self.taken()
                 if decision.action == action:
                     return decision, data
+                await asyncio.sleep(PACE_S)
 
     async def points(self, pitch_deg: float, yaw_deg: float) -> pb.Telemetry:
         """Wait until the gimbal is measured there."""

@@ -172,9 +172,12 @@ class EventsOfTheCluster(RuleBasedStateMachine):
         return next(r for r in self.live.reflectors() if r.kind == kind)
 
     def take(self, kind: Kind, type_: str, body: Body) -> None:
-        self.reflector(kind)._take(type_, copy.deepcopy(body))
-        if kind is kinds.APPLICATION and type_ == "DELETED":
-            self.decided.pop(key_of(body), None)
+        key, reflector = key_of(body), self.reflector(kind)
+        known = reflector.get(key) is not None
+        reflector._take(type_, copy.deepcopy(body))
+        # What was deleted before the last answer told of it is there again, and its plan stays.
+        if kind is kinds.APPLICATION and known and reflector.get(key) is None:
+            self.decided.pop(key, None)
 
     @rule(kind=st.sampled_from(KINDS), again=st.booleans())
     def hear(self, kind: Kind, again: bool) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 from fractus_mavlink import message
+from fractus_mavlink.enums import MAV_MODE_FLAG
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.vehicle import Vehicle
 
@@ -119,3 +120,14 @@ def test_it_tells_of_satellites_wind_and_what_it_says() -> None:
         vehicle.take(message("STATUSTEXT", severity=4, text=f"text {number}".encode()), 5.0)
     assert len(vehicle.reports) == 50
     assert vehicle.reports[-1] == (60, 4, "text 59")
+
+
+@pytest.mark.parametrize(("flags", "lost"), [(POSITIONED, False), (BOOTED, True)])
+def test_a_path_is_kept_over_a_restart_of_the_service_where_the_position_is_known(flags: int, lost: bool) -> None:
+    vehicle = Vehicle(stack=ARDUCOPTER)
+    vehicle.take(message("HEARTBEAT", base_mode=MAV_MODE_FLAG.SAFETY_ARMED), 100.0)
+    vehicle.take(message("EKF_STATUS_REPORT", flags=flags), 100.5)
+    vehicle.take(message("EKF_STATUS_REPORT", flags=POSITIONED), 101.5)
+    assert vehicle.path_lost is lost
+    vehicle.take(message("EKF_STATUS_REPORT", flags=POSITIONED), 115.0)
+    assert vehicle.path_lost, "of what is silent for so long nothing is known"

@@ -163,7 +163,10 @@ def _status(vehicle: Vehicle, message: Message, now: float) -> None:
 def _estimator(vehicle: Vehicle, message: Message, now: float) -> None:
     # The checks pass without a position in modes that need none; the flags tell whether GUIDED has what it needs.
     vehicle.estimated = message.integer("flags") & _POSITIONED == _POSITIONED
-    vehicle.path_lost = vehicle.path_lost or (vehicle.armed and now - vehicle.placed_at > PATH_KEPT_S)
+    # A service that begins in flight has heard of no position before: a vehicle that has one kept its path as far as anyone knows.
+    begins = vehicle.placed_at == -math.inf and vehicle.estimated
+    lost = vehicle.armed and not begins and now - vehicle.placed_at > PATH_KEPT_S
+    vehicle.path_lost = vehicle.path_lost or lost
     if vehicle.estimated:
         vehicle.placed_at = now
     vehicle.estimated_at = now

@@ -103,3 +103,20 @@ def test_what_others_have_armed_is_theirs_also_after_a_restart_of_the_service(mo
             assert (again.control.authority, again.journal.record.armed_by_others) == (Authority.SYSTEM, False)
 
     virtual_time.fly(work)
+
+
+def test_motors_that_others_start_just_after_the_driver_did_are_theirs(tmp_path: Path) -> None:
+    """The start was answered, and then the motors stopped again: no answer is missing any more."""
+
+    async def work() -> None:
+        async with World(tmp_path) as world:
+            grant = world.grants.put(spec())
+            await world.drive(grant)
+            await world.service.arm(grant)
+            for armed in (False, True):
+                world.plane.vehicle.armed = armed
+                world.observer.heartbeat()
+            assert world.control.authority is Authority.PILOT
+            assert world.control.state.armed_by_others
+
+    virtual_time.fly(work)

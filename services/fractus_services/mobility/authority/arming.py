@@ -138,11 +138,12 @@ class Arming:
                     if autopilot.now > deadline:
                         raise AutopilotError("the autopilot accepted to arm and did not")
                     await autopilot.update(WAIT_S)
+                unanswered = False
                 await autopilot.set_home(*home)
                 await self._control.tasks.attempt(autopilot.ask_home)
                 permit()
             except Exception as error:
-                unanswered = not (isinstance(error, AutopilotError) and error.refused)
+                unanswered = unanswered and not (isinstance(error, AutopilotError) and error.refused)
                 if not autopilot.vehicle.in_air:
                     await self._control.tasks.attempt(autopilot.disarm)
                 raise

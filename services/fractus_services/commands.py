@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import asyncio
+from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any
 
@@ -99,9 +100,20 @@ def mobility() -> None:
 @click.option("--verbose", "-v", is_flag=True, help="Log more.")
 def serve_mobility(verbose: bool, **given: Any) -> None:
     """Serve until stopped; waits for certificates and for the autopilot."""
-    from fractus_services.mobility.rpc.server import run  # noqa: PLC0415 - the command line stays quick
+    from fractus_services.mobility.mavlink.startup import with_heartbeats  # noqa: PLC0415 - the command line stays quick
+
+    async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
+        # Most of the start is importing, on a small computer for longer than a drone in flight is left alone.
+        serve = await with_heartbeats(asyncio.to_thread(_mobility_server), options.state, options.autopilot)
+        await serve(options, stop)
 
     until_signalled("mobility", run, MobilityOptions(**given), verbose)
+
+
+def _mobility_server() -> Callable[[MobilityOptions, asyncio.Event], Coroutine[Any, Any, None]]:
+    from fractus_services.mobility.rpc.server import run  # noqa: PLC0415 - takes long
+
+    return run
 
 
 @click.group()

@@ -9,7 +9,7 @@ from pathlib import Path
 from fractus_core.api.descriptions import InvalidDescription, parse_description
 from fractus_core.api.nodes import Drone, EdgeNode
 
-from fractus_services.errors import CannotServe
+from fractus_services.options import CannotServe
 
 log = logging.getLogger(__name__)
 

@@ -90,7 +90,3 @@ class AutopilotError(Exception):
         super().__init__(reason)
         self.link = link
         self.refused = refused
-
-
-class CannotServe(Exception):
-    """A service cannot run as it is told to; the message names what is wrong and the remedy."""

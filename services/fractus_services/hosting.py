@@ -14,7 +14,7 @@ from fractus_observe.spans import Tracer
 
 from fractus_services.admission import CallAdmission
 from fractus_services.auth import KEEPALIVE, TlsFiles
-from fractus_services.errors import CannotServe
+from fractus_services.options import CannotServe
 
 log = logging.getLogger(__name__)
 

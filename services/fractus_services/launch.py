@@ -12,8 +12,7 @@ from typing import Any, TypeVar
 import click
 from fractus_observe import logs
 
-from fractus_services.errors import CannotServe
-from fractus_services.options import ServiceOptions
+from fractus_services.options import CannotServe, ServiceOptions
 from fractus_services.service_lock import ServiceLock
 
 # gRPC reads it when it is imported, which is later. Below that, its core writes a line for each handshake that fails, past any

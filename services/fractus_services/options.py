@@ -6,6 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 
+class CannotServe(Exception):
+    """A service cannot run as it is told to; the message names what is wrong and the remedy."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServiceOptions:
     """Options of both services."""

@@ -16,7 +16,7 @@ from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
-from fractus_services.errors import CannotServe
+from fractus_services.options import CannotServe
 
 log = logging.getLogger(__name__)
 

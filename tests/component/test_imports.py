@@ -46,3 +46,10 @@ def test_plain_pictures_need_no_opencv() -> None:
     )
     assert "PIL" in imported
     assert "cv2" not in imported
+
+
+def test_the_first_heartbeats_of_a_start_wait_for_no_large_import() -> None:
+    """A drone in flight waits for them: what takes a small computer seconds to import comes afterwards."""
+    _, imported = after("import fractus_services.commands, fractus_services.mobility.mavlink.startup")
+    assert "fractus_mavlink" in imported
+    assert not imported & {"grpc", "google", "numpy", "shapely", "pydantic", "yaml", "cryptography", "fractus_core"}

@@ -81,6 +81,7 @@ async def test_a_killed_service_finds_its_drone_again(rig: Rig) -> None:
     await goto_once_located(again, 0, 40)
     reply = await again.stub.ReturnControl(pb.ReturnControlRequest(), timeout=5)
     assert reply.mission_complete
+    assert "heartbeats keep it from its failsafe" in rig.log("service"), "while it was imported"
     await rig.until(lambda t: not t.armed, 90, "landing")
 
 

@@ -12,7 +12,7 @@ from fractus_core.api.model import API_VERSION
 from fractus_core.api.nodes import Drone, EdgeNode
 from fractus_services import description as module
 from fractus_services.description import NodeDescription
-from fractus_services.errors import CannotServe
+from fractus_services.options import CannotServe
 
 
 def drone(pitch: float, name: str = "drone-1") -> dict[str, Any]:

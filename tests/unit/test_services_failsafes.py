@@ -11,8 +11,8 @@ import pytest
 from fractus_core.policy.values import Airframe
 from fractus_mavlink import message
 from fractus_services.mobility.autopilot import Checked
+from fractus_services.mobility.mavlink.companion import SYSTEM_ID
 from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes
-from fractus_services.mobility.mavlink.link import SYSTEM_ID
 from parameter_vehicle import MOVEMENT, ParameterVehicle
 from virtual_time import Loop
 

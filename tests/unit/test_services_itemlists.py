@@ -12,8 +12,8 @@ from fractus_services.mobility.mavlink import itemlists
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
 from fractus_services.mobility.mavlink.bounds import Item
+from fractus_services.mobility.mavlink.companion import COMPONENT_ID, SYSTEM_ID
 from fractus_services.mobility.mavlink.itemlists import NoLists, NoSpace, download, upload
-from fractus_services.mobility.mavlink.link import COMPONENT_ID, SYSTEM_ID
 
 ITEMS = tuple(Item(5001, 3.0, 393600000 + i, 229500000 - i) for i in range(3))
 

@@ -8,7 +8,8 @@ from typing import Literal, Protocol
 from fractus_core.policy.values import Situation
 
 from fractus_services.camera.imaging.pixels import Pixels
-from fractus_services.errors import CannotServe, Unavailable
+from fractus_services.errors import Unavailable
+from fractus_services.options import CannotServe
 
 TIMEOUT_S = 5.0
 """A camera that takes longer for a picture is broken."""

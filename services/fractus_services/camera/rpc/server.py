@@ -35,12 +35,11 @@ from fractus_services.camera.rpc.handlers import CameraHandlers
 from fractus_services.camera.rpc.telemetry import follow_telemetry
 from fractus_services.clock import Clock
 from fractus_services.description import NodeDescription
-from fractus_services.errors import CannotServe
 from fractus_services.grant_verifier import GrantVerifier
 from fractus_services.grants import GrantFiles
 from fractus_services.hosting import run_until, serve_grpc
 from fractus_services.metrics import ServiceMetrics, common_figures
-from fractus_services.options import CameraOptions
+from fractus_services.options import CameraOptions, CannotServe
 from fractus_services.recording.recorder import Recorder
 from fractus_services.recording.segments import segments_in
 

@@ -10,8 +10,8 @@ from fractus_core.policy.returning import ReturnBounds
 from fractus_core.policy.values import Airframe
 from fractus_mavlink.enums import COPTER_MODE, FENCE_TYPE, MAV_AUTOPILOT, MAV_TYPE
 
+from fractus_services.mobility.mavlink.companion import SYSTEM_ID
 from fractus_services.mobility.mavlink.flight_stack import Names, ParameterReader, Setting
-from fractus_services.mobility.mavlink.link import SYSTEM_ID
 
 _KINDS = {
     COPTER_MODE.GUIDED: ModeKind.COMMANDED,

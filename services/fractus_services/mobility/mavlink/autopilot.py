@@ -21,8 +21,9 @@ from fractus_mavlink.enums import (
 
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.autopilot import COURSE_S, Permit, always
+from fractus_services.mobility.mavlink.companion import SYSTEM_ID
 from fractus_services.mobility.mavlink.flight_stack import FlightStack
-from fractus_services.mobility.mavlink.link import SYSTEM_ID, Link, ignore
+from fractus_services.mobility.mavlink.link import Link, ignore
 from fractus_services.mobility.mavlink.neighbours import Memory
 from fractus_services.mobility.mavlink.orders import Orders, Velocity, moves
 from fractus_services.mobility.mavlink.parameters import Parameters

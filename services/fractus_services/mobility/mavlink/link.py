@@ -10,9 +10,9 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 
 from fractus_mavlink import Endpoint, Message, message
-from fractus_mavlink.enums import MAV_AUTOPILOT, MAV_COMPONENT, MAV_STATE, MAV_TYPE
 
 from fractus_services.errors import AutopilotError
+from fractus_services.mobility.mavlink.companion import COMPONENT_ID, SYSTEM_ID, heartbeat
 from fractus_services.mobility.mavlink.flight_stack import FlightStack
 from fractus_services.mobility.mavlink.listeners import Listeners
 from fractus_services.mobility.mavlink.neighbours import Memory, Neighbours, Source
@@ -22,16 +22,10 @@ from fractus_services.mobility.mavlink.vehicle import Vehicle
 
 log = logging.getLogger(__name__)
 
-SYSTEM_ID, COMPONENT_ID = 244, MAV_COMPONENT.ONBOARD_COMPUTER
-"""The companion is a system of its own, whose heartbeats alone hold off the autopilot's failsafe: ground stations, which
-are 255 as a rule, must not."""
-
 HEARTBEAT_S = 1.0
 SILENCE_S = 3.0
 RECONNECT_AFTER_S = 6.0
 BACKOFF_S = (0.2, 3.0)
-MAVLINK_VERSION = 3
-"""What a heartbeat says of the dialect; the frames' version is in their first byte."""
 
 
 def ignore(_data: bytes) -> None:
@@ -180,15 +174,7 @@ class Link:
             if not self.found:
                 self._knock()
             return
-        self.send(
-            message(
-                "HEARTBEAT",
-                type=MAV_TYPE.ONBOARD_CONTROLLER,
-                autopilot=MAV_AUTOPILOT.INVALID,
-                system_status=MAV_STATE.ACTIVE,
-                mavlink_version=MAVLINK_VERSION,
-            )
-        )
+        self.send(heartbeat())
 
     def _knock(self) -> None:
         """Speak without a heartbeat: an autopilot behind UDP answers only those it has heard."""

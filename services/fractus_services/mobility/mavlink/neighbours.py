@@ -52,6 +52,18 @@ def _tells_autopilot(message: Message) -> bool:
     )
 
 
+def remembered(path: Path) -> tuple[str, Source] | None:
+    """The drone's own vehicle as a file remembers it, and the link on which it was heard."""
+    try:
+        stored = json.loads(path.read_bytes())
+        return str(stored["link"]), (int(stored["system"]), int(stored["component"]))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        log.critical("link: which vehicle is the drone's own is forgotten (path=%s, error=%s)", path, error)
+        return None
+
+
 class Memory:
     """The drone's own vehicle on disk: after a restart in flight there is no time to find out which one it is.
 
@@ -64,14 +76,9 @@ class Memory:
         self._path, self._url = path, url
         self._storing: asyncio.Future[None] | None = None
         self.own: Source | None = None
-        try:
-            stored = json.loads(path.read_bytes())
-            if stored["link"] == url:
-                self.own = int(stored["system"]), int(stored["component"])
-        except FileNotFoundError:
-            return
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            log.critical("link: which vehicle is the drone's own is forgotten (path=%s, error=%s)", path, error)
+        known = remembered(path)
+        if known is not None and known[0] == url:
+            self.own = known[1]
 
     def keep(self, own: Source) -> None:
         """Write it in the background, once."""

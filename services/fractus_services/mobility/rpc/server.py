@@ -16,7 +16,6 @@ from fractus_storage.audit import AuditLog
 from fractus_services.auth import TlsFiles
 from fractus_services.clock import Clock
 from fractus_services.description import NodeDescription
-from fractus_services.errors import CannotServe
 from fractus_services.grant_verifier import GrantVerifier
 from fractus_services.grants import GrantFiles
 from fractus_services.hosting import run_until, serve_grpc
@@ -28,11 +27,12 @@ from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes
 from fractus_services.mobility.mavlink.fence import MissionFence
 from fractus_services.mobility.mavlink.neighbours import Memory
 from fractus_services.mobility.mavlink.returning import MavlinkReturn
+from fractus_services.mobility.mavlink.startup import VEHICLE_FILE, came_to_serve
 from fractus_services.mobility.mavlink.traced import TracedAutopilot
 from fractus_services.mobility.rpc.figures import flight_figures
 from fractus_services.mobility.rpc.handlers import MobilityHandlers
 from fractus_services.mobility.rpc.wiring import Parts
-from fractus_services.options import MobilityOptions
+from fractus_services.options import CannotServe, MobilityOptions
 from fractus_services.recording.recorder import Recorder
 from fractus_services.recording.segments import segments_in
 
@@ -83,6 +83,7 @@ def _linked(
     def found() -> None:
         heard.set()
         parts.observer.found()
+        parts.control.tasks.spawn(came_to_serve(options.state))
 
     autopilot = TracedAutopilot(
         url,
@@ -92,7 +93,7 @@ def _linked(
         on_found=found,
         on_heartbeat=lambda: parts.observer.heartbeat(),  # noqa: PLW0108
         on_parameter=lambda name: parts.observer.parameter(name),  # noqa: PLW0108
-        memory=Memory(options.state / "vehicle.json", url),
+        memory=Memory(options.state / VEHICLE_FILE, url),
         received=recorder.take_received,
         sent=recorder.take_sent,
     )

@@ -1,0 +1,123 @@
+"""Heartbeats while the service starts: for a drone in flight, for a limited time, and once for each service that served."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fractus_mavlink import Endpoint, Parser
+from fractus_mavlink.enums import COPTER_MODE, MAV_AUTOPILOT, MAV_MODE_FLAG, MAV_STATE, MAV_TYPE
+from fractus_services.mobility.mavlink import startup
+from fractus_services.mobility.mavlink.companion import COMPONENT_ID, SYSTEM_ID
+from virtual_time import Loop
+
+URL = "udpout:192.168.1.2:14550"
+
+
+class Air:
+    """A link, and a vehicle that tells its heartbeat once a second once it was spoken to."""
+
+    def __init__(self, *, state: MAV_STATE = MAV_STATE.ACTIVE, armed: bool = True, sysid: int = 1) -> None:
+        self._vehicle = Endpoint(sysid, 1)
+        self._told = {
+            "type": MAV_TYPE.QUADROTOR, "autopilot": MAV_AUTOPILOT.ARDUPILOTMEGA, "custom_mode": COPTER_MODE.GUIDED,
+            "system_status": state, "base_mode": MAV_MODE_FLAG.SAFETY_ARMED if armed else 0,
+        }  # fmt: skip
+        self._receive: Callable[[bytes], None] | None = None
+        self.opened: list[str] = []
+        self.beats: list[float] = []
+
+    async def open_link(self, url: str, receive: Callable[[bytes], None], closed: Callable[[Any], None]) -> Air:
+        self.opened.append(url)
+        if len(self.opened) == 1:
+            raise ConnectionRefusedError
+        self._closed = closed
+        self._fly(receive)
+        return self
+
+    def _fly(self, receive: Callable[[bytes], None]) -> None:
+        if self._receive is not None:
+            receive(self._vehicle.encode("HEARTBEAT", self._told))
+        self._again = asyncio.get_running_loop().call_later(1.0, self._fly, receive)
+
+    def write(self, data: bytes) -> None:
+        self._receive = self._receive or (lambda _data: None)
+        for heard in Parser().feed(data):
+            if heard.name == "HEARTBEAT":
+                assert (heard.sysid, heard.compid) == (SYSTEM_ID, COMPONENT_ID)
+                self.beats.append(asyncio.get_running_loop().time())
+
+    def close(self) -> None:
+        self._again.cancel()
+
+
+def served(directory: Path) -> Path:
+    (directory / "vehicle.json").write_text(json.dumps({"link": URL, "system": 1, "component": 1}))
+    asyncio.run(startup.came_to_serve(directory))
+    return directory
+
+
+def start(
+    air: Air, directory: Path, monkeypatch: pytest.MonkeyPatch, *, url: str | None = None, takes_s: float = 7.5
+) -> list[float]:
+    """When heartbeats were sent during a start."""
+    monkeypatch.setattr(startup, "open_link", air.open_link)
+    with asyncio.Runner(loop_factory=Loop) as runner:
+        begun_s = runner.get_loop().time()
+        assert runner.run(startup.with_heartbeats(asyncio.sleep(takes_s, "server"), directory, url)) == "server"
+    return [round(at - begun_s, 1) for at in air.beats]
+
+
+@pytest.mark.parametrize("url", [None, URL])
+def test_a_drone_in_flight_hears_heartbeats_while_the_service_starts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, url: str | None
+) -> None:
+    air = Air()
+    assert start(air, served(tmp_path), monkeypatch, url=url) == [2.0, 3.0, 4.0, 5.0, 6.0, 7.0]
+    assert air.opened == [URL, URL]
+
+
+def test_a_start_that_takes_too_long_leaves_the_drone_to_its_failsafe(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    beats = start(Air(), served(tmp_path), monkeypatch, takes_s=60.0)
+    assert startup.TIMEOUT_S - 1.5 < beats[-1] <= startup.TIMEOUT_S
+
+
+def test_a_start_that_fails_leaves_the_next_one_no_heartbeats(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    served(tmp_path)
+    assert start(Air(), tmp_path, monkeypatch)
+    air = Air()
+    assert start(air, tmp_path, monkeypatch) == []
+    assert air.opened == []
+    served(tmp_path)
+    assert start(Air(), tmp_path, monkeypatch)
+
+
+@pytest.mark.parametrize(
+    "air",
+    [Air(armed=False), Air(state=MAV_STATE.STANDBY), Air(state=MAV_STATE.CRITICAL), Air(sysid=2)],
+    ids=["stands", "on the ground", "failsafe acts", "another vehicle"],
+)
+def test_no_one_else_hears_heartbeats(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, air: Air) -> None:
+    assert start(air, served(tmp_path), monkeypatch) == []
+
+
+def test_another_link_or_an_unknown_vehicle_is_not_spoken_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    air = Air()
+    assert start(air, served(tmp_path), monkeypatch, url="tcp:127.0.0.1:5760") == []
+    (tmp_path / "vehicle.json").unlink()
+    assert start(air, tmp_path, monkeypatch) == []
+    assert air.opened == []
+
+
+def test_a_broken_link_keeps_no_service_from_starting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Broken(Air):
+        async def open_link(self, url: str, receive: Any, closed: Any) -> Air:
+            raise ValueError(url)
+
+    assert start(Broken(), served(tmp_path), monkeypatch) == []

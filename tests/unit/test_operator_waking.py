@@ -44,6 +44,24 @@ async def test_what_another_application_leaves_wakes_only_those_without_a_plan_t
         assert await placed.changed(1)
 
 
+async def test_a_manifest_that_is_applied_ends_a_rest_and_what_is_reported_does_not() -> None:
+    live = LiveInventory(cast(Store, None))
+
+    def seen(version: int, generation: int, phase: str) -> None:
+        names = {"namespace": "ns", "name": "a", "uid": "a"}
+        metadata = {**names, "resourceVersion": str(version), "generation": generation}
+        live.applications.note(("ns", "a"), {**APPLICATION, "metadata": metadata, "status": {"phase": phase}})
+
+    seen(1, 1, "Deploying")
+    with live.subscriptions.subscribe(("ns", "a")) as inputs:
+        seen(2, 1, "Running")
+        assert await inputs.changed(0)
+        assert not inputs._urgent.is_set()
+        seen(3, 2, "Running")
+        assert await inputs.changed(0)
+        assert inputs._urgent.is_set(), "who applies it waits for the answer"
+
+
 def pod_body(version: int, node: str | None, phase: str = "Running") -> dict[str, Any]:
     metadata = {"namespace": "ns", "name": "p", "uid": "p", "resourceVersion": str(version)}
     return {"metadata": metadata, "spec": {"nodeName": node, "containers": []}, "status": {"phase": phase}}

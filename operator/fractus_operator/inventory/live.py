@@ -257,7 +257,7 @@ class LiveInventory:
             # What is new leaves nothing to others.
             if old is not None:
                 self.subscriptions.wake_waiting()
-        self.subscriptions.wake(key)
+        self.subscriptions.wake(key, urgent=_was_changed(old, new))
 
     def _child_changed(self, key: Key, old: Body | None, new: Body | None) -> None:
         body = new or old or {}
@@ -287,6 +287,11 @@ class LiveInventory:
     def _report(self, kind: Kind, key: Key) -> None:
         for listener in self._listeners.get(kind, ()):
             listener(key)
+
+
+def _was_changed(old: Submitted | None, new: Submitted | None) -> bool:
+    """Whether a user changed an Application, and waits for the answer; what is reported of it is no such change."""
+    return old is not None and new is not None and old.metadata.generation != new.metadata.generation
 
 
 def _held(pod: PodView | None) -> tuple[str, Mapping[str, float]] | None:

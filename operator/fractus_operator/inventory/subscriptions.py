@@ -79,10 +79,10 @@ class Subscriptions:
         if full:
             self._full[label] = full
 
-    def wake(self, key: Key) -> None:
+    def wake(self, key: Key, *, urgent: bool = False) -> None:
         """Wake one application."""
         for subscription in self._of.get(labelled(key), ()):
-            subscription.wake()
+            subscription.wake(urgent=urgent)
 
     def wake_waiting(self) -> None:
         """Wake every application without a plan that suits it: another one left something that it may wait for."""

@@ -133,7 +133,7 @@ class Applications:
                     await self._reporter.failed(self._live.applications.get(key), backoff.attempts, error)
                 took_s = loop.time() - started
                 if await inputs.changed(next_s):
-                    # Changes come in bursts, such as the pods of a plan: one reconcile for all. Zones and policies do not wait.
+                    # Changes come in bursts, such as the pods of a plan: one reconcile for all. What a user applies does not wait.
                     await inputs.rest(min(_REST_FACTOR * took_s, _MAX_REST_S))
 
     async def reconcile(self, key: Key) -> float:

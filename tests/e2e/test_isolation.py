@@ -231,8 +231,19 @@ def test_naming_the_drone_does_not_get_a_pod_there(alices: Kube) -> None:
     named = grasping("named")
     del named["spec"]["tolerations"]
     named["spec"]["nodeName"] = DRONE
-    assert "instead of nodeName" in create(alices, named)
-    assert get(alices, "named") is None
+    assert create(alices, named) == ""
+    seen: list[Object] = []
+
+    def over() -> bool:
+        now = get(alices, "named")
+        seen.extend([now] if now else [])
+        return now is None or now["status"]["phase"] == "Failed"
+
+    alices.wait("the pod is turned away", over, timeout_s=60)
+    statuses = [s for found in seen for s in found["status"].get("containerStatuses", [])]
+    assert not [s for s in statuses if s.get("started") or "running" in s["state"] or "terminated" in s["state"]]
+    events = [e for e in alices.all("events", NAMESPACE) if e["involvedObject"]["name"] == "named"]
+    assert not {"Pulled", "Created", "Started"} & {e["reason"] for e in events}
 
 
 def get(kube: Kube, name: str) -> Object | None:

@@ -645,6 +645,26 @@ def test_nodes_get_location_labels(world: World, operator: OperatorProcess) -> N
     assert set(labels) == {"fractus.dev/class"}
 
 
+def test_a_node_is_labelled_as_guarded_while_its_taint_guards_it(world: World, operator: OperatorProcess) -> None:
+    node = "/api/v1/nodes/edge-1"
+
+    def taint(*effects: str) -> None:
+        taints = [{"key": "fractus.dev/class", "value": "edge", "effect": effect} for effect in effects]
+        world.api.merge(node, {"spec": {"taints": taints}})
+
+    def guarded() -> bool:
+        return "fractus.dev/guarded" in (world.api.get(node) or {})["metadata"]["labels"]
+
+    try:
+        taint("NoSchedule", "NoExecute")
+        wait_for(guarded, "the node's label")
+        taint("NoSchedule")
+        wait_for(lambda: not guarded(), "the label to go")
+        assert _geohash(world, "edge-1")
+    finally:
+        taint()
+
+
 def test_a_small_change_moves_nothing_else(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     before = versions(world, namespace)

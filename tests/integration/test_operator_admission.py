@@ -162,12 +162,14 @@ def test_no_pod_gets_to_a_drone_by_naming_it(world: World, chart: None, namespac
     wait_for(lambda: refused("drone-1"), "the admission policy to be in force")
     denied(named("edge-1"), "edge-1 is a drone or an edge node, for which the scheduler places pods")
     named("cloud-1")()
-    # One machine that is all at once, to try it out.
-    world.api.merge(drone, {"metadata": {"labels": {"fractus.dev/cloud": "true"}}})
-    try:
-        wait_for(lambda: not refused("drone-1"), "the node's label to be known")
-    finally:
-        world.api.merge(drone, {"metadata": {"labels": {"fractus.dev/cloud": None}}})
+    # One machine that is all at once, to try it out; and one whose kubelet sees to it, which no policy need look for in each pod.
+    for label in ("fractus.dev/cloud", "fractus.dev/guarded"):
+        world.api.merge(drone, {"metadata": {"labels": {label: "true"}}})
+        try:
+            wait_for(lambda: not refused("drone-1"), "the node's label to be known")
+        finally:
+            world.api.merge(drone, {"metadata": {"labels": {label: None}}})
+        wait_for(lambda: refused("drone-1"), "the node's label to be gone")
 
 
 # -- the operator's own permissions --

@@ -160,7 +160,7 @@ def left(world: World) -> Iterator[list[str]]:
     world.api.apply(f"{CORE}/configmaps/fractus-ca", public)
     lease = {"apiVersion": "coordination.k8s.io/v1", "kind": "Lease", "metadata": {"name": "fractus-operator", "namespace": SYSTEM}}  # fmt: skip
     world.api.apply(f"{LEASES}/fractus-operator", lease)
-    labels = {"fractus.dev/depot": "base", "fractus.dev/geohash": "swbb5f", "fractus.dev/interface-wifi": "true"}
+    labels = {f"fractus.dev/{n}": "true" for n in ("depot", "geohash", "guarded", "interface-wifi")}
     world.api.merge("/api/v1/nodes/drone-1", {"metadata": {"labels": labels | {"example.com/mine": "yes"}}})
     for name, signer in (("ours", "fractus.dev/node"), ("theirs", "example.com/other")):
         spec = {

@@ -425,6 +425,20 @@ def test_a_node_s_heartbeat_changes_nothing() -> None:
     assert not read_host({"metadata": {"name": "n"}, "spec": {"unschedulable": True}}).schedulable
 
 
+@pytest.mark.parametrize(
+    ("key", "effect", "guarded"),
+    [
+        ("fractus.dev/class", "NoExecute", True),
+        ("fractus.dev/class", "NoSchedule", False),
+        ("node.kubernetes.io/unreachable", "NoExecute", False),
+    ],
+)
+def test_only_the_taint_that_kubelets_heed_guards_a_node(key: str, effect: str, guarded: bool) -> None:
+    node = {"metadata": {"name": "n"}, "spec": {"taints": [{"key": key, "effect": effect}]}}
+    assert read_host(node).guarded is guarded
+    assert not read_host({"metadata": {"name": "n"}}).guarded
+
+
 # -- settings --
 
 

@@ -23,6 +23,7 @@ class Host:
     Attributes:
         allocatable: what it offers to pods, resource name to quantity in base units (cores, bytes, pieces).
         requested: what the pods on it have asked for, the same way; those of the application that is planned do not count.
+        guarded: whether its kubelet turns away pods that do not tolerate the taint of drones and edge nodes, also those that name it.
     """
 
     name: str
@@ -31,6 +32,7 @@ class Host:
     requested: Mapping[str, float] = field(default_factory=dict)
     ready: bool = True
     schedulable: bool = True
+    guarded: bool = False
 
     @property
     def is_cloud(self) -> bool:

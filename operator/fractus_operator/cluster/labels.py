@@ -35,14 +35,16 @@ FINALIZER = f"{GROUP}/teardown"
 DEPOT_LABEL = f"{GROUP}/depot"
 GEOHASH_LABEL = f"{GROUP}/geohash"
 INTERFACE_LABEL = f"{GROUP}/interface-"
+GUARDED_LABEL = f"{GROUP}/guarded"
+"""On Nodes: its taint keeps also pods away that name it, so that no admission policy has to look for its name in every pod."""
 
 LEASE_NAME = "fractus-operator"
 """Of the Lease by which one operator acts."""
 
 
 def is_location_label(name: str) -> bool:
-    """Whether a label of a Node says where it is: the operator's own."""
-    return name in {DEPOT_LABEL, GEOHASH_LABEL} or name.startswith(INTERFACE_LABEL)
+    """Whether a label of a Node says where it is, or that it is guarded: the operator's own."""
+    return name in {DEPOT_LABEL, GEOHASH_LABEL, GUARDED_LABEL} or name.startswith(INTERFACE_LABEL)
 
 
 def service_name(application: str, component: Component) -> str:

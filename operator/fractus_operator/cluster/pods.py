@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import NamedTuple
 
+from fractus_core.api.names import CLASS_LABEL
 from fractus_core.planning.inventory import Host
 from fractus_core.planning.quantities import amount_of
 
@@ -225,6 +226,7 @@ def read_host(body: Body) -> Host:
         allocatable=_allocatable(tuple((status.get("allocatable") or {}).items())),
         ready=ready,
         schedulable=not spec.get("unschedulable", False),
+        guarded=any(t["key"] == CLASS_LABEL and t["effect"] == "NoExecute" for t in spec.get("taints") or ()),
     )
 
 

@@ -8,7 +8,13 @@ from fractus_core.api import Drone, EdgeNode
 from fractus_core.api.geometry import Point
 
 from fractus_operator.cluster.kinds import NODE, Key
-from fractus_operator.cluster.labels import DEPOT_LABEL, GEOHASH_LABEL, INTERFACE_LABEL, is_location_label
+from fractus_operator.cluster.labels import (
+    DEPOT_LABEL,
+    GEOHASH_LABEL,
+    GUARDED_LABEL,
+    INTERFACE_LABEL,
+    is_location_label,
+)
 from fractus_operator.cluster.store import NotFound, Store
 from fractus_operator.inventory.live import LiveInventory
 
@@ -70,7 +76,7 @@ class Locations:
         self._live = live
 
     async def reconcile(self, key: Key) -> None:
-        """Label one Node as its Drone or EdgeNode says; with neither, take these labels away."""
+        """Label one Node as its Drone or EdgeNode and its taint say; with none, take these labels away."""
         name = key[1]
         host = self._live.hosts.get(key)
         if host is None:
@@ -81,6 +87,8 @@ class Locations:
             depot = self._live.depots.get(("", node.spec.depot))
             home = depot.spec.location if depot is not None else None
         wanted = location_labels(node, home) if node is not None else {}
+        if host.guarded:
+            wanted[GUARDED_LABEL] = "true"
         present = {label: value for label, value in host.labels.items() if is_location_label(label)}
         if present == wanted:
             return

@@ -19,6 +19,8 @@ RUN apt-get update -q \
 RUN python3 -m pip install --quiet --no-cache-dir --break-system-packages --root-user-action=ignore uv==${UV_VERSION}
 
 # ---- root: Python, the libraries it links to, a shell; no package manager, no documentation
+# Python reads its library and dependencies from .pyc files alone, for sources would double them; docstrings, which numpy needs,
+# stay. Modules for tests, and those whose libraries are not here, go.
 FROM tools AS root
 RUN mkdir -p /out/usr/bin /out/usr/sbin /out/usr/lib /out/usr/lib64 /out/etc /out/run /out/proc /out/sys /out/dev \
       /out/var/lib /out/var/log /out/home/fractus /out/usr/local/lib/python3.11/dist-packages /out/usr/local/bin \
@@ -27,7 +29,8 @@ RUN mkdir -p /out/usr/bin /out/usr/sbin /out/usr/lib /out/usr/lib64 /out/etc /ou
       libsqlite3-0 python3-minimal python3.11-minimal libpython3.11-minimal libpython3.11-stdlib \
       busybox media-types netbase | sort -u \
   | grep -Ev '^/usr/share/(doc|man|locale|lintian|bug|perl5|base-files|binfmts)|/gconv/|__pycache__|/(audit|ld-)[^/]*/' \
-  | grep -Ev '/python3.11/(lib2to3|pydoc_data|idlelib|turtledemo|tkinter|unittest/test|ensurepip|config-)' \
+  | grep -Ev '/python3.11/(lib2to3|pydoc_data|idlelib|tkinter|unittest/test|test/|ensurepip|config-|turtle)' \
+  | grep -Ev '/lib-dynload/(_test|_ctypes_test|_xxtest|xxlimited|_crypt|_curses|_dbm|nis|readline)' \
   | while read -r path; do if [ -L "$path" ] || [ ! -d "$path" ]; then echo "$path"; fi; done \
   | grep -Ev '^/(bin|sbin|lib|lib64|var/run|var/lock)$' | xargs cp -a --parents -t /out \
  && ln -sf python3.11 /out/usr/bin/python3 && ln -sf python3.11 /out/usr/bin/python \
@@ -38,7 +41,7 @@ RUN mkdir -p /out/usr/bin /out/usr/sbin /out/usr/lib /out/usr/lib64 /out/etc /ou
  && printf 'hosts: files dns\npasswd: files\ngroup: files\nprotocols: files\nservices: files\n' > /out/etc/nsswitch.conf \
  && printf '#!/usr/bin/python3\nimport sys\nfrom fractus_cli.main import main\nsys.exit(main())\n' > /out/usr/local/bin/fractus \
  && chmod 755 /out/usr/local/bin/fractus && chown 10001:10001 /out/home/fractus && mkdir -m 700 /out/root \
- && python3 -m compileall -q --invalidation-mode unchecked-hash -s /out /out/usr/lib/python3.11
+ && python3 -m compileall -q -b --invalidation-mode unchecked-hash -s /out /out/usr/lib/python3.11 && find /out/usr/lib/python3.11 -name '*.py' -delete
 
 # ---- nft: the program that makes the table of direct links, and the libraries that nothing else needs
 FROM tools AS nft
@@ -53,6 +56,9 @@ RUN apt-get update -q && DEBIAN_FRONTEND=noninteractive apt-get install -qy --no
 # synchronous one too, which with what it needs takes an agent 7 MB of memory and the image as much.
 FROM tools AS dependencies
 ARG SSL_CERT_FILE
+RUN apt-get update -q && DEBIAN_FRONTEND=noninteractive apt-get install -qy --no-install-recommends \
+      gcc libc6-dev libgfortran-12-dev liblapack-dev liblapack64-dev >/dev/null \
+ && rm -rf /var/lib/apt/lists/*
 WORKDIR /build
 COPY pyproject.toml uv.lock /build/
 ENV UV_LINK_MODE=copy UV_PYTHON=/usr/bin/python3 UV_PYTHON_DOWNLOADS=never
@@ -64,14 +70,14 @@ RUN --mount=type=cache,target=/root/.cache/uv \
       uv export --quiet --frozen --no-dev --no-emit-project $extra --output-file /build/$name.txt; \
       uv pip install --quiet --no-deps --require-hashes --target /deps/$name -r /build/$name.txt; \
       cd /deps/$name; \
-      rm -rf bin .lock tzdata tzdata-* zstandard zstandard-* numpy/_core/_simd.* numpy/_core/include numpy/_core/lib numpy/f2py numpy/distutils cv2/gapi; \
+      rm -rf bin .lock tzdata tzdata-* zstandard zstandard-* numpy/_core/_simd.* numpy/_core/include numpy/_core/lib numpy/f2py numpy/distutils numpy/_core/*_tests.* \
+        cv2/gapi cffi pycparser* google/api google/cloud google/gapic google/logging google/longrunning google/type; \
       find . -path '*/tests' -prune -exec rm -rf {} +; \
       if [ -d kubernetes ]; then : > kubernetes/__init__.py; \
         find kubernetes -mindepth 1 -maxdepth 1 ! -name aio ! -name __init__.py -exec rm -rf {} +; \
         find kubernetes/aio/client/models kubernetes/aio/client/api -type f ! -name __init__.py -delete; \
         rm -rf certifi* charset_normalizer* durationpy* oauthlib* requests* websocket*; fi; \
-      strip --strip-unneeded cryptography/hazmat/bindings/_rust.abi3.so yaml/*.so aiohttp/*.so multidict/*.so \
-        frozenlist/*.so propcache/*.so lz4/*/*.so watchfiles/*.so 2>/dev/null || true; \
+      find . -name '*.so*' -type f -exec strip --strip-unneeded {} +; \
       find . \( -name '*.pyi' -o -name '*.pyx' -o -name '*.pxd' -o -name '*.c' -o -name '*.h' -o -name '*.a' \) -delete; \
     done; \
     for pair in core:sdk keys:core operator:keys agent:keys mobility:keys services:mobility view:core; do \
@@ -82,9 +88,36 @@ RUN --mount=type=cache,target=/root/.cache/uv \
     cp -a /deps/sdk /only-sdk; \
     mkdir /only-geometry; cd /only-core; mv numpy* shapely* geographiclib* /only-geometry/; \
     for name in sdk core keys geometry operator agent mobility services view; do \
-      python3 -m compileall -q --invalidation-mode unchecked-hash -s /only-$name \
-        -p /usr/local/lib/python3.11/dist-packages /only-$name; \
+      python3 -m compileall -q -b --invalidation-mode unchecked-hash -s /only-$name -p /usr/local/lib/python3.11/dist-packages /only-$name; \
+      find /only-$name -name '*.py' ! -path '*/cv2/config*.py' -delete; \
     done
+# OpenBLAS is 28 MB of numpy and 42 MB of OpenCV, which have it for large matrices; ours are small. Each gets a library of
+# the name that it is linked to, with just the routines that it calls, from Debian's reference BLAS and LAPACK (a wrong
+# argument ends the program there, too). numpy's have integers of 64 bits, and names that say so.
+RUN set -e; archives=/usr/lib/$(gcc -print-multiarch); \
+    echo 'void abort(void); void xerbla_(void) { abort(); } void cblas_xerbla(void) { abort(); }' > errors.c; \
+    replace() { library=$1; bits=$2; shift 2; \
+      nm -D --defined-only "$library" | awk '{print $3}' | sort > offered; \
+      nm -D --undefined-only "$@" | awk '{print $2}' | sort -u | comm -12 - offered > called; \
+      { echo '{ global:'; sed 's/$/;/' called; echo 'local: *; };'; } > exported; \
+      sed -E -e 's/^scipy_(.*)64_$/--defsym=&=\1/' -e t -e 's/^/--undefined=/' called > options; \
+      gcc -shared -fPIC -s -o "$library" errors.c -Wl,@options,--version-script=exported,--gc-sections,--no-undefined \
+        "-Wl,-soname,${library##*/},--start-group" "$archives/liblapack${bits}_pic.a" "$archives/blas$bits/libblas$bits.a" \
+        "$(gcc -print-file-name=libgfortran.a)" -Wl,--end-group -lm; \
+      rm -f "${library%/*}"/libgfortran-* "${library%/*}"/libquadmath-*; }; \
+    replace /only-geometry/numpy.libs/libscipy_openblas64_-*.so 64 /only-geometry/numpy/*/*.so; \
+    replace /only-services/opencv_python_headless.libs/libopenblasp-*.so '' /only-services/cv2/*.so
+# Of OpenCV stay the cascades that are read; FFmpeg (36 MB) goes, since the camera takes its pictures from V4L2, not from
+# files or streams. To load, OpenCV wants the names of its functions; OPENCV_VIDEOIO_PRIORITY_FFMPEG=0 keeps it from calls.
+RUN set -e; cd /only-services/opencv_python_headless.libs; \
+    find ../cv2/data -name '*.xml' ! -name '*_frontalface_alt2.xml' ! -name '*_frontalface_default.xml' ! -name '*_profileface.xml' -delete; \
+    for library in libavcodec-* libavformat-* libavutil-* libswscale-*; do \
+      version=$(echo "$library" | sed -E 's/^(lib[a-z]+)-.*\.so\.([0-9]+)\..*/\U\1_\2/'); \
+      echo "$version { global: *; };" > /build/exported; \
+      nm -D --undefined-only ../cv2/cv2.abi3.so | sed -n "s/^ *U \(.*\)@$version\$/void \1(void) { __builtin_trap(); }/p" > /build/names.c; \
+      gcc -shared -fPIC -s "-Wl,--version-script=/build/exported,-soname,$library" -o "$library" /build/names.c; \
+    done; \
+    rm libswresample-* libdav1d-* libvpx-* libdrm-* libssl-* libcrypto-*
 
 # ---- code: the packages and what tells Python their name, version and commands
 FROM tools AS code
@@ -172,6 +205,7 @@ ENTRYPOINT ["fractus"]
 COPY --from=code /images/services /usr/local/lib/python3.11/dist-packages
 
 FROM mobility-dependencies AS camera
+ENV OPENCV_VIDEOIO_PRIORITY_FFMPEG=0
 COPY --from=dependencies /only-services /usr/local/lib/python3.11/dist-packages
 ENTRYPOINT ["fractus"]
 COPY --from=code /images/services /usr/local/lib/python3.11/dist-packages

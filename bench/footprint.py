@@ -31,7 +31,7 @@ import fractus
 import yaml
 from fractus_cli.standalone import StandalonePki
 from fractus_cluster.commands import run
-from fractus_cluster.images.build import image_name
+from fractus_cluster.images.build import SIZE_LIMITS_MB, image_name
 from fractus_cluster.ports import free_port
 from fractus_core.api import Grant
 from fractus_core.geo import LocalFrame
@@ -47,7 +47,6 @@ SIDE_M = 60.0
 HEIGHT_M = 15.0
 TARGET_MB = 120.0
 K3S_AGENT_MB = 268.0
-IMAGES_MB = {"agent": 150.0, "mobility": 120.0, "camera": 250.0, "operator": 150.0}
 WARM_UP_S = 40.0
 """Until a side of the square with hidden faces was flown along, and all that is loaded on demand is there."""
 _MOUNTS = """
@@ -305,19 +304,19 @@ def main() -> int:
     parser.add_argument("--json", type=Path, help="write the claims to a file")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as directory, Images(options.tag) as images:
-        sizes = {name: images.size_mb(name) for name in IMAGES_MB}
+        sizes = {name: images.size_mb(name) for name in SIZE_LIMITS_MB}
         with node_in(Path(directory), images) as (node, processes):
             found = watched(node, processes, 20.0 if options.quick else options.seconds)
     print(f"{'in flight':12} {'PSS':>9} {'its own':>10} {'at most':>10}")
     for name, seen in found.items():
         shared, own = (statistics.mean(column) for column in zip(*seen, strict=True))
         print(f"{name:12} {shared:6.1f} MB {own:7.1f} MB {max(seen)[0]:7.1f} MB")
-    ours = {name: [pss for pss, _ in seen] for name, seen in found.items() if name in IMAGES_MB}
+    ours = {name: [pss for pss, _ in seen] for name, seen in found.items() if name in SIZE_LIMITS_MB}
     together = statistics.mean(map(sum, zip(*ours.values(), strict=True)))
     theirs = statistics.mean(pss for pss, _ in found["MAVProxy"]) + K3S_AGENT_MB
     print(f"together {together:.1f} MB; MAVProxy and a k3s agent ({K3S_AGENT_MB:.0f} MB) {theirs:.1f} MB")
     claims = [claim("agent, mobility and camera in flight", together, TARGET_MB, theirs)]
-    claims += [claim(f"image {name}", sizes[name], limit) for name, limit in IMAGES_MB.items()]
+    claims += [claim(f"image {name}", sizes[name], limit) for name, limit in SIZE_LIMITS_MB.items()]
     for one in claims:
         print(
             f"{one['name']:40} {one['ours']:6.1f} MB (target {one['target']:.0f}){'' if one['holds'] else '  MISSED'}"

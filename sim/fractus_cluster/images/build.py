@@ -40,6 +40,10 @@ _CODE: Mapping[str, tuple[str, ...]] = MappingProxyType(
 )
 TARGETS = tuple(_CODE)
 """The targets of the Dockerfile that are images of their own."""
+SIZE_LIMITS_MB: Mapping[str, float] = MappingProxyType(
+    {"agent": 150.0, "mobility": 120.0, "camera": 250.0, "operator": 150.0}
+)
+"""What the files of an image may take."""
 
 _BUILD_TIMEOUT_S = 1800.0
 _LOCK_TIMEOUT_S = 1800.0

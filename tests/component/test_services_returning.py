@@ -111,6 +111,58 @@ def test_it_is_limited_while_a_mission_lasts(tmp_path: Path, restarted: bool) ->
     fly(flight)
 
 
+FLOWN = {"GUID_OPTIONS": 32.0, "GUID_TIMEOUT": 3.0, "RTL_ALT_FINAL": 500.0, "RALLY_LIMIT_KM": 0.3, "RTL_ALT_TYPE": 1.0}
+HELD = {"GUID_OPTIONS": 0.0, "GUID_TIMEOUT": 1.0, "RTL_ALT_FINAL": 0.0, "RALLY_LIMIT_KM": 2.0**-10, "RTL_ALT_TYPE": 0.0}
+
+
+@pytest.mark.parametrize("restarted", [False, True])
+def test_what_a_mission_needs_otherwise_holds_while_it_lasts_and_is_the_owners_before_and_after(
+    tmp_path: Path, restarted: bool
+) -> None:
+    def found(world: World) -> dict[str, float]:
+        return {name: world.plane.parameters[name] for name in FLOWN}
+
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            world.plane.parameters |= FLOWN
+            world.observer.found()
+            await world.until(lambda: world.control.checked is not None and not world.control.checked.problem)
+            assert found(world) == FLOWN, "nothing flies yet"
+            grant = world.grants.put(spec())
+            await world.up(grant, 8.0)
+            assert found(world) == HELD
+            world.plane.parameters["GUID_OPTIONS"] = 16.0
+            await world.until(lambda: found(world) == HELD, 30)
+            await end(world.service.goto(grant, goto(0, 30, 8.0), 0))
+            if not restarted:
+                await drivers.give_back(world.control, grant)
+                await world.until(lambda: not world.plane.vehicle.armed)
+                await world.until(lambda: found(world) == FLOWN, 30)
+        if restarted:
+            async with World(tmp_path, after=world, known=False) as again:
+                again.observer.found()
+                await again.until(lambda: not again.plane.vehicle.armed)
+                await again.until(lambda: found(again) == FLOWN, 30)
+
+    fly(flight)
+
+
+@pytest.mark.parametrize("name", FLOWN)
+def test_nothing_arms_where_it_cannot_be_set(tmp_path: Path, name: str) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            world.plane.parameters |= FLOWN
+            world.plane.fixed = (name,)
+            grant = world.grants.put(spec())
+            await world.drive(grant)
+            refused = await refusal(world.service.arm(grant, 10.0))
+            assert refused.verdict.code == "ReturnNotLimited"
+            assert f"{name} cannot be set to {HELD[name]:g}" in refused.verdict.reason
+            assert not world.plane.vehicle.armed
+
+    fly(flight)
+
+
 def test_it_is_put_back_although_the_fence_is_not(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:

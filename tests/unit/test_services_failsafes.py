@@ -38,8 +38,8 @@ def run(work: Coroutine[Any, Any, T]) -> T:
         return runner.run(work)
 
 
-def configured(parameters: Parameters) -> Checked:
-    return run(MavlinkFailsafes(parameters).configure())
+def configured(parameters: Parameters, *, flying: bool = False) -> Checked:
+    return run(MavlinkFailsafes(parameters).configure(flying=flying))
 
 
 def test_the_companion_is_no_ground_station() -> None:
@@ -89,11 +89,12 @@ def test_legs_are_flown_with_the_owners_speed_where_the_vehicle_spells_it_so() -
 def test_its_own_return_leads_home_at_an_altitude_above_home_and_ends_on_the_ground() -> None:
     owned = {"RTL_ALT_TYPE": 1.0, "RTL_ALT_FINAL": 500.0, "RALLY_LIMIT_KM": 0.5}
     vehicle = Parameters({"SYSID_MYGCS": 255.0} | owned)
-    assert not configured(vehicle).problem
+    assert not configured(vehicle, flying=True).problem
     assert {name: vehicle.values[name] for name in owned} == {
         "RTL_ALT_TYPE": 0.0, "RTL_ALT_FINAL": 0.0, "RALLY_LIMIT_KM": 2.0**-10,
     }  # fmt: skip
-    assert "RTL_ALT_FINAL is 500" in configured(Parameters({"SYSID_MYGCS": 255.0} | owned, ("RTL_ALT_FINAL",))).problem
+    stubborn = Parameters({"SYSID_MYGCS": 255.0} | owned, ("RTL_ALT_FINAL",))
+    assert "RTL_ALT_FINAL is 500" in configured(stubborn, flying=True).problem
 
 
 RETRACING = {"SYSID_MYGCS": 244.0, "SRTL_POINTS": 300.0}
@@ -147,19 +148,19 @@ def test_armed_elsewhere_it_goes_straight_and_from_home_again_on_its_path() -> N
 
 def test_a_velocity_ends_soon_without_another() -> None:
     vehicle = Parameters({"SYSID_MYGCS": SYSTEM_ID, "GUID_TIMEOUT": 3.0})
-    assert not configured(vehicle).problem
+    assert not configured(vehicle, flying=True).problem
     assert vehicle.values["GUID_TIMEOUT"] == 1.0
-    assert "GUID_TIMEOUT is 3" in configured(Parameters({"GUID_TIMEOUT": 3.0}, ("GUID_TIMEOUT",))).problem
-    assert "GUID_TIMEOUT" in configured(Parameters({"SYSID_MYGCS": SYSTEM_ID})).missing
+    assert "GUID_TIMEOUT is 3" in configured(Parameters({"GUID_TIMEOUT": 3.0}, ("GUID_TIMEOUT",)), flying=True).problem
+    assert "GUID_TIMEOUT" in configured(Parameters({"SYSID_MYGCS": SYSTEM_ID}), flying=True).missing
 
 
 @pytest.mark.parametrize(("options", "after"), [(0.0, 0.0), (4.0, 4.0), (192.0, 192.0), (16.0, 0.0), (36.0, 0.0)])
 def test_a_vehicle_follows_the_velocities_that_stop_it(options: float, after: float) -> None:
     vehicle = Parameters({"SYSID_MYGCS": SYSTEM_ID, "GUID_OPTIONS": options})
-    assert not configured(vehicle).problem
+    assert not configured(vehicle, flying=True).problem
     assert vehicle.values["GUID_OPTIONS"] == after
     stubborn = Parameters({"SYSID_MYGCS": SYSTEM_ID, "GUID_OPTIONS": 32.0}, ("GUID_OPTIONS",))
-    assert "GUID_OPTIONS is 32" in configured(stubborn).problem
+    assert "GUID_OPTIONS is 32" in configured(stubborn, flying=True).problem
 
 
 @pytest.mark.parametrize(

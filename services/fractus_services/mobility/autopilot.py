@@ -355,14 +355,14 @@ class Failsafes(Protocol):
 
 
 class ReturnLimits(Protocol):
-    """How high and how fast the autopilot flies home by itself."""
+    """How the autopilot flies during a mission, and how high and how fast home by itself."""
 
     @property
     def limited(self) -> bool:
         """Whether the vehicle has values of ours."""
 
     async def limit(self, bounds: ReturnBounds) -> tuple[str, ...]:
-        """Set what is above the bounds, and what was lowered more than they ask; what changed, in sentences."""
+        """Set what is above the bounds, what was lowered more than they ask, and what a mission needs; what changed, in sentences."""
 
     async def lift(self, idle: Callable[[], bool]) -> None:
         """Put back what the owner had, if anything was changed."""

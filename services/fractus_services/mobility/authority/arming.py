@@ -172,7 +172,7 @@ class Arming:
         try:
             lowered = await self._limit_return(grant)
         except (AutopilotError, OSError) as error:
-            why = f"the autopilot would fly home higher or faster than it may: {error}"
+            why = f"the autopilot would not fly, or fly home, as it must: {error}"
             raise PreconditionFailed("ReturnNotLimited", why) from error
         if lowered or not self._fence.missing:
             checked = self._learnt(checked, await self._failsafes.learn_return(checked))

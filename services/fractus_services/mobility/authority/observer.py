@@ -183,7 +183,7 @@ class Observer:
         control = self._control
         if control.last_grant is not None:
             for what in await self._limit_return(control.last_grant):
-                control.note("limited", f"how the autopilot flies home: {what}", "ReturnLimited")
+                control.note("limited", f"how the autopilot flies, or flies home: {what}", "ReturnLimited")
         return ()
 
     async def _keep_fence(self) -> tuple[str, ...]:

@@ -89,14 +89,16 @@ class ArduCopter:
             ("SYSID_MYGCS", "MAV_GCS_SYSID"), SYSTEM_ID, frozenset(), True, _LISTENS, {"MAV_GCS_SYSID": _LISTENS_TO_ONE}
         ),
         Setting(("FS_GCS_TIMEOUT",), 5, frozenset(), False, "after five seconds of silence"),
-        Setting(("GUID_TIMEOUT",), 1, frozenset(), False, "gives a velocity up after a second without another"),
-        Setting(("GUID_OPTIONS",), 0, _STEERED, False, "follows velocities, so that it stops when it is told to"),
         Setting(("BATT_FS_CRT_ACT",), 1, frozenset({1.0}), False, "lands on a critical battery"),
         Setting(("FS_EKF_ACTION",), 1, frozenset({1.0, 3.0}), False, "lands when it no longer knows where it is"),
         # 0 switches that failsafe off.
         Setting(
             ("FS_EKF_THRESH",), 0.75, frozenset(), False, "notices that it no longer knows where it is", span=(0.0, 1.0)
         ),
+    )
+    flown: tuple[Setting, ...] = (
+        Setting(("GUID_TIMEOUT",), 1, frozenset(), False, "gives a velocity up after a second without another"),
+        Setting(("GUID_OPTIONS",), 0, _STEERED, False, "follows velocities, so that it stops when it is told to"),
         Setting(
             ("RTL_ALT_TYPE",), 0, frozenset(), False, "returns at an altitude above home, not above the ground below"
         ),

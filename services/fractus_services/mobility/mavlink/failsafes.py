@@ -118,7 +118,7 @@ class MavlinkFailsafes:
         self._stack = autopilot.stack
         self._parameters = autopilot.vehicle_parameters
         stack = self._stack
-        settings = (*stack.failsafes, *stack.straight, *stack.retracing)
+        settings = (*stack.failsafes, *stack.flown, *stack.straight, *stack.retracing)
         self._wanted: tuple[Spellings, ...] = tuple(
             dict.fromkeys(
                 (
@@ -169,7 +169,8 @@ class MavlinkFailsafes:
     async def _configure(self, flying: bool, before: Checked | None) -> Checked:
         stack = self._stack
         settings = _Settings(self._parameters, await self._parameters.read(self._wanted))
-        await settings.establish(stack.failsafes)
+        # On the ground the owner has the rest as it likes: it is set, and put back, with the limits of a mission.
+        await settings.establish((*stack.failsafes, *stack.flown) if flying else stack.failsafes)
         missing = tuple(settings.missing)
         parameter, least_points = stack.path_memory
         remembers = settings.told.get(parameter, 0.0) >= least_points

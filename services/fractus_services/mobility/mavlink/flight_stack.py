@@ -69,7 +69,8 @@ class FlightStack(Protocol):
         return_straight: the mode in which it flies home straight.
         return_retracing: the mode in which it flies home on the path that it came; `return_straight` where there is none.
         witness: a parameter that each such autopilot has: one that does not tell it does not answer at all.
-        failsafes: what must hold before anything may arm.
+        failsafes: what must hold before anything may arm, and stays.
+        flown: what must hold while it flies for a mission; its owner may have it otherwise.
         straight: failsafes that bring the drone home straight.
         retracing: failsafes that bring it home on its own path; the first one tells in flight which of both was chosen.
         path_memory: the parameter with the number of points of its path that it remembers, and how many are enough to rely
@@ -90,6 +91,7 @@ class FlightStack(Protocol):
     return_retracing: FlightMode
     witness: str
     failsafes: tuple[Setting, ...]
+    flown: tuple[Setting, ...]
     straight: tuple[Setting, ...]
     retracing: tuple[Setting, ...]
     path_memory: tuple[str, float]

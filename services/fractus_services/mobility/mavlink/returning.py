@@ -1,4 +1,4 @@
-"""How high and how fast the autopilot flies home by itself: as the limits of a mission allow, and as its owner chose after it."""
+"""How the autopilot flies during a mission, home by itself above all: as that and its limits ask for, and as its owner chose after it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 
 
 class MavlinkReturn:
-    """Lowers height and speed of RTL and SmartRTL, see `ReturnLimits`. What the owner had is on disk before it is changed.
+    """Lowers height and speed of RTL and SmartRTL, and lets hold what a mission needs, see `ReturnLimits`. What the owner had is on disk before it is changed.
 
     Args:
         autopilot: the link.
@@ -29,6 +29,7 @@ class MavlinkReturn:
     def __init__(self, autopilot: MavlinkAutopilot, directory: Path) -> None:
         self._parameters = autopilot.vehicle_parameters
         self._stack = autopilot.stack
+        self._names = (*self._stack.returning, *(setting.names for setting in self._stack.flown))
         self._path = directory / "return.json"
         self._lock = asyncio.Lock()
         self._owned = self._load()
@@ -47,10 +48,10 @@ class MavlinkReturn:
             OSError: what the owner had cannot be stored.
         """
         async with self._lock:
-            told = await self._parameters.read(self._stack.returning)
+            told = await self._parameters.read(self._names)
             # What the file says of another release's names is not this vehicle's.
             owned = told | {name: value for name, value in self._owned.items() if name in told}
-            wanted = self._stack.return_values(owned, bounds)
+            wanted = self._stack.return_values(owned, bounds) | self._flown(owned)
             changed = {name: value for name, value in wanted.items() if not same(told[name], value)}
             if changed:
                 self._owned = {name: owned[name] for name in wanted}
@@ -71,12 +72,21 @@ class MavlinkReturn:
         async with self._lock:
             if not idle() or not self._owned:
                 return
-            told = await self._parameters.read(self._stack.returning)
+            told = await self._parameters.read(self._names)
             await self._set({name: value for name, value in self._owned.items() if name in told})
             await asyncio.to_thread(self._path.unlink, True)
             self._owned = {}
             self._remember()
-            log.info("returning: height and speed as the vehicle's owner left them")
+            log.info("returning: as the vehicle's owner left it")
+
+    def _flown(self, owned: dict[str, float]) -> dict[str, float]:
+        """What must hold during a mission, as far as the vehicle has it; the owner's where that will do."""
+        return {
+            name: owned[name] if setting.holds(owned[name]) else setting.value
+            for setting in self._stack.flown
+            for name in setting.names
+            if name in owned
+        }
 
     async def _set(self, values: dict[str, float]) -> None:
         for name, value in values.items():

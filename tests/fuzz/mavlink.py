@@ -13,40 +13,80 @@ import atheris
 with atheris.instrument_imports(include=["fractus_mavlink", "fractus_cli.tlog_tail"]):
     from fractus_cli.tlog_tail import Tail, split
     from fractus_mavlink import Message, Parser, Signing, encode, layout_of
-    from fractus_mavlink.framing import MAGIC_V2
+    from fractus_mavlink.framing import MAGIC_V1, MAGIC_V2
+    from fractus_mavlink.messages import Layout
 from fastcrc.crc16 import mcrf4xx
 
 LAYOUTS = [layout for layout in map(layout_of, range(1 << 16)) if layout is not None]
+MAGICS = bytes((MAGIC_V1, MAGIC_V2))
 KEY = bytes(range(32))
 STAMP = struct.pack(">Q", 1_790_000_000_000_000)
 NAME = "000001-20260601T120000Z.tlog"
 
 
 def one(data: bytes) -> None:
-    """Bytes as they are, as a tlog, and as the payload of a sound frame."""
+    """Bytes as they are, as a tlog, and as the payload of sound frames."""
     pieces(data)
     tlog(data)
-    if len(data) > 2:
+    if len(data) > 3:
         layout = LAYOUTS[int.from_bytes(data[:2], "little") % len(LAYOUTS)]
-        payload = data[2:257]
-        body = (
-            struct.pack("<BBBBBBHB", len(payload), 0, 0, 0, 1, 1, layout.msgid & 0xFFFF, layout.msgid >> 16) + payload
-        )
-        frame = bytes((MAGIC_V2,)) + body + struct.pack("<H", mcrf4xx(body + bytes((layout.crc_extra,))))
-        for message in pieces(frame):
-            again(message)
+        # Any length: none at all, what a sender cuts off, what a newer dialect adds.
+        payload = data[3 : 3 + data[2]]
+        frame = framed(layout, payload)
+        again(heard(frame, data))
         recorded(frame, data)
         signed(frame, data)
+        if layout.msgid <= 0xFF:
+            old = framed_v1(layout, payload)
+            assert repr(heard(old, data).values) == repr(layout.unpack(payload))
+            recorded(old, data)
+            unsigned(old, layout)
+        unsigned(frame, layout)
+
+
+def framed(layout: Layout, payload: bytes) -> bytes:
+    """A frame of MAVLink 2."""
+    body = struct.pack("<BBBBBBHB", len(payload), 0, 0, 0, 1, 1, layout.msgid & 0xFFFF, layout.msgid >> 16) + payload
+    return bytes((MAGIC_V2,)) + body + struct.pack("<H", mcrf4xx(body + bytes((layout.crc_extra,))))
+
+
+def framed_v1(layout: Layout, payload: bytes) -> bytes:
+    """A frame of MAVLink 1."""
+    body = struct.pack("<BBBBB", len(payload), 0, 1, 1, layout.msgid) + payload
+    return bytes((MAGIC_V1,)) + body + struct.pack("<H", mcrf4xx(body + bytes((layout.crc_extra,))))
+
+
+def heard(frame: bytes, noise: bytes) -> Message:
+    """A sound frame is one message, also behind bytes that begin none and before any."""
+    (message,) = pieces(noise[:16].translate(None, MAGICS) + frame)
+    (first, *_) = pieces(frame + noise[:16])
+    assert message.frame == first.frame == frame
+    return message
+
+
+def unsigned(frame: bytes, layout: Layout) -> None:
+    """A frame without a signature is not believed on a signed link, but of a modem that has no key."""
+    signing = Signing(KEY, 1000)
+    messages = Parser(lambda: signing).feed(frame)
+    assert [one.name for one in messages] == ["RADIO_STATUS"] * (layout.name == "RADIO_STATUS")
+    assert not any(one.signed for one in messages)
 
 
 def pieces(data: bytes) -> list[Message]:
-    """Messages of a stream: whole, in two parts and byte by byte."""
-    whole, parts, single = Parser(), Parser(), Parser()
-    messages = whole.feed(data)
+    """Messages of a stream: whole, in two parts and byte by byte; what is none is counted alike."""
     half = len(data) // 2
-    assert repr(parts.feed(data[:half]) + parts.feed(data[half:])) == repr(messages)
-    assert repr([m for i in range(len(data)) for m in single.feed(data[i : i + 1])]) == repr(messages)
-    assert whole.pending <= 280, whole.pending
+    outcomes, told = [], []
+    for cuts in ([data[i : i + 1] for i in range(len(data))], [data[:half], data[half:]], [data]):
+        foreign: list[bytes] = []
+        parser = Parser(unknown=foreign.append)
+        messages = [message for part in cuts for message in parser.feed(part)]
+        assert parser.pending <= 280, parser.pending
+        outcomes.append((repr(messages), parser.bad, parser.lost))
+        told.append(foreign)
+    assert outcomes[0] == outcomes[1] == outcomes[2], outcomes
+    # While no byte is behind it, what ends as noise may be told as a frame of another dialect.
+    assert {*told[2]} <= {*told[1]} <= {*told[0]}, told
+    assert all(frame in data for frame in told[0])
     return messages
 
 

@@ -1,6 +1,7 @@
 """Manifests as anyone may write them: a sentence says what is wrong, or all their applications are planned or refused.
 
-Bytes are read as a file; or they say what to change in the example's objects, which gets further than bytes alone do.
+Bytes are read as a file; or they say what to change in the example's objects, which gets further than bytes alone do: their values,
+where on Earth all of it is, how it is spelt. What is planned can be written, and its grants can be enforced.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ import contextlib
 import copy
 import json
 import logging
+import math
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -22,8 +24,11 @@ with atheris.instrument_imports(include=["fractus_core", "fractus_cli.manifests"
     from fractus_cli.planning import plan_all
     from fractus_core.api.descriptions import InvalidDescription, parse_description
     from fractus_core.api.nodes import Drone, EdgeNode
-    from fractus_core.documents import parse_documents
+    from fractus_core.api.plans import GrantSpec
+    from fractus_core.documents import dump_documents, parse_documents
     from fractus_core.planning import Settings
+    from fractus_core.planning.grants import compile_grants
+    from fractus_core.policy.compiled import compile_grant
 
 FOLDER = Path(tempfile.mkdtemp())
 YAML, JSON = FOLDER / "manifest.yaml", FOLDER / "manifest.json"
@@ -36,6 +41,13 @@ OBJECTS = [
     if isinstance(body, dict) and body.get("kind") in KINDS and file.name != "passenger-only.yaml"
 ]
 NEAR_DEG = 0.01
+HOME_DEG = (50.8650, 4.6805)
+ELSEWHERE_DEG = [(0.0, 180.0), (-52.0, -180.0), (80.0, 180.0), (89.0, 0.0), (-89.0, 60.0), (0.0, 0.0)]
+SPELLINGS = [
+    ".nan", "-.inf", ".INF", "1e999", "-0", "0x7f", "0o17", "017", "1_000", "9" * 400, "1e-400", "12:30:00", "2026-01-01", "yes", "~", "=",
+    "&a", "*a", "&a [*a]", "{<<: *a}", "<<", "!!python/object:os.system {}", "!!binary AA==", "!!float 1", "!x 1", "|", ">-", "'", '"\\ud800"',
+    '"\\0"', "\t", "[" * 200, "{" * 50, "- - -", "? x", "{1: 2}", "{[a]: b}", "{a: 1, a: 2}", "---", "...", "%YAML 1.1", "# x", "\ufeff", "\x85",
+]  # fmt: skip
 logging.disable(logging.CRITICAL)
 
 Place = tuple[Any, Any]
@@ -51,9 +63,22 @@ def places(inside: Any) -> Iterator[Place]:
             yield from places(value)
 
 
+def move(inside: Any, lat: float, lon: float) -> None:
+    """Put the example elsewhere, in its shape: over the antimeridian, near a pole."""
+    for part in inside.values() if isinstance(inside, dict) else inside:
+        if isinstance(part, dict | list):
+            move(part, lat, lon)
+    if isinstance(inside, dict) and {"lat", "lon"} <= inside.keys():
+        narrower = math.cos(math.radians(HOME_DEG[0])) / math.cos(math.radians(lat))
+        east = (inside["lon"] - HOME_DEG[1]) * narrower + lon
+        inside["lat"], inside["lon"] = inside["lat"] - HOME_DEG[0] + lat, (east + 180.0) % 360.0 - 180.0
+
+
 def changed(given: atheris.FuzzedDataProvider) -> list[Any]:
     """The example with a few values that are others."""
     objects = copy.deepcopy(OBJECTS)
+    if not given.ConsumeIntInRange(0, 3):
+        move(objects, *given.PickValueInList(ELSEWHERE_DEG))
     for _ in range(given.ConsumeIntInRange(0, 6)):
         if not (there := list(places(objects))):
             break
@@ -81,7 +106,29 @@ def value(given: atheris.FuzzedDataProvider, before: Any) -> Any:
         return given.PickValueInList([0, -1, 1, 89.9999, -90, 180, -180, 1e-9, 1e9, 1e300, 2**63, before * 10, -before])
     if isinstance(before, str) and given.ConsumeBool():
         return given.ConsumeUnicodeNoSurrogates(20)
-    return given.PickValueInList([None, "", "x" * 300, 0, 1.5, True, [], {}, [[]], {"": {}}, "é\n", "1e3", "5m", "-1"])
+    return given.PickValueInList(
+        [None, "", "x" * 300, 0, 1.5, True, [], {}, [[]], {"": {}}, "é\n", "1e3", "5m", "-1", math.nan, math.inf]
+    )
+
+
+def respelt(given: atheris.FuzzedDataProvider) -> str:
+    """The example, changed, with a few values in the spellings of YAML; before it perhaps one of aliases that repeat each other."""
+    text = dump_documents(changed(given))
+    lines = text.splitlines()
+    for _ in range(given.ConsumeIntInRange(0, 4)):
+        at = given.ConsumeIntInRange(0, len(lines) - 1)
+        name, colon, rest = lines[at].partition(": ")
+        put = given.PickValueInList(SPELLINGS)
+        lines[at] = f"{name}{colon}{put} {rest if given.ConsumeBool() else ''}"
+    if not given.ConsumeIntInRange(0, 3):
+        return bomb(given.ConsumeIntInRange(1, 40), given.ConsumeIntInRange(1, 40)) + "\n".join(lines)
+    return "\n".join(lines)
+
+
+def bomb(levels: int, width: int) -> str:
+    """A zone whose labels are lists of lists of lists."""
+    lists = [f"  l{i}: &l{i} [{', '.join([f'*l{i - 1}' if i else 'x'] * width)}]\n" for i in range(levels)]
+    return "apiVersion: fractus.dev/v1alpha1\nkind: Zone\nmetadata:\n  name: z\nspec:\n" + "".join(lists) + "---\n"
 
 
 def planned(file: Path) -> None:
@@ -92,6 +139,11 @@ def planned(file: Path) -> None:
         if manifests.applications():
             for decided in plan_all(manifests, Settings()):
                 assert (decided.plan is None) == (decided.refusal is not None)
+                if decided.plan is not None:
+                    json.dumps(decided.plan.to_dict(), allow_nan=False)
+                    for grant in compile_grants(decided.application, decided.plan, manifests.inventory(), Settings()):
+                        written = json.dumps(grant.to_dict(), allow_nan=False)
+                        compile_grant(GrantSpec.model_validate_json(written))
     except BadManifest as error:
         assert str(error).startswith(str(file)), error
         assert "\n" not in str(error).strip(), error
@@ -99,9 +151,14 @@ def planned(file: Path) -> None:
 
 def one(data: bytes) -> None:
     """One file."""
-    if data[:1] == b"\xff":
-        JSON.write_text(json.dumps({"kind": "List", "items": changed(atheris.FuzzedDataProvider(data[1:]))}))
-        planned(JSON)
+    if data[:1] >= b"\x80":  # no text begins so
+        given = atheris.FuzzedDataProvider(data[1:])
+        if data[0] % 2:
+            JSON.write_text(json.dumps({"kind": "List", "items": changed(given)}))
+            planned(JSON)
+        else:
+            YAML.write_text(respelt(given), errors="surrogatepass")
+            planned(YAML)
         return
     YAML.write_bytes(data)
     planned(YAML)

@@ -1,7 +1,7 @@
 """Sequences of calls, as any components may make them, through the handlers of the mobility service to a vehicle that flies.
 
 Time is virtual. Whatever is called, by any caller: no handler fails, the vehicle does not move without a call of its driver, and it
-stays in its operation area and out of the zone.
+stays in its operation area and out of the zone. So it does whatever others say on its link, and when grants are revoked.
 """
 
 from __future__ import annotations
@@ -16,18 +16,21 @@ from pathlib import Path
 from typing import Any
 
 import atheris
+import grpc
 
 # First what flies: instrumented, it would be several times slower.
 from mobility_world import World, spec, touring, zone
 
 with atheris.instrument_imports(include=["fractus_services.mobility.rpc", "fractus_services.admission"]):
     from fractus_services.mobility.rpc.handlers import MobilityHandlers
-from fractus_mavlink import Message, layout_named, layout_of
+from fractus_core.api.names import node_identity
+from fractus_mavlink import encode, layout_named, layout_of
 from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc
 from virtual_time import fly
 from wire import DEADLINES_S, STRANGE, Context, Registry, called, certificate, request
 
 FOLDER = Path(tempfile.mkdtemp())
+NODE = "drone-1"
 WALL = (-40.0, 25.0, 40.0, 40.0)
 AREA_M, NEAR_M = 200.0, 2.0
 METHODS = (
@@ -48,6 +51,8 @@ SAID = [
     "HEARTBEAT", "GLOBAL_POSITION_INT", "EXTENDED_SYS_STATE", "SYS_STATUS", "HOME_POSITION", "ATTITUDE", "GPS_RAW_INT",
     "EKF_STATUS_REPORT", "STATUSTEXT", "COMMAND_ACK", "PARAM_VALUE", "TIMESYNC", "MISSION_REQUEST_INT", "MISSION_ACK",
 ]  # fmt: skip
+OTHERS = [(255, 190), (1, 154), (1, 191), (2, 1), (244, 191), (0, 0)]
+"""Who else speaks on a link: a ground station, a gimbal, another companion, another vehicle, someone with our own address, no one."""
 LAYOUTS = [layout for layout in map(layout_of, range(1 << 16)) if layout is not None]
 logging.disable(logging.CRITICAL)
 
@@ -78,9 +83,10 @@ class Flight:
             if toured:
                 known.append(world.grants.put(TOURIST, "m3"))
             chains = [(of(one.identity),) for one in known]
-            chains += [*STRANGE, (of(active.identity, 1),)]
+            node = (of(node_identity(NODE)),)
+            chains += [*STRANGE, (of(active.identity, 1),), node]
             handlers = MobilityHandlers(
-                world.service, world.control, world.streams, grants=world.grants, node="drone-1", clock=time.time,  # type: ignore[arg-type]
+                world.service, world.control, world.streams, grants=world.grants, node=NODE, clock=time.time,  # type: ignore[arg-type]
                 heard=world.tours.heard,
             )  # fmt: skip
             registry = Registry(handlers.admission)
@@ -114,8 +120,10 @@ class Flight:
             if not given.remaining_bytes():
                 break
             if not given.ConsumeIntInRange(0, 9):
-                lied = True
-                world.plane.take(_said(given))
+                lied = self._says(world) or lied
+                continue
+            if not given.ConsumeIntInRange(0, 15) and world.grants.active:
+                world.grants.remove(given.PickValueInList(list(world.grants.active.values())))
                 continue
             name = given.PickValueInList(NAMES)
             which = given.ConsumeIntInRange(0, 4 * len(chains) - 1)
@@ -123,17 +131,29 @@ class Flight:
             self._driven = self._driven or chain == chains[0]
             deadline_s = given.PickValueInList(DEADLINES_S) if given.ConsumeBool() else DEADLINES_S[0]
             context = Context(chain, deadline_s)
-            call = called(registry.handlers[name], request(given, TYPES[name]), context)
+            call = _told(registry.handlers[name], request(given, TYPES[name]), context, of_node=chain == chains[-1])
             self._running.append(asyncio.ensure_future(call))
             await asyncio.sleep(given.PickValueInList(waits_s))
         return lied
 
+    def _says(self, world: World) -> bool:
+        """Any bytes on the link; whether they are a message of the vehicle."""
+        given = self._given
+        if not given.ConsumeIntInRange(0, 7):
+            world.plane._received(given.ConsumeBytes(given.ConsumeIntInRange(0, 300)))
+            return True
+        layout = layout_named(given.PickValueInList(SAID)) if given.ConsumeBool() else given.PickValueInList(LAYOUTS)
+        source = given.PickValueInList(OTHERS) if given.ConsumeBool() else world.plane.target or (1, 1)
+        values = layout.unpack(given.ConsumeBytes(layout.packer.size))
+        world.plane._received(encode(layout, values, sequence=0, sysid=source[0], compid=source[1]))
+        return source not in OTHERS
 
-def _said(given: atheris.FuzzedDataProvider) -> Message:
-    """Any message of the vehicle."""
-    layout = layout_named(given.PickValueInList(SAID)) if given.ConsumeBool() else given.PickValueInList(LAYOUTS)
-    values = layout.unpack(given.ConsumeBytes(layout.packer.size))
-    return Message(layout.name, layout.msgid, 1, 1, values)
+
+async def _told(handler: grpc.RpcMethodHandler, body: bytes, context: Context, *, of_node: bool) -> None:
+    """Make a call; how missions ended is told to no one but the node."""
+    await called(handler, body, context)
+    for message in context.written:
+        assert of_node or not getattr(message, "missions", None), "another's mission is told"
 
 
 def one(data: bytes) -> None:

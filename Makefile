@@ -104,10 +104,11 @@ FUZZERS := manifests zones calls mobility camera exchange mavlink
 .PHONY: fuzz
 fuzz: env ## Fuzz manifests, zones, calls, both services and MAVLink for SECONDS=600 each
 	mkdir -p $(addprefix $(OUT)/fuzz/,$(FUZZERS)) && cp examples/traffic-monitoring/*.yaml $(OUT)/fuzz/manifests
-	for name in $(FUZZERS); do \
+	found=; for name in $(FUZZERS); do \
 		PYTHONPATH=tests:tests/component:tests/unit $(RUN) --with atheris==3.0.0 python tests/fuzz/$$name.py \
-			-max_total_time=$(SECONDS) -len_control=0 -max_len=2048 -artifact_prefix=$(OUT)/fuzz/$$name- $(OUT)/fuzz/$$name; \
-	done
+			-max_total_time=$(SECONDS) -len_control=0 -max_len=2048 -artifact_prefix=$(OUT)/fuzz/$$name- $(OUT)/fuzz/$$name \
+			|| found="$$found $$name"; \
+	done; test -z "$$found" || { echo "findings of:$$found; see $(OUT)/fuzz" >&2; exit 1; }
 
 .PHONY: lint
 lint: env ## Style, types and the direction of imports

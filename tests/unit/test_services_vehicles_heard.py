@@ -119,3 +119,17 @@ def test_a_torn_memory_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture)
     (tmp_path / "vehicle.json").write_text("{")
     assert memory(tmp_path).own is None
     assert "is forgotten" in caplog.text
+
+
+async def test_a_vehicle_that_cannot_be_stored_is_stored_later(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    known = Memory(tmp_path / "state" / "vehicle.json", URL)
+    for _ in range(2):
+        known.keep((7, 1))
+        await stored(known)
+    assert caplog.text.count("cannot be stored yet") == 1
+    (tmp_path / "state").mkdir()
+    known.keep((7, 1))
+    await stored(known)
+    assert Memory(tmp_path / "state" / "vehicle.json", URL).own == (7, 1)

@@ -75,13 +75,14 @@ class Memory:
     def __init__(self, path: Path, url: str) -> None:
         self._path, self._url = path, url
         self._storing: asyncio.Future[None] | None = None
+        self._failed = False
         self.own: Source | None = None
         known = remembered(path)
         if known is not None and known[0] == url:
             self.own = known[1]
 
     def keep(self, own: Source) -> None:
-        """Write it in the background, once."""
+        """Write it in the background, once; where that fails, the next call tries again."""
         if own != self.own:
             self.own = own
             self._storing = asyncio.ensure_future(self._store(own))
@@ -91,9 +92,12 @@ class Memory:
         try:
             await asyncio.to_thread(write_file, self._path, content)
         except OSError as error:
-            log.critical(
-                "link: which vehicle is the drone's own cannot be stored (path=%s, error=%s)", self._path, error
-            )
+            self.own = None
+            if not self._failed:
+                log.critical(
+                    "link: which vehicle is the drone's own cannot be stored yet (path=%s, error=%s)", self._path, error
+                )
+            self._failed = True
 
 
 class Neighbours:

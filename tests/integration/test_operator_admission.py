@@ -212,6 +212,13 @@ def test_the_operator_writes_nothing_that_it_has_not_made(
         denied(lambda: client.merge(node, {"metadata": {"labels": {"fractus.dev/class": "cloud"}}}), labels)
         denied(lambda: client.merge(node, {"metadata": {"labels": {"kubernetes.io/os": "x"}}}), labels)
         client.merge(node, {"metadata": {"labels": {"fractus.dev/geohash": "sx1"}}})
+        guarded = {"metadata": {"labels": {"fractus.dev/guarded": "true"}}}
+        denied(lambda: client.merge(node, guarded), "calls no node guarded")
+        world.api.merge(node, {"spec": {"taints": [{"key": "fractus.dev/class", "effect": "NoExecute"}]}})
+        client.merge(node, guarded)
+        world.api.merge(node, {"spec": {"taints": []}})
+        client.merge(node, {"metadata": {"labels": {"fractus.dev/geohash": "sx2"}}})
+        client.merge(node, {"metadata": {"labels": {"fractus.dev/guarded": None}}})
         world.put(traffic(namespace))
         path = world.path(traffic(namespace))
         denied(

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any, cast
 
 import pytest
+from fractus_core.api import Application, InvalidObject
 from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.identity.authority import Authority
 from fractus_core.planning.inventory import Inventory
@@ -62,6 +64,35 @@ async def test_a_manifest_that_is_applied_ends_a_rest_and_what_is_reported_does_
         assert inputs._urgent.is_set(), "who applies it waits for the answer"
 
 
+async def test_a_node_s_labels_wake_no_application_and_what_plans_depend_on_wakes_all() -> None:
+    """A drone that flies along gets another geohash every minute."""
+    live = LiveInventory(cast(Store, None))
+    version = iter(range(1, 100))
+
+    def seen(labels: dict[str, str], ready: str = "True", unschedulable: bool = False, cpu: str = "4") -> None:
+        metadata = {"name": "n", "labels": labels, "resourceVersion": str(next(version))}
+        status = {"conditions": [{"type": "Ready", "status": ready}], "allocatable": {"cpu": cpu}}
+        live.hosts.note(("", "n"), {"metadata": metadata, "spec": {"unschedulable": unschedulable}, "status": status})
+
+    edge_class = {"fractus.dev/class": "edge"}
+    seen(edge_class)
+    with live.subscriptions.subscribe(("ns", "a")) as inputs:
+        seen({**edge_class, "fractus.dev/geohash": "u1"})
+        seen({**edge_class, "fractus.dev/geohash": "u2", "some": "label"})
+        assert not await inputs.changed(0)
+        seen({**edge_class, "fractus.dev/cloud": "true"})
+        assert await inputs.changed(0)
+        seen(edge_class)
+        assert await inputs.changed(0)
+        for change in ({"ready": "False"}, {"unschedulable": True}, {"cpu": "8"}):
+            seen(edge_class, **cast(Any, change))
+            assert await inputs.changed(0), change
+            seen(edge_class)
+            assert await inputs.changed(0)
+        live.hosts._drop(("", "n"))
+        assert await inputs.changed(0)
+
+
 def pod_body(version: int, node: str | None, phase: str = "Running") -> dict[str, Any]:
     metadata = {"namespace": "ns", "name": "p", "uid": "p", "resourceVersion": str(version)}
     return {"metadata": metadata, "spec": {"nodeName": node, "containers": []}, "status": {"phase": phase}}
@@ -89,6 +120,25 @@ async def test_what_leaves_a_node_wakes_those_alone_who_want_room_on_it() -> Non
         assert not await here.changed(0), "it has all it wants by now"
         assert not await there.changed(0)
     assert not live.subscriptions._full
+
+
+def test_an_application_is_checked_again_where_it_or_a_rule_changed_and_not_at_each_look() -> None:
+    def applied(generation: int, uid: str) -> Application:
+        points = [{"point": {"depot": "base"}, "path": [at(100, 0, 10)], "navigation": "pathBased"}]
+        services = [{"service": "mobility", "methods": ["Goto"]}]
+        driver = component("Navigator", "drone", **{"class": "driver", "services": services, "controlPoints": points})
+        body = manifest("Application", "a", {"components": [driver]})
+        body["metadata"] |= {"namespace": "ns", "uid": uid, "generation": generation}
+        return Application.from_body(body)
+
+    memory, known = _Memory(), inventory()
+    lacking = replace(known, depots={})
+    memory.check(applied(1, "a"), known, 1)
+    memory.check(applied(1, "a"), lacking, 1)
+    for application, rules in ((applied(1, "a"), 2), (applied(2, "a"), 1), (applied(1, "b"), 1)):
+        for _ in range(2):
+            with pytest.raises(InvalidObject):
+                memory.check(application, lacking, rules)
 
 
 def full_node() -> Inventory:

@@ -174,7 +174,8 @@ class LiveInventory:
             self._locations.remove_host(key[1])
         else:
             self._locations.upsert_host(new.name, new.is_cloud)
-        self.subscriptions.wake_all()
+        if _host_view(old) != _host_view(new):
+            self.subscriptions.wake_all()
 
     def _pod_changed(self, key: Key, old: PodView | None, new: PodView | None) -> None:
         self._bookings.pod_changed(old, new)
@@ -287,6 +288,11 @@ class LiveInventory:
     def _report(self, kind: Kind, key: Key) -> None:
         for listener in self._listeners.get(kind, ()):
             listener(key)
+
+
+def _host_view(host: Host | None) -> tuple[object, ...] | None:
+    """What of a Node decides over plans; where it is, and flies along, its Drone or EdgeNode says."""
+    return (host.is_cloud, host.allocatable, host.ready, host.schedulable) if host is not None else None
 
 
 def _was_changed(old: Submitted | None, new: Submitted | None) -> bool:

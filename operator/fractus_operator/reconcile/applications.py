@@ -79,6 +79,18 @@ class _Memory:
 
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
     excluded: dict[str, tuple[datetime, str]] = field(default_factory=dict)
+    checked: tuple[object, ...] = ()
+
+    def check(self, application: Application, inventory: Inventory, rules: int) -> None:
+        """Check an application, once for each of its generations and each revision of the rules, depots included.
+
+        Raises:
+            InvalidObject: it names unknown depots, or has broken regions.
+        """
+        revision = (application.metadata.uid, application.metadata.generation, rules)
+        if self.checked != revision:
+            check_application(application, inventory.depots)
+            self.checked = revision
 
     def exclude(self, stuck: dict[str, str], now: datetime) -> dict[str, str]:
         """Leave nodes out of plans for a while; returns all that are, with the reason."""
@@ -260,7 +272,7 @@ class Applications:
             await self._rollout.follow_pods(seen.key, seen.plan, seen.pods)
             return status.waiting(self._deployed(seen, seen.plan, len(seen.grants)), seen.in_flight or ""), RESYNC_S
         try:
-            check_application(application, inventory.depots)
+            memory.check(application, inventory, seen.rules)
             with timed("plan"):
                 plan, again_s = self._plan(application, seen, inventory, memory)
         except InvalidObject as error:

@@ -262,8 +262,12 @@ class EventsOfTheCluster(RuleBasedStateMachine):
                 held[drone.name] = replace(last, over=True)
         self.last.update(held)
         assert dict(self.live.fleet.claims()) == held
-        heard = [spec["node"] for spec in (body["spec"] for body in self.live.children[kinds.GRANT].values())]
-        assert set(heard) <= set(held), "a drone with a grant is not free"
+        heard = {(b["spec"]["application"]["uid"], b["spec"]["node"]) for b in self.live.children[kinds.GRANT].values()}
+        drones = [(plan.uid, plan.spec.drone) for plan in plans.values() if plan.spec.drone is not None]
+        sharing = {(uid, drone.node) for uid, drone in drones if drone.shared_with is not None}
+        assert {node for _, node in heard - sharing} <= set(held), (
+            "a drone with the grant of one that shares no flight is not free"
+        )
         owners = {(claim.uid, node) for node, claim in held.items() if not claim.over}
         own = {
             plan.spec.drone.node

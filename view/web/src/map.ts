@@ -250,11 +250,13 @@ export class FlightMap {
 
   /** What a drone flew since MapLibre was told. */
   private tail(context: CanvasRenderingContext2D, drone: Drone, time: number): void {
-    const begin = drone.position(this.drawn);
+    const fixes = drone.fixes.values.slice(drone.fixes.count(this.drawn), drone.fixes.count(time));
+    // It may have been seen first after MapLibre was told.
+    const before = drone.position(this.drawn);
+    const begin = before === undefined ? fixes[0] : { ...before, time_ms: before.seen };
     const end = drone.position(time);
     if (begin === undefined || end === undefined || time <= this.drawn || time - end.seen > GAP_MS) return;
-    const fixes = drone.fixes.values.slice(drone.fixes.count(this.drawn), drone.fixes.count(time));
-    let last = begin.seen;
+    let last = begin.time_ms;
     context.beginPath();
     let { x, y } = this.map.project([begin.lon, begin.lat]);
     context.moveTo(x, y);

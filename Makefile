@@ -57,7 +57,8 @@ QUICK := $(RUN) pytest -q -n 2 --dist loadfile --no-loadscope-reorder
 GOLDEN := tests/component/test_control_golden.py
 
 # Many of these tests fly in real time, which a machine that stalls can fail: what fails gets a second try, alone. Any other code
-# than 1 tells of no failed test but of a run that was cut short, of which a second try would know nothing.
+# than 1 tells of no failed test but of a run that was cut short, of which a second try would know nothing. Groups are part of the
+# names by which failed tests are found again: a second try without them would pass over a failed test of a group.
 INTEGRATION := tests/integration tests/e2e/test_cluster.py
 E2E := tests/e2e --ignore tests/e2e/test_cluster.py
 # These are of the charts on a cluster that is not ours: they run on kind, or on FRACTUS_E2E_CLUSTER=current.
@@ -69,11 +70,11 @@ test: packages env lint ## Everything: lint, types, unit, component, integration
 	$(RUN) fractus cluster binaries
 	$(QUICK) tests/component tests/unit --ignore $(GOLDEN)
 	FRACTUS_DEEP=1 $(RUN) pytest -q -n 2 $(GOLDEN)
-	$(RUN) pytest -n 3 --dist loadgroup $(INTEGRATION) $(call second_try,$(INTEGRATION))
+	$(RUN) pytest -n 3 --dist loadgroup $(INTEGRATION) $(call second_try,-n 1 --dist loadgroup $(INTEGRATION))
 ifeq ($(FRACTUS_E2E_CLUSTER),current)
 	$(RUN) pytest $(E2E) $(call second_try,$(E2E))
 else
-	$(RUN) pytest -n 2 --dist loadgroup $(E2E) $(ON_KIND:%=--ignore %) $(call second_try,$(E2E) $(ON_KIND:%=--ignore %))
+	$(RUN) pytest -n 2 --dist loadgroup $(E2E) $(ON_KIND:%=--ignore %) $(call second_try,-n 1 --dist loadgroup $(E2E) $(ON_KIND:%=--ignore %))
 	STEPS="images cluster load charts tests uninstall" $(MAKE) test-kind
 endif
 

@@ -30,14 +30,11 @@ SYSTEM = "fractus-system"
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Everything here needs a cluster, and time; two workers, each with a cluster of its own, have half of it each."""
+    """Everything here needs a cluster, and time; of two workers each has a cluster of its own."""
     for item in items:
         if pathlib.Path(__file__).parent in item.path.parents:
             item.add_marker(pytest.mark.e2e)
             item.add_marker(pytest.mark.timeout(600))
-        if "kube" in getattr(item, "fixturenames", ()):
-            half = "kills" if item.path.stem == "test_kills" and not _current() else "others"
-            item.add_marker(pytest.mark.xdist_group(f"cluster-{half}"))
 
 
 def _current() -> bool:

@@ -22,7 +22,6 @@ pytestmark = [
     pytest.mark.skipif(
         os.environ.get("FRACTUS_E2E_CLUSTER") == "current", reason="the tutorial brings its own cluster up"
     ),
-    pytest.mark.xdist_group("cluster-kills"),  # no third cluster at a time
 ]
 
 

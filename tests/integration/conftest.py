@@ -24,11 +24,7 @@ LONG = ("test_scenario_field", "test_sdk_flight", "test_mobility_sdk", "test_mob
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Give every worker single tests; of those that need an API server, each half shares one, and a worker."""
-    for item in items:
-        if "control_plane" in getattr(item, "fixturenames", ()):
-            half = "operator" if item.path.stem == "test_operator" else "others"
-            item.add_marker(pytest.mark.xdist_group(f"control-plane-{half}"))
+    """Begin with the longest."""
     items.sort(key=lambda item: item.path.stem not in LONG)
 
 

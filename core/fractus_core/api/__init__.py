@@ -13,6 +13,7 @@ from fractus_core.api.model import Resource as Resource
 from fractus_core.api.names import component_identity as component_identity
 from fractus_core.api.names import node_identity as node_identity
 from fractus_core.api.names import node_server_name as node_server_name
+from fractus_core.api.node_grants import NodeGrants as NodeGrants
 from fractus_core.api.nodes import Depot as Depot
 from fractus_core.api.nodes import Drone as Drone
 from fractus_core.api.nodes import EdgeNode as EdgeNode
@@ -30,5 +31,6 @@ KINDS: tuple[type[Resource], ...] = (
     Application,
     DeploymentPlan,
     Grant,
+    NodeGrants,
     DirectLink,
 )

@@ -267,10 +267,13 @@ class GrantSpec(Model):
         return frozenset(granted)
 
 
+GrantPhase = Literal["Pending", "Active", "Complete", "Revoked", "Failed"]
+
+
 class GrantStatus(OpenModel):
     """What became of the grant on its node."""
 
-    phase: Literal["Pending", "Active", "Complete", "Revoked", "Failed"] | None = Field(
+    phase: GrantPhase | None = Field(
         default=None, description="Pending until the node has it; then how its mission stands."
     )
     message: str | None = Field(default=None, description="One sentence for people.")

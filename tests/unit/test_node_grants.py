@@ -1,0 +1,94 @@
+"""The Grants of a node, packed into one object."""
+
+from __future__ import annotations
+
+import base64
+import json
+import lzma
+import tracemalloc
+from typing import Any
+
+import pytest
+from fractus_core.api import InvalidObject
+from fractus_core.api.node_grants import MAX_UNPACKED_BYTES, pack, unpack
+from hypothesis import given
+from hypothesis import strategies as st
+
+WORDS = st.text(st.characters(codec="utf-8"), max_size=20)
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**53), 2**53) | st.floats(allow_nan=False, allow_infinity=False) | WORDS,
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(WORDS, inner, max_size=4),
+    max_leaves=10,
+)
+
+
+def body(name: str, spec: Any = None, **metadata: Any) -> dict[str, Any]:
+    return {
+        "apiVersion": "fractus.dev/v1alpha1",
+        "kind": "Grant",
+        "metadata": {"name": name, "uid": f"uid-{name}", "generation": 1, **metadata},
+        "spec": {} if spec is None else spec,
+    }
+
+
+def packed(value: Any) -> str:
+    return base64.b64encode(lzma.compress(json.dumps(value).encode())).decode()
+
+
+@given(
+    st.dictionaries(st.text("abc", min_size=1), st.dictionaries(WORDS, VALUES, max_size=4), max_size=5), st.randoms()
+)
+def test_what_is_packed_is_unpacked_by_name(specs: dict[str, Any], random: Any) -> None:
+    bodies = [body(name, spec) for name, spec in specs.items()]
+    text = pack(bodies)
+    assert unpack(text) == tuple(sorted(bodies, key=lambda each: each["metadata"]["name"]))
+    random.shuffle(bodies)
+    assert pack(bodies) == text
+
+
+def test_what_changes_with_reports_alone_is_left_out() -> None:
+    signed = body("a", {"node": "drone-1"}, annotations={"fractus.dev/signature": "x"}, labels={"l": "v"})
+    changed = {**signed, "status": {"phase": "Active"}}
+    changed["metadata"] = {**signed["metadata"], "resourceVersion": "7", "managedFields": [{}], "finalizers": ["f"]}
+    assert pack([changed]) == pack([signed])
+    assert unpack(pack([changed])) == (signed,)
+
+
+def test_zones_that_grants_share_are_packed_once() -> None:
+    area = [[round(0.001 * i, 7), round(0.0013 * i * i % 7, 7)] for i in range(1_500)]
+    one, many = (len(pack([body(f"g{i}", {"area": area, "n": i}) for i in range(count)])) for count in (1, 100))
+    assert many < 3 * one
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("no base64!", "cannot be unpacked"),
+        ("", "is cut short"),
+        (base64.b64encode(b"this is not xz at all").decode(), "cannot be unpacked"),
+        (base64.b64encode(lzma.compress(b"[]")[:-8]).decode(), "is cut short"),
+        (base64.b64encode(lzma.compress(b"[1")).decode(), "cannot be unpacked"),
+        (base64.b64encode(lzma.compress(b"\xff")).decode(), "cannot be unpacked"),
+        (base64.b64encode(lzma.compress(b"[" * 100_000)).decode(), "cannot be unpacked"),
+        (base64.b64encode(lzma.compress(b"[]", lzma.FORMAT_ALONE)).decode(), "cannot be unpacked"),
+        (packed({}), "is no list of Grants"),
+        (packed([1]), "is no list of Grants"),
+        (packed([{"metadata": {"name": "a"}}]), "is no list of Grants"),
+        (packed([{"metadata": None}]), "is no list of Grants"),
+    ],
+)
+def test_what_is_not_packed_is_refused(text: str, reason: str) -> None:
+    with pytest.raises(InvalidObject, match=rf"^spec\.packed: {reason}.*; the operator writes it again$"):
+        unpack(text)
+
+
+def test_what_unpacks_to_too_much_is_refused_at_the_bound() -> None:
+    text = base64.b64encode(lzma.compress(b" " * (MAX_UNPACKED_BYTES + 1), preset=0)).decode()
+    assert len(text) < 100_000
+    tracemalloc.start()
+    try:
+        with pytest.raises(InvalidObject, match="holds more than 67108864 bytes"):
+            unpack(text)
+        assert tracemalloc.get_traced_memory()[1] < 3 * MAX_UNPACKED_BYTES
+    finally:
+        tracemalloc.stop()

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import copy
+import math
 import os
+import time
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -106,3 +109,30 @@ def with_certificate(
         """Neither changes."""
 
     return Access(configuration, nothing)
+
+
+def with_tokens(configuration: Configuration, token: Callable[[], Awaitable[str]], life_s: float) -> Access:
+    """Access to the API server of a configuration by tokens that are asked for: the first before the first request.
+
+    Args:
+        configuration: of any other access to it; its credentials are left out.
+        token: asks for a new one.
+        life_s: how long one is used; it should be valid for twice as long.
+    """
+    own = copy.copy(configuration)
+    own.cert_file = own.key_file = None
+    # The client asks the hook for a token where it has had one, if only an empty one.
+    own.api_key = {"BearerToken": ""}
+    renew_at_s = -math.inf
+
+    async def renew() -> None:
+        nonlocal renew_at_s
+        own.api_key["BearerToken"] = f"Bearer {await token()}"
+        renew_at_s = time.monotonic() + life_s
+
+    async def in_time(_configuration: Configuration) -> None:
+        if time.monotonic() >= renew_at_s:
+            await renew()
+
+    own.refresh_api_key_hook = in_time
+    return Access(own, renew)

@@ -11,6 +11,7 @@ import json
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from functools import partial
 
+from fractus_kube.access import with_tokens
 from fractus_kube.connection import Connection, ContentType, translated
 from fractus_kube.errors import Conflict, NotFound, from_status
 from fractus_kube.objects import Body, Key, Kind, key_of
@@ -19,6 +20,10 @@ LIST_TIMEOUT_S = 120.0
 """Lists are long where links are slow: one that makes progress goes on, so that it does not start over again and again."""
 PAGE = 250
 """Objects a page: while one is read it takes several times its size."""
+
+
+_TOKEN_LIFE_S = 3600
+_SERVICE_ACCOUNT = Kind("v1", "ServiceAccount", "serviceaccounts", namespaced=True)
 
 
 class Page:
@@ -34,6 +39,30 @@ class Page:
 
 class Client(Connection):
     """An API server by kinds of objects."""
+
+    def account(self, name: str, namespace: str, node: str) -> Client:
+        """A client that acts as a ServiceAccount, by tokens that this one asks for; each is bound to a Node, for an hour.
+
+        Args:
+            name: of the ServiceAccount.
+            namespace: of the ServiceAccount.
+            node: with which tokens end.
+        """
+        request: Body = {
+            "apiVersion": "authentication.k8s.io/v1",
+            "kind": "TokenRequest",
+            "spec": {
+                "expirationSeconds": _TOKEN_LIFE_S,
+                "boundObjectRef": {"apiVersion": "v1", "kind": "Node", "name": node},
+            },
+        }
+
+        async def token() -> str:
+            made = await self.request("POST", _SERVICE_ACCOUNT.path(namespace, name, "token"), request)
+            return str(made["status"]["token"])
+
+        access = with_tokens(self._access.configuration, token, _TOKEN_LIFE_S / 2)
+        return Client(access, self.field_manager, trust_env=self._trust_env)
 
     async def get(self, kind: Kind, name: str, namespace: str = "") -> Body:
         """Read an object.

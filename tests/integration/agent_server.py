@@ -17,16 +17,17 @@ from agent_pki import TestAuthority
 from control_plane import ControlPlane, programs, wait_for
 from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric import ec
+from fractus_core.api.node_grants import NODE_GRANTS_NAMESPACE, pack
 from fractus_kube import KubeError
 
 FRACTUS = "/apis/fractus.dev/v1alpha1"
 REQUESTS = "/apis/certificates.k8s.io/v1/certificatesigningrequests"
 RULES: list[dict[str, list[str]]] = [
     {"apiGroups": ["fractus.dev"], "resources": ["drones", "edgenodes"], "verbs": ["get", "create", "update"]},
-    {"apiGroups": ["fractus.dev"], "resources": ["grants", "directlinks"], "verbs": ["get", "list", "watch"]},
+    {"apiGroups": ["fractus.dev"], "resources": ["directlinks"], "verbs": ["get", "list", "watch"]},
     {
         "apiGroups": ["fractus.dev"],
-        "resources": ["drones/status", "edgenodes/status", "grants/status", "directlinks/status"],
+        "resources": ["drones/status", "edgenodes/status", "directlinks/status"],
         "verbs": ["patch"],
     },
     {"apiGroups": [""], "resources": ["nodes"], "verbs": ["get"]},
@@ -38,6 +39,9 @@ RULES: list[dict[str, list[str]]] = [
     {"apiGroups": [""], "resources": ["configmaps"], "resourceNames": ["fractus-ca"], "verbs": ["get"]},
 ]
 """What charts/ gives the agent; tests run with no more."""
+RBAC = "/apis/rbac.authorization.k8s.io/v1"
+ACCOUNTS = f"/api/v1/namespaces/{NODE_GRANTS_NAMESPACE}/serviceaccounts"
+NODE_GRANTS = f"{FRACTUS}/namespaces/{NODE_GRANTS_NAMESPACE}/nodegrants"
 
 
 class ApiServer(ControlPlane):
@@ -100,17 +104,44 @@ class ApiServer(ControlPlane):
     def furnish(self, ca_pem: bytes) -> None:
         """The system's namespace with the authority, and the agent's rights."""
         self.write_kubeconfig("agent", "agent")
-        self.post("/api/v1/namespaces", {"metadata": {"name": "fractus-system"}})
+        for namespace in ("fractus-system", NODE_GRANTS_NAMESPACE):
+            self.post("/api/v1/namespaces", {"metadata": {"name": namespace}})
         data = {"metadata": {"name": "fractus-ca"}, "data": {"ca.crt": ca_pem.decode()}}
         self.post("/api/v1/namespaces/fractus-system/configmaps", data)
-        rbac = "/apis/rbac.authorization.k8s.io/v1"
-        self.post(f"{rbac}/clusterroles", {"metadata": {"name": "agent"}, "rules": RULES})
-        binding = {
-            "metadata": {"name": "agent"},
-            "roleRef": {"apiGroup": "rbac.authorization.k8s.io", "kind": "ClusterRole", "name": "agent"},
-            "subjects": [{"kind": "User", "name": "agent", "apiGroup": "rbac.authorization.k8s.io"}],
+        self.post(f"{RBAC}/clusterroles", {"metadata": {"name": "agent"}, "rules": RULES})
+        self.post(f"{RBAC}/clusterrolebindings", _binding("agent", "ClusterRole", AGENT))
+        tokens = {"apiGroups": [""], "resources": ["serviceaccounts/token"], "verbs": ["create"]}
+        self._permit("agent", [tokens], AGENT)
+
+    def publish(self, node: str) -> None:
+        """Keep what the operator keeps for a node: its Grants in one object, with an account that may read that."""
+        if self.get(f"{ACCOUNTS}/{node}") is None:
+            self.post(ACCOUNTS, {"metadata": {"name": node}})
+        if self.get(f"{RBAC}/namespaces/{NODE_GRANTS_NAMESPACE}/roles/{node}") is None:
+            own = {"apiGroups": ["fractus.dev"], "resourceNames": [node]}
+            rules = [
+                own | {"resources": ["nodegrants"], "verbs": ["get", "list", "watch"]},
+                own | {"resources": ["nodegrants/status"], "verbs": ["patch"]},
+            ]
+            self._permit(node, rules, {"kind": "ServiceAccount", "name": node, "namespace": NODE_GRANTS_NAMESPACE})
+        grants = self.admin.list(f"{FRACTUS}/grants", fieldSelector=f"spec.node={node}")
+        body = {
+            "apiVersion": "fractus.dev/v1alpha1",
+            "kind": "NodeGrants",
+            "metadata": {"name": node, "namespace": NODE_GRANTS_NAMESPACE},
+            "spec": {"count": len(grants), "packed": pack(grants)},
         }
-        self.post(f"{rbac}/clusterrolebindings", binding)
+        self.admin.apply(f"{NODE_GRANTS}/{node}", body)
+
+    def reported(self, node: str, grant: str) -> dict[str, Any]:
+        """What a node's agent reported of a Grant; empty while nothing."""
+        status = (self.get(f"{NODE_GRANTS}/{node}") or {}).get("status") or {}
+        return next((each for each in status.get("grants", ()) if each["name"] == grant), {})
+
+    def _permit(self, name: str, rules: list[dict[str, Any]], subject: dict[str, str]) -> None:
+        where = f"{RBAC}/namespaces/{NODE_GRANTS_NAMESPACE}"
+        self.post(f"{where}/roles", {"metadata": {"name": name}, "rules": rules})
+        self.post(f"{where}/rolebindings", _binding(name, "Role", subject))
 
     def sign_requests(self, authority: TestAuthority) -> int:
         """Approve and sign what waits, as the operator does; how many."""
@@ -127,6 +158,14 @@ class ApiServer(ControlPlane):
             self.admin.call("PUT", f"{path}/status", approved)
             signed += 1
         return signed
+
+
+AGENT = {"kind": "User", "name": "agent", "apiGroup": "rbac.authorization.k8s.io"}
+
+
+def _binding(name: str, kind: str, subject: dict[str, str]) -> dict[str, Any]:
+    role = {"apiGroup": "rbac.authorization.k8s.io", "kind": kind, "name": name}
+    return {"metadata": {"name": name}, "roleRef": role, "subjects": [subject]}
 
 
 def _post(url: str, body: dict[str, Any]) -> dict[str, Any]:

@@ -19,7 +19,7 @@ import grpc
 import pytest
 import yaml
 from agent_pki import TestAuthority
-from agent_server import FRACTUS, REQUESTS, ApiServer, running
+from agent_server import FRACTUS, NODE_GRANTS, REQUESTS, ApiServer, running
 from control_plane import wait_for
 from exposed import scraped
 from fractus_cluster.ports import free_port
@@ -163,6 +163,7 @@ class Node:
         for path in (f"{FRACTUS}/{self.plural}/{self.name}", f"/api/v1/nodes/{self.name}"):
             self.server.delete(path)
         self.server.delete(f"{FRACTUS}/grants?fieldSelector=spec.node%3D{self.name}")
+        self.server.delete(f"{NODE_GRANTS}/{self.name}")
         self.server.delete(REQUESTS)
 
 
@@ -184,12 +185,18 @@ def add_grant(server: ApiServer, name: str, node: str = "drone-1", **spec: Any) 
         "metadata": {"name": name},
         "spec": {"node": node, "application": application, "component": "Navigator", "instance": f"app-{name}"} | spec,
     }
-    return server.post(f"{FRACTUS}/grants", sign(body, *server.signer, datetime.now(UTC)))
+    made = server.post(f"{FRACTUS}/grants", sign(body, *server.signer, datetime.now(UTC)))
+    server.publish(node)
+    return made
 
 
-def phase(server: ApiServer, name: str) -> str | None:
-    grant = server.get(f"{FRACTUS}/grants/{name}") or {}
-    return (grant.get("status") or {}).get("phase")
+def remove_grant(server: ApiServer, name: str) -> None:
+    server.delete(f"{FRACTUS}/grants/{name}")
+    server.publish("drone-1")
+
+
+def phase(server: ApiServer, name: str, node: str = "drone-1") -> str | None:
+    return server.reported(node, name).get("phase")
 
 
 def test_a_drones_life(server: ApiServer, drone: Node) -> None:
@@ -204,7 +211,7 @@ def test_a_drones_life(server: ApiServer, drone: Node) -> None:
     stored = Grant.from_body(json.loads((drone.state / "grants" / "mine.json").read_text()))
     assert stored.spec.control == "full"
     assert stored.metadata.uid == uid
-    assert phase(server, "not-mine") is None
+    assert phase(server, "not-mine", "drone-2") is None
     assert (drone.object() or {})["spec"]["depot"] == "campus"
 
     wait_for(
@@ -220,7 +227,7 @@ def test_a_drones_life(server: ApiServer, drone: Node) -> None:
 
     seen = scraped(drone.metrics)
     assert seen["fractus_agent_grants", "stored"] == 1
-    assert 0 <= seen["fractus_agent_watch_age_seconds", "grants"] < 100
+    assert 0 <= seen["fractus_agent_watch_age_seconds", "nodegrants"] < 100
     assert 0 <= seen["fractus_agent_report_age_seconds",] < 100
     assert 0 <= seen["fractus_telemetry_age_seconds",] < 100
     assert seen["fractus_certificate_expiry_timestamp_seconds",] > time.time()
@@ -231,9 +238,7 @@ def test_a_drones_life(server: ApiServer, drone: Node) -> None:
     drone.mobility.now.missions[stored.spec.mission_key].CopyFrom(ended)
     wait_for(lambda: (drone.object() or {})["status"]["flightState"] == "flying", "flying", timeout_s=10)
     wait_for(lambda: phase(server, "mine") == "Failed", "failed grant", timeout_s=10)
-    grant = server.get(f"{FRACTUS}/grants/mine")
-    assert grant is not None
-    assert grant["status"]["message"] == "driver lost"
+    assert server.reported("drone-1", "mine")["message"] == "driver lost"
 
     drone.unserve()
     wait_for(lambda: drone.condition("Ready").get("reason") == "MobilityUnreachable", "lost service", timeout_s=15)
@@ -281,7 +286,7 @@ def test_grants_outlive_the_api_server(server: ApiServer, drone: Node) -> None:
         lambda: phase(server, "three") == "Active" and drone.grants() == {"one", "two", "three"}, "grants", timeout_s=30
     )
     drone.stop(signal.SIGKILL)
-    server.delete(f"{FRACTUS}/grants/one")
+    remove_grant(server, "one")
     server.stop_apiserver()
     drone.start()
     try:
@@ -297,7 +302,7 @@ def test_grants_outlive_the_api_server(server: ApiServer, drone: Node) -> None:
     wait_for(lambda: phase(server, "four") == "Active" and "four" in drone.grants(), "a new grant", timeout_s=10)
     server.stop_apiserver()
     server.start_apiserver()
-    server.delete(f"{FRACTUS}/grants/two")
+    remove_grant(server, "two")
     wait_for(lambda: drone.grants() == {"three", "four"}, "reconciled grants after a restart", timeout_s=40)
 
 
@@ -310,9 +315,11 @@ def test_what_the_operator_did_not_sign_is_not_stored(server: ApiServer, drone: 
     path = f"{FRACTUS}/grants/mine"
     good = (server.get(path) or {})["spec"]
     server.admin.merge(path, {"spec": {"control": "full"}})
+    server.publish("drone-1")
     wait_for(lambda: phase(server, "mine") == "Pending" and not drone.grants(), "no grant", timeout_s=30)
-    assert "changed after it was signed" in (server.get(path) or {})["status"]["message"]
+    assert "changed after it was signed" in server.reported("drone-1", "mine")["message"]
     server.admin.merge(path, {"spec": good})
+    server.publish("drone-1")
     wait_for(lambda: phase(server, "mine") == "Active" and drone.grants() == {"mine"}, "the grant again", timeout_s=30)
 
 

@@ -112,7 +112,7 @@ WRITER = """
 import sys
 from pathlib import Path
 from fractus_agent.grants.keeper import GrantDirectory, GrantKeeper
-from fractus_agent.cluster.store import Listed
+from fractus_agent.cluster.store import Granted
 def grant(name, size):
     return {"apiVersion": "fractus.dev/v1alpha1", "kind": "Grant", "metadata": {"name": name, "uid": name},
         "spec": {"node": "n", "application": {"namespace": "d", "name": "a", "uid": "u"}, "component": "C",
@@ -124,7 +124,7 @@ print("ready", flush=True)
 turn = 0
 while True:
     turn += 1
-    keeper.take(Listed(tuple(grant(f"g{i}", turn % 700 + 1) for i in range(turn % 5))))
+    keeper.take(Granted(turn, tuple(grant(f"g{i}", turn % 700 + 1) for i in range(turn % 5)), {}))
 """
 
 

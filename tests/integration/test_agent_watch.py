@@ -6,11 +6,11 @@ import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import pytest
 from agent_pki import TestAuthority
-from agent_server import FRACTUS, ApiServer, running
+from agent_server import ACCOUNTS, FRACTUS, NODE_GRANTS, RBAC, ApiServer, running
 from fractus_agent.cluster import store as store_module
 from fractus_agent.cluster.store import (
     Changed,
@@ -18,6 +18,7 @@ from fractus_agent.cluster.store import (
     Deleted,
     Event,
     Expired,
+    Granted,
     Invalid,
     KubeError,
     Listed,
@@ -25,15 +26,18 @@ from fractus_agent.cluster.store import (
     WatchTimes,
     connect,
 )
+from fractus_core.api.node_grants import ReportedGrant
 
 pytestmark = [pytest.mark.timeout(300), pytest.mark.xdist_group("agent-watch")]  # they share an API server
 WAIT_TIMEOUT_S = 30.0
+Told = TypeVar("Told", Event, Granted)
 
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ApiServer]:
     with running(tmp_path_factory.mktemp("plane")) as server:
         server.furnish(TestAuthority().pem)
+        server.post("/api/v1/nodes", {"metadata": {"name": "drone-1"}})
         yield server
 
 
@@ -41,18 +45,32 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ApiServer]:
 def credentials(server: ApiServer, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setenv("KUBECONFIG", str(server.agent_kubeconfig))
     yield
-    server.delete(f"{FRACTUS}/grants")
-    server.delete(f"{FRACTUS}/drones")
+    for collection in (f"{FRACTUS}/directlinks", f"{FRACTUS}/drones", f"{FRACTUS}/grants", NODE_GRANTS, ACCOUNTS):
+        server.delete(collection)
 
 
-def grant(name: str, node: str = "drone-1") -> dict[str, Any]:
-    application = {"namespace": "default", "name": "app", "uid": "a"}
+def link(name: str, drone: str = "drone-1") -> dict[str, Any]:
     return {
+        "apiVersion": "fractus.dev/v1alpha1",
+        "kind": "DirectLink",
+        "metadata": {"name": name},
+        "spec": {
+            "drone": drone, "node": "edge-1", "application": {"namespace": "default", "name": "app", "uid": "a"},
+            "technology": "WiFi", "pairing": {"mode": "adhoc", "networkId": "fleet"}, "range": 80, "bandwidth": 12,
+            "position": {"lat": 39.36, "lon": 22.94}, "heuristic": {"kind": "max", "metric": "ingress-bandwidth"},
+        },
+    }  # fmt: skip
+
+
+def add_grant(server: ApiServer, name: str, node: str = "drone-1") -> str:
+    application = {"namespace": "default", "name": "app", "uid": "a"}
+    body = {
         "apiVersion": "fractus.dev/v1alpha1",
         "kind": "Grant",
         "metadata": {"name": name},
         "spec": {"node": node, "application": application, "component": "Navigator", "instance": f"app-{name}"},
     }
+    return str(server.post(f"{FRACTUS}/grants", body)["metadata"]["uid"])
 
 
 @contextlib.asynccontextmanager
@@ -64,7 +82,7 @@ async def store(**times: Any) -> AsyncIterator[Store]:
         await made.close()
 
 
-async def following(events: AsyncIterator[Event]) -> Event:
+async def following(events: AsyncIterator[Told]) -> Told:
     return await asyncio.wait_for(anext(events), WAIT_TIMEOUT_S)
 
 
@@ -77,7 +95,7 @@ async def until(events: AsyncIterator[Event], wanted: type[Event]) -> Event:
 
 
 async def served(watched: Store) -> None:
-    events = watched.grants()
+    events = watched.direct_links("drone")
     await until(events, Listed)
     waiting = asyncio.ensure_future(anext(events))
     done, _ = await asyncio.wait([waiting], timeout=2.0)
@@ -91,33 +109,34 @@ def names(event: Event) -> set[str]:
 
 
 async def test_a_list_then_changes_of_this_node_only(server: ApiServer) -> None:
-    server.post(f"{FRACTUS}/grants", grant("a"))
-    server.post(f"{FRACTUS}/grants", grant("other", "drone-2"))
+    server.post(f"{FRACTUS}/directlinks", link("a"))
+    server.post(f"{FRACTUS}/directlinks", link("other", "drone-2"))
     async with store() as watched:
-        events = watched.grants()
+        events = watched.direct_links("drone")
         assert names(await following(events)) == {"a"}
-        server.post(f"{FRACTUS}/grants", grant("other-2", "drone-2"))
-        server.post(f"{FRACTUS}/grants", grant("b"))
+        server.post(f"{FRACTUS}/directlinks", link("other-2", "drone-2"))
+        server.post(f"{FRACTUS}/directlinks", link("b"))
         event = await following(events)
         assert isinstance(event, Changed)
         assert event.object["metadata"]["name"] == "b"
-        server.delete(f"{FRACTUS}/grants/a")
+        server.delete(f"{FRACTUS}/directlinks/a")
         assert await following(events) == Deleted("a")
 
 
 async def test_an_expired_version_leads_to_a_list(server: ApiServer) -> None:
     async with store() as watched:
-        grants = store_module._KINDS["Grant"], watched._own("node")
-        _, old = await watched._list(*grants)
+        own = {"fieldSelector": "spec.drone=drone-1"}
+        links = store_module._Feed(watched._client, store_module._KINDS["DirectLink"], own)
+        _, old = await watched._list(links)
         for number in range(3):
-            server.post(f"{FRACTUS}/grants", grant(f"g{number}"))
+            server.post(f"{FRACTUS}/directlinks", link(f"g{number}"))
         server.stop_apiserver()
         server.start_apiserver()
         server.compact()
         # Storage of the kinds comes up a moment after the server says it is ready.
         await served(watched)
         with pytest.raises(Expired):
-            await until(watched._watch(*grants, old), Deleted)
+            await until(watched._watch(links, old), Deleted)
 
         real, used = watched._list, []
 
@@ -127,26 +146,26 @@ async def test_an_expired_version_leads_to_a_list(server: ApiServer) -> None:
             return objects, old if len(used) == 1 else version
 
         watched._list = stale_at_first  # type: ignore[method-assign]
-        events = watched.grants()
+        events = watched.direct_links("drone")
         assert names(await following(events)) == {"g0", "g1", "g2"}
         assert names(await following(events)) == {"g0", "g1", "g2"}
-        server.delete(f"{FRACTUS}/grants/g1")
+        server.delete(f"{FRACTUS}/directlinks/g1")
         assert await following(events) == Deleted("g1")
         assert len(used) == 2
 
 
 async def test_an_outage_yields_nothing_and_then_a_list(server: ApiServer) -> None:
-    server.post(f"{FRACTUS}/grants", grant("a"))
-    server.post(f"{FRACTUS}/grants", grant("b"))
+    server.post(f"{FRACTUS}/directlinks", link("a"))
+    server.post(f"{FRACTUS}/directlinks", link("b"))
     async with store() as watched:
-        events = watched.grants()
+        events = watched.direct_links("drone")
         assert names(await following(events)) == {"a", "b"}
         server.stop_apiserver()
         waiting = asyncio.ensure_future(anext(events))
         done, _ = await asyncio.wait([waiting], timeout=2.0)
         assert not done
         server.start_apiserver()
-        server.delete(f"{FRACTUS}/grants/a")
+        server.delete(f"{FRACTUS}/directlinks/a")
         async with asyncio.timeout(WAIT_TIMEOUT_S):
             event = await waiting
             while not (isinstance(event, Listed) and names(event) == {"b"}) and event != Deleted("a"):
@@ -155,13 +174,13 @@ async def test_an_outage_yields_nothing_and_then_a_list(server: ApiServer) -> No
 
 async def test_a_frozen_server_is_noticed_by_its_silence(server: ApiServer) -> None:
     async with store(silence_s=1.0) as watched:
-        events = watched.grants()
+        events = watched.direct_links("drone")
         assert names(await following(events)) == set()
         with server.frozen():
             waiting = asyncio.ensure_future(anext(events))
             done, _ = await asyncio.wait([waiting], timeout=3.0)
             assert not done
-        server.post(f"{FRACTUS}/grants", grant("late"))
+        server.post(f"{FRACTUS}/directlinks", link("late"))
         async with asyncio.timeout(WAIT_TIMEOUT_S):
             event = await waiting
             while isinstance(event, Listed) and names(event) != {"late"}:
@@ -170,14 +189,103 @@ async def test_a_frozen_server_is_noticed_by_its_silence(server: ApiServer) -> N
 
 async def test_a_watch_that_the_server_ends_goes_on_where_it_was(server: ApiServer) -> None:
     async with store(server_s=2) as watched:
-        events = watched.grants()
+        events = watched.direct_links("drone")
         assert names(await following(events)) == set()
         waiting = asyncio.ensure_future(anext(events))
         done, _ = await asyncio.wait([waiting], timeout=3.5)
         assert not done, "a clean end is no reason to list again"
-        server.post(f"{FRACTUS}/grants", grant("after"))
+        server.post(f"{FRACTUS}/directlinks", link("after"))
         event = await asyncio.wait_for(waiting, WAIT_TIMEOUT_S)
         assert isinstance(event, Changed)
+
+
+async def nothing_from(granted: AsyncIterator[Granted], for_s: float = 2.0) -> asyncio.Future[Granted]:
+    """What comes next, which is nothing for a while."""
+    waiting = asyncio.ensure_future(anext(granted))
+    done, _ = await asyncio.wait([waiting], timeout=for_s)
+    assert not done
+    return waiting
+
+
+def named(granted: Granted) -> set[str] | None:
+    return None if granted.grants is None else {body["metadata"]["name"] for body in granted.grants}
+
+
+async def test_the_grants_of_the_node_are_those_of_its_object(server: ApiServer) -> None:
+    uid = add_grant(server, "a")
+    add_grant(server, "other", "drone-2")
+    for node in ("drone-1", "drone-2"):
+        server.publish(node)
+    async with store() as watched:
+        granted = watched.grants()
+        first = await following(granted)
+        assert named(first) == {"a"}
+        assert first.grants is not None
+        assert first.grants[0]["metadata"]["uid"] == uid
+        add_grant(server, "b")
+        server.publish("drone-1")
+        second = await following(granted)
+        assert (named(second), second.generation) == ({"a", "b"}, first.generation + 1)
+        report = ReportedGrant(uid=uid, name="a", phase="Active", observed_generation=1)
+        assert await watched.report_grants(second.generation, [report])
+        assert server.reported("drone-1", "a")["phase"] == "Active"
+        third = await following(granted)
+        assert (named(third), third.reported) == (None, {uid: report}), "what is the same is not unpacked again"
+        assert await watched.report_grants(second.generation, [])
+        assert server.reported("drone-1", "a") == {}
+
+
+async def test_an_object_that_is_not_there_takes_no_grant_away(server: ApiServer) -> None:
+    async with store() as watched:
+        granted = watched.grants()
+        waiting = await nothing_from(granted)
+        assert not await _reports(watched)
+        add_grant(server, "a")
+        server.publish("drone-1")
+        assert named(await asyncio.wait_for(waiting, WAIT_TIMEOUT_S)) == {"a"}
+        server.delete(f"{NODE_GRANTS}/drone-1")
+        waiting = await nothing_from(granted)
+        assert not await _reports(watched)
+        server.publish("drone-1")
+        assert named(await asyncio.wait_for(waiting, WAIT_TIMEOUT_S)) in ({"a"}, None)
+        server.admin.merge(f"{NODE_GRANTS}/drone-1", {"spec": {"packed": "damaged"}})
+        waiting = await nothing_from(granted)
+        server.delete(f"{FRACTUS}/grants/a")
+        server.publish("drone-1")
+        assert named(await asyncio.wait_for(waiting, WAIT_TIMEOUT_S)) == set()
+
+
+async def _reports(watched: Store) -> bool:
+    try:
+        return await watched.report_grants(1, [])
+    except KubeError:
+        return False
+
+
+async def test_an_account_that_is_made_again_or_may_not_takes_no_grant_away(server: ApiServer) -> None:
+    add_grant(server, "a")
+    server.publish("drone-1")
+    async with store(server_s=1) as watched:
+        granted = watched.grants()
+        assert named(await following(granted)) == {"a"}
+        server.delete(f"{ACCOUNTS}/drone-1")
+        waiting = await nothing_from(granted, 4.0)
+        server.publish("drone-1")
+        add_grant(server, "b")
+        server.publish("drone-1")
+        assert named(await asyncio.wait_for(waiting, WAIT_TIMEOUT_S)) == {"a", "b"}
+        roles = f"{RBAC}/namespaces/fractus-nodes/rolebindings/drone-1"
+        binding = server.get(roles)
+        assert binding is not None
+        server.delete(roles)
+        waiting = await nothing_from(granted, 4.0)
+        server.post(
+            roles.rpartition("/")[0],
+            {key: binding[key] for key in ("roleRef", "subjects")} | {"metadata": {"name": "drone-1"}},
+        )
+        server.delete(f"{FRACTUS}/grants/b")
+        server.publish("drone-1")
+        assert named(await asyncio.wait_for(waiting, WAIT_TIMEOUT_S)) == {"a"}
 
 
 async def test_a_rotated_token_is_read_again(

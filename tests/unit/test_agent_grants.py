@@ -1,20 +1,21 @@
 """What becomes of grants: phases, and which news changes the disk."""
 
 import json
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
-from fractus_agent.cluster.store import Backoff, Changed, Deleted, Event, KubeError, Listed
+from fractus_agent.cluster.store import Backoff, Granted, KubeError
 from fractus_agent.grants.keeper import (
     UNVERIFIED_TIMEOUT_S,
     GrantDirectory,
     GrantKeeper,
     outcome_of,
-    status_of,
+    report_of,
     stored_form,
 )
+from fractus_core.api.node_grants import ReportedGrant
 from fractus_core.api.plans import Grant
 from fractus_core.control import Outcome, OutcomeKind
 from fractus_core.policy.trust import BadSignature, UnknownAuthority
@@ -41,18 +42,37 @@ def manifest(name: str = "g1", uid: str = "u1", version: str = "1", **more: Any)
     }
 
 
-class FakeStore:
-    def __init__(self) -> None:
-        self.statuses: list[tuple[str, dict[str, Any]]] = []
-        self.down = False
+def granted(*manifests: dict[str, Any], generation: int = 1, reported: Sequence[ReportedGrant] = ()) -> Granted:
+    return Granted(generation, manifests, {report.uid: report for report in reported})
 
-    async def apply_status(self, kind: str, name: str, status: dict[str, Any]) -> dict[str, Any] | None:
+
+def report(phase: str, message: str = "", name: str = "g1", uid: str = "u1") -> ReportedGrant:
+    return ReportedGrant.model_validate(
+        {"uid": uid, "name": name, "phase": phase, "message": message, "observedGeneration": 1}
+    )
+
+
+class FakeStore:
+    """What was reported, each time of all Grants."""
+
+    def __init__(self) -> None:
+        self.reports: list[dict[str, ReportedGrant]] = []
+        self.generation = 0
+        self.down = False
+        self.absent = False
+
+    async def report_grants(self, generation: int, reports: Sequence[ReportedGrant]) -> bool:
         if self.down:
             raise KubeError(0, "Unreachable", "down")
-        self.statuses.append((name, status))
-        return {}
+        if not self.absent:
+            self.generation = generation
+            self.reports.append({report.name: report for report in reports})
+        return not self.absent
 
-    async def grants(self) -> AsyncIterator[Event]:
+    def phases(self, name: str = "g1") -> list[str]:
+        return [reports[name].phase for reports in self.reports]
+
+    async def grants(self) -> AsyncIterator[Granted]:
         raise NotImplementedError
         yield
 
@@ -77,15 +97,13 @@ def on_disk(path: Path) -> set[str]:
     return {p.name for p in path.iterdir()}
 
 
-def test_only_a_list_or_a_deletion_removes(keeper: GrantKeeper, tmp_path: Path) -> None:
-    keeper.take(Listed((manifest("g1"), manifest("g2"))))
+def test_what_the_operator_does_not_name_any_more_is_removed(keeper: GrantKeeper, tmp_path: Path) -> None:
+    keeper.take(granted(manifest("g1"), manifest("g2")))
     assert on_disk(tmp_path) == {"g1.json", "g2.json"}
-    keeper.take(Changed(manifest("g3")))
-    assert on_disk(tmp_path) == {"g1.json", "g2.json", "g3.json"}
-    keeper.take(Deleted("g1"))
+    keeper.take(Granted(1, None, {}))
+    assert on_disk(tmp_path) == {"g1.json", "g2.json"}, "only what was reported has changed"
+    keeper.take(granted(manifest("g2"), manifest("g3")))
     assert on_disk(tmp_path) == {"g2.json", "g3.json"}
-    keeper.take(Listed((manifest("g3"),)))
-    assert on_disk(tmp_path) == {"g3.json"}
 
 
 def test_a_new_agent_removes_what_a_full_list_lacks(store: FakeStore, tmp_path: Path) -> None:
@@ -94,71 +112,96 @@ def test_a_new_agent_removes_what_a_full_list_lacks(store: FakeStore, tmp_path: 
     directory = GrantDirectory(tmp_path)
     directory.open()
     assert on_disk(tmp_path) == {"old.json"}
-    GrantKeeper(store, directory, "drone-1", believe).take(Listed(()))
+    GrantKeeper(store, directory, "drone-1", believe).take(granted())
     assert on_disk(tmp_path) == set()
 
 
 def test_a_file_is_the_grant_and_only_its_content_rewrites_it(keeper: GrantKeeper, tmp_path: Path) -> None:
-    keeper.take(Changed(manifest()))
+    keeper.take(granted(manifest()))
     file = tmp_path / "g1.json"
     assert Grant.from_body(json.loads(file.read_text())).spec.identity.endswith("/instance/app-navigator")
     assert file.stat().st_mode & 0o777 == 0o600
     first = file.stat().st_ino
-    keeper.take(Changed(manifest(version="2", status={"phase": "Active"})))
+    keeper.take(granted(manifest(version="2", status={"phase": "Active"})))
     assert file.stat().st_ino == first
-    keeper.take(Changed(manifest(version="3", spec={"control": "full"})))
+    keeper.take(granted(manifest(version="3", spec={"control": "full"})))
     assert file.stat().st_ino != first
     assert json.loads(file.read_text())["spec"]["control"] == "full"
 
 
-def test_a_grant_being_deleted_or_of_another_node_is_gone(keeper: GrantKeeper, tmp_path: Path) -> None:
-    keeper.take(Listed((manifest("g1"), manifest("g2"))))
-    keeper.take(Changed(manifest("g1", metadata={"deletionTimestamp": "2026-01-01T00:00:00Z"})))
-    keeper.take(Changed(manifest("g2", spec={"node": "drone-2"})))
-    assert on_disk(tmp_path) == set()
+def test_a_grant_of_another_node_is_not_stored(keeper: GrantKeeper, tmp_path: Path) -> None:
+    keeper.take(granted(manifest("g1"), manifest("g2")))
+    keeper.take(granted(manifest("g1"), manifest("g2", spec={"node": "drone-2"})))
+    assert on_disk(tmp_path) == {"g1.json"}
 
 
 async def test_an_unreadable_grant_grants_nothing_and_says_so(
     keeper: GrantKeeper, store: FakeStore, tmp_path: Path
 ) -> None:
-    keeper.take(Listed((manifest(),)))
-    keeper.take(Changed(manifest(spec={"newRestriction": True})))
+    keeper.take(granted(manifest()))
+    keeper.take(granted(manifest(spec={"newRestriction": True})))
     assert on_disk(tmp_path) == set()
     await keeper.report_once()
-    (name, status) = store.statuses[-1]
-    assert (name, status["phase"]) == ("g1", "Failed")
-    assert "spec.newRestriction" in status["message"]
+    (found,) = store.reports[-1].values()
+    assert (found.name, found.uid, found.phase) == ("g1", "u1", "Failed")
+    assert "spec.newRestriction" in found.message
 
 
 async def test_phases_are_reported_once_and_survive_outages(keeper: GrantKeeper, store: FakeStore) -> None:
-    keeper.take(Listed((manifest(),)))
+    keeper.take(granted(manifest()))
     store.down = True
     with pytest.raises(KubeError):
         await keeper.report_once()
     store.down = False
     await keeper.report_once()
     await keeper.report_once()
-    assert [s["phase"] for _, s in store.statuses] == ["Active"]
+    assert store.phases() == ["Active"]
     keeper.missions_changed({KEY: FAILED})
     await keeper.report_once()
-    assert store.statuses[-1] == ("g1", {"phase": "Failed", "message": "driver lost", "observedGeneration": 1})
+    assert store.reports[-1] == {"g1": report("Failed", "driver lost")}
 
 
 async def test_a_new_agent_does_not_repeat_what_is_reported(keeper: GrantKeeper, store: FakeStore) -> None:
-    status = {"phase": "Active", "message": "", "observedGeneration": 1}
-    keeper.take(Listed((manifest(status=status),)))
+    keeper.take(granted(manifest(), reported=[report("Active")]))
     await keeper.report_once()
-    assert store.statuses == []
+    assert store.reports == []
+
+
+async def test_what_the_api_server_lost_is_reported_again(keeper: GrantKeeper, store: FakeStore) -> None:
+    keeper.take(granted(manifest(), generation=4))
+    await keeper.report_once()
+    keeper.take(Granted(5, None, {}))
+    await keeper.report_once()
+    assert store.phases() == ["Active", "Active"]
+    assert store.generation == 5
+
+
+async def test_what_is_reported_names_all_grants_and_no_other(keeper: GrantKeeper, store: FakeStore) -> None:
+    keeper.take(granted(manifest(), manifest("g2", "u2"), reported=[report("Active")]))
+    await keeper.report_once()
+    assert store.reports == [{"g1": report("Active"), "g2": report("Active", name="g2", uid="u2")}]
+    keeper.take(granted(manifest("g2", "u2"), reported=list(store.reports[-1].values())))
+    await keeper.report_once()
+    assert store.reports[-1] == {"g2": report("Active", name="g2", uid="u2")}
+
+
+async def test_reports_wait_for_an_object_that_takes_them(keeper: GrantKeeper, store: FakeStore) -> None:
+    store.absent = True
+    keeper.take(granted(manifest()))
+    await keeper.report_once()
+    store.absent = False
+    await keeper.report_once()
+    assert store.phases() == ["Active"]
 
 
 async def test_a_grant_made_again_under_its_name_is_reported_again(keeper: GrantKeeper, store: FakeStore) -> None:
     keeper.missions_changed({KEY: COMPLETE})
     for uid in ("u1", "u2"):
-        keeper.take(Changed(manifest(uid=uid)))
+        keeper.take(granted(manifest(uid=uid)))
         await keeper.report_once()
-    keeper.take(Changed(manifest(uid="u3")))
+    keeper.take(granted(manifest(uid="u3")))
     await keeper.report_once()
-    assert [s["phase"] for _, s in store.statuses] == ["Complete", "Active", "Active"]
+    assert store.phases() == ["Complete", "Active", "Active"]
 
 
 async def test_a_grant_that_cannot_be_stored_is_pending_until_it_can(
@@ -169,13 +212,13 @@ async def test_a_grant_that_cannot_be_stored_is_pending_until_it_can(
 
     with monkeypatch.context() as patch:
         patch.setattr("os.fsync", full)
-        keeper.take(Listed((manifest(),)))
+        keeper.take(granted(manifest()))
     await keeper.report_once()
-    assert store.statuses[-1][1]["phase"] == "Pending"
-    assert "No space left" in store.statuses[-1][1]["message"]
+    assert store.phases()[-1] == "Pending"
+    assert "No space left" in store.reports[-1]["g1"].message
     keeper.retry_disk()
     await keeper.report_once()
-    assert store.statuses[-1][1]["phase"] == "Active"
+    assert store.phases()[-1] == "Active"
 
 
 class Doubter:
@@ -211,32 +254,32 @@ def doubting(store: FakeStore, doubter: Doubter, tmp_path: Path) -> GrantKeeper:
 async def test_a_grant_that_is_not_signed_is_not_stored_and_takes_away_the_one_before(
     doubting: GrantKeeper, doubter: Doubter, store: FakeStore, tmp_path: Path
 ) -> None:
-    doubting.take(Listed((manifest(),)))
+    doubting.take(granted(manifest()))
     doubter.error = BadSignature("it was changed after it was signed")
-    doubting.take(Changed(manifest(spec={"control": "full"})))
+    doubting.take(granted(manifest(spec={"control": "full"})))
     assert on_disk(tmp_path) == set()
     await doubting.report_once()
-    name, status = store.statuses[-1]
-    assert (name, status["phase"]) == ("g1", "Pending"), "the operator signs it again; nothing has failed"
-    assert "changed after" in status["message"]
+    found = store.reports[-1]["g1"]
+    assert found.phase == "Pending", "the operator signs it again; nothing has failed"
+    assert "changed after" in found.message
     doubter.error = None
-    doubting.take(Changed(manifest()))
+    doubting.take(granted(manifest()))
     await doubting.report_once()
     assert on_disk(tmp_path) == {"g1.json"}
-    assert store.statuses[-1][1]["phase"] == "Active"
+    assert store.phases()[-1] == "Active"
 
 
 async def test_a_change_of_authorities_takes_no_grant_away(
     doubting: GrantKeeper, doubter: Doubter, store: FakeStore, tmp_path: Path
 ) -> None:
-    doubting.take(Listed((manifest(),)))
+    doubting.take(granted(manifest()))
     await doubting.report_once()
     doubter.error = UnknownAuthority("it is of an authority that is not in ca.crt")
-    doubting.take(Changed(manifest(spec={"control": "full"})))
+    doubting.take(granted(manifest(spec={"control": "full"}), reported=[report("Active")]))
     await doubting.report_once()
     assert "control" not in json.loads((tmp_path / "g1.json").read_text())["spec"]
     assert doubter.asked == 1
-    assert [s["phase"] for _, s in store.statuses] == ["Active"]
+    assert store.phases() == ["Active"]
     doubter.error = None
     doubting.authority_changed()
     assert json.loads((tmp_path / "g1.json").read_text())["spec"]["control"] == "full"
@@ -245,16 +288,16 @@ async def test_a_change_of_authorities_takes_no_grant_away(
 def test_an_authority_that_stays_unknown_ends_the_grant(
     doubting: GrantKeeper, doubter: Doubter, tmp_path: Path
 ) -> None:
-    doubting.take(Listed((manifest(),)))
+    doubting.take(granted(manifest()))
     doubter.error = UnknownAuthority("it is of an authority that is not in ca.crt")
-    doubting.take(Changed(manifest(spec={"control": "full"})))
+    doubting.take(granted(manifest(spec={"control": "full"})))
     doubter.now_s = UNVERIFIED_TIMEOUT_S
     doubting.give_up_unverified()
     assert on_disk(tmp_path) == {"g1.json"}
     doubter.now_s = UNVERIFIED_TIMEOUT_S + 1
     doubting.give_up_unverified()
     assert on_disk(tmp_path) == set()
-    doubting.take(Listed(()))
+    doubting.take(granted())
     doubter.error = None
     doubting.authority_changed()
     assert on_disk(tmp_path) == set(), "what the API server has no more does not come back"
@@ -263,21 +306,21 @@ def test_an_authority_that_stays_unknown_ends_the_grant(
 async def test_a_stored_grant_outlives_its_authority_and_the_agent(
     doubting: GrantKeeper, doubter: Doubter, store: FakeStore, tmp_path: Path
 ) -> None:
-    doubting.take(Listed((manifest(),)))
+    doubting.take(granted(manifest()))
     doubter.error = UnknownAuthority("it is of an authority that is not in ca.crt")
     again = GrantKeeper(store, GrantDirectory(tmp_path), "drone-1", doubter.check, monotonic=lambda: doubter.now_s)
-    again.take(Listed((manifest(),)))
+    again.take(granted(manifest()))
     doubter.now_s = UNVERIFIED_TIMEOUT_S * 2
     again.give_up_unverified()
     await again.report_once()
     assert on_disk(tmp_path) == {"g1.json"}
-    assert store.statuses[-1][1]["phase"] == "Active"
+    assert store.phases()[-1] == "Active"
 
 
 async def test_an_api_server_that_is_gone_for_a_month_takes_no_grant_away(
     doubting: GrantKeeper, doubter: Doubter, store: FakeStore, tmp_path: Path
 ) -> None:
-    doubting.take(Listed((manifest("g1"), manifest("g2"))))
+    doubting.take(granted(manifest("g1"), manifest("g2")))
     store.down = True
     doubter.error = UnknownAuthority("there is no ca.crt any more")
     for _ in range(30):
@@ -304,9 +347,16 @@ def test_outcomes() -> None:
 
 
 def test_a_reported_end_is_final() -> None:
-    grant = Grant.from_body(manifest(status={"phase": "Complete", "message": "done"}))
-    assert status_of(grant, {}, None)["phase"] == "Complete"
-    assert status_of(grant, {KEY: "failed: x"}, "disk full")["phase"] == "Complete"
+    grant, ended = Grant.from_body(manifest()), report("Complete", "done")
+    assert report_of(grant, {}, None, ended) == ended
+    assert report_of(grant, {KEY: FAILED}, "disk full", ended) == ended
+    assert report_of(grant, {KEY: FAILED}, "disk full", report("Active")).phase == "Pending"
+
+
+async def test_a_new_agent_takes_no_reported_end_back(keeper: GrantKeeper, store: FakeStore) -> None:
+    keeper.take(granted(manifest(), reported=[report("Complete", "done")]))
+    await keeper.report_once()
+    assert store.reports == []
 
 
 def test_the_stored_form_is_stable() -> None:

@@ -8,14 +8,15 @@ import contextlib
 import logging
 import os
 import time
-from collections.abc import AsyncGenerator, Mapping
+from collections.abc import AsyncGenerator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from fractus_core.api import DirectLink, Drone, EdgeNode, Grant
+from fractus_core.api import DirectLink, Drone, EdgeNode, InvalidObject, NodeGrants
 from fractus_core.api.model import API_VERSION, GROUP
 from fractus_core.api.names import NODE_SIGNER
+from fractus_core.api.node_grants import NODE_GRANTS_NAMESPACE, ReportedGrant, unpack
 from fractus_kube import (
     Backoff,
     Body,
@@ -37,7 +38,6 @@ __all__ = ["Backoff", "Conflict", "Expired", "Invalid", "KubeError", "Object", "
 LOG = logging.getLogger(__name__)
 
 Object = Body
-Selectors = Mapping[str, str]
 
 FIELD_MANAGER = "fractus-agent"
 SYSTEM_NAMESPACE = "fractus-system"
@@ -67,6 +67,23 @@ class Deleted:
 
 
 Event = Listed | Changed | Deleted
+
+
+@dataclass(frozen=True, slots=True)
+class Granted:
+    """All Grants of the node, as the operator says by now.
+
+    Attributes:
+        generation: metadata.generation of the object that holds them.
+        grants: None where they are as they were told of last.
+        reported: what the API server was told became of them, by uid.
+    """
+
+    generation: int
+    grants: tuple[Object, ...] | None
+    reported: Mapping[str, ReportedGrant]
+
+
 End = Literal["drone", "node"]
 """Which end of its direct links a node is, as their specs name it: the one that asks, or the one that is asked."""
 
@@ -86,12 +103,22 @@ class WatchTimes:
 
 
 _KINDS = {
-    model.KIND: Kind(API_VERSION, model.KIND, model.PLURAL, namespaced=False)
-    for model in (Drone, EdgeNode, Grant, DirectLink)
+    model.KIND: Kind(API_VERSION, model.KIND, model.PLURAL, namespaced=False) for model in (Drone, EdgeNode, DirectLink)
 }
+_NODE_GRANTS = Kind(API_VERSION, NodeGrants.KIND, NodeGrants.PLURAL, namespaced=True)
 _NODE = Kind("v1", "Node", "nodes", namespaced=False)
 _SIGNING_REQUEST = Kind("certificates.k8s.io/v1", "CertificateSigningRequest", "certificatesigningrequests", False)
 _CONFIG_MAP = Kind("v1", "ConfigMap", "configmaps", namespaced=True)
+
+
+@dataclass(frozen=True, slots=True)
+class _Feed:
+    """What is followed, and by whom."""
+
+    client: Client
+    kind: Kind
+    selectors: Mapping[str, str]
+    namespace: str = ""
 
 
 async def connect(service_account: Path = SERVICE_ACCOUNT) -> Client:
@@ -106,13 +133,15 @@ async def connect(service_account: Path = SERVICE_ACCOUNT) -> Client:
 
 
 class Store:
-    """The node's own objects and grants at the API server.
+    """The node's own objects and Grants at the API server.
 
     Every call either returns within CALL_TIMEOUT_S or raises a KubeError.
     """
 
     def __init__(self, client: Client, node: str, times: WatchTimes | None = None) -> None:
         self._client = client
+        # All agents are one account, which may read no Grant: those of a node are for an account of its own.
+        self._own_client = client.account(node, NODE_GRANTS_NAMESPACE, node)
         self._node = node
         self._times = times or WatchTimes()
         self._heard: dict[str, float] = {}
@@ -197,34 +226,64 @@ class Store:
             if name.startswith(f"fractus-{self._node}-"):
                 await self._client.delete(_SIGNING_REQUEST, ("", name))
 
-    def grants(self) -> AsyncGenerator[Event, None]:
-        """Grants of this node, as `_follow` tells of them."""
-        return self._follow(_KINDS["Grant"], self._own("node"))
+    async def grants(self) -> AsyncGenerator[Granted, None]:
+        """The node's Grants, at first and after each change.
+
+        Only an object that is there and can be read tells which Grants there are: one that is not there yet, was deleted, is
+        withheld or damaged takes no Grant from a drone.
+        """
+        feed = _Feed(
+            self._own_client, _NODE_GRANTS, {"fieldSelector": f"metadata.name={self._node}"}, NODE_GRANTS_NAMESPACE
+        )
+        packed: str | None = None
+        async for event in self._follow(feed):
+            match event:
+                case Listed((body,)) | Changed(body):
+                    try:
+                        found = NodeGrants.from_body(body)
+                        grants = None if found.spec.packed == packed else unpack(found.spec.packed)
+                    except InvalidObject as error:
+                        LOG.error("grants: cannot be read, keeping those on disk: %s", error)  # noqa: TRY400
+                        continue
+                    packed = found.spec.packed
+                    reported = found.status.grants if found.status is not None else ()
+                    yield Granted(found.metadata.generation or 0, grants, {each.uid: each for each in reported})
+                case _:
+                    LOG.warning("grants: the operator has not told of any, keeping those on disk")
+
+    async def report_grants(self, generation: int, reports: Sequence[ReportedGrant]) -> bool:
+        """Tell what became of the node's Grants; False while there is no object to tell it in."""
+        status = {"observedGeneration": generation, "grants": [report.to_dict() for report in reports]}
+        body = {**_NODE_GRANTS.header(self._node, NODE_GRANTS_NAMESPACE), "status": status}
+        try:
+            await self._own_client.apply(_NODE_GRANTS, body, subresource="status")
+        except NotFound:
+            return False
+        return True
 
     def direct_links(self, end: End) -> AsyncGenerator[Event, None]:
         """DirectLinks of this node, as `_follow` tells of them."""
-        return self._follow(_KINDS["DirectLink"], self._own(end))
+        own = {"fieldSelector": f"spec.{end}={self._node}"}
+        return self._follow(_Feed(self._client, _KINDS["DirectLink"], own))
 
-    def _own(self, field: str) -> Selectors:
-        return {"fieldSelector": f"spec.{field}={self._node}"}
-
-    async def _follow(self, kind: Kind, selectors: Selectors) -> AsyncGenerator[Event, None]:
+    async def _follow(self, feed: _Feed) -> AsyncGenerator[Event, None]:
         """Objects, indefinitely: a complete list, then changes, and a list again after any break.
 
         A break is never taken for an empty list. After one the list is read again rather than the watch resumed: the
         list is short, and an API server restored from a backup may count versions from an earlier number.
         """
         backoff = Backoff(self._times.first_retry_s, self._times.longest_retry_s)
+        kind = feed.kind
         self._heard.setdefault(kind.plural, time.monotonic())
         while True:
             started_s = time.monotonic()
             try:
-                objects, version = await self._list(kind, selectors)
+                objects, version = await self._list(feed)
                 self._heard[kind.plural] = time.monotonic()
                 if backoff.attempts > 1:
                     LOG.info("%s: the API server is back (attempts=%d)", kind.plural, backoff.attempts)
                 yield Listed(objects)
-                async with contextlib.aclosing(self._watch(kind, selectors, version)) as events:
+                async with contextlib.aclosing(self._watch(feed, version)) as events:
                     async for event in events:
                         yield event
             except Expired:
@@ -242,6 +301,7 @@ class Store:
 
     async def close(self) -> None:
         """Close the connections."""
+        await self._own_client.aclose()
         await self._client.aclose()
 
     async def _get(self, kind: Kind, name: str, namespace: str = "") -> Object | None:
@@ -250,24 +310,27 @@ class Store:
         except NotFound:
             return None
 
-    async def _list(self, kind: Kind, selectors: Selectors) -> tuple[tuple[Object, ...], str]:
-        page = await self._client.list_whole(kind, selectors=selectors, timeout_s=CALL_TIMEOUT_S)
+    async def _list(self, feed: _Feed) -> tuple[tuple[Object, ...], str]:
+        page = await feed.client.list_whole(
+            feed.kind, namespace=feed.namespace, selectors=feed.selectors, timeout_s=CALL_TIMEOUT_S
+        )
         return tuple(page.items), page.resource_version
 
-    async def _watch(self, kind: Kind, selectors: Selectors, version: str) -> AsyncGenerator[Event, None]:
+    async def _watch(self, feed: _Feed, version: str) -> AsyncGenerator[Event, None]:
         until_s = time.monotonic() + self._times.relist_s
         while time.monotonic() < until_s:
             opened_s = time.monotonic()
-            events = self._client.watch(
-                kind,
+            events = feed.client.watch(
+                feed.kind,
                 resource_version=version,
-                selectors=selectors,
+                namespace=feed.namespace,
+                selectors=feed.selectors,
                 timeout_s=self._times.server_s,
                 silence_s=self._times.silence_s,
             )
             async for change, body in events:
                 version = body["metadata"]["resourceVersion"]
-                self._heard[kind.plural] = time.monotonic()
+                self._heard[feed.kind.plural] = time.monotonic()
                 if change == "DELETED":
                     yield Deleted(body["metadata"]["name"])
                 elif change in ("ADDED", "MODIFIED"):

@@ -8,22 +8,22 @@ import logging
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from fractus_core.api.model import InvalidObject
-from fractus_core.api.plans import Grant
+from fractus_core.api.node_grants import ReportedGrant
+from fractus_core.api.plans import Grant, GrantPhase
 from fractus_core.control import Outcome, OutcomeKind
 from fractus_core.policy.trust import BadSignature, UnknownAuthority
 from fractus_storage import remove_file, write_file
 
-from fractus_agent.cluster.store import Changed, Deleted, Event, Listed, Object, Store
+from fractus_agent.cluster.store import Granted, Object, Store
 from fractus_agent.supervisor import repeat
 
 LOG = logging.getLogger(__name__)
 
-Phase = Literal["Pending", "Active", "Complete", "Revoked", "Failed"]
-ENDED: frozenset[str] = frozenset({"Complete", "Revoked", "Failed"})
-_OUTCOMES: dict[OutcomeKind, Phase] = {
+ENDED: frozenset[GrantPhase] = frozenset({"Complete", "Revoked", "Failed"})
+_OUTCOMES: dict[OutcomeKind, GrantPhase] = {
     OutcomeKind.COMPLETE: "Complete",
     OutcomeKind.REVOKED: "Revoked",
     OutcomeKind.FAILED: "Failed",
@@ -85,33 +85,40 @@ def stored_form(grant: Grant) -> bytes:
     return json.dumps(body, sort_keys=True, indent=1).encode() + b"\n"
 
 
-def outcome_of(grant: Grant, missions: Mapping[str, Outcome]) -> tuple[Phase, str] | None:
+def outcome_of(grant: Grant, missions: Mapping[str, Outcome]) -> tuple[GrantPhase, str] | None:
     """How the grant's mission ended, as the mobility service tells; None while it has not."""
     outcome = missions.get(grant.spec.mission_key)
     return (_OUTCOMES[outcome.kind], outcome.reason) if outcome is not None else None
 
 
-def status_of(grant: Grant, missions: Mapping[str, Outcome], problem: str | None) -> dict[str, Any]:
-    """The status that the agent reports of a grant; an end once reported is never taken back."""
-    reported = grant.status
+def report_of(
+    grant: Grant, missions: Mapping[str, Outcome], problem: str | None, reported: ReportedGrant | None
+) -> ReportedGrant:
+    """What the agent reports of a grant; an end once reported is never taken back."""
     if reported is not None and reported.phase in ENDED:
-        phase, message = reported.phase, reported.message or ""
+        phase, message = reported.phase, reported.message
     elif problem is not None:
         phase, message = "Pending", problem
     else:
         phase, message = outcome_of(grant, missions) or ("Active", "")
-    return _status(phase, message, grant.metadata.generation)
+    return _report(grant.metadata.model_dump(by_alias=True), phase, message)
 
 
-def _status(phase: Phase | None, message: str, generation: int | None) -> dict[str, Any]:
-    return {"phase": phase, "message": message, "observedGeneration": generation or 0}
+def _report(metadata: Mapping[str, Any], phase: GrantPhase, message: str) -> ReportedGrant:
+    return ReportedGrant(
+        uid=metadata.get("uid") or "",
+        name=metadata["name"],
+        phase=phase,
+        message=message,
+        observed_generation=metadata.get("generation") or 0,
+    )
 
 
 class GrantKeeper:
     """Mirrors the node's grants to disk and reports their phases.
 
-    Files are removed only when the API server says so: by a deletion, by absence from a complete list, or by a Grant that
-    the operator did not sign. An API server that is out of reach removes nothing, so a flight goes on.
+    Files are removed only when the API server says so: by absence from what the operator says are all of them, or by a Grant
+    that the operator did not sign. An API server that is out of reach removes nothing, so a flight goes on.
 
     Args:
         store: the API server.
@@ -140,10 +147,11 @@ class GrantKeeper:
         self._monotonic = monotonic
         self._unverified: dict[str, tuple[Object, float]] = {}
         self._grants: dict[str, Grant] = {}
-        self._unusable: dict[str, dict[str, Any]] = {}
+        self._unusable: dict[str, ReportedGrant] = {}
         self._unstored: dict[str, str] = {}
         self._unremoved: set[str] = set()
-        self._reported: dict[str, dict[str, Any]] = {}
+        self._generation = 0
+        self._reported: Mapping[str, ReportedGrant] = {}
         self._missions: Mapping[str, Outcome] = {}
         self._work = asyncio.Event()
         self._reviewed_s = monotonic()
@@ -172,23 +180,19 @@ class GrantKeeper:
     async def follow(self) -> None:
         """Keep the directory in step with the API server until cancelled."""
         self._directory.open()
-        async for event in self._store.grants():
-            self.take(event)
+        async for granted in self._store.grants():
+            self.take(granted)
 
-    def take(self, event: Event) -> None:
-        """Apply one event to the disk."""
-        match event:
-            case Listed(grants):
-                names = {body["metadata"]["name"] for body in grants}
-                known = self._directory.names().union(self._grants, self._unusable, self._unverified)
-                for gone in known - names:
-                    self._remove(gone)
-                for body in grants:
-                    self._put(body)
-            case Changed(body):
+    def take(self, granted: Granted) -> None:
+        """Bring the disk in step with what the operator says."""
+        self._generation, self._reported = granted.generation, granted.reported
+        if granted.grants is not None:
+            names = {body["metadata"]["name"] for body in granted.grants}
+            known = self._directory.names().union(self._grants, self._unusable, self._unverified)
+            for gone in known - names:
+                self._remove(gone)
+            for body in granted.grants:
                 self._put(body)
-            case Deleted(name):
-                self._remove(name)
         self._work.set()
 
     async def report(self) -> None:
@@ -203,16 +207,20 @@ class GrantKeeper:
         return REVIEW_INTERVAL_S
 
     async def report_once(self) -> None:
-        """Report every grant whose status at the API server is not what the node knows."""
+        """Report every grant, where what the API server was told is not what the node knows."""
         wanted = {
-            name: status_of(grant, self._missions, self._unstored.get(name)) for name, grant in self._grants.items()
-        }
-        for name, status in (wanted | self._unusable).items():
-            if self._reported.get(name) == status:
-                continue
-            await self._store.apply_status("Grant", name, status)
-            self._reported[name] = status
-            LOG.info("grants: reported (grant=%s phase=%s): %s", name, status["phase"], status["message"] or "-")
+            name: report_of(
+                grant, self._missions, self._unstored.get(name), self._reported.get(grant.metadata.uid or "")
+            )
+            for name, grant in self._grants.items()
+        } | self._unusable
+        reports = {report.uid: report for _, report in sorted(wanted.items())}
+        if reports == self._reported or not await self._store.report_grants(self._generation, list(reports.values())):
+            return
+        for report in reports.values():
+            if self._reported.get(report.uid) != report:
+                LOG.info("grants: reported (grant=%s phase=%s): %s", report.name, report.phase, report.message or "-")
+        self._reported = reports
 
     def _put(self, body: Object) -> None:
         name = body["metadata"]["name"]
@@ -224,7 +232,7 @@ class GrantKeeper:
             self._remove(name)
             self._report_unusable(body, "Failed", f"The agent of {self._node} cannot read the grant: {error}")
             return
-        if grant.metadata.deletion_timestamp is not None or grant.spec.node != self._node:
+        if grant.spec.node != self._node:
             self._remove(name)
             return
         try:
@@ -242,13 +250,7 @@ class GrantKeeper:
         self._unverified.pop(name, None)
         self._unusable.pop(name, None)
         self._unremoved.discard(name)
-        old = self._grants.get(name)
-        if old is None or old.metadata.uid != grant.metadata.uid:
-            self._reported.pop(name, None)
         self._grants[name] = grant
-        if grant.status is not None:
-            known = grant.status
-            self._reported[name] = _status(known.phase, known.message or "", known.observed_generation)
         self._write(grant)
 
     def _stored(self, grant: Grant) -> bool:
@@ -278,9 +280,8 @@ class GrantKeeper:
     def _waits(self, why: object) -> str:
         return f"The agent of {self._node} waits for the operator's signature: {why}"
 
-    def _report_unusable(self, body: Object, phase: Phase, message: str) -> None:
-        metadata = body["metadata"]
-        self._unusable[metadata["name"]] = _status(phase, message, metadata.get("generation"))
+    def _report_unusable(self, body: Object, phase: GrantPhase, message: str) -> None:
+        self._unusable[body["metadata"]["name"]] = _report(body["metadata"], phase, message)
 
     def _write(self, grant: Grant) -> None:
         try:
@@ -300,7 +301,7 @@ class GrantKeeper:
             self._remove(name)
 
     def _remove(self, name: str) -> None:
-        for record in (self._grants, self._unusable, self._unstored, self._reported, self._unverified):
+        for record in (self._grants, self._unusable, self._unstored, self._unverified):
             record.pop(name, None)
         self._unremoved.discard(name)
         try:

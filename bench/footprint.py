@@ -196,6 +196,7 @@ class Node:
             "/api/v1/nodes", {"metadata": {"name": NODE, "labels": {"fractus.dev/class": "drone"}}}
         )  # fmt: skip
         self._server.post(f"{FRACTUS}/grants", pki.sign(GRANT))
+        self._server.publish(NODE)
         shutil.copy(self._server.agent_kubeconfig, etc / "kubeconfig")
         camera = f"http://127.0.0.1:{self._ports['world']}/snapshot.jpg"
         (etc / "node.yaml").write_text(described(self._links[0], camera))

@@ -15,6 +15,8 @@ from kubernetes.aio.client import Configuration
 from kubernetes.aio.config import ConfigException, load_kube_config
 from kubernetes.aio.config.incluster_config import InClusterConfigLoader
 
+from fractus_kube.errors import KubeError
+
 SERVICE_ACCOUNT = Path("/var/run/secrets/kubernetes.io/serviceaccount")
 _KUBECONFIG = "~/.kube/config"
 
@@ -117,7 +119,7 @@ def with_tokens(configuration: Configuration, token: Callable[[], Awaitable[str]
     Args:
         configuration: of any other access to it; its credentials are left out.
         token: asks for a new one.
-        life_s: how long one is used; it should be valid for twice as long.
+        life_s: how long one is used before the next is asked for; it should be valid for twice as long.
     """
     own = copy.copy(configuration)
     own.cert_file = own.key_file = None
@@ -131,8 +133,16 @@ def with_tokens(configuration: Configuration, token: Callable[[], Awaitable[str]
         renew_at_s = time.monotonic() + life_s
 
     async def in_time(_configuration: Configuration) -> None:
-        if time.monotonic() >= renew_at_s:
+        nonlocal renew_at_s
+        if time.monotonic() < renew_at_s:
+            return
+        try:
             await renew()
+        except KubeError:
+            if not own.api_key["BearerToken"]:
+                raise
+            # The one that there is may be good for as long again; where it is not, the API server says so.
+            renew_at_s = time.monotonic() + life_s / 10
 
     own.refresh_api_key_hook = in_time
     return Access(own, renew)

@@ -124,7 +124,7 @@ print("ready", flush=True)
 turn = 0
 while True:
     turn += 1
-    keeper.take(Granted(turn, tuple(grant(f"g{i}", turn % 700 + 1) for i in range(turn % 5)), {}))
+    keeper.take(Granted(turn, tuple(grant(f"g{i}", turn % 700 + 1) for i in range(turn % 5)), {}, 0))
 """
 
 

@@ -14,6 +14,7 @@ from fractus_agent.grants.keeper import (
     outcome_of,
     report_of,
     stored_form,
+    unless_ended,
 )
 from fractus_core.api.node_grants import ReportedGrant
 from fractus_core.api.plans import Grant
@@ -42,8 +43,10 @@ def manifest(name: str = "g1", uid: str = "u1", version: str = "1", **more: Any)
     }
 
 
-def granted(*manifests: dict[str, Any], generation: int = 1, reported: Sequence[ReportedGrant] = ()) -> Granted:
-    return Granted(generation, manifests, {report.uid: report for report in reported})
+def granted(
+    *manifests: dict[str, Any], generation: int = 1, reported: Sequence[ReportedGrant] = (), reported_of: int = 1
+) -> Granted:
+    return Granted(generation, manifests, {report.uid: report for report in reported}, reported_of)
 
 
 def report(phase: str, message: str = "", name: str = "g1", uid: str = "u1") -> ReportedGrant:
@@ -100,7 +103,7 @@ def on_disk(path: Path) -> set[str]:
 def test_what_the_operator_does_not_name_any_more_is_removed(keeper: GrantKeeper, tmp_path: Path) -> None:
     keeper.take(granted(manifest("g1"), manifest("g2")))
     assert on_disk(tmp_path) == {"g1.json", "g2.json"}
-    keeper.take(Granted(1, None, {}))
+    keeper.take(Granted(1, None, {}, 0))
     assert on_disk(tmp_path) == {"g1.json", "g2.json"}, "only what was reported has changed"
     keeper.take(granted(manifest("g2"), manifest("g3")))
     assert on_disk(tmp_path) == {"g2.json", "g3.json"}
@@ -170,7 +173,7 @@ async def test_a_new_agent_does_not_repeat_what_is_reported(keeper: GrantKeeper,
 async def test_what_the_api_server_lost_is_reported_again(keeper: GrantKeeper, store: FakeStore) -> None:
     keeper.take(granted(manifest(), generation=4))
     await keeper.report_once()
-    keeper.take(Granted(5, None, {}))
+    keeper.take(Granted(5, None, {}, 0))
     await keeper.report_once()
     assert store.phases() == ["Active", "Active"]
     assert store.generation == 5
@@ -347,10 +350,42 @@ def test_outcomes() -> None:
 
 
 def test_a_reported_end_is_final() -> None:
-    grant, ended = Grant.from_body(manifest()), report("Complete", "done")
-    assert report_of(grant, {}, None, ended) == ended
-    assert report_of(grant, {KEY: FAILED}, "disk full", ended) == ended
-    assert report_of(grant, {KEY: FAILED}, "disk full", report("Active")).phase == "Pending"
+    grant, ended = Grant.from_body(manifest(metadata={"generation": 2})), report("Complete", "done")
+    now = report_of(grant, {KEY: FAILED}, None)
+    assert unless_ended(now, ended) == ended.model_copy(update={"observed_generation": 2})
+    assert unless_ended(report_of(grant, {}, "disk full"), ended).phase == "Complete"
+    assert unless_ended(now, report("Active")) == unless_ended(now, None) == now
+
+
+@pytest.mark.parametrize("problem", [BadSignature("changed"), UnknownAuthority("unknown"), None])
+async def test_nor_is_an_end_taken_back_by_a_grant_that_is_unusable(
+    doubting: GrantKeeper, doubter: Doubter, store: FakeStore, problem: Exception | None
+) -> None:
+    doubter.error = problem
+    spec = {} if problem is not None else {"newRestriction": True}
+    doubting.take(granted(manifest(spec=spec), reported=[report("Complete", "done")]))
+    await doubting.report_once()
+    assert store.reports == []
+
+
+async def test_what_is_reported_is_of_the_present_generation(keeper: GrantKeeper, store: FakeStore) -> None:
+    """Signed again, a Grant has other annotations and the same generation."""
+    keeper.take(granted(manifest(), reported=[report("Active")]))
+    again = manifest(metadata={"annotations": {"fractus.dev/signature": "again"}})
+    keeper.take(granted(again, generation=2, reported=[report("Active")]))
+    await keeper.report_once()
+    assert (store.generation, store.phases()) == (2, ["Active"])
+
+
+def test_what_is_unchanged_is_not_verified_again(doubting: GrantKeeper, doubter: Doubter, tmp_path: Path) -> None:
+    doubting.take(granted(manifest("g1"), manifest("g2")))
+    doubter.error = BadSignature("it is asked again")
+    doubting.take(granted(manifest("g1"), manifest("g2", spec={"control": "full"})))
+    assert on_disk(tmp_path) == {"g1.json"}
+    (tmp_path / "g1.json").unlink()
+    doubter.error = None
+    doubting.take(granted(manifest("g1"), manifest("g2")))
+    assert on_disk(tmp_path) == {"g1.json", "g2.json"}, "what was removed by hand is stored again"
 
 
 async def test_a_new_agent_takes_no_reported_end_back(keeper: GrantKeeper, store: FakeStore) -> None:

@@ -41,7 +41,7 @@ def packed(value: Any) -> str:
 def test_what_is_packed_is_unpacked_by_name(specs: dict[str, Any], random: Any) -> None:
     bodies = [body(name, spec) for name, spec in specs.items()]
     text = pack(bodies)
-    assert unpack(text) == tuple(sorted(bodies, key=lambda each: each["metadata"]["name"]))
+    assert unpack(text, len(bodies)) == tuple(sorted(bodies, key=lambda each: each["metadata"]["name"]))
     random.shuffle(bodies)
     assert pack(bodies) == text
 
@@ -51,7 +51,7 @@ def test_what_changes_with_reports_alone_is_left_out() -> None:
     changed = {**signed, "status": {"phase": "Active"}}
     changed["metadata"] = {**signed["metadata"], "resourceVersion": "7", "managedFields": [{}], "finalizers": ["f"]}
     assert pack([changed]) == pack([signed])
-    assert unpack(pack([changed])) == (signed,)
+    assert unpack(pack([changed]), 1) == (signed,)
 
 
 def test_zones_that_grants_share_are_packed_once() -> None:
@@ -75,11 +75,14 @@ def test_zones_that_grants_share_are_packed_once() -> None:
         (packed([1]), "is no list of Grants"),
         (packed([{"metadata": {"name": "a"}}]), "is no list of Grants"),
         (packed([{"metadata": None}]), "is no list of Grants"),
+        (packed([{"metadata": {"name": "../a", "uid": "u"}}]), "is no list of Grants"),
+        (packed([{"metadata": {"name": "a" * 254, "uid": "u"}}]), "is no list of Grants"),
+        (packed([{"metadata": {"name": "a", "uid": "u"}}]), "holds 1 Grants, not the 0 of spec.count"),
     ],
 )
 def test_what_is_not_packed_is_refused(text: str, reason: str) -> None:
     with pytest.raises(InvalidObject, match=rf"^spec\.packed: {reason}.*; the operator writes it again$"):
-        unpack(text)
+        unpack(text, 0)
 
 
 def test_what_unpacks_to_too_much_is_refused_at_the_bound() -> None:
@@ -88,7 +91,7 @@ def test_what_unpacks_to_too_much_is_refused_at_the_bound() -> None:
     tracemalloc.start()
     try:
         with pytest.raises(InvalidObject, match="holds more than 67108864 bytes"):
-            unpack(text)
+            unpack(text, 0)
         assert tracemalloc.get_traced_memory()[1] < 3 * MAX_UNPACKED_BYTES
     finally:
         tracemalloc.stop()

@@ -16,7 +16,7 @@ from typing import Literal
 from fractus_core.api import DirectLink, Drone, EdgeNode, InvalidObject, NodeGrants
 from fractus_core.api.model import API_VERSION, GROUP
 from fractus_core.api.names import NODE_SIGNER
-from fractus_core.api.node_grants import NODE_GRANTS_NAMESPACE, ReportedGrant, unpack
+from fractus_core.api.node_grants import NODE_GRANTS_NAMESPACE, NodeGrantsStatus, ReportedGrant, unpack
 from fractus_kube import (
     Backoff,
     Body,
@@ -77,11 +77,13 @@ class Granted:
         generation: metadata.generation of the object that holds them.
         grants: None where they are as they were told of last.
         reported: what the API server was told became of them, by uid.
+        reported_of: the generation that this was said of.
     """
 
     generation: int
     grants: tuple[Object, ...] | None
     reported: Mapping[str, ReportedGrant]
+    reported_of: int
 
 
 End = Literal["drone", "node"]
@@ -237,19 +239,24 @@ class Store:
         )
         packed: str | None = None
         async for event in self._follow(feed):
-            match event:
-                case Listed((body,)) | Changed(body):
-                    try:
-                        found = NodeGrants.from_body(body)
-                        grants = None if found.spec.packed == packed else unpack(found.spec.packed)
-                    except InvalidObject as error:
-                        LOG.error("grants: cannot be read, keeping those on disk: %s", error)  # noqa: TRY400
-                        continue
-                    packed = found.spec.packed
-                    reported = found.status.grants if found.status is not None else ()
-                    yield Granted(found.metadata.generation or 0, grants, {each.uid: each for each in reported})
-                case _:
-                    LOG.warning("grants: the operator has not told of any, keeping those on disk")
+            if isinstance(event, Deleted) or (isinstance(event, Listed) and not event.objects):
+                LOG.warning("grants: the operator has told of none yet, keeping those on disk")
+                packed = None
+                continue
+            # A list, which follows each break, is compared with the disk again.
+            body, known = (event.objects[0], None) if isinstance(event, Listed) else (event.object, packed)
+            try:
+                found = NodeGrants.from_body(body)
+                fresh = None if found.spec.packed == known else unpack(found.spec.packed, found.spec.count)
+            except InvalidObject as error:
+                LOG.error("grants: cannot be read, keeping those on disk: %s", error)  # noqa: TRY400
+                continue
+            packed = found.spec.packed
+            status = found.status or NodeGrantsStatus()
+            reported = {each.uid: each for each in status.grants}
+            yield Granted(found.metadata.generation or 0, fresh, reported, status.observed_generation or 0)
+            # They are many times as large as they came, and the next may be hours away.
+            del event, body, fresh
 
     async def report_grants(self, generation: int, reports: Sequence[ReportedGrant]) -> bool:
         """Tell what became of the node's Grants; False while there is no object to tell it in."""

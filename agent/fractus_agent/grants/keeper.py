@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import json
 import logging
 import time
@@ -91,17 +92,23 @@ def outcome_of(grant: Grant, missions: Mapping[str, Outcome]) -> tuple[GrantPhas
     return (_OUTCOMES[outcome.kind], outcome.reason) if outcome is not None else None
 
 
-def report_of(
-    grant: Grant, missions: Mapping[str, Outcome], problem: str | None, reported: ReportedGrant | None
-) -> ReportedGrant:
-    """What the agent reports of a grant; an end once reported is never taken back."""
-    if reported is not None and reported.phase in ENDED:
-        phase, message = reported.phase, reported.message
-    elif problem is not None:
+def report_of(grant: Grant, missions: Mapping[str, Outcome], problem: str | None) -> ReportedGrant:
+    """What became of a grant."""
+    phase, message = outcome_of(grant, missions) or ("Active", "")
+    if problem is not None:
         phase, message = "Pending", problem
-    else:
-        phase, message = outcome_of(grant, missions) or ("Active", "")
     return _report(grant.metadata.model_dump(by_alias=True), phase, message)
+
+
+def unless_ended(report: ReportedGrant, reported: ReportedGrant | None) -> ReportedGrant:
+    """What is reported of a grant of which something was reported before: an end is never taken back."""
+    if reported is None or reported.phase not in ENDED:
+        return report
+    return reported.model_copy(update={"observed_generation": report.observed_generation})
+
+
+def _digest(body: Object) -> bytes:
+    return hashlib.sha256(json.dumps(body, sort_keys=True).encode()).digest()
 
 
 def _report(metadata: Mapping[str, Any], phase: GrantPhase, message: str) -> ReportedGrant:
@@ -148,9 +155,10 @@ class GrantKeeper:
         self._unverified: dict[str, tuple[Object, float]] = {}
         self._grants: dict[str, Grant] = {}
         self._unusable: dict[str, ReportedGrant] = {}
+        self._digests: dict[str, bytes] = {}
         self._unstored: dict[str, str] = {}
         self._unremoved: set[str] = set()
-        self._generation = 0
+        self._generation = self._reported_of = 0
         self._reported: Mapping[str, ReportedGrant] = {}
         self._missions: Mapping[str, Outcome] = {}
         self._work = asyncio.Event()
@@ -182,17 +190,24 @@ class GrantKeeper:
         self._directory.open()
         async for granted in self._store.grants():
             self.take(granted)
+            del granted
 
     def take(self, granted: Granted) -> None:
         """Bring the disk in step with what the operator says."""
-        self._generation, self._reported = granted.generation, granted.reported
+        self._generation = granted.generation
+        self._reported_of, self._reported = granted.reported_of, granted.reported
         if granted.grants is not None:
             names = {body["metadata"]["name"] for body in granted.grants}
             known = self._directory.names().union(self._grants, self._unusable, self._unverified)
             for gone in known - names:
                 self._remove(gone)
+            stored = self._directory.names()
             for body in granted.grants:
-                self._put(body)
+                name, digest = body["metadata"]["name"], _digest(body)
+                # Each costs some 15 ms to read, verify and compare with the disk: most change alone.
+                if self._digests.get(name) != digest or name not in stored or name not in self._grants:
+                    self._put(body)
+                    self._digests[name] = digest
         self._work.set()
 
     async def report(self) -> None:
@@ -209,18 +224,19 @@ class GrantKeeper:
     async def report_once(self) -> None:
         """Report every grant, where what the API server was told is not what the node knows."""
         wanted = {
-            name: report_of(
-                grant, self._missions, self._unstored.get(name), self._reported.get(grant.metadata.uid or "")
-            )
-            for name, grant in self._grants.items()
+            name: report_of(grant, self._missions, self._unstored.get(name)) for name, grant in self._grants.items()
         } | self._unusable
-        reports = {report.uid: report for _, report in sorted(wanted.items())}
-        if reports == self._reported or not await self._store.report_grants(self._generation, list(reports.values())):
+        reports = {
+            report.uid: unless_ended(report, self._reported.get(report.uid)) for _, report in sorted(wanted.items())
+        }
+        if (self._generation, reports) == (self._reported_of, self._reported):
+            return
+        if not await self._store.report_grants(self._generation, list(reports.values())):
             return
         for report in reports.values():
             if self._reported.get(report.uid) != report:
                 LOG.info("grants: reported (grant=%s phase=%s): %s", report.name, report.phase, report.message or "-")
-        self._reported = reports
+        self._reported_of, self._reported = self._generation, reports
 
     def _put(self, body: Object) -> None:
         name = body["metadata"]["name"]
@@ -301,7 +317,7 @@ class GrantKeeper:
             self._remove(name)
 
     def _remove(self, name: str) -> None:
-        for record in (self._grants, self._unusable, self._unstored, self._unverified):
+        for record in (self._grants, self._digests, self._unusable, self._unstored, self._unverified):
             record.pop(name, None)
         self._unremoved.discard(name)
         try:

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from fractus_core.api.model import AGE, InvalidObject, ObservedGeneration, OpenModel, Resource, keyed
+from fractus_core.api.names import is_subdomain
 from fractus_core.api.plans import GrantPhase
 
 NODE_GRANTS_NAMESPACE = "fractus-nodes"
@@ -84,11 +85,15 @@ def pack(bodies: Iterable[Mapping[str, Any]]) -> str:
     return base64.b64encode(lzma.compress(text, preset=_LEVEL)).decode()
 
 
-def unpack(packed: str) -> tuple[dict[str, Any], ...]:
+def unpack(packed: str, count: int) -> tuple[dict[str, Any], ...]:
     """The Grants of `NodeGrantsSpec.packed`.
 
+    Args:
+        packed: what `pack` made.
+        count: how many there are.
+
     Raises:
-        InvalidObject: it is not what `pack` makes, or larger than MAX_UNPACKED_BYTES.
+        InvalidObject: it is not what `pack` makes of that many, or larger than MAX_UNPACKED_BYTES.
     """
     try:
         # Of what goes in some is kept for later: it ends where the bound is, however well it is packed.
@@ -104,12 +109,15 @@ def unpack(packed: str) -> tuple[dict[str, Any], ...]:
         raise InvalidObject(_FIELD, f"cannot be unpacked ({error}); the operator writes it again") from None
     if not isinstance(found, list) or not all(_named(body) for body in found):
         raise InvalidObject(_FIELD, "is no list of Grants; the operator writes it again")
+    if len(found) != count:
+        raise InvalidObject(
+            _FIELD, f"holds {len(found)} Grants, not the {count} of spec.count; the operator writes it again"
+        )
     return tuple(found)
 
 
 def _named(body: Any) -> bool:
-    return (
-        isinstance(body, dict)
-        and isinstance(metadata := body.get("metadata"), dict)
-        and all(isinstance(metadata.get(key), str) for key in ("name", "uid"))
-    )
+    """Whether it has a name and a uid as the API server gives them: files are called by the one."""
+    metadata = body.get("metadata") if isinstance(body, dict) else None
+    name, uid = (metadata.get("name"), metadata.get("uid")) if isinstance(metadata, dict) else (None, None)
+    return isinstance(name, str) and is_subdomain(name) and isinstance(uid, str)

@@ -45,6 +45,7 @@ from loopback import LoopbackCluster, simulated_node, wait_until
 EXAMPLE = pathlib.Path(__file__).parents[1] / "examples" / "traffic-monitoring"
 API = "/apis/fractus.dev/v1alpha1"
 SYSTEM = "fractus-system"
+NODES = "fractus-nodes"
 READY = {"type": "Ready", "status": "True", "reason": "Simulated", "lastTransitionTime": "2026-01-01T00:00:00Z"}
 AT_DEPOT = 40
 AT_ONCE = 50
@@ -95,7 +96,7 @@ class Scene:
         self._drone, (self._depot,) = documents("drone.yaml")[0], documents("depot.yaml")
         self._edges = documents("edge-nodes.yaml")
         self.nodes = 0
-        for name in (SYSTEM, "plain"):
+        for name in (SYSTEM, NODES, "plain"):
             self._api.apply(
                 f"/api/v1/namespaces/{name}", {"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": name}}
             )

@@ -36,7 +36,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any
 
-from deploy import API, NODE, READY, SYSTEM, Api, Body, Operator, documents, path_of
+from deploy import API, NODE, NODES, READY, SYSTEM, Api, Body, Operator, documents, path_of
 from fractus_cluster.errors import ClusterError
 from fractus_core.api import KINDS, Application, DeploymentPlan
 from fractus_core.api.crd import crd
@@ -185,7 +185,7 @@ class Scene:
         self._api = api
         self.sites = [Site(i) for i in range(nodes // NODES_PER_SITE)]
         self.slots = [Slot(i, self.sites[i % len(self.sites)]) for i in range(applications)]
-        for name in {SYSTEM, *(slot.key[0] for slot in self.slots)}:
+        for name in {SYSTEM, NODES, *(slot.key[0] for slot in self.slots)}:
             body = {"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": name}}
             api.apply(f"/api/v1/namespaces/{name}", body)
         made = [("cloud", f"cloud-{i}", None) for i in range(CLOUD_NODES)]

@@ -34,9 +34,11 @@ SERVICES = ("fractus-agent", "fractus-mobility", "fractus-camera")
 POLICIES = (
     "fractus-agent",
     "fractus-agent-kind",
+    "fractus-agent-token",
     "fractus-pods",
     "fractus-pod-nodes",
     "fractus-operator",
+    "fractus-operator-nodes",
     "fractus-flight-pods",
     "fractus-flight-nodes",
     "fractus-flight-system",

@@ -65,6 +65,10 @@ class Reflector(Generic[T]):
         """The object with this key, or None."""
         return self._objects.get(key)
 
+    def __contains__(self, key: Key) -> bool:
+        """Whether there is an object with this key, be it one that `parse` makes nothing of."""
+        return key in self._objects
+
     def items(self) -> Iterator[tuple[Key, T]]:
         """Every object with its key."""
         return iter(self._objects.items())

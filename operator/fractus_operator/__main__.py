@@ -31,6 +31,7 @@ from fractus_operator.reconcile import service_rollout, silence
 from fractus_operator.reconcile.applications import Applications
 from fractus_operator.reconcile.link_events import LinkEvents
 from fractus_operator.reconcile.location import Locations
+from fractus_operator.reconcile.node_grants import NodeGrantsKeeper
 from fractus_operator.reconcile.node_reports import NodeReports
 from fractus_operator.reconcile.on_mission import OnMission
 from fractus_operator.reconcile.orphans import LOST_PODS_PERIOD_S, LostPods, Orphans
@@ -74,7 +75,7 @@ async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
         live = LiveInventory(store, settings.namespace)
         shown = _observed(lease, live, authority)
         applications = Applications(store, live, authority, _now, settings.planning)
-        signing = NodeSigning(store, live.signing_requests.get, authority, settings.agent_user, _now)
+        signing = NodeSigning(store, live.signing_requests.get, authority, settings.agent_users, _now)
         background: list[Coroutine[Any, Any, None]] = [reflector.run() for reflector in live.reflectors()]
         reports = NodeReports(store, live, _now)
         background += [worklist.run() for worklist in worklists(store, live, signing, reports)]
@@ -174,7 +175,7 @@ def worklists(store: Store, live: LiveInventory, signing: NodeSigning, reports: 
     ]
     for kind, listener in listeners:
         live.listen(kind, listener)
-    return [nodes, requests, zones, policies, *orphans.values(), drones]
+    return [nodes, requests, zones, policies, *orphans.values(), drones, *NodeGrantsKeeper(store, live).worklists()]
 
 
 async def _together(main: Coroutine[Any, Any, None], background: list[Coroutine[Any, Any, None]]) -> None:

@@ -33,6 +33,9 @@ _TEXTS = {
 """Which variable sets what is taken as it is."""
 
 
+FORMER_AGENT_ACCOUNT = "fractus-agent"
+"""The service account of the agents of earlier releases."""
+
 DEFAULT_LEASE_S = 10.0
 MIN_LEASE_S = 1.0
 
@@ -55,7 +58,7 @@ class Settings:
     """
 
     namespace: str = "fractus-system"
-    agent_account: str = "fractus-agent"
+    agent_account: str = "fractus-node"
     health: str = "http://0.0.0.0:8080/healthz"
     metrics_port: int = 0
     identity: str = ""
@@ -65,9 +68,10 @@ class Settings:
     planning: PlanningSettings = field(default_factory=PlanningSettings)
 
     @property
-    def agent_user(self) -> str:
-        """User name of the agents."""
-        return f"system:serviceaccount:{self.namespace}:{self.agent_account}"
+    def agent_users(self) -> frozenset[str]:
+        """User names of the agents, also of those that an upgrade has yet to replace."""
+        accounts = (self.agent_account, FORMER_AGENT_ACCOUNT)
+        return frozenset(f"system:serviceaccount:{self.namespace}:{account}" for account in accounts)
 
     @classmethod
     def from_environment(cls, environment: Mapping[str, str]) -> Settings:

@@ -19,6 +19,14 @@ from fractus_kube import BlockingClient, KubeError
 Body = dict[str, Any]
 FRACTUS = "/apis/fractus.dev/v1alpha1"
 SYSTEM = "fractus-system"
+NODES = "fractus-nodes"
+NODE_OBJECTS = (
+    f"{FRACTUS}/namespaces/{NODES}/nodegrants",
+    f"/apis/rbac.authorization.k8s.io/v1/namespaces/{NODES}/rolebindings",
+    f"/apis/rbac.authorization.k8s.io/v1/namespaces/{NODES}/roles",
+    f"/api/v1/namespaces/{NODES}/serviceaccounts",
+)
+"""Where the operator keeps what each node has."""
 LAT, LON = 39.3606, 22.9307
 MOBILITY = [
     "Arm",
@@ -93,7 +101,8 @@ class World:
 
     def furnish(self, drones: int = 1, edges: int = 3) -> None:
         self.clear()
-        self.api.apply(f"/api/v1/namespaces/{SYSTEM}", _namespace(SYSTEM))
+        for name in (SYSTEM, NODES):
+            self.api.apply(f"/api/v1/namespaces/{name}", _namespace(name))
         self.put(ours("Depot", "base", {"location": at(0, 0), "radius": 30}))
         for i in range(1, drones + 1):
             self.add_drone(f"drone-{i}")
@@ -223,6 +232,9 @@ class World:
         for plural in ("drones", "edgenodes", "depots", "zones", "policies", "grants", "directlinks"):
             for item in self.api.list(f"{FRACTUS}/{plural}"):
                 self._delete(f"{FRACTUS}/{plural}/{item['metadata']['name']}")
+        for path in NODE_OBJECTS:
+            for item in self.api.list(path, labelSelector="app.kubernetes.io/managed-by=fractus"):
+                self._delete(f"{path}/{item['metadata']['name']}")
         for node in self.api.list("/api/v1/nodes"):
             self._delete(f"/api/v1/nodes/{node['metadata']['name']}")
 

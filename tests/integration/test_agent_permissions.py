@@ -9,15 +9,21 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from chart import operator_token, path_of, render
 from control_plane import ControlPlane, wait_for
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
 from cryptography.x509.oid import NameOID
-from fractus_kube import BlockingClient, KubeError
-from operator_world import FRACTUS, SYSTEM, Body, OperatorProcess, World, at, denied, ours
+from fractus_core.api.node_grants import pack
+from fractus_kube import BlockingClient, ContentType, Kind, KubeError
+from fractus_operator.cluster.kinds import NODE_GRANTS, ROLE, ROLE_BINDING, SERVICE_ACCOUNT
+from fractus_operator.cluster.node_accounts import ACCOUNT_KINDS, account_object, header
+from operator_world import FRACTUS, NODES, SYSTEM, Body, OperatorProcess, World, at, denied, ours
 
 REQUESTS = "/apis/certificates.k8s.io/v1/certificatesigningrequests"
+
+OLD = {"ServiceAccount", "ClusterRole", "ClusterRoleBinding", "Role", "RoleBinding"}
 
 # -- what agents may do --
 
@@ -30,13 +36,13 @@ def agents(control_plane: ControlPlane, world: World, chart: None) -> Iterator[d
     for node in ("drone-1", "edge-1"):
         name = f"fractus-agent-{node}"
         world.api.delete(f"{pods}/{name}", grace_s=0)
-        spec = {"nodeName": node, "serviceAccountName": "fractus-agent", "containers": [{"name": "a", "image": "a"}]}
+        spec = {"nodeName": node, "serviceAccountName": "fractus-node", "containers": [{"name": "a", "image": "a"}]}
         pod = {"apiVersion": "v1", "kind": "Pod", "metadata": {"name": name, "namespace": SYSTEM}, "spec": spec}
         uid = world.api.call("POST", pods, pod)["metadata"]["uid"]
         bound = {"kind": "Pod", "apiVersion": "v1", "name": name, "uid": uid}
         request = {"apiVersion": "authentication.k8s.io/v1", "kind": "TokenRequest",
                    "spec": {"expirationSeconds": 600, "boundObjectRef": bound}}  # fmt: skip
-        path = f"/api/v1/namespaces/{SYSTEM}/serviceaccounts/fractus-agent/token"
+        path = f"/api/v1/namespaces/{SYSTEM}/serviceaccounts/fractus-node/token"
         clients[node] = control_plane.with_token(world.api.call("POST", path, request)["status"]["token"])
     # The API server needs a moment to know a new admission policy: wait until it denies.
     wait_for(lambda: _denied(clients["edge-1"]), "the admission policy to be in force")
@@ -97,13 +103,190 @@ def _grant(world: World, node: str) -> str:
     return f"{FRACTUS}/grants/{name}"
 
 
-def test_an_agent_reports_on_grants_of_its_node_only(world: World, agents: dict[str, BlockingClient]) -> None:
-    mine, other = _grant(world, "drone-1"), _grant(world, "edge-1")
-    status = {"status": {"phase": "Active"}}
-    agents["drone-1"].merge(f"{mine}/status", status)
-    denied(lambda: agents["drone-1"].merge(f"{other}/status", status), "drone-1 only")
-    denied(lambda: agents["drone-1"].merge(mine, {"spec": {"component": "B"}}), "cannot patch")
-    denied(lambda: agents["drone-1"].merge(f"{FRACTUS}/zones/any", {"spec": {}}), "cannot patch")
+def test_an_agent_has_no_right_on_grants(world: World, agents: dict[str, BlockingClient]) -> None:
+    mine, agent = _grant(world, "drone-1"), agents["drone-1"]
+    copied = [{"op": "copy", "from": "/spec/identity", "path": "/status/phase"}]
+    denied(lambda: agent.get(mine), "cannot get")
+    denied(lambda: agent.list(f"{FRACTUS}/grants", fieldSelector="spec.node=drone-1"), "cannot list")
+    denied(lambda: agent.list(f"{FRACTUS}/grants", watch="true", timeoutSeconds="1"), "cannot watch")
+    denied(lambda: agent.merge(f"{mine}/status", {"status": {"phase": "Active"}}), "cannot patch")
+    denied(lambda: agent.call("PATCH", f"{mine}/status", copied, content_type=ContentType.JSON_PATCH), "cannot patch")
+    denied(lambda: agent.merge(mine, {"spec": {"component": "B"}}), "cannot patch")
+    denied(lambda: agent.list(f"{FRACTUS}/namespaces/{NODES}/nodegrants"), "cannot list")
+    denied(lambda: agent.get(f"{FRACTUS}/namespaces/{NODES}/nodegrants/drone-1"), "cannot get")
+    denied(lambda: agent.merge(f"{FRACTUS}/zones/any", {"spec": {}}), "cannot patch")
+
+
+def token_request(node: str = "drone-1", **spec: Any) -> Body:
+    bound = {"kind": "Node", "apiVersion": "v1", "name": node}
+    given = {"expirationSeconds": 3600, "boundObjectRef": bound} | spec
+    return {"apiVersion": "authentication.k8s.io/v1", "kind": "TokenRequest", "spec": given}
+
+
+def token_path(node: str, namespace: str = NODES) -> str:
+    return f"/api/v1/namespaces/{namespace}/serviceaccounts/{node}/token"
+
+
+@pytest.fixture
+def accounts(control_plane: ControlPlane, world: World, agents: dict[str, BlockingClient]) -> None:
+    """The accounts of drone-1 and edge-1 with their objects, made with the operator's own rights."""
+    operator = control_plane.with_token(operator_token(world))
+    for node in agents:
+        for path, body in node_objects(node).items():
+            wait_for(lambda path=path, body=body: operator.call("POST", path, body), f"{body['kind']} {node}")
+    operator.close()
+
+
+def node_objects(node: str) -> dict[str, Body]:
+    """What the operator makes for a node, by the path of its collection."""
+    made = {kind.path(NODES): account_object(kind, node) for kind in ACCOUNT_KINDS}
+    spec = {"count": 0, "packed": pack(())}
+    return made | {NODE_GRANTS.path(NODES): header(NODE_GRANTS, node) | {"spec": spec}}
+
+
+def test_an_agent_reads_and_reports_on_the_one_object_of_its_node(
+    control_plane: ControlPlane, agents: dict[str, BlockingClient], accounts: None
+) -> None:
+    token = agents["drone-1"].call("POST", token_path("drone-1"), token_request())["status"]["token"]
+    node = control_plane.with_token(token)
+    path = f"{FRACTUS}/namespaces/{NODES}/nodegrants"
+    status = {"status": {"observedGeneration": 1, "grants": []}}
+    assert node.get(f"{path}/drone-1")
+    assert len(node.list(path, fieldSelector="metadata.name=drone-1")) == 1
+    node.merge(f"{path}/drone-1/status", status)
+    denied(lambda: node.get(f"{path}/edge-1"), "cannot get")
+    denied(lambda: node.list(path), "cannot list")
+    denied(lambda: node.list(path, fieldSelector="metadata.name=edge-1"), "cannot list")
+    denied(lambda: node.list(f"{FRACTUS}/nodegrants", fieldSelector="metadata.name=drone-1"), "cannot list")
+    denied(lambda: node.merge(f"{path}/edge-1/status", status), "cannot patch")
+    denied(lambda: node.merge(f"{path}/drone-1", {"spec": {"count": 1}}), "cannot patch")
+    denied(lambda: node.delete(f"{path}/drone-1"), "cannot delete")
+    denied(lambda: node.list(f"{FRACTUS}/grants"), "cannot list")
+    denied(lambda: node.call("POST", token_path("drone-1"), token_request()), "cannot create")
+    node.close()
+
+
+@pytest.mark.parametrize(
+    ("path", "request_", "words"),
+    [
+        pytest.param(
+            token_path("edge-1"), token_request("edge-1"), "of the account of drone-1 only", id="another node"
+        ),
+        pytest.param(token_path("edge-1"), token_request(), "of the account of drone-1 only", id="another account"),
+        pytest.param(token_path("drone-1"), token_request("edge-1"), "to the Node drone-1 only", id="bound elsewhere"),
+        pytest.param(token_path("drone-1"), token_request(boundObjectRef=None), "to the Node drone-1 only", id="loose"),
+        pytest.param(token_path("drone-1"), token_request(expirationSeconds=3601), "for an hour at most", id="longer"),
+        pytest.param(token_path("default"), token_request(), "of the account of drone-1 only", id="default"),
+        pytest.param(token_path("fractus-node", SYSTEM), token_request(), "cannot create", id="its own"),
+        pytest.param(token_path("fractus-operator", SYSTEM), token_request(), "cannot create", id="the operator"),
+    ],
+)
+def test_an_agent_gets_no_other_token(
+    agents: dict[str, BlockingClient], accounts: None, path: str, request_: Body, words: str
+) -> None:
+    denied(lambda: agents["drone-1"].call("POST", path, request_), words)
+
+
+def _rules(node: str, *more: Body, **changed: Any) -> Body:
+    role = account_object(ROLE, node)
+    return role | {"rules": [{**rule, **changed} for rule in role["rules"]] + list(more)}
+
+
+SECRETS = {"apiGroups": [""], "resources": ["secrets"], "verbs": ["get"]}
+
+
+@pytest.mark.parametrize(
+    ("kind", "body", "words"),
+    [
+        pytest.param(ROLE, _rules("n", resourceNames=["m"]), "node of their name", id="another node"),
+        pytest.param(ROLE, _rules("n", resourceNames=[]), "node of their name", id="all nodes"),
+        pytest.param(ROLE, _rules("n", verbs=["patch"]), "node of their name", id="other verbs"),
+        pytest.param(ROLE, _rules("n", {**SECRETS}), "node of their name", id="more"),
+        pytest.param(ROLE, account_object(ROLE, "n") | {"metadata": {"name": "n"}}, "made itself", id="not labelled"),
+        pytest.param(
+            ROLE_BINDING,
+            account_object(ROLE_BINDING, "drone-1")
+            | {"subjects": [{"kind": "ServiceAccount", "name": "m", "namespace": NODES}]},
+            "node of their name",
+            id="another account",
+        ),
+        pytest.param(
+            ROLE_BINDING,
+            account_object(ROLE_BINDING, "drone-1")
+            | {"subjects": [{"kind": "User", "apiGroup": "rbac.authorization.k8s.io", "name": "drone-1"}]},
+            "node of their name",
+            id="a user",
+        ),
+        pytest.param(
+            SERVICE_ACCOUNT,
+            account_object(SERVICE_ACCOUNT, "n") | {"automountServiceAccountToken": True},
+            "without Secrets",
+            id="mounted",
+        ),
+    ],
+)
+def test_who_has_the_operator_s_token_gives_no_other_rights(
+    control_plane: ControlPlane, world: World, accounts: None, kind: Kind, body: Body, words: str
+) -> None:
+    client = control_plane.with_token(operator_token(world))
+    try:
+        denied(lambda: client.call("POST", kind.path(NODES), body), words)
+    finally:
+        client.close()
+
+
+def test_the_operator_makes_no_account_elsewhere_and_takes_no_other_s(
+    control_plane: ControlPlane, world: World, accounts: None
+) -> None:
+    client = control_plane.with_token(operator_token(world))
+    try:
+        for kind in (*ACCOUNT_KINDS, NODE_GRANTS):
+            denied(lambda kind=kind: client.call("POST", kind.path(SYSTEM), {}), "cannot create")
+        denied(lambda: client.delete(ROLE.path(NODES, "fractus:operator")), "made itself")
+        denied(lambda: client.call("POST", token_path("drone-1"), token_request()), "cannot create")
+        path = NODE_GRANTS.path(NODES, "drone-1", "status")
+        denied(lambda: client.merge(path, {"status": {"observedGeneration": 3}}), "what agents report")
+    finally:
+        client.close()
+
+
+def test_agents_of_the_release_before_keep_their_account_until_they_are_replaced(
+    control_plane: ControlPlane, world: World, agents: dict[str, BlockingClient]
+) -> None:
+    connected = ("--dry-run=server", f"--kubeconfig={control_plane.kubeconfig}")
+
+    def old() -> list[Body]:
+        return [
+            body for body in render(*connected) if body["metadata"]["name"] == "fractus-agent" and body["kind"] in OLD
+        ]
+
+    assert not old()
+    pods = f"/api/v1/namespaces/{SYSTEM}/pods"
+    world.api.apply(
+        f"/api/v1/namespaces/{SYSTEM}/serviceaccounts/fractus-agent",
+        {"apiVersion": "v1", "kind": "ServiceAccount", "metadata": {"name": "fractus-agent", "namespace": SYSTEM}},
+    )
+    spec = {"nodeName": "edge-2", "serviceAccountName": "fractus-agent", "containers": [{"name": "a", "image": "a"}]}
+    pod = {"apiVersion": "v1", "kind": "Pod", "metadata": {"name": "old", "namespace": SYSTEM}, "spec": spec}
+    uid = world.api.call("POST", pods, pod)["metadata"]["uid"]
+    made = old()
+    assert {body["kind"] for body in made} == OLD
+    for body in made:
+        world.api.apply(path_of(body), body)
+    bound = {"kind": "Pod", "apiVersion": "v1", "name": "old", "uid": uid}
+    request = token_request(boundObjectRef=bound, expirationSeconds=600)
+    path = f"/api/v1/namespaces/{SYSTEM}/serviceaccounts/fractus-agent/token"
+    agent = control_plane.with_token(world.api.call("POST", path, request)["status"]["token"])
+    mine, other, status = _grant(world, "edge-2"), _grant(world, "drone-1"), {"status": {"phase": "Complete"}}
+    wait_for(lambda: agent.get(mine), "the right to read Grants")
+    agent.merge(f"{mine}/status", status)
+    denied(lambda: agent.merge(f"{other}/status", status), "edge-2 only")
+    denied(lambda: agent.call("POST", token_path("edge-2"), token_request("edge-2")), "cannot create")
+    agent.close()
+    world.api.delete(f"{pods}/old", grace_s=0)
+    for body in made:
+        world.api.delete(path_of(body))
+    assert not old()
 
 
 def _direct_link(world: World, drone: str, node: str) -> str:
@@ -133,7 +316,7 @@ def test_an_agent_reports_on_direct_links_of_its_node_only(world: World, agents:
 def test_a_token_that_is_bound_to_no_node_writes_nothing(
     control_plane: ControlPlane, world: World, agents: dict[str, BlockingClient]
 ) -> None:
-    path = f"/api/v1/namespaces/{SYSTEM}/serviceaccounts/fractus-agent/token"
+    path = f"/api/v1/namespaces/{SYSTEM}/serviceaccounts/fractus-node/token"
     request = {"apiVersion": "authentication.k8s.io/v1", "kind": "TokenRequest", "spec": {"expirationSeconds": 600}}
     loose = control_plane.with_token(world.api.call("POST", path, request)["status"]["token"])
     state = {"status": {"flightState": "flying"}}

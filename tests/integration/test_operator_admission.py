@@ -321,7 +321,7 @@ def test_who_has_the_operator_s_token_gets_no_further(
         denied(secret("theirs-tls", SYSTEM), certificates)
         # Nor does it read or write what gives rights.
         for path in (
-            f"/api/v1/namespaces/{SYSTEM}/serviceaccounts/fractus-agent/token",
+            f"/api/v1/namespaces/{SYSTEM}/serviceaccounts/fractus-node/token",
             "/apis/rbac.authorization.k8s.io/v1/clusterrolebindings",
             f"/apis/rbac.authorization.k8s.io/v1/namespaces/{namespace}/rolebindings",
             f"/api/v1/namespaces/{namespace}/pods",

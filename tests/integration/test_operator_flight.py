@@ -12,7 +12,7 @@ import yaml
 from chart import operator_token, render
 from control_plane import ControlPlane, wait_for
 from fractus_kube import KubeError
-from operator_world import FRACTUS, SYSTEM, OperatorProcess, World, traffic
+from operator_world import FRACTUS, NODES, SYSTEM, OperatorProcess, World, traffic
 
 Body = dict[str, Any]
 PODS = f"/api/v1/namespaces/{SYSTEM}/pods"
@@ -129,6 +129,7 @@ def together(world: World) -> dict[str, Callable[[], object]]:
             f"{DAEMON_SETS}/fractus-agent{dry}", {"spec": {"updateStrategy": {"type": "RollingUpdate"}}}
         ),
         "delete the namespace": lambda: try_delete(world, f"/api/v1/namespaces/{SYSTEM}"),
+        "delete the namespace of nodes": lambda: try_delete(world, f"/api/v1/namespaces/{NODES}"),
         "delete all DaemonSets": lambda: try_delete(world, DAEMON_SETS),
     }
 

@@ -66,6 +66,7 @@ uninstall() {
   bash -e <(sed -n '/^### What stays, and wiping/,/^## /s/^    \(helm .* upgrade .*\)/\1/p' docs/upgrades.md)
   bash -e <(sed -n '/^## Uninstalling/,/^## /s/^    \(kubectl delete app.*\|helm .* uninstall .*\)/\1/p' docs/upgrades.md)
   kubectl wait --for=delete pod --all --namespace fractus-system --timeout=120s
+  kubectl wait --for=delete namespace/fractus-nodes --timeout=120s
   kinds=$(kubectl api-resources --verbs=list --output=name | grep -v '^events')
   left=$(kubectl get "$(echo $kinds | tr ' ' ',')" --all-namespaces --selector app.kubernetes.io/name=fractus --output name)
   [ -z "$left" ] || { echo "left: $left" >&2; return 1; }

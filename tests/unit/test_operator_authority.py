@@ -84,5 +84,5 @@ def test_a_request_whose_names_cannot_be_read_is_malformed(names: str) -> None:
         "usages": ["server auth", "client auth"],
         "request": base64.b64encode(request.public_bytes(serialization.Encoding.PEM)).decode(),
     }
-    found = review({"spec": spec}, "agent")
+    found = review({"spec": spec}, {"agent"})
     assert (found.reason, found.node) == ("Malformed", None)

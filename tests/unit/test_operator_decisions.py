@@ -445,7 +445,7 @@ def test_only_the_taint_that_kubelets_heed_guards_a_node(key: str, effect: str, 
 def test_settings_come_from_the_environment() -> None:
     settings = Settings.from_environment({"FRACTUS_PLANNING_SAFETY_RADIUS": "9.5", "FRACTUS_LOG_LEVEL": "debug"})
     assert (settings.planning.safety_radius_m, settings.log_level) == (9.5, 10)
-    assert settings.agent_user == "system:serviceaccount:fractus-system:fractus-agent"
+    assert settings.agent_users == {f"system:serviceaccount:fractus-system:fractus-{n}" for n in ("agent", "node")}
 
 
 @pytest.mark.parametrize(

@@ -33,10 +33,20 @@ app.kubernetes.io/instance: {{ .root.Release.Name }}
 app.kubernetes.io/component: {{ .part }}
 {{- end }}
 
-{{/* User name of the agents. */}}
-{{- define "fractus.agentUser" -}}
-system:serviceaccount:{{ .Release.Namespace }}:fractus-agent
+{{/* CEL: whether an agent asks, also one of an earlier release that has yet to be replaced. */}}
+{{- define "fractus.byAnAgent" -}}
+request.userInfo.username in ["system:serviceaccount:{{ .Release.Namespace }}:fractus-node", "system:serviceaccount:{{ .Release.Namespace }}:fractus-agent"]
 {{- end }}
+
+{{/* CEL: the node that the token of who asks is bound to; empty where it is bound to none. */}}
+{{- define "fractus.callersNode" -}}
+has(request.userInfo.extra) && "authentication.kubernetes.io/node-name" in request.userInfo.extra
+&& size(request.userInfo.extra["authentication.kubernetes.io/node-name"]) == 1
+? request.userInfo.extra["authentication.kubernetes.io/node-name"][0] : ""
+{{- end }}
+
+{{/* Where each node has an account of its own, and its Grants; fractus_core.api.node_grants knows it by this name. */}}
+{{- define "fractus.nodesNamespace" -}}fractus-nodes{{- end }}
 
 {{- define "fractus.pullSecrets" -}}
 {{- with .Values.imagePullSecrets }}

@@ -11,6 +11,7 @@ from fractus_core.api import (
     Drone,
     EdgeNode,
     Grant,
+    NodeGrants,
     Policy,
     Resource,
     Zone,
@@ -27,6 +28,7 @@ def _ours(model: type[Resource]) -> Kind:
 APPLICATION = _ours(Application)
 DEPLOYMENT_PLAN = _ours(DeploymentPlan)
 GRANT = _ours(Grant)
+NODE_GRANTS = _ours(NodeGrants)
 DIRECT_LINK = _ours(DirectLink)
 DRONE = _ours(Drone)
 EDGE_NODE = _ours(EdgeNode)
@@ -37,6 +39,7 @@ POLICY = _ours(Policy)
 NODE = Kind("v1", "Node", "nodes", namespaced=False)
 POD = Kind("v1", "Pod", "pods", namespaced=True)
 SERVICE = Kind("v1", "Service", "services", namespaced=True)
+SERVICE_ACCOUNT = Kind("v1", "ServiceAccount", "serviceaccounts", namespaced=True)
 SECRET = Kind("v1", "Secret", "secrets", namespaced=True)
 CONFIG_MAP = Kind("v1", "ConfigMap", "configmaps", namespaced=True)
 EVENT = Kind("v1", "Event", "events", namespaced=True)
@@ -47,6 +50,8 @@ DISRUPTION_BUDGET = Kind("policy/v1", "PodDisruptionBudget", "poddisruptionbudge
 NETWORK_POLICY = Kind("networking.k8s.io/v1", "NetworkPolicy", "networkpolicies", namespaced=True)
 CONTROLLER_REVISION = Kind("apps/v1", "ControllerRevision", "controllerrevisions", namespaced=True)
 ENDPOINT_SLICE = Kind("discovery.k8s.io/v1", "EndpointSlice", "endpointslices", namespaced=True)
+ROLE = Kind("rbac.authorization.k8s.io/v1", "Role", "roles", namespaced=True)
+ROLE_BINDING = Kind("rbac.authorization.k8s.io/v1", "RoleBinding", "rolebindings", namespaced=True)
 SIGNING_REQUEST = Kind("certificates.k8s.io/v1", "CertificateSigningRequest", "certificatesigningrequests", False)
 
 CHILDREN: tuple[Kind, ...] = (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from datetime import datetime
 
@@ -48,16 +48,16 @@ class Refused(Exception):
         super().__init__(message)
 
 
-def review(body: Body, agent: str) -> Review:
+def review(body: Body, agents: Collection[str]) -> Review:
     """Review a CertificateSigningRequest of the signer fractus.dev/node.
 
     Args:
         body: The request, with what the API server adds about its requester.
-        agent: User name of the agents' service account.
+        agents: User names of the agents' service accounts.
     """
     spec = body["spec"]
-    if spec.get("username") != agent:
-        return Review("WrongRequester", f"{spec.get('username')} is not the agent ({agent})")
+    if spec.get("username") not in agents:
+        return Review("WrongRequester", f"{spec.get('username')} is not the agent ({', '.join(sorted(agents))})")
     nodes = (spec.get("extra") or {}).get(NODE_NAME_CLAIM) or []
     if len(nodes) != 1:
         return Review("NotNodeBound", "the requester's token is not bound to a pod on a node")
@@ -107,13 +107,13 @@ class NodeSigning:
         store: Store,
         read: Callable[[Key], Body | None],
         authority: Authority,
-        agent: str,
+        agents: Collection[str],
         clock: Callable[[], datetime],
     ) -> None:
         self._store = store
         self._read = read
         self._authority = authority
-        self._agent = agent
+        self._agents = agents
         self._clock = clock
 
     async def reconcile(self, key: Key) -> None:
@@ -128,7 +128,7 @@ class NodeSigning:
         conditions = {c["type"] for c in status.get("conditions") or ()}
         if status.get("certificate") or conditions & {"Denied", "Failed"}:
             return
-        reviewed = review(body, self._agent)
+        reviewed = review(body, self._agents)
         try:
             if "Approved" not in conditions:
                 verdict = "Approved" if reviewed.node is not None else "Denied"

@@ -29,6 +29,7 @@ from fractus_operator.inventory.bookings import BookedHosts, Bookings, ByName
 from fractus_operator.inventory.claims import Fleet, HolderNames
 from fractus_operator.inventory.grouped import Grouped
 from fractus_operator.inventory.made import Made, application_of
+from fractus_operator.inventory.node_objects import NodeObjects
 from fractus_operator.inventory.node_services import NodeServices, read_revision
 from fractus_operator.inventory.observed import Observed
 from fractus_operator.inventory.plans import Plans
@@ -47,6 +48,7 @@ class LiveInventory:
         self.revisions = Reflector(
             store, kinds.CONTROLLER_REVISION, read_revision, self.services.revision_changed, namespace=namespace
         )
+        self.node_objects = NodeObjects(store)
         self.hosts = Reflector(store, kinds.NODE, read_host, self._host_changed)
         self.pods = Reflector(store, kinds.POD, read_pod, self._pod_changed)
         self.drones = Reflector(store, kinds.DRONE, parts.sharing(reader(Drone)), self._drone_changed)
@@ -81,12 +83,10 @@ class LiveInventory:
         self._pods: Grouped[PodView] = Grouped()
         self._locations = NodeLocations()
 
-    # -- running --
-
     def reflectors(self) -> list[Reflector[Any]]:
         """Every reflector; run each as a task of its own."""
         own: list[Reflector[Any]] = [r for r in vars(self).values() if isinstance(r, Reflector)]
-        return own + list(self.children.values())
+        return own + list(self.children.values()) + self.node_objects.reflectors()
 
     async def synced(self) -> None:
         """Wait until every collection was listed once: before that, nothing can be decided."""
@@ -264,6 +264,7 @@ class LiveInventory:
         body = new or old or {}
         if body.get("kind") == Grant.KIND:
             self._grant_changed(key, new)
+            self.node_objects.grant_changed(key, old, new)
         elif body.get("kind") == DeploymentPlan.KIND:
             self.plans.stored(key, new)
             if new is None:

@@ -74,6 +74,7 @@ class Worklist:
         name: What the keys are of, for the log.
         reconcile: Brings one key to its desired state.
         after: What is waited for before each.
+        at_once: How many keys are reconciled at a time; of one key never two.
     """
 
     def __init__(
@@ -82,11 +83,14 @@ class Worklist:
         reconcile: Callable[[Key], Awaitable[None]],
         *,
         after: Callable[[], Awaitable[None]] | None = None,
+        at_once: int = 1,
     ) -> None:
         self.name = name
         self.failures: dict[Key, Backoff] = {}
         self._reconcile = reconcile
         self._after = after
+        self._at_once = at_once
+        self._under_way: set[Key] = set()
         self._waiting: dict[Key, None] = {}
         self._added = asyncio.Event()
         self._later: dict[Key, asyncio.TimerHandle] = {}
@@ -101,13 +105,25 @@ class Worklist:
 
     async def run(self) -> None:
         """Reconcile until cancelled."""
+        async with asyncio.TaskGroup() as group:
+            for _ in range(self._at_once):
+                group.create_task(self._work())
+
+    async def _work(self) -> None:
         while True:
             await self._added.wait()
-            self._added.clear()
-            while self._waiting:
-                key = next(iter(self._waiting))
-                del self._waiting[key]
+            key = next((key for key in self._waiting if key not in self._under_way), None)
+            if key is None:
+                self._added.clear()
+                continue
+            del self._waiting[key]
+            self._under_way.add(key)
+            try:
                 await self._attempt(key)
+            finally:
+                self._under_way.discard(key)
+                if key in self._waiting:
+                    self._added.set()
 
     async def _attempt(self, key: Key) -> None:
         try:

@@ -35,7 +35,10 @@ def too_many_requests() -> str:
             "limitResponse": {"type": "Reject"},
         }},
     }  # fmt: skip
-    who = {"kind": "Group", "group": {"name": "system:serviceaccounts:fractus-system"}}
+    who = [
+        {"kind": "Group", "group": {"name": f"system:serviceaccounts:{name}"}}
+        for name in ("fractus-system", "fractus-nodes")
+    ]
     every = {
         "verbs": ["*"], "apiGroups": ["*"], "resources": ["*"], "clusterScope": True, "namespaces": ["*"]
     }  # fmt: skip
@@ -43,7 +46,7 @@ def too_many_requests() -> str:
         "apiVersion": api, "kind": "FlowSchema", "metadata": {"name": _NAME},
         "spec": {
             "priorityLevelConfiguration": {"name": _NAME}, "matchingPrecedence": 1,
-            "rules": [{"subjects": [who], "resourceRules": [every]}],
+            "rules": [{"subjects": who, "resourceRules": [every]}],
         },
     }  # fmt: skip
     return dump_documents([level, flow])

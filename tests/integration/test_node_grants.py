@@ -1,0 +1,92 @@
+"""Each node's Grants in one object: the operator writes it and copies what is reported there, with the rights that the chart gives it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+from chart import operator_token
+from control_plane import ControlPlane, wait_for
+from fractus_core.api.node_grants import unpack
+from operator_world import FRACTUS, NODE_OBJECTS, NODES, Body, OperatorProcess, World
+from test_operator import running
+
+NODE_GRANTS = f"{FRACTUS}/namespaces/{NODES}/nodegrants"
+
+
+@pytest.fixture
+def operator(control_plane: ControlPlane, world: World, chart: None, tmp_path: Path) -> Iterator[OperatorProcess]:
+    """The operator with the token of its account, which the chart's roles and admission policies bind."""
+    cluster = {"server": control_plane.server, "certificate-authority": str(control_plane.ca)}
+    config = {
+        "apiVersion": "v1",
+        "kind": "Config",
+        "current-context": "operator",
+        "clusters": [{"name": "test", "cluster": cluster}],
+        "users": [{"name": "operator", "user": {"token": operator_token(world)}}],
+        "contexts": [{"name": "operator", "context": {"cluster": "test", "user": "operator"}}],
+    }
+    kubeconfig = tmp_path / "operator.kubeconfig"
+    kubeconfig.write_text(yaml.safe_dump(config))
+    process = OperatorProcess(kubeconfig, tmp_path / "operator.log", FRACTUS_LEASE="2")
+    process.start()
+    yield process
+    if process.running:
+        process.stop()
+    print(process.log())
+
+
+def carried(world: World, node: str) -> dict[str, Body] | None:
+    """The Grants that a node's object carries, by name; None without one."""
+    found = world.api.get(f"{NODE_GRANTS}/{node}")
+    return (
+        None
+        if found is None
+        else {g["metadata"]["name"]: g for g in unpack(found["spec"]["packed"], found["spec"]["count"])}
+    )
+
+
+def test_a_node_s_object_follows_its_grants_and_its_reports_reach_them(
+    world: World, operator: OperatorProcess, namespace: str
+) -> None:
+    wait_for(lambda: carried(world, "drone-1") == {}, "the object of a drone without Grants")
+    for path in NODE_OBJECTS:
+        wait_for(lambda path=path: world.api.get(f"{path}/edge-1"), f"{path} of edge-1")
+
+    name = f"{namespace}.traffic-navigator"
+    running(world, namespace)
+    grant = world.api.get(f"{FRACTUS}/grants/{name}") or {}
+    mine = wait_for(lambda: (carried(world, "drone-1") or {}).get(name), "the Grant in the object of its node")
+    assert (mine["metadata"]["uid"], mine["spec"]) == (grant["metadata"]["uid"], grant["spec"])
+    assert {each["spec"]["node"] for each in (carried(world, "drone-1") or {}).values()} == {"drone-1"}
+    assert name not in (carried(world, "edge-1") or {})
+
+    def status() -> Body:
+        return (world.api.get(f"{FRACTUS}/grants/{name}") or {}).get("status") or {}
+
+    def report(node: str, phase: str, message: str = "") -> None:
+        said = {"uid": grant["metadata"]["uid"], "name": name, "phase": phase, "message": message}
+        reports = {"observedGeneration": 1, "grants": [said | {"observedGeneration": 1}]}
+        world.api.merge(f"{NODE_GRANTS}/{node}/status", {"status": reports})
+
+    report("drone-1", "Active")
+    wait_for(lambda: status() == {"phase": "Active", "message": "", "observedGeneration": 1}, "the status")
+
+    # What happens while no operator acts, the next one makes good.
+    operator.stop()
+    report("edge-1", "Failed", "not its own")
+    report("drone-1", "Complete", "flown")
+    operator.start()
+    wait_for(lambda: status().get("phase") == "Complete", "the status after a restart")
+    report("drone-1", "Active")
+    wait_for(lambda: world.status(namespace).get("phase") in {"Returning", "Completed"}, "the mission's end")
+    assert (status()["phase"], status()["message"]) == ("Complete", "flown")
+
+    world.api.delete(f"{FRACTUS}/namespaces/{namespace}/applications/traffic")
+    wait_for(lambda: carried(world, "drone-1") == {}, "the Grant to be revoked on its node")
+    world.api.delete(f"{FRACTUS}/edgenodes/edge-1")
+    for path in NODE_OBJECTS:
+        wait_for(lambda path=path: world.api.get(f"{path}/edge-1") is None, f"{path} of edge-1 to be removed")
+        assert world.api.get(f"{path}/edge-2")

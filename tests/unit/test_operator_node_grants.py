@@ -1,0 +1,287 @@
+"""What the operator keeps for each node: its Grants in one object, an account, and the reports of its agent."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import json
+from collections.abc import AsyncIterator
+from typing import Any
+
+import pytest
+from fractus_core.api.node_grants import NODE_GRANTS_NAMESPACE, ReportedGrant, unpack
+from fractus_kube import Conflict, KubeError, NotFound
+from fractus_operator.cluster import kinds
+from fractus_operator.cluster.kinds import Body, Kind
+from fractus_operator.cluster.node_accounts import ACCOUNT_KINDS, account_object, is_as_made
+from fractus_operator.cluster.store import Store
+from fractus_operator.inventory.live import LiveInventory
+from fractus_operator.reconcile.grant_reports import reported_status
+from fractus_operator.reconcile.node_grants import NodeGrantsKeeper
+
+
+def report(phase: Any, message: str = "", generation: int = 1, uid: str = "u") -> ReportedGrant:
+    return ReportedGrant(uid=uid, name="g", phase=phase, message=message, observed_generation=generation)
+
+
+@pytest.mark.parametrize(
+    ("known", "said", "wanted"),
+    [
+        (None, report("Active"), {"phase": "Active", "message": "", "observedGeneration": 1}),
+        ({"phase": "Active", "message": "", "observedGeneration": 1}, report("Active"), None),
+        (
+            {"phase": "Active", "message": "", "observedGeneration": 1, "conditions": []},
+            report("Complete", "flown", 2),
+            {"phase": "Complete", "message": "flown", "observedGeneration": 2},
+        ),
+        ({"phase": "Complete", "message": "flown", "observedGeneration": 1}, report("Active"), None),
+        (
+            {"phase": "Failed", "message": "wind", "observedGeneration": 1},
+            report("Complete", "flown", 2),
+            {"phase": "Failed", "message": "wind", "observedGeneration": 2},
+        ),
+    ],
+)
+def test_a_report_becomes_the_status_and_takes_no_end_back(
+    known: Body | None, said: ReportedGrant, wanted: Body | None
+) -> None:
+    assert reported_status({"metadata": {"name": "g"}, "status": known}, said) == wanted
+
+
+@pytest.mark.parametrize("kind", ACCOUNT_KINDS, ids=lambda kind: kind.name)
+def test_an_account_that_gives_other_rights_is_not_as_made(kind: Kind) -> None:
+    made = account_object(kind, "drone-1")
+    assert is_as_made(kind, made | {"secrets": []})
+    for field in made.keys() - {"apiVersion", "kind", "metadata"}:
+        assert not is_as_made(kind, made | {field: []})
+    assert not is_as_made(kind, made | {"metadata": {"name": "drone-2"}}) or kind is kinds.SERVICE_ACCOUNT
+
+
+class Api(Store):
+    """The objects of one API server; what it is asked is remembered."""
+
+    def __init__(self) -> None:
+        self.field_manager = "test"
+        self.objects: dict[str, Body] = {}
+        self.asked: list[tuple[str, str]] = []
+        self._versions = itertools.count(1)
+
+    async def request(self, method: str, path: str, body: Any = None, **_: Any) -> Any:
+        self.asked.append((method, path))
+        await asyncio.sleep(0)
+        target = path.removesuffix("/status")
+        if method == "POST":
+            target = f"{path}/{body['metadata']['name']}"
+            if target in self.objects:
+                raise Conflict(409, "AlreadyExists", target)
+            self.objects[target] = json.loads(json.dumps(body))
+            self.objects[target]["metadata"]["uid"] = f"uid of {target}"
+        elif target not in self.objects:
+            raise NotFound(404, "NotFound", path)
+        elif method == "DELETE":
+            del self.objects[target]
+            return {"kind": "Status"}
+        elif method == "PATCH":
+            found = self.objects[target]
+            if body["metadata"]["uid"] != found["metadata"]["uid"]:
+                raise Conflict(409, "Conflict", path)
+            found |= {field: value for field, value in body.items() if field != "metadata"}
+        else:
+            raise KubeError(405, "MethodNotAllowed", path)
+        self.objects[target]["metadata"]["resourceVersion"] = str(next(self._versions))
+        return json.loads(json.dumps(self.objects[target]))
+
+    def node(self, name: str) -> dict[str, Body]:
+        """What a node has, by kind."""
+        return {
+            body["kind"]: body
+            for path, body in self.objects.items()
+            if f"/{NODE_GRANTS_NAMESPACE}/" in path and path.endswith(f"/{name}")
+        }
+
+    def granted(self, name: str) -> list[str] | None:
+        """The names of the Grants that a node's object carries; None without one."""
+        found = self.node(name).get("NodeGrants")
+        return (
+            None
+            if found is None
+            else [grant["metadata"]["name"] for grant in unpack(found["spec"]["packed"], found["spec"]["count"])]
+        )
+
+
+class Cluster:
+    """The keeper at work, and what its watches tell it."""
+
+    def __init__(self) -> None:
+        self.api = Api()
+        self.live = LiveInventory(self.api)
+        self.keeper = NodeGrantsKeeper(self.api, self.live)
+        self.tasks = [asyncio.create_task(worklist.run()) for worklist in self.keeper.worklists()]
+        for reflector in self.live.reflectors():
+            reflector.synced.set()
+        self._versions = itertools.count(1000)
+
+    def drone(self, name: str) -> None:
+        spec = {"home": {"lat": 1.0, "lon": 1.0, "alt": 1.0}, "services": {}}
+        body = kinds.DRONE.header(name, uid=name, resourceVersion=str(next(self._versions))) | {"spec": spec}
+        self.live.drones._take("MODIFIED", body)
+
+    def no_drone(self, name: str) -> None:
+        self.live.drones._drop(("", name))
+
+    def grant(self, name: str, node: str, **metadata: Any) -> Body:
+        spec = {
+            "node": node,
+            "application": {"namespace": "t", "name": "a", "uid": "a"},
+            "component": "A",
+            "instance": name,
+        }
+        labels = {"app.kubernetes.io/managed-by": "fractus", "fractus.dev/application": "a"}
+        known = {"uid": f"uid of {name}", "labels": labels, "generation": 1, **metadata}
+        body = kinds.GRANT.header(name, **known, resourceVersion=str(next(self._versions))) | {"spec": spec}
+        self.api.objects[kinds.GRANT.path("", name)] = json.loads(json.dumps(body))
+        self.live.children[kinds.GRANT]._take("MODIFIED", body)
+        return body
+
+    def no_grant(self, name: str) -> None:
+        del self.api.objects[kinds.GRANT.path("", name)]
+        self.live.children[kinds.GRANT]._drop(("", name))
+
+    def report(self, node: str, *reports: ReportedGrant) -> None:
+        body = json.loads(json.dumps(self.api.node(node)["NodeGrants"]))
+        body["status"] = {"observedGeneration": 1, "grants": [each.to_dict() for each in reports]}
+        body["metadata"]["resourceVersion"] = str(next(self._versions))
+        self.live.node_objects.known._take("MODIFIED", body)
+
+    def status(self, grant: str) -> Any:
+        return self.api.objects[kinds.GRANT.path("", grant)].get("status")
+
+    def gone(self, kind: Kind, node: str) -> None:
+        """The watch tells of a deletion."""
+        objects = self.live.node_objects
+        reflector: Any = objects.known if kind is kinds.NODE_GRANTS else objects.accounts[kind]
+        reflector._drop((NODE_GRANTS_NAMESPACE, node))
+
+    async def until(self, condition: Any) -> None:
+        async with asyncio.timeout(10):
+            while not condition():  # noqa: ASYNC110 (the worklists tell no one)
+                await asyncio.sleep(0)
+
+    async def settled(self) -> None:
+        """All that was added is done."""
+        await self.until(lambda: not any(w._waiting or w._under_way for w in self.keeper.worklists()))
+
+
+@pytest.fixture
+async def cluster() -> AsyncIterator[Cluster]:
+    found = Cluster()
+    yield found
+    for task in found.tasks:
+        task.cancel()
+    await asyncio.gather(*found.tasks, return_exceptions=True)
+
+
+ALL = {"ServiceAccount", "Role", "RoleBinding", "NodeGrants"}
+
+
+async def test_a_node_gets_its_account_and_an_object_that_says_that_nothing_is_granted(cluster: Cluster) -> None:
+    cluster.drone("drone-1")
+    await cluster.until(lambda: cluster.api.node("drone-1").keys() == ALL)
+    assert cluster.api.granted("drone-1") == []
+    await cluster.settled()
+    cluster.api.asked.clear()
+    cluster.drone("drone-1")
+    await cluster.settled()
+    assert cluster.api.asked == []
+
+
+async def test_nothing_is_decided_before_all_is_known(cluster: Cluster) -> None:
+    cluster.live.children[kinds.GRANT].synced.clear()
+    cluster.drone("drone-1")
+    for _ in range(20):
+        await asyncio.sleep(0)
+    assert cluster.api.asked == []
+    cluster.live.children[kinds.GRANT].synced.set()
+    await cluster.until(lambda: cluster.api.granted("drone-1") == [])
+
+
+async def test_a_node_s_object_follows_its_grants_and_no_others(cluster: Cluster) -> None:
+    cluster.drone("drone-1")
+    cluster.grant("a", "drone-1")
+    cluster.grant("b", "edge-1")
+    await cluster.until(lambda: cluster.api.granted("drone-1") == ["a"] and cluster.api.granted("edge-1") == ["b"])
+    cluster.grant("c", "drone-1")
+    await cluster.until(lambda: cluster.api.granted("drone-1") == ["a", "c"])
+    cluster.grant("c", "drone-1", deletionTimestamp="2026-01-01T00:00:00Z")
+    await cluster.until(lambda: cluster.api.granted("drone-1") == ["a"])
+    cluster.no_grant("a")
+    await cluster.until(lambda: cluster.api.granted("drone-1") == [])
+
+
+async def test_what_is_reported_is_copied_to_the_node_s_own_grants(cluster: Cluster) -> None:
+    cluster.grant("a", "drone-1")
+    cluster.grant("b", "edge-1")
+    await cluster.until(lambda: cluster.api.granted("drone-1") == ["a"])
+    await cluster.settled()
+    cluster.api.asked.clear()
+    strangers = (report("Failed", uid="uid of b"), report("Failed", uid="unknown"))
+    cluster.report("drone-1", report("Complete", "flown", uid="uid of a"), *strangers)
+    await cluster.until(lambda: cluster.status("a") is not None)
+    await cluster.settled()
+    assert cluster.status("a") == {"phase": "Complete", "message": "flown", "observedGeneration": 1}
+    assert cluster.status("b") is None
+    # The status of a Grant does not make its node's object be written, nor the same report the status.
+    assert cluster.api.asked == [("PATCH", f"{kinds.GRANT.path('', 'a')}/status")]
+    cluster.report("drone-1", report("Complete", "flown", uid="uid of a"), report("Active", uid="more"))
+    await cluster.settled()
+    assert len(cluster.api.asked) == 1
+
+
+async def test_a_node_that_is_gone_is_told_that_nothing_is_granted_and_loses_all(cluster: Cluster) -> None:
+    cluster.drone("drone-1")
+    cluster.grant("a", "drone-1")
+    await cluster.until(lambda: cluster.api.node("drone-1").keys() == ALL and cluster.api.granted("drone-1") == ["a"])
+    cluster.no_drone("drone-1")
+    await cluster.settled()
+    assert cluster.api.granted("drone-1") == ["a"], "a Grant names it"
+    cluster.api.asked.clear()
+    cluster.no_grant("a")
+    await cluster.until(lambda: not cluster.api.node("drone-1"))
+    assert [method for method, _ in cluster.api.asked] == ["PATCH", "DELETE", "DELETE", "DELETE", "DELETE"]
+
+
+@pytest.mark.parametrize("kind", [*ACCOUNT_KINDS, kinds.NODE_GRANTS], ids=lambda kind: kind.name)
+async def test_what_is_deleted_or_changed_by_hand_is_made_again(cluster: Cluster, kind: Kind) -> None:
+    cluster.drone("drone-1")
+    cluster.grant("a", "drone-1")
+    await cluster.until(lambda: cluster.api.node("drone-1").keys() == ALL)
+    await cluster.settled()
+    path = kind.path(NODE_GRANTS_NAMESPACE, "drone-1")
+    before = cluster.api.objects[path]
+    if kind is kinds.NODE_GRANTS:
+        changed = before | {"spec": {"count": 0, "packed": ""}}
+        reflector: Any = cluster.live.node_objects.known
+    else:
+        changed = before | {"rules": [], "subjects": [], "automountServiceAccountToken": True}
+        reflector = cluster.live.node_objects.accounts[kind]
+    version = str(next(cluster._versions))
+    cluster.api.objects[path] = json.loads(json.dumps(changed))
+    reflector._take("MODIFIED", changed | {"metadata": before["metadata"] | {"resourceVersion": version}})
+    await cluster.settled()
+    wanted = {field: value for field, value in before.items() if field != "metadata"}
+    assert {field: cluster.api.objects[path].get(field) for field in wanted} == wanted
+    del cluster.api.objects[path]
+    cluster.gone(kind, "drone-1")
+    await cluster.until(lambda: path in cluster.api.objects)
+    await cluster.settled()
+    assert cluster.api.granted("drone-1") == ["a"]
+
+
+async def test_grants_that_change_while_others_are_packed_are_written_last(cluster: Cluster) -> None:
+    for number in range(20):
+        cluster.grant(f"g{number:02d}", "drone-1")
+        await asyncio.sleep(0)
+    await cluster.until(lambda: len(cluster.api.granted("drone-1") or ()) == 20)
+    await cluster.settled()
+    writes = [path for method, path in cluster.api.asked if "/nodegrants" in path]
+    assert len(writes) < 20

@@ -55,9 +55,17 @@ class GrantDirectory:
     def holds(self, grant: Grant) -> bool:
         """Whether this very grant is stored."""
         try:
-            return self._file(grant.name).read_bytes() == stored_form(grant)
+            return self.read(grant.name) == stored_form(grant)
         except FileNotFoundError:
             return False
+
+    def read(self, name: str) -> bytes:
+        """A grant as it is stored.
+
+        Raises:
+            OSError: it cannot be read.
+        """
+        return self._file(name).read_bytes()
 
     def put(self, grant: Grant) -> bool:
         """Store a grant; False when the same was stored already."""
@@ -107,8 +115,8 @@ def unless_ended(report: ReportedGrant, reported: ReportedGrant | None) -> Repor
     return reported.model_copy(update={"observed_generation": report.observed_generation})
 
 
-def _digest(body: Object) -> bytes:
-    return hashlib.sha256(json.dumps(body, sort_keys=True).encode()).digest()
+def _digest(text: bytes) -> bytes:
+    return hashlib.sha256(text).digest()
 
 
 def _report(metadata: Mapping[str, Any], phase: GrantPhase, message: str) -> ReportedGrant:
@@ -155,7 +163,8 @@ class GrantKeeper:
         self._unverified: dict[str, tuple[Object, float]] = {}
         self._grants: dict[str, Grant] = {}
         self._unusable: dict[str, ReportedGrant] = {}
-        self._digests: dict[str, bytes] = {}
+        self._digests: dict[str, tuple[bytes, bytes | None]] = {}
+        """Of each Grant as it was taken, and of its file as that was written."""
         self._unstored: dict[str, str] = {}
         self._unremoved: set[str] = set()
         self._generation = self._reported_of = 0
@@ -201,13 +210,12 @@ class GrantKeeper:
             known = self._directory.names().union(self._grants, self._unusable, self._unverified)
             for gone in known - names:
                 self._remove(gone)
-            stored = self._directory.names()
             for body in granted.grants:
-                name, digest = body["metadata"]["name"], _digest(body)
-                # Each costs some 15 ms to read, verify and compare with the disk: most change alone.
-                if self._digests.get(name) != digest or name not in stored or name not in self._grants:
+                # Each costs some 15 ms to read, verify and store: most change alone.
+                name, digest = body["metadata"]["name"], _digest(json.dumps(body, sort_keys=True).encode())
+                if name not in self._grants or self._digests.get(name) != (digest, self._stored_digest(name)):
                     self._put(body)
-                    self._digests[name] = digest
+                    self._digests[name] = digest, self._stored_digest(name)
         self._work.set()
 
     async def report(self) -> None:
@@ -274,6 +282,13 @@ class GrantKeeper:
             return self._directory.holds(grant)
         except OSError:
             return False
+
+    def _stored_digest(self, name: str) -> bytes | None:
+        """Of the file as it is now; None where there is none that can be read."""
+        try:
+            return _digest(self._directory.read(name))
+        except OSError:
+            return None
 
     def _hold(self, body: Object, why: str) -> None:
         """Keep what is stored for a while: the authority may be about to change."""

@@ -274,7 +274,7 @@ class Bench:
         """Measure at N nodes."""
         self.scene.grow(nodes)
         found = Measured(self.scene.nodes)
-        # Once, so that nodes have their location labels, as they have where the operator is only started again.
+        # Once, so that nodes have their location labels and accounts, as they have where the operator is only started again.
         self.operator.start()
         self._labelled()
         self.operator.stop()
@@ -306,6 +306,16 @@ class Bench:
             )
 
         wait_until(all_labelled, "nodes to be labelled", timeout_s=300, pause_s=1.0)
+        described = sum(
+            len(self._api.list(f"{API}/{plural}", resourceVersion="0")) for plural in ("drones", "edgenodes")
+        )
+        objects = f"{API}/namespaces/{NODES}/nodegrants"
+        wait_until(
+            lambda: len(self._api.list(objects, resourceVersion="0")) == described,
+            "nodes to have their objects",
+            timeout_s=600,
+            pause_s=1.0,
+        )
 
     def _first_plan(self) -> float:
         """From the start of the operator to the plan of an application that waits for it."""

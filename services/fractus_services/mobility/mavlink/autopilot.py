@@ -6,7 +6,7 @@ import asyncio
 import logging
 import math
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 
 from fractus_core.control.values import FlightMode
 from fractus_mavlink import Message, Value, layout_named, message
@@ -21,6 +21,7 @@ from fractus_mavlink.enums import (
 
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.autopilot import COURSE_S, Permit, always
+from fractus_services.mobility.mavlink.acknowledgements import ACK_TIMEOUT_S, Acknowledgements, Answer
 from fractus_services.mobility.mavlink.companion import SYSTEM_ID
 from fractus_services.mobility.mavlink.flight_stack import FlightStack
 from fractus_services.mobility.mavlink.link import Link, ignore
@@ -32,12 +33,12 @@ from fractus_services.mobility.mavlink.streams import Streams
 
 log = logging.getLogger(__name__)
 
-ACK_TIMEOUT_S = 0.7
 MODE_TIMEOUT_S = 2.0
 REJECTED_RETRY_S = 0.3
 TAKEOFF_TIMEOUT_S = 3.0
 ATTEMPTS = 4
 
+_AT_ONCE = frozenset({MAV_CMD.DO_SET_MODE})
 _RESULTS: dict[int, str] = {
     MAV_RESULT.TEMPORARILY_REJECTED: "temporarily rejected",
     MAV_RESULT.DENIED: "denied",
@@ -96,6 +97,7 @@ class MavlinkAutopilot(Link):
         self.starting = asyncio.Lock()
         self.vehicle_parameters = Parameters(self, on_parameter)
         self._locks: dict[int, asyncio.Lock] = {}
+        self._acknowledgements = Acknowledgements(sysid, self.timing)
         self._streams = Streams()
         self._probing: asyncio.Task[None] | None = None
         self._orders = Orders()
@@ -130,6 +132,7 @@ class MavlinkAutopilot(Link):
         self.vehicle.gimbal_measured = self.vehicle.gimbal_limits = None
         self.vehicle.unclear = ""
         self._streams.forget()
+        self._acknowledgements.forget()
         self.vehicle_parameters.forget()
 
     def take(self, incoming: Message) -> None:
@@ -137,6 +140,8 @@ class MavlinkAutopilot(Link):
         self._streams.take(incoming.name)
         if incoming.name == "PARAM_VALUE":
             self.vehicle_parameters.take(incoming)
+        elif incoming.name == "COMMAND_ACK":
+            self._acknowledgements.take(incoming, self.now)
         elif incoming.name == "GIMBAL_DEVICE_ATTITUDE_STATUS" and self.vehicle.gimbal_measured is None:
             self.vehicle_parameters.ask(self.stack.gimbal_type)
         super().take(incoming)
@@ -163,17 +168,19 @@ class MavlinkAutopilot(Link):
         Raises:
             AutopilotError: it was refused, or there was no answer.
         """
-        # An acknowledgement names the command, not the sending: two of one kind at a time would take each other's.
-        async with self._locks.setdefault(command, asyncio.Lock()):
-            sent_at = self.now
+        # Sent again, one would undo another. No change of mode waits for one without an answer, for it may be the way home.
+        async with nullcontext() if command in _AT_ONCE else self._locks.setdefault(command, asyncio.Lock()):
+            answer = Answer()
             for attempt in range(attempts):
                 permit()
+                if attempt and self._acknowledgements.overtaken(command, answer):
+                    raise AutopilotError(f"a later command {command.name} has overtaken one that was not answered")
+                answer = Answer() if answer.done() else answer
                 result = await self._attempt(
-                    _outgoing(command, params, place, frame, confirmation=attempt, **self.address()), command
+                    _outgoing(command, params, place, frame, confirmation=attempt, **self.address()), command, answer
                 )
                 if result is None:
                     continue
-                self.timing.acknowledged(sent_at, self.now)
                 if result == MAV_RESULT.ACCEPTED:
                     return
                 if result == MAV_RESULT.TEMPORARILY_REJECTED and attempt + 1 < attempts:
@@ -182,19 +189,13 @@ class MavlinkAutopilot(Link):
                 raise AutopilotError(self._refusal(command, result), refused=True)
         raise AutopilotError(f"the autopilot did not answer command {command.name}", link=True)
 
-    async def _attempt(self, outgoing: Message, command: MAV_CMD) -> int | None:
-        """The result of one sending; None without an answer in time."""
-        with self.listening("COMMAND_ACK") as answers:
-            self.send(outgoing)
-            try:
-                async with asyncio.timeout(ACK_TIMEOUT_S):
-                    while True:
-                        ack = await answers.get()
-                        result = ack.integer("result")
-                        if ack.integer("command") == command and result != MAV_RESULT.IN_PROGRESS:
-                            return result
-            except TimeoutError:
-                return None
+    async def _attempt(self, outgoing: Message, command: MAV_CMD, answer: Answer) -> int | None:
+        """The result of a command that is sent, for the first time or again; None without one in time."""
+        self._acknowledgements.sent(command, answer, self.now)
+        self.send(outgoing)
+        if not answer.done():
+            await asyncio.wait([answer], timeout=self._acknowledgements.timeout_s)
+        return answer.result() if answer.done() else None
 
     def _refusal(self, command: MAV_CMD, result: int) -> str:
         why = [t for t in self.vehicle.texts[-4:] if self.stack.explains_refusal(t)]

@@ -69,7 +69,7 @@ class Timing:
         self._samples: deque[tuple[float, float]] = deque()
         self._history: deque[tuple[float, float]] = deque()
         self._asked: dict[int, tuple[float, float]] = {}
-        self._delays: deque[tuple[float, float]] = deque()
+        self._delays: deque[tuple[float, float, float]] = deque()
         self._unanswered = 0
         self._heard_at = self._read_at_ns = -math.inf
         self.pace = 1.0
@@ -173,7 +173,7 @@ class Timing:
         delay_s = heard - present
         if -_SLACK_S <= delay_s <= self.pace * (now - sent) + _SLACK_S:
             self._unanswered = 0
-            self._take(max(delay_s, 0.0), now)
+            self._take(max(delay_s, 0.0), sent, now)
 
     def acknowledged(self, sent: float, now: float) -> None:
         """Take the acknowledgement of a command: of a vehicle that answers no TIMESYNC its round trip is the bound.
@@ -182,27 +182,36 @@ class Timing:
         """
         resumed = sent >= self._resumed_at and now - self._arrived_at <= MAX_POSITION_AGE_S
         if self.unanswering and resumed:
-            self._take(self.pace * (now - sent), now)
+            self._take(self.pace * (now - sent), sent, now)
 
     @property
     def unanswering(self) -> bool:
         """Whether the vehicle answers no TIMESYNC."""
         return self._unanswered >= UNANSWERED
 
-    def _take(self, delay_s: float, now: float) -> None:
+    def _take(self, delay_s: float, sent: float, now: float) -> None:
         self._heard_at = now
-        self._delays.append((now, delay_s))
+        self._delays.append((now, delay_s, now - sent))
         while self._delays[0][0] < now - WINDOW_S:
             self._delays.popleft()
 
     @property
     def delay_s(self) -> float:
         """The longest delay of late, there and back, in the vehicle's seconds; infinite while there is none."""
-        return max((delay_s for _, delay_s in self._delays), default=math.inf)
+        return max((delay_s for _, delay_s, _ in self._delays), default=math.inf)
 
     def way_s(self, now: float) -> float:
         """Our seconds that any message takes at most, by the longest delay of late there and back; infinite: not known."""
         return math.inf if now - self._heard_at > STALE_S else self.delay_s / self.pace
+
+    @property
+    def answer_s(self) -> float:
+        """Our seconds that the slowest answer of late took; 0 while there is none."""
+        return max((took_s for _, _, took_s in self._delays), default=0.0)
+
+    def silence_s(self, now: float) -> float:
+        """Our seconds since the last answer: one that is under way may take as long already; infinite: there was none."""
+        return now - self._heard_at
 
     def latency_s(self, now: float) -> float:
         """The vehicle's seconds from its last position to the effect of a command that is sent now; infinite: not known."""

@@ -1,0 +1,196 @@
+"""Each acknowledgement answers the oldest sending that it can be of, and no later command."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from fractus_mavlink import Endpoint, Message, Parser, message
+from fractus_mavlink.enums import MAV_CMD, MAV_RESULT
+from fractus_services.mobility.mavlink.acknowledgements import (
+    ACK_TIMEOUT_S,
+    MAX_ACK_TIMEOUT_S,
+    MAX_OPEN,
+    Acknowledgements,
+    Answer,
+)
+from fractus_services.mobility.mavlink.timing import Timing
+
+SPEED, MODE = MAV_CMD.DO_CHANGE_SPEED, MAV_CMD.DO_SET_MODE
+ACCEPTED, DENIED, IN_PROGRESS = MAV_RESULT.ACCEPTED, MAV_RESULT.DENIED, MAV_RESULT.IN_PROGRESS
+
+
+def ack(result: MAV_RESULT = ACCEPTED, command: MAV_CMD = SPEED, target: int = 245) -> Message:
+    return message("COMMAND_ACK", command=command, result=result, target_system=target)
+
+
+def link(way_s: float = 1.0) -> Acknowledgements:
+    """Over a link whose answers take so long, and go on coming."""
+    return Acknowledgements(245, measured(way_s))
+
+
+def measured(way_s: float) -> Timing:
+    timing = Timing()
+    if math.isfinite(way_s):
+        timing.sampled(1000, 0.0)
+        number = timing.request(0.0)
+        assert number is not None
+        timing.replied(1_000_000_000, number, way_s)
+        timing.silence_s = lambda now: 0.2  # type: ignore[method-assign, assignment]
+    return timing
+
+
+@pytest.mark.parametrize(
+    ("way_s", "timeout_s"),
+    [(0.02, ACK_TIMEOUT_S), (0.5, 0.7), (1.0, 1.2), (2.0, 2.2), (2.9, MAX_ACK_TIMEOUT_S), (math.inf, ACK_TIMEOUT_S)],
+)
+def test_a_sending_is_lost_when_no_message_takes_as_long(way_s: float, timeout_s: float) -> None:
+    assert link(way_s).timeout_s == pytest.approx(timeout_s)
+
+
+async def test_the_answer_to_what_was_sent_again_does_not_deny_the_next_command() -> None:
+    acks, first, later = link(), Answer(), Answer()
+    acks.sent(SPEED, first, 0.0)
+    acks.sent(SPEED, first, 0.7)
+    acks.take(ack(), 1.0)
+    assert first.result() == ACCEPTED
+    acks.sent(SPEED, later, 1.1)
+    acks.take(ack(DENIED), 1.7)
+    assert not later.done()
+    acks.take(ack(), 2.1)
+    assert later.result() == ACCEPTED
+
+
+async def test_nor_does_an_early_acceptance_let_a_denied_one_pass() -> None:
+    acks, first, later = link(), Answer(), Answer()
+    for at in (0.0, 0.7):
+        acks.sent(SPEED, first, at)
+    acks.take(ack(), 1.0)
+    acks.sent(SPEED, later, 1.1)
+    acks.take(ack(), 1.7)
+    acks.take(ack(DENIED), 2.1)
+    assert later.result() == DENIED
+
+
+@pytest.mark.parametrize("way_s", [0.05, 0.5, 1.0, 2.0])
+async def test_a_lost_sending_takes_no_answer_from_the_next_command(way_s: float) -> None:
+    acks, first, later = link(way_s), Answer(), Answer()
+    again = acks.timeout_s
+    acks.sent(SPEED, first, 0.0)
+    acks.sent(SPEED, first, again)
+    acks.take(ack(), again + way_s)
+    assert first.result() == ACCEPTED
+    acks.sent(SPEED, later, again + way_s)
+    acks.take(ack(DENIED), again + 2 * way_s)
+    assert later.result() == DENIED
+
+
+async def test_an_answer_to_a_command_that_was_given_up_is_not_for_the_next() -> None:
+    acks, first, later = link(), Answer(), Answer()
+    acks.sent(SPEED, first, 0.0)
+    first.cancel()
+    acks.sent(SPEED, later, 0.1)
+    acks.take(ack(DENIED), 1.0)
+    assert not later.done()
+    acks.take(ack(), 1.1)
+    assert later.result() == ACCEPTED
+
+
+async def test_a_link_that_gets_slow_still_answers() -> None:
+    acks, answer = link(0.02), Answer()
+    for at in (0.0, 0.7):
+        acks.sent(SPEED, answer, at)
+    acks.take(ack(), 2.0)
+    assert answer.result() == ACCEPTED
+
+
+async def test_answers_that_stay_away_may_be_on_their_way() -> None:
+    timing, first, later = measured(0.02), Answer(), Answer()
+    timing.silence_s = lambda now: now  # type: ignore[method-assign]
+    acks = Acknowledgements(245, timing)
+    acks.sent(SPEED, first, 0.1)
+    first.cancel()
+    acks.sent(SPEED, later, 1.9)
+    acks.take(ack(DENIED), 2.1)
+    assert not later.done()
+
+
+async def test_while_the_delay_is_not_known_late_answers_are_reckoned_with() -> None:
+    acks, first, later = link(math.inf), Answer(), Answer()
+    for at in (0.0, 0.7, 1.4):
+        acks.sent(SPEED, first, at)
+    acks.take(ack(), 2.0)
+    acks.sent(SPEED, later, 2.1)
+    acks.take(ack(DENIED), 2.7)
+    acks.take(ack(DENIED), 3.4)
+    assert not later.done()
+    acks.take(ack(), 4.1)
+    assert later.result() == ACCEPTED
+
+
+async def test_progress_is_no_answer_and_keeps_the_sending_open() -> None:
+    acks, first, later = link(), Answer(), Answer()
+    acks.sent(SPEED, first, 0.0)
+    acks.take(ack(IN_PROGRESS), 1.0)
+    assert not first.done()
+    acks.sent(SPEED, later, 1.5)
+    acks.take(ack(DENIED), 2.0)
+    assert first.result() == DENIED
+    assert not later.done()
+
+
+async def test_answers_to_others_and_of_other_commands_are_left_alone() -> None:
+    acks, answer = link(), Answer()
+    acks.sent(SPEED, answer, 0.0)
+    acks.take(ack(DENIED, target=255), 0.5)
+    acks.take(ack(DENIED, MODE), 0.6)
+    assert not answer.done()
+    acks.take(ack(target=0), 0.7)
+    assert answer.result() == ACCEPTED
+
+
+async def test_a_frame_that_a_network_doubles_answers_once() -> None:
+    autopilot, parser, acks, first, later = Endpoint(1, 1), Parser(), link(0.05), Answer(), Answer()
+
+    def heard(result: MAV_RESULT) -> Message:
+        (incoming,) = parser.feed(autopilot.encode("COMMAND_ACK", ack(result).values))
+        return incoming
+
+    acks.sent(SPEED, first, 0.0)
+    denied = heard(DENIED)
+    acks.take(denied, 0.05)
+    acks.sent(SPEED, later, 0.06)
+    acks.take(denied, 0.07)
+    assert not later.done()
+    acks.take(heard(DENIED), 0.11)
+    assert later.result() == DENIED
+
+
+async def test_a_connection_that_broke_owes_no_answers(caplog: pytest.LogCaptureFixture) -> None:
+    acks, before, after = link(), Answer(), Answer()
+    acks.sent(SPEED, before, 0.0)
+    acks.forget()
+    assert not acks.overtaken(SPEED, before)
+    with caplog.at_level("DEBUG"):
+        acks.take(ack(DENIED), 0.2)
+    assert "answers nothing" in caplog.text
+    assert not before.done()
+    acks.sent(SPEED, after, 0.3)
+    acks.take(ack(), 0.9)
+    assert after.result() == ACCEPTED
+
+
+async def test_a_vehicle_that_acknowledges_nothing_does_not_fill_the_memory() -> None:
+    acks = link()
+    for at in range(10 * MAX_OPEN):
+        acks.sent(SPEED, Answer(), float(at))
+    assert len(acks._sent[SPEED]) == MAX_OPEN
+
+
+async def test_what_is_sent_later_overtakes() -> None:
+    acks, first, later = link(), Answer(), Answer()
+    acks.sent(MODE, first, 0.0)
+    assert not acks.overtaken(MODE, first)
+    acks.sent(MODE, later, 0.1)
+    assert acks.overtaken(MODE, first)
+    assert not acks.overtaken(MODE, later)

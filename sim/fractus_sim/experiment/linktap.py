@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from fractus_sim.experiment.errors import ExperimentError
 from fractus_sim.experiment.tlog import Framer, TlogWriter
 
 POLL_S = 0.2
@@ -37,7 +38,7 @@ class LinkTap:
 
     Args:
         listener: a listening socket; closed with the tap.
-        connect: connects to the server.
+        connect: connects to the server; a client is hung up when it raises OSError or ExperimentError.
         log: file of the tlog.
     """
 
@@ -96,7 +97,7 @@ class LinkTap:
             return
         try:
             server = self._connect()
-        except OSError:
+        except (OSError, ExperimentError):
             client.close()
             return
         near, far = (_End(one, Framer(self._log)) for one in (client, server))

@@ -520,6 +520,13 @@ class Bench:
         except KubeError:
             return False
 
+    def _nodes_furnished(self) -> bool:
+        described, given = (
+            sum(len(self._api.list(f"{API}/{path}", resourceVersion="0")) for path in paths)
+            for paths in (("drones", "edgenodes"), (f"namespaces/{NODES}/nodegrants",))
+        )
+        return given == described
+
     def close(self) -> None:
         self._operator.stop()
         self._api.close()
@@ -533,6 +540,8 @@ class Bench:
         self._converge()
         found.created_s = time.monotonic() - began
         print(f"{found.applications} applications created and running after {found.created_s:.0f} s", flush=True)
+        # What a new node is given once is no change of an application.
+        wait_until(self._nodes_furnished, "nodes to have their objects", timeout_s=600, pause_s=1.0)
         self._alone()
         load.done.clear()
         began, cpu, since = time.monotonic(), self._operator.cpu_s(), datetime.now(UTC)

@@ -65,6 +65,7 @@ def test_files_come_change_and_go(tmp_path: Path) -> None:
         json.dumps(manifest(policies=[{"name": "p", "spec": {"type": "GeofenceControl", "kind": "wall"}}])),
         json.dumps(manifest(surprise=1)),
     ],
+    ids=["empty", "list", "policy", "other-node", "unsigned", "crossing-area", "unknown-policy", "unknown-field"],
 )  # fmt: skip
 def test_what_is_not_understood_grants_nothing(tmp_path: Path, text: str) -> None:
     (tmp_path / "g.json").write_text(text)

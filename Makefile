@@ -61,6 +61,9 @@ GOLDEN := tests/component/test_control_golden.py
 # names by which failed tests are found again: a second try without them would pass over a failed test of a group.
 INTEGRATION := tests/integration tests/e2e/test_cluster.py
 E2E := tests/e2e --ignore tests/e2e/test_cluster.py
+# Named file by file: of a directory pytest looks up what failed before pytest-xdist adds the groups to the names.
+INTEGRATION_FILES = $(wildcard tests/integration/test_*.py) tests/e2e/test_cluster.py
+E2E_FILES = $(filter-out tests/e2e/test_cluster.py $(ON_KIND),$(wildcard tests/e2e/test_*.py))
 # These are of the charts on a cluster that is not ours: they run on kind, or on FRACTUS_E2E_CLUSTER=current.
 ON_KIND := $(patsubst %,tests/e2e/test_%.py,mission refusals upgrade uninstall)
 second_try = || { code=$$?; [ $$code -eq 1 ] || exit $$code; $(RUN) pytest --last-failed --last-failed-no-failures none $(1); }
@@ -70,11 +73,11 @@ test: packages env lint ## Everything: lint, types, unit, component, integration
 	$(RUN) fractus cluster binaries
 	$(QUICK) tests/component tests/unit --ignore $(GOLDEN)
 	FRACTUS_DEEP=1 $(RUN) pytest -q -n 2 $(GOLDEN)
-	$(RUN) pytest -n 3 --dist loadgroup $(INTEGRATION) $(call second_try,-n 1 --dist loadgroup $(INTEGRATION))
+	$(RUN) pytest -n 3 --dist loadgroup $(INTEGRATION) $(call second_try,-n 1 --dist loadgroup $(INTEGRATION_FILES))
 ifeq ($(FRACTUS_E2E_CLUSTER),current)
 	$(RUN) pytest $(E2E) $(call second_try,$(E2E))
 else
-	$(RUN) pytest -n 2 --dist loadgroup $(E2E) $(ON_KIND:%=--ignore %) $(call second_try,-n 1 --dist loadgroup $(E2E) $(ON_KIND:%=--ignore %))
+	$(RUN) pytest -n 2 --dist loadgroup $(E2E) $(ON_KIND:%=--ignore %) $(call second_try,-n 1 --dist loadgroup $(E2E_FILES))
 	STEPS="images cluster load charts tests uninstall" $(MAKE) test-kind
 endif
 

@@ -174,7 +174,9 @@ class MavlinkAutopilot(Link):
             for attempt in range(attempts):
                 permit()
                 if attempt and self._acknowledgements.overtaken(command, answer):
-                    raise AutopilotError(f"a later command {command.name} has overtaken one that was not answered")
+                    raise AutopilotError(
+                        f"a later command {command.name} has overtaken one that was not answered", link=True
+                    )
                 answer = Answer() if answer.done() else answer
                 result = await self._attempt(
                     _outgoing(command, params, place, frame, confirmation=attempt, **self.address()), command, answer

@@ -87,6 +87,7 @@ def test_a_node_s_object_follows_its_grants_and_its_reports_reach_them(
     world.api.delete(f"{FRACTUS}/namespaces/{namespace}/applications/traffic")
     wait_for(lambda: carried(world, "drone-1") == {}, "the Grant to be revoked on its node")
     world.api.delete(f"{FRACTUS}/edgenodes/edge-1")
+    world.api.delete("/api/v1/nodes/edge-1")
     for path in NODE_OBJECTS:
         wait_for(lambda path=path: world.api.get(f"{path}/edge-1") is None, f"{path} of edge-1 to be removed")
         assert world.api.get(f"{path}/edge-2")

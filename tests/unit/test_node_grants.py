@@ -5,12 +5,13 @@ from __future__ import annotations
 import base64
 import json
 import lzma
+import random
 import tracemalloc
 from typing import Any
 
 import pytest
-from fractus_core.api import InvalidObject
-from fractus_core.api.node_grants import MAX_UNPACKED_BYTES, pack, unpack
+from fractus_core.api import InvalidObject, node_grants
+from fractus_core.api.node_grants import MAX_UNPACKED_BYTES, pack, pack_oldest, unpack
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -95,3 +96,19 @@ def test_what_unpacks_to_too_much_is_refused_at_the_bound() -> None:
         assert tracemalloc.get_traced_memory()[1] < 3 * MAX_UNPACKED_BYTES
     finally:
         tracemalloc.stop()
+
+
+@pytest.mark.parametrize("bound", ["MAX_UNPACKED_BYTES", "MAX_PACKED_BYTES"])
+@pytest.mark.parametrize("fits", [0, 1, 5, 9, 10])
+def test_of_too_many_the_oldest_are_packed(monkeypatch: pytest.MonkeyPatch, bound: str, fits: int) -> None:
+    chance = random.Random(7)
+    bodies = [
+        body(f"g{9 - hour}", {"noise": chance.randbytes(500).hex()}, creationTimestamp=f"2026-01-01T0{hour}:00:00Z")
+        for hour in range(10)
+    ]
+    text = pack(bodies[:fits])
+    size = len(text) if bound == "MAX_PACKED_BYTES" else len(lzma.decompress(base64.b64decode(text)))
+    monkeypatch.setattr(node_grants, bound, size)
+    chance.shuffle(bodies)
+    packed, count = pack_oldest(bodies)
+    assert (packed, count) == (text, fits)

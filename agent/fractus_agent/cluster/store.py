@@ -32,6 +32,7 @@ from fractus_kube import (
     kubeconfig,
 )
 from fractus_kube.access import SERVICE_ACCOUNT
+from pydantic import ValidationError
 
 __all__ = ["Backoff", "Conflict", "Expired", "Invalid", "KubeError", "Object", "Store", "Unconfigured", "connect"]
 
@@ -121,6 +122,15 @@ class _Feed:
     kind: Kind
     selectors: Mapping[str, str]
     namespace: str = ""
+
+
+def _reported(body: Object) -> NodeGrantsStatus:
+    """What was reported in a NodeGrants; what cannot be read, as of another release, is reported again."""
+    try:
+        return NodeGrantsStatus.model_validate(body.get("status") or {})
+    except ValidationError as error:
+        LOG.warning("grants: what was reported cannot be read: %s", InvalidObject.from_pydantic(error))
+        return NodeGrantsStatus()
 
 
 async def connect(service_account: Path = SERVICE_ACCOUNT) -> Client:
@@ -246,13 +256,14 @@ class Store:
             # A list, which follows each break, is compared with the disk again.
             body, known = (event.objects[0], None) if isinstance(event, Listed) else (event.object, packed)
             try:
-                found = NodeGrants.from_body(body)
-                fresh = None if found.spec.packed == known else unpack(found.spec.packed, found.spec.count)
+                found = NodeGrants.from_body({**body, "status": None})
+                packed_now, count = found.spec.packed, found.spec.count
+                fresh = None if packed_now == known else await asyncio.to_thread(unpack, packed_now, count)
             except InvalidObject as error:
                 LOG.error("grants: cannot be read, keeping those on disk: %s", error)  # noqa: TRY400
                 continue
-            packed = found.spec.packed
-            status = found.status or NodeGrantsStatus()
+            packed = packed_now
+            status = _reported(body)
             reported = {each.uid: each for each in status.grants}
             yield Granted(found.metadata.generation or 0, fresh, reported, status.observed_generation or 0)
             # They are many times as large as they came, and the next may be hours away.

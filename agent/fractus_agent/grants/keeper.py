@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from fractus_core.api.model import InvalidObject
-from fractus_core.api.node_grants import ReportedGrant
+from fractus_core.api.node_grants import MAX_MESSAGE, ReportedGrant
 from fractus_core.api.plans import Grant, GrantPhase
 from fractus_core.control import Outcome, OutcomeKind
 from fractus_core.policy.trust import BadSignature, UnknownAuthority
@@ -124,7 +124,7 @@ def _report(metadata: Mapping[str, Any], phase: GrantPhase, message: str) -> Rep
         uid=metadata.get("uid") or "",
         name=metadata["name"],
         phase=phase,
-        message=message,
+        message=message[:MAX_MESSAGE],
         observed_generation=metadata.get("generation") or 0,
     )
 

@@ -6,7 +6,7 @@ import base64
 import binascii
 import json
 import lzma
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Annotated, Any, Literal
 
 from pydantic import Field
@@ -19,10 +19,14 @@ NODE_GRANTS_NAMESPACE = "fractus-nodes"
 """Where the operator keeps them, with an account for each node that may read its own."""
 
 MAX_UNPACKED_BYTES = 64 * 2**20
-"""Of a node's Grants as JSON: some 40 times what etcd takes of the packed text, as zones are alike in all of them."""
+"""Of a node's Grants as JSON: zones are alike in all of them, so that they are packed into a hundredth."""
+MAX_PACKED_BYTES = 2**20
+"""Of the packed text: what etcd takes of an object has room beside it for what the agent reports."""
+MAX_MESSAGE = 1024
 
 _FIELD = "spec.packed"
 _METADATA = ("name", "uid", "generation", "labels", "annotations")
+_MEMORY_BYTES = 128 * 2**20
 _LEVEL = 1
 """Of xz: higher levels take several times as long for a few per cent."""
 
@@ -41,7 +45,7 @@ class ReportedGrant(OpenModel):
     uid: str = Field(max_length=128, description="metadata.uid of the Grant.")
     name: str = Field(max_length=253, description="Its name.")
     phase: GrantPhase = Field(description="Pending until the node has it; then how its mission stands.")
-    message: str = Field(default="", description="One sentence for people.")
+    message: str = Field(default="", max_length=MAX_MESSAGE, description="One sentence for people.")
     observed_generation: Annotated[int, Field(ge=0, description="metadata.generation of the Grant this was said of.")]
 
 
@@ -71,6 +75,9 @@ def pack(bodies: Iterable[Mapping[str, Any]]) -> str:
 
     Args:
         bodies: as the API server gives them.
+
+    Raises:
+        InvalidObject: they are larger than MAX_UNPACKED_BYTES, or MAX_PACKED_BYTES when they are packed.
     """
     grants = [
         {
@@ -79,10 +86,37 @@ def pack(bodies: Iterable[Mapping[str, Any]]) -> str:
             "metadata": {key: body["metadata"][key] for key in _METADATA if key in body["metadata"]},
             "spec": body["spec"],
         }
-        for body in sorted(bodies, key=lambda body: str(body["metadata"]["name"]))
+        for body in sorted(bodies, key=_name)
     ]
     text = json.dumps(grants, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
-    return base64.b64encode(lzma.compress(text, preset=_LEVEL)).decode()
+    if len(text) > MAX_UNPACKED_BYTES:
+        raise InvalidObject(_FIELD, f"would hold {len(text)} bytes, more than {MAX_UNPACKED_BYTES}")
+    packed = base64.b64encode(lzma.compress(text, preset=_LEVEL)).decode()
+    if len(packed) > MAX_PACKED_BYTES:
+        raise InvalidObject(_FIELD, f"would have {len(packed)} bytes, more than {MAX_PACKED_BYTES}")
+    return packed
+
+
+def pack_oldest(bodies: Sequence[Mapping[str, Any]]) -> tuple[str, int]:
+    """Grants as `NodeGrantsSpec`: packed, and how many; of too many the oldest that fit.
+
+    So what is revoked always leaves the node, and what is not granted yet has to wait.
+    """
+    oldest = sorted(bodies, key=lambda body: (str(body["metadata"].get("creationTimestamp", "")), _name(body)))
+    packed, fit, too_many = "", 0, len(oldest) + 1
+    count = len(oldest)
+    while True:
+        try:
+            packed, fit = pack(oldest[:count]), count
+        except InvalidObject:
+            too_many = count
+        if too_many - fit <= 1:
+            return packed or pack(()), fit
+        count = (fit + too_many) // 2
+
+
+def _name(body: Mapping[str, Any]) -> str:
+    return str(body["metadata"]["name"])
 
 
 def unpack(packed: str, count: int) -> tuple[dict[str, Any], ...]:
@@ -97,7 +131,7 @@ def unpack(packed: str, count: int) -> tuple[dict[str, Any], ...]:
     """
     try:
         # Of what goes in some is kept for later: it ends where the bound is, however well it is packed.
-        unpacker = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=2 * MAX_UNPACKED_BYTES)
+        unpacker = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=_MEMORY_BYTES)
         text = unpacker.decompress(base64.b64decode(packed, validate=True), MAX_UNPACKED_BYTES)
         if not unpacker.eof:
             reason = "is cut short" if unpacker.needs_input else f"holds more than {MAX_UNPACKED_BYTES} bytes"

@@ -5,12 +5,12 @@ from __future__ import annotations
 import asyncio
 import logging
 
-from fractus_core.api.node_grants import NODE_GRANTS_NAMESPACE, pack
+from fractus_core.api.node_grants import NODE_GRANTS_NAMESPACE, pack_oldest
 
 from fractus_operator.cluster import kinds
-from fractus_operator.cluster.kinds import Key, Kind
+from fractus_operator.cluster.kinds import Body, Key, Kind
 from fractus_operator.cluster.node_accounts import ACCOUNT_KINDS, account_object, header
-from fractus_operator.cluster.store import Conflict, ContentType, NotFound, Store
+from fractus_operator.cluster.store import Conflict, ContentType, Invalid, NotFound, Store
 from fractus_operator.inventory.live import LiveInventory
 from fractus_operator.reconcile.grant_reports import reported_status
 from fractus_operator.reconcile.worklist import Worklist
@@ -25,7 +25,7 @@ class NodeGrantsKeeper:
     """Keeps what each node has in the namespace of nodes.
 
     Nodes are the Drones and EdgeNodes, and what a Grant names. A node's agent takes an object that is not there for no
-    revocation: one without Grants is one that says so.
+    revocation: one without Grants is one that says so, and stays for as long as the Node is there, which may be offline.
 
     Args:
         store: The API server.
@@ -40,15 +40,20 @@ class NodeGrantsKeeper:
         self._grants = Worklist("node grants", self._bring_grants, after=live.synced, at_once=_AT_ONCE)
         self._reports = Worklist("grant report", self._bring_reports, after=live.synced, at_once=_AT_ONCE)
         live.node_objects.listen(accounts=self._look, grants=self._granted, reports=self._reports.add)
-        for kind in (kinds.DRONE, kinds.EDGE_NODE):
-            live.listen(kind, self._look)
+        for kind in (kinds.DRONE, kinds.EDGE_NODE, kinds.NODE):
+            live.listen(kind, self._seen)
 
     def worklists(self) -> list[Worklist]:
         """What is to be run."""
         return [self._accounts, self._grants, self._reports]
 
+    def _seen(self, key: Key) -> None:
+        """Look at a node that reports, as they do all the time: what was refused is tried again after its delay."""
+        if key not in self._accounts.failures:
+            self._look(key)
+
     def _look(self, key: Key) -> None:
-        """Reconcile a node's account where it is not as it should be: drones report all the time."""
+        """Reconcile a node's account where it is not as it should be."""
         wanted, node = self._is_node(key[1]), key[1]
         objects = self._live.node_objects
         if not objects.is_complete(node) if wanted else objects.account_of(node) or objects.known_of(node):
@@ -60,8 +65,8 @@ class NodeGrantsKeeper:
 
     def _is_node(self, name: str) -> bool:
         live = self._live
-        there = ("", name) in live.drones or ("", name) in live.edge_nodes
-        return there or bool(live.node_objects.grants_of(name))
+        there = ("", name) in live.drones or ("", name) in live.edge_nodes or bool(live.node_objects.grants_of(name))
+        return there or (("", name) in live.hosts and live.node_objects.known_of(name) is not None)
 
     async def _bring_account(self, key: Key) -> None:
         node = key[1]
@@ -95,11 +100,18 @@ class NodeGrantsKeeper:
             return
         grants = self._live.node_objects.grants_of(node)
         # Bodies are replaced, never changed, so that a thread may read them.
-        packed = await asyncio.to_thread(pack, grants)
+        packed, count = await asyncio.to_thread(pack_oldest, grants)
         known = self._live.node_objects.known_of(node)
-        if known is not None and known.carries(packed, len(grants)):
+        if known is not None and known.carries(packed, count):
             return
-        place, spec = (NODE_GRANTS_NAMESPACE, node), {"packed": packed, "count": len(grants)}
+        if count < len(grants):
+            logger.error(
+                "node grants: one object takes no more; the newest are not granted (node=%s grants=%d left_out=%d)",
+                node,
+                len(grants),
+                len(grants) - count,
+            )
+        place, spec = (NODE_GRANTS_NAMESPACE, node), {"packed": packed, "count": count}
         if known is None:
             written = await self._store.create(kinds.NODE_GRANTS, header(kinds.NODE_GRANTS, node) | {"spec": spec})
         else:
@@ -117,11 +129,18 @@ class NodeGrantsKeeper:
             if grant is None or status is None:
                 continue
             name = ("", grant["metadata"]["name"])
-            changes = {"metadata": {"uid": report.uid}, "status": status}
+            # A merge would not look at the uid: of a status the API server takes no other field.
+            changes: list[Body] = [
+                {"op": "test", "path": "/metadata/uid", "value": report.uid},
+                {"op": "add", "path": "/status", "value": {**(grant.get("status") or {}), **status}},
+            ]
             try:
-                written = await self._store.patch(kinds.GRANT, name, changes, ContentType.MERGE, subresource="status")
-            except (Conflict, NotFound):
+                written = await self._store.patch(
+                    kinds.GRANT, name, changes, ContentType.JSON_PATCH, subresource="status"
+                )
+            except (Conflict, Invalid, NotFound) as error:
                 # It is gone, or another has its name by now, of which nothing was reported yet.
+                logger.info("node grants: a report is of no Grant any more (grant=%s): %s", name[1], error)
                 continue
             self._live.children[kinds.GRANT].note(name, written)
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from fractus_core.api.model import InvalidObject
 from fractus_core.api.node_grants import MAX_MESSAGE, ReportedGrant
-from fractus_core.api.plans import Grant, GrantPhase
+from fractus_core.api.plans import ENDED, Grant, GrantPhase
 from fractus_core.control import Outcome, OutcomeKind
 from fractus_core.policy.trust import BadSignature, UnknownAuthority
 from fractus_storage import remove_file, write_file
@@ -23,7 +23,6 @@ from fractus_agent.supervisor import repeat
 
 LOG = logging.getLogger(__name__)
 
-ENDED: frozenset[GrantPhase] = frozenset({"Complete", "Revoked", "Failed"})
 _OUTCOMES: dict[OutcomeKind, GrantPhase] = {
     OutcomeKind.COMPLETE: "Complete",
     OutcomeKind.REVOKED: "Revoked",

@@ -23,9 +23,10 @@ MAX_UNPACKED_BYTES = 64 * 2**20
 MAX_PACKED_BYTES = 2**20
 """Of the packed text: what etcd takes of an object has room beside it for what the agent reports."""
 MAX_MESSAGE = 1024
+PACKED_METADATA = ("name", "uid", "generation", "labels", "annotations")
+"""What of a Grant's metadata is packed: a change of anything else needs no other text."""
 
 _FIELD = "spec.packed"
-_METADATA = ("name", "uid", "generation", "labels", "annotations")
 _MEMORY_BYTES = 128 * 2**20
 _LEVEL = 1
 """Of xz: higher levels take several times as long for a few per cent."""
@@ -83,7 +84,7 @@ def pack(bodies: Iterable[Mapping[str, Any]]) -> str:
         {
             "apiVersion": body["apiVersion"],
             "kind": body["kind"],
-            "metadata": {key: body["metadata"][key] for key in _METADATA if key in body["metadata"]},
+            "metadata": {key: body["metadata"][key] for key in PACKED_METADATA if key in body["metadata"]},
             "spec": body["spec"],
         }
         for body in sorted(bodies, key=_name)

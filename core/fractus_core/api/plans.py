@@ -268,6 +268,8 @@ class GrantSpec(Model):
 
 
 GrantPhase = Literal["Pending", "Active", "Complete", "Revoked", "Failed"]
+ENDED: frozenset[GrantPhase] = frozenset({"Complete", "Revoked", "Failed"})
+"""Of these none is taken back once it was reported."""
 
 
 class GrantStatus(OpenModel):

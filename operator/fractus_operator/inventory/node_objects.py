@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from fractus_core.api.node_grants import NODE_GRANTS_NAMESPACE, NodeGrantsStatus, ReportedGrant
+from fractus_core.api.node_grants import NODE_GRANTS_NAMESPACE, PACKED_METADATA, NodeGrantsStatus, ReportedGrant
 from pydantic import ValidationError
 
 from fractus_operator.cluster.kinds import NODE_GRANTS, Body, Key, Kind
@@ -20,7 +20,6 @@ from fractus_operator.inventory.grouped import Grouped
 logger = logging.getLogger(__name__)
 
 _Listener = Callable[[Key], None]
-_PACKED_METADATA = ("name", "uid", "generation", "labels", "annotations", "deletionTimestamp")
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,4 +144,4 @@ def _node_of(grant: Body | None) -> str | None:
 
 
 def _packed_part(grant: Body) -> tuple[object, ...]:
-    return (grant.get("spec"), *(grant["metadata"].get(field) for field in _PACKED_METADATA))
+    return (grant.get("spec"), *(grant["metadata"].get(field) for field in (*PACKED_METADATA, "deletionTimestamp")))

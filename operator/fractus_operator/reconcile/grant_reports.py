@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from fractus_core.api.node_grants import ReportedGrant
+from fractus_core.api.plans import ENDED
 
 from fractus_operator.cluster.kinds import Body
-
-_ENDED = frozenset({"Complete", "Revoked", "Failed"})
 
 
 def reported_status(grant: Body, report: ReportedGrant) -> Body | None:
@@ -18,7 +17,7 @@ def reported_status(grant: Body, report: ReportedGrant) -> Body | None:
     """
     known = grant.get("status") or {}
     said: Body = {"phase": report.phase, "message": report.message}
-    if known.get("phase") in _ENDED:
+    if known.get("phase") in ENDED:
         said = {"phase": known["phase"], "message": known.get("message") or ""}
     said["observedGeneration"] = report.observed_generation
     return None if all(known.get(field) == value for field, value in said.items()) else said

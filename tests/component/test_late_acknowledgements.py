@@ -68,12 +68,14 @@ def test_answers_to_what_was_sent_again_are_not_for_the_next_command(
     fly(flight)
 
 
-def test_acknowledgements_measure_a_slow_link_to_a_vehicle_that_answers_nothing_else(tmp_path: Path) -> None:
+def test_acknowledgements_measure_a_slow_link_to_a_vehicle_that_answers_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             plane = world.plane
             hear = plane._hear
-            plane._hear = lambda outgoing: None if outgoing.name == "TIMESYNC" else hear(outgoing)  # type: ignore[method-assign]
+            monkeypatch.setattr(plane, "_hear", lambda sent: None if sent.name == "TIMESYNC" else hear(sent))
             slow(plane, 0.5)
             await asyncio.sleep(20.0)
             assert plane.timing.unanswering
@@ -87,7 +89,7 @@ def was_refused(command: asyncio.Future[None]) -> bool:
     return isinstance(error, AutopilotError) and error.refused
 
 
-def test_a_change_of_mode_waits_for_none_that_is_not_answered(tmp_path: Path) -> None:
+def test_a_change_of_mode_waits_for_none_that_is_not_answered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The way home is flown as soon as it is asked for, and what it overtakes is not sent again behind it."""
 
     async def flight() -> None:
@@ -105,7 +107,7 @@ def test_a_change_of_mode_waits_for_none_that_is_not_answered(tmp_path: Path) ->
                         return
                 hear(outgoing)
 
-            plane._hear = listen  # type: ignore[method-assign]
+            monkeypatch.setattr(plane, "_hear", listen)
             began = plane.now
             first = asyncio.ensure_future(plane.set_mode(LOITER))
             await asyncio.sleep(0.1)

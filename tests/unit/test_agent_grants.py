@@ -3,10 +3,11 @@
 import json
 from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, Self, cast
 
 import pytest
-from fractus_agent.cluster.store import Backoff, Granted, KubeError
+from fractus_agent.cluster.store import Backoff, Granted, KubeError, Store
 from fractus_agent.grants.keeper import (
     UNVERIFIED_TIMEOUT_S,
     GrantDirectory,
@@ -16,7 +17,7 @@ from fractus_agent.grants.keeper import (
     stored_form,
     unless_ended,
 )
-from fractus_core.api.node_grants import ReportedGrant
+from fractus_core.api.node_grants import ReportedGrant, pack
 from fractus_core.api.plans import Grant
 from fractus_core.control import Outcome, OutcomeKind
 from fractus_core.policy.trust import BadSignature, UnknownAuthority
@@ -415,3 +416,32 @@ def test_backoff_doubles_to_its_cap_and_starts_again() -> None:
         assert full / 2 <= delay <= full
     backoff.succeeded()
     assert backoff.delay_s() <= 0.5
+
+
+class OneObject:
+    """A client that finds the object of the node, and then hears nothing."""
+
+    def __init__(self, body: dict[str, Any]) -> None:
+        self._body = body
+
+    def account(self, *_: str) -> Self:
+        return self
+
+    async def list_whole(self, *_: object, **__: object) -> SimpleNamespace:
+        return SimpleNamespace(items=[self._body], resource_version="1")
+
+
+async def test_what_was_reported_keeps_no_grant_from_the_node() -> None:
+    """By a release that knew of other phases."""
+    reports = [{"uid": "u1", "name": "g1", "phase": "Paused", "observedGeneration": 1}]
+    body = {
+        "apiVersion": "fractus.dev/v1alpha1",
+        "kind": "NodeGrants",
+        "metadata": {"name": "drone-1", "namespace": "fractus-nodes", "generation": 3},
+        "spec": {"count": 1, "packed": pack([manifest()])},
+        "status": {"observedGeneration": 2, "grants": reports},
+    }
+    found = await anext(Store(cast(Any, OneObject(body)), "drone-1").grants())
+    assert found.grants is not None
+    assert [grant["metadata"]["name"] for grant in found.grants] == ["g1"]
+    assert (found.generation, found.reported, found.reported_of) == (3, {}, 0), "and it is reported again"

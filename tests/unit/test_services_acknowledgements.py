@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import pytest
 from fractus_mavlink import Endpoint, Message, Parser, message
@@ -29,14 +30,24 @@ def link(way_s: float = 1.0) -> Acknowledgements:
     return Acknowledgements(245, measured(way_s))
 
 
-def measured(way_s: float) -> Timing:
-    timing = Timing()
+class Heard(Timing):
+    """Of a link on which the last answer came so long ago."""
+
+    def __init__(self, silence: Callable[[float], float]) -> None:
+        super().__init__()
+        self._silence = silence
+
+    def silence_s(self, now: float) -> float:
+        return self._silence(now)
+
+
+def measured(way_s: float, silence: Callable[[float], float] = lambda _now: 0.2) -> Timing:
+    timing = Heard(silence) if math.isfinite(way_s) else Timing()
     if math.isfinite(way_s):
         timing.sampled(1000, 0.0)
         number = timing.request(0.0)
         assert number is not None
         timing.replied(1_000_000_000, number, way_s)
-        timing.silence_s = lambda now: 0.2  # type: ignore[method-assign, assignment]
     return timing
 
 
@@ -105,8 +116,7 @@ async def test_a_link_that_gets_slow_still_answers() -> None:
 
 
 async def test_answers_that_stay_away_may_be_on_their_way() -> None:
-    timing, first, later = measured(0.02), Answer(), Answer()
-    timing.silence_s = lambda now: now  # type: ignore[method-assign]
+    timing, first, later = measured(0.02, lambda now: now), Answer(), Answer()
     acks = Acknowledgements(245, timing)
     acks.sent(SPEED, first, 0.1)
     first.cancel()

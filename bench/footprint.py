@@ -6,6 +6,8 @@ picture a second; on one side of it faces are hidden. Memory is the proportional
 
 Beside it: MAVProxy on a link to the same vehicle, and the agent of k3s as its documentation has it for a Raspberry Pi 4
 (https://docs.k3s.io/reference/resource-profiling, v1.26.5, 268 MB as 95th percentile): what a node with neither of ours takes.
+And the libraries alone: three processes from the same images that import what ours import of others, and each wait with a gRPC
+server that nobody calls. No code of Fractus gets below that.
 
 Needs root, the programs of the embedded cluster, and the images of this checkout: `fractus images build`.
 """
@@ -46,6 +48,25 @@ FRAME = LocalFrame(*HOME[:2])
 SIDE_M = 60.0
 HEIGHT_M = 15.0
 TARGET_MB = 120.0
+LIBRARIES = {
+    "agent": ("aiohttp", "cryptography.x509", "grpc", "kubernetes.aio.client", "pydantic", "yaml"),
+    "mobility": ("click", "cryptography.x509", "grpc", "pydantic", "shapely", "yaml"),
+    "camera": ("click", "cryptography.x509", "cv2", "grpc", "pydantic", "shapely", "yaml"),
+}
+"""What the program of an image imports of others at the least."""
+_IDLE = """
+import asyncio, importlib, sys
+for name in sys.argv[1:]:
+    importlib.import_module(name)
+import grpc
+async def main():
+    server = grpc.aio.server()
+    server.add_insecure_port("127.0.0.1:0")
+    await server.start()
+    print("waiting", flush=True)
+    await asyncio.Event().wait()
+asyncio.run(main())
+"""
 K3S_AGENT_MB = 268.0
 WARM_UP_S = 40.0
 """Until a side of the square with hidden faces was flown along, and all that is loaded on demand is there."""
@@ -265,6 +286,21 @@ def watched(node: Node, processes: Processes, seconds: float) -> dict[str, list[
     return found
 
 
+def libraries_mb(folder: Path, images: Images) -> dict[str, float]:
+    """PSS of the libraries of each image, in a process that does nothing with them."""
+    for name in ("etc", "state"):
+        (folder / name).mkdir(parents=True)
+    with Processes(folder) as processes:
+        pids = {}
+        for name, modules in LIBRARIES.items():
+            pids[name] = processes.start(name, *images.command(name, folder, "python3", "-c", _IDLE, *modules))
+        for name in pids:
+            wait_for(
+                lambda name=name: processes.check() or "waiting" in processes.log(name), f"{name}'s libraries", 60.0
+            )
+        return {name: memory_mb(pid)[0] for name, pid in pids.items()}
+
+
 @contextlib.contextmanager
 def node_in(folder: Path, images: Images) -> Iterator[tuple[Node, Processes]]:
     """A node in flight for the length of a block."""
@@ -306,15 +342,18 @@ def main() -> int:
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as directory, Images(options.tag) as images:
         sizes = {name: images.size_mb(name) for name in SIZE_LIMITS_MB}
+        libraries = libraries_mb(Path(directory) / "libraries", images)
         with node_in(Path(directory), images) as (node, processes):
             found = watched(node, processes, 20.0 if options.quick else options.seconds)
-    print(f"{'in flight':12} {'PSS':>9} {'its own':>10} {'at most':>10}")
+    print(f"{'in flight':12} {'PSS':>9} {'its own':>10} {'at most':>10} {'libraries':>10}")
     for name, seen in found.items():
         shared, own = (statistics.mean(column) for column in zip(*seen, strict=True))
-        print(f"{name:12} {shared:6.1f} MB {own:7.1f} MB {max(seen)[0]:7.1f} MB")
+        alone = f"{libraries[name]:7.1f} MB" if name in libraries else ""
+        print(f"{name:12} {shared:6.1f} MB {own:7.1f} MB {max(seen)[0]:7.1f} MB {alone}")
     ours = {name: [pss for pss, _ in seen] for name, seen in found.items() if name in SIZE_LIMITS_MB}
     together = statistics.mean(map(sum, zip(*ours.values(), strict=True)))
     theirs = statistics.mean(pss for pss, _ in found["MAVProxy"]) + K3S_AGENT_MB
+    print(f"the libraries alone, idle: {sum(libraries.values()):.1f} MB")
     print(f"together {together:.1f} MB; MAVProxy and a k3s agent ({K3S_AGENT_MB:.0f} MB) {theirs:.1f} MB")
     claims = [claim("agent, mobility and camera in flight", together, TARGET_MB, theirs)]
     claims += [claim(f"image {name}", sizes[name], limit) for name, limit in SIZE_LIMITS_MB.items()]
@@ -323,7 +362,7 @@ def main() -> int:
             f"{one['name']:40} {one['ours']:6.1f} MB (target {one['target']:.0f}){'' if one['holds'] else '  MISSED'}"
         )
     if options.json:
-        options.json.write_text(json.dumps({"claims": claims}, indent=1))
+        options.json.write_text(json.dumps({"claims": claims, "libraries_mb": libraries}, indent=1))
     return 0 if all(one["holds"] for one in claims) else 1
 
 

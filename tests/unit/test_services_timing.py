@@ -169,6 +169,32 @@ def test_a_link_that_becomes_slow_is_noticed_and_forgotten_when_it_is_over() -> 
     assert bench.timing.delay_s < 0.1
 
 
+def test_a_link_that_gets_slow_is_noticed_before_its_first_slow_answer() -> None:
+    """Positions go on coming: what the way there has got slower by, only the answers that are late can tell."""
+    up_s = 0.05
+    bench = Bench(lambda: up_s, steady(0.05))
+    bench.fly(15)
+    before_s, up_s = bench.timing.latency_s(bench.now), 1.0
+    bench.fly(0.9)
+    assert bench.timing.delay_s < 0.2, "no slow answer has come yet"
+    assert bench.timing.latency_s(bench.now) >= before_s + 0.6
+    bench.worst = -math.inf
+    bench.fly(1.0)
+    assert bench.worst <= 0.0
+
+
+def test_a_lost_answer_makes_no_link_slower_than_can_be_flown_with() -> None:
+    bench = Bench(steady(0.05), steady(0.05))
+    bench.fly(15)
+    before_s = bench.timing.latency_s(bench.now)
+    bench.answers = False
+    bench.fly(1.7)
+    assert math.isfinite(bench.timing.latency_s(bench.now))
+    bench.answers = True
+    bench.fly(0.4)
+    assert bench.timing.latency_s(bench.now) == pytest.approx(before_s, abs=0.05)
+
+
 def test_without_answers_nothing_is_known() -> None:
     bench = Bench(steady(0.02), steady(0.02))
     assert math.isinf(bench.timing.latency_s(bench.now))

@@ -71,7 +71,7 @@ class Timing:
         self._asked: dict[int, tuple[float, float]] = {}
         self._delays: deque[tuple[float, float, float]] = deque()
         self._unanswered = 0
-        self._heard_at = self._read_at_ns = -math.inf
+        self._heard_at = self._read_at_ns = self._answered = -math.inf
         self.pace = 1.0
         self.restarted = self._begun_again = False
 
@@ -173,6 +173,7 @@ class Timing:
         delay_s = heard - present
         if -_SLACK_S <= delay_s <= self.pace * (now - sent) + _SLACK_S:
             self._unanswered = 0
+            self._answered = max(self._answered, sent)
             self._take(max(delay_s, 0.0), sent, now)
 
     def acknowledged(self, sent: float, now: float) -> None:
@@ -218,7 +219,19 @@ class Timing:
         if now - self._heard_at > STALE_S or self.delay_s > MAX_DELAY_S:
             return math.inf
         age_s = self._present(now) - self._sampled
-        return age_s + self.delay_s + REACTION_S if age_s <= MAX_POSITION_AGE_S else math.inf
+        # By waiting alone nothing gets slower than can be flown with: one request may be lost, and the next one answered.
+        delay_s = min(self.delay_s + self.pace * self._overdue_s(now), MAX_DELAY_S)
+        return age_s + delay_s + REACTION_S if age_s <= MAX_POSITION_AGE_S else math.inf
+
+    def _overdue_s(self, now: float) -> float:
+        """By how much the first request after the last answered one waits longer than the slowest answer of late took.
+
+        A link that gets slow tells by no answer until the first slow one is there: meanwhile it is slower by this at the least.
+        """
+        if self.unanswering:
+            return 0.0
+        waiting = min((sent for sent, _ in self._asked.values() if sent > self._answered), default=now)
+        return max(now - waiting - self.answer_s, 0.0)
 
     def problem(self, now: float) -> str:
         """Why nothing may arm over this link; empty when nothing is wrong."""

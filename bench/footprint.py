@@ -7,7 +7,7 @@ picture a second; on one side of it faces are hidden. Memory is the proportional
 Beside it: MAVProxy on a link to the same vehicle, and the agent of k3s as its documentation has it for a Raspberry Pi 4
 (https://docs.k3s.io/reference/resource-profiling, v1.26.5, 268 MB as 95th percentile): what a node with neither of ours takes.
 And the libraries alone: three processes from the same images that import what ours import of others, and each wait with a gRPC
-server that nobody calls. No code of Fractus gets below that.
+server that is never called. No code of Fractus gets below that.
 
 Needs root, the programs of the embedded cluster, and the images of this checkout: `fractus images build`.
 """

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import click
 
-from fractus_cluster.binaries import CLUSTER_PROGRAMS, PROGRAMS, ensure_binaries
+from fractus_cluster.binaries import CLUSTER_PROGRAMS, DEFAULT_KUBERNETES, PROGRAMS, ensure_binaries
 from fractus_cluster.cluster import Cluster, NodeStatus, print_report
 from fractus_cluster.errors import ClusterError
 from fractus_cluster.images.build import find_source
@@ -217,8 +217,11 @@ def logs(program: str, node: str | None, lines: int, name: str | None) -> None:
         click.echo(line)
 
 
+_EXTRA_PROGRAMS = sorted(set(PROGRAMS[DEFAULT_KUBERNETES]) - set(CLUSTER_PROGRAMS))
+
+
 @cluster.command()
-@click.option("--with", "extra", multiple=True, type=click.Choice(sorted(set(PROGRAMS) - set(CLUSTER_PROGRAMS))))
+@click.option("--with", "extra", multiple=True, type=click.Choice(_EXTRA_PROGRAMS))
 @_output_option
 def binaries(extra: tuple[str, ...], output: str) -> None:
     """Provide the Kubernetes programs, building those that are missing, and print where they are."""

@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from fractus_cluster import machine, network
-from fractus_cluster.binaries import ensure_binaries
+from fractus_cluster.binaries import chosen_kubernetes, ensure_binaries
 from fractus_cluster.cgroups import cluster_branch
 from fractus_cluster.commands import run
 from fractus_cluster.errors import ClusterError
@@ -183,7 +183,7 @@ class Cluster:
         for sentence in (text for node in self.spec.nodes for text in shortfalls(node, describe_machine())):
             self._report(f"note: {sentence}")
         with self._locked():
-            memory = claim(self.spec, self._state, self._report)
+            memory = claim(self.spec, self._state, chosen_kubernetes(), self._report)
             self._state.write_spec(self.spec)
             startup = self._startup(memory)
             startup.start_control_plane(binaries)

@@ -207,12 +207,21 @@ def wiring_of(cluster: str, state: StateDirectory, memory: Memory) -> network.Wi
     return network.Wiring(cluster, Addressing(memory.block), state.marks)
 
 
-def claim(spec: ClusterSpec, state: StateDirectory, report: Report) -> Memory:
-    """Claim addresses, and remove the nodes that the description has no more."""
+def claim(spec: ClusterSpec, state: StateDirectory, kubernetes: str, report: Report) -> Memory:
+    """Claim addresses, and remove the nodes that the description has no more.
+
+    Raises:
+        ClusterError: The cluster came up with another minor version of Kubernetes, or no addresses are free.
+    """
     remembered = state.read_memory()
+    if remembered is not None and remembered.kubernetes != kubernetes:
+        raise ClusterError(
+            f"cluster {spec.name} runs Kubernetes {remembered.kubernetes}; set FRACTUS_KUBERNETES={remembered.kubernetes}, "
+            f"or take it down before it comes up with {kubernetes}: fractus cluster down --name {spec.name}"
+        )
     names = [node.name for node in spec.nodes]
     block = machine.claim(spec.name, state.path, remembered.block if remembered else None)
-    memory = (remembered or Memory(block, {})).with_nodes(names)
+    memory = (remembered or Memory(block, {}, kubernetes)).with_nodes(names)
     old_spec = state.read_spec()
     if remembered is not None and old_spec is not None:
         gone = [node for node in old_spec.nodes if node.name in remembered.indexes and node.name not in names]

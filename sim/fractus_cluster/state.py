@@ -11,6 +11,7 @@ from pathlib import Path
 import yaml
 from fractus_storage import write_file
 
+from fractus_cluster.binaries import DEFAULT_KUBERNETES
 from fractus_cluster.errors import ClusterError
 from fractus_cluster.spec import ClusterSpec, parse_spec
 
@@ -27,10 +28,12 @@ class Memory:
     Attributes:
         block: Its addresses.
         indexes: Index of each node; a node keeps its own, so that its addresses never change.
+        kubernetes: Minor version of its programs: what a newer one has stored, an older one cannot read.
     """
 
     block: IPv4Network
     indexes: dict[str, int]
+    kubernetes: str = DEFAULT_KUBERNETES
 
     def with_nodes(self, names: list[str]) -> Memory:
         """Return a memory for the given nodes: those known keep their index, new ones get the lowest free one."""
@@ -94,11 +97,12 @@ class StateDirectory:
             content = json.loads((self.path / "memory.json").read_text())
         except FileNotFoundError:
             return None
-        return Memory(IPv4Network(content["block"]), content["indexes"])
+        return Memory(IPv4Network(content["block"]), content["indexes"], content.get("kubernetes", DEFAULT_KUBERNETES))
 
     def write_memory(self, memory: Memory) -> None:
         """Remember."""
-        self._write("memory.json", json.dumps({"block": str(memory.block), "indexes": memory.indexes}))
+        content = {"block": str(memory.block), "indexes": memory.indexes, "kubernetes": memory.kubernetes}
+        self._write("memory.json", json.dumps(content))
 
     def read_spec(self) -> ClusterSpec | None:
         """Return the cluster as last brought up, or None."""

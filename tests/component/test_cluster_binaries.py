@@ -4,15 +4,26 @@ from __future__ import annotations
 
 import re
 from importlib import resources
+from ipaddress import IPv4Network
 from pathlib import Path
 
 import pytest
 from fractus_cluster import prerequisites
-from fractus_cluster.binaries import CLUSTER_PROGRAMS, KUBERNETES_VERSION, PROGRAMS, ensure_binaries
+from fractus_cluster.binaries import (
+    CLUSTER_PROGRAMS,
+    DEFAULT_KUBERNETES,
+    KUBERNETES_VERSIONS,
+    PROGRAMS,
+    ensure_binaries,
+)
 from fractus_cluster.binaries import build as build_module
 from fractus_cluster.binaries.catalog import MODULES
 from fractus_cluster.errors import ClusterError, PrerequisiteError
+from fractus_cluster.ledger import write_ledger
 from fractus_cluster.prerequisites import check_root
+from fractus_cluster.spec import ClusterSpec
+from fractus_cluster.startup import claim
+from fractus_cluster.state import Memory, StateDirectory
 
 GOMOD = resources.files("fractus_cluster.binaries") / "gomod"
 
@@ -35,9 +46,10 @@ def script(path: Path, prints: str) -> None:
     path.chmod(0o755)
 
 
+@pytest.mark.parametrize("minor", KUBERNETES_VERSIONS)
 @pytest.mark.parametrize(("program", "module"), REQUIRED.items())
-def test_go_mod_pins_the_version_of_the_catalog(program: str, module: str) -> None:
-    entry = PROGRAMS[program]
+def test_go_mod_pins_the_version_of_the_catalog(program: str, module: str, minor: str) -> None:
+    entry = PROGRAMS[minor][program]
     text = (GOMOD / entry.module / "go.mod").read_text()
     found = re.search(rf"^(?:require )?\s*{re.escape(module)} v(\S+)", text, re.MULTILINE)
     assert found is not None
@@ -49,11 +61,13 @@ def test_sources_are_pinned_by_checksum(module: str) -> None:
     assert (GOMOD / module / "go.sum").read_text().count("h1:") > 20
 
 
+@pytest.mark.parametrize(("minor", "version"), KUBERNETES_VERSIONS.items())
 @pytest.mark.parametrize("module", ["kubernetes", "kubeadm"])
-def test_staging_modules_match_kubernetes(module: str) -> None:
-    text = (GOMOD / module / "go.mod").read_text()
+def test_staging_modules_match_kubernetes(module: str, minor: str, version: str) -> None:
+    assert version.startswith(f"{minor}.")
+    text = (GOMOD / f"{module}-{minor}" / "go.mod").read_text()
     versions = set(re.findall(r"=> k8s\.io/\S+ v(\S+)", text))
-    assert versions == {"0" + KUBERNETES_VERSION[1:]}
+    assert versions == {"0" + version[1:]}
 
 
 @pytest.fixture
@@ -61,14 +75,15 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A machine with an empty cache, nothing on PATH but a shell, and no Go."""
     monkeypatch.setenv("FRACTUS_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("PATH", str(tmp_path / "path"))
-    monkeypatch.delenv("KUBEBUILDER_ASSETS", raising=False)
+    for name in ("KUBEBUILDER_ASSETS", "FRACTUS_KUBERNETES"):
+        monkeypatch.delenv(name, raising=False)
     return tmp_path
 
 
 def test_takes_programs_from_assets_and_path(machine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     script(machine / "assets" / "etcd", "etcd Version: 3.5.1")
     script(machine / "path" / "etcd", "etcd Version: 3.6.0")
-    script(machine / "path" / "kubectl", f"Client Version: v{KUBERNETES_VERSION}")
+    script(machine / "path" / "kubectl", f"Client Version: v{KUBERNETES_VERSIONS[DEFAULT_KUBERNETES]}")
     assert ensure_binaries(["etcd", "kubectl"], report=print)["etcd"] == machine / "path" / "etcd"
     monkeypatch.setenv("KUBEBUILDER_ASSETS", str(machine / "assets"))
     found = ensure_binaries(["etcd", "kubectl"], report=print)
@@ -80,6 +95,41 @@ def test_does_not_take_another_version(machine: Path) -> None:
     script(machine / "path" / "kubectl", "Client Version: v1.32.4")
     with pytest.raises(PrerequisiteError, match=r"Go 1\.25"):
         ensure_binaries(["kubectl"], report=print)
+
+
+def test_takes_programs_of_the_chosen_version(machine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    script(machine / "assets" / "kubectl", "Client Version: v1.34.1")
+    script(machine / "path" / "kubectl", "Client Version: v1.35.1")
+    monkeypatch.setenv("KUBEBUILDER_ASSETS", str(machine / "assets"))
+    assert ensure_binaries(["kubectl"], report=print)["kubectl"] == machine / "path" / "kubectl"
+    monkeypatch.setenv("FRACTUS_KUBERNETES", "1.34")
+    assert ensure_binaries(["kubectl"], report=print)["kubectl"] == machine / "assets" / "kubectl"
+
+
+def test_builds_of_two_versions_are_kept_apart(machine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for minor, version in KUBERNETES_VERSIONS.items():
+        own = machine / "cache" / f"v{version}"
+        script(own / "bin" / "kubelet", f"Kubernetes v{version}")
+        digest = build_module.module_digest(MODULES[f"kubernetes-{minor}"])
+        write_ledger(own / "built.json", {"kubelet": digest})
+        monkeypatch.setenv("FRACTUS_KUBERNETES", minor)
+        assert ensure_binaries(["kubelet"], report=print)["kubelet"] == own / "bin" / "kubelet"
+
+
+@pytest.mark.parametrize("chosen", ["1.33", "1.34.4", "latest"])
+def test_other_kubernetes_is_refused(machine: Path, monkeypatch: pytest.MonkeyPatch, chosen: str) -> None:
+    monkeypatch.setenv("FRACTUS_KUBERNETES", chosen)
+    with pytest.raises(ClusterError) as error:
+        ensure_binaries(["kubelet"], report=print)
+    assert str(error.value) == f"there is no Kubernetes {chosen}; set FRACTUS_KUBERNETES to 1.35 or 1.34"
+
+
+def test_a_cluster_keeps_its_kubernetes(tmp_path: Path) -> None:
+    state = StateDirectory(tmp_path)
+    state.write_memory(Memory(IPv4Network("10.200.0.0/16"), {}, "1.35"))
+    with pytest.raises(ClusterError, match=r"runs Kubernetes 1\.35; set FRACTUS_KUBERNETES=1\.35, or take it down"):
+        claim(ClusterSpec.placeholder("demo"), state, "1.34", print)
+    assert state.read_memory() == Memory(IPv4Network("10.200.0.0/16"), {}, "1.35")
 
 
 def test_old_go_is_refused(machine: Path) -> None:
@@ -101,7 +151,7 @@ def test_failed_build_leaves_nothing(machine: Path) -> None:
 def test_wrong_version_of_a_build_is_refused(machine: Path) -> None:
     script(machine / "etcd", "etcd Version: 3.5.9")
     with pytest.raises(ClusterError, match=r"reports 3\.5\.9"):
-        build_module.check_version(machine / "etcd", PROGRAMS["etcd"])
+        build_module.check_version(machine / "etcd", PROGRAMS[DEFAULT_KUBERNETES]["etcd"])
 
 
 def test_unknown_program_is_named() -> None:
@@ -110,7 +160,8 @@ def test_unknown_program_is_named() -> None:
 
 
 def test_cluster_programs_are_in_the_catalog() -> None:
-    assert set(CLUSTER_PROGRAMS) <= set(PROGRAMS)
+    for programs in PROGRAMS.values():
+        assert set(CLUSTER_PROGRAMS) <= set(programs) == set(PROGRAMS[DEFAULT_KUBERNETES])
     assert not {"kwok", "crane"} & set(CLUSTER_PROGRAMS)
 
 

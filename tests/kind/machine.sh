@@ -3,7 +3,8 @@
 # and reaches no registry of images (root). Everything is made here and ended with COMMAND: Docker's engine in namespaces
 # of its own, kind and Kubernetes from Go modules, Debian and the nodes' image by debootstrap.
 #
-#   FRACTUS_KIND=FOLDER  keeps the engine's images there for the next time (some 6 GB)
+#   FRACTUS_KIND=FOLDER      keeps the engine's images there for the next time (some 6 GB)
+#   FRACTUS_KUBERNETES=1.34  Kubernetes of that version
 set -euo pipefail
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 source=$(cd "$here/../.." && pwd)
@@ -24,18 +25,10 @@ programs() {
     DEBIAN_FRONTEND=noninteractive apt-get install -qq --no-remove --no-install-recommends docker.io > /dev/null
   }
   make -C "$source" packages env
-  "$source/.venv/bin/python" - "$home/bin" <<'PYTHON'
-import sys
-from pathlib import Path
-
-from fractus_cluster.binaries import CLUSTER_PROGRAMS, ensure_binaries
-
-folder = Path(sys.argv[1])
-folder.mkdir(parents=True, exist_ok=True)
-for name, path in ensure_binaries((*CLUSTER_PROGRAMS, "kubeadm", "kind"), report=print).paths.items():
-    (folder / name).unlink(missing_ok=True)
-    (folder / name).symlink_to(path)
-PYTHON
+  mkdir -p "$home/bin"
+  "$source/.venv/bin/fractus" cluster binaries --with kubeadm --with kind | while read -r name path; do
+    ln -sf "$path" "$home/bin/$name"
+  done
   ln -sf /usr/bin/docker "$home/bin/docker"
   export PATH="$home/bin:$PATH"
 }

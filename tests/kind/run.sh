@@ -29,6 +29,9 @@ create() {
   made+=("$1")
   kind create cluster --name "$@" --wait 300s ${KIND_NODE_IMAGE:+--image "$KIND_NODE_IMAGE"}
   kubectl wait --for=condition=Ready node --all --timeout=300s
+  local runs
+  runs=$(kubectl get nodes --output jsonpath='{.items[0].status.nodeInfo.kubeletVersion}')
+  [[ $runs == "v${FRACTUS_KUBERNETES:-1}."* ]] || { echo "nodes run $runs, not $FRACTUS_KUBERNETES: KIND_NODE_IMAGE says which" >&2; return 1; }
 }
 
 cluster() {

@@ -6,7 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
-KUBERNETES_VERSION = "1.35.4"
+KUBERNETES_VERSIONS: Mapping[str, str] = MappingProxyType({"1.35": "1.35.4", "1.34": "1.34.4"})
+"""What is built of each minor version of Kubernetes that there is."""
+
+DEFAULT_KUBERNETES = "1.35"
 ETCD_VERSION = "3.6.13"
 COREDNS_VERSION = "1.14.2"
 HELM_VERSION = "3.21.0"
@@ -62,59 +65,68 @@ def _kubernetes_link_variables(version: str) -> dict[str, str]:
     return {f"{package}.{name}": value for package in packages for name, value in values.items()}
 
 
-def _kubernetes(name: str, *version_arguments: str) -> Program:
-    minor = KUBERNETES_VERSION.rsplit(".", 1)[0]
+def _kubernetes(minor: str, name: str, *version_arguments: str) -> Program:
     return Program(
         name,
-        "kubernetes",
+        f"kubernetes-{minor}",
         f"k8s.io/kubernetes/cmd/{name}",
-        KUBERNETES_VERSION,
+        KUBERNETES_VERSIONS[minor],
         version_arguments or ("--version",),
         accepts=f"{minor}.",
     )
 
 
-PROGRAMS: Mapping[str, Program] = MappingProxyType(
-    {
-        program.name: program
-        for program in (
-            _kubernetes("kube-apiserver"),
-            _kubernetes("kube-controller-manager"),
-            _kubernetes("kube-scheduler"),
-            _kubernetes("kubelet"),
-            _kubernetes("kube-proxy"),
-            _kubernetes("kubectl", "version", "--client"),
-            # In a module of its own: what the others share does not change with what kubeadm alone needs.
-            Program("kubeadm", "kubeadm", "k8s.io/kubernetes/cmd/kubeadm", KUBERNETES_VERSION, ("version",)),
-            Program("kind", "kind", "sigs.k8s.io/kind", KIND_VERSION),
-            Program("etcd", "etcd", ".", ETCD_VERSION, accepts="3."),
-            Program("coredns", "coredns", ".", COREDNS_VERSION, ("-version",), accepts="1."),
-            Program("helm", "helm", "helm.sh/helm/v3/cmd/helm", HELM_VERSION, ("version", "--short"), accepts="3."),
-            Program("pause", "pause", ".", KUBERNETES_VERSION, ()),
-            Program("kwok", "kwok", "sigs.k8s.io/kwok/cmd/kwok", KWOK_VERSION, accepts="0."),
-            Program(
-                "crane",
-                "crane",
-                "github.com/google/go-containerregistry/cmd/crane",
-                CRANE_VERSION,
-                ("version",),
-                accepts="0.",
-            ),
-        )
-    }
+def _programs(minor: str) -> Mapping[str, Program]:
+    version = KUBERNETES_VERSIONS[minor]
+    programs = (
+        _kubernetes(minor, "kube-apiserver"),
+        _kubernetes(minor, "kube-controller-manager"),
+        _kubernetes(minor, "kube-scheduler"),
+        _kubernetes(minor, "kubelet"),
+        _kubernetes(minor, "kube-proxy"),
+        _kubernetes(minor, "kubectl", "version", "--client"),
+        # In a module of its own: what the others share does not change with what kubeadm alone needs.
+        Program("kubeadm", f"kubeadm-{minor}", "k8s.io/kubernetes/cmd/kubeadm", version, ("version",)),
+        Program("kind", "kind", "sigs.k8s.io/kind", KIND_VERSION),
+        Program("etcd", "etcd", ".", ETCD_VERSION, accepts="3."),
+        Program("coredns", "coredns", ".", COREDNS_VERSION, ("-version",), accepts="1."),
+        Program("helm", "helm", "helm.sh/helm/v3/cmd/helm", HELM_VERSION, ("version", "--short"), accepts="3."),
+        Program("pause", "pause", ".", version, ()),
+        Program("kwok", "kwok", "sigs.k8s.io/kwok/cmd/kwok", KWOK_VERSION, accepts="0."),
+        Program(
+            "crane",
+            "crane",
+            "github.com/google/go-containerregistry/cmd/crane",
+            CRANE_VERSION,
+            ("version",),
+            accepts="0.",
+        ),
+    )
+    return MappingProxyType({program.name: program for program in programs})
+
+
+PROGRAMS: Mapping[str, Mapping[str, Program]] = MappingProxyType(
+    {minor: _programs(minor) for minor in KUBERNETES_VERSIONS}
 )
+"""By minor version of Kubernetes, and by name; the names are the same for all versions."""
 
 MODULES: Mapping[str, Module] = MappingProxyType(
     {
-        "kubernetes": Module("kubernetes", _kubernetes_link_variables(KUBERNETES_VERSION)),
-        "kubeadm": Module("kubeadm", _kubernetes_link_variables(KUBERNETES_VERSION)),
-        "kind": Module("kind"),
-        "etcd": Module("etcd"),
-        "coredns": Module("coredns"),
-        "helm": Module("helm", {"helm.sh/helm/v3/internal/version.version": f"v{HELM_VERSION}"}),
-        "pause": Module("pause"),
-        "kwok": Module("kwok", {"sigs.k8s.io/kwok/pkg/consts.Version": f"v{KWOK_VERSION}"}),
-        "crane": Module("crane", {"github.com/google/go-containerregistry/cmd/crane/cmd.Version": f"v{CRANE_VERSION}"}),
+        module.name: module
+        for module in (
+            *(
+                Module(f"{name}-{minor}", _kubernetes_link_variables(version))
+                for name in ("kubernetes", "kubeadm")
+                for minor, version in KUBERNETES_VERSIONS.items()
+            ),
+            Module("kind"),
+            Module("etcd"),
+            Module("coredns"),
+            Module("helm", {"helm.sh/helm/v3/internal/version.version": f"v{HELM_VERSION}"}),
+            Module("pause"),
+            Module("kwok", {"sigs.k8s.io/kwok/pkg/consts.Version": f"v{KWOK_VERSION}"}),
+            Module("crane", {"github.com/google/go-containerregistry/cmd/crane/cmd.Version": f"v{CRANE_VERSION}"}),
+        )
     }
 )
 

@@ -9,7 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fractus_cluster.binaries.build import build, module_digest, reported_version
-from fractus_cluster.binaries.catalog import CLUSTER_PROGRAMS, KUBERNETES_VERSION, MODULES, PROGRAMS, Program
+from fractus_cluster.binaries.catalog import (
+    CLUSTER_PROGRAMS,
+    DEFAULT_KUBERNETES,
+    KUBERNETES_VERSIONS,
+    MODULES,
+    PROGRAMS,
+    Program,
+)
 from fractus_cluster.errors import ClusterError
 from fractus_cluster.ledger import read_ledger, write_ledger
 from fractus_cluster.locking import locked
@@ -50,6 +57,20 @@ def cache_directory() -> Path:
     return (Path(base) if base else Path.home() / ".cache") / "fractus"
 
 
+def chosen_kubernetes() -> str:
+    """Return the minor version of Kubernetes to run: FRACTUS_KUBERNETES, or the default.
+
+    Raises:
+        ClusterError: There is no such version.
+    """
+    chosen = os.environ.get("FRACTUS_KUBERNETES") or DEFAULT_KUBERNETES
+    if chosen not in KUBERNETES_VERSIONS:
+        raise ClusterError(
+            f"there is no Kubernetes {chosen}; set FRACTUS_KUBERNETES to {' or '.join(KUBERNETES_VERSIONS)}"
+        )
+    return chosen
+
+
 def ensure_binaries(names: Iterable[str] = CLUSTER_PROGRAMS, *, report: Report) -> Binaries:
     """Return paths of the named programs, building those that the machine does not have.
 
@@ -58,11 +79,12 @@ def ensure_binaries(names: Iterable[str] = CLUSTER_PROGRAMS, *, report: Report) 
         report: Told about progress, a line at a time.
 
     Raises:
-        ClusterError: A name is unknown, or a build failed.
+        ClusterError: A name or the chosen version is unknown, or a build failed.
         PrerequisiteError: Something has to be built and Go is missing or too old.
     """
-    wanted = [_program(name) for name in names]
-    directory = cache_directory() / f"v{KUBERNETES_VERSION}"
+    minor = chosen_kubernetes()
+    wanted = [_program(minor, name) for name in names]
+    directory = cache_directory() / f"v{KUBERNETES_VERSIONS[minor]}"
     paths = _present(wanted, directory)
     if len(paths) < len(wanted):
         with locked(
@@ -78,11 +100,11 @@ def ensure_binaries(names: Iterable[str] = CLUSTER_PROGRAMS, *, report: Report) 
     return Binaries(paths)
 
 
-def _program(name: str) -> Program:
+def _program(minor: str, name: str) -> Program:
     try:
-        return PROGRAMS[name]
+        return PROGRAMS[minor][name]
     except KeyError:
-        raise ClusterError(f"no program called {name}; there are {', '.join(sorted(PROGRAMS))}") from None
+        raise ClusterError(f"no program called {name}; there are {', '.join(sorted(PROGRAMS[minor]))}") from None
 
 
 def _present(wanted: Iterable[Program], directory: Path) -> dict[str, Path]:

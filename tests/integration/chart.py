@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import yaml
+from fractus_cluster.binaries import KUBERNETES_VERSIONS, chosen_kubernetes
 from operator_world import SYSTEM, World
 
 Body = dict[str, Any]
 CHARTS = Path(__file__).parents[2] / "charts"
+KUBERNETES = f"--kube-version={KUBERNETES_VERSIONS[chosen_kubernetes()]}"
 _PLURALS = {"PriorityClass": "priorityclasses", "ValidatingAdmissionPolicy": "validatingadmissionpolicies"}
 
 
@@ -31,11 +34,23 @@ def uninstall(world: World) -> None:
             world.api.delete(path_of(body))
 
 
-def render(*arguments: str) -> list[Body]:
-    """The objects of the chart, rendered by helm."""
-    argv = [helm(), "template", "fractus", str(CHARTS / "fractus"), "--namespace", SYSTEM, "--kube-version", "1.35.4"]
+def render(*arguments: str, chart: str = "fractus") -> list[Body]:
+    """The objects of a chart, rendered by helm."""
+    argv = [helm(), "template", chart, str(CHARTS / chart), "--namespace", SYSTEM, KUBERNETES]
     done = subprocess.run([*argv, *arguments], capture_output=True, text=True, timeout=60, check=True)
     return [body for body in yaml.safe_load_all(done.stdout) if body]
+
+
+def values_of(chart: str) -> Iterator[tuple[str, Any]]:
+    """The values of a chart with their names, but for limits and labels, where one that is missing is meant to be."""
+
+    def within(values: Body, above: str) -> Iterator[tuple[str, Any]]:
+        for key, value in values.items():
+            yield f"{above}{key}", value
+            if isinstance(value, dict) and key not in {"resources", "labels"}:
+                yield from within(value, f"{above}{key}.")
+
+    return within(yaml.safe_load((CHARTS / chart / "values.yaml").read_text()), "")
 
 
 def helm() -> str:

@@ -2,38 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
-
 import pytest
-import yaml
-from chart import CHARTS, render
+from chart import render, values_of
 
-VALUES: dict[str, Any] = yaml.safe_load((CHARTS / "fractus" / "values.yaml").read_text())
+VALUES = tuple(values_of("fractus"))
 EVERYTHING = [
     f"--set={part}.enabled=true" for part in ("view", "metrics.podMonitor", "metrics.rules", "metrics.dashboard")
 ]
-
-
-def keys(values: dict[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
-    """Values with their names, but for limits and labels, where one that is missing is meant to be."""
-    for key, value in values.items():
-        yield f"{above}{key}", value
-        if isinstance(value, dict) and key not in {"resources", "labels"}:
-            yield from keys(value, f"{above}{key}.")
 
 
 def without(*names: str) -> list[str]:
     return [f"--set={name}=null" for name in names]
 
 
-@pytest.mark.parametrize("name", [name for name, value in keys(VALUES) if isinstance(value, dict)])
+@pytest.mark.parametrize("name", [name for name, value in VALUES if isinstance(value, dict)])
 def test_a_missing_part_has_its_defaults(name: str) -> None:
     assert render(*without(name)) == render()
 
 
 def test_missing_values_have_their_defaults() -> None:
-    missing = [name for name, value in keys(VALUES) if not isinstance(value, dict) and not name.endswith(".enabled")]
+    missing = [name for name, value in VALUES if not isinstance(value, dict) and not name.endswith(".enabled")]
     assert len(missing) > 30
     assert render(*EVERYTHING, *without(*missing)) == render(*EVERYTHING)
 

@@ -6,13 +6,13 @@ import subprocess
 from typing import Any
 
 import yaml
-from chart import CHARTS, helm
+from chart import CHARTS, KUBERNETES, helm
 
 EXAMPLE = CHARTS.parent / "examples" / "traffic-monitoring"
 
 
 def template(*values: str) -> subprocess.CompletedProcess[str]:
-    argv = [helm(), "template", "demo", str(CHARTS / "fractus-demo"), "--kube-version", "1.35.4"]
+    argv = [helm(), "template", "demo", str(CHARTS / "fractus-demo"), KUBERNETES]
     argv += [f"--set={value}" for value in values]
     return subprocess.run(argv, capture_output=True, text=True, timeout=60, check=False)
 

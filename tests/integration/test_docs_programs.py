@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from functools import cache
 
 import pytest
+from chart import KUBERNETES
 from control_plane import ControlPlane
 from docs_commands import ROOT, Command, every_command, has_placeholder
 from fractus_cluster.binaries import ensure_binaries
@@ -91,7 +92,7 @@ def test_the_charts_take_what_they_are_given(control_plane: ControlPlane, world:
             "--kubeconfig",
             str(control_plane.kubeconfig),
             "--dry-run=server",
-            "--kube-version=1.35.4",
+            KUBERNETES,
             *(["--is-upgrade"] if verb == "upgrade" else []),
         ]
         done = ran(program("helm"), *words, *more)

@@ -11,7 +11,7 @@ import socket
 import sys
 import time
 from collections.abc import Callable, Coroutine
-from contextlib import AsyncExitStack
+from contextlib import AsyncExitStack, aclosing
 from datetime import UTC, datetime
 from typing import Any
 
@@ -40,7 +40,7 @@ from fractus_operator.reconcile.service_rollout import ServiceRollout
 from fractus_operator.reconcile.silence import HearingClock, SilenceWatch, shown_state
 from fractus_operator.reconcile.worklist import Worklist, regularly
 from fractus_operator.settings import BadSetting, Settings
-from fractus_operator.standby import standing_by
+from fractus_operator.standby import kinds_served, standing_by
 
 logger = logging.getLogger("fractus_operator")
 
@@ -59,6 +59,8 @@ async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
         settings: How to run.
         stop: Set it to end the operator; signals do so as well.
     """
+    async with aclosing(await Store.connect()) as reading:
+        await kinds_served(reading)
     identity = settings.identity or f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(4)}"
     # The Lease has a thread and a connection of its own: neither a long plan nor a burst of requests keeps a renewal waiting.
     lease = LeaseThread(Store.connect, (settings.namespace, LEASE_NAME), identity, settings.lease_s, time.monotonic)

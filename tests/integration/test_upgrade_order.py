@@ -1,0 +1,79 @@
+"""The chart fractus was upgraded before fractus-crds: a kind that the release needs is missing."""
+
+from __future__ import annotations
+
+import subprocess
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import pytest
+from chart import render
+from control_plane import ControlPlane, wait_for
+from fractus_core.api import NodeGrants
+from fractus_core.api.crd import crd
+from fractus_kube import KubeError
+from operator_world import FRACTUS, NODES, SYSTEM, OperatorProcess, World
+from test_uninstall_chart import on
+
+KIND = "/apis/apiextensions.k8s.io/v1/customresourcedefinitions/nodegrants.fractus.dev"
+OBJECTS = f"{FRACTUS}/namespaces/{NODES}/nodegrants"
+LEASE = f"/apis/coordination.k8s.io/v1/namespaces/{SYSTEM}/leases/fractus-operator"
+
+
+def is_served(world: World) -> bool:
+    return any(each["kind"] == "NodeGrants" for each in world.api.call("GET", FRACTUS)["resources"])
+
+
+def is_stored(world: World) -> bool:
+    try:
+        return world.api.get(OBJECTS) is not None
+    except KubeError:
+        # "storage is (re)initializing"
+        return False
+
+
+@contextmanager
+def without_kind(world: World) -> Iterator[None]:
+    world.api.delete(KIND)
+    wait_for(lambda: world.api.get(KIND) is None and not is_served(world), "the kind to be gone")
+    try:
+        yield
+    finally:
+        world.api.apply(KIND, crd(NodeGrants))
+        wait_for(lambda: is_served(world) and is_stored(world), "the kind to be back")
+
+
+def test_an_operator_leaves_the_lease_to_the_release_before(
+    control_plane: ControlPlane, world: World, tmp_path: Path
+) -> None:
+    """It could decide nothing, and a healthy one would have that end which can."""
+    process = OperatorProcess(control_plane.kubeconfig, tmp_path / "operator.log")
+
+    def healthy() -> bool:
+        with suppress(OSError):
+            return bool(urllib.request.urlopen(process.health, timeout=5).status == 200)
+        return False
+
+    world.api.delete(LEASE)
+    try:
+        with without_kind(world):
+            process.start()
+            wait_for(lambda: "operator: waits for kinds" in process.log(), process.log)
+            assert "upgrade the chart fractus-crds (missing=NodeGrants)" in process.log()
+            assert not healthy()
+            assert world.api.get(LEASE) is None
+        wait_for(healthy, process.log)
+        wait_for(lambda: world.api.get(f"{OBJECTS}/drone-1"), process.log)
+    finally:
+        if process.running:
+            process.stop()
+
+
+@pytest.mark.parametrize("how", [(), ("--is-upgrade",)])
+def test_the_chart_is_refused(world: World, how: tuple[str, ...]) -> None:
+    assert render(*on(world, *how))
+    with without_kind(world), pytest.raises(subprocess.CalledProcessError) as refused:
+        render(*on(world, *how))
+    assert "install or upgrade the chart fractus-crds first" in refused.value.stderr

@@ -13,20 +13,27 @@ from fractus_cluster.controlplane import API_PORT
 from fractus_core.documents import dump_documents
 
 from fractus_sim.chaos import processes
+from fractus_sim.demo.kube import SYSTEM, Kube
 
 SLOW_S = 2.0
 _QUICK_S = 0.4
+_POLL_S = 0.2
 _TIMEOUT_S = 20.0
 _NAME = "fractus-chaos"
 RULES = (
     f"flowschemas.flowcontrol.apiserver.k8s.io/{_NAME}",
     f"prioritylevelconfigurations.flowcontrol.apiserver.k8s.io/{_NAME}",
 )
-"""The objects of `too_many_requests`, as kubectl names them."""
+"""The objects of `no_room`, as kubectl names them."""
+_ACCOUNTS = (SYSTEM, "fractus-nodes")
+_UNFINISHED = (
+    "create", "--raw=/apis/authorization.k8s.io/v1/selfsubjectaccessreviews", "-f", "-",
+    f"--as=system:serviceaccount:{SYSTEM}:chaos",
+)  # fmt: skip
 
 
-def too_many_requests() -> str:
-    """Manifests after which the API server answers 429 to every account of Fractus."""
+def no_room() -> str:
+    """Manifests after which the API server has room for one request at a time of all accounts of Fractus."""
     api = "flowcontrol.apiserver.k8s.io/v1"
     level = {
         "apiVersion": api, "kind": "PriorityLevelConfiguration", "metadata": {"name": _NAME},
@@ -35,21 +42,40 @@ def too_many_requests() -> str:
             "limitResponse": {"type": "Reject"},
         }},
     }  # fmt: skip
-    who = [
-        {"kind": "Group", "group": {"name": f"system:serviceaccounts:{name}"}}
-        for name in ("fractus-system", "fractus-nodes")
-    ]
+    who = [{"kind": "Group", "group": {"name": f"system:serviceaccounts:{name}"}} for name in _ACCOUNTS]
     every = {
         "verbs": ["*"], "apiGroups": ["*"], "resources": ["*"], "clusterScope": True, "namespaces": ["*"]
     }  # fmt: skip
     flow = {
         "apiVersion": api, "kind": "FlowSchema", "metadata": {"name": _NAME},
         "spec": {
-            "priorityLevelConfiguration": {"name": _NAME}, "matchingPrecedence": 1,
+            "priorityLevelConfiguration": {"name": _NAME}, "matchingPrecedence": 2,
             "rules": [{"subjects": who, "resourceRules": [every]}],
         },
     }  # fmt: skip
     return dump_documents([level, flow])
+
+
+@contextmanager
+def occupied(kube: Kube) -> Iterator[None]:
+    """A request that no one completes takes the room of `no_room`: every other one of Fractus is answered with 429."""
+    over = threading.Event()
+
+    def hold() -> None:
+        # The API server ends it after a minute, and refuses it while another one is under way.
+        while not over.is_set():
+            with kube.follow(_UNFINISHED, subprocess.DEVNULL, subprocess.PIPE) as request:
+                while request.poll() is None and not over.wait(_POLL_S):
+                    continue
+                request.kill()
+
+    holder = threading.Thread(target=hold, daemon=True)
+    holder.start()
+    try:
+        yield
+    finally:
+        over.set()
+        holder.join(_TIMEOUT_S)
 
 
 @contextmanager

@@ -98,8 +98,9 @@ def _slow_api(stage: Stage, _chance: random.Random) -> Breaking:
 
 def _too_many_requests(stage: Stage, _chance: random.Random) -> Breaking:
     try:
-        stage.kube.run("apply", "-f", "-", stdin=apiserver.too_many_requests(), timeout_s=20.0)
-        yield "the API server answers 429 to Fractus"
+        stage.kube.run("apply", "-f", "-", stdin=apiserver.no_room(), timeout_s=20.0)
+        with apiserver.occupied(stage.kube):
+            yield "the API server answers 429 to Fractus"
     finally:
         _until_done(lambda: stage.kubectl("delete", "--ignore-not-found", *apiserver.RULES))
 

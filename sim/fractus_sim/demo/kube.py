@@ -81,10 +81,12 @@ class Kube:
         """Take a release away."""
         self._run(self.release_tool, ["uninstall", release, "-n", SYSTEM, "--ignore-not-found", "--wait"], None, 180.0)
 
-    def follow(self, arguments: Sequence[str], out: IO[bytes]) -> subprocess.Popen[bytes]:
+    def follow(
+        self, arguments: Sequence[str], out: IO[bytes] | int, stdin: int | None = None
+    ) -> subprocess.Popen[bytes]:
         """Start a kubectl that writes until it is ended."""
         return subprocess.Popen(
-            [str(self.kubectl), *arguments], stdout=out, stderr=subprocess.DEVNULL, env=self._environment()
+            [str(self.kubectl), *arguments], stdin=stdin, stdout=out, stderr=subprocess.DEVNULL, env=self._environment()
         )
 
     def _run(

@@ -1,0 +1,47 @@
+"""What chaos makes of an API server, on a real one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+from chart import path_of
+from control_plane import ControlPlane, wait_for
+from fractus_cluster.binaries import ensure_binaries
+from fractus_kube import BlockingClient, KubeError
+from fractus_sim.chaos.apiserver import no_room, occupied
+from fractus_sim.demo.kube import Kube
+
+
+def status(client: BlockingClient) -> int:
+    """With which status a client is refused what none may read."""
+    with pytest.raises(KubeError) as refusal:
+        client.get("/api/v1/namespaces/default/secrets/any")
+    return refusal.value.status
+
+
+def test_every_account_of_fractus_and_no_other_is_answered_429(control_plane: ControlPlane) -> None:
+    kube = Kube(ensure_binaries(("kubectl",), report=print)["kubectl"], Path("helm"), control_plane.kubeconfig)
+    accounts = [
+        control_plane.as_user(
+            namespace,
+            f"system:serviceaccount:{namespace}:any",
+            ("system:serviceaccounts", f"system:serviceaccounts:{namespace}"),
+        )
+        for namespace in ("fractus-system", "fractus-nodes")
+    ]
+    stranger = control_plane.as_user("stranger", "stranger", ())
+    rules = list(yaml.safe_load_all(no_room()))
+    try:
+        for body in rules:
+            control_plane.admin.apply(path_of(body), body)
+        with occupied(kube):
+            wait_for(lambda: all(status(account) == 429 for account in accounts * 3), "429")
+            assert status(stranger) == 403
+    finally:
+        for body in reversed(rules):
+            control_plane.admin.delete(path_of(body))
+    wait_for(lambda: all(status(account) == 403 for account in accounts), "another answer than 429")
+    for client in (*accounts, stranger):
+        client.close()

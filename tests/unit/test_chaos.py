@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from datetime import UTC, datetime
-from typing import Any
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
+from fractus_core.api import Grant
+from fractus_core.api.node_grants import pack
 from fractus_core.api.plans import GrantSpec
 from fractus_core.policy.values import Home
 from fractus_sim.chaos.faults import FAULTS
@@ -18,7 +23,9 @@ from fractus_sim.chaos.invariants import (
     not_ended,
     without_authority,
 )
+from fractus_sim.chaos.missions import Missions
 from fractus_sim.chaos.schedule import schedule
+from fractus_sim.chaos.stage import Stage
 
 HOME = Home(50.8637, 4.6785, 25.0)
 DURATIONS = {name: (fault.shortest_s, fault.longest_s) for name, fault in FAULTS.items()}
@@ -170,3 +177,22 @@ def test_nothing_is_left_over() -> None:
     }
     (found,) = left_over([{"kind": "ReplicaSet", "metadata": ends}])
     assert "ReplicaSet/one (there; ends since 12:00; owned by D/d; held by orphan)" in found.found
+
+
+def test_a_grant_that_its_node_keeps_is_left_over(tmp_path: Path) -> None:
+    def body(application: str) -> dict[str, Any]:
+        metadata = {"name": f"default.{application}-navigator", "uid": f"uid-{application}", "generation": 1}
+        return Grant.model_validate({"metadata": metadata, "spec": grant(application)}).to_dict()
+
+    objects = {
+        "applications.fractus.dev": [{"kind": "Application", "metadata": {"name": "flies"}}],
+        "nodegrants.fractus.dev": [{"spec": {"count": 2, "packed": pack([body("flies"), body("carried")])}}],
+    }
+    stored = tmp_path / "var-lib" / "fractus" / "grants"
+    stored.mkdir(parents=True)
+    for application in ("flies", "stored"):
+        (stored / f"{application}.json").write_text(json.dumps(body(application)))
+    cluster = SimpleNamespace(nodes=[SimpleNamespace(directory=tmp_path)])
+    stage = cast("Stage", SimpleNamespace(objects=lambda kinds, *_: objects.get(kinds, []), cluster=cluster))
+    left = Missions(stage, "chaos", print).left_over()
+    assert [each["metadata"]["name"] for each in left] == ["default.carried-navigator", "default.stored-navigator"]

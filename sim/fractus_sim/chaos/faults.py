@@ -108,7 +108,9 @@ def _too_many_requests(stage: Stage, _chance: random.Random) -> Breaking:
 def _conflicts(stage: Stage, _chance: random.Random) -> Breaking:
     """Writes all the time what others write, so that their writes meet a newer version: 409."""
     over = threading.Event()
-    kinds = "applications.fractus.dev,deploymentplans.fractus.dev,grants.fractus.dev,drones.fractus.dev"
+    kinds = ",".join(
+        f"{kind}.fractus.dev" for kind in ("applications", "deploymentplans", "grants", "nodegrants", "drones")
+    )
 
     def write() -> None:
         count = 0

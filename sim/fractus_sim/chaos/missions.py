@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import yaml
+from fractus_core.api.node_grants import unpack
 
 from fractus_sim.chaos.stage import Stage
 from fractus_sim.demo.clusters import EXAMPLE, documents
@@ -67,7 +70,7 @@ class Missions:
             time.sleep(0.5)
 
     def left_over(self) -> list[Object]:
-        """Applications that are being deleted, and objects of those that do not exist any more.
+        """Applications that are being deleted, and objects and stored Grants of those that do not exist any more.
 
         Raises:
             DemoError: the API server does not answer.
@@ -78,7 +81,22 @@ class Missions:
         found = self.stage.objects(CHILDREN, "-A", "-l", "fractus.dev/application")
         found += self.stage.objects("grants.fractus.dev,directlinks.fractus.dev", "-A")
         found += self.stage.objects("deploymentplans.fractus.dev", "-A")
+        found += self._carried() + self._stored()
         return leaving + [body for body in found if _application(body) not in names]
+
+    def _carried(self) -> list[Object]:
+        """Grants that the objects of nodes carry."""
+        specs = [body["spec"] for body in self.stage.objects("nodegrants.fractus.dev", "-A")]
+        return [grant for spec in specs for grant in unpack(spec["packed"], spec["count"])]
+
+    def _stored(self) -> list[Object]:
+        """Grants on the disks of nodes."""
+        stored = []
+        for node in self.stage.cluster.nodes:
+            for path in (node.directory / "var-lib" / "fractus" / "grants").glob("*.json"):
+                with suppress(FileNotFoundError):  # it was removed meanwhile
+                    stored.append(json.loads(path.read_bytes()))
+        return stored
 
     def _look(self) -> None:
         found = {

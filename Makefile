@@ -158,20 +158,32 @@ bench: env ## Run every benchmark
 release: env ## Set VERSION=X.Y.Z of package and charts, and gather the changelog for it; commit and tag what this leaves
 	@[[ "$${VERSION:-}" =~ ^[0-9]+\.[0-9]+\.[0-9]+$$ ]] || { echo "give VERSION=X.Y.Z" >&2; exit 1; }
 	sed -i 's/^version = ".*"/version = "$(VERSION)"/' pyproject.toml
-	sed -i -E 's/^(version|appVersion): .*/\1: $(VERSION)/' charts/*/Chart.yaml
+	sed -i 's/^version: .*/version: $(VERSION)/' charts/*/Chart.yaml
 	$(UV) lock --quiet
 	$(RUN) towncrier build --yes --version "$(VERSION)"
 
 # What a user installs, without what only builds and tests it.
 SHIPPED := --frozen --no-dev --extra operator --extra agent --extra services --extra view --extra tracing
 
+# The charts of a checkout take the images that are built from it (localhost/fractus/NAME:dev), those of a release its own.
+REGISTRY ?= localhost/fractus
+DIST ?= dist
+PACKAGED = $(shell sed -n 's/^version = "\(.*\)"/\1/p' pyproject.toml)
+.PHONY: charts
+charts: ## Package the charts into dist/, for the images of this version in REGISTRY=localhost/fractus
+	folder="$$(mktemp -d)"; trap 'rm -rf "$$folder"' EXIT; cp -RL charts/. "$$folder"; \
+		sed -i 's|^  registry: .*|  registry: $(REGISTRY)|' "$$folder"/{fractus,fractus-demo,fractus/files}/values.yaml; \
+		helm="$$(command -v helm || ls -t "$${XDG_CACHE_HOME:-$$HOME/.cache}"/fractus/*/bin/helm | head -n 1)"; \
+		for chart in "$$folder"/*/; do \
+			"$$helm" package "$$chart" --version $(PACKAGED) --app-version $(PACKAGED) --destination $(DIST) > /dev/null; \
+		done
+
 .PHONY: dist
 dist: env ## Build what a release has into dist/: wheel, source archive, charts, dependencies and their licences, checksums
 	rm -rf dist
 	$(UV) build --quiet --out-dir dist
-	$(RUN) fractus cluster binaries
-	helm="$$(command -v helm || ls -t "$${XDG_CACHE_HOME:-$$HOME/.cache}"/fractus/*/bin/helm | head -n 1)"; \
-		for chart in charts/*/; do "$$helm" package "$$chart" --destination dist > /dev/null; done
+	command -v helm > /dev/null || $(RUN) fractus cluster binaries
+	$(MAKE) charts
 	$(UV) export --quiet $(SHIPPED) --no-emit-project --format cyclonedx1.5 > dist/dependencies.cdx.json
 	# A licence that asks more than to be named would bind what is built on Fractus.
 	$(UV) run --quiet --isolated $(SHIPPED) --with pip-licenses==5.5.5 pip-licenses --ignore-packages fractus-drones \

@@ -34,9 +34,9 @@ def uninstall(world: World) -> None:
             world.api.delete(path_of(body))
 
 
-def render(*arguments: str, chart: str = "fractus") -> list[Body]:
-    """The objects of a chart, rendered by helm."""
-    argv = [helm(), "template", chart, str(CHARTS / chart), "--namespace", SYSTEM, KUBERNETES]
+def render(*arguments: str, chart: str | Path = "fractus") -> list[Body]:
+    """The objects of a chart, one of the checkout's by its name or another by its path, rendered by helm."""
+    argv = [helm(), "template", Path(chart).stem, str(CHARTS / chart), "--namespace", SYSTEM, KUBERNETES]
     done = subprocess.run([*argv, *arguments], capture_output=True, text=True, timeout=60, check=True)
     return [body for body in yaml.safe_load_all(done.stdout) if body]
 

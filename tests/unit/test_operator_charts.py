@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from fractus_cluster.images.build import image_name
 from fractus_core.api import KINDS
 from fractus_core.api.crd import crd
 
@@ -39,12 +40,14 @@ def test_every_value_is_in_the_schema_and_the_other_way_round(chart: str) -> Non
     compare(values, schema, chart)
 
 
-def test_the_charts_have_the_version_of_the_package() -> None:
+def test_the_charts_have_the_version_of_the_package_and_the_images_of_the_checkout() -> None:
     import tomllib
 
     version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
-    for chart in ("fractus", "fractus-crds"):
-        assert yaml.safe_load((CHARTS / chart / "Chart.yaml").read_text())["appVersion"] == version
+    for chart in ("fractus", "fractus-crds", "fractus-demo"):
+        described = yaml.safe_load((CHARTS / chart / "Chart.yaml").read_text())
+        assert described["version"] == version
+        assert image_name("agent", described["appVersion"]) == image_name("agent")
 
 
 def test_the_templates_know_the_defaults() -> None:

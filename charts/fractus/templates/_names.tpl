@@ -48,6 +48,11 @@ has(request.userInfo.extra) && "authentication.kubernetes.io/node-name" in reque
 {{/* Where each node has an account of its own, and its Grants; fractus_core.api.node_grants knows it by this name. */}}
 {{- define "fractus.nodesNamespace" -}}fractus-nodes{{- end }}
 
+{{/* The image of a part; take (dict "root" $ "part" "agent"). */}}
+{{- define "fractus.image" -}}
+{{- with .root }}{{ printf "%s/%s:%s" .Values.image.registry $.part (.Values.image.tag | default .Chart.AppVersion) | quote }}{{ end }}
+{{- end }}
+
 {{- define "fractus.pullSecrets" -}}
 {{- with .Values.imagePullSecrets }}
 imagePullSecrets:

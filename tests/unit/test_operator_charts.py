@@ -24,7 +24,7 @@ def test_the_chart_carries_the_generated_kinds() -> None:
         assert carried[f"{kind.PLURAL}.yaml"] == json.loads(json.dumps(crd(kind))), "run `make generate`"
 
 
-@pytest.mark.parametrize("chart", ["fractus", "fractus-crds"])
+@pytest.mark.parametrize("chart", ["fractus", "fractus-crds", "fractus-demo"])
 def test_every_value_is_in_the_schema_and_the_other_way_round(chart: str) -> None:
     values = yaml.safe_load((CHARTS / chart / "values.yaml").read_text())
     schema = json.loads((CHARTS / chart / "values.schema.json").read_text())

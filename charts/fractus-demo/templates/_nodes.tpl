@@ -9,6 +9,11 @@
 {{- toJson (sortAlpha $names) }}
 {{- end }}
 
+{{/* An image; take (dict "root" $ "part" "sim"). */}}
+{{- define "fractus-demo.image" -}}
+{{- with .root }}{{ .Values.image.registry }}/{{ $.part }}:{{ .Values.image.tag | default .Chart.AppVersion }}{{ end }}
+{{- end }}
+
 {{/* Name of the node that this release made the drone, also while other nodes come and go: hardware does not move. */}}
 {{- define "fractus-demo.earlier" -}}
 {{- if .Release.IsUpgrade }}

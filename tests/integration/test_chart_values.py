@@ -15,13 +15,15 @@ def without(*names: str) -> list[str]:
     return [f"--set={name}=null" for name in names]
 
 
-@pytest.mark.parametrize("name", [name for name, value in VALUES if isinstance(value, dict)])
+@pytest.mark.parametrize("name", [name for name, value in VALUES if value and isinstance(value, dict)])
 def test_a_missing_part_has_its_defaults(name: str) -> None:
     assert render(*without(name)) == render()
 
 
 def test_missing_values_have_their_defaults() -> None:
-    missing = [name for name, value in VALUES if not isinstance(value, dict) and not name.endswith(".enabled")]
+    missing = [
+        name for name, value in VALUES if not (value and isinstance(value, dict)) and not name.endswith(".enabled")
+    ]
     assert len(missing) > 30
     assert render(*EVERYTHING, *without(*missing)) == render(*EVERYTHING)
 

@@ -62,27 +62,6 @@ imagePullSecrets:
 {{- end }}
 {{- end }}
 
-{{/* What pods on drones and edge nodes share; take (dict "root" $ "classes" (list "drone")). */}}
-{{- define "fractus.nodePod" -}}
-hostNetwork: true
-dnsPolicy: Default
-enableServiceLinks: false
-priorityClassName: {{ .root.Values.priorityClass.name }}
-terminationGracePeriodSeconds: 10
-affinity:
-  nodeAffinity:
-    requiredDuringSchedulingIgnoredDuringExecution:
-      nodeSelectorTerms:
-        - matchExpressions:
-            - key: fractus.dev/class
-              operator: In
-              values: {{ toJson .classes }}
-# A drone out of reach keeps what flies it.
-tolerations:
-  - operator: Exists
-{{ include "fractus.pullSecrets" .root }}
-{{- end }}
-
 {{- define "fractus.logEnv" -}}
 - {name: FRACTUS_LOG_LEVEL, value: {{ .Values.logLevel }}}
 - {name: FRACTUS_LOG_FORMAT, value: {{ .Values.logFormat }}}
@@ -128,31 +107,4 @@ seccompProfile: {type: RuntimeDefault}
 {{/* CEL: whether a pod may run on drones and edge nodes; takes the name of the variable that holds the pod. */}}
 {{- define "fractus.tolerates" -}}
 {{ . }}.spec.?tolerations.orValue([]).exists(t, t.?key.orValue("") in ["", "fractus.dev/class"])
-{{- end }}
-
-{{/* Where the operator's image runs: on nodes that are neither drones nor at the edge, or are of the cloud as well. */}}
-{{- define "fractus.cloudPod" -}}
-affinity:
-  nodeAffinity:
-    requiredDuringSchedulingIgnoredDuringExecution:
-      nodeSelectorTerms:
-        - matchExpressions:
-            - key: fractus.dev/class
-              operator: NotIn
-              values: [drone, edge]
-        - matchExpressions:
-            - {key: fractus.dev/cloud, operator: In, values: ["true"]}
-  podAntiAffinity:
-    preferredDuringSchedulingIgnoredDuringExecution:
-      - weight: 100
-        podAffinityTerm:
-          topologyKey: kubernetes.io/hostname
-          labelSelector:
-            matchLabels: {{- include "fractus.selector" (dict "root" . "part" "operator") | nindent 14 }}
-{{- with .Values.operator.nodeSelector }}
-nodeSelector: {{- toYaml . | nindent 2 }}
-{{- end }}
-{{- with .Values.operator.tolerations }}
-tolerations: {{- toYaml . | nindent 2 }}
-{{- end }}
 {{- end }}

@@ -1,0 +1,189 @@
+"""What the cluster's operator adds to the pods of each workload: it reaches them, beside what they need and never instead of it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from functools import cache
+from typing import Any
+
+import pytest
+from chart import render
+
+Body = dict[str, Any]
+
+ON_NODES, IN_THE_CLOUD = ("agent", "mobility", "camera"), ("operator", "view")
+WORKLOADS = (*ON_NODES, *IN_THE_CLOUD)
+DRONE = "--set=drone=d"
+WHERE, RATHER = "requiredDuringSchedulingIgnoredDuringExecution", "preferredDuringSchedulingIgnoredDuringExecution"
+
+SSD = {"key": "disk", "operator": "In", "values": ["ssd"]}
+BIG = {"key": "memory", "operator": "Exists"}
+NAMED = {"key": "metadata.name", "operator": "In", "values": ["node-1"]}
+APART = {"topologyKey": "rack", "labelSelector": {"matchLabels": {"team": "birds"}}}
+FOR_ALL: Body = {
+    "podLabels": {"team": "birds", "example.com/cost-centre": "7"},
+    "podAnnotations": {"example.com/scrape": "no"},
+    "extraEnv": [{"name": "HTTPS_PROXY", "value": "http://proxy:3128"}, {"name": "WHERE", "value": "$(FRACTUS_NODE)"}],
+    "resources": {"requests": {"cpu": "1m"}},
+}
+FOR_PLACED = FOR_ALL | {
+    "nodeSelector": {"region": "north"},
+    "affinity": {
+        "nodeAffinity": {
+            WHERE: {"nodeSelectorTerms": [{"matchExpressions": [SSD], "matchFields": [NAMED]}, {"matchExpressions": [BIG]}]},
+            RATHER: [{"weight": 1, "preference": {"matchExpressions": [BIG]}}],
+        },
+        "podAffinity": {RATHER: [{"weight": 2, "podAffinityTerm": APART}]},
+        "podAntiAffinity": {WHERE: [APART]},
+    },
+}  # fmt: skip
+FOR_THE_CLOUD = FOR_PLACED | {
+    "tolerations": [{"key": "dedicated", "operator": "Exists"}],
+    "topologySpreadConstraints": [{"maxSkew": 1, "topologyKey": "zone", "whenUnsatisfiable": "DoNotSchedule"}],
+    "priorityClassName": "ground",
+}
+
+
+@cache
+def templates(*arguments: str, chart: str = "fractus") -> dict[str, Body]:
+    """The pods' templates of each workload, by its part."""
+    bodies = [body for body in render(*arguments, chart=chart) if body["kind"] in {"Deployment", "DaemonSet", "Job"}]
+    return {body["metadata"]["labels"]["app.kubernetes.io/component"]: body["spec"]["template"] for body in bodies}
+
+
+def everything() -> dict[str, Body]:
+    asked = [f"--set-json={name}={json.dumps(FOR_THE_CLOUD)}" for name in IN_THE_CLOUD]
+    asked += [f"--set-json={name}={json.dumps(FOR_PLACED)}" for name in ON_NODES]
+    return templates(*asked, "--set=view.enabled=true", "--set=uninstall.wipeNodes=true", "--is-upgrade")
+
+
+def plain() -> dict[str, Body]:
+    return templates("--set=view.enabled=true", "--set=uninstall.wipeNodes=true", "--is-upgrade")
+
+
+def refusal(*arguments: str, chart: str = "fractus") -> str:
+    with pytest.raises(subprocess.CalledProcessError) as error:
+        render(*arguments, chart=chart)
+    return str(error.value.stderr)
+
+
+@pytest.mark.parametrize("part", [*WORKLOADS, "uninstall", "removal", "wipe"])
+def test_labels_and_annotations_reach_the_pods_beside_ours(part: str) -> None:
+    ours = plain()[part]["metadata"]["labels"]
+    assert everything()[part]["metadata"] == {
+        "labels": ours | FOR_ALL["podLabels"], "annotations": FOR_ALL["podAnnotations"],
+    }  # fmt: skip
+    assert ours["app.kubernetes.io/component"] == part
+
+
+@pytest.mark.parametrize("part", WORKLOADS)
+def test_variables_and_resources_reach_the_container(part: str) -> None:
+    (before,), (container,) = (found[part]["spec"]["containers"] for found in (plain(), everything()))
+    assert container.get("env") == before.get("env", []) + FOR_ALL["extraEnv"]
+    assert container["resources"]["requests"] == before["resources"]["requests"] | {"cpu": "1m"}
+
+
+@pytest.mark.parametrize("part", WORKLOADS)
+def test_where_pods_run_is_what_they_need_and_what_is_asked_for(part: str) -> None:
+    pod, before = everything()[part]["spec"], plain()[part]["spec"]
+    assert pod["nodeSelector"] == FOR_PLACED["nodeSelector"]
+    needed = before["affinity"]["nodeAffinity"][WHERE]["nodeSelectorTerms"]
+    assert [term["matchExpressions"][0]["key"].partition("/")[0] for term in needed] == ["fractus.dev"] * len(needed)
+    assert pod["affinity"]["nodeAffinity"][WHERE]["nodeSelectorTerms"] == [
+        {"matchExpressions": [*term["matchExpressions"], asked], **fields}
+        for term in needed
+        for asked, fields in ((SSD, {"matchFields": [NAMED]}), (BIG, {}))
+    ]
+    asked = FOR_PLACED["affinity"]
+    assert pod["affinity"]["nodeAffinity"][RATHER] == asked["nodeAffinity"][RATHER]
+    assert pod["affinity"]["podAffinity"] == asked["podAffinity"]
+    ours = before["affinity"].get("podAntiAffinity", {})
+    assert pod["affinity"]["podAntiAffinity"] == ours | asked["podAntiAffinity"]
+
+
+@pytest.mark.parametrize("part", [*IN_THE_CLOUD, "uninstall", "removal"])
+def test_pods_in_the_cloud_are_spread_and_tolerate_as_asked(part: str) -> None:
+    pod = everything()[part]["spec"]
+    assert pod["tolerations"] == FOR_THE_CLOUD["tolerations"]
+    assert pod["priorityClassName"] == "ground"
+    (spread,) = pod["topologySpreadConstraints"]
+    counted = spread.pop("labelSelector")["matchLabels"]
+    assert spread == FOR_THE_CLOUD["topologySpreadConstraints"][0]
+    labels = everything()["view" if part == "view" else "operator"]["metadata"]["labels"]
+    assert counted.items() <= labels.items()
+    assert "app.kubernetes.io/component" in counted
+
+
+def test_a_constraint_keeps_its_own_selector() -> None:
+    asked = FOR_THE_CLOUD["topologySpreadConstraints"][0] | {"labelSelector": {"matchLabels": {"team": "birds"}}}
+    pods = templates(f"--set-json=operator.topologySpreadConstraints={json.dumps([asked])}")
+    assert pods["operator"]["spec"]["topologySpreadConstraints"] == [asked]
+
+
+@pytest.mark.parametrize("part", ON_NODES)
+def test_pods_on_nodes_have_the_nodes_priority_and_tolerate_everything(part: str) -> None:
+    pod = everything()[part]["spec"]
+    assert pod["priorityClassName"] == "fractus-node"
+    assert pod["tolerations"] == [{"operator": "Exists"}]
+    for name, value in (("priorityClassName", '"low"'), ("tolerations", "[]"), ("topologySpreadConstraints", "[]")):
+        assert name in refusal(f"--set-json={part}.{name}={value}")
+
+
+def test_operators_are_apart_where_they_can() -> None:
+    found = plain()["operator"]["spec"]["affinity"]["podAntiAffinity"]
+    assert set(found) == {RATHER}, "an operator more beside another one is better than none"
+    assert {term["podAffinityTerm"]["topologyKey"]: term["weight"] for term in found[RATHER]} == {
+        "kubernetes.io/hostname": 100,
+        "topology.kubernetes.io/zone": 50,
+    }
+
+
+def test_the_view_runs_where_the_operator_may_unless_it_is_said_otherwise() -> None:
+    said = [
+        "--set=view.enabled=true",
+        "--set=operator.nodeSelector.pool=a",
+        "--set=operator.tolerations[0].operator=Exists",
+    ]
+    pod = templates(*said)["view"]["spec"]
+    assert (pod["nodeSelector"], pod["tolerations"]) == ({"pool": "a"}, [{"operator": "Exists"}])
+    assert templates(*said, "--set=view.nodeSelector.pool=b")["view"]["spec"]["nodeSelector"]["pool"] == "b"
+
+
+RESERVED = (
+    "app.kubernetes.io/name",
+    "app.kubernetes.io/component",
+    "app.kubernetes.io/version",
+    "fractus.dev/application",
+    "operator.fractus.dev/anything",
+    "helm.sh/chart",
+    "controller-revision-hash",
+    "pod-template-hash",
+)
+
+
+@pytest.mark.parametrize("name", RESERVED)
+def test_no_label_by_which_policies_and_selectors_go_is_replaced(name: str) -> None:
+    for part in ("operator", "mobility"):
+        said = refusal(f"--set-json={part}.podLabels={json.dumps({name: 'x'})}", "--skip-schema-validation")
+        assert f"{part}.podLabels: policies, selectors or the operator go by {name}" in said
+    assert name in refusal(DRONE, f"--set-json=vehicle.podLabels={json.dumps({name: 'x'})}", chart="fractus-demo")
+
+
+@pytest.mark.parametrize("part", WORKLOADS)
+def test_no_variable_of_ours_is_replaced(part: str) -> None:
+    said = refusal(f"--set={part}.extraEnv[0].name=FRACTUS_NODE", "--set=view.enabled=true")
+    assert f"{part}.extraEnv: FRACTUS_NODE is the chart's own" in said
+
+
+def test_the_vehicle_of_the_demo_takes_them_too() -> None:
+    before = templates(DRONE, chart="fractus-demo")["vehicle"]
+    asked = FOR_ALL | {"priorityClassName": "fractus-node"}
+    after = templates(DRONE, f"--set-json=vehicle={json.dumps(asked)}", chart="fractus-demo")["vehicle"]
+    assert after["metadata"] == {
+        "labels": before["metadata"]["labels"] | FOR_ALL["podLabels"], "annotations": FOR_ALL["podAnnotations"],
+    }  # fmt: skip
+    assert after["spec"]["priorityClassName"] == "fractus-node"
+    (container,) = after["spec"]["containers"]
+    assert container["env"] == FOR_ALL["extraEnv"]
+    assert container["resources"]["requests"]["cpu"] == "1m"

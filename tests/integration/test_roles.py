@@ -1,0 +1,118 @@
+"""The chart's roles, as a real API server takes them: who may read and write each kind, alone and by the built-in roles."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+from typing import Any
+
+import pytest
+import yaml
+from chart import CHARTS, path_of, render
+from control_plane import wait_for
+from operator_world import World
+
+Body = dict[str, Any]
+
+NAMES = [yaml.safe_load(path.read_text())["spec"]["names"] for path in (CHARTS.parent / "crds").glob("*.yaml")]
+KINDS = {names["singular"]: names["plural"] for names in NAMES}
+WRITTEN_BY_THE_OPERATOR = {"deploymentplan", "grant", "nodegrants", "directlink"}
+WRITTEN_BY_AUTHORITIES = set(KINDS) - WRITTEN_BY_THE_OPERATOR - {"application"}
+
+READ, WRITE, ALL = ("get", "list", "watch"), ("create", "update", "patch", "delete"), ("deletecollection",)
+
+
+@cache
+def chart_roles() -> dict[str, Body]:
+    """The roles that somebody may bind, by name."""
+    names = {f"fractus-{kind}-{role}" for kind in KINDS for role in ("viewer", "editor", "admin")}
+    return {body["metadata"]["name"]: body for body in render() if body["metadata"]["name"] in names}
+
+
+@pytest.fixture(scope="module")
+def roles(control_plane: Any) -> Iterator[World]:
+    """A control plane with the roles, aggregated."""
+    world = World(control_plane)
+    for body in chart_roles().values():
+        world.api.apply(path_of(body), body)
+    with bound(world, "edit", "t-settled"):
+        wait_for(lambda: may(world, "t-settled", "create", "applications"), "the built-in roles are aggregated")
+    with bound(world, "view", "t-settled"):
+        wait_for(lambda: all(may(world, "t-settled", "get", kind) for kind in KINDS.values()), "view is aggregated")
+    yield world
+    for body in chart_roles().values():
+        world.api.delete(path_of(body))
+
+
+@contextmanager
+def bound(world: World, role: str, group: str) -> Iterator[None]:
+    """A group that has a ClusterRole in the whole cluster."""
+    body = {
+        "apiVersion": "rbac.authorization.k8s.io/v1",
+        "kind": "ClusterRoleBinding",
+        "metadata": {"name": group},
+        "roleRef": {"apiGroup": "rbac.authorization.k8s.io", "kind": "ClusterRole", "name": role},
+        "subjects": [{"apiGroup": "rbac.authorization.k8s.io", "kind": "Group", "name": group}],
+    }
+    world.api.apply(path_of(body), body)
+    try:
+        yield
+    finally:
+        world.api.delete(path_of(body))
+
+
+def may(world: World, group: str, verb: str, plural: str, subresource: str = "") -> bool:
+    """What the API server answers to an access review."""
+    asked = {"group": "fractus.dev", "resource": plural, "verb": verb, "subresource": subresource}
+    review = {
+        "apiVersion": "authorization.k8s.io/v1",
+        "kind": "SubjectAccessReview",
+        "spec": {"user": "someone", "groups": [group], "resourceAttributes": asked},
+    }
+    return bool(
+        world.api.call("POST", "/apis/authorization.k8s.io/v1/subjectaccessreviews", review)["status"]["allowed"]
+    )
+
+
+def allowed(world: World, role: str) -> set[tuple[str, str]]:
+    """What a role lets do with which kind."""
+    group = f"t-{role}"
+    with bound(world, role, group):
+        # The authorizer hears of bindings by a watch.
+        wait_for(lambda: any(may(world, group, "get", kind) for kind in KINDS.values()), f"{role} is in force")
+        found = {(v, kind) for kind in KINDS for v in (*READ, *WRITE, *ALL) if may(world, group, v, KINDS[kind])}
+        assert not any(may(world, group, verb, kind, "status") for verb in WRITE for kind in KINDS.values())
+    return found
+
+
+def test_each_kind_has_its_roles() -> None:
+    every = {f"fractus-{kind}-viewer" for kind in KINDS}
+    assert set(chart_roles()) == every | {
+        f"fractus-{kind}-{role}" for kind in set(KINDS) - WRITTEN_BY_THE_OPERATOR for role in ("editor", "admin")
+    }
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_role_reaches_its_kind_and_no_other(roles: World, kind: str) -> None:
+    assert allowed(roles, f"fractus-{kind}-viewer") == {(verb, kind) for verb in READ}
+    if kind not in WRITTEN_BY_THE_OPERATOR:
+        more = ALL if kind == "application" else ()
+        assert allowed(roles, f"fractus-{kind}-editor") == {(verb, kind) for verb in (*READ, *WRITE, *more)}
+        assert allowed(roles, f"fractus-{kind}-admin") == {(verb, kind) for verb in (*READ, *WRITE, *ALL)}
+
+
+def test_the_built_in_roles_read_all_and_write_applications(roles: World) -> None:
+    read = {(verb, kind) for verb in READ for kind in KINDS}
+    write = {(verb, "application") for verb in (*WRITE, *ALL)}
+    assert allowed(roles, "view") == read
+    assert allowed(roles, "edit") == read | write
+    assert allowed(roles, "admin") == read | write
+    assert {kind for _, kind in write} & WRITTEN_BY_AUTHORITIES == set()
+
+
+def test_without_aggregation_the_roles_are_there_to_be_bound() -> None:
+    found = {body["metadata"]["name"]: body for body in render("--set=rbac.aggregate=false")}
+    for name, role in chart_roles().items():
+        assert found[name]["rules"] == role["rules"]
+        assert not [label for label in found[name]["metadata"]["labels"] if "aggregate" in label]

@@ -1,0 +1,52 @@
+"""A namespace that enforces Pod Security: helm refuses to install where no pod of a node service would be admitted."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Iterator
+
+import pytest
+from chart import CHARTS, helm
+from control_plane import ControlPlane
+from operator_world import SYSTEM, World
+
+ENFORCE = "pod-security.kubernetes.io/enforce"
+CHART = {"fractus": (), "fractus-demo": ("--set=drone=drone-1",)}
+
+
+@pytest.fixture
+def namespace(world: World) -> Iterator[str]:
+    """The system's namespace, whose labels are the test's."""
+    yield f"/api/v1/namespaces/{SYSTEM}"
+    world.api.merge(f"/api/v1/namespaces/{SYSTEM}", {"metadata": {"labels": {ENFORCE: None}}})
+
+
+def rendered(chart: str, control_plane: ControlPlane, *more: str) -> subprocess.CompletedProcess[str]:
+    """As `helm install` renders it first, which stops there when this fails."""
+    argv = [helm(), "template", chart, str(CHARTS / chart), "-n", SYSTEM, "--kubeconfig", str(control_plane.kubeconfig)]
+    argv += ["--kube-version=1.35.4", *CHART[chart], *more]
+    return subprocess.run(argv, capture_output=True, text=True, timeout=60, check=False)
+
+
+@pytest.mark.parametrize("chart", CHART)
+def test_a_namespace_that_refuses_the_pods_is_refused(
+    control_plane: ControlPlane, world: World, namespace: str, chart: str
+) -> None:
+    for level in ("baseline", "restricted"):
+        world.api.merge(namespace, {"metadata": {"labels": {ENFORCE: level}}})
+        for verb in ((), ("--is-upgrade",)):
+            done = rendered(chart, control_plane, "--dry-run=server", *verb)
+            assert done.returncode != 0
+            assert f"the namespace {SYSTEM} enforces Pod Security {level}" in done.stderr
+            assert f"kubectl label namespace {SYSTEM} {ENFORCE}=privileged --overwrite" in done.stderr
+        assert rendered(chart, control_plane).returncode == 0, "without a cluster nothing is known of it"
+
+
+@pytest.mark.parametrize("chart", CHART)
+def test_a_namespace_that_admits_them_is_taken(
+    control_plane: ControlPlane, world: World, namespace: str, chart: str
+) -> None:
+    for level in ("privileged", None):
+        world.api.merge(namespace, {"metadata": {"labels": {ENFORCE: level}}})
+        done = rendered(chart, control_plane, "--dry-run=server")
+        assert done.returncode == 0, done.stderr

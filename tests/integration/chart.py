@@ -38,7 +38,19 @@ def render(*arguments: str, chart: str | Path = "fractus") -> list[Body]:
     """The objects of a chart, one of the checkout's by its name or another by its path, rendered by helm."""
     argv = [helm(), "template", Path(chart).stem, str(CHARTS / chart), "--namespace", SYSTEM, KUBERNETES]
     done = subprocess.run([*argv, *arguments], capture_output=True, text=True, timeout=60, check=True)
-    return [body for body in yaml.safe_load_all(done.stdout) if body]
+    return [body for body in yaml.load_all(done.stdout, Loader=yaml.CSafeLoader) if body]
+
+
+def values_of(chart: str) -> Iterator[tuple[str, Any]]:
+    """The values of a chart with their names, but for limits and labels, where one that is missing is meant to be."""
+
+    def within(values: Body, above: str) -> Iterator[tuple[str, Any]]:
+        for key, value in values.items():
+            yield f"{above}{key}", value
+            if isinstance(value, dict) and key not in {"resources", "labels"}:
+                yield from within(value, f"{above}{key}.")
+
+    return within(yaml.safe_load((CHARTS / chart / "values.yaml").read_text()), "")
 
 
 def values_of(chart: str) -> Iterator[tuple[str, Any]]:

@@ -18,21 +18,31 @@ RUN apt-get update -q \
  && rm -rf /var/lib/apt/lists/*
 RUN python3 -m pip install --quiet --no-cache-dir --break-system-packages --root-user-action=ignore uv==${UV_VERSION}
 
+# ---- packages: `record FOLDER PACKAGE...` writes down whose files FOLDER has, as images of distroless do: scanners read names,
+# versions and checksums there, people the licences
+FROM tools AS packages
+RUN printf '%s\n' '#!/bin/sh -e' 'cd "$1"; shift; mkdir -p var/lib/dpkg/status.d' 'for name; do' \
+      '  dpkg-query --status "$name" > "var/lib/dpkg/status.d/$name"' \
+      '  cp "$(dpkg-query --control-path "$name" md5sums)" "var/lib/dpkg/status.d/$name.md5sums"' \
+      '  cp -L --parents "/usr/share/doc/$name/copyright" .' \
+      'done' > /usr/local/bin/record && chmod 755 /usr/local/bin/record
+
 # ---- root: Python, the libraries it links to, a shell; no package manager, no documentation
 # Python reads its library and dependencies from .pyc files alone, for sources would double them; docstrings, which numpy needs,
 # stay. Modules for tests, and those whose libraries are not here, go.
-FROM tools AS root
-RUN mkdir -p /out/usr/bin /out/usr/sbin /out/usr/lib /out/usr/lib64 /out/etc /out/run /out/proc /out/sys /out/dev \
+FROM packages AS root
+RUN packages='base-files gcc-12-base libc6 libgcc-s1 libstdc++6 zlib1g libssl3 libffi8 libexpat1 libbz2-1.0 liblzma5 libuuid1 \
+      libsqlite3-0 python3-minimal python3.11-minimal libpython3.11-minimal libpython3.11-stdlib busybox media-types netbase' \
+ && mkdir -p /out/usr/bin /out/usr/sbin /out/usr/lib /out/usr/lib64 /out/etc /out/run /out/proc /out/sys /out/dev \
       /out/var/lib /out/var/log /out/home/fractus /out/usr/local/lib/python3.11/dist-packages /out/usr/local/bin \
  && ln -s usr/bin usr/sbin usr/lib usr/lib64 /out/ && ln -s /run /out/var/run && mkdir -m 1777 /out/tmp /out/var/tmp \
- && dpkg -L base-files libc6 libgcc-s1 libstdc++6 zlib1g libssl3 libffi8 libexpat1 libbz2-1.0 liblzma5 libuuid1 \
-      libsqlite3-0 python3-minimal python3.11-minimal libpython3.11-minimal libpython3.11-stdlib \
-      busybox media-types netbase | sort -u \
+ && dpkg -L $packages | sort -u \
   | grep -Ev '^/usr/share/(doc|man|locale|lintian|bug|perl5|base-files|binfmts)|/gconv/|__pycache__|/(audit|ld-)[^/]*/' \
   | grep -Ev '/python3.11/(lib2to3|pydoc_data|idlelib|tkinter|unittest/test|test/|ensurepip|config-|turtle)' \
   | grep -Ev '/lib-dynload/(_test|_ctypes_test|_xxtest|xxlimited|_crypt|_curses|_dbm|nis|readline)' \
   | while read -r path; do if [ -L "$path" ] || [ ! -d "$path" ]; then echo "$path"; fi; done \
   | grep -Ev '^/(bin|sbin|lib|lib64|var/run|var/lock)$' | xargs cp -a --parents -t /out \
+ && record /out $packages \
  && ln -sf python3.11 /out/usr/bin/python3 && ln -sf python3.11 /out/usr/bin/python \
  && for name in sh ls cat ps env sleep ip wget nc vi grep top kill mkdir rm cp mv tail head id hostname; do \
       [ -e /out/usr/bin/$name ] || ln -s busybox /out/usr/bin/$name; done \
@@ -44,12 +54,13 @@ RUN mkdir -p /out/usr/bin /out/usr/sbin /out/usr/lib /out/usr/lib64 /out/etc /ou
  && python3 -m compileall -q -b --invalidation-mode unchecked-hash -s /out /out/usr/lib/python3.11 && find /out/usr/lib/python3.11 -name '*.py' -delete
 
 # ---- nft: the program that makes the table of direct links, and the libraries that nothing else needs
-FROM tools AS nft
+FROM packages AS nft
 RUN apt-get update -q && DEBIAN_FRONTEND=noninteractive apt-get install -qy --no-install-recommends nftables >/dev/null \
  && rm -rf /var/lib/apt/lists/* \
  && libraries=/out/usr/lib/$(basename "$(dirname "$(ldconfig -p | awk '/libnftables.so.1/ {print $NF; exit}')")") \
  && mkdir -p "$libraries" /out/usr/bin && cp /usr/sbin/nft /out/usr/bin/ \
- && ldd /usr/sbin/nft | awk '$2 == "=>" && $1 !~ /^libc\.so/ {print $3}' | xargs cp -L -t "$libraries"
+ && ldd /usr/sbin/nft | awk '$2 == "=>" && $1 !~ /^lib[cm]\.so/ {print $3}' > needed && xargs cp -L -t "$libraries" < needed \
+ && record /out nftables $(xargs readlink -f < needed | sed 's,.*/,*/,' | xargs dpkg -S | cut -d : -f 1 | sort -u)
 
 # ---- dependencies: one directory for each set, holding what the sets below it do not have already
 # Of the Kubernetes client only the asynchronous half is kept, without its 700 classes: `import kubernetes` would run the

@@ -11,8 +11,12 @@ import importlib.util
 import json
 import os
 import pkgutil
+import platform
+import sqlite3
+import ssl
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 
 def lacking() -> set[str]:
@@ -34,6 +38,14 @@ def modules() -> Iterator[str]:
             for module in pkgutil.walk_packages(found.__path__, package.name + "."):
                 if not module.name.endswith("__main__"):
                     yield module.name
+
+
+def packages() -> None:
+    """The versions that scanners read are of what runs."""
+    records = Path("/var/lib/dpkg/status.d")
+    assert f"Version: {platform.python_version()}-" in (records / "libpython3.11-stdlib").read_text()
+    assert f"Version: {ssl.OPENSSL_VERSION.split()[1]}-" in (records / "libssl3").read_text()
+    assert f"Version: {sqlite3.sqlite_version}-" in (records / "libsqlite3-0").read_text()
 
 
 def linear_algebra() -> None:
@@ -147,6 +159,7 @@ def calls() -> None:
 def main() -> None:
     """Run what the image has libraries for."""
     found = lacking()
+    packages()
     for library, check in (
         ("numpy", linear_algebra),
         ("shapely", geometry),

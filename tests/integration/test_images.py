@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import re
 import subprocess
+import tomllib
 from collections.abc import Iterator
+from importlib.metadata import distributions
 from pathlib import Path
 
 import pytest
@@ -27,6 +31,12 @@ LACKING = {
     "sim": _SERVICE | {"pyproj", "scipy", "tifffile"},
     "view": {"cryptography", "fractus", "fractus_mavlink", "fractus_services"},
 }
+
+
+# What the Dockerfile writes itself.
+WRITTEN = {"etc/passwd", "etc/group", "etc/nsswitch.conf"}
+# Modules of which Debian has links, which have no checksum.
+LINKED = ("sitecustomize", "_sysconfigdata__linux_")
 
 
 @pytest.fixture(scope="module")
@@ -55,3 +65,48 @@ def test_has_what_its_programs_call(image: tuple[str, str]) -> None:
     assert done.returncode == 0, done.stderr
     print(done.stdout)
     assert set(json.loads(done.stdout.splitlines()[-1])) == LACKING.get(target, _COMPONENT)
+
+
+@pytest.mark.parametrize("image", TARGETS, indirect=True)
+def test_tells_the_package_of_each_file_of_debian(image: tuple[str, str]) -> None:
+    root = Path(run(["buildah", "mount", image[1]]).stdout.strip())
+    records = root / "var" / "lib" / "dpkg" / "status.d"
+    packages = {path.name for path in records.iterdir() if path.suffix != ".md5sums"}
+    known, checksums = set(), set()
+    for name in packages:
+        stanza = (records / name).read_text()
+        assert re.search(rf"^Package: {re.escape(name)}$", stanza, re.MULTILINE)
+        assert re.search(r"^Version: \d\S+$", stanza, re.MULTILINE)
+        lines = (records / f"{name}.md5sums").read_text().splitlines()
+        known |= {line.split(maxsplit=1)[1] for line in lines}
+        checksums |= {line.split()[0] for line in lines} | set(re.findall(r"\b[0-9a-f]{32}\b", stanza))
+        assert (root / "usr" / "share" / "doc" / name / "copyright").is_file()
+
+    def told(path: Path) -> bool:
+        if path.suffix == ".pyc":
+            return f"{path.relative_to(root).with_suffix('.py')}" in known or path.name.startswith(LINKED)
+        return hashlib.md5(path.read_bytes(), usedforsecurity=False).hexdigest() in checksums
+
+    ours = {root / "app", root / "usr" / "local", records}
+    files = [
+        path for path in root.rglob("*") if path.is_file() and not path.is_symlink() and ours.isdisjoint(path.parents)
+    ]
+    assert len(files) > 600
+    assert {f"{path.relative_to(root)}" for path in files if not told(path)} == WRITTEN
+
+
+@pytest.mark.parametrize("image", TARGETS, indirect=True)
+def test_tells_the_distribution_of_each_python_package(image: tuple[str, str]) -> None:
+    root = Path(run(["buildah", "mount", image[1]]).stdout.strip())
+    here = root / "usr" / "local" / "lib" / "python3.11" / "dist-packages"
+    found = list(distributions(path=[str(here)]))
+    locked = {
+        package["name"]: package["version"] for package in tomllib.loads((ROOT / "uv.lock").read_text())["package"]
+    }
+    named = {re.sub(r"[-_.]+", "-", each.metadata["Name"]).lower(): each.version for each in found}
+    assert named.items() <= locked.items()
+    told = {file.parts[0] for each in found for file in each.files or ()}
+    strangers = {
+        f"{path.name.removesuffix('c')}" if path.suffix == ".pyc" else path.name for path in here.iterdir()
+    } - told
+    assert {name for name in strangers if not name.startswith("fractus")} == set()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import uuid
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -175,6 +176,28 @@ def test_no_pod_gets_to_a_drone_by_naming_it(world: World, chart: None, namespac
 # -- the operator's own permissions --
 
 
+def test_the_operator_reads_no_secret(control_plane: ControlPlane, world: World, chart: None, namespace: str) -> None:
+    """But the key of the authority; in whatever way: a patch would answer with what is there, and so would a collection's end."""
+    client = control_plane.with_token(operator_token(world))
+    for place in (namespace, "kube-system", SYSTEM):
+        secrets = f"/api/v1/namespaces/{place}/secrets"
+        body = {"apiVersion": "v1", "kind": "Secret", "metadata": {"name": "theirs", "namespace": place}}
+        world.api.apply(f"{secrets}/theirs", body)
+        try:
+            for method, path, verb in (
+                ("GET", secrets, "list"),
+                ("GET", f"{secrets}?watch=true", "watch"),
+                ("GET", f"{secrets}/theirs", "get"),
+                ("DELETE", f"{secrets}?dryRun=All", "deletecollection"),
+            ):
+                denied(partial(client.call, method, path), f'cannot {verb} resource "secrets"')
+            denied(partial(client.merge, f"{secrets}/theirs", {}), 'cannot patch resource "secrets"')
+            denied(partial(client.apply, f"{secrets}/theirs", body), 'cannot patch resource "secrets"')
+        finally:
+            world.api.delete(f"{secrets}/theirs")
+    denied(partial(client.call, "GET", "/api/v1/secrets"), 'cannot list resource "secrets"')
+
+
 def test_the_operator_writes_nothing_that_it_has_not_made(
     control_plane: ControlPlane, world: World, chart: None, namespace: str
 ) -> None:
@@ -186,12 +209,11 @@ def test_the_operator_writes_nothing_that_it_has_not_made(
     made = "writes only the secrets that it has made itself"
     try:
         wait_for(lambda: _probe_refused(client), "the admission policy to be in force")
-        # A patch would answer with the whole Secret: what is refused is not told either.
-        denied(lambda: client.merge(theirs, {}), made)
-        denied(lambda: client.merge(theirs, ours_too), made)
-        denied(lambda: client.apply(theirs, body | {"data": {}}), made)
+        secrets = theirs.rpartition("/")[0]
+        labelled = body | {"metadata": body["metadata"] | ours_too["metadata"], "type": "Opaque"}
+        denied(lambda: client.call("PUT", theirs, labelled), made)
         denied(lambda: client.delete(theirs), made)
-        denied(lambda: client.apply(theirs.replace("theirs", "fresh"), body | {"metadata": {"name": "fresh"}}), made)
+        denied(lambda: client.call("POST", secrets, body | {"metadata": {"name": "fresh"}}), made)
         container = {"name": "main", "image": "registry.test/theirs:1"}
         pod = {"apiVersion": "v1", "kind": "Pod", "metadata": {"name": "theirs"}, "spec": {"containers": [container]}}
         pods = f"/api/v1/namespaces/{namespace}/pods"

@@ -137,12 +137,12 @@ def _invalid(world: World, namespace: str) -> None:
     world.put(manifest)
 
 
-def _foreign_secret(world: World, namespace: str) -> None:
-    path = f"/api/v1/namespaces/{namespace}/secrets/traffic-navigator-tls"
-    world.api.merge(path, {"metadata": {"ownerReferences": None, "annotations": None}, "data": {"tls.crt": ""}})
+def _foreign_deployment(world: World, namespace: str) -> None:
+    path = f"/apis/apps/v1/namespaces/{namespace}/deployments/traffic-navigator"
+    world.api.merge(path, {"metadata": {"ownerReferences": None, "annotations": None}})
 
 
-@pytest.mark.parametrize("trouble", [_infeasible, _invalid, _foreign_secret])
+@pytest.mark.parametrize("trouble", [_infeasible, _invalid, _foreign_deployment])
 def test_no_trouble_keeps_a_policy_from_a_grant(
     world: World, operator: OperatorProcess, namespace: str, trouble: Any
 ) -> None:

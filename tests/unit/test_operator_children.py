@@ -96,7 +96,7 @@ def made_on(store: Webhooks) -> Children:
     return Children(cast(Any, store), cast(Any, defaultdict(Copy)), cast(Any, signer))
 
 
-@pytest.mark.parametrize(("hanging", "full"), [(kinds.SECRET, 2), (kinds.DEPLOYMENT, 8)])
+@pytest.mark.parametrize(("hanging", "full"), [(kinds.SERVICE, 2), (kinds.DEPLOYMENT, 8)])
 async def test_what_hangs_holds_up_neither_plans_nor_grants(hanging: Kind, full: int) -> None:
     store = Webhooks(hanging, full)
     children = made_on(store)
@@ -220,7 +220,7 @@ async def test_a_deployment_with_another_owner_is_removed(owner: str) -> None:
     body["metadata"]["ownerReferences"][0]["kind"] = owner
     copies[kinds.DEPLOYMENT].note((APPLICATION.key[0], "one"), body)
     assert await Children(cast(Any, store), copies, cast(Any, None)).remove(APPLICATION.key, kinds.DEPLOYMENT)
-    assert store.said == ["delete Deployment"]
+    assert store.said == ["delete Deployment", "delete Secret"]
 
 
 @pytest.mark.parametrize("kept", [True, False])
@@ -251,7 +251,7 @@ async def test_a_deployment_that_a_finalizer_keeps_takes_no_pods_along(kept: boo
     live = SimpleNamespace(applications={("city", "a"): SimpleNamespace(settled_generation=None)})
     children = Children(cast(Any, store), copies, cast(Any, None))
     await FinishedPods(cast(Any, store), cast(Any, live), children, lambda: NOW).tear_down(("city", "a"))
-    assert store.said == ["delete Deployment", *(["delete ReplicaSet", "delete Pod"] if kept else [])]
+    assert store.said == ["delete Deployment", "delete Secret", *(["delete ReplicaSet", "delete Pod"] if kept else [])]
 
 
 async def test_a_pod_that_was_kept_is_left_to_no_garbage_collector() -> None:
@@ -363,7 +363,7 @@ class Spelling(Webhooks):
         written = await super().written(how, kind, body)
         return {**written, "spec": {"cpu": "500m"}, "metadata": {**written["metadata"], "resourceVersion": "1"}}
 
-    async def delete(self, kind: Kind, key: Key, _uid: str | None, *, orphan: bool = False) -> bool:
+    async def delete(self, kind: Kind, key: Key, _uid: str | None = None, *, orphan: bool = False) -> bool:
         self.said.append(f"delete {kind.name}")
         return (kind, key[1]) not in self.kept
 
@@ -381,6 +381,81 @@ async def test_what_is_removed_is_not_remembered_how_it_was_spelled() -> None:
         await children.apply(APPLICATION, {kinds.DEPLOYMENT: [one]})
     assert store.said == ["create Deployment"], "the same, spelled differently, is not written again"
     nothing: dict[Kind, list[Body]] = {kind: [] for kind in kinds.CHILDREN}
-    await children.prune(APPLICATION, nothing, keep_secrets=())
-    assert store.said[1:] == ["delete Deployment"]
+    await children.prune(APPLICATION, nothing)
+    assert store.said[1:] == ["delete Deployment", "delete Secret"]
     assert not children._normalised
+
+
+class Secrets:
+    """An API server that lets Secrets be written and deleted, and never read."""
+
+    def __init__(self, *there: str) -> None:
+        self.there = set(there)
+        self.said: list[str] = []
+        self.refused = False
+
+    async def create(self, kind: Kind, body: Body) -> Body:
+        self.said.append("create")
+        if body["metadata"]["name"] in self.there:
+            raise Conflict(409, "AlreadyExists", "it is there")
+        self.there.add(body["metadata"]["name"])
+        return body
+
+    async def replace(self, kind: Kind, body: Body) -> Body:
+        self.said.append("replace")
+        if body["metadata"]["name"] not in self.there:
+            raise NotFound(404, "NotFound", "it is gone")
+        return body
+
+    async def delete(self, kind: Kind, key: Key, _uid: str = "", *, orphan: bool = False) -> bool:
+        if kind is kinds.SECRET:
+            if self.refused:
+                raise KubeError(422, "Invalid", "no")
+            self.there.discard(key[1])
+        self.said.append(f"delete {kind.name}")
+        return True
+
+
+@pytest.mark.parametrize(
+    ("why", "there", "said"),
+    [
+        ("new", False, ["create"]),
+        ("new", True, ["create", "replace"]),
+        ("renewed", True, ["replace"]),
+        ("renewed", False, ["replace", "create"]),
+        ("lost", True, ["create"]),
+        ("lost", False, ["create"]),
+    ],
+)
+async def test_secrets_are_written_without_a_look(why: Any, there: bool, said: list[str]) -> None:
+    store = Secrets(*["one-tls"] * there)
+    children = made_on(cast(Any, store))
+    assert await children.write_secret(APPLICATION, "one", kinds.SECRET.header("one-tls", "city"), why)
+    assert store.said == said
+    assert store.there == {"one-tls"}
+
+
+async def test_no_secret_of_anothers_deployment_is_written() -> None:
+    store = Secrets()
+    copies = {kind: Made(cast(Any, store), kind, lambda body: body, lambda *_: None) for kind in kinds.CHILDREN}
+    copies[kinds.DEPLOYMENT].note((APPLICATION.key[0], "one"), kinds.DEPLOYMENT.header("one", APPLICATION.key[0]))
+    children = Children(cast(Any, store), copies, cast(Any, None))
+    assert not await children.write_secret(APPLICATION, "one", kinds.SECRET.header("one-tls", "city"), "new")
+    assert store.said == []
+
+
+async def test_the_secret_of_a_deployment_goes_with_it_and_is_deleted_again_where_that_was_refused() -> None:
+    store = Secrets("one-tls")
+    copies = {kind: Made(cast(Any, store), kind, lambda body: body, lambda *_: None) for kind in kinds.CHILDREN}
+    children = Children(cast(Any, store), copies, cast(Any, None))
+    copies[kinds.DEPLOYMENT].note((APPLICATION.key[0], "one"), child(kinds.DEPLOYMENT, APPLICATION, "one", {}))
+    store.refused = True
+    with pytest.raises(KubeError, match="no"):
+        await children.remove(APPLICATION.key, kinds.DEPLOYMENT)
+    assert store.said == ["delete Deployment"], "what runs goes first"
+    store.refused = False
+    await children.remove(APPLICATION.key, kinds.SERVICE)
+    assert store.there == set()
+    store.said.clear()
+    await children.remove(APPLICATION.key, kinds.SERVICE)
+    assert store.said == []

@@ -57,7 +57,6 @@ SIGNING_REQUEST = Kind("certificates.k8s.io/v1", "CertificateSigningRequest", "c
 CHILDREN: tuple[Kind, ...] = (
     GRANT,
     DEPLOYMENT_PLAN,
-    SECRET,
     SERVICE,
     ENDPOINT_SLICE,
     NETWORK_POLICY,
@@ -65,4 +64,4 @@ CHILDREN: tuple[Kind, ...] = (
     DEPLOYMENT,
     DIRECT_LINK,
 )
-"""What the operator makes for an Application, in the order in which it is applied."""
+"""What the operator makes for an Application and follows, in the order in which it is applied; Secrets it writes and cannot read."""

@@ -26,6 +26,9 @@ DIGEST_ANNOTATION = f"{GROUP}/applied"
 CAUSE_ANNOTATION = f"{GROUP}/cause"
 """On Deployments: DIGEST@NODE, of what the manifest says of the component, and the node that it is made for."""
 
+CERTIFICATE_ANNOTATION = f"{GROUP}/certificate"
+"""On Deployments: the public half of what is in the Secret of the instance, base64 of the certificate and of its authority's."""
+
 FINISHED_LABEL = f"{GROUP}/finished"
 """On pods that are stopped, and kept for their logs: since when, as FINISHED_FORMAT."""
 

@@ -64,7 +64,6 @@ _BESIDE_PODS = (
     kinds.ENDPOINT_SLICE,
     kinds.NETWORK_POLICY,
     kinds.SERVICE,
-    kinds.SECRET,
 )
 """What is removed when a mission is over: first rights, then what runs, then the rest. The plan stays, as its record."""
 
@@ -189,7 +188,7 @@ class Applications:
             await self._children.revoke(key)
             await self._finished_pods.tear_down(key)
         self._memories.pop(key, None)
-        for part in (self._grants, self._notes, self._reporter, self._live):
+        for part in (self._grants, self._notes, self._reporter, self._rollout, self._live):
             part.forget(key)
 
     # -- steps --
@@ -268,7 +267,7 @@ class Applications:
         if application is None:
             raise Blocked("Invalid", "Planned", "Invalid", str(seen.submitted.error))
         if seen.plan is not None and waits_for_landing(application, seen.plan, seen.in_flight):
-            await self._rollout.renew_certificates(application, seen.plan)
+            await self._rollout.renew_certificates(application, seen.plan, seen.pods)
             await self._rollout.follow_pods(seen.key, seen.plan, seen.pods)
             return status.waiting(self._deployed(seen, seen.plan, len(seen.grants)), seen.in_flight or ""), RESYNC_S
         try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, assert_never
+from typing import Any, Literal, assert_never
 
 from fractus_core.api import API_VERSION, Application, Component, Drone
 from fractus_core.api.containers import TLS_DIR
@@ -20,6 +20,9 @@ from fractus_operator.cluster.pods import PodView
 COMPONENT_USER = 10001
 MOBILITY_PORT = 50051
 CAMERA_PORT = 50052
+
+SecretWrite = Literal["new", "renewed", "lost"]
+"""Why a Secret is written: there is none that is known of; it is due; or its pod may wait for one that is gone."""
 
 
 def children(

@@ -7,11 +7,15 @@ import json
 from typing import Any
 
 from fractus_operator.cluster.kinds import Body
-from fractus_operator.cluster.labels import DIGEST_ANNOTATION
+from fractus_operator.cluster.labels import CERTIFICATE_ANNOTATION, DIGEST_ANNOTATION
 
 
 def digest(desired: Body) -> str:
-    """A digest of what is to be applied."""
+    """A digest of what is to be applied; a certificate that is renewed changes nothing else."""
+    annotations = desired["metadata"].get("annotations") or {}
+    if CERTIFICATE_ANNOTATION in annotations:
+        rest = {name: value for name, value in annotations.items() if name != CERTIFICATE_ANNOTATION}
+        desired = {**desired, "metadata": {**desired["metadata"], "annotations": rest}}
     return hashlib.sha256(json.dumps(desired, sort_keys=True, separators=(",", ":")).encode()).hexdigest()[:16]
 
 

@@ -5,22 +5,23 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 
-from fractus_core.api import Application, InvalidObject, component_identity
-from fractus_core.api.plans import DeploymentPlanSpec, GrantSpec, PlannedInstance
+from fractus_core.api import Application, InvalidObject
+from fractus_core.api.plans import DeploymentPlanSpec, GrantSpec
 from fractus_core.identity.authority import Authority
 from fractus_core.planning.links import flown_path, plan_links
 
 from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Body, Key, Kind, key_of
-from fractus_operator.cluster.labels import CAUSE_ANNOTATION, COMPONENT_LABEL
+from fractus_operator.cluster.labels import CAUSE_ANNOTATION, CERTIFICATE_ANNOTATION, COMPONENT_LABEL
 from fractus_operator.cluster.pods import PodView
 from fractus_operator.inventory.bookings import ByName
 from fractus_operator.inventory.live import LiveInventory
 from fractus_operator.reconcile import builders
-from fractus_operator.reconcile.children import Children
+from fractus_operator.reconcile.certificates import Certificate, Certificates
+from fractus_operator.reconcile.children import Children, every
 from fractus_operator.reconcile.difference import contains
 from fractus_operator.reconcile.isolation import network_policies
 from fractus_operator.reconcile.links import direct_links, retargeted
@@ -45,8 +46,7 @@ class Rollout:
     ) -> None:
         self._children = children
         self._live = live
-        self._authority = authority
-        self._clock = clock
+        self._certificates = Certificates(authority, clock)
         self.under_way = 0
         """How many applications are being rolled out."""
 
@@ -91,10 +91,12 @@ class Rollout:
         wanted = builders.children(application, decided, grants, pods, self._live.drone)
         wanted[kinds.NETWORK_POLICY] = network_policies(application, decided)
         wanted[kinds.DIRECT_LINK] = self._links(application, decided, pods)
-        secrets = {builders.secret_name(placed.instance): placed for placed in decided.placements}
+        certificates = self._certified(application, decided, pods)
+        for body in wanted[kinds.DEPLOYMENT]:
+            body["metadata"]["annotations"] |= _noted(certificates[body["metadata"]["name"]])
         # The plan before all else: it tells, also after a crash, which application flies the drone and which share its flight.
         await self._children.apply(application, {kinds.DEPLOYMENT_PLAN: wanted[kinds.DEPLOYMENT_PLAN]})
-        await self._children.prune(application, wanted, keep_secrets=secrets.keys())
+        await self._children.prune(application, wanted)
         running = [body for body in wanted[kinds.DEPLOYMENT] if not self._is_in_flight(body, decided)]
         starts = not all(self._is_there(kinds.DEPLOYMENT, body) for body in running)
         granted = [body for body in wanted[kinds.GRANT] if self._is_there(kinds.GRANT, body)]
@@ -104,8 +106,8 @@ class Rollout:
 
         async def beside() -> None:
             await asyncio.wait({made}, timeout=_HEAD_START_S)
-            certificates = [self._certificate(application, placed) for placed in secrets.values()]
-            await self._children.apply(application, {kinds.SECRET: certificates})
+            # Without its Deployment an instance waits for no certificate; where that is another's, its Secret may be, too.
+            await self._write(application, certificates, of_all=not made.done())
 
         async def after() -> bool:
             if starts:
@@ -144,6 +146,10 @@ class Rollout:
             await self._children.apply(
                 application, {kinds.DEPLOYMENT_PLAN: [builders.deployment_plan(application, kept)]}
             )
+
+    def forget(self, key: Key) -> None:
+        """An application is gone."""
+        self._certificates.forget(key)
 
     def _is_there(self, kind: Kind, body: Body) -> bool:
         return self._children.get(kind, key_of(body)) is not None
@@ -213,23 +219,57 @@ class Rollout:
             if present != services:
                 await self._children.change(kinds.DIRECT_LINK, body, {"spec": {"services": present}})
 
-    async def renew_certificates(self, application: Application, plan: DeploymentPlanSpec) -> None:
+    async def renew_certificates(
+        self, application: Application, plan: DeploymentPlanSpec, pods: Sequence[PodView]
+    ) -> None:
         """Renew the certificates of what runs by a plan, and change nothing else.
 
         Raises:
             KubeError: the API server refuses one, or cannot be reached.
         """
-        renewed = [self._certificate(application, placed) for placed in plan.placements]
-        await self._children.apply(application, {kinds.SECRET: renewed})
+        await self._write(application, self._certified(application, plan, pods), of_all=False)
 
-    def _certificate(self, application: Application, placed: PlannedInstance) -> Body:
-        """The Secret of an instance: the present certificate while it is good, so that a restart renews nothing."""
-        namespace, name = application.key
-        identity = component_identity(namespace, name, placed.component, placed.instance)
-        place = (namespace, builders.secret_name(placed.instance))
-        observed = self._children.get(kinds.SECRET, place)
-        data = dict((observed or {}).get("data") or {})
-        now = self._clock()
-        if not self._authority.is_current(data, identity, now):
-            data = self._authority.issue_component(identity, now)
-        return builders.tls_secret(application, placed, data)
+    def _certified(
+        self, application: Application, plan: DeploymentPlanSpec, pods: Sequence[PodView]
+    ) -> dict[str, Certificate]:
+        """The certificates of all instances of a plan."""
+        namespace, _ = application.key
+
+        def deployment(instance: str) -> Body | None:
+            return self._children.get(kinds.DEPLOYMENT, (namespace, instance))
+
+        return {
+            placed.instance: self._certificates.of(application, placed, deployment(placed.instance), pods)
+            for placed in plan.placements
+        }
+
+    async def _write(self, application: Application, certificates: Mapping[str, Certificate], *, of_all: bool) -> None:
+        """Write the Secrets that are due, and then what their Deployments say of them; one that fails stops no other.
+
+        Args:
+            application: Whose they are.
+            certificates: By instance.
+            of_all: Also of instances whose Deployments are not there yet.
+        """
+        namespace, _ = application.key
+        due = [
+            (instance, certificate)
+            for instance, certificate in certificates.items()
+            if certificate.secret is not None
+            and (of_all or self._children.get(kinds.DEPLOYMENT, (namespace, instance)) is not None)
+        ]
+        await every(self._write_one(application, *one) for one in due)
+
+    async def _write_one(self, application: Application, instance: str, certificate: Certificate) -> None:
+        assert certificate.secret is not None
+        with self._certificates.written(application.key, instance):
+            written = await self._children.write_secret(application, instance, certificate.secret, certificate.why)
+        observed = self._children.get(kinds.DEPLOYMENT, (application.key[0], instance))
+        if written and certificate.public and observed is not None:
+            said = {"annotations": {CERTIFICATE_ANNOTATION: certificate.public}}
+            await self._children.change(kinds.DEPLOYMENT, observed, {"metadata": said})
+
+
+def _noted(certificate: Certificate) -> dict[str, str]:
+    """What a Deployment says of its instance's certificate."""
+    return {CERTIFICATE_ANNOTATION: certificate.noted} if certificate.noted else {}

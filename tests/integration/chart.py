@@ -53,18 +53,6 @@ def values_of(chart: str) -> Iterator[tuple[str, Any]]:
     return within(yaml.safe_load((CHARTS / chart / "values.yaml").read_text()), "")
 
 
-def values_of(chart: str) -> Iterator[tuple[str, Any]]:
-    """The values of a chart with their names, but for limits and labels, where one that is missing is meant to be."""
-
-    def within(values: Body, above: str) -> Iterator[tuple[str, Any]]:
-        for key, value in values.items():
-            yield f"{above}{key}", value
-            if isinstance(value, dict) and key not in {"resources", "labels"}:
-                yield from within(value, f"{above}{key}.")
-
-    return within(yaml.safe_load((CHARTS / chart / "values.yaml").read_text()), "")
-
-
 def helm() -> str:
     """The program, as the embedded cluster has it, or from the PATH."""
     caches = sorted((Path.home() / ".cache" / "fractus").glob("*/bin/helm"), reverse=True)

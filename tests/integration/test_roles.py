@@ -25,7 +25,7 @@ READ, WRITE, ALL = ("get", "list", "watch"), ("create", "update", "patch", "dele
 
 @cache
 def chart_roles() -> dict[str, Body]:
-    """The roles that somebody may bind, by name."""
+    """The roles that someone may bind, by name."""
     names = {f"fractus-{kind}-{role}" for kind in KINDS for role in ("viewer", "editor", "admin")}
     return {body["metadata"]["name"]: body for body in render() if body["metadata"]["name"] in names}
 

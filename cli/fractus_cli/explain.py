@@ -9,24 +9,24 @@ from typing import Any
 import click
 
 from fractus_cli.output import output_option, printable
-from fractus_cli.reading import EXIT_PROBLEM, GROUP, Body, Cluster, cluster, kubeconfig_option
+from fractus_cli.reading import EXIT_PROBLEM, GROUP, Body, Cluster, application, cluster, kubeconfig_option
 
 _LISTED = 5
 
 
 @click.command()
-@click.argument("application")
+@click.argument("name", metavar="APPLICATION")
 @click.option("-n", "--namespace", default="default", show_default=True, help="Of the application.")
 @click.option("--all", "everything", is_flag=True, help="List every rejected node and event, not the first five.")
 @output_option
 @kubeconfig_option
-def explain(application: str, namespace: str, everything: bool, output: str, config: str | None) -> int:
+def explain(name: str, namespace: str, everything: bool, output: str, config: str | None) -> int:
     """Say why APPLICATION runs where it runs, why not elsewhere, and which policy did what.
 
     Exits with 2 where it has no plan, or where policies do not let its mission be flown as planned.
     """
     with cluster(config) as found:
-        seen = look(found, namespace, application)
+        seen = look(found, namespace, name)
     shown = map(printable, lines(seen, None if everything else _LISTED))
     click.echo(json.dumps(seen) if output == "json" else "\n".join(shown))
     conflict = (seen["drone"] or {}).get("policyConflict")
@@ -40,9 +40,7 @@ def look(found: Cluster, namespace: str, name: str) -> dict[str, Any]:
         ClickException: there is no such application.
     """
     scope = f"{GROUP}/namespaces/{namespace}"
-    body = found.get(f"{scope}/applications/{name}")
-    if body is None:
-        raise click.ClickException(f"there is no Application {namespace}/{name}; see fractus status")
+    body = application(found, namespace, name)
     plans = [p for p in found.list(f"{scope}/deploymentplans") if p["spec"]["application"] == name]
     plan: Body = plans[0]["spec"] if plans else {}
     listed = found.list_permitted(f"{GROUP}/grants")

@@ -60,6 +60,7 @@ COMMANDS: dict[str, Entry] = {
     "forward": Entry("fractus_cli.forward:forward", "Send what an autopilot says to a ground station, read only.", "services"),
     "grants": Entry("fractus_cli.grants:grants", "Sign Grants and make certificates, without Kubernetes.", "operator"),
     "images": Entry("fractus_cluster.images.cli:images", "Build the container images of Fractus with buildah.", "sim"),
+    "logs": Entry("fractus_cli.logs:logs", "Show what the pods of an Application print.", "kube"),
     "mobility": Entry("fractus_services.commands:mobility", "The mobility service of a drone.", "services"),
     "plan": Entry("fractus_cli.plan:plan", "Plan the Applications in some manifests, without a cluster.", "core"),
     "policy": Entry("fractus_cli.policy:policy", "Ask the policy engine, without a cluster.", "core"),

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import difflib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from http import HTTPStatus
 from typing import Any
 
 import click
-from fractus_kube import BlockingClient, KubeError, NotFound, from_environment, kubeconfig
+from fractus_kube import Access, BlockingClient, KubeError, NotFound, from_environment, kubeconfig
 
 Body = Mapping[str, Any]
 
@@ -72,13 +73,51 @@ def cluster(config: str | None) -> Iterator[Cluster]:
         Unconfigured: there are no credentials.
         ClickException: the API server refused what the command asked for, or could not be reached.
     """
-    access = asyncio.run(kubeconfig(config) if config is not None else from_environment())
-    with BlockingClient(access, "fractus", trust_env=True) as client:
-        try:
-            yield Cluster(client)
-        except KubeError as error:
-            remedy = "check your permissions" if error.status else "check the cluster and --kubeconfig"
-            raise click.ClickException(f"{error}; {remedy}") from error
+    with refusals_explained(), BlockingClient(asyncio.run(access_to(config)), "fractus", trust_env=True) as client:
+        yield Cluster(client)
+
+
+async def access_to(config: str | None) -> Access:
+    """Access to the cluster of a kubeconfig, or the one that kubectl would take.
+
+    Raises:
+        Unconfigured: there are no credentials.
+    """
+    return await (kubeconfig(config) if config is not None else from_environment())
+
+
+@contextmanager
+def refusals_explained() -> Iterator[None]:
+    """Refusals and silence of the API server as the one line that the user sees.
+
+    Raises:
+        ClickException: the API server refused what the command asked for, or could not be reached.
+    """
+    try:
+        yield
+    except (KubeError, ExceptionGroup) as error:
+        first: Exception = error
+        while isinstance(first, ExceptionGroup):
+            first = first.exceptions[0]  # what failed first is the cause; the others were cancelled by it
+        if not isinstance(first, KubeError):
+            raise
+        remedy = "check your permissions" if first.status else "check the cluster and --kubeconfig"
+        raise click.ClickException(f"{first}; {remedy}") from first
+
+
+def application(found: Cluster, namespace: str, name: str) -> Body:
+    """An Application.
+
+    Raises:
+        ClickException: there is none of that name; it names the nearest.
+    """
+    body = found.get(f"{GROUP}/namespaces/{namespace}/applications/{name}")
+    if body is not None:
+        return body
+    there = [b["metadata"]["name"] for b in found.list_permitted(f"{GROUP}/namespaces/{namespace}/applications") or ()]
+    near = difflib.get_close_matches(name, there, n=1)
+    hint = f"did you mean {near[0]}?" if near else "see fractus status"
+    raise click.ClickException(f"there is no Application {namespace}/{name}; {hint}")
 
 
 def conditions_of(body: Body) -> dict[str, Body]:

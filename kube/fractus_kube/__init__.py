@@ -2,7 +2,7 @@
 
 from fractus_kube.access import Access, Unconfigured, from_environment, in_cluster, kubeconfig, with_certificate
 from fractus_kube.blocking import BlockingClient
-from fractus_kube.client import Client, Page
+from fractus_kube.client import POD, Client, Page
 from fractus_kube.connection import ContentType
 from fractus_kube.errors import Conflict, Expired, Invalid, KubeError, NotFound
 from fractus_kube.lease import LEASE, Lease, LeaseThread, LostLease
@@ -12,6 +12,7 @@ from fractus_kube.reflector import Reflector
 
 __all__ = [
     "LEASE",
+    "POD",
     "Access",
     "Backoff",
     "BlockingClient",

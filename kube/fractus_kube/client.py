@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping, Sequence
 from functools import partial
+
+import aiohttp
 
 from fractus_kube.access import with_tokens
 from fractus_kube.connection import Connection, ContentType, translated
@@ -21,6 +23,7 @@ LIST_TIMEOUT_S = 120.0
 PAGE = 250
 """Objects a page: while one is read it takes several times its size."""
 
+POD = Kind("v1", "Pod", "pods", namespaced=True)
 
 _TOKEN_LIFE_S = 3600
 _SERVICE_ACCOUNT = Kind("v1", "ServiceAccount", "serviceaccounts", namespaced=True)
@@ -35,6 +38,22 @@ class Page:
         self.items: list[Body] = body.get("items") or []
         self.resource_version: str = body["metadata"].get("resourceVersion", "")
         self.continue_: str = body["metadata"].get("continue", "")
+
+
+async def _lines(content: aiohttp.StreamReader, silence_s: float | None) -> AsyncIterator[bytes]:
+    """What comes, by lines with their ends; one that was cut off has none."""
+    rest = b""
+    while True:
+        # aiohttp's own time-out ends with the connection, also where that never tells the reader.
+        async with asyncio.timeout(silence_s):
+            chunk = await content.readany()
+        if not chunk:
+            break
+        *lines, rest = (rest + chunk).split(b"\n")
+        for line in lines:
+            yield line + b"\n"
+    if rest:
+        yield rest
 
 
 class Client(Connection):
@@ -156,19 +175,27 @@ class Client(Connection):
         with translated(f"watch of {kind.plural}"):
             async with self.answer("GET", kind.path(namespace), params, silence_s=silence_s) as response:
                 opened()
-                rest = b""
-                while True:
-                    # aiohttp's own time-out ends with the connection, also where that never tells the reader.
-                    async with asyncio.timeout(silence_s):
-                        chunk = await response.content.readany()
-                    if not chunk:
-                        return
-                    *lines, rest = (rest + chunk).split(b"\n")
-                    for line in filter(None, lines):
+                async for line in _lines(response.content, silence_s):
+                    if line.endswith(b"\n") and line.strip():
                         event = json.loads(line)
                         if event["type"] == "ERROR":
                             raise from_status(500, event["object"])
                         yield event["type"], event["object"]
+
+    async def log(self, pod: Key, params: Mapping[str, str], *, silence_s: float | None) -> AsyncGenerator[bytes, None]:
+        """Lines of a container's log, without their ends, until the log ends or, followed, the container does.
+
+        Args:
+            pod: (namespace, name).
+            params: those of the log subresource: container, follow, previous, sinceTime, timestamps and so on.
+            silence_s: How long nothing may come. None where the log is followed: a container may say nothing for hours,
+                and a kubelet answers with its first line.
+        """
+        path = POD.path(*pod, "log")
+        with translated(f"GET {path}"):
+            async with self.answer("GET", path, params, silence_s=silence_s) as response:
+                async for line in _lines(response.content, silence_s):
+                    yield line.rstrip(b"\r\n")
 
     async def create(self, kind: Kind, body: Body, *, strict: bool = True) -> Body:
         """Create an object; if strict, what the API server does not know is refused, as by an apply, not dropped.

@@ -138,7 +138,7 @@ class Connection:
         body: Body | Sequence[Body] | None = None,
         content_type: ContentType = ContentType.JSON,
         *,
-        silence_s: float = REQUEST_TIMEOUT_S,
+        silence_s: float | None = REQUEST_TIMEOUT_S,
     ) -> AsyncIterator[aiohttp.ClientResponse]:
         """The answer to a request, once its head is here and says success.
 

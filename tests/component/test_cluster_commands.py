@@ -178,6 +178,14 @@ def test_explain_fails_where_there_is_no_plan_or_a_conflict(run: Run, explained:
     assert "There is no plan." in said
 
 
+def test_explain_names_the_nearest_application(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    show(monkeypatch, explain, {f"{V1}/namespaces/default/applications": [APPLICATION]})
+    assert run("explain", "trafic") == (
+        1,
+        "fractus: there is no Application default/trafic; did you mean traffic?\n",
+    )
+
+
 # -- doctor --
 
 
@@ -343,6 +351,6 @@ def test_the_page_of_the_command_line_names_every_command() -> None:
     assert rows == {name: entry.summary for name, entry in main.COMMANDS.items()}
 
 
-@pytest.mark.parametrize("name", ["status", "explain", "doctor", "completion"])
+@pytest.mark.parametrize("name", ["status", "explain", "logs", "doctor", "completion"])
 def test_the_page_shows_the_help_of_commands_that_read_clusters(run: Run, name: str) -> None:
     assert run(name, "--help")[1].strip() in DOCS.read_text()

@@ -86,6 +86,7 @@ class ServiceChannel:
         self.reconnect_timeout_s = reconnect_timeout_s
         self._connection: _Connection | None = None
         self._retired: set[_Connection] = set()
+        self._outdated: grpc.aio.AioRpcError | None = None
 
     async def close(self) -> None:
         """Close every connection; calls in flight are cancelled."""
@@ -102,9 +103,18 @@ class ServiceChannel:
         connection.calls += 1
         try:
             yield connection.stub
+        except grpc.aio.AioRpcError as error:
+            # A stream may outlive the certificate that it was opened with.
+            if error.code() is grpc.StatusCode.UNAUTHENTICATED and connection.stamp != self._stamp():
+                self._outdated = error
+            raise
         finally:
             connection.calls -= 1
             await self._close_unused()
+
+    def transient(self, error: grpc.aio.AioRpcError) -> bool:
+        """Whether another attempt may succeed: the service is away, or the certificate was renewed since the call began."""
+        return error is self._outdated or error.code() is grpc.StatusCode.UNAVAILABLE
 
     async def unary(self, method: str, request: Any, *, timeout_s: float | None = None) -> Any:
         """One call with a deadline; while the service restarts it is tried again, for `reconnect_timeout_s` at most, unless in `NOT_RETRIED`.
@@ -222,7 +232,7 @@ class Retries:
         """
         now, delay = asyncio.get_running_loop().time(), next(self._delays)
         self._give_up = self._give_up or now + self._channel.reconnect_timeout_s
-        transient = error is None or error.code() is grpc.StatusCode.UNAVAILABLE
+        transient = error is None or self._channel.transient(error)
         if not (transient and self._retried) or now + delay > self._give_up:
             if error is None:
                 raise Unavailable(f"{self._method}: the service ended the stream")

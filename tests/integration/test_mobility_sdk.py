@@ -7,6 +7,7 @@ import contextlib
 import math
 import signal
 from collections.abc import AsyncIterator, Callable
+from dataclasses import replace
 from typing import TypeVar
 
 import pytest
@@ -14,8 +15,10 @@ from fractus import sync
 from fractus.drone import Mobility
 from fractus.environment import Endpoint
 from fractus.errors import ControlLost, InvalidRequest, MissionComplete, PolicyDenied
+from fractus.pictures import Camera
 from fractus_core.api.names import node_server_name
 from mobility_rig import (
+    ALL,
     DRIVER,
     FRAME,
     NAVIGATOR_MISSION,
@@ -32,12 +35,14 @@ from mobility_rig import (
 T = TypeVar("T")
 
 
-def endpoint(rig: Rig, identity: str = DRIVER) -> Endpoint:
+def endpoint(rig: Rig, identity: str = DRIVER, **how: float) -> Endpoint:
     folder = rig.directory / f"tls-{identity.rpartition('/')[2]}"
     folder.mkdir(exist_ok=True)
-    key, certificate = rig.authority.issue(identity)
+    key, certificate = rig.authority.issue(identity, **how)
     for name, data in (("tls.key", key), ("tls.crt", certificate), ("ca.crt", rig.authority.pem)):
-        (folder / name).write_bytes(data)
+        fresh = folder / f".{name}"
+        fresh.write_bytes(data)
+        fresh.replace(folder / name)
     return Endpoint(rig.address, node_server_name(NODE), folder)
 
 
@@ -177,3 +182,42 @@ async def test_asking_first_and_riding_along(rig: Rig) -> None:
                 assert (ride.visited, ride.complete) == (0, False)
                 if ride.flying:
                     break
+
+
+CALL_EVERY_S = 0.05
+LIFE_S = 8.0
+
+
+async def test_no_call_is_lost_while_certificates_are_renewed_before_they_expire(rig: Rig) -> None:
+    """Of server and client, of mobility and camera, with control of the drone held all the while."""
+    rig.write_grant(
+        grant(services=[{"service": "mobility", "methods": ALL}, {"service": "camera", "methods": ["ListImages"]}])
+    )
+    rig.start_service()
+    camera_address = rig.start_camera()
+    rig.start_vehicle()
+    await rig.until(lambda t: t.ready and t.HasField("position"), 40)
+    clock = asyncio.get_running_loop()
+    rig.write_tls(seconds=LIFE_S)
+    told = endpoint(rig, seconds=LIFE_S)
+    expiry_s = clock.time() + LIFE_S
+    async with Mobility(told) as drone, Camera(replace(told, address=camera_address)) as camera:
+        calls: list[asyncio.Task[object]] = []
+
+        async def call_until(end_s: float) -> None:
+            # At a fixed rate, whatever becomes of the calls before: one that stalls holds none back.
+            while clock.time() < end_s:
+                calls.extend(map(asyncio.ensure_future, (drone.position(), camera.list())))
+                await asyncio.sleep(CALL_EVERY_S)
+
+        async with asyncio.timeout(60), drone.control() as control:
+            await call_until(clock.time() + 0.5)
+            rig.write_tls()
+            await call_until(clock.time() + 0.5)
+            endpoint(rig)
+            await call_until(expiry_s + 2.0)
+            ended = await asyncio.gather(*calls, return_exceptions=True)
+            assert [one for one in ended if isinstance(one, BaseException)] == []
+            assert control.lost is None
+            assert (await rig.telemetry()).controller == DRIVER
+    assert len(calls) > 20 * LIFE_S

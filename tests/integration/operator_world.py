@@ -153,6 +153,19 @@ class World:
     def put(self, body: Body) -> Body:
         return self.api.apply(self.path(body), body)
 
+    def bound_pod(
+        self, namespace: str, name: str, node: str, labels: dict[str, str] | None = None, **spec: Any
+    ) -> Body:
+        """Make a pod, and bind it to a node as the scheduler would."""
+        path = f"/api/v1/namespaces/{namespace}/pods"
+        given = {"containers": [{"name": "main", "image": "a"}], **spec}
+        metadata = {"name": name, "namespace": namespace, "labels": labels or {}}
+        pod = self.api.call("POST", path, {"apiVersion": "v1", "kind": "Pod", "metadata": metadata, "spec": given})
+        target = {"apiVersion": "v1", "kind": "Node", "name": node}
+        binding = {"apiVersion": "v1", "kind": "Binding", "metadata": {"name": name}, "target": target}
+        self.api.call("POST", f"{path}/{name}/binding", binding)
+        return pod
+
     def application(self, namespace: str, name: str = "traffic") -> Body | None:
         return self.api.get(f"{FRACTUS}/namespaces/{namespace}/applications/{name}")
 

@@ -1,0 +1,149 @@
+"""Who has a kubelet's certificate, or a component's: what Kubernetes gives a node (NodeRestriction), and nothing of Fractus beyond that."""
+
+from __future__ import annotations
+
+import base64
+import uuid
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+from control_plane import ControlPlane
+from fractus_core.api import KINDS
+from fractus_core.identity.authority import Authority
+from fractus_kube import BlockingClient, KubeError, with_certificate
+from operator_world import FRACTUS, NODES, SYSTEM, Body, OperatorProcess, World, denied
+from test_agent_permissions import REQUESTS, settled, signing_request
+
+TOKENS = {"apiVersion": "authentication.k8s.io/v1", "kind": "TokenRequest"}
+
+
+@pytest.fixture
+def kubelet(control_plane: ControlPlane, world: World, chart: None) -> Iterator[BlockingClient]:
+    """With the certificate of drone-1's kubelet."""
+    client = control_plane.as_user("kubelet", "system:node:drone-1", ("system:nodes",))
+    yield client
+    client.close()
+
+
+@pytest.fixture
+def pod_on(world: World, namespace: str) -> Callable[..., Body]:
+    """Makes a pod on a node, as the scheduler and the DaemonSets would."""
+
+    def make(node: str, place: str = namespace, **spec: object) -> Body:
+        return world.bound_pod(place, f"p-{uuid.uuid4().hex[:8]}", node, **spec)
+
+    return make
+
+
+def test_it_reads_and_writes_no_object_of_fractus(world: World, kubelet: BlockingClient, namespace: str) -> None:
+    for kind in KINDS:
+        scope = f"/namespaces/{namespace}" if kind.NAMESPACED else ""
+        path = f"{FRACTUS}{scope}/{kind.PLURAL}"
+        denied(lambda path=path: kubelet.list(path), "cannot list")
+        denied(lambda path=path: kubelet.list(path, watch="true", timeoutSeconds="1"), "cannot watch")
+        denied(lambda path=path: kubelet.get(f"{path}/drone-1"), "cannot get")
+        denied(lambda path=path: kubelet.call("POST", path, {}), "cannot create")
+        denied(lambda path=path: kubelet.merge(f"{path}/drone-1", {"metadata": {}}), "cannot patch")
+        denied(lambda path=path: kubelet.merge(f"{path}/drone-1/status", {"status": {}}), "cannot patch")
+        denied(lambda path=path: kubelet.delete(f"{path}/drone-1"), "cannot delete")
+    denied(lambda: kubelet.get(f"{FRACTUS}/namespaces/{NODES}/nodegrants/drone-1"), "cannot get")
+
+
+def test_it_reads_the_certificates_of_its_own_pods_only(
+    world: World, kubelet: BlockingClient, namespace: str, pod_on: Callable[..., Body]
+) -> None:
+    secrets = f"/api/v1/namespaces/{namespace}/secrets"
+    for name in ("mine", "theirs"):
+        secret = {"apiVersion": "v1", "kind": "Secret", "metadata": {"name": name}, "stringData": {"tls.key": name}}
+        world.api.apply(f"{secrets}/{name}", secret)
+    for name, node in (("mine", "drone-1"), ("theirs", "edge-1")):
+        pod_on(node, volumes=[{"name": "tls", "secret": {"secretName": name}}])
+    assert kubelet.get(f"{secrets}/mine") is not None
+    denied(lambda: kubelet.get(f"{secrets}/theirs"), "no relationship found")
+    denied(lambda: kubelet.get(f"/api/v1/namespaces/{SYSTEM}/secrets/fractus-ca"), "no relationship found")
+    denied(lambda: kubelet.list(secrets), "cannot list")
+
+
+def test_it_gets_tokens_of_its_own_agent_only(
+    world: World, kubelet: BlockingClient, pod_on: Callable[..., Body]
+) -> None:
+    def token(account: str, pod: Body, place: str = SYSTEM) -> object:
+        bound = {"kind": "Pod", "apiVersion": "v1", "name": pod["metadata"]["name"], "uid": pod["metadata"]["uid"]}
+        request = TOKENS | {"spec": {"expirationSeconds": 600, "boundObjectRef": bound}}
+        return kubelet.call("POST", f"/api/v1/namespaces/{place}/serviceaccounts/{account}/token", request)
+
+    mine, theirs = (pod_on(node, SYSTEM, serviceAccountName="fractus-node") for node in ("drone-1", "edge-1"))
+    operator = pod_on("cloud-1", SYSTEM, serviceAccountName="fractus-operator")
+    assert token("fractus-node", mine)
+    denied(lambda: token("fractus-node", theirs), "pod")
+    denied(lambda: token("fractus-operator", operator), "forbidden")
+    denied(lambda: token("fractus-operator", mine), "forbidden")
+    # What an agent asks for its node's own account with, the kubelet cannot: none of its pods runs under it.
+    denied(lambda: token("drone-1", mine, NODES), "forbidden")
+    node = {"kind": "Node", "apiVersion": "v1", "name": "drone-1"}
+    loose = TOKENS | {"spec": {"boundObjectRef": node}}
+    denied(
+        lambda: kubelet.call("POST", f"/api/v1/namespaces/{NODES}/serviceaccounts/drone-1/token", loose), "forbidden"
+    )
+
+
+def test_it_gets_no_certificate_of_its_node(world: World, operator: OperatorProcess, kubelet: BlockingClient) -> None:
+    body = signing_request("drone-1")
+    kubelet.call("POST", REQUESTS, body)
+    status = settled(world, body)
+    assert "certificate" not in status
+    assert [(c["type"], c["reason"]) for c in status["conditions"]] == [("Denied", "WrongRequester")]
+    approval = {"status": {"conditions": [{"type": "Approved", "status": "True", "reason": "x", "message": "x"}]}}
+    path = f"{REQUESTS}/{body['metadata']['name']}"
+    for part in ("approval", "status"):
+        denied(lambda part=part: kubelet.merge(f"{path}/{part}", approval), "cannot patch")
+
+
+def test_it_makes_no_pods_but_records_of_its_own_and_is_no_other_node(
+    world: World, kubelet: BlockingClient, namespace: str, pod_on: Callable[..., Body]
+) -> None:
+    labels = {"fractus.dev/application": "traffic", "app.kubernetes.io/managed-by": "fractus"}
+    pods = f"/api/v1/namespaces/{namespace}/pods"
+
+    def pod(node: str, **annotations: str) -> Body:
+        metadata = {"name": "theirs", "labels": labels, "annotations": annotations}
+        spec = {"nodeName": node, "containers": [{"name": "a", "image": "a"}]}
+        return {"apiVersion": "v1", "kind": "Pod", "metadata": metadata, "spec": spec}
+
+    denied(lambda: kubelet.call("POST", pods, pod("drone-1")), "can only create mirror pods")
+    record = {"kubernetes.io/config.mirror": "x"}
+    denied(
+        lambda: kubelet.call("POST", pods, pod("edge-1", **record)),
+        "can only create pods with spec.nodeName set to itself",
+    )
+    other = pod_on("edge-1")["metadata"]["name"]
+    denied(
+        lambda: kubelet.merge(f"{pods}/{other}/status", {"status": {"phase": "Failed"}}), "can only update pod status"
+    )
+    denied(lambda: kubelet.delete(f"{pods}/{other}"), "can only delete pods")
+    for part in ("", "/status"):
+        path = f"/api/v1/nodes/edge-1{part}"
+        denied(
+            lambda path=path: kubelet.merge(path, {"metadata": {"labels": {"a": "b"}}}), "is not allowed to modify node"
+        )
+
+
+def test_the_certificate_of_a_component_is_no_account(
+    control_plane: ControlPlane, world: World, tmp_path: Path
+) -> None:
+    """Of what an application's pod has, nothing is good for the API server: it mounts no token."""
+    now = datetime.now(UTC)
+    issued = Authority.generate(now).issue_component("spiffe://fractus.dev/ns/n/app/a/component/C/instance/i", now)
+    for name, value in issued.items():
+        (tmp_path / name).write_bytes(base64.b64decode(value))
+    certificate = (tmp_path / "tls.crt", tmp_path / "tls.key")
+    client = BlockingClient(with_certificate(control_plane.server, control_plane.ca, certificate), "component")
+    try:
+        for path in (f"{FRACTUS}/drones", f"{FRACTUS}/grants", f"/api/v1/namespaces/{SYSTEM}/secrets"):
+            with pytest.raises(KubeError) as refusal:
+                client.list(path)
+            assert refusal.value.status == 401, refusal.value
+    finally:
+        client.close()

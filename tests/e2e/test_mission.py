@@ -11,6 +11,8 @@ from conftest import DRONE, NODES, SYSTEM, example, flight_state, short_flight
 from fractus_cli import main
 from fractus_storage.chain import verify
 from kubectl import Kube, Object, condition
+from leaks import leaks
+from told import secrets, told
 
 MOBILITY = "app.kubernetes.io/component=mobility"
 
@@ -56,6 +58,8 @@ def test_traffic_monitoring_flies_under_policies(grounded: Kube, capsys: pytest.
     kube.apply(app)
     kube.wait("all pods of the example are Ready", lambda: ready(kube, "traffic-monitoring"), timeout_s=60)
     print(f"apply to all pods Ready: {time.monotonic() - started:.1f} s")
+    kept = secrets(kube)
+    said = {f"{what} in flight": text for what, text in told(kube).items()}
 
     plan = kube.get("deploymentplan", "traffic-monitoring")
     placed = {(p["component"], p.get("node")) for p in plan["spec"]["placements"]}
@@ -110,6 +114,14 @@ def test_traffic_monitoring_flies_under_policies(grounded: Kube, capsys: pytest.
     assert (last["node"], bool(last["time"])) == (DRONE, True)
     events = {e["reason"] for e in kube.all("events", "default")}
     assert {"Planned", "MissionComplete"} <= events
+
+    assert {
+        f"{SYSTEM}/fractus-ca/tls.key",
+        f"key of {DRONE}",
+        "default/traffic-monitoring-navigator-tls/tls.key",
+    } <= kept.keys()
+    said |= told(kube) | {"audit log": audit_text(kube)}
+    assert leaks(said, kept) == []
 
 
 def test_deleting_the_application_in_flight_brings_the_drone_home(grounded: Kube) -> None:

@@ -1,0 +1,59 @@
+"""What a cluster with Fractus keeps secret, and all that it tells of itself."""
+
+from __future__ import annotations
+
+import base64
+import json
+
+from conftest import SYSTEM
+from fractus_core.api.node_grants import unpack
+from kubectl import Kube
+
+TOKEN = "/var/run/secrets/kubernetes.io/serviceaccount/token"
+NODE_KEY = "/var/lib/fractus/tls/tls.key"
+
+
+def secrets(kube: Kube) -> dict[str, bytes]:
+    """What is in Secrets, the keys of nodes, and the tokens that are mounted in pods of Fractus."""
+    found: dict[str, bytes] = {}
+    for body in kube.all("secrets"):
+        # What a release was made of, and kubeadm's tokens with what they are for, are not of Fractus.
+        if body["type"] not in {"helm.sh/release.v1", "bootstrap.kubernetes.io/token"}:
+            for name, value in (body.get("data") or {}).items():
+                found[f"{body['metadata']['namespace']}/{body['metadata']['name']}/{name}"] = base64.b64decode(value)
+    for pod in kube.all("pods", SYSTEM, "app.kubernetes.io/component in (agent,operator)"):
+        name = pod["metadata"]["name"]
+        found[f"token of {name}"] = kube.must("exec", "-n", SYSTEM, name, "--", "cat", TOKEN).encode()
+        if pod["metadata"]["labels"]["app.kubernetes.io/component"] == "agent":
+            found[f"key of {pod['spec']['nodeName']}"] = kube.must(
+                "exec", "-n", SYSTEM, name, "--", "cat", NODE_KEY
+            ).encode()
+    return found
+
+
+def told(kube: Kube) -> dict[str, str]:
+    """Logs of all pods of Fractus and its applications, Events, and every object that is no Secret."""
+    found: dict[str, str] = {}
+    for pod in (*kube.all("pods", SYSTEM), *kube.all("pods", None, "fractus.dev/application")):
+        namespace, name = pod["metadata"]["namespace"], pod["metadata"]["name"]
+        found[f"log of {name}"] = kube.must("logs", "-n", namespace, name, "--all-containers")
+        if any(status["restartCount"] for status in pod["status"].get("containerStatuses") or ()):
+            found[f"log of {name} before"] = kube.run("logs", "-n", namespace, name, "--all-containers", "-p").stdout
+    kinds = kube.must("api-resources", "--api-group=fractus.dev", "-o", "name").split()
+    for kind in (
+        *kinds,
+        "events",
+        "pods",
+        "nodes",
+        "configmaps",
+        "deployments",
+        "daemonsets",
+        "leases",
+        "serviceaccounts",
+    ):
+        for body in kube.all(kind):
+            what = f"{kind} {body['metadata'].get('namespace', '')}/{body['metadata']['name']}"
+            found[what] = json.dumps(body)
+            if kind.startswith("nodegrants"):
+                found[f"{what} unpacked"] = json.dumps(unpack(body["spec"]["packed"], body["spec"]["count"]))
+    return found

@@ -4,6 +4,11 @@
 #
 # Every image is one small root file system with Python, the dependencies that it alone needs in layers shared
 # with the others, and the code on top, so that a change of code replaces a layer of a few hundred kilobytes.
+#
+# Builds of the same files give the same images, as long as BASE and the packages of Debian's archive are the same. BASE is a
+# tag here, so that a build has Debian's latest corrections; a release looks up the digest behind it and gives that
+# (`--build-arg BASE=debian:bookworm-slim@sha256:...`), and every image says in a label what it was given. (The labels
+# org.opencontainers.image.base.* are for images that have the layers of their base, which these do not.)
 ARG BASE=debian:bookworm-slim
 
 # ---- tools: what builds the rest; nothing of it is in an image except what is copied out
@@ -140,7 +145,7 @@ RUN python3 -m pip install --quiet --no-cache-dir --break-system-packages --root
 COPY . /build/
 RUN uv build --quiet --wheel --no-build-isolation --out-dir /wheel \
  && uv pip install --quiet --no-deps --target /code /wheel/*.whl \
- && rm -rf /code/bin /code/.lock /code/fractus_drones-*.dist-info/RECORD \
+ && rm -rf /code/bin /code/.lock /code/fractus_drones-*.dist-info/RECORD /code/fractus_drones-*.dist-info/uv_cache.json \
  && python3 -m compileall -q --invalidation-mode unchecked-hash -s /code -p /usr/local/lib/python3.11/dist-packages /code \
  && assemble() { target=$1; shift; mkdir -p /images/$target; \
       for name in fractus_proto "$@"; do cp -a /code/$name /images/$target/; done; \
@@ -154,6 +159,8 @@ RUN uv build --quiet --wheel --no-build-isolation --out-dir /wheel \
 
 # ---- python: the common start of all images, with what the SDK needs
 FROM scratch AS python
+ARG BASE
+LABEL dev.fractus.image.built-on=${BASE}
 COPY --from=root /out /
 COPY --from=dependencies /only-sdk /usr/local/lib/python3.11/dist-packages
 ENV PATH=/usr/local/bin:/usr/bin:/bin LANG=C.UTF-8 PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1

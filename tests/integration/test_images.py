@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+import shutil
 import subprocess
 import tomllib
 from collections.abc import Iterator
@@ -110,3 +111,31 @@ def test_tells_the_distribution_of_each_python_package(image: tuple[str, str]) -
         f"{path.name.removesuffix('c')}" if path.suffix == ".pyc" else path.name for path in here.iterdir()
     } - told
     assert {name for name in strangers if not name.startswith("fractus")} == set()
+
+
+def test_the_same_code_gives_the_same_layers(tmp_path: Path) -> None:
+    checkout = tmp_path / "elsewhere"
+    for line in (ROOT / ".dockerignore").read_text().splitlines():
+        here, there = ROOT / line.removeprefix("!"), checkout / line.removeprefix("!")
+        if line.startswith("!") and here.is_dir():
+            # With the times of now.
+            shutil.copytree(here, there, copy_function=shutil.copy, ignore=shutil.ignore_patterns("node_modules"))
+        elif line.startswith("!"):
+            there.parent.mkdir(exist_ok=True)
+            shutil.copy2(here, there)
+    for name in ("Dockerfile", ".dockerignore"):
+        shutil.copy(ROOT / name, checkout)
+    [one] = build_images(ROOT, targets=["component"], report=print)
+    try:
+        [other] = build_images(checkout, targets=["component"], tag="elsewhere", report=print)
+        assert layers(other) == layers(one)
+    finally:
+        run(["buildah", "rmi", image_name("component", "elsewhere")], check=False)
+
+
+def layers(image: str) -> list[str]:
+    """The digests of an image's layers."""
+    described = json.loads(run(["buildah", "inspect", "--type", "image", image]).stdout)
+    found: list[str] = described["OCIv1"]["rootfs"]["diff_ids"]
+    assert len(found) > 2
+    return found

@@ -10,6 +10,7 @@ import tarfile
 from pathlib import Path
 
 import pytest
+import yaml
 from fractus_cluster.errors import ClusterError
 from fractus_cluster.images.build import TARGETS, build_images, find_source, image_name, source_digest
 from fractus_cluster.images.layout import Layout
@@ -86,6 +87,19 @@ def test_every_target_is_in_the_dockerfile() -> None:
         if line.startswith("FROM ")
     }
     assert set(TARGETS) <= stages
+
+
+def test_a_release_builds_on_a_digest_that_its_images_name() -> None:
+    workflow = yaml.safe_load((ROOT / ".github/workflows/release.yaml").read_text())
+    (script,) = [step["run"] for step in workflow["jobs"]["images"]["steps"] if "run" in step]
+    (build,) = re.findall(r"docker buildx build (?:.*\\\n)*.*", script)
+    assert '--build-arg "BASE=$base@$digest"' in build
+    assert "--output type=registry,rewrite-timestamp=true" in build
+    assert script.index("export SOURCE_DATE_EPOCH=") < script.index(build)
+    dockerfile = (ROOT / "Dockerfile").read_text()
+    assert "FROM scratch AS python\nARG BASE\nLABEL dev.fractus.image.built-on=${BASE}\n" in dockerfile
+    (base,) = re.findall(r"^ARG BASE=(.+)$", dockerfile, re.MULTILINE)
+    assert f"base={base}\n" in script
 
 
 def test_every_image_of_the_examples_can_be_built() -> None:

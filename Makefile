@@ -147,8 +147,8 @@ view: uv ## Build the page of `fractus view` from view/web
 	$(NPM) run build
 
 .PHONY: images
-images: packages env ## Build the container images
-	$(RUN) python -m fractus_cluster.images build
+images: packages env ## Build the container images, and a bill of materials of each in out/images
+	$(RUN) python -m fractus_cluster.images build --sbom $(OUT)/images
 
 .PHONY: bench
 bench: env ## Run every benchmark

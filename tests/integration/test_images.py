@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 from fractus_cluster.commands import run
+from fractus_cluster.images.bill import image_bill
 from fractus_cluster.images.build import SIZE_LIMITS_MB, TARGETS, build_images, image_name
 
 pytestmark = [pytest.mark.root, pytest.mark.timeout(1800), pytest.mark.xdist_group("cluster")]
@@ -139,3 +140,11 @@ def layers(image: str) -> list[str]:
     found: list[str] = described["OCIv1"]["rootfs"]["diff_ids"]
     assert len(found) > 2
     return found
+
+
+def test_has_a_bill_of_materials() -> None:
+    [name] = build_images(ROOT, targets=["agent"], report=print)
+    bill = json.loads(image_bill(name))
+    versions = {each["name"]: each["version"] for each in bill["components"]}
+    assert versions.keys() >= {"libc6", "nftables", "libnftables1", "grpcio", "fractus-drones"}
+    assert versions["fractus-drones"] == tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]

@@ -5,8 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import click
+from fractus_storage import write_file
 
 from fractus_cluster.cluster import print_report
+from fractus_cluster.images.bill import image_bill
 from fractus_cluster.images.build import TARGETS, build_images, find_source
 
 
@@ -22,8 +24,18 @@ def images() -> None:
 )
 @click.option("--tag", default="dev", show_default=True)
 @click.option("--force", is_flag=True, help="Build although nothing changed.")
-def build(targets: tuple[str, ...], source: Path | None, tag: str, force: bool) -> None:
+@click.option(
+    "--sbom",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Folder for a bill of materials of each (CycloneDX).",
+)
+def build(targets: tuple[str, ...], source: Path | None, tag: str, force: bool, sbom: Path | None) -> None:
     """Build the TARGETs, or all; those of which nothing changed are left alone. Prints the images' names."""
-    built = build_images(source or find_source(), targets=targets or TARGETS, tag=tag, force=force, report=print_report)
-    for image in built:
+    targets = targets or TARGETS
+    built = build_images(source or find_source(), targets=targets, tag=tag, force=force, report=print_report)
+    if sbom is not None:
+        sbom.mkdir(parents=True, exist_ok=True)
+    for target, image in zip(targets, built, strict=True):
+        if sbom is not None:
+            write_file(sbom / f"{target}.cdx.json", image_bill(image).encode(), 0o644, durable=False)
         click.echo(image)

@@ -16,10 +16,14 @@ BURST = 50
 """Records of one line of the program that are written one after the other."""
 RATE_PER_S = 0.5
 """Records of one line of the program that are written from then on."""
+MAX_LIMITS = 1_000
+"""Limits that are kept; what would need one more shares that of its line of the program."""
 
 
 class LogLimit(logging.Filter):
     """Limits the records of each line of the program; the next one that is written tells how many were left out.
+
+    A record with an attribute `limit_by` (`extra` of the call that logs it) is limited together with those of the same value only.
 
     Args:
         monotonic: seconds that never jump.
@@ -28,13 +32,16 @@ class LogLimit(logging.Filter):
     def __init__(self, monotonic: Callable[[], float] = time.monotonic) -> None:
         super().__init__()
         self._monotonic = monotonic
-        self._lines: dict[tuple[str, int], list[float]] = {}
+        self._lines: dict[tuple[str, int, str], list[float]] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Whether to write a record."""
         now_s = self._monotonic()
         # Left, since when, left out; by the line of code, of which there are not many, whatever the text.
-        line = self._lines.setdefault((record.pathname, record.lineno), [BURST, now_s, 0])
+        key = (record.pathname, record.lineno, getattr(record, "limit_by", ""))
+        if key not in self._lines and len(self._lines) >= MAX_LIMITS:
+            key = (record.pathname, record.lineno, "")
+        line = self._lines.setdefault(key, [BURST, now_s, 0])
         line[:2] = min(line[0] + (now_s - line[1]) * RATE_PER_S, BURST), now_s
         if line[0] < 1:
             line[2] += 1

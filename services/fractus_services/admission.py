@@ -161,5 +161,10 @@ class CallAdmission:
         """
         grant = self._grants.of(caller.identity)
         if grant is None:
+            log.warning(
+                "policy: no grant on this node, call refused (caller=%s)",
+                caller.identity,
+                extra={"limit_by": caller.identity},
+            )
             raise PolicyDenied("NoGrant", f"{caller.identity} has no grant on this node")
         return grant

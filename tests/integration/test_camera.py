@@ -197,6 +197,9 @@ async def test_policies_that_come_later_hold_for_pictures_from_before(rig: Rig) 
     assert len(blurred) == chunks[0].image.size_bytes < len(plain)
     assert not chunks[0].image.HasField("position")
     assert b"Exif" not in blurred
+    # A picture of a fixed camera needs what the place of the camera needs now.
+    logged = f"policy: filters required (action=correct caller={PASSENGER} method=RetrieveImage filters=blurAverage policies=privacy"
+    await rig.until_logged("camera", logged)
     again = await capture(camera)
     assert again.decision.action == types_pb2.Decision.ACTION_CORRECT
     write(privacy("refuse", -20, -20, 20, 20))

@@ -97,6 +97,7 @@ async def test_a_whole_mission_with_a_correction_and_refusals(rig: Rig) -> None:
 
     await _return_and_land(rig, driver)
     _check_audit(rig)
+    _check_log(rig)
 
 
 async def _return_and_land(rig: Rig, driver: Driver) -> None:
@@ -122,6 +123,16 @@ def _check_audit(rig: Rig) -> None:
     states = rig.entries("state")
     assert len(states) > 10
     assert max(s["alt"] for s in states) < 16.0
+
+
+def _check_log(rig: Rig) -> None:
+    """Each decision that is no plain permission has a line, and a permission has none."""
+    log = (rig.directory / "service.log").read_text()
+    lines = [line for line in log.splitlines() if " policy: " in line]
+    changed = [call for call in rig.entries("call") if call["action"] != "allow"]
+    assert [f"action={c['action']} caller={c['caller']} method={c['method']} code={c['code']} " in line
+            for c, line in zip(changed, lines, strict=True)] == [True] * len(changed), lines  # fmt: skip
+    assert f"control: granted (kind=control controller={DRIVER} " in log
 
 
 async def _first_event(driver: Driver) -> None:

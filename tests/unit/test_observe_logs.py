@@ -8,7 +8,7 @@ import math
 from typing import Any
 
 import pytest
-from fractus_observe.logs import BURST, RATE_PER_S, JsonFormatter, LogLimit, configure
+from fractus_observe.logs import BURST, MAX_LIMITS, RATE_PER_S, JsonFormatter, LogLimit, configure
 
 
 class Log:
@@ -18,8 +18,10 @@ class Log:
         self.now_s = 10.0
         self.limit = LogLimit(lambda: self.now_s)
 
-    def written(self, line: int, text: str = "peer %s", *args: object) -> str | None:
+    def written(self, line: int, text: str = "peer %s", *args: object, limit_by: str = "") -> str | None:
         record = logging.LogRecord("n", logging.ERROR, "module.py", line, text, args or ("a",), None)
+        if limit_by:
+            record.limit_by = limit_by
         return record.getMessage() if self.limit.filter(record) else None
 
 
@@ -32,6 +34,17 @@ def test_a_line_is_written_so_often_at_most_and_tells_what_was_left_out() -> Non
     assert [log.written(1), log.written(1)] == ["peer a (left_out=1000)", None]
     log.now_s += 1e6
     assert [log.written(1) for _ in range(BURST + 1)] == ["peer a (left_out=1)", *["peer a"] * (BURST - 1), None]
+
+
+def test_records_of_different_origin_are_limited_apart_up_to_a_number_of_origins() -> None:
+    log = Log()
+    assert [log.written(1, limit_by="a") for _ in range(BURST + 7)][BURST:] == [None] * 7
+    assert log.written(1, limit_by="b") == "peer a"
+    log.now_s += 1 / RATE_PER_S
+    assert log.written(1, limit_by="a") == "peer a (left_out=7)"
+    kept = [log.written(1, limit_by=f"origin-{number}") for number in range(10 * MAX_LIMITS)]
+    assert MAX_LIMITS <= len([text for text in kept if text]) < MAX_LIMITS + BURST
+    assert log.written(2) is not None, "a new line of the program is limited by itself"
 
 
 @pytest.mark.parametrize(("text", "args", "told"), [

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from contextlib import AsyncExitStack
+from types import SimpleNamespace
 from typing import Any, cast
 
 import grpc
@@ -13,6 +14,7 @@ from fractus_proto.v1 import types_pb2
 from fractus_services import admission
 from fractus_services.admission import BURST, MAX_OPEN_CALLS, URGENT_BURST, CallAdmission
 from fractus_services.auth import Caller
+from fractus_services.errors import PolicyDenied
 from google.protobuf import any_pb2
 from google.rpc import error_details_pb2, status_pb2
 
@@ -115,3 +117,12 @@ async def test_whatever_breaks_refuses_and_is_told(
             raise error()
     assert told == ["InternalError"]
     assert not calls._open
+
+
+def test_a_caller_without_a_grant_is_logged(caplog: pytest.LogCaptureFixture) -> None:
+    calls = CallAdmission(cast("Any", SimpleNamespace(of=lambda _identity: None)), lambda: 0.0)
+    with pytest.raises(PolicyDenied):
+        calls.grant_of(Caller("spiffe://fractus.dev/a", math.inf))
+    (record,) = caplog.records
+    assert record.getMessage() == "policy: no grant on this node, call refused (caller=spiffe://fractus.dev/a)"
+    assert record.limit_by == "spiffe://fractus.dev/a"  # type: ignore[attr-defined]

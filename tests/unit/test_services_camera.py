@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import threading
 import time
 from collections.abc import Iterator
@@ -173,6 +174,32 @@ async def test_an_application_of_the_same_name_does_not_inherit_pictures(world: 
 
 
 # Filters
+
+
+async def test_filters_that_become_necessary_are_written_down(world: World) -> None:
+    def written() -> list[tuple[str, list[str], list[str]]]:
+        entries = [json.loads(line) for line in (world.directory.parent / "audit.jsonl").read_text().splitlines()]
+        return [(entry["method"], entry["filters"], entry["policies"]) for entry in entries]
+
+    far = policy("q", "PrivacyControl", "camera", [zone("far", box(500, 500, 510, 510))], action="refuse")
+    free, bound, faces = active_grant(far), active_grant(private("black")), active_grant(private("blurFaces"))
+    world.scene.during = lambda: setattr(world.drone, "y", 0.0)
+    shot = await world.capture(bound)  # The drone came over the zone during the exposure,
+    await world.capture(bound)  # was there from the beginning,
+    await world.capture(faces)  # and too high for faces to be found.
+    plain = await world.capture(free)
+    world.drone.y = 80.0
+    await world.pixels(bound, shot)  # It has its filters already; this one not.
+    await world.pixels(bound, plain)
+    await world.audit.close()
+    assert written() == [
+        ("CaptureImage", [], []), ("CaptureImage", ["black"], ["p"]),
+        ("CaptureImage", ["black"], ["p"]),
+        ("CaptureImage", ["blurFaces"], ["p"]), ("CaptureImage", ["blurAverage"], ["p"]),
+        ("CaptureImage", [], []),
+        ("RetrieveImage", [], []),
+        ("RetrieveImage", [], []), ("RetrieveImage", ["black"], ["p"]),
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("action", ["black", "blurAverage", "blurMedian", "removeBackground"])

@@ -48,6 +48,7 @@ class _Exposure:
         name: of the picture.
         grant: by which it was judged.
         verdict: which filters it needs.
+        known: the verdict before it was taken, which was written down.
         after: where the camera was at the end, and on which way it got there.
         frames: what the camera gave.
         view_width_px: width of the whole view, in pixels that the camera gave.
@@ -56,6 +57,7 @@ class _Exposure:
     name: str
     grant: ActiveGrant
     verdict: Verdict
+    known: Verdict
     after: Situation
     frames: list[Pixels]
     view_width_px: int
@@ -139,21 +141,21 @@ class PictureCapture:
             # A camera may deliver a picture that it took before it was asked.
             begun_s = time.monotonic() - self._shutter.latency_s
             grant, before = current_grant(), self._poses.situation(self._clock())
-            verdict = self._judge.judge(call, grant, before)
+            known = self._judge.judge(call, grant, before)
             problem = await asyncio.to_thread(self._album.quota_problem, owner)
             if problem:
                 raise AlbumFull(problem)
             with spans.call().child("camera.capture"):
-                frames = await self._shutter.expose(*self._wanted(args, grant, before, verdict))
+                frames = await self._shutter.expose(*self._wanted(args, grant, before, known))
             if before.lens is not None:
                 # It is judged by a view in these proportions, whatever the camera gave.
                 frames = [cropped(one, *self._camera.resolution) for one in frames]
             way, grant = self._poses.situations_since(begun_s, self._clock()), current_grant()
             after = replace(way[-1], exposure=way)
-            verdict = combined([verdict, *self._judge_again(call, grant, before, after)])
+            verdict = combined([known, *self._judge_again(call, grant, before, after)])
             # Enlarging a picture does not make its faces easier to find.
             view_width_px = min(self._camera.source_size(args.width, args.height)[0], frames[len(frames) // 2].shape[1])
-            return _Exposure(self._name(after), grant, verdict, after, frames, view_width_px)
+            return _Exposure(self._name(after), grant, verdict, known, after, frames, view_width_px)
 
     def _wanted(
         self, args: CaptureArgs, grant: ActiveGrant, before: Situation, verdict: Verdict
@@ -188,7 +190,7 @@ class PictureCapture:
         farthest_m = view.farthest_m if view is not None else math.inf
         face_px = smallest_face_px(after.lens, farthest_m, exposure.view_width_px)
         call, camera = Call("CaptureImage", args), self._camera
-        plan, verdict = self._judge.plan(call, grant, exposure.verdict, after, face_px=face_px)
+        plan, verdict = self._judge.plan(call, grant, exposure.verdict, after, face_px=face_px, known=exposure.known)
         poses, moment_s = tuple(Pose.of(one) for one in after.exposure), float(after.time_s)
         # Of another lens the pose has a bound of the view, which is wider.
         view_px = camera.source_size(args.width, args.height)[0] if camera.pinhole else None

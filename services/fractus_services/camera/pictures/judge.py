@@ -73,9 +73,11 @@ class PictureJudge:
         return combined([verdict, self.judge_view(call, grant, taken_at(poses, now))])
 
     def plan(
-        self, call: Call, grant: ActiveGrant, verdict: Verdict, seen: Situation, *, face_px: float
+        self, call: Call, grant: ActiveGrant, verdict: Verdict, seen: Situation, *, face_px: float, known: Verdict
     ) -> tuple[FilterPlan, Verdict]:
         """The filters that a verdict requires of a picture, and the verdict that names a fallback among them.
+
+        It is written down if these filters are others than the audit log tells by now.
 
         Args:
             call: method and arguments.
@@ -83,6 +85,7 @@ class PictureJudge:
             verdict: with the required filters.
             seen: where the picture was taken.
             face_px: width of the smallest face that the picture may show; 0 when it is unknown.
+            known: the verdict on the call that was written down.
 
         Raises:
             Refused: faces cannot be hidden reliably, and a policy allows no picture then.
@@ -93,7 +96,10 @@ class PictureJudge:
             refusal = Verdict("deny", None, "FacesNotFound", f"{verdict.reason}; {error}", verdict.policies)
             self.require(call, grant, refusal, seen)
             raise AssertionError("a denial always raises") from error
-        return plan, replace(verdict, reason=f"{verdict.reason}; {plan.note}") if plan.note else verdict
+        noted = replace(verdict, reason=f"{verdict.reason}; {plan.note}") if plan.note else verdict
+        if (plan.filters, verdict.policies) != (known.filters, known.policies):
+            self.require(call, grant, replace(noted, filters=plan.filters), seen, record=True)
+        return plan, noted
 
     def require(
         self, call: Call, grant: ActiveGrant, verdict: Verdict, now: Situation, *, record: bool = False

@@ -68,10 +68,10 @@ class PictureLibrary:
             current_grant: as for `PictureCapture.capture`.
         """
         call, now = Call("RetrieveImage"), self._now()
-        verdict = self._judge.judge(call, grant, now)
+        known = self._judge.judge(call, grant, now)
         owner = owner_of(grant)
         shot = await asyncio.to_thread(self._album.find, owner, name)
-        verdict = self._judge.judge_stored(call, grant, shot.poses, verdict, now)
+        verdict = self._judge.judge_stored(call, grant, shot.poses, known, now)
         missing = remaining(verdict.filters, shot.filters)
         path = self._album.path(owner, name)
         if not missing:
@@ -79,7 +79,7 @@ class PictureLibrary:
         # In a picture that was filtered before it is unknown which faces are still found.
         face_px = 0.0 if shot.filters else shot.face_px
         plan, noted = self._judge.plan(
-            call, grant, replace(verdict, filters=missing), taken_at(shot.poses, now), face_px=face_px
+            call, grant, replace(verdict, filters=missing), taken_at(shot.poses, now), face_px=face_px, known=known
         )
         data = await self._tasks.complete(self._filtered(owner, path, plan, replace(shot, face_px=face_px)))
         shot = replace(shot, size_bytes=len(data), filters=(*shot.filters, *plan.filters))

@@ -34,6 +34,7 @@ from fractus_services.camera.pose.provider import FixedPose, PoseProvider
 from fractus_services.camera.rpc.handlers import CameraHandlers
 from fractus_services.camera.rpc.telemetry import follow_telemetry
 from fractus_services.clock import Clock
+from fractus_services.decision_log import log_decision
 from fractus_services.description import NodeDescription
 from fractus_services.grant_verifier import GrantVerifier
 from fractus_services.grants import GrantFiles
@@ -86,6 +87,7 @@ async def run(options: CameraOptions, stop: asyncio.Event) -> None:
     def recorded(entry: dict[str, Any]) -> None:
         metrics.take_entry(entry)
         recorder.take_entry(entry)
+        log_decision(entry)
 
     audit = AuditLog(options.audit, clock, tls=options.tls, copied=recorded)
     grants = GrantFiles(

@@ -223,11 +223,6 @@ class Performer:
     # The audit log
 
     def _record(self, entry: RecordAudit) -> None:
-        level = logging.WARNING if entry.kind == "takeover" else logging.INFO
-        log.log(
-            level, "control: %s (kind=%s, controller=%s, code=%s, reason=%s)",
-            entry.action, entry.kind, entry.controller, entry.code or "-", entry.reason or "-",
-        )  # fmt: skip
         vehicle = self._autopilot.vehicle
         self._audit.append(
             entry.kind,

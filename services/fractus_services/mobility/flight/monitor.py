@@ -111,7 +111,11 @@ class MotionMonitor:
         fresh = verdict.code != self._alarm or (lasting and acts)
         if fresh:
             self._alarm, self._alarm_at = verdict.code, control.autopilot.now
-            log.warning("monitor: alarm (code=%s, mode=%s, reason=%s)", verdict.code, mode.name, verdict.reason)
+            policies = ",".join(verdict.policies) or "-"
+            log.warning(
+                "monitor: alarm (code=%s mode=%s policies=%s reason=%s)",
+                verdict.code, mode.name, policies, verdict.reason,
+            )  # fmt: skip
         if watched:
             if fresh:
                 self._note("takeBack" if acts else "alarm", verdict)

@@ -15,6 +15,7 @@ from fractus_storage.audit import AuditLog
 
 from fractus_services.auth import TlsFiles
 from fractus_services.clock import Clock
+from fractus_services.decision_log import log_decision
 from fractus_services.description import NodeDescription
 from fractus_services.grant_verifier import GrantVerifier
 from fractus_services.grants import GrantFiles
@@ -130,6 +131,7 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
     def recorded(entry: dict[str, Any]) -> None:
         metrics.take_entry(entry)
         recorder.take_entry(entry)
+        log_decision(entry)
 
     audit = AuditLog(options.audit, clock, tls=options.tls, copied=recorded)
     verifier = GrantVerifier(options.tls, options.grant_memory)

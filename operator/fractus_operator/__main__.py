@@ -29,6 +29,7 @@ from fractus_operator.identity.node_requests import NodeSigning
 from fractus_operator.inventory.live import LiveInventory
 from fractus_operator.reconcile import service_rollout, silence
 from fractus_operator.reconcile.applications import Applications
+from fractus_operator.reconcile.drone_events import DroneEvents
 from fractus_operator.reconcile.link_events import LinkEvents
 from fractus_operator.reconcile.location import Locations
 from fractus_operator.reconcile.node_grants import NodeGrantsKeeper
@@ -148,6 +149,7 @@ def worklists(store: Store, live: LiveInventory, signing: NodeSigning, reports: 
     orphans = {kind: Worklist(kind.name, those.reconcile, after=live.synced) for kind, those in unowned.items()}
     missions = OnMission(store, live, reports, _now)
     drones = Worklist("drone", missions.reconcile, after=live.synced)
+    told = DroneEvents(store, live, missions.holders, _now)
 
     def policies_of_zone(key: Key) -> None:
         for policy in readiness.policies_of(key[1]):
@@ -157,6 +159,7 @@ def worklists(store: Store, live: LiveInventory, signing: NodeSigning, reports: 
         drone = missions.grant_changed(key)
         if drone is not None:
             drones.add(drone)
+            told.worklist.add(drone)
 
     def left_by_removed(key: Key) -> None:
         if live.applications.get(key) is None:
@@ -173,11 +176,13 @@ def worklists(store: Store, live: LiveInventory, signing: NodeSigning, reports: 
         *((kind, worklist.add) for kind, worklist in orphans.items()),
         (kinds.GRANT, drone_of_grant),
         (kinds.DRONE, drones.add),
+        (kinds.DRONE, told.changed),
         (kinds.APPLICATION, left_by_removed),
     ]
     for kind, listener in listeners:
         live.listen(kind, listener)
-    return [nodes, requests, zones, policies, *orphans.values(), drones, *NodeGrantsKeeper(store, live).worklists()]
+    own = [nodes, requests, zones, policies, *orphans.values(), drones, told.worklist]
+    return [*own, *NodeGrantsKeeper(store, live).worklists()]
 
 
 async def _together(main: Coroutine[Any, Any, None], background: list[Coroutine[Any, Any, None]]) -> None:

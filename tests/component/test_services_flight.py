@@ -390,6 +390,7 @@ def test_a_command_that_waits_is_not_sent_once_it_is_stale(tmp_path: Path, event
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
             stream = await world.up(grant)
+            assert world.control.taken_because() == "", "a driver has control"
             world.plane.deaf = True  # the autopilot neither acts nor answers: commands are tried again
             asking = asyncio.ensure_future(refusal(world.service.set_speed(grant, SetSpeedArgs(3.0))))
             await asyncio.sleep(0.3)
@@ -406,7 +407,10 @@ def test_a_command_that_waits_is_not_sent_once_it_is_stale(tmp_path: Path, event
             why = await asking
             assert why.verdict.code in {"NotInControl", "ControlLost"}
             assert MAV_CMD.DO_CHANGE_SPEED not in world.plane.commands, "the retry was dropped"
+            assert world.control.taken_because(), "the node is told why the system has control"
             await world.until(lambda: not world.plane.vehicle.armed)
+            world.control.note("landed", "the motors are stopped")
+            assert not world.control.taken_because(), "what was so in this flight is not why the system flies the next"
 
     fly(flight)
 

@@ -199,6 +199,22 @@ def test_a_complete_mission_leaves_only_its_plan(world: World, operator: Operato
     assert world.condition(namespace, "MissionComplete")["status"] == "True"
     assert status["message"] == "all control points were returned"
     wait_for(lambda: set(world.children(namespace)) == {"deploymentplans/traffic"}, "children to go")
+    wait_for(lambda: len(flight_events(world)) >= 4, "the Events of the flight")
+    assert flight_events(world) == [
+        "TookOff: drone-1 took off",
+        f"MissionBegun: {namespace}/traffic flies drone-1",
+        f"MissionOver: {namespace}/traffic does not fly drone-1 any more: all control points were returned",
+        "Landed: drone-1 landed",
+    ], "nothing of planning and deploying, which costs enough requests, and nothing twice"
+
+
+def flight_events(world: World) -> list[str]:
+    """The Events on the present Drone drone-1, in the order in which they were posted."""
+    drone = world.api.get("/apis/fractus.dev/v1alpha1/drones/drone-1") or {}
+    found = world.api.list("/api/v1/namespaces/default/events")
+    ours = [e for e in found if e["involvedObject"].get("uid") == drone["metadata"]["uid"]]
+    ours.sort(key=lambda event: int(event["metadata"]["resourceVersion"]))
+    return [f"{event['reason']}: {event['message']}" for event in ours]
 
 
 def test_finished_pods_stay_stopped_for_their_logs(world: World, operator: OperatorProcess, namespace: str) -> None:

@@ -19,6 +19,7 @@ from fractus_agent.registration.status import (
 )
 from fractus_agent.telemetry.feed import snapshot
 from fractus_agent.telemetry.snapshot import Snapshot
+from fractus_core.api.names import CONTROL_TAKEN
 from fractus_core.api.nodes import DroneStatus, EdgeNodeStatus
 from fractus_core.control import Outcome, OutcomeKind
 from fractus_proto.v1.mobility_pb2 import MissionOutcome, Telemetry
@@ -79,6 +80,22 @@ def test_telemetry_becomes_a_valid_drone_status() -> None:
         ("Ready", "True", 3),
         ("Certified", "True", 3),
     }
+
+
+@pytest.mark.parametrize(("changes", "expected"), [
+    ({}, ("SystemInControl", "policy campus forbids it")), ({"controller": "pilot"}, ("PilotInControl", "policy campus forbids it")),
+    ({"controller_reason": ""}, None), ({"controller": "spiffe://fractus.dev/a"}, None), ({"in_air": False}, None),
+    ({"connected": False}, None),
+])  # fmt: skip
+def test_a_drone_in_the_air_tells_why_no_driver_has_control(
+    changes: dict[str, Any], expected: tuple[str, str] | None
+) -> None:
+    assert snapshot(Telemetry(controller_reason="x")).controller_reason == "x"
+    status = node_status(
+        observed(snapshot=seen(**{"controller_reason": "policy campus forbids it", **changes})), {}, 1, NOW
+    )
+    taken = [(c["reason"], c["message"]) for c in status["conditions"] if c["type"] == CONTROL_TAKEN]
+    assert taken == ([expected] if expected else [])
 
 
 @pytest.mark.parametrize(

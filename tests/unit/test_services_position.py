@@ -59,7 +59,9 @@ def told(vehicle: Vehicle, now: float, missions: bool = False, heard: int = 0, w
     autopilot = SimpleNamespace(vehicle=vehicle, now=now, connected=True, way_s=way_s)
     ended = Mission("uid", "identity", outcome=Outcome(OutcomeKind.REVOKED, "why"))
     state = ControlState(missions={"uid": ended, "other": Mission("other", "identity")})
-    control: Any = SimpleNamespace(autopilot=autopilot, checked=None, state=state)
+    control: Any = SimpleNamespace(
+        autopilot=autopilot, checked=None, state=state, taken_because=lambda: "a pilot took it"
+    )
     return telemetry_of(control, 0.0, missions=missions, not_ready_reason="", heard=heard)
 
 
@@ -122,9 +124,10 @@ def test_an_attitude_is_as_old_as_its_time_stamp_says() -> None:
 
 
 def test_missions_are_for_the_node_alone() -> None:
-    missions = dict(told(Vehicle(stack=ARDUCOPTER), 0.0, missions=True).missions)
-    assert missions == {"uid": MissionOutcome(kind=MissionOutcome.KIND_REVOKED, reason="why")}
-    assert not told(Vehicle(stack=ARDUCOPTER), 0.0).missions
+    ours, others = (told(Vehicle(stack=ARDUCOPTER), 0.0, missions=node) for node in (True, False))
+    assert dict(ours.missions) == {"uid": MissionOutcome(kind=MissionOutcome.KIND_REVOKED, reason="why")}
+    assert ours.controller_reason == "a pilot took it"
+    assert (dict(others.missions), others.controller_reason) == ({}, "")
 
 
 def test_telemetry_tells_of_satellites_wind_and_new_texts() -> None:

@@ -10,7 +10,14 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, get_args
 
-from fractus_core.api.nodes import DRONE_REPORT_S, EDGE_REPORT_S, FLIGHT_REPORT_S, FlightState, is_airborne
+from fractus_core.api.names import CONTROL_TAKEN
+from fractus_core.api.nodes import (
+    DRONE_REPORT_S,
+    EDGE_REPORT_S,
+    FLIGHT_REPORT_S,
+    FlightState,
+    is_airborne,
+)
 
 from fractus_agent.cluster.store import Object, Store
 from fractus_agent.conditions import Condition, timestamp, to_kubernetes
@@ -88,7 +95,9 @@ def node_status(observed: Observed, previous: Object, generation: int | None, no
     """
     conditions = [readiness(observed), observed.certified]
     conditions += [
-        problem for problem in (observed.described, observed.handed, _unrecorded(observed)) if problem is not None
+        more
+        for more in (observed.described, observed.handed, _unrecorded(observed), _taken(observed))
+        if more is not None
     ]
     status: dict[str, Any] = {
         "lastSeen": timestamp(now),
@@ -112,6 +121,15 @@ def _unrecorded(observed: Observed) -> Condition | None:
     flights = observed.snapshot.recording_problem if observed.snapshot is not None else ""
     problem = "; ".join(filter(None, (flights, *observed.unrecorded)))
     return Condition("Recording", "False", "RecordingStopped", problem) if problem else None
+
+
+def _taken(observed: Observed) -> Condition | None:
+    """That the system or a pilot has control in flight, and why; nothing is told while a driver has, or it is not known."""
+    seen = observed.snapshot if observed.problem is None else None
+    if seen is None or not (seen.connected and seen.in_air and seen.controller_reason):
+        return None
+    by = {"pilot": "PilotInControl", "system": "SystemInControl"}.get(seen.controller)
+    return Condition(CONTROL_TAKEN, "True", by, seen.controller_reason) if by else None
 
 
 def _last_known(previous: Object) -> str | None:

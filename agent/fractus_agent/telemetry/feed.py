@@ -75,6 +75,7 @@ def snapshot(message: Telemetry) -> Snapshot:
         velocity_mps=(message.velocity.east_mps, message.velocity.north_mps, -message.velocity.down_mps),
         altitude_amsl_m=message.altitude_amsl_m,
         recording_problem=message.recording_problem,
+        controller_reason=message.controller_reason,
     )
 
 

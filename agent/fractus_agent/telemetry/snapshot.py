@@ -29,3 +29,5 @@ class Snapshot:
     altitude_amsl_m: float = 0.0
     recording_problem: str = ""
     """Why flights are not recorded that should be; empty when nothing is wrong."""
+    controller_reason: str = ""
+    """Why no driver has control; empty while one has, or where that is not known."""

@@ -21,6 +21,9 @@ CLOUD_LABEL = f"{TRUST_DOMAIN}/cloud"
 NODE_SIGNER = f"{TRUST_DOMAIN}/node"
 """The signer that agents ask for the certificates of their nodes."""
 
+CONTROL_TAKEN = "ControlTaken"
+"""Condition of a Drone in the air, by its agent: True while no driver has control of it, with why."""
+
 DNS_LABEL = r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$"
 Name = Annotated[str, Field(min_length=1, max_length=63, pattern=DNS_LABEL)]
 """A DNS label (RFC 1123), as Kubernetes names objects."""

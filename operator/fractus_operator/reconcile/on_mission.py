@@ -56,6 +56,10 @@ class OnMission:
             self._holders.setdefault(node, {})[key] = f"{owner['namespace']}/{owner['name']}"
         return ("", node) if node is not None else None
 
+    def holders(self, drone: str) -> list[str]:
+        """The Applications that may fly a drone, as NAMESPACE/NAME."""
+        return sorted(set(self._holders.get(drone, {}).values()))
+
     async def reconcile(self, key: Key) -> None:
         """Say it of one drone.
 
@@ -71,7 +75,7 @@ class OnMission:
         await self._record_override(drone)
 
     def _observed(self, drone: Drone) -> ConditionUpdate | None:
-        holders = sorted(set(self._holders.get(drone.name, {}).values()))
+        holders = self.holders(drone.name)
         if holders:
             self._reports_of.pop(drone.name, None)
             return ConditionUpdate(ON_MISSION, "True", "Granted", f"{', '.join(holders)} may fly it")

@@ -306,7 +306,7 @@ class StatusText(_message.Message):
     def __init__(self, number: _Optional[int] = ..., severity: _Optional[int] = ..., text: _Optional[str] = ...) -> None: ...
 
 class Telemetry(_message.Message):
-    __slots__ = ("time", "position", "altitude_amsl_m", "velocity", "yaw_deg", "battery_remaining", "battery_voltage_v", "battery_current_a", "armed", "in_air", "mode", "ready", "home", "flight_state", "controller", "autopilot_connected", "missions", "position_error_m", "attitude", "position_age_s", "attitude_age_s", "gps", "wind", "not_ready_reason", "texts", "recording_problem", "gimbal", "gimbal_age_s")
+    __slots__ = ("time", "position", "altitude_amsl_m", "velocity", "yaw_deg", "battery_remaining", "battery_voltage_v", "battery_current_a", "armed", "in_air", "mode", "ready", "home", "flight_state", "controller", "autopilot_connected", "missions", "position_error_m", "attitude", "position_age_s", "attitude_age_s", "gps", "wind", "not_ready_reason", "texts", "recording_problem", "gimbal", "gimbal_age_s", "controller_reason")
     class MissionsEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -342,6 +342,7 @@ class Telemetry(_message.Message):
     RECORDING_PROBLEM_FIELD_NUMBER: _ClassVar[int]
     GIMBAL_FIELD_NUMBER: _ClassVar[int]
     GIMBAL_AGE_S_FIELD_NUMBER: _ClassVar[int]
+    CONTROLLER_REASON_FIELD_NUMBER: _ClassVar[int]
     time: _timestamp_pb2.Timestamp
     position: _types_pb2.Position
     altitude_amsl_m: float
@@ -370,4 +371,5 @@ class Telemetry(_message.Message):
     recording_problem: str
     gimbal: _types_pb2.Attitude
     gimbal_age_s: float
-    def __init__(self, time: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., position: _Optional[_Union[_types_pb2.Position, _Mapping]] = ..., altitude_amsl_m: _Optional[float] = ..., velocity: _Optional[_Union[_types_pb2.Velocity, _Mapping]] = ..., yaw_deg: _Optional[float] = ..., battery_remaining: _Optional[float] = ..., battery_voltage_v: _Optional[float] = ..., battery_current_a: _Optional[float] = ..., armed: bool = ..., in_air: bool = ..., mode: _Optional[str] = ..., ready: bool = ..., home: _Optional[_Union[_types_pb2.Position, _Mapping]] = ..., flight_state: _Optional[str] = ..., controller: _Optional[str] = ..., autopilot_connected: bool = ..., missions: _Optional[_Mapping[str, MissionOutcome]] = ..., position_error_m: _Optional[float] = ..., attitude: _Optional[_Union[_types_pb2.Attitude, _Mapping]] = ..., position_age_s: _Optional[float] = ..., attitude_age_s: _Optional[float] = ..., gps: _Optional[_Union[Gps, _Mapping]] = ..., wind: _Optional[_Union[Wind, _Mapping]] = ..., not_ready_reason: _Optional[str] = ..., texts: _Optional[_Iterable[_Union[StatusText, _Mapping]]] = ..., recording_problem: _Optional[str] = ..., gimbal: _Optional[_Union[_types_pb2.Attitude, _Mapping]] = ..., gimbal_age_s: _Optional[float] = ...) -> None: ...
+    controller_reason: str
+    def __init__(self, time: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., position: _Optional[_Union[_types_pb2.Position, _Mapping]] = ..., altitude_amsl_m: _Optional[float] = ..., velocity: _Optional[_Union[_types_pb2.Velocity, _Mapping]] = ..., yaw_deg: _Optional[float] = ..., battery_remaining: _Optional[float] = ..., battery_voltage_v: _Optional[float] = ..., battery_current_a: _Optional[float] = ..., armed: bool = ..., in_air: bool = ..., mode: _Optional[str] = ..., ready: bool = ..., home: _Optional[_Union[_types_pb2.Position, _Mapping]] = ..., flight_state: _Optional[str] = ..., controller: _Optional[str] = ..., autopilot_connected: bool = ..., missions: _Optional[_Mapping[str, MissionOutcome]] = ..., position_error_m: _Optional[float] = ..., attitude: _Optional[_Union[_types_pb2.Attitude, _Mapping]] = ..., position_age_s: _Optional[float] = ..., attitude_age_s: _Optional[float] = ..., gps: _Optional[_Union[Gps, _Mapping]] = ..., wind: _Optional[_Union[Wind, _Mapping]] = ..., not_ready_reason: _Optional[str] = ..., texts: _Optional[_Iterable[_Union[StatusText, _Mapping]]] = ..., recording_problem: _Optional[str] = ..., gimbal: _Optional[_Union[_types_pb2.Attitude, _Mapping]] = ..., gimbal_age_s: _Optional[float] = ..., controller_reason: _Optional[str] = ...) -> None: ...

@@ -99,10 +99,10 @@ class Control:
         self.modes = modes
         # Each needs the other, so one is looked up when it is called.
         self._machine = Machine(autopilot, known, lambda actions: self._performer.perform(actions))  # noqa: PLW0108
-        self._performer = Performer(self._machine, autopilot, modes, approach, audit=audit, journal=journal)
-        self.tasks, self.leases = self._performer.tasks, self._performer.leases
-        self.wait, self.wake = self._performer.wait, self._performer.wake
-        self.hold, self.undisturbed = self._performer.hold, self._performer.undisturbed
+        performer = self._performer = Performer(self._machine, autopilot, modes, approach, audit=audit, journal=journal)
+        self.tasks, self.leases, self.taken_because = performer.tasks, performer.leases, performer.taken_because
+        self.wait, self.wake = performer.wait, performer.wake
+        self.hold, self.undisturbed = performer.hold, performer.undisturbed
         grants.listen(self._grant_changed)
 
     # The state machine

@@ -25,6 +25,7 @@ from fractus_core.control.actions import (
     WakeWaiters,
 )
 from fractus_core.control.events import Event, SystemTaskEnded
+from fractus_core.control.step import DRIVER_LOST
 from fractus_core.control.values import FlightMode, SystemTask, TaskKind
 from fractus_storage.audit import AuditLog
 
@@ -105,6 +106,11 @@ class Performer:
         self._journal = journal
         self._running: dict[int, asyncio.Task[None]] = {}
         self._changed = asyncio.Event()
+        self._taken_because = ""
+
+    def taken_because(self) -> str:
+        """Why no driver has control; empty while one has, or where that is not known."""
+        return self._taken_because
 
     def perform(self, actions: Sequence[Action]) -> None:
         """Carry out everything, in order.
@@ -223,6 +229,10 @@ class Performer:
     # The audit log
 
     def _record(self, entry: RecordAudit) -> None:
+        if entry.kind == "takeover" or entry.action in {"returned", DRIVER_LOST}:
+            self._taken_because = entry.reason or "its driver returned control"
+        elif entry.action in {"granted", "landed"}:
+            self._taken_because = ""
         vehicle = self._autopilot.vehicle
         self._audit.append(
             entry.kind,

@@ -61,7 +61,7 @@ def telemetry_of(
     Args:
         control: who flies, and what.
         time_s: Unix time.
-        missions: whether the subscriber may know of the missions of all applications.
+        missions: whether the subscriber may know of the missions of all applications, and of what ended their control.
         not_ready_reason: why the motors could not be started now; empty when they could.
         heard: number of the last of the autopilot's texts that the subscriber has.
     """
@@ -79,6 +79,7 @@ def telemetry_of(
         not_ready_reason=not_ready_reason,
         flight_state=vehicle.flight_state,
         controller=control.state.controller,
+        controller_reason=control.taken_because() if missions else "",
         autopilot_connected=control.autopilot.connected,
         missions={key: _ended(outcome) for key, outcome in control.state.outcomes.items()} if missions else {},
     )

@@ -1,0 +1,199 @@
+"""Events of a drone's flights: each transition once, whatever the watch, the agent and the operator do; and no flood."""
+
+from __future__ import annotations
+
+import asyncio
+from datetime import UTC, datetime, timedelta
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+from fractus_core.api import Drone
+from fractus_core.api.model import API_VERSION
+from fractus_operator.cluster.store import KubeError
+from fractus_operator.reconcile import drone_events
+from fractus_operator.reconcile.drone_events import BURST, DroneEvents
+
+NOW = datetime(2026, 6, 1, 12, 0, tzinfo=UTC)
+KEY = ("", "drone-1")
+DRIVER = "spiffe://fractus.dev/ns/city/app/traffic/component/Navigator/instance/a"
+APPLICATION = "city/traffic"
+
+
+def drone(state: str, controller: str | None = "system", *, at_s: int, why: str = "", uid: str = "u1") -> Drone:
+    taken = {
+        "type": "ControlTaken", "status": "True", "reason": "SystemInControl", "message": why,
+        "lastTransitionTime": "2026-06-01T12:00:00Z",
+    }  # fmt: skip
+    status = {"flightState": state, "controller": controller, "lastSeen": (NOW + timedelta(seconds=at_s)).isoformat()}
+    status |= {"conditions": [taken] if why else [], "lastFlightState": "flying" if state == "unknown" else state}
+    metadata = {"name": "drone-1", "uid": uid}
+    return Drone.from_body(
+        {"apiVersion": API_VERSION, "kind": "Drone", "metadata": metadata, "spec": {}, "status": status}
+    )
+
+
+class Cluster:
+    """What the operator sees of a cluster, and the Events that it posts there; an operator may start again."""
+
+    def __init__(self) -> None:
+        self.drones: dict[str, Drone] = {}
+        self.holders: list[str] = [APPLICATION]
+        self.applications: dict[tuple[str, str], Any] = {}
+        self.posted: dict[str, tuple[str, str]] = {}
+        self.failing = 0
+        self.landed = asyncio.Event()
+        self.start()
+
+    def start(self) -> None:
+        async def synced() -> None:
+            return
+
+        live = SimpleNamespace(drone=self.drones.get, synced=synced, applications=self.applications)
+        self.events = DroneEvents(cast(Any, self), cast(Any, live), lambda _drone: self.holders, lambda: NOW)
+
+    async def record_event(
+        self, regarding: Any, *, reason: str, message: str, name: str, warning: bool, **_: object
+    ) -> None:
+        assert regarding["kind"] == "Drone"
+        assert not warning
+        self.failing -= 1
+        if self.failing == 0:
+            raise KubeError(503, "ServiceUnavailable", "not now")
+        self.posted.setdefault(name, (reason, message))  # A second one of that name is dropped.
+        if reason == "Landed":
+            self.landed.set()
+
+    async def see(self, *seen: Drone | None) -> list[str]:
+        """Reasons of what is posted after these reports."""
+        before = len(self.posted)
+        for each in seen:
+            if each is None:
+                self.drones.pop("drone-1")
+            else:
+                self.drones["drone-1"] = each
+            self.events.changed(KEY)
+            await self.events.tell(KEY)
+        return [reason for reason, _ in self.posted.values()][before:]
+
+    def sentences(self) -> list[str]:
+        return [sentence for _, sentence in self.posted.values()]
+
+
+@pytest.fixture
+def cluster() -> Cluster:
+    return Cluster()
+
+
+def ended(message: str) -> Any:
+    condition = {"type": "MissionComplete", "status": "True", "reason": "MissionComplete", "message": message}
+    return SimpleNamespace(body={"status": {"conditions": [condition]}})
+
+
+async def test_the_story_of_a_flight(cluster: Cluster) -> None:
+    assert await cluster.see(drone("inactive", at_s=0), drone("inactive", DRIVER, at_s=1)) == []
+    assert await cluster.see(drone("takingOff", DRIVER, at_s=2)) == ["TookOff", "MissionBegun"]
+    assert await cluster.see(drone("flying", DRIVER, at_s=6), drone("flying", DRIVER, at_s=11)) == []
+    taken = drone("flying", "system", at_s=12, why="policy campus forbids it")
+    assert await cluster.see(taken) == ["SystemTookControl"]
+    assert await cluster.see(drone("flying", DRIVER, at_s=20)) == ["ControlGranted"]
+    assert await cluster.see(drone("flying", "pilot", at_s=25)) == ["PilotTookControl"]
+    cluster.holders = []
+    cluster.applications["city", "traffic"] = ended("all control points were returned")
+    assert await cluster.see(drone("landing", "pilot", at_s=28)) == ["MissionOver"]
+    assert await cluster.see(drone("inactive", "system", at_s=30), drone("charging", "system", at_s=60)) == ["Landed"]
+    assert cluster.sentences() == [
+        "drone-1 took off, flown by Navigator",
+        "city/traffic flies drone-1",
+        "the system has control of drone-1 instead of Navigator: policy campus forbids it",
+        "Navigator has control of drone-1",
+        "a pilot has control of drone-1 instead of Navigator",
+        "city/traffic does not fly drone-1 any more: all control points were returned",
+        "drone-1 landed",
+    ]
+
+
+async def test_what_does_not_fly_has_no_events(cluster: Cluster) -> None:
+    """Planning, and what follows from it, takes no further request."""
+    cluster.holders = []
+    await cluster.see(drone("inactive", at_s=0))
+    cluster.holders = [APPLICATION]
+    await cluster.see(drone("inactive", DRIVER, at_s=5))
+    cluster.holders = []
+    assert await cluster.see(drone("inactive", "system", at_s=9)) == []
+    assert not cluster.posted
+
+
+async def test_an_operator_that_starts_tells_only_what_comes_then(cluster: Cluster) -> None:
+    await cluster.see(drone("inactive", at_s=0), drone("flying", DRIVER, at_s=5))
+    before = dict(cluster.posted)
+    cluster.start()
+    assert await cluster.see(drone("flying", DRIVER, at_s=5), drone("flying", DRIVER, at_s=10)) == []
+    assert cluster.posted == before
+    cluster.holders = []
+    assert await cluster.see(drone("landing", DRIVER, at_s=15)) == ["MissionOver"], "it flew when the operator started"
+    assert cluster.sentences()[-1].endswith("any more: it was deleted")
+    cluster.start()
+    assert await cluster.see(drone("inactive", at_s=16)) == []
+
+
+@pytest.mark.parametrize("late_s", [1, 30, 60])
+async def test_reports_that_come_twice_or_late_are_not_told(cluster: Cluster, late_s: int) -> None:
+    landed = drone("inactive", at_s=100)
+    await cluster.see(drone("inactive", at_s=0), drone("flying", at_s=50), landed)
+    before = dict(cluster.posted)
+    assert (
+        await cluster.see(landed, drone("flying", DRIVER, at_s=100 - late_s), landed, drone("inactive", at_s=105)) == []
+    )
+    assert cluster.posted == before
+
+
+async def test_a_clock_that_is_set_back_silences_no_drone(cluster: Cluster) -> None:
+    await cluster.see(drone("inactive", at_s=86_400))
+    assert await cluster.see(drone("flying", at_s=0)) == ["TookOff", "MissionBegun"]
+
+
+async def test_a_silent_drone_neither_landed_nor_changed_hands(cluster: Cluster) -> None:
+    await cluster.see(drone("inactive", at_s=0), drone("flying", DRIVER, at_s=5))
+    silent = drone("unknown", None, at_s=5)
+    assert await cluster.see(silent, drone("flying", DRIVER, at_s=500)) == []
+    assert await cluster.see(silent, drone("inactive", at_s=900)) == ["Landed"]
+    assert cluster.sentences()[-1] == "drone-1 landed, between 12:08:20 and 12:15:00 UTC"
+
+
+async def test_a_drone_of_the_same_name_is_another(cluster: Cluster) -> None:
+    await cluster.see(drone("inactive", at_s=0))
+    assert await cluster.see(drone("flying", at_s=5, uid="u2")) == []
+    assert await cluster.see(None, drone("inactive", at_s=9, uid="u2")) == []
+
+
+async def test_what_fails_is_posted_later_and_the_rest_not_again(cluster: Cluster) -> None:
+    await cluster.see(drone("inactive", at_s=0))
+    cluster.failing = 2
+    with pytest.raises(KubeError):
+        await cluster.see(drone("flying", at_s=5))
+    assert [reason for reason, _ in cluster.posted.values()] == ["TookOff"]
+    assert await cluster.see(drone("flying", at_s=10)) == ["MissionBegun"]
+
+
+async def test_a_drone_that_flaps_writes_few_events(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(drone_events, "PERIOD_S", 1e6)
+    cluster.holders = []
+    for flap in range(2000):
+        await cluster.see(drone("inactive" if flap % 2 else "flying", at_s=flap))
+    assert len(cluster.posted) == BURST
+    assert cluster.sentences()[-1] == "drone-1 took off, flown by system"
+    monkeypatch.setattr(drone_events, "PERIOD_S", 1e-9)
+    assert await cluster.see(drone("inactive", at_s=2001)) == ["Landed"], "how it is now is told when it may be"
+
+
+async def test_what_may_not_be_told_yet_is_told_later(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(drone_events, "PERIOD_S", 0.2)
+    monkeypatch.setattr(drone_events, "BURST", 1)
+    cluster.holders = []
+    await cluster.see(drone("inactive", at_s=0), drone("flying", at_s=1), drone("inactive", at_s=2))
+    running = asyncio.create_task(cluster.events.worklist.run())
+    async with asyncio.timeout(20.0):
+        await cluster.landed.wait()
+    running.cancel()
+    assert cluster.sentences() == ["drone-1 took off, flown by system", "drone-1 landed"]

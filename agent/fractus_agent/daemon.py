@@ -105,7 +105,7 @@ class Agent:
             reported_s=self._reporter.age_s,
             telemetry_s=(self._feed.age_s if self._feed else math.inf) if self._has_mobility() else None,
             grants=self._keeper.counts(),
-            checkpoints={log: int(number) for log, number, _ in heads},
+            checkpoints={log: (int(number), hash_) for log, number, hash_ in heads},
         ).metrics()
         if self._links is not None:
             yield from self._links.figures()

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 from fractus_observe.exposition import CERTIFICATE_EXPIRY
-from fractus_observe.figures import Figure, gauge
+from fractus_observe.figures import Figure, gauge, hash_number
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,7 +19,7 @@ class AgentFigures:
         reported_s: seconds since the API server took the node's status; infinite before that.
         telemetry_s: seconds since the mobility service was heard; None on a node without one.
         grants: how many are stored, unverified, unusable or unstored.
-        checkpoints: by name of an audit log, number of the entry that was signed last.
+        checkpoints: by name of an audit log, number and hash of the entry that was signed last.
     """
 
     expires_s: float | None
@@ -27,7 +27,7 @@ class AgentFigures:
     reported_s: float
     telemetry_s: float | None
     grants: Mapping[str, int] = field(default_factory=dict)
-    checkpoints: Mapping[str, int] = field(default_factory=dict)
+    checkpoints: Mapping[str, tuple[int, str]] = field(default_factory=dict)
 
     def metrics(self) -> Iterator[Figure]:
         """All of it for Prometheus."""
@@ -46,6 +46,12 @@ class AgentFigures:
         yield gauge(
             "fractus_audit_checkpoint_sequence",
             "Number of the entry of an audit log that was signed last.",
-            self.checkpoints,
+            {log: number for log, (number, _) in self.checkpoints.items()},
+            "log",
+        )
+        yield gauge(
+            "fractus_audit_checkpoint_head",
+            "First 13 hexadecimal digits of that entry's hash, as a number.",
+            {log: hash_number(hash_) for log, (_, hash_) in self.checkpoints.items()},
             "log",
         )

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from fractus_observe.exposition import CERTIFICATE_EXPIRY
-from fractus_observe.figures import Counter, Figure, gauge, text_of
+from fractus_observe.figures import Counter, Figure, gauge, hash_number, text_of
 from fractus_storage.audit import AuditLog
 
 from fractus_services.grants import GrantFiles
@@ -99,7 +99,10 @@ def common_figures(
     if expires_s is not None:
         yield gauge(CERTIFICATE_EXPIRY, "When the node's certificate expires, in Unix time.", expires_s)
     yield gauge("fractus_grants", "Grants in force.", len(grants.active))
-    yield gauge("fractus_audit_sequence", "Number of the last entry of the audit log on disk.", audit.sequence)
+    head = audit.head
+    yield gauge("fractus_audit_sequence", "Number of the last entry of the audit log on disk.", head.sequence)
+    digits = hash_number(head.hash)
+    yield gauge("fractus_audit_head", "First 13 hexadecimal digits of that entry's hash, as a number.", digits)
     yield gauge("fractus_audit_waiting", "Entries of the audit log that are not on disk yet.", audit.waiting)
     yield gauge("fractus_audit_failing", "1 while the audit log cannot be written.", bool(audit.failure))
     yield gauge("fractus_recording_failing", "1 while nothing is recorded that should be.", bool(recording_problem()))

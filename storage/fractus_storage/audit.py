@@ -131,9 +131,9 @@ class AuditLog:
         return self._problem
 
     @property
-    def sequence(self) -> int:
-        """Number of the last entry on disk; 0 while there is none."""
-        return self._end.sequence
+    def head(self) -> Link:
+        """Number and hash of the last entry on disk."""
+        return self._end
 
     @property
     def waiting(self) -> int:

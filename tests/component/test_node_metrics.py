@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import math
 from ipaddress import IPv4Address
 from pathlib import Path
@@ -91,6 +92,8 @@ def test_the_mobility_service_tells_what_is_documented(tmp_path: Path) -> None:
     assert_documented(whole, "Mobility and camera", "Mobility")
     seen = values(whole)
     assert seen["fractus_audit_sequence",] == 3
+    last = json.loads((tmp_path / "audit.jsonl").read_text().splitlines()[-1])
+    assert f"{int(seen['fractus_audit_head',]):013x}" == last["hash"][:13]
     assert seen["fractus_audit_waiting",] == seen["fractus_audit_failing",] == seen["fractus_recording_failing",] == 0
     assert seen["fractus_grants",] == 2
     assert seen["fractus_in_air",] == seen["fractus_companion_alive",] == seen["fractus_failsafes_verified",] == 1
@@ -108,7 +111,7 @@ def test_the_agent_tells_what_is_documented() -> None:
         reported_s=math.inf,
         telemetry_s=0.5,
         grants={"stored": 2, "unverified": 0},
-        checkpoints={"mobility": 7},
+        checkpoints={"mobility": (7, "fedcba9876543210" * 4)},
     )
     told = text(figures.metrics)
     assert_documented(told, "Agent")
@@ -116,6 +119,7 @@ def test_the_agent_tells_what_is_documented() -> None:
     assert seen["fractus_agent_report_age_seconds",] == math.inf
     assert seen["fractus_agent_watch_age_seconds", "grants"] == 3.0
     assert seen["fractus_audit_checkpoint_sequence", "mobility"] == 7.0
+    assert seen["fractus_audit_checkpoint_head", "mobility"] == 0xFEDCBA9876543
 
 
 def test_the_drones_links_tell_what_is_documented() -> None:

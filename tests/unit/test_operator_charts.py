@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from fractus_cli.doctor import MIN_VERSION
 from fractus_cluster.images.build import image_name
 from fractus_core.api import KINDS
 from fractus_core.api.crd import crd
@@ -48,6 +49,15 @@ def test_the_charts_have_the_version_of_the_package_and_the_images_of_the_checko
         described = yaml.safe_load((CHARTS / chart / "Chart.yaml").read_text())
         assert described["version"] == version
         assert image_name("agent", described["appVersion"]) == image_name("agent")
+
+
+def test_the_charts_ask_for_the_kubernetes_that_is_said() -> None:
+    least = ".".join(map(str, MIN_VERSION))
+    for page in ("README.md", "docs/clusters.md"):
+        assert f"Kubernetes {least} or later" in (ROOT / page).read_text()
+    for chart in ("fractus", "fractus-crds", "fractus-demo"):
+        described = yaml.safe_load((CHARTS / chart / "Chart.yaml").read_text())
+        assert described["kubeVersion"] == f">={least}.0-0"
 
 
 def test_the_templates_know_the_defaults() -> None:

@@ -167,7 +167,7 @@ SHIPPED := --frozen --no-dev --extra operator --extra agent --extra services --e
 
 # The charts of a checkout take the images that are built from it (localhost/fractus/NAME:dev), those of a release its own.
 REGISTRY ?= localhost/fractus
-DIST ?= dist
+DIST := dist
 PACKAGED = $(shell sed -n 's/^version = "\(.*\)"/\1/p' pyproject.toml)
 .PHONY: charts
 charts: ## Package the charts into dist/, for the images of this version in REGISTRY=localhost/fractus
@@ -178,17 +178,39 @@ charts: ## Package the charts into dist/, for the images of this version in REGI
 			"$$helm" package "$$chart" --version $(PACKAGED) --app-version $(PACKAGED) --destination $(DIST) > /dev/null; \
 		done
 
+# Docker builds for several architectures, with what images consist of and how they were made; without PLATFORMS buildah builds for this one.
+RELEASED := operator agent mobility camera view component sim example-traffic-monitoring
+.PHONY: archives
+archives: env ## Save the images of this version into dist/, as nodes load them (PLATFORMS=linux/amd64,linux/arm64: with Docker)
+	mkdir -p $(DIST)
+ifdef PLATFORMS
+	for image in $(RELEASED); do \
+		docker buildx build --quiet --platform $(PLATFORMS) --target "$$image" --tag "$(REGISTRY)/$$image:$(PACKAGED)" --sbom=true \
+			$(if $(BASE),--build-arg "BASE=$(BASE)") --provenance=mode=max \
+			--output "type=oci,rewrite-timestamp=true,dest=$(DIST)/$$image-$(PACKAGED).image.tar" .; \
+	done
+else
+	$(RUN) python -m fractus_cluster.images build --tag $(PACKAGED) $(RELEASED)
+	for image in $(RELEASED); do \
+		buildah push --quiet "localhost/fractus/$$image:$(PACKAGED)" \
+			"docker-archive:$(DIST)/$$image-$(PACKAGED).image.tar:$(REGISTRY)/$$image:$(PACKAGED)"; \
+	done
+endif
+
+TAG ?= $(shell git describe --tags --exact-match --match 'v[0-9]*' 2> /dev/null)
 .PHONY: dist
-dist: env ## Build what a release has into dist/: wheel, source archive, charts, dependencies and their licences, checksums
+dist: $(if $(PLATFORMS),,packages) env ## Build all of a release into dist/: wheel, charts, images, dependencies and licences, checksums
+	@[ "$(or $(TAG),v$(PACKAGED))" = "v$(PACKAGED)" ] || { echo "the tag $(TAG) is not that of version $(PACKAGED) in pyproject.toml:" \
+		"make release VERSION=$(TAG:v%=%), commit, and tag that" >&2; exit 1; }
 	rm -rf dist
 	$(UV) build --quiet --out-dir dist
 	command -v helm > /dev/null || $(RUN) fractus cluster binaries
-	$(MAKE) charts
+	$(MAKE) charts archives
 	$(UV) export --quiet $(SHIPPED) --no-emit-project --format cyclonedx1.5 > dist/dependencies.cdx.json
 	# A licence that asks more than to be named would bind what is built on Fractus.
 	$(UV) run --quiet --isolated $(SHIPPED) --with pip-licenses==5.5.5 pip-licenses --ignore-packages fractus-drones \
 		--format=markdown --with-urls --order=license --partial-match --fail-on=GPL --output-file=dist/LICENSES.md > /dev/null
-	cd dist && sha256sum -- *.whl *.tar.gz *.tgz *.json *.md > SHA256SUMS
+	cd dist && sha256sum -- *.whl *.tar.gz *.tgz *.image.tar *.json *.md > SHA256SUMS
 
 .PHONY: audit
 audit: env ## Look for known vulnerabilities in what is shipped (asks PyPI's advisories)

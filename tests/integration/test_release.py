@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
 import subprocess
+import tarfile
 from pathlib import Path
 
 import pytest
 import yaml
 from chart import CHARTS, Body, helm, render
 from control_plane import ControlPlane
+from fractus_cluster.commands import run
 from fractus_cluster.images.build import image_name
 from operator_world import SYSTEM
 
@@ -31,34 +34,46 @@ def script(beginning: str) -> str:
     return str(found)
 
 
-def run_step(beginning: str, folder: Path, **stubs: str) -> None:
-    """Run a step of the workflow for a tag, with stubs in place of programs that would reach a registry."""
-    programs = folder / "programs"
-    programs.mkdir(exist_ok=True)
-    for name, text in stubs.items():
-        (programs / name).write_text(f"#!/bin/sh\n{text}\n")
-        (programs / name).chmod(0o755)
-    variables = {
-        "PATH": f"{programs}:{os.environ['PATH']}", "GITHUB_REPOSITORY_OWNER": "Some-One", "GITHUB_REF_NAME": f"v{VERSION}",
-        "FOLDER": str(folder),
-    }  # fmt: skip
-    subprocess.run(
-        ["bash", "-euo", "pipefail", "-c", script(beginning)], env={**os.environ, **variables}, cwd=ROOT, timeout=60, check=True
-    )  # fmt: skip
+STUBS = {
+    "make": f'shift; exec {shutil.which("make")} -C {ROOT} charts archives DIST="$PWD/dist" "$@"',
+    # An archive holds the name of its image here.
+    "docker": """
+while [ $# -gt 0 ]; do
+  case $1 in --tag) name=$2 ;; --output) archive=${2##*dest=} ;; esac
+  shift
+done
+echo "$name" > "$archive"
+""",
+    "skopeo": """
+while [ $# -gt 2 ]; do
+  [ "$1" != --digestfile ] || echo sha256:0 > "$2"
+  shift
+done
+echo "$(cat "${1#oci-archive:}") ${2#docker://}" >> saved-and-pushed
+""",
+    "cosign": 'echo "$3" >> signed',
+}
+"""What stands for the programs that would build for half an hour, or reach a registry."""
 
 
 @pytest.fixture(scope="module")
 def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A directory with the charts of a release, and `pushed`, the names of its images, by the workflow's own commands."""
+    """A directory in which the workflow's own commands have run for a tag, with stubs: `dist`, and lists of images."""
     folder = tmp_path_factory.mktemp("release")
-    run_step("make dist", folder, make=f'shift; exec {shutil.which("make")} charts DIST="$FOLDER" "$@"')
-    pushes = 'while [ "$1" != --tag ]; do shift; done; echo "$2" >> "$FOLDER/pushed"'
-    run_step("registry=", folder, docker=pushes, cosign="true", jq="echo sha256:0")
+    (folder / "programs").mkdir()
+    for name, text in STUBS.items():
+        (folder / "programs" / name).write_text(f"#!/bin/sh\n{text}\n")
+        (folder / "programs" / name).chmod(0o755)
+    variables = {"GITHUB_REPOSITORY_OWNER": "Some-One", "GITHUB_REF_NAME": f"v{VERSION}"}
+    variables["PATH"] = f"{folder / 'programs'}:{os.environ['PATH']}"
+    for step in ("make dist", "for archive"):
+        argv = ["bash", "-euo", "pipefail", "-c", script(step)]
+        subprocess.run(argv, env={**os.environ, **variables}, cwd=folder, timeout=60, check=True)
     return folder
 
 
 def rendered(folder: Path, chart: str, *values: str) -> list[Body]:
-    return render(*values, chart=folder / f"{chart}-{VERSION}.tgz")
+    return render(*values, chart=folder / "dist" / f"{chart}-{VERSION}.tgz")
 
 
 def images_of(bodies: list[Body]) -> set[str]:
@@ -69,11 +84,15 @@ def images_of(bodies: list[Body]) -> set[str]:
 
 
 def test_the_charts_of_a_release_run_the_images_that_it_pushes(published: Path) -> None:
-    pushed = set((published / "pushed").read_text().split())
+    pairs = [line.split() for line in (published / "saved-and-pushed").read_text().splitlines()]
+    assert all(saved == to for saved, to in pairs), (
+        "an archive that is loaded has the name by which its image is pulled"
+    )
+    pushed = {to for _, to in pairs}
     assert f"ghcr.io/some-one/fractus/operator:{VERSION}" in pushed
     bodies = [*rendered(published, "fractus", *EVERYTHING), *rendered(published, "fractus-demo", "--set=drone=d")]
     assert images_of(bodies) | {f"ghcr.io/some-one/fractus/{BUILT_ON}:{VERSION}"} == pushed
-    assert len(pushed) == len(images_of(bodies)) + 1
+    assert set((published / "signed").read_text().split()) == {f"{name.rpartition(':')[0]}@sha256:0" for name in pushed}
 
 
 def test_the_charts_of_a_checkout_run_the_images_that_are_built_from_it() -> None:
@@ -87,9 +106,39 @@ def test_a_tag_that_is_said_is_taken() -> None:
     assert {name.rpartition(":")[2] for name in images_of(bodies)} == {"1.2.3"}
 
 
+def test_a_tag_of_another_version_is_refused() -> None:
+    done = subprocess.run(
+        ["make", "dist", "TAG=v9.9.9", "PLATFORMS=none"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert (
+        f"the tag v9.9.9 is not that of version {VERSION} in pyproject.toml: make release VERSION=9.9.9" in done.stderr
+    )
+
+
+@pytest.mark.root
+@pytest.mark.timeout(900)
+@pytest.mark.xdist_group("cluster")
+def test_an_image_is_saved_under_the_name_that_the_charts_pull(tmp_path: Path) -> None:
+    run(
+        ["make", "archives", "RELEASED=component", "REGISTRY=registry.example/f", f"DIST={tmp_path}"],
+        cwd=ROOT,
+        timeout_s=600,
+    )
+    with tarfile.open(tmp_path / f"component-{VERSION}.image.tar") as archive:
+        described = json.loads((archive.extractfile("manifest.json") or pytest.fail("no manifest")).read())
+    (image,) = described
+    assert f"registry.example/f/component:{VERSION}" in image["RepoTags"]
+
+
 @pytest.mark.parametrize(("tag", "said"), [("0.0.1", True), (VERSION, False), ("", False)])
 def test_who_keeps_another_tag_is_told(control_plane: ControlPlane, published: Path, tag: str, *, said: bool) -> None:
-    argv = [helm(), "install", "fractus", str(published / f"fractus-{VERSION}.tgz"), f"--set=image.tag={tag}"]
+    argv = [helm(), "install", "fractus", str(published / "dist" / f"fractus-{VERSION}.tgz"), f"--set=image.tag={tag}"]
     argv += ["--namespace", SYSTEM, "--dry-run=server", "--kubeconfig", str(control_plane.kubeconfig)]
     done = subprocess.run(argv, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr

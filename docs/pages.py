@@ -1,10 +1,11 @@
 """What the site has beside the files of docs/: pages of the repository's root, and the reference, generated from the code.
 
-A hook of MkDocs, see mkdocs.yml.
+A hook of MkDocs, see mkdocs.yml. Run as a program, it writes the charts' README.md.
 """
 
 from __future__ import annotations
 
+import json
 import posixpath
 import re
 import tempfile
@@ -166,15 +167,39 @@ def _plain(name: str) -> str:
 def values() -> Iterator[str]:
     """Every value of every chart, from the comments of values.yaml."""
     yield "# Chart values"
-    for chart in sorted((ROOT / "charts").iterdir()):
+    for chart in charts():
         described = yaml.safe_load((chart / "Chart.yaml").read_text())
         yield f"## {described['name']}"
         yield f"{described['description']}."
-        rows = list(_values((chart / "values.yaml").read_text().splitlines()))
-        yield "\n".join(["| Value | Default | Meaning |", "|---|---|---|", *rows])
+        yield _value_table(chart)
 
 
-def _values(lines: list[str]) -> Iterator[str]:
+def charts() -> list[Path]:
+    """The folders of the charts."""
+    return sorted(path.parent for path in (ROOT / "charts").glob("*/Chart.yaml"))
+
+
+def chart_readme(chart: Path) -> str:
+    """What `helm show readme` prints of a chart."""
+    described = yaml.safe_load((chart / "Chart.yaml").read_text())
+    parts = [
+        f"# {described['name']}",
+        f"{described['description']}.",
+        f"For Kubernetes `{described['kubeVersion']}`. How to install it: [README](../../README.md#on-your-own-cluster),"
+        " [clusters](../../docs/clusters.md), [upgrades](../../docs/upgrades.md).",
+        "## Values",
+        _value_table(chart),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _value_table(chart: Path) -> str:
+    schema = json.loads((chart / "values.schema.json").read_text())
+    rows = _values((chart / "values.yaml").read_text().splitlines(), schema)
+    return "\n".join(["| Value | Default | Meaning |", "|---|---|---|", *rows])
+
+
+def _values(lines: list[str], schema: dict[str, Any]) -> Iterator[str]:
     above: list[tuple[int, str]] = []
     said: list[str] = []
     for line in lines:
@@ -190,10 +215,21 @@ def _values(lines: list[str]) -> Iterator[str]:
         above = [(depth, name) for depth, name in above if depth < indent]
         default = (found.group(3) or "").strip()
         if default or said:
-            name = ".".join([*(name for _, name in above), found.group(2)])
-            yield f"| `{name}` | {f'`{_cell(default)}`' if default else ''} | {_cell(' '.join(said))} |"
+            path = [*(name for _, name in above), found.group(2)]
+            meaning = " ".join(said) or _description(schema, path)
+            yield f"| `{'.'.join(path)}` | {f'`{_cell(default)}`' if default else ''} | {_cell(meaning)} |"
         above.append((indent, found.group(2)))
         said = []
+
+
+def _description(schema: dict[str, Any], path: list[str]) -> str:
+    """What the schema says of a value; empty where it says nothing."""
+    part = schema
+    for name in path:
+        part = part.get("properties", {}).get(name, {})
+        if "$ref" in part:
+            part = schema["definitions"][part["$ref"].rpartition("/")[2]]
+    return str(part.get("description", ""))
 
 
 def commands() -> Iterator[str]:
@@ -218,3 +254,8 @@ def _help(command: click.Command | None, above: click.Context, name: str) -> Ite
 
 def _cell(text: str) -> str:
     return " ".join(str(text).split()).replace("|", "\\|")
+
+
+if __name__ == "__main__":
+    for folder in charts():
+        (folder / "README.md").write_text(chart_readme(folder))

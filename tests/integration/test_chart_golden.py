@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+import subprocess
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
-from chart import CHARTS, render, values_of
+from chart import CHARTS, helm, render, values_of
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "charts"
 EVERYTHING = {chart: GOLDEN / "values" / f"{chart}.yaml" for chart in ("fractus", "fractus-demo")}
@@ -67,3 +68,11 @@ def test_the_kinds_are_the_generated_ones_and_kept() -> None:
                 body["metadata"]["annotations"] = body["metadata"].get("annotations", {}) | kept
             assert bodies.pop(body["metadata"]["name"]) == body
         assert bodies == {}
+
+
+@pytest.mark.parametrize("chart", ["fractus", "fractus-crds", "fractus-demo"])
+def test_helm_shows_what_can_be_set(chart: str) -> None:
+    argv = [helm(), "show", "readme", str(CHARTS / chart)]
+    shown = subprocess.run(argv, capture_output=True, text=True, timeout=60, check=True).stdout
+    assert "| Value | Default | Meaning |" in shown
+    assert shown.strip() == (CHARTS / chart / "README.md").read_text().strip()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 from pathlib import Path
 
@@ -63,3 +64,25 @@ def test_the_charts_ask_for_the_kubernetes_that_is_said() -> None:
 def test_the_templates_know_the_defaults() -> None:
     known = (CHARTS / "fractus" / "files" / "values.yaml").read_text()
     assert known == (CHARTS / "fractus" / "values.yaml").read_text(), "run `make generate`"
+
+
+@pytest.mark.parametrize("chart", ["fractus", "fractus-crds", "fractus-demo"])
+def test_the_readme_has_the_values(chart: str) -> None:
+    spec = importlib.util.spec_from_file_location("pages", ROOT / "docs" / "pages.py")
+    assert spec is not None
+    assert spec.loader is not None
+    pages = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(pages)
+    text = (CHARTS / chart / "README.md").read_text()
+    assert text == pages.chart_readme(CHARTS / chart), "run `make generate`"
+
+    def leaves(values: dict, above: str) -> list[str]:
+        return [
+            name
+            for key, value in values.items()
+            for name in (leaves(value, f"{above}{key}.") if isinstance(value, dict) and value else [f"{above}{key}"])
+        ]
+
+    for name in leaves(yaml.safe_load((CHARTS / chart / "values.yaml").read_text()), ""):
+        # What is written in braces has one row.
+        assert f"`{name}`" in text or f"`{name.rpartition('.')[0]}`" in text, name

@@ -14,7 +14,11 @@ from operator_world import SYSTEM, World
 Body = dict[str, Any]
 CHARTS = Path(__file__).parents[2] / "charts"
 KUBERNETES = f"--kube-version={KUBERNETES_VERSIONS[chosen_kubernetes()]}"
-_PLURALS = {"PriorityClass": "priorityclasses", "ValidatingAdmissionPolicy": "validatingadmissionpolicies"}
+_PLURALS = {
+    "NetworkPolicy": "networkpolicies",
+    "PriorityClass": "priorityclasses",
+    "ValidatingAdmissionPolicy": "validatingadmissionpolicies",
+}
 
 
 def install(world: World) -> None:

@@ -187,3 +187,34 @@ def test_the_vehicle_of_the_demo_takes_them_too() -> None:
     (container,) = after["spec"]["containers"]
     assert container["env"] == FOR_ALL["extraEnv"]
     assert container["resources"]["requests"]["cpu"] == "1m"
+
+
+@pytest.mark.parametrize(("said", "host"), [((), "127.0.0.1"), (("--set=metrics.nodes.address=node",), None)])
+def test_an_agent_is_ready_when_it_answers_for_its_metrics(said: tuple[str, ...], host: str | None) -> None:
+    (container,) = templates(*said)["agent"]["spec"]["containers"]
+    asked = container["readinessProbe"]["httpGet"]
+    assert (asked["path"], asked.get("host")) == ("/metrics", host)
+    (listens,) = (one["value"] for one in container["env"] if one["name"] == "FRACTUS_METRICS")
+    assert listens == f"{host or '$(FRACTUS_HOST)'}:{asked['port']}"
+
+
+def test_without_metrics_an_agent_is_ready_when_it_runs() -> None:
+    (container,) = templates("--set=metrics.nodes.enabled=false")["agent"]["spec"]["containers"]
+    assert "readinessProbe" not in container
+
+
+@pytest.mark.parametrize("part", ON_NODES)
+def test_nothing_restarts_a_node_s_services_in_the_air(part: str) -> None:
+    (container,) = plain()[part]["spec"]["containers"]
+    assert "readinessProbe" in container
+    assert not {"livenessProbe", "startupProbe"} & set(container)
+
+
+def test_what_listens_in_the_operator_s_pods_is_reached_and_nothing_else() -> None:
+    (policy,) = (b for b in render() if (b["kind"], b["metadata"]["name"]) == ("NetworkPolicy", "fractus-operator"))
+    assert policy["spec"]["policyTypes"] == ["Ingress"], "what it asks of others is left alone"
+    pod = templates()["operator"]
+    assert policy["spec"]["podSelector"]["matchLabels"].items() <= pod["metadata"]["labels"].items()
+    (rule,) = policy["spec"]["ingress"]
+    (container,) = pod["spec"]["containers"]
+    assert {port["port"] for port in rule["ports"]} == {port["name"] for port in container["ports"]}

@@ -13,6 +13,10 @@ from operator_world import SYSTEM, World
 
 Body = dict[str, Any]
 CHARTS = Path(__file__).parents[2] / "charts"
+_GOLDEN = Path(__file__).parents[1] / "golden" / "charts" / "values"
+EVERYTHING = {chart: _GOLDEN / f"{chart}.yaml" for chart in ("fractus", "fractus-demo")}
+"""Values with all switched on that can be, and all set that is empty by itself."""
+
 KUBERNETES = f"--kube-version={KUBERNETES_VERSIONS[chosen_kubernetes()]}"
 _PLURALS = {
     "NetworkPolicy": "networkpolicies",

@@ -9,10 +9,9 @@ from typing import Any
 
 import pytest
 import yaml
-from chart import CHARTS, helm, render, values_of
+from chart import CHARTS, EVERYTHING, helm, render, values_of
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "charts"
-EVERYTHING = {chart: GOLDEN / "values" / f"{chart}.yaml" for chart in ("fractus", "fractus-demo")}
 CASES = {
     "fractus": ("fractus",),
     "fractus-everything": ("fractus", f"--values={EVERYTHING['fractus']}", "--is-upgrade"),

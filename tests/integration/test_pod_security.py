@@ -6,7 +6,7 @@ import subprocess
 from collections.abc import Iterator
 
 import pytest
-from chart import CHARTS, helm
+from chart import CHARTS, KUBERNETES, helm
 from control_plane import ControlPlane
 from operator_world import SYSTEM, World
 
@@ -24,7 +24,7 @@ def namespace(world: World) -> Iterator[str]:
 def rendered(chart: str, control_plane: ControlPlane, *more: str) -> subprocess.CompletedProcess[str]:
     """As `helm install` renders it first, which stops there when this fails."""
     argv = [helm(), "template", chart, str(CHARTS / chart), "-n", SYSTEM, "--kubeconfig", str(control_plane.kubeconfig)]
-    argv += ["--kube-version=1.35.4", *CHART[chart], *more]
+    argv += [KUBERNETES, *CHART[chart], *more]
     return subprocess.run(argv, capture_output=True, text=True, timeout=60, check=False)
 
 

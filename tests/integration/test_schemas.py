@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 import yaml
-from chart import CHARTS, render, values_of
+from chart import CHARTS, EVERYTHING, render
 from fractus_cluster.binaries import KUBERNETES_VERSIONS
 from kubernetes_validate import validate
 from kubernetes_validate.utils import SchemaNotFoundError, ValidationError
@@ -25,29 +25,15 @@ ELSEWHERE = {"fractus.dev", "monitoring.coreos.com"}
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "operator" / "expected"
 
-FILLED = (
-    "--set=imagePullSecrets={registry}",
-    '--set-json=operator.nodeSelector={"disk": "ssd"}',
-    '--set-json=operator.tolerations=[{"key": "node-role.kubernetes.io/control-plane", "operator": "Exists"}]',
-    '--set-json=mobility.extraEnv=[{"name": "A", "value": "b"}]',
-    '--set-json=camera.extraEnv=[{"name": "A", "value": "b"}]',
-    "--set=mobility.autopilot=tcp:127.0.0.1:5760",
-    "--set=view.hostnames={view.example.org}",
-    "--set=view.namespace=city",
-)
-"""Values that are empty unless someone fills them."""
-
 
 @cache
 def made(what: str) -> tuple[Body, ...]:
     """Objects that a version is asked about."""
     match what:
         case "fractus with everything":
-            off = [name for name, value in values_of("fractus") if value is False]
-            assert {"view.enabled", "metrics.podMonitor.enabled", "uninstall.wipeNodes"} <= set(off)
-            return tuple(render(*(f"--set={name}=true" for name in off), *FILLED))
+            return tuple(render(f"--values={EVERYTHING['fractus']}", "--is-upgrade"))
         case "fractus-demo":
-            return tuple(render("--set=drone=d", "--set=edgeNodes={a,b,c}", chart=what))
+            return tuple(render(f"--values={EVERYTHING[what]}", chart=what))
         case "operator":
             return tuple(yaml.safe_load(path.read_text()) for path in sorted(GOLDEN.glob("*.yaml")))
         case _:

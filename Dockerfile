@@ -154,7 +154,7 @@ RUN uv build --quiet --wheel --no-build-isolation --out-dir /wheel \
  && assemble operator fractus_core fractus_kube fractus_observe fractus_operator \
  && assemble agent fractus_core fractus_kube fractus_observe fractus_storage fractus_agent \
  && assemble services fractus fractus_cli fractus_core fractus_mavlink fractus_observe fractus_storage fractus_services \
- && assemble view fractus_core fractus_kube fractus_cli fractus_view \
+ && assemble view fractus_core fractus_kube fractus_cli fractus_observe fractus_view \
  && assemble sim fractus_vehicle fractus_world
 
 # ---- python: the common start of all images, with what the SDK needs

@@ -18,11 +18,14 @@ from unittest.mock import AsyncMock
 import pytest
 from aiohttp import ClientSession, hdrs, web
 from click.testing import CliRunner
+from exposed import scraped, values
+from fractus_cluster.ports import free_port
+from fractus_observe.figures import text_of
 from fractus_services.recording import messages
 from fractus_services.recording.mcap_file import McapFile
 from fractus_services.recording.messages import Record
 from fractus_view import command, server
-from fractus_view.command import view
+from fractus_view.command import Site, view
 from fractus_view.events import Event, Fix, Problem, State, Verdict
 from fractus_view.hub import RECENT, TRAIL, Hub, Trail
 from fractus_view.mcap_tail import Damaged, Tail
@@ -387,6 +390,40 @@ async def test_every_answer_keeps_the_page_to_itself(served: tuple[str, View]) -
 
 
 # The command, and the page that is checked in
+
+
+async def test_requests_and_open_pages_are_counted_for_prometheus(recording: Path) -> None:
+    port, metrics = free_port(), free_port()
+    site = Site("127.0.0.1", port, (), None, f"127.0.0.1:{metrics}")
+    task = asyncio.create_task(command._serve(Following(recording.parent), site))
+    try:
+        async with asyncio.timeout(20), ClientSession() as session:
+            while not (await asyncio.to_thread(scraped, metrics)):
+                assert not task.done()
+            async with session.get(f"http://127.0.0.1:{port}/") as answer:
+                assert answer.status == 401
+            async with session.get(f"http://127.0.0.1:{port}/healthz") as answer:
+                assert answer.status == 200
+            seen = await asyncio.to_thread(scraped, metrics)
+            assert seen["fractus_view_requests_total", "401"] == seen["fractus_view_requests_total", "200"] == 1
+            assert seen["fractus_view_pages",] == 0
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+
+async def test_an_open_page_counts(served: tuple[str, View]) -> None:
+    address, shown = served
+    shown.source = Hub()  # type: ignore[assignment]
+
+    def pages() -> float:
+        return values(text_of(shown.figures()).decode())["fractus_view_pages",]
+
+    async with ClientSession(headers={hdrs.AUTHORIZATION: f"Bearer {shown.token}"}) as session, asyncio.timeout(20):
+        assert pages() == 0
+        async with session.get(f"{address}/stream") as answer:
+            await answer.content.readuntil(b"\n\n")
+            assert pages() == 1
 
 
 def test_the_command_says_what_is_wrong(tmp_path: Path, recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -39,8 +39,17 @@ def test_it_is_only_there_when_asked_for_and_may_write_nothing() -> None:
     (volume,) = pod["volumes"]
     assert volume["secret"]["secretName"] == "fractus-view"
     assert all(container[probe]["httpGet"]["path"] == "/healthz" for probe in ("readinessProbe", "livenessProbe"))
-    (port,) = found["NetworkPolicy"]["spec"]["ingress"][0]["ports"]
-    assert {port["port"], found["Service"]["spec"]["ports"][0]["targetPort"]} == {container["ports"][0]["name"]}
+    open_, (served,) = found["NetworkPolicy"]["spec"]["ingress"][0]["ports"], found["Service"]["spec"]["ports"]
+    assert [port["port"] for port in open_] == [port["name"] for port in container["ports"]] == ["http", "metrics"]
+    assert served["targetPort"] == "http", "what needs no token is not behind the Service"
+    assert f"--metrics=:{container['ports'][1]['containerPort']}" in container["args"]
+
+
+def test_its_metrics_are_found_as_those_of_others() -> None:
+    monitored = ("--set", "metrics.podMonitor.enabled=true")
+    assert of_view(*monitored) == {}
+    (endpoint,) = of_view("--set", "view.enabled=true", *monitored)["PodMonitor"]["spec"]["podMetricsEndpoints"]
+    assert endpoint["port"] == "metrics"
 
 
 def test_the_api_server_lets_it_list_and_nothing_else(control_plane: ControlPlane, world: World) -> None:

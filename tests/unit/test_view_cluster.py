@@ -11,11 +11,14 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner
+from exposed import assert_documented, values
 from fractus_core import api
 from fractus_kube import Body, Kind, KubeError, Page
+from fractus_observe.figures import text_of
 from fractus_view import cluster as cluster_module
 from fractus_view import command, objects
 from fractus_view.cluster import KINDS, Cluster
+from fractus_view.server import View
 
 NOW_MS = 1_780_000_000_000
 
@@ -155,6 +158,17 @@ async def until(cluster: Cluster, wanted: Any) -> list[dict[str, Any]]:
 
 def last(events: list[dict[str, Any]], type_: str) -> dict[str, Any]:
     return [event for event in events if event["type"] == type_][-1]
+
+
+async def test_the_view_tells_prometheus_what_is_documented(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with watched(ApiServer(*ALL), Clock(), monkeypatch) as cluster:
+        await until(cluster, lambda event: event["type"] == "policies")
+        text = text_of([*View(cluster, frozenset()).figures(), *cluster.figures()]).decode()
+    assert_documented(text, "View")
+    seen = values(text)
+    assert all(seen["fractus_view_watch_open", kind.PLURAL] == 1 for kind in KINDS)
+    assert all(0 <= seen["fractus_view_watch_age_seconds", kind.PLURAL] < 20 for kind in KINDS)
+    assert seen["fractus_view_pages",] == 0
 
 
 async def test_all_that_a_cluster_knows_of_flights_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

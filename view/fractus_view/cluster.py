@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 from fractus_core import api
 from fractus_kube import Body, Client, Key, Kind, KubeError, Reflector
+from fractus_observe.figures import Figure, gauge
 
 from fractus_view import objects
 from fractus_view.events import Applications, Areas, Contact, Event, Gone, Links, Policies, Problem
@@ -82,6 +83,14 @@ class Cluster:
                 group.create_task(reflector.run())
             group.create_task(self._keep_contact())
             group.create_task(self._tell())
+
+    def figures(self) -> Iterator[Figure]:
+        """What Prometheus is told of the watches."""
+        listed = [each for each in self._reflectors.values() if each.synced.is_set()]
+        opened = {each.kind.plural: float(each.watching) for each in listed}
+        yield gauge("fractus_view_watch_open", "1 while the watch of a kind is open.", opened, "kind")
+        ages_s = {each.kind.plural: each.age_s() for each in listed}
+        yield gauge("fractus_view_watch_age_seconds", "Since the API server said anything of a kind.", ages_s, "kind")
 
     # What is so
 

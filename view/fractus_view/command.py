@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import secrets
 import signal
+from collections.abc import Callable, Iterable
 from contextlib import aclosing, suppress
 from dataclasses import dataclass
 from ipaddress import ip_address
@@ -13,6 +14,8 @@ from pathlib import Path
 import click
 from aiohttp import web
 from fractus_kube import Client, KubeError, Unconfigured, from_environment, kubeconfig
+from fractus_observe.exposition import serving
+from fractus_observe.figures import Figure, text_of
 
 from fractus_view.cluster import Cluster
 from fractus_view.mcap_tail import MAGIC
@@ -32,12 +35,17 @@ _REMEDIES = {
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """Where to serve, by which further names, and to who knows the token in a file; None: a new one."""
+    """Where to serve, by which further names, and to who knows the token in a file; None: a new one.
+
+    Attributes:
+        metrics: where Prometheus is answered; empty: nowhere.
+    """
 
     host: str
     port: int
     hostnames: tuple[str, ...]
     token_file: Path | None
+    metrics: str = ""
 
 
 def _listen(_context: click.Context, _option: click.Parameter, text: str) -> tuple[str, int]:
@@ -82,6 +90,12 @@ def _listen(_context: click.Context, _option: click.Parameter, text: str) -> tup
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
     help="Who knows what is in it now may look; else a new token is made at each start.",
 )
+@click.option(
+    "--metrics",
+    default="",
+    metavar="[HOST]:PORT",
+    help="Where to answer GET /metrics, without a token; else nowhere.",
+)
 def view(
     *,
     recordings: tuple[Path, ...],
@@ -92,6 +106,7 @@ def view(
     listen: tuple[str, int],
     hostnames: tuple[str, ...],
     token_file: Path | None,
+    metrics: str,
 ) -> None:
     """Show flights on a web page: those of a cluster, as they happen, or a replay of RECORDINGs (MCAP files).
 
@@ -100,7 +115,7 @@ def view(
     of_cluster = bool(namespace or context or config)
     if bool(recordings) + (directory is not None) + of_cluster > 1:
         raise click.UsageError("give recordings to replay, --recordings, or the options of a cluster: one of them")
-    site = Site(*listen, hostnames, token_file)
+    site = Site(*listen, hostnames, token_file, metrics)
     if directory is not None:
         asyncio.run(_serve(Following(directory), site))
     elif recordings:
@@ -162,10 +177,10 @@ async def _serve_cluster(config: Path | None, context: str | None, namespace: st
         except KubeError as error:
             remedy = _REMEDIES.get(error.status, "check your permissions: the role view is enough")
             raise click.ClickException(f"{error}; {remedy}") from error
-        await _serve(cluster, site)
+        await _serve(cluster, site, cluster.figures)
 
 
-async def _serve(source: Source, where: Site) -> None:
+async def _serve(source: Source, where: Site, figures: Callable[[], Iterable[Figure]] = tuple) -> None:
     stopped = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -193,7 +208,8 @@ async def _serve(source: Source, where: Site) -> None:
         if not _loopback(host):
             click.echo("view: others on this network can read what is sent, the token too: put TLS before it", err=True)
         following = None if given is None else asyncio.create_task(_follow_token(given, served))
-        await stopped.wait()
+        async with serving(where.metrics, lambda: text_of([*served.figures(), *figures()])):
+            await stopped.wait()
         if following is not None:
             following.cancel()
     finally:

@@ -7,12 +7,13 @@ import hmac
 import logging
 import mimetypes
 import secrets
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from dataclasses import dataclass, field
 from ipaddress import ip_address
 from pathlib import Path
 
 from aiohttp import hdrs, web
+from fractus_observe.figures import Counter, Figure, gauge
 
 from fractus_view.sources import Source
 
@@ -63,6 +64,9 @@ class View:
     token: str = field(default_factory=lambda: secrets.token_urlsafe(32))
     page: Path = PAGE
     _streams: set[object] = field(default_factory=set)
+    _answers: Counter = field(
+        default_factory=lambda: Counter("fractus_view_requests_total", "Requests answered, by status code.", "code")
+    )
     _running: asyncio.Task[None] | None = None
 
     def application(self) -> web.Application:
@@ -72,7 +76,7 @@ class View:
             OSError: the page was not built.
         """
         application = web.Application(middlewares=[self._only_reads, self._only_our_name, self._only_with_token])
-        application.on_response_prepare.append(_secure)
+        application.on_response_prepare.extend((_secure, self._count))
         files = {path.relative_to(self.page).as_posix(): path.read_bytes() for path in _files(self.page)}
         for name, data in files.items():
             application.router.add_get("/" if name == "index.html" else f"/{name}", _static(name, data))
@@ -81,6 +85,14 @@ class View:
         application.router.add_get("/pictures/{id}", self._picture)
         application.cleanup_ctx.append(self._run)
         return application
+
+    def figures(self) -> Iterator[Figure]:
+        """What Prometheus is told of the server."""
+        yield self._answers.figure()
+        yield gauge("fractus_view_pages", "Pages that are open now and kept current.", len(self._streams))
+
+    async def _count(self, _request: web.Request, response: web.StreamResponse) -> None:
+        self._answers.count(str(response.status))
 
     async def _run(self, _application: web.Application) -> AsyncIterator[None]:
         """Keep the source current while the server runs; without it the page would silently stand still."""

@@ -37,7 +37,8 @@ def need(truth: object, command: Command, what: str) -> None:
 def check_fractus(command: Command, click_command: click.Command = fractus, words: Sequence[str] | None = None) -> None:
     """Parse it as the program does: every option, every value that is no placeholder, every file that it reads."""
     rest = [here(word) for word in (command.argv[1:] if words is None else words)]
-    context = click.Context(click_command, info_name=click_command.name)
+    # With its settings, as the program has it: a command remembers the names of its help option from then on.
+    context = click.Context(click_command, info_name=click_command.name, **click_command.context_settings)
     while True:
         if any(has_placeholder(word) for word in rest[:1]) and isinstance(click_command, click.Group):
             return

@@ -102,11 +102,9 @@ def test_tells_the_distribution_of_each_python_package(image: tuple[str, str]) -
     root = Path(run(["buildah", "mount", image[1]]).stdout.strip())
     here = root / "usr" / "local" / "lib" / "python3.11" / "dist-packages"
     found = list(distributions(path=[str(here)]))
-    locked = {
-        package["name"]: package["version"] for package in tomllib.loads((ROOT / "uv.lock").read_text())["package"]
-    }
-    named = {re.sub(r"[-_.]+", "-", each.metadata["Name"]).lower(): each.version for each in found}
-    assert named.items() <= locked.items()
+    locked = {(each["name"], each["version"]) for each in tomllib.loads((ROOT / "uv.lock").read_text())["package"]}
+    named = {(re.sub(r"[-_.]+", "-", each.metadata["Name"]).lower(), each.version) for each in found}
+    assert named <= locked
     told = {file.parts[0] for each in found for file in each.files or ()}
     strangers = {
         f"{path.name.removesuffix('c')}" if path.suffix == ".pyc" else path.name for path in here.iterdir()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from datetime import UTC, datetime
 from pathlib import Path
+from random import Random
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -13,7 +14,7 @@ from fractus_core.api import Grant
 from fractus_core.api.node_grants import pack
 from fractus_core.api.plans import GrantSpec
 from fractus_core.policy.values import Home
-from fractus_sim.chaos.faults import FAULTS
+from fractus_sim.chaos.faults import FAULTS, broken
 from fractus_sim.chaos.invariants import (
     Seen,
     forbidden_calls,
@@ -26,6 +27,7 @@ from fractus_sim.chaos.invariants import (
 from fractus_sim.chaos.missions import Missions
 from fractus_sim.chaos.schedule import schedule
 from fractus_sim.chaos.stage import Stage
+from fractus_sim.demo.kube import DemoError
 
 HOME = Home(50.8637, 4.6785, 25.0)
 DURATIONS = {name: (fault.shortest_s, fault.longest_s) for name, fault in FAULTS.items()}
@@ -196,3 +198,29 @@ def test_a_grant_that_its_node_keeps_is_left_over(tmp_path: Path) -> None:
     stage = cast("Stage", SimpleNamespace(objects=lambda kinds, *_: objects.get(kinds, []), cluster=cluster))
     left = Missions(stage, "chaos", print).left_over()
     assert [each["metadata"]["name"] for each in left] == ["default.carried-navigator", "default.stored-navigator"]
+
+
+def test_a_drained_node_is_uncordoned_though_the_api_server_refuses_at_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fractus_sim.chaos.faults._RETRY_S", 0.0)
+    cordoned, refusals = False, 1
+
+    def kubectl(command: str, *arguments: str, **_: object) -> str:
+        """As kubectl does: of these, only patch tells by its exit code that it was refused."""
+        nonlocal cordoned, refusals
+        if command == "drain":
+            cordoned = True
+        elif refusals:
+            refusals -= 1
+            if command != "uncordon":
+                raise DemoError("the server was unable to return a response in the time allotted")
+        elif command == "uncordon" or '{"spec": {"unschedulable": null}}' in arguments:
+            cordoned = False
+        return ""
+
+    spec = SimpleNamespace(nodes=[SimpleNamespace(name="edge-1")])
+    stage = SimpleNamespace(
+        kubectl=kubectl, kube=SimpleNamespace(run=kubectl), drone="drone-1", cluster=SimpleNamespace(spec=spec)
+    )
+    with broken(FAULTS["drain"], cast("Stage", stage), Random(1)):
+        assert cordoned
+    assert not cordoned

@@ -185,7 +185,9 @@ def _drain(stage: Stage, chance: random.Random) -> Breaking:
             drained = f"tried to drain ({str(error)[-120:]})"
         yield f"{drained} {node}"
     finally:
-        _until_done(lambda: stage.kubectl("uncordon", node))
+        # kubectl uncordon ends with 0 when the API server refuses it.
+        schedulable = '{"spec": {"unschedulable": null}}'
+        _until_done(lambda: stage.kubectl("patch", "node", node, "--type=merge", "-p", schedulable))
 
 
 def _take_label(stage: Stage, _chance: random.Random) -> Breaking:

@@ -12,7 +12,7 @@ from typing import Any
 from web import serve
 
 PORT = 8080
-RESULTS = Path("/tmp/results.jsonl")  # an emptyDir: survives a restart of the container
+RESULTS = Path("/tmp/results.jsonl")  # nosec B108  # an emptyDir: survives a restart of the container
 MAX_BYTES = 32 * 2**20
 log = logging.getLogger("data-store")
 writing = threading.Lock()

@@ -52,7 +52,7 @@ class LinkSpec:
             if not colon or not port.isdigit() or int(port) > MAX_PORT:
                 raise LinkError(f"link {text!r}: expected {kind}:HOST:PORT")
             kind = {"tcpin": "tcp", "udp": "udpin"}.get(kind, kind)
-            return cls(kind, host or "0.0.0.0", int(port))  # noqa: S104 - what `tcp::5760` means in MAVLink
+            return cls(kind, host or "0.0.0.0", int(port))  # nosec B104  # noqa: S104 - what `tcp::5760` means in MAVLink
         if kind == "serial" and rest:
             path, _, baud = rest.rpartition(":")
             return cls(kind, path=path, baud=int(baud)) if baud.isdigit() and path else cls(kind, path=rest)

@@ -121,6 +121,15 @@ def test_a_tag_of_another_version_is_refused() -> None:
     )
 
 
+def test_an_audit_without_advisories_says_so() -> None:
+    nowhere = {"HTTPS_PROXY": "http://127.0.0.1:9", "https_proxy": "http://127.0.0.1:9"}
+    done = subprocess.run(
+        ["make", "--silent", "audit"], cwd=ROOT, env={**os.environ, **nowhere}, capture_output=True, text=True, timeout=120, check=False
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert done.stderr.startswith("nothing was audited: PyPI's advisories (https://pypi.org/")
+
+
 @pytest.mark.root
 @pytest.mark.timeout(900)
 @pytest.mark.xdist_group("cluster")

@@ -19,7 +19,9 @@ _EXTENDED = (
 _NAME_LENGTH = 317
 TLS_DIR = "/var/run/fractus/tls"
 """Where a component finds its certificate."""
-_OWN_VOLUMES = {"tls": TLS_DIR, "tmp": "/tmp"}  # noqa: S108  (the pod's own)
+TMP_DIR = "/tmp"  # nosec B108  # noqa: S108  (the pod's own)
+"""Where a component may write."""
+_OWN_VOLUMES = {"tls": TLS_DIR, "tmp": TMP_DIR}
 _IMAGE = (
     r"^([a-zA-Z0-9]([-a-zA-Z0-9.]*[a-zA-Z0-9])?(:[0-9]+)?/)?[a-z0-9]+(([._]|__|-+)[a-z0-9]+)*"
     r"(/[a-z0-9]+(([._]|__|-+)[a-z0-9]+)*)*(:[A-Za-z0-9_][-A-Za-z0-9_.]{0,127})?(@[a-z0-9]+:[0-9a-f]{32,128})?$"

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Literal, assert_never
 
 from fractus_core.api import API_VERSION, Application, Component, Drone
-from fractus_core.api.containers import TLS_DIR
+from fractus_core.api.containers import TLS_DIR, TMP_DIR
 from fractus_core.api.names import CLASS_LABEL, CLOUD_LABEL, address_variable
 from fractus_core.api.plans import DeploymentPlanSpec, GrantSpec, PlannedInstance
 
@@ -257,7 +257,7 @@ def _pod_spec(application: Application, component: Component, placed: PlannedIns
                 },
                 "volumeMounts": [
                     {"name": "tls", "mountPath": TLS_DIR, "readOnly": True},
-                    {"name": "tmp", "mountPath": "/tmp"},  # noqa: S108  (the pod's own)
+                    {"name": "tmp", "mountPath": TMP_DIR},
                     *(volume.mount() for volume in container.volumes),
                 ],
             }

@@ -114,7 +114,7 @@ class TruthWatch:
     def _ask(self) -> Mapping[str, Any] | None:
         """The truth of the last snapshot; None while there is none, or the world does not answer."""
         try:
-            with urllib.request.urlopen(self._url, timeout=ANSWER_S) as answer:  # noqa: S310 - our own loopback URL
+            with urllib.request.urlopen(self._url, timeout=ANSWER_S) as answer:  # nosec B310  # noqa: S310 - our own loopback URL
                 content: Mapping[str, Any] = json.load(answer)
                 return content
         except (OSError, ValueError, urllib.error.URLError) as error:

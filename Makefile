@@ -102,6 +102,10 @@ test-e2e: packages env ## End-to-end tests only, on the embedded cluster or on F
 test-kind: env ## The charts, a mission's end-to-end tests and the demo on a cluster of kind (without Docker, kind, kubectl or helm: with those made here, as root)
 	export ON_KIND="$(ON_KIND)"; if docker info > /dev/null 2>&1 && type kind kubectl helm > /dev/null; then tests/kind/run.sh; else tests/kind/machine.sh tests/kind/run.sh; fi
 
+.PHONY: test-kubeadm
+test-kubeadm: env ## The charts and a mission's end-to-end tests on a cluster of kubeadm, without kind (with Docker and programs made here, as root)
+	BY=kubeadm ON_KIND="$(ON_KIND)" tests/kind/machine.sh tests/kind/run.sh
+
 # libFuzzer's own options; what it finds is left in out/fuzz. The examples are where manifests start from.
 SECONDS ?= 600
 FUZZERS := manifests zones calls mobility camera exchange mavlink

@@ -2,6 +2,7 @@
 # Everything on a cluster that kind makes: images by Docker, the charts, the end-to-end tests of a mission, the demo.
 # Needs docker, kind, kubectl and helm on the PATH; tests/kind/machine.sh brings them where they are missing.
 #
+#   BY=kubeadm            the cluster by kubeadm alone (tests/kind/kubeadm.sh)
 #   STEPS="cluster"       only these steps, of: images cluster load charts tests demo uninstall one_node
 #   ON_KIND="FILES..."    the tests, as `make test-kind` gives them
 #   KEEP=1                leaves the clusters
@@ -23,15 +24,19 @@ images() {
   done
 }
 
+right_version() {
+  local runs
+  runs=$(kubectl get nodes --output jsonpath='{.items[0].status.nodeInfo.kubeletVersion}')
+  [[ $runs == "v${FRACTUS_KUBERNETES:-1}."* ]] || { echo "nodes run $runs, not $FRACTUS_KUBERNETES: KIND_NODE_IMAGE says which" >&2; return 1; }
+}
+
 # create NAME [OPTION...]: a cluster of that name, whose nodes are ready.
 create() {
   ! kind get clusters 2> /dev/null | grep -qx "$1" || { echo "there is a cluster $1 already: kind delete cluster --name $1" >&2; return 1; }
   made+=("$1")
   kind create cluster --name "$@" --wait 300s ${KIND_NODE_IMAGE:+--image "$KIND_NODE_IMAGE"}
   kubectl wait --for=condition=Ready node --all --timeout=300s
-  local runs
-  runs=$(kubectl get nodes --output jsonpath='{.items[0].status.nodeInfo.kubeletVersion}')
-  [[ $runs == "v${FRACTUS_KUBERNETES:-1}."* ]] || { echo "nodes run $runs, not $FRACTUS_KUBERNETES: KIND_NODE_IMAGE says which" >&2; return 1; }
+  right_version
 }
 
 cluster() {
@@ -42,14 +47,21 @@ cluster() {
   kubectl get nodes --output wide --label-columns fractus.dev/class
 }
 
+# The nodes, and the cluster's end.
+nodes() { kind get nodes --name "$name"; }
+delete() { kind delete cluster --name "$1"; }
+
 load() {
   kind load docker-image --name "${1:-$name}" $(printf "localhost/fractus/%s:dev " "${targets[@]}")
 }
 
 charts() {
+  local began=$SECONDS pods
   bash -e <(grep '^helm install' README.md)
   kubectl wait --for=condition=Ready pod --all --namespace fractus-system --timeout=300s
+  pods=$((SECONDS - began))
   kubectl wait --for=condition=Ready drone --all --timeout=120s
+  echo "from the first helm install: $pods s until all pods are Ready, $((SECONDS - began)) s until the drones are"
   kubectl get pods --namespace fractus-system --output wide
 }
 
@@ -73,9 +85,8 @@ uninstall() {
   kinds=$(kubectl api-resources --verbs=list --output=name | grep -v '^events')
   left=$(kubectl get "$(echo $kinds | tr ' ' ',')" --all-namespaces --selector app.kubernetes.io/name=fractus --output name)
   [ -z "$left" ] || { echo "left: $left" >&2; return 1; }
-  nodes=$(kind get nodes --name "$name")
-  [ -n "$nodes" ] || { echo "there are no nodes of $name to look at" >&2; return 1; }
-  for node in $nodes; do
+  [ -n "$(nodes)" ] || { echo "there are no nodes of $name to look at" >&2; return 1; }
+  for node in $(nodes); do
     left=$(docker exec "$node" sh -c 'ls -A /var/lib/fractus 2> /dev/null || true')
     [ -z "$left" ] || { echo "left on $node: $left" >&2; return 1; }
   done
@@ -84,7 +95,7 @@ uninstall() {
 # docs/clusters.md, "One node": the same charts, and a mission that needs no edge nodes.
 one_node() {
   # One of them at a time is enough for a small machine; what someone else made, or wants to look at, stays.
-  [ -n "${KEEP:-}" ] || [[ " ${made[*]} " != *" $name "* ]] || kind delete cluster --name "$name"
+  [ -n "${KEEP:-}" ] || [[ " ${made[*]} " != *" $name "* ]] || delete "$name"
   create "$name-one" --config <(sed '/^nodes:/,$d' tests/kind/cluster.yaml)
   kubectl label node --all fractus.dev/class=drone fractus.dev/cloud=true
   load "$name-one"
@@ -100,12 +111,14 @@ leave() {
     kubectl get nodes,pods --all-namespaces --output wide || true
     kubectl get events --all-namespaces --sort-by=.lastTimestamp | tail -n 30 || true
   fi
-  [ -n "${KEEP:-}" ] || for cluster in "${made[@]}"; do kind delete cluster --name "$cluster"; done
+  [ -n "${KEEP:-}" ] || for cluster in "${made[@]}"; do delete "$cluster"; done
   [ -n "${KEEP:-}" ] || rm -rf "$state"
   exit "$code"
 } >&2
 trap leave EXIT
 
+# shellcheck source=tests/kind/kubeadm.sh
+[ -z "${BY:-}" ] || . "tests/kind/$BY.sh"
 for step in ${STEPS:-images cluster load charts tests demo uninstall one_node}; do
   echo "== $step ($(date +%T))"
   "$step"

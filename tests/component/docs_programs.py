@@ -65,8 +65,9 @@ def check_make(command: Command, folder: Path) -> None:
 
 def check_image_build(command: Command, folder: Path) -> None:
     """The stage and the arguments exist; the context is a directory with a Dockerfile."""
-    need(command.argv[1] in {"build", "save"}, command, "only build and save are known")
-    words, context = iter(command.argv[2:]), None
+    argv = command.argv[1:] if command.argv[1] == "buildx" else command.argv
+    need(argv[1] in {"build", "save"}, command, "only build and save are known")
+    words, context = iter(argv[2:]), None
     for word in words:
         if word == "--target":
             target = next(words)
@@ -78,12 +79,12 @@ def check_image_build(command: Command, folder: Path) -> None:
         elif word == "--build-arg":
             name = next(words).partition("=")[0]
             need(re.search(rf"^ARG {name}\b", DOCKERFILE, re.MULTILINE), command, f"no argument {name}")
-        elif word in {"-t", "--tag", "--output"}:
-            need(re.fullmatch(r"[\w./:-]+", next(words)), command, f"{word} has no name")
+        elif word in {"-t", "--tag", "--output", "--platform"}:
+            need(re.fullmatch(r"[\w./:=,-]+", next(words)), command, f"{word} has no name")
         else:
             need(not word.startswith("-"), command, f"{word} is not known to this test")
             context = word
-    if command.argv[1] == "build":
+    if argv[1] == "build":
         need(
             context is not None and (folder / context / "Dockerfile").is_file(),
             command,

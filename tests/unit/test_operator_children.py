@@ -220,7 +220,7 @@ async def test_a_deployment_with_another_owner_is_removed(owner: str) -> None:
     body["metadata"]["ownerReferences"][0]["kind"] = owner
     copies[kinds.DEPLOYMENT].note((APPLICATION.key[0], "one"), body)
     assert await Children(cast(Any, store), copies, cast(Any, None)).remove(APPLICATION.key, kinds.DEPLOYMENT)
-    assert store.said == ["delete Deployment", "delete Secret"]
+    assert store.said == ["delete Secret", "delete Deployment"]
 
 
 @pytest.mark.parametrize("kept", [True, False])
@@ -251,7 +251,7 @@ async def test_a_deployment_that_a_finalizer_keeps_takes_no_pods_along(kept: boo
     live = SimpleNamespace(applications={("city", "a"): SimpleNamespace(settled_generation=None)})
     children = Children(cast(Any, store), copies, cast(Any, None))
     await FinishedPods(cast(Any, store), cast(Any, live), children, lambda: NOW).tear_down(("city", "a"))
-    assert store.said == ["delete Deployment", "delete Secret", *(["delete ReplicaSet", "delete Pod"] if kept else [])]
+    assert store.said == ["delete Secret", "delete Deployment", *(["delete ReplicaSet", "delete Pod"] if kept else [])]
 
 
 async def test_a_pod_that_was_kept_is_left_to_no_garbage_collector() -> None:
@@ -382,7 +382,7 @@ async def test_what_is_removed_is_not_remembered_how_it_was_spelled() -> None:
     assert store.said == ["create Deployment"], "the same, spelled differently, is not written again"
     nothing: dict[Kind, list[Body]] = {kind: [] for kind in kinds.CHILDREN}
     await children.prune(APPLICATION, nothing)
-    assert store.said[1:] == ["delete Deployment", "delete Secret"]
+    assert store.said[1:] == ["delete Secret", "delete Deployment"]
     assert not children._normalised
 
 
@@ -452,7 +452,7 @@ async def test_the_secret_of_a_deployment_goes_with_it_and_is_deleted_again_wher
     store.refused = True
     with pytest.raises(KubeError, match="no"):
         await children.remove(APPLICATION.key, kinds.DEPLOYMENT)
-    assert store.said == ["delete Deployment"], "what runs goes first"
+    assert store.said == ["delete Deployment"], "what runs goes all the same"
     store.refused = False
     await children.remove(APPLICATION.key, kinds.SERVICE)
     assert store.there == set()

@@ -50,6 +50,11 @@ def is_location_label(name: str) -> bool:
     return name in {DEPOT_LABEL, GEOHASH_LABEL, GUARDED_LABEL} or name.startswith(INTERFACE_LABEL)
 
 
+def secret_name(instance: str) -> str:
+    """Name of the Secret of an instance."""
+    return f"{instance}-tls"
+
+
 def service_name(application: str, component: Component) -> str:
     """Name of the Service of a component."""
     return object_name(application, component.slug)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Literal, assert_never
+from typing import Any, assert_never
 
 from fractus_core.api import API_VERSION, Application, Component, Drone
 from fractus_core.api.containers import TLS_DIR, TMP_DIR
@@ -20,9 +20,6 @@ from fractus_operator.cluster.pods import PodView
 COMPONENT_USER = 10001
 MOBILITY_PORT = 50051
 CAMERA_PORT = 50052
-
-SecretWrite = Literal["new", "renewed", "lost"]
-"""Why a Secret is written: there is none that is known of; it is due; or its pod may wait for one that is gone."""
 
 
 def children(
@@ -104,13 +101,8 @@ def tls_secret(application: Application, placed: PlannedInstance, data: dict[str
     """The Secret with an instance's client certificate."""
     described = {labels.COMPONENT_LABEL: placed.component, labels.INSTANCE_LABEL: placed.instance}
     return child(
-        kinds.SECRET, application, secret_name(placed.instance), described, type="kubernetes.io/tls", data=data
+        kinds.SECRET, application, labels.secret_name(placed.instance), described, type="kubernetes.io/tls", data=data
     )
-
-
-def secret_name(instance: str) -> str:
-    """Name of the Secret of an instance."""
-    return f"{instance}-tls"
 
 
 def service(application: Application, component: Component) -> Body:
@@ -239,7 +231,7 @@ def _pod_spec(application: Application, component: Component, placed: PlannedIns
         "affinity": {"nodeAffinity": _affinity(placed)},
         "tolerations": _tolerations(placed, drone),
         "volumes": [
-            {"name": "tls", "secret": {"secretName": secret_name(placed.instance), "defaultMode": 0o440}},
+            {"name": "tls", "secret": {"secretName": labels.secret_name(placed.instance), "defaultMode": 0o440}},
             {"name": "tmp", "emptyDir": {"sizeLimit": "64Mi"}},
             *(volume.pod_volume() for volume in container.volumes),
         ],

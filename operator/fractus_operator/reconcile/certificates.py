@@ -19,11 +19,11 @@ from fractus_operator.cluster.kinds import Body, Key
 from fractus_operator.cluster.labels import CERTIFICATE_ANNOTATION
 from fractus_operator.cluster.pods import PodView
 from fractus_operator.reconcile import builders
-from fractus_operator.reconcile.builders import SecretWrite
+from fractus_operator.reconcile.component_secrets import SecretWrite
 
 _PUBLIC = ("tls.crt", "ca.crt")
 _AGAIN = (timedelta(minutes=1), timedelta(hours=1))
-"""How long a pod that has its node may be without being ready until its Secret is made if it is gone; twice as long each time."""
+"""How long a pod may be without being ready until its Secret is made if it is gone; twice as long each time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,11 +58,10 @@ class _Known:
     unwritten: bool = False
 
     def look(self, pods: Sequence[PodView], now: datetime) -> bool:
-        """Whether it is time to see whether the Secret is there: pods that wait for it have their nodes, and are not ready."""
-        if all(pod.ready or pod.node is None for pod in pods):
+        """Whether it is time to see whether the Secret is there: pods that are not ready may wait for it."""
+        if pods and all(pod.ready for pod in pods):
             self.look_at, self.again = now + _AGAIN[0], _AGAIN[0]
-            return False
-        if now < self.look_at:
+        if now < self.look_at or all(pod.ready for pod in pods):
             return False
         self.look_at, self.again = now + self.again, min(2 * self.again, _AGAIN[1])
         return True

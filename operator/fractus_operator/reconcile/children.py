@@ -20,13 +20,12 @@ from fractus_operator.cluster.labels import (
     SLICE_LABEL,
     SLICES_BY,
     label_value,
-    labelled,
 )
 from fractus_operator.cluster.reading import read
 from fractus_operator.cluster.store import Conflict, ContentType, KubeError, NotFound, Store
 from fractus_operator.inventory.made import Made, application_of
 from fractus_operator.reconcile import builders
-from fractus_operator.reconcile.builders import SecretWrite
+from fractus_operator.reconcile.component_secrets import ComponentSecrets, SecretWrite
 from fractus_operator.reconcile.difference import contains, digest, is_current, stamped
 
 logger = logging.getLogger(__name__)
@@ -66,8 +65,7 @@ class Children:
         self._beside = asyncio.Semaphore(_MAX_BESIDE)
         self._met: set[tuple[Kind, Key]] = set()
         self._normalised: dict[tuple[Kind, Key], tuple[object, ...]] = {}
-        self._keyless: dict[Key, set[Key]] = {}
-        """By application: Secrets whose Deployments were removed. After a restart it is their owner's end that removes them."""
+        self._secrets = ComponentSecrets(store, self._beside)
 
     # -- reading --
 
@@ -108,28 +106,13 @@ class Children:
     async def write_secret(self, application: Application, instance: str, body: Body, why: SecretWrite) -> bool:
         """Write the Secret of an instance, unless its Deployment is not of the application; whether it was written.
 
-        The chart's admission policy refuses to write one that the operator has not made.
-
         Raises:
             KubeError: the API server refuses it, or cannot be reached.
         """
         deployment = self.get(kinds.DEPLOYMENT, (application.key[0], instance))
         if deployment is not None and not _is_child(application, kinds.DEPLOYMENT, deployment):
             return False
-        async with self._beside:
-            self._keyless.get(labelled(application.key), set()).discard(key_of(body))
-            if why == "renewed":
-                # A creation that fails counts against the quota of its namespace.
-                with contextlib.suppress(NotFound):
-                    await self._store.replace(kinds.SECRET, body)
-                    return True
-            try:
-                await self._store.create(kinds.SECRET, body)
-            except Conflict as taken:
-                if taken.reason != _EXISTS:
-                    raise
-                if why != "lost":
-                    await self._store.replace(kinds.SECRET, body)
+        await self._secrets.write(application.key, body, why)
         return True
 
     async def _refresh_one(self, grant: Grant, spec: GrantSpec) -> None:
@@ -246,7 +229,7 @@ class Children:
             for child in self.of(application.key, kind):
                 if child["metadata"]["name"] not in names and _is_child(application, kind, child):
                     await self._delete(kind, child)
-        await self._remove_secrets(application.key)
+        await self._secrets.remove_kept(application.key)
 
     async def remove(self, key: Key, *of: Kind, orphan: bool = False) -> bool:
         """Delete every child of some kinds, one kind after the other, and what it owns unless that is left; True if there was any."""
@@ -255,7 +238,7 @@ class Children:
             for child in self.of(key, kind):
                 removed = True
                 await self._delete(kind, child, orphan=orphan)
-        await self._remove_secrets(key)
+        await self._secrets.remove_kept(key)
         return removed
 
     async def remove_at_once(self, key: Key, kind: Kind) -> set[str]:
@@ -270,23 +253,13 @@ class Children:
         for grant in await self._store.list(kinds.GRANT, selectors={"labelSelector": selector}):
             await self._delete(kinds.GRANT, grant)
 
-    async def _remove_secrets(self, key: Key) -> None:
-        """Delete the Secrets of Deployments that were removed; those that the API server keeps are deleted the next time."""
-        left = self._keyless.get(labelled(key), set())
-        for secret in list(left):
-            await self._store.delete(kinds.SECRET, secret)
-            left.discard(secret)
-        if not left:
-            self._keyless.pop(labelled(key), None)
-
     async def _delete(self, kind: Kind, body: Body, *, orphan: bool = False) -> bool:
         """Delete a child; whether it is gone now."""
         if "deletionTimestamp" in body["metadata"]:
             return False
         logger.info("children: removing (kind=%s name=%s)", kind.name, body["metadata"]["name"])
         if kind is kinds.DEPLOYMENT:
-            namespace, instance = key_of(body)
-            self._keyless.setdefault(application_of(body), set()).add((namespace, builders.secret_name(instance)))
+            await self._secrets.remove_of(application_of(body), body)
         self._normalised.pop((kind, key_of(body)), None)
         self._met.discard((kind, key_of(body)))
         return await self._store.delete(kind, key_of(body), body["metadata"].get("uid"), orphan=orphan)

@@ -77,7 +77,8 @@ def fly(stage: Stage, watch: Watch, task: Task, say: Callable[[str], None]) -> R
     planned = schedule(task.seed, task.run_s, durations)
     missions = Missions(stage, f"chaos-{task.seed}", run.note)
     threads = [
-        threading.Thread(target=_happen, args=(stage, each, random.Random(f"{task.seed}/{at}"), run))  # noqa: S311
+        # A run that is interrupted waits for no fault: its cluster is taken down.
+        threading.Thread(target=_happen, args=(stage, each, random.Random(f"{task.seed}/{at}"), run), daemon=True)  # noqa: S311
         for at, each in enumerate(planned)
     ]
     for thread in threads:

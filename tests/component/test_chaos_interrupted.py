@@ -1,0 +1,22 @@
+"""A chaos run that is interrupted, as a process."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+PROGRAM = """
+from fractus_sim.chaos import run
+
+def interrupted(*_, **__):
+    raise KeyboardInterrupt
+
+run.Missions.step = interrupted
+run.fly(None, None, run.Task(1, 1800.0, ["etcd-restart"]), print)
+"""
+
+
+def test_it_does_not_wait_for_faults_to_come() -> None:
+    done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode
+    assert done.stderr.endswith("KeyboardInterrupt\n")

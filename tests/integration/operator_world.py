@@ -304,6 +304,11 @@ class OperatorProcess:
         self._process = None
         return code
 
+    def kill(self) -> None:
+        """End it at once, from whatever thread."""
+        if self._process is not None:
+            self._process.kill()
+
     @property
     def running(self) -> bool:
         return self._process is not None and self._process.poll() is None

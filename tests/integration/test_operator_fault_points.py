@@ -1,0 +1,168 @@
+"""The operator is killed at each step of its work: after each kind of write has taken effect, before it hears of it."""
+
+from __future__ import annotations
+
+import asyncio
+import ssl
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import aiohttp
+import pytest
+import yaml
+from aiohttp import web
+from control_plane import ControlPlane, wait_for
+from fractus_cluster.ports import free_port
+from operator_world import OperatorProcess, World, traffic
+from test_operator import deployed, end_mission, gone
+
+EXPECTED = {
+    "application is taken": {"PATCH applications", "PATCH applications/status", "POST deploymentplans"},
+    "roll-out": {
+        "POST deployments", "POST secrets", "POST services", "POST endpointslices", "POST networkpolicies", "POST grants",
+        "POST poddisruptionbudgets", "POST nodegrants", "POST events",
+    },
+    "end of the mission": {"PATCH nodegrants", "DELETE secrets", "DELETE deployments", "DELETE replicasets", "PATCH pods"},
+    "deletion": {"DELETE grants", "DELETE deploymentplans"},
+}  # fmt: skip
+"""Steps that there are at the least."""
+
+
+class FaultPoints:
+    """Stands between the operator and the API server, and kills the operator after the first write of each kind.
+
+    Args:
+        plane: the API server.
+        operator: which it kills.
+    """
+
+    def __init__(self, plane: ControlPlane, operator: OperatorProcess, port: int) -> None:
+        self._operator = operator
+        self._server = plane.server
+        self._port = port
+        credential = plane.authority.issue("points", common_name="points", organizations=("system:masters",))
+        self._tls = ssl.create_default_context(cafile=str(plane.ca))
+        self._tls.load_cert_chain(credential.certificate, credential.key)
+        self.reached: list[str] = []
+
+    @contextmanager
+    def serving(self) -> Iterator[None]:
+        """Forward requests for the length of a block."""
+        ready = threading.Event()
+        running: list[tuple[asyncio.AbstractEventLoop, asyncio.Event]] = []
+
+        async def main() -> None:
+            running.append((asyncio.get_running_loop(), end := asyncio.Event()))
+            async with aiohttp.ClientSession(connector=aiohttp.TCPConnector(ssl=self._tls, limit=0)) as session:
+                application = web.Application(client_max_size=1 << 26)
+                application.router.add_route("*", "/{path:.*}", lambda request: self._forward(session, request))
+                runner = web.AppRunner(application, shutdown_timeout=0.1)
+                await runner.setup()
+                await web.TCPSite(runner, "127.0.0.1", self._port).start()
+                ready.set()
+                await end.wait()
+                await runner.cleanup()
+
+        thread = threading.Thread(target=lambda: asyncio.run(main()))
+        thread.start()
+        assert ready.wait(30)
+        try:
+            yield
+        finally:
+            loop, end = running[0]
+            loop.call_soon_threadsafe(end.set)
+            thread.join(30)
+
+    async def _forward(self, session: aiohttp.ClientSession, request: web.Request) -> web.StreamResponse:
+        kept = {name: value for name, value in request.headers.items() if name.lower() in {"accept", "content-type"}}
+        body, timeout = await request.read(), aiohttp.ClientTimeout(total=None)
+        url = f"{self._server}{request.raw_path}"
+        async with session.request(request.method, url, data=body or None, headers=kept, timeout=timeout) as answer:
+            step = _step(request)
+            if step is not None and step not in self.reached and answer.ok:
+                self.reached.append(step)
+                self._operator.kill()
+                return web.Response(status=503)
+            response = web.StreamResponse(status=answer.status)
+            response.content_type = answer.content_type
+            await response.prepare(request)
+            async for chunk in answer.content.iter_any():
+                await response.write(chunk)
+        return response
+
+
+def _step(request: web.Request) -> str | None:
+    """What kind of write a request is: its method, the kind, and its subresource; None for what is no step of the work."""
+    if request.method == "GET":
+        return None
+    parts = request.path.strip("/").split("/")
+    rest = parts[2:] if parts[0] == "api" else parts[3:]
+    if rest[0] == "namespaces" and len(rest) > 2:
+        rest = rest[2:]
+    if rest[0] == "leases":
+        return None
+    return f"{request.method} {'/'.join([rest[0], *rest[2:]])}"
+
+
+@contextmanager
+def killed_at_each_step(plane: ControlPlane, folder: Path) -> Iterator[tuple[OperatorProcess, FaultPoints]]:
+    """An operator that is started again each time that it was killed."""
+    port, kubeconfig = free_port(), folder / "points.kubeconfig"
+    cluster = {"name": "points", "cluster": {"server": f"http://127.0.0.1:{port}"}}
+    context = {"name": "points", "context": {"cluster": "points", "user": "points"}}
+    users = [{"name": "points", "user": {}}]
+    kubeconfig.write_text(
+        yaml.safe_dump({"clusters": [cluster], "contexts": [context], "users": users, "current-context": "points"})
+    )
+    operator = OperatorProcess(kubeconfig, folder / "operator.log")
+    points = FaultPoints(plane, operator, port)
+    over = threading.Event()
+
+    def again() -> None:
+        while not over.wait(0.05):
+            if not operator.running:
+                operator.start()
+
+    keeper = threading.Thread(target=again)
+    with points.serving():
+        keeper.start()
+        try:
+            yield operator, points
+        finally:
+            over.set()
+            keeper.join()
+            if operator.running:
+                operator.stop()
+            print(points.reached, operator.log()[-6000:])
+
+
+@pytest.mark.timeout(1500)
+def test_killed_after_each_write_it_ends_where_it_would_have(
+    control_plane: ControlPlane, world: World, namespace: str, tmp_path: Path
+) -> None:
+    with killed_at_each_step(control_plane, tmp_path) as (operator, points):
+        world.put(traffic(namespace))
+        # Each of two dozen operators takes seconds to start, on a busy machine ten.
+        wait_for(lambda: len(world.pods(namespace)) == 7, operator.log, 600)
+        # No pod starts without its certificate.
+        wait_for(lambda: sum(name.startswith("secrets/") for name in world.children(namespace)) == 7, operator.log, 600)
+        world.run_pods(namespace)
+        wait_for(lambda: world.condition(namespace, "Ready").get("status") == "True", operator.log, 600)
+        status = deployed(world, namespace)
+        assert (status["drone"], status["pods"]) == ("drone-1", "7/7")
+        grants = [grant["spec"]["instance"] for grant in world.grants(namespace)]
+        assert len(grants) == len(set(grants)) == 4
+        assert len(world.pods(namespace)) == 7
+        end_mission(world, namespace, "Complete", "done")
+        wait_for(lambda: world.status(namespace).get("phase") == "Completed", operator.log, 600)
+        wait_for(lambda: not world.grants(namespace), operator.log, 600)
+        wait_for(
+            lambda: all(pod["spec"].get("activeDeadlineSeconds") for pod in world.pods(namespace)), operator.log, 600
+        )
+        wait_for(lambda: list(world.children(namespace)) == ["deploymentplans/traffic"], operator.log, 600)
+        world.api.delete(f"/apis/fractus.dev/v1alpha1/namespaces/{namespace}/applications/traffic")
+        wait_for(lambda: gone(world, namespace) and not world.pods(namespace), operator.log, 600)
+        for when, steps in EXPECTED.items():
+            assert steps <= set(points.reached), f"{when}: {steps - set(points.reached)}"

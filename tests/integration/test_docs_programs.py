@@ -17,7 +17,7 @@ from operator_world import World
 COMMANDS = [command for command in every_command() if command.argv[0] in {"kubectl", "helm"} and len(command.argv) > 1]
 KUBECTL = [command for command in COMMANDS if command.argv[0] == "kubectl" and command.argv[1] != "fractus"]
 HELM = [command for command in COMMANDS if command.argv[0] == "helm"]
-TWO_WORDS = {"create secret generic", "auth can-i"}
+TWO_WORDS = {"create secret generic", "create clusterrolebinding", "auth can-i"}
 READ, CHANGE = {"get", "api-resources"}, {"apply", "label", "taint", "delete", "annotate", "create"}
 NOT_THERE = re.compile(r"NotFound|not found")
 """What a command is told that names an object which only a reader's cluster has."""

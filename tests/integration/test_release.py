@@ -148,7 +148,15 @@ def test_an_image_is_saved_under_the_name_that_the_charts_pull(tmp_path: Path) -
 @pytest.mark.parametrize(("tag", "said"), [("0.0.1", True), (VERSION, False), ("", False)])
 def test_who_keeps_another_tag_is_told(control_plane: ControlPlane, published: Path, tag: str, *, said: bool) -> None:
     argv = [helm(), "install", "fractus", str(published / "dist" / f"fractus-{VERSION}.tgz"), f"--set=image.tag={tag}"]
-    argv += ["--namespace", SYSTEM, "--dry-run=server", "--kubeconfig", str(control_plane.kubeconfig)]
+    # Other tests have made what is of the chart, without helm.
+    argv += [
+        "--namespace",
+        SYSTEM,
+        "--dry-run=server",
+        "--take-ownership",
+        "--kubeconfig",
+        str(control_plane.kubeconfig),
+    ]
     done = subprocess.run(argv, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr
     notes = done.stdout.partition("NOTES:")[2]

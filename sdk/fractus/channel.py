@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import random
+import weakref
 from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -86,7 +87,7 @@ class ServiceChannel:
         self.reconnect_timeout_s = reconnect_timeout_s
         self._connection: _Connection | None = None
         self._retired: set[_Connection] = set()
-        self._outdated: grpc.aio.AioRpcError | None = None
+        self._outdated: weakref.WeakSet[grpc.aio.AioRpcError] = weakref.WeakSet()
 
     async def close(self) -> None:
         """Close every connection; calls in flight are cancelled."""
@@ -106,7 +107,8 @@ class ServiceChannel:
         except grpc.aio.AioRpcError as error:
             # A stream may outlive the certificate that it was opened with.
             if error.code() is grpc.StatusCode.UNAUTHENTICATED and connection.stamp != self._stamp():
-                self._outdated = error
+                # All that were opened with it end together.
+                self._outdated.add(error)
             raise
         finally:
             connection.calls -= 1
@@ -114,7 +116,7 @@ class ServiceChannel:
 
     def transient(self, error: grpc.aio.AioRpcError) -> bool:
         """Whether another attempt may succeed: the service is away, or the certificate was renewed since the call began."""
-        return error is self._outdated or error.code() is grpc.StatusCode.UNAVAILABLE
+        return error in self._outdated or error.code() is grpc.StatusCode.UNAVAILABLE
 
     async def unary(self, method: str, request: Any, *, timeout_s: float | None = None) -> Any:
         """One call with a deadline; while the service restarts it is tried again, for `reconnect_timeout_s` at most, unless in `NOT_RETRIED`.

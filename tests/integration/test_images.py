@@ -32,7 +32,7 @@ LACKING = {
     "mobility": _SERVICE,
     "camera": _SERVICE,
     "sim": _SERVICE | {"pyproj", "scipy", "tifffile"},
-    "view": {"cryptography", "fractus", "fractus_mavlink", "fractus_services"},
+    "view": {"cryptography", "fractus", "fractus_mavlink", "fractus_services", "opentelemetry"},
 }
 
 

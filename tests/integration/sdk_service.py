@@ -70,6 +70,10 @@ class Authority:
         )
 
 
+EXPIRED = Event()
+"""In a control stream: the certificate that it was opened with has expired."""
+
+
 class Drone(mobility_pb2_grpc.MobilityServiceServicer):
     """A drone without physics: motions take `steps` messages, or wait for `release` when it is set up to block.
 
@@ -83,6 +87,7 @@ class Drone(mobility_pb2_grpc.MobilityServiceServicer):
         self.targets: list[types_pb2.Position] = []
         self.deadlines: list[float | None] = []
         self.control: asyncio.Queue[Event] = asyncio.Queue()
+        self.expired = asyncio.Event()
         self.stream_open = asyncio.Event()
         self.stream_closed = asyncio.Event()
         self.moving = asyncio.Event()
@@ -114,12 +119,20 @@ class Drone(mobility_pb2_grpc.MobilityServiceServicer):
             self.stream_open.set()
             while True:
                 event = await self.control.get()
+                if event is EXPIRED:
+                    await _expired(context)
                 yield event
                 if event.state in {Event.STATE_LOST, Event.STATE_COMPLETE}:
                     return
         finally:
             self.stream_open.clear()
             self.stream_closed.set()
+
+    async def SubscribeTelemetry(self, request, context):  # noqa: N802
+        self._note("SubscribeTelemetry", context)
+        yield mobility_pb2.Telemetry(battery_remaining=0.5)
+        await self.expired.wait()
+        await _expired(context)
 
     async def ReturnControl(self, request, context):  # noqa: N802
         self._note("ReturnControl", context)
@@ -228,6 +241,10 @@ def _decision(corrected: bool) -> types_pb2.Decision:
     return types_pb2.Decision(
         action=types_pb2.Decision.ACTION_CORRECT, code="AboveLimit", reason="above the limit", policies=["limit"]
     )
+
+
+async def _expired(context: grpc.aio.ServicerContext) -> None:
+    await context.abort(grpc.StatusCode.UNAUTHENTICATED, "the certificate is no longer valid")
 
 
 async def _refuse(context: grpc.aio.ServicerContext) -> None:

@@ -16,7 +16,8 @@ from fractus import running
 from fractus.drone import Mobility
 from fractus.pictures import Camera
 from fractus_proto.v1 import mobility_pb2
-from sdk_service import NAVIGATOR, Authority, Drone, Event, Pictures, Server
+from grpc.aio import Metadata
+from sdk_service import EXPIRED, NAVIGATOR, Authority, Drone, Event, Pictures, Server
 
 pytestmark = pytest.mark.timeout(180)
 WAIT_S = 15.0
@@ -404,6 +405,45 @@ async def test_a_renewed_certificate_is_used_without_ending_the_flight(stage: St
         assert control.lost is None
         stage.drone.release.set()
         assert (await asyncio.wait_for(flight, WAIT_S)).complete
+
+
+async def test_all_streams_go_on_with_a_renewed_certificate(stage: Stage) -> None:
+    async with stage.client() as drone, drone.control() as control:
+        samples = drone.telemetry()
+        await anext(samples)
+        stage.renew()
+        stage.drone.stream_open.clear()
+        stage.drone.expired.set()
+        stage.drone.control.put_nowait(EXPIRED)
+        await asyncio.wait_for(anext(samples), WAIT_S)
+        await samples.aclose()
+        await asyncio.wait_for(stage.drone.stream_open.wait(), WAIT_S)
+        assert control.lost is None
+    assert stage.drone.calls.count("GetControl") == stage.drone.calls.count("SubscribeTelemetry") == 2
+    assert len(stage.drone.certificates) == 2
+
+
+async def test_each_call_that_ends_with_an_old_certificate_is_tried_again(stage: Stage) -> None:
+    async with stage.client() as drone:
+        channel = drone._channel
+        errors = [grpc.aio.AioRpcError(grpc.StatusCode.UNAUTHENTICATED, Metadata(), Metadata()) for _ in range(2)]
+        calls = [channel.stub() for _ in errors]
+        for call in calls:
+            await call.__aenter__()
+        stage.renew()
+        for call, error in zip(calls, errors, strict=True):
+            assert not await call.__aexit__(type(error), error, None)
+        assert all(channel.transient(error) for error in errors)
+
+
+async def test_a_stream_ends_with_a_certificate_that_is_not_renewed(stage: Stage) -> None:
+    async with stage.client() as drone:
+        samples = drone.telemetry()
+        await anext(samples)
+        stage.drone.expired.set()
+        with pytest.raises(fractus.FractusError, match="no longer valid"):
+            await anext(samples)
+    assert stage.drone.calls == ["SubscribeTelemetry"]
 
 
 async def test_the_server_must_be_the_node_that_was_meant(stage: Stage) -> None:

@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from fractus_core.api.plans import GrantSpec
+from fractus_mavlink.enums import FENCE_TYPE, MAV_CMD
 from fractus_storage import remove_temporary, write_file
 
 from fractus_services.errors import AutopilotError
@@ -24,6 +25,9 @@ log = logging.getLogger(__name__)
 _RESTORE_TIMEOUT_S = 5.0
 ITEMS_AGAIN_S = 60.0
 """In flight the items are read again after this time: of others in their place, as many as there were, no message tells."""
+
+_SWITCHED = FENCE_TYPE.ALT_MAX | FENCE_TYPE.CIRCLE | FENCE_TYPE.POLYGON
+"""Without the floor, which the autopilot switches by itself."""
 
 _CLOSE_E7 = 2
 """Autopilots that store floats give positions back a few centimetres off."""
@@ -66,7 +70,7 @@ class MissionFence:
         self._path = directory / "fence.json"
         self._lock = asyncio.Lock()
         self._standing: tuple[Bounds, bool] | None = None
-        self._compared_at = -math.inf
+        self._compared_at = self._switched_at = -math.inf
         self.missing = ""
 
     @property
@@ -127,7 +131,7 @@ class MissionFence:
 
     async def _keep(self, owned: Owned) -> tuple[str, ...]:
         raised, total = owned.raised, self._stack.fence_total
-        changed = await self._set(raised)
+        changed = await self._set(raised) + await self._switch_on()
         if total in raised:
             items = (await self._parameters.read([(total,)])).get(total, 0.0)
             if items != raised[total]:
@@ -139,6 +143,19 @@ class MissionFence:
                 raise AutopilotError("another station changed its fence, which has other items than were loaded")
             self._compared_at = self._autopilot.now
         return changed
+
+    async def _switch_on(self) -> tuple[str, ...]:
+        """Switch on the fence that a command of another station, or a radio's switch, switched off: no parameter tells of that.
+
+        Not while the autopilot comes down, which may do so itself, nor under a pilot, whose switch it is.
+        """
+        vehicle = self._autopilot.vehicle
+        left_alone = vehicle.armed and not vehicle.mode.commanded
+        if vehicle.fenced is not False or vehicle.checks_at <= self._switched_at or left_alone:
+            return ()
+        await self._autopilot.command(MAV_CMD.DO_FENCE_ENABLE, 1, _SWITCHED)
+        self._switched_at = self._autopilot.now
+        return ("the fence was switched off and is on",)
 
     async def _offered(self) -> bool:
         """Whether the autopilot knows fences."""
@@ -174,7 +191,8 @@ class MissionFence:
             await self._set(values)
             total = await self._parameters.read([(self._stack.fence_total,)])
             await asyncio.to_thread(self._store, replace(owned, raised=values | total, around=around))
-            self._standing, self._compared_at = (bounds, retraces), self._autopilot.now
+            self._standing = bounds, retraces
+            self._compared_at = self._switched_at = self._autopilot.now
         except (AutopilotError, asyncio.CancelledError):
             await self._recover(owned)
             raise

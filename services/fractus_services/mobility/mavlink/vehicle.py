@@ -43,6 +43,7 @@ class Vehicle(VehicleState):
         gimbal_measured: whether the firmware measures where its gimbal points, and does not repeat where it was told to; None
             until it has told of which type that is.
         placed_at: when its estimator had a position last.
+        fenced: whether its own fence is switched on; None for one that has none. Told at `checks_at`.
         gimbal_limits: the least and the greatest pitch and yaw of its gimbal, degrees; None until it has told.
     """
 
@@ -51,6 +52,7 @@ class Vehicle(VehicleState):
     gimbal_measured: bool | None = None
     gimbal_limits: tuple[tuple[float, float], ...] | None = None
     placed_at: float = -math.inf
+    fenced: bool | None = None
 
     def take(self, message: Message, now: float) -> None:
         """Update from one message."""
@@ -157,6 +159,9 @@ def _status(vehicle: Vehicle, message: Message, now: float) -> None:
     present = message.integer("onboard_control_sensors_present") & MAV_SYS_STATUS_SENSOR.PREARM_CHECK
     healthy = message.integer("onboard_control_sensors_health") & MAV_SYS_STATUS_SENSOR.PREARM_CHECK
     vehicle.ready = bool(healthy) if present else vehicle.fix_type >= GPS_FIX_TYPE.TYPE_3D_FIX
+    fence = MAV_SYS_STATUS_SENSOR.GEOFENCE
+    has_fence = message.integer("onboard_control_sensors_present") & fence
+    vehicle.fenced = bool(message.integer("onboard_control_sensors_enabled") & fence) if has_fence else None
     vehicle.checks_at = now
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 import pytest
 from fractus_services.mobility.mavlink.timing import (
     MAX_ARMING_DELAY_S,
+    MAX_DELAY_S,
     MAX_PACE,
     PROBE_S,
     REACTION_S,
@@ -181,6 +182,20 @@ def test_a_link_that_gets_slow_is_noticed_before_its_first_slow_answer() -> None
     bench.worst = -math.inf
     bench.fly(1.0)
     assert bench.worst <= 0.0
+
+
+def test_many_overdue_answers_are_no_quick_link() -> None:
+    """Ten requests without an answer are of a vehicle that answers none, or of a link that got slow: until that is clear they count."""
+    up_s = 0.05
+    bench = Bench(lambda: up_s, steady(0.05))
+    bench.fly(15)
+    up_s = 2.6
+    bench.fly(1.9)
+    bench.fly(0.6)
+    assert bench.timing.unanswering
+    assert bench.timing.latency_s(bench.now) >= MAX_DELAY_S
+    bench.fly(2.0)
+    assert math.isinf(bench.timing.latency_s(bench.now)), "the slow answers are there"
 
 
 def test_a_lost_answer_makes_no_link_slower_than_can_be_flown_with() -> None:

@@ -228,8 +228,8 @@ class Timing:
 
         A link that gets slow tells by no answer until the first slow one is there: meanwhile it is slower by this at the least.
         """
-        if self.unanswering:
-            return 0.0
+        if self.unanswering and now - self._answered > STALE_S:
+            return 0.0  # It is measured by its acknowledgements; before that, its answers may only have become slow.
         waiting = min((sent for sent, _ in self._asked.values() if sent > self._answered), default=now)
         return max(now - waiting - self.answer_s, 0.0)
 

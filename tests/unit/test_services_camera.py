@@ -232,6 +232,27 @@ async def test_a_picture_is_judged_again_by_where_it_was_taken(world: World) -> 
     assert grain(await world.pixels(free, shot)) > 30
 
 
+async def test_a_picture_is_not_returned_that_shows_what_must_not_be_retrieved(world: World) -> None:
+    """By a denial of the method, also from elsewhere: what counts is what the picture shows, not what the camera sees by then."""
+    ground, methods = [zone("z", box(-20, -20, 20, 20))], ["RetrieveImage"]
+    grant = active_grant(policy("d", "AccessControl", "denial", ground, methods=methods))
+    world.drone.y = 0.0
+    shot = await world.capture(grant)
+    assert await refusal(world.library.retrieve(grant, shot.name)) == "MethodDenied"
+    world.drone.y = 80.0
+    assert await refusal(world.library.retrieve(grant, shot.name)) == "MethodDenied"
+    assert (await world.library.retrieve(grant, (await world.capture(grant)).name))[0].permits
+
+
+async def test_a_denial_counts_that_held_when_the_camera_may_have_seen_its_zone(world: World) -> None:
+    world.drone.y = 0.0
+    past = {**zone("z", box(-20, -20, 20, 20)), "schedule": [{"start": "08:00", "end": "11:50"}]}
+    grant = active_grant(policy("d", "AccessControl", "denial", [past], methods=["CaptureImage"]))
+    await world.capture(grant)
+    world.scene.latency_s = 900.0
+    assert await refusal(world.camera.capture(grant, CaptureArgs())) == "MethodDenied"
+
+
 async def test_a_picture_is_judged_again_once_its_filters_are_applied(world: World) -> None:
     far = [zone("far", box(500, 500, 510, 510))]
     free, bound = (

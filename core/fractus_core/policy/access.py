@@ -23,14 +23,9 @@ def judge_access(call: Call, now: Situation, grant: CompiledGrant) -> Verdict | 
             "MethodNotGranted",
             f"the grant of {grant.identity} does not include {method}; add it to the component's services",
         )
-    denials = grant.denials.get(method)
-    if denials is not None:
-        forbidding = (
-            seen(denials, now, grant) if method in SEEING else _matching(denials, now, grant, now.position_error_m)
-        )
-        if forbidding:
-            rule = forbidding[0]
-            return deny("MethodDenied", f"policy {rule.name} denies {method} here", names(forbidding))
+    denied = judge_denials(method, now, grant)
+    if denied is not None:
+        return denied
     allowances = grant.allowances.get(method)
     if allowances is not None and not _allowing(allowances, now, grant):
         rules = ordered({p.rule.name: p.rule for p in allowances.zones} | {r.name: r for r in allowances.everywhere})
@@ -38,6 +33,17 @@ def judge_access(call: Call, now: Situation, grant: CompiledGrant) -> Verdict | 
     if method in SEEING and grant.operation is not None:
         return _outside_operation_area(method, now, grant)
     return None
+
+
+def judge_denials(method: str, now: Situation, grant: CompiledGrant) -> Verdict | None:
+    """The denial of a method where the drone is; of one of `SEEING`, by what a picture from there may show."""
+    denials = grant.denials.get(method)
+    if denials is None:
+        return None
+    forbidding = seen(denials, now, grant) if method in SEEING else _matching(denials, now, grant, now.position_error_m)
+    if not forbidding:
+        return None
+    return deny("MethodDenied", f"policy {forbidding[0].name} denies {method} here", names(forbidding))
 
 
 def _outside_operation_area(method: str, now: Situation, grant: CompiledGrant) -> Verdict | None:

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 
+from fractus_core.policy.access import judge_denials
 from fractus_core.policy.engine import judge
 from fractus_core.policy.privacy import compose, judge_privacy
 from fractus_core.policy.values import Call, Situation, Verdict
@@ -55,12 +56,13 @@ class PictureJudge:
         return self.require(call, grant, verdict, now, record=record)
 
     def judge_view(self, call: Call, grant: ActiveGrant, seen: Situation) -> Verdict:
-        """The verdict of privacy policies on what the camera saw in a situation.
+        """The verdict on what the camera saw in a situation: of privacy policies, and of those that deny the method.
 
         Raises:
             Refused: no picture may be taken or returned there.
         """
-        return self.require(call, grant, judge_privacy(seen, grant.compiled), seen)
+        verdict = judge_denials(call.method, seen, grant.compiled) or judge_privacy(seen, grant.compiled)
+        return self.require(call, grant, verdict, seen)
 
     def judge_stored(
         self, call: Call, grant: ActiveGrant, poses: Sequence[Pose], verdict: Verdict, now: Situation

@@ -83,7 +83,9 @@ def _place(lat_e7: int, lon_e7: int) -> tuple[float, float] | None:
 
 
 def _position(vehicle: Vehicle, message: Message, now: float) -> None:
-    if not vehicle.located:
+    # With a GPS that has its fix the estimator may fly without: it then tells where it has reckoned to be, and drifts.
+    reckons = math.isfinite(vehicle.estimated_at) and not vehicle.estimated
+    if reckons or not vehicle.located:
         return
     place = _place(message.integer("lat"), message.integer("lon"))
     if place is None:

@@ -1,0 +1,57 @@
+"""An estimator that tells of no absolute position flies on by what it dead-reckons: with a GPS that has its fix all the same."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+import pytest
+import shapely
+from closed_loop import Account, Oracle, Sky
+from fractus_core.policy.values import TakeoffArgs
+from fractus_mavlink.enums import EKF_STATUS_FLAGS
+from fractus_services.mobility.rpc.telemetry import located
+from fractus_vehicle.body import Body
+from fractus_vehicle.control import Estimate
+from fractus_vehicle.estimator import Estimator
+from mobility_world import goto, spec, zone
+from sky_drone import fly, ready, until
+
+WALL = shapely.box(-100.0, 40.0, 100.0, 70.0)
+FLOW = (
+    EKF_STATUS_FLAGS.ATTITUDE | EKF_STATUS_FLAGS.VELOCITY_HORIZ | EKF_STATUS_FLAGS.VELOCITY_VERT
+    | EKF_STATUS_FLAGS.POS_HORIZ_REL | EKF_STATUS_FLAGS.POS_VERT_ABS | EKF_STATUS_FLAGS.PRED_POS_HORIZ_REL
+)  # fmt: skip
+"""Of a vehicle with optical flow that takes its GPS for jammed, or whose pilot has switched to other sources: it stays in GUIDED."""
+
+DRIFT_MPS = 0.3
+
+
+def test_a_drone_that_drifts_without_knowing_where_it_is_comes_home(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def work(sky: Sky, directory: Path) -> None:
+        oracle = Oracle(sky, Account(0))
+        async with ready(sky, directory) as (drone, grant):
+            drone.grants.put(spec(zone("wall", "ignore", *WALL.bounds)))
+            await drone.service.arm(grant, 120.0)
+            async for _ in drone.service.take_off(grant, TakeoffArgs(15.0)):
+                pass
+            async for _ in drone.service.goto(grant, goto(0.0, 32.0), 0.0):
+                pass
+            kept_m: list[float] = []
+            sky.witnesses.append(lambda: kept_m.append(WALL.distance(shapely.Point(*oracle.place()[:2]))))
+            since_s, estimate = sky.time(), Estimator.estimate
+
+            def drifting(self: Estimator, body: Body) -> Estimate:
+                known = estimate(self, body)
+                return known._replace(north=known.north - DRIFT_MPS * (sky.time() - since_s))
+
+            monkeypatch.setattr(Estimator, "estimate", drifting)
+            monkeypatch.setattr(Estimator, "flags", FLOW)
+            await asyncio.sleep(2.0)
+            assert not located(drone.control), "pictures are judged by it as well"
+            await until(lambda: drone.control.state.returning or min(kept_m) <= 0.0)
+            assert min(kept_m) > 1.0
+
+    fly(work, tmp_path)

@@ -71,6 +71,19 @@ def test_rounds_are_never_cut_short_and_hardly_larger(radius, pieces):
         assert beyond <= max(0.0101, 3.2e-4 * radius)
 
 
+@given(latitudes, longitudes, st.floats(1, 200_000), st.floats(0, 300_000), st.floats(0, math.tau))
+def test_what_stands_for_a_circle_to_stay_in_is_never_larger(lat, lon, radius, away, bearing):
+    """However far its middle is from the origin of the frame, which shows distances there too small."""
+    frame = LocalFrame(lat, lon)
+    centre_lat, centre_lon = frame.latlon(away * math.sin(bearing), away * math.cos(bearing))
+    centre = Point(lat=centre_lat, lon=centre_lon)
+    shape = polygon(frame, Area(circle=Circle(center=centre, radius=radius)), within=True)
+    for x, y in shapely.get_coordinates(shape)[::16]:
+        corner_lat, corner_lon = frame.latlon(x, y)
+        assert geodesic_m(centre, Point(lat=corner_lat, lon=corner_lon)) <= radius + 1e-6
+    assert shape.area >= math.pi * radius**2 * (0.99 if away < 50_000 else 0.98)
+
+
 @given(st.floats(1, 200), st.floats(-9, 3), st.floats(0, math.tau))
 def test_a_corridor_covers_its_legs_however_short(radius, magnitude, direction):
     frame = LocalFrame(50, 4)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import pytest
+from fractus_core.api.geometry import Point
+from fractus_core.geo import distance_m
 from fractus_core.policy.motion import stopping_distance_m
 from fractus_core.policy.values import (
     Airframe,
@@ -12,6 +14,8 @@ from fractus_core.policy.values import (
     TakeoffArgs,
 )
 from policy_world import (
+    FRAME,
+    HOME,
     ask,
     at,
     box,
@@ -161,6 +165,18 @@ def test_adjusting_inside_an_inclusion_zone() -> None:
     assert ask(compiled(inclusion(box(-30, -30, 60, 60))), goto(0, 100)).code == "OutsideInclusionZone"
     assert ask(compiled(inclusion(box(-30, -30, 60, 60), "land")), goto(0, 100)).takeover == "land"
     assert ask(compiled(inclusion(box(-30, -30, 60, 60))), goto(0, 59)).code == "TooCloseToInclusionBorder"
+
+
+@pytest.mark.parametrize("radius_m", [20_000.0, 100_000.0])
+def test_a_wide_circle_to_stay_in_is_not_left(radius_m: float) -> None:
+    """Its border is 100 m north of home, and its middle far to the south."""
+    lat, lon = FRAME.latlon(0.0, -(radius_m - 100.0))
+    # True to scale, unlike the frame.
+    south_m = distance_m(Point(lat=lat, lon=lon), Point(lat=HOME.lat, lon=HOME.lon))
+    circle = {"circle": {"center": {"lat": lat, "lon": lon}, "radius": south_m + 100.0}}
+    grant = compiled(inclusion(circle))
+    assert ask(grant, goto(0, 102), at(0, -170)).code == "OutsideInclusionZone"
+    assert ask(grant, goto(0, -180), at(0, -170)).action == "allow"
 
 
 def test_inclusion_is_the_union_of_a_policys_zones() -> None:

@@ -24,6 +24,9 @@ _CORNER_M = 0.01
 MAX_EXTENT_M = 1_000_000.0
 """No point of an area may be further from its middle: beyond, a local frame means nothing."""
 
+_MIN_CURVATURE_M = 6_335_000.0
+"""The ellipsoid bends no more than a sphere of this radius."""
+
 _SNAPPED = 1e-5
 """GEOS merges corners that are closer than about a millionth of the radius, which would cut short a leg as short."""
 
@@ -33,23 +36,32 @@ def points_xy(frame: LocalFrame, points: Iterable[Point]) -> list[tuple[float, f
     return [frame.xy(p.lat, p.lon) for p in points]
 
 
-def polygon(frame: LocalFrame, area: Area) -> shapely.Polygon:
+def polygon(frame: LocalFrame, area: Area, *, within: bool = False) -> shapely.Polygon:
     """The area in metres east and north of the frame's origin; a circle is circumscribed, never cut short.
+
+    Args:
+        frame: where.
+        area: what.
+        within: a circle is inscribed instead, and never exceeded.
 
     Raises:
         InvalidObject: a ring crosses itself, encloses nothing, or a hole leaves the exterior.
     """
     if area.circle is not None:
-        return _circle(frame, area.circle)
+        return _circle(frame, area.circle, within=within)
     if area.polygon is None:
         raise InvalidObject("", "give either polygon or circle")
     return _polygon(frame, area.polygon)
 
 
-def _circle(frame: LocalFrame, circle: Circle) -> shapely.Polygon:
+def _circle(frame: LocalFrame, circle: Circle, *, within: bool) -> shapely.Polygon:
     x, y = frame.xy(circle.center.lat, circle.center.lon)
-    circumscribed, segments = _circumscribed(circle.radius)
-    return shapely.Point(x, y).buffer(circumscribed, quad_segs=segments)
+    radius_m, segments = _circumscribed(circle.radius)
+    if within:
+        # The frame shows what is far from its origin too small, so that as many of its metres reach too far.
+        furthest = (math.hypot(x, y) + circle.radius) / _MIN_CURVATURE_M
+        radius_m = circle.radius * math.sqrt(max(1.0 - furthest * furthest, 0.0))
+    return shapely.Point(x, y).buffer(radius_m, quad_segs=segments)
 
 
 def _polygon(frame: LocalFrame, spec: Polygon) -> shapely.Polygon:

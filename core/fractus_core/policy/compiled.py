@@ -23,6 +23,8 @@ REACH_M = 500_000.0
 """Ground further than this from the origin is left out of the frame: no drone of ours gets there."""
 MAX_UNINDEXED = 4
 """Up to this many zones are faster to test one by one than through an index."""
+_WITHIN = frozenset({"inclusion", "grant"})
+"""Kinds of policies that allow something in their zones: what stands for a zone must not be larger."""
 OPERATION_AREA = "operation-area"
 """Name under which verdicts list the fence that every grant implies."""
 
@@ -315,8 +317,9 @@ def _union(frame: LocalFrame, areas: tuple[Area, ...]) -> BaseGeometry | None:
 
 
 def _policy_zones(frame: LocalFrame, rule: Rule, policy: GrantedPolicy) -> list[PolicyZone]:
+    within = rule.spec.kind in _WITHIN
     return [
-        PolicyZone(rule, zone.name, _prepared(polygon(frame, zone.area)), zone.altitude, zone.schedule)
+        PolicyZone(rule, zone.name, _prepared(polygon(frame, zone.area, within=within)), zone.altitude, zone.schedule)
         for zone in policy.zones
         if _within_reach(frame, zone.area)
     ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import replace
 from typing import Any
 
@@ -17,6 +18,7 @@ from fractus_core.policy.monitoring import monitor
 from fractus_core.policy.routes import route
 from fractus_core.policy.values import Airframe, Call, GotoArgs, Home, Moment, Situation, VelocityArgs
 from policy_world import (
+    FRAME,
     METHODS,
     NOW,
     altitude,
@@ -28,12 +30,30 @@ from policy_world import (
     goto,
     inclusion,
     policy,
+    ring,
     spec,
     zone,
 )
 
 SERVICES = [{"service": "mobility", "methods": [*METHODS, "SetVelocity"]}]
 RETRACING = Airframe(retraces=True)
+
+
+def test_no_judgement_takes_long_beside_an_outline_of_many_corners() -> None:
+    """Of a region with ten thousand corners, which any application may have: the motion monitor and the heartbeats wait meanwhile."""
+    corners = [
+        ((300.0 if i % 2 else 150.0) * math.sin(math.tau * i / 10_000), (300.0 if i % 2 else 150.0) * math.cos(math.tau * i / 10_000))
+        for i in range(10_000)
+    ]  # fmt: skip
+    region = compiled(operationArea=[ring(corners)])
+    zones = compiled(exclusion(ring(corners), "adjust"), operationArea=[box(-900, -900, 900, 900)], home=None)
+    away = Home(*FRAME.latlon(0.0, 500.0), 100.0)
+    begun_s = time.process_time()
+    assert ask(region, goto(0, 0), at(0, 149)).action == "allow", "back from the border"
+    assert ask(region, goto(0, 0), at(0, 315)).action == "allow", "from outside"
+    assert ask(zones, goto(0, 0), at(0, 400, home=away)).code == "LegShortened"
+    assert ask(zones, goto(0, 400), at(0, 301, home=away)).action == "allow", "out of its margin"
+    assert time.process_time() - begun_s < 1.0
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import shapely
 
 from fractus_core.policy.compiled import Air, CompiledGrant, height_m
 from fractus_core.policy.corrections import caused
-from fractus_core.policy.fences import Breach, breaches, broken
+from fractus_core.policy.fences import HALVINGS, Breach, breaches, broken
 from fractus_core.policy.limits import (
     MIN_LEG_ALTITUDE_M,
     SLACK,
@@ -42,6 +42,8 @@ from fractus_core.policy.values import POSITION_UNKNOWN, Call, GotoArgs, Situati
 
 MAX_RANGE_M = 100_000.0
 """Farther than any drone here flies, and well inside what the grant's frame shows true to scale."""
+MIN_LEG_M = 0.5
+"""A leg that could be flown no further is not worth it."""
 NEAR_DEG = 30.0
 """A target this near, in degrees, certainly lies on the frame's side of the globe."""
 
@@ -232,21 +234,18 @@ def way_home_blocked(target: XY, altitude_m: float, now: Situation, grant: Compi
 
 def _last_legal(leg: Leg, found: list[Breach]) -> XY | None:
     """The furthest point of a leg that no breached fence objects to, or None when there is none worth flying to."""
-    line = leg.line
-    start = shapely.points(leg.stop)
-    if not isinstance(line, shapely.LineString):
-        return None
-    reach = line.length
-    for breach in found:
-        legal = breach.legal()
-        pieces = [p for p in shapely.get_parts(legal) if p.distance(start) < 1e-6 and isinstance(p, shapely.LineString)]
-        if not pieces:
-            return None
-        reach = min(reach, pieces[0].length)
-    if reach < 0.5:
-        return None
-    point = line.interpolate(reach - 0.01)
-    return (point.x, point.y)
+    length_m = math.dist(leg.stop, leg.target)
+    (x, y), (tx, ty) = leg.stop, leg.target
+
+    def along(share: float) -> XY:
+        return x + (tx - x) * share, y + (ty - y) * share
+
+    low, high = 0.0, 1.0
+    for _ in range(HALVINGS):
+        share = (low + high) / 2
+        part = shapely.linestrings((leg.stop, along(share)))
+        low, high = (share, high) if all(breach.permits(part) for breach in found) else (low, share)
+    return along(low - 0.01 / length_m) if low * length_m >= MIN_LEG_M else None
 
 
 def _outcome(args: GotoArgs, flown: _Aim, notes: list[Clamped], grant: CompiledGrant) -> Verdict:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -83,6 +84,7 @@ class GrantFiles:
         self._loaded: dict[Path, ActiveGrant | None] = {}
         self._active: dict[str, ActiveGrant] = {}
         self._listeners: list[Listener] = []
+        self._reading = threading.Lock()
 
     @property
     def active(self) -> Mapping[str, ActiveGrant]:
@@ -108,12 +110,12 @@ class GrantFiles:
                     self._directory, debounce=50, step=20, rust_timeout=RESCAN_INTERVAL_MS, yield_on_timeout=True,
                     recursive=False,
                 ):  # fmt: skip
-                    self.scan()
+                    await self._scan_aside()
                     self._remember()
             except (OSError, RuntimeError) as error:
                 log.warning("grants: cannot watch, scanning instead (directory=%s): %s", self._directory, error)
             await asyncio.sleep(RESCAN_INTERVAL_MS / 1000)
-            self.scan()
+            await self._scan_aside()
 
     def _remember(self) -> None:
         """Store what was seen, in a thread: a disk that hangs must not delay a change of grants."""
@@ -124,10 +126,25 @@ class GrantFiles:
 
     def scan(self) -> None:
         """Read what changed."""
+        if self._read_changes():
+            self._replace()
+
+    async def _scan_aside(self) -> None:
+        """Read what changed, in a thread: grants of large areas take seconds, in which a flight is watched all the same."""
+        if await asyncio.to_thread(self._read_changes):
+            self._replace()
+
+    def _read_changes(self) -> bool:
+        """Read the files that changed; whether there are any."""
+        # The thread of a watch that was cancelled may still read.
+        with self._reading:
+            return self._read_changed()
+
+    def _read_changed(self) -> bool:
         found, whole = self._list()
         trusted = self._verifier.reload_authorities()
         if found == self._stamps and not trusted:
-            return
+            return False
         before = dict(self._loaded)
         for path in self._stamps.keys() - found.keys():
             self._loaded.pop(path, None)
@@ -141,7 +158,7 @@ class GrantFiles:
                 gone = before[path]
                 if gone is not None and gone.digest not in renamed:
                     self._revoke(gone)
-        self._replace()
+        return True
 
     def _list(self) -> tuple[dict[Path, _Stamp], bool]:
         """The files, and whether those that are missing were certainly removed, and are not just unreadable."""

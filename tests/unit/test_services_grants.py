@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
+import threading
 from pathlib import Path
 from typing import Any
 
 import pytest
+from fractus_core.policy.compiled import CompiledGrant, compile_grant
+from fractus_services import grants as module
 from fractus_services.admission import Allowance
 from fractus_services.grant_verifier import GrantVerifier
 from fractus_services.grants import ActiveGrant, GrantFiles
@@ -55,6 +59,33 @@ def test_files_come_change_and_go(tmp_path: Path) -> None:
     path.unlink()
     files.scan()
     assert seen == [(None, "u1"), ("u1", "u2"), ("u2", None), (None, "u3"), ("u3", None)]
+
+
+async def test_a_flight_is_watched_while_large_grants_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The event loop has the motion monitor and the heartbeats."""
+    begun, goes_on = threading.Event(), threading.Event()
+
+    def slowly(*args: Any, **options: Any) -> CompiledGrant:
+        begun.set()
+        assert goes_on.wait(10.0), "the event loop waits for this thread"
+        return compile_grant(*args, **options)
+
+    monkeypatch.setattr(module, "compile_grant", slowly)
+    files, changed = grant_files(tmp_path), asyncio.Event()
+    files.listen(lambda _old, _new: changed.set())
+    watching = asyncio.ensure_future(files.run())
+    try:
+        (tmp_path / "g.json").write_text(body())
+        async with asyncio.timeout(20.0):
+            await asyncio.to_thread(begun.wait, 10.0)
+            assert not files.active
+            goes_on.set()
+            await changed.wait()
+        assert len(files.active) == 1
+    finally:
+        goes_on.set()
+        watching.cancel()
+        await asyncio.gather(watching, return_exceptions=True)
 
 
 @pytest.mark.parametrize(

@@ -312,6 +312,19 @@ def test_the_operator_does_not_say_that_a_drone_has_landed(control_plane: Contro
             )
 
 
+def test_the_operator_does_not_bring_back_what_someone_saw(control_plane: ControlPlane, guarded: World) -> None:
+    """That the drone stood there when it was last heard of, before this flight; the annotation that says so stays."""
+    path, seen = f"{FRACTUS}/drones/drone-1", "2026-01-01T00:00:00Z"
+    guarded.api.merge(path, {"metadata": {"annotations": {"fractus.dev/grounded": seen}}})
+    guarded.api.merge(f"{path}/status", {"status": {"lastSeen": "2026-01-02T00:00:00Z"}})
+    with control_plane.with_token(operator_token(guarded)) as client:
+        for time in (seen, None):
+            assert "or when it reported" in refusal(
+                lambda time=time: client.merge(f"{path}/status", {"status": {"lastSeen": time}})
+            )
+        assert "drone-1 is in the air" in refusal(lambda: client.delete(f"{PODS}/fractus-mobility-drone-1"))
+
+
 def test_whether_a_drone_has_a_mission_is_said(guarded: World, permitted: OperatorProcess, namespace: str) -> None:
     path = f"{FRACTUS}/drones/drone-2"
     guarded.api.merge(f"{path}/status", {"status": {"lastSeen": "2026-01-01T00:00:00Z"}})

@@ -233,6 +233,12 @@ def test_the_operator_writes_nothing_that_it_has_not_made(
         denied(lambda: client.merge(node, {"spec": {"unschedulable": True}}), labels)
         denied(lambda: client.merge(node, {"metadata": {"labels": {"fractus.dev/class": "cloud"}}}), labels)
         denied(lambda: client.merge(node, {"metadata": {"labels": {"kubernetes.io/os": "x"}}}), labels)
+        # What network plugins and others go by, and what would keep a Node or have it collected.
+        for field, value in (
+            ("annotations", {"flannel.alpha.coreos.com/public-ip": "192.0.2.1"}),
+            ("finalizers", ["a/b"]),
+        ):
+            denied(lambda field=field, value=value: client.merge(node, {"metadata": {field: value}}), labels)
         client.merge(node, {"metadata": {"labels": {"fractus.dev/geohash": "sx1"}}})
         guarded = {"metadata": {"labels": {"fractus.dev/guarded": "true"}}}
         denied(lambda: client.merge(node, guarded), "calls no node guarded")

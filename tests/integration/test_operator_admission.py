@@ -16,6 +16,7 @@ from control_plane import ControlPlane, wait_for
 from fractus_kube import BlockingClient, ContentType, KubeError
 from operator_world import (
     FRACTUS,
+    NODES,
     SYSTEM,
     Body,
     OperatorProcess,
@@ -272,12 +273,9 @@ def test_who_has_the_operator_s_token_gets_no_further(
     client = control_plane.with_token(operator_token(world))
     mine = {"app.kubernetes.io/managed-by": "fractus"}
 
+    restricted = {"allowPrivilegeEscalation": False, "capabilities": {"drop": ["ALL"]}, "readOnlyRootFilesystem": True}
+
     def deployment(place: str = namespace, container: dict[str, Any] | None = None, **pod: Any) -> Callable[[], object]:
-        restricted = {
-            "allowPrivilegeEscalation": False,
-            "capabilities": {"drop": ["ALL"]},
-            "readOnlyRootFilesystem": True,
-        }
         main = {"name": "main", "image": "registry.test/theirs:1", "securityContext": restricted} | (container or {})
         spec = {
             "automountServiceAccountToken": False,
@@ -311,7 +309,7 @@ def test_who_has_the_operator_s_token_gets_no_further(
         # As it is, it would be let in: what follows is refused for what it says.
         deployment()()
         secret("traffic-navigator-tls")()
-        for place in ("kube-system", SYSTEM):
+        for place in ("kube-system", SYSTEM, NODES):
             denied(deployment(place), "runs nothing in the namespace")
         for pod in (
             {"automountServiceAccountToken": True},
@@ -336,6 +334,19 @@ def test_who_has_the_operator_s_token_gets_no_further(
             {"allowPrivilegeEscalation": False, "readOnlyRootFilesystem": True, "capabilities": {"drop": ["ALL"]}, "runAsUser": 0},
         ):  # fmt: skip
             denied(deployment(container={"securityContext": given}), "one container without privileges")
+        confined = {"runAsNonRoot": True, "runAsUser": 10001, "seccompProfile": {"type": "RuntimeDefault"}}
+        for more in ({"seLinuxOptions": {"type": "spc_t"}}, {"appArmorProfile": {"type": "Unconfined"}}):
+            denied(deployment(securityContext=confined | more), "pods that are confined")
+            denied(deployment(container={"securityContext": restricted | more}), "pods that are confined")
+        denied(
+            deployment(securityContext=confined | {"sysctls": [{"name": "a.b", "value": "1"}]}),
+            "pods that are confined",
+        )
+        unmasked = {"securityContext": restricted | {"procMount": "Unmasked"}}
+        denied(deployment(container=unmasked, hostUsers=False), "pods that are confined")
+        beyond = {"httpGet": {"host": "169.254.169.254", "port": 80}}
+        for called in ({"livenessProbe": beyond}, {"lifecycle": {"postStart": beyond}}):
+            denied(deployment(container=called), "has no kubelet call others")
         certificates = "certificates of instances only"
         denied(
             secret("theirs-tls", type="kubernetes.io/service-account-token", data={}, metadata=account), certificates
@@ -346,7 +357,8 @@ def test_who_has_the_operator_s_token_gets_no_further(
         )
         denied(secret("theirs"), certificates)
         denied(secret("fractus-ca"), certificates)
-        denied(secret("theirs-tls", SYSTEM), certificates)
+        for place in (SYSTEM, NODES, "kube-system", "kube-public", "kube-node-lease"):
+            denied(secret("theirs-tls", place), certificates)
         # Nor does it read or write what gives rights.
         for path in (
             f"/api/v1/namespaces/{SYSTEM}/serviceaccounts/fractus-node/token",

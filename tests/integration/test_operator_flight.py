@@ -86,6 +86,8 @@ def attempts(world: World, drone: str) -> dict[str, Callable[[], object]]:
     """What would take a service from a drone, or end it; none is carried out."""
     api, pod, node = world.api, f"{PODS}/fractus-mobility-{drone}", f"/api/v1/nodes/{drone}"
     dry = "?dryRun=All"
+    # With the service's processes in sight, which it may end.
+    debugger = {"name": "debugger", "image": "tools:1", "targetContainerName": "mobility"}
     return {
         "delete a pod": lambda: try_delete(world, pod),
         "delete a pod by force": lambda: try_delete(world, pod, gracePeriodSeconds=0),
@@ -93,6 +95,9 @@ def attempts(world: World, drone: str) -> dict[str, Callable[[], object]]:
         "delete all pods": lambda: try_delete(world, PODS),
         "change a pod's image": lambda: api.merge(
             pod + dry, {"spec": {"containers": [{**whole(world, pod)["spec"]["containers"][0], "image": "bad"}]}}
+        ),
+        "debug a pod": lambda: api.merge(
+            f"{pod}/ephemeralcontainers{dry}", {"spec": {"ephemeralContainers": [debugger]}}
         ),
         "give a pod a deadline": lambda: api.merge(pod + dry, {"spec": {"activeDeadlineSeconds": 1}}),
         "hide a pod": lambda: api.merge(pod + dry, {"metadata": {"labels": {"app.kubernetes.io/component": "x"}}}),

@@ -393,9 +393,12 @@ class Secrets:
         self.there = set(there)
         self.said: list[str] = []
         self.refused = False
+        self.full = False
 
     async def create(self, kind: Kind, body: Body) -> Body:
         self.said.append("create")
+        if self.full:
+            raise KubeError(403, "Forbidden", "exceeded quota")
         if body["metadata"]["name"] in self.there:
             raise Conflict(409, "AlreadyExists", "it is there")
         self.there.add(body["metadata"]["name"])
@@ -433,6 +436,19 @@ async def test_secrets_are_written_without_a_look(why: Any, there: bool, said: l
     assert await children.write_secret(APPLICATION, "one", kinds.SECRET.header("one-tls", "city"), why)
     assert store.said == said
     assert store.there == {"one-tls"}
+
+
+@pytest.mark.parametrize("why", ["new", "renewed", "lost"])
+async def test_a_quota_that_is_used_up_is_said_of_a_secret_that_is_not_there(why: Any) -> None:
+    """The API server looks at quotas first: it would refuse to make one that is there, and no try would ever succeed."""
+    secret = kinds.SECRET.header("one-tls", "city")
+    store = Secrets("one-tls")
+    store.full = True
+    assert await made_on(cast(Any, store)).write_secret(APPLICATION, "one", secret, why)
+    assert store.said[-1] == "replace"
+    store.there.clear()
+    with pytest.raises(KubeError, match="exceeded quota"):
+        await made_on(cast(Any, store)).write_secret(APPLICATION, "one", secret, why)
 
 
 async def test_no_secret_of_anothers_deployment_is_written() -> None:

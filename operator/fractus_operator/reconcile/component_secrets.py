@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+from http import HTTPStatus
 from typing import Literal
 
 from fractus_operator.cluster.kinds import SECRET, Body, Key, key_of
@@ -50,11 +51,17 @@ class ComponentSecrets:
                     return
             try:
                 await self._store.create(SECRET, body)
-            except Conflict as taken:
-                if taken.reason != _EXISTS:
+            except KubeError as refused:
+                exists = isinstance(refused, Conflict) and refused.reason == _EXISTS
+                # Of a namespace whose quota is used up the API server says no more, also of a Secret that is there.
+                if not exists and refused.status != HTTPStatus.FORBIDDEN:
                     raise
-                if why != "lost":
+                if exists and why == "lost":
+                    return
+                try:
                     await self._store.replace(SECRET, body)
+                except NotFound:
+                    raise refused from None
 
     async def remove_of(self, application: Key, deployment: Body) -> None:
         """Delete that of a Deployment which is about to be removed, after which nothing tells its name.

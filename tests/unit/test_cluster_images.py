@@ -106,6 +106,16 @@ def test_a_release_builds_on_a_digest_that_its_images_name() -> None:
     assert f'echo "BASE={base}@$digest" >> "$GITHUB_ENV"' in scripts[told]
 
 
+def test_what_a_release_is_signed_beside_is_named_by_its_commit() -> None:
+    """Who moves a tag of an action would sign, and push, as the release's workflow."""
+    for path in (ROOT / ".github/workflows").iterdir():
+        workflow = yaml.safe_load(path.read_text())
+        for job in workflow["jobs"].values():
+            if "write" in (job.get("permissions") or workflow["permissions"]).values():
+                actions = [step["uses"] for step in job["steps"] if "uses" in step]
+                assert [action for action in actions if not re.fullmatch("[^@]+@[0-9a-f]{40}", action)] == []
+
+
 def test_every_image_of_the_examples_can_be_built() -> None:
     manifests = (ROOT / "examples").rglob("*.yaml")
     named = {name for path in manifests for name in re.findall(r"image: localhost/fractus/(\S+):dev", path.read_text())}

@@ -170,6 +170,15 @@ def test_no_label_by_which_policies_and_selectors_go_is_replaced(name: str) -> N
     assert name in refusal(DRONE, f"--set-json=vehicle.podLabels={json.dumps({name: 'x'})}", chart="fractus-demo")
 
 
+@pytest.mark.parametrize(("chart", "more"), [("fractus", ()), ("fractus-demo", (DRONE,))])
+def test_what_can_be_no_tag_is_refused(chart: str, more: tuple[str, ...]) -> None:
+    """No kubelet takes a digest in its place, and each node would wait for its services."""
+    for tag in (f"sha256:{64 * '0'}", f"1.0@sha256:{64 * '0'}", "-x", 129 * "x"):
+        assert "image/tag" in refusal(f"--set-string=image.tag={tag}", *more, chart=chart)
+    for tag in ("", "1.2.3_amd64-rc.1"):
+        assert render(f"--set-string=image.tag={tag}", *more, chart=chart)
+
+
 @pytest.mark.parametrize("part", WORKLOADS)
 def test_no_variable_of_ours_is_replaced(part: str) -> None:
     said = refusal(f"--set={part}.extraEnv[0].name=FRACTUS_NODE", "--set=view.enabled=true")

@@ -39,6 +39,7 @@ POLICIES = (
     "fractus-pod-nodes",
     "fractus-operator",
     "fractus-operator-nodes",
+    "fractus-operator-slices",
     "fractus-flight-pods",
     "fractus-flight-nodes",
     "fractus-flight-system",

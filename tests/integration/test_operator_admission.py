@@ -424,6 +424,7 @@ def test_who_has_the_operator_s_token_moves_no_traffic(
             {"target": {"namespace": "elsewhere"}},
         ):
             denied(endpoints(**changed), "EndpointSlices of pods of applications")
+        _leads_no_other_s_traffic(world, client, namespace)
         made("NetworkPolicy", {"podSelector": {"matchLabels": own}, "policyTypes": ["Ingress"]})()
         for spec in (
             {"podSelector": {}, "policyTypes": ["Ingress"]},
@@ -437,6 +438,45 @@ def test_who_has_the_operator_s_token_moves_no_traffic(
         denied(made("Service", {"ports": ports, "selector": own}, "kube-system"), "runs nothing in the namespace")
     finally:
         client.close()
+
+
+def _leads_no_other_s_traffic(world: World, client: BlockingClient, namespace: str) -> None:
+    """A Service's traffic goes to every EndpointSlice with its name, also to one that another client made."""
+    services = f"/api/v1/namespaces/{namespace}/services"
+    slices = f"/apis/discovery.k8s.io/v1/namespaces/{namespace}/endpointslices"
+
+    def ends(address: str) -> list[Body]:
+        return [{"addresses": [address], "targetRef": {"kind": "Pod", "name": "p", "namespace": namespace}}]
+
+    def lead(name: str, query: str = "") -> object:
+        labels = {
+            "app.kubernetes.io/managed-by": "fractus",
+            "fractus.dev/application": "a",
+            "kubernetes.io/service-name": name,
+            "endpointslice.kubernetes.io/managed-by": "operator.fractus.dev",
+        }
+        body: Body = {"apiVersion": "discovery.k8s.io/v1", "kind": "EndpointSlice", "addressType": "IPv4"}
+        body |= {"metadata": {"name": name, "labels": labels}, "endpoints": ends("10.1.2.3")}
+        return client.call("POST", f"{slices}{query}", body)
+
+    def refused(name: str) -> bool:
+        try:
+            lead(name, "?dryRun=All")
+        except KubeError as error:
+            return f"has not made the Service {name}, and leads its traffic nowhere" in str(error)
+        return False
+
+    for name, labels in (("bank", {}), ("ours", {"app.kubernetes.io/managed-by": "fractus"})):
+        metadata = {"name": name, "labels": labels}
+        body = {"apiVersion": "v1", "kind": "Service", "metadata": metadata, "spec": {"ports": [{"port": 80}]}}
+        world.api.call("POST", services, body)
+    wait_for(lambda: refused("bank"), "the Service to be known")
+    lead("ours")
+    # What was made before the Service was someone's is not led elsewhere afterwards.
+    world.api.merge(f"{services}/ours", {"metadata": {"labels": {"app.kubernetes.io/managed-by": "helm"}}})
+    wait_for(lambda: refused("ours"), "the Service to be another's")
+    elsewhere = {"endpoints": ends("10.1.2.4")}
+    denied(lambda: client.merge(f"{slices}/ours", elsewhere), "has not made the Service ours")
 
 
 def _probe_refused(client: BlockingClient) -> bool:

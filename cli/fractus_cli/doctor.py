@@ -41,6 +41,7 @@ POLICIES = (
     "fractus-operator-nodes",
     "fractus-operator-slices",
     "fractus-flight-pods",
+    "fractus-flight-pod-status",
     "fractus-flight-nodes",
     "fractus-flight-system",
     "fractus-flight-node-status",

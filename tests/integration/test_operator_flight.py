@@ -106,11 +106,6 @@ def attempts(world: World, drone: str) -> dict[str, Callable[[], object]]:
             node + dry, {"metadata": {"labels": {"fractus.dev/class": "edge"}}}
         ),
         "taint the node": lambda: api.merge(node + dry, {"spec": {"taints": [{"key": "x", "effect": "NoExecute"}]}}),
-        "end a pod by its status": lambda: api.merge(f"{pod}/status{dry}", {"status": {"phase": "Failed"}}),
-        "say that a pod does not run": lambda: api.merge(f"{pod}/status{dry}", {"status": {"containerStatuses": []}}),
-        "hide a pod by its status": lambda: api.merge(
-            f"{pod}/status{dry}", {"metadata": {"labels": {"app.kubernetes.io/component": "x"}}}
-        ),
         "delete the node": lambda: try_delete(world, node),
         "delete the Drone": lambda: try_delete(world, f"{FRACTUS}/drones/{drone}"),
     }
@@ -194,6 +189,28 @@ def test_what_a_node_is_does_not_change_by_way_of_its_status(guarded: World) -> 
     change = {"metadata": {"labels": {"fractus.dev/class": None}}}
     told = wait_for(lambda: refusal(lambda: guarded.api.merge(f"{NODE}/status?dryRun=All", change)), "the policy")
     assert "kubectl label node" in told
+
+
+@pytest.mark.parametrize("drone", ["drone-1", "drone-2"])
+def test_only_its_kubelet_says_that_a_service_has_ended(
+    control_plane: ControlPlane, guarded: World, drone: str
+) -> None:
+    """Also on the ground, so that no Drone is looked at for what kubelets write all the time."""
+    path = f"{PODS}/fractus-mobility-{drone}/status?dryRun=All"
+    failed, ended = {"status": {"phase": "Failed"}}, {"status": {"containerStatuses": []}}
+    for change in (failed, ended):
+        assert "only its node's kubelet" in refusal(lambda change=change: guarded.api.merge(path, change))
+    hidden = {"metadata": {"labels": {"app.kubernetes.io/component": "x"}}}
+    assert "labels of services" in refusal(lambda: guarded.api.merge(path, hidden))
+    guarded.api.merge(path, {"status": {"conditions": [{"type": "Ready", "status": "False"}]}})
+    with control_plane.as_user(f"kubelet-{drone}", f"system:node:{drone}", ("system:nodes",)) as kubelet:
+        kubelet.merge(path, failed)
+        kubelet.merge(path, ended)
+    # The rights of that controller are those of its user name, by a ClusterRoleBinding of Kubernetes's own.
+    collector = "system:serviceaccount:kube-system:pod-garbage-collector"
+    with control_plane.as_user("collector", collector, ()) as client:
+        client.merge(path, failed)
+        assert "only its node's kubelet" in refusal(lambda: client.merge(path, ended))
 
 
 def test_the_kinds_stay_while_the_chart_needs_them(guarded: World) -> None:

@@ -371,6 +371,22 @@ def test_a_pod_asks_for_the_larger_of_its_phases() -> None:
     assert (pod.instance, pod.ready, pod.labels) == ("i", False, {"fractus.dev/instance": "i"})
 
 
+def test_what_runs_beside_a_pods_containers_is_asked_for_too() -> None:
+    """As by a service mesh, whose proxy is an init container that stays: the scheduler counts it, too."""
+
+    def asks(cpu: str, **more: str) -> dict:
+        return {"resources": {"requests": {"cpu": cpu}}, **more}
+
+    def asked(**spec: Any) -> float:
+        return read_pod({"metadata": {"name": "p", "namespace": "ns"}, "spec": spec}).requests["cpu"]
+
+    proxy, main = asks("200m", restartPolicy="Always"), asks("300m")
+    assert asked(containers=[main], initContainers=[proxy]) == pytest.approx(0.5)
+    assert asked(containers=[main], initContainers=[proxy, asks("400m")]) == pytest.approx(0.6)
+    assert asked(containers=[main], initContainers=[asks("400m"), proxy]) == pytest.approx(0.5)
+    assert asked(containers=[main], initContainers=[proxy], **asks("1")) == pytest.approx(1)
+
+
 @pytest.mark.parametrize(
     ("spec", "phase", "kept"),
     [({}, "Running", False), ({}, "Failed", True), ({"activeDeadlineSeconds": 1}, "Running", True),

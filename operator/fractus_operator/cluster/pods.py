@@ -198,21 +198,31 @@ def _controller(metadata: Body, kind: str) -> str | None:
 
 
 def _requests(spec: Body) -> dict[str, float]:
-    """Effective requests of a Pod: the sum of its containers, or its largest init container, plus overhead."""
+    """Effective requests of a Pod, as the scheduler counts them: of all that runs at a time, or of the pod as a whole, and overhead.
+
+    An init container that is restarted always, such as the proxy of a service mesh, runs on beside those that follow.
+    """
     total: dict[str, float] = {"pods": 1.0}
+    most: dict[str, float] = {}
+    for container in spec.get("initContainers") or ():
+        for resource, amount in _asked(container).items():
+            beside = total.get(resource, 0.0) + amount
+            most[resource] = max(most.get(resource, 0.0), beside)
+            if container.get("restartPolicy") == "Always":
+                total[resource] = beside
     for container in spec.get("containers") or ():
         for resource, amount in _asked(container).items():
             total[resource] = total.get(resource, 0.0) + amount
-    for container in spec.get("initContainers") or ():
-        for resource, amount in _asked(container).items():
-            total[resource] = max(total.get(resource, 0.0), amount)
+    for resource, amount in most.items():
+        total[resource] = max(total.get(resource, 0.0), amount)
+    total |= _asked(spec)
     for resource, amount in (spec.get("overhead") or {}).items():
         total[resource] = total.get(resource, 0.0) + amount_of(amount)
     return total
 
 
-def _asked(container: Body) -> dict[str, float]:
-    resources = container.get("resources") or {}
+def _asked(part: Body) -> dict[str, float]:
+    resources = part.get("resources") or {}
     return {name: amount_of(q) for name, q in (resources.get("requests") or {}).items()}
 
 

@@ -36,8 +36,9 @@ _LISTENS_TO_ONE = Setting(
     ("MAV_GCS_SYSID_HI",), 0, frozenset(float(n) for n in range(1, SYSTEM_ID + 1)), False, _LISTENS
 )
 
-_UNSTEERED = 1 << 4 | 1 << 5
-"""Bits of GUID_OPTIONS: it corrects neither position nor velocity, and flies on when it is told to stop."""
+_UNSTEERED = 1 << 4 | 1 << 5 | 1 << 6
+"""Bits of GUID_OPTIONS: it corrects neither position nor velocity, and flies on when it is told to stop; or it flies to positions as
+in a mission, at WPNAV_SPEED whatever speed it is told, and by its own ways around obstacles."""
 _STEERED = frozenset(float(options) for options in range(256) if not options & _UNSTEERED)
 
 # FS_GCS_ENABLE and FENCE_ACTION: returns, or goes back on its path. BATT_FS_LOW_ACT numbers them otherwise.
@@ -98,7 +99,7 @@ class ArduCopter:
     )
     flown: tuple[Setting, ...] = (
         Setting(("GUID_TIMEOUT",), 1, frozenset(), False, "gives a velocity up after a second without another"),
-        Setting(("GUID_OPTIONS",), 0, _STEERED, False, "follows velocities, so that it stops when it is told to"),
+        Setting(("GUID_OPTIONS",), 0, _STEERED, False, "flies as fast as it is told, and stops when it is told to"),
         Setting(
             ("RTL_ALT_TYPE",), 0, frozenset(), False, "returns at an altitude above home, not above the ground below"
         ),

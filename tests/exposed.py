@@ -38,24 +38,25 @@ def values(text: str) -> dict[tuple[str, ...], float]:
     return {(s.name, *(v for _, v in sorted(s.labels.items()))): s.value for f in families for s in f.samples}
 
 
-def documented(*sections: str) -> dict[str, tuple[str, set[str]]]:
-    """Type and labels by name, of the metrics in some sections of the page; of all when none is named."""
+def documented(*sections: str) -> dict[str, tuple[str, set[str], str]]:
+    """Type, labels and what it tells by name, of the metrics in some sections of the page; of all when none is named."""
     parts = (DOCS / "metrics.md").read_text().split("\n## ")[1:]
     chosen = [part for part in parts if not sections or part.splitlines()[0] in sections]
     assert len(chosen) == len(sections or parts)
     return {
-        name: (kind, set(re.findall(r"`(\w+)`", labels)))
+        name: (kind, set(re.findall(r"`(\w+)`", labels)), tells.replace("`", ""))
         for part in chosen
-        for name, kind, labels in re.findall(r"^\| `(\w+)` \| (\w+) \| (.*?) ?\|", part, re.MULTILINE)
+        for name, kind, labels, tells in re.findall(r"^\| `(\w+)` \| (\w+) \| (.*?) ?\| (.*) \|$", part, re.MULTILINE)
     }
 
 
 def assert_documented(text: str, *sections: str) -> None:
-    """Metrics are those of the sections, with their types and labels; a counter that never counted may miss its labels."""
+    """Metrics are those of the sections, with types, labels and help; a counter that never counted may miss its labels."""
     told = {name(f): f for f in text_string_to_metric_families(text)}
     rows = documented(*sections)
-    assert {key: family.type for key, family in told.items()} == {key: kind for key, (kind, _) in rows.items()}
+    assert {key: family.type for key, family in told.items()} == {key: kind for key, (kind, _, _) in rows.items()}
     for key, family in told.items():
+        assert family.documentation == f"{rows[key][2][0].upper()}{rows[key][2][1:]}.", key
         for sample in family.samples:
             assert sample.labels.keys() - {"le"} == rows[key][1], key
 

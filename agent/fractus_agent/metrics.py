@@ -35,14 +35,25 @@ class AgentFigures:
             yield gauge(CERTIFICATE_EXPIRY, "When the node's certificate expires, in Unix time.", self.expires_s)
         yield gauge(
             "fractus_agent_watch_age_seconds",
-            "Since the API server said anything about a kind; it does at least about every minute.",
+            "Since the API server said anything about nodegrants or directlinks; above 150 the watch is dead.",
             self.heard_s,
             "kind",
         )
-        yield gauge("fractus_agent_report_age_seconds", "Since the API server took the node's status.", self.reported_s)
+        yield gauge(
+            "fractus_agent_report_age_seconds",
+            "Since the API server took the status of the Drone or EdgeNode.",
+            self.reported_s,
+        )
         if self.telemetry_s is not None:
-            yield gauge("fractus_telemetry_age_seconds", "Since the mobility service was heard.", self.telemetry_s)
-        yield gauge("fractus_agent_grants", "Grants of the node, by what became of them.", self.grants, "state")
+            yield gauge(
+                "fractus_telemetry_age_seconds", "Since the mobility service was heard; on drones.", self.telemetry_s
+            )
+        yield gauge(
+            "fractus_agent_grants",
+            "Grants: stored, unverified (of an authority that is not known), unusable, unstored (the disk does not take them).",
+            self.grants,
+            "state",
+        )
         yield gauge(
             "fractus_audit_checkpoint_sequence",
             "Number of the entry of an audit log that was signed last.",
@@ -51,7 +62,7 @@ class AgentFigures:
         )
         yield gauge(
             "fractus_audit_checkpoint_head",
-            "First 13 hexadecimal digits of that entry's hash, as a number.",
+            "Hash of the entry of an audit log that was signed last, as in fractus_audit_head.",
             {log: hash_number(hash_) for log, (_, hash_) in self.checkpoints.items()},
             "log",
         )

@@ -14,19 +14,19 @@ _SECONDS = (0.001, 0.005, 0.02, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
 
 RECONCILES = Histogram(
     "fractus_operator_reconcile_seconds",
-    "How long one step of reconciliation took, waiting for the API server included.",
+    "How long a step of reconciliation took, waiting for the API server included.",
     "kind",
     _SECONDS,
 )
 ERRORS = Counter(
     "fractus_operator_reconcile_errors_total",
-    "Steps of reconciliation that failed and are tried again, by why (a reason of the API server, or Bug).",
+    "Steps that failed and are tried again; Bug where it was not the API server that refused.",
     "kind",
     "reason",
 )
 PHASES = Histogram(
     "fractus_operator_plan_phase_seconds",
-    "How long a phase of deploying an Application took: observe, plan, grants, rollout; ways: what policies say of its way.",
+    "Phases of deploying an Application: observe, plan, grants, rollout; ways: what policies say of its way.",
     "phase",
     _SECONDS,
 )
@@ -97,12 +97,17 @@ class Observed:
         )
         yield gauge(
             "fractus_operator_watch_age_seconds",
-            "Seconds since the API server said anything about a kind; it does at least about every minute.",
+            "Since the API server said anything about a kind; above 100 the watch is dead.",
             {kind: age_s for kind, (_, age_s) in watches.items()},
             "kind",
         )
         yield gauge("fractus_applications", "Applications by phase.", Tally(self._phases()), "phase")
-        yield gauge("fractus_drones", "Drones by flight state.", Tally(self._states()), "state")
+        yield gauge(
+            "fractus_drones",
+            "Drones by flight state; offline: it was on the ground when last heard of, and no application may fly it; unknown: it may be in the air.",
+            Tally(self._states()),
+            "state",
+        )
         if self._expires_s is not None:
             yield gauge(CERTIFICATE_EXPIRY, "When the certificate authority expires, in Unix time.", self._expires_s)
 

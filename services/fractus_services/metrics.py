@@ -20,16 +20,19 @@ class DecisionMetrics:
 
     def __init__(self) -> None:
         self._verdicts = Counter(
-            "fractus_verdicts_total", "Verdicts on calls, as the audit log has them.", "action", "code"
+            "fractus_verdicts_total",
+            "Verdicts on calls: allow, correct or deny, and the code that callers see, empty where nothing was wrong.",
+            "action",
+            "code",
         )
         self._by_policy = Counter(
             "fractus_policy_verdicts_total",
-            "Verdicts on calls that a policy decided; one that several decided counts for each.",
+            "Verdicts on calls by the policies that decided; one of several counts for each, the 201st policy and later ones as other.",
             "policy",
             "action",
         )
         self._takeovers = Counter(
-            "fractus_takeovers_total", "Changes of control authority that no driver asked for.", "controller", "code"
+            "fractus_takeovers_total", "Takeovers by the system or a pilot.", "controller", "code"
         )
         self._interventions = Counter(
             "fractus_monitor_interventions_total",
@@ -84,6 +87,12 @@ class ServiceMetrics:
         return text_of(figure for figures in self._figures for figure in figures())
 
 
+def telemetry_age(age_s: float) -> Figure:
+    """How old what a service knows of the drone is."""
+    what = "Age of the drone's position, as this service knows it; not of a camera that stands."
+    return gauge("fractus_telemetry_age_seconds", what, age_s)
+
+
 def common_figures(
     expiry: Callable[[], float | None], grants: GrantFiles, audit: AuditLog, recording_problem: Callable[[], str]
 ) -> Iterator[Figure]:
@@ -100,9 +109,17 @@ def common_figures(
         yield gauge(CERTIFICATE_EXPIRY, "When the node's certificate expires, in Unix time.", expires_s)
     yield gauge("fractus_grants", "Grants in force.", len(grants.active))
     head = audit.head
-    yield gauge("fractus_audit_sequence", "Number of the last entry of the audit log on disk.", head.sequence)
+    yield gauge(
+        "fractus_audit_sequence",
+        "Number of the last entry of the audit log on disk: the head of its chain.",
+        head.sequence,
+    )
     digits = hash_number(head.hash)
-    yield gauge("fractus_audit_head", "First 13 hexadecimal digits of that entry's hash, as a number.", digits)
+    yield gauge(
+        "fractus_audit_head",
+        "Hash of the last entry of the audit log on disk: its first 13 hexadecimal digits, as a number.",
+        digits,
+    )
     yield gauge("fractus_audit_waiting", "Entries of the audit log that are not on disk yet.", audit.waiting)
     yield gauge("fractus_audit_failing", "1 while the audit log cannot be written.", bool(audit.failure))
     yield gauge("fractus_recording_failing", "1 while nothing is recorded that should be.", bool(recording_problem()))

@@ -3,11 +3,21 @@
 from __future__ import annotations
 
 import math
+import re
 
 import pytest
-from exposed import values
+from exposed import DOCS, documented, values
 from fractus_observe.figures import Counter, Figure, Histogram, gauge, text_of
 from prometheus_client.parser import text_string_to_metric_families
+
+OTHER_NAMES = {"fractus_agent", "fractus_call", "fractus_operator"}
+"""Of loggers and of a context's variable."""
+
+
+def test_the_page_has_every_metric_that_the_code_names_and_no_other() -> None:
+    rooms = ("observe", "operator", "agent", "services", "view", "kube", "storage", "core")
+    code = "".join(file.read_text() for room in rooms for file in (DOCS.parent / room).rglob("*.py"))
+    assert set(re.findall(r'"(fractus_[a-z_]+)"', code)) - OTHER_NAMES == documented().keys()
 
 
 @pytest.mark.parametrize("value", [0.0, -1.5, 1e-9, 1e300, 1_780_000_000.25, math.inf, -math.inf, True])

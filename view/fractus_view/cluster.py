@@ -88,9 +88,14 @@ class Cluster:
         """What Prometheus is told of the watches."""
         listed = [each for each in self._reflectors.values() if each.synced.is_set()]
         opened = {each.kind.plural: float(each.watching) for each in listed}
-        yield gauge("fractus_view_watch_open", "1 while the watch of a kind is open.", opened, "kind")
+        yield gauge("fractus_view_watch_open", "1 while the watch of a kind is open; of a cluster.", opened, "kind")
         ages_s = {each.kind.plural: each.age_s() for each in listed}
-        yield gauge("fractus_view_watch_age_seconds", "Since the API server said anything of a kind.", ages_s, "kind")
+        yield gauge(
+            "fractus_view_watch_age_seconds",
+            "Since the API server said anything about a kind; above 100 the watch is dead.",
+            ages_s,
+            "kind",
+        )
 
     # What is so
 

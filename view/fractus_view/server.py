@@ -65,7 +65,11 @@ class View:
     page: Path = PAGE
     _streams: set[object] = field(default_factory=set)
     _answers: Counter = field(
-        default_factory=lambda: Counter("fractus_view_requests_total", "Requests answered, by status code.", "code")
+        default_factory=lambda: Counter(
+            "fractus_view_requests_total",
+            "Requests answered, health checks as well, by status code; 401: without the token.",
+            "code",
+        )
     )
     _running: asyncio.Task[None] | None = None
 
@@ -89,7 +93,7 @@ class View:
     def figures(self) -> Iterator[Figure]:
         """What Prometheus is told of the server."""
         yield self._answers.figure()
-        yield gauge("fractus_view_pages", "Pages that are open now and kept current.", len(self._streams))
+        yield gauge("fractus_view_pages", "Pages that are open now; at 64 there are no more.", len(self._streams))
 
     async def _count(self, _request: web.Request, response: web.StreamResponse) -> None:
         self._answers.count(str(response.status))

@@ -13,17 +13,23 @@ from fractus_agent.links.reports import DroneReport
 CLOUD = "cloud"
 
 _GAUGES = {
-    "fractus_path_bandwidth_mbps": ("path", "What a path offers: measured of the link that is up, else expected."),
+    "fractus_path_bandwidth_mbps": (
+        "path",
+        "What a path offers: measured of the link that is up, else expected; cloud is the cloud path.",
+    ),
     "fractus_path_latency_milliseconds": ("path", "How long a path takes, one way: measured or expected."),
     "fractus_path_quality": ("path", "Share of its bandwidth that a link is expected to offer where the drone is."),
-    "fractus_link_up": ("path", "Whether the direct link goes to this node."),
+    "fractus_link_up": ("path", "1 while the direct link goes to this node."),
     "fractus_link_attempts_failed": ("path", "Attempts to pair that failed since the link last worked."),
-    "fractus_traffic_direct": ("", "How many services take the direct link."),
+    "fractus_traffic_direct": ("", "Services that take the direct link."),
     "fractus_service_sent_mbps": (
         "service",
         "What a service moved to the other node over the link, in the last seconds.",
     ),
-    "fractus_service_received_mbps": ("service", "What a service moved from the other node over the link."),
+    "fractus_service_received_mbps": (
+        "service",
+        "What a service moved from the other node over the link, in the last seconds.",
+    ),
 }
 """Label and description by name."""
 
@@ -43,7 +49,7 @@ class LinkMetrics:
 
     def collect(self) -> Iterator[Figure]:
         """All metrics."""
-        what = "Changes of services' paths since the agent started."
+        what = "Changes of services' paths."
         yield Figure("fractus_switches_total", what, "counter", [("", {}, self._switches)])
         found: dict[str, dict[str, float]] = {}
         for name, key, value in self._samples():

@@ -14,7 +14,7 @@ from typing import Any
 from fractus_core.api.nodes import Drone, EdgeNode
 from fractus_core.policy.lenses import lens_of
 from fractus_observe.exposition import LastRead, serving
-from fractus_observe.figures import Figure, gauge
+from fractus_observe.figures import Figure
 from fractus_proto.v1 import camera_pb2_grpc
 from fractus_storage.audit import AuditLog
 
@@ -39,7 +39,7 @@ from fractus_services.description import NodeDescription
 from fractus_services.grant_verifier import GrantVerifier
 from fractus_services.grants import GrantFiles
 from fractus_services.hosting import run_until, serve_grpc
-from fractus_services.metrics import ServiceMetrics, common_figures
+from fractus_services.metrics import ServiceMetrics, common_figures, telemetry_age
 from fractus_services.options import CameraOptions, CannotServe
 from fractus_services.recording.recorder import Recorder
 from fractus_services.recording.segments import segments_in
@@ -135,7 +135,7 @@ class _Watched:
     def figures(self) -> Iterator[Figure]:
         """What Prometheus is told of it."""
         if self.history is not None:
-            yield gauge("fractus_telemetry_age_seconds", "Age of the drone's position.", self.history.age_s)
+            yield telemetry_age(self.history.age_s)
 
 
 async def _serve(

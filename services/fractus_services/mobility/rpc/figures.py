@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from fractus_core.control import Authority
 from fractus_observe.figures import Figure, gauge
 
+from fractus_services.metrics import telemetry_age
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.supervisor import Supervisor
 
@@ -14,9 +15,7 @@ from fractus_services.mobility.authority.supervisor import Supervisor
 def flight_figures(control: Control, supervisor: Supervisor) -> Iterator[Figure]:
     """What holds of the drone now."""
     autopilot, vehicle = control.autopilot, control.autopilot.vehicle
-    yield gauge(
-        "fractus_telemetry_age_seconds", "Age of the drone's position.", max(autopilot.now - vehicle.position_at, 0.0)
-    )
+    yield telemetry_age(max(autopilot.now - vehicle.position_at, 0.0))
     yield gauge(
         "fractus_autopilot_heartbeat_age_seconds",
         "Since the autopilot was heard.",
@@ -25,13 +24,13 @@ def flight_figures(control: Control, supervisor: Supervisor) -> Iterator[Figure]
     yield gauge("fractus_in_air", "1 while the drone is in the air, or may be.", vehicle.in_air)
     yield gauge(
         "fractus_control_authority",
-        "1 for who has control authority.",
+        "1 for who has control authority: driver, system or pilot.",
         {authority.value: float(authority is control.authority) for authority in Authority},
         "authority",
     )
     yield gauge(
         "fractus_companion_alive",
-        "1 while the autopilot gets heartbeats, since a driver, the system or a pilot is responsible for the drone.",
+        "1 while the autopilot gets heartbeats: a driver, the system or a pilot is responsible for the drone.",
         supervisor.alive(),
     )
     yield gauge(
@@ -39,4 +38,6 @@ def flight_figures(control: Control, supervisor: Supervisor) -> Iterator[Figure]
         "1 while the autopilot's failsafes are known to be set.",
         control.checked is not None,
     )
-    yield gauge("fractus_battery_ratio", "Charge that is left, 0 to 1; NaN while unknown.", vehicle.battery_remaining)
+    yield gauge(
+        "fractus_battery_ratio", "Charge that is left, 0 to 1; NaN while it is not known.", vehicle.battery_remaining
+    )

@@ -96,6 +96,16 @@ def commands(page: str, text: str) -> list[Command]:
     return sorted(found, key=lambda command: command.line)
 
 
+def typed_lines(page: str, section: str = "") -> list[str]:
+    """What the blocks of a page have a reader type, line by line; or those of a section, by its heading."""
+    text = (ROOT / page).read_text()
+    if section:
+        _, heading, rest = text.partition(f"\n## {section}\n")
+        assert heading, f"{page} has no section {section}"
+        text = rest.partition("\n## ")[0]
+    return [typed for block in _parts(text)[0] for _, typed, _ in _lines(block)]
+
+
 def _parts(text: str) -> tuple[list[_Block], list[str]]:
     """Blocks of commands, fenced or indented; and the lines of everything else but blocks, with empty ones in their places."""
     blocks: list[_Block] = []
@@ -126,7 +136,16 @@ def _parts(text: str) -> tuple[list[_Block], list[str]]:
 
 
 def _typed(page: str, block: _Block) -> Iterator[Command]:
-    """Each line of a block; where some begin with $, what follows them is output."""
+    """The commands of each line of a block."""
+    for number, typed, output in _lines(block):
+        *most, last = _parsed(page, number, typed) or [None]
+        yield from (one for one in most if one is not None)
+        if last is not None:
+            yield Command(**{**_fields(last), "output": tuple(output)})
+
+
+def _lines(block: _Block) -> list[tuple[int, str, list[str]]]:
+    """Where each line of a block begins, what is typed, and what it prints; where some begin with $, what follows is output."""
     marked = any(line.startswith("$ ") for _, line in block.lines)
     lines = iter(block.lines)
     found: list[tuple[int, str, list[str]]] = []
@@ -139,11 +158,7 @@ def _typed(page: str, block: _Block) -> Iterator[Command]:
             typed = typed[:-1] + next(lines)[1]
         if typed.strip():
             found.append((number, typed, []))
-    for number, typed, output in found:
-        *most, last = _parsed(page, number, typed) or [None]
-        yield from (one for one in most if one is not None)
-        if last is not None:
-            yield Command(**{**_fields(last), "output": tuple(output)})
+    return found
 
 
 def _fields(command: Command) -> dict[str, object]:

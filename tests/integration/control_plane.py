@@ -96,7 +96,8 @@ class ControlPlane:
     def with_token(self, token: str) -> BlockingClient:
         return BlockingClient(with_certificate(self.server, self.ca, token=token), "kubectl")
 
-    def start(self) -> None:
+    def start(self, kinds: bool = True) -> None:
+        """Bring it up, with our kinds unless the chart of them is to be installed."""
         client, peer = free_port(), free_port()
         accounts = self.authority.service_account_key()
         serving = self.authority.issue(
@@ -135,8 +136,9 @@ class ControlPlane:
             "--endpoint-reconciler-type=none",
         )
         wait_for(self.admin.ready, "the API server", timeout_s=60)
-        # Before the garbage collector starts: it learns of new kinds only every 30 s.
-        self._install_crds()
+        if kinds:
+            # Before the garbage collector starts: it learns of new kinds only every 30 s.
+            self._install_crds()
         self._run(
             "kube-controller-manager",
             f"--kubeconfig={self.kubeconfig}",

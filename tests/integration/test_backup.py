@@ -1,0 +1,151 @@
+"""docs/backup.md as it is typed: what was in a cluster that is lost is in another one, under the same authority, until it is removed."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+from control_plane import ControlPlane, programs, wait_for
+from cryptography import x509
+from docs_commands import ROOT, typed_lines
+from docs_shell import Shell
+from fractus_core.api import Grant
+from fractus_core.policy.signatures import verify
+from operator_world import FRACTUS, SYSTEM, Body, OperatorProcess, World, at, ours, traffic
+
+PAGE = "docs/backup.md"
+*BACK_UP, VALUES = (line for line in typed_lines(PAGE, "Back up") if "MOBILITY-POD" not in line)
+RESTORE = typed_lines(PAGE, "Restore")
+KEPT = ("policies", "zones", "depots", "drones", "edgenodes", "applications")
+SERVER_S = {"uid", "resourceVersion", "generation", "creationTimestamp", "managedFields", "annotations"}
+"""What an API server writes into metadata by itself, and kubectl: what it was given last."""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Where all is typed: a checkout."""
+    (tmp_path / "charts").symlink_to(ROOT / "charts")
+    return tmp_path
+
+
+@pytest.fixture
+def found(folder: Path, namespace: str) -> Iterator[World]:
+    """A cluster that has nothing of Fractus, but nodes, and the namespace of the Applications."""
+    plane = ControlPlane(programs(), folder / "found")
+    try:
+        plane.start(kinds=False)
+        world = World(plane)
+        for name, of in (("drone-1", "drone"), *((f"edge-{i}", "edge") for i in (1, 2, 3)), ("cloud-1", "cloud")):
+            world.add_node(name, of)
+        world.api.apply(
+            f"/api/v1/namespaces/{namespace}",
+            {"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": namespace}},
+        )
+        yield world
+    finally:
+        plane.stop()
+
+
+def written(world: World) -> dict[str, Body]:
+    """What users and authorities wrote, by kind and name, without what the API server adds, and without status."""
+    found = {}
+    for body in (body for plural in KEPT for body in world.api.list(f"{FRACTUS}/{plural}")):
+        metadata = {key: value for key, value in body["metadata"].items() if key not in SERVER_S}
+        found[f"{body['kind']} {metadata['name']}"] = {**body, "metadata": metadata, "status": None}
+    return found
+
+
+def granted(world: World, namespace: str) -> dict[str, Body]:
+    """What the instances of the application may do; the mission is another one, and granted later."""
+    grants = {body["metadata"]["name"]: dict(body["spec"]) for body in world.grants(namespace)}
+    for spec in grants.values():
+        del spec["mission"], spec["application"]["uid"], spec["issuedAt"]
+    return grants
+
+
+def authority(world: World) -> bytes:
+    """The certificate that nodes take Grants by."""
+    public = world.api.get(f"/api/v1/namespaces/{SYSTEM}/configmaps/fractus-ca") or {}
+    return str(public["data"]["ca.crt"]).encode()
+
+
+def test_what_was_backed_up_is_restored_and_removed(
+    world: World, operator: OperatorProcess, found: World, namespace: str, folder: Path
+) -> None:
+    world.put(ours("Zone", "school", {"area": {"circle": {"center": at(40, 180), "radius": 30}}}))
+    no_school = {"type": "GeofenceControl", "kind": "exclusion", "selector": {"zones": ["school"]}}
+    world.put(ours("Policy", "no-school", no_school))
+    (folder / "application.yaml").write_text(json.dumps(traffic(namespace)))
+    lost, shell = Shell(folder, world.plane), Shell(folder, found.plane)
+    lost.type("kubectl apply -f application.yaml")
+    world.phase(namespace, "Deploying")
+    operator.stop()
+    before, may, signed_by = written(world), granted(world, namespace), authority(world)
+    for line in BACK_UP:
+        lost.type(line)
+
+    values = {"logFormat": "json", "operator": {"replicas": 1}}
+    (folder / "values.yaml").write_text(yaml.safe_dump(values))
+    for line in RESTORE:
+        shell.type(line)
+    assert found.api.get(f"{FRACTUS}/drones/drone-1"), "before the agents, who would make it of what the node says"
+    found.drone_status("drone-1", "inactive")
+    again = OperatorProcess(found.plane.kubeconfig, folder / "found.log")
+    again.start()
+    try:
+        found.phase(namespace, "Deploying")
+        assert written(found) == before
+        assert granted(found, namespace) == may != {}
+        assert authority(found) == signed_by
+        for body in found.grants(namespace):
+            verify(Grant.from_body(body), x509.load_pem_x509_certificates(signed_by))
+
+        (folder / "values.yaml").unlink()
+        shell.type(VALUES)
+        assert yaml.safe_load((folder / "values.yaml").read_text()) == values
+        found.api.delete(f"{FRACTUS}/zones/school")
+        found.api.merge(f"{FRACTUS}/drones/drone-1", {"spec": {"home": at(9, 9, alt=9)}})
+        shell.type("kubectl apply -f fractus.yaml")
+        assert written(found) == before
+        # As it is kept in version control, which knows of no finalizer: the operator sets it again.
+        shell.type("kubectl apply -f application.yaml")
+        wait_for(lambda: written(found) == before, "the application to be as it was")
+        shell.type(REMOVE[0])
+    finally:
+        again.stop()
+    remove(found, shell)
+
+
+REMOVE = typed_lines("docs/upgrades.md", "Uninstalling")
+EVERYWHERE = "clusterroles,clusterrolebindings,validatingadmissionpolicies,validatingadmissionpolicybindings,priorityclasses,crds"
+INSIDE = "deployments,daemonsets,jobs,services,serviceaccounts,roles,rolebindings,secrets,configmaps,leases"
+
+
+def remove(world: World, shell: Shell) -> None:
+    """Remove Fractus without helm's hooks, for which there is no kubelet here, as docs/upgrades.md does by hand."""
+    world.api.merge(
+        "/api/v1/nodes/drone-1", {"spec": {"taints": [{"key": "fractus.dev/class", "effect": "NoExecute"}]}}
+    )
+    # As its agent reports once its Grants are gone.
+    world.drone_status("drone-1", "inactive")
+    attempt = f"kubectl -n {SYSTEM} delete daemonset fractus-mobility --dry-run=server || true"
+    wait_for(lambda: "deleted" in shell.type(attempt), "the policies to know that no drone is in the air")
+    for line in REMOVE:
+        if re.search(r"uninstall fractus(-crds)?$", line):
+            shell.type(f"{line} --no-hooks")
+    for line in REMOVE:
+        if re.search(r"label|lease|secret|removal", line) and "install" not in line:
+            shell.type(line)
+    for begins in ("kubectl delete crd", "kubectl label nodes", "kubectl taint nodes"):
+        (line,) = re.findall(rf"`({begins}[^`]*)`", (ROOT / "docs/upgrades.md").read_text())
+        # Of nodes without that taint it says so, by its code as well.
+        shell.type(line, code=1 if "taint" in line else 0)
+    assert "fractus" not in shell.type(f"kubectl get {EVERYWHERE} -o name")
+    assert "fractus" not in shell.type(f"kubectl get -n {SYSTEM} {INSIDE} -o name")
+    nodes = world.api.list("/api/v1/nodes")
+    assert len(nodes) == 5
+    assert "fractus.dev" not in str([(node["metadata"].get("labels"), node["spec"].get("taints")) for node in nodes])

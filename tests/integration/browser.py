@@ -1,4 +1,4 @@
-"""The page of `fractus view` in a real Chromium."""
+"""The page of `fractus view`, as it is served and in a real Chromium."""
 
 from __future__ import annotations
 
@@ -8,9 +8,12 @@ import shutil
 import signal
 import subprocess
 import sys
+import urllib.error
+import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
 from playwright.sync_api import Browser, Page, Playwright, Route
 
 CHROMIUM = shutil.which("chromium")
@@ -39,6 +42,21 @@ def serving(*arguments: str | Path) -> Iterator[str]:
         finally:
             process.send_signal(signal.SIGTERM)
         assert process.wait(20) == 0
+
+
+def told_to_pages(address: str, *words: str) -> None:
+    """Wait until pages of those who have the token are told all of these words; no one else is told anything."""
+    plain, _, token = address.partition("?token=")
+    with pytest.raises(urllib.error.HTTPError) as refused:
+        urllib.request.urlopen(plain, timeout=20)
+    assert refused.value.code == 401
+    request = urllib.request.Request(f"{plain}stream", headers={"Authorization": f"Bearer {token}"})
+    missing = set(words)
+    with urllib.request.urlopen(request, timeout=20) as answer:
+        while missing:
+            line = answer.readline().decode()
+            assert line, f"the stream ended without {missing}"
+            missing = {word for word in missing if word not in line}
 
 
 @contextlib.contextmanager

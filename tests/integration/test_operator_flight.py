@@ -11,6 +11,8 @@ import pytest
 import yaml
 from chart import operator_token, render
 from control_plane import ControlPlane, wait_for
+from docs_commands import typed_lines
+from docs_shell import Shell
 from fractus_kube import KubeError
 from operator_world import FRACTUS, NODES, SYSTEM, OperatorProcess, World, traffic
 
@@ -169,17 +171,18 @@ def test_on_the_ground_all_of_it_is_allowed(guarded: World) -> None:
         assert not refusal(attempt), name
 
 
-def test_a_silent_drone_is_in_the_air_until_someone_sees_it_on_the_ground(guarded: World) -> None:
+def test_a_silent_drone_is_in_the_air_until_someone_sees_it_on_the_ground(guarded: World, tmp_path: Path) -> None:
+    (line,) = (typed for typed in typed_lines("docs/upgrades.md") if "fractus.dev/grounded" in typed)
     path = f"{FRACTUS}/drones/drone-1"
     seen = "2026-01-01T00:00:00Z"
     status = {"flightState": "unknown", "lastFlightState": "landing", "lastSeen": seen}
     guarded.api.merge(f"{path}/status", {"status": status})
     attempt = attempts(guarded, "drone-1")["delete a pod"]
     told = wait_for(lambda: "last heard of" in refusal(attempt) and refusal(attempt), "the silence to be known")
-    assert f"kubectl annotate drone drone-1 fractus.dev/grounded={seen} --overwrite" in told
+    assert line in told
     guarded.api.merge(path, {"metadata": {"annotations": {"fractus.dev/grounded": "2025-12-31T00:00:00Z"}}})
     assert refusal(attempt), "said of an earlier flight"
-    guarded.api.merge(path, {"metadata": {"annotations": {"fractus.dev/grounded": seen}}})
+    Shell(tmp_path, guarded.plane).type(line)
     wait_for(lambda: not refusal(attempt), "the annotation to count")
     guarded.api.merge(f"{path}/status", {"status": {"lastSeen": "2026-01-01T00:00:05Z"}})
     wait_for(lambda: refusal(attempt), "the drone to be heard of again")

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 from chart import CHARTS, path_of, render
 from control_plane import wait_for
+from docs_commands import ROOT, typed_lines
+from docs_shell import Shell
 from operator_world import World
 
 Body = dict[str, Any]
@@ -109,6 +113,29 @@ def test_the_built_in_roles_read_all_and_write_applications(roles: World) -> Non
     assert allowed(roles, "edit") == read | write
     assert allowed(roles, "admin") == read | write
     assert {kind for _, kind in write} & WRITTEN_BY_AUTHORITIES == set()
+
+
+PAGE = "docs/roles.md"
+
+
+def test_the_page_tells_of_each_kind() -> None:
+    rows = re.findall(r"^\| (`\w+`.*?) \| yes \| (yes|no).*? \|", (ROOT / PAGE).read_text(), re.MULTILINE)
+    told = {kind: writes == "yes" for kinds, writes in rows for kind in re.findall(r"`(\w+)`", kinds)}
+    assert told == {kind: kind not in WRITTEN_BY_THE_OPERATOR for kind in KINDS}
+
+
+def test_an_authority_writes_zones_and_policies_by_the_commands_of_the_page(roles: World, tmp_path: Path) -> None:
+    shell = Shell(tmp_path, roles.plane)
+    lines = typed_lines(PAGE)
+    for line in lines:
+        shell.type(line)
+    try:
+        for asked, answer in (("create zones", "yes"), ("patch policies.fractus.dev", "yes"), ("create drones", "no")):
+            line = f"kubectl auth can-i {asked} --as=anna --as-group=aviation || true"
+            wait_for(lambda line=line, answer=answer: shell.type(line).split() == [answer], asked)
+    finally:
+        for line in lines:
+            shell.type(f"kubectl delete clusterrolebinding {line.split()[3]}")
 
 
 def test_without_aggregation_the_roles_are_there_to_be_bound() -> None:

@@ -1,0 +1,162 @@
+"""docs/standalone.md as it is typed, but for ports: a flight without Kubernetes, and what other pages do with its files."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import shlex
+import shutil
+import subprocess
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import yaml
+from browser import serving, told_to_pages
+from docs_commands import ROOT, typed_lines
+from docs_shell import Shell
+from fractus_cli.standalone import StandalonePki
+from fractus_cluster.ports import free_port
+from fractus_core.api import Grant
+from fractus_storage.chain import last_link
+from operator_world import FRACTUS, World
+
+PAGE = "docs/standalone.md"
+TEXT = (ROOT / PAGE).read_text()
+INIT, SIGN, MOBILITY, CAMERA, FLY, SINCE, SINCE_STATUS = typed_lines(PAGE)
+_CLUSTER, LIVE, REPLAY = (line for line in typed_lines("docs/view.md") if line.startswith("fractus view"))
+FLIGHT_TIMEOUT_S = 120
+
+
+@dataclass(frozen=True)
+class Flown:
+    """What a flight has left.
+
+    Attributes:
+        folder: where all was typed.
+        said: what the component printed.
+    """
+
+    folder: Path
+    said: str
+
+
+def written(name: str) -> str:
+    """A file that the page shows."""
+    found = re.search(rf"`{name}`[^`\n]*:\n```\w+\n(.*?)```", TEXT, re.DOTALL)
+    assert found is not None, name
+    return found[1]
+
+
+def in_sentence(begins: str) -> str:
+    """A command between backticks."""
+    found = re.search(rf"`({begins}[^`]*)`", TEXT)
+    assert found is not None, begins
+    return found[1]
+
+
+@contextlib.contextmanager
+def serves(shell: Shell, folder: Path, line: str) -> Iterator[None]:
+    """Have a line serve until the end of the block, and end it as Ctrl-C does."""
+    program = shlex.split(line)
+    with (folder / f"{program[1]}.log").open("wb") as log:
+        process = subprocess.Popen(program, cwd=folder, env=shell.environment, stdout=log, stderr=log)
+        try:
+            yield
+        finally:
+            process.terminate()
+            process.wait(20)
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
+    """The flight of the page, with recordings as another page has them."""
+    folder = tmp_path_factory.mktemp("standalone")
+    shell = Shell(folder)
+    ports = {known: str(free_port()) for known in ("50051", "50052", "5760")}
+
+    def own(line: str) -> str:
+        return re.sub("|".join(ports), lambda found: ports[found[0]], line)
+
+    def listens(port: str) -> str:
+        return f" --listen 127.0.0.1:{ports[port]} --description none.yaml"
+
+    for name in ("survey.yaml", "navigator.py"):
+        (folder / name).write_text(written(name))
+    shell.type(INIT)
+    shell.type(in_sentence("cp -r"))
+    shell.type(SIGN)
+    vehicle = f"{in_sentence('fractus vehicle')} --listen tcp:127.0.0.1:{ports['5760']} --ready-after 5 --speedup 3"
+    mobility = re.sub(r"--autopilot \S+", own(in_sentence("--autopilot tcp")), MOBILITY)
+    with (
+        serves(shell, folder, vehicle),
+        serves(shell, folder, f"{mobility} --recordings recordings/mobility{listens('50051')}"),
+        serves(
+            shell, folder,
+            f"{CAMERA} --recordings recordings/camera --mobility 127.0.0.1:{ports['50051']}{listens('50052')}",
+        ),
+    ):  # fmt: skip
+        done = subprocess.run(
+            ["bash", "-c", own(FLY)], cwd=folder, env=shell.environment, capture_output=True, text=True,
+            timeout=FLIGHT_TIMEOUT_S, check=False,
+        )  # fmt: skip
+    logs = "".join((folder / f"{name}.log").read_text() for name in ("vehicle", "mobility", "camera"))
+    assert done.returncode == 0, done.stdout + done.stderr + logs
+    return Flown(folder, done.stdout + done.stderr)
+
+
+def test_the_program_meets_its_policies(flown: Flown) -> None:
+    assert re.search(r"^climbed to 15 m: .*policy low", flown.said, re.MULTILINE), flown.said
+    assert re.search(r"^going on without it: .*zone pool of policy pool", flown.said, re.MULTILINE), flown.said
+    assert re.search(r"^a picture of \d{4,} bytes$", flown.said, re.MULTILINE), flown.said
+    assert "the mission is over; nothing is left to fly" in flown.said
+
+
+def test_the_audit_log_tells_of_it_and_shows_what_is_cut_off(flown: Flown, world: World, tmp_path: Path) -> None:
+    shutil.copytree(flown.folder, tmp_path, dirs_exist_ok=True)
+    shell = Shell(tmp_path, world.plane)
+    told = shell.type(in_sentence("fractus audit show"))
+    assert re.search(r"Takeoff.*\blow\b", told), told
+    assert re.search(r"Goto.*\bpool\b", told), told
+    kept = tmp_path / "kept"
+    kept.mkdir()
+    for name in ("mobility", "camera"):
+        shutil.copy(tmp_path / "audit" / f"{name}.checkpoint", kept)
+    log = tmp_path / "audit/mobility.jsonl"
+    head = last_link(log)
+    assert head is not None
+    reported = {"status": {"audit": [f"mobility:{head.sequence}:{head.hash}"]}}
+    world.api.merge(f"{FRACTUS}/drones/drone-1/status", reported)
+    alone = in_sentence("fractus audit verify audit")
+    for line in (alone, SINCE, SINCE_STATUS):
+        shell.type(line)
+    log.write_text("".join(log.read_text().splitlines(keepends=True)[:-3]))
+    (tmp_path / "audit/mobility.checkpoint").unlink()
+    shell.type(alone)
+    for line in (SINCE, SINCE_STATUS):
+        shell.type(line, code=1)
+
+
+def test_grants_are_made_from_python(flown: Flown, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copytree(flown.folder / "pki", tmp_path / "pki")
+    monkeypatch.chdir(tmp_path)
+    names = {"manifest": yaml.safe_load(written("survey.yaml")), "Grant": Grant}
+    exec(re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)[-1], names)
+    assert names["StandalonePki"] is StandalonePki
+    assert (tmp_path / "grants/default.survey-navigator.json").is_file()
+    for folder in (names["tls"], names["own"]):
+        assert {"tls.key", "tls.crt", "ca.crt"} <= {path.name for path in (tmp_path / str(folder)).iterdir()}
+
+
+@pytest.mark.parametrize("line", [LIVE, REPLAY], ids=["live", "replay"])
+def test_its_recordings_are_viewed(flown: Flown, line: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(flown.folder)
+    folder = flown.folder / "recordings"
+    for name, recorded in (("flight", "mobility"), ("camera", "camera")):
+        (found,) = (folder / recorded).glob("*.mcap")
+        shutil.copy(found, f"{name}.mcap")
+        found.touch()
+    words = [word.replace("/var/lib/fractus/recordings", str(folder)) for word in shlex.split(line, comments=True)]
+    with serving(*words[2:]) as address:
+        told_to_pages(address, '"drone-1"', '"verdict"', "InsideExclusionZone", '"picture"')

@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 
 from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.asymmetric import ec
 
 _PEM_KEY = re.compile(rb"-----BEGIN ([A-Z ]*)PRIVATE KEY-----.*?-----END \1PRIVATE KEY-----", re.DOTALL)
 _ANY_KEY = re.compile(r"BEGIN [A-Z ]*PRIVATE KEY")
@@ -33,8 +34,8 @@ def parts(value: bytes) -> Iterator[bytes]:
     keys = [found[0] for found in _PEM_KEY.finditer(value)]
     for pem in keys:
         key = serialization.load_pem_private_key(pem, password=None)
-        numbers = key.private_numbers()  # type: ignore[union-attr]
-        yield numbers.private_value.to_bytes(key.curve.key_size // 8)  # type: ignore[union-attr]
+        assert isinstance(key, ec.EllipticCurvePrivateKey)
+        yield key.private_numbers().private_value.to_bytes(key.curve.key_size // 8)
         # The last ones are of the public key.
         yield from pem.splitlines()[1:3]
     if not keys and b"-----BEGIN " not in value and len(value) >= MIN_BYTES:

@@ -13,6 +13,7 @@ from fractus_cluster.controlplane import API_PORT
 from fractus_core.documents import dump_documents
 
 from fractus_sim.chaos import processes
+from fractus_sim.chaos.holding import held
 from fractus_sim.demo.kube import SYSTEM, Kube
 
 SLOW_S = 2.0
@@ -59,9 +60,8 @@ def no_room() -> str:
 @contextmanager
 def occupied(kube: Kube) -> Iterator[None]:
     """A request that no one completes takes the room of `no_room`: every other one of Fractus is answered with 429."""
-    over = threading.Event()
 
-    def hold() -> None:
+    def hold(over: threading.Event) -> None:
         # The API server ends it after a minute, and refuses it while another one is under way.
         while not over.is_set():
             with kube.follow(_UNFINISHED, subprocess.DEVNULL, subprocess.PIPE) as request:
@@ -69,13 +69,8 @@ def occupied(kube: Kube) -> Iterator[None]:
                     continue
                 request.kill()
 
-    holder = threading.Thread(target=hold, daemon=True)
-    holder.start()
-    try:
+    with held(hold):
         yield
-    finally:
-        over.set()
-        holder.join(_TIMEOUT_S)
 
 
 @contextmanager
@@ -105,22 +100,18 @@ def silenced(namespace: Path) -> Iterator[int]:
 @contextmanager
 def slowed(pids: Callable[[], list[int]]) -> Iterator[None]:
     """Stop the API server for two seconds again and again."""
-    over = threading.Event()
 
-    def hold() -> None:
+    def hold(over: threading.Event) -> None:
         while not over.is_set():
             processes.tell(pids(), signal.SIGSTOP)
             over.wait(SLOW_S)
             processes.tell(pids(), signal.SIGCONT)
             over.wait(_QUICK_S)
 
-    holder = threading.Thread(target=hold, daemon=True)
-    holder.start()
     try:
-        yield
+        with held(hold):
+            yield
     finally:
-        over.set()
-        holder.join(_TIMEOUT_S)
         processes.tell(pids(), signal.SIGCONT)
 
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from fractus_core.api.names import CLASS_LABEL
 
 from fractus_sim.chaos import apiserver, processes
+from fractus_sim.chaos.holding import held
 from fractus_sim.chaos.stage import Stage
 from fractus_sim.demo.kube import NAMESPACE, SYSTEM, DemoError
 
@@ -23,7 +24,6 @@ Breaking = Generator[str, None, None]
 _HEAL_TIMEOUT_S = 180.0
 _RETRY_S = 1.0
 _RECONCILE_S = 4.0
-_JOIN_S = 30.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,25 +107,19 @@ def _too_many_requests(stage: Stage, _chance: random.Random) -> Breaking:
 
 def _conflicts(stage: Stage, _chance: random.Random) -> Breaking:
     """Writes all the time what others write, so that their writes meet a newer version: 409."""
-    over = threading.Event()
     kinds = ",".join(
         f"{kind}.fractus.dev" for kind in ("applications", "deploymentplans", "grants", "nodegrants", "drones")
     )
 
-    def write() -> None:
+    def write(over: threading.Event) -> None:
         count = 0
         while not over.is_set():
             count += 1
             with suppress(DemoError):
                 stage.kubectl("annotate", kinds, "--all", "-A", f"fractus-chaos={count}", "--overwrite")
 
-    writer = threading.Thread(target=write, daemon=True)
-    writer.start()
-    try:
+    with held(write):
         yield "every object of Fractus is written all the time"
-    finally:
-        over.set()
-        writer.join(_JOIN_S)
 
 
 def _restart_etcd(stage: Stage, _chance: random.Random) -> Breaking:

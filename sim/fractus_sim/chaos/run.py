@@ -76,10 +76,11 @@ def fly(stage: Stage, watch: Watch, task: Task, say: Callable[[str], None]) -> R
     durations = {kind: (FAULTS[kind].shortest_s, FAULTS[kind].longest_s) for kind in task.kinds}
     planned = schedule(task.seed, task.run_s, durations)
     missions = Missions(stage, f"chaos-{task.seed}", run.note)
+    chances = [random.Random(f"{task.seed}/{at}") for at in range(len(planned))]  # noqa: S311 - chosen to repeat
     threads = [
         # A run that is interrupted waits for no fault: its cluster is taken down.
-        threading.Thread(target=_happen, args=(stage, each, random.Random(f"{task.seed}/{at}"), run), daemon=True)  # noqa: S311
-        for at, each in enumerate(planned)
+        threading.Thread(target=_happen, args=(stage, each, chance, run), daemon=True)
+        for each, chance in zip(planned, chances, strict=True)
     ]
     for thread in threads:
         thread.start()

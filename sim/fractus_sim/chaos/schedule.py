@@ -41,7 +41,7 @@ def schedule(seed: int, run_s: float, durations: Mapping[str, tuple[float, float
         run_s: how long the run is, seconds.
         durations: for each fault its shortest and longest duration, seconds.
     """
-    chance = random.Random(seed)  # noqa: S311
+    chance = random.Random(seed)  # noqa: S311 - chosen to repeat
     planned: list[Planned] = []
     waiting: list[str] = []
     ends: dict[str, float] = {}

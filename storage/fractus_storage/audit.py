@@ -13,7 +13,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -61,10 +61,13 @@ class _Waiting:
     time: str
     kind: str
     content: dict[str, Any]
+    boot_s: float = field(default_factory=lambda: round(time.clock_gettime(time.CLOCK_BOOTTIME), 3))
 
 
 class AuditLog:
     """Appends entries; a thread writes them, so that a slow disk never delays a flight.
+
+    Each has its time, and with `boot_s` the seconds since the machine started, which no step of its clock moves.
 
     While the disk is full or does not answer, or another process writes the same log, entries wait; those beyond `MAX_WAITING` are lost, and one entry in their
     place records how many.
@@ -368,7 +371,8 @@ def _chained(batch: Iterable[_Waiting], end: Link) -> tuple[bytes, Link]:
     lines = []
     for waiting in batch:
         sequence = end.sequence + 1
-        entry = {"seq": sequence, "time": waiting.time, "kind": waiting.kind, **waiting.content, "prev": end.hash}
+        known = {"time": waiting.time, "boot_s": waiting.boot_s, "kind": waiting.kind}
+        entry = {"seq": sequence, **known, **waiting.content, "prev": end.hash}
         entry["hash"] = digest(entry)
         end = Link(sequence, entry["hash"])
         lines.append(canonical(entry) + b"\n")

@@ -46,6 +46,22 @@ async def test_a_sound_chain_goes_on_after_a_restart(tmp_path: Path) -> None:
     assert json.loads(lines[0])["value"] == "nan"
 
 
+async def test_entries_tell_how_long_lay_between_them_whatever_the_clock_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steady = iter([50.0, 53.2504, 60.0])
+    clock = iter([1_780_000_000.0, 1_779_906_400.0, 1_780_000_010.0])
+    monkeypatch.setattr("fractus_storage.audit.time.clock_gettime", lambda _clock: next(steady))
+    log = AuditLog(tmp_path / "audit.jsonl", lambda: next(clock))
+    for number in range(3):
+        log.append("call", {"n": number})
+    await log.close()
+    entries = [json.loads(line) for line in read(tmp_path / "audit.jsonl")]
+    assert [entry["boot_s"] for entry in entries] == [50.0, 53.25, 60.0]
+    assert entries[1]["time"] < entries[0]["time"]
+    assert not verify(read(tmp_path / "audit.jsonl")).problem
+
+
 async def test_two_processes_that_write_one_log_make_one_chain(tmp_path: Path) -> None:
     path = tmp_path / "audit.jsonl"
     first, second = (AuditLog(path, lambda: 0.0) for _ in range(2))

@@ -17,6 +17,7 @@ from fractus_cluster import machine, network
 from fractus_cluster.binaries import chosen_kubernetes, ensure_binaries
 from fractus_cluster.cgroups import cluster_branch
 from fractus_cluster.commands import run
+from fractus_cluster.disk import unmount_below
 from fractus_cluster.errors import ClusterError
 from fractus_cluster.images.store import ImageStore
 from fractus_cluster.locking import locked
@@ -222,6 +223,7 @@ class Cluster:
             branch.kill_all()
             branch.remove()
             network.unwire(self.name)
+            unmount_below(self._state.path)
             if self._state.path.exists():
                 shutil.rmtree(self._state.path)
             machine.release(self.name)

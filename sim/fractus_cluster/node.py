@@ -19,6 +19,7 @@ from fractus_cluster.binaries import Binaries
 from fractus_cluster.cgroups import Branch
 from fractus_cluster.commands import run
 from fractus_cluster.controlplane import server_url
+from fractus_cluster.disk import mount_disk, unmount_below
 from fractus_cluster.errors import ClusterError
 from fractus_cluster.hardware import hardware_commands, hardware_environment
 from fractus_cluster.pki import Authority, write_private
@@ -80,6 +81,11 @@ class Node:
     def directory(self) -> Path:
         """Its files on the machine; `var-lib/` and `etc/` below are its /var/lib and what differs in its /etc."""
         return self.state.node(self.name)
+
+    @property
+    def own_state(self) -> Path:
+        """What is /var/lib/fractus on it."""
+        return self.directory / "var-lib" / "fractus"
 
     @property
     def powered(self) -> bool:
@@ -165,6 +171,8 @@ class Node:
         if self.powered:
             return False
         self.power_off()
+        if self.spec.hardware.disk is not None:
+            mount_disk(self.directory / "disk.img", self.own_state, self.spec.hardware.disk.size_bytes)
         network.flush_firewall(self.wiring, self.name)
         record = spawn(
             init_command(self.directory / "config" / "init.json", self.wiring.namespace_path(self.name)),
@@ -206,6 +214,7 @@ class Node:
         self.power_off()
         self.stop_hardware()
         network.unwire_node(self.wiring, self.name, self.index)
+        unmount_below(self.directory)
         shutil.rmtree(self.directory, ignore_errors=True)
         shutil.rmtree(self.state.logs / self.name, ignore_errors=True)
 

@@ -85,7 +85,8 @@ def prepare(view: NodeView) -> None:
         layers = f"lowerdir=/etc,upperdir={source['etc']},workdir={source['etc-work']}"
         _mount("overlay", "/etc", "overlay", 0, layers)
         _bind(source["var-log"], Path("/var/log"))
-        _bind(source["var-lib"], Path("/var/lib"))
+        # With the disk that a node may have of its own.
+        _mount(source["var-lib"], "/var/lib", None, _MS_BIND | _MS_REC, None)
     _settings(view.sysctls)
     _mount("none", "/", None, _MS_SHARED | _MS_REC, None)
 

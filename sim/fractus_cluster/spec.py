@@ -30,6 +30,9 @@ _SUFFIXES: dict[str, Decimal | int] = {
     "Gi": 2**30,
     "Ti": 2**40,
 }
+MIN_DISK_BYTES = 16 * 2**20
+"""Of a node's own disk: what its file system itself takes, and some files."""
+
 _DEFAULT_CONNECTION = "tcp:127.0.0.1:5760"
 
 
@@ -112,6 +115,28 @@ class UplinkHardware(_Value):
     delay: Annotated[float, Field(ge=0, le=10_000)] = 60.0
 
 
+class DiskHardware(_Value):
+    """A disk of a node's own for its /var/lib/fractus, which is otherwise on the machine's.
+
+    Attributes:
+        size: Bytes, as a quantity; a disk that is there keeps its size.
+    """
+
+    size: str
+
+    @field_validator("size")
+    @classmethod
+    def _holds_files(cls, value: str) -> str:
+        if parse_quantity(value) < MIN_DISK_BYTES:
+            raise ValueError(f"a disk has {MIN_DISK_BYTES // 2**20}Mi at least")
+        return value
+
+    @property
+    def size_bytes(self) -> int:
+        """Its size."""
+        return int(parse_quantity(self.size))
+
+
 class Hardware(_Value):
     """What stands beside a node and does not lose power with it."""
 
@@ -119,6 +144,7 @@ class Hardware(_Value):
     camera: CameraHardware | None = None
     wifi: WifiHardware | None = None
     uplink: UplinkHardware | None = None
+    disk: DiskHardware | None = None
 
 
 class AirSpec(_Value):

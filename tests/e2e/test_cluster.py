@@ -66,8 +66,9 @@ spec: {{selector: {{app: web}}, ports: [{{port: 80, targetPort: 8080}}]}}
 
 
 def spec_of(name: str, nodes: int = 2) -> ClusterSpec:
-    """A drone, and edge nodes."""
+    """A drone with a disk of its own, and edge nodes."""
     drone = load_spec(ROOT / "examples" / "clusters" / "demo.yaml").nodes[0].model_dump(by_alias=True)
+    drone["hardware"]["disk"] = {"size": "32Mi"}
     edges = [
         {"name": f"edge-{n}", "class": "edge", "resources": {"cpu": 1, "memory": "1Gi", "fractus.dev/gpu": 3}}
         for n in range(1, nodes)
@@ -199,6 +200,8 @@ def test_power_off_kills_the_node_but_not_its_vehicle(healthy: Cluster) -> None:
     vehicle = read_record(state_of(NAME).process("vehicle.drone-1"))
     assert vehicle is not None
     uid = pods(healthy)["drone-1"]["metadata"]["uid"]
+    drone.exec(["sh", "-c", "echo kept > /var/lib/fractus/file"])
+    assert drone.own_state.is_mount()
     drone.power_off()
     assert not drone.powered
     assert vehicle.alive
@@ -211,6 +214,10 @@ def test_power_off_kills_the_node_but_not_its_vehicle(healthy: Cluster) -> None:
     until(lambda: running(healthy, "drone-1"), "the pod to be back")
     assert pods(healthy)["drone-1"]["metadata"]["uid"] == uid
     assert vehicle.alive
+    assert (drone.own_state / "file").read_text() == "kept\n"
+    assert (
+        drone.exec(["stat", "-f", "-c", "%b", "/var/lib/fractus"]).stdout == f"{os.statvfs(drone.own_state).f_blocks}\n"
+    )
 
 
 def test_cut_link_loses_contact_and_nothing_else(healthy: Cluster) -> None:

@@ -10,10 +10,12 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
+from fractus_cluster.spec import load_spec
 from fractus_core.api import Grant
 from fractus_core.api.node_grants import pack
 from fractus_core.api.plans import GrantSpec
 from fractus_core.policy.values import Home
+from fractus_sim.chaos.__main__ import with_disk
 from fractus_sim.chaos.faults import FAULTS, broken
 from fractus_sim.chaos.invariants import (
     Seen,
@@ -29,6 +31,7 @@ from fractus_sim.chaos.schedule import schedule
 from fractus_sim.chaos.stage import Stage
 from fractus_sim.demo.kube import DemoError
 
+ROOT = Path(__file__).parents[2]
 HOME = Home(50.8637, 4.6785, 25.0)
 DURATIONS = {name: (fault.shortest_s, fault.longest_s) for name, fault in FAULTS.items()}
 BEGAN_S = 1_800_000_000.0
@@ -76,6 +79,13 @@ def flight(*modes: tuple[float, str], end_s: float = 60) -> list[Seen]:
         Seen(BEGAN_S + at, HOME.lat, HOME.lon, at < end_s, [mode for since, mode in modes if since <= at][-1])
         for at in range(round(end_s) + 2)
     ]
+
+
+def test_the_drone_alone_has_a_disk_of_its_own() -> None:
+    spec = load_spec(ROOT / "examples" / "clusters" / "demo.yaml")
+    sizes = {node.name: node.hardware.disk and node.hardware.disk.size_bytes for node in with_disk(spec).nodes}
+    assert sizes == {node.name: 2**30 if node.name == "drone-1" else None for node in spec.nodes}
+    assert with_disk(spec).nodes[0].hardware.vehicle == spec.nodes[0].hardware.vehicle
 
 
 def test_a_seed_repeats_its_schedule() -> None:
@@ -190,11 +200,11 @@ def test_a_grant_that_its_node_keeps_is_left_over(tmp_path: Path) -> None:
         "applications.fractus.dev": [{"kind": "Application", "metadata": {"name": "flies"}}],
         "nodegrants.fractus.dev": [{"spec": {"count": 2, "packed": pack([body("flies"), body("carried")])}}],
     }
-    stored = tmp_path / "var-lib" / "fractus" / "grants"
-    stored.mkdir(parents=True)
+    stored = tmp_path / "grants"
+    stored.mkdir()
     for application in ("flies", "stored"):
         (stored / f"{application}.json").write_text(json.dumps(body(application)))
-    cluster = SimpleNamespace(nodes=[SimpleNamespace(directory=tmp_path)])
+    cluster = SimpleNamespace(nodes=[SimpleNamespace(own_state=tmp_path)])
     stage = cast("Stage", SimpleNamespace(objects=lambda kinds, *_: objects.get(kinds, []), cluster=cluster))
     left = Missions(stage, "chaos", print).left_over()
     assert [each["metadata"]["name"] for each in left] == ["default.carried-navigator", "default.stored-navigator"]

@@ -57,6 +57,8 @@ def test_reads_back_what_it_writes() -> None:
     ("path", "value", "said"),
     [
         ("name", "Demo", "name"),
+        ("nodes.0.hardware.disk", {"size": "1Mi"}, "16Mi at least"),
+        ("nodes.0.hardware.disk", {"size": "much"}, "not a quantity"),
         ("name", "x" * 31, "name"),
         ("nodes", [], "nodes"),
         ("nodes.0.class", "plane", "nodes.0.class"),

@@ -11,8 +11,9 @@ import click
 from fractus_cluster.cluster import Cluster
 from fractus_cluster.errors import ClusterError
 from fractus_cluster.images.build import build_images
+from fractus_cluster.spec import ClusterSpec, DiskHardware, NodeSpec, load_spec
 
-from fractus_sim.chaos.faults import FAULTS
+from fractus_sim.chaos.faults import BALLAST, FAULTS
 from fractus_sim.chaos.report import page
 from fractus_sim.chaos.run import Run, Task, fly
 from fractus_sim.chaos.stage import Stage
@@ -27,12 +28,25 @@ from fractus_sim.report.page import write_page
 CLUSTER = "chaos"
 DRONE = "drone-1"
 VEHICLE_PORT = 5760
+DISK = "1Gi"
+"""Recordings take half of it at most, and leave 200 MB to the audit logs, which take some megabytes in an hour."""
+
 READY_TIMEOUT_S = 180.0
 
 
 def say(line: str) -> None:
     """Tell what happens, a line at a time."""
     click.echo(line, err=True)
+
+
+def with_disk(spec: ClusterSpec) -> ClusterSpec:
+    """The cluster with a disk for its drone."""
+
+    def furnished(node: NodeSpec) -> NodeSpec:
+        hardware = node.hardware.model_copy(update={"disk": DiskHardware(size=DISK)})
+        return node.model_copy(update={"hardware": hardware}) if node.name == DRONE else node
+
+    return spec.model_copy(update={"nodes": tuple(map(furnished, spec.nodes))})
 
 
 @contextmanager
@@ -44,14 +58,17 @@ def embedded(keep: bool) -> Iterator[Stage]:
         DemoError: Fractus does not.
     """
     images = build_images(ROOT, targets=TARGETS, report=say)
-    cluster = Cluster.load(ROOT / "examples" / "clusters" / "demo.yaml", name=CLUSTER, report=say)
+    cluster = Cluster.load(with_disk(load_spec(ROOT / "examples" / "clusters" / "demo.yaml")), name=CLUSTER, report=say)
     try:
         cluster.up(images=images)
         kube = kube_of(cluster, say)
+        stage = Stage(cluster, kube, DRONE)
+        # A run that was killed may have left it.
+        (stage.state / BALLAST).unlink(missing_ok=True)
         install_fractus(kube)
         kube.apply(surroundings())
         wait_ready(kube, READY_TIMEOUT_S, lambda _line: None)
-        yield Stage(cluster, kube, DRONE)
+        yield stage
     finally:
         if not keep:
             with uninterrupted():

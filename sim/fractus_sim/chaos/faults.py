@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import random
-import resource
 import signal
 import subprocess
 import threading
@@ -11,6 +12,7 @@ import time
 from collections.abc import Callable, Generator, Iterable, Mapping
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
+from typing import IO
 
 from fractus_core.api.names import CLASS_LABEL
 
@@ -21,7 +23,11 @@ from fractus_sim.demo.kube import NAMESPACE, SYSTEM, DemoError
 
 Breaking = Generator[str, None, None]
 
+BALLAST = "ballast"
+"""The file that takes a disk."""
+
 _HEAL_TIMEOUT_S = 180.0
+_FILL_S = 0.2
 _RETRY_S = 1.0
 _RECONCILE_S = 4.0
 
@@ -193,20 +199,36 @@ def _take_label(stage: Stage, _chance: random.Random) -> Breaking:
 
 
 def _fill_disk(stage: Stage, _chance: random.Random) -> Breaking:
-    """No file of agent and services may grow: what they write fails, as on a full disk, with another error number."""
-    pods = [stage.system_pod(component, stage.drone) for component in ("agent", "mobility", "camera")]
-    pids = [pid for pod in pods for pid in processes.of_pod(pod["metadata"]["uid"])]
-    _limit_files(pids, 0)
+    """Take all of the disk of the drone's node, also what is freed on it meanwhile."""
+    if not stage.state.is_mount():
+        raise DemoError(f"{stage.drone} has no disk of its own")
+    ballast = stage.state / BALLAST
     try:
-        yield "the disk takes nothing from agent and services of the drone"
+        with ballast.open("wb") as file:
+            _take_all(file)
+
+            def fill(over: threading.Event) -> None:
+                while not over.wait(_FILL_S):
+                    _take_all(file)
+
+            with held(fill):
+                yield f"the disk of {stage.drone} is full"
     finally:
-        _limit_files(pids, resource.RLIM_INFINITY)
+        ballast.unlink(missing_ok=True)
 
 
-def _limit_files(pids: list[int], size: int) -> None:
-    for pid in pids:
-        with suppress(ProcessLookupError):
-            resource.prlimit(pid, resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
+def _take_all(file: IO[bytes]) -> None:
+    """Let a file take every block that its disk has left."""
+    end, piece = os.fstat(file.fileno()).st_size, 1 << 30
+    while piece:
+        try:
+            os.posix_fallocate(file.fileno(), end, piece)
+        except OSError as error:
+            if error.errno != errno.ENOSPC:
+                raise
+            piece //= 2
+        else:
+            end += piece
 
 
 def _some_node(stage: Stage, chance: random.Random) -> str:

@@ -93,7 +93,7 @@ class Missions:
         """Grants on the disks of nodes."""
         stored = []
         for node in self.stage.cluster.nodes:
-            for path in (node.directory / "var-lib" / "fractus" / "grants").glob("*.json"):
+            for path in (node.own_state / "grants").glob("*.json"):
                 with suppress(FileNotFoundError):  # it was removed meanwhile
                     stored.append(json.loads(path.read_bytes()))
         return stored

@@ -38,7 +38,7 @@ class Stage:
     @property
     def state(self) -> Path:
         """The directory on this machine that is /var/lib/fractus of the drone's node."""
-        return self.node.directory / "var-lib" / "fractus"
+        return self.node.own_state
 
     @property
     def control_plane(self) -> Path:

@@ -118,7 +118,7 @@ class ClusterTestbed(Testbed):
         """Read the audit logs from the drones' disks."""
         self._stop.set()
         for setup in self.experiment.setups():
-            folder = self._cluster.node(setup.name).directory / "var-lib" / "fractus" / "audit"
+            folder = self._cluster.node(setup.name).own_state / "audit"
             for name in AUDIT_LOGS:
                 if (folder / name).exists():
                     read_audit(folder / name, f"{setup.name}/{name}", self.findings)

@@ -11,7 +11,7 @@ OUT ?= out
 UV_VERSION := 0.13.8
 # What is looked for : the Debian package that has it.
 PROGRAMS := buildah:buildah containerd:containerd runc:runc nft:nftables iptables:iptables ip:iproute2 \
-	debootstrap:debootstrap wpa_supplicant:wpasupplicant chromium:chromium /usr/lib/cni/ptp:containernetworking-plugins \
+	gcc:gcc /usr/include/time.h:libc6-dev debootstrap:debootstrap wpa_supplicant:wpasupplicant chromium:chromium /usr/lib/cni/ptp:containernetworking-plugins \
 	/etc/ssl/certs/ca-certificates.crt:ca-certificates
 
 UV := $(shell uv --version 2> /dev/null | grep -q '^uv ' && command -v uv || echo .tools/bin/uv)

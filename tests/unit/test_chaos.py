@@ -24,6 +24,7 @@ from fractus_sim.chaos.invariants import (
     landed_elsewhere,
     left_over,
     not_ended,
+    steadily_timed,
     without_authority,
 )
 from fractus_sim.chaos.missions import Missions
@@ -112,6 +113,16 @@ def test_silence_in_the_air_is_a_drone_without_authority() -> None:
     assert found.time_s == BEGAN_S + 32
     assert not without_authority(flight((0, "GUIDED"), (30, "RTL")), log)
     assert not without_authority(flight((0, "GUIDED"), end_s=25), log)
+
+
+def test_a_stepped_clock_neither_makes_nor_hides_silence() -> None:
+    started_s = BEGAN_S - 5000
+    state = {"controller": "system", "in_air": True}
+    ahead = [entry(at + (7200 if at > 10 else 0), "state", boot_s=5000 + at, **state) for at in range(60)]
+    assert not without_authority(flight((0, "GUIDED")), steadily_timed(ahead, started_s))
+    hidden = [entry(at * 3, "state", boot_s=5000 + at, **state) for at in range(20)]
+    (found,) = without_authority(flight((0, "GUIDED")), steadily_timed(hidden, started_s))
+    assert found.time_s == BEGAN_S + 32
 
 
 def test_an_entry_in_the_air_names_a_controller() -> None:

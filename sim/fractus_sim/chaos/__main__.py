@@ -13,6 +13,7 @@ from fractus_cluster.errors import ClusterError
 from fractus_cluster.images.build import build_images
 from fractus_cluster.spec import ClusterSpec, DiskHardware, NodeSpec, load_spec
 
+from fractus_sim.chaos import clocks
 from fractus_sim.chaos.faults import BALLAST, FAULTS
 from fractus_sim.chaos.report import page
 from fractus_sim.chaos.run import Run, Task, fly
@@ -65,7 +66,8 @@ def embedded(keep: bool) -> Iterator[Stage]:
         stage = Stage(cluster, kube, DRONE)
         # A run that was killed may have left it.
         (stage.state / BALLAST).unlink(missing_ok=True)
-        install_fractus(kube)
+        clocks.furnish(node.own_state for node in cluster.nodes if node.spec.node_class != "cloud")
+        install_fractus(kube, clocks.chart_values())
         kube.apply(surroundings())
         wait_ready(kube, READY_TIMEOUT_S, lambda _line: None)
         yield stage

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import os
 import random
 import signal
@@ -16,12 +17,15 @@ from typing import IO
 
 from fractus_core.api.names import CLASS_LABEL
 
-from fractus_sim.chaos import apiserver, processes
+from fractus_sim.chaos import apiserver, clocks, processes
 from fractus_sim.chaos.holding import held
 from fractus_sim.chaos.stage import Stage
 from fractus_sim.demo.kube import NAMESPACE, SYSTEM, DemoError
 
 Breaking = Generator[str, None, None]
+
+MIN_STEP_S, MAX_STEP_S = 30.0, 26 * 3600.0
+"""Of a clock: less is what NTP does all the time, and more is longer than any certificate here is valid."""
 
 BALLAST = "ballast"
 """The file that takes a disk."""
@@ -231,6 +235,20 @@ def _take_all(file: IO[bytes]) -> None:
             end += piece
 
 
+def _step_clock(stage: Stage, chance: random.Random) -> Breaking:
+    """Step the clock of one service of the drone's node, or of all of them, as a node whose time server is wrong."""
+    if not clocks.can_step(stage.state):
+        raise DemoError(f"clocks of {stage.drone} cannot be stepped")
+    services = chance.choice([*((service,) for service in clocks.SERVICES), clocks.SERVICES])
+    # As often by minutes as by hours.
+    offset_s = chance.choice((-1, 1)) * math.exp(chance.uniform(math.log(MIN_STEP_S), math.log(MAX_STEP_S)))
+    try:
+        clocks.step(stage.state, services, offset_s)
+        yield f"clocks of {', '.join(services)} of {stage.drone} were stepped by {offset_s:+.0f} s"
+    finally:
+        clocks.step(stage.state, services, 0.0)
+
+
 def _some_node(stage: Stage, chance: random.Random) -> str:
     """The drone's node as often as any other."""
     others = [node.name for node in stage.cluster.spec.nodes if node.name != stage.drone]
@@ -271,4 +289,5 @@ FAULTS: Mapping[str, Fault] = {
     "drain": Fault(_drain, 5, 30),
     "label-removal": Fault(_take_label, 5, 30),
     "disk-full": Fault(_fill_disk, 10, 60),
+    "clock-jump": Fault(_step_clock, 10, 120),
 }

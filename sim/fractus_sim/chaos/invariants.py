@@ -5,9 +5,9 @@ from __future__ import annotations
 import bisect
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import UTC, datetime
 from typing import Any
 
 from fractus_core.api.plans import GrantSpec
@@ -50,6 +50,17 @@ class Seen:
 def time_of(entry: Entry) -> float:
     """When an entry was made, Unix seconds."""
     return datetime.fromisoformat(str(entry["time"])).timestamp()
+
+
+def steadily_timed(entries: Iterable[Entry], started_s: float) -> Iterator[Entry]:
+    """Entries with the times at which they were made, whatever the clock of their service said.
+
+    Args:
+        entries: of an audit log.
+        started_s: when the machine started, Unix seconds.
+    """
+    for entry in entries:
+        yield {**entry, "time": datetime.fromtimestamp(started_s + float(entry["boot_s"]), UTC).isoformat()}
 
 
 def without_authority(seen: Sequence[Seen], entries: Iterable[Entry]) -> list[Broken]:

@@ -125,6 +125,7 @@ def _settle(stage: Stage, missions: Missions) -> list[Broken]:
     for what, holds in (
         ("every node is Ready", lambda: all(map(is_ready, stage.objects("nodes")))),
         ("the drone is Ready", lambda: all(map(is_ready, stage.objects("drones.fractus.dev")))),
+        ("every edge node is Ready", lambda: all(map(is_ready, stage.objects("edgenodes.fractus.dev")))),
     ):
         if not _awaited(holds, RECOVER_TIMEOUT_S):
             found.append(Broken("all recovers", 0.0, f"not so after {RECOVER_TIMEOUT_S:.0f} s: {what}"))
@@ -140,8 +141,9 @@ def _judge(stage: Stage, watch: Watch, run: Run) -> list[Broken]:
         found.append(Broken("watched", 0.0, f"the vehicle was not seen: {watch.failure or 'it has no position'}"))
     else:
         found += invariants.landed_elsewhere(seen, watch.home)
+    started_s = time.time() - time.clock_gettime(time.CLOCK_BOOTTIME)
     for node in stage.cluster.nodes:
-        folder = node.directory / "var-lib" / "fractus" / "audit"
+        folder = node.own_state / "audit"
         for log, files in logs([folder] if folder.is_dir() else []).items():
             lines = [line for _, _, line in lines_of(files)]
             finding = verify(lines)
@@ -149,7 +151,7 @@ def _judge(stage: Stage, watch: Watch, run: Run) -> list[Broken]:
             if finding.problem:
                 what = f"{node.name}/{log.name}: line {finding.line} {finding.problem}"
                 found.append(Broken("one writer of each audit log", 0.0, what))
-            said = list(entries(lines))
+            said = list(invariants.steadily_timed(entries(lines), started_s))
             if log.stem == "mobility":
                 found += invariants.without_authority(seen, said)
                 found += invariants.in_two_applications(said, watch.grants)

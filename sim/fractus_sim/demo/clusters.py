@@ -51,10 +51,10 @@ def kube_of(cluster: Cluster, report: Say) -> Kube:
     return Kube(programs["kubectl"], programs["helm"], cluster.kubeconfig)
 
 
-def install_fractus(kube: Kube) -> None:
-    """Install or upgrade the charts of this checkout."""
+def install_fractus(kube: Kube, values: Sequence[str] = ()) -> None:
+    """Install or upgrade the charts of this checkout, with values of the chart fractus (`key=value`)."""
     for release in RELEASES:
-        kube.install(release, ROOT / "charts" / release)
+        kube.install(release, ROOT / "charts" / release, values if release == "fractus" else ())
 
 
 class DemoCluster(Protocol):

@@ -245,3 +245,33 @@ def test_a_drained_node_is_uncordoned_though_the_api_server_refuses_at_first(mon
     with broken(FAULTS["drain"], cast("Stage", stage), Random(1)):
         assert cordoned
     assert not cordoned
+
+
+def test_a_drone_loses_its_label_once_it_is_let_and_an_edge_node_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fractus_sim.chaos.faults._RETRY_S", 0.0)
+    labels: dict[str, str] = {}
+    refusals = 0
+
+    def kubectl(_command: str, _kind: str, node: str, label: str, *_: object, **__: object) -> str:
+        nonlocal refusals
+        if label.endswith("-"):
+            if node == "drone-1" and refusals < 3:
+                refusals += 1
+                raise DemoError("drone-1 is in the air")
+            del labels[node]
+        else:
+            labels[node] = label.partition("=")[2]
+        return ""
+
+    nodes = [SimpleNamespace(name=name, node_class=name.split("-")[0]) for name in ("drone-1", "edge-1", "cloud-1")]
+    cluster = SimpleNamespace(spec=SimpleNamespace(nodes=nodes))
+    stage = cast("Stage", SimpleNamespace(kubectl=kubectl, drone="drone-1", cluster=cluster))
+    whole = {"drone-1": "drone", "edge-1": "edge"}
+    lost = set()
+    for seed in range(8):
+        labels.update(whole)
+        with broken(FAULTS["label-removal"], stage, Random(seed)):
+            lost |= whole.keys() - labels.keys()
+        assert labels == whole
+    assert lost == {"drone-1", "edge-1"}
+    assert refusals == 3

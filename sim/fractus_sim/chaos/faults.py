@@ -33,6 +33,7 @@ BALLAST = "ballast"
 _HEAL_TIMEOUT_S = 180.0
 _FILL_S = 0.2
 _RETRY_S = 1.0
+_LANDING_S = 60.0
 _RECONCILE_S = 4.0
 
 
@@ -194,12 +195,15 @@ def _drain(stage: Stage, chance: random.Random) -> Breaking:
         _until_done(lambda: stage.kubectl("patch", "node", node, "--type=merge", "-p", schedulable))
 
 
-def _take_label(stage: Stage, _chance: random.Random) -> Breaking:
-    stage.kubectl("label", "node", stage.drone, f"{CLASS_LABEL}-")
+def _take_label(stage: Stage, chance: random.Random) -> Breaking:
+    """Take the class of a drone, which is refused until it has landed and has no mission, or of an edge node."""
+    edges = [node.name for node in stage.cluster.spec.nodes if node.node_class == "edge"]
+    node, node_class = (stage.drone, "drone") if chance.random() < 0.5 else (chance.choice(edges), "edge")
     try:
-        yield f"{stage.drone} lost its label {CLASS_LABEL}"
+        _until_done(lambda: stage.kubectl("label", "node", node, f"{CLASS_LABEL}-"), _LANDING_S)
+        yield f"{node} lost its label {CLASS_LABEL}"
     finally:
-        _until_done(lambda: stage.kubectl("label", "node", stage.drone, f"{CLASS_LABEL}=drone", "--overwrite"))
+        _until_done(lambda: stage.kubectl("label", "node", node, f"{CLASS_LABEL}={node_class}", "--overwrite"))
 
 
 def _fill_disk(stage: Stage, _chance: random.Random) -> Breaking:
@@ -255,16 +259,16 @@ def _some_node(stage: Stage, chance: random.Random) -> str:
     return stage.drone if chance.random() < 0.5 else chance.choice(others)
 
 
-def _until_done(heal: Callable[[], object]) -> None:
-    """Try again while the API server cannot be had, for another fault may have taken it.
+def _until_done(act: Callable[[], object], timeout_s: float = _HEAL_TIMEOUT_S) -> None:
+    """Try again while the API server refuses it or cannot be had, for another fault may have taken it.
 
     Raises:
         DemoError: it could not be done in time.
     """
-    deadline = time.monotonic() + _HEAL_TIMEOUT_S
+    deadline = time.monotonic() + timeout_s
     while True:
         try:
-            heal()
+            act()
         except (DemoError, subprocess.SubprocessError):
             if time.monotonic() > deadline:
                 raise

@@ -225,6 +225,46 @@ async def test_a_grant_that_cannot_be_stored_is_pending_until_it_can(
     assert store.phases()[-1] == "Active"
 
 
+def test_services_do_not_go_on_by_a_grant_whose_change_cannot_be_stored(
+    keeper: GrantKeeper, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    keeper.take(granted(manifest()))
+    stored = (tmp_path / "g1.json").read_bytes()
+    narrower = manifest()
+    narrower["spec"]["limits"] = {"maxAltitude": 10, "maxSpeed": 5}
+    annotated = manifest()
+    annotated["metadata"]["annotations"] = {"note": "new"}
+    with monkeypatch.context() as patch:
+        patch.setattr("fractus_agent.grants.keeper.write_file", full)
+        keeper.take(granted(annotated))
+        assert (tmp_path / "g1.json").read_bytes() == stored, "it grants the same"
+        keeper.take(granted(narrower))
+        assert on_disk(tmp_path) == set()
+        assert keeper.counts()["unstored"] == 1
+    keeper.retry_disk()
+    assert json.loads((tmp_path / "g1.json").read_bytes())["spec"]["limits"]["maxAltitude"] == 10
+
+
+def test_the_older_grant_makes_room_for_the_newer(
+    keeper: GrantKeeper, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def tight(path: Path, content: bytes) -> None:
+        if path.exists():
+            raise OSError(28, "No space left on device")
+        path.write_bytes(content)
+
+    keeper.take(granted(manifest()))
+    monkeypatch.setattr("fractus_agent.grants.keeper.write_file", tight)
+    narrower = manifest()
+    narrower["spec"]["limits"] = {"maxAltitude": 10, "maxSpeed": 5}
+    keeper.take(granted(narrower))
+    assert json.loads((tmp_path / "g1.json").read_bytes())["spec"]["limits"]["maxAltitude"] == 10
+    assert keeper.counts()["unstored"] == 0
+
+
 class Doubter:
     """The operator's word on grants, which a test changes."""
 

@@ -315,12 +315,34 @@ class GrantKeeper:
 
     def _write(self, grant: Grant) -> None:
         try:
-            if self._directory.put(grant):
+            try:
+                stored = self._directory.put(grant)
+            except OSError:
+                if not self._withdrawn(grant):
+                    raise
+                stored = self._directory.put(grant)  # there may be room now
+            if stored:
                 LOG.info("grants: stored (grant=%s identity=%s)", grant.name, grant.spec.identity)
             self._unstored.pop(grant.name, None)
         except OSError as error:
             LOG.exception("grants: cannot be written to disk (grant=%s)", grant.name)
             self._unstored[grant.name] = f"The node cannot store the grant: {error.strerror or error}."
+
+    def _withdrawn(self, grant: Grant) -> bool:
+        """Remove what is stored of a Grant that has changed: services must not go on by what does not hold any more.
+
+        Returns:
+            Whether something was removed.
+        """
+        try:
+            if Grant.from_body(json.loads(self._directory.read(grant.name))).spec.unsigned == grant.spec.unsigned:
+                return False
+        except FileNotFoundError:
+            return False
+        except (OSError, ValueError, RecursionError, InvalidObject) as error:
+            LOG.warning("grants: what is stored cannot be read (grant=%s): %s", grant.name, error)
+        LOG.error("grants: removed, its change cannot be stored (grant=%s)", grant.name)
+        return self._directory.drop(grant.name)
 
     def retry_disk(self) -> None:
         """Try again to write and remove files."""

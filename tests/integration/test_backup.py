@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -83,7 +84,7 @@ def test_what_was_backed_up_is_restored_and_removed(
     lost, shell = Shell(folder, world.plane), Shell(folder, found.plane)
     lost.type("kubectl apply -f application.yaml")
     world.phase(namespace, "Deploying")
-    operator.stop()
+    operator.stop(signal.SIGKILL)
     before, may, signed_by = written(world), granted(world, namespace), authority(world)
     for line in BACK_UP:
         lost.type(line)
@@ -116,7 +117,7 @@ def test_what_was_backed_up_is_restored_and_removed(
         wait_for(lambda: written(found) == before, "the application to be as it was")
         shell.type(REMOVE[0])
     finally:
-        again.stop()
+        again.stop(signal.SIGKILL)
     remove(found, shell)
 
 

@@ -95,10 +95,11 @@ def test_what_pages_look_at_is_there(world: World, operator: OperatorProcess, tm
         (grant,) = (body for body in world.grants("default", NAME) if body["spec"]["component"] == "Navigator")
         names = {"dlk": link["metadata"]["name"], "grant": grant["metadata"]["name"], "drone": "drone-1"}
         assert looks() == sorted(SHOWN)
+        shown: dict[str, str] = {}
         for line, pattern in SHOWN.items():
             chosen = re.sub(r"(\w+) NAME", lambda found: f"{found[1]} {names[found[1]]}", line).replace("APP", NAME)
-            shown = shell.type(chosen)
-            assert re.search(pattern, shown), f"{chosen} does not show {pattern}:\n{shown}"
+            shown[chosen] = shown.get(chosen) or shell.type(chosen)
+            assert re.search(pattern, shown[chosen]), f"{chosen} does not show {pattern}:\n{shown[chosen]}"
         checks(shell, tmp_path)
     finally:
         world.drone_status("drone-1", "inactive")

@@ -87,7 +87,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
     shell.type(INIT)
     shell.type(in_sentence("cp -r"))
     shell.type(SIGN)
-    vehicle = f"{in_sentence('fractus vehicle')} --listen tcp:127.0.0.1:{ports['5760']} --ready-after 5 --speedup 3"
+    vehicle = f"{in_sentence('fractus vehicle')} --listen tcp:127.0.0.1:{ports['5760']} --ready-after 2 --speedup 3"
     mobility = re.sub(r"--autopilot \S+", own(in_sentence("--autopilot tcp")), MOBILITY)
     with (
         serves(shell, folder, vehicle),

@@ -1,7 +1,7 @@
 """What becomes of grants: phases, and which news changes the disk."""
 
 import json
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Self, cast
@@ -223,6 +223,35 @@ async def test_a_grant_that_cannot_be_stored_is_pending_until_it_can(
     keeper.retry_disk()
     await keeper.report_once()
     assert store.phases()[-1] == "Active"
+
+
+async def test_what_the_disk_did_not_take_is_tried_again_within_seconds(
+    store: FakeStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    now_s = [0.0]
+    waits_s: list[float] = []
+
+    async def repeated(_name: str, step: Callable[[], Awaitable[float]], _changed: object) -> None:
+        for _ in range(4):
+            waits_s.append(await step())
+            now_s[0] += waits_s[-1]
+
+    directory = GrantDirectory(tmp_path)
+    keeper = GrantKeeper(store, directory, "drone-1", believe, monotonic=lambda: now_s[0])
+    monkeypatch.setattr("fractus_agent.grants.keeper.repeat", repeated)
+    with monkeypatch.context() as patch:
+        patch.setattr("fractus_agent.grants.keeper.write_file", full)
+        keeper.take(granted(manifest()))
+        await keeper.report()
+    assert max(waits_s) <= 5
+    assert caplog.text.count("cannot be written to disk") == 1, "it is told once"
+    waits_s.clear()
+    await keeper.report()
+    assert on_disk(tmp_path) == {"g1.json"}
+    assert waits_s == [60.0] * 4
 
 
 def test_services_do_not_go_on_by_a_grant_whose_change_cannot_be_stored(

@@ -29,7 +29,9 @@ _OUTCOMES: dict[OutcomeKind, GrantPhase] = {
     OutcomeKind.FAILED: "Failed",
 }
 REVIEW_INTERVAL_S = 60.0
-"""Seconds after which reports and failed writes are tried again."""
+"""Seconds after which reports are tried again."""
+DISK_INTERVAL_S = 5.0
+"""Seconds after which what the disk did not take is tried again."""
 UNVERIFIED_TIMEOUT_S = 120.0
 """Seconds for which a stored Grant outlives a newer one whose authority is unknown: a change of authorities takes that
 long to reach every node."""
@@ -170,7 +172,7 @@ class GrantKeeper:
         self._reported: Mapping[str, ReportedGrant] = {}
         self._missions: Mapping[str, Outcome] = {}
         self._work = asyncio.Event()
-        self._reviewed_s = monotonic()
+        self._retried_s = monotonic()
 
     def counts(self) -> dict[str, int]:
         """How many grants are stored, or why they are not: unverified, unusable, or the disk does not take them."""
@@ -222,11 +224,11 @@ class GrantKeeper:
         await repeat("grants", self._report_step, self._work)
 
     async def _report_step(self) -> float:
-        if self._monotonic() - self._reviewed_s >= REVIEW_INTERVAL_S:
+        if self._monotonic() - self._retried_s >= DISK_INTERVAL_S:
             self.retry_disk()
         self.give_up_unverified()
         await self.report_once()
-        return REVIEW_INTERVAL_S
+        return DISK_INTERVAL_S if self._unstored or self._unremoved else REVIEW_INTERVAL_S
 
     async def report_once(self) -> None:
         """Report every grant, where what the API server was told is not what the node knows."""
@@ -325,7 +327,8 @@ class GrantKeeper:
                 LOG.info("grants: stored (grant=%s identity=%s)", grant.name, grant.spec.identity)
             self._unstored.pop(grant.name, None)
         except OSError as error:
-            LOG.exception("grants: cannot be written to disk (grant=%s)", grant.name)
+            if grant.name not in self._unstored:
+                LOG.exception("grants: cannot be written to disk, trying again (grant=%s)", grant.name)
             self._unstored[grant.name] = f"The node cannot store the grant: {error.strerror or error}."
 
     def _withdrawn(self, grant: Grant) -> bool:
@@ -346,7 +349,7 @@ class GrantKeeper:
 
     def retry_disk(self) -> None:
         """Try again to write and remove files."""
-        self._reviewed_s = self._monotonic()
+        self._retried_s = self._monotonic()
         for name in list(self._unstored):
             self._write(self._grants[name])
         for name in list(self._unremoved):
@@ -355,10 +358,11 @@ class GrantKeeper:
     def _remove(self, name: str) -> None:
         for record in (self._grants, self._digests, self._unusable, self._unstored, self._unverified):
             record.pop(name, None)
-        self._unremoved.discard(name)
         try:
             if self._directory.drop(name):
                 LOG.info("grants: removed (grant=%s)", name)
+            self._unremoved.discard(name)
         except OSError:
-            LOG.exception("grants: cannot be removed from disk, trying again (grant=%s)", name)
+            if name not in self._unremoved:
+                LOG.exception("grants: cannot be removed from disk, trying again (grant=%s)", name)
             self._unremoved.add(name)

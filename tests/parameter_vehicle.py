@@ -23,7 +23,7 @@ MOVEMENT = {
 FAILSAFES = {
     "SYSID_MYGCS": 244.0, "FS_GCS_ENABLE": 1.0, "FS_GCS_TIMEOUT": 5.0, "GUID_TIMEOUT": 1.0, "BATT_FS_CRT_ACT": 1.0,
     "BATT_FS_LOW_ACT": 2.0, "FS_EKF_ACTION": 1.0, "SRTL_POINTS": 0.0, "RTL_ALT_TYPE": 0.0, "RTL_ALT_FINAL": 0.0,
-    "RALLY_LIMIT_KM": 2.0**-10, "GUID_OPTIONS": 0.0, "FS_EKF_THRESH": 0.8,
+    "RALLY_LIMIT_KM": 2.0**-10, "RTL_CONE_SLOPE": 3.0, "GUID_OPTIONS": 0.0, "FS_EKF_THRESH": 0.8,
 }  # fmt: skip
 """Failsafes that hold, of a vehicle that does not remember its path."""
 

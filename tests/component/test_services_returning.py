@@ -111,8 +111,22 @@ def test_it_is_limited_while_a_mission_lasts(tmp_path: Path, restarted: bool) ->
     fly(flight)
 
 
-FLOWN = {"GUID_OPTIONS": 32.0, "GUID_TIMEOUT": 3.0, "RTL_ALT_FINAL": 500.0, "RALLY_LIMIT_KM": 0.3, "RTL_ALT_TYPE": 1.0}
-HELD = {"GUID_OPTIONS": 0.0, "GUID_TIMEOUT": 1.0, "RTL_ALT_FINAL": 0.0, "RALLY_LIMIT_KM": 2.0**-10, "RTL_ALT_TYPE": 0.0}
+FLOWN = {
+    "GUID_OPTIONS": 32.0,
+    "GUID_TIMEOUT": 3.0,
+    "RTL_ALT_FINAL": 500.0,
+    "RALLY_LIMIT_KM": 0.3,
+    "RTL_ALT_TYPE": 1.0,
+    "RTL_CONE_SLOPE": 1.0,
+}
+HELD = {
+    "GUID_OPTIONS": 0.0,
+    "GUID_TIMEOUT": 1.0,
+    "RTL_ALT_FINAL": 0.0,
+    "RALLY_LIMIT_KM": 2.0**-10,
+    "RTL_ALT_TYPE": 0.0,
+    "RTL_CONE_SLOPE": 3.0,
+}
 
 
 @pytest.mark.parametrize("restarted", [False, True])

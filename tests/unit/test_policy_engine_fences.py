@@ -231,6 +231,16 @@ def test_the_way_home_must_stay_legal() -> None:
     assert ask(compiled(inclusion(box(20, -50, 150, 150))), goto(100, 50), at(80, 50)).code == "WayHomeBlocked"
 
 
+def test_near_home_an_autopilot_returns_lower() -> None:
+    """It climbs to three times its distance from home, and not to its return altitude."""
+    grant = compiled(exclusion(box(-20, 15, 20, 17), name="mast", upper=70))
+    high = at(60, 60, airframe=Airframe(return_altitude_m=100.0))
+    assert ask(grant, goto(0, 60), high).action == "allow", "from there it returns at 100 m"
+    near = ask(grant, goto(0, 23), high)
+    assert near.code == "WayHomeBlocked"
+    assert "69.0 to 100.0 m" in near.reason
+
+
 def test_vertical_motions_respect_fences() -> None:
     grant = compiled(exclusion(box(-10, -10, 10, 10), "land", lower=20))
     assert ask(grant, Call("Takeoff", TakeoffArgs(10)), at(alt=0)).action == "allow"

@@ -165,6 +165,13 @@ def test_a_vehicle_flies_and_stops_as_it_is_told(options: float, after: float) -
     assert "GUID_OPTIONS is 32" in configured(stubborn, flying=True).problem
 
 
+@pytest.mark.parametrize(("slope", "after"), [(0.0, 0.0), (0.5, 3.0), (3.0, 3.0), (8.0, 8.0)])
+def test_a_vehicle_returns_no_lower_than_ways_home_are_judged_for(slope: float, after: float) -> None:
+    vehicle = Parameters({"SYSID_MYGCS": SYSTEM_ID, "RTL_CONE_SLOPE": slope})
+    assert not configured(vehicle, flying=True).problem
+    assert vehicle.values["RTL_CONE_SLOPE"] == after
+
+
 @pytest.mark.parametrize(
     ("lean", "accel_mps2"),
     [

@@ -17,6 +17,10 @@ from fractus_core.policy.values import Situation, Verdict, deny
 MIN_HOMEWARD_M = 10.0
 """No way home below a zone is looked for lower than this above home, for the terrain is not known."""
 
+CONE = 3.0
+"""An autopilot climbs to its return altitude as far as that is worth it: to three times its distance from home, or higher where its
+owner wants that (ArduPilot: RTL_CONE_SLOPE)."""
+
 BELOW_M = 0.5
 """How much lower than it must a drone flies home below a zone: it does not hold its height exactly."""
 
@@ -116,7 +120,7 @@ def straight_home_blocked(
 ) -> Verdict | None:
     """The denial of a target from which the straight way home is not legal.
 
-    That way is the autopilot's: it climbs to its return altitude, flies straight, and descends at home.
+    That way is the autopilot's: it climbs to its return altitude, or less high near home (`CONE`), flies straight, and descends at home.
 
     Args:
         target: where it begins, in metres of the grant's frame.
@@ -134,26 +138,26 @@ def straight_home_blocked(
         return None
     home = grant.frame.xy(now.home.lat, now.home.lon)
     return_m = max(altitude_m, now.airframe.return_altitude_m)
+    least_m = max(altitude_m, min(return_m, CONE * math.dist(target, home)))
     lane = shapely.linestrings((target, home)) if target != home else shapely.points(home)
     anything = grant.exclusions.near(Air(lane, margin, -slack, return_m + slack), now, grant.flat_terrain)
     if not grant.inclusions and next(anything, None) is None:
         return None
     parts = (
-        Leg(target, target, target, home, return_m, return_m),
+        Leg(target, target, target, home, least_m, return_m),
         standing(target, altitude_m, return_m),
         standing(home, 0.0, return_m),
     )
+    how = f"at {return_m:.1f} m" if least_m == return_m else f"at {least_m:.1f} to {return_m:.1f} m"
     for part in parts:
         air = Air(part.ground, margin, part.lower_m - slack, part.upper_m + slack)
         for zone in grant.exclusions.near(air, now, grant.flat_terrain):
-            return _blocked(
-                f"at {return_m:.1f} m, is blocked by zone {zone.name} of policy {zone.rule.name}", zone.rule.name
-            )
+            return _blocked(f"{how}, is blocked by zone {zone.name} of policy {zone.rule.name}", zone.rule.name)
     for fence in grant.inclusions:
         if fence.rule.in_force(now.time_s):
-            shape, _ = fence.at(return_m, return_m, now, grant.flat_terrain)
+            shape, _ = fence.at(least_m, return_m, now, grant.flat_terrain)
             if not shape.covers(lane):
-                return _blocked(f"at {return_m:.1f} m, leaves the zones of policy {fence.rule.name}", fence.rule.name)
+                return _blocked(f"{how}, leaves the zones of policy {fence.rule.name}", fence.rule.name)
     return None
 
 

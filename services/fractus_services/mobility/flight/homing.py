@@ -11,7 +11,13 @@ from dataclasses import replace
 from fractus_core.control.values import FlightMode, ModeKind, TaskKind
 from fractus_core.policy.compiled import CompiledGrant
 from fractus_core.policy.motion import height_margin_m, margin_m
-from fractus_core.policy.returning import descent_enters, homeward_heights_m, may_change_height, straight_home_blocked
+from fractus_core.policy.returning import (
+    CONE,
+    descent_enters,
+    homeward_heights_m,
+    may_change_height,
+    straight_home_blocked,
+)
 
 from fractus_services.errors import AutopilotError, PreconditionFailed, Refused, Unavailable
 from fractus_services.grants import ActiveGrant
@@ -29,9 +35,6 @@ LEVEL_M = 1.0
 
 LAST_LEG_M = 0.5
 """How near to home the last leg ends: there the drone lands."""
-
-CONE = 3.0
-"""It climbs to its return altitude as far as that is worth it: to three times its distance from home (ArduPilot: RTL_CONE_SLOPE)."""
 
 MAX_TRIES = 3
 """How many times the system tries to fly around what is in the way when the autopilot refuses. After that the drone goes

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 
 from fractus_core.control.values import FlightMode, ModeKind
-from fractus_core.policy.returning import ReturnBounds
+from fractus_core.policy.returning import CONE, ReturnBounds
 from fractus_core.policy.values import Airframe
 from fractus_mavlink.enums import COPTER_MODE, FENCE_TYPE, MAV_AUTOPILOT, MAV_TYPE
 
@@ -102,6 +102,10 @@ class ArduCopter:
         Setting(("GUID_OPTIONS",), 0, _STEERED, False, "flies as fast as it is told, and stops when it is told to"),
         Setting(
             ("RTL_ALT_TYPE",), 0, frozenset(), False, "returns at an altitude above home, not above the ground below"
+        ),
+        # 0 switches that cone off; what is more than three times as high only climbs higher.
+        Setting(
+            ("RTL_CONE_SLOPE",), CONE, frozenset({0.0}), False, "climbs far enough before it returns", span=(CONE, 10.0)
         ),
         Setting(("RTL_ALT_FINAL", "RTL_ALT_FINAL_M"), 0, frozenset(), False, "lands when it has returned"),
         Setting(("RALLY_LIMIT_KM",), _NO_RALLY_KM, frozenset(), False, "returns to home and to no rally point"),

@@ -335,6 +335,13 @@ def test_the_operator_does_not_say_that_a_drone_has_landed(control_plane: Contro
             assert "does not say what a drone does" in refusal(
                 lambda body=body: client.call("PUT", f"{path}/status", body)
             )
+        # What it may say of one that is silent is no step to another lie.
+        client.merge(f"{path}/status", {"status": {"flightState": "unknown", "lastFlightState": "flying"}})
+        for last in ("unknown", "inactive", None):
+            assert "does not say what a drone does" in refusal(
+                lambda last=last: client.merge(f"{path}/status", {"status": {"lastFlightState": last}})
+            )
+        assert "fractus-flight-pods" in refusal(lambda: client.delete(f"{PODS}/fractus-mobility-drone-1"))
 
 
 def test_the_operator_does_not_bring_back_what_someone_saw(control_plane: ControlPlane, guarded: World) -> None:

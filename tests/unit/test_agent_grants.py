@@ -277,6 +277,27 @@ def test_services_do_not_go_on_by_a_grant_whose_change_cannot_be_stored(
     assert json.loads((tmp_path / "g1.json").read_bytes())["spec"]["limits"]["maxAltitude"] == 10
 
 
+def test_a_grant_that_cannot_be_read_for_a_while_is_kept_if_it_is_the_same(
+    keeper: GrantKeeper, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An agent without a free descriptor may still remove files, and must not take what a drone flies by."""
+
+    def unreadable(_path: Path) -> bytes:
+        raise OSError(24, "Too many open files")
+
+    keeper.take(granted(manifest()))
+    narrower = manifest()
+    narrower["spec"]["limits"] = {"maxAltitude": 10, "maxSpeed": 5}
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "read_bytes", unreadable)
+        keeper.take(granted(manifest(), generation=2))
+        assert on_disk(tmp_path) == {"g1.json"}
+        keeper.take(granted(narrower, generation=3))
+        assert on_disk(tmp_path) == set()
+    keeper.retry_disk()
+    assert json.loads((tmp_path / "g1.json").read_bytes())["spec"]["limits"]["maxAltitude"] == 10
+
+
 def test_the_older_grant_makes_room_for_the_newer(
     keeper: GrantKeeper, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

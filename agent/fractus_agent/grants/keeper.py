@@ -13,7 +13,7 @@ from typing import Any
 
 from fractus_core.api.model import InvalidObject
 from fractus_core.api.node_grants import MAX_MESSAGE, ReportedGrant
-from fractus_core.api.plans import ENDED, Grant, GrantPhase
+from fractus_core.api.plans import ENDED, Grant, GrantPhase, GrantSpec
 from fractus_core.control import Outcome, OutcomeKind
 from fractus_core.policy.trust import BadSignature, UnknownAuthority
 from fractus_storage import remove_file, write_file
@@ -166,6 +166,8 @@ class GrantKeeper:
         self._unusable: dict[str, ReportedGrant] = {}
         self._digests: dict[str, tuple[bytes, bytes | None]] = {}
         """Of each Grant as it was taken, and of its file as that was written."""
+        self._written: dict[str, GrantSpec] = {}
+        """What was stored last of each Grant, for a file that cannot be read for a while."""
         self._unstored: dict[str, str] = {}
         self._unremoved: set[str] = set()
         self._generation = self._reported_of = 0
@@ -325,6 +327,7 @@ class GrantKeeper:
                 stored = self._directory.put(grant)  # there may be room now
             if stored:
                 LOG.info("grants: stored (grant=%s identity=%s)", grant.name, grant.spec.identity)
+            self._written[grant.name] = grant.spec.unsigned
             self._unstored.pop(grant.name, None)
         except OSError as error:
             if grant.name not in self._unstored:
@@ -337,13 +340,19 @@ class GrantKeeper:
         Returns:
             Whether something was removed.
         """
+        stored = None
         try:
-            if Grant.from_body(json.loads(self._directory.read(grant.name))).spec.unsigned == grant.spec.unsigned:
-                return False
+            stored = Grant.from_body(json.loads(self._directory.read(grant.name))).spec.unsigned
         except FileNotFoundError:
             return False
-        except (OSError, ValueError, RecursionError, InvalidObject) as error:
+        except OSError as error:
+            # No descriptor is left, say: services still go on by what was written.
+            LOG.warning("grants: what is stored cannot be read now (grant=%s): %s", grant.name, error)
+            stored = self._written.get(grant.name)
+        except (ValueError, RecursionError, InvalidObject) as error:
             LOG.warning("grants: what is stored cannot be read (grant=%s): %s", grant.name, error)
+        if stored == grant.spec.unsigned:
+            return False
         LOG.error("grants: removed, its change cannot be stored (grant=%s)", grant.name)
         return self._directory.drop(grant.name)
 
@@ -356,7 +365,7 @@ class GrantKeeper:
             self._remove(name)
 
     def _remove(self, name: str) -> None:
-        for record in (self._grants, self._digests, self._unusable, self._unstored, self._unverified):
+        for record in (self._grants, self._digests, self._unusable, self._written, self._unstored, self._unverified):
             record.pop(name, None)
         try:
             if self._directory.drop(name):

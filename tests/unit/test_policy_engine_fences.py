@@ -176,6 +176,9 @@ def test_a_wide_circle_to_stay_in_is_not_left(radius_m: float) -> None:
     circle = {"circle": {"center": {"lat": lat, "lon": lon}, "radius": south_m + 100.0}}
     grant = compiled(inclusion(circle))
     assert ask(grant, goto(0, 102), at(0, -170)).code == "OutsideInclusionZone"
+    area = compiled(operationArea=[circle], corridor=[circle])
+    assert ask(area, goto(0, 102), at(0, -170)).code == "OutsideOperationArea"
+    assert ask(area, goto(0, -180), at(0, -170)).action == "allow"
     assert ask(grant, goto(0, -180), at(0, -170)).action == "allow"
 
 

@@ -311,9 +311,10 @@ def _prepared(shape: BaseGeometry) -> BaseGeometry:
 
 
 def _union(frame: LocalFrame, areas: tuple[Area, ...]) -> BaseGeometry | None:
+    """Ground to stay on."""
     if not areas:
         return None
-    return _prepared(shapely.union_all([polygon(frame, area) for area in areas]))
+    return _prepared(shapely.union_all([polygon(frame, area, within=True) for area in areas]))
 
 
 def _policy_zones(frame: LocalFrame, rule: Rule, policy: GrantedPolicy) -> list[PolicyZone]:

@@ -43,9 +43,10 @@ class ReturnToLaunch(Flight):
         self._target, base_down = (point.north, point.east), point.base_down
         distance = point.distance_m((v.est.north, v.est.east))
         height = base_down - v.est.down
-        wanted = max(height + p["RTL_CLIMB_MIN"] / 100.0, p["RTL_ALT"] / 100.0, point.altitude_m, 2.0)
+        least = max(height + p["RTL_CLIMB_MIN"] / 100.0, 2.0)
+        wanted = max(least, p["RTL_ALT"] / 100.0, point.altitude_m)
         if p["RTL_CONE_SLOPE"] >= 0.5:
-            wanted = min(wanted, max(distance * p["RTL_CONE_SLOPE"], 2.0))
+            wanted = min(wanted, max(distance * p["RTL_CONE_SLOPE"], least))
         ceiling = v.fence.alt_max_m - p["FENCE_MARGIN"]
         if v.fence.enabled and v.fence.types & 1:
             wanted = min(wanted, ceiling)

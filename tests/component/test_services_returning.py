@@ -74,7 +74,7 @@ def test_heights_just_below_zones_overhead_are_the_last_to_be_tried() -> None:
     [
         (OWNED, ReturnBounds(12.0, 3.5), LOW),
         (OWNED, ReturnBounds(60.0, 12.0), OWNED | {"RTL_CLIMB_MIN": 0.0}),
-        (OWNED, ReturnBounds(), OWNED),
+        (OWNED, ReturnBounds(), OWNED | {"RTL_CLIMB_MIN": 0.0}),
         (OWNED, ReturnBounds(12.345678, 0.0), LOW | {"RTL_ALT": 1234.0, "WPNAV_SPEED": 20.0}),
         ({"RTL_ALT_M": 40.0, "RTL_SPEED_MS": 9.0, "WP_SPD": 8.0}, ReturnBounds(12.5, 3.5),
          {"RTL_ALT_M": 12.5, "RTL_SPEED_MS": 3.5, "WP_SPD": 3.5}),

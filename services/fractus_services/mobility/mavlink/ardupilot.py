@@ -169,12 +169,11 @@ class ArduCopter:
         return text.startswith("SmartRTL deactivated")
 
     def return_values(self, owned: Mapping[str, float], bounds: ReturnBounds) -> dict[str, float]:
-        """RTL_ALT; RTL_SPEED, which is WPNAV_SPEED when it is 0; WPNAV_SPEED for SmartRTL; and no climb above all of that."""
+        """RTL_ALT; RTL_SPEED, which is WPNAV_SPEED when it is 0; WPNAV_SPEED for SmartRTL; and no climb above the height that ways home are judged for."""
         speed_mps = max(bounds.speed_mps, _MIN_SPEED_MPS)
-        climb_m = math.inf if math.isinf(bounds.height_m) else 0.0
         found = {}
         for names, most in (
-            (_RETURN_ALTITUDE, bounds.height_m), (_RETURN_SPEED, speed_mps), (_SPEED, speed_mps), (_RETURN_CLIMB, climb_m),
+            (_RETURN_ALTITUDE, bounds.height_m), (_RETURN_SPEED, speed_mps), (_SPEED, speed_mps), (_RETURN_CLIMB, 0.0),
         ):  # fmt: skip
             for name, scale in names:
                 if name in owned:

@@ -353,8 +353,9 @@ class GrantKeeper:
             LOG.warning("grants: what is stored cannot be read (grant=%s): %s", grant.name, error)
         if stored == grant.spec.unsigned:
             return False
+        dropped = self._directory.drop(grant.name)
         LOG.error("grants: removed, its change cannot be stored (grant=%s)", grant.name)
-        return self._directory.drop(grant.name)
+        return dropped
 
     def retry_disk(self) -> None:
         """Try again to write and remove files."""

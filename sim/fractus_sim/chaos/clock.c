@@ -1,5 +1,5 @@
 /* The real-time clock of the processes that load this, ahead by the nanoseconds in the file that CLOCK_OFFSET names: they may
-   change at any time. No other clock is touched, and no wait: those of Python and gRPC go by the monotonic clock. */
+   change at any time. No other clock is touched, and no wait: one until a time of this clock ends by the true one. */
 
 #define _GNU_SOURCE
 #include <dlfcn.h>

@@ -56,7 +56,8 @@ cluster() {
 load() {
   local image class save import
   save=$(sed -n 's/^    \(docker save .*\)/\1/p' docs/clusters.md)
-  import=$(sed -n 's/^    \(ctr .* import [^ ]*\) .*/\1/p' docs/clusters.md)
+  import=$(sed -n '/^    docker save /{n;s/^    \(ctr .* import NAME.tar\)/\1/p}' docs/clusters.md)
+  [ -n "$save" ] && [ -n "$import" ] || { echo "docs/clusters.md does not say how images are saved and imported" >&2; return 1; }
   for image in "${targets[@]}"; do
     case $image in
       operator) class=cloud ;;

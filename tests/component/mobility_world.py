@@ -75,7 +75,7 @@ class Plane(MavlinkAutopilot):
         self.parameters = MOVEMENT | FAILSAFES | {"WPNAV_SPEED": 100 * DEFAULT_MPS}
         vehicle = self.vehicle
         vehicle.mode, vehicle.located, vehicle.position_error_m = GUIDED, True, 0.5
-        vehicle.ready = vehicle.estimated = True
+        vehicle.ready, vehicle.estimated, vehicle.received_at = True, True, math.inf
         vehicle.home = Home(39.36, 22.95, GROUND_M)
         self.home_amsl_m = GROUND_M
 

@@ -30,7 +30,7 @@ def test_an_armed_vehicle_whose_place_is_unknown_flies() -> None:
 
 @pytest.mark.parametrize(("vx", "forward_mps2"), [((100, 12), 2.4), ((600, -10), -2.0), ((300, 0), 0.0)])
 def test_it_tells_how_it_speeds_up(vx: tuple[int, int], forward_mps2: float) -> None:
-    vehicle = Vehicle(stack=ARDUCOPTER, located=True)
+    vehicle = Vehicle(stack=ARDUCOPTER, located=True, received_at=0.0)
     assert vehicle.forward_mps2 is None
     for i in range(12):
         told = message("GLOBAL_POSITION_INT", time_boot_ms=i * 50, lat=1, lon=1, vx=vx[0] + i * vx[1])
@@ -61,6 +61,23 @@ def test_a_vehicle_that_stands_without_a_position_loses_no_path() -> None:
     vehicle.armed = True
     vehicle.take(message("EKF_STATUS_REPORT", flags=POSITIONED), 42.0)
     assert not vehicle.path_lost
+
+
+@pytest.mark.parametrize("silent", ["EKF_STATUS_REPORT", "GPS_RAW_INT"])
+def test_a_position_whose_quality_is_not_told_any_more_becomes_unknown(silent: str) -> None:
+    vehicle = Vehicle(stack=ARDUCOPTER)
+    for tenth in range(300):
+        now = tenth / 10
+        for told in (message("EKF_STATUS_REPORT", flags=POSITIONED), message("GPS_RAW_INT", fix_type=3, h_acc=800)):
+            if now < 10.0 or told.name != silent:
+                vehicle.take(told, now)
+        vehicle.take(message("GLOBAL_POSITION_INT", lat=393600000, lon=229500000), now)
+        if not 19.5 < now < 21.0:
+            assert vehicle.position_fresh(now) is (now < 20.0)
+    vehicle.take(message("EKF_STATUS_REPORT", flags=POSITIONED), 30.0)
+    vehicle.take(message("GPS_RAW_INT", fix_type=3, h_acc=800), 30.0)
+    vehicle.take(message("GLOBAL_POSITION_INT", lat=393600000, lon=229500000), 30.0)
+    assert vehicle.position_fresh(30.0)
 
 
 HEALTHY = {"onboard_control_sensors_present": 1 << 28, "onboard_control_sensors_health": 1 << 28}

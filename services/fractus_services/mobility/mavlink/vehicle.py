@@ -28,6 +28,10 @@ _POSITIONED = EKF_STATUS_FLAGS.POS_HORIZ_ABS | EKF_STATUS_FLAGS.PRED_POS_HORIZ_A
 MIN_ERROR_M, MAX_ERROR_M = 0.5, 10.0
 """A GPS that says it is better is not believed; one that is worse gives no position."""
 
+STATUS_MAX_AGE_S = 10.0
+"""How long it counts what estimator and GPS said of the position. They tell it once a second or more, and are asked for it again
+where they do not: after so long a silence the estimator may only reckon where it is."""
+
 PATH_KEPT_S = 12.0
 """ArduCopter gives the path up, and says so once, when it had no position for 15 s: a little less is waited, for that text may be
 lost. One that tells nothing for so long may have given it up meanwhile."""
@@ -43,6 +47,7 @@ class Vehicle(VehicleState):
         gimbal_measured: whether the firmware measures where its gimbal points, and does not repeat where it was told to; None
             until it has told of which type that is.
         placed_at: when its estimator had a position last.
+        received_at: when its GPS told of its fix.
         fenced: whether its own fence is switched on; None for one that has none. Told at `checks_at`.
         gimbal_limits: the least and the greatest pitch and yaw of its gimbal, degrees; None until it has told.
     """
@@ -52,6 +57,7 @@ class Vehicle(VehicleState):
     gimbal_measured: bool | None = None
     gimbal_limits: tuple[tuple[float, float], ...] | None = None
     placed_at: float = -math.inf
+    received_at: float = -math.inf
     fenced: bool | None = None
 
     def take(self, message: Message, now: float) -> None:
@@ -84,8 +90,9 @@ def _place(lat_e7: int, lon_e7: int) -> tuple[float, float] | None:
 
 def _position(vehicle: Vehicle, message: Message, now: float) -> None:
     # With a GPS that has its fix the estimator may fly without: it then tells where it has reckoned to be, and drifts.
-    reckons = math.isfinite(vehicle.estimated_at) and not vehicle.estimated
-    if reckons or not vehicle.located:
+    told = math.isfinite(vehicle.estimated_at)
+    reckons = told and not (vehicle.estimated and now - vehicle.estimated_at <= STATUS_MAX_AGE_S)
+    if reckons or not vehicle.located or now - vehicle.received_at > STATUS_MAX_AGE_S:
         return
     place = _place(message.integer("lat"), message.integer("lon"))
     if place is None:
@@ -179,7 +186,8 @@ def _estimator(vehicle: Vehicle, message: Message, now: float) -> None:
     vehicle.estimated_at = now
 
 
-def _gps(vehicle: Vehicle, message: Message, _now: float) -> None:
+def _gps(vehicle: Vehicle, message: Message, now: float) -> None:
+    vehicle.received_at = now
     vehicle.fix_type, accuracy_mm = message.integer("fix_type"), message.integer("h_acc")
     satellites = message.integer("satellites_visible")
     vehicle.satellites = satellites if satellites != _UNKNOWN_U8 else 0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any, cast
@@ -16,6 +18,7 @@ from fractus_operator.cluster.reading import read_submitted
 from fractus_operator.cluster.store import Store
 from fractus_operator.inventory.grouped import Grouped
 from fractus_operator.inventory.live import LiveInventory
+from fractus_operator.inventory.subscriptions import Subscription, Subscriptions
 from fractus_operator.reconcile.applications import Applications, _Memory
 from fractus_operator.reconcile.status import StatusUpdate
 from test_planning import at, component, edge, host, inventory, manifest
@@ -44,6 +47,36 @@ async def test_what_another_application_leaves_wakes_only_those_without_a_plan_t
         assert not await new.changed(0)
         live.drones.note(("", "d"), drone_body(4, "inactive"))
         assert await placed.changed(1)
+
+
+async def test_what_all_depend_on_wakes_one_application_a_turn() -> None:
+    """Who is changed by a user meanwhile does not wait until hundreds have reconciled."""
+    subscriptions, order = Subscriptions(), list[str]()
+
+    async def reconciler(name: str, inputs: Subscription) -> None:
+        await inputs.changed(5)
+        order.append(name)
+
+    names = [f"a{i}" for i in range(6)]
+    with contextlib.ExitStack() as stack:
+        each = [(name, stack.enter_context(subscriptions.subscribe(("ns", name)))) for name in names]
+        async with asyncio.TaskGroup() as group:
+            for name, inputs in each:
+                group.create_task(reconciler(name, inputs))
+            await asyncio.sleep(0)
+            subscriptions.wake_all(urgent=True)
+            subscriptions.wake(("ns", "a5"))
+        assert set(order) == set(names), "each is woken"
+        assert order.index("a5") <= 1, "who is woken by itself waits for no other"
+        assert all(inputs._urgent.is_set() for _, inputs in each), "who is woken by itself is as urgent as all"
+        await asyncio.sleep(0.01)
+        for _, inputs in each:
+            assert not await inputs.changed(0), "once"
+        # One that is deleted meanwhile keeps no other from its turn.
+        subscriptions.wake_all()
+    with subscriptions.subscribe(("ns", "late")) as inputs:
+        subscriptions.wake_all()
+        assert await inputs.changed(1)
 
 
 async def test_a_manifest_that_is_applied_ends_a_rest_and_what_is_reported_does_not() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -304,14 +305,13 @@ def _granted(
         base, reach_m = bounds
         if beyond is None and _regards_pictures(policy.spec):
             reach_m += MAX_SIGHT_M
-        near = [z for z in zones if not _circle_beyond(z.area, base, reach_m) and _distance_m(z.area, base) <= reach_m]
+        near = [zone for zone in zones if zone.is_within(reach_m, base)]
     if named and not near:
         return None
     # What is left out is not selected either, so that a node can tell a zone that is far from one that is missing.
-    selector = policy.spec.selector.model_copy(update={"zones": tuple(zone.name for zone in near)})
-    return GrantedPolicy(
-        name=policy.name, spec=policy.spec.model_copy(update={"selector": selector}), zones=tuple(near)
-    )
+    granted = tuple(zone.granted for zone in near)
+    selector = policy.spec.selector.model_copy(update={"zones": tuple(zone.name for zone in granted)})
+    return GrantedPolicy(name=policy.name, spec=policy.spec.model_copy(update={"selector": selector}), zones=granted)
 
 
 def _regards_pictures(spec: PolicySpec) -> bool:
@@ -338,7 +338,7 @@ def _bounds(grant: GrantSpec, node: Drone | EdgeNode | None, inventory: Inventor
     return (middle(grant.operation_area[0]), reach_m) if grant.operation_area else None
 
 
-def _zone(policy: Policy, index: int, name: str, inventory: Inventory) -> GrantedZone:
+def _zone(policy: Policy, index: int, name: str, inventory: Inventory) -> _SoundZone:
     if name in inventory.unreadable_zones:
         raise InvalidObject(f"Zone {name}", inventory.unreadable_zones[name])
     if name not in inventory.zones:
@@ -346,12 +346,7 @@ def _zone(policy: Policy, index: int, name: str, inventory: Inventory) -> Grante
             f"Policy {policy.name} spec.selector.zones[{index}]",
             f"there is no Zone {name}; apply it, or correct the policy",
         )
-    spec = inventory.zones[name].spec
-    try:
-        _outline(spec.area)
-    except InvalidObject as error:
-        raise InvalidObject(f"Zone {name} spec.area.{error.field}", error.problem) from None
-    return GrantedZone(name=name, area=spec.area, altitude=spec.altitude, schedule=spec.schedule)
+    return _sound(_Same(inventory.zones[name]))
 
 
 def _surely_beyond(zone: Zone | None, base: Point, reach_m: float) -> bool:
@@ -370,14 +365,48 @@ def _circle_beyond(area: Area, base: Point, reach_m: float) -> bool:
     return circle is not None and distance_m(circle.center, base) > (reach_m + circle.radius) * _GENEROUS
 
 
-@lru_cache(maxsize=256)
-def _outline(area: Area) -> tuple[LocalFrame, shapely.Polygon]:
-    """A zone's area in a frame of its own: every grant asks for the same ones."""
-    frame = LocalFrame.at(middle(area))
-    return frame, polygon(frame, area)
+@dataclass(frozen=True, slots=True)
+class _SoundZone:
+    """A zone as it is granted, with its outline in a frame of its own."""
+
+    granted: GrantedZone
+    frame: LocalFrame
+    outline: shapely.Polygon
+
+    def is_within(self, reach_m: float, base: Point) -> bool:
+        """Whether some of it is within reach of a place."""
+        if _circle_beyond(self.granted.area, base, reach_m):
+            return False
+        return float(self.outline.distance(shapely.Point(*self.frame.xy(base.lat, base.lon)))) <= reach_m
 
 
-def _distance_m(area: Area, base: Point) -> float:
-    frame, outline = _outline(area)
-    x, y = frame.xy(base.lat, base.lon)
-    return float(outline.distance(shapely.Point(x, y)))
+class _Same:
+    """A Zone that equals none but itself: to compare and hash all its points takes longer than to look at it."""
+
+    __slots__ = ("zone",)
+
+    def __init__(self, zone: Zone) -> None:
+        self.zone = zone
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and other.zone is self.zone
+
+    def __hash__(self) -> int:
+        return id(self.zone)
+
+
+@lru_cache(maxsize=2048)
+def _sound(same: _Same) -> _SoundZone:
+    """A zone that is looked at for every grant.
+
+    Raises:
+        InvalidObject: it is broken.
+    """
+    name, spec = same.zone.name, same.zone.spec
+    try:
+        frame = LocalFrame.at(middle(spec.area))
+        outline = polygon(frame, spec.area)
+    except InvalidObject as error:
+        raise InvalidObject(f"Zone {name} spec.area.{error.field}", error.problem) from None
+    granted = GrantedZone(name=name, area=spec.area, altitude=spec.altitude, schedule=spec.schedule)
+    return _SoundZone(granted, frame, outline)

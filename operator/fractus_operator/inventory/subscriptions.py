@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import itertools
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 
@@ -50,6 +49,8 @@ class Subscriptions:
         self._of: dict[Key, list[Subscription]] = {}
         self._placed: set[Key] = set()
         self._full: dict[Key, Collection[str]] = {}
+        self._in_turn: dict[Key, bool] = {}
+        """Those that `wake_all` has yet to wake, and whether urgently."""
 
     @contextmanager
     def subscribe(self, key: Key) -> Iterator[Subscription]:
@@ -81,8 +82,7 @@ class Subscriptions:
 
     def wake(self, key: Key, *, urgent: bool = False) -> None:
         """Wake one application."""
-        for subscription in self._of.get(labelled(key), ()):
-            subscription.wake(urgent=urgent)
+        self._wake(labelled(key), urgent=urgent)
 
     def wake_waiting(self) -> None:
         """Wake every application without a plan that suits it: another one left something that it may wait for."""
@@ -98,6 +98,25 @@ class Subscriptions:
                     subscription.wake()
 
     def wake_all(self, *, urgent: bool = False) -> None:
-        """Wake every application: something that all depend on changed."""
-        for subscription in itertools.chain.from_iterable(self._of.values()):
+        """Wake every application, because something that all depend on changed.
+
+        They are woken one at each turn of the event loop: hundreds that reconcile take seconds of it, for which an
+        application that a user changes meanwhile does not wait.
+        """
+        idle = not self._in_turn
+        for label in self._of:
+            self._in_turn[label] = urgent or self._in_turn.get(label, False)
+        if idle:
+            self._next_turn()
+
+    def _next_turn(self) -> None:
+        if self._in_turn:
+            self._wake(next(iter(self._in_turn)))
+        if self._in_turn:
+            asyncio.get_running_loop().call_soon(self._next_turn)
+
+    def _wake(self, label: Key, *, urgent: bool = False) -> None:
+        # Who is woken for another reason sees at once what all are to see.
+        urgent = self._in_turn.pop(label, False) or urgent
+        for subscription in self._of.get(label, ()):
             subscription.wake(urgent=urgent)

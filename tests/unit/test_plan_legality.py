@@ -7,9 +7,11 @@ from datetime import UTC, datetime
 
 import pytest
 from fractus_core.api import Zone
+from fractus_core.api.geometry import Point
 from fractus_core.api.plans import DroneChoice
 from fractus_core.planning import Infeasible, Settings, operation_area, plan
-from fractus_core.planning.grants import AROUND_WAY_M, _distance_m, compile_grants, flight_grant
+from fractus_core.planning.granted_zones import sound
+from fractus_core.planning.grants import AROUND_WAY_M, compile_grants, flight_grant
 from fractus_core.planning.legality import MAX_LISTED, MAX_SEARCHES, with_legality
 from fractus_core.policy.compiled import compile_grant
 from fractus_core.policy.engine import judge
@@ -219,7 +221,8 @@ def test_every_zone_around_the_way_counts():
     grant = flight_grant(APP, inventory_.drones["d"], inventory_, area_)
     corners = [area_.frame.xy(p.lat, p.lon) for p in grant.corridor[0].polygon.exterior]
     reach_m = max(math.hypot(x, y) for x, y in corners) + AROUND_WAY_M
-    near = {z.name for z in zones if _distance_m(z.spec.area, area_.frame) <= reach_m}
+    middle = Point(lat=area_.frame.lat, lon=area_.frame.lon)
+    near = {z.name for z in zones if sound(z).distance_m(middle) <= reach_m}
     assert {z.name for z in grant.policies[0].zones} == near
     assert 50 < len(near) < 300
 

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from fractus_core.api import Application, Component, Drone, EdgeNode, InvalidObject, Policy, Zone
+from fractus_core.api import Application, Component, Drone, EdgeNode, InvalidObject, Policy
 from fractus_core.api.components import ServiceRequest
 from fractus_core.api.geometry import MAX_HOLES, MAX_RING_POINTS, Area, Circle, Point, Position
 from fractus_core.api.methods import MOBILITY_METHODS
@@ -20,13 +17,13 @@ from fractus_core.api.plans import (
     DeploymentPlanSpec,
     GrantedLimits,
     GrantedPolicy,
-    GrantedZone,
     GrantSpec,
     PlannedInstance,
 )
 from fractus_core.api.policies import PolicySpec
-from fractus_core.geo import LocalFrame, area_of, distance_m, ground, middle, polygon
+from fractus_core.geo import area_of, ground, middle, polygon
 from fractus_core.planning.area import OperationArea, operation_area
+from fractus_core.planning.granted_zones import SoundZone, sound, surely_beyond
 from fractus_core.planning.inventory import Inventory, Settings
 from fractus_core.policy.access import SEEING
 from fractus_core.policy.footprint import MAX_SIGHT_M
@@ -40,9 +37,6 @@ MAX_ROUNDING_M = 0.16
 
 AROUND_WAY_M = 100.0
 """Zones further than this from where a drone may be do not change its way."""
-
-_GENEROUS = 1.05
-"""Room for what the frame of a large zone bends."""
 
 _ONLY_THERE = frozenset({"inclusion", "grant"})
 """Kinds of policies that allow something in their zones and nowhere else: zones out of reach count, too."""
@@ -297,7 +291,7 @@ def _granted(
     zones = [
         _zone(policy, i, name, inventory)
         for i, name in enumerate(named)
-        if beyond is None or policy.spec.kind in _ONLY_THERE or not _surely_beyond(inventory.zones.get(name), *beyond)
+        if beyond is None or policy.spec.kind in _ONLY_THERE or not surely_beyond(inventory.zones.get(name), *beyond)
     ]
     if bounds is None or policy.spec.kind in _ONLY_THERE:
         near = zones
@@ -338,7 +332,7 @@ def _bounds(grant: GrantSpec, node: Drone | EdgeNode | None, inventory: Inventor
     return (middle(grant.operation_area[0]), reach_m) if grant.operation_area else None
 
 
-def _zone(policy: Policy, index: int, name: str, inventory: Inventory) -> _SoundZone:
+def _zone(policy: Policy, index: int, name: str, inventory: Inventory) -> SoundZone:
     if name in inventory.unreadable_zones:
         raise InvalidObject(f"Zone {name}", inventory.unreadable_zones[name])
     if name not in inventory.zones:
@@ -346,67 +340,4 @@ def _zone(policy: Policy, index: int, name: str, inventory: Inventory) -> _Sound
             f"Policy {policy.name} spec.selector.zones[{index}]",
             f"there is no Zone {name}; apply it, or correct the policy",
         )
-    return _sound(_Same(inventory.zones[name]))
-
-
-def _surely_beyond(zone: Zone | None, base: Point, reach_m: float) -> bool:
-    """Whether a zone is out of reach, told in microseconds; False where that needs a closer look."""
-    if zone is None or zone.spec.area.polygon is None:
-        return zone is not None and _circle_beyond(zone.spec.area, base, reach_m)
-    ring = zone.spec.area.polygon.exterior
-    # No point of a polygon is further from a corner than half its outline.
-    outline_m = sum(distance_m(a, b) for a, b in itertools.pairwise((*ring, ring[0])))
-    return distance_m(ring[0], base) > (reach_m + outline_m / 2) * _GENEROUS
-
-
-def _circle_beyond(area: Area, base: Point, reach_m: float) -> bool:
-    """Whether an area is a circle that is surely out of reach."""
-    circle = area.circle
-    return circle is not None and distance_m(circle.center, base) > (reach_m + circle.radius) * _GENEROUS
-
-
-@dataclass(frozen=True, slots=True)
-class _SoundZone:
-    """A zone as it is granted, with its outline in a frame of its own."""
-
-    granted: GrantedZone
-    frame: LocalFrame
-    outline: shapely.Polygon
-
-    def is_within(self, reach_m: float, base: Point) -> bool:
-        """Whether some of it is within reach of a place."""
-        if _circle_beyond(self.granted.area, base, reach_m):
-            return False
-        return float(self.outline.distance(shapely.Point(*self.frame.xy(base.lat, base.lon)))) <= reach_m
-
-
-class _Same:
-    """A Zone that equals none but itself: to compare and hash all its points takes longer than to look at it."""
-
-    __slots__ = ("zone",)
-
-    def __init__(self, zone: Zone) -> None:
-        self.zone = zone
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and other.zone is self.zone
-
-    def __hash__(self) -> int:
-        return id(self.zone)
-
-
-@lru_cache(maxsize=2048)
-def _sound(same: _Same) -> _SoundZone:
-    """A zone that is looked at for every grant.
-
-    Raises:
-        InvalidObject: it is broken.
-    """
-    name, spec = same.zone.name, same.zone.spec
-    try:
-        frame = LocalFrame.at(middle(spec.area))
-        outline = polygon(frame, spec.area)
-    except InvalidObject as error:
-        raise InvalidObject(f"Zone {name} spec.area.{error.field}", error.problem) from None
-    granted = GrantedZone(name=name, area=spec.area, altitude=spec.altitude, schedule=spec.schedule)
-    return _SoundZone(granted, frame, outline)
+    return sound(inventory.zones[name])

@@ -278,6 +278,8 @@ class EventsOfTheCluster(RuleBasedStateMachine):
             and self.live.drone(plan.spec.drone.node) is not None
         }
         assert {flown.drone.name for flown in self.live.fleet.flown()} == own
+        flying = {key for key, plan in plans.items() if self.live.fleet.in_flight(plan.spec) is not None}
+        assert set(self.live.fleet.flying()) == flying
 
     @invariant()
     def each_node_has_booked_on_it_what_runs_or_is_planned_there(self) -> None:

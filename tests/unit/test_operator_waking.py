@@ -72,6 +72,13 @@ async def test_what_all_depend_on_wakes_one_application_a_turn() -> None:
         await asyncio.sleep(0.01)
         for _, inputs in each:
             assert not await inputs.changed(0), "once"
+        order.clear()
+        async with asyncio.TaskGroup() as group:
+            for name, inputs in each:
+                group.create_task(reconciler(name, inputs))
+            await asyncio.sleep(0)
+            subscriptions.wake_all(first=[("ns", "a4"), ("ns", "gone"), ("ns", "a3")])
+        assert order == ["a4", "a3", "a0", "a1", "a2", "a5"]
         # One that is deleted meanwhile keeps no other from its turn.
         subscriptions.wake_all()
     with subscriptions.subscribe(("ns", "late")) as inputs:

@@ -171,6 +171,11 @@ class Fleet:
         """The applications with a plan in force for a drone, also those that share its flight."""
         return list(self._plans.members(("", node)))
 
+    def flying(self) -> Iterator[Key]:
+        """The applications whose drones fly."""
+        for node in self._in_flight:
+            yield from self.on(node)
+
     def claims(self) -> Mapping[str, Claim]:
         """Which application has which drone: from the plan on, until its grants are gone and the drone has come home.
 

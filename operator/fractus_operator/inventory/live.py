@@ -245,7 +245,7 @@ class LiveInventory:
 
     def _rules_changed(self, *, urgent: bool = False) -> None:
         self.rules_revision += 1
-        self.subscriptions.wake_all(urgent=urgent)
+        self.subscriptions.wake_all(urgent=urgent, first=self.fleet.flying())
 
     def _application_changed(self, key: Key, old: Submitted | None, new: Submitted | None) -> None:
         self.plans.application_changed(key)

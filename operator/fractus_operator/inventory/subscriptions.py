@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 
 from fractus_operator.cluster.kinds import Key
@@ -97,15 +97,19 @@ class Subscriptions:
                 for subscription in self._of.get(label, ()):
                     subscription.wake()
 
-    def wake_all(self, *, urgent: bool = False) -> None:
+    def wake_all(self, *, urgent: bool = False, first: Iterable[Key] = ()) -> None:
         """Wake every application, because something that all depend on changed.
 
         They are woken one at each turn of the event loop: hundreds that reconcile take seconds of it, for which an
         application that a user changes meanwhile does not wait.
+
+        Args:
+            urgent: End a rest.
+            first: Those that are to see it before all others: what flies is to be judged by new rules at once.
         """
-        idle = not self._in_turn
-        for label in self._of:
-            self._in_turn[label] = urgent or self._in_turn.get(label, False)
+        idle, waiting = not self._in_turn, self._in_turn
+        order = dict.fromkeys(filter(self._of.__contains__, map(labelled, first)))
+        self._in_turn = {label: urgent or waiting.get(label, False) for label in {**order, **waiting, **self._of}}
         if idle:
             self._next_turn()
 

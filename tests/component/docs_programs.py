@@ -226,7 +226,7 @@ def check_helm(command: Command, folder: Path) -> None:
     del folder
     words = operands(command.argv[1:])
     need(
-        words and words[0] in {"get", "install", "upgrade", "uninstall", "rollback", "template"},
+        words and words[0] in {"get", "install", "upgrade", "uninstall", "rollback", "template", "test"},
         command,
         "this verb is not known to this test",
     )

@@ -31,7 +31,7 @@ def install(world: World) -> None:
         f"/api/v1/namespaces/{SYSTEM}", {"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": SYSTEM}}
     )
     for body in render():
-        if body["kind"] not in {"Deployment", "DaemonSet"}:
+        if body["kind"] not in {"Deployment", "DaemonSet", "Pod"}:
             world.api.apply(path_of(body), body)
 
 

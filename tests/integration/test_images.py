@@ -27,7 +27,7 @@ PROGRAM = (Path(__file__).parent / "image_program.py").read_text()
 _COMPONENT = {"cryptography", "fractus_core", "fractus_kube", "fractus_mavlink", "fractus_services"}
 _SERVICE = {"opentelemetry", "fractus_kube"}
 LACKING = {
-    "operator": {"opentelemetry"},
+    "operator": {"fractus", "fractus_mavlink", "fractus_services", "fractus_storage", "opentelemetry"},
     "agent": {"opentelemetry", "numpy", "shapely"},
     "mobility": _SERVICE,
     "camera": _SERVICE,

@@ -9,6 +9,7 @@ import pytest
 from chart import path_of, render
 from control_plane import ControlPlane, wait_for
 from fractus_cli import main
+from fractus_cli.reading import GROUP, SYSTEM
 from fractus_kube import KubeError
 from operator_world import OperatorProcess, World, traffic
 
@@ -114,3 +115,27 @@ def test_pods_that_a_policy_would_not_let_be_made_again_are_told(
     assert [f["level"] for f in found] == ["warning"]
     assert "cni on drone-1" in found[0]["message"]
     assert f"admission.exemptNamespaces={{kube-system,{namespace}}}" in found[0]["remedy"]
+
+
+def test_the_account_of_helm_test_may_read_what_doctor_reads(
+    control_plane: ControlPlane, world: World, chart: None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The chart's pod runs it; more than that its account may not."""
+    account = f"system:serviceaccount:{SYSTEM}:fractus-test"
+    kubeconfig = control_plane.write_kubeconfig("fractus-test", account, ("system:authenticated",))
+
+    def examined() -> bool:
+        code = main.run(["doctor", "-o", "json", "--kubeconfig", str(kubeconfig)])
+        said = capsys.readouterr()
+        # The authorizer hears of roles by a watch.
+        assert not said.err or "Forbidden" in said.err, said.err
+        return code == 2 and "operator" in {finding["check"] for finding in json.loads(said.out)}
+
+    wait_for(examined, "doctor by the chart's account")
+    (pod,) = (body for body in render() if body["kind"] == "Pod")
+    assert pod["spec"]["serviceAccountName"] == "fractus-test"
+    assert pod["spec"]["containers"][0]["command"] == ["fractus", "doctor"]
+    client = control_plane.as_user("fractus-test-2", account, ("system:authenticated",))
+    for path in ("/api/v1/secrets", f"{GROUP}/grants", f"/api/v1/namespaces/{SYSTEM}/secrets"):
+        with pytest.raises(KubeError, match="forbidden"):
+            client.list(path)

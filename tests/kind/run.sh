@@ -63,6 +63,7 @@ charts() {
   kubectl wait --for=condition=Ready drone --all --timeout=120s
   echo "from the first helm install: $pods s until all pods are Ready, $((SECONDS - began)) s until the drones are"
   kubectl get pods --namespace fractus-system --output wide
+  helm --namespace fractus-system test fractus
 }
 
 tests() {

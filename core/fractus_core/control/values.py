@@ -258,6 +258,7 @@ class ControlState:
         unconfirmed: a mode that the system asked for without an answer, and until when it may still be obeyed.
         failsafe_seen: whether a failsafe acted at the last heartbeat already.
         mode_changes: how many changes of mode by the system are under way.
+        own_modes: those that the vehicle may show meanwhile without anyone else's doing: where each began, and where it leads.
         starting_motors: whether the system starts the motors at this moment.
         start_unconfirmed_until: until when motors that run may do so for a start by the system whose answers were lost.
         preparing: how many attempts to arm are under way, from the fence that is raised first to running motors.
@@ -288,6 +289,7 @@ class ControlState:
     unconfirmed: tuple[FlightMode, float] | None = None
     failsafe_seen: bool = False
     mode_changes: int = 0
+    own_modes: frozenset[FlightMode] = frozenset()
     starting_motors: bool = False
     start_unconfirmed_until: float = -math.inf
     preparing: int = 0

@@ -53,9 +53,11 @@ def on_vehicle(step: Step, event: VehicleEvent) -> None:
                 step.update_mission(mission, flown=True)
                 step.act(SaveJournal())
         case ModeChangeBegan(mode):
-            step.set(expected_mode=mode, mode_changes=step.state.mode_changes + 1)
+            own = step.state.own_modes | {step.state.vehicle.mode, mode}
+            step.set(expected_mode=mode, mode_changes=step.state.mode_changes + 1, own_modes=own)
         case ModeChangeEnded(mode, before, done, refused):
-            step.set(mode_changes=max(step.state.mode_changes - 1, 0))
+            changes = max(step.state.mode_changes - 1, 0)
+            step.set(mode_changes=changes, own_modes=step.state.own_modes if changes else frozenset())
             # A change that failed is not expected any more; where only the answers were lost, the vehicle may show it after all.
             if done:
                 step.set(unconfirmed=None)
@@ -143,8 +145,8 @@ def _heartbeat(step: Step) -> None:
             _armed(step)
         else:
             _disarmed(step)
-    if step.state.mode_changes:
-        return  # until the change is confirmed or given up, either mode is ours
+    if step.state.mode_changes and not (vehicle.armed and vehicle.mode not in step.state.own_modes):
+        return  # until the change is confirmed or given up, either mode is ours; a third one is not, and must not be overruled
     if not vehicle.armed:
         step.set(expected_mode=vehicle.mode)
     elif step.state.expected_mode is not None and vehicle.mode != step.state.expected_mode:

@@ -1,0 +1,58 @@
+"""A pilot, or a failsafe, that changes the mode while the system changes it too: the system does not overrule what it hears."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import pytest
+from closed_loop import Sky, Wire
+from fractus_core.control import Authority
+from fractus_core.policy.values import TakeoffArgs
+from fractus_mavlink import Parser
+from fractus_mavlink.enums import COPTER_MODE, MAV_CMD
+from fractus_services.mobility.authority import drivers
+from mobility_world import end, goto
+from sky_drone import fly, ready, until
+
+
+def lose_mode_changes(wire: Wire, count: int) -> list[float]:
+    """Let the first changes of mode that the companion sends be lost; the times of all of them, as they are sent."""
+    write, parser, sent_at = wire.write, Parser(), []
+
+    def noted(data: Any) -> None:
+        for sent in parser.feed(bytes(data)):
+            if sent.name == "COMMAND_LONG" and sent.integer("command") == MAV_CMD.DO_SET_MODE:
+                sent_at.append(asyncio.get_running_loop().time())
+                if len(sent_at) <= count:
+                    return
+        write(data)
+
+    wire.write = noted  # type: ignore[method-assign]
+    return sent_at
+
+
+@pytest.mark.parametrize("after_s", [0.1, 0.5, 1.0])
+def test_a_pilot_who_takes_over_while_the_system_changes_the_mode_keeps_the_drone(
+    after_s: float, tmp_path: Path
+) -> None:
+    """The first commands to land are lost: those that follow would come after the pilot's, and the system's would count."""
+
+    async def work(sky: Sky, directory: Path) -> None:
+        async with ready(sky, directory) as (drone, grant):
+            await drone.service.arm(grant, 120.0)
+            await end(drone.service.take_off(grant, TakeoffArgs(15.0)))
+            await end(drone.service.goto(grant, goto(0, 40, 15), 0.0))
+            sent_at = lose_mode_changes(sky.wires[0], 3)
+            await drivers.give_back(drone.control, grant)
+            await until(lambda: sent_at)
+            await asyncio.sleep(after_s)
+            assert sky.truth.mode is COPTER_MODE.GUIDED
+            assert sky.craft.vehicle.modes.change(COPTER_MODE.LOITER)
+            await until(lambda: drone.control.authority is Authority.PILOT, 2.0)
+            await asyncio.sleep(10.0)
+            assert sky.truth.mode is COPTER_MODE.LOITER
+            assert drone.control.authority is Authority.PILOT
+
+    fly(work, tmp_path)

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from fractus_core.api.plans import GrantSpec
-from fractus_core.control.events import ArmingRequested
+from fractus_core.control.events import Airborne, ArmingRequested
 from fractus_core.policy.values import Airframe, TakeoffArgs
 from fractus_mavlink.enums import MAV_CMD
 from fractus_services.errors import AutopilotError
@@ -96,6 +96,7 @@ def test_failsafes_that_are_set_again_meanwhile_forbid_arming(
 
             if during == "choice":
                 control.dispatch(ArmingRequested(grant.key, grant.identity, (39.3604, 22.95, 10.0)))
+                control.dispatch(Airborne())  # it has landed on the way
                 plane.vehicle_parameters.write = chosen  # type: ignore[method-assign]
             elif during == "fence":
                 world.fence.raise_around = raised  # type: ignore[method-assign]
@@ -127,6 +128,7 @@ def test_a_link_that_comes_back_in_flight_leaves_the_way_home_as_chosen(tmp_path
             grant = world.grants.put(spec())
             await world.drive(grant)
             control.dispatch(ArmingRequested(grant.key, grant.identity, (39.3604, 22.95, 10.0)))
+            control.dispatch(Airborne())  # it has landed on the way
             await world.service.arm(grant)
             await end(world.service.take_off(grant, TakeoffArgs(10.0)))
             assert plane.parameters["FS_GCS_ENABLE"] == 1.0

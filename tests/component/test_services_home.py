@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 from fractus_core.control import Authority
-from fractus_core.policy.values import GotoArgs
+from fractus_core.policy.values import GotoArgs, TakeoffArgs
 from fractus_mavlink import message
 from fractus_mavlink.enums import COPTER_MODE, MAV_AUTOPILOT, MAV_CMD, MAV_MODE_FLAG, MAV_TYPE
-from fractus_services.errors import Unavailable
+from fractus_services.errors import AutopilotError, Unavailable
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority import drivers
 from fractus_services.mobility.rpc.telemetry import located
@@ -225,5 +225,34 @@ def test_a_pilots_flight_from_where_a_mission_landed_counts_from_there(tmp_path:
             move(world, (0.0, 0.0, 0.0))
             await asyncio.sleep(1.0)
             assert not located(world.control)
+
+    fly(flight)
+
+
+def test_an_attempt_to_arm_that_came_to_nothing_leaves_no_home_behind(tmp_path: Path) -> None:
+    """Refused beside iron, the drone is carried to a better place, and its estimate of its height has settled meanwhile."""
+
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            plane, grant = world.plane, world.grants.put(spec())
+            await world.drive(grant)
+            plane.refuses.add(MAV_CMD.COMPONENT_ARM_DISARM)
+            with pytest.raises(AutopilotError):
+                await world.service.arm(grant)
+            plane.xy[:] = [30.0, 0.0]
+            await asyncio.sleep(0.5)
+            plane.refuses.clear()
+            await world.service.arm(grant)
+            home = plane.vehicle.home
+            assert home is not None
+            east, north = FRAME.xy(home.lat, home.lon)
+            assert abs(east - 30.0) < 0.5
+            assert abs(north) < 0.5
+            # Once it has flown, landing on the way and arming again moves home no more.
+            await end(world.service.take_off(grant, TakeoffArgs(10.0)))
+            await end(world.service.goto(grant, GotoArgs(*at(0, 40), 10.0), 0))
+            await end(world.service.land(grant))
+            await world.service.arm(grant)
+            assert plane.vehicle.home == home
 
     fly(flight)

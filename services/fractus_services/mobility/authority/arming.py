@@ -197,11 +197,15 @@ class Arming:
         return checked
 
     def _home_of(self, grant: ActiveGrant, mission: Mission) -> tuple[float, float, float]:
-        """Home is where the mission armed first: landing on the way and arming again does not move it."""
+        """Home is where the mission took off first: landing on the way and arming again does not move it.
+
+        A drone that was carried away, or whose estimate has settled, after an attempt that came to nothing begins where it stands.
+        """
         vehicle = self._control.autopilot.vehicle
         if vehicle.lat is None or vehicle.lon is None:
             raise PreconditionFailed("PositionUnknown", "the position is not known yet")
-        lat, lon, amsl_m = mission.home or (vehicle.lat, vehicle.lon, vehicle.amsl_m)
+        began = mission.home if mission.flown else None
+        lat, lon, amsl_m = began or (vehicle.lat, vehicle.lon, vehicle.amsl_m)
         base = grant.spec.home or grant.spec.depot
         if base is not None:
             away = math.hypot(*LocalFrame(base.lat, base.lon).xy(lat, lon))

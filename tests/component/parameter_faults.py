@@ -19,7 +19,7 @@ NEEDED = {
     "accel_mps2": (("WPNAV_ACCEL", 0.01), ("WP_ACC", 1.0), 0.1),
     "position_gain": (("PSC_POSXY_P", 1.0), ("PSC_NE_POS_P", 1.0), 0.1),
     "climb_accel_mps2": (("WPNAV_ACCEL_Z", 0.01), ("WP_ACC_Z", 1.0), 0.1),
-    "jerk_mps3": (("PSC_JERK_XY", 1.0), ("PSC_JERK_NE", 1.0), 0.5),
+    "jerk_mps3": (("PSC_JERK_XY", 1.0), ("PSC_NE_JERK", 1.0), 0.5),
     "return_altitude_m": (("RTL_ALT", 0.01), ("RTL_ALT_M", 1.0), -math.inf),
     "speed_mps": (("WPNAV_SPEED", 0.01), ("WP_SPD", 1.0), -math.inf),
 }

@@ -33,13 +33,14 @@ AS_4_6 = {
 }  # fmt: skip
 SPELT_4_7 = {
     "SYSID_MYGCS": ("MAV_GCS_SYSID", 1.0), "WPNAV_ACCEL": ("WP_ACC", 0.01), "PSC_POSXY_P": ("PSC_NE_POS_P", 1.0),
-    "WPNAV_ACCEL_Z": ("WP_ACC_Z", 0.01), "PSC_JERK_XY": ("PSC_JERK_NE", 1.0), "RTL_ALT": ("RTL_ALT_M", 0.01),
+    "WPNAV_ACCEL_Z": ("WP_ACC_Z", 0.01), "PSC_JERK_XY": ("PSC_NE_JERK", 1.0), "RTL_ALT": ("RTL_ALT_M", 0.01),
     "WPNAV_SPEED": ("WP_SPD", 0.01), "RTL_SPEED": ("RTL_SPEED_MS", 0.01), "RTL_CLIMB_MIN": ("RTL_CLIMB_MIN_M", 0.01),
     "RTL_ALT_FINAL": ("RTL_ALT_FINAL_M", 0.01), "ANGLE_MAX": ("ATC_ANGLE_MAX", 0.01),
 }  # fmt: skip
 AS_4_7 = {
     SPELT_4_7.get(name, (name, 1.0))[0]: value * SPELT_4_7.get(name, (name, 1.0))[1] for name, value in AS_4_6.items()
 } | {"MAV_GCS_SYSID_HI": 0.0}
+AS_4_7_0 = {{"PSC_NE_JERK": "PSC_JERK_NE"}.get(name, name): value for name, value in AS_4_7.items()}
 FIGURES = Airframe(
     accel_mps2=1.0, position_gain=0.6, climb_accel_mps2=0.7, jerk_mps3=3.0, return_altitude_m=42.0, retraces=True
 )
@@ -63,7 +64,7 @@ def rounded(airframe: Airframe) -> Airframe:
     )
 
 
-@pytest.mark.parametrize("release", [AS_4_6, AS_4_7])
+@pytest.mark.parametrize("release", [AS_4_6, AS_4_7, AS_4_7_0])
 @pytest.mark.parametrize(("loss", "starts"), [(0.1, examples(60)), (0.3, examples(40, 20))])
 def test_no_start_takes_a_figure_that_is_not_the_vehicles(loss: float, starts: int, release: dict[str, float]) -> None:
     verified = 0

@@ -57,7 +57,8 @@ _DEFAULT_MARGIN_M = 2.0
 _ACCEL: Names = (("WPNAV_ACCEL", 0.01), ("WP_ACC", 1.0))
 _GAIN: Names = (("PSC_POSXY_P", 1.0), ("PSC_NE_POS_P", 1.0))
 _CLIMB: Names = (("WPNAV_ACCEL_Z", 0.01), ("WP_ACC_Z", 1.0))
-_JERK: Names = (("PSC_JERK_XY", 1.0), ("PSC_JERK_NE", 1.0))
+# 4.7.0 and 4.7.1 spell it in two ways.
+_JERK: Names = (("PSC_JERK_XY", 1.0), ("PSC_NE_JERK", 1.0), ("PSC_JERK_NE", 1.0))
 # Of the position controller in degrees, where it is not 0, and of the vehicle.
 _OWN_LEAN: Names = (("PSC_ANGLE_MAX", 1.0),)
 _LEAN: Names = (("ANGLE_MAX", 0.01), ("ATC_ANGLE_MAX", 1.0))

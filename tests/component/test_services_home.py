@@ -9,15 +9,19 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import sky_drone
+from closed_loop import Sky
 from fractus_core.control import Authority
 from fractus_core.policy.values import GotoArgs, TakeoffArgs
-from fractus_mavlink import message
-from fractus_mavlink.enums import COPTER_MODE, MAV_AUTOPILOT, MAV_CMD, MAV_MODE_FLAG, MAV_TYPE
-from fractus_services.errors import AutopilotError, Unavailable
+from fractus_mavlink import Endpoint, Parser, layout_named, message
+from fractus_mavlink.enums import COPTER_MODE, MAV_AUTOPILOT, MAV_CMD, MAV_COMPONENT, MAV_FRAME, MAV_MODE_FLAG, MAV_TYPE
+from fractus_services.errors import AutopilotError, Refused, Unavailable
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority import drivers
+from fractus_services.mobility.authority.home import home_moved
 from fractus_services.mobility.rpc.telemetry import located
 from mobility_world import FRAME, GROUND_M, GUIDED, LOITER, SMART_RTL, World, at, end, refusal, spec
+from sky_drone import ready, until
 from virtual_time import fly
 
 AWAY = (0.0, 100.0, 0.0)
@@ -256,3 +260,42 @@ def test_an_attempt_to_arm_that_came_to_nothing_leaves_no_home_behind(tmp_path: 
             assert plane.vehicle.home == home
 
     fly(flight)
+
+
+@pytest.mark.parametrize("up_m", [-40.0, 40.0])
+def test_home_that_is_moved_up_or_down_is_noticed_though_the_news_of_it_is_lost(up_m: float, tmp_path: Path) -> None:
+    """Another station on the same port has stopped the stream that tells of home, and the one message about its move is lost."""
+
+    async def work(sky: Sky, directory: Path) -> None:
+        station, parser, lost = Endpoint(255, MAV_COMPONENT.MISSIONPLANNER), Parser(), []
+        async with ready(sky, directory) as (drone, grant):
+            (wire,) = sky.wires
+            deliver = wire._protocol.data_received
+
+            def tell(kind: str, **values: Any) -> None:
+                values |= {"target_system": 1, "target_component": 1}
+                sky.craft.receive(wire._channel, station.encode(kind, values))
+
+            def lose_the_first(data: Any) -> None:
+                for heard in parser.feed(bytes(data)):
+                    if heard.name == "HOME_POSITION" and not lost:
+                        lost.append(heard)
+                    else:
+                        deliver(heard.frame)
+
+            await drone.service.arm(grant, 120.0)
+            await end(drone.service.take_off(grant, TakeoffArgs(15.0)))
+            kind = float(layout_named("HOME_POSITION").msgid)
+            tell("COMMAND_LONG", command=MAV_CMD.SET_MESSAGE_INTERVAL, param1=kind, param2=-1.0)
+            await asyncio.sleep(0.3)
+            wire._protocol.data_received = lose_the_first  # type: ignore[method-assign]
+            lat, lon = (round(degrees * 1e7) for degrees in at(0, 0))
+            place = {"x": lat, "y": lon, "z": GROUND_M + up_m}
+            tell("COMMAND_INT", command=MAV_CMD.DO_SET_HOME, frame=MAV_FRAME.GLOBAL, **place)
+            await until(lambda: lost, 2.0)
+            with contextlib.suppress(Refused):
+                await end(drone.service.goto(grant, GotoArgs(*at(0, 20), 15.0), 0.0))
+            await until(lambda: not home_moved(drone.control.state, drone.autopilot.vehicle), 3.0)
+            assert abs(-sky.truth.body.down - 15.0) < 2.5
+
+    sky_drone.fly(work, tmp_path)

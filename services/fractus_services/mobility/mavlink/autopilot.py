@@ -24,6 +24,7 @@ from fractus_services.mobility.autopilot import COURSE_S, Permit, always
 from fractus_services.mobility.mavlink.acknowledgements import ACK_TIMEOUT_S, Acknowledgements, Answer
 from fractus_services.mobility.mavlink.companion import SYSTEM_ID
 from fractus_services.mobility.mavlink.flight_stack import FlightStack
+from fractus_services.mobility.mavlink.home_watch import HomeWatch
 from fractus_services.mobility.mavlink.link import Link, ignore
 from fractus_services.mobility.mavlink.neighbours import Memory
 from fractus_services.mobility.mavlink.orders import Orders, Velocity, moves
@@ -98,7 +99,7 @@ class MavlinkAutopilot(Link):
         self.vehicle_parameters = Parameters(self, on_parameter)
         self._locks: dict[int, asyncio.Lock] = {}
         self._acknowledgements = Acknowledgements(sysid, self.timing)
-        self._streams = Streams()
+        self._streams, self._home_watch = Streams(), HomeWatch(self)
         self._probing: asyncio.Task[None] | None = None
         self._orders = Orders()
 
@@ -132,6 +133,7 @@ class MavlinkAutopilot(Link):
         self.vehicle.gimbal_measured = self.vehicle.gimbal_limits = None
         self.vehicle.unclear = ""
         self._streams.forget()
+        self._home_watch.forget()
         self._acknowledgements.forget()
         self.vehicle_parameters.forget()
 
@@ -145,6 +147,7 @@ class MavlinkAutopilot(Link):
         elif incoming.name == "GIMBAL_DEVICE_ATTITUDE_STATUS" and self.vehicle.gimbal_measured is None:
             self.vehicle_parameters.ask(self.stack.gimbal_type)
         super().take(incoming)
+        self._home_watch.take(incoming.name)
 
     async def command(
         self,

@@ -32,6 +32,12 @@ STATUS_MAX_AGE_S = 10.0
 """How long it counts what estimator and GPS said of the position. They tell it once a second or more, and are asked for it again
 where they do not: after so long a silence the estimator may only reckon where it is."""
 
+STOPPED_S = 0.7
+"""For so long heartbeats, one a second, must say that the motors have stopped in flight, before they are believed to have."""
+
+STARTED_S = 5.0
+"""A drone whose motors have run for less may be about to take off; one that was not heard for as long may have landed meanwhile."""
+
 PATH_KEPT_S = 12.0
 """ArduCopter gives the path up, and says so once, when it had no position for 15 s: a little less is waited, for that text may be
 lost. One that tells nothing for so long may have given it up meanwhile."""
@@ -49,6 +55,8 @@ class Vehicle(VehicleState):
         placed_at: when its estimator had a position last.
         received_at: when its GPS told of its fix.
         fenced: whether its own fence is switched on; None for one that has none. Told at `checks_at`.
+        started_at: when a heartbeat said first that its motors run.
+        stopping_at: when the first of its last heartbeats said that they had stopped in flight; infinite: the last did not.
         gimbal_limits: the least and the greatest pitch and yaw of its gimbal, degrees; None until it has told.
     """
 
@@ -59,6 +67,8 @@ class Vehicle(VehicleState):
     placed_at: float = -math.inf
     received_at: float = -math.inf
     fenced: bool | None = None
+    started_at: float = -math.inf
+    stopping_at: float = math.inf
 
     def take(self, message: Message, now: float) -> None:
         """Update from one message."""
@@ -71,11 +81,19 @@ def _heartbeat(vehicle: Vehicle, message: Message, now: float) -> None:
     vehicle.silent_s = now - vehicle.heartbeat_at if math.isfinite(vehicle.heartbeat_at) else 0.0
     vehicle.heartbeat_at = now
     vehicle.foreign = vehicle.stack.foreign(message.integer("type"), message.integer("autopilot"))
-    vehicle.mode = vehicle.stack.mode(message.integer("custom_mode"))
     armed = bool(message.integer("base_mode") & MAV_MODE_FLAG.SAFETY_ARMED)
+    # Those from before the start may come late, or once more, and have no time stamp. Taken for true, they make the next one tell
+    # of motors that others have started.
+    flies = vehicle.in_air or now - vehicle.started_at < STARTED_S
+    stops = vehicle.armed and not armed and flies and vehicle.silent_s < STARTED_S
+    vehicle.stopping_at = min(vehicle.stopping_at, now) if stops else math.inf
+    if stops and now - vehicle.stopping_at < STOPPED_S:
+        return
+    vehicle.mode = vehicle.stack.mode(message.integer("custom_mode"))
     if armed and not vehicle.armed:
         # Arming moves home to where the vehicle stands; what it told before says nothing of this flight.
         vehicle.ground_home = None
+        vehicle.started_at = now
     vehicle.armed = armed
     vehicle.path_lost = vehicle.path_lost and vehicle.armed
     vehicle.failsafe = message.integer("system_status") in {MAV_STATE.CRITICAL, MAV_STATE.EMERGENCY}

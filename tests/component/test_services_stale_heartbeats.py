@@ -1,0 +1,75 @@
+"""Heartbeats from before the start that a network delivers in flight: they have no time stamp, and the drone is still its driver's."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from pathlib import Path
+from typing import Any
+
+from closed_loop import Sky
+from fractus_core.control import StreamState
+from fractus_core.policy.values import TakeoffArgs
+from fractus_mavlink import Parser
+from fractus_mavlink.enums import COPTER_MODE
+from mobility_world import end, goto
+from sky_drone import fly, ready, until
+
+
+def test_heartbeats_of_standing_motors_in_flight_take_the_drone_from_no_one(tmp_path: Path) -> None:
+    async def work(sky: Sky, directory: Path) -> None:
+        async with ready(sky, directory) as (drone, grant):
+            (wire,) = sky.wires
+            deliver, parser, kept = wire._protocol.data_received, Parser(), []
+
+            def keep(data: Any) -> None:
+                kept.extend(m.frame for m in parser.feed(bytes(data)) if m.name == "HEARTBEAT" and not sky.truth.armed)
+                deliver(data)
+
+            wire._protocol.data_received = keep  # type: ignore[method-assign]
+            await until(lambda: len(kept) >= 3)
+            await drone.service.arm(grant, 120.0)
+            climb = asyncio.ensure_future(end(drone.service.take_off(grant, TakeoffArgs(15.0))))
+            await asyncio.sleep(0.5)
+            assert not drone.autopilot.vehicle.in_air
+            deliver(b"".join(kept[:3]))
+            await climb
+            for _ in range(3):
+                deliver(b"".join(kept[:3]))
+                await asyncio.sleep(2.5)
+            assert drone.state is StreamState.GRANTED
+            await end(drone.service.goto(grant, goto(20, 0, 15), 0.0))
+            assert drone.state is StreamState.GRANTED
+            await end(drone.service.land(grant))
+            await until(lambda: not sky.truth.armed)
+            await until(lambda: not drone.autopilot.vehicle.armed, 3.0)
+
+    fly(work, tmp_path)
+
+
+def test_motors_that_stop_in_the_air_are_seen_to(tmp_path: Path) -> None:
+    async def work(sky: Sky, directory: Path) -> None:
+        async with ready(sky, directory) as (drone, grant):
+            await drone.service.arm(grant, 120.0)
+            await end(drone.service.take_off(grant, TakeoffArgs(15.0)))
+            sky.truth.armed = False
+            await until(lambda: not drone.autopilot.vehicle.armed, 3.0)
+            assert sky.truth.mode is COPTER_MODE.GUIDED
+
+    fly(work, tmp_path)
+
+
+def test_a_drone_that_landed_while_its_link_was_cut_is_not_taken_for_a_flying_one(tmp_path: Path) -> None:
+    async def work(sky: Sky, directory: Path) -> None:
+        async with ready(sky, directory) as (drone, grant):
+            await drone.service.arm(grant, 120.0)
+            await end(drone.service.take_off(grant, TakeoffArgs(15.0)))
+            sky.severed_at = sky.time()
+            await until(lambda: not sky.truth.armed)
+            assert drone.autopilot.vehicle.in_air
+            sky.severed_at = math.inf
+            await until(lambda: drone.autopilot.connected)
+            assert not drone.autopilot.vehicle.armed
+            assert not any("found the drone in the air" in event for event in drone._account.events)
+
+    fly(work, tmp_path)

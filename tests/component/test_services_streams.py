@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import asyncio
 from pathlib import Path
+from typing import Any
 
+import pytest
 from closed_loop import Sky
 from fractus_core.control import StreamState
 from fractus_core.policy.values import TakeoffArgs
-from fractus_mavlink import Endpoint
-from fractus_mavlink.enums import COPTER_MODE, MAV_COMPONENT, MAV_DATA_STREAM
+from fractus_mavlink import Endpoint, Parser, layout_named
+from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_COMPONENT, MAV_DATA_STREAM, MAV_RESULT
+from fractus_services.mobility.mavlink.companion import SYSTEM_ID
 from mobility_world import end, goto
 from sky_drone import fly, ready, until
 
@@ -53,5 +56,39 @@ def test_streams_that_another_station_stopped_come_again(tmp_path: Path) -> None
             await end(drone.service.goto(grant, goto(20, 0, 15), 0.0))
             assert drone.state is StreamState.GRANTED
             assert sky.truth.mode is COPTER_MODE.GUIDED
+
+    fly(work, tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["SYS_STATUS", "GLOBAL_POSITION_INT"])
+def test_a_stream_whose_request_was_lost_comes_though_the_answer_to_another_one_came_twice(
+    kind: str, tmp_path: Path
+) -> None:
+    async def work(sky: Sky, directory: Path) -> None:
+        connect, wanted, lost = sky.create_connection, float(layout_named(kind).msgid), []
+        answer = {"command": MAV_CMD.SET_MESSAGE_INTERVAL, "result": MAV_RESULT.ACCEPTED, "target_system": SYSTEM_ID}
+        twice = Endpoint(1, MAV_COMPONENT.AUTOPILOT1).encode("COMMAND_ACK", answer)
+
+        async def create_connection(*args: Any, **kwargs: Any) -> Any:
+            wire, protocol = await connect(*args, **kwargs)
+            write, parser = wire.write, Parser()
+
+            def lose_the_first(data: Any) -> None:
+                for sent in parser.feed(bytes(data)):
+                    asks = sent.name == "COMMAND_LONG" and sent.integer("command") == MAV_CMD.SET_MESSAGE_INTERVAL
+                    if asks and sent.real("param1") == wanted and not lost:
+                        lost.append(sent)
+                        sky.call_later(0.01, protocol.data_received, twice)
+                    else:
+                        write(sent.frame)
+
+            wire.write = lose_the_first
+            return wire, protocol
+
+        sky.create_connection = create_connection  # type: ignore[method-assign]
+        async with ready(sky, directory) as (drone, grant):
+            await drone.service.arm(grant, 60.0)
+            assert lost
+            assert sky.truth.armed
 
     fly(work, tmp_path)

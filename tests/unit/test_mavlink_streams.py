@@ -5,15 +5,16 @@ from __future__ import annotations
 import itertools
 
 from fractus_mavlink.enums import MAV_CMD
-from fractus_services.mobility.mavlink.streams import LOOK_S, MAX_LOOK_S, STREAMS, Streams
+from fractus_services.mobility.mavlink.streams import LOOK_S, MAX_LOOK_S, MAX_UNHEARD, STREAMS, Streams
 
 STEP_S = 0.5
 
 
 class SlowAutopilot:
-    """Accepts every rate, and sends one position a second whatever it is asked for."""
+    """Accepts every rate, and sends each message that it has once a second, whatever it is asked for."""
 
-    def __init__(self) -> None:
+    def __init__(self, *lacks: str) -> None:
+        self.has = STREAMS.keys() - set(lacks)
         self.now = 0.0
         self.asked: list[tuple[float, MAV_CMD]] = []
 
@@ -27,7 +28,8 @@ async def asks(streams: Streams, autopilot: SlowAutopilot, until_s: float, *, fl
         await streams.ask(autopilot, flying)
         autopilot.now += STEP_S
         if autopilot.now % 1.0 == 0.0:
-            streams.take("GLOBAL_POSITION_INT")
+            for name in autopilot.has:
+                streams.take(name)
     return sorted({at for at, _ in autopilot.asked})
 
 
@@ -48,3 +50,9 @@ async def test_a_landing_makes_it_look_early_again() -> None:
     assert at[-1] == 100.0  # four a second were asked for: one is enough
     at = await asks(streams, autopilot, 150.0, flying=True)
     assert [moment for moment in at if moment > 100.0] == [130.0, 130.0 + LOOK_S, 130.0 + 3 * LOOK_S]
+
+
+async def test_a_stream_that_never_comes_is_not_asked_for_indefinitely() -> None:
+    streams, autopilot = Streams(), SlowAutopilot("EXTENDED_SYS_STATE")
+    at = await asks(streams, autopilot, 600.0, flying=False)
+    assert len(at) == 1 + MAX_UNHEARD

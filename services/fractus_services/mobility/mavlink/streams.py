@@ -41,6 +41,11 @@ MAX_LOOK_S = 40.0
 """Asking without success doubles the time until the next look, up to this: an autopilot behind a slow radio sends less whatever it is asked."""
 
 
+MAX_UNHEARD = 5
+"""How often the streams are asked for again because of one that never came, though the vehicle has said that it would: the answer was
+another request's, sent twice by the network. Few vehicles do not have what they accept to send."""
+
+
 class Commander(Protocol):
     """The autopilot, as far as streams need it."""
 
@@ -66,6 +71,8 @@ class Streams:
         """The connection broke: nothing was asked for, nothing has come."""
         self._flying: bool | None = None
         self._known.clear()
+        self._accepted: set[str] = set()
+        self._unheard = 0
         self._look_s = LOOK_S
         self._count_from(-math.inf)
 
@@ -89,6 +96,7 @@ class Streams:
             try:
                 interval_us = 1e6 / rates[flying]
                 await autopilot.command(MAV_CMD.SET_MESSAGE_INTERVAL, layout_named(name).msgid, interval_us, attempts=2)
+                self._accepted.add(name)
             except AutopilotError as error:
                 if error.link and self._flying is flying:
                     self._flying = None
@@ -105,8 +113,10 @@ class Streams:
         self._count_from(now)
         if math.isinf(counted_s):
             return False  # nothing was asked for yet
-        expected = {name: STREAMS[name][flying] * counted_s for name in self._known - _OPTIONAL}
+        unheard = self._accepted - self._known if self._known and self._unheard < MAX_UNHEARD else set()
+        expected = {name: STREAMS[name][flying] * counted_s for name in (self._known | unheard) - _OPTIONAL}
         failing = [name for name, count in expected.items() if count >= LOOK_S and counted[name] < MIN_SHARE * count]
+        self._unheard += not unheard.isdisjoint(failing)
         self._look_s = min(2 * self._look_s, MAX_LOOK_S) if failing else LOOK_S
         if failing:
             log.warning("autopilot: asking for the streams again, some do not come (messages=%s)", ", ".join(failing))

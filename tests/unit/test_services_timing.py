@@ -368,3 +368,15 @@ def test_what_our_own_loop_delays_counts() -> None:
     # It was due at 3.5, sent at 3.9 by a loop that was busy, and heard at once.
     timing.replied(round((5.0 + 3.9 - 1.0) * 1e9), number, 3.95)
     assert timing.delay_s == pytest.approx(0.4, abs=0.01)
+
+
+def test_one_position_from_long_ago_is_none_and_two_that_go_on_from_there_are_of_a_vehicle_that_has_restarted() -> None:
+    timing = Timing()
+    for number in range(100):
+        assert timing.sampled(60_000 + 50 * number, 1.0 + 0.05 * number) is not None
+    assert timing.sampled(30_000, 6.0) is None
+    assert timing.sampled(65_000, 6.0) is not None
+    assert not timing.restarted
+    assert timing.sampled(2_000, 6.05) is None
+    assert timing.sampled(2_050, 6.1) is not None
+    assert timing.restarted

@@ -73,7 +73,8 @@ class Timing:
         self._unanswered = 0
         self._heard_at = self._read_at_ns = self._answered = -math.inf
         self.pace = 1.0
-        self.restarted = self._begun_again = False
+        self.restarted = False
+        self._begun_ms: int | None = None
 
     def sampled(self, boot_ms: int, now: float) -> float | None:
         """Take the time stamp of a position.
@@ -90,11 +91,16 @@ class Timing:
             later_s = self._since(boot_ms)
             if -OVERTAKEN_S < later_s <= 0.0:
                 return None
-            if later_s <= 0.0 or self._present(now) + OVERTAKEN_S < self._sampled + later_s:
+            if later_s <= 0.0:
+                # One from long ago that a network delivers now is no place to fly by: a vehicle that has restarted goes on from there.
+                begun_ms, self._begun_ms = self._begun_ms, boot_ms
+                if begun_ms is None or not 0 < boot_ms - begun_ms < OVERTAKEN_S * 1e3:
+                    return None
                 self.reset()
-                self._begun_again = later_s <= 0.0
-            elif self._begun_again:
-                self.restarted = True  # the next position goes on from there: it was no old one that came late
+                self.restarted = True
+            elif self._present(now) + OVERTAKEN_S < self._sampled + later_s:
+                self.reset()
+        self._begun_ms = None
         if now - self._arrived_at > MAX_POSITION_AGE_S:
             # What was sent while nothing came measures the gap, not the link that is back. And what a connection kept
             # meanwhile comes all at once: nothing of it says how fast the vehicle's clock runs.

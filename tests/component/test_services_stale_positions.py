@@ -1,0 +1,46 @@
+"""A position from long before that a network delivers in flight: the drone is not there, and does not land as if it were at home."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from pathlib import Path
+from typing import Any
+
+from closed_loop import Sky
+from fractus_core.policy.values import TakeoffArgs
+from fractus_mavlink import Parser
+from fractus_services.mobility.authority import drivers
+from mobility_world import FRAME, end, goto
+from sky_drone import fly, ready, until
+
+
+def test_a_position_at_home_from_long_ago_is_not_where_a_drone_on_its_way_home_is(tmp_path: Path) -> None:
+    async def work(sky: Sky, directory: Path) -> None:
+        def away_m() -> float:
+            place = sky.truth.true_place
+            return math.hypot(*FRAME.xy(place.lat_e7 / 1e7, place.lon_e7 / 1e7))
+
+        async with ready(sky, directory) as (drone, grant):
+            (wire,) = sky.wires
+            deliver, parser, kept = wire._protocol.data_received, Parser(), []
+
+            def keep(data: Any) -> None:
+                kept.extend(m.frame for m in parser.feed(bytes(data)) if m.name == "GLOBAL_POSITION_INT")
+                deliver(data)
+
+            await drone.service.arm(grant, 120.0)
+            await end(drone.service.take_off(grant, TakeoffArgs(15.0)))
+            wire._protocol.data_received = keep  # type: ignore[method-assign]
+            await until(lambda: kept)
+            await end(drone.service.goto(grant, goto(0, 60, 15), 0.0))
+            deliver(kept[0])
+            assert drone.autopilot.vehicle.distance_m(*FRAME.latlon(0, 0)) > 50.0
+            await drivers.give_back(drone.control, grant)
+            for _ in range(50):
+                deliver(kept[0])
+                await asyncio.sleep(0.02)
+            await until(lambda: not sky.truth.armed)
+            assert away_m() < 3.0
+
+    fly(work, tmp_path)

@@ -22,6 +22,7 @@ RUN apt-get update -q \
       python3 python3-pip busybox binutils media-types netbase >/dev/null \
  && rm -rf /var/lib/apt/lists/*
 RUN python3 -m pip install --quiet --no-cache-dir --break-system-packages --root-user-action=ignore uv==${UV_VERSION}
+COPY sim/fractus_cluster/images/bytecode.py /usr/local/bin/
 
 # ---- packages: `record FOLDER PACKAGE...` writes down whose files FOLDER has, as images of distroless do: scanners read names,
 # versions and checksums there, people the licences
@@ -33,8 +34,8 @@ RUN printf '%s\n' '#!/bin/sh -e' 'cd "$1"; shift; mkdir -p var/lib/dpkg/status.d
       'done' > /usr/local/bin/record && chmod 755 /usr/local/bin/record
 
 # ---- root: Python, the libraries it links to, a shell; no package manager, no documentation
-# Python reads its library and dependencies from .pyc files alone, for sources would double them; docstrings, which numpy needs,
-# stay. Modules for tests, and those whose libraries are not here, go.
+# Python reads its library and dependencies from .pyc files alone, for sources would double them; bytecode.py leaves out what
+# takes memory and is not read: 2 MB of each process. Modules for tests, and those whose libraries are not here, go.
 FROM packages AS root
 RUN packages='base-files gcc-12-base libc6 libgcc-s1 libstdc++6 zlib1g libssl3 libffi8 libexpat1 libbz2-1.0 liblzma5 libuuid1 \
       libsqlite3-0 python3-minimal python3.11-minimal libpython3.11-minimal libpython3.11-stdlib busybox media-types netbase' \
@@ -56,7 +57,7 @@ RUN packages='base-files gcc-12-base libc6 libgcc-s1 libstdc++6 zlib1g libssl3 l
  && printf 'hosts: files dns\npasswd: files\ngroup: files\nprotocols: files\nservices: files\n' > /out/etc/nsswitch.conf \
  && printf '#!/usr/bin/python3\nimport sys\nfrom fractus_cli.main import main\nsys.exit(main())\n' > /out/usr/local/bin/fractus \
  && chmod 755 /out/usr/local/bin/fractus && chown 10001:10001 /out/home/fractus && mkdir -m 700 /out/root \
- && python3 -m compileall -q -b --invalidation-mode unchecked-hash -s /out /out/usr/lib/python3.11 && find /out/usr/lib/python3.11 -name '*.py' -delete
+ && python3 -X no_debug_ranges /usr/local/bin/bytecode.py /out/usr/lib/python3.11 /usr/lib/python3.11 && find /out/usr/lib/python3.11 -name '*.py' -delete
 
 # ---- nft: the program that makes the table of direct links, and the libraries that nothing else needs
 FROM packages AS nft
@@ -69,7 +70,8 @@ RUN apt-get update -q && DEBIAN_FRONTEND=noninteractive apt-get install -qy --no
 
 # ---- dependencies: one directory for each set, holding what the sets below it do not have already
 # Of the Kubernetes client only the asynchronous half is kept, without its 700 classes: `import kubernetes` would run the
-# synchronous one too, which with what it needs takes an agent 7 MB of memory and the image as much.
+# synchronous one too, which with what it needs takes an agent 7 MB of memory and the image as much. `import kubernetes.aio` would
+# run all of that half: its parts that are not used, and urllib3, take another 3 MB.
 FROM tools AS dependencies
 ARG SSL_CERT_FILE
 RUN apt-get update -q && DEBIAN_FRONTEND=noninteractive apt-get install -qy --no-install-recommends \
@@ -89,10 +91,10 @@ RUN --mount=type=cache,target=/root/.cache/uv \
       rm -rf bin .lock tzdata tzdata-* zstandard zstandard-* numpy/_core/_simd.* numpy/_core/include numpy/_core/lib numpy/f2py numpy/distutils numpy/_core/*_tests.* \
         cv2/gapi cffi pycparser* google/api google/cloud google/gapic google/logging google/longrunning google/type; \
       find . -path '*/tests' -prune -exec rm -rf {} +; \
-      if [ -d kubernetes ]; then : > kubernetes/__init__.py; \
+      if [ -d kubernetes ]; then : > kubernetes/__init__.py; : > kubernetes/aio/__init__.py; \
         find kubernetes -mindepth 1 -maxdepth 1 ! -name aio ! -name __init__.py -exec rm -rf {} +; \
         find kubernetes/aio/client/models kubernetes/aio/client/api -type f ! -name __init__.py -delete; \
-        rm -rf certifi* charset_normalizer* durationpy* oauthlib* requests* websocket*; fi; \
+        rm -rf certifi* charset_normalizer* durationpy* oauthlib* requests* urllib3* websocket*; fi; \
       find . -name '*.so*' -type f -exec strip --strip-unneeded {} +; \
       find . \( -name '*.pyi' -o -name '*.pyx' -o -name '*.pxd' -o -name '*.c' -o -name '*.h' -o -name '*.a' \) -delete; \
     done; \
@@ -104,7 +106,7 @@ RUN --mount=type=cache,target=/root/.cache/uv \
     cp -a /deps/sdk /only-sdk; \
     mkdir /only-geometry; cd /only-core; mv numpy* shapely* geographiclib* /only-geometry/; \
     for name in sdk core keys geometry operator agent mobility services view; do \
-      python3 -m compileall -q -b --invalidation-mode unchecked-hash -s /only-$name -p /usr/local/lib/python3.11/dist-packages /only-$name; \
+      python3 -X no_debug_ranges /usr/local/bin/bytecode.py /only-$name /usr/local/lib/python3.11/dist-packages; \
       find /only-$name -name '*.py' ! -path '*/cv2/config*.py' -delete; \
     done
 # OpenBLAS is 28 MB of numpy and 42 MB of OpenCV, which have it for large matrices; ours are small. Each gets a library of

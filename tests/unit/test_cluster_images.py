@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import importlib.util
 import io
 import json
+import marshal
 import re
 import shutil
+import sys
 import tarfile
+import types
 from pathlib import Path
 
 import pytest
 import yaml
 from fractus_cluster.errors import ClusterError
 from fractus_cluster.images.build import TARGETS, build_images, find_source, image_name, source_digest
+from fractus_cluster.images.bytecode import main as compile_below
 from fractus_cluster.images.layout import Layout
 
 ROOT = Path(__file__).parents[2]
@@ -171,3 +176,56 @@ def test_unknown_target_is_refused(checkout: Path) -> None:
 
 def test_names() -> None:
     assert image_name("agent") == "localhost/fractus/agent:dev"
+
+
+def test_modules_of_images_have_no_docstrings_and_keep_all_else(tmp_path: Path) -> None:
+    source = '''"""A module."""
+from __future__ import annotations
+from dataclasses import dataclass
+
+def plain():
+    """Says what it does."""
+    return 42
+
+async def later():
+    """Only this."""
+
+class Kind:
+    """A class."""
+    text = "no docstring"
+
+@dataclass
+class Value:
+    """What a dataclass would make for itself is longer."""
+    x: int = 1
+
+def edited():
+    return plain.__doc__.replace("a", "b")
+
+def checked():
+    assert False, "kept"
+'''
+    folder = tmp_path / "package"
+    folder.mkdir()
+    (folder / "module.py").write_text(source)
+    (folder / "template.py").write_text("{{ no Python }}")
+    (folder / "numpy").mkdir()
+    (folder / "numpy" / "ma.py").write_text('"""Looked into by what imports it."""')
+    compile_below(folder, Path("/in/image"))
+    kept, file = sorted(folder.rglob("*.pyc"), key=lambda path: path.stem)
+    assert b"Looked into" in kept.read_bytes(), "numpy keeps its docstrings"
+    header, found = file.read_bytes()[:16], types.ModuleType("module")
+    assert header[:4] == importlib.util.MAGIC_NUMBER
+    assert header[4:8] == b"\x01\0\0\0", "it is loaded without a look at the source"
+    code = marshal.loads(file.read_bytes()[16:])
+    assert code.co_filename == "/in/image/module.py"
+    sys.modules["module"] = found
+    try:
+        exec(code, found.__dict__)
+    finally:
+        del sys.modules["module"]
+    assert [part.__doc__ for part in (found, found.plain, found.later, found.Kind)] == [""] * 4
+    assert found.Value.__doc__ == "What a dataclass would make for itself is longer."
+    assert (found.plain(), found.Kind.text, found.edited()) == (42, "no docstring", "")
+    with pytest.raises(AssertionError, match="kept"):
+        found.checked()

@@ -23,7 +23,10 @@ from fractus_cluster.prerequisites import check_root
 PREFIX = "localhost/fractus"
 BASE_IMAGE = f"{PREFIX}/base:bookworm"
 
-_RECIPE = ("Dockerfile", ".dockerignore", "pyproject.toml", "uv.lock", "README.md", "LICENSE")
+_RECIPE = (
+    "Dockerfile", ".dockerignore", "pyproject.toml", "uv.lock", "README.md", "LICENSE",
+    "sim/fractus_cluster/images/bytecode.py",
+)  # fmt: skip
 _CODE: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "component": ("sdk", "cli", "proto"),

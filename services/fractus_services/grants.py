@@ -15,11 +15,12 @@ from fractus_core.api.plans import Grant, GrantSpec
 from fractus_core.policy.compiled import CompiledGrant, compile_grant
 from fractus_core.policy.trust import BadSignature
 
+from fractus_services.directory_watch import DirectoryWatch
 from fractus_services.grant_verifier import GrantVerifier
 
 log = logging.getLogger(__name__)
 
-RESCAN_INTERVAL_MS = 2_000
+RESCAN_INTERVAL_S = 2.0
 """Files are also read this often: inotify misses changes on some file systems."""
 _Stamp = tuple[int, int, int]
 
@@ -101,20 +102,17 @@ class GrantFiles:
 
     async def run(self) -> None:
         """Watch until cancelled: changes are read at once, and all files every 2 s."""
-        from watchfiles import awatch  # noqa: PLC0415 - starts a thread pool on import
-
         while True:
-            self._directory.mkdir(parents=True, exist_ok=True)
             try:
-                async for _ in awatch(
-                    self._directory, debounce=50, step=20, rust_timeout=RESCAN_INTERVAL_MS, yield_on_timeout=True,
-                    recursive=False,
-                ):  # fmt: skip
-                    await self._scan_aside()
-                    self._remember()
-            except (OSError, RuntimeError) as error:
+                self._directory.mkdir(parents=True, exist_ok=True)
+                with DirectoryWatch(self._directory) as watch:
+                    while True:
+                        await watch.changed(RESCAN_INTERVAL_S)
+                        await self._scan_aside()
+                        self._remember()
+            except OSError as error:
                 log.warning("grants: cannot watch, scanning instead (directory=%s): %s", self._directory, error)
-            await asyncio.sleep(RESCAN_INTERVAL_MS / 1000)
+            await asyncio.sleep(RESCAN_INTERVAL_S)
             await self._scan_aside()
 
     def _remember(self) -> None:

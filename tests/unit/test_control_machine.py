@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any, get_args
 
 from depth import DEEP
-from fractus_core.control import Authority, ControlState, Mission, Outcome, OutcomeKind, transition
+from fractus_core.control import Authority, ControlState, Mission, Outcome, OutcomeKind
 from fractus_core.control import events as told
 from fractus_core.control.actions import (
     Action,
@@ -18,6 +18,7 @@ from fractus_core.control.actions import (
     StartSystemTask,
     StopMotion,
 )
+from fractus_core.control.machine import transition
 from fractus_core.control.values import (
     FlightMode,
     ModeKind,

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from fractus_core.control import Authority, ControlState, Outcome, OutcomeKind, StreamState, transition
+from fractus_core.control import Authority, ControlState, Outcome, OutcomeKind, StreamState
 from fractus_core.control import events as told
 from fractus_core.control.actions import (
     Action,
@@ -15,6 +15,7 @@ from fractus_core.control.actions import (
     SendEvent,
     StartSystemTask,
 )
+from fractus_core.control.machine import transition
 from fractus_core.control.values import (
     ActiveMotion,
     FlightMode,

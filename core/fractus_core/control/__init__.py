@@ -1,7 +1,8 @@
-"""Who may command a vehicle: transition(state, event, now) -> (state, actions)."""
+"""Who may command a vehicle: transition(state, event, now) -> (state, actions), in `machine`.
 
-from fractus_core.control.machine import transition
-from fractus_core.control.readiness import not_ready_reason
+Here are its values alone: who only reads how a mission ended, as an agent, does without the megabyte of the rest.
+"""
+
 from fractus_core.control.values import (
     Authority,
     ControlEvent,
@@ -20,6 +21,4 @@ __all__ = [
     "Outcome",
     "OutcomeKind",
     "StreamState",
-    "not_ready_reason",
-    "transition",
 ]

@@ -5,9 +5,10 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Sequence
 
-from fractus_core.control import ControlState, transition
+from fractus_core.control import ControlState
 from fractus_core.control.actions import Action
 from fractus_core.control.events import Event, Tick
+from fractus_core.control.machine import transition
 from fractus_core.control.values import VehicleFacts
 
 from fractus_services.mobility.autopilot import Autopilot

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fractus_core import control as core
+from fractus_core.control import readiness as core
 from fractus_core.control.readiness import NOT_CONNECTED, Readiness
 
 from fractus_services.mobility.authority.control import Control

@@ -12,7 +12,7 @@ from typing import IO, Any, cast
 from xml.sax.saxutils import escape
 
 from fractus_core.api import Zone
-from fractus_core.geo.formats import kml_document, zone_placemark
+from fractus_core.geo.formats.kml import kml_document, zone_placemark
 from fractus_services.recording.mcap_file import McapFile
 from fractus_services.recording.messages import component_of, location, number, of_audit, sentence, zones
 from fractus_services.recording.places import Feature, placed

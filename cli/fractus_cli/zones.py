@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Iterable
 import click
 from fractus_core.api import InvalidObject, Zone
 from fractus_core.documents import BadDocument, dump_documents, parse_documents
-from fractus_core.geo import formats
+from fractus_core.geo.formats import every as formats
 from fractus_core.validation import check_zone
 
 from fractus_cli.manifests import BadManifest, read_file, read_manifests

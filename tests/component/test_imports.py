@@ -53,3 +53,15 @@ def test_the_first_heartbeats_of_a_start_wait_for_no_large_import() -> None:
     _, imported = after("import fractus_services.commands, fractus_services.mobility.mavlink.startup")
     assert "fractus_mavlink" in imported
     assert not imported & {"grpc", "google", "numpy", "shapely", "pydantic", "yaml", "cryptography", "fractus_core"}
+
+
+def test_an_agent_reads_outcomes_without_what_decides_them() -> None:
+    said, _ = after("import fractus_agent.__main__; print(*sys.modules)")
+    assert "fractus_core.control.values" in said.split()
+    assert "fractus_core.control.machine" not in said.split()
+
+
+def test_recordings_have_zones_without_the_formats_of_others() -> None:
+    said, _ = after("import fractus_services.recording.places; print(*sys.modules)")
+    assert "fractus_core.geo.formats.geojson" in said.split()
+    assert "fractus_core.geo.formats.kml" not in said.split()

@@ -9,8 +9,9 @@ import yaml
 from click.testing import CliRunner
 from fractus_cli.zones import zones as command
 from fractus_core.api import InvalidObject, Zone
-from fractus_core.geo import LocalFrame, formats, middle, polygon
+from fractus_core.geo import LocalFrame, middle, polygon
 from fractus_core.geo.formats import drafts
+from fractus_core.geo.formats import every as formats
 from test_planning import manifest
 
 SQUARE = [[4.0, 50.0], [4.01, 50.0], [4.01, 50.01], [4.0, 50.01], [4.0, 50.0]]

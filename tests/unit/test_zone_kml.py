@@ -4,7 +4,8 @@ import json
 
 import pytest
 from fractus_core.api import InvalidObject
-from fractus_core.geo import formats, middle
+from fractus_core.geo import middle
+from fractus_core.geo.formats import every as formats
 from test_zone_formats import HOLE, ROUND, SQUARE, kml
 
 

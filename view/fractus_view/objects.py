@@ -11,7 +11,7 @@ from fractus_core.api.geometry import Area, Circle, Position
 from fractus_core.api.model import Condition, Metadata
 from fractus_core.api.policies import PolicySpec, ZoneSpec
 from fractus_core.geo import geojson_line
-from fractus_core.geo.formats import zone_feature
+from fractus_core.geo.formats.geojson import zone_feature
 
 from fractus_view.events import Application, Fix, Link, Policy, State
 from fractus_view.translation import who

@@ -9,7 +9,7 @@ from fractus_core.api import Zone
 from fractus_core.api.model import Metadata
 from fractus_core.api.plans import GrantSpec
 from fractus_core.api.policies import ZoneShape, ZoneSpec
-from fractus_core.geo.formats import zone_feature
+from fractus_core.geo.formats.geojson import zone_feature
 
 Feature = dict[str, Any]
 

@@ -1,0 +1,24 @@
+"""All formats: GeoJSON, KML, QGroundControl plans and ED-269."""
+
+from fractus_core.geo.formats.drafts import Exported, Imported, Inexact
+from fractus_core.geo.formats.ed269 import read_ed269, write_ed269
+from fractus_core.geo.formats.geojson import read_geojson, write_geojson, zone_feature
+from fractus_core.geo.formats.kml import kml_document, read_kml, write_kml, zone_placemark
+from fractus_core.geo.formats.qgc_plan import read_qgc_plan, write_qgc_plan
+
+__all__ = [
+    "Exported",
+    "Imported",
+    "Inexact",
+    "kml_document",
+    "read_ed269",
+    "read_geojson",
+    "read_kml",
+    "read_qgc_plan",
+    "write_ed269",
+    "write_geojson",
+    "write_kml",
+    "write_qgc_plan",
+    "zone_feature",
+    "zone_placemark",
+]

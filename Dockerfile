@@ -210,7 +210,9 @@ USER 10001:10001
 ENTRYPOINT ["fractus", "view"]
 COPY --from=code /images/view /usr/local/lib/python3.11/dist-packages
 
+# On nodes, glibc's arenas are two: one for each thread that asks at once would hold free memory of its own, 1 to 3 MB in flight.
 FROM keys AS agent
+ENV MALLOC_ARENA_MAX=2
 COPY --from=nft /out /
 COPY --from=dependencies /only-agent /usr/local/lib/python3.11/dist-packages
 ENTRYPOINT ["python3", "-m", "fractus_agent"]
@@ -218,6 +220,7 @@ COPY --from=code /images/agent /usr/local/lib/python3.11/dist-packages
 
 # What flies a drone has no libraries for pictures: those are the camera's alone.
 FROM domain AS mobility-dependencies
+ENV MALLOC_ARENA_MAX=2
 COPY --from=dependencies /only-mobility /usr/local/lib/python3.11/dist-packages
 
 FROM mobility-dependencies AS mobility

@@ -18,8 +18,9 @@ Pixels = npt.NDArray[np.uint8]
 
 QUALITY = 90
 _M_MMAP_THRESHOLD = -3
-_OWN_PAGES_BYTES = 1_000_000
-"""Larger blocks get pages of their own, which glibc gives back to the system at once: a third less memory at peak."""
+_OWN_PAGES_BYTES = 128_000
+"""Larger blocks get pages of their own, which glibc gives back to the system at once: a third less memory at peak, and strips of
+pictures (see `_pixels`) leave no holes in the memory of every thread that worked on one."""
 MAX_PIXELS = 50_000_000
 MAX_BYTES = 64_000_000
 _STRIP_ROWS = 256

@@ -112,11 +112,12 @@ class Side:
         self.times: dict[str, list[float]] = {}
         self.names: dict[str, str] = {}
         home = folder / name
+        certificate = pki.node(NODE)
         pki.grant(dict(GRANT), home / "grants")
         (home / "node.yaml").write_text(DESCRIPTION)
         self._address = f"127.0.0.1:{free_port()}"
         arguments = [
-            "serve", "--grants", str(home / "grants"), "--tls", str(pki.node(NODE)), "--state", str(home / "state"),
+            "serve", "--grants", str(home / "grants"), "--tls", str(certificate), "--state", str(home / "state"),
             "--audit", str(home / "audit.jsonl"), "--node", NODE, "--description", str(home / "node.yaml"),
             "--listen", self._address, "--camera", camera, "--keep-mb", "500",
         ]  # fmt: skip

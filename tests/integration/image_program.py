@@ -51,6 +51,7 @@ def packages() -> None:
 def linear_algebra() -> None:
     """Each routine of BLAS and LAPACK that numpy calls, in each of its types, against the equation that it solves."""
     import numpy as np
+    import numpy.ma
 
     random = np.random.default_rng(1)
     for kind, close in (("f", 1e-2), ("F", 1e-2), ("d", 1e-8), ("D", 1e-8)):

@@ -19,11 +19,13 @@ Pixels = npt.NDArray[np.uint8]
 QUALITY = 90
 _M_MMAP_THRESHOLD = -3
 _OWN_PAGES_BYTES = 128_000
-"""Larger blocks get pages of their own, which glibc gives back to the system at once: a third less memory at peak, and strips of
-pictures (see `_pixels`) leave no holes in the memory of every thread that worked on one."""
+"""Larger blocks get pages of their own, which glibc gives back to the system at once: a third less memory at peak, and no holes in the
+memory of every thread that worked on a picture."""
 MAX_PIXELS = 50_000_000
 MAX_BYTES = 64_000_000
-_STRIP_ROWS = 256
+_STRIP_ROWS = 64
+"""Pillow hands pixels over in pieces of 64 kB, for which the threads that work on pictures keep memory."""
+_REVERSED = slice(None, None, -1)
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
 """What is read; Pillow has readers for many others, which no camera needs and which strangers could feed."""
 
@@ -72,19 +74,19 @@ def decoded(data: bytes) -> Pixels:
             ImageOps.exif_transpose(source, in_place=True)
             deep = source.mode.startswith("I;16")
             shallow = image.fromarray((np.asarray(source) >> 8).astype(np.uint8)) if deep else source
-            return _pixels(shallow if shallow.mode == "RGB" else shallow.convert("RGB"))
+            return _pixels(shallow if shallow.mode == "RGB" else shallow.convert("RGB"), _REVERSED)
     except NotAPicture:
         raise
     except Exception as error:
         raise NotAPicture(f"the {len(data)} bytes cannot be decoded as {' or '.join(FORMATS)}: {error}") from None
 
 
-def _pixels(image: Any) -> Pixels:
+def _pixels(image: Any, channels: slice = slice(None)) -> Pixels:
     """A picture of Pillow's as an array: in strips, or there would be three copies of a large one at a time."""
     pixels = np.empty((image.height, image.width, 3), np.uint8)
     for top in range(0, image.height, _STRIP_ROWS):
         strip = image.crop((0, top, image.width, min(top + _STRIP_ROWS, image.height)))
-        pixels[top : top + _STRIP_ROWS] = np.asarray(strip)[..., ::-1]
+        pixels[top : top + _STRIP_ROWS] = np.asarray(strip)[..., channels]
     return pixels
 
 
@@ -108,7 +110,7 @@ def resized(picture: Pixels, width: int, height: int) -> Pixels:
     """The picture in another size: averages where it gets smaller, blends where it gets larger."""
     image = pillow()
     how = image.Resampling.BOX if picture.shape[1] > width else image.Resampling.BILINEAR
-    return np.array(image.fromarray(np.ascontiguousarray(picture)).resize((width, height), how))
+    return _pixels(image.fromarray(np.ascontiguousarray(picture)).resize((width, height), how))
 
 
 def source_size(width: int, height: int, native: tuple[int, int]) -> tuple[int, int]:

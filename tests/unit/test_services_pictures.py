@@ -91,6 +91,25 @@ def test_a_hidden_face_is_found_no_more(method: Any, width_px: int, photo: Pixel
     assert abs(np.corrcoef(fine[0].ravel(), fine[1].ravel())[0, 1]) < 0.3
 
 
+@pytest.mark.parametrize("method", ["pixelate", "gaussian"])
+def test_a_face_that_is_found_within_a_face_brings_nothing_back(method: Any, photo: Pixels) -> None:
+    face, region = (100, 100, 98, 98), np.s_[65:233, 65:233]
+    cells = cv2.resize(photo[region], (7, 7), interpolation=cv2.INTER_AREA)
+    coarse = photo.copy()
+    coarse[region] = cv2.resize(cells, (168, 168), interpolation=cv2.INTER_NEAREST)
+    for boxes in ([face, (140, 130, 30, 30), (110, 150, 24, 24)], [(140, 130, 30, 30), face], [face, (60, 60, 40, 40)]):
+        shown, nothing = (hide_faces(one, boxes, method)[region] for one in (photo, coarse))
+        # A box across the edge of the region mixes in what is beside it, before the face is hidden or after.
+        assert float(np.abs(shown.astype(int) - nothing).mean()) < 1, boxes
+
+
+def test_a_face_at_the_edge_keeps_no_more_colours_than_one_in_the_middle(photo: Pixels) -> None:
+    hidden = hide_faces(photo, [(-60, 200, 100, 100), (472, 430, 100, 100)], "pixelate")
+    assert len(np.unique(hidden[240, :75], axis=0)) <= 3
+    assert len(np.unique(hidden[480, 440:], axis=0)) <= 3
+    assert len(np.unique(hidden[400:, 500], axis=0)) <= 5
+
+
 def test_faces_at_the_edge_do_not_break_the_filter(photo: Pixels) -> None:
     hidden = hide_faces(photo, [(-50, -50, 80, 80), (500, 500, 90, 90), (600, 600, 10, 10), (5, 5, 1, 1)], "pixelate")
     assert hidden.shape == photo.shape

@@ -73,13 +73,16 @@ def hide_faces(picture: Pixels, boxes: Sequence[Box], method: FaceMethod) -> Pix
         x1, y1 = min(int(left + (1 + MARGIN) * width) + 1, columns), min(int(top + (1 + MARGIN) * height) + 1, rows)
         if x1 <= x0 or y1 <= y0:
             continue
-        region = picture[y0:y1, x0:x1]
-        # The region is wider than the face by both margins, so it gets that many more cells.
-        cells = max(round(FACE_CELLS * (1 + 2 * MARGIN)), 1)
-        few = cv2.resize(region, (min(cells, x1 - x0), min(cells, y1 - y0)), interpolation=cv2.INTER_AREA)
+        # Of what is hidden by now: detectors also find small faces within large ones, whose finer cells must bring back
+        # nothing of the picture.
+        region = hidden[y0:y1, x0:x1]
+        # The region has both margins or ends with the picture, so it gets cells in proportion.
+        columns_left = min(max(round(FACE_CELLS * (x1 - x0) / max(width, 1)), 1), x1 - x0)
+        rows_left = min(max(round(FACE_CELLS * (y1 - y0) / max(height, 1)), 1), y1 - y0)
+        few = cv2.resize(region, (columns_left, rows_left), interpolation=cv2.INTER_AREA)
         if method == "gaussian":
             soft = cv2.resize(few, (x1 - x0, y1 - y0), interpolation=cv2.INTER_CUBIC)
-            hidden[y0:y1, x0:x1] = cv2.GaussianBlur(soft, (0, 0), max((x1 - x0) / cells, 0.8))
+            hidden[y0:y1, x0:x1] = cv2.GaussianBlur(soft, (0, 0), max((x1 - x0) / columns_left, 0.8))
         else:
             hidden[y0:y1, x0:x1] = cv2.resize(few, (x1 - x0, y1 - y0), interpolation=cv2.INTER_NEAREST)
     return hidden

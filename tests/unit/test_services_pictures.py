@@ -143,6 +143,27 @@ def test_what_moves_is_kept_and_the_rest_is_black(photo: Pixels) -> None:
     assert not standing[360, 120]
 
 
+@pytest.mark.parametrize("fixed", [True, False])
+@pytest.mark.parametrize("light", [(1.0, 1.2, 1.4), (0.7, 0.85, 1.0), (1.3, 1.0, 1.3), (0.5, 1.0, 0.5)])
+def test_a_camera_that_adapts_to_light_shows_nothing_that_stands(
+    light: tuple[float, ...], fixed: bool, photo: Pixels
+) -> None:
+    frames = []
+    for i, (factor, car) in enumerate(zip(light, (100, 200, 300), strict=True)):
+        picture = np.roll(photo, 0 if fixed else 3 * i, axis=1).copy()
+        picture[350:380, car : car + 40] = (40, 200, 40)
+        frames.append(cv2.convertScaleAbs(picture, alpha=factor))
+    mask = moving(*frames, fixed=fixed)
+    assert mask is not None
+    assert mask[352:378, 202:238].all(), "the car"
+    assert mask.mean() < 0.08
+
+
+def test_where_light_changes_too_much_nothing_is_shown(photo: Pixels) -> None:
+    dark = cv2.convertScaleAbs(photo, alpha=0.3)
+    assert moving(photo, dark, photo, fixed=True) is None
+
+
 def test_where_motion_is_unknown_nothing_is_shown(photo: Pixels) -> None:
     other = np.asarray(cv2.rotate(photo[:, ::-1], cv2.ROTATE_90_CLOCKWISE))
     noise = np.random.default_rng(3).integers(0, 256, photo.shape).astype(np.uint8)

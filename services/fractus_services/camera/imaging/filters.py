@@ -28,6 +28,11 @@ MOTION_PX = 1280
 MOTION_LEVELS = 25
 MAX_MOTION = 0.5
 """Share of a picture that may move; if it is more, the camera's own motion was not estimated."""
+_MIN_LIGHT = 16
+_MAX_LIGHT = 250
+"""Darker pixels tell nothing of how light changed, and brighter ones may be saturated."""
+_MAX_LIGHT_CHANGE = 2.0
+"""Beyond this, a camera's curve leaves too much of a change of light to tell it from motion."""
 _FEATURES = 1500
 _MIN_MATCHES = 25
 
@@ -140,8 +145,34 @@ def _difference(other: Pixels, picture: Pixels, fixed: bool) -> Mask | None:
         if matrix is None:
             return None
         other, shown = cv2.warpPerspective(other, matrix, size), cv2.warpPerspective(shown, matrix, size)
+    even = _in_one_light(other, picture, shown == 255)
+    if even is None:
+        return None
+    other, picture = even
     difference = cv2.absdiff(cv2.GaussianBlur(other, (5, 5), 0), cv2.GaussianBlur(picture, (5, 5), 0)).max(axis=2)
     return np.asarray((difference > MOTION_LEVELS) & (cv2.erode(shown, np.ones((7, 7), np.uint8)) == 255))
+
+
+def _in_one_light(one: Pixels, other: Pixels, shown: Mask) -> tuple[Pixels, Pixels] | None:
+    """Two pictures that lie over each other, both as bright as the darker one, for each colour.
+
+    A camera that adapts its exposure or its white balance between them changes all that stands still, too. Where the
+    brighter picture is saturated, the darker one is cut off at the same level.
+
+    Returns:
+        None when light changed too much to tell.
+    """
+    ones, others = np.empty_like(one), np.empty_like(other)
+    for colour in range(one.shape[2]):
+        here, there = one[..., colour], other[..., colour]
+        high = np.maximum(here, there)
+        telling = shown & (high >= _MIN_LIGHT) & (high <= _MAX_LIGHT)
+        change = float(np.median((here[telling] + 1.0) / (there[telling] + 1.0))) if telling.any() else 1.0
+        if not 1 / _MAX_LIGHT_CHANGE <= change <= _MAX_LIGHT_CHANGE:
+            return None
+        ones[..., colour] = np.minimum(here / max(change, 1.0), 255 / max(change, 1 / change))
+        others[..., colour] = np.minimum(there * min(change, 1.0), 255 / max(change, 1 / change))
+    return ones, others
 
 
 def _overlay(other: npt.NDArray[np.uint8], gray: npt.NDArray[np.uint8]) -> npt.NDArray[np.float64] | None:

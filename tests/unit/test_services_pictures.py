@@ -143,6 +143,31 @@ def test_what_moves_is_kept_and_the_rest_is_black(photo: Pixels) -> None:
     assert not standing[360, 120]
 
 
+@pytest.mark.parametrize("sway_px", [0, 2, 8, 16])
+def test_a_mast_that_sways_shows_nothing_that_stands(sway_px: int, photo: Pixels) -> None:
+    frames = []
+    for i, car in enumerate((100, 200, 300)):
+        picture = photo.copy()
+        picture[350:380, car : car + 40] = (40, 200, 40)
+        matrix = cv2.getRotationMatrix2D((256, 256), (i - 1) * sway_px / 20, 1.0)
+        matrix[:, 2] += ((i - 1) * sway_px, sway_px * (i == 1) / 2)
+        frames.append(np.asarray(cv2.warpAffine(picture, matrix, (512, 512), borderMode=cv2.BORDER_REFLECT), np.uint8))
+    mask = moving(*frames, fixed=True)
+    assert mask is not None
+    assert mask[360:370, 205:235].all(), "the car"
+    assert mask.mean() < 0.08
+
+
+def test_a_fixed_camera_that_sees_little_shows_what_moves(photo: Pixels) -> None:
+    frames = [np.full_like(photo, 90) for _ in range(3)]
+    for i, frame in enumerate(frames):
+        frame[350:380, 100 * i + 100 : 100 * i + 140] = (40, 200, 40)
+    mask = moving(*frames, fixed=True)
+    assert mask is not None
+    assert mask[352:378, 202:238].all()
+    assert mask.mean() < 0.02
+
+
 @pytest.mark.parametrize("fixed", [True, False])
 @pytest.mark.parametrize("light", [(1.0, 1.2, 1.4), (0.7, 0.85, 1.0), (1.3, 1.0, 1.3), (0.5, 1.0, 0.5)])
 def test_a_camera_that_adapts_to_light_shows_nothing_that_stands(

@@ -112,7 +112,7 @@ def moving(before: Pixels, picture: Pixels, after: Pixels, *, fixed: bool) -> Ma
         before: taken a moment before, of the same view.
         picture: the one that is asked about.
         after: taken a moment after, of the same view.
-        fixed: the camera does not move.
+        fixed: the camera does not move, but for what the wind does to its mast.
 
     Returns:
         True where something moves; None when the pictures could not be laid over each other.
@@ -138,13 +138,23 @@ def moving(before: Pixels, picture: Pixels, after: Pixels, *, fixed: bool) -> Ma
 def _difference(other: Pixels, picture: Pixels, fixed: bool) -> Mask | None:
     """Where a picture differs from another that is laid over it; what only one of them shows does not."""
     cv2 = opencv()
-    size = (picture.shape[1], picture.shape[0])
-    shown = np.full((size[1], size[0]), 255, np.uint8)
+    everything = np.full(picture.shape[:2], 255, np.uint8)
+    matrix = _overlay(cv2.cvtColor(other, cv2.COLOR_BGR2GRAY), cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
+    laid = None
+    if matrix is not None:
+        size = (picture.shape[1], picture.shape[0])
+        shown = cv2.warpPerspective(everything, matrix, size)
+        laid = _differing(cv2.warpPerspective(other, matrix, size), shown, picture)
     if not fixed:
-        matrix = _overlay(cv2.cvtColor(other, cv2.COLOR_BGR2GRAY), cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
-        if matrix is None:
-            return None
-        other, shown = cv2.warpPerspective(other, matrix, size), cv2.warpPerspective(shown, matrix, size)
+        return laid
+    # A mast sways in the wind, so that edges of what stands move by some pixels: what the overlay explains stands, too.
+    as_it_is = _differing(other, everything, picture)
+    return as_it_is if laid is None or as_it_is is None else as_it_is & laid
+
+
+def _differing(other: Pixels, shown: npt.NDArray[np.uint8], picture: Pixels) -> Mask | None:
+    """Where two pictures differ that lie over each other, as far as the other one shows anything there."""
+    cv2 = opencv()
     even = _in_one_light(other, picture, shown == 255)
     if even is None:
         return None

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import os
+import struct
 import sys
 import types
 from pathlib import Path
@@ -467,6 +469,10 @@ def test_a_directory_gives_the_picture_that_was_taken_nearest_in_space(tmp_path:
         )
     (tmp_path / "untagged.png").write_bytes(bytes(cv2.imencode(".png", np.zeros((4, 4, 3), np.uint8))[1]))
     (tmp_path / "broken.jpg").write_bytes(b"no picture")
+    # A bitmap of 3.6 gigapixels, of which only the header is there.
+    header = struct.pack("<IIIIiiHHIIiiII", 54, 0, 54, 40, 60_000, 60_000, 1, 24, *[0] * 6)
+    (tmp_path / "mosaic.tif").write_bytes(b"BM" + header)
+    os.mkfifo(tmp_path / "pipe.jpg")
     driver = driver_for(f"directory:{tmp_path}")
 
     def level(**place: float) -> int:

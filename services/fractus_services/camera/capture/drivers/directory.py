@@ -17,6 +17,8 @@ log = logging.getLogger(__name__)
 
 _SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp"})
 _MAX_FILES = 100_000
+_UNREADABLE = (OSError, KeyError, TypeError, ValueError, ZeroDivisionError, SyntaxError)
+"""What Pillow raises for files that are no pictures, or whose position is none."""
 
 
 class GeotaggedDirectory:
@@ -59,7 +61,9 @@ class GeotaggedDirectory:
             stamp = self._path.stat().st_mtime_ns
             if stamp == self._stamp:
                 return
-            files = sorted(p for p in self._path.iterdir() if p.suffix.lower() in _SUFFIXES)[:_MAX_FILES]
+            named = (p for p in self._path.iterdir() if p.suffix.lower() in _SUFFIXES)
+            # Opening a pipe would wait for someone to write into it.
+            files = sorted(p for p in named if p.is_file())[:_MAX_FILES]
         except OSError as error:
             raise CameraFailed(f"{self._path} cannot be read: {error.strerror or error}") from None
         found = [(file, place) for file in files if (place := position_of(file)) is not None]
@@ -72,7 +76,7 @@ class GeotaggedDirectory:
 
 def position_of(file: Path) -> tuple[float, float, float] | None:
     """Latitude, longitude, and metres above mean sea level (NaN where unknown) from a picture's EXIF data."""
-    from PIL import Image, UnidentifiedImageError  # noqa: PLC0415 - only this camera needs it
+    from PIL import Image  # noqa: PLC0415 - only this camera needs it
     from PIL.ExifTags import GPS, IFD  # noqa: PLC0415
 
     try:
@@ -84,7 +88,7 @@ def position_of(file: Path) -> tuple[float, float, float] | None:
         alt = float(tags.get(GPS.GPSAltitude, math.nan))
         # Cameras write the reference as a number or as a byte; 1 is below sea level.
         below = tags.get(GPS.GPSAltitudeRef) in {1, b"\x01"}
-    except (OSError, UnidentifiedImageError, KeyError, TypeError, ValueError, ZeroDivisionError, SyntaxError) as error:
+    except (*_UNREADABLE, Image.DecompressionBombError) as error:
         log.debug("camera directory: picture has no position (file=%s): %s", file, error)
         return None
     if not (-90 <= lat <= 90 and -180 <= lon <= 180):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import time
 from collections import Counter
@@ -15,7 +16,14 @@ from fractus_observe import spans
 from google.protobuf.message import DecodeError
 
 from fractus_services.auth import Caller, Callers
-from fractus_services.errors import InternalError, InvalidRequest, PolicyDenied, Refused, ResourceExhausted
+from fractus_services.errors import (
+    InternalError,
+    InvalidRequest,
+    NotAuthenticated,
+    PolicyDenied,
+    Refused,
+    ResourceExhausted,
+)
 from fractus_services.grants import ActiveGrant, GrantFiles
 from fractus_services.replies import abort
 
@@ -31,6 +39,9 @@ URGENT_BURST = 40.0
 
 MAX_OPEN_CALLS = 32
 """How many calls of one identity may be under way at a time, streams included."""
+
+REQUEST_TIMEOUT_S = 10.0
+"""Within which the request of a call has to come. Clients send both at once, but a bad link may lose the second part."""
 
 _MAX_COUNTED = 1_000
 
@@ -122,23 +133,53 @@ class CallAdmission:
                     del self._open[admitted]
 
     def decoded(self, handler: grpc.RpcMethodHandler) -> grpc.RpcMethodHandler:
-        """A handler whose requests are decoded once their caller is let in and counted: a flood of nonsense is one too."""
+        """A handler whose requests are decoded once their caller is let in and counted: a flood of nonsense is one too.
+
+        gRPC begins the call of a method with one request when that has arrived, and keeps those whose request never does. So
+        to gRPC it is a method with a stream of requests, of which the first one is read.
+        """
         decode, handle = handler.request_deserializer, handler.unary_unary or handler.unary_stream
+        unsent: Counter[str] = Counter()
 
-        def attempt(request: bytes) -> Any:
+        async def behaviour(_requests: Any, context: Any) -> Any:
+            body = await self._received(unsent, context)
             try:
-                return decode(request)
+                request = None if body is grpc.aio.EOF else decode(body)
             except DecodeError:
-                return None
-
-        async def behaviour(request: Any, context: Any) -> Any:
+                request = None
             if request is not None:
                 return await handle(request, context)
             async with self.call(context, lasting=True):
                 raise InvalidRequest("InvalidArgument", "the request cannot be decoded; send this method's message")
 
-        build = grpc.unary_unary_rpc_method_handler if handler.unary_unary else grpc.unary_stream_rpc_method_handler
-        return build(behaviour, attempt, handler.response_serializer)
+        build = grpc.stream_unary_rpc_method_handler if handler.unary_unary else grpc.stream_stream_rpc_method_handler
+        return build(behaviour, None, handler.response_serializer)
+
+    async def _received(self, unsent: Counter[str], context: Any) -> Any:
+        """The bytes of a call's request, or EOF; ends a call that does not send it, and the one too many that has not yet.
+
+        Args:
+            unsent: calls of each identity whose request is not there yet.
+            context: gRPC's context of the call.
+        """
+        try:
+            identity = self._callers.of(context.auth_context(), True).identity
+        except NotAuthenticated:
+            identity = ""
+        if unsent[identity] >= MAX_OPEN_CALLS:
+            reason = f"{MAX_OPEN_CALLS} calls of this method wait for their request; send it with the call"
+            await abort(context, ResourceExhausted("TooManyCalls", reason, retry_after_s=1.0))
+        unsent[identity] += 1
+        try:
+            async with asyncio.timeout(REQUEST_TIMEOUT_S):
+                return await context.read()
+        except TimeoutError:
+            reason = f"no request came within {REQUEST_TIMEOUT_S:.0f} s of the call; send it with the call"
+            await abort(context, InvalidRequest("InvalidArgument", reason))
+        finally:
+            unsent[identity] -= 1
+            if not unsent[identity]:
+                del unsent[identity]
 
     def _admit(self, identity: str, allowance: Allowance, urgent: bool) -> None:
         """Count a call.

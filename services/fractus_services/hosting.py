@@ -48,13 +48,13 @@ class _Registry:
 
 def _traced(method: str, handler: grpc.RpcMethodHandler, tracer: Tracer) -> grpc.RpcMethodHandler:
     """A handler whose calls are traced, from before their callers are let in."""
-    handle = handler.unary_unary or handler.unary_stream
+    handle = handler.stream_unary or handler.stream_stream
 
-    async def behaviour(request: Any, context: Any) -> Any:
+    async def behaviour(requests: Any, context: Any) -> Any:
         with tracer.serve(method, context.invocation_metadata()):
-            return await handle(request, context)
+            return await handle(requests, context)
 
-    build = grpc.unary_unary_rpc_method_handler if handler.unary_unary else grpc.unary_stream_rpc_method_handler
+    build = grpc.stream_unary_rpc_method_handler if handler.stream_unary else grpc.stream_stream_rpc_method_handler
     return build(behaviour, handler.request_deserializer, handler.response_serializer)
 
 

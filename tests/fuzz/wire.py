@@ -106,6 +106,10 @@ class Context:
         self._chain, self._remaining_s = chain, remaining_s
         self.code: grpc.StatusCode | None = None
         self.written: list[Any] = []
+        self.body: Any = grpc.aio.EOF
+
+    async def read(self) -> Any:
+        return self.body
 
     def auth_context(self) -> dict[str, Any]:
         return {"x509_pem_cert": list(self._chain)}
@@ -127,9 +131,10 @@ class Context:
 
 async def called(handler: grpc.RpcMethodHandler, body: bytes, context: Context) -> Any:
     """The answer of a handler; None if it refuses or streams."""
-    handle = handler.unary_unary or handler.unary_stream
+    handle = handler.stream_unary or handler.stream_stream
+    context.body = body
     try:
-        answer = await handle(handler.request_deserializer(body), context)
+        answer = await handle(None, context)
     except grpc.aio.AbortError:
         return None
     if answer is not None:

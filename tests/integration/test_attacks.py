@@ -10,7 +10,7 @@ import ssl
 import sys
 import time
 from collections import Counter
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -18,10 +18,10 @@ from typing import Any
 import grpc
 import pytest
 from cryptography.hazmat.primitives import serialization
-from fractus_core.api.names import OPERATOR_IDENTITY, node_identity, node_server_name
+from fractus_core.api.names import OPERATOR_IDENTITY, component_identity, node_identity, node_server_name
 from fractus_proto.v1 import camera_pb2, camera_pb2_grpc, mobility_pb2_grpc, types_pb2
 from fractus_proto.v1 import mobility_pb2 as pb
-from fractus_services.admission import BURST, CALLS_PER_S
+from fractus_services.admission import BURST, CALLS_PER_S, MAX_OPEN_CALLS
 from fractus_storage.chain import verify
 from google.rpc import error_details_pb2
 from grpc_status import rpc_status
@@ -393,6 +393,25 @@ async def test_a_flood_of_connections_leaves_the_others_served(rig: Rig) -> None
     finally:
         for one in silent:
             one.close()
+
+
+async def test_calls_whose_request_never_comes_are_counted_and_end(rig: Rig) -> None:
+    rig.write_grant(grant())
+    rig.start_service()
+    stub = await served(rig)
+
+    async def nothing() -> AsyncIterator[bytes]:
+        await asyncio.Event().wait()
+        yield b""
+
+    stranger = rig.channel(component_identity("default", "none", "Stranger", "none-stranger"))
+    ask = stranger.stream_unary("/fractus.v1.MobilityService/GetSpeed")
+    ended = await asyncio.wait_for(
+        asyncio.gather(*(ask(nothing(), timeout=120) for _ in range(100)), return_exceptions=True), 60
+    )
+    codes = Counter(error.code() for error in ended if isinstance(error, grpc.aio.AioRpcError))
+    assert codes == {Status.RESOURCE_EXHAUSTED: 100 - MAX_OPEN_CALLS, Status.INVALID_ARGUMENT: MAX_OPEN_CALLS}
+    await stub.GetSpeed(ASK, timeout=5)
 
 
 def _closed(connection: socket.socket) -> bool:

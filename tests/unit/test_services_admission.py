@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 from collections.abc import Callable
 from contextlib import AsyncExitStack
@@ -92,6 +93,28 @@ async def test_only_so_many_calls_at_a_time(calls: CallAdmission) -> None:
     async with calls.call(Context()):
         pass
     assert not calls._open
+
+
+async def test_only_so_many_calls_wait_for_their_request(calls: CallAdmission) -> None:
+    sent = asyncio.Event()
+
+    class Slow(Context):
+        async def read(self) -> Any:
+            await sent.wait()
+            return b"asked"
+
+    async def answer(request: bytes, _context: Any) -> bytes:
+        return request + b", answered"
+
+    method = calls.decoded(grpc.unary_unary_rpc_method_handler(answer, lambda body: body)).stream_unary
+    waiting = [asyncio.create_task(method(None, Slow())) for _ in range(MAX_OPEN_CALLS)]
+    await asyncio.sleep(0)
+    with pytest.raises(Aborted, match="RESOURCE_EXHAUSTED: 32 calls of this method wait") as refusal:
+        await method(None, Slow())
+    assert refusal.value.find(error_details_pb2.RetryInfo).retry_delay.ToSeconds() == 1
+    sent.set()
+    assert await asyncio.gather(*waiting) == [b"asked, answered"] * MAX_OPEN_CALLS
+    assert await method(None, Slow()) == b"asked, answered"
 
 
 @pytest.mark.parametrize(("urgent", "lasting"), [(True, False), (False, True)])

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import skimage.data
 from camera_world import Scene, World, active_grant, grain, private, refusal
 from fractus_core.api.model import API_VERSION
 from fractus_core.api.nodes import Drone
@@ -20,6 +21,7 @@ from fractus_services.camera.album.album import owner_of
 from fractus_services.camera.capture.driver import CameraFailed, Wanted
 from fractus_services.camera.capture.properties import CameraProperties
 from fractus_services.camera.capture.shutter import Shutter
+from fractus_services.camera.imaging.faces import CascadeDetector
 from fractus_services.camera.pictures.fair_queue import MAX_PER_OWNER, QueueFull
 from fractus_services.errors import PolicyDenied, Refused
 from fractus_services.grants import ActiveGrant
@@ -291,6 +293,34 @@ async def test_faces_are_hidden_where_they_are_large_enough_to_be_found(tmp_path
     strict = active_grant(private("blurFaces", fallback="refuse"))
     assert await refusal(world.camera.capture(strict, CaptureArgs())) == "FacesNotFound"
     assert grain(await world.pixels(active_grant(private("black")), shot)) == 0
+    world.shutter.close()
+
+
+@pytest.mark.parametrize(("width", "height"), [(62, 1600), (1600, 62)])
+async def test_a_part_of_the_view_that_cuts_a_face_shows_nothing_of_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, width: int, height: int
+) -> None:
+    world = World(tmp_path, (1600, 1600))
+    world.drone.y, world.drone.alt = 0.0, 2.0
+    # The strip shows two thirds of a face that is 97 pixels wide, too little for a detector.
+    scene = np.full((1600, 1600, 3), 90, np.uint8)
+    left, top = 776 - 225, 776 - 114
+    scene[top : top + 512, left : left + 512] = skimage.data.astronaut()[..., ::-1]
+    face = np.s_[776 - 38 : 776 + 38, 776 - 38 : 776 + 38]
+    shown = np.s_[(1600 - height) // 2 : (1600 + height) // 2, (1600 - width) // 2 : (1600 + width) // 2]
+    monkeypatch.setattr(world.scene, "capture", lambda _wanted: scene)
+    monkeypatch.setattr(world.finder, "find", CascadeDetector().find)
+    grant, later = active_grant(private("blurFaces")), active_grant(private("blurFaces"), uid="u2")
+    picture = np.zeros_like(scene)
+    picture[shown] = world.stored(grant, await world.capture(grant, width=width, height=height))
+    before = np.zeros_like(scene)
+    before[shown] = scene[shown]
+    assert grain(picture[face]) < 0.5 * grain(before[face])
+    world.drone.y = 80.0
+    shot = await world.capture(later, width=width, height=height)
+    assert not shot.filters
+    assert not shot.face_px, "faces in it are not found either when they have to be hidden later"
+    assert (await world.capture(later, width=800, height=800)).face_px
     world.shutter.close()
 
 

@@ -38,6 +38,8 @@ MAX_FILTERING = 8
 """Pictures that are being filtered or wait for it; each takes tens of megabytes of memory."""
 FRAME_INTERVAL_S = 0.25
 """Between the frames that show what moves."""
+_ROUNDED_PX = 2
+"""By so much the whole view may be larger than what was asked for, in its own proportions."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,30 +194,35 @@ class PictureCapture:
         call, camera = Call("CaptureImage", args), self._camera
         plan, verdict = self._judge.plan(call, grant, exposure.verdict, after, face_px=face_px, known=exposure.known)
         poses, moment_s = tuple(Pose.of(one) for one in after.exposure), float(after.time_s)
-        # Of another lens the pose has a bound of the view, which is wider.
-        view_px = camera.source_size(args.width, args.height)[0] if camera.pinhole else None
+        asked, whole = (args.width, args.height), camera.source_size(args.width, args.height)
 
         def work() -> bytes:
-            sized = _sized(frames, args)
+            # Filters see the whole view: callers could ask for parts of it that cut each face in two, which no detector finds.
+            sized = _sized(frames, *(whole if plan.filters else asked))
             frames.clear()
             upright = is_upright(poses)
-            data = encoded(apply_filters(sized, plan, self._detector, face_px, upright=upright, fixed=camera.fixed))
+            filtered = apply_filters(sized, plan, self._detector, face_px, upright=upright, fixed=camera.fixed)
+            data = encoded(fitted(filtered, *asked))
             if verdict.filters:
                 # A filtered picture tells nothing of where it was taken.
                 return data
+            # Of another lens the pose has a bound of the view, which is wider.
+            view_px = whole[0] if camera.pinhole else None
             return with_metadata(data, poses[-1], time_s=moment_s, camera=camera.model, view_width_px=view_px)
 
         with spans.call().child("camera.filters") as span:
             span.note("fractus.filters", [one.action for one in plan.filters])
             data = await asyncio.to_thread(work)
-        shot = Shot(exposure.name, moment_s, args.width, args.height, len(data), poses, face_px, plan.filters)
+        # In a part of the view faces are cut as well, when they have to be hidden later.
+        found_px = face_px if max(whole[0] - asked[0], whole[1] - asked[1]) <= _ROUNDED_PX else 0.0
+        shot = Shot(exposure.name, moment_s, *asked, len(data), poses, found_px, plan.filters)
         await asyncio.to_thread(self._album.add, owner_of(grant), shot, data)
         return verdict, shot
 
 
-def _sized(frames: list[Pixels], args: CaptureArgs) -> list[Pixels]:
-    """The middle frame in the size that was asked for, the others no larger than motion is detected in."""
-    scale = min(MOTION_PX / args.width, 1.0)
-    sizes = [(max(round(args.width * scale), 1), max(round(args.height * scale), 1))] * len(frames)
-    sizes[len(sizes) // 2] = (args.width, args.height)
+def _sized(frames: list[Pixels], width: int, height: int) -> list[Pixels]:
+    """The middle frame in a size, the others no larger than motion is detected in."""
+    scale = min(MOTION_PX / width, 1.0)
+    sizes = [(max(round(width * scale), 1), max(round(height * scale), 1))] * len(frames)
+    sizes[len(sizes) // 2] = (width, height)
     return [fitted(one, *size) for one, size in zip(frames, sizes, strict=True)]

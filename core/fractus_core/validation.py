@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping
 from fractus_core.api import Application, Depot, InvalidObject, Policy, Zone
 from fractus_core.api.geometry import Area
 from fractus_core.geo import LocalFrame, check_extent, middle, polygon
-from fractus_core.planning.area import operation_area
+from fractus_core.planning.area import check_crossings, route_of
 from fractus_core.policy.selectors import is_attribute
 
 MAX_WAYPOINTS = 2000
@@ -58,7 +58,7 @@ def check_policy(policy: Policy, zones: Collection[str]) -> None:
 
 
 def check_application(application: Application, depots: Mapping[str, Depot]) -> None:
-    """Refuse an application that names unknown depots or has broken regions.
+    """Refuse an application that names unknown depots, has broken regions, or ways that cross too often.
 
     Raises:
         InvalidObject: naming the field.
@@ -76,6 +76,6 @@ def check_application(application: Application, depots: Mapping[str, Depot]) -> 
             if point.region is not None:
                 check_area(point.region, f"spec.components[{index}].controlPoints[{i}].region")
     try:
-        operation_area(application.spec, depots, safety_radius_m=1.0)
+        check_crossings(application.spec, route_of(application.spec, depots))
     except InvalidObject as error:
         raise InvalidObject(f"spec.{error.field}", error.problem) from None

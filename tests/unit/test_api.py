@@ -1,5 +1,6 @@
 """Kinds: what is accepted, and the sentence for what is not."""
 
+import math
 import pathlib
 from datetime import datetime
 from typing import Any
@@ -11,9 +12,10 @@ from fractus_core.api.crd import crd
 from fractus_core.api.model import quantity
 from fractus_core.api.nodes import Interface
 from fractus_core.api.schedules import ActiveTime, active_at
+from fractus_core.planning import operation_area
 from fractus_core.validation import check_application, check_area, check_policy
 from pydantic import ValidationError
-from test_planning import CHECKER, PATH, STORE, VIEWER, application, component, manifest, navigator
+from test_planning import CHECKER, PATH, STORE, VIEWER, application, at, component, manifest, navigator
 
 ROOT = pathlib.Path(__file__).parents[2]
 
@@ -116,6 +118,42 @@ def test_crossing_region_names_the_ring():
     app = application(navigator(PATH) | {"controlPoints": [point]})
     with pytest.raises(InvalidObject, match=r"controlPoints\[0\]\.region\.polygon\.exterior: the ring crosses itself"):
         check_application(app, {})
+
+
+def star(east, spikes, radius_m=100):
+    turn = math.tau / (2 * spikes)
+    radii = [radius_m, radius_m / 5] * spikes
+    return [at(east + r * math.cos(turn * i), r * math.sin(turn * i)) for i, r in enumerate(radii)]
+
+
+def test_regions_that_cross_too_often_are_refused_before_they_are_united():
+    """Uniting a few that are as spiky as a manifest may say takes minutes, in which no other application is reconciled."""
+
+    def flown(*regions):
+        points = [{"navigation": "regionBased", "region": {"polygon": {"exterior": r}}} for r in regions]
+        return application(navigator(PATH) | {"control": "partial", "controlPoints": points})
+
+    check_application(flown(star(0, 600), star(1000, 600), star(0, 600)), {})
+    app = flown(star(0, 600), star(1000, 4), star(5, 600))
+    with pytest.raises(InvalidObject, match=r"components\[0\]\.controlPoints: ways and edges .* more than 5000 times"):
+        check_application(app, {})
+    with pytest.raises(InvalidObject, match="more than 5000 times"):
+        operation_area(app.spec, {}, 7.0)
+
+
+def test_a_way_that_crosses_itself_too_often_is_refused():
+    def grid(lines):
+        ends = [at(20 * (i // 2), 20 * lines * (((i + 1) // 2) % 2), 10) for i in range(2 * lines)]
+        across = [at(20 * lines * (((i + 1) // 2) % 2), 20 * (i // 2), 10) for i in range(2 * lines)]
+        return ends + across
+
+    driver = navigator(grid(50), point={"position": at(0, 0, 10)})
+    check_application(application(driver), {})
+    with pytest.raises(InvalidObject, match=r"components\[0\]\.controlPoints: ways and edges"):
+        check_application(application(navigator(grid(100), point={"position": at(0, 0, 10)})), {})
+    guide = VIEWER | {"egress": [], "pointsOfInterest": {"points": grid(100)}}
+    with pytest.raises(InvalidObject, match=r"spec\.components: ways and edges"):
+        check_application(application(guide), {})
 
 
 def test_area_of_continental_size_is_refused():

@@ -8,7 +8,7 @@ import pytest
 import shapely
 from fractus_core.api import InvalidObject
 from fractus_core.api.geometry import Area, Circle, Point, Polygon
-from fractus_core.geo import LocalFrame, area_of, corridor, geodesic_m, geojson, middle_of, polygon
+from fractus_core.geo import LocalFrame, area_of, corridor, crossings, geodesic_m, geojson, middle_of, polygon
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
@@ -181,6 +181,29 @@ def test_corridor_of_a_path_that_crosses_itself_a_thousand_times_is_the_dilated_
     shape = corridor(frame, points, 7)
     assert shape.covers(whole)
     assert shape.area == pytest.approx(whole.area, rel=2e-3)
+
+
+def test_crossings_are_those_of_each_piece_with_each_other():
+    rng = np.random.default_rng(7)
+    for corners in (2, 3, 30, 200):
+        lines = [rng.uniform(-100, 100, (corners, 2)) for _ in range(3)]
+        pieces = [shapely.LineString(pair) for line in lines for pair in itertools.pairwise(line)]
+        expected = sum(a.crosses(b) for a, b in itertools.combinations(pieces, 2))
+        assert crossings(lines, 10**9) == expected
+        assert crossings(lines, expected) == expected
+        assert (expected == 0) or crossings(lines, expected - 1) == expected
+    assert crossings([], 5) == 0
+
+
+def test_lines_that_only_touch_or_lie_on_each_other_do_not_cross():
+    square = np.array([[0, 0], [10, 0], [10, 10], [0, 10], [0, 0]], dtype=float)
+    assert crossings([square, square, np.add(square, (10, 0))], 100) == 0
+
+
+def test_more_pieces_beside_each_other_than_can_be_compared_count_as_too_many():
+    teeth = np.array([[i + (i % 2) * 1e4, -i + (i % 2) * 1e4] for i in range(10_000)], dtype=float)
+    assert crossings([teeth], 5000) == 5001
+    assert crossings([teeth[:2000]], 5000) == 0
 
 
 def test_rings_across_the_antimeridian_stay_closed_and_repeat_no_corner():

@@ -13,7 +13,7 @@ from shapely.geometry.base import BaseGeometry
 
 from fractus_core.api.geometry import Area, Circle, Point, Polygon, Position
 from fractus_core.api.model import InvalidObject
-from fractus_core.geo.frames import LocalFrame, geodesic_m
+from fractus_core.geo.frames import LocalFrame, distance_m
 
 _SEGMENTS = (8, 32)
 """Straight pieces per quarter of a circle, minimum and maximum: the area is right within 0.4 %."""
@@ -123,7 +123,7 @@ def check_extent(area: Area) -> None:
     """
     centre = middle(area)
     for i, point in enumerate(area.polygon.exterior if area.polygon is not None else ()):
-        if geodesic_m(centre, point) > MAX_EXTENT_M:
+        if distance_m(centre, point) > MAX_EXTENT_M:
             how = f"is more than {MAX_EXTENT_M / 1000:.0f} km from the middle; split the area"
             raise InvalidObject(f"polygon.exterior[{i}]", how)
 

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import assert_never
 
+import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
@@ -16,8 +17,11 @@ from fractus_core.api.components import ControlPoint
 from fractus_core.api.geometry import Area, Circle, Point, Position
 from fractus_core.api.model import InvalidObject
 from fractus_core.api.nodes import Depot
-from fractus_core.geo import LocalFrame, corridor, ground, middle, middle_of, polygon
+from fractus_core.geo import LocalFrame, corridor, crossings, ground, middle, middle_of, points_xy, polygon
 from fractus_core.planning.tour import short_tour
+
+MAX_CROSSINGS = 5000
+"""How often ways and the edges of regions may cross: uniting what they enclose takes a second then, and minutes for ten times as many."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,11 +54,12 @@ def operation_area(spec: ApplicationSpec, depots: Mapping[str, Depot], safety_ra
     stand anywhere in it. Regions count as given.
 
     Raises:
-        InvalidObject: a depot is unknown or a ring crosses itself; the field is relative to spec.
+        InvalidObject: a depot is unknown, a ring crosses itself, or ways and edges cross too often; the field is relative to spec.
     """
     route = route_of(spec, depots)
     if not route:
         return None
+    check_crossings(spec, route)
     frame = LocalFrame.at(middle_of(route))
     parts: list[BaseGeometry] = []
     driver = spec.driver
@@ -75,6 +80,38 @@ def operation_area(spec: ApplicationSpec, depots: Mapping[str, Depot], safety_ra
                 assert_never(poi.service_access)
     length = length_m(frame, [ground(p) for p in route])
     return OperationArea(frame, shapely.union_all(parts), tuple(route), tuple(parts), length)
+
+
+def check_crossings(spec: ApplicationSpec, route: Sequence[Position]) -> None:
+    """Refuse an application whose area would take so long to work out that others wait for it.
+
+    Args:
+        spec: of the application.
+        route: as `route_of` tells it.
+
+    Raises:
+        InvalidObject: its ways and the edges of its regions cross too often; the field is relative to spec.
+    """
+    if not route:
+        return
+    frame = LocalFrame.at(middle_of(route))
+    driver, poi = spec.driver, spec.points_of_interest
+    rings: list[Sequence[Point]] = []
+    if driver is not None:
+        ways: list[Sequence[Point]] = [point.path for point in driver.control_points if point.path is not None]
+        areas = (point.region.polygon for point in driver.control_points if point.region is not None)
+        rings = [ring for area in areas if area is not None for ring in (area.exterior, *area.holes)]
+        field = f"components[{spec.components.index(driver)}].controlPoints"
+    elif poi is not None and poi.service_access == "path":
+        ways, field = [route], "components"
+    else:
+        return
+    lines = [np.asarray(points_xy(frame, way)) for way in (*ways, *((*ring, ring[0]) for ring in rings))]
+    if crossings(lines, MAX_CROSSINGS) > MAX_CROSSINGS:
+        raise InvalidObject(
+            field,
+            f"ways and edges of regions cross more than {MAX_CROSSINGS} times; give fewer waypoints, or regions with fewer corners",
+        )
 
 
 def start_of(point: ControlPoint, depots: Mapping[str, Depot]) -> Position | None:

@@ -29,7 +29,10 @@ _ANSWER_SHARE = _HELD_SHARE / 2
 
 
 class LostLease(Exception):
-    """Another operator has acted since this one last did: what this one remembers may be wrong, it must start again."""
+    """What this operator remembers may be wrong, and it must start again.
+
+    Another one has acted since it last did, or the API server has gone back to an earlier state, as of a backup.
+    """
 
 
 class Lease:
@@ -37,6 +40,9 @@ class Lease:
 
     Another operator takes it only after it has seen it unchanged for its whole duration, by its own clock; the holder counts
     as such for a part of that, from before it asked. So clocks need not agree, and a holder that was frozen knows better.
+
+    The Lease is also what tells that the API server has gone back: its version, as that of every object, only grows. Watches would
+    go on from versions that are yet to come, and tell of nothing until then.
 
     Args:
         client: The API server, through connections of its own: no burst of other requests keeps a renewal waiting.
@@ -56,6 +62,7 @@ class Lease:
         self._seen: tuple[object, ...] = ()
         self._seen_at = 0.0
         self._transitions: int | None = None
+        self._version = 0
         self._acquired = asyncio.Event()
 
     @property
@@ -73,7 +80,7 @@ class Lease:
         """Take the Lease and keep it, until cancelled; it is given back then.
 
         Raises:
-            LostLease: another operator has held it since.
+            LostLease: another operator has held it since, or it is one of an earlier time.
         """
         try:
             while True:
@@ -104,12 +111,14 @@ class Lease:
         """Take or renew the Lease, if it is ours or free.
 
         Raises:
+            LostLease: another operator has held it since, or it is one of an earlier time.
             KubeError: the API server did not take it.
         """
         try:
             body = await self._client.get(LEASE, self._name, self._namespace)
         except NotFound:
             body = LEASE.header(self._name, self._namespace)
+        self._check_history(body)
         spec = body.get("spec") or {}
         if self._transitions is not None and spec.get("leaseTransitions") != self._transitions:
             raise LostLease(
@@ -120,11 +129,23 @@ class Lease:
         wanted = self._wanted(body)
         write = self._client.replace if spec else self._client.create
         try:
-            await write(LEASE, wanted)
+            self._version = _version(await write(LEASE, wanted))
         except Conflict:
             return False
         self._transitions = int(wanted["spec"]["leaseTransitions"])
         return True
+
+    def _check_history(self, body: Body) -> None:
+        """Check that a Lease which this operator has held is not one of an earlier time.
+
+        Raises:
+            LostLease: it is.
+        """
+        if 0 < _version(body) < self._version:
+            raise LostLease(
+                f"the API server has gone back to version {_version(body)} of the Lease from {self._version}, as after a"
+                f" restore: what {self._identity} knows is of another history"
+            )
 
     def _expired(self, body: Body) -> bool:
         """Whether a Lease of another process has not changed for its duration, as far as this process has seen."""
@@ -166,6 +187,12 @@ class Lease:
             logger.info("lease: not released: %s", error)
 
 
+def _version(body: Body) -> int:
+    """The version of an object as a number, which grows; 0 where it is none."""
+    version = str(body["metadata"].get("resourceVersion", ""))
+    return int(version) if version.isdecimal() else 0
+
+
 class LeaseThread:
     """A Lease that is kept in a thread with an event loop of its own: what keeps the caller's loop busy delays no renewal.
 
@@ -203,7 +230,7 @@ class LeaseThread:
         """Take the Lease and keep it, until cancelled; it is given back then, before this returns.
 
         Raises:
-            LostLease: another process has held it since.
+            LostLease: another process has held it since, or it is one of an earlier time.
             Unconfigured: there are no credentials.
         """
         caller, stop, cancelled = asyncio.get_running_loop(), asyncio.Event(), threading.Event()

@@ -124,6 +124,9 @@ class Reflector(Generic[T]):
             steady = loop.time() - opened_s >= _STEADY_S
             if steady:
                 self._backoff.succeeded()
+            if self.age_s() >= _SILENCE_S:
+                # An API server sends bookmarks. One that was restored from a backup says nothing until it comes to this version again.
+                version = ""
             if not (steady and ended):
                 await asyncio.sleep(self._backoff.delay_s())
             self.restarts += 1

@@ -54,25 +54,25 @@ class ApiServer(ControlPlane):
     signer: tuple[ec.EllipticCurvePrivateKey, x509.Certificate]
 
     def stop_apiserver(self, number: int = signal.SIGKILL) -> None:
-        process = self._processes[1]
+        process = self._processes["kube-apiserver"]
         process.send_signal(number)
         process.wait(20)
 
     def start_apiserver(self) -> None:
         with (self._directory / "kube-apiserver.log").open("ab") as log:
             again = subprocess.Popen(self._arguments(), stdout=log, stderr=log, cwd=self._directory)
-        self._processes[1] = again
+        self._processes["kube-apiserver"] = again
         wait_for(self.admin.ready, "the API server", timeout_s=60)
 
     def _arguments(self) -> list[str]:
-        arguments = self._processes[1].args
+        arguments = self._processes["kube-apiserver"].args
         assert isinstance(arguments, list)
         return [str(a) for a in arguments]
 
     @contextlib.contextmanager
     def frozen(self) -> Iterator[None]:
         """An API server that keeps its connections and says nothing."""
-        pid = self._processes[1].pid
+        pid = self._processes["kube-apiserver"].pid
         os.kill(pid, signal.SIGSTOP)
         try:
             yield

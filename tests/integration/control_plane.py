@@ -67,7 +67,10 @@ class ControlPlane:
     def __init__(self, programs: dict[str, Path], directory: Path) -> None:
         self._programs = programs
         self._directory = directory
-        self._processes: list[subprocess.Popen[bytes]] = []
+        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._started: dict[str, tuple[str, ...]] = {}
+        self.data = directory / "etcd"
+        """What etcd keeps; to be copied or replaced while the storage is stopped."""
         (directory / "pki").mkdir(parents=True)
         self.authority = Authority(directory / "pki")
         self.server = f"https://127.0.0.1:{free_port()}"
@@ -108,7 +111,7 @@ class ControlPlane:
         etcd = f"http://127.0.0.1:{client}"
         self._run(
             "etcd",
-            f"--data-dir={self._directory / 'etcd'}",
+            f"--data-dir={self.data}",
             f"--listen-client-urls={etcd}",
             f"--advertise-client-urls={etcd}",
             f"--listen-peer-urls=http://127.0.0.1:{peer}",
@@ -153,14 +156,30 @@ class ControlPlane:
     def stop(self) -> None:
         """Nothing of it is kept: a graceful end takes an API server that is still watched ten seconds."""
         self.admin.close()
-        for process in reversed(self._processes):
+        for process in reversed(self._processes.values()):
             process.kill()
             process.wait(10)
 
+    def stop_storage(self) -> Callable[[], None]:
+        """End etcd and the API server, which keeps copies of it; returns what starts them again, on what is in `data` then."""
+        ended = [(program, self._started[program]) for program in ("etcd", "kube-apiserver")]
+        for program, _ in reversed(ended):
+            process = self._processes.pop(program)
+            process.kill()
+            process.wait(10)
+
+        def start() -> None:
+            for program, arguments in ended:
+                self._run(program, *arguments)
+            wait_for(self.admin.ready, "the API server", timeout_s=60)
+
+        return start
+
     def _run(self, program: str, *arguments: str) -> None:
-        with (self._directory / f"{program}.log").open("wb") as log:
+        self._started[program] = arguments
+        with (self._directory / f"{program}.log").open("ab") as log:
             argv = [str(self._programs[program]), *arguments]
-            self._processes.append(subprocess.Popen(argv, stdout=log, stderr=log, cwd=self._directory))
+            self._processes[program] = subprocess.Popen(argv, stdout=log, stderr=log, cwd=self._directory)
 
     def _install_crds(self) -> None:
         root = "/apis/apiextensions.k8s.io/v1/customresourcedefinitions"

@@ -126,6 +126,24 @@ async def test_a_frozen_holder_knows_that_it_must_start_again() -> None:
         await step(first)
 
 
+async def test_who_finds_the_lease_of_an_earlier_time_must_start_again() -> None:
+    """As after the restore of a backup: its watches would wait for versions that are yet to come."""
+    shelf, clock = Shelf(), Clock()
+    only = lease(shelf, clock, "only")
+    await step(only)
+    backup, writes = copy.deepcopy(shelf.body), shelf.writes
+    for _ in range(3):
+        await step(only)
+    shelf.body, shelf.writes = backup, writes
+    with pytest.raises(LostLease, match="gone back to version 1 of the Lease from 4, as after a restore"):
+        await step(only)
+    again = lease(shelf, clock, "again")
+    await step(again)
+    clock.now += DURATION_S + 1
+    await step(again)
+    assert again.left_s > 0
+
+
 async def test_an_api_server_out_of_reach_takes_the_lease_until_it_is_back() -> None:
     shelf, clock = Shelf(), Clock()
     only = lease(shelf, clock, "only")

@@ -137,6 +137,16 @@ async def test_a_broken_connection_is_taken_up_again(monkeypatch: pytest.MonkeyP
     assert script.calls == ["list", "list", "watch 5", "watch 6", "watch 7"]
 
 
+async def test_after_a_long_silence_it_lists_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An API server that was restored from a backup tells a watch nothing until it comes to the watch's version once more."""
+    monkeypatch.setattr(reflector_module, "_SILENCE_S", 0.0)
+    silent = [KubeError(0, "Unreachable", "TimeoutError")]
+    script = Script(page(50, zone("a", 40, 4), zone("b", 41, 5)), silent, page(9, zone("a", 7, 3)))
+    held, _ = await follow(script, monkeypatch)
+    assert held == {("", "a"): 3}
+    assert script.calls == ["list", "watch 50", "list", "watch 9"]
+
+
 async def test_an_unchanged_view_wakes_no_one(monkeypatch: pytest.MonkeyPatch) -> None:
     script = Script(page(5, zone("a", 1, 1)), [("MODIFIED", zone("a", 6, 1))])
     _, changes = await follow(script, monkeypatch)

@@ -1,0 +1,56 @@
+"""The operator where etcd is restored from an older backup: what it watches goes back to versions that were there before."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from control_plane import ControlPlane, programs, wait_for
+from operator_world import FRACTUS, OperatorProcess, World, fresh_namespace, traffic
+
+
+@pytest.fixture
+def plane(tmp_path: Path) -> Iterator[ControlPlane]:
+    """One of the test's own."""
+    plane = ControlPlane(programs(), tmp_path / "plane")
+    try:
+        plane.start()
+        yield plane
+    finally:
+        plane.stop()
+
+
+def test_an_operator_that_outlives_a_restore_starts_again(plane: ControlPlane, tmp_path: Path) -> None:
+    world, backup = World(plane), tmp_path / "backup"
+    world.furnish()
+    operator = OperatorProcess(plane.kubeconfig, tmp_path / "operator.log")
+    operator.start()
+    try:
+        with fresh_namespace(world, "before") as before, fresh_namespace(world, "after") as after:
+            world.put(traffic(before))
+            wait_for(lambda: len(world.pods(before)) == 7, operator.log)
+            start = plane.stop_storage()
+            shutil.copytree(plane.data, backup)
+            start()
+            for number in range(500):
+                note = {"metadata": {"annotations": {"number": str(number)}}}
+                world.api.merge("/api/v1/namespaces/default", note)
+            world.api.delete(f"{FRACTUS}/namespaces/{before}/applications/traffic")
+            wait_for(lambda: world.application(before) is None, operator.log)
+            start = plane.stop_storage()
+            shutil.rmtree(plane.data)
+            shutil.copytree(backup, plane.data)
+            start()
+            wait_for(lambda: not operator.running, operator.log)
+            assert "as after a restore" in operator.log()
+            # As its kubelet does.
+            operator.start()
+            world.put(traffic(after, "second"))
+            wait_for(lambda: world.status(after, "second").get("phase"), operator.log)
+            # It came back with the backup, and is followed again.
+            wait_for(lambda: world.status(before).get("drone") == "drone-1" and world.grants(before), operator.log)
+    finally:
+        if operator.running:
+            operator.stop()

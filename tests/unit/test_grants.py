@@ -10,6 +10,7 @@ from fractus_core.geo import polygon
 from fractus_core.planning import flight_of, grants, plan
 from fractus_core.planning.area import operation_area
 from fractus_core.planning.grants import compile_grants, refresh
+from fractus_core.planning.zones import sound, zone_crossings
 from fractus_core.policy.compiled import compile_grant
 from fractus_core.policy.engine import judge
 from fractus_core.policy.selectors import is_attribute, matches, node_attributes
@@ -35,6 +36,43 @@ def compiled(*policies, zones=(), components=None):
     stock = inventory([drone("d")], zones={z.name: z for z in zones}, policies={p.name: p for p in policies})
     app = application(*(components or [navigator(PATH)]))
     return compile_grants(app, plan(app, stock), stock)
+
+
+def comb(name, teeth, across=False, lon=None):
+    """A zone with long thin teeth, to the north or to the east."""
+    sides = [(500.0 * (((i + 1) // 2) % 2), float(i - teeth)) for i in range(2 * teeth)]
+    corners = [*sides, (-1.0, float(teeth)), (-1.0, float(-teeth - 1))]
+    ring = [at(*(c if across else reversed(c))) for c in corners]
+    if lon is not None:
+        ring = [c | {"lon": (c["lon"] - ring[0]["lon"] + lon + 180) % 360 - 180} for c in ring]
+    return Zone.from_body(manifest("Zone", name, {"area": {"polygon": {"exterior": ring}}}))
+
+
+def test_zones_whose_union_takes_minutes_are_not_granted():
+    """A drone's services would take as long for each grant, and read no other meanwhile."""
+    spiky = [comb("north", 150), comb("east", 150, across=True)]
+    inside = {"type": "GeofenceControl", "kind": "inclusion", "action": "land"}
+    with pytest.raises(
+        InvalidObject, match=r"Policy in spec\.selector\.zones: edges of its zones cross more than 5000 times"
+    ):
+        compiled(policy("in", ("north", "east"), **inside), zones=spiky)
+    # What was granted stays, as with any other broken policy.
+    (granted,) = compiled(policy("in", ("north",), **inside), zones=spiky)
+    stock = inventory([drone("d")], zones={z.name: z for z in spiky})
+    broken = dataclasses.replace(stock, policies={"in": policy("in", ("north", "east"), **inside)})
+    assert refresh(granted, broken).policies == granted.policies
+    # Others are not united.
+    assert compiled(policy("out", ("north", "east"), **FENCE), zones=spiky)
+
+
+def test_crossings_of_zones_are_the_same_across_the_antimeridian():
+    zones = [
+        tuple(sound(z) for z in (comb("north", 20, lon=lon), comb("east", 20, across=True, lon=lon)))
+        for lon in (20.0, 179.9999, -180.0)
+    ]
+    first, *others = (zone_crossings(each, 10**6) for each in zones)
+    assert first > 150
+    assert others == [pytest.approx(first, rel=0.05)] * 2
 
 
 def test_driver_and_passenger_get_their_own_grants():

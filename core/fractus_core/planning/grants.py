@@ -23,8 +23,8 @@ from fractus_core.api.plans import (
 from fractus_core.api.policies import PolicySpec
 from fractus_core.geo import area_of, ground, middle, polygon
 from fractus_core.planning.area import OperationArea, operation_area
-from fractus_core.planning.granted_zones import SoundZone, sound, surely_beyond
 from fractus_core.planning.inventory import Inventory, Settings
+from fractus_core.planning.zones import SoundZone, check_united, sound, surely_beyond
 from fractus_core.policy.access import SEEING
 from fractus_core.policy.footprint import MAX_SIGHT_M
 from fractus_core.policy.selectors import holds, node_attributes, owner_of
@@ -285,7 +285,7 @@ def _granted(
     Zones that are easily seen to be out of reach of `beyond` are not looked at any closer.
 
     Raises:
-        InvalidObject: a zone does not exist, or is broken.
+        InvalidObject: a zone does not exist, or is broken; or zones that are united where they are enforced cross too often.
     """
     named = dict.fromkeys(policy.spec.selector.zones)
     zones = [
@@ -302,6 +302,7 @@ def _granted(
         near = [zone for zone in zones if zone.is_within(reach_m, base)]
     if named and not near:
         return None
+    check_united(policy, near)
     # What is left out is not selected either, so that a node can tell a zone that is far from one that is missing.
     granted = tuple(zone.granted for zone in near)
     selector = policy.spec.selector.model_copy(update={"zones": tuple(zone.name for zone in granted)})

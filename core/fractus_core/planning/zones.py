@@ -1,17 +1,20 @@
-"""Zones as grants have them, looked at once for all grants, and which of them a node is far from."""
+"""Zones as grants have them, looked at once for all grants: which of them a node is far from, and how often their edges cross."""
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
+import numpy as np
 import shapely
 
-from fractus_core.api import InvalidObject, Zone
+from fractus_core.api import InvalidObject, Policy, Zone
 from fractus_core.api.geometry import Area, Point
 from fractus_core.api.plans import GrantedZone
-from fractus_core.geo import LocalFrame, distance_m, middle, polygon
+from fractus_core.geo import LocalFrame, crossings, distance_m, middle, polygon
+from fractus_core.planning.area import MAX_CROSSINGS
 
 _GENEROUS = 1.05
 """Room for what the frame of a large zone bends."""
@@ -33,9 +36,9 @@ def _circle_beyond(area: Area, base: Point, reach_m: float) -> bool:
     return circle is not None and distance_m(circle.center, base) > (reach_m + circle.radius) * _GENEROUS
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class SoundZone:
-    """A zone as it is granted, with its outline in a frame of its own."""
+    """A zone as it is granted, with its outline in a frame of its own; it equals none but itself."""
 
     granted: GrantedZone
     frame: LocalFrame
@@ -84,3 +87,35 @@ def sound(zone: Zone) -> SoundZone:
         InvalidObject: it is broken.
     """
     return _looked_at(_Same(zone))
+
+
+@lru_cache(maxsize=256)
+def zone_crossings(zones: tuple[SoundZone, ...], at_most: int) -> int:
+    """How often the edges of several zones cross; no more than `at_most` + 1 are counted."""
+    lines = []
+    for zone in zones if len(zones) > 1 else ():
+        for ring in shapely.get_rings(zone.outline):
+            lats, lons = zone.frame.latlon_array(shapely.get_coordinates(ring))
+            lines.append(np.column_stack([lons, lats]))
+    # Whatever a degree measures, edges cross in degrees or do not; but on one side of the antimeridian.
+    middle_lon = float(lines[0][0, 0]) if lines else 0.0
+    for line in lines:
+        line[:, 0] = (line[:, 0] - middle_lon + 540.0) % 360.0 - 180.0
+    return crossings(lines, at_most)
+
+
+def check_united(policy: Policy, zones: Sequence[SoundZone]) -> None:
+    """Refuse a policy whose zones are united where it is enforced, and would take too long for that.
+
+    Args:
+        policy: to be enforced.
+        zones: those of its zones that count.
+
+    Raises:
+        InvalidObject: their edges cross too often.
+    """
+    if policy.spec.kind == "inclusion" and zone_crossings(tuple(zones), MAX_CROSSINGS) > MAX_CROSSINGS:
+        raise InvalidObject(
+            f"Policy {policy.name} spec.selector.zones",
+            f"edges of its zones cross more than {MAX_CROSSINGS} times; make one zone of them, or give them fewer corners",
+        )

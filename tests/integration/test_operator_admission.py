@@ -118,6 +118,12 @@ def test_a_crossing_zone_and_an_unknown_zone_are_not_ready(world: World, operato
         ours("Policy", "knot", {"type": "GeofenceControl", "kind": "exclusion", "selector": {"zones": ["bowtie"]}})
     )
 
+    teeth = [*((0.02 * i, 100.0 * (i % 2)) for i in range(400)), (9.0, 101.0), (-1.0, 101.0)]
+    for name, corners in (("north", teeth), ("east", [(y, x) for x, y in teeth])):
+        world.put(ours("Zone", name, {"area": {"polygon": {"exterior": [at(*corner) for corner in corners]}}}))
+    both = {"type": "GeofenceControl", "kind": "inclusion", "selector": {"zones": ["north", "east"]}}
+    world.put(ours("Policy", "both", both))
+
     def ready(plural: str, name: str) -> Body | None:
         conditions = ((world.api.get(f"{FRACTUS}/{plural}/{name}") or {}).get("status") or {}).get("conditions") or ()
         return next((c for c in conditions if c["type"] == "Ready"), None)
@@ -130,6 +136,9 @@ def test_a_crossing_zone_and_an_unknown_zone_are_not_ready(world: World, operato
     assert "spec.selector.zones[0]" in missing["message"]
     knot = wait_for(lambda: ready("policies", "knot"), "the policy's condition")
     assert (knot["status"], knot["reason"]) == ("False", "ZoneInvalid")
+    crossed = wait_for(lambda: ready("policies", "both"), "the policy's condition")
+    assert (crossed["status"], crossed["reason"]) == ("False", "ZoneInvalid")
+    assert "cross more than 5000 times" in crossed["message"]
 
 
 def test_a_corrected_application_is_deployed(world: World, operator: OperatorProcess, namespace: str) -> None:

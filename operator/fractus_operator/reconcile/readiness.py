@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from datetime import datetime
 
 from fractus_core.api import Condition, InvalidObject, Policy, Zone
+from fractus_core.planning.zones import check_united, sound
 from fractus_core.validation import check_policy, check_zone
 
 from fractus_operator.cluster.kinds import POLICY, ZONE, Key, Kind
@@ -67,6 +68,11 @@ class Readiness:
             if update.status != "True":
                 message = f"spec.selector.zones[{i}]: Zone {name}: {update.message}"
                 return ConditionUpdate("Ready", "False", "ZoneInvalid", message)
+        found = [zones[name] for name in dict.fromkeys(policy.spec.selector.zones)]
+        try:
+            check_united(policy, [sound(zone) for zone in found if isinstance(zone, Zone)])
+        except InvalidObject as error:
+            return ConditionUpdate("Ready", "False", "ZoneInvalid", str(error))
         return ConditionUpdate("Ready", "True", "Valid", "the policy can be enforced")
 
     async def _report(self, kind: Kind, resource: Zone | Policy | Unreadable, update: ConditionUpdate) -> None:

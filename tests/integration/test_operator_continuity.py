@@ -158,6 +158,29 @@ def test_no_trouble_keeps_a_policy_from_a_grant(
     wait_for(lambda: granted(world, namespace) == [], "the policy to go")
 
 
+def _without_depot(world: World, namespace: str) -> None:
+    world.api.delete(f"{FRACTUS}/depots/base")
+
+
+@pytest.mark.parametrize("trouble", [_infeasible, _invalid, _without_depot])
+def test_no_trouble_keeps_what_runs_from_new_certificates(
+    world: World, operator: OperatorProcess, namespace: str, trouble: Any
+) -> None:
+    """They last for a day, and what waits for a node or a correction may wait for longer."""
+    running(world, namespace)
+    trouble(world, namespace)
+    wait_for(
+        lambda: world.condition(namespace, "Ready").get("reason") not in (None, "PodsReady", "PodsNotReady"),
+        lambda: f"the trouble to show: {world.status(namespace)}",
+    )
+    deployment = f"/apis/apps/v1/namespaces/{namespace}/deployments/traffic-navigator"
+    secret = f"/api/v1/namespaces/{namespace}/secrets/traffic-navigator-tls"
+    before = (world.api.get(secret) or {})["data"]["tls.crt"]
+    # To the operator, one that cannot be read is as one that has expired.
+    world.api.merge(deployment, {"metadata": {"annotations": {"fractus.dev/certificate": "expired"}}})
+    wait_for(lambda: (world.api.get(secret) or {})["data"]["tls.crt"] != before, lambda: operator.log()[-3000:])
+
+
 def test_a_broken_policy_stays_as_granted_and_blocks_no_other(
     world: World, operator: OperatorProcess, namespace: str
 ) -> None:

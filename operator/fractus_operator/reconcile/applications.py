@@ -219,7 +219,7 @@ class Applications:
             self._live.subscriptions.placed(seen.key, placed=False, full=blocked.full)
             await self._reporter.report(submitted, status.blocked(blocked, present))
             if seen.plan is not None:
-                await self._rollout.follow_pods(seen.key, seen.plan, seen.pods)
+                await self._rollout.keep_running(seen.key, submitted.application, seen.plan, seen.pods)
             return blocked.retry_s
         await self._reporter.report(submitted, update)
         return again_s

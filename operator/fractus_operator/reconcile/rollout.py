@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
@@ -17,6 +18,7 @@ from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Body, Key, Kind, key_of
 from fractus_operator.cluster.labels import CAUSE_ANNOTATION, CERTIFICATE_ANNOTATION, COMPONENT_LABEL
 from fractus_operator.cluster.pods import PodView
+from fractus_operator.cluster.store import KubeError
 from fractus_operator.inventory.bookings import ByName
 from fractus_operator.inventory.live import LiveInventory
 from fractus_operator.reconcile import builders
@@ -26,6 +28,8 @@ from fractus_operator.reconcile.difference import contains
 from fractus_operator.reconcile.isolation import network_policies
 from fractus_operator.reconcile.links import direct_links, retargeted
 from fractus_operator.reconcile.replanning import of_generation
+
+logger = logging.getLogger(__name__)
 
 _HEAD_START_S = 0.5
 """How long Deployments go first at most, where there are new ones: neither a webhook that holds them up nor pods that no node
@@ -200,10 +204,25 @@ class Rollout:
 
         return direct_links(application, decided, planned, path, pods, cluster_ip=cluster_ip)
 
-    async def follow_pods(self, key: Key, plan: DeploymentPlanSpec, pods: Sequence[PodView]) -> None:
-        """Bring the addresses in what was rolled out up to date with the pods, and change nothing else.
+    async def keep_running(
+        self, key: Key, application: Application | None, plan: DeploymentPlanSpec, pods: Sequence[PodView]
+    ) -> None:
+        """Renew what runs by a plan, addresses and certificates, where the next step has to wait: for days, if need be.
 
-        For an application whose next plan waits, or cannot be made: pods that restart meanwhile have other addresses.
+        Raises:
+            KubeError: the API server refuses a change of addresses, or cannot be reached.
+        """
+        await self.follow_pods(key, plan, pods)
+        try:
+            if application is not None:
+                await self.renew_certificates(application, plan, pods)
+        except KubeError as error:
+            if not error.status:
+                raise
+            logger.warning("rollout: certificates not renewed (application=%s/%s): %s", *key, error)
+
+    async def follow_pods(self, key: Key, plan: DeploymentPlanSpec, pods: Sequence[PodView]) -> None:
+        """Bring the addresses in what was rolled out up to date with the pods, which may restart, and change nothing else.
 
         Raises:
             KubeError: the API server refuses a change, or cannot be reached.

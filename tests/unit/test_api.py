@@ -134,6 +134,7 @@ def test_regions_that_cross_too_often_are_refused_before_they_are_united():
         return application(navigator(PATH) | {"control": "partial", "controlPoints": points})
 
     check_application(flown(star(0, 600), star(1000, 600), star(0, 600)), {})
+    check_application(flown(star(0, 3000), star(0, 3000)), {})
     app = flown(star(0, 600), star(1000, 4), star(5, 600))
     with pytest.raises(InvalidObject, match=r"components\[0\]\.controlPoints: ways and edges .* more than 5000 times"):
         check_application(app, {})

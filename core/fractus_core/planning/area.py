@@ -99,7 +99,9 @@ def check_crossings(spec: ApplicationSpec, route: Sequence[Position]) -> None:
     rings: list[Sequence[Point]] = []
     if driver is not None:
         ways: list[Sequence[Point]] = [point.path for point in driver.control_points if point.path is not None]
-        areas = (point.region.polygon for point in driver.control_points if point.region is not None)
+        areas = {point.region.polygon for point in driver.control_points if point.region is not None} - {None}
+        if not ways and len(areas) < 2:
+            return  # the rings of one region do not cross
         rings = [ring for area in areas if area is not None for ring in (area.exterior, *area.holes)]
         field = f"components[{spec.components.index(driver)}].controlPoints"
     elif poi is not None and poi.service_access == "path":

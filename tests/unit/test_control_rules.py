@@ -27,7 +27,7 @@ from fractus_core.control.values import (
     ended_refusal,
 )
 from fractus_core.control.vehicles import UNCONFIRMED_S
-from test_control_machine import ARMED, DRIVER, FLYING, FOUND, GROUND, GUIDED, LATE_S, LOITER, RTL
+from test_control_machine import ARMED, DRIVER, FLYING, FOUND, GROUND, GUIDED, LAND, LATE_S, LOITER, RTL
 
 
 def told_of(*events: told.Event, state: ControlState = FOUND) -> tuple[ControlState, tuple[Action, ...]]:
@@ -299,6 +299,33 @@ def test_a_mode_change_whose_answers_were_lost_is_the_systems() -> None:
     assert other.authority is Authority.PILOT
     observed, _ = told_of(shown[0], state=given_up)
     assert transition(observed, shown[1], LATE_S)[0].authority is Authority.PILOT, "too late to be ours"
+
+
+def test_a_mode_that_is_obeyed_late_is_the_systems_while_the_next_one_is_asked_for() -> None:
+    given_up = (told.ModeChangeBegan(LAND), told.ModeChangeEnded(LAND, GUIDED, done=False))
+    shows = {
+        mode: (told.VehicleObserved(replace(FLYING, mode=mode)), told.Heartbeat()) for mode in (LAND, GUIDED, LOITER)
+    }
+    next_one = (told.ModeChangeBegan(GUIDED), *shows[LAND])
+    done = (*shows[GUIDED], told.ModeChangeEnded(GUIDED, LAND, done=True), told.Heartbeat())
+    ours, _ = told_of(*FLIES, *given_up, *next_one, *done)
+    assert ours.authority is Authority.DRIVER
+    pilots, _ = told_of(*FLIES, *given_up, *next_one, *shows[LOITER])
+    assert pilots.authority is Authority.PILOT
+    state, _ = told_of(*FLIES, *given_up)
+    for event in next_one:
+        state, _ = transition(state, event, UNCONFIRMED_S + 0.1)
+    assert state.authority is Authority.PILOT, "too late to be ours"
+
+
+def test_a_mode_that_was_asked_for_before_a_failsafe_is_no_pilots() -> None:
+    returns = (told.VehicleObserved(replace(FLYING, mode=RTL, failsafe=True)), told.Heartbeat())
+    asked = (told.ModeChangeBegan(LAND), *returns, told.ModeChangeEnded(LAND, GUIDED, done=False))
+    lands = (told.VehicleObserved(replace(FLYING, mode=LAND, failsafe=True)), told.Heartbeat())
+    ours, _ = told_of(*FLIES, *asked, *lands)
+    assert ours.authority is Authority.SYSTEM
+    refused = (*asked[:-1], told.ModeChangeEnded(LAND, GUIDED, done=False, refused=True))
+    assert told_of(*FLIES, *refused, *lands)[0].authority is Authority.PILOT
 
 
 def test_a_mode_that_the_autopilot_refused_is_not_the_systems() -> None:

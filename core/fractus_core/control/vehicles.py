@@ -53,7 +53,9 @@ def on_vehicle(step: Step, event: VehicleEvent) -> None:
                 step.update_mission(mission, flown=True)
                 step.act(SaveJournal())
         case ModeChangeBegan(mode):
-            own = step.state.own_modes | {step.state.vehicle.mode, mode}
+            own, late = step.state.own_modes | {step.state.vehicle.mode, mode}, step.state.unconfirmed
+            if late is not None and step.now < late[1]:
+                own |= {late[0]}
             step.set(expected_mode=mode, mode_changes=step.state.mode_changes + 1, own_modes=own)
         case ModeChangeEnded(mode, before, done, refused):
             changes = max(step.state.mode_changes - 1, 0)
@@ -63,6 +65,9 @@ def on_vehicle(step: Step, event: VehicleEvent) -> None:
                 step.set(unconfirmed=None)
             elif step.state.expected_mode == mode and step.state.vehicle.mode != mode:
                 step.set(expected_mode=before, unconfirmed=None if refused else (mode, step.now + UNCONFIRMED_S))
+            elif not refused and step.state.expected_mode != mode and step.state.authority is Authority.SYSTEM:
+                # A failsafe came between: what was sent before it was heard may take effect after it.
+                step.set(unconfirmed=(mode, step.now + UNCONFIRMED_S))
         case _:
             assert_never(event)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -53,24 +54,12 @@ class SoundZone:
         return float(self.outline.distance(shapely.Point(*self.frame.xy(base.lat, base.lon))))
 
 
-class _Same:
-    """A Zone that equals none but itself: to compare and hash all its points takes longer than to look at it."""
-
-    __slots__ = ("zone",)
-
-    def __init__(self, zone: Zone) -> None:
-        self.zone = zone
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and other.zone is self.zone
-
-    def __hash__(self) -> int:
-        return id(self.zone)
+_SOUND: dict[int, SoundZone] = {}
+"""Zones that were looked at, by the identity of their objects: to hash and compare all their points takes longer than that."""
 
 
-@lru_cache(maxsize=2048)
-def _looked_at(same: _Same) -> SoundZone:
-    name, spec = same.zone.name, same.zone.spec
+def _looked_at(zone: Zone) -> SoundZone:
+    name, spec = zone.name, zone.spec
     try:
         frame = LocalFrame.at(middle(spec.area))
         outline = polygon(frame, spec.area)
@@ -81,15 +70,19 @@ def _looked_at(same: _Same) -> SoundZone:
 
 
 def sound(zone: Zone) -> SoundZone:
-    """A zone as grants have it; of one object it is made once.
+    """A zone as grants have it; of one object it is made once, and kept as long as that is.
 
     Raises:
         InvalidObject: it is broken.
     """
-    return _looked_at(_Same(zone))
+    known = _SOUND.get(id(zone))
+    if known is None:
+        known = _SOUND[id(zone)] = _looked_at(zone)
+        weakref.finalize(zone, _SOUND.pop, id(zone), None)
+    return known
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=32)
 def zone_crossings(zones: tuple[SoundZone, ...], at_most: int) -> int:
     """How often the edges of several zones cross; no more than `at_most` + 1 are counted."""
     lines = []

@@ -138,7 +138,7 @@ def test_a_crossing_zone_and_an_unknown_zone_are_not_ready(world: World, operato
     assert (knot["status"], knot["reason"]) == ("False", "ZoneInvalid")
     crossed = wait_for(lambda: ready("policies", "both"), "the policy's condition")
     assert (crossed["status"], crossed["reason"]) == ("False", "ZoneInvalid")
-    assert "cross more than 5000 times" in crossed["message"]
+    assert "cross more than 50000 times" in crossed["message"]
 
 
 def test_a_corrected_application_is_deployed(world: World, operator: OperatorProcess, namespace: str) -> None:

@@ -1,6 +1,7 @@
 """Grants: which policies reach which instance, and that what cannot be resolved grants nothing."""
 
 import dataclasses
+import gc
 
 import pytest
 import shapely
@@ -10,7 +11,7 @@ from fractus_core.geo import polygon
 from fractus_core.planning import flight_of, grants, plan
 from fractus_core.planning.area import operation_area
 from fractus_core.planning.grants import compile_grants, refresh
-from fractus_core.planning.zones import sound, zone_crossings
+from fractus_core.planning.zones import _SOUND, sound, zone_crossings
 from fractus_core.policy.compiled import compile_grant
 from fractus_core.policy.engine import judge
 from fractus_core.policy.selectors import is_attribute, matches, node_attributes
@@ -50,10 +51,10 @@ def comb(name, teeth, across=False, lon=None):
 
 def test_zones_whose_union_takes_minutes_are_not_granted():
     """A drone's services would take as long for each grant, and read no other meanwhile."""
-    spiky = [comb("north", 150), comb("east", 150, across=True)]
+    spiky = [comb("north", 480), comb("east", 480, across=True)]
     inside = {"type": "GeofenceControl", "kind": "inclusion", "action": "land"}
     with pytest.raises(
-        InvalidObject, match=r"Policy in spec\.selector\.zones: edges of its zones cross more than 5000 times"
+        InvalidObject, match=r"Policy in spec\.selector\.zones: edges of its zones cross more than 50000 times"
     ):
         compiled(policy("in", ("north", "east"), **inside), zones=spiky)
     # What was granted stays, as with any other broken policy.
@@ -63,6 +64,19 @@ def test_zones_whose_union_takes_minutes_are_not_granted():
     assert refresh(granted, broken).policies == granted.policies
     # Others are not united.
     assert compiled(policy("out", ("north", "east"), **FENCE), zones=spiky)
+
+
+def test_what_was_seen_of_a_zone_goes_with_it():
+    """Each change of a zone, also of its status, is another object."""
+    gc.collect()
+    before, near = len(_SOUND), zone("near", (50, 0))
+    compiled(policy("out", ("near",), **FENCE), zones=[near])
+    compiled(policy("out", ("near",), **FENCE), zones=[near])
+    assert len(_SOUND) == before + 1
+    assert sound(near) is sound(near)
+    del near
+    gc.collect()
+    assert len(_SOUND) == before
 
 
 def test_crossings_of_zones_are_the_same_across_the_antimeridian():

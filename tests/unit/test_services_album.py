@@ -87,6 +87,21 @@ async def test_a_picture_of_an_earlier_release_has_an_unknown_place(tmp_path: Pa
     world.shutter.close()
 
 
+async def test_faces_are_not_looked_for_in_a_picture_that_may_be_a_part_of_the_view(tmp_path: Path) -> None:
+    """Releases that cropped before they looked for faces did not say so."""
+    world = World(tmp_path)
+    shot = await world.capture(active_grant())
+    record = world.album.path(owner_of(active_grant()), shot.name).with_suffix(".json")
+    body = json.loads(record.read_text())
+    assert body.pop("whole")
+    record.write_text(json.dumps({**body, "face_px": 900.0}))
+    world.shutter.close()
+    world = World(tmp_path)
+    (kept,) = (await world.library.list(active_grant()))[1]
+    assert kept == replace(shot, face_px=0.0, whole=False)
+    world.shutter.close()
+
+
 def modes(directory: Path) -> dict[str, set[int]]:
     """Permissions of the folders and files of an album."""
     found = [(path.is_dir(), stat.S_IMODE(path.stat().st_mode)) for path in directory.rglob("*")]

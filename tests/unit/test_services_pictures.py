@@ -354,7 +354,7 @@ def test_records_of_pictures_survive_json() -> None:
     import json
 
     pose = Pose.of(at(attitude=Attitude(1, 2, 3)))
-    shot = Shot("n", NOW, 10, 20, 30, (pose, Pose.of(at(home=None))), 12.0, (Filter("blurFaces", "gaussian"),))
+    shot = Shot("n", NOW, 10, 20, 30, (pose, Pose.of(at(home=None))), 12.0, (Filter("blurFaces", "gaussian"),), True)
     assert Shot.parse(json.loads(json.dumps(shot.to_json()))) == shot
     for broken in ({}, {"before": 1}, {**shot.to_json(), "colour": "red"}):
         with pytest.raises(ValueError, match="no shot"):

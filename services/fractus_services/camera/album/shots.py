@@ -24,6 +24,7 @@ class Shot:
         poses: where the camera was while it was taken, from its begin to its end.
         face_px: width of the smallest face that it may show; 0 when it is unknown.
         filters: what was done to it.
+        whole: whether it shows all of the camera's view; faces in a part of it are cut, and their size is taken to be unknown.
     """
 
     name: str
@@ -34,6 +35,7 @@ class Shot:
     poses: tuple[Pose, ...]
     face_px: float = 0.0
     filters: tuple[Filter, ...] = ()
+    whole: bool = False
 
     def to_json(self) -> dict[str, Any]:
         """As JSON values."""
@@ -50,6 +52,9 @@ class Shot:
             if "poses" not in body:
                 known = {key: value for key, value in body.items() if key in cls.__slots__}
                 body = {**known, "poses": [asdict(Pose.of(Situation(0.0)))], "face_px": 0.0}
+            if not body.get("whole"):
+                # In a part of the view faces are cut; releases that did not say so kept their size all the same.
+                body = {**body, "face_px": 0.0}
             poses = tuple(Pose.parse(pose) for pose in body["poses"])
             shot = cls(**{**body, "poses": poses, "filters": tuple(Filter(**one) for one in body["filters"])})
             sound = all(pose.at(Situation(0.0)).sound for pose in poses) and math.isfinite(shot.face_px + shot.time_s)

@@ -214,8 +214,9 @@ class PictureCapture:
             span.note("fractus.filters", [one.action for one in plan.filters])
             data = await asyncio.to_thread(work)
         # In a part of the view faces are cut as well, when they have to be hidden later.
-        found_px = face_px if max(whole[0] - asked[0], whole[1] - asked[1]) <= _ROUNDED_PX else 0.0
-        shot = Shot(exposure.name, moment_s, *asked, len(data), poses, found_px, plan.filters)
+        uncut = max(whole[0] - asked[0], whole[1] - asked[1]) <= _ROUNDED_PX
+        found_px = face_px if uncut else 0.0
+        shot = Shot(exposure.name, moment_s, *asked, len(data), poses, found_px, plan.filters, whole=uncut)
         await asyncio.to_thread(self._album.add, owner_of(grant), shot, data)
         return verdict, shot
 

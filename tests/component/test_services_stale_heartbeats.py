@@ -73,3 +73,22 @@ def test_a_drone_that_landed_while_its_link_was_cut_is_not_taken_for_a_flying_on
             assert not any("found the drone in the air" in event for event in drone._account.events)
 
     fly(work, tmp_path)
+
+
+def test_a_drone_that_landed_as_its_connection_broke_is_not_taken_for_a_flying_one(tmp_path: Path) -> None:
+    async def work(sky: Sky, directory: Path) -> None:
+        async with ready(sky, directory) as (drone, grant):
+            await drone.service.arm(grant, 120.0)
+            await end(drone.service.take_off(grant, TakeoffArgs(15.0)))
+            landing = asyncio.ensure_future(end(drone.service.land(grant)))
+            await until(lambda: not sky.truth.armed)
+            assert drone.autopilot.vehicle.armed
+            (wire,) = sky.wires
+            wire._protocol.connection_lost(None)
+            await until(lambda: drone.autopilot._broken.is_set() or sky.wires != [wire])
+            await until(lambda: drone.autopilot.connected and sky.wires != [wire], 10.0)
+            assert not drone.autopilot.vehicle.armed
+            assert not any("found the drone in the air" in event for event in drone._account.events)
+            await asyncio.gather(landing, return_exceptions=True)
+
+    fly(work, tmp_path)

@@ -132,10 +132,10 @@ class MavlinkAutopilot(Link):
     def _lost(self) -> None:
         self.vehicle.gimbal_measured = self.vehicle.gimbal_limits = None
         self.vehicle.unclear = ""
-        self._streams.forget()
-        self._home_watch.forget()
-        self._acknowledgements.forget()
-        self.vehicle_parameters.forget()
+        # The first heartbeat of a new connection is believed: the drone may have landed meanwhile.
+        self.vehicle.stopping_at = -math.inf
+        for part in (self._streams, self._home_watch, self._acknowledgements, self.vehicle_parameters):
+            part.forget()
 
     def take(self, incoming: Message) -> None:
         """Hand on a message of the vehicle."""

@@ -19,6 +19,9 @@ from fractus_services.errors import AutopilotError, Refused, Unavailable
 from fractus_services.grants import ActiveGrant
 from fractus_services.mobility.authority import drivers
 from fractus_services.mobility.authority.home import home_moved
+from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
+from fractus_services.mobility.mavlink.home_watch import HomeWatch
+from fractus_services.mobility.mavlink.vehicle import Vehicle
 from fractus_services.mobility.rpc.telemetry import located
 from mobility_world import FRAME, GROUND_M, GUIDED, LOITER, SMART_RTL, World, at, end, refusal, spec
 from sky_drone import ready, until
@@ -299,3 +302,27 @@ def test_home_that_is_moved_up_or_down_is_noticed_though_the_news_of_it_is_lost(
             assert abs(-sky.truth.body.down - 15.0) < 2.5
 
     sky_drone.fly(work, tmp_path)
+
+
+async def test_home_that_is_not_told_is_asked_for_a_few_times_a_second() -> None:
+    """A refusal comes at once."""
+
+    class Refusing:
+        vehicle, connected, asked = Vehicle(stack=ARDUCOPTER, armed=True, heartbeat_at=10.0), True, 0
+
+        async def ask_home(self) -> None:
+            self.asked += 1
+            raise AutopilotError("refused", refused=True)
+
+    autopilot = Refusing()
+    assert autopilot.vehicle.in_air
+    watch = HomeWatch(autopilot)
+    for amsl_m in (50.0, 90.0):
+        autopilot.vehicle.amsl_m = amsl_m
+        watch.take("GLOBAL_POSITION_INT")
+    for _ in range(20):
+        await asyncio.sleep(0)
+        watch.take("ATTITUDE")
+    assert autopilot.asked == 1
+    assert watch._asking is not None
+    watch._asking.cancel()

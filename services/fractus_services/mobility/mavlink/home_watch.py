@@ -64,4 +64,4 @@ class HomeWatch:
     async def _ask(self) -> None:
         with suppress(AutopilotError):
             await self._autopilot.ask_home()
-            await asyncio.sleep(AGAIN_S)
+        await asyncio.sleep(AGAIN_S)

@@ -102,6 +102,7 @@ class GrantFiles:
 
     async def run(self) -> None:
         """Watch until cancelled: changes are read at once, and all files every 2 s."""
+        told = ""
         while True:
             try:
                 self._directory.mkdir(parents=True, exist_ok=True)
@@ -111,9 +112,12 @@ class GrantFiles:
                         await self._scan_aside()
                         self._remember()
             except OSError as error:
-                log.warning("grants: cannot watch, scanning instead (directory=%s): %s", self._directory, error)
+                if str(error) != told:
+                    told = str(error)
+                    log.warning("grants: cannot watch, scanning instead (directory=%s): %s", self._directory, error)
             await asyncio.sleep(RESCAN_INTERVAL_S)
             await self._scan_aside()
+            self._remember()
 
     def _remember(self) -> None:
         """Store what was seen, in a thread: a disk that hangs must not delay a change of grants."""

@@ -114,7 +114,7 @@ class Mission:
         points_done: control points that were returned.
         waypoints: waypoints of the present control point that were reached, or points of interest that were visited.
         flown: whether the vehicle has been in the air for it.
-        home: latitude, longitude and altitude above sea level of where it armed first.
+        home: latitude, longitude and altitude above sea level of where it armed for its first takeoff.
         leg_flown: whether a leg of its driver has ended, or its driver has steered it.
     """
 

@@ -1,4 +1,4 @@
-"""Home, from which altitudes count and to which all ways home lead: where the mission armed first, also when others move it."""
+"""Home, from which altitudes count and to which all ways home lead: where the mission armed for its first takeoff, also when others move it."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def _apart(home: Home, began: tuple[float, float, float]) -> bool:
 
 
 async def keep_home(autopilot: Autopilot, state: Callable[[], ControlState]) -> None:
-    """Set home back to where the mission armed first, if it was moved.
+    """Set home back to where the mission armed for its first takeoff, if it was moved.
 
     Args:
         autopilot: the link.

@@ -44,7 +44,8 @@ MAX_PACE = 6.0
 """A simulator that runs faster than this multiple of real time cannot be followed."""
 
 OVERTAKEN_S = 5.0
-"""A position that is older than the last by less than this was overtaken on its way; by more: the vehicle has restarted."""
+"""A position that is older than the last by less than this was overtaken on its way. One that is older by more is of long ago, or the
+vehicle has restarted: then the next one goes on from it."""
 
 _WRAP_MS = 1 << 32
 _SLACK_S = 0.5

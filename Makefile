@@ -73,7 +73,7 @@ test: packages env lint ## Everything: lint, types, unit, component, integration
 	$(RUN) fractus cluster binaries
 	$(QUICK) tests/component tests/unit --ignore $(GOLDEN)
 	FRACTUS_DEEP=1 $(RUN) pytest -q -n 2 $(GOLDEN)
-	$(RUN) pytest -n 3 --dist loadgroup --no-loadscope-reorder $(INTEGRATION) $(call second_try,-n 1 --dist loadgroup $(INTEGRATION_FILES))
+	$(RUN) pytest -n 4 --dist loadgroup --no-loadscope-reorder $(INTEGRATION) $(call second_try,-n 1 --dist loadgroup $(INTEGRATION_FILES))
 ifeq ($(FRACTUS_E2E_CLUSTER),current)
 	$(RUN) pytest $(E2E) $(call second_try,$(E2E))
 else

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -18,6 +19,7 @@ from typing import Any
 
 import pytest
 import yaml
+from docs_commands import typed_lines
 from fractus_cluster.cluster import Cluster
 from fractus_cluster.errors import ClusterError
 from fractus_cluster.images.build import build_images
@@ -69,10 +71,9 @@ def spec_of(name: str, nodes: int = 2) -> ClusterSpec:
     """A drone with a disk of its own, and edge nodes."""
     drone = load_spec(ROOT / "examples" / "clusters" / "demo.yaml").nodes[0].model_dump(by_alias=True)
     drone["hardware"]["disk"] = {"size": "32Mi"}
-    edges = [
-        {"name": f"edge-{n}", "class": "edge", "resources": {"cpu": 1, "memory": "1Gi", "fractus.dev/gpu": 3}}
-        for n in range(1, nodes)
-    ]
+    edge = load_spec(ROOT / "examples" / "clusters" / "demo.yaml").nodes[1].model_dump(by_alias=True)
+    edge["resources"] = {"cpu": 1, "memory": "1Gi", "fractus.dev/gpu": 3}
+    edges = [{**edge, "name": f"edge-{n}"} for n in range(1, nodes)]
     return parse_spec({"name": name, "nodes": [drone, *edges]}, source="test")
 
 
@@ -232,6 +233,36 @@ def test_cut_link_loses_contact_and_nothing_else(healthy: Cluster) -> None:
     again = pods(healthy)["edge-1"]
     assert again["metadata"]["uid"] == pod["metadata"]["uid"]
     assert again["status"]["containerStatuses"][0]["restartCount"] == 0
+
+
+def test_the_commands_of_its_page_do_what_they_say(healthy: Cluster) -> None:
+    drone, edge = healthy.node("drone-1"), healthy.node("edge-1")
+    typed_words = [shlex.split(line, comments=True) for line in typed_lines("docs/embedded-cluster.md")]
+    lines = {words[2]: words for words in typed_words if len(words) > 3}
+
+    def typed(verb: str, *instead: str) -> str:
+        """A line as it stands, or with its last words replaced; with the cluster's name, for there are others."""
+        words = lines[verb]
+        argv = [str(Path(sys.executable).with_name("fractus")), "cluster", verb, "--name", NAME, *words[3:]]
+        argv = [*argv[: len(argv) - len(instead)], *instead] if instead else argv
+        done = subprocess.run(argv, capture_output=True, text=True, timeout=120, check=False)
+        assert done.returncode == 0, f"{argv}: {done.stderr}"
+        return done.stdout
+
+    assert str(drone.address) in typed("exec")
+    assert (lines["power"][3:], lines["link"][3:]) == (["off", "drone-1"], ["cut", "edge-1"])
+    typed("power")
+    assert not drone.powered
+    typed("power", "on", "drone-1")
+    assert drone.powered
+    typed("link")
+    assert [node.linked for node in healthy.status() if node.name == "edge-1"] == [False]
+    typed("link", "heal", "edge-1")
+    assert [node.linked for node in healthy.status() if node.name == "edge-1"] == [True]
+    assert edge.exec(["cat", "/sys/class/net/wlan0/operstate"]).stdout
+    typed("radio")
+    typed("radio", "on")
+    assert "kubelet" in typed("logs")
 
 
 @pytest.mark.parametrize("victim", ["control-plane", "node.edge-1", "vehicle.drone-1"])

@@ -66,3 +66,13 @@ def test_services_get_further_variables() -> None:
     assert variables["fractus-mobility"][-1] == added
     assert added not in variables["fractus-camera"]
     assert "FRACTUS_NODE" in {one["name"] for one in variables["fractus-mobility"]}
+
+
+def test_any_name_and_path_stays_text() -> None:
+    said = ["--set-string=priorityClass.name=123", "--set=host.config=/etc/a: b}", "--set=logLevel=INFO"]
+    bodies = {(body["kind"], body["metadata"]["name"]): body for body in render(*said)}
+    assert ("PriorityClass", "123") in bodies
+    agent = bodies["DaemonSet", "fractus-agent"]["spec"]["template"]["spec"]
+    assert agent["priorityClassName"] == "123"
+    paths = {volume["name"]: volume["hostPath"]["path"] for volume in agent["volumes"] if "hostPath" in volume}
+    assert paths["config"] == "/etc/a: b}"

@@ -63,8 +63,8 @@ imagePullSecrets:
 {{- end }}
 
 {{- define "fractus.logEnv" -}}
-- {name: FRACTUS_LOG_LEVEL, value: {{ .Values.logLevel }}}
-- {name: FRACTUS_LOG_FORMAT, value: {{ .Values.logFormat }}}
+- {name: FRACTUS_LOG_LEVEL, value: {{ .Values.logLevel | quote }}}
+- {name: FRACTUS_LOG_FORMAT, value: {{ .Values.logFormat | quote }}}
 {{- end }}
 
 {{/* Where nodes tell their metrics: localhost, node (their own address, out of reach over direct links), or nothing. */}}

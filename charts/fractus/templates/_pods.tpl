@@ -68,7 +68,7 @@ which the policy fractus-pods keeps others below, and tolerate everything.
 hostNetwork: true
 dnsPolicy: Default
 enableServiceLinks: false
-priorityClassName: {{ .root.Values.priorityClass.name }}
+priorityClassName: {{ .root.Values.priorityClass.name | quote }}
 terminationGracePeriodSeconds: 10
 affinity:
   {{- $ours := printf `{"key": "fractus.dev/class", "operator": "In", "values": %s}` (toJson .classes) | fromJson }}

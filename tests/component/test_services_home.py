@@ -266,7 +266,9 @@ def test_an_attempt_to_arm_that_came_to_nothing_leaves_no_home_behind(tmp_path: 
 
 
 @pytest.mark.parametrize("up_m", [-40.0, 40.0])
-def test_home_that_is_moved_up_or_down_is_noticed_though_the_news_of_it_is_lost(up_m: float, tmp_path: Path) -> None:
+def test_home_that_is_moved_up_or_down_is_noticed_though_the_news_of_it_is_lost(
+    up_m: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Another station on the same port has stopped the stream that tells of home, and the one message about its move is lost."""
 
     async def work(sky: Sky, directory: Path) -> None:
@@ -291,7 +293,7 @@ def test_home_that_is_moved_up_or_down_is_noticed_though_the_news_of_it_is_lost(
             kind = float(layout_named("HOME_POSITION").msgid)
             tell("COMMAND_LONG", command=MAV_CMD.SET_MESSAGE_INTERVAL, param1=kind, param2=-1.0)
             await asyncio.sleep(0.3)
-            wire._protocol.data_received = lose_the_first  # type: ignore[method-assign]
+            monkeypatch.setattr(wire._protocol, "data_received", lose_the_first)
             lat, lon = (round(degrees * 1e7) for degrees in at(0, 0))
             place = {"x": lat, "y": lon, "z": GROUND_M + up_m}
             tell("COMMAND_INT", command=MAV_CMD.DO_SET_HOME, frame=MAV_FRAME.GLOBAL, **place)

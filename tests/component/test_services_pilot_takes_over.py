@@ -17,7 +17,7 @@ from mobility_world import end, goto
 from sky_drone import fly, ready, until
 
 
-def lose_mode_changes(wire: Wire, count: int) -> list[float]:
+def lose_mode_changes(wire: Wire, count: int, monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """Let the first changes of mode that the companion sends be lost; the times of all of them, as they are sent."""
     write, parser, sent_at = wire.write, Parser(), []
 
@@ -29,13 +29,13 @@ def lose_mode_changes(wire: Wire, count: int) -> list[float]:
                     return
         write(data)
 
-    wire.write = noted  # type: ignore[method-assign]
+    monkeypatch.setattr(wire, "write", noted)
     return sent_at
 
 
 @pytest.mark.parametrize("after_s", [0.1, 0.5, 1.0])
 def test_a_pilot_who_takes_over_while_the_system_changes_the_mode_keeps_the_drone(
-    after_s: float, tmp_path: Path
+    after_s: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The first commands to land are lost: those that follow would come after the pilot's, and the system's would count."""
 
@@ -44,7 +44,7 @@ def test_a_pilot_who_takes_over_while_the_system_changes_the_mode_keeps_the_dron
             await drone.service.arm(grant, 120.0)
             await end(drone.service.take_off(grant, TakeoffArgs(15.0)))
             await end(drone.service.goto(grant, goto(0, 40, 15), 0.0))
-            sent_at = lose_mode_changes(sky.wires[0], 3)
+            sent_at = lose_mode_changes(sky.wires[0], 3, monkeypatch)
             await drivers.give_back(drone.control, grant)
             await until(lambda: sent_at)
             await asyncio.sleep(after_s)

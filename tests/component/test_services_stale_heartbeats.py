@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import pytest
 from closed_loop import Sky
 from fractus_core.control import StreamState
 from fractus_core.policy.values import TakeoffArgs
@@ -16,7 +17,9 @@ from mobility_world import end, goto
 from sky_drone import fly, ready, until
 
 
-def test_heartbeats_of_standing_motors_in_flight_take_the_drone_from_no_one(tmp_path: Path) -> None:
+def test_heartbeats_of_standing_motors_in_flight_take_the_drone_from_no_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     async def work(sky: Sky, directory: Path) -> None:
         async with ready(sky, directory) as (drone, grant):
             (wire,) = sky.wires
@@ -26,7 +29,7 @@ def test_heartbeats_of_standing_motors_in_flight_take_the_drone_from_no_one(tmp_
                 kept.extend(m.frame for m in parser.feed(bytes(data)) if m.name == "HEARTBEAT" and not sky.truth.armed)
                 deliver(data)
 
-            wire._protocol.data_received = keep  # type: ignore[method-assign]
+            monkeypatch.setattr(wire._protocol, "data_received", keep)
             await until(lambda: len(kept) >= 3)
             await drone.service.arm(grant, 120.0)
             climb = asyncio.ensure_future(end(drone.service.take_off(grant, TakeoffArgs(15.0))))

@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import pytest
 from closed_loop import Sky
 from fractus_core.policy.values import TakeoffArgs
 from fractus_mavlink import Parser
@@ -15,7 +16,9 @@ from mobility_world import FRAME, end, goto
 from sky_drone import fly, ready, until
 
 
-def test_a_position_at_home_from_long_ago_is_not_where_a_drone_on_its_way_home_is(tmp_path: Path) -> None:
+def test_a_position_at_home_from_long_ago_is_not_where_a_drone_on_its_way_home_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     async def work(sky: Sky, directory: Path) -> None:
         def away_m() -> float:
             place = sky.truth.true_place
@@ -31,7 +34,7 @@ def test_a_position_at_home_from_long_ago_is_not_where_a_drone_on_its_way_home_i
 
             await drone.service.arm(grant, 120.0)
             await end(drone.service.take_off(grant, TakeoffArgs(15.0)))
-            wire._protocol.data_received = keep  # type: ignore[method-assign]
+            monkeypatch.setattr(wire._protocol, "data_received", keep)
             await until(lambda: kept)
             await end(drone.service.goto(grant, goto(0, 60, 15), 0.0))
             deliver(kept[0])

@@ -62,7 +62,7 @@ def test_streams_that_another_station_stopped_come_again(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("kind", ["SYS_STATUS", "GLOBAL_POSITION_INT"])
 def test_a_stream_whose_request_was_lost_comes_though_the_answer_to_another_one_came_twice(
-    kind: str, tmp_path: Path
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def work(sky: Sky, directory: Path) -> None:
         connect, wanted, lost = sky.create_connection, float(layout_named(kind).msgid), []
@@ -85,7 +85,7 @@ def test_a_stream_whose_request_was_lost_comes_though_the_answer_to_another_one_
             wire.write = lose_the_first
             return wire, protocol
 
-        sky.create_connection = create_connection  # type: ignore[method-assign]
+        monkeypatch.setattr(sky, "create_connection", create_connection)
         async with ready(sky, directory) as (drone, grant):
             await drone.service.arm(grant, 60.0)
             assert lost

@@ -142,16 +142,21 @@ def _foreign_deployment(world: World, namespace: str) -> None:
     world.api.merge(path, {"metadata": {"ownerReferences": None, "annotations": None}})
 
 
-@pytest.mark.parametrize("trouble", [_infeasible, _invalid, _foreign_deployment])
-def test_no_trouble_keeps_a_policy_from_a_grant(
-    world: World, operator: OperatorProcess, namespace: str, trouble: Any
-) -> None:
+def _in_trouble(world: World, namespace: str, trouble: Any) -> None:
+    """An application that runs, and has got into trouble since."""
     running(world, namespace)
     trouble(world, namespace)
     wait_for(
         lambda: world.condition(namespace, "Ready").get("reason") not in (None, "PodsReady", "PodsNotReady"),
         lambda: f"the trouble to show: {world.status(namespace)}",
     )
+
+
+@pytest.mark.parametrize("trouble", [_infeasible, _invalid, _foreign_deployment])
+def test_no_trouble_keeps_a_policy_from_a_grant(
+    world: World, operator: OperatorProcess, namespace: str, trouble: Any
+) -> None:
+    _in_trouble(world, namespace, trouble)
     world.put(ours("Policy", "low", LOW))
     wait_for(lambda: granted(world, namespace) == ["low"], lambda: f"the policy: {operator.log()[-3000:]}")
     world.api.delete(f"{FRACTUS}/policies/low")
@@ -167,12 +172,7 @@ def test_no_trouble_keeps_what_runs_from_new_certificates(
     world: World, operator: OperatorProcess, namespace: str, trouble: Any
 ) -> None:
     """They last for a day, and what waits for a node or a correction may wait for longer."""
-    running(world, namespace)
-    trouble(world, namespace)
-    wait_for(
-        lambda: world.condition(namespace, "Ready").get("reason") not in (None, "PodsReady", "PodsNotReady"),
-        lambda: f"the trouble to show: {world.status(namespace)}",
-    )
+    _in_trouble(world, namespace, trouble)
     deployment = f"/apis/apps/v1/namespaces/{namespace}/deployments/traffic-navigator"
     secret = f"/api/v1/namespaces/{namespace}/secrets/traffic-navigator-tls"
     before = (world.api.get(secret) or {})["data"]["tls.crt"]

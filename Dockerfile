@@ -153,10 +153,10 @@ RUN uv build --quiet --wheel --no-build-isolation --out-dir /wheel \
       for name in fractus_proto "$@"; do cp -a /code/$name /images/$target/; done; \
       cp -a /code/fractus_drones-*.dist-info /images/$target/; } \
  && assemble component fractus fractus_cli \
- && assemble operator fractus_cli fractus_core fractus_kube fractus_observe fractus_operator \
- && assemble agent fractus_core fractus_kube fractus_observe fractus_storage fractus_agent \
- && assemble services fractus fractus_cli fractus_core fractus_mavlink fractus_observe fractus_storage fractus_services \
- && assemble view fractus_core fractus_kube fractus_cli fractus_observe fractus_view \
+ && assemble operator fractus_cli fractus_core fractus_runtime fractus_operator \
+ && assemble agent fractus_core fractus_runtime fractus_agent \
+ && assemble services fractus fractus_cli fractus_core fractus_mavlink fractus_runtime fractus_services \
+ && assemble view fractus_core fractus_runtime fractus_cli fractus_view \
  && assemble sim fractus_vehicle fractus_world
 
 # ---- python: the common start of all images, with what the SDK needs

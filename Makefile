@@ -160,12 +160,11 @@ bench: env ## Run every benchmark
 	for file in bench/*.py; do $(RUN) python "$$file" --quick; done
 
 .PHONY: release
-release: env ## Set VERSION=X.Y.Z of package and charts, and gather the changelog for it; commit and tag what this leaves
+release: env ## Set VERSION=X.Y.Z of the package and the charts; describe it in CHANGELOG.md, commit and tag
 	@[[ "$${VERSION:-}" =~ ^[0-9]+\.[0-9]+\.[0-9]+$$ ]] || { echo "give VERSION=X.Y.Z" >&2; exit 1; }
 	sed -i 's/^version = ".*"/version = "$(VERSION)"/' pyproject.toml
 	sed -i 's/^version: .*/version: $(VERSION)/' charts/*/Chart.yaml
 	$(UV) lock --quiet
-	$(RUN) towncrier build --yes --version "$(VERSION)"
 
 # What a user installs, without what only builds and tests it.
 SHIPPED := --frozen --no-dev --extra operator --extra agent --extra services --extra view --extra tracing
@@ -221,7 +220,7 @@ dist: $(if $(PLATFORMS),,packages) env ## Build all of a release into dist/: whe
 .PHONY: bandit
 bandit: uv ## Look for insecure code in what is shipped
 	$(UV) tool run bandit==1.9.2 --quiet --severity-level medium --recursive \
-		core kube storage observe operator agent mavlink services cli view/fractus_view sdk sim proto examples
+		core runtime operator agent mavlink services cli view/fractus_view sdk sim proto examples
 
 # Where a proxy passes on packages alone, pip-audit would call the first of them unknown.
 ADVISORIES := https://pypi.org/pypi/pip-audit/2.10.1/json

@@ -39,7 +39,7 @@ import yaml
 from fractus_cluster.ports import free_port
 from fractus_core.api import KINDS
 from fractus_core.api.crd import crd
-from fractus_kube import BlockingClient, Client, Kind, KubeError, with_certificate
+from fractus_runtime.kubernetes import BlockingClient, Client, Kind, KubeError, with_certificate
 from loopback import LoopbackCluster, simulated_node, wait_until
 
 EXAMPLE = pathlib.Path(__file__).parents[1] / "examples" / "traffic-monitoring"

@@ -40,7 +40,7 @@ from deploy import API, NODE, NODES, READY, SYSTEM, Api, Body, Operator, documen
 from fractus_cluster.errors import ClusterError
 from fractus_core.api import KINDS, Application, DeploymentPlan
 from fractus_core.api.crd import crd
-from fractus_kube import Client, Kind, KubeError
+from fractus_runtime.kubernetes import Client, Kind, KubeError
 from loopback import LoopbackCluster, simulated_node, wait_until
 
 USER = "fractus-operator"

@@ -10,7 +10,7 @@ import signal
 import sys
 from collections.abc import Mapping
 
-from fractus_observe import logs
+from fractus_runtime import logs
 
 from fractus_agent.cluster.store import Store, Unconfigured, connect
 from fractus_agent.daemon import Agent

@@ -11,8 +11,8 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from fractus_core.api.nodes import direct_interface
-from fractus_observe.exposition import LastRead, serving
-from fractus_observe.figures import text_of
+from fractus_runtime.exposition import LastRead, serving
+from fractus_runtime.figures import text_of
 
 from fractus_agent.cluster.store import Object, Store
 from fractus_agent.grants.keeper import GrantDirectory, GrantKeeper
@@ -31,7 +31,7 @@ from fractus_agent.watchdog import guard
 if TYPE_CHECKING:
     from fractus_core.api.nodes import Drone, EdgeNode
     from fractus_core.linking import Seen
-    from fractus_observe.figures import Figure
+    from fractus_runtime.figures import Figure
 
     from fractus_agent.links.connectivity import Connectivity
     from fractus_agent.telemetry.feed import TelemetryFeed

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
-from fractus_observe.exposition import CERTIFICATE_EXPIRY
-from fractus_observe.figures import Figure, gauge, hash_number
+from fractus_runtime.exposition import CERTIFICATE_EXPIRY
+from fractus_runtime.figures import Figure, gauge, hash_number
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ from fractus_cli.audit_logs import Window, decided, entries, found_logs, judged
 from fractus_cli.output import output_option, printable
 
 if TYPE_CHECKING:
-    from fractus_storage.checkpoints import Checkpoint
+    from fractus_runtime.audit_checkpoints import Checkpoint
 
     from fractus_cli.flight_export import Places
 
@@ -183,7 +183,7 @@ def _checkpoints(since: tuple[str, ...], ca: Path | None) -> dict[str, Checkpoin
         return {}
     # Imported here: what only verifies chains needs no cryptography.
     from cryptography import x509  # noqa: PLC0415
-    from fractus_storage.checkpoints import InvalidCheckpoint, noted, read_checkpoint  # noqa: PLC0415
+    from fractus_runtime.audit_checkpoints import InvalidCheckpoint, noted, read_checkpoint  # noqa: PLC0415
 
     known: dict[str, Checkpoint] = {}
     try:

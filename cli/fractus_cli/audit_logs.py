@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import click
+from fractus_runtime.audit_chain import Finding, Link, lines_of, logs, verify
 from fractus_services.recording.messages import component_of, moment_ns
-from fractus_storage.chain import Finding, Link, lines_of, logs, verify
 
 Entry = dict[str, Any]
 

@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 
-from fractus_kube import POD, Backoff, Client, Key, KubeError, Reflector
+from fractus_runtime.kubernetes import POD, Backoff, Client, Key, KubeError, Reflector
 
 from fractus_cli.log_reader import LogReader, Problems
 from fractus_cli.log_sources import Line, Source, sources

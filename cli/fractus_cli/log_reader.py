@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from datetime import timedelta
 from http import HTTPStatus
 
-from fractus_kube import Client, Invalid, KubeError, NotFound
+from fractus_runtime.kubernetes import Client, Invalid, KubeError, NotFound
 
 from fractus_cli.log_sources import Line, Source, by_node, read_line
 

@@ -12,7 +12,7 @@ from datetime import timedelta
 from http import HTTPStatus
 
 import click
-from fractus_kube import POD, Client, KubeError
+from fractus_runtime.kubernetes import POD, Client, KubeError
 
 from fractus_cli.log_follower import Follower, Place
 from fractus_cli.log_reader import Extent, LogReader, Problems

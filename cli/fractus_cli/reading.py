@@ -10,7 +10,7 @@ from http import HTTPStatus
 from typing import Any
 
 import click
-from fractus_kube import Access, BlockingClient, KubeError, NotFound, from_environment, kubeconfig
+from fractus_runtime.kubernetes import Access, BlockingClient, KubeError, NotFound, from_environment, kubeconfig
 
 Body = Mapping[str, Any]
 

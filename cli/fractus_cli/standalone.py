@@ -18,7 +18,7 @@ from fractus_core.api import Grant, InvalidObject
 from fractus_core.api.names import ComponentIdentity, is_subdomain
 from fractus_core.identity.authority import Authority, BrokenAuthority, Data
 from fractus_core.identity.grant_signer import GrantSigner
-from fractus_storage import write_file
+from fractus_runtime.files import write_file
 
 LIFE = timedelta(days=365)
 

@@ -16,8 +16,8 @@ from datetime import UTC, datetime
 from typing import Any
 
 from fractus_core.identity.authority import Authority, BrokenAuthority
-from fractus_observe import logs
-from fractus_observe.exposition import serving
+from fractus_runtime import logs
+from fractus_runtime.exposition import serving
 
 from fractus_operator import handlers, metrics
 from fractus_operator.cluster import kinds

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Literal
 
-from fractus_observe.exposition import CERTIFICATE_EXPIRY
-from fractus_observe.figures import Counter, Figure, Histogram, gauge, text_of
+from fractus_runtime.exposition import CERTIFICATE_EXPIRY
+from fractus_runtime.figures import Counter, Figure, Histogram, gauge, text_of
 
 _SECONDS = (0.001, 0.005, 0.02, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
 

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from http import HTTPStatus
 
 from fractus_core.api.names import CLASS_LABEL, NODE_SIGNER
-from fractus_kube import LEASE
+from fractus_runtime.kubernetes import LEASE
 
 from fractus_operator.cluster.kinds import (
     CONFIG_MAP,

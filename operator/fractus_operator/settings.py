@@ -11,7 +11,7 @@ from fractus_core.api import InvalidObject
 from fractus_core.planning.inventory import PolicyConflicts
 from fractus_core.planning.inventory import Settings as PlanningSettings
 from fractus_core.planning.plugins import UnknownPlugin, load_plugin
-from fractus_observe.logs import FORMS
+from fractus_runtime.logs import FORMS
 
 _PLANNING = {
     "safety_radius_m": "FRACTUS_PLANNING_SAFETY_RADIUS",

@@ -12,7 +12,7 @@ from typing import Any
 
 import grpc
 from fractus_core.policy.values import Verdict
-from fractus_observe import spans
+from fractus_runtime import spans
 from google.protobuf.message import DecodeError
 
 from fractus_services.auth import Caller, Callers

@@ -19,7 +19,7 @@ from fractus_core.policy.signatures import (
     verify,
 )
 from fractus_core.policy.trust import BadSignature, UnknownAuthority
-from fractus_storage import remove_temporary, write_file
+from fractus_runtime.files import remove_temporary, write_file
 
 log = logging.getLogger(__name__)
 

@@ -9,8 +9,8 @@ from collections.abc import Callable, Coroutine, Mapping
 from typing import Any
 
 import grpc
-from fractus_observe import tracing
-from fractus_observe.spans import Tracer
+from fractus_runtime import tracing
+from fractus_runtime.spans import Tracer
 
 from fractus_services.admission import CallAdmission
 from fractus_services.auth import KEEPALIVE, TlsFiles

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import click
-from fractus_observe import logs
+from fractus_runtime import logs
 
 from fractus_services.options import CannotServe, ServiceOptions
 from fractus_services.service_lock import ServiceLock

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from fractus_observe.exposition import CERTIFICATE_EXPIRY
-from fractus_observe.figures import Counter, Figure, gauge, hash_number, text_of
-from fractus_storage.audit import AuditLog
+from fractus_runtime.audit import AuditLog
+from fractus_runtime.exposition import CERTIFICATE_EXPIRY
+from fractus_runtime.figures import Counter, Figure, gauge, hash_number, text_of
 
 from fractus_services.grants import GrantFiles
 

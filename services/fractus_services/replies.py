@@ -7,8 +7,8 @@ from typing import Any, NoReturn
 import grpc
 from fractus_core.exhaustive import exhaustive
 from fractus_core.policy.values import Action, Verdict
-from fractus_observe import spans
 from fractus_proto.v1 import types_pb2
+from fractus_runtime import spans
 from google.protobuf import any_pb2
 from google.rpc import code_pb2, error_details_pb2, status_pb2
 from grpc_status import rpc_status

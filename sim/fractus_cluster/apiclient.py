@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from fractus_kube import BlockingClient, KubeError, Unconfigured, with_certificate
+from fractus_runtime.kubernetes import BlockingClient, KubeError, Unconfigured, with_certificate
 
 from fractus_cluster.errors import ClusterError
 from fractus_cluster.pki import Credential

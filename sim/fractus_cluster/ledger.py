@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from pathlib import Path
 
-from fractus_storage import write_file
+from fractus_runtime.files import write_file
 
 
 def read_ledger(path: Path) -> dict[str, str]:

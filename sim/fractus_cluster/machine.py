@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field
 from ipaddress import IPv4Network
 from pathlib import Path
 
-from fractus_storage import write_file
+from fractus_runtime.files import write_file
 
 from fractus_cluster.addressing import choose_block
 from fractus_cluster.cgroups import find_hierarchies, remove_top

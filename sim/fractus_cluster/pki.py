@@ -14,7 +14,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
-from fractus_storage import write_file
+from fractus_runtime.files import write_file
 
 _LIFETIME = datetime.timedelta(days=3650)
 _SKEW = datetime.timedelta(hours=1)

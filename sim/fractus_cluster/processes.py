@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
 
-from fractus_storage import write_file
+from fractus_runtime.files import write_file
 
 from fractus_cluster.errors import ClusterError
 

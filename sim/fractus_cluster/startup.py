@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from datetime import datetime
 
-from fractus_kube import BlockingClient, Conflict, KubeError
+from fractus_runtime.kubernetes import BlockingClient, Conflict, KubeError
 
 from fractus_cluster import machine, manifests, network
 from fractus_cluster.addressing import Addressing

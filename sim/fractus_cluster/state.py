@@ -9,7 +9,7 @@ from ipaddress import IPv4Network
 from pathlib import Path
 
 import yaml
-from fractus_storage import write_file
+from fractus_runtime.files import write_file
 
 from fractus_cluster.binaries import DEFAULT_KUBERNETES
 from fractus_cluster.errors import ClusterError

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import demo_flight
 from docs_commands import ROOT, Command
-from fractus_storage.audit import AuditLog
+from fractus_runtime.audit import AuditLog
 
 
 def furnish(folder: Path, page: str) -> None:

@@ -16,7 +16,7 @@ from urllib.parse import parse_qs, urlsplit
 
 import pytest
 from fractus_cluster.pki import Authority
-from fractus_kube import (
+from fractus_runtime.kubernetes import (
     BlockingClient,
     Client,
     Conflict,
@@ -250,7 +250,7 @@ async def test_a_list_that_makes_progress_has_more_time_than_an_object() -> None
 
 
 async def test_a_list_that_makes_no_progress_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fractus_kube.connection.REQUEST_TIMEOUT_S", 0.2)
+    monkeypatch.setattr("fractus_runtime.kubernetes.connection.REQUEST_TIMEOUT_S", 0.2)
     async with client_of(Server(CHUNKED + chunk(b'{"items"'))) as client, asyncio.timeout(5.0):
         with pytest.raises(KubeError, match="no answer"):
             await client.list(ZONE)

@@ -18,11 +18,11 @@ from fractus_agent.links.reports import DroneReport
 from fractus_agent.metrics import AgentFigures
 from fractus_agent.redirector.nft import Endpoint
 from fractus_core.linking import NO_LINK, PathMetrics, Peer
-from fractus_observe.figures import text_of
+from fractus_runtime.audit import AuditLog
+from fractus_runtime.figures import text_of
 from fractus_services.grants import GrantFiles
 from fractus_services.metrics import MAX_POLICIES, DecisionMetrics, ServiceMetrics, common_figures
 from fractus_services.mobility.rpc.figures import flight_figures
-from fractus_storage.audit import AuditLog
 from mobility_world import World, spec
 from virtual_time import fly
 

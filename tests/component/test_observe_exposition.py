@@ -11,9 +11,9 @@ import time
 import pytest
 from exposed import get, values
 from fractus_cluster.ports import free_port
-from fractus_observe import exposition
-from fractus_observe.exposition import MAX_CONNECTIONS, LastRead, serving
-from fractus_observe.figures import gauge, text_of
+from fractus_runtime import exposition
+from fractus_runtime.exposition import MAX_CONNECTIONS, LastRead, serving
+from fractus_runtime.figures import gauge, text_of
 
 
 def text() -> bytes:

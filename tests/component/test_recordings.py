@@ -28,12 +28,12 @@ from fractus_core.api import Grant
 from fractus_mavlink import Endpoint, Parser
 from fractus_mavlink.enums import MAV_AUTOPILOT, MAV_MODE_FLAG
 from fractus_proto.v1.mobility_pb2 import Telemetry
+from fractus_runtime.audit import AuditLog
 from fractus_services.recording import flight_writer, recorder
 from fractus_services.recording.flight_writer import FlightWriter
 from fractus_services.recording.mcap_file import completed
 from fractus_services.recording.recorder import Recorder
 from fractus_services.recording.segments import MIN_SEGMENT_BYTES, Segments, segments_in
-from fractus_storage.audit import AuditLog
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.writer import MCAP0_MAGIC
 

@@ -16,8 +16,8 @@ import fractus.tracing
 import grpc
 import pytest
 from collector import Collector, collecting
-from fractus_observe import span_export, spans, tracing
-from fractus_observe.span_export import MAX_CALLS_PER_S, MAX_PARENTS, MAX_PARTS, ExportingTracer
+from fractus_runtime import span_export, spans, tracing
+from fractus_runtime.span_export import MAX_CALLS_PER_S, MAX_PARENTS, MAX_PARTS, ExportingTracer
 from opentelemetry import trace
 from opentelemetry.sdk.trace import TracerProvider
 from opentelemetry.sdk.trace.export import SimpleSpanProcessor
@@ -69,7 +69,7 @@ def test_the_standard_variables_turn_traces_on(
     assert named(environment) == found
 
 
-SERVICE = "from fractus_observe import tracing; assert tracing.tracer('mobility', 'n', os.environ) is None"
+SERVICE = "from fractus_runtime import tracing; assert tracing.tracer('mobility', 'n', os.environ) is None"
 SDK = "import fractus; from fractus.tracing import traced; channel = object(); assert traced(channel) is channel"
 
 
@@ -87,7 +87,7 @@ def ran(program: str, **environment: str) -> str:
 def test_without_a_collector_nothing_is_imported(program: str, off: dict[str, str]) -> None:
     said = ran(f"{program}; print(*sys.modules, file=sys.stderr)", **off)
     assert "tracing" in said
-    assert not [name for name in said.split() if name.startswith(("opentelemetry", "fractus_observe.span_export"))]
+    assert not [name for name in said.split() if name.startswith(("opentelemetry", "fractus_runtime.span_export"))]
 
 
 @pytest.mark.parametrize("program", [SERVICE, SDK], ids=["service", "sdk"])

@@ -20,7 +20,7 @@ from aiohttp import ClientSession, hdrs, web
 from click.testing import CliRunner
 from exposed import scraped, values
 from fractus_cluster.ports import free_port
-from fractus_observe.figures import text_of
+from fractus_runtime.figures import text_of
 from fractus_services.recording import messages
 from fractus_services.recording.mcap_file import McapFile
 from fractus_services.recording.messages import Record

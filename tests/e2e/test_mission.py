@@ -9,7 +9,7 @@ import time
 import pytest
 from conftest import DRONE, NODES, SYSTEM, example, flight_state, short_flight
 from fractus_cli import main
-from fractus_storage.chain import verify
+from fractus_runtime.audit_chain import verify
 from kubectl import Kube, Object, condition
 from leaks import leaks
 from told import secrets, told

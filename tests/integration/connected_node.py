@@ -19,8 +19,8 @@ from fractus_agent.cluster.store import End, Event, KubeError, Listed
 from fractus_agent.links.connectivity import Connectivity
 from fractus_core.api.nodes import Drone, EdgeNode
 from fractus_core.linking import Seen
-from fractus_observe.exposition import serving
-from fractus_observe.figures import text_of
+from fractus_runtime.exposition import serving
+from fractus_runtime.figures import text_of
 
 POLL_S = 0.2
 

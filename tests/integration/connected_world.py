@@ -27,8 +27,8 @@ from fractus_radio.medium import Medium, Station
 from fractus_radio.propagation import Propagation
 from fractus_radio.radio import Radio
 from fractus_radio.taps import Tap
-from fractus_storage.chain import verify
-from fractus_storage.checkpoints import read_checkpoint
+from fractus_runtime.audit_chain import verify
+from fractus_runtime.audit_checkpoints import read_checkpoint
 from redirect_rig import CLIENT, SERVER, run
 
 VIP = Endpoint(IPv4Address("10.96.0.5"), 8080)

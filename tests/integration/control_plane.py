@@ -17,7 +17,7 @@ from fractus_cluster.pki import Authority
 from fractus_cluster.ports import free_port
 from fractus_core.api import KINDS
 from fractus_core.api.crd import crd
-from fractus_kube import BlockingClient, KubeError, with_certificate
+from fractus_runtime.kubernetes import BlockingClient, KubeError, with_certificate
 
 T = TypeVar("T")
 Body = dict[str, Any]

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from control_plane import ControlPlane, wait_for
 from fractus_cluster.ports import free_port
-from fractus_kube import BlockingClient, KubeError
+from fractus_runtime.kubernetes import BlockingClient, KubeError
 
 Body = dict[str, Any]
 FRACTUS = "/apis/fractus.dev/v1alpha1"

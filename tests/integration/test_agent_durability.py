@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from fractus_storage import read_set, write_file, write_set
+from fractus_runtime.files import read_set, write_file, write_set
 
 WATCHED = ("open", "write", "fsync", "fchmod", "replace", "symlink", "mkdir", "unlink", "rename")
 

@@ -13,7 +13,7 @@ from fractus_agent.cluster.store import KubeError
 from fractus_agent.identity.certificates import Unusable, inspect
 from fractus_agent.identity.csr import make_request
 from fractus_agent.identity.identity import FILES, Identity, SigningRefused, make_request_in_process
-from fractus_storage import read_set, write_set
+from fractus_runtime.files import read_set, write_set
 
 NODE = "drone-1"
 

@@ -16,9 +16,9 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
 from cryptography.x509.oid import NameOID
 from fractus_core.api.node_grants import pack
-from fractus_kube import BlockingClient, ContentType, Kind, KubeError
 from fractus_operator.cluster.kinds import NODE_GRANTS, ROLE, ROLE_BINDING, SERVICE_ACCOUNT
 from fractus_operator.cluster.node_accounts import ACCOUNT_KINDS, account_object, header
+from fractus_runtime.kubernetes import BlockingClient, ContentType, Kind, KubeError
 from operator_world import FRACTUS, NODES, SYSTEM, Body, OperatorProcess, World, at, denied, ours
 
 REQUESTS = "/apis/certificates.k8s.io/v1/certificatesigningrequests"

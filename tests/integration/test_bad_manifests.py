@@ -19,7 +19,7 @@ from corpus import CASES
 from fractus_cli.manifests import BadManifest, read_manifests
 from fractus_core.api import KINDS, InvalidObject
 from fractus_core.api.crd import crd
-from fractus_kube import KubeError
+from fractus_runtime.kubernetes import KubeError
 
 Body = dict[str, Any]
 API = "/apis/fractus.dev/v1alpha1"

@@ -21,7 +21,7 @@ from fractus_agent.registration.handover import Handover
 from fractus_cluster.ports import free_port
 from fractus_core.api.nodes import EdgeNode
 from fractus_proto.v1 import camera_pb2, camera_pb2_grpc, types_pb2
-from fractus_storage.chain import verify
+from fractus_runtime.audit_chain import verify
 from mobility_rig import (
     DRIVER,
     FRAME,

@@ -9,7 +9,7 @@ import yaml
 from chart import path_of
 from control_plane import ControlPlane, wait_for
 from fractus_cluster.binaries import ensure_binaries
-from fractus_kube import BlockingClient, KubeError
+from fractus_runtime.kubernetes import BlockingClient, KubeError
 from fractus_sim.chaos.apiserver import no_room, occupied
 from fractus_sim.demo.kube import Kube
 

@@ -19,7 +19,7 @@ from docs_shell import Shell
 from fractus_cli.standalone import StandalonePki
 from fractus_cluster.ports import free_port
 from fractus_core.api import Grant
-from fractus_storage.chain import last_link
+from fractus_runtime.audit_chain import last_link
 from operator_world import FRACTUS, World
 
 PAGE = "docs/standalone.md"

@@ -24,10 +24,10 @@ ROOT = Path(__file__).parents[2]
 PROGRAM = (Path(__file__).parent / "image_program.py").read_text()
 
 # Packages of commands and extras that are not for the image: tracing, `fractus` commands that read a cluster, Fractus elsewhere.
-_COMPONENT = {"cryptography", "fractus_core", "fractus_kube", "fractus_mavlink", "fractus_services"}
-_SERVICE = {"opentelemetry", "fractus_kube"}
+_COMPONENT = {"cryptography", "fractus_core", "fractus_runtime.kubernetes", "fractus_mavlink", "fractus_services"}
+_SERVICE = {"opentelemetry", "fractus_runtime.kubernetes"}
 LACKING = {
-    "operator": {"fractus", "fractus_mavlink", "fractus_services", "fractus_storage", "opentelemetry"},
+    "operator": {"fractus", "fractus_mavlink", "fractus_services", "fractus_runtime", "opentelemetry"},
     "agent": {"opentelemetry", "numpy", "shapely"},
     "mobility": _SERVICE,
     "camera": _SERVICE,

@@ -12,7 +12,7 @@ import pytest
 from control_plane import ControlPlane
 from fractus_core.api import KINDS
 from fractus_core.identity.authority import Authority
-from fractus_kube import BlockingClient, KubeError, with_certificate
+from fractus_runtime.kubernetes import BlockingClient, KubeError, with_certificate
 from operator_world import FRACTUS, NODES, SYSTEM, Body, OperatorProcess, World, denied
 from test_agent_permissions import REQUESTS, settled, signing_request
 

@@ -18,7 +18,7 @@ from fractus_core.api.names import node_identity
 from fractus_core.api.nodes import Drone
 from fractus_proto.v1 import mobility_pb2 as pb
 from fractus_proto.v1 import types_pb2
-from fractus_storage.chain import verify
+from fractus_runtime.audit_chain import verify
 from mobility_rig import (
     ALL,
     DRIVER,

@@ -13,7 +13,7 @@ import pytest
 import yaml
 from chart import operator_token
 from control_plane import ControlPlane, wait_for
-from fractus_kube import BlockingClient, ContentType, KubeError
+from fractus_runtime.kubernetes import BlockingClient, ContentType, KubeError
 from operator_world import (
     FRACTUS,
     NODES,

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from control_plane import wait_for
-from fractus_kube import KubeError
+from fractus_runtime.kubernetes import KubeError
 from operator_world import FRACTUS, OperatorProcess, World, at, navigator, ours, traffic
 from test_operator import deployed, end_mission, gone, running
 

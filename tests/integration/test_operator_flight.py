@@ -13,7 +13,7 @@ from chart import operator_token, render
 from control_plane import ControlPlane, wait_for
 from docs_commands import typed_lines
 from docs_shell import Shell
-from fractus_kube import KubeError
+from fractus_runtime.kubernetes import KubeError
 from operator_world import FRACTUS, NODES, SYSTEM, OperatorProcess, World, traffic
 
 Body = dict[str, Any]

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from control_plane import wait_for
-from fractus_kube import ContentType
+from fractus_runtime.kubernetes import ContentType
 from operator_world import FRACTUS, OperatorProcess, World, at, component, ours, traffic
 from test_operator import deployed, end_mission, events, gone, running
 

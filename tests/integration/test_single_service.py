@@ -7,8 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from fractus_runtime.audit_chain import verify
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
-from fractus_storage.chain import verify
 from mobility_rig import Driver, Rig, grant, passenger_grant
 from test_camera import CAMERA, EDGE, capture, stub
 from test_mobility_lost import until_mode

@@ -10,7 +10,7 @@ from chart import path_of, render
 from control_plane import ControlPlane, wait_for
 from fractus_cli import main
 from fractus_cli.reading import GROUP, SYSTEM
-from fractus_kube import KubeError
+from fractus_runtime.kubernetes import KubeError
 from operator_world import OperatorProcess, World, traffic
 
 

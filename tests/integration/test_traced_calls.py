@@ -237,6 +237,6 @@ async def test_without_a_collector_nothing_of_opentelemetry_is_imported(
     with pytest.raises(grpc.aio.AioRpcError, match="position is not known yet"):
         await rig.stub().GetPosition(pb.GetPositionRequest(), timeout=60, wait_for_ready=True)
     imported = (rig.directory / "service.log").read_text()
-    assert "| " in imported and "fractus_observe.tracing" in imported
+    assert "| " in imported and "fractus_runtime.tracing" in imported
     assert "opentelemetry" not in imported
-    assert "fractus_observe.span_export" not in imported
+    assert "fractus_runtime.span_export" not in imported

@@ -13,7 +13,7 @@ from chart import render
 from control_plane import ControlPlane, wait_for
 from fractus_core.api import NodeGrants
 from fractus_core.api.crd import crd
-from fractus_kube import KubeError
+from fractus_runtime.kubernetes import KubeError
 from operator_world import FRACTUS, NODES, SYSTEM, OperatorProcess, World
 from test_uninstall_chart import on
 

@@ -7,7 +7,7 @@ from typing import Any
 import chart as fractus_chart
 import pytest
 from control_plane import ControlPlane
-from fractus_kube import KubeError
+from fractus_runtime.kubernetes import KubeError
 from fractus_view.cluster import KINDS
 from operator_world import FRACTUS, SYSTEM, World
 

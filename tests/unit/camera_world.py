@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from fractus_core.policy.values import Attitude, CaptureArgs, Lens, Situation
+from fractus_runtime.audit import AuditLog
 from fractus_services.camera.album.album import Album, owner_of
 from fractus_services.camera.album.shots import Shot
 from fractus_services.camera.capture.driver import Wanted
@@ -25,7 +26,6 @@ from fractus_services.camera.pictures.judge import PictureJudge
 from fractus_services.camera.pictures.library import PictureLibrary
 from fractus_services.errors import Refused
 from fractus_services.grants import ActiveGrant
-from fractus_storage.audit import AuditLog
 from policy_world import NOW, at, box, compiled, policy, spec, zone
 
 SEEING = Lens(60.0, 60.0, stabilised=True, error_deg=0.0)

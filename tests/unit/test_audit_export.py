@@ -18,7 +18,7 @@ import pytest
 import shapely.geometry
 from click.testing import CliRunner, Result
 from fractus_cli.audit import audit
-from fractus_storage.audit import AuditLog
+from fractus_runtime.audit import AuditLog
 from mcap.reader import make_reader
 
 TAKEOVER = {

@@ -306,7 +306,7 @@ def test_a_full_disk_grants_on_and_remembers_when_there_is_room(
     assert content is not None
     assert node.verifier.unsaved() is None
     with monkeypatch.context() as patch:
-        patch.setattr("fractus_storage.files.os.fsync", full)
+        patch.setattr("fractus_runtime.files.os.fsync", full)
         node.verifier.store(content)
     assert "No space left" in caplog.text
     node.restart()

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import pytest
-from fractus_kube.access import Access, with_tokens
-from fractus_kube.errors import KubeError
+from fractus_runtime.kubernetes.access import Access, with_tokens
+from fractus_runtime.kubernetes.errors import KubeError
 from kubernetes.aio.client import Configuration
 
 

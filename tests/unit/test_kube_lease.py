@@ -8,8 +8,19 @@ import time
 from typing import Any, cast
 
 import pytest
-from fractus_kube import Body, Client, Conflict, Kind, KubeError, Lease, LeaseThread, LostLease, NotFound, key_of
-from fractus_kube import lease as lease_module
+from fractus_runtime.kubernetes import (
+    Body,
+    Client,
+    Conflict,
+    Kind,
+    KubeError,
+    Lease,
+    LeaseThread,
+    LostLease,
+    NotFound,
+    key_of,
+)
+from fractus_runtime.kubernetes import leader_election as lease_module
 
 DURATION_S = 10.0
 

@@ -9,8 +9,8 @@ from collections.abc import AsyncIterator
 from typing import Any
 
 import pytest
-from fractus_kube import Body, Expired, Key, Kind, KubeError, Page, Reflector
-from fractus_kube import reflector as reflector_module
+from fractus_runtime.kubernetes import Body, Expired, Key, Kind, KubeError, Page, Reflector
+from fractus_runtime.kubernetes import informer as reflector_module
 
 POLICY = Kind("fractus.dev/v1alpha1", "Policy", "policies", namespaced=False)
 ZONE = Kind("fractus.dev/v1alpha1", "Zone", "zones", namespaced=False)

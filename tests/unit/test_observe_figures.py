@@ -7,7 +7,7 @@ import re
 
 import pytest
 from exposed import DOCS, documented, values
-from fractus_observe.figures import Counter, Figure, Histogram, gauge, text_of
+from fractus_runtime.figures import Counter, Figure, Histogram, gauge, text_of
 from prometheus_client.parser import text_string_to_metric_families
 
 OTHER_NAMES = {"fractus_agent", "fractus_call", "fractus_operator"}

@@ -8,7 +8,7 @@ import math
 from typing import Any
 
 import pytest
-from fractus_observe.logs import BURST, MAX_LIMITS, RATE_PER_S, JsonFormatter, LogLimit, configure
+from fractus_runtime.logs import BURST, MAX_LIMITS, RATE_PER_S, JsonFormatter, LogLimit, configure
 
 
 class Log:

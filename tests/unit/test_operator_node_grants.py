@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 from fractus_core.api import node_grants
 from fractus_core.api.node_grants import NODE_GRANTS_NAMESPACE, ReportedGrant, unpack
-from fractus_kube import Conflict, Invalid, KubeError, NotFound
 from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Body, Kind
 from fractus_operator.cluster.node_accounts import ACCOUNT_KINDS, account_object, is_as_made
@@ -19,6 +18,7 @@ from fractus_operator.cluster.store import Store
 from fractus_operator.inventory.live import LiveInventory
 from fractus_operator.reconcile.grant_reports import reported_status
 from fractus_operator.reconcile.node_grants import NodeGrantsKeeper
+from fractus_runtime.kubernetes import Conflict, Invalid, KubeError, NotFound
 
 
 def report(phase: Any, message: str = "", generation: int = 1, uid: str = "u") -> ReportedGrant:

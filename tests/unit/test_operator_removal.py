@@ -9,11 +9,11 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from fractus_kube import KubeError, NotFound
 from fractus_operator import removal
 from fractus_operator.cluster.kinds import POD, SIGNING_REQUEST
 from fractus_operator.cluster.store import Store
 from fractus_operator.removal import await_wiped, main, remove, run, unwiped
+from fractus_runtime.kubernetes import KubeError, NotFound
 
 NODES = [{"metadata": {"name": name}} for name in ("drone-2", "drone-1", "edge-1")]
 

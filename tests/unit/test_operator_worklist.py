@@ -5,10 +5,10 @@ from __future__ import annotations
 import asyncio
 
 import pytest
-from fractus_kube import KubeError
 from fractus_operator.cluster.kinds import Key
 from fractus_operator.reconcile import worklist as worklist_module
 from fractus_operator.reconcile.worklist import Worklist, regularly
+from fractus_runtime.kubernetes import KubeError
 
 
 async def test_an_unforeseen_failure_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

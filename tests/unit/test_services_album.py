@@ -144,7 +144,7 @@ async def test_a_full_disk_is_said_and_leaves_nothing_behind(world: World, monke
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as broken:
-        broken.setattr("fractus_storage.files.os.fsync", full)
+        broken.setattr("fractus_runtime.files.os.fsync", full)
         with pytest.raises(OSError, match="No space left") as caught:
             await world.capture(active_grant())
     refused = storage_failed(caught.value)

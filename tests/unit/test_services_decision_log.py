@@ -7,7 +7,7 @@ import logging
 from typing import Any
 
 import pytest
-from fractus_observe.logs import BURST, JsonFormatter, LogLimit
+from fractus_runtime.logs import BURST, JsonFormatter, LogLimit
 from fractus_services.decision_log import log_decision
 
 CALL = {

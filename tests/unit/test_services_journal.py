@@ -98,7 +98,7 @@ async def test_a_disk_that_fails_is_told(tmp_path: Path, monkeypatch: pytest.Mon
         def fail(*_: object) -> None:
             raise OSError(28, "No space left on device")
 
-        broken.setattr("fractus_storage.files.os.fsync", fail)
+        broken.setattr("fractus_runtime.files.os.fsync", fail)
         await journal.save(journal.record)
         assert "No space left" in journal.failure
     assert not list(tmp_path.glob(".*.tmp"))  # noqa: ASYNC240 - a temporary directory

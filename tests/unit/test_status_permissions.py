@@ -11,7 +11,7 @@ import pytest
 from fractus_cli import doctor, explain, main, status
 from fractus_cli.output import printable
 from fractus_cli.reading import Cluster
-from fractus_kube import KubeError
+from fractus_runtime.kubernetes import KubeError
 
 OURS = "/apis/fractus.dev/v1alpha1/namespaces/team/"
 PATROL = {"metadata": {"namespace": "team", "name": "patrol"}, "status": {"phase": "Running", "message": "it flies"}}

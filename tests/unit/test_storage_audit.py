@@ -16,8 +16,8 @@ import pytest
 from click.testing import CliRunner
 from fractus_cli.audit import audit
 from fractus_core.identity.authority import Authority
-from fractus_storage.audit import AuditLog
-from fractus_storage.chain import digest, last_link, verify
+from fractus_runtime.audit import AuditLog
+from fractus_runtime.audit_chain import digest, last_link, verify
 
 EPOCH = datetime.fromtimestamp(0, UTC)
 AUTHORITY = Authority.generate(EPOCH)
@@ -51,7 +51,7 @@ async def test_entries_tell_how_long_lay_between_them_whatever_the_clock_does(
 ) -> None:
     steady = iter([50.0, 53.2504, 60.0])
     clock = iter([1_780_000_000.0, 1_779_906_400.0, 1_780_000_010.0])
-    monkeypatch.setattr("fractus_storage.audit.time.clock_gettime", lambda _clock: next(steady))
+    monkeypatch.setattr("fractus_runtime.audit.time.clock_gettime", lambda _clock: next(steady))
     log = AuditLog(tmp_path / "audit.jsonl", lambda: next(clock))
     for number in range(3):
         log.append("call", {"n": number})
@@ -161,7 +161,7 @@ async def test_a_sync_that_fails_leaves_nothing_twice(tmp_path: Path, monkeypatc
             raise OSError(5, "Input/output error")
         real(file)
 
-    monkeypatch.setattr("fractus_storage.audit.os.fsync", fsync)
+    monkeypatch.setattr("fractus_runtime.audit.os.fsync", fsync)
     log = AuditLog(tmp_path / "audit.jsonl", lambda: 0.0)
     log.append("call", {"n": 0})
     await until(lambda: log.failure)
@@ -185,7 +185,7 @@ async def test_what_a_failed_write_left_is_cut_off_later(tmp_path: Path, monkeyp
         return call
 
     for which in real:
-        monkeypatch.setattr(f"fractus_storage.audit.os.{which}", fails(which))
+        monkeypatch.setattr(f"fractus_runtime.audit.os.{which}", fails(which))
     log = AuditLog(tmp_path / "audit.jsonl", lambda: 0.0)
     log.append("call", {"n": 0})
     await until(lambda: log.failure)
@@ -199,8 +199,8 @@ async def test_what_a_failed_write_left_is_cut_off_later(tmp_path: Path, monkeyp
 async def test_a_disk_that_hangs_is_a_failure_and_the_queue_has_an_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fractus_storage.audit.MAX_WAITING", 10)
-    monkeypatch.setattr("fractus_storage.audit.HANG_TIMEOUT_S", 0.02)
+    monkeypatch.setattr("fractus_runtime.audit.MAX_WAITING", 10)
+    monkeypatch.setattr("fractus_runtime.audit.HANG_TIMEOUT_S", 0.02)
     real, answers, asked = os.fsync, threading.Event(), threading.Event()
 
     def fsync(file: int) -> None:
@@ -208,7 +208,7 @@ async def test_a_disk_that_hangs_is_a_failure_and_the_queue_has_an_end(
         answers.wait(10)
         real(file)
 
-    monkeypatch.setattr("fractus_storage.audit.os.fsync", fsync)
+    monkeypatch.setattr("fractus_runtime.audit.os.fsync", fsync)
     log = AuditLog(tmp_path / "audit.jsonl", lambda: 0.0)
     log.append("call", {"n": 0})
     await until(asked.is_set)

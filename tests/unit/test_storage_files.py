@@ -6,8 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from fractus_storage import files as module
-from fractus_storage import read_set, remove_temporary, write_file, write_set
+from fractus_runtime import files as module
+from fractus_runtime.files import read_set, remove_temporary, write_file, write_set
 
 
 def stopped_at(call: int, monkeypatch: pytest.MonkeyPatch) -> list[str]:

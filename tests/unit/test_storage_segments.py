@@ -16,8 +16,8 @@ from click.testing import CliRunner
 from fractus_agent.registration.evidence import audit_heads
 from fractus_cli.audit import audit
 from fractus_core.identity.authority import Authority
-from fractus_storage.audit import AuditLog
-from fractus_storage.chain import last_link, segments, verify
+from fractus_runtime.audit import AuditLog
+from fractus_runtime.audit_chain import last_link, segments, verify
 from test_storage_audit import AUTHORITY, EPOCH, read, until, written
 
 
@@ -222,7 +222,7 @@ async def test_a_node_without_a_certificate_has_no_checkpoint_yet(
 async def test_the_last_entries_are_signed_though_no_other_follows(
     tmp_path: Path, tls: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fractus_storage.audit.CHECKPOINT_INTERVAL_S", 0.2)
+    monkeypatch.setattr("fractus_runtime.audit.CHECKPOINT_INTERVAL_S", 0.2)
     path = tmp_path / "audit.jsonl"
     found = path.with_suffix(".checkpoint")
     log = AuditLog(path, lambda: 0.0, tls=tls)
@@ -246,8 +246,8 @@ async def test_a_certificate_that_is_missing_is_looked_for_now_and_then(
         raise FileNotFoundError
 
     with monkeypatch.context() as patched:
-        patched.setattr("fractus_storage.audit.CHECKPOINT_INTERVAL_S", 0.1)
-        patched.setattr("fractus_storage.audit.signed", missing)
+        patched.setattr("fractus_runtime.audit.CHECKPOINT_INTERVAL_S", 0.1)
+        patched.setattr("fractus_runtime.audit.signed", missing)
         path = tmp_path / "audit.jsonl"
         log = AuditLog(path, lambda: 0.0, tls=tls)
         log.append("call", {"n": 0})
@@ -281,9 +281,9 @@ async def test_a_disk_that_became_read_only_is_a_failure_and_no_crash(
         return looked(file, mode, *args, **named) if mode in {"r", "rb"} else refuse()
 
     with monkeypatch.context() as patched:
-        patched.setattr("fractus_storage.audit.Path.touch", refuse)
-        patched.setattr("fractus_storage.audit.Path.open", looked_at)
-        patched.setattr("fractus_storage.audit.os.open", opened)
+        patched.setattr("fractus_runtime.audit.Path.touch", refuse)
+        patched.setattr("fractus_runtime.audit.Path.open", looked_at)
+        patched.setattr("fractus_runtime.audit.os.open", opened)
         log = AuditLog(path, lambda: 0.0)
         log.append("call", {"n": 2})
         await until(lambda: "Read-only file system" in log.failure)
@@ -337,7 +337,7 @@ async def test_a_segment_that_cannot_be_closed_costs_nothing(
     def refuse(*_: object) -> None:
         raise OSError(30, "Read-only file system")
 
-    monkeypatch.setattr("fractus_storage.audit.Path.rename", refuse)
+    monkeypatch.setattr("fractus_runtime.audit.Path.rename", refuse)
     await filled(tmp_path / "audit.jsonl", 4, segment_bytes=1)
     assert "cannot close a segment" in caplog.text
     assert verify(read(tmp_path / "audit.jsonl")).entries == 4

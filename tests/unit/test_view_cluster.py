@@ -13,8 +13,8 @@ import pytest
 from click.testing import CliRunner
 from exposed import assert_documented, values
 from fractus_core import api
-from fractus_kube import Body, Kind, KubeError, Page
-from fractus_observe.figures import text_of
+from fractus_runtime.figures import text_of
+from fractus_runtime.kubernetes import Body, Kind, KubeError, Page
 from fractus_view import cluster as cluster_module
 from fractus_view import command, objects
 from fractus_view.cluster import KINDS, Cluster
@@ -86,7 +86,7 @@ ALL = (DRONE, EDGE, DEPOT, ZONE, POLICY, APPLICATION, PLAN, LINK)
 
 
 class ApiServer:
-    """Stands for `fractus_kube.Client`: lists what it holds, tells of changes, and is out of reach when told so."""
+    """Stands for `fractus_runtime.kubernetes.Client`: lists what it holds, tells of changes, and is out of reach when told so."""
 
     def __init__(self, *bodies: Body) -> None:
         self.bodies = list(bodies)

@@ -8,8 +8,8 @@ from collections.abc import AsyncIterator, Callable, Iterator
 from typing import Any, TypeVar
 
 from fractus_core import api
-from fractus_kube import Body, Client, Key, Kind, KubeError, Reflector
-from fractus_observe.figures import Figure, gauge
+from fractus_runtime.figures import Figure, gauge
+from fractus_runtime.kubernetes import Body, Client, Key, Kind, KubeError, Reflector
 
 from fractus_view import objects
 from fractus_view.events import Applications, Areas, Contact, Event, Gone, Links, Policies, Problem

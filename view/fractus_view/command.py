@@ -13,9 +13,9 @@ from pathlib import Path
 
 import click
 from aiohttp import web
-from fractus_kube import Client, KubeError, Unconfigured, from_environment, kubeconfig
-from fractus_observe.exposition import serving
-from fractus_observe.figures import Figure, text_of
+from fractus_runtime.exposition import serving
+from fractus_runtime.figures import Figure, text_of
+from fractus_runtime.kubernetes import Client, KubeError, Unconfigured, from_environment, kubeconfig
 
 from fractus_view.cluster import Cluster
 from fractus_view.mcap_tail import MAGIC

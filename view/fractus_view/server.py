@@ -13,7 +13,7 @@ from ipaddress import ip_address
 from pathlib import Path
 
 from aiohttp import hdrs, web
-from fractus_observe.figures import Counter, Figure, gauge
+from fractus_runtime.figures import Counter, Figure, gauge
 
 from fractus_view.sources import Source
 

@@ -17,7 +17,7 @@ from fractus_core.api import DirectLink, Drone, EdgeNode, InvalidObject, NodeGra
 from fractus_core.api.model import API_VERSION, GROUP
 from fractus_core.api.names import NODE_SIGNER
 from fractus_core.api.node_grants import NODE_GRANTS_NAMESPACE, NodeGrantsStatus, ReportedGrant, unpack
-from fractus_kube import (
+from fractus_runtime.kubernetes import (
     Backoff,
     Body,
     Client,
@@ -31,7 +31,7 @@ from fractus_kube import (
     in_cluster,
     kubeconfig,
 )
-from fractus_kube.access import SERVICE_ACCOUNT
+from fractus_runtime.kubernetes.access import SERVICE_ACCOUNT
 from pydantic import ValidationError
 
 __all__ = ["Backoff", "Conflict", "Expired", "Invalid", "KubeError", "Object", "Store", "Unconfigured", "connect"]

@@ -16,7 +16,7 @@ from collections.abc import Awaitable, Callable
 from datetime import datetime
 from pathlib import Path
 
-from fractus_storage import read_set, write_set
+from fractus_runtime.files import read_set, write_set
 
 from fractus_agent.cluster.store import Backoff, KubeError, Store
 from fractus_agent.conditions import Condition

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from fractus_core.api.nodes import Drone, Interface, direct_interface
 from fractus_core.linking import Seen
-from fractus_observe.figures import Figure
+from fractus_runtime.figures import Figure
 
 from fractus_agent.cluster.store import End, Store
 from fractus_agent.links import beacons, pairing
@@ -170,7 +170,7 @@ class Connectivity:
             OSError: the directory of audit logs cannot be made.
         """
         # Imported here: its signatures need the cryptography, a fifth of the memory, which nodes without links do not need.
-        from fractus_storage.audit import AuditLog  # noqa: PLC0415
+        from fractus_runtime.audit import AuditLog  # noqa: PLC0415
 
         audit = AuditLog(self._audit, time.time, tls=self._tls)
         try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from fractus_core.linking import PathMetrics, Phase
-from fractus_observe.figures import Figure, gauge
+from fractus_runtime.figures import Figure, gauge
 
 from fractus_agent.links.plans import route_key
 from fractus_agent.links.reports import DroneReport

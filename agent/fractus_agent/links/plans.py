@@ -11,7 +11,7 @@ from pathlib import Path
 
 from fractus_core.api.links import DirectLink, LinkedService
 from fractus_core.api.model import InvalidObject
-from fractus_storage import remove_file, write_file
+from fractus_runtime.files import remove_file, write_file
 
 from fractus_agent.cluster.store import Changed, Deleted, End, Event, Listed, Object, Store
 from fractus_agent.redirector.nft import Endpoint

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from fractus_core.api.model import InvalidObject
 from fractus_core.api.nodes import Drone, EdgeNode
-from fractus_storage import remove_temporary, write_file
+from fractus_runtime.files import remove_temporary, write_file
 
 from fractus_agent.conditions import Condition
 

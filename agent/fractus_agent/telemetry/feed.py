@@ -17,7 +17,7 @@ from fractus_core.exhaustive import exhaustive
 from fractus_proto.v1.mobility_pb2 import MissionOutcome, SubscribeTelemetryRequest, Telemetry
 from fractus_proto.v1.mobility_pb2_grpc import MobilityServiceStub
 from fractus_proto.v1.types_pb2 import AltitudeReference
-from fractus_storage import read_set
+from fractus_runtime.files import read_set
 
 from fractus_agent.cluster.store import Backoff
 from fractus_agent.identity.identity import FILES

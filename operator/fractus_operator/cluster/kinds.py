@@ -16,7 +16,7 @@ from fractus_core.api import (
     Resource,
     Zone,
 )
-from fractus_kube import Body, Key, Kind, key_of
+from fractus_runtime.kubernetes import Body, Key, Kind, key_of
 
 __all__ = ["Body", "Key", "Kind", "key_of"]
 

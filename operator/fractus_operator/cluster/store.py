@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from typing import Self
 
-from fractus_kube import (
+from fractus_runtime.kubernetes import (
     Access,
     Backoff,
     Client,

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fractus_core.api.plans import GrantSpec
-from fractus_storage.files import write_file
+from fractus_runtime.files import write_file
 
 from fractus_services.recording.segments import Segments
 

@@ -30,12 +30,12 @@ _RECIPE = (
 _CODE: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "component": ("sdk", "cli", "proto"),
-        "operator": ("core", "kube", "observe", "operator", "proto"),
-        "agent": ("core", "kube", "observe", "storage", "agent", "proto"),
-        "mobility": ("core", "mavlink", "observe", "storage", "services", "sdk", "cli", "proto"),
-        "camera": ("core", "mavlink", "observe", "storage", "services", "sdk", "cli", "proto"),
-        "view": ("core", "kube", "cli", "view/fractus_view", "proto"),
-        "sim": ("core", "mavlink", "observe", "storage", "services", "sdk", "cli", "proto", "sim"),
+        "operator": ("core", "runtime", "operator", "proto"),
+        "agent": ("core", "runtime", "agent", "proto"),
+        "mobility": ("core", "mavlink", "runtime", "services", "sdk", "cli", "proto"),
+        "camera": ("core", "mavlink", "runtime", "services", "sdk", "cli", "proto"),
+        "view": ("core", "runtime", "cli", "view/fractus_view", "proto"),
+        "sim": ("core", "mavlink", "runtime", "services", "sdk", "cli", "proto", "sim"),
         "example-traffic-monitoring": ("sdk", "cli", "proto", "examples/traffic-monitoring"),
         "example-field": ("sdk", "cli", "proto", "examples/field"),
         "example-links": ("sdk", "cli", "proto", "examples/links"),

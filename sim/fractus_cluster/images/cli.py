@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import click
-from fractus_storage import write_file
+from fractus_runtime.files import write_file
 
 from fractus_cluster.cluster import print_report
 from fractus_cluster.images.bill import image_bill

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
-from fractus_storage import write_file
+from fractus_runtime.files import write_file
 
 from fractus_cluster.errors import ClusterError
 

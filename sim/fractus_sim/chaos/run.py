@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 from fractus_cluster.errors import ClusterError
 from fractus_cluster.manifests import is_ready
-from fractus_storage.chain import entries, lines_of, logs, verify
+from fractus_runtime.audit_chain import entries, lines_of, logs, verify
 
 from fractus_sim.chaos import invariants
 from fractus_sim.chaos.faults import FAULTS, broken

@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from fractus_storage.chain import lines_of, logs, verify
+from fractus_runtime.audit_chain import lines_of, logs, verify
 from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader
 

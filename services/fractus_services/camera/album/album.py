@@ -13,7 +13,7 @@ import threading
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from fractus_storage import write_file
+from fractus_runtime.files import write_file
 
 from fractus_services.camera.album.shots import Shot
 from fractus_services.errors import NotFound, ResourceExhausted

@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from fractus_core.policy.footprint import seen_from
 from fractus_core.policy.privacy import judge_privacy
 from fractus_core.policy.values import Call, CaptureArgs, Moment, Situation, Verdict, earliest
-from fractus_observe import spans
+from fractus_runtime import spans
 
 from fractus_services.background import Background
 from fractus_services.camera.album.album import Album, AlbumFull, owner_of

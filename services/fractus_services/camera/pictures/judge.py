@@ -10,8 +10,8 @@ from fractus_core.policy.access import judge_denials
 from fractus_core.policy.engine import judge
 from fractus_core.policy.privacy import compose, judge_privacy
 from fractus_core.policy.values import Call, Situation, Verdict
-from fractus_observe import spans
-from fractus_storage.audit import AuditLog
+from fractus_runtime import spans
+from fractus_runtime.audit import AuditLog
 
 from fractus_services.camera.imaging.faces import Detector
 from fractus_services.camera.imaging.pipeline import FacesNotReliable, FilterPlan, plan_filters

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from fractus_core.policy.privacy import remaining
 from fractus_core.policy.values import Call, Situation, Verdict
-from fractus_observe import spans
+from fractus_runtime import spans
 
 from fractus_services.background import Background
 from fractus_services.camera.album.album import Album, owner_of

@@ -13,10 +13,10 @@ from typing import Any
 
 from fractus_core.api.nodes import Drone, EdgeNode
 from fractus_core.policy.lenses import lens_of
-from fractus_observe.exposition import LastRead, serving
-from fractus_observe.figures import Figure
 from fractus_proto.v1 import camera_pb2_grpc
-from fractus_storage.audit import AuditLog
+from fractus_runtime.audit import AuditLog
+from fractus_runtime.exposition import LastRead, serving
+from fractus_runtime.figures import Figure
 
 from fractus_services.admission import CallAdmission
 from fractus_services.auth import TlsFiles

@@ -30,7 +30,7 @@ from fractus_core.control.events import (
 )
 from fractus_core.policy.compiled import CompiledGrant, for_transit
 from fractus_core.policy.values import Verdict
-from fractus_storage.audit import AuditLog
+from fractus_runtime.audit import AuditLog
 
 from fractus_services.grants import ActiveGrant, GrantFiles
 from fractus_services.mobility.authority.journal import Journal, record_of

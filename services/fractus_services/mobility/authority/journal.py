@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from fractus_core.control import ControlState, Mission, Outcome, OutcomeKind
-from fractus_storage import remove_temporary, write_file
+from fractus_runtime.files import remove_temporary, write_file
 
 log = logging.getLogger(__name__)
 

@@ -27,7 +27,7 @@ from fractus_core.control.actions import (
 from fractus_core.control.events import Event, SystemTaskEnded
 from fractus_core.control.step import DRIVER_LOST
 from fractus_core.control.values import FlightMode, SystemTask, TaskKind
-from fractus_storage.audit import AuditLog
+from fractus_runtime.audit import AuditLog
 
 from fractus_services.background import Background
 from fractus_services.errors import Aborted, AutopilotError, PreconditionFailed, Refused, Unavailable

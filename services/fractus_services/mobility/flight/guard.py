@@ -9,8 +9,8 @@ from dataclasses import asdict
 from fractus_core.policy.compiled import CompiledGrant
 from fractus_core.policy.engine import judge
 from fractus_core.policy.values import Call, Situation, Verdict
-from fractus_observe import spans
-from fractus_storage.audit import AuditLog
+from fractus_runtime import spans
+from fractus_runtime.audit import AuditLog
 
 from fractus_services.grants import ActiveGrant
 

@@ -16,7 +16,7 @@ from fractus_core.control.values import ModeKind, TaskKind
 from fractus_core.policy.compiled import CompiledGrant
 from fractus_core.policy.monitoring import monitor
 from fractus_core.policy.values import GotoArgs, SetSpeedArgs, Verdict
-from fractus_storage.audit import AuditLog
+from fractus_runtime.audit import AuditLog
 
 from fractus_services.errors import Aborted, AutopilotError, Refused
 from fractus_services.grants import ActiveGrant

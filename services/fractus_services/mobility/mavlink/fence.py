@@ -12,7 +12,7 @@ from pathlib import Path
 
 from fractus_core.api.plans import GrantSpec
 from fractus_mavlink.enums import FENCE_TYPE, MAV_CMD
-from fractus_storage import remove_temporary, write_file
+from fractus_runtime.files import remove_temporary, write_file
 
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot

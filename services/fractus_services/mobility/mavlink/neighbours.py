@@ -10,7 +10,7 @@ from pathlib import Path
 
 from fractus_mavlink import Message
 from fractus_mavlink.enums import MAV_AUTOPILOT, MAV_COMPONENT, MAV_MODE_FLAG, MAV_TYPE
-from fractus_storage import write_file
+from fractus_runtime.files import write_file
 
 log = logging.getLogger(__name__)
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from fractus_core.policy.returning import ReturnBounds
-from fractus_storage import write_file
+from fractus_runtime.files import write_file
 
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot

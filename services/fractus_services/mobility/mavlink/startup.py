@@ -16,7 +16,7 @@ from typing import TypeVar
 
 from fractus_mavlink import Endpoint, Message, message
 from fractus_mavlink.enums import MAV_MODE_FLAG, MAV_STATE
-from fractus_storage import remove_file, write_file
+from fractus_runtime.files import remove_file, write_file
 
 from fractus_services.mobility.mavlink.companion import COMPONENT_ID, SYSTEM_ID, heartbeat
 from fractus_services.mobility.mavlink.neighbours import Source, remembered

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from fractus_mavlink.enums import MAV_CMD
-from fractus_observe import spans
+from fractus_runtime import spans
 
 from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
 

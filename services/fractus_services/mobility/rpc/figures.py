@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from fractus_core.control import Authority
-from fractus_observe.figures import Figure, gauge
+from fractus_runtime.figures import Figure, gauge
 
 from fractus_services.metrics import telemetry_age
 from fractus_services.mobility.authority.control import Control

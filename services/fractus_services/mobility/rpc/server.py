@@ -9,9 +9,9 @@ from functools import partial
 from typing import Any
 
 from fractus_core.api.nodes import Drone
-from fractus_observe.exposition import LastRead, serving
 from fractus_proto.v1 import mobility_pb2_grpc
-from fractus_storage.audit import AuditLog
+from fractus_runtime.audit import AuditLog
+from fractus_runtime.exposition import LastRead, serving
 
 from fractus_services.auth import TlsFiles
 from fractus_services.clock import Clock

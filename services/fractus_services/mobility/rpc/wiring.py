@@ -7,7 +7,7 @@ from functools import partial
 
 from fractus_core.control import ControlState
 from fractus_core.policy.returning import return_bounds
-from fractus_storage.audit import AuditLog
+from fractus_runtime.audit import AuditLog
 
 from fractus_services.grants import ActiveGrant, GrantFiles
 from fractus_services.mobility.authority.arming import Arming

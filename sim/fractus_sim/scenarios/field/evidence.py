@@ -12,7 +12,7 @@ from typing import Any
 from fractus_cli.tlog_tail import split
 from fractus_mavlink import Message, Parser
 from fractus_mavlink.enums import COPTER_MODE, MAV_COMPONENT, MAV_MODE_FLAG
-from fractus_storage.chain import entries
+from fractus_runtime.audit_chain import entries
 
 from fractus_sim.experiment.station import FLYING_STATES
 from fractus_sim.report.track import Place, Sample, Track

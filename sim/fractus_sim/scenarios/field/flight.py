@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from fractus_storage.chain import entries
+from fractus_runtime.audit_chain import entries
 from fractus_vehicle.estimator import FULL_START_S
 
 from fractus_sim.experiment.errors import ExperimentError

@@ -1,1 +1,0 @@
-"""What a workload tells those who operate it: figures for Prometheus, and logs."""

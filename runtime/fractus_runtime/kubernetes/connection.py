@@ -1,0 +1,233 @@
+"""A connection to the API server: requests over the official client (kubernetes.aio, aiohttp), and their time-outs."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+import ssl
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
+from contextlib import asynccontextmanager, contextmanager
+from enum import StrEnum
+from http import HTTPStatus
+from urllib.parse import urlencode
+from urllib.request import getproxies_environment
+
+import aiohttp
+from kubernetes.aio.client.rest import RESTClientObject
+from kubernetes.aio.config import ConfigException
+
+from fractus_runtime.kubernetes.access import Access, Unconfigured
+from fractus_runtime.kubernetes.errors import KubeError, from_status, unreachable
+from fractus_runtime.kubernetes.objects import Body
+
+REQUEST_TIMEOUT_S = 15.0
+MAX_CONNECTIONS = 100
+_KEPT_OPEN_S = 60.0
+"""Connections stay open between two changes, for less than the API server's 90 s: each costs a TLS handshake."""
+_KEEPALIVE = {"TCP_KEEPIDLE": 10, "TCP_KEEPINTVL": 5, "TCP_KEEPCNT": 3}
+"""A connection whose other side is gone without a word is found dead after 25 s."""
+_FAILURES = (aiohttp.ClientError, TimeoutError, OSError, ConfigException, Unconfigured)
+
+
+class ContentType(StrEnum):
+    """How a body is meant."""
+
+    JSON = "application/json"
+    APPLY = "application/apply-patch+yaml"
+    MERGE = "application/merge-patch+json"
+    JSON_PATCH = "application/json-patch+json"
+
+
+class Connection:
+    """An API server by paths.
+
+    Every request ends within its time-out, with an answer or a KubeError.
+
+    Args:
+        access: Where the API server is, and who asks.
+        field_manager: Who owns the fields that are written.
+        may_write_s: For how many seconds writes may still take effect; none where another process may write instead.
+        trust_env: Whether proxies of the environment are used.
+
+    Raises:
+        Unconfigured: a certificate or key cannot be read.
+    """
+
+    def __init__(
+        self,
+        access: Access,
+        field_manager: str,
+        *,
+        may_write_s: Callable[[], float] = lambda: REQUEST_TIMEOUT_S,
+        trust_env: bool = True,
+    ) -> None:
+        self.field_manager = field_manager
+        self._access = access
+        self._may_write_s = may_write_s
+        self._trust_env = trust_env
+        self._closed = False
+        try:
+            self._rest = RESTClientObject(access.configuration)
+        except (ssl.SSLError, OSError) as error:
+            raise Unconfigured(f"the certificates of the cluster cannot be used: {error}") from error
+
+    async def aclose(self) -> None:
+        """Close every connection; requests from now on fail as if the API server were out of reach."""
+        self._closed = True
+        await self._rest.close()
+
+    async def request(
+        self,
+        method: str,
+        path: str,
+        body: Body | Sequence[Body] | None = None,
+        *,
+        content_type: ContentType = ContentType.JSON,
+        params: Mapping[str, str] | None = None,
+        timeout_s: float = REQUEST_TIMEOUT_S,
+    ) -> Body:
+        """Send one request; the object in the answer.
+
+        Raises:
+            KubeError: it was refused, or there was no answer in time.
+        """
+        if method != "GET":
+            timeout_s = min(timeout_s, self._may_write_s())
+            if timeout_s <= 0:
+                raise KubeError(0, "NotActing", f"{method} {path}: the lease is not held, another operator may act")
+        silence_s = min(timeout_s, REQUEST_TIMEOUT_S)
+        with translated(f"{method} {path}"):
+            try:
+                # As a whole: aiohttp's own time-outs are for each part of a request, and start over with every byte.
+                async with (
+                    asyncio.timeout(timeout_s),
+                    self.answer(method, path, params, body, content_type, silence_s=silence_s) as response,
+                ):
+                    result: Body = json.loads(await response.read())
+            except TimeoutError as error:
+                raise unreachable(f"{method} {path}: no answer in {timeout_s:.1f} s") from error
+        return result
+
+    async def ready(self) -> bool:
+        """Whether the API server says that it is ready."""
+        try:
+            async with asyncio.timeout(REQUEST_TIMEOUT_S), self.answer("GET", "/readyz", None):
+                return True
+        except (KubeError, *_FAILURES):
+            return False
+
+    async def answers(self, timeout_s: float) -> bool:
+        """Whether anything is heard from the API server within some seconds, be it a refusal: the path to it works."""
+        try:
+            async with asyncio.timeout(timeout_s), self.answer("GET", "/livez", None):
+                return True
+        except KubeError:
+            return True
+        except aiohttp.ClientConnectorError as error:
+            return isinstance(error.os_error, ConnectionRefusedError)
+        except _FAILURES:
+            return False
+
+    @asynccontextmanager
+    async def answer(
+        self,
+        method: str,
+        path: str,
+        params: Mapping[str, str] | None,
+        body: Body | Sequence[Body] | None = None,
+        content_type: ContentType = ContentType.JSON,
+        *,
+        silence_s: float | None = REQUEST_TIMEOUT_S,
+    ) -> AsyncIterator[aiohttp.ClientResponse]:
+        """The answer to a request, once its head is here and says success.
+
+        Raises:
+            KubeError: the API server refused it.
+        """
+        url = str(self._access.configuration.host) + path
+        if params:
+            url += "?" + urlencode(params)
+        timeout = aiohttp.ClientTimeout(
+            total=None, connect=REQUEST_TIMEOUT_S, sock_connect=REQUEST_TIMEOUT_S, sock_read=silence_s
+        )
+        for last in (False, True):
+            async with asyncio.timeout(silence_s):
+                headers = await self._headers(content_type)
+                self._open()
+                answer = await self._rest.request(method, url, headers, body, _request_timeout=timeout)
+            response: aiohttp.ClientResponse = answer.response
+            try:
+                if response.status == HTTPStatus.UNAUTHORIZED and not last:
+                    async with asyncio.timeout(silence_s):
+                        await self._access.renew()
+                    continue
+                if response.status >= HTTPStatus.BAD_REQUEST:
+                    async with asyncio.timeout(silence_s):
+                        raise _refusal(response.status, await response.read())
+                yield response
+                return
+            finally:
+                # This closes the connection where the answer was not read to its end.
+                response.release()
+
+    async def _headers(self, content_type: ContentType) -> dict[str, str]:
+        headers = {"Accept": "application/json", "Content-Type": content_type.value}
+        bearer = (await self._access.configuration.auth_settings()).get("BearerToken")
+        if bearer is not None and bearer["value"]:
+            # A token file may end with a newline, which no header may hold.
+            headers["Authorization"] = bearer["value"].strip()
+        return headers
+
+    def _open(self) -> None:
+        """Make the pool of connections, once there is a loop; the official client's own keeps them for 15 s only."""
+        if self._closed:
+            raise aiohttp.ClientConnectionError("the connection was closed")
+        if self._rest.pool_manager is None:
+            no_redirects = aiohttp.TraceConfig()
+            no_redirects.on_request_redirect.append(_refuse_redirect)
+            self._rest.pool_manager = aiohttp.ClientSession(
+                trace_configs=[no_redirects],
+                connector=aiohttp.TCPConnector(
+                    ssl=self._rest.ssl_context,
+                    limit=MAX_CONNECTIONS,
+                    keepalive_timeout=_KEPT_OPEN_S,
+                    socket_factory=_socket,
+                ),
+                cookie_jar=aiohttp.DummyCookieJar(),
+                # Looking for proxies takes a request as long as all else, so not where there are none.
+                trust_env=self._trust_env and bool(getproxies_environment()),
+            )
+
+
+def _socket(address: aiohttp.AddrInfoType) -> socket.socket:
+    """One that asks the other side whether it is there: a watch sends nothing, and would not notice that it is gone."""
+    made = socket.socket(*address[:3])
+    made.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for option, value in _KEEPALIVE.items():
+        if hasattr(socket, option):
+            made.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
+    return made
+
+
+async def _refuse_redirect(
+    _session: aiohttp.ClientSession, _context: object, redirect: aiohttp.TraceRequestRedirectParams
+) -> None:
+    """An API server does not redirect; what does could have Secrets sent to it, in plain text."""
+    raise aiohttp.ClientError(f"refused a redirect to {redirect.response.headers.get('Location', 'nowhere')}")
+
+
+@contextmanager
+def translated(what: str) -> Iterator[None]:
+    """What went wrong with a connection, as a KubeError."""
+    try:
+        yield
+    except (*_FAILURES, ValueError) as error:
+        raise unreachable(f"{what}: {type(error).__name__}: {error}") from error
+
+
+def _refusal(code: int, content: bytes) -> KubeError:
+    try:
+        return from_status(code, json.loads(content))
+    except ValueError:
+        return from_status(code, content.decode(errors="replace"))

@@ -51,47 +51,37 @@ chaos: packages uv ## Fly missions on an embedded cluster while its parts fail (
 compare-vehicle: env ## Play the script of a real ArduCopter's answers on the simulated vehicle (AUTOPILOT=tcp:HOST:PORT: on that one)
 	PYTHONPATH=tests/component $(RUN) python tests/component/vehicle_script.py --all $(if $(AUTOPILOT),--autopilot $(AUTOPILOT))
 
-# In order, by which the longest flights are not what is left for one of two processes at the end.
-QUICK := $(RUN) pytest -q -n 2 --dist loadfile --no-loadscope-reorder
-# `make test` flies all of the recorded flights: they alone show that no change of the code changed a flight.
-GOLDEN := tests/component/test_control_golden.py
-
-# Many of these tests fly in real time, which a machine that stalls can fail: what fails gets a second try, alone. Any other code
-# than 1 tells of no failed test but of a run that was cut short, of which a second try would know nothing. Groups are part of the
-# names by which failed tests are found again: a second try without them would pass over a failed test of a group.
-INTEGRATION := tests/integration tests/e2e/test_cluster.py
-E2E := tests/e2e --ignore tests/e2e/test_cluster.py
-# Named file by file: of a directory pytest looks up what failed before pytest-xdist adds the groups to the names.
-INTEGRATION_FILES = $(wildcard tests/integration/test_*.py) tests/e2e/test_cluster.py
-E2E_FILES = $(filter-out tests/e2e/test_cluster.py $(ON_KIND),$(wildcard tests/e2e/test_*.py))
-# These are of the charts on a cluster that is not ours: they run on kind, or on FRACTUS_E2E_CLUSTER=current.
+# --no-loadscope-reorder keeps the order of collection, so that one of the workers does not begin the longest flights last.
+PYTEST := $(RUN) pytest -q --no-loadscope-reorder
+UNIT := -n 2 --dist loadfile
+GROUPS := --dist loadgroup
+# The end-to-end tests of the charts that also run on clusters of kind and kubeadm (tests/kind).
 ON_KIND := $(patsubst %,tests/e2e/test_%.py,mission refusals upgrade uninstall)
-second_try = || { code=$$?; [ $$code -eq 1 ] || exit $$code; $(RUN) pytest --last-failed --last-failed-no-failures none $(1); }
+# Each worker brings up an embedded cluster of its own. The cluster of KUBECONFIG is only one.
+E2E_WORKERS = $(if $(filter current,$(FRACTUS_E2E_CLUSTER)),0,2)
 
 .PHONY: test
-test: packages env lint ## Everything: lint, types, unit, component, integration and end-to-end tests
+test: packages env lint ## The gate for every change: lint, types, unit, component and integration tests, attacks, kills, and a mission on an embedded cluster (20 min)
 	$(RUN) fractus cluster binaries
-	$(QUICK) tests/component tests/unit --ignore $(GOLDEN)
-	FRACTUS_DEEP=1 $(RUN) pytest -q -n 2 $(GOLDEN)
-	$(RUN) pytest -n 4 --dist loadgroup --no-loadscope-reorder $(INTEGRATION) $(call second_try,-n 1 --dist loadgroup $(INTEGRATION_FILES))
-ifeq ($(FRACTUS_E2E_CLUSTER),current)
-	$(RUN) pytest $(E2E) $(call second_try,$(E2E))
-else
-	$(RUN) pytest -n 2 --dist loadgroup $(E2E) $(ON_KIND:%=--ignore %) $(call second_try,-n 1 --dist loadgroup $(E2E_FILES))
-	STEPS="images cluster load charts tests uninstall" $(MAKE) test-kind
-endif
+	$(PYTEST) $(UNIT) -m "not slow" tests/component tests/unit
+	$(PYTEST) -n 4 $(GROUPS) -m "not slow" tests/integration
+	$(PYTEST) -n $(E2E_WORKERS) $(GROUPS) -m "not slow" tests/e2e
+
+.PHONY: test-all
+test-all: packages env lint ## Everything: also slow tests, all golden flights and property-based examples, images, docs, chaos, and clusters of kind and kubeadm
+	$(RUN) fractus cluster binaries
+	FRACTUS_DEEP=1 $(PYTEST) $(UNIT) tests/component tests/unit
+	$(PYTEST) -n 4 $(GROUPS) tests/integration tests/e2e/test_cluster.py
+	$(PYTEST) -n $(E2E_WORKERS) $(GROUPS) tests/e2e --ignore tests/e2e/test_cluster.py
+	$(MAKE) test-kind test-kubeadm
 
 .PHONY: test-fast
-test-fast: env lint ## The inner loop: lint, types and unit tests
-	$(QUICK) tests/unit
+test-fast: env lint ## The inner loop: lint, types and unit tests (2 min)
+	$(PYTEST) $(UNIT) tests/unit
 
 .PHONY: test-component
 test-component: env ## Component tests: flights of whole services in virtual time, processes, servers
-	$(QUICK) tests/component
-
-.PHONY: test-deep
-test-deep: env ## Unit and component tests with all examples of the property-based ones
-	FRACTUS_DEEP=1 $(QUICK) tests/component tests/unit
+	$(PYTEST) $(UNIT) tests/component
 
 .PHONY: test-e2e
 test-e2e: packages env ## End-to-end tests only, on the embedded cluster or on FRACTUS_E2E_CLUSTER=current

@@ -1,4 +1,4 @@
-"""How many examples property-based tests try: few by default, all of them where `FRACTUS_DEEP` is set (`make test-deep`)."""
+"""Number of examples of property-based tests: few by default, all of them if `FRACTUS_DEEP` is set (`make test-all`)."""
 
 import os
 from collections.abc import Iterable

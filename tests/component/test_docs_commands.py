@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import shutil
-import subprocess
 from pathlib import Path
 
 import docs_folder
@@ -206,16 +205,3 @@ def test_output_that_is_not_printed_is_found(folder: Path, capsys: pytest.Captur
 def test_pages_are_all_looked_at() -> None:
     names = {str(page.relative_to(ROOT)) for page in PAGES}
     assert {"README.md", "docs/tutorial.md", "examples/heuristic-plugin/README.md"} <= names
-
-
-@pytest.mark.parametrize(("code", "runs"), [(0, 1), (1, 2), (2, 1), (5, 1)])
-def test_only_failed_tests_get_the_second_try_of_make_test(code: int, runs: int, tmp_path: Path) -> None:
-    """A run that was interrupted, or collected nothing, has failed no test: a second try would find none, and pass."""
-    log, run = tmp_path / "runs", tmp_path / "run"
-    run.write_text(f'#!/bin/sh\necho "$@" >> {log}\nexit $([ $(wc -l < {log}) -eq 1 ] && echo {code} || echo 0)\n')
-    run.chmod(0o755)
-    rule = "try: ; $(RUN) pytest -n 3 some $(call second_try,some)"
-    made = subprocess.run(["make", "--eval", rule, "try", f"RUN={run}"], cwd=ROOT, timeout=60, check=False)
-    tried = log.read_text().splitlines()
-    assert (made.returncode == 0) == (code in {0, 1})
-    assert tried == ["pytest -n 3 some", "pytest --last-failed --last-failed-no-failures none some"][:runs]

@@ -29,6 +29,7 @@ from fractus_cluster.spec import ClusterSpec, load_spec, parse_spec
 from fractus_cluster.state import state_of
 
 pytestmark = [
+    pytest.mark.slow,
     pytest.mark.root,
     pytest.mark.skipif(os.geteuid() != 0, reason="needs root"),
     pytest.mark.xdist_group("cluster"),

@@ -17,7 +17,9 @@ PARTS: dict[str, tuple[str, str, str | None]] = {
 }
 
 
-@pytest.mark.parametrize("part", PARTS)
+@pytest.mark.parametrize(
+    "part", [part if part == "mobility" else pytest.param(part, marks=pytest.mark.slow) for part in PARTS]
+)
 def test_kill_in_flight(grounded: Kube, part: str) -> None:
     kube = grounded
     application = f"kill-{part}"

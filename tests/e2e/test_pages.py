@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import json
 
+import pytest
 from conftest import DRONE, SYSTEM
 from docs_commands import every_command
 from kubectl import Kube
+
+pytestmark = pytest.mark.slow
 
 ELSEWHERE = {"fractus-test", "job/fractus-removal", "service/fractus-view", "fractus.dev/application=patrol"}
 """What is there at other times: after a test of helm or an uninstall that failed, with the page of flights, in the tutorial."""

@@ -19,6 +19,7 @@ NAME = "tutorial-e2e"
 BEGINS, ENDS = "## 6. ", "## When it does not fly"
 TIMEOUT_S = 1500
 pytestmark = [
+    pytest.mark.slow,
     pytest.mark.skipif(
         os.environ.get("FRACTUS_E2E_CLUSTER") == "current", reason="the tutorial brings its own cluster up"
     ),

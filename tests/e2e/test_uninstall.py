@@ -7,8 +7,11 @@ import os
 import shutil
 import subprocess
 
+import pytest
 from conftest import SYSTEM, short_flight
 from kubectl import Kube
+
+pytestmark = pytest.mark.slow
 
 
 def helm(kube: Kube, *args: str) -> subprocess.CompletedProcess[str]:

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import subprocess
 
+import pytest
 from conftest import DRONE, ROOT, SYSTEM, flight_state, short_flight
 from kubectl import Kube, condition
 from test_mission import audit_log, phase
 from test_uninstall import helm
+
+pytestmark = pytest.mark.slow
 
 CHART = str(ROOT / "charts" / "fractus")
 

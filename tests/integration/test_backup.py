@@ -18,6 +18,8 @@ from fractus_core.api import Grant
 from fractus_core.policy.signatures import verify
 from operator_world import FRACTUS, SYSTEM, Body, OperatorProcess, World, at, ours, traffic
 
+pytestmark = pytest.mark.slow
+
 PAGE = "docs/backup.md"
 *BACK_UP, VALUES = (line for line in typed_lines(PAGE, "Back up") if "MOBILITY-POD" not in line)
 RESTORE = typed_lines(PAGE, "Restore")

@@ -13,6 +13,8 @@ from fractus_runtime.kubernetes import BlockingClient, KubeError
 from fractus_sim.chaos.apiserver import no_room, occupied
 from fractus_sim.demo.kube import Kube
 
+pytestmark = pytest.mark.slow
+
 
 def status(client: BlockingClient) -> int:
     """With which status a client is refused what none may read."""

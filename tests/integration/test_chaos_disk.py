@@ -17,7 +17,7 @@ from fractus_sim.chaos.faults import FAULTS, broken
 from fractus_sim.chaos.stage import Stage
 from fractus_sim.demo.kube import DemoError
 
-pytestmark = pytest.mark.root
+pytestmark = [pytest.mark.slow, pytest.mark.root]
 
 
 @pytest.fixture

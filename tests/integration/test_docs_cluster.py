@@ -14,6 +14,8 @@ from docs_commands import ROOT, every_command, typed_lines
 from docs_shell import Shell
 from operator_world import FRACTUS, SYSTEM, OperatorProcess, World
 
+pytestmark = pytest.mark.slow
+
 PAGES = {f"docs/{name}.md" for name in ("alerts", "applications", "ardupilot", "direct-links", "logs", "upgrades")}
 LOOK = {
     ("kubectl", "get"), ("kubectl", "describe"), ("kubectl", "explain"), ("kubectl", "api-resources"),

@@ -22,6 +22,8 @@ from fractus_core.api import Grant
 from fractus_runtime.audit_chain import last_link
 from operator_world import FRACTUS, World
 
+pytestmark = pytest.mark.slow
+
 PAGE = "docs/standalone.md"
 TEXT = (ROOT / PAGE).read_text()
 INIT, SIGN, MOBILITY, CAMERA, FLY, SINCE, SINCE_STATUS = typed_lines(PAGE)

@@ -15,6 +15,8 @@ from docs_commands import ROOT, Command, every_command, has_placeholder
 from fractus_cluster.binaries import ensure_binaries
 from operator_world import World
 
+pytestmark = pytest.mark.slow
+
 COMMANDS = [command for command in every_command() if command.argv[0] in {"kubectl", "helm"} and len(command.argv) > 1]
 KUBECTL = [command for command in COMMANDS if command.argv[0] == "kubectl" and command.argv[1] != "fractus"]
 HELM = [command for command in COMMANDS if command.argv[0] == "helm"]

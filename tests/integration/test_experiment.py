@@ -20,6 +20,8 @@ from fractus_sim.experiment.processes import Processes, listening
 from mcap.reader import make_reader
 from pymavlink import mavutil
 
+pytestmark = pytest.mark.slow
+
 EXAMPLES = Path(__file__).parents[2] / "examples" / "experiments"
 HOME = {"lat": 50.8637, "lon": 4.6785, "alt": 25}
 TASK = [{"do": "takeoff", "alt": 8}, {"do": "goto", "north": 15, "east": 0, "alt": 8}, {"do": "returnToLaunch"}]

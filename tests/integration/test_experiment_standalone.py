@@ -18,6 +18,8 @@ from pymavlink import mavutil
 
 PROGRAM = """
 import asyncio, os, pathlib, fractus
+
+pytestmark = pytest.mark.slow
 async def main():
     (task,) = fractus.control_points()
     async with fractus.mobility() as drone, drone.control():

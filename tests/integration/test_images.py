@@ -18,7 +18,7 @@ from fractus_cluster.commands import run
 from fractus_cluster.images.bill import image_bill
 from fractus_cluster.images.build import SIZE_LIMITS_MB, TARGETS, build_images, image_name
 
-pytestmark = [pytest.mark.root, pytest.mark.timeout(1800), pytest.mark.xdist_group("cluster")]
+pytestmark = [pytest.mark.slow, pytest.mark.root, pytest.mark.timeout(1800), pytest.mark.xdist_group("cluster")]
 
 ROOT = Path(__file__).parents[2]
 PROGRAM = (Path(__file__).parent / "image_program.py").read_text()

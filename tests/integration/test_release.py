@@ -18,6 +18,8 @@ from fractus_cluster.commands import run
 from fractus_cluster.images.build import image_name
 from operator_world import SYSTEM
 
+pytestmark = pytest.mark.slow
+
 ROOT = CHARTS.parent
 WORKFLOW = yaml.safe_load((ROOT / ".github" / "workflows" / "release.yaml").read_text())
 VERSION = yaml.safe_load((CHARTS / "fractus" / "Chart.yaml").read_text())["version"]

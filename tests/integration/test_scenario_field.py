@@ -15,6 +15,8 @@ import pytest
 from fractus_cluster.ports import free_port
 from vehicle_process import running_vehicle
 
+pytestmark = pytest.mark.slow
+
 SLOW = ("WPNAV_SPEED=450", "WPNAV_ACCEL=150", "WPNAV_SPEED_UP=200", "RTL_ALT=1300", "LAND_SPEED=70")
 SPEEDUP = "2"
 

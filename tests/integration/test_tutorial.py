@@ -17,7 +17,7 @@ from fractus_cluster.ports import free_port
 
 PAGE = (Path(__file__).parents[2] / "docs" / "tutorial.md").read_text()
 FLIGHT_TIMEOUT_S = 180
-pytestmark = pytest.mark.timeout(300)
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 
 
 def block(kind: str) -> str:

@@ -19,6 +19,8 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 from operator_world import SYSTEM, World
 
+pytestmark = pytest.mark.slow
+
 Body = dict[str, Any]
 WIPES = "--set=uninstall.wipeNodes=true"
 WIPE = (WIPES, "--is-upgrade")

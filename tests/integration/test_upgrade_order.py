@@ -17,6 +17,8 @@ from fractus_runtime.kubernetes import KubeError
 from operator_world import FRACTUS, NODES, SYSTEM, OperatorProcess, World
 from test_uninstall_chart import on
 
+pytestmark = pytest.mark.slow
+
 KIND = "/apis/apiextensions.k8s.io/v1/customresourcedefinitions/nodegrants.fractus.dev"
 OBJECTS = f"{FRACTUS}/namespaces/{NODES}/nodegrants"
 LEASE = f"/apis/coordination.k8s.io/v1/namespaces/{SYSTEM}/leases/fractus-operator"

@@ -16,6 +16,8 @@ import pytest
 from fractus_cluster.ports import free_port
 from vehicle_process import HOME, Client, running_vehicle
 
+pytestmark = pytest.mark.slow
+
 SESSIONS = Path(__file__).with_name("vehicle_clients")
 PYTHON = os.environ.get("FRACTUS_CLIENTS_PYTHON", sys.executable)
 

@@ -26,6 +26,7 @@ FLOWN, ZONE = (11, 87, 184), (194, 24, 43)
 """Colours of the page in light."""
 
 pytestmark = [
+    pytest.mark.slow,
     pytest.mark.skipif(
         CHROMIUM is None, reason="there is no Chromium here: make packages installs it where apt-get is"
     ),

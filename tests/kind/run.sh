@@ -67,9 +67,8 @@ charts() {
 }
 
 tests() {
-  # What fails gets a second try, as in `make test`: these tests fly in real time.
   # shellcheck disable=SC2086 # several words
-  .venv/bin/pytest $ON_KIND || .venv/bin/pytest --last-failed --last-failed-no-failures none $ON_KIND
+  .venv/bin/pytest $ON_KIND
 }
 
 demo() {

@@ -16,9 +16,12 @@ from control_plane import ControlPlane
 from operator_world import FRACTUS, World, at, ours, traffic
 from playwright.sync_api import expect, sync_playwright
 
-pytestmark = pytest.mark.skipif(
-    CHROMIUM is None, reason="there is no Chromium here: make packages installs it where apt-get is"
-)
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        CHROMIUM is None, reason="there is no Chromium here: make packages installs it where apt-get is"
+    ),
+]
 
 
 class Way:

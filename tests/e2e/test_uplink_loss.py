@@ -14,6 +14,8 @@ from kubectl import Kube, Object, condition
 from test_kills import restarts
 from test_mission import phase
 
+pytestmark = pytest.mark.slow
+
 LINKS = EXAMPLE.parent / "links"
 PEER = "edge-1"
 CUT_S = 300.0 if DEEP else 75.0

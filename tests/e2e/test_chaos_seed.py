@@ -12,6 +12,8 @@ from fractus_sim.chaos.watching import Watch
 from fractus_sim.demo.kube import Kube as Programs
 from kubectl import Kube
 
+pytestmark = pytest.mark.slow
+
 SEED = 7
 RUN_S = 75.0
 FAULTS = ("operator-kill", "api-down", "etcd-restart", "link-cut", "pod-delete")

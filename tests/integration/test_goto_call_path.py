@@ -1,0 +1,178 @@
+"""The call path of one `Goto`: every function of ours between the SDK call and the first byte on the autopilot link.
+
+The number of files and functions is the reading that an engineer has to do to follow one call. It must not grow.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextvars
+import socket
+import sys
+import threading
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from types import CodeType, FrameType
+from typing import Any
+
+from fractus.drone import Mobility
+from fractus.environment import Endpoint
+from fractus_core.api.names import node_server_name
+from fractus_services.mobility.rpc.server import run
+from fractus_services.options import MobilityOptions
+from mobility_rig import DRIVER, FRAME, NODE, Rig, altitude_limit, fence, grant
+
+MAX_FILES = 59
+MAX_FUNCTIONS = 196
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+FOLDERS = ("agent", "core", "mavlink", "proto", "runtime", "sdk", "services")
+
+_traced: contextvars.ContextVar[bool] = contextvars.ContextVar("traced", default=False)
+
+
+class CallPath:
+    """Records the functions of this repository that run on behalf of one call, up to the first byte on the link.
+
+    A function counts if it runs in a task that began after the recording (the SDK call, gRPC's task of the handler, and
+    the tasks and threads that these start). Tasks that ran before, such as heartbeats, telemetry and the monitor, do not
+    count. Comprehensions and nested functions count as part of the function that contains them.
+    """
+
+    def __init__(self) -> None:
+        self.functions: dict[tuple[str, str], None] = {}
+        self.sent = asyncio.Event()
+        self._earlier = asyncio.all_tasks()
+        self._ours: dict[CodeType, tuple[str, str] | None] = {}
+
+    def start(self) -> None:
+        """Begin to record."""
+        threading.setprofile(self._profile)
+        sys.setprofile(self._profile)
+
+    def stop(self) -> None:
+        """End the recording."""
+        sys.setprofile(None)
+        threading.setprofile(None)  # type: ignore[arg-type]
+
+    @property
+    def files(self) -> list[str]:
+        """The files of the functions, in the order of the path."""
+        return list(dict.fromkeys(file for file, _ in self.functions))
+
+    def _profile(self, frame: FrameType, event: str, arg: Any) -> None:
+        if self.sent.is_set():
+            return
+        if event == "call":
+            function = self._function(frame.f_code)
+            if function is not None and self._counts():
+                self.functions.setdefault(function)
+        elif event == "c_call" and _sends(arg) and self._counts():
+            self.sent.set()
+
+    def _counts(self) -> bool:
+        """Return True in a task of the call, and in threads that such a task starts."""
+        if _traced.get():
+            return True
+        try:
+            task = asyncio.current_task()
+        except RuntimeError:
+            return False
+        if task is None or task in self._earlier:
+            return False
+        _traced.set(True)
+        return True
+
+    def _function(self, code: CodeType) -> tuple[str, str] | None:
+        if code not in self._ours:
+            self._ours[code] = self._locate(code)
+        return self._ours[code]
+
+    def _locate(self, code: CodeType) -> tuple[str, str] | None:
+        path = Path(code.co_filename)
+        if not path.is_relative_to(REPOSITORY):
+            return None
+        relative = path.relative_to(REPOSITORY)
+        if relative.parts[0] not in FOLDERS:
+            return None
+        return str(relative), code.co_qualname.partition(".<locals>")[0]
+
+
+def _sends(function: Any) -> bool:
+    """Return True for a socket's `send`. The sockets of gRPC are not Python's, so this is the link's."""
+    return function.__name__ == "send" and isinstance(getattr(function, "__self__", None), socket.socket)
+
+
+@asynccontextmanager
+async def serving(rig: Rig) -> AsyncIterator[None]:
+    """Run the mobility service in this process and event loop."""
+    options = MobilityOptions(
+        grants=rig.grants,
+        tls=rig.tls,
+        state=rig.directory / "state",
+        audit=rig.audit,
+        node=NODE,
+        node_object=rig.directory / "none.json",
+        description=rig.directory / "none.yaml",
+        listen=rig.address,
+        lock_timeout=5.0,
+        recordings=None,
+        recordings_mb=0,
+        metrics="",
+        autopilot=rig.link,
+        driver_grace=15.0,
+        boarding=60.0,
+        flat_terrain=False,
+    )
+    stop = asyncio.Event()
+    service = asyncio.create_task(run(options, stop))
+    try:
+        yield
+    finally:
+        stop.set()
+        await service
+
+
+def endpoint(rig: Rig) -> Endpoint:
+    """Store the driver's certificate and return the address of the service."""
+    folder = rig.directory / "driver-tls"
+    folder.mkdir()
+    key, certificate = rig.authority.issue(DRIVER)
+    for name, data in (("tls.key", key), ("tls.crt", certificate), ("ca.crt", rig.authority.pem)):
+        (folder / name).write_bytes(data)
+    return Endpoint(rig.address, node_server_name(NODE), folder)
+
+
+async def record(call: Callable[[], Any]) -> CallPath:
+    """Start a motion, record its path to the first byte on the link, then wait until it is complete."""
+    path = CallPath()
+
+    async def fly() -> None:
+        await call()
+
+    path.start()
+    try:
+        flying = asyncio.create_task(fly())
+        async with asyncio.timeout(10):
+            await path.sent.wait()
+    finally:
+        path.stop()
+    await flying
+    return path
+
+
+async def test_goto_call_path_stays_within_its_number_of_files_and_functions(rig: Rig) -> None:
+    rig.write_grant(grant(altitude_limit(2, 30), fence("no-fly", "exclusion", "ignore", -60, -10, -40, 10)))
+    rig.start_vehicle(2.0)
+    async with serving(rig), Mobility(endpoint(rig)) as drone, drone.control():
+        await drone.arm()
+        await drone.takeoff(8)
+        await rig.until(lambda drone: abs(drone.velocity.down_mps) < 0.05, what="hover")
+        lat, lon = FRAME.latlon(0, 8)
+        path = await record(lambda: drone.goto(lat, lon, 8))
+    for file, function in path.functions:
+        print(f"{file}: {function}")
+    print(f"{len(path.files)} files, {len(path.functions)} functions")
+    assert len(path.files) <= MAX_FILES
+    assert len(path.functions) <= MAX_FUNCTIONS

@@ -185,7 +185,7 @@ def chart_readme(chart: Path) -> str:
     parts = [
         f"# {described['name']}",
         f"{described['description']}.",
-        f"For Kubernetes `{described['kubeVersion']}`. How to install it: [README](../../README.md#on-your-own-cluster),"
+        f"For Kubernetes `{described['kubeVersion']}`. Installation: [README](../../README.md#install-on-your-own-cluster),"
         " [clusters](../../docs/clusters.md), [upgrades](../../docs/upgrades.md).",
         "## Values",
         _value_table(chart),

@@ -20,9 +20,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import skimage.data
-from fractus_services.camera.imaging.faces import DEFAULT_MIN_PX, Box, CascadeDetector
-from fractus_services.camera.imaging.filters import FACE_CELLS, blur_average, blur_median, hide_faces
-from fractus_services.camera.imaging.pixels import Pixels
+from fractus_services.camera.face_detection import DEFAULT_MIN_PX, Box, CascadeDetector
+from fractus_services.camera.filters import FACE_CELLS, blur_average, blur_median, hide_faces
+from fractus_services.camera.pixels import Pixels
 
 SEED = 40
 ASTRONAUT = (177, 66, 97)

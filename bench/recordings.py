@@ -72,13 +72,13 @@ def main() -> int:
     # What the service has loaded without a recording, so that memory is only what recording adds.
     from fractus_mavlink import Endpoint  # noqa: PLC0415
     from fractus_services.mobility.rpc import server as _server  # noqa: F401, PLC0415
-    from fractus_services.recording.segments import Segments  # noqa: PLC0415
+    from fractus_services.recording.segment_directory import SegmentDirectory  # noqa: PLC0415
 
     vehicle, companion, before_mb = Endpoint(1, 1), Endpoint(244, 191), resident_mb()
     from fractus_services.recording.flight_writer import FlightWriter  # noqa: PLC0415
 
     with tempfile.TemporaryDirectory() as directory:
-        writer = FlightWriter(Segments(Path(directory), 500_000_000, reserve_bytes=0), "drone-1")
+        writer = FlightWriter(SegmentDirectory(Path(directory), 500_000_000, reserve_bytes=0), "drone-1")
         writer.begin()
         begun_s = time.process_time()
         record(writer, seconds, vehicle, companion)

@@ -155,7 +155,7 @@ def export(
 
 def _places(paths: Sequence[Path]) -> Places:
     from fractus_core.api import Grant, Zone  # noqa: PLC0415
-    from fractus_services.recording.places import areas_of, zones_of  # noqa: PLC0415
+    from fractus_services.recording.map_features import areas_of, zones_of  # noqa: PLC0415
 
     from fractus_cli.flight_export import Places  # noqa: PLC0415
     from fractus_cli.manifests import BadManifest, read_manifests  # noqa: PLC0415

@@ -13,9 +13,9 @@ from xml.sax.saxutils import escape
 
 from fractus_core.api import Zone
 from fractus_core.geo.formats.kml import kml_document, zone_placemark
-from fractus_services.recording.mcap_file import McapFile
+from fractus_services.recording.map_features import Feature, placed
+from fractus_services.recording.mcap_file import McapWriter
 from fractus_services.recording.messages import component_of, location, number, of_audit, sentence, zones
-from fractus_services.recording.places import Feature, placed
 
 from fractus_cli.audit_logs import Entry, decided, who
 
@@ -189,7 +189,7 @@ def _plain(value: object) -> bool:
 def write_mcap(export: Export, out: IO[bytes]) -> None:
     """A file for Foxglove: location, state, decisions and log of each node, and the areas as GeoJSON."""
     # The writer asks how far it is, which a pipe cannot say.
-    file = McapFile(cast(IO[bytes], _Counted(out)))
+    file = McapWriter(cast(IO[bytes], _Counted(out)))
     file.describe("audit", {"verified": "no" if export.problems else "yes", "problems": "\n".join(export.problems)})
     features = export.places.features()
     for entry in export.entries:

@@ -16,6 +16,7 @@ from fractus_runtime import spans
 from google.protobuf.message import DecodeError
 
 from fractus_services.auth import Caller, Callers
+from fractus_services.error_details import abort
 from fractus_services.errors import (
     InternalError,
     InvalidRequest,
@@ -24,8 +25,7 @@ from fractus_services.errors import (
     Refused,
     ResourceExhausted,
 )
-from fractus_services.grants import ActiveGrant, GrantFiles
-from fractus_services.replies import abort
+from fractus_services.grant_files import ActiveGrant, GrantFiles
 
 log = logging.getLogger(__name__)
 

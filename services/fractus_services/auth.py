@@ -13,7 +13,7 @@ from typing import Any
 import grpc
 from cryptography import x509
 from fractus_core.api.names import SPIFFE_SCHEME
-from fractus_core.policy.values import Moment
+from fractus_core.policy.values import UncertainTime
 
 from fractus_services.clock import steady_s
 from fractus_services.errors import NotAuthenticated
@@ -102,7 +102,7 @@ class Callers:
         begun = now_s >= begin_s - MAX_SKEW_S
         if not (begun or urgent):
             raise NotAuthenticated("the client certificate is not valid yet; check the clocks")
-        if begun and caller.left_s and not isinstance(now_s, Moment):
+        if begun and caller.left_s and not isinstance(now_s, UncertainTime):
             # While the clock is in doubt, or wrong about this certificate, nothing is remembered: it may be right later.
             self._seen[pem] = caller
             if len(self._seen) > MAX_SEEN:

@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Callable
 
-from fractus_core.policy.values import Moment
+from fractus_core.policy.values import UncertainTime
 
 log = logging.getLogger(__name__)
 
@@ -26,7 +26,7 @@ class Clock:
     """Unix time in seconds.
 
     A clock that is stepped, back or ahead, must neither bring what has expired back to life nor end at once what restricts.
-    Until it is clear which reading is right, the time is a `Moment`: what it is as a number is the later reading, and the
+    Until it is clear which reading is right, the time is a `UncertainTime`: what it is as a number is the later reading, and the
     policy engine counts both against the caller. Who was let in before the step stays in by steady time (`auth.Callers`).
 
     Args:
@@ -57,7 +57,7 @@ class Clock:
             self._stepped(step_s, False)
         if now_s - self._doubted_since_s < TRUST_AFTER_S:
             readings = now_s + self._offset_s, now_s + offset_s
-            return Moment(max(readings), min(readings))
+            return UncertainTime(max(readings), min(readings))
         self._offset_s, self._doubted_since_s = offset_s, None
         log.warning("clock: the step lasted, the new reading counts (seconds=%.0f)", step_s)
         self._stepped(step_s, True)

@@ -152,6 +152,6 @@ def camera() -> None:
 )
 def serve_camera(**given: Any) -> None:
     """Serve until stopped; waits for certificates."""
-    from fractus_services.camera.rpc.server import run  # noqa: PLC0415 - the command line stays quick
+    from fractus_services.camera.server import run  # noqa: PLC0415 - the command line stays quick
 
     until_signalled("camera", run, CameraOptions(**given))

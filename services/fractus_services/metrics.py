@@ -9,7 +9,7 @@ from fractus_runtime.audit import AuditLog
 from fractus_runtime.exposition import CERTIFICATE_EXPIRY
 from fractus_runtime.figures import Counter, Figure, gauge, hash_number, text_of
 
-from fractus_services.grants import GrantFiles
+from fractus_services.grant_files import GrantFiles
 
 MAX_POLICIES = 200
 """Policies that are counted by name; verdicts of others count as those of `other`."""

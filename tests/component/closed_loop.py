@@ -24,7 +24,7 @@ from fractus_core.control import ControlEvent, ControlState, StreamState
 from fractus_core.policy.values import SetSpeedArgs, TakeoffArgs, VelocityArgs
 from fractus_mavlink import Parser
 from fractus_services.errors import AutopilotError, Refused
-from fractus_services.grants import ActiveGrant
+from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.journal import Journal
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot

@@ -16,7 +16,7 @@ from typing import Any
 
 from fractus_core.control.values import FlightMode
 from fractus_core.policy.values import TakeoffArgs
-from fractus_services.grants import ActiveGrant
+from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority import drivers
 from mobility_world import World, goto
 from virtual_time import fly

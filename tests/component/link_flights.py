@@ -21,7 +21,7 @@ from fractus_core.api.plans import GrantSpec
 from fractus_core.control import StreamState
 from fractus_core.policy.values import TakeoffArgs, VelocityArgs
 from fractus_services.errors import AutopilotError, Refused, Unavailable
-from fractus_services.grants import ActiveGrant
+from fractus_services.grant_files import ActiveGrant
 from mobility_world import area, goto, spec, zone
 
 WALL = shapely.box(-120.0, 60.0, 120.0, 90.0)

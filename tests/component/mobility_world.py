@@ -19,7 +19,7 @@ from fractus_core.policy.values import Airframe, GotoArgs, Home, TakeoffArgs
 from fractus_mavlink import Message, message
 from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_RESULT
 from fractus_services.errors import Refused
-from fractus_services.grants import ActiveGrant
+from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.journal import Journal
 from fractus_services.mobility.autopilot import COURSE_S, Checked
 from fractus_services.mobility.flight.service import Progress

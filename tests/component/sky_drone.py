@@ -9,7 +9,7 @@ from pathlib import Path
 
 from closed_loop import Account, Drone, Sky, Weather
 from fractus_core.control import StreamState
-from fractus_services.grants import ActiveGrant
+from fractus_services.grant_files import ActiveGrant
 from mobility_world import spec
 
 

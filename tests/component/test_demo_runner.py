@@ -14,7 +14,7 @@ import pytest
 import yaml
 from click.testing import CliRunner
 from fractus_services.recording import messages
-from fractus_services.recording.tape import Tape
+from fractus_services.recording.segment_writer import SegmentWriter
 from fractus_sim.demo import collect, watch
 from fractus_sim.demo import view as demo_view
 from fractus_sim.demo.__main__ import demo
@@ -187,7 +187,7 @@ def test_pictures_are_spread_over_the_flight() -> None:
 def test_pictures_of_the_flight_come_from_the_camera_s_recording(tmp_path: Path, whole: bool) -> None:
     record = Record.of(demo_flight.content(), demo_flight.audit())
     paths = [tmp_path / f"{service}-000001-20260601T120000Z.mcap" for service in ("camera", "mobility")]
-    tape = Tape(paths[0].with_suffix(""), "drone-1")
+    tape = SegmentWriter(paths[0].with_suffix(""), "drone-1")
     for seconds in range(-100, 300, 5):
         at_ns = int((demo_flight.TAKEOFF_S + seconds) * 1e9)
         tape.write(at_ns, b"", (messages.picture(at_ns, "drone-1", b"\xff\xd8%d" % seconds),))

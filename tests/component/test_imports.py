@@ -40,8 +40,8 @@ def test_what_flies_needs_no_library_of_pictures() -> None:
 
 def test_plain_pictures_need_no_opencv() -> None:
     _, imported = after(
-        "import numpy as np; from fractus_services.camera.imaging.pixels import decoded, encoded, fitted; "
-        "from fractus_services.camera.imaging.filters import blur_average; "
+        "import numpy as np; from fractus_services.camera.pixels import decoded, encoded, fitted; "
+        "from fractus_services.camera.filters import blur_average; "
         "decoded(encoded(blur_average(fitted(np.zeros((90, 120, 3), np.uint8), 50, 40))))"
     )
     assert "PIL" in imported
@@ -62,6 +62,6 @@ def test_an_agent_reads_outcomes_without_what_decides_them() -> None:
 
 
 def test_recordings_have_zones_without_the_formats_of_others() -> None:
-    said, _ = after("import fractus_services.recording.places; print(*sys.modules)")
+    said, _ = after("import fractus_services.recording.map_features; print(*sys.modules)")
     assert "fractus_core.geo.formats.geojson" in said.split()
     assert "fractus_core.geo.formats.kml" not in said.split()

@@ -33,7 +33,7 @@ from fractus_services.recording import flight_writer, recorder
 from fractus_services.recording.flight_writer import FlightWriter
 from fractus_services.recording.mcap_file import completed
 from fractus_services.recording.recorder import Recorder
-from fractus_services.recording.segments import MIN_SEGMENT_BYTES, Segments, segments_in
+from fractus_services.recording.segment_directory import MIN_SEGMENT_BYTES, SegmentDirectory, segments_in
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.writer import MCAP0_MAGIC
 
@@ -89,7 +89,7 @@ def writer_in(directory: Path, megabytes: float = 4.0, *, always: bool = False) 
     """A writer of a process that takes the place of the one before."""
     while opened:
         opened.pop().segments.release()
-    segments = Segments(directory, int(megabytes * 1e6), reserve_bytes=0)
+    segments = SegmentDirectory(directory, int(megabytes * 1e6), reserve_bytes=0)
     opened.append(FlightWriter(segments, "drone-1", always=always, steady=lambda: Steady.now_s))
     opened[-1].begin()
     return opened[-1]
@@ -357,7 +357,7 @@ def test_one_file_that_cannot_be_completed_stops_no_recording(
 
 
 def test_a_directory_has_one_writer(tmp_path: Path) -> None:
-    first, second = (Segments(tmp_path, 4_000_000, reserve_bytes=0) for _ in range(2))
+    first, second = (SegmentDirectory(tmp_path, 4_000_000, reserve_bytes=0) for _ in range(2))
     first.prepare()
     with pytest.raises(
         OSError, match=r"another service records into .*; give each its own directory with --recordings"
@@ -452,7 +452,7 @@ def test_a_full_disk_stops_the_recording_and_it_goes_on_when_there_is_room(
             raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(os, "fdatasync", sync)
-    vehicle, taken = Vehicle(), Recorder(Segments(tmp_path, 4_000_000, reserve_bytes=0), "drone-1")
+    vehicle, taken = Vehicle(), Recorder(SegmentDirectory(tmp_path, 4_000_000, reserve_bytes=0), "drone-1")
 
     def flies() -> None:
         taken.take_received(vehicle.heartbeat(True) + vehicle.position(39.0, 22.0, 100.0))
@@ -483,7 +483,7 @@ def test_a_full_disk_stops_the_recording_and_it_goes_on_when_there_is_room(
 @pytest.mark.usefixtures("quick")
 def test_one_line_tells_that_a_disk_has_no_room(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     tried = len(caplog.records)
-    taken = Recorder(Segments(tmp_path / "r", 4_000_000, reserve_bytes=2**62), "drone-1")
+    taken = Recorder(SegmentDirectory(tmp_path / "r", 4_000_000, reserve_bytes=2**62), "drone-1")
     until(lambda: taken.problem)
     vehicle, deadline = Vehicle(), time.monotonic() + 0.3
     while time.monotonic() < deadline:  # a dozen of attempts
@@ -502,7 +502,7 @@ def test_a_disk_that_hangs_delays_no_one(
     hangs, monotonic = threading.Event(), time.monotonic
     monkeypatch.setattr(recorder, "DRAIN_S", 0.005)
     monkeypatch.setattr(FlightWriter, "received", lambda _self, _now, _data: hangs.wait(60))
-    taken = Recorder(Segments(tmp_path, 4_000_000, reserve_bytes=0), "drone-1", max_waiting=50)
+    taken = Recorder(SegmentDirectory(tmp_path, 4_000_000, reserve_bytes=0), "drone-1", max_waiting=50)
     taken.take_received(b"")
     until(lambda: taken._busy_since_s is not None and taken._waiting.empty())
     for _ in range(500):
@@ -525,7 +525,7 @@ def test_an_error_of_ours_is_a_problem_and_no_crash(tmp_path: Path, monkeypatch:
         raise ZeroDivisionError("oops")
 
     monkeypatch.setattr(FlightWriter, "sent", broken)
-    taken = Recorder(Segments(tmp_path, 4_000_000, reserve_bytes=0), "drone-1")
+    taken = Recorder(SegmentDirectory(tmp_path, 4_000_000, reserve_bytes=0), "drone-1")
     taken.take_sent(b"x")
     until(lambda: taken.problem == "recording stopped: ZeroDivisionError: oops")
     taken.take_entry({})
@@ -540,14 +540,14 @@ def test_the_agent_is_told_what_is_not_recorded(tmp_path: Path, monkeypatch: pyt
     full = threading.Event()
     full.set()
 
-    def check(_self: Segments) -> None:
+    def check(_self: SegmentDirectory) -> None:
         if full.is_set():
             raise OSError(errno.ENOSPC, "no room")
 
-    monkeypatch.setattr(Segments, "check_space", check)
+    monkeypatch.setattr(SegmentDirectory, "check_space", check)
     Recorder(None, "drone-1", told=state / "recording.problem")
     assert recording_problems(tmp_path) == []
-    taken = Recorder(Segments(tmp_path / "r", 4_000_000), "drone-1", told=state / "recording.problem")
+    taken = Recorder(SegmentDirectory(tmp_path / "r", 4_000_000), "drone-1", told=state / "recording.problem")
     until(lambda: recording_problems(tmp_path) == ["camera: recording stopped: no room"])
     full.clear()
     until(lambda: recording_problems(tmp_path) == [])
@@ -578,5 +578,5 @@ def test_the_status_of_the_node_tells_that_nothing_is_recorded() -> None:
 
 
 def test_a_segment_is_never_smaller_than_what_is_worth_a_file(tmp_path: Path) -> None:
-    assert Segments(tmp_path, 1).segment_bytes == MIN_SEGMENT_BYTES
-    assert Segments(tmp_path, 10**12).segment_bytes == 32_000_000
+    assert SegmentDirectory(tmp_path, 1).segment_bytes == MIN_SEGMENT_BYTES
+    assert SegmentDirectory(tmp_path, 10**12).segment_bytes == 32_000_000

@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 from exposed import get, values
 from fractus_cluster.ports import free_port
-from fractus_services import description
-from fractus_services.camera.rpc import server
+from fractus_services import node_description
+from fractus_services.camera import server
 from fractus_services.options import CameraOptions
 
 
-class Counted(server.Album):
+class Counted(server.ImageStore):
     """Counts how many are made."""
 
     made = 0
@@ -33,8 +33,8 @@ async def test_a_node_that_is_described_otherwise_keeps_its_album(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A second album would tidy away the picture that is still being written through the first."""
-    monkeypatch.setattr(server, "Album", Counted)
-    monkeypatch.setattr(description, "POLL_INTERVAL_S", 0.01)
+    monkeypatch.setattr(server, "ImageStore", Counted)
+    monkeypatch.setattr(node_description, "POLL_INTERVAL_S", 0.01)
     node = tmp_path / "node.json"
     port = free_port()
     options = CameraOptions(

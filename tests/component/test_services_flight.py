@@ -13,7 +13,7 @@ from fractus_core.control.values import FlightMode
 from fractus_core.policy.values import Call, GotoArgs, SetSpeedArgs, TakeoffArgs, Verdict
 from fractus_mavlink.enums import MAV_CMD
 from fractus_services.errors import AutopilotError, Refused
-from fractus_services.grants import ActiveGrant
+from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority import drivers
 from mobility_world import (
     GUIDED,

@@ -16,7 +16,7 @@ from fractus_core.policy.values import GotoArgs, TakeoffArgs
 from fractus_mavlink import Endpoint, Parser, layout_named, message
 from fractus_mavlink.enums import COPTER_MODE, MAV_AUTOPILOT, MAV_CMD, MAV_COMPONENT, MAV_FRAME, MAV_MODE_FLAG, MAV_TYPE
 from fractus_services.errors import AutopilotError, Refused, Unavailable
-from fractus_services.grants import ActiveGrant
+from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority import drivers
 from fractus_services.mobility.authority.home import home_moved
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER

@@ -16,7 +16,7 @@ from fractus_proto.v1 import mobility_pb2
 from fractus_services import admission, background
 from fractus_services.auth import Caller
 from fractus_services.background import in_slices
-from fractus_services.grants import ActiveGrant
+from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.flight import calls, courses
 from fractus_services.mobility.rpc.handlers import MobilityHandlers
 from google.rpc import error_details_pb2, status_pb2

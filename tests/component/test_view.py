@@ -22,7 +22,7 @@ from exposed import scraped, values
 from fractus_cluster.ports import free_port
 from fractus_runtime.figures import text_of
 from fractus_services.recording import messages
-from fractus_services.recording.mcap_file import McapFile
+from fractus_services.recording.mcap_file import McapWriter
 from fractus_services.recording.messages import Record
 from fractus_view import command, server
 from fractus_view.command import Site, view
@@ -55,7 +55,7 @@ def records(seconds: int = 4) -> list[Record]:
 
 
 def write(file: Any, told: Iterable[Record], flush_every: int = 40) -> None:
-    out = McapFile(file)
+    out = McapWriter(file)
     for number, record in enumerate(told):
         out.write(f"/drone-1/{record.topic}", record.schema, record.time_ns, record.content)
         if number % flush_every == 0:

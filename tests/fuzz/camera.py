@@ -20,23 +20,21 @@ from typing import Any
 
 import atheris
 
-with atheris.instrument_imports(
-    include=["fractus_services.camera.rpc", "fractus_services.camera.pictures", "fractus_services.camera.album"]
-):
-    from fractus_services.camera.album.album import Album
-    from fractus_services.camera.pictures.capture import MAX_FILTERING, PictureCapture
-    from fractus_services.camera.pictures.fair_queue import MAX_PER_OWNER, FairQueue
-    from fractus_services.camera.pictures.judge import PictureJudge
-    from fractus_services.camera.pictures.library import PictureLibrary
-    from fractus_services.camera.rpc.handlers import CameraHandlers
+with atheris.instrument_imports(include=["fractus_services.camera"]):
+    from fractus_services.camera.fair_queue import MAX_PER_OWNER, FairQueue
+    from fractus_services.camera.handlers import CameraHandlers
+    from fractus_services.camera.image_authorization import ImageAuthorizer
+    from fractus_services.camera.image_capture import MAX_FILTERING, ImageCapture
+    from fractus_services.camera.image_store import ImageStore
+    from fractus_services.camera.stored_images import StoredImages
 import numpy as np
 from camera_world import Drone, Finder, active_grant, private
 from fractus_proto.v1 import camera_pb2, camera_pb2_grpc
 from fractus_services.admission import CallAdmission
-from fractus_services.camera.capture.driver import CameraFailed, Wanted
-from fractus_services.camera.capture.properties import CameraProperties
-from fractus_services.camera.imaging.pixels import Pixels, reduced
-from fractus_services.grants import ActiveGrant
+from fractus_services.camera.camera_properties import CameraProperties
+from fractus_services.camera.drivers.driver import CameraFailed, CaptureRequest
+from fractus_services.camera.pixels import Pixels, reduced
+from fractus_services.grant_files import ActiveGrant
 from mobility_world import Grants
 from policy_world import NOW
 from virtual_time import fly
@@ -63,7 +61,7 @@ class Shutter:
     def __init__(self) -> None:
         self.broken = False
 
-    async def expose(self, wanted: Wanted, count: int = 1, apart_s: float = 0.0) -> list[Pixels]:
+    async def expose(self, wanted: CaptureRequest, count: int = 1, apart_s: float = 0.0) -> list[Pixels]:
         await asyncio.sleep(count * apart_s)
         if self.broken:
             raise CameraFailed("the camera gave no picture; check it and its connection")
@@ -80,17 +78,17 @@ class Service:
         for grant in (FIRST, SECOND):
             self.grants.active[grant.identity] = grant
         shutil.rmtree(FOLDER / "album", ignore_errors=True)
-        album = Album(FOLDER / "album", 5, 10**6)
+        album = ImageStore(FOLDER / "album", 5, 10**6)
         audit: Any = SimpleNamespace(append=lambda _kind, _content: None)
         finder = Finder()
         shared: Any = {
             "detector": finder, "filter_queue": FairQueue(MAX_PER_OWNER, MAX_FILTERING), "album": album,
-            "judge": PictureJudge(audit, finder), "clock": lambda: NOW,
+            "judge": ImageAuthorizer(audit, finder), "clock": lambda: NOW,
         }  # fmt: skip
         admission = CallAdmission(self.grants, time.time)  # type: ignore[arg-type]
         handlers = CameraHandlers(
-            PictureCapture(self.drone, self.shutter, CameraProperties((64, 48)), **shared),  # type: ignore[arg-type]
-            PictureLibrary(self.drone, **shared), admission,
+            ImageCapture(self.drone, self.shutter, CameraProperties((64, 48)), **shared),  # type: ignore[arg-type]
+            StoredImages(self.drone, **shared), admission,
         )  # fmt: skip
         registry = Registry(admission)
         camera_pb2_grpc.add_CameraServiceServicer_to_server(handlers, registry)

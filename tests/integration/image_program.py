@@ -97,9 +97,9 @@ def geometry() -> None:
 def pictures() -> None:
     """What filters call of OpenCV and Pillow, and OpenCV's linear algebra."""
     import numpy as np
-    from fractus_services.camera.imaging.faces import CascadeDetector
-    from fractus_services.camera.imaging.filters import moving
-    from fractus_services.camera.imaging.pixels import decoded, encoded, opencv
+    from fractus_services.camera.face_detection import CascadeDetector
+    from fractus_services.camera.filters import moving
+    from fractus_services.camera.pixels import decoded, encoded, opencv
 
     cv2 = opencv()
     random = np.random.default_rng(1)

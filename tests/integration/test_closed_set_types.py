@@ -17,7 +17,7 @@ def test_mypy_notices_a_filter_that_is_not_applied(tmp_path: Path) -> None:
     text = policies.read_text()
     policies.write_text(text.replace('FilterAction = Literal["black",', 'FilterAction = Literal["mosaic", "black",'))
     assert policies.read_text() != text
-    pipeline = ROOT / "services/fractus_services/camera/imaging/pipeline.py"
+    pipeline = ROOT / "services/fractus_services/camera/filter_pipeline.py"
     command = [sys.executable, "-m", "mypy", "--config-file", ROOT / "pyproject.toml", "--follow-imports=silent"]
     command += ["--cache-dir", tmp_path / "cache", pipeline]
     paths = ":".join(map(str, (tmp_path, ROOT / "services")))

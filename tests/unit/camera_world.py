@@ -13,19 +13,19 @@ import numpy as np
 import pytest
 from fractus_core.policy.values import Attitude, CaptureArgs, Lens, Situation
 from fractus_runtime.audit import AuditLog
-from fractus_services.camera.album.album import Album, owner_of
-from fractus_services.camera.album.shots import Shot
-from fractus_services.camera.capture.driver import Wanted
-from fractus_services.camera.capture.properties import CameraProperties
-from fractus_services.camera.capture.shutter import Shutter
-from fractus_services.camera.imaging.faces import Box
-from fractus_services.camera.imaging.pixels import Pixels, decoded
-from fractus_services.camera.pictures.capture import MAX_FILTERING, PictureCapture
-from fractus_services.camera.pictures.fair_queue import MAX_PER_OWNER, FairQueue
-from fractus_services.camera.pictures.judge import PictureJudge
-from fractus_services.camera.pictures.library import PictureLibrary
+from fractus_services.camera.camera_properties import CameraProperties
+from fractus_services.camera.drivers.driver import CaptureRequest
+from fractus_services.camera.face_detection import Box
+from fractus_services.camera.fair_queue import MAX_PER_OWNER, FairQueue
+from fractus_services.camera.image_authorization import ImageAuthorizer
+from fractus_services.camera.image_capture import MAX_FILTERING, ImageCapture
+from fractus_services.camera.image_record import ImageRecord
+from fractus_services.camera.image_store import ImageStore, owner_of
+from fractus_services.camera.pixels import Pixels, decoded
+from fractus_services.camera.shutter import Shutter
+from fractus_services.camera.stored_images import StoredImages
 from fractus_services.errors import Refused
-from fractus_services.grants import ActiveGrant
+from fractus_services.grant_files import ActiveGrant
 from policy_world import NOW, at, box, compiled, policy, spec, zone
 
 SEEING = Lens(60.0, 60.0, stabilised=True, error_deg=0.0)
@@ -60,14 +60,14 @@ class Scene:
 
     def __init__(self) -> None:
         self.latency_s = 0.0
-        self.taken: list[Wanted] = []
+        self.taken: list[CaptureRequest] = []
         self.during: Callable[[], None] = lambda: None
         self._begun = threading.Event()
 
     async def begun(self) -> None:
         assert await asyncio.to_thread(self._begun.wait, 10)
 
-    def capture(self, wanted: Wanted) -> Pixels:
+    def capture(self, wanted: CaptureRequest) -> Pixels:
         self.taken.append(wanted)
         self._begun.set()
         self.during()
@@ -113,24 +113,24 @@ class World:
         self.drone, self.scene, self.finder = Drone(), Scene(), Finder()
         self.shutter = Shutter(self.scene, timeout_s=5.0)
         self.audit = AuditLog(directory / "audit.jsonl", lambda: NOW)
-        self.album = Album(self.directory, keep, 10**9)
-        judge, queue = PictureJudge(self.audit, self.finder), FairQueue(MAX_PER_OWNER, MAX_FILTERING)
-        self.camera = PictureCapture(
+        self.album = ImageStore(self.directory, keep, 10**9)
+        judge, queue = ImageAuthorizer(self.audit, self.finder), FairQueue(MAX_PER_OWNER, MAX_FILTERING)
+        self.camera = ImageCapture(
             self.drone, self.shutter, CameraProperties(resolution, pinhole=pinhole), detector=self.finder, filter_queue=queue,
             album=self.album, judge=judge, clock=lambda: NOW,
         )  # fmt: skip
-        self.library = PictureLibrary(
+        self.library = StoredImages(
             self.drone, self.album, detector=self.finder, filter_queue=queue, judge=judge, clock=lambda: NOW
         )
 
-    async def capture(self, grant: ActiveGrant, **size: int) -> Shot:
+    async def capture(self, grant: ActiveGrant, **size: int) -> ImageRecord:
         return (await self.camera.capture(grant, CaptureArgs(**size)))[1]
 
-    async def pixels(self, grant: ActiveGrant, shot: Shot) -> Pixels:
+    async def pixels(self, grant: ActiveGrant, shot: ImageRecord) -> Pixels:
         source = (await self.library.retrieve(grant, shot.name))[2]
         return decoded(source if isinstance(source, bytes) else source.read_bytes())
 
-    def stored(self, grant: ActiveGrant, shot: Shot) -> Pixels:
+    def stored(self, grant: ActiveGrant, shot: ImageRecord) -> Pixels:
         return decoded(self.album.path(owner_of(grant), shot.name).read_bytes())
 
 

@@ -13,9 +13,9 @@ from fractus_core.policy.footprint import camera_axes, footprint, seen_from
 from fractus_core.policy.lenses import lens_of
 from fractus_core.policy.values import Attitude, Lens, Situation
 from fractus_proto.v1 import mobility_pb2
-from fractus_services.camera.pose import history
-from fractus_services.camera.pose.history import PoseHistory
-from fractus_services.camera.rpc.telemetry import STEP_S, ArrivalClock, measurement
+from fractus_services.camera import pose_history
+from fractus_services.camera.pose_history import PoseHistory
+from fractus_services.camera.telemetry_client import STEP_S, ArrivalClock, measurement
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from policy_world import FRAME, HOME
@@ -76,8 +76,8 @@ def test_every_pose_since_the_begin_counts_with_the_one_before_it(drone: Drone) 
     way = drone.way(100.45)
     assert [attitude(now).yaw_deg for now in way] == [40, 50, 60, 70, 80, 90]
     # Half of what neighbours differ by, and what an airframe turns unseen in half a tenth of a second.
-    assert attitude(way[1]).yaw_error_deg == pytest.approx(history.YAW_ERROR_DEG + 5.0 + 0.05 * 60.0)
-    assert attitude(way[1]).tilt_error_deg == pytest.approx(history.TILT_ERROR_DEG + 0.05 * 60.0)
+    assert attitude(way[1]).yaw_error_deg == pytest.approx(pose_history.YAW_ERROR_DEG + 5.0 + 0.05 * 60.0)
+    assert attitude(way[1]).tilt_error_deg == pytest.approx(pose_history.TILT_ERROR_DEG + 0.05 * 60.0)
     assert drone.poses.situation(1.0).attitude is not None
 
 
@@ -87,7 +87,7 @@ def test_errors_grow_with_the_age_of_what_they_belong_to(drone: Drone) -> None:
     now = drone.poses.situation(1.0)
     assert now.position_error_m == pytest.approx(1.0 + 8.0 * 0.6 + 2.5 * 0.36)
     assert now.altitude_error_m == pytest.approx(1.0 + 3.0 * 0.6 + 2.5 * 0.36)
-    assert attitude(now).tilt_error_deg == pytest.approx(history.TILT_ERROR_DEG + 60.0 * 0.7)
+    assert attitude(now).tilt_error_deg == pytest.approx(pose_history.TILT_ERROR_DEG + 60.0 * 0.7)
     drone.now_s = 100.75
     now = drone.poses.situation(1.0)
     assert now.lat is not None
@@ -100,7 +100,7 @@ def test_a_message_that_waited_tells_where_the_drone_was_when_it_was_made(drone:
     drone.tell(100.0, speed=(8.0, 0.0), late_s=0.4)
     now = drone.poses.situation(1.0)
     assert now.position_error_m == pytest.approx(1.0 + 8.0 * 0.4 + 2.5 * 0.16, abs=1e-4)
-    assert attitude(now).tilt_error_deg == pytest.approx(history.TILT_ERROR_DEG + 60.0 * 0.4, abs=1e-4)
+    assert attitude(now).tilt_error_deg == pytest.approx(pose_history.TILT_ERROR_DEG + 60.0 * 0.4, abs=1e-4)
     drone.tell(100.1, late_s=3.0)
     assert drone.poses.situation(1.0).lat is None
     drone.tell(100.2, late_s=-3600.0)
@@ -109,7 +109,7 @@ def test_a_message_that_waited_tells_where_the_drone_was_when_it_was_made(drone:
 
 def test_an_age_that_is_not_told_is_not_none(drone: Drone) -> None:
     drone.tell(100.0, ages=None)
-    assert attitude(drone.poses.situation(1.0)).yaw_error_deg > history.YAW_ERROR_DEG + 20.0
+    assert attitude(drone.poses.situation(1.0)).yaw_error_deg > pose_history.YAW_ERROR_DEG + 20.0
 
 
 def test_where_a_part_of_the_exposure_was_not_told_it_is_unknown(drone: Drone) -> None:
@@ -242,8 +242,12 @@ def test_a_gimbal_that_is_not_measured_lets_the_camera_look_anywhere() -> None:
     gimbal_told(poses, 100.0, (0.0, -90.0, 0.0))
     now_s = 100.1
     known = poses.situation(1.0)
-    assert attitude(known).tilt_error_deg == pytest.approx(history.TILT_ERROR_DEG + 0.1 * history.MAX_GIMBAL_TURN_DEG_S)
-    assert attitude(known).yaw_error_deg == pytest.approx(history.YAW_ERROR_DEG + 0.1 * history.MAX_TURN_DEG_S)
+    assert attitude(known).tilt_error_deg == pytest.approx(
+        pose_history.TILT_ERROR_DEG + 0.1 * pose_history.MAX_GIMBAL_TURN_DEG_S
+    )
+    assert attitude(known).yaw_error_deg == pytest.approx(
+        pose_history.YAW_ERROR_DEG + 0.1 * pose_history.MAX_TURN_DEG_S
+    )
     told = []
     for turned, age_s in ((None, 0.0), ((0.0, -90.0, 0.0), 1.01), ((0.0, math.nan, 0.0), 0.0)):
         gimbal_told(poses, now_s, turned, age_s)

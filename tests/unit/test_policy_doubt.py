@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from fractus_core.policy.engine import judge
 from fractus_core.policy.monitoring import monitor
-from fractus_core.policy.values import Airframe, Call, CaptureArgs, Home, Lens, Moment, Situation
+from fractus_core.policy.values import Airframe, Call, CaptureArgs, Home, Lens, Situation, UncertainTime
 from policy_world import HOME, NOW, altitude, ask, at, box, compiled, exclusion, goto, inclusion, policy, zone
 
 CAPTURE = Call("CaptureImage", CaptureArgs())
@@ -67,7 +67,7 @@ def _with(body: dict[str, Any], **spec: Any) -> dict[str, Any]:
 
 def test_restrictions_hold_at_either_reading_of_the_clock_and_permissions_at_both() -> None:
     day = 86_400.0
-    doubtful = replace(at(), time_s=Moment(NOW + 3 * day, NOW))
+    doubtful = replace(at(), time_s=UncertainTime(NOW + 3 * day, NOW))
     fence = compiled(_with(exclusion(box(-20, 20, 20, 60)), **_until(NOW + day)))
     assert ask(fence, goto(0, 40), doubtful).action == "deny"
     assert ask(fence, goto(0, 40), replace(at(), time_s=NOW + 3 * day)).action == "allow"
@@ -84,8 +84,8 @@ def test_a_zone_to_stay_in_must_be_active_at_both_readings() -> None:
     body["zones"][0]["schedule"] = [{"start": "11:00", "end": "13:00"}]
     grant = compiled(body)
     assert ask(grant, goto(0, 50)).action == "allow"
-    assert ask(grant, goto(0, 50), replace(at(), time_s=Moment(NOW, NOW - 6 * 3600))).action == "deny"
-    assert ask(grant, goto(0, 50), replace(at(), time_s=Moment(NOW + 6 * 3600, NOW))).action == "deny"
+    assert ask(grant, goto(0, 50), replace(at(), time_s=UncertainTime(NOW, NOW - 6 * 3600))).action == "deny"
+    assert ask(grant, goto(0, 50), replace(at(), time_s=UncertainTime(NOW + 6 * 3600, NOW))).action == "deny"
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from fractus_core.policy.engine import judge
 from fractus_core.policy.limits import forbids_height
 from fractus_core.policy.monitoring import monitor
 from fractus_core.policy.routes import route
-from fractus_core.policy.values import Airframe, Call, GotoArgs, Home, Moment, Situation, VelocityArgs
+from fractus_core.policy.values import Airframe, Call, GotoArgs, Home, Situation, UncertainTime, VelocityArgs
 from policy_world import (
     FRAME,
     METHODS,
@@ -183,10 +183,10 @@ def test_a_clock_set_back_in_flight() -> None:
     fence = exclusion(box(-20, 20, 20, 60), "land")
     fence["spec"] |= shut
     grant = compiled(fence, services=SERVICES)
-    back = replace(at(0, 10, north_mps=5), time_s=Moment(NOW, NOW - 7200.0))
+    back = replace(at(0, 10, north_mps=5), time_s=UncertainTime(NOW, NOW - 7200.0))
     assert monitor(back, grant) is not None, "it may be any time in between"
     assert not ask(grant, Call("SetVelocity", VelocityArgs(5, 0)), back).permits
-    assert not ask(grant, goto(0, 40), replace(back, time_s=Moment(NOW + 7200, NOW))).permits
+    assert not ask(grant, goto(0, 40), replace(back, time_s=UncertainTime(NOW + 7200, NOW))).permits
 
 
 def test_a_grant_without_anything_grants_nothing() -> None:

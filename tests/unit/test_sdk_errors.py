@@ -13,8 +13,8 @@ from fractus_core.control import Outcome, OutcomeKind
 from fractus_core.control.values import ended_refusal
 from fractus_core.policy.values import Verdict
 from fractus_services import errors
+from fractus_services.error_details import abort
 from fractus_services.errors import Refused, ResourceExhausted, denied
-from fractus_services.replies import abort
 
 
 async def failed(refusal: Refused) -> grpc.aio.AioRpcError:

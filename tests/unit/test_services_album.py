@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 from camera_world import World, active_grant, private, refusal
-from fractus_services.camera.album.album import Album, AlbumFull, NoSuchImage, owner_of
-from fractus_services.camera.rpc.handlers import storage_failed
+from fractus_services.camera.handlers import storage_failed
+from fractus_services.camera.image_store import ImageStore, ImageStoreFull, NoSuchImage, owner_of
 from fractus_services.errors import ResourceExhausted
 
 
@@ -31,13 +31,13 @@ async def test_the_album_forgets_what_a_crash_left_and_makes_room(tmp_path: Path
     (folder / "20260101000000000-0001.jpg").write_bytes(b"half")
     (folder / ".20260101000000000-0002.jpg.7.tmp").write_bytes(b"half")
     (folder / "20260101000000000-0003.json").write_text('{"name": "old"}')
-    album = Album(world.directory, 50, 10**9)
+    album = ImageStore(world.directory, 50, 10**9)
     assert [s.name for s in album.list(owner_of(active_grant()))] == [shot.name]
     assert len(list(folder.glob("*.jpg*"))) == 1
     assert album.list(owner_of(active_grant())) == (shot,), "a shot survives its record"
 
     living = [owner_of(active_grant(instance="other"))]
-    small = Album(world.directory, 50, 10**9, 1000, lambda: living)
+    small = ImageStore(world.directory, 50, 10**9, 1000, lambda: living)
     assert small.quota_problem(living[0]) == "", "pictures of those who are gone make room"
     assert not folder.exists()
     small.add(living[0], replace(shot, name="20260101000000000-0009.jpg"), b"x" * 2000)
@@ -63,7 +63,7 @@ async def test_a_picture_whose_record_is_damaged_is_removed_and_never_handed_out
     assert not records[0].with_suffix(".jpg").exists()
     with pytest.raises(NoSuchImage, match="there is no picture"):
         await world.library.delete(active_grant(), shots[0].name)
-    assert Album(world.directory, 50, 10**9).list(owner) == (shots[4],)
+    assert ImageStore(world.directory, 50, 10**9).list(owner) == (shots[4],)
     assert [path.name for path in world.directory.glob("*/*.jpg")] == [shots[4].name]
     world.shutter.close()
 
@@ -132,7 +132,7 @@ async def test_pictures_of_an_earlier_release_are_closed_to_others(world: World)
     foreign.chmod(0o644)
     (folder,) = (path for path in world.directory.iterdir() if path.is_dir())
     (folder / "20260101000000000-0001.json").symlink_to(foreign)
-    album = Album(world.directory, 50, 10**9)
+    album = ImageStore(world.directory, 50, 10**9)
     (folder / "20260101000000000-0001.json").unlink(missing_ok=True)
     assert modes(world.directory) == {"folders": {0o700}, "files": {0o600}}
     assert stat.S_IMODE(foreign.stat().st_mode) == 0o644, "a link leads to no other file"
@@ -157,7 +157,7 @@ async def test_a_full_disk_is_said_and_leaves_nothing_behind(world: World, monke
 async def test_a_full_album_says_what_to_do(tmp_path: Path) -> None:
     world = World(tmp_path, keep=1)
     await world.capture(active_grant())
-    with pytest.raises(AlbumFull, match="DeleteImage") as caught:
+    with pytest.raises(ImageStoreFull, match="DeleteImage") as caught:
         await world.capture(active_grant())
     assert isinstance(caught.value, ResourceExhausted)
     await world.capture(active_grant(instance="other"))

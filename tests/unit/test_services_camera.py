@@ -17,14 +17,14 @@ from camera_world import Scene, World, active_grant, grain, private, refusal
 from fractus_core.api.model import API_VERSION
 from fractus_core.api.nodes import Drone
 from fractus_core.policy.values import CaptureArgs, Lens
-from fractus_services.camera.album.album import owner_of
-from fractus_services.camera.capture.driver import CameraFailed, Wanted
-from fractus_services.camera.capture.properties import CameraProperties
-from fractus_services.camera.capture.shutter import Shutter
-from fractus_services.camera.imaging.faces import CascadeDetector
-from fractus_services.camera.pictures.fair_queue import MAX_PER_OWNER, QueueFull
+from fractus_services.camera.camera_properties import CameraProperties
+from fractus_services.camera.drivers.driver import CameraFailed, CaptureRequest
+from fractus_services.camera.face_detection import CascadeDetector
+from fractus_services.camera.fair_queue import MAX_PER_OWNER, QueueFull
+from fractus_services.camera.image_store import owner_of
+from fractus_services.camera.shutter import Shutter
 from fractus_services.errors import PolicyDenied, Refused
-from fractus_services.grants import ActiveGrant
+from fractus_services.grant_files import ActiveGrant
 from policy_world import FRAME, NOW, at, box, policy, zone
 
 
@@ -391,7 +391,7 @@ async def test_a_camera_that_hangs_is_reported_and_comes_back(tmp_path: Path) ->
     scene, stuck = Scene(), threading.Event()
     scene.during = lambda: stuck.wait(20) and None
     shutter = Shutter(scene, timeout_s=0.2)
-    wanted = Wanted(8, 8, (8, 8), "RGB", at())
+    wanted = CaptureRequest(8, 8, (8, 8), "RGB", at())
     with pytest.raises(CameraFailed, match="gave no picture in"):
         await shutter.expose(wanted)
     begun = time.monotonic()

@@ -10,7 +10,7 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
-from fractus_core.policy.values import Moment, earliest
+from fractus_core.policy.values import UncertainTime, earliest
 from fractus_services import auth
 from fractus_services import clock as clock_module
 from fractus_services.auth import MAX_SEEN, Callers
@@ -74,10 +74,10 @@ def certificate(begin_s: float = -300.0, end_s: float = DAY_S, uris: tuple[str, 
 def test_a_step_is_in_doubt_until_it_has_lasted(machine: Machine, step_s: float) -> None:
     machine.offset_s += step_s
     now = machine.clock()
-    assert isinstance(now, Moment)
+    assert isinstance(now, UncertainTime)
     assert (earliest(now), now) == tuple(sorted((BEGIN_S, BEGIN_S + step_s))), "both readings count"
     machine.wait(TRUST_AFTER_S - 1)
-    assert isinstance(machine.clock(), Moment)
+    assert isinstance(machine.clock(), UncertainTime)
     machine.wait(2)
     assert (machine.clock(), type(machine.clock())) == (BEGIN_S + step_s + TRUST_AFTER_S + 1, float)
     assert machine.told == [(pytest.approx(step_s), False), (pytest.approx(step_s), True)]
@@ -95,7 +95,7 @@ def test_each_further_step_begins_the_doubt_again(machine: Machine) -> None:
     for _ in range(3):
         machine.offset_s += 3600.0
         machine.wait(TRUST_AFTER_S - 10)
-        assert isinstance(machine.clock(), Moment)
+        assert isinstance(machine.clock(), UncertainTime)
     machine.wait(20)
     assert machine.clock() == BEGIN_S + 3 * 3600.0 + 3 * (TRUST_AFTER_S - 10) + 20
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from fractus_services.grants import ActiveGrant
+from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.leases import FlightConstraints
 from fractus_services.mobility.flight import courses
 from policy_world import at, compiled, spec

@@ -10,8 +10,8 @@ import pytest
 from fractus_agent.registration.handover import Handover
 from fractus_core.api.model import API_VERSION
 from fractus_core.api.nodes import Drone, EdgeNode
-from fractus_services import description as module
-from fractus_services.description import NodeDescription
+from fractus_services import node_description as module
+from fractus_services.node_description import NodeDescription
 from fractus_services.options import CannotServe
 
 

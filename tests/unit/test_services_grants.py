@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 from fractus_core.policy.compiled import CompiledGrant, compile_grant
-from fractus_services import grants as module
+from fractus_services import grant_files as module
 from fractus_services.admission import Allowance
+from fractus_services.grant_files import ActiveGrant, GrantFiles
 from fractus_services.grant_verifier import GrantVerifier
-from fractus_services.grants import ActiveGrant, GrantFiles
 from grant_signing import CA_PEM, signed
 from policy_world import spec
 
@@ -143,7 +143,7 @@ def test_whatever_a_file_breaks_it_grants_nothing(tmp_path: Path, monkeypatch: p
     files = grant_files(tmp_path)
     files.scan()
     assert files.active
-    monkeypatch.setattr("fractus_services.grants.compile_grant", broken)
+    monkeypatch.setattr("fractus_services.grant_files.compile_grant", broken)
     (tmp_path / "a.json").write_text(body(uid="changed"))
     files.scan()
     assert not files.active, "the grant that was there before is gone, too"

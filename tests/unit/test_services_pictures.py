@@ -17,11 +17,11 @@ import pytest
 import skimage.data
 from depth import examples
 from fractus_core.policy.values import Attitude, Filter, Home, Lens
-from fractus_services.camera.album.shots import Shot
-from fractus_services.camera.capture.connection import driver_for
-from fractus_services.camera.capture.driver import BadConnection, CameraFailed, Wanted
-from fractus_services.camera.imaging.faces import BadModel, CascadeDetector, ModelDetector, smallest_face_px
-from fractus_services.camera.imaging.filters import (
+from fractus_services.camera.drivers.connection import driver_for
+from fractus_services.camera.drivers.driver import BadConnection, CameraFailed, CaptureRequest
+from fractus_services.camera.face_detection import BadModel, CascadeDetector, ModelDetector, smallest_face_px
+from fractus_services.camera.filter_pipeline import FacesNotReliable, plan_filters
+from fractus_services.camera.filters import (
     black,
     blur_average,
     blur_median,
@@ -29,10 +29,10 @@ from fractus_services.camera.imaging.filters import (
     moving,
     remove_background,
 )
-from fractus_services.camera.imaging.metadata import with_metadata
-from fractus_services.camera.imaging.pipeline import FacesNotReliable, plan_filters
-from fractus_services.camera.imaging.pixels import NotAPicture, Pixels, decoded, encoded, fitted, source_size
-from fractus_services.camera.pose.pose import Pose, is_upright
+from fractus_services.camera.image_metadata import with_metadata
+from fractus_services.camera.image_record import ImageRecord
+from fractus_services.camera.pixels import NotAPicture, Pixels, decoded, encoded, fitted, source_size
+from fractus_services.camera.pose import Pose, is_upright
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
@@ -354,18 +354,20 @@ def test_records_of_pictures_survive_json() -> None:
     import json
 
     pose = Pose.of(at(attitude=Attitude(1, 2, 3)))
-    shot = Shot("n", NOW, 10, 20, 30, (pose, Pose.of(at(home=None))), 12.0, (Filter("blurFaces", "gaussian"),), True)
-    assert Shot.parse(json.loads(json.dumps(shot.to_json()))) == shot
+    shot = ImageRecord(
+        "n", NOW, 10, 20, 30, (pose, Pose.of(at(home=None))), 12.0, (Filter("blurFaces", "gaussian"),), True
+    )
+    assert ImageRecord.parse(json.loads(json.dumps(shot.to_json()))) == shot
     for broken in ({}, {"before": 1}, {**shot.to_json(), "colour": "red"}):
         with pytest.raises(ValueError, match="no shot"):
-            Shot.parse(broken)
+            ImageRecord.parse(broken)
 
 
 # Drivers
 
 
-def wanted(**more: Any) -> Wanted:
-    return Wanted(64, 48, (64, 48), "RGB", at(**more))
+def wanted(**more: Any) -> CaptureRequest:
+    return CaptureRequest(64, 48, (64, 48), "RGB", at(**more))
 
 
 @pytest.mark.parametrize(
@@ -485,4 +487,4 @@ def test_a_directory_gives_the_picture_that_was_taken_nearest_in_space(tmp_path:
     )
     assert level(x=5, y=3, alt=20) == 250
     with pytest.raises(CameraFailed, match="position is unknown"):
-        driver.capture(Wanted(64, 48, (64, 48), "RGB", at().__class__(time_s=NOW)))
+        driver.capture(CaptureRequest(64, 48, (64, 48), "RGB", at().__class__(time_s=NOW)))

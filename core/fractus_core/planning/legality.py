@@ -18,7 +18,17 @@ from fractus_core.policy.compiled import CompiledGrant, compile_grant, height_m
 from fractus_core.policy.engine import judge
 from fractus_core.policy.routes import quick_route
 from fractus_core.policy.selectors import holds, node_attributes, owner_of
-from fractus_core.policy.values import Airframe, Call, GotoArgs, Home, Moment, Situation, TakeoffArgs, Verdict, distinct
+from fractus_core.policy.values import (
+    Airframe,
+    Call,
+    GotoArgs,
+    Home,
+    Situation,
+    TakeoffArgs,
+    UncertainTime,
+    Verdict,
+    distinct,
+)
 
 MAX_LISTED = 50
 """Legs that a plan lists at most."""
@@ -121,7 +131,7 @@ class WayJudge:
             self._known[key] = Way((), mission.distance_m, mission.needed_min)
         elif key not in self._known:
             # What holds when it begins or when it ends may hold when the drone is there.
-            during = Moment(time_s + mission.needed_min * 60, time_s)
+            during = UncertainTime(time_s + mission.needed_min * 60, time_s)
             cruise_mps = min(self._settings.cruise_speed_mps, mobility.max_speed)
             now = Situation(
                 during,

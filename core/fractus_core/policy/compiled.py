@@ -17,7 +17,7 @@ from fractus_core.api.plans import GrantedPolicy, GrantSpec
 from fractus_core.api.policies import PolicySpec
 from fractus_core.api.schedules import ActiveTime, active_at
 from fractus_core.geo import LocalFrame, check_extent, middle, polygon
-from fractus_core.policy.values import Home, Moment, Situation, earliest
+from fractus_core.policy.values import Home, Situation, UncertainTime, earliest
 
 REACH_M = 500_000.0
 """Ground further than this from the origin is left out of the frame: no drone of ours gets there."""
@@ -63,7 +63,7 @@ class PolicyZone:
         if not self.rule.in_force(time_s):
             return False
         return active_at(self.schedule, time_s) or (
-            isinstance(time_s, Moment) and active_at(self.schedule, time_s.earliest)
+            isinstance(time_s, UncertainTime) and active_at(self.schedule, time_s.earliest)
         )
 
 

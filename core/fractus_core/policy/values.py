@@ -97,7 +97,7 @@ class CaptureArgs:
     height: int = 0
 
 
-class Moment(float):
+class UncertainTime(float):
     """Unix time of a clock that was set back: the later reading, and the earlier one that may be right instead.
 
     Restrictions hold from the earlier to the later reading, permissions only when they hold at both.
@@ -105,7 +105,7 @@ class Moment(float):
 
     earliest: float
 
-    def __new__(cls, latest: float, earliest: float) -> Moment:
+    def __new__(cls, latest: float, earliest: float) -> UncertainTime:
         """A time between two readings."""
         moment = super().__new__(cls, latest)
         moment.earliest = min(earliest, latest)
@@ -114,7 +114,7 @@ class Moment(float):
 
 def earliest(time_s: float) -> float:
     """The earliest that a time may be."""
-    return time_s.earliest if isinstance(time_s, Moment) else time_s
+    return time_s.earliest if isinstance(time_s, UncertainTime) else time_s
 
 
 Args = TakeoffArgs | GotoArgs | SetSpeedArgs | VelocityArgs | PointGimbalArgs | CaptureArgs | None
@@ -211,7 +211,7 @@ class Situation:
     """The state of node and drone at the moment of a decision.
 
     Attributes:
-        time_s: Unix time in seconds; a `Moment` when the clock is in doubt.
+        time_s: Unix time in seconds; a `UncertainTime` when the clock is in doubt.
         lat: degrees north; None while the position is unknown.
         lon: degrees east; None while the position is unknown.
         altitude_m: metres above home.

@@ -14,12 +14,12 @@ from fractus_core.api.plans import GrantSpec
 from fractus_mavlink import Parser
 
 from fractus_services.recording import messages
+from fractus_services.recording.map_features import features
+from fractus_services.recording.mavlink_messages import armed, records_of
 from fractus_services.recording.mcap_file import completed
 from fractus_services.recording.messages import Record
-from fractus_services.recording.places import features
-from fractus_services.recording.segments import Segments
-from fractus_services.recording.tape import Tape
-from fractus_services.recording.vehicle_messages import armed, records_of
+from fractus_services.recording.segment_directory import SegmentDirectory
+from fractus_services.recording.segment_writer import SegmentWriter
 
 log = logging.getLogger(__name__)
 
@@ -63,7 +63,12 @@ class FlightWriter:
     """
 
     def __init__(
-        self, segments: Segments, node: str, *, always: bool = False, steady: Callable[[], float] = time.monotonic
+        self,
+        segments: SegmentDirectory,
+        node: str,
+        *,
+        always: bool = False,
+        steady: Callable[[], float] = time.monotonic,
     ) -> None:
         self.segments = segments
         self._node = node
@@ -74,7 +79,7 @@ class FlightWriter:
         self._armed_s: float | None = None
         self._before: deque[_Noted] = deque(maxlen=MAX_BEFORE)
         self._map: Record | None = None
-        self._tape: Tape | None = None
+        self._tape: SegmentWriter | None = None
         self._flush_due_s = 0.0
         self._completing: Iterator[None] = iter(())
         self.rests = False
@@ -203,9 +208,9 @@ class FlightWriter:
             noted = self._before.popleft()
             self._tape.write(noted.time_ns, noted.frame, noted.records)
 
-    def _new_tape(self) -> Tape:
+    def _new_tape(self) -> SegmentWriter:
         first_ns = self._before[0].time_ns
-        tape = Tape(self.segments.begin(first_ns), self._node)
+        tape = SegmentWriter(self.segments.begin(first_ns), self._node)
         self._flush_due_s = time.monotonic() + FLUSH_S
         if self._map is not None:
             tape.write(first_ns, b"", (self._map,))

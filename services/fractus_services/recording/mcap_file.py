@@ -14,7 +14,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from fractus_services.recording.messages import SCHEMAS
-from fractus_services.recording.segments import PART_SUFFIX, create
+from fractus_services.recording.segment_directory import PART_SUFFIX, create
 
 CHUNK_BYTES = 256_000
 """Messages are compressed and written in pieces of this size, before compression."""
@@ -23,7 +23,7 @@ MAX_RECORD_BYTES = 100_000_000
 """No record of ours is longer: a length beyond that is damage."""
 
 
-class McapFile:
+class McapWriter:
     """One MCAP file, with a channel for each topic. What was flushed stays readable if the rest is never written.
 
     Args:

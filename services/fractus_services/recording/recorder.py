@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from fractus_core.api.plans import GrantSpec
 from fractus_runtime.files import write_file
 
-from fractus_services.recording.segments import Segments
+from fractus_services.recording.segment_directory import SegmentDirectory
 
 if TYPE_CHECKING:
     from fractus_services.recording.flight_writer import FlightWriter
@@ -52,7 +52,7 @@ class Recorder:
 
     def __init__(
         self,
-        segments: Segments | None,
+        segments: SegmentDirectory | None,
         node: str,
         *,
         always: bool = False,

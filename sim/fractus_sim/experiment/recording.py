@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from fractus_mavlink import Message
-from fractus_services.recording.mcap_file import McapFile
+from fractus_services.recording.mcap_file import McapWriter
 from fractus_services.recording.messages import Record, location, schema, text
 
 from fractus_sim.experiment.station import Station
@@ -28,7 +28,7 @@ _SCHEMAS = dict(
 _LEVELS = (5, 5, 5, 4, 3, 2, 2, 1)
 
 
-class McapLog(McapFile):
+class McapLog(McapWriter):
     """The MCAP file of an experiment."""
 
     def __init__(self, path: Path) -> None:

@@ -13,7 +13,7 @@ from fractus_core.control.values import ended_refusal
 from fractus_core.geo import LocalFrame
 
 from fractus_services.errors import AutopilotError, PreconditionFailed, Refused, Unavailable
-from fractus_services.grants import ActiveGrant
+from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.autopilot import BEING_SET, Checked, Failsafes, Fence, Permit
 

@@ -32,7 +32,7 @@ from fractus_core.policy.compiled import CompiledGrant, for_transit
 from fractus_core.policy.values import Verdict
 from fractus_runtime.audit import AuditLog
 
-from fractus_services.grants import ActiveGrant, GrantFiles
+from fractus_services.grant_files import ActiveGrant, GrantFiles
 from fractus_services.mobility.authority.journal import Journal, record_of
 from fractus_services.mobility.authority.leases import FlightConstraints, Lease, Motion
 from fractus_services.mobility.authority.machine import Machine

@@ -15,7 +15,7 @@ from fractus_core.control.events import (
 from fractus_core.geo import LocalFrame
 
 from fractus_services.errors import PreconditionFailed, Unavailable
-from fractus_services.grants import ActiveGrant
+from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.leases import Lease, Motion
 from fractus_services.mobility.autopilot import Permit

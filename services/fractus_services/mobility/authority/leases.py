@@ -11,7 +11,7 @@ from fractus_core.policy.compiled import CompiledGrant
 from fractus_core.policy.values import GotoArgs
 
 from fractus_services.errors import Refused
-from fractus_services.grants import ActiveGrant
+from fractus_services.grant_files import ActiveGrant
 
 _ids = itertools.count(1)
 """Names what control is told of: the state machine knows leases, motions and flights by their numbers alone."""

@@ -13,7 +13,7 @@ from fractus_core.control.events import Heartbeat, VehicleFound
 from fractus_core.policy.values import Verdict
 
 from fractus_services.errors import AutopilotError
-from fractus_services.grants import ActiveGrant
+from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.home import home_moved, keep_home
 from fractus_services.mobility.autopilot import BEING_SET, Failsafes, Fence

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from fractus_core.policy.values import POSITION_UNKNOWN, Call, Verdict
 
 from fractus_services.errors import Aborted, Unavailable, denied
-from fractus_services.grants import ActiveGrant
+from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.flight.guard import Guard
 

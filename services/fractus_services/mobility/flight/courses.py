@@ -20,7 +20,7 @@ from fractus_core.policy.values import Call, GotoArgs, Home, Situation
 
 from fractus_services.background import in_slices
 from fractus_services.errors import Aborted, PreconditionFailed, Refused, Unavailable
-from fractus_services.grants import ActiveGrant
+from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.leases import FlightConstraints, Motion
 from fractus_services.mobility.autopilot import Permit

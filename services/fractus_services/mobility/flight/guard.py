@@ -12,7 +12,7 @@ from fractus_core.policy.values import Call, Situation, Verdict
 from fractus_runtime import spans
 from fractus_runtime.audit import AuditLog
 
-from fractus_services.grants import ActiveGrant
+from fractus_services.grant_files import ActiveGrant
 
 log = logging.getLogger(__name__)
 

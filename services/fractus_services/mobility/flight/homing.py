@@ -20,7 +20,7 @@ from fractus_core.policy.returning import (
 )
 
 from fractus_services.errors import AutopilotError, PreconditionFailed, Refused, Unavailable
-from fractus_services.grants import ActiveGrant
+from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.home import home_moved, keep_home
 from fractus_services.mobility.authority.leases import Motion

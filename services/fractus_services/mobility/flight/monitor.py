@@ -19,7 +19,7 @@ from fractus_core.policy.values import GotoArgs, SetSpeedArgs, Verdict
 from fractus_runtime.audit import AuditLog
 
 from fractus_services.errors import Aborted, AutopilotError, Refused
-from fractus_services.grants import ActiveGrant
+from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.control import CORRECTION, Control
 from fractus_services.mobility.authority.leases import Motion
 from fractus_services.mobility.authority.situation import fences_of

@@ -5,7 +5,7 @@ from __future__ import annotations
 from fractus_core.policy.values import Call, PointGimbalArgs, Verdict
 
 from fractus_services.errors import PreconditionFailed
-from fractus_services.grants import ActiveGrant
+from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.drivers import driver_permit
 from fractus_services.mobility.flight.calls import CallJudge

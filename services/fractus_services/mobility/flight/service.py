@@ -11,7 +11,7 @@ from functools import partial
 from fractus_core.policy.values import Call, GotoArgs, SetSpeedArgs, TakeoffArgs, VelocityArgs, Verdict
 
 from fractus_services.errors import Aborted, PreconditionFailed, Refused
-from fractus_services.grants import ActiveGrant
+from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority import drivers
 from fractus_services.mobility.authority.arming import Arming
 from fractus_services.mobility.authority.control import Control

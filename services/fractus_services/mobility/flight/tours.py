@@ -12,7 +12,7 @@ from fractus_core.control.events import TourEnded, TourInterrupted, TourPointVis
 from fractus_core.control.values import COMPLETE
 
 from fractus_services.errors import AutopilotError, Refused, Unavailable
-from fractus_services.grants import ActiveGrant, GrantFiles
+from fractus_services.grant_files import ActiveGrant, GrantFiles
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.permits import tour_permit
 from fractus_services.mobility.authority.readiness import not_ready_reason

@@ -25,11 +25,11 @@ from fractus_core.policy.values import (
 from fractus_proto.v1 import mobility_pb2, types_pb2
 from pydantic.alias_generators import to_snake
 
+from fractus_services.error_details import decision
 from fractus_services.errors import InvalidRequest, Refused
 from fractus_services.mobility.autopilot import VehicleState
 from fractus_services.mobility.flight.motions import Step
 from fractus_services.mobility.rpc.telemetry import position_of
-from fractus_services.replies import decision
 
 DEFAULT_HOLD_S = 0.5
 """How long a velocity holds when the caller does not say; proto3 cannot tell an absent number from 0."""

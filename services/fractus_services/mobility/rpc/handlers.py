@@ -16,8 +16,9 @@ from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc
 from fractus_services.admission import CallAdmission
 from fractus_services.auth import Caller
 from fractus_services.clock import Clock
+from fractus_services.error_details import decision
 from fractus_services.errors import AutopilotError, PreconditionFailed, Refused, Unavailable
-from fractus_services.grants import ActiveGrant, GrantFiles
+from fractus_services.grant_files import ActiveGrant, GrantFiles
 from fractus_services.mobility.authority import drivers
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.readiness import arming_problem
@@ -34,7 +35,6 @@ from fractus_services.mobility.rpc.arguments import (
 )
 from fractus_services.mobility.rpc.streams import Streams
 from fractus_services.mobility.rpc.telemetry import located, position_of, telemetry_of, velocity_of
-from fractus_services.replies import decision
 
 MIN_INTERVAL_S, DEFAULT_INTERVAL_S = 0.05, 0.2
 ANSWER_S = 1.0

@@ -16,10 +16,9 @@ from fractus_runtime.exposition import LastRead, serving
 from fractus_services.auth import TlsFiles
 from fractus_services.clock import Clock
 from fractus_services.decision_log import log_decision
-from fractus_services.description import NodeDescription
+from fractus_services.grant_files import GrantFiles
 from fractus_services.grant_verifier import GrantVerifier
-from fractus_services.grants import GrantFiles
-from fractus_services.hosting import run_until, serve_grpc
+from fractus_services.grpc_server import run_until, serve_grpc
 from fractus_services.metrics import ServiceMetrics, common_figures
 from fractus_services.mobility.authority.journal import Journal
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
@@ -33,9 +32,10 @@ from fractus_services.mobility.mavlink.traced import TracedAutopilot
 from fractus_services.mobility.rpc.figures import flight_figures
 from fractus_services.mobility.rpc.handlers import MobilityHandlers
 from fractus_services.mobility.rpc.wiring import Parts
+from fractus_services.node_description import NodeDescription
 from fractus_services.options import CannotServe, MobilityOptions
 from fractus_services.recording.recorder import Recorder
-from fractus_services.recording.segments import segments_in
+from fractus_services.recording.segment_directory import segments_in
 
 log = logging.getLogger(__name__)
 

@@ -10,7 +10,7 @@ from fractus_core.control.events import PassengerBoarded, TransitRequested
 from fractus_core.control.values import ended_refusal
 
 from fractus_services.errors import PolicyDenied, PreconditionFailed
-from fractus_services.grants import ActiveGrant
+from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority import drivers
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.leases import Lease

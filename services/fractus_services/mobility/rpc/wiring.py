@@ -9,7 +9,7 @@ from fractus_core.control import ControlState
 from fractus_core.policy.returning import return_bounds
 from fractus_runtime.audit import AuditLog
 
-from fractus_services.grants import ActiveGrant, GrantFiles
+from fractus_services.grant_files import ActiveGrant, GrantFiles
 from fractus_services.mobility.authority.arming import Arming
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.drivers import require

@@ -13,12 +13,12 @@ from fractus_proto.v1 import camera_pb2, camera_pb2_grpc
 
 from fractus_services.admission import CallAdmission
 from fractus_services.auth import Caller
-from fractus_services.camera.album.album import NoSuchImage, owner_of
-from fractus_services.camera.album.shots import Shot
-from fractus_services.camera.pictures.capture import PictureCapture
-from fractus_services.camera.pictures.library import PictureLibrary
+from fractus_services.camera.image_capture import ImageCapture
+from fractus_services.camera.image_record import ImageRecord
+from fractus_services.camera.image_store import NoSuchImage, owner_of
+from fractus_services.camera.stored_images import StoredImages
+from fractus_services.error_details import decision
 from fractus_services.errors import ResourceExhausted
-from fractus_services.replies import decision
 
 CHUNK_BYTES = 256 * 1024
 READ_BYTES = 4 * CHUNK_BYTES
@@ -27,7 +27,7 @@ READ_BYTES = 4 * CHUNK_BYTES
 class CameraHandlers(camera_pb2_grpc.CameraServiceServicer):
     """The service on the wire."""
 
-    def __init__(self, capture: PictureCapture, library: PictureLibrary, calls: CallAdmission) -> None:
+    def __init__(self, capture: ImageCapture, library: StoredImages, calls: CallAdmission) -> None:
         self._capture = capture
         self._library = library
         self._admission = calls
@@ -100,7 +100,7 @@ async def _pieces(source: bytes | Path, name: str) -> AsyncIterator[bytes]:
             yield piece
 
 
-def _info(shot: Shot) -> camera_pb2.ImageInfo:
+def _info(shot: ImageRecord) -> camera_pb2.ImageInfo:
     info = camera_pb2.ImageInfo(
         name=shot.name, width=shot.width, height=shot.height, size_bytes=shot.size_bytes, media_type="image/jpeg"
     )

@@ -9,15 +9,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO
 
-from fractus_services.recording.mcap_file import McapFile
+from fractus_services.recording.mcap_file import McapWriter
 from fractus_services.recording.messages import Record
-from fractus_services.recording.segments import create
+from fractus_services.recording.segment_directory import create
 
 _STAMP = struct.Struct(">Q")
 """Before each frame of a tlog: Unix microseconds, as ground stations write them."""
 
 
-class Tape:
+class SegmentWriter:
     """An open segment.
 
     Args:
@@ -29,7 +29,7 @@ class Tape:
         self._stem = stem
         self._node = node
         self._out = create(stem.with_suffix(".mcap"))
-        self._mcap = McapFile(self._out)
+        self._mcap = McapWriter(self._out)
         self._tlog: IO[bytes] | None = None
         self._bytes = 0
 

@@ -15,9 +15,9 @@ from pathlib import Path
 
 from fractus_runtime.files import write_file
 
-from fractus_services.camera.album.shots import Shot
+from fractus_services.camera.image_record import ImageRecord
 from fractus_services.errors import NotFound, ResourceExhausted
-from fractus_services.grants import ActiveGrant
+from fractus_services.grant_files import ActiveGrant
 
 log = logging.getLogger(__name__)
 
@@ -31,7 +31,7 @@ _FOLDER = re.compile(r"[0-9a-f]{32}")
 _REMEDY = "delete each picture once it is fetched (camera.delete of the SDK; the component's methods need DeleteImage)"
 
 
-class AlbumFull(ResourceExhausted):
+class ImageStoreFull(ResourceExhausted):
     """A quota is used up."""
 
     def __init__(self, reason: str) -> None:
@@ -50,7 +50,7 @@ def owner_of(grant: ActiveGrant) -> str:
     return f"{grant.spec.application.uid}/{grant.identity}"
 
 
-class Album:
+class ImageStore:
     """The pictures of all instances on this node; an owner is one instance of one application.
 
     Args:
@@ -85,12 +85,12 @@ class Album:
     def _folder(self, owner: str) -> Path:
         return self._directory / hashlib.sha256(owner.encode()).hexdigest()[:32]
 
-    def list(self, owner: str) -> tuple[Shot, ...]:
+    def list(self, owner: str) -> tuple[ImageRecord, ...]:
         """The pictures of an instance, oldest first."""
         shots = []
         for path in sorted(self._folder(owner).glob("*.json")):
             try:
-                shots.append(Shot.parse(json.loads(path.read_bytes())))
+                shots.append(ImageRecord.parse(json.loads(path.read_bytes())))
             except FileNotFoundError:
                 continue
             except ValueError as error:
@@ -112,17 +112,17 @@ class Album:
             )
         return ""
 
-    def add(self, owner: str, shot: Shot, data: bytes) -> None:
+    def add(self, owner: str, shot: ImageRecord, data: bytes) -> None:
         """Keep a picture.
 
         Raises:
-            AlbumFull: a quota is used up.
+            ImageStoreFull: a quota is used up.
             OSError: the disk is full.
         """
         with self._lock:
             problem = self.quota_problem(owner)
             if problem:
-                raise AlbumFull(problem)
+                raise ImageStoreFull(problem)
             folder = self._folder(owner)
             folder.mkdir(FOLDER_MODE, parents=True, exist_ok=True)
             picture = folder / shot.name
@@ -134,7 +134,7 @@ class Album:
                 raise
         self._added(shot.time_s, data)
 
-    def find(self, owner: str, name: str) -> Shot:
+    def find(self, owner: str, name: str) -> ImageRecord:
         """What is known of a picture.
 
         Raises:
@@ -143,7 +143,7 @@ class Album:
         """
         record = self._record(owner, name)
         try:
-            return Shot.parse(json.loads(record.read_bytes()))
+            return ImageRecord.parse(json.loads(record.read_bytes()))
         except FileNotFoundError:
             raise _missing(name) from None
         except ValueError as error:
@@ -214,7 +214,7 @@ class Album:
             if not _NAME.fullmatch(record.with_suffix(".jpg").name):
                 continue
             try:
-                Shot.parse(json.loads(record.read_bytes()))
+                ImageRecord.parse(json.loads(record.read_bytes()))
             except ValueError as error:
                 log.warning("album: record is damaged, removing it and its picture (file=%s): %s", record, error)
                 record.unlink(missing_ok=True)

@@ -12,25 +12,25 @@ from datetime import UTC, datetime
 
 from fractus_core.policy.footprint import seen_from
 from fractus_core.policy.privacy import judge_privacy
-from fractus_core.policy.values import Call, CaptureArgs, Moment, Situation, Verdict, earliest
+from fractus_core.policy.values import Call, CaptureArgs, Situation, UncertainTime, Verdict, earliest
 from fractus_runtime import spans
 
 from fractus_services.background import Background
-from fractus_services.camera.album.album import Album, AlbumFull, owner_of
-from fractus_services.camera.album.shots import Shot
-from fractus_services.camera.capture.driver import Wanted
-from fractus_services.camera.capture.properties import CameraProperties
-from fractus_services.camera.capture.shutter import Shutter
-from fractus_services.camera.imaging.faces import Detector, smallest_face_px
-from fractus_services.camera.imaging.filters import MOTION_PX
-from fractus_services.camera.imaging.metadata import with_metadata
-from fractus_services.camera.imaging.pipeline import apply_filters
-from fractus_services.camera.imaging.pixels import Pixels, cropped, encoded, fitted
-from fractus_services.camera.pictures.fair_queue import MAX_PER_OWNER, FairQueue
-from fractus_services.camera.pictures.judge import PictureJudge, combined
-from fractus_services.camera.pose.pose import Pose, is_upright
-from fractus_services.camera.pose.provider import PoseProvider
-from fractus_services.grants import ActiveGrant
+from fractus_services.camera.camera_properties import CameraProperties
+from fractus_services.camera.drivers.driver import CaptureRequest
+from fractus_services.camera.face_detection import Detector, smallest_face_px
+from fractus_services.camera.fair_queue import MAX_PER_OWNER, FairQueue
+from fractus_services.camera.filter_pipeline import apply_filters
+from fractus_services.camera.filters import MOTION_PX
+from fractus_services.camera.image_authorization import ImageAuthorizer, combined
+from fractus_services.camera.image_metadata import with_metadata
+from fractus_services.camera.image_record import ImageRecord
+from fractus_services.camera.image_store import ImageStore, ImageStoreFull, owner_of
+from fractus_services.camera.pixels import Pixels, cropped, encoded, fitted
+from fractus_services.camera.pose import Pose, is_upright
+from fractus_services.camera.pose_provider import PoseProvider
+from fractus_services.camera.shutter import Shutter
+from fractus_services.grant_files import ActiveGrant
 
 MAX_EXPOSURES = 8
 """Pictures of all components that are being taken or wait for the shutter."""
@@ -65,7 +65,7 @@ class _Exposure:
     view_width_px: int
 
 
-class PictureCapture:
+class ImageCapture:
     """CaptureImage of Table 8.2 of the thesis, for callers whose grant is known.
 
     A picture is filtered before it is stored: where a policy requires filters, no picture without them is ever on disk.
@@ -89,8 +89,8 @@ class PictureCapture:
         *,
         detector: Detector,
         filter_queue: FairQueue,
-        album: Album,
-        judge: PictureJudge,
+        album: ImageStore,
+        judge: ImageAuthorizer,
         clock: Callable[[], float],
     ) -> None:
         self._poses = poses
@@ -107,7 +107,7 @@ class PictureCapture:
 
     async def capture(
         self, grant: ActiveGrant, args: CaptureArgs, current_grant: Callable[[], ActiveGrant] | None = None
-    ) -> tuple[Verdict, Shot]:
+    ) -> tuple[Verdict, ImageRecord]:
         """Take a picture and store it.
 
         It is judged when the shutter is free, and again when the picture is taken, together with all that the camera saw
@@ -125,7 +125,7 @@ class PictureCapture:
 
     async def _capture(
         self, owner: str, args: CaptureArgs, current_grant: Callable[[], ActiveGrant]
-    ) -> tuple[Verdict, Shot]:
+    ) -> tuple[Verdict, ImageRecord]:
         expected = judge_privacy(self._poses.situation(self._clock()), current_grant().compiled)
         if not expected.filters:
             exposure = await self._expose(owner, args, current_grant)
@@ -146,7 +146,7 @@ class PictureCapture:
             known = self._judge.judge(call, grant, before)
             problem = await asyncio.to_thread(self._album.quota_problem, owner)
             if problem:
-                raise AlbumFull(problem)
+                raise ImageStoreFull(problem)
             with spans.call().child("camera.capture"):
                 frames = await self._shutter.expose(*self._wanted(args, grant, before, known))
             if before.lens is not None:
@@ -161,11 +161,11 @@ class PictureCapture:
 
     def _wanted(
         self, args: CaptureArgs, grant: ActiveGrant, before: Situation, verdict: Verdict
-    ) -> tuple[Wanted, int, float]:
+    ) -> tuple[CaptureRequest, int, float]:
         """What to ask the shutter for; what moves is seen only in several frames."""
         camera = self._camera
         size = camera.source_size(args.width, args.height)
-        wanted = Wanted(*size, camera.resolution, camera.sensor, before, grant.spec.node)
+        wanted = CaptureRequest(*size, camera.resolution, camera.sensor, before, grant.spec.node)
         moving = any(one.action == "removeBackground" for one in verdict.filters)
         return wanted, 3 if moving else 1, FRAME_INTERVAL_S
 
@@ -179,14 +179,14 @@ class PictureCapture:
             self._judge.judge(call, grant, moment, record=False)
             for moment in (after, replace(after, time_s=before.time_s))
         ]
-        first_s = Moment(before.time_s, earliest(before.time_s) - self._shutter.latency_s)
+        first_s = UncertainTime(before.time_s, earliest(before.time_s) - self._shutter.latency_s)
         return [*verdicts, self._judge.judge_view(call, grant, replace(after, time_s=first_s))]
 
     def _name(self, after: Situation) -> str:
         moment = datetime.fromtimestamp(after.time_s, UTC).strftime("%Y%m%d%H%M%S%f")[:17]
         return f"{moment}-{next(self._numbers) % 10000:04d}.jpg"
 
-    async def _store(self, args: CaptureArgs, exposure: _Exposure) -> tuple[Verdict, Shot]:
+    async def _store(self, args: CaptureArgs, exposure: _Exposure) -> tuple[Verdict, ImageRecord]:
         grant, after, frames = exposure.grant, exposure.after, exposure.frames
         view = seen_from(after.exposure, grant.compiled.frame)
         farthest_m = view.farthest_m if view is not None else math.inf
@@ -216,7 +216,7 @@ class PictureCapture:
         # In a part of the view faces are cut as well, when they have to be hidden later.
         uncut = max(whole[0] - asked[0], whole[1] - asked[1]) <= _ROUNDED_PX
         found_px = face_px if uncut else 0.0
-        shot = Shot(exposure.name, moment_s, *asked, len(data), poses, found_px, plan.filters, whole=uncut)
+        shot = ImageRecord(exposure.name, moment_s, *asked, len(data), poses, found_px, plan.filters, whole=uncut)
         await asyncio.to_thread(self._album.add, owner_of(grant), shot, data)
         return verdict, shot
 

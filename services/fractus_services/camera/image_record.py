@@ -8,11 +8,11 @@ from typing import Any
 
 from fractus_core.policy.values import Filter, Situation
 
-from fractus_services.camera.pose.pose import Pose
+from fractus_services.camera.pose import Pose
 
 
 @dataclass(frozen=True, slots=True)
-class Shot:
+class ImageRecord:
     """A picture that was taken.
 
     Attributes:
@@ -42,7 +42,7 @@ class Shot:
         return asdict(self)
 
     @classmethod
-    def parse(cls, body: dict[str, Any]) -> Shot:
+    def parse(cls, body: dict[str, Any]) -> ImageRecord:
         """The shot that JSON holds; one without poses, of an earlier release, was taken at an unknown place.
 
         Raises:

@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 from fractus_core.api.policies import FaceMethod
 
-from fractus_services.camera.imaging.faces import Box
-from fractus_services.camera.imaging.pixels import Pixels, opencv, reduced, resized
+from fractus_services.camera.face_detection import Box
+from fractus_services.camera.pixels import Pixels, opencv, reduced, resized
 
 Mask = npt.NDArray[np.bool_]
 

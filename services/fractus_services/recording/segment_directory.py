@@ -27,8 +27,8 @@ PART_SUFFIX = ".part"
 _NAME = re.compile(r"(?P<number>\d{6,})-\d{8}T\d{6}Z\.(mcap|tlog)")
 
 
-class Segments:
-    """Segments are numbered, as a clock may be set back; the files of one have one name and several suffixes.
+class SegmentDirectory:
+    """SegmentDirectory are numbered, as a clock may be set back; the files of one have one name and several suffixes.
 
     Args:
         directory: where they are kept; nothing else is, and no other process keeps its own there.
@@ -138,6 +138,6 @@ def create(path: Path) -> IO[bytes]:
     return os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, FILE_MODE), "wb")
 
 
-def segments_in(directory: Path | None, megabytes: int) -> Segments | None:
+def segments_in(directory: Path | None, megabytes: int) -> SegmentDirectory | None:
     """What the options of a service ask for; None: nothing is recorded."""
-    return Segments(directory, megabytes * 1_000_000) if directory is not None and megabytes > 0 else None
+    return SegmentDirectory(directory, megabytes * 1_000_000) if directory is not None and megabytes > 0 else None

@@ -7,7 +7,7 @@ from typing import Literal, Protocol
 
 from fractus_core.policy.values import Situation
 
-from fractus_services.camera.imaging.pixels import Pixels
+from fractus_services.camera.pixels import Pixels
 from fractus_services.errors import Unavailable
 from fractus_services.options import CannotServe
 
@@ -27,7 +27,7 @@ class BadConnection(CannotServe):
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class CaptureRequest:
     """What is asked of a camera.
 
     Attributes:
@@ -47,7 +47,7 @@ class Wanted:
     label: str = ""
 
 
-def as_described(picture: Pixels, wanted: Wanted) -> Pixels:
+def as_described(picture: Pixels, wanted: CaptureRequest) -> Pixels:
     """The picture of a camera that was set to its native size, unless it is not of that size.
 
     Another size may be another part of the sensor, so the described field of view does not hold for it.
@@ -73,7 +73,7 @@ class Driver(Protocol):
     def latency_s(self) -> float:
         """How many seconds before it is asked for a picture may have been exposed, at most."""
 
-    def capture(self, wanted: Wanted) -> Pixels:
+    def capture(self, wanted: CaptureRequest) -> Pixels:
         """A picture of the present moment, or of one at most `latency_s` ago.
 
         Raises:

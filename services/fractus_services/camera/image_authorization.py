@@ -13,16 +13,16 @@ from fractus_core.policy.values import Call, Situation, Verdict
 from fractus_runtime import spans
 from fractus_runtime.audit import AuditLog
 
-from fractus_services.camera.imaging.faces import Detector
-from fractus_services.camera.imaging.pipeline import FacesNotReliable, FilterPlan, plan_filters
-from fractus_services.camera.pose.pose import Pose
+from fractus_services.camera.face_detection import Detector
+from fractus_services.camera.filter_pipeline import FacesNotReliable, FilterPlan, plan_filters
+from fractus_services.camera.pose import Pose
 from fractus_services.errors import denied
-from fractus_services.grants import ActiveGrant
+from fractus_services.grant_files import ActiveGrant
 
 log = logging.getLogger(__name__)
 
 
-class PictureJudge:
+class ImageAuthorizer:
     """The policy engine as the camera service asks it: a denial is an exception.
 
     Args:

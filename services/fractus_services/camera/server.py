@@ -20,29 +20,29 @@ from fractus_runtime.figures import Figure
 
 from fractus_services.admission import CallAdmission
 from fractus_services.auth import TlsFiles
-from fractus_services.camera.album.album import Album, owner_of
-from fractus_services.camera.capture.connection import driver_for
-from fractus_services.camera.capture.properties import CameraProperties
-from fractus_services.camera.capture.shutter import Shutter
-from fractus_services.camera.imaging.faces import BadModel, CascadeDetector, Detector, ModelDetector
-from fractus_services.camera.pictures.capture import MAX_FILTERING, PictureCapture
-from fractus_services.camera.pictures.fair_queue import MAX_PER_OWNER, FairQueue
-from fractus_services.camera.pictures.judge import PictureJudge
-from fractus_services.camera.pictures.library import PictureLibrary
-from fractus_services.camera.pose.history import PoseHistory
-from fractus_services.camera.pose.provider import FixedPose, PoseProvider
-from fractus_services.camera.rpc.handlers import CameraHandlers
-from fractus_services.camera.rpc.telemetry import follow_telemetry
+from fractus_services.camera.camera_properties import CameraProperties
+from fractus_services.camera.drivers.connection import driver_for
+from fractus_services.camera.face_detection import BadModel, CascadeDetector, Detector, ModelDetector
+from fractus_services.camera.fair_queue import MAX_PER_OWNER, FairQueue
+from fractus_services.camera.handlers import CameraHandlers
+from fractus_services.camera.image_authorization import ImageAuthorizer
+from fractus_services.camera.image_capture import MAX_FILTERING, ImageCapture
+from fractus_services.camera.image_store import ImageStore, owner_of
+from fractus_services.camera.pose_history import PoseHistory
+from fractus_services.camera.pose_provider import FixedPose, PoseProvider
+from fractus_services.camera.shutter import Shutter
+from fractus_services.camera.stored_images import StoredImages
+from fractus_services.camera.telemetry_client import follow_telemetry
 from fractus_services.clock import Clock
 from fractus_services.decision_log import log_decision
-from fractus_services.description import NodeDescription
+from fractus_services.grant_files import GrantFiles
 from fractus_services.grant_verifier import GrantVerifier
-from fractus_services.grants import GrantFiles
-from fractus_services.hosting import run_until, serve_grpc
+from fractus_services.grpc_server import run_until, serve_grpc
 from fractus_services.metrics import ServiceMetrics, common_figures, telemetry_age
+from fractus_services.node_description import NodeDescription
 from fractus_services.options import CameraOptions, CannotServe
 from fractus_services.recording.recorder import Recorder
-from fractus_services.recording.segments import segments_in
+from fractus_services.recording.segment_directory import segments_in
 
 log = logging.getLogger(__name__)
 
@@ -94,9 +94,9 @@ async def run(options: CameraOptions, stop: asyncio.Event) -> None:
         options.grants, node, GrantVerifier(options.tls, options.grant_memory), refused=audit.refused_grant
     )
     grants.scan()
-    judge = PictureJudge(audit, detector_of(options))
+    judge = ImageAuthorizer(audit, detector_of(options))
     # One for all descriptions: a second one would tidy away what the first is still writing.
-    album = Album(
+    album = ImageStore(
         options.state,
         options.keep,
         options.keep_mb * 1_000_000,
@@ -147,8 +147,8 @@ async def _serve(
     tls: TlsFiles,
     grants: GrantFiles,
     clock: Clock,
-    judge: PictureJudge,
-    album: Album,
+    judge: ImageAuthorizer,
+    album: ImageStore,
     watched: _Watched,
 ) -> None:
     """Serve until `stop` is set, or the description changes."""
@@ -173,10 +173,10 @@ async def _serve(
         parts.append(follow_telemetry(options.mobility, node, tls, history.add, clock=clock, gimbal=gimbal))
     admission = CallAdmission(grants, clock)
     handlers = CameraHandlers(
-        PictureCapture(
+        ImageCapture(
             poses, shutter, camera, detector=judge.detector, filter_queue=queue, album=album, judge=judge, clock=clock
         ),
-        PictureLibrary(poses, album, detector=judge.detector, filter_queue=queue, judge=judge, clock=clock),
+        StoredImages(poses, album, detector=judge.detector, filter_queue=queue, judge=judge, clock=clock),
         admission,
     )
     register = partial(camera_pb2_grpc.add_CameraServiceServicer_to_server, handlers)

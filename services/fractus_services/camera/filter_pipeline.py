@@ -9,9 +9,9 @@ from typing import assert_never
 from fractus_core.policy.privacy import compose
 from fractus_core.policy.values import Filter
 
-from fractus_services.camera.imaging import filters
-from fractus_services.camera.imaging.faces import Detector
-from fractus_services.camera.imaging.pixels import Pixels
+from fractus_services.camera import filters
+from fractus_services.camera.face_detection import Detector
+from fractus_services.camera.pixels import Pixels
 
 
 class FacesNotReliable(Exception):

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from fractus_services.camera.capture.driver import CameraFailed, Wanted, as_described
-from fractus_services.camera.imaging.pixels import Pixels, opencv
+from fractus_services.camera.drivers.driver import CameraFailed, CaptureRequest, as_described
+from fractus_services.camera.pixels import Pixels, opencv
 
 _STALE_FRAMES = 4
 """Pictures that the driver's buffers hold from before."""
@@ -27,7 +27,7 @@ class VideoDevice:
         self._path = path
         self._device: Any = None
 
-    def capture(self, wanted: Wanted) -> Pixels:
+    def capture(self, wanted: CaptureRequest) -> Pixels:
         """See `Driver`."""
         cv2 = opencv()
         if not Path(self._path).exists():
@@ -53,7 +53,7 @@ class VideoDevice:
             self._device.release()
             self._device = None
 
-    def _opened(self, wanted: Wanted) -> Any:
+    def _opened(self, wanted: CaptureRequest) -> Any:
         cv2 = opencv()
         device = cv2.VideoCapture(self._path, cv2.CAP_V4L2)
         if not device.isOpened():

@@ -7,7 +7,7 @@ from typing import Literal
 
 from fractus_core.api.nodes import Drone, EdgeNode
 
-from fractus_services.camera.imaging.pixels import source_size
+from fractus_services.camera.pixels import source_size
 from fractus_services.errors import InvalidRequest
 
 MIN_PX, MAX_PX = 16, 8192

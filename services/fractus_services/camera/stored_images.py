@@ -12,20 +12,20 @@ from fractus_core.policy.values import Call, Situation, Verdict
 from fractus_runtime import spans
 
 from fractus_services.background import Background
-from fractus_services.camera.album.album import Album, owner_of
-from fractus_services.camera.album.shots import Shot
-from fractus_services.camera.imaging.faces import Detector
-from fractus_services.camera.imaging.pipeline import FilterPlan, apply_filters
-from fractus_services.camera.imaging.pixels import decoded, encoded
-from fractus_services.camera.pictures.fair_queue import FairQueue
-from fractus_services.camera.pictures.judge import PictureJudge, taken_at
-from fractus_services.camera.pose.pose import is_upright
-from fractus_services.camera.pose.provider import PoseProvider
+from fractus_services.camera.face_detection import Detector
+from fractus_services.camera.fair_queue import FairQueue
+from fractus_services.camera.filter_pipeline import FilterPlan, apply_filters
+from fractus_services.camera.image_authorization import ImageAuthorizer, taken_at
+from fractus_services.camera.image_record import ImageRecord
+from fractus_services.camera.image_store import ImageStore, owner_of
+from fractus_services.camera.pixels import decoded, encoded
+from fractus_services.camera.pose import is_upright
+from fractus_services.camera.pose_provider import PoseProvider
 from fractus_services.errors import PolicyDenied
-from fractus_services.grants import ActiveGrant
+from fractus_services.grant_files import ActiveGrant
 
 
-class PictureLibrary:
+class StoredImages:
     """RetrieveImage, ListImages and DeleteImage of Table 8.2 of the thesis, for callers whose grant is known.
 
     Args:
@@ -40,11 +40,11 @@ class PictureLibrary:
     def __init__(
         self,
         poses: PoseProvider,
-        album: Album,
+        album: ImageStore,
         *,
         detector: Detector,
         filter_queue: FairQueue,
-        judge: PictureJudge,
+        judge: ImageAuthorizer,
         clock: Callable[[], float],
     ) -> None:
         self._poses = poses
@@ -57,7 +57,7 @@ class PictureLibrary:
 
     async def retrieve(
         self, grant: ActiveGrant, name: str, current_grant: Callable[[], ActiveGrant] | None = None
-    ) -> tuple[Verdict, Shot, bytes | Path]:
+    ) -> tuple[Verdict, ImageRecord, bytes | Path]:
         """A picture; policies apply to where it was taken and to where the camera is now, and the stricter counts.
 
         It is judged again when its filters are applied, as other pictures may come first.
@@ -65,7 +65,7 @@ class PictureLibrary:
         Args:
             grant: the caller's.
             name: of the picture.
-            current_grant: as for `PictureCapture.capture`.
+            current_grant: as for `ImageCapture.capture`.
         """
         call, now = Call("RetrieveImage"), self._now()
         known = self._judge.judge(call, grant, now)
@@ -86,7 +86,7 @@ class PictureLibrary:
         self.judge_again(current_grant() if current_grant else grant, owner, shot)
         return replace(verdict, reason=noted.reason), shot, data
 
-    def judge_again(self, grant: ActiveGrant, owner: str, shot: Shot) -> None:
+    def judge_again(self, grant: ActiveGrant, owner: str, shot: ImageRecord) -> None:
         """Judge a picture whose retrieval was permitted by the policies of this moment: before each part of it is sent.
 
         Args:
@@ -109,7 +109,7 @@ class PictureLibrary:
             refusal = Verdict("deny", None, "PrivacyZone", reason, verdict.policies)
             self._judge.require(call, grant, refusal, now)
 
-    async def _filtered(self, owner: str, path: Path, plan: FilterPlan, shot: Shot) -> bytes:
+    async def _filtered(self, owner: str, path: Path, plan: FilterPlan, shot: ImageRecord) -> bytes:
         def work() -> bytes:
             picture, upright = decoded(path.read_bytes()), is_upright(shot.poses)
             return encoded(apply_filters([picture], plan, self._detector, shot.face_px, upright=upright))
@@ -119,7 +119,7 @@ class PictureLibrary:
                 span.note("fractus.filters", [one.action for one in plan.filters])
                 return await asyncio.to_thread(work)
 
-    async def list(self, grant: ActiveGrant) -> tuple[Verdict, tuple[Shot, ...]]:
+    async def list(self, grant: ActiveGrant) -> tuple[Verdict, tuple[ImageRecord, ...]]:
         """The pictures of the caller."""
         verdict = self._judge.judge(Call("ListImages"), grant, self._now())
         return verdict, await asyncio.to_thread(self._album.list, owner_of(grant))

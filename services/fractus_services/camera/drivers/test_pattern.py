@@ -6,18 +6,18 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from fractus_services.camera.capture.driver import Wanted
-from fractus_services.camera.imaging.pixels import Pixels, opencv
+from fractus_services.camera.drivers.driver import CaptureRequest
+from fractus_services.camera.pixels import Pixels, opencv
 
 GRID_PX = 80
 
 
-class Rendered:
+class TestPattern:
     """Draws a grid, the node's name, and where and when it is."""
 
     latency_s = 0.0
 
-    def capture(self, wanted: Wanted) -> Pixels:
+    def capture(self, wanted: CaptureRequest) -> Pixels:
         """See `Driver`."""
         cv2 = opencv()
         now, width, height = wanted.now, wanted.width, wanted.height

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from fractus_core.policy.values import Lens
 
-from fractus_services.camera.imaging.pixels import Pixels, opencv
+from fractus_services.camera.pixels import Pixels, opencv
 from fractus_services.errors import PreconditionFailed
 
 Box = tuple[int, int, int, int]

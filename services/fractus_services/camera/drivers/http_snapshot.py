@@ -8,13 +8,13 @@ import urllib.error
 import urllib.parse
 import urllib.request
 
-from fractus_services.camera.capture.driver import TIMEOUT_S, BadConnection, CameraFailed, Wanted
-from fractus_services.camera.imaging.pixels import MAX_BYTES, NotAPicture, Pixels, decoded
+from fractus_services.camera.drivers.driver import TIMEOUT_S, BadConnection, CameraFailed, CaptureRequest
+from fractus_services.camera.pixels import MAX_BYTES, NotAPicture, Pixels, decoded
 
 _PIECE_BYTES = 256 * 1024
 
 
-class Snapshot:
+class HttpSnapshot:
     """A camera with a snapshot URL.
 
     The size that is wanted goes into {width} and {height} of the URL; into its query where it has none. User name and
@@ -48,7 +48,7 @@ class Snapshot:
             handlers += [urllib.request.HTTPBasicAuthHandler(known), urllib.request.HTTPDigestAuthHandler(known)]
         self._opener = urllib.request.build_opener(*handlers)
 
-    def capture(self, wanted: Wanted) -> Pixels:
+    def capture(self, wanted: CaptureRequest) -> Pixels:
         """See `Driver`."""
         try:
             data = self._fetch(self._address(wanted))
@@ -67,7 +67,7 @@ class Snapshot:
     def close(self) -> None:
         """Nothing to close."""
 
-    def _address(self, wanted: Wanted) -> str:
+    def _address(self, wanted: CaptureRequest) -> str:
         if "{width}" in self._url or "{height}" in self._url:
             return self._url.replace("{width}", str(wanted.width)).replace("{height}", str(wanted.height))
         if "?" in self._url:

@@ -6,7 +6,7 @@ import math
 import struct
 from datetime import UTC, datetime
 
-from fractus_services.camera.pose.pose import Pose, directions
+from fractus_services.camera.pose import Pose, directions
 
 _SOI = b"\xff\xd8"
 _APP1 = 0xE1

@@ -8,9 +8,9 @@ import threading
 import time
 from collections.abc import Callable
 
-from fractus_services.camera.capture.driver import TIMEOUT_S, CameraFailed, Driver, Wanted
-from fractus_services.camera.imaging.filters import MOTION_PX
-from fractus_services.camera.imaging.pixels import Pixels, reduced
+from fractus_services.camera.drivers.driver import TIMEOUT_S, CameraFailed, CaptureRequest, Driver
+from fractus_services.camera.filters import MOTION_PX
+from fractus_services.camera.pixels import Pixels, reduced
 
 _Answer = asyncio.Future[list[Pixels]]
 
@@ -35,7 +35,7 @@ class Shutter:
         """How many seconds before `expose` begins its first picture may have been exposed, at most."""
         return self._driver.latency_s
 
-    async def expose(self, wanted: Wanted, count: int = 1, apart_s: float = 0.0) -> list[Pixels]:
+    async def expose(self, wanted: CaptureRequest, count: int = 1, apart_s: float = 0.0) -> list[Pixels]:
         """Pictures one after the other; the one in the middle in full, the others reduced to `MOTION_PX`.
 
         Args:
@@ -74,7 +74,7 @@ class Shutter:
         self._driver.close()
 
     def _take(
-        self, wanted: Wanted, count: int, apart_s: float, loop: asyncio.AbstractEventLoop, answer: _Answer
+        self, wanted: CaptureRequest, count: int, apart_s: float, loop: asyncio.AbstractEventLoop, answer: _Answer
     ) -> None:
         pictures: list[Pixels] = []
         failure: Exception | None = None

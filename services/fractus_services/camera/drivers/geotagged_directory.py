@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from fractus_core.geo import LocalFrame
 
-from fractus_services.camera.capture.driver import CameraFailed, Wanted
-from fractus_services.camera.imaging.pixels import NotAPicture, Pixels, decoded
+from fractus_services.camera.drivers.driver import CameraFailed, CaptureRequest
+from fractus_services.camera.pixels import NotAPicture, Pixels, decoded
 
 log = logging.getLogger(__name__)
 
@@ -36,7 +36,7 @@ class GeotaggedDirectory:
         self._files: list[Path] = []
         self._places: npt.NDArray[np.float64] = np.empty((0, 3))
 
-    def capture(self, wanted: Wanted) -> Pixels:
+    def capture(self, wanted: CaptureRequest) -> Pixels:
         """See `Driver`."""
         now = wanted.now
         if now.lat is None or now.lon is None:

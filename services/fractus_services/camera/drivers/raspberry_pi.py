@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from fractus_services.camera.capture.driver import CameraFailed, Wanted, as_described
-from fractus_services.camera.imaging.pixels import Pixels
+from fractus_services.camera.drivers.driver import CameraFailed, CaptureRequest, as_described
+from fractus_services.camera.pixels import Pixels
 
 
-class RaspberryCamera:
+class RaspberryPiCamera:
     """A camera module, started at the first picture and again after it failed.
 
     Args:
@@ -24,7 +24,7 @@ class RaspberryCamera:
         self._number = number
         self._camera: Any = None
 
-    def capture(self, wanted: Wanted) -> Pixels:
+    def capture(self, wanted: CaptureRequest) -> Pixels:
         """See `Driver`."""
         if self._camera is None:
             self._camera = self._started(wanted)
@@ -44,7 +44,7 @@ class RaspberryCamera:
         if camera is not None:
             camera.close()
 
-    def _started(self, wanted: Wanted) -> Any:
+    def _started(self, wanted: CaptureRequest) -> Any:
         try:
             from picamera2 import Picamera2  # noqa: PLC0415 - there on a Raspberry Pi only
         except ImportError:

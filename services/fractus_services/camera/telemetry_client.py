@@ -15,7 +15,7 @@ from fractus_core.policy.values import Attitude, Home, Situation
 from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc
 
 from fractus_services.auth import TlsFiles
-from fractus_services.camera.pose.history import Measurement
+from fractus_services.camera.pose_history import Measurement
 
 log = logging.getLogger(__name__)
 

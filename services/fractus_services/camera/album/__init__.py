@@ -1,1 +1,0 @@
-"""Pictures on disk with the records by which they are judged again."""

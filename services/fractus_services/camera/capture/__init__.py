@@ -1,1 +1,0 @@
-"""Cameras: drivers, and the shutter that calls them on a thread."""

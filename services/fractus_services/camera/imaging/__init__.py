@@ -1,1 +1,0 @@
-"""Pictures as arrays: decoding, face detection, filters, metadata."""

@@ -1,1 +1,0 @@
-"""Judges a call, takes a picture, filters it, stores it, returns it."""

@@ -1,1 +1,0 @@
-"""gRPC of the camera service: handlers, the server, and the telemetry client."""

@@ -32,8 +32,8 @@ def serve(service: click.Group, tmp_path: Path, *more: str) -> Result:
     [
         (b"kind: [", "is not YAML"),
         (b"\xff\xfe\x00", "cannot be read"),
-        (b"- a list", "must hold one manifest of kind Drone"),
-        (b"kind: Zone", "must hold one manifest of kind Drone"),
+        (b"- a list", "must contain one manifest of kind Drone"),
+        (b"kind: Zone", "must contain one manifest of kind Drone"),
         (b"{apiVersion: fractus.dev/v1alpha1, kind: Drone, metadata: {name: d}, spec: 5}", "spec"),
     ],
 )

@@ -75,20 +75,20 @@ def test_sentences_of_bad_applications():
         ([STORE | {"replicas": 0}], "spec.components[0].replicas: must be greater than or equal to 1, not 0"),
         ([edge_component(locations=[{"center": plain, "radius": -1}])], "spec.components[0].locations[0].radius: must be greater than 0, not -1"),
         ([edge_component(locations=[{"center": plain, "radius": 1, "instances": 0}])], "spec.components[0].locations[0].instances: instances is a whole number of 1 to 10000, or"),
-        ([edge_component(locations=[])], "spec.components[0].locations: locations are needed for placement edge"),
-        ([STORE | {"egress": ["Stranger"]}], "spec.components[0].egress[0]: egress names a component that the application does not have (Stranger)"),
+        ([edge_component(locations=[])], "spec.components[0].locations: locations are required for placement edge"),
+        ([STORE | {"egress": ["Stranger"]}], "spec.components[0].egress[0]: egress names a component that is not in the application (Stranger)"),
         ([STORE | {"egress": ["DataStore"]}], "spec.components[0].egress[0]: egress names the component itself; remove it (DataStore)"),
         ([edge_component(services=[{"service": "camera", "methods": ["Fly"]}])], "spec.components[0].services[0].methods[0]: must be 'Arm'"),
-        ([edge_component(services=[{"service": "camera", "methods": ["Goto"]}])], "spec.components[0].services[0].methods[0]: the camera service has CaptureImage, DeleteImage"),
-        ([edge_component(services=[{"service": "mobility", "methods": ["Goto"]}])], "spec.components[0].services: the mobility service is on drones only"),
-        ([STORE, STORE | {"name": "data-store"}], "spec.components[1].name: names of components differ in more than capitals and hyphens; rename one (data-store and DataStore)"),
+        ([edge_component(services=[{"service": "camera", "methods": ["Goto"]}])], "spec.components[0].services[0].methods[0]: the methods of the camera service are CaptureImage, DeleteImage"),
+        ([edge_component(services=[{"service": "mobility", "methods": ["Goto"]}])], "spec.components[0].services: the mobility service is only available on drones"),
+        ([STORE, STORE | {"name": "data-store"}], "spec.components[1].name: component names must differ in more than capitalisation and hyphens; rename one of them (data-store and DataStore)"),
         ([STORE | {"replica": 2}], "spec.components[0].replica: there is no such field; remove it"),
         ([STORE | {"container": {"image": "x", "volumes": [{"name": "v", "mountPath": "/v"}]}}], "spec.components[0].container.volumes[0]: give exactly one of emptyDir"),
-        ([STORE | {"container": {"image": "x", "volumes": [{"name": "v", "mountPath": "/v", "secret": "other-tls"}]}}], "spec.components[0].container.volumes[0].secret: Secrets whose names end in -tls"),
-        ([STORE | {"container": {"image": "x", "volumes": [{"name": "tls", "mountPath": "/v", "claim": "c"}]}}], "spec.components[0].container.volumes[0].name: the pod has volumes tls and tmp of its own"),
-        ([STORE | {"container": {"image": "x", "env": [{"name": "A", "value": "1"}, {"name": "A"}]}}], "spec.components[0].container.env[1].name: A is there twice; remove one of them"),
-        ([STORE | {"container": {"image": "x", "ports": [{"port": 80}, {"port": 80}]}}], "spec.components[0].container.ports[1].port: 80 is there twice; remove one of them"),
-        ([STORE | {"container": {"image": "x", "ports": [{"port": 80, "name": "a"}, {"port": 81, "name": "a"}]}}], "spec.components[0].container.ports[1].name: each port needs a name of its own; choose another name"),
+        ([STORE | {"container": {"image": "x", "volumes": [{"name": "v", "mountPath": "/v", "secret": "other-tls"}]}}], "spec.components[0].container.volumes[0].secret: Secrets with names ending in -tls are reserved for component certificates; choose another name"),
+        ([STORE | {"container": {"image": "x", "volumes": [{"name": "tls", "mountPath": "/v", "claim": "c"}]}}], "spec.components[0].container.volumes[0].name: the volumes tls and tmp at"),
+        ([STORE | {"container": {"image": "x", "env": [{"name": "A", "value": "1"}, {"name": "A"}]}}], "spec.components[0].container.env[1].name: A is duplicated; remove one of the entries"),
+        ([STORE | {"container": {"image": "x", "ports": [{"port": 80}, {"port": 80}]}}], "spec.components[0].container.ports[1].port: 80 is duplicated; remove one of the entries"),
+        ([STORE | {"container": {"image": "x", "ports": [{"port": 80, "name": "a"}, {"port": 81, "name": "a"}]}}], "spec.components[0].container.ports[1].name: port names must be unique; choose another name"),
         ([STORE | {"container": {"image": "x", "resources": {"limits": {"cpu": "much"}}}}], "spec.components[0].container.resources.limits.cpu: 'much' is not a quantity"),
     ]  # fmt: skip
     for components, sentence in cases:
@@ -169,15 +169,15 @@ def test_area_of_continental_size_is_refused():
     [
         (
             {"type": "AccessControl", "kind": "speed"},
-            "spec.kind: AccessControl takes kind grant or denial, and methods",
+            "spec.kind: AccessControl requires kind grant or denial, and methods",
         ),
         (
             {"type": "AccessControl", "kind": "denial"},
-            "spec.methods: AccessControl takes kind grant or denial, and methods",
+            "spec.methods: AccessControl requires kind grant or denial, and methods",
         ),
         (
             {"type": "LimitControl", "kind": "speed"},
-            "spec.upperLimit: LimitControl takes kind speed or altitude, and upperLimit or lowerLimit",
+            "spec.upperLimit: LimitControl requires kind speed or altitude, and upperLimit or lowerLimit",
         ),
         (
             {"type": "LimitControl", "kind": "altitude", "lowerLimit": 9, "upperLimit": 5},
@@ -185,35 +185,35 @@ def test_area_of_continental_size_is_refused():
         ),
         (
             {"type": "LimitControl", "kind": "speed", "upperLimit": -5},
-            "spec.upperLimit: a speed has an upperLimit above 0 and a lowerLimit of at least 0 m/s, an altitude above terrain an upperLimit above 0 m",
+            "spec.upperLimit: speed limits require an upperLimit above 0 and a lowerLimit of at least 0 m/s; limits above terrain require an upperLimit above 0 m",
         ),
         (
             {"type": "LimitControl", "kind": "speed", "upperLimit": 0},
-            "spec.upperLimit: a speed has an upperLimit above 0 and a lowerLimit of at least 0 m/s, an altitude above terrain an upperLimit above 0 m",
+            "spec.upperLimit: speed limits require an upperLimit above 0 and a lowerLimit of at least 0 m/s; limits above terrain require an upperLimit above 0 m",
         ),
         (
             {"type": "LimitControl", "kind": "speed", "lowerLimit": -0.5, "upperLimit": 5},
-            "spec.lowerLimit: a speed has an upperLimit above 0 and a lowerLimit of at least 0 m/s, an altitude above terrain an upperLimit above 0 m",
+            "spec.lowerLimit: speed limits require an upperLimit above 0 and a lowerLimit of at least 0 m/s; limits above terrain require an upperLimit above 0 m",
         ),
         (
             {"type": "LimitControl", "kind": "altitude", "upperLimit": 0, "altitudeReference": "terrain"},
-            "spec.upperLimit: a speed has an upperLimit above 0 and a lowerLimit of at least 0 m/s, an altitude above terrain an upperLimit above 0 m",
+            "spec.upperLimit: speed limits require an upperLimit above 0 and a lowerLimit of at least 0 m/s; limits above terrain require an upperLimit above 0 m",
         ),
         (
             {"type": "GeofenceControl", "kind": "exclusion"},
-            "spec.selector.zones: GeofenceControl takes kind inclusion or exclusion, and selector.zones",
+            "spec.selector.zones: GeofenceControl requires kind inclusion or exclusion, and selector.zones",
         ),
         (
             {"type": "PrivacyControl", "kind": "camera"},
-            "spec.action: PrivacyControl takes kind camera, and action refuse, black",
+            "spec.action: PrivacyControl requires kind camera, and action refuse, black",
         ),
         (
             {"type": "PrivacyControl", "kind": "camera", "action": "black", "fallback": "refuse"},
-            "spec.fallback: faces and fallback go with PrivacyControl and action blurFaces",
+            "spec.fallback: faces and fallback are only allowed for PrivacyControl with action blurFaces",
         ),
         (
             {"type": "LimitControl", "kind": "speed", "upperLimit": 3, "faces": "gaussian"},
-            "spec.faces: faces and fallback go with PrivacyControl and action blurFaces",
+            "spec.faces: faces and fallback are only allowed for PrivacyControl with action blurFaces",
         ),
     ],
 )

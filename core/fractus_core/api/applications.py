@@ -1,4 +1,4 @@
-"""Application: what the user submits (thesis Listings 12 and 13)."""
+"""Application: the kind that users submit (thesis Listings 12 and 13)."""
 
 from __future__ import annotations
 
@@ -9,16 +9,18 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from fractus_core.api.components import Component, Placement, PointsOfInterest, Reference
+from fractus_core.api.components import Component, Placement, PointsOfInterest, ReferenceField
 from fractus_core.api.model import AGE, READY, Conditions, Model, ObservedGeneration, OpenModel, Resource, keyed
-from fractus_core.api.rules import Broken, rule
+from fractus_core.api.rules import Violation, rule
 
 
-def _each(field: Reference, cel: str, message: str, fits: Callable[[ApplicationSpec, Component, str], bool]) -> Any:
-    """The rule that every name in a field of every component fits; `cel` is a test of name n in component c."""
+def _each(
+    field: ReferenceField, cel: str, message: str, fits: Callable[[ApplicationSpec, Component, str], bool]
+) -> Any:
+    """Return the rule that every name in a field of every component is valid; `cel` tests name n in component c."""
 
     @rule(f"self.components.all(c, !has(c.{field}) || c.{field}.all(n, {cel}))", f"{field} {message}")
-    def each(self: ApplicationSpec) -> Broken:
+    def each(self: ApplicationSpec) -> Violation:
         for i, component in enumerate(self.components):
             for j, name in enumerate(component.references(field)):
                 if not fits(self, component, name):
@@ -28,21 +30,21 @@ def _each(field: Reference, cel: str, message: str, fits: Callable[[ApplicationS
     return each
 
 
-def _known(field: Reference) -> Any:
+def _known(field: ReferenceField) -> Any:
     return _each(
         field,
         "self.components.exists(d, d.name == n)",
-        "names a component that the application does not have",
+        "names a component that is not in the application",
         lambda spec, _, name: spec.find(name) is not None,
     )
 
 
-def _other(field: Reference) -> Any:
+def _other(field: ReferenceField) -> Any:
     return _each(field, "n != c.name", "names the component itself; remove it", lambda _, c, name: name != c.name)
 
 
 _NOT_MISSION = {"update_policy", "ttl_after_finished"}
-"""Fields that may change while a mission goes on, or after it, without being another mission."""
+"""Fields that may change without starting another mission."""
 
 
 class ApplicationSpec(Model):
@@ -52,27 +54,27 @@ class ApplicationSpec(Model):
         min_length=1,
         max_length=50,
         json_schema_extra=keyed("name"),
-        description="The parts of the application, each a container image with a place to run.",
+        description="Components of the application; each has a container image and a placement.",
     )
     update_policy: Literal["OnGround", "Immediate"] = Field(
         default="OnGround",
-        description="When a changed manifest is carried out: once the drone is on the ground, or also in flight, which restarts"
-        " what changed, such as the driver.",
+        description="When changes of a running application take effect. OnGround: after the drone has landed. Immediate: also"
+        " in flight, which restarts the changed components, including the driver.",
     )
     ttl_after_finished: int = Field(
         default=600,
         ge=0,
         le=604_800,
-        description="How long pods are kept once the mission is over, in seconds, for their logs: stopped, and with nothing booked on"
-        " their nodes. Then they are removed.",
+        description="Seconds for which the stopped pods are kept after the mission, so that their logs can be read. They"
+        " reserve no resources on their nodes.",
     )
 
     @rule(
         "self.components.all(c, self.components.exists_one(d,"
         " d.name.replace('-', '').lowerAscii() == c.name.replace('-', '').lowerAscii()))",
-        "names of components differ in more than capitals and hyphens; rename one",
+        "component names must differ in more than capitalisation and hyphens; rename one of them",
     )
-    def _distinct_objects(self) -> Broken:
+    def _distinct_objects(self) -> Violation:
         seen: dict[str, str] = {}
         for i, component in enumerate(self.components):
             plain = component.name.replace("-", "").lower()
@@ -85,7 +87,7 @@ class ApplicationSpec(Model):
         "self.components.filter(c, has(c.class) && c.class == 'driver').size() <= 1",
         "an application has at most one driver",
     )
-    def _one_driver(self) -> Broken:
+    def _one_driver(self) -> Violation:
         drivers = self._where(lambda c: c.class_ == "driver")
         return f"components[{drivers[1]}].class" if len(drivers) > 1 else None
 
@@ -94,7 +96,7 @@ class ApplicationSpec(Model):
         " self.components.exists(c, (has(c.class) && c.class == 'driver') || has(c.pointsOfInterest))",
         "an application with drone components needs a driver, or one passenger with pointsOfInterest",
     )
-    def _flown(self) -> Broken:
+    def _flown(self) -> Violation:
         aboard = self._where(lambda c: c.placement == "drone")
         flown = self.driver is not None or self.points_of_interest is not None
         return f"components[{aboard[0]}].pointsOfInterest" if aboard and not flown else None
@@ -117,18 +119,18 @@ class ApplicationSpec(Model):
 
     @rule(
         "self.components.filter(c, has(c.pointsOfInterest)).size() <= 1",
-        "only one passenger gives pointsOfInterest",
+        "only one passenger may have pointsOfInterest",
     )
-    def _one_guide(self) -> Broken:
+    def _one_guide(self) -> Violation:
         guides = self._where(lambda c: c.points_of_interest is not None)
         return f"components[{guides[1]}].pointsOfInterest" if len(guides) > 1 else None
 
     @rule(
         "!self.components.exists(c, has(c.pointsOfInterest)) ||"
         " !self.components.exists(c, has(c.class) && c.class == 'driver')",
-        "the driver says where the drone flies; remove pointsOfInterest",
+        "an application with a driver cannot have pointsOfInterest; remove them",
     )
-    def _driver_or_guide(self) -> Broken:
+    def _driver_or_guide(self) -> Violation:
         guides = self._where(lambda c: c.points_of_interest is not None)
         return f"components[{guides[0]}].pointsOfInterest" if guides and self.driver is not None else None
 
@@ -137,51 +139,51 @@ class ApplicationSpec(Model):
 
     @property
     def mission_digest(self) -> str:
-        """Tells what is to be flown and run apart: a hash of all but how updates are carried out and how long pods are kept."""
-        said = self.model_dump(mode="json", by_alias=True, exclude_defaults=True, exclude=_NOT_MISSION)
-        return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+        """Hash of all fields that define the mission, that is, of all but the update policy and the pod retention."""
+        mission = self.model_dump(mode="json", by_alias=True, exclude_defaults=True, exclude=_NOT_MISSION)
+        return hashlib.sha256(json.dumps(mission, sort_keys=True).encode()).hexdigest()
 
     @property
     def driver(self) -> Component | None:
-        """The component that flies the drone, if the application has one."""
+        """The driver, or None if the application has none."""
         return next((c for c in self.components if c.class_ == "driver"), None)
 
     @property
     def leader(self) -> Component | None:
-        """The component that says where the drone flies: the driver, or the passenger that gives points of interest."""
+        """The component that determines the flight: the driver, or the passenger with points of interest."""
         return self.driver or next((c for c in self.components if c.points_of_interest is not None), None)
 
     @property
     def points_of_interest(self) -> PointsOfInterest | None:
-        """The points of the one passenger that gives some."""
+        """The points of interest of the application."""
         return self.leader.points_of_interest if self.leader is not None else None
 
     def on(self, placement: Placement) -> Iterator[Component]:
-        """The components with this placement, in order."""
+        """Return the components with a placement, in order."""
         return (c for c in self.components if c.placement == placement)
 
     def find(self, name: str) -> Component | None:
-        """The component with this name, None if there is none."""
+        """Return the component with a name, or None."""
         return next((c for c in self.components if c.name == name), None)
 
     def component(self, name: str) -> Component:
-        """The component with this name.
+        """Return the component with a name.
 
         Raises:
-            KeyError: there is none.
+            KeyError: The application has no such component.
         """
-        found = self.find(name)
-        if found is None:
+        component = self.find(name)
+        if component is None:
             raise KeyError(name)
-        return found
+        return component
 
     def callers(self, name: str) -> set[str]:
-        """The components that a component says it is called by, or that say they call it; none where all may call it."""
+        """Return the components that may call a component, from its ingress and their egress. Empty if all may call it."""
         return {other.name for other in self.components if name in other.egress}.union(self.component(name).ingress)
 
 
 class ApplicationStatus(OpenModel):
-    """Where the application stands."""
+    """Observed state of an application."""
 
     observed_generation: ObservedGeneration = None
     phase: (
@@ -201,13 +203,13 @@ class ApplicationStatus(OpenModel):
             "Invalid",
         ]
         | None
-    ) = Field(default=None, description="How far it is, and its drone.")
-    drone: str | None = Field(default=None, description="The drone that flies it.")
+    ) = Field(default=None, description="Current phase of the application.")
+    drone: str | None = Field(default=None, description="Name of the drone that flies the application.")
     controller: str | None = Field(
-        default=None, description="Who flies it, while it is in the air: system, pilot, or a component."
+        default=None, description="Control authority of the airborne drone: system, pilot, or the name of the driver."
     )
-    pods: str | None = Field(default=None, description="Ready pods of all pods, such as 6/7.")
-    message: str | None = Field(default=None, description="One sentence on what is going on.")
+    pods: str | None = Field(default=None, description="Number of ready pods and of all pods, such as 6/7.")
+    message: str | None = Field(default=None, description="Human-readable description of the current state.")
     conditions: Conditions = ()
 
 

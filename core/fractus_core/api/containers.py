@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from fractus_core.api.model import InvalidObject, Model, Quantity, keyed, quantity
 from fractus_core.api.names import Name, PortName
-from fractus_core.api.rules import Broken, rule
+from fractus_core.api.rules import Violation, rule
 
 _RESOURCES = ("cpu", "memory", "ephemeral-storage")
 _EXTENDED = (
@@ -18,9 +18,9 @@ _EXTENDED = (
 )
 _NAME_LENGTH = 317
 TLS_DIR = "/var/run/fractus/tls"
-"""Where a component finds its certificate."""
+"""Directory with the certificate of a component."""
 TMP_DIR = "/tmp"  # nosec B108  # noqa: S108  (the pod's own)
-"""Where a component may write."""
+"""Directory that a component may write to."""
 _OWN_VOLUMES = {"tls": TLS_DIR, "tmp": TMP_DIR}
 _IMAGE = (
     r"^([a-zA-Z0-9]([-a-zA-Z0-9.]*[a-zA-Z0-9])?(:[0-9]+)?/)?[a-z0-9]+(([._]|__|-+)[a-z0-9]+)*"
@@ -31,50 +31,52 @@ _IMAGE = (
 class ContainerPort(Model):
     """A port the component listens on."""
 
-    port: int = Field(ge=1, le=65535, description="Its number.")
-    name: PortName | None = Field(default=None, description="Unset: port- and its number.")
-    protocol: Literal["TCP", "UDP"] = Field(default="TCP", description="What it speaks.")
+    port: int = Field(ge=1, le=65535, description="Port number.")
+    name: PortName | None = Field(default=None, description="Port name; default: port- and the number.")
+    protocol: Literal["TCP", "UDP"] = Field(default="TCP", description="Transport protocol (TCP or UDP).")
 
     @rule(
         "!has(self.name) || !self.name.startsWith('port-')",
-        "ports without a name get one that begins with port-; choose another name, or leave it out",
+        "names that begin with port- are reserved for ports without a name; choose another name or remove it",
     )
-    def _own_name(self) -> Broken:
+    def _own_name(self) -> Violation:
         return "name" if self.name is not None and self.name.startswith("port-") else None
 
     @property
     def label(self) -> str:
-        """The name that it goes by."""
+        """Name of the port, declared or generated."""
         return self.name or f"port-{self.port}{'-udp' if self.protocol == 'UDP' else ''}"
 
 
 class EnvVar(Model):
     """An environment variable."""
 
-    name: str = Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$", max_length=128, description="What the program reads it as.")
-    value: str = Field(default="", max_length=32768, description="A text; put numbers in quotes.")
+    name: str = Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$", max_length=128, description="Name of the variable.")
+    value: str = Field(default="", max_length=32768, description="Value as a string; put numbers in quotes.")
 
-    @rule(
-        "!self.name.startsWith('FRACTUS_')", "names that begin with FRACTUS_ are set by the system; choose another name"
-    )
-    def _own_name(self) -> Broken:
+    @rule("!self.name.startsWith('FRACTUS_')", "names that begin with FRACTUS_ are reserved; choose another name")
+    def _own_name(self) -> Violation:
         return "name" if self.name.startswith("FRACTUS_") else None
 
 
 class Resources(Model):
-    """Kubernetes resources: cpu, memory, and extended ones such as fractus.dev/gpu."""
+    """Resource requests and limits: cpu, memory, ephemeral-storage and extended resources such as fractus.dev/gpu."""
 
     requests: dict[str, Quantity] = Field(
-        default_factory=dict, max_length=32, description="What it needs; the node must have it free."
+        default_factory=dict,
+        max_length=32,
+        description="Resources that the node must have available, as Kubernetes quantities.",
     )
-    limits: dict[str, Quantity] = Field(default_factory=dict, max_length=32, description="What it gets at most.")
+    limits: dict[str, Quantity] = Field(
+        default_factory=dict, max_length=32, description="Maximum resource usage, as Kubernetes quantities."
+    )
 
     @rule(
         "[has(self.requests) ? self.requests : {}, has(self.limits) ? self.limits : {}]"
         f".all(m, m.all(k, k in {list(_RESOURCES)} || (k.size() <= {_NAME_LENGTH} && k.matches('{_EXTENDED}'))))",
-        f"resources are {', '.join(_RESOURCES)}, or extended ones such as fractus.dev/gpu",
+        f"a resource must be {', '.join(_RESOURCES)}, or an extended resource such as fractus.dev/gpu",
     )
-    def _known(self) -> Broken:
+    def _known(self) -> Violation:
         for field, given in (("requests", self.requests), ("limits", self.limits)):
             for name in given:
                 if name not in _RESOURCES and (len(name) > _NAME_LENGTH or not re.fullmatch(_EXTENDED, name)):
@@ -87,7 +89,7 @@ class Resources(Model):
         " quantity(string(self.requests[k])).compareTo(quantity(string(self.limits[k]))) <= 0)",
         "a request must not be above the limit of the same resource",
     )
-    def _within_limits(self) -> Broken:
+    def _within_limits(self) -> Violation:
         for name, amount in self.requests.items():
             if name in self.limits and quantity(amount) > quantity(self.limits[name]):
                 return f"requests.{name}", f"{amount} is above {self.limits[name]}"
@@ -99,7 +101,7 @@ class Resources(Model):
         " quantity(string(self.requests[k])).compareTo(quantity(string(self.limits[k]))) == 0)))",
         "an extended resource needs a limit that is equal to its request",
     )
-    def _not_overcommitted(self) -> Broken:
+    def _not_overcommitted(self) -> Violation:
         for name, amount in self.requests.items():
             if "/" in name and (name not in self.limits or quantity(amount) != quantity(self.limits[name])):
                 return f"limits.{name}"
@@ -108,60 +110,70 @@ class Resources(Model):
     @rule(
         "!has(self.limits) || self.limits.all(k, !k.contains('/') || !isQuantity(string(self.limits[k])) ||"
         " quantity(string(self.limits[k])).isInteger())",
-        "extended resources are whole",
+        "limits of extended resources must be whole numbers",
     )
-    def _whole(self) -> Broken:
+    def _whole(self) -> Violation:
         parts = (name for name, amount in self.limits.items() if "/" in name and not quantity(amount).is_integer())
         return next((f"limits.{name}" for name in parts), None)
 
 
 class EmptyDirectory(Model):
-    """An empty directory that lives as long as the pod."""
+    """A directory that is empty at the start of the pod and deleted with it."""
 
-    size_limit: Quantity | None = Field(default=None, description="Bytes, such as 256Mi; unset: what the node allows.")
-    medium: Literal["disk", "memory"] = Field(default="disk", description="What keeps it; memory counts as the pod's.")
+    size_limit: Quantity | None = Field(
+        default=None, description="Maximum size as a Kubernetes quantity, such as 256Mi; unset: limit of the node."
+    )
+    medium: Literal["disk", "memory"] = Field(
+        default="disk", description="Storage medium; files in memory count as memory of the pod."
+    )
 
 
 class Volume(Model):
-    """Files that the component sees: an empty directory, a ConfigMap, a Secret or a claim of storage."""
+    """Files for a component: an empty directory, a ConfigMap, a Secret or a PersistentVolumeClaim."""
 
-    name: Name = Field(description="Its name among the volumes of the component.")
+    name: Name = Field(description="Name of the volume, unique in the component.")
     mount_path: str = Field(
-        pattern=r"^(/[^/:]+)+$", max_length=512, description="Where the component finds it; an absolute path."
+        pattern=r"^(/[^/:]+)+$", max_length=512, description="Absolute path of the volume in the container."
     )
-    read_only: bool = Field(default=False, description="ConfigMaps and Secrets are read-only anyway.")
+    read_only: bool = Field(
+        default=False, description="Mount without write access. ConfigMaps and Secrets are always read-only."
+    )
     empty_dir: EmptyDirectory | None = None
-    config_map: Name | None = Field(default=None, description="A ConfigMap of the application's namespace.")
-    secret: Name | None = Field(default=None, description="A Secret of the application's namespace.")
-    claim: Name | None = Field(default=None, description="A PersistentVolumeClaim of the application's namespace.")
+    config_map: Name | None = Field(
+        default=None, description="Name of a ConfigMap in the namespace of the application."
+    )
+    secret: Name | None = Field(default=None, description="Name of a Secret in the namespace of the application.")
+    claim: Name | None = Field(
+        default=None, description="Name of a PersistentVolumeClaim in the namespace of the application."
+    )
 
     @rule(
         "[has(self.emptyDir), has(self.configMap), has(self.secret), has(self.claim)].filter(x, x).size() == 1",
         "give exactly one of emptyDir, configMap, secret and claim",
     )
-    def _one_source(self) -> Broken:
+    def _one_source(self) -> Violation:
         given = [s for s in (self.empty_dir, self.config_map, self.secret, self.claim) if s is not None]
         return "" if len(given) != 1 else None
 
     @rule(
         "!has(self.secret) || !self.secret.endsWith('-tls')",
-        "Secrets whose names end in -tls are certificates of components; give yours another name",
+        "Secrets with names ending in -tls are reserved for component certificates; choose another name",
     )
-    def _own_secret(self) -> Broken:
+    def _own_secret(self) -> Violation:
         return "secret" if self.secret is not None and self.secret.endswith("-tls") else None
 
     @rule(
         f"!(self.name in {list(_OWN_VOLUMES)}) && !(self.mountPath in {list(_OWN_VOLUMES.values())})",
-        f"the pod has volumes {' and '.join(_OWN_VOLUMES)} of its own at {' and '.join(_OWN_VOLUMES.values())};"
+        f"the volumes {' and '.join(_OWN_VOLUMES)} at {' and '.join(_OWN_VOLUMES.values())} are reserved;"
         " choose another name and path",
     )
-    def _apart(self) -> Broken:
-        return (
-            "name" if self.name in _OWN_VOLUMES else "mountPath" if self.mount_path in _OWN_VOLUMES.values() else None
-        )
+    def _apart(self) -> Violation:
+        if self.name in _OWN_VOLUMES:
+            return "name"
+        return "mountPath" if self.mount_path in _OWN_VOLUMES.values() else None
 
     def pod_volume(self) -> dict[str, Any]:
-        """The entry for volumes of a pod."""
+        """Return the entry for `volumes` of the pod."""
         if self.empty_dir is not None:
             source: dict[str, Any] = {}
             if self.empty_dir.size_limit is not None:
@@ -176,18 +188,20 @@ class Volume(Model):
         return {"name": self.name, "persistentVolumeClaim": {"claimName": self.claim}}
 
     def mount(self) -> dict[str, Any]:
-        """The entry for volumeMounts of a container."""
+        """Return the entry for `volumeMounts` of the container."""
         fixed = self.config_map is not None or self.secret is not None
         return {"name": self.name, "mountPath": self.mount_path, "readOnly": self.read_only or fixed}
 
 
 class Container(Model):
-    """What runs in the component's pods."""
+    """The container of a component."""
 
     image: str = Field(
-        min_length=1, max_length=512, pattern=_IMAGE, description="A name such as registry.example/app:1.2."
+        min_length=1, max_length=512, pattern=_IMAGE, description="Image reference such as registry.example/app:1.2."
     )
-    command: tuple[str, ...] = Field(default=(), max_length=64, description="Empty: the image's own entry point.")
+    command: tuple[str, ...] = Field(
+        default=(), max_length=64, description="Command of the container; default: the entry point of the image."
+    )
     args: tuple[str, ...] = Field(default=(), max_length=64, description="Arguments of the command.")
     env: tuple[EnvVar, ...] = Field(
         default=(), max_length=256, json_schema_extra=keyed("name"), description="Environment variables."
@@ -196,48 +210,48 @@ class Container(Model):
         default=(),
         max_length=32,
         json_schema_extra=keyed("port", "protocol"),
-        description="The ports it listens on; components that name it in egress call the first.",
+        description="Ports that the component listens on. Components that name it in egress connect to the first one.",
     )
     resources: Resources = Field(default_factory=Resources)
     volumes: tuple[Volume, ...] = Field(
         default=(),
         max_length=16,
         json_schema_extra=keyed("name"),
-        description="Files that it sees besides those of its image.",
+        description="Volumes of the component.",
     )
 
     @model_validator(mode="after")
     def _distinct_keys(self) -> Self:
-        """What the API server refuses by the keys of lists."""
+        """Reject duplicate list keys, as the API server does."""
         for i in _repeated(v.name for v in self.env):
-            raise InvalidObject(f"env[{i}].name", f"{self.env[i].name} is there twice; remove one of them")
+            raise InvalidObject(f"env[{i}].name", f"{self.env[i].name} is duplicated; remove one of the entries")
         for i in _repeated((p.port, p.protocol) for p in self.ports):
-            raise InvalidObject(f"ports[{i}].port", f"{self.ports[i].port} is there twice; remove one of them")
+            raise InvalidObject(f"ports[{i}].port", f"{self.ports[i].port} is duplicated; remove one of the entries")
         for i in _repeated(v.name for v in self.volumes):
-            raise InvalidObject(f"volumes[{i}].name", f"{self.volumes[i].name} is taken; choose another name")
+            raise InvalidObject(f"volumes[{i}].name", f"{self.volumes[i].name} is duplicated; choose another name")
         return self
 
     @rule(
         "!has(self.ports) || self.ports.all(p, !has(p.name) || self.ports.exists_one(q, has(q.name) && q.name == p.name))",
-        "each port needs a name of its own; choose another name",
+        "port names must be unique; choose another name",
     )
-    def _distinct_ports(self) -> Broken:
+    def _distinct_ports(self) -> Violation:
         return next((f"ports[{i}].name" for i in _repeated(p.label for p in self.ports)), None)
 
     @rule(
         "!has(self.volumes) || self.volumes.all(v, self.volumes.exists_one(w, w.mountPath == v.mountPath))",
-        "each volume needs a mountPath of its own; choose another path",
+        "mountPath must be unique; choose another path",
     )
-    def _distinct_paths(self) -> Broken:
+    def _distinct_paths(self) -> Violation:
         return next((f"volumes[{i}].mountPath" for i in _repeated(v.mount_path for v in self.volumes)), None)
 
 
 def _repeated(keys: Iterable[Hashable]) -> list[int]:
-    """Where keys are that came before."""
+    """Return the indexes of keys that occurred before."""
     seen: set[Hashable] = set()
-    found = []
+    repeated = []
     for i, key in enumerate(keys):
         if key in seen:
-            found.append(i)
+            repeated.append(i)
         seen.add(key)
-    return found
+    return repeated

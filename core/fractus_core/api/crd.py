@@ -1,7 +1,7 @@
-"""The CRD generator: `python -m fractus_core.api.crd DIR` writes one manifest a kind.
+"""CRD generator: `python -m fractus_core.api.crd DIR` writes one manifest per kind.
 
-Kubernetes wants structural schemas (inline, typed, no $ref, no null), pydantic writes JSON Schema 2020-12; this module
-maps the one to the other and refuses what it does not understand, so that nothing is lost in silence.
+Kubernetes requires structural schemas (inline, typed, no $ref, no null), but pydantic writes JSON Schema 2020-12. This
+module converts the schemas and raises an error for any keyword that it does not know, so that no rule is lost.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""DirectLink: an ad hoc link that a drone may have with another node, and the traffic that may take it (thesis 8.6)."""
+"""DirectLink: an ad hoc link between a drone and another node, and the services that use it (thesis 8.6)."""
 
 from __future__ import annotations
 
@@ -14,89 +14,95 @@ from fractus_core.api.nodes import CONDITIONS_BY_TYPE, Pairing, Technology
 from fractus_core.api.plans import ApplicationReference
 
 LINKED = "Linked"
-"""Condition of the drone's agent: whether the link is up, or why not."""
+"""Condition set by the drone's agent: True if the link is up."""
 TRAFFIC_DIRECT = "TrafficDirect"
-"""Condition of the drone's agent: whether the traffic takes the link, or why not."""
+"""Condition set by the drone's agent: True if the traffic uses the link."""
 PEER_READY = "PeerReady"
-"""Condition of the other node's agent: whether it takes the drone's calls, or why not."""
+"""Condition set by the agent of the other node: True if it accepts the drone's connections."""
 
 
 class VirtualAddress(OpenModel):
-    """Where clients call a service: the address and port of its Service, which never change."""
+    """Stable address of a service for its clients: the cluster IP and port of its Service."""
 
-    address: str = Field(max_length=45, description="The Service's cluster IP.")
-    port: int = Field(ge=1, le=65535, description="The Service's port.")
-    protocol: Literal["TCP", "UDP"] = Field(default="TCP", description="What it speaks.")
+    address: str = Field(max_length=45, description="Cluster IP of the Service.")
+    port: int = Field(ge=1, le=65535, description="Port of the Service.")
+    protocol: Literal["TCP", "UDP"] = Field(default="TCP", description="Transport protocol (TCP or UDP).")
 
 
 class TargetAddress(OpenModel):
-    """Where the pod on the other node listens."""
+    """Address of the pod on the other node."""
 
-    address: str = Field(max_length=45, description="The pod's IP.")
-    port: int = Field(ge=1, le=65535, description="The pod's port.")
+    address: str = Field(max_length=45, description="IP address of the pod.")
+    port: int = Field(ge=1, le=65535, description="Port of the pod.")
 
 
 class Caller(OpenModel):
-    """An instance on the drone that may call a service."""
+    """An instance on the drone that may call a service over the link."""
 
-    instance: str = Field(description="Name of the instance that calls.")
-    address: str | None = Field(default=None, max_length=45, description="Its pod's IP; unset while there is none.")
+    instance: str = Field(description="Name of the calling instance.")
+    address: str | None = Field(
+        default=None, max_length=45, description="IP address of its pod; unset while it has none."
+    )
 
 
 class LinkedService(OpenModel):
-    """A port of a hybrid component that the drone's components can reach over the link."""
+    """A port of a hybrid component that is reachable over the link."""
 
-    component: str = Field(description="The component that provides it.")
-    instance: str = Field(description="Its instance on the node that is asked.")
+    component: str = Field(description="Component that provides the service.")
+    instance: str = Field(description="Instance of the component on the other node.")
     virtual: VirtualAddress
-    target: TargetAddress | None = Field(default=None, description="Unset while no pod of the instance is ready.")
+    target: TargetAddress | None = Field(
+        default=None, description="Address of a ready pod of the instance; unset while there is none."
+    )
     callers: tuple[Caller, ...] | None = Field(
         default=None,
-        description="Who on the drone may call it over the link; unset where the component names no caller, and all may.",
+        description="Instances on the drone that may call the service; unset if the component does not restrict its callers.",
     )
 
 
 class DirectLinkSpec(OpenModel):
-    """Which two nodes may link, how they find each other, and what for."""
+    """The two nodes of the link, their network settings, and the services that use it."""
 
-    # Open: an agent reads what a newer operator writes.
-    drone: str = Field(description="The node that asks for the link: its agent decides when.")
-    node: str = Field(description="The node that is asked.")
+    # Unknown fields are ignored, because an older agent reads objects of a newer operator.
+    drone: str = Field(description="Name of the drone, whose agent sets up the link.")
+    node: str = Field(description="Name of the other node, which accepts the link.")
     application: ApplicationReference
-    technology: Technology = Field(description="Of the two interfaces.")
-    pairing: Pairing = Field(description="Of the node that is asked: the drone joins its network.")
-    range: float = Field(gt=0, description="Metres that the link reaches: the lesser reach of the two interfaces.")
-    bandwidth: float = Field(gt=0, description="Mbit/s that the link offers well inside its range, in each direction.")
-    position: Position = Field(description="Of the node that is asked.")
-    heuristic: Heuristic = Field(description="What makes one path better than another for the traffic.")
+    technology: Technology = Field(description="Network technology of both interfaces.")
+    pairing: Pairing = Field(description="Network settings of the other node, which the drone joins.")
+    range: float = Field(gt=0, description="Range in metres: the smaller range of the two interfaces.")
+    bandwidth: float = Field(gt=0, description="Bandwidth in Mbit/s and direction at good reception.")
+    position: Position = Field(description="Position of the other node.")
+    heuristic: Heuristic = Field(description="Rule that selects the path of the traffic (cloud or direct).")
     path: tuple[Position, ...] = Field(
         default=(),
-        description="The waypoints that the drone flies in this order; empty where it moves freely in a region.",
+        description="Planned waypoints of the drone in order; empty if the drone flies freely in a region.",
     )
     services: tuple[LinkedService, ...] = Field(
-        default=(), description="What the drone's components call over the link."
+        default=(), description="Services on the other node that components on the drone call."
     )
 
 
 class DirectLinkStatus(OpenModel):
-    """What became of the link; the drone's agent writes it, but for the condition PeerReady."""
+    """State of the link. The drone's agent writes it, except for the condition PeerReady."""
 
     observed_generation: ObservedGeneration = None
-    phase: Literal["Idle", "Connecting", "Up"] | None = Field(default=None, description="How far the link is.")
-    traffic: Literal["cloud", "direct"] | None = Field(default=None, description="Which path the traffic takes.")
-    reason: str | None = Field(default=None, description="CamelCase reason of the last decision, for programs.")
-    message: str | None = Field(default=None, description="The last decision in one sentence, for people.")
-    bandwidth: float | None = Field(default=None, ge=0, description="Mbit/s measured on the link last.")
-    latency: float | None = Field(default=None, ge=0, description="Milliseconds one way, measured on the link last.")
-    switches: int | None = Field(default=None, ge=0, description="How often the traffic changed its path.")
-    last_switch: datetime | None = Field(default=None, description="When it last did.")
+    phase: Literal["Idle", "Connecting", "Up"] | None = Field(default=None, description="State of the link.")
+    traffic: Literal["cloud", "direct"] | None = Field(default=None, description="Current path of the traffic.")
+    reason: str | None = Field(default=None, description="Machine-readable CamelCase reason for the last decision.")
+    message: str | None = Field(default=None, description="Human-readable explanation of the last decision.")
+    bandwidth: float | None = Field(default=None, ge=0, description="Last measured bandwidth of the link in Mbit/s.")
+    latency: float | None = Field(
+        default=None, ge=0, description="Last measured one-way latency of the link in milliseconds."
+    )
+    switches: int | None = Field(default=None, ge=0, description="Number of path changes of the traffic.")
+    last_switch: datetime | None = Field(default=None, description="Time of the last path change.")
     conditions: Conditions = Field(default=(), json_schema_extra=CONDITIONS_BY_TYPE)
 
 
 class DirectLink(
     Resource, plural="directlinks", short="dlk", written_by_operator=True, selectable=(".spec.drone", ".spec.node")
 ):
-    """An ad hoc link between a drone and another node: the operator says who may link, the drone's agent when."""
+    """An ad hoc link between a drone and another node. The operator plans it, and the drone's agent sets it up."""
 
     COLUMNS = (
         ("Drone", "string", ".spec.drone"),

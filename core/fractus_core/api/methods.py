@@ -1,4 +1,4 @@
-"""The methods of the system services (thesis Table 8.2), the vocabulary of policies and grants."""
+"""Methods of the system services (thesis Table 8.2), as used in policies and Grants."""
 
 from __future__ import annotations
 
@@ -22,4 +22,4 @@ METHODS_OF: dict[Service, frozenset[str]] = {
     "mobility": frozenset(MOBILITY_METHODS) | frozenset(CONTROL_METHODS),
     "camera": frozenset(CAMERA_METHODS),
 }
-"""Which methods belong to which service; GetControl and ReturnControl come with the mobility service."""
+"""Methods of each service. GetControl and ReturnControl belong to the mobility service."""

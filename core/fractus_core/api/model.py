@@ -1,4 +1,4 @@
-"""What every kind is made of: the strict model, object metadata, conditions, quantities."""
+"""Base types of every kind: strict models, object metadata, conditions, quantities, timestamps."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ _SCALE = {
 
 
 def quantity(text: str | float) -> float:
-    """Value of a Kubernetes quantity in its base unit (cores, bytes, pieces).
+    """Convert a Kubernetes quantity to its base unit (cores, bytes or items).
 
     Raises:
-        ValueError: the text is not a non-negative Kubernetes quantity.
+        ValueError: `text` is not a non-negative Kubernetes quantity.
     """
     match = re.fullmatch(_QUANTITY, str(text))
     if match is None:
@@ -56,7 +56,7 @@ Quantity = Annotated[
         }
     ),
 ]
-"""A Kubernetes quantity, such as 250m, 1.5 or 512Mi; whole numbers may be written without quotes."""
+"""A Kubernetes quantity such as 250m, 1.5 or 512Mi. Whole numbers may be written without quotes."""
 
 _TIMESTAMP = (
     r"^(19[7-9]|2[0-9][0-9])[0-9]-[0-9]{2}-[0-9]{2}T([01][0-9]|2[0-3]):[0-5][0-9]:[0-5][0-9]([.][0-9]{1,9})?"
@@ -76,30 +76,30 @@ def _checked_timestamp(given: object) -> object:
 Timestamp = Annotated[
     datetime, Field(json_schema_extra={"pattern": _TIMESTAMP, "maxLength": 35}), BeforeValidator(_checked_timestamp)
 ]
-"""A moment as RFC 3339 spells it, with its zone."""
+"""An RFC 3339 timestamp with a time zone."""
 
 
 VALIDATIONS = "x-kubernetes-validations"
 
 MAX_OBJECT_BYTES = 3 * 2**19
-"""Of an object as JSON: what etcd takes by default."""
+"""Maximum size of an object as JSON: the default request limit of etcd."""
 
 
 def _add_rules(schema: dict[str, Any], model: type[Any]) -> None:
-    """Put the CEL of a model's rules (see `api.rules`) into its schema, in the order of their declaration."""
+    """Add the CEL rules of a model (see `api.rules`) to its schema, in the order of their declaration."""
     declared = (decorator.func for decorator in model.__pydantic_decorators__.model_validators.values())
-    rules = [found for check in declared if (found := getattr(check, VALIDATIONS, None)) is not None]
+    rules = [rule for check in declared if (rule := getattr(check, VALIDATIONS, None)) is not None]
     if rules:
         schema[VALIDATIONS] = rules
 
 
 def keyed(*keys: str) -> dict[str, Any]:
-    """What the schema of a list says where no two entries may have the same keys."""
+    """Return the schema keywords of a list whose entries must differ in the given keys."""
     return {"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": list(keys)}
 
 
 class Model(BaseModel):
-    """A frozen value of the API; camelCase outside, snake_case inside, unknown fields refused."""
+    """A frozen value of the API: camelCase in JSON, snake_case in Python, unknown fields rejected."""
 
     model_config = ConfigDict(
         alias_generator=to_camel,
@@ -111,12 +111,12 @@ class Model(BaseModel):
     )
 
     def to_dict(self) -> dict[str, Any]:
-        """The value as Kubernetes stores it: camelCase keys, no nulls, JSON types only."""
+        """Return the value as Kubernetes stores it: camelCase keys, no nulls, JSON types only."""
         return self.model_dump(mode="json", by_alias=True, exclude_none=True)
 
 
 class OpenModel(Model):
-    """A value whose unknown fields are dropped: what others (the API server) may extend."""
+    """A value whose unknown fields are ignored, because another writer (such as the API server) may extend it."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -133,7 +133,7 @@ class OwnerReference(OpenModel):
 
 
 class Metadata(OpenModel):
-    """The part of ObjectMeta that Fractus reads."""
+    """The fields of ObjectMeta that Fractus reads."""
 
     name: Annotated[str, Field(max_length=253, pattern=DNS_SUBDOMAIN)]
     namespace: Name | None = None
@@ -151,18 +151,20 @@ class Metadata(OpenModel):
 class Condition(OpenModel):
     """A Kubernetes condition: one observed fact about an object."""
 
-    type: str = Field(description="What is observed, CamelCase.", max_length=316)
+    type: str = Field(description="CamelCase type of the condition.", max_length=316)
     status: Literal["True", "False", "Unknown"] = Field(
-        description="Whether it holds; Unknown while that cannot be told."
+        description="True, False, or Unknown if the state cannot be determined."
     )
-    reason: str = Field(description="CamelCase reason of the last transition, for programs.", max_length=1024)
-    message: str = Field(default="", description="One sentence for people.", max_length=32768)
-    last_transition_time: datetime = Field(description="When the status last changed.")
-    observed_generation: int | None = Field(default=None, ge=0, description="metadata.generation this was said of.")
+    reason: str = Field(description="Machine-readable CamelCase reason for the last transition.", max_length=1024)
+    message: str = Field(default="", description="Human-readable details.", max_length=32768)
+    last_transition_time: datetime = Field(description="Time of the last change of status.")
+    observed_generation: int | None = Field(
+        default=None, ge=0, description="metadata.generation that the condition describes."
+    )
 
 
-ObservedGeneration = Annotated[int | None, Field(description="metadata.generation that the status was said of.")]
-Conditions = Annotated[tuple[Condition, ...], Field(description="Single facts about it, by type.")]
+ObservedGeneration = Annotated[int | None, Field(description="metadata.generation that the status describes.")]
+Conditions = Annotated[tuple[Condition, ...], Field(description="Current state of the object, by condition type.")]
 
 Column = tuple[str, str, str]
 """A printer column: title, type, JSONPath."""
@@ -172,16 +174,16 @@ AGE: Column = ("Age", "date", ".metadata.creationTimestamp")
 
 
 class Resource(Model):
-    """An object of one of Fractus' kinds."""
+    """An object of a Fractus kind."""
 
     KIND: ClassVar[str]
     PLURAL: ClassVar[str]
     SHORT: ClassVar[str]
     NAMESPACED: ClassVar[bool]
     SELECTABLE: ClassVar[Sequence[str]]
-    """JSONPaths that watches may select on."""
+    """JSONPaths of the fields that watches may select on."""
     WRITTEN_BY_OPERATOR: ClassVar[bool]
-    """The operator alone writes it, of parts that were checked where they came in: its schema needs no rules."""
+    """True if only the operator writes objects of the kind. Its parts are already validated, so the CRD has no CEL rules."""
     COLUMNS: ClassVar[Sequence[Column]] = ()
 
     api_version: Literal["fractus.dev/v1alpha1"] = "fractus.dev/v1alpha1"
@@ -203,15 +205,15 @@ class Resource(Model):
 
     @classmethod
     def from_body(cls, body: Any) -> Self:
-        """Parse an object as the API server or a manifest gives it.
+        """Parse an object from the API server or a manifest.
 
         Raises:
             InvalidObject: with one sentence that names the field and the remedy.
         """
         try:
-            # As JSON, in strict mode: no text is taken for a number, as in the schemas of the API server.
+            # Validate as JSON in strict mode, because the API server does not convert strings to numbers either.
             text = json.dumps(_plain(body), separators=(",", ":"))
-            found = cls.model_validate_json(text, strict=True)
+            parsed = cls.model_validate_json(text, strict=True)
             whole = json.dumps(_plain(body, nulls=True), separators=(",", ":"))
             if whole != text:
                 _refuse_unknown(cls, whole)
@@ -221,7 +223,7 @@ class Resource(Model):
             raise InvalidObject(
                 "", f"has {len(text)} bytes as JSON, more than the {MAX_OBJECT_BYTES} that etcd keeps; split it"
             )
-        return found
+        return parsed
 
     @property
     def name(self) -> str:
@@ -233,10 +235,10 @@ _WHOLE, _LARGEST = 2**63, 10**300
 
 
 def _plain(value: Any, *, nulls: bool = False) -> Any:
-    """Copy mappings and sequences of any type (kopf's views, say) into dicts and lists.
+    """Copy mappings and sequences of any type (such as kopf's views) into dicts and lists.
 
-    As the API server does: a field that is null is not there, unless `nulls`, 2.0 is a whole number, and what has more
-    than 64 bits is none.
+    Normalise values as the API server does: drop null fields unless `nulls` is set, convert whole floats such as 2.0 to
+    integers, and convert integers that do not fit into 64 bits to floats.
     """
     if hasattr(value, "items"):
         return {k: _plain(v, nulls=nulls) for k, v in value.items() if nulls or v is not None}
@@ -248,7 +250,7 @@ def _plain(value: Any, *, nulls: bool = False) -> Any:
 
 
 def _refuse_unknown(model: type[Resource], text: str) -> None:
-    """Refuse fields that are null and that there are not; all other fields were checked without them."""
+    """Reject unknown fields whose value is null. The first validation ran without null fields."""
     try:
         model.model_validate_json(text, strict=True)
     except ValidationError as error:
@@ -262,7 +264,7 @@ def _path(finding: ErrorDetails) -> str:
 
 
 class InvalidObject(ValueError):
-    """An object breaks the rules of its kind; the message names the field and the remedy."""
+    """An object violates the rules of its kind. The message names the field and the remedy."""
 
     def __init__(self, field: str, problem: str) -> None:
         self.field = field
@@ -271,7 +273,7 @@ class InvalidObject(ValueError):
 
     @classmethod
     def from_pydantic(cls, error: ValidationError) -> InvalidObject:
-        """Translate the first finding of pydantic into field path and sentence."""
+        """Convert the first pydantic error to a field path and a sentence."""
         finding = error.errors(include_url=False)[0]
         path = _path(finding)
         context = finding.get("ctx", {}).get("error")
@@ -297,11 +299,11 @@ _SENTENCES = {
     "int_type": "must be a whole number",
     "finite_number": "must be a finite number",
     "bool_type": "must be true or false",
-    "string_type": "must be a text; put it in quotes",
+    "string_type": "must be a string; put it in quotes",
     "missing": "is missing; give it",
     "extra_forbidden": "there is no such field; remove it, or correct its name",
 }
-"""What is wrong, in words of manifests where pydantic uses those of Python."""
+"""Messages in the terms of manifests, by pydantic error type whose own message uses Python terms."""
 
 
 def _problem(finding: ErrorDetails) -> str:

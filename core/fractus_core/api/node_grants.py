@@ -1,4 +1,4 @@
-"""NodeGrants: the Grants of one node in one object, the only one that the node's agent may read."""
+"""NodeGrants: all Grants of one node in one object. The agent of a node can read only its own NodeGrants object."""
 
 from __future__ import annotations
 
@@ -16,51 +16,53 @@ from fractus_core.api.names import is_subdomain
 from fractus_core.api.plans import GrantPhase
 
 NODE_GRANTS_NAMESPACE = "fractus-nodes"
-"""Where the operator keeps them, with an account for each node that may read its own."""
+"""Namespace of the NodeGrants objects. Each node has a service account that may read only its own."""
 
 MAX_UNPACKED_BYTES = 64 * 2**20
-"""Of a node's Grants as JSON: zones are alike in all of them, so that they are packed into a hundredth."""
+"""Maximum size of the Grants of a node as JSON. Compression reduces it to about 1 %, because Grants share zones."""
 MAX_PACKED_BYTES = 2**20
-"""Of the packed text: what etcd takes of an object has room beside it for what the agent reports."""
+"""Maximum length of the packed text. The rest of the etcd object limit is left for the status."""
 MAX_MESSAGE = 1024
 PACKED_METADATA = ("name", "uid", "generation", "labels", "annotations")
-"""What of a Grant's metadata is packed: a change of anything else needs no other text."""
+"""Metadata fields of a Grant that are packed. Changes of other fields do not change the packed text."""
 
 _FIELD = "spec.packed"
 _MEMORY_BYTES = 128 * 2**20
 _LEVEL = 1
-"""Of xz: higher levels take several times as long for a few per cent."""
+"""Compression level of xz. Higher levels take several times as long and save a few per cent."""
 
 
 class NodeGrantsSpec(OpenModel):
     """All Grants of the node."""
 
-    # Open: an agent reads what a newer operator writes.
-    count: int = Field(ge=0, description="How many Grants there are.")
-    packed: str = Field(description="The Grants without their status: a JSON list by name, as xz, in base64.")
+    # Unknown fields are ignored, because an older agent reads objects of a newer operator.
+    count: int = Field(ge=0, description="Number of Grants.")
+    packed: str = Field(
+        description="The Grants without their status: a JSON list sorted by name, xz-compressed, base64-encoded."
+    )
 
 
 class ReportedGrant(OpenModel):
-    """What became of one Grant on the node, as in its own status."""
+    """State of one Grant on the node, as in the status of the Grant."""
 
     uid: str = Field(max_length=128, description="metadata.uid of the Grant.")
-    name: str = Field(max_length=253, description="Its name.")
-    phase: GrantPhase = Field(description="Pending until the node has it; then how its mission stands.")
-    message: str = Field(default="", max_length=MAX_MESSAGE, description="One sentence for people.")
-    observed_generation: Annotated[int, Field(ge=0, description="metadata.generation of the Grant this was said of.")]
+    name: str = Field(max_length=253, description="Name of the Grant.")
+    phase: GrantPhase = Field(description="Pending until the node has stored the Grant; then the state of its mission.")
+    message: str = Field(default="", max_length=MAX_MESSAGE, description="Human-readable explanation.")
+    observed_generation: Annotated[int, Field(ge=0, description="metadata.generation of the Grant that is described.")]
 
 
 class NodeGrantsStatus(OpenModel):
-    """What the node's agent reports; the operator copies it to the Grants."""
+    """State of the Grants as reported by the agent. The operator copies it to the Grants."""
 
     observed_generation: ObservedGeneration = None
     grants: Annotated[tuple[ReportedGrant, ...], Field(json_schema_extra=keyed("uid"))] = Field(
-        default=(), description="One entry for each Grant that the agent knows."
+        default=(), description="State of each Grant that the agent knows."
     )
 
 
 class NodeGrants(Resource, plural="nodegrants", short="fng", namespaced=True, written_by_operator=True):
-    """The Grants of one node, by whose name it is called; the node's agent may read no other."""
+    """The Grants of one node. The object is named after the node, and its agent can read no other."""
 
     COLUMNS = (("Grants", "integer", ".spec.count"), AGE)
 
@@ -70,15 +72,15 @@ class NodeGrants(Resource, plural="nodegrants", short="fng", namespaced=True, wr
 
 
 def pack(bodies: Iterable[Mapping[str, Any]]) -> str:
-    """Grants as `NodeGrantsSpec.packed`; the same Grants, in any order, make the same text.
+    """Pack Grants for `NodeGrantsSpec.packed`. The result does not depend on their order.
 
-    Some 2 ms for each Grant of 31 kB: many are packed in a thread.
+    Packing takes about 2 ms per Grant of 31 kB, so pack many Grants in a thread.
 
     Args:
-        bodies: as the API server gives them.
+        bodies: Grants as returned by the API server.
 
     Raises:
-        InvalidObject: they are larger than MAX_UNPACKED_BYTES, or MAX_PACKED_BYTES when they are packed.
+        InvalidObject: The Grants exceed MAX_UNPACKED_BYTES, or MAX_PACKED_BYTES when packed.
     """
     grants = [
         {
@@ -99,13 +101,18 @@ def pack(bodies: Iterable[Mapping[str, Any]]) -> str:
 
 
 def pack_oldest(bodies: Sequence[Mapping[str, Any]]) -> tuple[str, int]:
-    """Grants as `NodeGrantsSpec`: packed, and how many; of too many the oldest that fit.
+    """Pack the Grants of a node. If they are too many, pack the oldest ones that fit.
 
-    So what is revoked always leaves the node, and what is not granted yet has to wait.
+    Keeping the oldest Grants means that revoked Grants always leave the node and that new Grants have to wait.
+
+    Returns:
+        The packed text and the number of packed Grants.
     """
     oldest = sorted(bodies, key=lambda body: (str(body["metadata"].get("creationTimestamp", "")), _name(body)))
-    packed, fit, too_many = "", 0, len(oldest) + 1
+    packed = ""
+    fit = 0
     count = len(oldest)
+    too_many = count + 1
     while True:
         try:
             packed, fit = pack(oldest[:count]), count
@@ -121,38 +128,40 @@ def _name(body: Mapping[str, Any]) -> str:
 
 
 def unpack(packed: str, count: int) -> tuple[dict[str, Any], ...]:
-    """The Grants of `NodeGrantsSpec.packed`.
+    """Unpack the Grants of `NodeGrantsSpec.packed`.
 
     Args:
-        packed: what `pack` made.
-        count: how many there are.
+        packed: Text made by `pack`.
+        count: Expected number of Grants.
 
     Raises:
-        InvalidObject: it is not what `pack` makes of that many, or larger than MAX_UNPACKED_BYTES.
+        InvalidObject: The text is damaged, exceeds MAX_UNPACKED_BYTES, or holds another number of Grants.
     """
     try:
-        # Of what goes in some is kept for later: it ends where the bound is, however well it is packed.
+        # The output limit bounds the memory, regardless of the compression ratio.
         unpacker = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=_MEMORY_BYTES)
         text = unpacker.decompress(base64.b64decode(packed, validate=True), MAX_UNPACKED_BYTES)
         if not unpacker.eof:
             reason = "is cut short" if unpacker.needs_input else f"holds more than {MAX_UNPACKED_BYTES} bytes"
             raise InvalidObject(_FIELD, f"{reason}; the operator writes it again")
-        found = json.loads(text)
+        grants = json.loads(text)
     except (binascii.Error, lzma.LZMAError, ValueError, RecursionError) as error:
         if isinstance(error, InvalidObject):
             raise
         raise InvalidObject(_FIELD, f"cannot be unpacked ({error}); the operator writes it again") from None
-    if not isinstance(found, list) or not all(_named(body) for body in found):
-        raise InvalidObject(_FIELD, "is no list of Grants; the operator writes it again")
-    if len(found) != count:
+    if not isinstance(grants, list) or not all(_has_identity(body) for body in grants):
+        raise InvalidObject(_FIELD, "is not a list of Grants; the operator writes it again")
+    if len(grants) != count:
         raise InvalidObject(
-            _FIELD, f"holds {len(found)} Grants, not the {count} of spec.count; the operator writes it again"
+            _FIELD, f"holds {len(grants)} Grants, not the {count} of spec.count; the operator writes it again"
         )
-    return tuple(found)
+    return tuple(grants)
 
 
-def _named(body: Any) -> bool:
-    """Whether it has a name and a uid as the API server gives them: files are called by the one."""
+def _has_identity(body: Any) -> bool:
+    """Return True if a body has a uid, and a name that is safe as a file name."""
     metadata = body.get("metadata") if isinstance(body, dict) else None
-    name, uid = (metadata.get("name"), metadata.get("uid")) if isinstance(metadata, dict) else (None, None)
-    return isinstance(name, str) and is_subdomain(name) and isinstance(uid, str)
+    if not isinstance(metadata, dict):
+        return False
+    name = metadata.get("name")
+    return isinstance(name, str) and is_subdomain(name) and isinstance(metadata.get("uid"), str)

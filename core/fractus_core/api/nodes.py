@@ -1,4 +1,4 @@
-"""Drone, EdgeNode and Depot: what there is to deploy on (thesis Listings 9 and 10)."""
+"""Drone, EdgeNode and Depot: the nodes that applications are deployed on (thesis Listings 9 and 10)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from fractus_core.api.geometry import Point, Position
 from fractus_core.api.methods import CameraMethod, MobilityMethod
 from fractus_core.api.model import AGE, GROUP, READY, Conditions, Model, OpenModel, Resource
 from fractus_core.api.names import Name
-from fractus_core.api.rules import Broken, named_by_others, rule
+from fractus_core.api.rules import Violation, referenced_by, rule
 
 Technology = Literal["Ethernet", "4G", "5G", "WiFi", "BLE"]
 FlightState = Literal["unknown", "inactive", "charging", "takingOff", "flying", "landing"]
@@ -20,74 +20,77 @@ GROUNDED: frozenset[FlightState] = frozenset({"inactive", "charging"})
 """Flight states of a drone on the ground."""
 
 BANDWIDTH_MBPS: dict[Technology, float] = {"Ethernet": 100.0, "4G": 8.0, "5G": 50.0, "WiFi": 12.0, "BLE": 0.7}
-"""What applications get of an interface in a good place, where its node does not say: Mbit/s."""
+"""Default usable bandwidth of an interface at good reception, in Mbit/s."""
 
 FLIGHT_REPORT_S, DRONE_REPORT_S, EDGE_REPORT_S = 5.0, 30.0, 60.0
-"""Seconds between two reports of an agent at most: of a drone in the air, of one on the ground, of an edge node."""
+"""Maximum interval between two status reports of an agent, in seconds: airborne drone, grounded drone, edge node."""
 
 
 CONDITIONS_BY_TYPE: dict[str, JsonValue] = {"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["type"]}
-"""Agent and operator each write conditions of their own."""
+"""The agent and the operator write different conditions of one object."""
 
 
 GROUNDED_ANNOTATION = f"{GROUP}/grounded"
-"""On a Drone: someone sees it on the ground; the value is the lastSeen that this is said of, and it counts until the next report."""
+"""Annotation of a Drone that a person saw on the ground. The value is the `lastSeen` of the last report before that.
+The annotation is ignored after the next report."""
 
 ON_MISSION = "OnMission"
-"""Condition of a Drone, by the operator: unless False, it may have taken off since its last report."""
+"""Condition of a Drone, set by the operator: unless it is False, the drone may have taken off since its last report."""
 
 
 def is_airborne(state: str | None, last: str | None) -> bool:
-    """Whether a drone is in the air for all that is known: one that is not heard of any more is where it was.
+    """Return True if a drone is airborne according to its last known state. An unreachable drone keeps its last state.
 
     Args:
-        state: its flight state; None while it was never heard of, which takes it to be on the ground.
-        last: the last one that was known.
+        state: Current flight state. None if the drone never reported, which counts as on the ground.
+        last: Last known flight state.
     """
     known = last if state in {None, "unknown"} else state
     return known not in {None, "unknown", *GROUNDED}
 
 
 class Pairing(Model):
-    """How two interfaces of one technology find each other."""
+    """Network settings with which two interfaces of one technology connect."""
 
-    mode: Literal["adhoc", "infrastructure"] = Field(default="adhoc", description="Ad hoc, or through an access point.")
+    mode: Literal["adhoc", "infrastructure"] = Field(
+        default="adhoc", description="adhoc (directly), or infrastructure (through an access point)."
+    )
     network_id: str = Field(
-        min_length=1, max_length=32, pattern=r"^[ -~]+$", description="Name of the network (SSID for WiFi), in ASCII."
+        min_length=1, max_length=32, pattern=r"^[ -~]+$", description="Network name (SSID for WiFi), ASCII."
     )
 
 
 class Interface(Model):
     """A network interface of a node."""
 
-    technology: Technology = Field(description="What it connects by.")
+    technology: Technology = Field(description="Network technology of the interface.")
     device: str | None = Field(
         default=None,
         max_length=15,
         pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$",
-        description="Name of the device on the node, such as wlan0.",
+        description="Name of the network device on the node, such as wlan0.",
     )
     range: float | None = Field(
-        default=None, gt=0, le=100_000, description="Reach of a direct link in metres; unset: no direct links."
+        default=None, gt=0, le=100_000, description="Range of a direct link in metres; unset: no direct links."
     )
-    pairing: Pairing | None = Field(default=None, description="Needed for direct links.")
+    pairing: Pairing | None = Field(default=None, description="Network settings for direct links; required for them.")
     bandwidth: float | None = Field(
         default=None,
         gt=0,
         le=100_000,
-        description="Mbit/s that applications get of it in a good place; unset: "
+        description="Usable bandwidth at good reception, in Mbit/s; default: "
         + ", ".join(f"{mbps:g} for {technology}" for technology, mbps in BANDWIDTH_MBPS.items())
         + ".",
     )
 
     @property
     def bandwidth_mbps(self) -> float:
-        """The bandwidth, declared or usual for its technology."""
+        """Declared bandwidth, or the default of the technology."""
         return self.bandwidth if self.bandwidth is not None else BANDWIDTH_MBPS[self.technology]
 
 
 def direct_interface(interfaces: Iterable[Interface]) -> Interface | None:
-    """The interface that a node's agent makes direct links over: the first with a device, a range and a pairing."""
+    """Return the interface for direct links: the first one with a device, a range and a pairing."""
     usable = (each for each in interfaces if each.device and each.range is not None and each.pairing is not None)
     return next(usable, None)
 
@@ -95,56 +98,59 @@ def direct_interface(interfaces: Iterable[Interface]) -> Interface | None:
 class Dimensions(Model):
     """Outer dimensions of an airframe."""
 
-    height: float = Field(gt=0, description="Millimetres.")
-    length: float = Field(gt=0, description="Millimetres.")
-    width: float = Field(gt=0, description="Millimetres.")
+    height: float = Field(gt=0, description="Height in millimetres.")
+    length: float = Field(gt=0, description="Length in millimetres.")
+    width: float = Field(gt=0, description="Width in millimetres.")
 
 
 class PhysicalFeatures(Model):
-    """The airframe."""
+    """Physical properties of the airframe."""
 
     dimensions: Dimensions | None = None
     mtom: float | None = Field(default=None, gt=0, description="Maximum take-off mass in grams.")
 
 
 class MobilityFeatures(Model):
-    """What the mobility service of a drone offers."""
+    """The mobility service of a drone."""
 
-    autopilot: Literal["ardupilot"] = Field(default="ardupilot", description="The autopilot's firmware family.")
+    autopilot: Literal["ardupilot"] = Field(default="ardupilot", description="Autopilot firmware family.")
     connection: str = Field(
         default="tcp:127.0.0.1:5760",
         pattern=r"^(tcp|udpin|udpout|serial):.+$",
         max_length=128,
-        description="Link to the autopilot on the node: tcp:, udpin:, udpout: or serial:DEVICE:BAUD.",
+        description="Connection from the node to the autopilot: tcp:, udpin:, udpout: or serial:DEVICE:BAUD.",
     )
-    max_altitude: float = Field(gt=0, le=20000, description="Metres above home.")
-    max_flight_time: float = Field(gt=0, le=1440, description="Minutes with a full battery.")
-    max_speed: float = Field(gt=0, le=100, description="Metres per second over ground.")
-    methods: tuple[MobilityMethod, ...] = Field(min_length=1, max_length=32, description="Methods offered.")
+    max_altitude: float = Field(gt=0, le=20000, description="Maximum altitude in metres above home.")
+    max_flight_time: float = Field(gt=0, le=1440, description="Flight time with a full battery, in minutes.")
+    max_speed: float = Field(gt=0, le=100, description="Maximum ground speed in metres per second.")
+    methods: tuple[MobilityMethod, ...] = Field(min_length=1, max_length=32, description="Supported methods.")
 
 
 class CameraMount(Model):
-    """How a camera sits on its node."""
+    """Mounting position and orientation of a camera."""
 
     pitch: float = Field(
-        default=-90, ge=-90, le=90, description="Degrees: 0 looks forward, -90 straight down, 90 straight up."
+        default=-90, ge=-90, le=90, description="Pitch in degrees: 0 is forward, -90 straight down, 90 straight up."
     )
     yaw: float = Field(
         default=0,
         ge=-360,
         le=360,
-        description="Degrees clockwise from the drone's nose; on an edge node from true north.",
+        description="Yaw in degrees clockwise: from the nose of a drone, from true north on an edge node.",
     )
-    stabilised: bool = Field(default=False, description="Whether a gimbal keeps it level while the airframe tilts.")
+    stabilised: bool = Field(
+        default=False, description="True if a gimbal keeps the camera level while the airframe tilts."
+    )
     gimbal: bool = Field(
         default=False,
-        description="Whether a gimbal of the autopilot's moves it: its view then follows the attitude that is measured.",
+        description="True if a gimbal of the autopilot moves the camera. The measured gimbal attitude then determines its view.",
     )
     height: float | None = Field(
         default=None,
         ge=0,
         le=10_000,
-        description="On an edge node: metres above the ground. Unset: unknown, and it may see everything around it.",
+        description="Height above the ground in metres, for edge nodes only. If unset, privacy policies assume that the"
+        " camera may see everything around it.",
     )
 
 
@@ -153,11 +159,11 @@ def _coefficient(name: str) -> Any:
 
 
 class CameraLens(Model):
-    """How a camera's lens projects what it sees."""
+    """Projection model of a camera lens."""
 
     model: Literal["pinhole", "brownConrady", "equidistant"] = Field(
-        description="pinhole: straight lines stay straight (as do those of a picture that is rectified); brownConrady: pinhole"
-        " with the distortion that calibration tells; equidistant: a fisheye, with angles in proportion to pixels."
+        description="Lens model. pinhole: straight lines stay straight (also for rectified images). brownConrady: pinhole with"
+        " calibrated distortion coefficients. equidistant: fisheye, angles are proportional to pixels."
     )
     k1: float | None = _coefficient("k1")
     k2: float | None = _coefficient("k2")
@@ -169,49 +175,55 @@ class CameraLens(Model):
         "self.model == 'brownConrady' || !(has(self.k1) || has(self.k2) || has(self.k3) || has(self.p1) || has(self.p2))",
         "distortion coefficients belong to model brownConrady",
     )
-    def _coefficients(self) -> Broken:
+    def _coefficients(self) -> Violation:
         given = [name for name in ("k1", "k2", "k3", "p1", "p2") if getattr(self, name) is not None]
         return given[0] if given and self.model != "brownConrady" else None
 
 
 class CameraFeatures(Model):
-    """What the camera service of a node offers."""
+    """The camera service of a node."""
 
     connection: str = Field(
         default="test:",
         pattern=r"^(https?://[^/].*|v4l2:/dev/.+|picamera2:[0-9]|directory:/.+|test:)$",
         max_length=512,
-        description="Where pictures come from: http://HOST/snapshot.jpg, v4l2:/dev/video0, picamera2:0, directory:/PATH"
-        " of geotagged pictures, or test: for a drawn one.",
+        description="Image source: http://HOST/snapshot.jpg, v4l2:/dev/video0, picamera2:0, directory:/PATH with geotagged"
+        " images, or test: for generated images.",
     )
-    model: str = Field(default="", max_length=128, description="Make and model.")
+    model: str = Field(default="", max_length=128, description="Manufacturer and model.")
     resolution: str = Field(
-        default="1920x1080", pattern=r"^[1-9][0-9]{1,4}x[1-9][0-9]{1,4}$", description="Pixels, WIDTHxHEIGHT."
+        default="1920x1080", pattern=r"^[1-9][0-9]{1,4}x[1-9][0-9]{1,4}$", description="WIDTHxHEIGHT in pixels."
     )
-    sensor_type: Literal["RGB", "IR"] = Field(default="RGB", description="What the sensor sees.")
+    sensor_type: Literal["RGB", "IR"] = Field(default="RGB", description="Spectral range: RGB or IR (infrared).")
     horizontal_field_of_view: float | None = Field(
         default=None,
         gt=0,
         lt=180,
-        description="Degrees from side to side through the middle of the picture, distortion included. Unset: unknown, and"
-        " privacy policies take it to see everything around.",
+        description="Horizontal field of view in degrees through the image centre, including distortion. If unset, privacy"
+        " policies assume that the camera sees everything around it.",
     )
     lens: CameraLens | None = Field(
-        default=None, description="Unset: unknown, and privacy policies take it to see what any of these lenses may."
+        default=None,
+        description="Lens model. If unset, privacy policies assume the widest view of all supported models.",
     )
     mount: CameraMount | None = Field(
-        default=None, description="Unset: unknown, and privacy policies take it to look everywhere."
+        default=None,
+        description="Mounting of the camera. If unset, privacy policies assume that it may look in any direction.",
     )
-    methods: tuple[CameraMethod, ...] = Field(min_length=1, max_length=32, description="Methods offered.")
+    methods: tuple[CameraMethod, ...] = Field(min_length=1, max_length=32, description="Supported methods.")
 
     @property
     def pixels(self) -> tuple[int, int]:
-        """Width and height."""
+        """Width and height in pixels."""
         width, height = self.resolution.split("x")
         return int(width), int(height)
 
     def unknown_view(self, fixed: bool) -> str:
-        """What is missing to know what it sees, on a fixed node or a drone; empty when nothing is."""
+        """Return the missing fields without which the field of view is unknown, comma-separated; empty if none is missing.
+
+        Args:
+            fixed: True for an edge node, False for a drone.
+        """
         missing = [] if self.horizontal_field_of_view is not None else ["horizontalFieldOfView"]
         if self.mount is None:
             missing.append("mount")
@@ -228,33 +240,33 @@ class NodeServices(Model):
 
 
 class DroneSpec(Model):
-    """A drone: airframe, interfaces, services."""
+    """Airframe, network interfaces and services of a drone."""
 
     mobility_type: Literal["quadcopter", "hexacopter", "octocopter"] = Field(
-        default="quadcopter", description="How it moves."
+        default="quadcopter", description="Airframe type."
     )
     class_: Literal["C0", "C1", "C2", "C3", "C4", "C5", "C6"] | None = Field(
-        default=None, alias="class", description="Class of Commission Delegated Regulation (EU) 2019/945."
+        default=None, alias="class", description="UAS class according to Delegated Regulation (EU) 2019/945."
     )
     physical_features: PhysicalFeatures = Field(default_factory=PhysicalFeatures)
-    interfaces: tuple[Interface, ...] = Field(default=(), max_length=16, description="Its network interfaces.")
+    interfaces: tuple[Interface, ...] = Field(default=(), max_length=16, description="Network interfaces.")
     services: NodeServices = Field(default_factory=NodeServices)
-    depot: Name | None = Field(default=None, description="The Depot it is kept in.")
+    depot: Name | None = Field(default=None, description="Name of the Depot where the drone is kept.")
     home: Position | None = Field(
-        default=None, description="Where it stands when not in use; alt is AMSL ground height."
+        default=None, description="Parking position; alt is the ground elevation in metres above mean sea level."
     )
     autonomy: int | None = Field(
         default=None,
         ge=0,
-        description="Seconds its pods stay when the node is unreachable; unset: indefinitely.",
+        description="Seconds for which pods stay on the drone while its node is unreachable; unset: no time limit.",
     )
 
     @rule(
         "!has(self.services) || !has(self.services.camera) || !has(self.services.camera.mount)"
         " || !has(self.services.camera.mount.height)",
-        "height is for the camera of an edge node; a drone's is where the drone is",
+        "mount.height applies to cameras of edge nodes only; remove it",
     )
-    def _flies_its_camera(self) -> Broken:
+    def _no_camera_height(self) -> Violation:
         mount = self.services.camera.mount if self.services.camera is not None else None
         return "services.camera.mount.height" if mount is not None and mount.height is not None else None
 
@@ -262,35 +274,37 @@ class DroneSpec(Model):
 class Battery(OpenModel):
     """State of a drone's battery."""
 
-    remaining: float = Field(ge=0, le=1, description="Share of the full charge, 0 to 1.")
-    voltage: float | None = Field(default=None, description="Volts.")
-    current: float | None = Field(default=None, description="Amperes drawn.")
+    remaining: float = Field(ge=0, le=1, description="State of charge, 0 to 1.")
+    voltage: float | None = Field(default=None, description="Voltage in volts.")
+    current: float | None = Field(default=None, description="Current draw in amperes.")
 
 
 _AUDIT: Any = Field(
     default=(),
     max_length=16,
-    description="LOG:NUMBER:HASH of the last entries of the services' audit logs, for `fractus audit verify --since`.",
+    description="Last entries of the audit logs of the services as LOG:NUMBER:HASH, for `fractus audit verify --since`.",
 )
 
 
 class DroneStatus(OpenModel):
-    """What the node's agent sees; where it sees nothing, the position and battery are the last known ones."""
+    """State of a drone as reported by its agent. Unavailable position and battery values keep their last known value."""
 
     flight_state: FlightState = Field(
-        default="unknown", description="What the drone does now; unknown while nothing is heard of it."
+        default="unknown", description="Current flight state; unknown without current telemetry."
     )
-    last_flight_state: FlightState | None = Field(default=None, description="The last flight state that was known.")
+    last_flight_state: FlightState | None = Field(default=None, description="Last known flight state.")
     position: Position | None = None
     battery: Battery | None = None
-    controller: str | None = Field(default=None, description="Who flies: system, pilot, or the driver's identity.")
-    last_seen: datetime | None = Field(default=None, description="When its agent last wrote this.")
+    controller: str | None = Field(
+        default=None, description="Control authority: system, pilot, or the SPIFFE ID of the driver."
+    )
+    last_seen: datetime | None = Field(default=None, description="Time of the last report of the agent.")
     audit: tuple[str, ...] = _AUDIT
     conditions: Conditions = Field(default=(), json_schema_extra=CONDITIONS_BY_TYPE)
 
     @property
     def in_air(self) -> bool:
-        """Whether it is in the air, for all that is known."""
+        """True if the drone is airborne according to its last known state."""
         return is_airborne(self.flight_state, self.last_flight_state)
 
 
@@ -314,22 +328,25 @@ class Drone(Resource, plural="drones", short="drn"):
 
     @property
     def in_air(self) -> bool:
-        """Whether it is in the air, for all that is known."""
+        """True if the drone is airborne according to its last known state."""
         return self.status is not None and self.status.in_air and not self.grounded_by_hand
 
     @property
     def may_take_off(self) -> bool:
-        """Whether it may have taken off since its last report, for all that is known."""
+        """True if the drone may have taken off since its last report."""
         conditions = self.status.conditions if self.status is not None else ()
         unsure = any(c.type == ON_MISSION and c.status != "False" for c in conditions)
         return unsure and not self.grounded_by_hand
 
     @property
     def grounded_by_hand(self) -> bool:
-        """Whether someone saw it on the ground, and nothing was heard of it since."""
-        said, seen = self.metadata.annotations.get(GROUNDED_ANNOTATION), self.status and self.status.last_seen
+        """True if a person declared the drone grounded (`GROUNDED_ANNOTATION`) and it has not reported since."""
+        declared = self.metadata.annotations.get(GROUNDED_ANNOTATION)
+        last_seen = self.status.last_seen if self.status is not None else None
+        if declared is None or last_seen is None:
+            return False
         try:
-            return said is not None and seen is not None and datetime.fromisoformat(said.replace("Z", "+00:00")) == seen
+            return datetime.fromisoformat(declared.replace("Z", "+00:00")) == last_seen
         except ValueError:
             return False
 
@@ -338,27 +355,27 @@ class EdgeNodeSpec(Model):
     """A fixed node at the edge."""
 
     location: Position
-    interfaces: tuple[Interface, ...] = Field(default=(), max_length=16, description="Its network interfaces.")
+    interfaces: tuple[Interface, ...] = Field(default=(), max_length=16, description="Network interfaces.")
     services: NodeServices = Field(default_factory=NodeServices)
 
-    @rule("!has(self.services) || !has(self.services.mobility)", "an edge node does not fly; remove services.mobility")
-    def _fixed(self) -> Broken:
+    @rule("!has(self.services) || !has(self.services.mobility)", "an edge node cannot fly; remove services.mobility")
+    def _no_mobility(self) -> Violation:
         return "services.mobility" if self.services.mobility is not None else None
 
     @rule(
         "!has(self.services) || !has(self.services.camera) || !has(self.services.camera.mount)"
         " || !has(self.services.camera.mount.gimbal) || !self.services.camera.mount.gimbal",
-        "a gimbal belongs to a drone's autopilot; give pitch and yaw of the camera",
+        "an edge node has no gimbal; remove gimbal and set pitch and yaw of the camera",
     )
-    def _no_gimbal(self) -> Broken:
+    def _no_gimbal(self) -> Violation:
         mount = self.services.camera.mount if self.services.camera is not None else None
         return "services.camera.mount.gimbal" if mount is not None and mount.gimbal else None
 
 
 class EdgeNodeStatus(OpenModel):
-    """What the node's agent last saw."""
+    """State of an edge node as reported by its agent."""
 
-    last_seen: datetime | None = Field(default=None, description="When its agent last wrote this.")
+    last_seen: datetime | None = Field(default=None, description="Time of the last report of the agent.")
     audit: tuple[str, ...] = _AUDIT
     conditions: Conditions = Field(default=(), json_schema_extra=CONDITIONS_BY_TYPE)
 
@@ -379,10 +396,10 @@ class EdgeNode(Resource, plural="edgenodes", short="edn"):
 
 
 class DepotSpec(Model):
-    """Where drones are kept and charged."""
+    """Location of a drone base."""
 
     location: Point
-    radius: float = Field(default=30, gt=0, le=10_000, description="Metres around location that belong to the depot.")
+    radius: float = Field(default=30, gt=0, le=10_000, description="Radius of the depot around location, in metres.")
 
 
 class Depot(Resource, plural="depots", short="dpt"):
@@ -397,4 +414,4 @@ class Depot(Resource, plural="depots", short="dpt"):
     kind: Literal["Depot"] = "Depot"
     spec: DepotSpec
 
-    _nameable = named_by_others("Depot", "drones and applications")
+    _nameable = referenced_by("Depot", "drones and applications")

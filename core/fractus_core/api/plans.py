@@ -1,4 +1,4 @@
-"""DeploymentPlan and Grant: what the operator decided, and what a node needs to enforce it offline."""
+"""DeploymentPlan: the result of planning an application."""
 
 from __future__ import annotations
 
@@ -25,120 +25,141 @@ GeoJson = Annotated[dict[str, Any], WithJsonSchema({"type": "object", "x-kuberne
 
 
 class Alternative(Model):
-    """A drone that could fly the application, with what ranks it."""
+    """A drone that could also fly the application."""
 
-    node: str = Field(description="The drone.")
-    score: float = Field(description="Higher is better; comparable within one plan only.")
+    node: str = Field(description="Name of the drone.")
+    score: float = Field(description="Score; higher is better, comparable only within one plan.")
 
 
 class TransitLeg(Model):
-    """A straight piece of a transit, that is of flight by the system."""
+    """A straight leg of a transit flight, which the system flies."""
 
     start: Position
     end: Position
 
 
 class LegLegality(Model):
-    """A leg that policies do not let be flown as it was asked for, as the policy engine judges it from standstill."""
+    """A leg that policies do not allow as requested, judged by the policy engine for a start from hover."""
 
     start: Position
     end: Position
-    flown_by: Literal["system", "driver"] = Field(description="Whose leg it is.")
+    flown_by: Literal["system", "driver"] = Field(description="Control authority on the leg.")
     outcome: Literal["Detour", "Corrected", "Denied"] = Field(
-        description="The system flies around; altitude or speed are corrected; it is not flown, or not to its end."
+        description="Detour: the system flies around. Corrected: altitude or speed is changed. Denied: the leg is not flown"
+        " (completely)."
     )
-    reason: str = Field(description="CamelCase, for programs.")
-    message: str = Field(description="One sentence for people.")
-    policies: tuple[str, ...] = Field(default=(), description="Those that decided, the most restrictive first.")
+    reason: str = Field(description="Machine-readable CamelCase reason.")
+    message: str = Field(description="Human-readable explanation.")
+    policies: tuple[str, ...] = Field(default=(), description="Names of the deciding policies, most restrictive first.")
 
 
 class Mission(Model):
-    """What the application takes of the drone, with the way to its start and home, and what the drone has."""
+    """Estimated flight of the application, including the approach from and the return to the home position."""
 
-    distance: float = Field(ge=0, description="Metres over ground.")
-    duration: float = Field(ge=0, description="Minutes of flight.")
-    available: float = Field(description="Minutes the drone can fly with its reserve kept.")
+    distance: float = Field(ge=0, description="Ground distance in metres.")
+    duration: float = Field(ge=0, description="Flight time in minutes.")
+    available: float = Field(description="Available flight time of the drone in minutes, without the battery reserve.")
 
 
 class DroneChoice(Model):
-    """The drone that flies, and the runners-up in order."""
+    """The selected drone, and the alternatives in order of preference."""
 
-    node: str = Field(description="The drone.")
-    score: float | None = Field(default=None, description="Higher is better; comparable within one plan only.")
+    node: str = Field(description="Name of the drone.")
+    score: float | None = Field(default=None, description="Score; higher is better, comparable only within one plan.")
     shared_with: str | None = Field(
-        default=None, description="namespace/name of the application that flies the drone; this one comes along."
+        default=None,
+        description="namespace/name of the application that flies the drone, if this application shares its flight.",
     )
-    mission: Mission | None = Field(default=None, description="Unset when the application comes along.")
-    transit: tuple[TransitLeg, ...] = Field(default=(), description="The legs that the system flies, in order.")
+    mission: Mission | None = Field(
+        default=None, description="Estimated flight; unset if the application shares the flight of another one."
+    )
+    transit: tuple[TransitLeg, ...] = Field(default=(), description="Legs that the system flies, in order.")
     legality: tuple[LegLegality, ...] = Field(
         default=(),
-        description="The legs that policies deny, correct or lead around, in order, as of the last change of policies and"
-        " zones; empty: all are legal as asked.",
+        description="Legs that policies deny, correct or divert, in order, according to the latest policies and zones;"
+        " empty: all legs are allowed as requested.",
     )
     legality_omitted: int | None = Field(
-        default=None, ge=1, description="How many such legs are not listed, for there are too many."
+        default=None, ge=1, description="Number of such legs omitted from `legality` because of its size limit."
     )
     policy_conflict: str | None = Field(
-        default=None, description="Why the policies do not let the mission be flown as planned; unset: they do."
+        default=None, description="Reason why policies do not allow the mission as planned; unset: they allow it."
     )
-    alternatives: tuple[Alternative, ...] = Field(default=(), description="The next best drones, best first.")
+    alternatives: tuple[Alternative, ...] = Field(
+        default=(), description="Other drones that could fly the application, best first."
+    )
 
 
 class Serves(Model):
-    """Which instance a hybrid instance is near to."""
+    """The instance near which a hybrid instance is placed."""
 
-    component: str = Field(description="Its component.")
-    node: str = Field(description="Its node.")
+    component: str = Field(description="Component of that instance.")
+    node: str = Field(description="Node of that instance.")
 
 
 class PlannedInstance(Model):
     """One instance of a component on a node."""
 
     component: str = Field(description="Name of the component.")
-    instance: str = Field(description="Name of the instance, unique in the namespace; pods and grants carry it.")
-    node: str | None = Field(description="Name of the node; null: any cloud node.", default=None)
-    placement: Placement = Field(description="As the component declares it.")
-    role: Role = Field(
-        description="What it is there for: on the drone, at a location, near another instance, in the cloud."
+    instance: str = Field(
+        description="Name of the instance, unique in the namespace and used by its pods and its Grant."
     )
-    replicas: int = Field(default=1, ge=1, description="Pods of it; more than one only in the cloud.")
+    node: str | None = Field(description="Name of the node; unset: any cloud node.", default=None)
+    placement: Placement = Field(description="Placement declared by the component.")
+    role: Role = Field(
+        description="Role of the instance: drone, static (at a location), hybrid-edge (near another edge instance),"
+        " hybrid-drone (along the flight path) or cloud."
+    )
+    replicas: int = Field(default=1, ge=1, description="Number of pods; greater than 1 only in the cloud.")
     serves: Serves | None = None
-    coverage: float | None = Field(default=None, ge=0, le=1, description="Share of the operation area it adds.")
+    coverage: float | None = Field(
+        default=None,
+        ge=0,
+        le=1,
+        description="Share of the operation area that this instance adds to the coverage, 0 to 1.",
+    )
     location: int | None = Field(
-        default=None, ge=0, description="For role static: which of the component's locations, counted from 0."
+        default=None, ge=0, description="For role static: index of the location in the component's locations."
     )
 
 
 class Rejection(Model):
-    """A node that was considered for a component and dropped."""
+    """A node that was considered for a component and rejected."""
 
     component: str = Field(description="Name of the component.")
     node: str = Field(description="Name of the node.")
-    reason: str = Field(description="CamelCase, for programs.")
-    message: str = Field(description="One sentence for people.")
+    reason: str = Field(description="Machine-readable CamelCase reason.")
+    message: str = Field(description="Human-readable explanation.")
 
 
 class DeploymentPlanSpec(Model):
-    """What was decided and why."""
+    """Decisions of the planner, with reasons."""
 
     application: str = Field(description="Name of the application, in this namespace.")
-    application_generation: int | None = Field(default=None, description="metadata.generation of it that was planned.")
-    application_digest: str | None = Field(
-        default=None, description="Hash of what it says of the mission: a change elsewhere needs no other plan."
+    application_generation: int | None = Field(
+        default=None, description="metadata.generation of the application that was planned."
     )
-    operation_area: GeoJson | None = Field(default=None, description="GeoJSON (lon, lat) MultiPolygon.")
+    application_digest: str | None = Field(
+        default=None,
+        description="Hash of the mission fields of the application. If it is unchanged, the plan is still valid.",
+    )
+    operation_area: GeoJson | None = Field(
+        default=None, description="Operation area as a GeoJSON MultiPolygon (longitude, latitude)."
+    )
     drone: DroneChoice | None = None
-    placements: tuple[PlannedInstance, ...] = Field(default=(), description="Which instance runs where.")
-    rejected: tuple[Rejection, ...] = Field(default=(), description="Nodes that were dropped, with the first reason.")
+    placements: tuple[PlannedInstance, ...] = Field(default=(), description="Instances and their nodes.")
+    rejected: tuple[Rejection, ...] = Field(
+        default=(), description="Rejected nodes, each with the first failed requirement."
+    )
     rejected_omitted: int | None = Field(
         default=None,
         ge=1,
-        description="How many rejected nodes are not listed: most of those too far away, and what is too much.",
+        description="Number of rejected nodes omitted from `rejected` (out of range, or above the list limit).",
     )
 
 
 class DeploymentPlan(Resource, plural="deploymentplans", short="fplan", namespaced=True, written_by_operator=True):
-    """The plan of an application: areas, placements, scores, rejected nodes with reasons."""
+    """The plan of an application: operation area, placements, scores, and rejected nodes with reasons."""
 
     COLUMNS = (
         ("Application", "string", ".spec.application"),
@@ -151,116 +172,122 @@ class DeploymentPlan(Resource, plural="deploymentplans", short="fplan", namespac
 
 
 class GrantedZone(ZoneShape):
-    """A zone of a granted policy, with its geometry, so that the node needs nothing else."""
+    """A zone of a granted policy with its geometry, so that the node can enforce it offline."""
 
     name: str = Field(description="Name of the Zone.")
 
 
 class GrantedPolicy(Model):
-    """A policy that holds for the instance, with its zones resolved."""
+    """A policy that applies to the instance, with its zones resolved."""
 
     name: str = Field(description="Name of the Policy.")
     spec: PolicySpec
     zones: tuple[GrantedZone, ...] = Field(
         default=(),
-        description="Those of spec.selector.zones with their areas; empty where that names none: everywhere.",
+        description="Zones of spec.selector.zones with their areas; empty if the policy applies everywhere.",
     )
 
     @model_validator(mode="after")
     def _resolved(self) -> Self:
-        """A zone without its area would restrict nothing: such a grant must not be flown under."""
+        """Reject a policy without the areas of all its zones: a zone without area would restrict nothing."""
         missing = sorted(set(self.spec.selector.zones) - {zone.name for zone in self.zones})
         if missing:
             raise InvalidObject(
-                "zones", f"policy {self.name} selects {', '.join(missing)}; give the area of each zone that it selects"
+                "zones", f"policy {self.name} selects {', '.join(missing)}; add the area of each selected zone"
             )
         return self
 
 
 class ApplicationReference(Model):
-    """The application that it is for; its uid tells it from another one of its name."""
+    """Reference to an application. The uid distinguishes it from other applications of the same name."""
 
-    namespace: str = Field(description="Its namespace.")
-    name: str = Field(description="Its name.")
-    uid: str = Field(description="Its metadata.uid.")
+    namespace: str = Field(description="Namespace of the application.")
+    name: str = Field(description="Name of the application.")
+    uid: str = Field(description="metadata.uid of the application.")
 
 
 class GrantedLimits(Model):
-    """What the airframe can do."""
+    """Performance limits of the airframe."""
 
-    max_altitude: float = Field(gt=0, description="Metres above home.")
-    max_speed: float = Field(gt=0, description="Metres per second.")
+    max_altitude: float = Field(gt=0, description="Maximum altitude in metres above home.")
+    max_speed: float = Field(gt=0, description="Maximum ground speed in metres per second.")
 
 
 class GrantSpec(Model):
     """The policy configuration of one component instance on one node."""
 
-    node: str = Field(description="The node whose services it is for.")
+    node: str = Field(description="Name of the node whose services the instance may call.")
     application: ApplicationReference
     component: str = Field(description="Name of the component.")
     instance: str = Field(description="Name of the instance, unique in the namespace.")
     class_: ComponentClass | None = Field(
-        default=None, alias="class", description="driver flies the drone, passenger comes along; unset: on no drone."
+        default=None,
+        alias="class",
+        description="Class of a drone component: driver (commands the drone) or passenger (does not); unset for other nodes.",
     )
     control: ControlScope | None = Field(
-        default=None, description="What a driver has of the flight: all of it, or a part."
+        default=None, description="Control of a driver: full (the whole flight) or partial (at its control points)."
     )
-    control_points: tuple[ControlPoint, ...] = Field(default=(), description="Where a driver flies, in this order.")
+    control_points: tuple[ControlPoint, ...] = Field(
+        default=(), description="Control points of the driver, in flight order."
+    )
     points_of_interest: PointsOfInterest | None = None
     tour: tuple[Position, ...] = Field(
         default=(),
-        description="Places that the system flies the drone to, in this order, and home from the last: the mission of an"
-        " application without a driver. Empty: a driver flies, or the application comes along with another.",
+        description="Positions that the system visits in this order before it returns home: the mission of an application"
+        " without a driver. Empty: a driver flies, or the application shares the flight of another one.",
     )
     services: tuple[ServiceRequest, ...] = Field(
-        default=(), description="The system services that it may call, with the methods."
+        default=(), description="System services that the instance may call, with the methods."
     )
     operation_area: tuple[Area, ...] = Field(
-        default=(), description="Where services may be used; needed on a drone. Empty: anywhere (fixed nodes)."
+        default=(),
+        description="Area in which services may be used; required on a drone. Empty: no bounds (fixed nodes).",
     )
     corridor: tuple[Area, ...] = Field(
-        default=(), description="Where the drone may be to get from its depot to the operation area and back."
+        default=(), description="Area in which the drone may fly between its depot and the operation area."
     )
     depot: Point | None = None
     home: Position | None = None
     limits: GrantedLimits | None = None
-    policies: tuple[GrantedPolicy, ...] = Field(default=(), description="Those that hold for it.")
+    policies: tuple[GrantedPolicy, ...] = Field(default=(), description="Policies that apply to the instance.")
     mission: str | None = Field(
         default=None,
         max_length=253,
-        description="Set when it is signed: names the mission. A drone remembers which missions are over; another one begins"
-        " with another name.",
+        description="Identifier of the mission, set when the Grant is signed. The drone remembers finished missions, so a new"
+        " mission needs a new identifier.",
     )
     issued_at: datetime | None = Field(
-        default=None, description="Set when it is signed; of two Grants for one instance the later one counts."
+        default=None,
+        description="Time of signing. If there are several Grants for an instance, the latest one applies.",
     )
 
     @property
     def identity(self) -> str:
-        """The SPIFFE id of the instance that the grant is for."""
+        """SPIFFE ID of the instance."""
         return component_identity(self.application.namespace, self.application.name, self.component, self.instance)
 
     @property
     def unsigned(self) -> Self:
-        """The same without what signing adds."""
+        """The specification without the fields that signing adds."""
         return self.model_copy(update={"mission": None, "issued_at": None})
 
     @property
     def mission_key(self) -> str:
-        """Tells the mission from all others: by what is signed, so that no grant can take another instance's drone."""
+        """Identifier of the mission that includes the instance, so that no Grant can claim the mission of another instance."""
         return f"{self.identity}#{self.mission or ''}"
 
     @property
     def unbounded(self) -> str:
-        """Why no drone may be flown under it; empty when it has bounds.
+        """Reason why no drone may fly under the Grant; empty if the flight is bounded.
 
-        An area that was left out by mistake must not let a drone fly anywhere: "everywhere" is said by an area that large.
+        A missing operation area must not allow flight anywhere, so unlimited flight needs an explicit, large area.
         """
         flies = self.class_ or ("tour" if self.tour else "")
         return f"a {flies} needs operationArea" if flies and not self.operation_area else ""
 
     def methods(self, service: str) -> frozenset[str]:
-        """The methods granted on a service; a driver may always get and return control."""
+        """Return the granted methods of a service. A driver may always get and return control."""
         granted = {m for s in self.services if s.service == service for m in s.methods}
         if service == "mobility" and self.class_ == "driver":
             granted |= {"GetControl", "ReturnControl"}
@@ -269,16 +296,17 @@ class GrantSpec(Model):
 
 GrantPhase = Literal["Pending", "Active", "Complete", "Revoked", "Failed"]
 ENDED: frozenset[GrantPhase] = frozenset({"Complete", "Revoked", "Failed"})
-"""Of these none is taken back once it was reported."""
+"""Final phases: a Grant never leaves them."""
 
 
 class GrantStatus(OpenModel):
-    """What became of the grant on its node."""
+    """State of the Grant on its node."""
 
     phase: GrantPhase | None = Field(
-        default=None, description="Pending until the node has it; then how its mission stands."
+        default=None,
+        description="Pending until the node has stored the Grant; then the state of its mission.",
     )
-    message: str | None = Field(default=None, description="One sentence for people.")
+    message: str | None = Field(default=None, description="Human-readable explanation.")
     observed_generation: ObservedGeneration = None
     conditions: Conditions = ()
 

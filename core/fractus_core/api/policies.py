@@ -1,4 +1,4 @@
-"""Zone and Policy: what authorities and providers allow (thesis Table 8.1, Listing 11)."""
+"""Zone and Policy: the rules of authorities and providers (thesis Table 8.1, Listing 11)."""
 
 from __future__ import annotations
 
@@ -13,33 +13,35 @@ from fractus_core.api.geometry import Altitude, AltitudeBand, Area, Reference
 from fractus_core.api.methods import Method
 from fractus_core.api.model import AGE, READY, Conditions, Model, ObservedGeneration, OpenModel, Resource
 from fractus_core.api.names import ComponentName, Name
-from fractus_core.api.rules import Broken, named_by_others, rule
+from fractus_core.api.rules import Violation, referenced_by, rule
 from fractus_core.api.schedules import ActiveTime, Validity
 
 
 class ReadyStatus(OpenModel):
-    """Whether the object is usable, and why not."""
+    """Readiness of the object."""
 
     observed_generation: ObservedGeneration = None
     conditions: Conditions = ()
 
 
 class ZoneShape(Model):
-    """A piece of air, and when it counts."""
+    """Area, altitude band and schedule of a zone."""
 
     area: Area
-    altitude: AltitudeBand | None = Field(default=None, description="The slab of air; unset: from the ground up.")
+    altitude: AltitudeBand | None = Field(
+        default=None, description="Altitude band; unset: from the ground without an upper bound."
+    )
     schedule: tuple[ActiveTime, ...] = Field(
         default=(),
         max_length=50,
-        description="When the zone is active; empty: always. Outside it, it is as if not there.",
+        description="Times at which the zone is active; empty: always. At other times the zone has no effect.",
     )
 
 
 class ZoneSpec(ZoneShape):
-    """A named piece of air or ground."""
+    """Specification of a zone."""
 
-    description: str = Field(default="", max_length=1024, description="For people.")
+    description: str = Field(default="", max_length=1024, description="Human-readable description.")
 
 
 class Zone(Resource, plural="zones", short="zn"):
@@ -51,7 +53,7 @@ class Zone(Resource, plural="zones", short="zn"):
     spec: ZoneSpec
     status: ReadyStatus | None = None
 
-    _selectable = named_by_others("Zone", "policies")
+    _selectable = referenced_by("Zone", "policies")
 
 
 _NUMBER = r"^[-+]?([0-9]+[.]?[0-9]*|[.][0-9]+)$"
@@ -63,35 +65,35 @@ class NodeExpression(Model):
     key: str = Field(
         min_length=1,
         max_length=128,
-        description="Attribute, dotted for nested ones: class, mtom, name, services.camera.model.",
+        description="Attribute of the node, dotted for nested fields: class, mtom, name, services.camera.model.",
     )
     operator: Literal["In", "NotIn", "Exists", "Gt", "Lt"] = Field(
-        description="How the attribute compares with values; Gt and Lt compare numbers."
+        description="Comparison of the attribute with values; Gt and Lt require a number."
     )
     values: tuple[Annotated[str, Field(max_length=256)], ...] = Field(
-        default=(), max_length=100, description="What it is compared with; left out for Exists."
+        default=(), max_length=100, description="Values to compare with; must be empty for Exists."
     )
 
     @rule(
         "self.operator == 'Exists' ? !has(self.values) || size(self.values) == 0 :"
         " has(self.values) && size(self.values) > 0",
-        "values must be given for In, NotIn, Gt and Lt, and left out for Exists",
+        "values are required for In, NotIn, Gt and Lt, and not allowed for Exists",
     )
-    def _values_fit(self) -> Broken:
+    def _values_fit(self) -> Violation:
         return "values" if (self.operator == "Exists") == bool(self.values) else None
 
     @rule(
         "!(self.operator in ['Gt', 'Lt']) || !has(self.values) || size(self.values) == 1",
-        "Gt and Lt take exactly one value",
+        "Gt and Lt require exactly one value",
     )
-    def _one_bound(self) -> Broken:
+    def _one_bound(self) -> Violation:
         return "values" if self.operator in {"Gt", "Lt"} and len(self.values) != 1 else None
 
     @rule(
         f"!(self.operator in ['Gt', 'Lt']) || !has(self.values) || self.values.all(v, v.matches('{_NUMBER}'))",
-        "Gt and Lt compare numbers",
+        "Gt and Lt require a number",
     )
-    def _numeric_bound(self) -> Broken:
+    def _numeric_bound(self) -> Violation:
         compared = self.values if self.operator in {"Gt", "Lt"} else ()
         return next(
             ((f"values[{i}]", f"not {v!r}") for i, v in enumerate(compared) if not re.fullmatch(_NUMBER, v)), None
@@ -99,25 +101,32 @@ class NodeExpression(Model):
 
 
 class ApplicationSelector(Model):
-    """Which applications and components."""
+    """Selects applications and their components."""
 
-    namespaces: tuple[Name, ...] = Field(default=(), max_length=100, description="Empty: every namespace.")
-    names: tuple[Name, ...] = Field(default=(), max_length=100, description="Empty: every application.")
-    components: tuple[ComponentName, ...] = Field(default=(), max_length=100, description="Empty: every component.")
+    namespaces: tuple[Name, ...] = Field(
+        default=(), max_length=100, description="Namespaces of applications; empty: all."
+    )
+    names: tuple[Name, ...] = Field(default=(), max_length=100, description="Names of applications; empty: all.")
+    components: tuple[ComponentName, ...] = Field(
+        default=(), max_length=100, description="Names of components; empty: all."
+    )
 
 
 class PolicySelector(Model):
-    """Where and for whom a policy holds; every part that is given must match."""
+    """Selects the places, nodes and applications that a policy applies to. All given parts must match."""
 
-    zones: tuple[Name, ...] = Field(default=(), max_length=1000, description="Zones; empty: everywhere.")
+    zones: tuple[Name, ...] = Field(default=(), max_length=1000, description="Names of Zones; empty: everywhere.")
     nodes: tuple[NodeExpression, ...] = Field(
-        default=(), max_length=32, description="All must match; empty: every node."
+        default=(), max_length=32, description="Conditions on the node, all of which must match; empty: every node."
     )
-    applications: ApplicationSelector | None = Field(default=None, description="Unset: every application.")
+    applications: ApplicationSelector | None = Field(
+        default=None, description="Applications that the policy applies to; unset: all."
+    )
 
 
 Limit = Annotated[
-    Altitude | None, Field(description="For LimitControl: m/s, or metres in the datum of altitudeReference.")
+    Altitude | None,
+    Field(description="For LimitControl: speed in m/s, or altitude in metres above altitudeReference."),
 ]
 PolicyType = Literal["AccessControl", "LimitControl", "GeofenceControl", "PrivacyControl"]
 AccessKind = Literal["grant", "denial"]
@@ -136,12 +145,12 @@ _FILTER_ACTIONS: dict[str | None, FilterAction] = {action: action for action in 
 
 
 def _for(type_: PolicyType, then: str) -> str:
-    """A CEL rule that holds for one type of policy."""
+    """Return a CEL rule that applies to one type of policy."""
     return f"self.type != '{type_}' || {then}"
 
 
 def _among(field: str, choices: object) -> str:
-    """CEL: whether a field has one of the values of a closed set."""
+    """Return a CEL expression that is true if a field has one of the values of a closed set."""
     return f"self.{field} in {list(get_args(choices))}"
 
 
@@ -151,99 +160,105 @@ def _listed(choices: object) -> str:
 
 
 def _for_other(type_: PolicyType, then: str) -> str:
-    """A CEL rule that holds for all other types of policy."""
+    """Return a CEL rule that applies to all other types of policy."""
     return f"self.type == '{type_}' || ({then})"
 
 
-def _only(message: str, there: Callable[[PolicySpec], bool], cel: str, *fields: str) -> Any:
-    """The rule that fields which elsewhere would do nothing are given only where they do something."""
+def _only(message: str, applies: Callable[[PolicySpec], bool], cel: str, *fields: str) -> Any:
+    """Return the rule that fields are set only for policies on which they have an effect."""
 
     @rule(cel, f"{message}; remove it, or correct the type")
-    def only(self: PolicySpec) -> Broken:
+    def only(self: PolicySpec) -> Violation:
         given = (f for f in fields if getattr(self, to_snake(f)) != PolicySpec.model_fields[to_snake(f)].default)
-        return None if there(self) else next(given, None)
+        return None if applies(self) else next(given, None)
 
     return only
 
 
 class PolicySpec(Validity):
-    """One rule of an authority or a provider."""
+    """A rule of an authority or a provider."""
 
     type: PolicyType = Field(
-        description="Which calls are allowed (AccessControl), how fast and high to fly (LimitControl), where to fly"
-        " (GeofenceControl), or what pictures may show (PrivacyControl)."
+        description="AccessControl: allowed calls. LimitControl: speed and altitude. GeofenceControl: flight areas."
+        " PrivacyControl: images."
     )
     kind: Literal[AccessKind, LimitKind, GeofenceKind, "camera"] = Field(
-        description="AccessControl: grant, denial. LimitControl: speed, altitude. GeofenceControl: inclusion, exclusion."
-        " PrivacyControl: camera."
+        description="AccessControl: grant or denial. LimitControl: speed or altitude. GeofenceControl: inclusion or"
+        " exclusion. PrivacyControl: camera."
     )
-    methods: tuple[Method, ...] = Field(default=(), max_length=64, description="For AccessControl: the methods meant.")
+    methods: tuple[Method, ...] = Field(
+        default=(), max_length=64, description="For AccessControl: methods that are granted or denied."
+    )
     lower_limit: Limit = None
     upper_limit: Limit = None
     altitude_reference: Reference = Field(
-        default="home", description="For LimitControl altitude: what the limits are measured from."
+        default="home", description="For LimitControl of kind altitude: datum of the limits (home, amsl or terrain)."
     )
     action: Literal[LimitAction, GeofenceAction, FilterAction] | None = Field(
         default=None,
-        description="What happens on a violation; unset: enforce for limits, ignore (the request is discarded) for geofences.",
+        description="Repair action on a violation. Default: enforce for limits, ignore (discard the request) for geofences.",
     )
-    faces: FaceMethod | None = Field(default=None, description="For blurFaces: how faces are hidden; unset: pixelate.")
+    faces: FaceMethod | None = Field(
+        default=None, description="For blurFaces: anonymisation method; default: pixelate."
+    )
     fallback: Fallback | None = Field(
         default=None,
-        description="For blurFaces: what is done where faces would be too small or too far to be found reliably;"
-        " unset: blurAverage, of the whole picture.",
+        description="For blurFaces: filter for images in which faces are too small or too far away to be detected reliably;"
+        " default: blurAverage of the whole image.",
     )
     selector: PolicySelector = Field(default_factory=PolicySelector)
-    priority: int = Field(default=0, ge=-1000, le=1000, description="Decides between equally restrictive policies.")
+    priority: int = Field(
+        default=0, ge=-1000, le=1000, description="Precedence among equally restrictive policies; the highest wins."
+    )
 
     @property
     def limit_action(self) -> LimitAction:
-        """What a limit does with a value beyond it."""
+        """Action for values beyond the limit."""
         return _LIMIT_ACTIONS.get(self.action, "enforce")
 
     @property
     def geofence_action(self) -> GeofenceAction:
-        """What a geofence does on a breach."""
+        """Action on a breach of the geofence."""
         return _GEOFENCE_ACTIONS.get(self.action, "ignore")
 
     @property
     def filter_action(self) -> FilterAction | None:
-        """What a privacy policy has done to pictures; None where it refuses them."""
+        """Filter for images, or None if the policy refuses them."""
         return _FILTER_ACTIONS.get(self.action)
 
     @rule(
         _for("AccessControl", f"({_among('kind', AccessKind)} && has(self.methods) && size(self.methods) > 0)"),
-        "AccessControl takes kind grant or denial, and methods",
+        "AccessControl requires kind grant or denial, and methods",
     )
-    def _access(self) -> Broken:
+    def _access(self) -> Violation:
         if self.type != "AccessControl":
             return None
         return "kind" if self.kind not in get_args(AccessKind) else "methods" if not self.methods else None
 
     @rule(
         _for("LimitControl", f"({_among('kind', LimitKind)} && (has(self.upperLimit) || has(self.lowerLimit)))"),
-        "LimitControl takes kind speed or altitude, and upperLimit or lowerLimit",
+        "LimitControl requires kind speed or altitude, and upperLimit or lowerLimit",
     )
-    def _limit(self) -> Broken:
+    def _limit(self) -> Violation:
         if self.type != "LimitControl":
             return None
         unlimited = self.lower_limit is None and self.upper_limit is None
         return "kind" if self.kind not in get_args(LimitKind) else "upperLimit" if unlimited else None
 
     @rule(
-        # An upper limit of 0 m/s would hold a drone where it is, and one below 0 flies it backwards; lower ones may be 0,
-        # which limits nothing. Below terrain no drone flies; below home and mean sea level it may, down to what
-        # `Altitude` bounds.
+        # An upper limit of 0 m/s would stop the drone, and one below 0 would fly it backwards. A lower limit may be 0, which
+        # has no effect. No drone flies below terrain. Below home and mean sea level it may fly, down to the bound of
+        # `Altitude`.
         _for(
             "LimitControl",
             "(!has(self.upperLimit) || self.upperLimit > 0.0 || (self.kind != 'speed'"
             " && !(has(self.altitudeReference) && self.altitudeReference == 'terrain')))"
             " && (self.kind != 'speed' || !has(self.lowerLimit) || self.lowerLimit >= 0.0)",
         ),
-        "a speed has an upperLimit above 0 and a lowerLimit of at least 0 m/s,"
-        " an altitude above terrain an upperLimit above 0 m",
+        "speed limits require an upperLimit above 0 and a lowerLimit of at least 0 m/s;"
+        " limits above terrain require an upperLimit above 0 m",
     )
-    def _limits_keepable(self) -> Broken:
+    def _limits_keepable(self) -> Violation:
         speed, lower, upper = self.kind == "speed", self.lower_limit, self.upper_limit
         if self.type != "LimitControl":
             return None
@@ -253,33 +268,33 @@ class PolicySpec(Validity):
 
     @rule(
         _for("LimitControl", f"!has(self.action) || {_among('action', LimitAction)}"),
-        f"LimitControl takes action {_listed(LimitAction)}",
+        f"LimitControl requires action {_listed(LimitAction)}",
     )
-    def _limit_action(self) -> Broken:
+    def _limit_action(self) -> Violation:
         return "action" if self.type == "LimitControl" and not self._acts(LimitAction) else None
 
     _limits_limit = _only(
-        "lowerLimit and upperLimit go with type LimitControl",
+        "lowerLimit and upperLimit are only allowed for type LimitControl",
         lambda spec: spec.type == "LimitControl",
         _for_other("LimitControl", "!has(self.lowerLimit) && !has(self.upperLimit)"),
         "lowerLimit",
         "upperLimit",
     )
     _datum_of_altitudes = _only(
-        "altitudeReference goes with type LimitControl and kind altitude",
+        "altitudeReference is only allowed for type LimitControl with kind altitude",
         lambda spec: spec.type == "LimitControl" and spec.kind == "altitude",
         "(self.type == 'LimitControl' && self.kind == 'altitude') || !has(self.altitudeReference)"
         " || self.altitudeReference == 'home'",
         "altitudeReference",
     )
     _access_to_methods = _only(
-        "methods go with type AccessControl",
+        "methods are only allowed for type AccessControl",
         lambda spec: spec.type == "AccessControl",
         _for_other("AccessControl", "!has(self.methods) || size(self.methods) == 0"),
         "methods",
     )
     _access_acts_alone = _only(
-        "AccessControl takes no action: what it denies is refused",
+        "AccessControl has no action, because denied calls are always refused",
         lambda spec: spec.type != "AccessControl",
         _for("AccessControl", "!has(self.action)"),
         "action",
@@ -289,7 +304,7 @@ class PolicySpec(Validity):
         "!has(self.upperLimit) || !has(self.lowerLimit) || self.lowerLimit <= self.upperLimit",
         "lowerLimit must not be above upperLimit",
     )
-    def _limits_ordered(self) -> Broken:
+    def _limits_ordered(self) -> Violation:
         lower, upper = self.lower_limit, self.upper_limit
         return "lowerLimit" if lower is not None and upper is not None and lower > upper else None
 
@@ -299,9 +314,9 @@ class PolicySpec(Validity):
             f"({_among('kind', GeofenceKind)} && has(self.selector)"
             " && has(self.selector.zones) && size(self.selector.zones) > 0)",
         ),
-        "GeofenceControl takes kind inclusion or exclusion, and selector.zones",
+        "GeofenceControl requires kind inclusion or exclusion, and selector.zones",
     )
-    def _geofence(self) -> Broken:
+    def _geofence(self) -> Violation:
         if self.type != "GeofenceControl":
             return None
         return (
@@ -310,16 +325,16 @@ class PolicySpec(Validity):
 
     @rule(
         _for("GeofenceControl", f"!has(self.action) || {_among('action', GeofenceAction)}"),
-        f"GeofenceControl takes action {_listed(GeofenceAction)}",
+        f"GeofenceControl requires action {_listed(GeofenceAction)}",
     )
-    def _geofence_action(self) -> Broken:
+    def _geofence_action(self) -> Violation:
         return "action" if self.type == "GeofenceControl" and not self._acts(GeofenceAction) else None
 
     @rule(
         _for("PrivacyControl", f"(self.kind == 'camera' && has(self.action) && {_among('action', PrivacyAction)})"),
-        f"PrivacyControl takes kind camera, and action {_listed(PrivacyAction)}",
+        f"PrivacyControl requires kind camera, and action {_listed(PrivacyAction)}",
     )
-    def _privacy(self) -> Broken:
+    def _privacy(self) -> Violation:
         if self.type != "PrivacyControl":
             return None
         return "kind" if self.kind != "camera" else "action" if self.action not in get_args(PrivacyAction) else None
@@ -327,9 +342,9 @@ class PolicySpec(Validity):
     @rule(
         "!(has(self.faces) || has(self.fallback)) || (self.type == 'PrivacyControl' && has(self.action)"
         " && self.action == 'blurFaces')",
-        "faces and fallback go with PrivacyControl and action blurFaces",
+        "faces and fallback are only allowed for PrivacyControl with action blurFaces",
     )
-    def _faces(self) -> Broken:
+    def _faces(self) -> Violation:
         if self.type == "PrivacyControl" and self.action == "blurFaces":
             return None
         return "faces" if self.faces is not None else "fallback" if self.fallback is not None else None

@@ -1,11 +1,11 @@
-"""Rules across fields, each stated once: in CEL for the API server, and as a check of the model for everyone else.
+"""Validation rules across fields, each declared once: as CEL for the API server and as a check of the pydantic model.
 
-The API server evaluates CEL at `kubectl apply`. The models are also read where no API server is: by `fractus plan`, by
-agents from disk, in tests. One decorator declares both forms side by side, with the one sentence that both give:
+The API server evaluates CEL at `kubectl apply`. The models are also used without an API server: by `fractus plan`, by
+agents that read files, and in tests. One decorator declares both forms with one error message:
 
     class Area(Model):
         @rule("has(self.polygon) != has(self.circle)", "give either polygon or circle, and only one of them")
-        def _one_shape(self) -> Broken:
+        def _one_shape(self) -> Violation:
             return "" if (self.polygon is None) == (self.circle is None) else None
 """
 
@@ -23,24 +23,24 @@ from fractus_core.api.names import DNS_LABEL
 
 M = TypeVar("M")
 
-Broken = str | tuple[str, str] | None
-"""The field that breaks a rule ("" for the object as a whole), or that and what is wrong with it; None: the rule holds."""
+Violation = str | tuple[str, str] | None
+"""The field that violates a rule ("" for the whole object), optionally with details. None if the rule is satisfied."""
 
 
-def rule(cel: str, message: str) -> Callable[[Callable[[M], Broken]], Any]:
-    """Declare a rule of a model by its CEL expression, its sentence, and a method that finds the field that breaks it.
+def rule(cel: str, message: str) -> Callable[[Callable[[M], Violation]], Any]:
+    """Declare a validation rule of a model. The decorated method returns the field that violates the rule.
 
     Args:
-        cel: true for an object that keeps the rule; `self` is the object as manifests spell it, without defaults.
-        message: what is asked for, and the remedy.
+        cel: CEL expression that is true for a valid object. `self` is the object as in the manifest, without defaults.
+        message: Error message with the requirement and the remedy.
     """
 
-    def declare(broken: Callable[[M], Broken]) -> Any:
-        @functools.wraps(broken)
+    def declare(find_violation: Callable[[M], Violation]) -> Any:
+        @functools.wraps(find_violation)
         def check(model: M) -> M:
-            found = broken(model)
-            if found is not None:
-                field, detail = found if isinstance(found, tuple) else (found, "")
+            violation = find_violation(model)
+            if violation is not None:
+                field, detail = violation if isinstance(violation, tuple) else (violation, "")
                 raise InvalidObject(field, f"{message} ({detail})" if detail else message)
             return model
 
@@ -50,25 +50,25 @@ def rule(cel: str, message: str) -> Callable[[Callable[[M], Broken]], Any]:
     return declare
 
 
-def named_by_others(kind: str, others: str) -> Any:
-    """The rule of a kind whose objects are named in fields of others: its names fit there."""
+def referenced_by(kind: str, referrers: str) -> Any:
+    """Return the rule that objects of a kind have names that fit into the fields of the kinds that refer to them."""
 
     @rule(
         f"self.metadata.name.size() <= 63 && self.metadata.name.matches('{DNS_LABEL}')",
-        f"the name of a {kind} has at most 63 small letters, digits and hyphens, for {others} name it",
+        f"the name of a {kind} must have at most 63 lowercase letters, digits and hyphens, because {referrers} refer to it",
     )
-    def nameable(self: Any) -> Broken:
+    def has_label_name(self: Any) -> Violation:
         name = self.metadata.name
         return None if len(name) <= 63 and re.fullmatch(DNS_LABEL, name) else "metadata.name"
 
-    return nameable
+    return has_label_name
 
 
 def one_of(first: str, second: str) -> Any:
-    """The rule that of two optional fields one is given, and not both."""
+    """Return the rule that exactly one of two optional fields is set."""
 
     @rule(f"has(self.{first}) != has(self.{second})", f"give either {first} or {second}, and only one of them")
-    def given(self: Any) -> Broken:
+    def exactly_one(self: Any) -> Violation:
         return "" if (getattr(self, first) is None) == (getattr(self, second) is None) else None
 
-    return given
+    return exactly_one

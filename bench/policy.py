@@ -29,11 +29,11 @@ import shapely
 from fractus_cluster.ports import free_port
 from fractus_core.api.plans import GrantSpec
 from fractus_core.geo import LocalFrame
-from fractus_core.policy.compiled import CompiledGrant, compile_grant
+from fractus_core.policy.compiled_grant import CompiledGrant, compile_grant
+from fractus_core.policy.decision_types import Airframe, Call, GotoArgs, Home, Situation, VelocityArgs
 from fractus_core.policy.engine import judge
 from fractus_core.policy.monitoring import monitor
-from fractus_core.policy.routes import route
-from fractus_core.policy.values import Airframe, Call, GotoArgs, Home, Situation, VelocityArgs
+from fractus_core.policy.route_search import find_route
 from pymavlink import mavutil
 
 HOME = Home(39.36, 22.95, 100.0)
@@ -256,9 +256,9 @@ def route_claim(runs: int) -> dict[str, Any]:
     """A way through a thousand zones."""
     compiled = compile_grant(grant(fences(1000, random.Random(8))))
     now = Situation(time_s=0, lat=HOME.lat, lon=HOME.lon, altitude_m=10, home=HOME, airframe=Airframe(retraces=True))
-    way = route((0.0, 0.0), (800.0, 700.0), now, compiled, 20.0)
+    way = find_route((0.0, 0.0), (800.0, 700.0), now, compiled, 20.0)
     assert way is not None
-    took, _ = timed(lambda: route((0.0, 0.0), (800.0, 700.0), now, compiled, 20.0), runs, time.thread_time_ns)
+    took, _ = timed(lambda: find_route((0.0, 0.0), (800.0, 700.0), now, compiled, 20.0), runs, time.thread_time_ns)
     print(f"a way of {len(way)} legs through a thousand zones: {took / 1e3:.1f} ms")
     name = "route among 1,000 zones"
     return {

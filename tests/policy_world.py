@@ -7,9 +7,9 @@ from typing import Any
 
 from fractus_core.api.plans import GrantSpec
 from fractus_core.geo import LocalFrame
-from fractus_core.policy.compiled import CompiledGrant, compile_grant
+from fractus_core.policy.compiled_grant import CompiledGrant, compile_grant
+from fractus_core.policy.decision_types import Call, GotoArgs, Home, Lens, Situation, Verdict
 from fractus_core.policy.engine import judge
-from fractus_core.policy.values import Call, GotoArgs, Home, Lens, Situation, Verdict
 
 HOME = Home(39.36, 22.95, 100.0)
 FRAME = LocalFrame(HOME.lat, HOME.lon)

@@ -12,7 +12,7 @@ from typing import Any, get_args
 
 import click
 from fractus_core.api.methods import Method
-from fractus_core.policy.values import (
+from fractus_core.policy.decision_types import (
     Args,
     Call,
     CaptureArgs,

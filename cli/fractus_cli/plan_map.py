@@ -9,7 +9,7 @@ from fractus_core.api import Application
 from fractus_core.api.geometry import Point
 from fractus_core.api.plans import DeploymentPlanSpec, PlannedInstance, Role
 from fractus_core.exhaustive import exhaustive
-from fractus_core.geo import geojson, geojson_line
+from fractus_core.geo import line_geojson, multipolygon_geojson
 from fractus_core.planning import Inventory, Settings, operation_area
 
 _COLOURS: dict[Role, str] = exhaustive(
@@ -38,12 +38,12 @@ def plan_map(
     if area is not None:
         if len(area.parts) > 1:
             for i, part in enumerate(area.parts):
-                shape = geojson(area.frame, part)
+                shape = multipolygon_geojson(area.frame, part)
                 yield _feature(shape, name, f"controlPoints[{i}]", {"fill-opacity": 0, "stroke": "#8c564b"})
         if len(area.route) > 1:
-            yield _feature(geojson_line(area.route), name, "route", {"stroke": "#d62728", "stroke-width": 2})
+            yield _feature(line_geojson(area.route), name, "route", {"stroke": "#d62728", "stroke-width": 2})
     for leg in plan.drone.transit if plan.drone is not None else ():
-        yield _feature(geojson_line((leg.start, leg.end)), name, "transit", {"stroke": "#7f7f7f"})
+        yield _feature(line_geojson((leg.start, leg.end)), name, "transit", {"stroke": "#7f7f7f"})
     for node, instances in _by_node(plan.placements).items():
         place = _place(node, stock)
         if place is not None:

@@ -17,10 +17,10 @@ from fractus_core.api.model import InvalidObject
 from fractus_core.api.plans import ApplicationReference, GrantedLimits, GrantSpec
 from fractus_core.planning import Settings
 from fractus_core.planning.grants import compile_grants, refresh
-from fractus_core.policy.compiled import compile_grant
+from fractus_core.policy.compiled_grant import compile_grant
+from fractus_core.policy.decision_types import Airframe, Attitude, Call, Home, Situation, Verdict
 from fractus_core.policy.engine import judge
-from fractus_core.policy.lenses import lens_of
-from fractus_core.policy.values import Airframe, Attitude, Call, Home, Situation, Verdict
+from fractus_core.policy.lenses import bounding_lens
 
 from fractus_cli.calls import figures, parse_call, parse_time
 from fractus_cli.manifests import BadManifest, Manifests, read_manifests
@@ -221,7 +221,7 @@ def _situation(drone: Drone, asked: Mapping[str, Any]) -> Situation:
         airframe=Airframe(retraces=asked["way_home"] == "retraced"),
         # Where a gimbal points is measured in flight; before, it may be anywhere.
         attitude=None if moved else Attitude(0.0, 0.0, math.degrees(math.atan2(east, north))),
-        lens=lens_of(camera),
+        lens=bounding_lens(camera),
     )
 
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Iterable
 import click
 from fractus_core.api import InvalidObject, Zone
 from fractus_core.documents import BadDocument, dump_documents, parse_documents
-from fractus_core.geo.formats import every as formats
+from fractus_core.geo import formats
 from fractus_core.validation import check_zone
 
 from fractus_cli.manifests import BadManifest, read_file, read_manifests
@@ -63,7 +63,7 @@ def import_(file: pathlib.Path, source: str, prefix: str, without: tuple[str, ..
             check_zone(zone)
     except UnicodeDecodeError:
         raise click.ClickException(f"{file}: this is no text file in UTF-8") from None
-    except formats.Inexact as error:
+    except formats.InexactFeatures as error:
         *most, last = (f"{_where(file, content, one)}: {one}" for one in error.every)
         _tell(most)
         raise click.ClickException(last) from None

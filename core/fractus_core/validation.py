@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping
 
 from fractus_core.api import Application, Depot, InvalidObject, Policy, Zone
 from fractus_core.api.geometry import Area
-from fractus_core.geo import LocalFrame, check_extent, middle, polygon
+from fractus_core.geo import LocalFrame, area_center, area_polygon, check_extent
 from fractus_core.planning.area import check_crossings, route_of
 from fractus_core.policy.selectors import is_attribute
 
@@ -22,7 +22,7 @@ def check_area(area: Area, field: str) -> None:
     """
     try:
         check_extent(area)
-        polygon(LocalFrame.at(middle(area)), area)
+        area_polygon(LocalFrame.at(area_center(area)), area)
     except InvalidObject as error:
         raise InvalidObject(f"{field}.{error.field}", error.problem) from None
 

@@ -11,7 +11,7 @@ from contextlib import asynccontextmanager
 from typing import Any
 
 import grpc
-from fractus_core.policy.values import Verdict
+from fractus_core.policy.decision_types import Verdict
 from fractus_runtime import spans
 from google.protobuf.message import DecodeError
 

@@ -13,7 +13,7 @@ from typing import Any
 import grpc
 from cryptography import x509
 from fractus_core.api.names import SPIFFE_SCHEME
-from fractus_core.policy.values import UncertainTime
+from fractus_core.policy.decision_types import UncertainTime
 
 from fractus_services.clock import steady_s
 from fractus_services.errors import NotAuthenticated

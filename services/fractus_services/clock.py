@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Callable
 
-from fractus_core.policy.values import UncertainTime
+from fractus_core.policy.decision_types import UncertainTime
 
 log = logging.getLogger(__name__)
 

@@ -6,7 +6,7 @@ from typing import Any, NoReturn
 
 import grpc
 from fractus_core.exhaustive import exhaustive
-from fractus_core.policy.values import Action, Verdict
+from fractus_core.policy.decision_types import Action, Verdict
 from fractus_proto.v1 import types_pb2
 from fractus_runtime import spans
 from google.protobuf import any_pb2

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fractus_core.policy.values import Verdict
+from fractus_core.policy.decision_types import Verdict
 
 
 class Refused(Exception):

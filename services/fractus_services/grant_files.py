@@ -12,8 +12,8 @@ from pathlib import Path
 
 from fractus_core.api.model import InvalidObject
 from fractus_core.api.plans import Grant, GrantSpec
-from fractus_core.policy.compiled import CompiledGrant, compile_grant
-from fractus_core.policy.trust import BadSignature
+from fractus_core.policy.compiled_grant import CompiledGrant, compile_grant
+from fractus_core.policy.grant_signatures import BadSignature
 
 from fractus_services.directory_watch import DirectoryWatch
 from fractus_services.grant_verifier import GrantVerifier

@@ -11,14 +11,15 @@ from pathlib import Path
 
 from cryptography import x509
 from fractus_core.api.plans import Grant
-from fractus_core.policy.signatures import (
+from fractus_core.policy.grant_signatures import (
     SIGNATURE_ANNOTATION,
     SIGNER_ANNOTATION,
-    canonical,
+    BadSignature,
+    UnknownAuthority,
     read_authorities,
+    signed_bytes,
     verify,
 )
-from fractus_core.policy.trust import BadSignature, UnknownAuthority
 from fractus_runtime.files import remove_temporary, write_file
 
 log = logging.getLogger(__name__)
@@ -175,4 +176,4 @@ def _digest(grant: Grant) -> str:
         grant.metadata.uid,
         *(grant.metadata.annotations.get(key) for key in (SIGNATURE_ANNOTATION, SIGNER_ANNOTATION)),
     ]
-    return hashlib.sha256(json.dumps(signed).encode() + canonical(grant)).hexdigest()
+    return hashlib.sha256(json.dumps(signed).encode() + signed_bytes(grant)).hexdigest()

@@ -21,7 +21,7 @@ from typing import Any
 import shapely
 from fractus_core.api.plans import GrantSpec
 from fractus_core.control import ControlEvent, ControlState, StreamState
-from fractus_core.policy.values import SetSpeedArgs, TakeoffArgs, VelocityArgs
+from fractus_core.policy.decision_types import SetSpeedArgs, TakeoffArgs, VelocityArgs
 from fractus_mavlink import Parser
 from fractus_services.errors import AutopilotError, Refused
 from fractus_services.grant_files import ActiveGrant

@@ -8,7 +8,7 @@ from typing import Any
 
 from control_flights import Flight, missions_of
 from fractus_core.control.values import FlightMode
-from fractus_core.policy.values import SetSpeedArgs, TakeoffArgs, VelocityArgs
+from fractus_core.policy.decision_types import SetSpeedArgs, TakeoffArgs, VelocityArgs
 from mobility_world import GUIDED, LAND, LOITER, RTL, partial, spec, touring, zone
 
 Course = Callable[[Flight], Coroutine[Any, Any, None]]

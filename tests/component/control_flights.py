@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from fractus_core.control.values import FlightMode
-from fractus_core.policy.values import TakeoffArgs
+from fractus_core.policy.decision_types import TakeoffArgs
 from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority import drivers
 from mobility_world import World, goto

@@ -9,7 +9,7 @@ from typing import Any
 
 from control_courses import POINTS, Course
 from control_flights import Flight
-from fractus_core.policy.values import GotoArgs, TakeoffArgs, VelocityArgs
+from fractus_core.policy.decision_types import GotoArgs, TakeoffArgs, VelocityArgs
 from mobility_world import GUIDED, LAND, LOITER, RTL, partial, spec, touring, zone
 
 WEIGHTS = {

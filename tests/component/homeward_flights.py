@@ -12,8 +12,8 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from fractus_core.policy.returning import return_bounds
-from fractus_core.policy.values import GotoArgs, Situation, Verdict
+from fractus_core.policy.decision_types import GotoArgs, Situation, Verdict
+from fractus_core.policy.return_route import return_bounds
 from fractus_services.errors import Refused
 from fractus_services.mobility.flight.homing import Homing
 from fractus_services.mobility.flight.motions import HEIGHT_REACHED_M, REACHED_M

@@ -19,7 +19,7 @@ import shapely
 from closed_loop import HALF_M, Account, Drone, Oracle, Sky, Weather
 from fractus_core.api.plans import GrantSpec
 from fractus_core.control import StreamState
-from fractus_core.policy.values import TakeoffArgs, VelocityArgs
+from fractus_core.policy.decision_types import TakeoffArgs, VelocityArgs
 from fractus_services.errors import AutopilotError, Refused, Unavailable
 from fractus_services.grant_files import ActiveGrant
 from mobility_world import area, goto, spec, zone

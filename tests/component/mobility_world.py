@@ -14,8 +14,8 @@ from fractus_core.api.plans import GrantSpec
 from fractus_core.control import ControlEvent, ControlState, StreamState
 from fractus_core.control.values import FlightMode
 from fractus_core.geo import LocalFrame
-from fractus_core.policy.compiled import compile_grant
-from fractus_core.policy.values import Airframe, GotoArgs, Home, TakeoffArgs
+from fractus_core.policy.compiled_grant import compile_grant
+from fractus_core.policy.decision_types import Airframe, GotoArgs, Home, TakeoffArgs
 from fractus_mavlink import Message, message
 from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_RESULT
 from fractus_services.errors import Refused

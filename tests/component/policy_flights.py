@@ -14,10 +14,10 @@ from typing import Any, Protocol
 
 import numpy as np
 from fractus_core.api.methods import Method
-from fractus_core.policy.compiled import CompiledGrant
+from fractus_core.policy.compiled_grant import CompiledGrant
+from fractus_core.policy.decision_types import Airframe, Call, GotoArgs, SetSpeedArgs, Situation, VelocityArgs, Verdict
 from fractus_core.policy.engine import judge
 from fractus_core.policy.monitoring import monitor
-from fractus_core.policy.values import Airframe, Call, GotoArgs, SetSpeedArgs, Situation, VelocityArgs, Verdict
 from fractus_services.mobility.mavlink.orders import turns
 from numpy.typing import NDArray
 from policy_world import HOME, METHODS, NOW, compiled, policy, ring

@@ -59,9 +59,3 @@ def test_an_agent_reads_outcomes_without_what_decides_them() -> None:
     said, _ = after("import fractus_agent.__main__; print(*sys.modules)")
     assert "fractus_core.control.values" in said.split()
     assert "fractus_core.control.machine" not in said.split()
-
-
-def test_recordings_have_zones_without_the_formats_of_others() -> None:
-    said, _ = after("import fractus_services.recording.map_features; print(*sys.modules)")
-    assert "fractus_core.geo.formats.geojson" in said.split()
-    assert "fractus_core.geo.formats.kml" not in said.split()

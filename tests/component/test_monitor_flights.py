@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 import pytest
+from fractus_core.policy.decision_types import Airframe
+from fractus_core.policy.kinematics import stop_point
 from fractus_core.policy.monitoring import monitor
-from fractus_core.policy.motion import stop_point
-from fractus_core.policy.values import Airframe
 from policy_flights import STEP_S, Fleet, scene
 from policy_world import ask, at, box, compiled, exclusion, goto
 

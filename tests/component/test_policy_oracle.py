@@ -14,11 +14,11 @@ import numpy as np
 import policy_flights
 import pytest
 from depth import cells, examples
-from fractus_core.policy import legs, returning, spaces, velocities
+from fractus_core.policy import free_space, goto_rules, return_route, velocity_rules
+from fractus_core.policy.decision_types import Call, GotoArgs, TakeoffArgs
 from fractus_core.policy.engine import MIN_TAKEOFF_ALTITUDE_M
 from fractus_core.policy.limits import MIN_LEG_ALTITUDE_M
 from fractus_core.policy.monitoring import monitor
-from fractus_core.policy.values import Call, GotoArgs, TakeoffArgs
 from fractus_services.mobility.mavlink import failsafes
 from homeward_flights import WaysHome
 from hypothesis import given, settings
@@ -230,7 +230,7 @@ def test_no_permitted_request_ends_in_a_breach() -> None:
 
 
 def test_the_oracle_would_notice(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (legs, velocities):
+    for module in (goto_rules, velocity_rules):
         monkeypatch.setattr(module, "margin_m", lambda _now: 0.5)
     assert flights(seed=3, count=200).wrong
 
@@ -244,9 +244,9 @@ def test_ways_home_break_nothing() -> None:
 
 
 def test_the_oracle_would_notice_a_way_home_through_a_zone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(returning, "straight_home_blocked", lambda *_, **__: None)
-    monkeypatch.setattr(legs, "way_home_blocked", lambda *_: None)
-    monkeypatch.setattr(spaces.Space, "blockers", lambda *_: [])
+    monkeypatch.setattr(return_route, "check_straight_return", lambda *_, **__: None)
+    monkeypatch.setattr(goto_rules, "check_return", lambda *_: None)
+    monkeypatch.setattr(free_space.FreeSpace, "blockers", lambda *_: [])
     wrong = flights(seed=11, count=160, requests=2, returns=WaysHome(11, 2)).wrong
     assert any("the way home of drone" in line for line in wrong)
     assert any("alone on its way home" in line for line in wrong)

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from fractus_core.api.plans import GrantSpec
 from fractus_core.control.events import Airborne, ArmingRequested
-from fractus_core.policy.values import Airframe, TakeoffArgs
+from fractus_core.policy.decision_types import Airframe, TakeoffArgs
 from fractus_mavlink.enums import MAV_CMD
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.authority import drivers

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from closed_loop import Sky
 from fractus_core.control import StreamState
-from fractus_core.policy.values import TakeoffArgs, VelocityArgs
+from fractus_core.policy.decision_types import TakeoffArgs, VelocityArgs
 from fractus_services.errors import AutopilotError, Refused
 from sky_drone import fly, ready, until
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import shapely
 from closed_loop import Account, Oracle, Sky
-from fractus_core.policy.values import TakeoffArgs
+from fractus_core.policy.decision_types import TakeoffArgs
 from fractus_mavlink.enums import EKF_STATUS_FLAGS
 from fractus_services.mobility.rpc.telemetry import located
 from fractus_vehicle.body import Body

@@ -6,7 +6,7 @@ import asyncio
 from pathlib import Path
 
 from closed_loop import Sky
-from fractus_core.policy.values import TakeoffArgs
+from fractus_core.policy.decision_types import TakeoffArgs
 from fractus_mavlink import Endpoint
 from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_COMPONENT
 from sky_drone import fly, ready, until

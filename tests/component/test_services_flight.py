@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from fractus_core.control import Authority, StreamState
 from fractus_core.control.values import FlightMode
-from fractus_core.policy.values import Call, GotoArgs, SetSpeedArgs, TakeoffArgs, Verdict
+from fractus_core.policy.decision_types import Call, GotoArgs, SetSpeedArgs, TakeoffArgs, Verdict
 from fractus_mavlink.enums import MAV_CMD
 from fractus_services.errors import AutopilotError, Refused
 from fractus_services.grant_files import ActiveGrant

@@ -12,7 +12,7 @@ import pytest
 import sky_drone
 from closed_loop import Sky
 from fractus_core.control import Authority
-from fractus_core.policy.values import GotoArgs, TakeoffArgs
+from fractus_core.policy.decision_types import GotoArgs, TakeoffArgs
 from fractus_mavlink import Endpoint, Parser, layout_named, message
 from fractus_mavlink.enums import COPTER_MODE, MAV_AUTOPILOT, MAV_CMD, MAV_COMPONENT, MAV_FRAME, MAV_MODE_FLAG, MAV_TYPE
 from fractus_services.errors import AutopilotError, Refused, Unavailable

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from fractus_core.control.values import FlightMode
-from fractus_core.policy.values import GotoArgs, TakeoffArgs
+from fractus_core.policy.decision_types import GotoArgs, TakeoffArgs
 from fractus_mavlink import message
 from fractus_mavlink.enums import MAV_CMD
 from fractus_services.mobility.authority import drivers

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 from fractus_core.api.geometry import Position
 from fractus_core.control import Authority
+from fractus_core.policy.decision_types import Call, SetSpeedArgs, TakeoffArgs, VelocityArgs
 from fractus_core.policy.engine import judge
 from fractus_core.policy.monitoring import monitor
-from fractus_core.policy.values import Call, SetSpeedArgs, TakeoffArgs, VelocityArgs
 from fractus_mavlink.enums import MAV_CMD
 from fractus_services.errors import AutopilotError, PreconditionFailed, Refused, Unavailable
 from fractus_services.mobility.authority import drivers

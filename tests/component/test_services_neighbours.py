@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from closed_loop import Account, Drone, Sky, Wire
 from fractus_core.control import StreamState
-from fractus_core.policy.values import TakeoffArgs
+from fractus_core.policy.decision_types import TakeoffArgs
 from fractus_mavlink import Endpoint, Parser
 from fractus_mavlink.enums import COPTER_MODE, MAV_AUTOPILOT, MAV_CMD, MAV_COMPONENT, MAV_MODE_FLAG, MAV_STATE, MAV_TYPE
 from fractus_services.errors import Refused

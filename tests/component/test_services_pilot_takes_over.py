@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from closed_loop import Sky, Wire
 from fractus_core.control import Authority
-from fractus_core.policy.values import TakeoffArgs
+from fractus_core.policy.decision_types import TakeoffArgs
 from fractus_mavlink import Parser
 from fractus_mavlink.enums import COPTER_MODE, MAV_CMD
 from fractus_services.mobility.authority import drivers

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fractus_core.policy.returning import ReturnBounds, homeward_heights_m, return_bounds
-from fractus_core.policy.values import Airframe
+from fractus_core.policy.decision_types import Airframe
+from fractus_core.policy.return_route import ReturnBounds, return_altitudes_m, return_bounds
 from fractus_services.mobility.authority import drivers
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from mobility_world import World, area, end, goto, refusal, spec
@@ -52,10 +52,10 @@ def test_a_limit_of_unknown_datum_lets_the_autopilot_climb_nowhere_and_leaves_th
     assert return_bounds(at(), compiled(altitude(upperLimit=20), floor, limits=None)).height_m == 20.0
     both = compiled(altitude(upperLimit=20), unknown)
     now = at(alt=25, airframe=Airframe(return_altitude_m=40))
-    assert all(height <= 25 for height in homeward_heights_m(now, both, 100.0))
-    assert homeward_heights_m(now, both, 100.0)[0] == 20.0
+    assert all(height <= 25 for height in return_altitudes_m(now, both, 100.0))
+    assert return_altitudes_m(now, both, 100.0)[0] == 20.0
     limited = compiled(altitude(upperLimit=20), floor)
-    assert homeward_heights_m(at(alt=10, airframe=Airframe(return_altitude_m=40)), limited, 100.0)[0] == 20.0
+    assert return_altitudes_m(at(alt=10, airframe=Airframe(return_altitude_m=40)), limited, 100.0)[0] == 20.0
 
 
 def test_heights_just_below_zones_overhead_are_the_last_to_be_tried() -> None:
@@ -64,9 +64,9 @@ def test_heights_just_below_zones_overhead_are_the_last_to_be_tried() -> None:
         ("above", 35, (20, -20, 80, 20)), ("lower", 20, (0, -5, 10, 5)), ("ground", 12, (0, 5, 10, 15)),
         ("beyond", 15, (500, 0, 510, 10)), ("higher", 60, (0, 0, 10, 10)),
     )]  # fmt: skip
-    assert homeward_heights_m(now, compiled(*zones), 150.0) == (40.0, 33.0, 32.5, 17.5)
+    assert return_altitudes_m(now, compiled(*zones), 150.0) == (40.0, 33.0, 32.5, 17.5)
     kept_up = compiled(*zones, altitude(lowerLimit=25), limits=None)
-    assert homeward_heights_m(now, kept_up, 150.0) == (40.0, 33.0, 32.5)
+    assert return_altitudes_m(now, kept_up, 150.0) == (40.0, 33.0, 32.5)
 
 
 @pytest.mark.parametrize(

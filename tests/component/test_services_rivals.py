@@ -10,7 +10,7 @@ import pytest
 import shapely
 import virtual_time
 from closed_loop import Account, Oracle, Sky
-from fractus_core.policy.values import TakeoffArgs
+from fractus_core.policy.decision_types import TakeoffArgs
 from fractus_mavlink import Endpoint
 from fractus_mavlink.enums import MAV_CMD, MAV_COMPONENT, MAV_FRAME, SPEED_TYPE
 from fractus_services.mobility.autopilot import COURSE_S

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fractus_core.policy.motion import surge
-from fractus_core.policy.values import VelocityArgs
+from fractus_core.policy.decision_types import VelocityArgs
+from fractus_core.policy.kinematics import motion_before_reaction
 from fractus_services.errors import AutopilotError
 from mobility_world import World, clear_m, end, goto, refusal, spec, zone
 from virtual_time import fly
@@ -194,7 +194,7 @@ def test_a_drone_that_slows_down_to_a_setpoint_is_not_taken_to_brake_on(tmp_path
             assert now.forward_mps2 is not None
             assert now.forward_mps2 < -2.0
             assert now.pending == ((4.0, 0.0, 0.0),)
-            assert surge(now).speed_mps == pytest.approx(now.north_mps)
+            assert motion_before_reaction(now).speed_mps == pytest.approx(now.north_mps)
             await world.service.hover(grant)
             await asyncio.sleep(1.0)
             assert world.guard.situation().pending == ((0.0, 0.0, 0.0),)

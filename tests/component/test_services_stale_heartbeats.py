@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from closed_loop import Sky
 from fractus_core.control import StreamState
-from fractus_core.policy.values import TakeoffArgs
+from fractus_core.policy.decision_types import TakeoffArgs
 from fractus_mavlink import Parser
 from fractus_mavlink.enums import COPTER_MODE
 from mobility_world import end, goto

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 from closed_loop import Sky
-from fractus_core.policy.values import TakeoffArgs
+from fractus_core.policy.decision_types import TakeoffArgs
 from fractus_mavlink import Parser
 from fractus_services.mobility.authority import drivers
 from mobility_world import FRAME, end, goto

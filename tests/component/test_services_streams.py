@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from closed_loop import Sky
 from fractus_core.control import StreamState
-from fractus_core.policy.values import TakeoffArgs
+from fractus_core.policy.decision_types import TakeoffArgs
 from fractus_mavlink import Endpoint, Parser, layout_named
 from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_COMPONENT, MAV_DATA_STREAM, MAV_RESULT
 from fractus_services.mobility.mavlink.companion import SYSTEM_ID

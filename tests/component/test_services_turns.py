@@ -11,7 +11,7 @@ from typing import Any
 
 import grpc
 import pytest
-from fractus_core.policy.values import Call, TakeoffArgs, Verdict
+from fractus_core.policy.decision_types import Call, TakeoffArgs, Verdict
 from fractus_proto.v1 import mobility_pb2
 from fractus_services import admission, background
 from fractus_services.auth import Caller

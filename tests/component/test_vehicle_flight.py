@@ -6,7 +6,7 @@ import itertools
 import math
 
 import pytest
-from fractus_core.policy.motion import stopping_distance_m
+from fractus_core.policy.kinematics import stopping_distance_m
 from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_LANDED_STATE, MAV_RESULT
 from fractus_vehicle.readiness import arming_refusals
 from fractus_vehicle.shaping import sqrt_controller, wrap_pi

@@ -7,8 +7,8 @@ import sys
 import atheris
 
 with atheris.instrument_imports(include=["fractus_services.mobility.rpc", "fractus_core.policy"]):
+    from fractus_core.policy.decision_types import Call
     from fractus_core.policy.engine import judge
-    from fractus_core.policy.values import Call
     from fractus_services.errors import Refused
     from fractus_services.mobility.rpc import arguments
 from fractus_proto.v1 import mobility_pb2

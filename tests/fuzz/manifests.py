@@ -28,7 +28,7 @@ with atheris.instrument_imports(include=["fractus_core", "fractus_cli.manifests"
     from fractus_core.documents import dump_documents, parse_documents
     from fractus_core.planning import Settings
     from fractus_core.planning.grants import compile_grants
-    from fractus_core.policy.compiled import compile_grant
+    from fractus_core.policy.compiled_grant import compile_grant
 
 FOLDER = Path(tempfile.mkdtemp())
 YAML, JSON = FOLDER / "manifest.yaml", FOLDER / "manifest.json"

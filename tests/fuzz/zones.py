@@ -14,7 +14,7 @@ with atheris.instrument_imports(
 ):
     from fractus_core.api import InvalidObject, Zone
     from fractus_core.documents import dump_documents, parse_documents
-    from fractus_core.geo.formats import every as formats
+    from fractus_core.geo import formats
     from fractus_core.validation import check_zone
 
 READERS = [formats.read_geojson, formats.read_kml, formats.read_qgc_plan, formats.read_ed269]

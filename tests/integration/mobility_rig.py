@@ -22,7 +22,7 @@ from cryptography.x509.oid import NameOID
 from fractus_cluster.ports import free_port
 from fractus_core.api.names import OPERATOR_IDENTITY, component_identity, node_identity, node_server_name
 from fractus_core.geo import LocalFrame
-from fractus_core.policy.signatures import DOCUMENT_SIGNING, sign
+from fractus_core.policy.grant_signatures import DOCUMENT_SIGNING, sign
 from fractus_proto.v1 import mobility_pb2 as pb
 from fractus_proto.v1 import mobility_pb2_grpc, types_pb2
 from grpc_status import rpc_status

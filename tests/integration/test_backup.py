@@ -15,7 +15,7 @@ from cryptography import x509
 from docs_commands import ROOT, typed_lines
 from docs_shell import Shell
 from fractus_core.api import Grant
-from fractus_core.policy.signatures import verify
+from fractus_core.policy.grant_signatures import verify
 from operator_world import FRACTUS, SYSTEM, Body, OperatorProcess, World, at, ours, traffic
 
 pytestmark = pytest.mark.slow

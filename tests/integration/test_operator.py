@@ -11,8 +11,7 @@ import pytest
 from control_plane import wait_for
 from cryptography import x509
 from fractus_core.api import Grant
-from fractus_core.policy.signatures import SIGNATURE_ANNOTATION, read_authorities, verify
-from fractus_core.policy.trust import BadSignature
+from fractus_core.policy.grant_signatures import SIGNATURE_ANNOTATION, BadSignature, read_authorities, verify
 from operator_world import FRACTUS, OperatorProcess, World, at, component, navigator, ours, traffic, viewer
 
 INSTANCES = {

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fractus_core.policy.values import Attitude, CaptureArgs, Lens, Situation
+from fractus_core.policy.decision_types import Attitude, CaptureArgs, Lens, Situation
 from fractus_runtime.audit import AuditLog
 from fractus_services.camera.camera_properties import CameraProperties
 from fractus_services.camera.drivers.driver import CaptureRequest

@@ -20,7 +20,7 @@ from fractus_agent.grants.keeper import (
 from fractus_core.api.node_grants import ReportedGrant, pack
 from fractus_core.api.plans import Grant
 from fractus_core.control import Outcome, OutcomeKind
-from fractus_core.policy.trust import BadSignature, UnknownAuthority
+from fractus_core.policy.grant_signatures import BadSignature, UnknownAuthority
 
 COMPLETE = Outcome(OutcomeKind.COMPLETE)
 FAILED = Outcome(OutcomeKind.FAILED, "driver lost")

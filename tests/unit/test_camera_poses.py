@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 from depth import examples
 from fractus_core.api.nodes import CameraFeatures
-from fractus_core.policy.footprint import camera_axes, footprint, seen_from
-from fractus_core.policy.lenses import lens_of
-from fractus_core.policy.values import Attitude, Lens, Situation
+from fractus_core.policy.decision_types import Attitude, Lens, Situation
+from fractus_core.policy.footprint import camera_axes, exposure_footprint, footprint
+from fractus_core.policy.lenses import bounding_lens
 from fractus_proto.v1 import mobility_pb2
 from fractus_services.camera import pose_history
 from fractus_services.camera.pose_history import PoseHistory
@@ -155,7 +155,7 @@ def test_whatever_is_seen_between_two_messages_is_in_the_footprint(
             at_s, x=speed[0] * measured_s, alt=40.0 - speed[1] * measured_s, turned=turned(at_s - ages[1]), speed=speed,
             ages=ages,
         )  # fmt: skip
-    shown = seen_from(drone.way(100.0), FRAME)
+    shown = exposure_footprint(drone.way(100.0), FRAME)
     assert shown is not None
     moment_s = 100.0 + share * (at_s - 100.0)
     drone = Drone()
@@ -227,7 +227,7 @@ def test_whatever_a_moving_gimbal_shows_is_in_the_footprint(
     for gap_s in [0.0, *gaps]:
         now_s += gap_s
         gimbal_told(poses, now_s, turned(now_s - age_s), age_s)
-    shown = seen_from(poses.situations_since(100.0, 1.0), FRAME)
+    shown = exposure_footprint(poses.situations_since(100.0, 1.0), FRAME)
     assert shown is not None
     moment_s = 100.0 + share * (now_s - 100.0)
     exact = replace(poses.situation(1.0), attitude=Attitude(*turned(moment_s), 0.0, 0.0), position_error_m=0.0)
@@ -261,7 +261,7 @@ def test_a_gimbal_that_is_not_measured_lets_the_camera_look_anywhere() -> None:
 def test_a_gimbals_camera_looks_where_its_attitude_points() -> None:
     camera = {"methods": ["CaptureImage"], "horizontalFieldOfView": 60, "lens": {"model": "pinhole"}}
     mounted = CameraFeatures.model_validate(camera | {"mount": {"pitch": -90, "stabilised": True, "gimbal": True}})
-    lens = lens_of(mounted)
+    lens = bounding_lens(mounted)
     assert lens is not None
     assert (lens.pitch_deg, lens.yaw_deg, lens.stabilised) == (0.0, 0.0, False)
     axis = camera_axes(lens, Attitude(0.0, -30.0, 90.0))[0]

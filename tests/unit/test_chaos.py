@@ -14,7 +14,7 @@ from fractus_cluster.spec import load_spec
 from fractus_core.api import Grant
 from fractus_core.api.node_grants import pack
 from fractus_core.api.plans import GrantSpec
-from fractus_core.policy.values import Home
+from fractus_core.policy.decision_types import Home
 from fractus_sim.chaos.__main__ import with_disk
 from fractus_sim.chaos.faults import FAULTS, broken
 from fractus_sim.chaos.invariants import (

@@ -9,9 +9,10 @@ from fractus_core.api.geometry import Reference
 from fractus_core.api.methods import METHODS_OF
 from fractus_core.api.policies import FilterAction, GeofenceAction, LimitAction, PolicySpec
 from fractus_core.exhaustive import exhaustive
-from fractus_core.policy.compiled import Rule, height_m
-from fractus_core.policy.privacy import compose, filter_of
-from fractus_core.policy.values import Filter
+from fractus_core.policy.altitude import altitude_above_home_m
+from fractus_core.policy.compiled_grant import Rule
+from fractus_core.policy.decision_types import Filter
+from fractus_core.policy.picture_rules import combine_filters, rule_filter
 from fractus_proto.v1 import mobility_pb2
 from fractus_services.mobility.rpc.arguments import call_of
 
@@ -32,9 +33,9 @@ def rule(**spec: object) -> Rule:
 
 @pytest.mark.parametrize("action", get_args(FilterAction))
 def test_every_filter_is_asked_for_by_its_name(action: FilterAction) -> None:
-    asked = filter_of(rule(type="PrivacyControl", kind="camera", action=action))
+    asked = rule_filter(rule(type="PrivacyControl", kind="camera", action=action))
     assert asked.action == action
-    assert compose([asked]) == (Filter(action),)
+    assert combine_filters([asked]) == (Filter(action),)
 
 
 @pytest.mark.parametrize("action", get_args(GeofenceAction))
@@ -50,7 +51,7 @@ def test_every_action_of_a_limit_is_its_own(action: LimitAction) -> None:
 
 @pytest.mark.parametrize("reference", get_args(Reference))
 def test_every_datum_has_a_height(reference: Reference) -> None:
-    assert height_m(5.0, reference, None, True) == (None if reference == "amsl" else 5.0)
+    assert altitude_above_home_m(5.0, reference, None, True) == (None if reference == "amsl" else 5.0)
 
 
 def test_every_method_of_the_mobility_service_can_be_checked() -> None:

@@ -17,9 +17,9 @@ from fractus_core.api import KINDS, Application, Depot, Drone, EdgeNode, Policy,
 from fractus_core.geo import geodesic_m
 from fractus_core.planning import Host, Inventory, plan
 from fractus_core.planning.grants import compile_grants
-from fractus_core.policy.compiled import compile_grant
+from fractus_core.policy.compiled_grant import compile_grant
+from fractus_core.policy.decision_types import Call, GotoArgs, Home, SetSpeedArgs, Situation
 from fractus_core.policy.engine import judge
-from fractus_core.policy.values import Call, GotoArgs, Home, SetSpeedArgs, Situation
 from fractus_core.validation import check_application, check_policy, check_zone
 
 ROOT = Path(__file__).parents[2]

@@ -8,7 +8,16 @@ import pytest
 import shapely
 from fractus_core.api import InvalidObject
 from fractus_core.api.geometry import Area, Circle, Point, Polygon
-from fractus_core.geo import LocalFrame, area_of, corridor, crossings, geodesic_m, geojson, middle_of, polygon
+from fractus_core.geo import (
+    LocalFrame,
+    area_polygon,
+    areas_of_shape,
+    center_of,
+    corridor,
+    count_crossings,
+    geodesic_m,
+    multipolygon_geojson,
+)
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
@@ -52,7 +61,7 @@ def test_many_points_are_converted_as_one_is(origin):
 @pytest.mark.parametrize("lon", [0, 179.9999, -180])
 def test_circle_area_anywhere(lat, lon):
     area = Area(circle=Circle(center=Point(lat=lat, lon=lon), radius=500))
-    shape = polygon(LocalFrame(lat, lon), area)
+    shape = area_polygon(LocalFrame(lat, lon), area)
     assert shape.area == pytest.approx(math.pi * 500**2, rel=5e-3)
     assert shape.area >= math.pi * 500**2
 
@@ -62,7 +71,10 @@ def test_rounds_are_never_cut_short_and_hardly_larger(radius, pieces):
     frame = LocalFrame(50, 4)
     here = Point(lat=50, lon=4)
     exact = shapely.Point(0, 0).buffer(radius, quad_segs=2000)
-    for shape in (polygon(frame, Area(circle=Circle(center=here, radius=radius))), corridor(frame, [here], radius)):
+    for shape in (
+        area_polygon(frame, Area(circle=Circle(center=here, radius=radius))),
+        corridor(frame, [here], radius),
+    ):
         assert shape.buffer(1e-12).covers(exact)
         assert shape.area == pytest.approx(exact.area, rel=4e-3)
         corners = shapely.get_coordinates(shape)[:-1]
@@ -77,7 +89,7 @@ def test_what_stands_for_a_circle_to_stay_in_is_never_larger(lat, lon, radius, a
     frame = LocalFrame(lat, lon)
     centre_lat, centre_lon = frame.latlon(away * math.sin(bearing), away * math.cos(bearing))
     centre = Point(lat=centre_lat, lon=centre_lon)
-    shape = polygon(frame, Area(circle=Circle(center=centre, radius=radius)), within=True)
+    shape = area_polygon(frame, Area(circle=Circle(center=centre, radius=radius)), within=True)
     for x, y in shapely.get_coordinates(shape)[::16]:
         corner_lat, corner_lon = frame.latlon(x, y)
         assert geodesic_m(centre, Point(lat=corner_lat, lon=corner_lon)) <= radius + 1e-6
@@ -104,9 +116,9 @@ def square(lat, lon, half):
 
 def test_polygon_across_the_antimeridian_is_small():
     ring = square(10, 180, 0.01)
-    shape = polygon(LocalFrame(10, 180), Area(polygon=Polygon(exterior=ring)))
+    shape = area_polygon(LocalFrame(10, 180), Area(polygon=Polygon(exterior=ring)))
     assert shape.area == pytest.approx(2211.9 * 2193.0, rel=5e-3)
-    collection = geojson(LocalFrame(10, 180), shape)
+    collection = multipolygon_geojson(LocalFrame(10, 180), shape)
     assert len(collection["coordinates"]) == 2
     assert all(-180 <= lon <= 180 for part in collection["coordinates"] for lon, _ in part[0])
 
@@ -123,8 +135,10 @@ def test_circles_at_the_poles_hold_on_a_map_of_degrees_what_they_hold_on_the_gro
     assume(abs(off - radius) > 0.2 * radius)
     lat = pole - math.copysign(off / 111_694, pole)
     frame = LocalFrame(lat, lon)
-    shape = polygon(frame, Area(circle=Circle(center=Point(lat=lat, lon=lon), radius=radius)))
-    drawn = [shapely.Polygon(*map(list, (part[0], part[1:]))) for part in geojson(frame, shape)["coordinates"]]
+    shape = area_polygon(frame, Area(circle=Circle(center=Point(lat=lat, lon=lon), radius=radius)))
+    drawn = [
+        shapely.Polygon(*map(list, (part[0], part[1:]))) for part in multipolygon_geojson(frame, shape)["coordinates"]
+    ]
     assert all(part.is_valid for part in drawn)
     for bearing, share in places:
         x, y = share * radius * math.sin(bearing), share * radius * math.cos(bearing)
@@ -135,18 +149,18 @@ def test_circles_at_the_poles_hold_on_a_map_of_degrees_what_they_hold_on_the_gro
 def test_bow_tie_names_the_ring_and_the_place():
     a, b, c, d = square(0, 0, 0.01)
     with pytest.raises(InvalidObject, match=r"polygon\.exterior: the ring crosses itself near lat -?0\.0"):
-        polygon(LocalFrame(0, 0), Area(polygon=Polygon(exterior=(a, c, b, d))))
+        area_polygon(LocalFrame(0, 0), Area(polygon=Polygon(exterior=(a, c, b, d))))
 
 
 def test_ring_without_area_is_refused():
     line = tuple(Point(lat=0, lon=v) for v in (0, 0.1, 0.2))
     with pytest.raises(InvalidObject, match=r"polygon\.exterior"):
-        polygon(LocalFrame(0, 0), Area(polygon=Polygon(exterior=line)))
+        area_polygon(LocalFrame(0, 0), Area(polygon=Polygon(exterior=line)))
 
 
 def test_hole_outside_is_refused():
     with pytest.raises(InvalidObject, match=r"holes\[0\]"):
-        polygon(LocalFrame(0, 0), Area(polygon=Polygon(exterior=square(0, 0, 0.01), holes=(square(1, 1, 0.01),))))
+        area_polygon(LocalFrame(0, 0), Area(polygon=Polygon(exterior=square(0, 0, 0.01), holes=(square(1, 1, 0.01),))))
 
 
 def test_corridor_covers_what_is_within_its_radius():
@@ -162,12 +176,12 @@ def test_corridor_covers_what_is_within_its_radius():
 def test_areas_survive_the_round_trip(lat, lon):
     frame = LocalFrame(lat, lon)
     shape = shapely.Polygon([(0, 0), (100, 0), (100, 80), (0, 80)], [[(10, 10), (20, 10), (20, 20)]])
-    (area,) = area_of(frame, shape)
-    assert polygon(frame, area).symmetric_difference(shape).area < 0.5
+    (area,) = areas_of_shape(frame, shape)
+    assert area_polygon(frame, area).symmetric_difference(shape).area < 0.5
 
 
 def test_middle_is_right_across_the_antimeridian():
-    middle = middle_of([Point(lat=0, lon=179), Point(lat=0, lon=-179)])
+    middle = center_of([Point(lat=0, lon=179), Point(lat=0, lon=-179)])
     assert abs(middle.lon) == pytest.approx(180)
 
 
@@ -189,28 +203,28 @@ def test_crossings_are_those_of_each_piece_with_each_other():
         lines = [rng.uniform(-100, 100, (corners, 2)) for _ in range(3)]
         pieces = [shapely.LineString(pair) for line in lines for pair in itertools.pairwise(line)]
         expected = sum(a.crosses(b) for a, b in itertools.combinations(pieces, 2))
-        assert crossings(lines, 10**9) == expected
-        assert crossings(lines, expected) == expected
-        assert (expected == 0) or crossings(lines, expected - 1) == expected
-    assert crossings([], 5) == 0
+        assert count_crossings(lines, 10**9) == expected
+        assert count_crossings(lines, expected) == expected
+        assert (expected == 0) or count_crossings(lines, expected - 1) == expected
+    assert count_crossings([], 5) == 0
 
 
 def test_lines_that_only_touch_or_lie_on_each_other_do_not_cross():
     square = np.array([[0, 0], [10, 0], [10, 10], [0, 10], [0, 0]], dtype=float)
-    assert crossings([square, square, np.add(square, (10, 0))], 100) == 0
+    assert count_crossings([square, square, np.add(square, (10, 0))], 100) == 0
 
 
 def test_more_pieces_beside_each_other_than_can_be_compared_count_as_too_many():
     teeth = np.array([[i + (i % 2) * 1e4, -i + (i % 2) * 1e4] for i in range(10_000)], dtype=float)
-    assert crossings([teeth], 5000) == 5001
-    assert crossings([teeth[:2000]], 5000) == 0
+    assert count_crossings([teeth], 5000) == 5001
+    assert count_crossings([teeth[:2000]], 5000) == 0
 
 
 def test_rings_across_the_antimeridian_stay_closed_and_repeat_no_corner():
     for lon in (179.9999, -179.9998):
         for radius in (20.0, 137.3, 900.0):
             frame = LocalFrame(-41.0, lon)
-            for part in geojson(frame, shapely.Point(3.0, 5.0).buffer(radius))["coordinates"]:
+            for part in multipolygon_geojson(frame, shapely.Point(3.0, 5.0).buffer(radius))["coordinates"]:
                 for ring in part:
                     assert ring[0] == ring[-1]
                     assert all(a != b for a, b in itertools.pairwise(ring))

@@ -20,14 +20,15 @@ from fractus_core.api import Grant, InvalidObject
 from fractus_core.api.names import component_identity, node_identity
 from fractus_core.identity.authority import SIGNER_LIFE, Authority
 from fractus_core.identity.grant_signer import GrantSigner
-from fractus_core.policy.signatures import (
+from fractus_core.policy.grant_signatures import (
     SIGNATURE_ANNOTATION,
     SIGNER_ANNOTATION,
+    BadSignature,
+    UnknownAuthority,
     read_authorities,
     sign,
     verify,
 )
-from fractus_core.policy.trust import BadSignature, UnknownAuthority
 from fractus_services import grant_verifier
 from fractus_services.grant_verifier import GrantVerifier
 from policy_world import spec

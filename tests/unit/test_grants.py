@@ -7,15 +7,15 @@ import pytest
 import shapely
 from fractus_core.api import InvalidObject, Policy, Zone
 from fractus_core.api.policies import NodeExpression
-from fractus_core.geo import polygon
+from fractus_core.geo import area_polygon
 from fractus_core.planning import flight_of, grants, plan
 from fractus_core.planning.area import operation_area
 from fractus_core.planning.grants import compile_grants, refresh
 from fractus_core.planning.zones import _SOUND, sound, zone_crossings
-from fractus_core.policy.compiled import compile_grant
+from fractus_core.policy.compiled_grant import compile_grant
+from fractus_core.policy.decision_types import Call, CaptureArgs, GotoArgs, Home, Situation
 from fractus_core.policy.engine import judge
 from fractus_core.policy.selectors import is_attribute, matches, node_attributes
-from fractus_core.policy.values import Call, CaptureArgs, GotoArgs, Home, Situation
 from fractus_core.validation import check_policy
 from test_planning import FRAME, PATH, VIEWER, application, at, component, drone, edge, inventory, manifest, navigator
 
@@ -137,7 +137,7 @@ def test_a_path_with_too_many_meshes_is_refused_with_a_sentence(monkeypatch):
 def _off_the_plan_m(grant, path):
     spec = application(navigator(path)).spec
     planned = operation_area(spec, inventory([drone("d")]).depots, 7.0)
-    granted = shapely.union_all([polygon(planned.frame, area) for area in grant.operation_area])
+    granted = shapely.union_all([area_polygon(planned.frame, area) for area in grant.operation_area])
     return max(
         float(shapely.distance(shapely.points(shapely.get_coordinates(a)), b.boundary).max())
         for a, b in ((granted, planned.shape), (planned.shape, granted))

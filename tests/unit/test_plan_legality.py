@@ -13,9 +13,9 @@ from fractus_core.planning import Infeasible, Settings, operation_area, plan
 from fractus_core.planning.grants import AROUND_WAY_M, compile_grants, flight_grant
 from fractus_core.planning.legality import MAX_LISTED, MAX_SEARCHES, with_legality
 from fractus_core.planning.zones import sound
-from fractus_core.policy.compiled import compile_grant
+from fractus_core.policy.compiled_grant import compile_grant
+from fractus_core.policy.decision_types import Airframe, Call, GotoArgs, Home, Situation
 from fractus_core.policy.engine import judge
-from fractus_core.policy.values import Airframe, Call, GotoArgs, Home, Situation
 from test_grants import FENCE, guide, policy, zone
 from test_plan_drones import flown_by_other, shared
 from test_planning import PATH, application, at, drone, inventory, manifest, navigator

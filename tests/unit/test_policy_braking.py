@@ -6,11 +6,11 @@ import math
 from typing import Any
 
 import pytest
-from fractus_core.geo import area_of, corridor
-from fractus_core.policy.compiled import CompiledGrant
+from fractus_core.geo import areas_of_shape, corridor
+from fractus_core.policy.compiled_grant import CompiledGrant
+from fractus_core.policy.decision_types import Airframe, GotoArgs, Situation
 from fractus_core.policy.engine import judge
-from fractus_core.policy.motion import stop_point
-from fractus_core.policy.values import Airframe, GotoArgs, Situation
+from fractus_core.policy.kinematics import stop_point
 from policy_world import FRAME, altitude, ask, at, box, compiled, exclusion, goto, inclusion, ring, zone
 
 
@@ -18,7 +18,7 @@ def lane(radius_m: float, *points: tuple[float, float], **changes: Any) -> Compi
     from fractus_core.api.geometry import Point
 
     line = [Point(lat=lat, lon=lon) for lat, lon in (FRAME.latlon(*p) for p in points)]
-    areas = [a.to_dict() for a in area_of(FRAME, corridor(FRAME, line, radius_m))]
+    areas = [a.to_dict() for a in areas_of_shape(FRAME, corridor(FRAME, line, radius_m))]
     return compiled(operationArea=areas, **changes)
 
 

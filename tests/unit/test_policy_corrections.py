@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 from depth import examples
 from fractus_core.policy import engine
-from fractus_core.policy.compiled import CompiledGrant
-from fractus_core.policy.values import (
+from fractus_core.policy.compiled_grant import CompiledGrant
+from fractus_core.policy.decision_types import (
     Args,
     Call,
     GotoArgs,
@@ -347,7 +347,7 @@ def test_what_is_corrected_is_allowed_as_it_is_and_breaks_nothing() -> None:
 
 
 def test_the_plain_reading_would_notice(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(engine, "settled", lambda _call, first, _judge: first)
+    monkeypatch.setattr(engine, "settle_correction", lambda _call, first, _judge: first)
     assert any(
         verdict.permits and not verdict.brake_first and any(broken(world.rules, verdict.args, now))
         for world, _, now, verdict in corrections(range(400))

@@ -8,9 +8,9 @@ from datetime import UTC, datetime
 from typing import Any
 
 import pytest
+from fractus_core.policy.decision_types import Airframe, Call, CaptureArgs, Home, Lens, Situation, UncertainTime
 from fractus_core.policy.engine import judge
 from fractus_core.policy.monitoring import monitor
-from fractus_core.policy.values import Airframe, Call, CaptureArgs, Home, Lens, Situation, UncertainTime
 from policy_world import HOME, NOW, altitude, ask, at, box, compiled, exclusion, goto, inclusion, policy, zone
 
 CAPTURE = Call("CaptureImage", CaptureArgs())

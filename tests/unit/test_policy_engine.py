@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 import pytest
-from fractus_core.policy.values import (
+from fractus_core.policy.decision_types import (
     Call,
     CaptureArgs,
     Filter,

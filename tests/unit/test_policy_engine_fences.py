@@ -5,14 +5,14 @@ from __future__ import annotations
 import pytest
 from fractus_core.api.geometry import Point
 from fractus_core.geo import distance_m
-from fractus_core.policy.motion import stopping_distance_m
-from fractus_core.policy.values import (
+from fractus_core.policy.decision_types import (
     Airframe,
     Call,
     GotoArgs,
     Home,
     TakeoffArgs,
 )
+from fractus_core.policy.kinematics import stopping_distance_m
 from policy_world import (
     FRAME,
     HOME,
@@ -286,8 +286,8 @@ def test_zones_on_the_other_side_of_the_globe_do_not_matter() -> None:
 
 def test_the_antimeridian_is_nothing_special() -> None:
     from fractus_core.geo import LocalFrame
+    from fractus_core.policy.decision_types import Situation
     from fractus_core.policy.engine import judge
-    from fractus_core.policy.values import Situation
 
     frame = LocalFrame(-17.0, 179.9999)
     corners = [

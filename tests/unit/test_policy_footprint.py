@@ -10,10 +10,10 @@ import pytest
 import shapely
 from depth import examples
 from fractus_core.api.nodes import CameraFeatures
+from fractus_core.policy.decision_types import Attitude, Call, Filter, Lens, Situation
 from fractus_core.policy.footprint import MAX_SIGHT_M, Footprint, footprint
-from fractus_core.policy.lenses import lens_of
-from fractus_core.policy.privacy import compose, judge_privacy, remaining
-from fractus_core.policy.values import Attitude, Call, Filter, Lens, Situation
+from fractus_core.policy.lenses import bounding_lens
+from fractus_core.policy.picture_rules import combine_filters, judge_privacy, remaining_filters
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from policy_world import FRAME, NOW, ask, at, box, compiled, policy, zone
@@ -174,24 +174,29 @@ _FILTERS = st.builds(
 @_cases
 @given(st.lists(_FILTERS, max_size=6), st.lists(_FILTERS, max_size=4))
 def test_filters_compose_to_what_satisfies_each_of_them(asked: list[Filter], more: list[Filter]) -> None:
-    composed = compose(asked)
-    assert composed == compose(reversed(asked)) == compose(composed)
+    composed = combine_filters(asked)
+    assert composed == combine_filters(reversed(asked)) == combine_filters(composed)
     done = {one.action for one in composed}
     hidden = {"blurAverage", "blurMedian", "black"}
     for one in asked:
         assert one.action in done or "black" in done or (one.action == "blurFaces" and done & hidden)
-    assert remaining(asked, composed) == ()
+    assert remaining_filters(asked, composed) == ()
     # What is done later makes up for what was not asked for before, or asked for in a milder way.
-    both = (*composed, *remaining(more, composed))
-    assert remaining(compose([*asked, *more]), both) == ()
+    both = (*composed, *remaining_filters(more, composed))
+    assert remaining_filters(combine_filters([*asked, *more]), both) == ()
 
 
 def test_the_stricter_way_to_hide_faces_stands() -> None:
     soft, hard = Filter("blurFaces", "gaussian", "refuse"), Filter("blurFaces", "pixelate", "black")
-    assert compose([soft, hard]) == (Filter("blurFaces", "pixelate", "refuse"),)
-    assert compose([soft]) == (soft,)
-    assert remaining([hard], [soft]) == (hard,), "a soft blur is not what is asked for"
-    assert remaining([soft], [hard]) == remaining([soft], [soft]) == remaining([hard], [Filter("blurMedian")]) == ()
+    assert combine_filters([soft, hard]) == (Filter("blurFaces", "pixelate", "refuse"),)
+    assert combine_filters([soft]) == (soft,)
+    assert remaining_filters([hard], [soft]) == (hard,), "a soft blur is not what is asked for"
+    assert (
+        remaining_filters([soft], [hard])
+        == remaining_filters([soft], [soft])
+        == remaining_filters([hard], [Filter("blurMedian")])
+        == ()
+    )
 
 
 def test_policies_name_their_filters() -> None:
@@ -216,9 +221,9 @@ def test_descriptions_tell_the_lens() -> None:
         "horizontalFieldOfView": 90,
         "lens": {"model": "pinhole"},
     }
-    assert lens_of(None) is None
-    assert lens_of(CameraFeatures.model_validate(fields)) is None, "no one knows where it looks"
-    lens = lens_of(CameraFeatures.model_validate({**fields, "mount": {"pitch": -60, "stabilised": True}}))
+    assert bounding_lens(None) is None
+    assert bounding_lens(CameraFeatures.model_validate(fields)) is None, "no one knows where it looks"
+    lens = bounding_lens(CameraFeatures.model_validate({**fields, "mount": {"pitch": -60, "stabilised": True}}))
     assert lens is not None
     assert (lens.pitch_deg, lens.stabilised) == (-60, True)
     assert lens.vertical_deg == pytest.approx(2 * math.degrees(math.atan(9 / 16)))

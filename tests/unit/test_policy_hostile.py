@@ -11,12 +11,12 @@ import pytest
 from fractus_core.api import InvalidObject
 from fractus_core.api.plans import GrantSpec
 from fractus_core.geo import LocalFrame
-from fractus_core.policy.compiled import compile_grant
+from fractus_core.policy.compiled_grant import compile_grant
+from fractus_core.policy.decision_types import Airframe, Call, GotoArgs, Home, Situation, UncertainTime, VelocityArgs
 from fractus_core.policy.engine import judge
-from fractus_core.policy.limits import forbids_height
+from fractus_core.policy.limits import limit_forbids_altitudes
 from fractus_core.policy.monitoring import monitor
-from fractus_core.policy.routes import route
-from fractus_core.policy.values import Airframe, Call, GotoArgs, Home, Situation, UncertainTime, VelocityArgs
+from fractus_core.policy.route_search import find_route
 from policy_world import (
     FRAME,
     METHODS,
@@ -74,7 +74,7 @@ def test_anywhere_on_the_globe(lat: float, lon: float) -> None:
     for x, y, code in ((45, 0, "InsideExclusionZone"), (100, 0, "LegThroughExclusionZone"), (0, 100, "")):
         assert judge(Call("Goto", GotoArgs(*frame.latlon(x, y), 10)), now, grant).code == code
     assert judge(Call("SetVelocity", VelocityArgs(0, 9, hold_s=2)), replace(now, east_mps=9), grant).action == "deny"
-    way = route((0, 0), (100, 0), now, grant, 10)
+    way = find_route((0, 0), (100, 0), now, grant, 10)
     assert way is not None
     assert len(way) == 3
     assert monitor(replace(now, east_mps=9), grant) is None
@@ -110,7 +110,7 @@ def test_one_altitude_that_is_both_limits_forbids_what_is_above_and_below() -> N
     (level,) = compiled(
         altitude(zones=[zone("level", box(0, 0, 9, 9))], lowerLimit=height, upperLimit=height)
     ).altitude_limits.zones
-    assert [forbids_height(level, m, m, at(), flat=False) for m in (19.0, 20.0, 21.0)] == [True, False, True]
+    assert [limit_forbids_altitudes(level, m, m, at(), flat=False) for m in (19.0, 20.0, 21.0)] == [True, False, True]
 
 
 def _court() -> dict[str, Any]:
@@ -125,7 +125,7 @@ def test_a_zone_with_a_hole() -> None:
     assert ask(grant, goto(38, 0)).code == "TooCloseToExclusionZone"
     assert ask(grant, goto(50, 0)).code == "InsideExclusionZone"
     assert ask(grant, goto(100, 0)).code == "LegThroughExclusionZone"
-    assert route((0, 0), (100, 0), at(airframe=RETRACING), grant, 10) is None
+    assert find_route((0, 0), (100, 0), at(airframe=RETRACING), grant, 10) is None
     kept = compiled(inclusion(_court()), operationArea=[])
     assert ask(kept, goto(50, 20), at(50, 0)).code == "WayHomeBlocked", "home lies in the hole"
     assert ask(kept, goto(30, 0), at(50, 0)).action == "deny"

@@ -11,9 +11,9 @@ import pytest
 import shapely
 from depth import examples
 from fractus_core.api.nodes import CameraFeatures, CameraLens
+from fractus_core.policy.decision_types import Attitude, Lens
 from fractus_core.policy.footprint import MAX_HALF_VIEW_DEG, footprint
-from fractus_core.policy.lenses import lens_of
-from fractus_core.policy.values import Attitude, Lens
+from fractus_core.policy.lenses import bounding_lens
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from policy_world import FRAME, at
@@ -97,7 +97,7 @@ def test_no_zone_that_a_picture_shows_is_missed(
     side = projected(model, np.array([[math.tan(half), 0.0, 1.0]]), 1.0, (0.0, 0.0), k)[0][0]
     assume(side > 0.01)
     focal, centre = _WIDTH / 2 / side, (_WIDTH / 2, height / 2)
-    lens = lens_of(described(model, half, height, k, told=told))
+    lens = bounding_lens(described(model, half, height, k, told=told))
     assert lens is not None
     exact = Lens(lens.horizontal_deg, lens.vertical_deg, error_deg=0.0)
     now = at(0, 0, alt=alt, lens=exact, attitude=Attitude(*turn, 0, 0), position_error_m=0.0, altitude_error_m=0.0)
@@ -129,7 +129,7 @@ def test_no_zone_that_a_picture_shows_is_missed(
 
 def half_views(model: str | None, field_deg: float, **more: float) -> tuple[float, float]:
     fields = {"methods": ["CaptureImage"], "resolution": "1280x960", "horizontalFieldOfView": field_deg, "mount": {}}
-    lens = lens_of(CameraFeatures.model_validate(fields | ({"lens": {"model": model, **more}} if model else {})))
+    lens = bounding_lens(CameraFeatures.model_validate(fields | ({"lens": {"model": model, **more}} if model else {})))
     assert lens is not None
     return lens.horizontal_deg / 2, lens.vertical_deg / 2
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+from fractus_core.policy.decision_types import GotoArgs, SetSpeedArgs, Verdict
 from fractus_core.policy.engine import judge
 from fractus_core.policy.monitoring import monitor
-from fractus_core.policy.values import GotoArgs, SetSpeedArgs, Verdict
 from policy_world import NOW, altitude, at, box, compiled, exclusion, goto, inclusion, speed
 
 WALL = box(-50, 50, 50, 90)

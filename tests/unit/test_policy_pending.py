@@ -7,9 +7,9 @@ import random
 
 import pytest
 import shapely
+from fractus_core.policy.decision_types import Call, Situation, VelocityArgs
 from fractus_core.policy.engine import judge
-from fractus_core.policy.motion import moving, stop_point, surge, swept
-from fractus_core.policy.values import Call, Situation, VelocityArgs
+from fractus_core.policy.kinematics import is_moving, motion_before_reaction, stop_point, velocity_leg
 from policy_world import at, box, compiled, exclusion, goto
 
 Velocity = tuple[float, float]
@@ -58,10 +58,10 @@ def test_what_a_setpoint_sweeps_holds_what_is_flown(seed: int) -> None:
         n, e = direction(rng, 12.0)
         asked = VelocityArgs(n, e, hold_s=rng.choice([0.3, 0.5, 1.0]))
         places = shapely.points(flown(rng, now, pending, asked))
-        holds = swept(now, (0.0, 0.0), asked).ground
+        holds = velocity_leg(now, (0.0, 0.0), asked).ground
         furthest_m = max(furthest_m, float(shapely.distance(holds, places).max()))
         blind = Situation(**{f: getattr(now, f) for f in Situation.__slots__ if f != "pending"})
-        missed_m = max(missed_m, float(shapely.distance(swept(blind, (0.0, 0.0), asked).ground, places).max()))
+        missed_m = max(missed_m, float(shapely.distance(velocity_leg(blind, (0.0, 0.0), asked).ground, places).max()))
     assert furthest_m < now.airframe.tracking_m, "legs keep that much more"
     assert missed_m > 2.0, "it is what is pending that makes the difference"
 
@@ -70,15 +70,15 @@ def test_a_drone_that_was_told_to_fly_on_does_not_go_on_braking() -> None:
     braking = at(0, 0, east_mps=8, forward_mps2=-2.5, latency_s=0.5)
     told = at(0, 0, east_mps=8, forward_mps2=-2.5, latency_s=0.5, pending=((0.0, 8.0, 0.0),))
     stopped = at(0, 0, east_mps=8, forward_mps2=-2.5, latency_s=0.5, pending=((0.0, 0.0, 0.0),))
-    assert surge(told).speed_mps == 8.0
-    assert surge(stopped).speed_mps == surge(braking).speed_mps < 7.0
+    assert motion_before_reaction(told).speed_mps == 8.0
+    assert motion_before_reaction(stopped).speed_mps == motion_before_reaction(braking).speed_mps < 7.0
     assert stop_point(told, (0.0, 0.0))[0] > stop_point(braking, (0.0, 0.0))[0] + 3.0
 
 
 def test_a_drone_that_was_told_to_fly_does_not_stand() -> None:
-    assert not moving(at(0, 0))
-    assert moving(at(0, 0, pending=((5.0, 0.0, 0.0),)))
-    assert not moving(at(0, 0, pending=((0.0, 0.0, 0.0),)))
+    assert not is_moving(at(0, 0))
+    assert is_moving(at(0, 0, pending=((5.0, 0.0, 0.0),)))
+    assert not is_moving(at(0, 0, pending=((0.0, 0.0, 0.0),)))
 
 
 def test_a_leg_is_judged_for_a_drone_that_may_have_begun_another() -> None:

@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 import shapely
 from depth import cells
-from fractus_core.policy.compiled import CompiledGrant, for_transit
+from fractus_core.policy.compiled_grant import CompiledGrant, compile_transit_grant
+from fractus_core.policy.decision_types import Airframe, GotoArgs, Situation
 from fractus_core.policy.engine import judge
-from fractus_core.policy.routes import CLEARANCES_M, route
-from fractus_core.policy.values import Airframe, GotoArgs, Situation
+from fractus_core.policy.route_search import CLEARANCES_M, find_route
 from policy_world import Corners, altitude, at, box, compiled, exclusion, goto, inclusion, policy, ring, spec, zone
 
 RETRACING = Airframe(retraces=True)
@@ -27,7 +27,7 @@ def free(*policies: dict[str, Any]) -> CompiledGrant:
 
 def find(grant: CompiledGrant, *ends: tuple[float, float], alt: float = 10.0, **state: Any) -> Way | None:
     now = at(*ends[0], alt=alt, **{"airframe": RETRACING, **state})
-    return route(ends[0], ends[1], now, grant, alt)
+    return find_route(ends[0], ends[1], now, grant, alt)
 
 
 def length(start: tuple[float, float], way: Way) -> float:
@@ -77,7 +77,7 @@ def test_bands_and_limits_of_altitude() -> None:
     low = free(exclusion(box(-100, 40, 30, 50), upper=20))
     assert find(low, (0, 0), (0, 100), alt=30) == ((0, 100),)
     assert len(find(low, (0, 0), (0, 100), alt=21) or ()) == 3, "too close above it"
-    climbing = route((0, 0), (0, 100), at(airframe=RETRACING), low, 30.0, from_m=5.0)
+    climbing = find_route((0, 0), (0, 100), at(airframe=RETRACING), low, 30.0, from_m=5.0)
     assert len(climbing or ()) == 3, "it might climb too late"
     limited = free(altitude(zones=[zone("low", box(-100, 40, 30, 50))], upperLimit=15))
     assert find(limited, (0, 0), (0, 100)) == ((0, 100),)
@@ -107,13 +107,13 @@ def test_the_system_flies_the_corridor() -> None:
         operationArea=[box(50, -20, 150, 20)], corridor=[box(-30, -30, 150, 30)], control="partial",
         services=[{"service": "mobility", "methods": ["GetPosition"]}],
     )  # fmt: skip
-    grant = for_transit(body)
+    grant = compile_transit_grant(body)
     now = at(airframe=RETRACING)
-    way = route((0, 0), (100, 0), now, grant, 10.0)
+    way = find_route((0, 0), (100, 0), now, grant, 10.0)
     assert way is not None
     assert len(way) > 1
     legal(grant, (0, 0), way, now)
-    assert route((0, 0), (100, 40), now, grant, 10.0) is None, "outside"
+    assert find_route((0, 0), (100, 40), now, grant, 10.0) is None, "outside"
 
 
 def test_a_straight_way_home_binds_every_waypoint() -> None:
@@ -212,17 +212,17 @@ def test_from_below_a_zone_too_close_overhead_the_first_leg_sinks() -> None:
     grant = free(exclusion(box(-200, -200, 200, 200), lower=16), exclusion(box(50, 2, 70, 30), name="wall"))
     low = replace(RETRACING, return_altitude_m=10.0)
     now = at(60, 0, alt=14.5, airframe=low)
-    way = route((60, 0), (60, 100), now, grant, 13.0, from_m=14.5)
+    way = find_route((60, 0), (60, 100), now, grant, 13.0, from_m=14.5)
     assert way is not None
     assert judge(goto(*way[0], 13.0), now, grant).action == "allow"
     legal(grant, way[0], way[1:], at(alt=13.0, airframe=low))
-    assert route((60, 0), (60, 100), now, grant, 14.5) is None, "all of it too close below the zone"
+    assert find_route((60, 0), (60, 100), now, grant, 14.5) is None, "all of it too close below the zone"
 
 
 def test_only_the_first_leg_is_flown_at_both_altitudes() -> None:
     grant = free(exclusion(box(30, -60, 40, 10), name="wall"), exclusion(box(80, -60, 90, 60), upper=20))
-    climbing = route((0, 0), (150, 0), at(alt=5, airframe=RETRACING), grant, 30.0, from_m=5.0)
-    level = route((0, 0), (150, 0), at(alt=5, airframe=RETRACING), grant, 5.0)
+    climbing = find_route((0, 0), (150, 0), at(alt=5, airframe=RETRACING), grant, 30.0, from_m=5.0)
+    level = find_route((0, 0), (150, 0), at(alt=5, airframe=RETRACING), grant, 5.0)
     assert level is not None
     assert climbing is not None
     assert length((0, 0), climbing) < 155 < length((0, 0), level), "it is above the second zone after its first leg"

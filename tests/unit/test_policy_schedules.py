@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import Any
 
-from fractus_core.policy.values import Call
+from fractus_core.policy.decision_types import Call
 from policy_world import ask, at, box, compiled, goto, policy, zone
 
 NOW = datetime.fromtimestamp(at().time_s, tz=UTC)

@@ -6,8 +6,8 @@ import math
 
 import pytest
 from depth import examples
+from fractus_core.policy.decision_types import Airframe, Call, Situation, VelocityArgs
 from fractus_core.policy.engine import judge
-from fractus_core.policy.values import Airframe, Call, Situation, VelocityArgs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from policy_world import at, box, compiled, exclusion, goto, policy, zone

@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 import pytest
-from fractus_core.policy.values import Airframe, Call, VelocityArgs, Verdict
+from fractus_core.policy.decision_types import Airframe, Call, VelocityArgs, Verdict
 from policy_world import METHODS, altitude, ask, at, box, exclusion, inclusion, ring, speed
 from policy_world import compiled as granted
 
@@ -46,7 +46,7 @@ def test_impossible_velocities(args: VelocityArgs | None) -> None:
 
 
 def test_no_one_flies_blind() -> None:
-    from fractus_core.policy.values import Situation
+    from fractus_core.policy.decision_types import Situation
 
     assert ask(compiled(operationArea=[]), fly(1), Situation(time_s=0)).code == "PositionUnknown"
     assert ask(compiled(), fly(1), at(home=None)).code == "HomeUnknown"

@@ -11,7 +11,7 @@ from fractus import Busy, ControlLost, FractusError, InvalidRequest, MissionEnde
 from fractus.errors import translate
 from fractus_core.control import Outcome, OutcomeKind
 from fractus_core.control.values import ended_refusal
-from fractus_core.policy.values import Verdict
+from fractus_core.policy.decision_types import Verdict
 from fractus_services import errors
 from fractus_services.error_details import abort
 from fractus_services.errors import Refused, ResourceExhausted, denied

@@ -16,7 +16,7 @@ import skimage.data
 from camera_world import Scene, World, active_grant, grain, private, refusal
 from fractus_core.api.model import API_VERSION
 from fractus_core.api.nodes import Drone
-from fractus_core.policy.values import CaptureArgs, Lens
+from fractus_core.policy.decision_types import CaptureArgs, Lens
 from fractus_services.camera.camera_properties import CameraProperties
 from fractus_services.camera.drivers.driver import CameraFailed, CaptureRequest
 from fractus_services.camera.face_detection import CascadeDetector

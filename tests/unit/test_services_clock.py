@@ -10,7 +10,7 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
-from fractus_core.policy.values import UncertainTime, earliest
+from fractus_core.policy.decision_types import UncertainTime, earliest_time
 from fractus_services import auth
 from fractus_services import clock as clock_module
 from fractus_services.auth import MAX_SEEN, Callers
@@ -75,7 +75,7 @@ def test_a_step_is_in_doubt_until_it_has_lasted(machine: Machine, step_s: float)
     machine.offset_s += step_s
     now = machine.clock()
     assert isinstance(now, UncertainTime)
-    assert (earliest(now), now) == tuple(sorted((BEGIN_S, BEGIN_S + step_s))), "both readings count"
+    assert (earliest_time(now), now) == tuple(sorted((BEGIN_S, BEGIN_S + step_s))), "both readings count"
     machine.wait(TRUST_AFTER_S - 1)
     assert isinstance(machine.clock(), UncertainTime)
     machine.wait(2)

@@ -26,7 +26,7 @@ def way(*_: Any, **__: Any) -> Iterator[None]:
 async def test_a_first_waypoint_beside_the_drone_is_left_out_only_at_its_altitude(
     monkeypatch: pytest.MonkeyPatch, altitude_m: float, waypoint: tuple[float, float]
 ) -> None:
-    monkeypatch.setattr(courses, "searching", way)
+    monkeypatch.setattr(courses, "route_steps", way)
     grant = compiled(operationArea=[])
     trip = courses.Trip(FlightConstraints(ActiveGrant("", "", spec(), grant), grant), "Transit", unused)
     found = await courses.first_leg(grant.frame.latlon(100.0, 50.0), (30.0,), at(0, 0, alt=altitude_m), trip)

@@ -8,7 +8,7 @@ from collections.abc import Coroutine
 from typing import Any, TypeVar
 
 import pytest
-from fractus_core.policy.values import Airframe
+from fractus_core.policy.decision_types import Airframe
 from fractus_mavlink import message
 from fractus_services.mobility.autopilot import Checked
 from fractus_services.mobility.mavlink.companion import SYSTEM_ID

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 from depth import examples
+from fractus_core.policy.decision_types import Attitude, Lens
 from fractus_core.policy.footprint import camera_axes
-from fractus_core.policy.values import Attitude, Lens
 from fractus_mavlink import message
 from fractus_mavlink.enums import GIMBAL_DEVICE_FLAGS as FLAGS
 from fractus_mavlink.enums import MAV_CMD

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fractus_core.policy.compiled import CompiledGrant, compile_grant
+from fractus_core.policy.compiled_grant import CompiledGrant, compile_grant
 from fractus_services import grant_files as module
 from fractus_services.admission import Allowance
 from fractus_services.grant_files import ActiveGrant, GrantFiles

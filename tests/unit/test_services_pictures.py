@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import skimage.data
 from depth import examples
-from fractus_core.policy.values import Attitude, Filter, Home, Lens
+from fractus_core.policy.decision_types import Attitude, Filter, Home, Lens
 from fractus_services.camera.drivers.connection import driver_for
 from fractus_services.camera.drivers.driver import BadConnection, CameraFailed, CaptureRequest
 from fractus_services.camera.face_detection import BadModel, CascadeDetector, ModelDetector, smallest_face_px

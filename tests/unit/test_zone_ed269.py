@@ -5,7 +5,7 @@ import json
 import pytest
 from fractus_core.api import InvalidObject
 from fractus_core.api.schedules import active_at
-from fractus_core.geo.formats import every as formats
+from fractus_core.geo import formats
 from test_zone_formats import ROUND, SQUARE, zone
 
 

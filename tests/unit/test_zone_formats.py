@@ -9,9 +9,8 @@ import yaml
 from click.testing import CliRunner
 from fractus_cli.zones import zones as command
 from fractus_core.api import InvalidObject, Zone
-from fractus_core.geo import LocalFrame, middle, polygon
-from fractus_core.geo.formats import drafts
-from fractus_core.geo.formats import every as formats
+from fractus_core.geo import LocalFrame, area_center, area_polygon, formats
+from fractus_core.geo.formats import zone_builder
 from test_planning import manifest
 
 SQUARE = [[4.0, 50.0], [4.01, 50.0], [4.01, 50.01], [4.0, 50.01], [4.0, 50.0]]
@@ -43,7 +42,7 @@ WRITERS = {
 
 
 def shape(spec):
-    return polygon(LocalFrame(50.0, 4.0), spec.area)
+    return area_polygon(LocalFrame(50.0, 4.0), spec.area)
 
 
 def kml(inside, around=""):
@@ -62,7 +61,7 @@ def test_areas_survive_the_round_trip(name):
     block, disc = sorted(back, key=lambda z: -shape(z.spec).area)
     if name == "qgc-plan":
         assert shape(block.spec).area == pytest.approx(
-            polygon(LocalFrame(50, 4), zone("x", {"polygon": {"exterior": points(SQUARE)}}).spec.area).area
+            area_polygon(LocalFrame(50, 4), zone("x", {"polygon": {"exterior": points(SQUARE)}}).spec.area).area
         )
     else:
         assert shape(block.spec).symmetric_difference(shape(BLOCK.spec)).area < 1e-3 * shape(BLOCK.spec).area
@@ -139,9 +138,9 @@ def test_polygons_across_the_antimeridian_survive_the_round_trip_in_parts(name):
     written = write([across])
     assert "a: it crosses the antimeridian and is cut there, into parts" in written.notes
     frame = LocalFrame(-17.0, 180.0)
-    parts = [polygon(frame, z.spec.area) for z in read(written.text).zones]
+    parts = [area_polygon(frame, z.spec.area) for z in read(written.text).zones]
     assert len(parts) == 2
-    whole = polygon(frame, across.spec.area)
+    whole = area_polygon(frame, across.spec.area)
     assert shapely.union_all(parts).symmetric_difference(whole).area < 1e-4 * whole.area
 
 
@@ -178,8 +177,8 @@ def test_geojson_follows_parallels():
     """A side of 140 km leaves its parallel by 470 m in the middle; the zone follows it to half a metre."""
     wide = [[4, 50], [6, 50], [6, 50.5], [4, 50.5], [4, 50]]
     (found,) = formats.read_geojson(json.dumps(feature({"type": "Polygon", "coordinates": [wide]}))).zones
-    frame = LocalFrame.at(middle(found.spec.area))
-    shape = polygon(frame, found.spec.area)
+    frame = LocalFrame.at(area_center(found.spec.area))
+    shape = area_polygon(frame, found.spec.area)
     for i in range(1, 200):
         for lat in (50, 50.5):
             along = shapely.Point(frame.xy(lat, 4 + i / 100))
@@ -314,14 +313,14 @@ def test_the_points_of_a_whole_file_have_a_limit(monkeypatch):
     one = feature({"type": "Polygon", "coordinates": around})
     count = len(formats.read_geojson(json.dumps(one)).zones[0].spec.area.polygon.exterior)
     assert count > 100 * len(long)
-    monkeypatch.setattr(drafts, "MAX_POINTS", 3 * count)
+    monkeypatch.setattr(zone_builder, "MAX_POINTS", 3 * count)
     collection = {"type": "FeatureCollection", "features": [one] * 3}
     assert len(formats.read_geojson(json.dumps(collection)).zones) == 3
     holes = feature({"type": "Polygon", "coordinates": around * 4})
     for more in (collection | {"features": [one] * 1000}, collection | {"features": [holes, one]}):
         with pytest.raises(InvalidObject, match=f"the file needs more than {3 * count} points") as refused:
             formats.read_geojson(json.dumps(more))
-        assert not isinstance(refused.value, formats.Inexact), "it is not read on"
+        assert not isinstance(refused.value, formats.InexactFeatures), "it is not read on"
 
 
 def test_a_file_with_a_key_twice_is_refused():

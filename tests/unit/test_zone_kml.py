@@ -4,8 +4,7 @@ import json
 
 import pytest
 from fractus_core.api import InvalidObject
-from fractus_core.geo import middle
-from fractus_core.geo.formats import every as formats
+from fractus_core.geo import area_center, formats
 from test_zone_formats import HOLE, ROUND, SQUARE, kml
 
 
@@ -33,7 +32,7 @@ def test_qgc_plan_of_others():
     plan = {"fileType": "Plan", "geoFence": fence, "mission": {"items": [{}]}, "rallyPoints": {"points": [[1, 2, 3]]}}
     found = formats.read_qgc_plan(json.dumps(plan))
     assert [z.name for z in found.zones] == ["inclusion-polygon-1", "exclusion-circle-1"]
-    assert middle(found.zones[1].spec.area).lat == 50.0
+    assert area_center(found.zones[1].spec.area).lat == 50.0
     assert len(found.notes) == 4
     assert (
         json.loads(formats.write_qgc_plan([ROUND], inclusion=True).text)["geoFence"]["circles"][0]["inclusion"] is True

@@ -10,7 +10,7 @@ from fractus_core import api
 from fractus_core.api.geometry import Area, Circle, Position
 from fractus_core.api.model import Condition, Metadata
 from fractus_core.api.policies import PolicySpec, ZoneSpec
-from fractus_core.geo import geojson_line
+from fractus_core.geo import line_geojson
 from fractus_core.geo.formats.geojson import zone_feature
 
 from fractus_view.events import Application, Fix, Link, Policy, State
@@ -153,9 +153,9 @@ def intentions(
             found.append(_feature("operationArea", name, plan.spec.operation_area, application=name))
         for component, path in _paths(each):
             if len(path) > 1:
-                found.append(_feature("path", name, geojson_line(path), application=name, component=component))
+                found.append(_feature("path", name, line_geojson(path), application=name, component=component))
         for leg in plan.spec.drone.transit if plan.spec.drone is not None else ():
-            shape = geojson_line((leg.start, leg.end))
+            shape = line_geojson((leg.start, leg.end))
             found.append(_feature("path", name, shape, application=name, component="system"))
     return found
 

@@ -15,7 +15,7 @@ from fractus_core.api.model import InvalidObject
 from fractus_core.api.node_grants import MAX_MESSAGE, ReportedGrant
 from fractus_core.api.plans import ENDED, Grant, GrantPhase, GrantSpec
 from fractus_core.control import Outcome, OutcomeKind
-from fractus_core.policy.trust import BadSignature, UnknownAuthority
+from fractus_core.policy.grant_signatures import BadSignature, UnknownAuthority
 from fractus_runtime.files import remove_file, write_file
 
 from fractus_agent.cluster.store import Granted, Object, Store

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from fractus_core.api.plans import Grant
-from fractus_core.policy.trust import UnknownAuthority
+from fractus_core.policy.grant_signatures import UnknownAuthority
 
 
 class GrantVerifier:
@@ -26,7 +26,7 @@ class GrantVerifier:
             UnknownAuthority: its authority is not known here yet.
         """
         # Imported here: the cryptography is a fifth of the memory, and nodes without a Grant do not need it.
-        from fractus_core.policy.signatures import read_authorities, verify  # noqa: PLC0415
+        from fractus_core.policy.grant_signatures import read_authorities, verify  # noqa: PLC0415
 
         try:
             authorities = read_authorities(self._path.read_bytes())

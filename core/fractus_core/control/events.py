@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from fractus_core.control.values import FlightMode, Outcome, VehicleFacts
-from fractus_core.policy.values import Takeover
+from fractus_core.policy.decision_types import Takeover
 
 # Drivers
 

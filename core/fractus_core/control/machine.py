@@ -38,7 +38,7 @@ from fractus_core.control.step import DRIVER_LOST, GRANT_REMOVED, Step
 from fractus_core.control.values import Authority, ControlState, OutcomeKind, SystemFlight, SystemTask, TaskKind
 from fractus_core.control.vehicles import on_arming, on_vehicle
 from fractus_core.exhaustive import exhaustive
-from fractus_core.policy.values import Takeover
+from fractus_core.policy.decision_types import Takeover
 
 TAKEOVERS: dict[Takeover, tuple[TaskKind, OutcomeKind | None]] = exhaustive(
     Takeover,

@@ -8,12 +8,13 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import shapely
 from shapely.geometry.base import BaseGeometry
 
 from fractus_core.api.geometry import Area, Circle, Point, Polygon, Position
 from fractus_core.api.model import InvalidObject
-from fractus_core.geo.frames import LocalFrame, distance_m
+from fractus_core.geo.local_frame import LocalFrame, distance_m
 
 _SEGMENTS = (8, 32)
 """Straight pieces per quarter of a circle, minimum and maximum: the area is right within 0.4 %."""
@@ -36,7 +37,7 @@ def points_xy(frame: LocalFrame, points: Iterable[Point]) -> list[tuple[float, f
     return [frame.xy(p.lat, p.lon) for p in points]
 
 
-def polygon(frame: LocalFrame, area: Area, *, within: bool = False) -> shapely.Polygon:
+def area_polygon(frame: LocalFrame, area: Area, *, within: bool = False) -> shapely.Polygon:
     """The area in metres east and north of the frame's origin; a circle is circumscribed, never cut short.
 
     Args:
@@ -121,23 +122,23 @@ def check_extent(area: Area) -> None:
     Raises:
         InvalidObject: naming the first point that is too far away.
     """
-    centre = middle(area)
+    centre = area_center(area)
     for i, point in enumerate(area.polygon.exterior if area.polygon is not None else ()):
         if distance_m(centre, point) > MAX_EXTENT_M:
             how = f"is more than {MAX_EXTENT_M / 1000:.0f} km from the middle; split the area"
             raise InvalidObject(f"polygon.exterior[{i}]", how)
 
 
-def middle(area: Area) -> Point:
+def area_center(area: Area) -> Point:
     """A point that serves as the origin of a frame for the area."""
     if area.circle is not None:
         return area.circle.center
     if area.polygon is None:
         raise InvalidObject("", "give either polygon or circle")
-    return middle_of(area.polygon.exterior)
+    return center_of(area.polygon.exterior)
 
 
-def middle_of(points: Iterable[Point]) -> Point:
+def center_of(points: Iterable[Point]) -> Point:
     """The middle of points on the sphere; it is right across the antimeridian and near the poles."""
     rad = np.radians([(p.lat, p.lon) for p in points])
     lat, lon = rad[:, 0], rad[:, 1]
@@ -150,7 +151,7 @@ def middle_of(points: Iterable[Point]) -> Point:
     )
 
 
-def area_of(frame: LocalFrame, shape: BaseGeometry) -> tuple[Area, ...]:
+def areas_of_shape(frame: LocalFrame, shape: BaseGeometry) -> tuple[Area, ...]:
     """A (multi)polygon in metres as areas of the API."""
     return tuple(
         Area(
@@ -164,7 +165,7 @@ def area_of(frame: LocalFrame, shape: BaseGeometry) -> tuple[Area, ...]:
     )
 
 
-def geojson(frame: LocalFrame, shape: BaseGeometry) -> dict[str, Any]:
+def multipolygon_geojson(frame: LocalFrame, shape: BaseGeometry) -> dict[str, Any]:
     """A (multi)polygon in metres as a GeoJSON MultiPolygon, lon before lat, split at the antimeridian (RFC 7946)."""
     polygons = []
     for part in shapely.get_parts(shape):
@@ -184,7 +185,7 @@ def geojson(frame: LocalFrame, shape: BaseGeometry) -> dict[str, Any]:
     return {"type": "MultiPolygon", "coordinates": coordinates}
 
 
-def geojson_line(points: Sequence[Point]) -> dict[str, Any]:
+def line_geojson(points: Sequence[Point]) -> dict[str, Any]:
     """A polyline as a GeoJSON MultiLineString, lon before lat, cut at the antimeridian (RFC 7946)."""
     unwrapped: list[tuple[float, float]] = []
     for p in points:
@@ -251,6 +252,51 @@ def _points(frame: LocalFrame, ring: BaseGeometry) -> tuple[Point, ...]:
     )
 
 
-def ground(position: Position) -> Point:
+def ground_point(position: Position) -> Point:
     """The place on the ground below a position."""
     return Point(lat=position.lat, lon=position.lon)
+
+
+Line = npt.NDArray[np.float64]
+"""The corners of a line in order, in metres: one a row."""
+
+_AT_ONCE = 64
+"""Pieces that are compared with all others at a time: of 30,000, these make a million pairs."""
+_MAX_PAIRS = 2_500_000
+"""Pairs of pieces that are looked at, within a second: as many as a way of two thousand pieces side by side has."""
+
+
+def count_crossings(lines: Sequence[Line], at_most: int) -> int:
+    """How many pairs of straight pieces cross, within a line and between lines; pieces that only touch do not.
+
+    Pieces are looked up by their bounding boxes: n pieces of which k pairs are near each other cost O(n log n + k).
+
+    Args:
+        lines: of two corners or more each.
+        at_most: where the count ends; there are more, or more than can be looked at, where the result is larger.
+    """
+    starts = np.concatenate([line[:-1] for line in lines]) if lines else np.empty((0, 2))
+    ends = np.concatenate([line[1:] for line in lines]) if lines else np.empty((0, 2))
+    pieces = shapely.linestrings(np.stack([starts, ends], axis=1)) if len(starts) else np.empty(0, dtype=object)
+    tree = shapely.STRtree(pieces)
+    found = looked_at = 0
+    for first in range(0, len(pieces), _AT_ONCE):
+        one, other = tree.query(pieces[first : first + _AT_ONCE])
+        one, other = one[other > one + first] + first, other[other > one + first]
+        looked_at += len(one)
+        found += int(np.count_nonzero(_cross(starts[one], ends[one], starts[other], ends[other])))
+        if found > at_most or looked_at > _MAX_PAIRS:
+            return at_most + 1
+    return found
+
+
+def _cross(a: Line, b: Line, c: Line, d: Line) -> npt.NDArray[np.bool_]:
+    """Whether the pieces from a to b cross those from c to d: the ends of each are on both sides of the other."""
+    apart = _side(a, b, c) * _side(a, b, d) < 0
+    return apart & (_side(c, d, a) * _side(c, d, b) < 0)
+
+
+def _side(start: Line, end: Line, place: Line) -> npt.NDArray[np.float64]:
+    """On which side of the way from start to end a place is: positive on the left."""
+    way, there = end - start, place - start
+    return np.sign(way[:, 0] * there[:, 1] - way[:, 1] * there[:, 0])

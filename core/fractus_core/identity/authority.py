@@ -16,7 +16,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from fractus_core.api import GROUP, node_identity, node_server_name
 from fractus_core.api.names import OPERATOR_IDENTITY, shortened
-from fractus_core.policy.signatures import DOCUMENT_SIGNING
+from fractus_core.policy.grant_signatures import DOCUMENT_SIGNING
 
 CA_LIFE = timedelta(days=3650)
 COMPONENT_LIFE = timedelta(hours=24)

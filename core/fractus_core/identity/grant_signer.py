@@ -13,8 +13,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 
 from fractus_core.api import Grant
 from fractus_core.identity.authority import Authority, renewal_time
-from fractus_core.policy.signatures import SIGNATURE_ANNOTATION, SIGNER_ANNOTATION, sign, verify
-from fractus_core.policy.trust import BadSignature
+from fractus_core.policy.grant_signatures import SIGNATURE_ANNOTATION, SIGNER_ANNOTATION, BadSignature, sign, verify
 
 _TICK = timedelta(microseconds=1)
 _MAX_VERIFIED = 4096

@@ -17,7 +17,16 @@ from fractus_core.api.components import ControlPoint
 from fractus_core.api.geometry import Area, Circle, Point, Position
 from fractus_core.api.model import InvalidObject
 from fractus_core.api.nodes import Depot
-from fractus_core.geo import LocalFrame, corridor, crossings, ground, middle, middle_of, points_xy, polygon
+from fractus_core.geo import (
+    LocalFrame,
+    area_center,
+    area_polygon,
+    center_of,
+    corridor,
+    count_crossings,
+    ground_point,
+    points_xy,
+)
 from fractus_core.planning.tour import short_tour
 
 MAX_CROSSINGS = 50_000
@@ -45,7 +54,7 @@ class OperationArea:
     @property
     def start(self) -> Point:
         """Where the work begins."""
-        return ground(self.route[0])
+        return ground_point(self.route[0])
 
 
 def operation_area(spec: ApplicationSpec, depots: Mapping[str, Depot], safety_radius_m: float) -> OperationArea | None:
@@ -61,7 +70,7 @@ def operation_area(spec: ApplicationSpec, depots: Mapping[str, Depot], safety_ra
     if not route:
         return None
     check_crossings(spec, route)
-    frame = LocalFrame.at(middle_of(route))
+    frame = LocalFrame.at(center_of(route))
     parts: list[BaseGeometry] = []
     driver = spec.driver
     poi = spec.points_of_interest
@@ -74,12 +83,14 @@ def operation_area(spec: ApplicationSpec, depots: Mapping[str, Depot], safety_ra
     elif poi is not None:
         match poi.service_access:
             case "points":
-                parts.append(shapely.union_all([corridor(frame, [ground(p)], safety_radius_m) for p in poi.points]))
+                parts.append(
+                    shapely.union_all([corridor(frame, [ground_point(p)], safety_radius_m) for p in poi.points])
+                )
             case "path":
-                parts.append(corridor(frame, [ground(p) for p in route], safety_radius_m))
+                parts.append(corridor(frame, [ground_point(p) for p in route], safety_radius_m))
             case _:
                 assert_never(poi.service_access)
-    length = length_m(frame, [ground(p) for p in route])
+    length = length_m(frame, [ground_point(p) for p in route])
     return OperationArea(frame, shapely.union_all(parts), tuple(route), tuple(parts), length)
 
 
@@ -95,7 +106,7 @@ def check_crossings(spec: ApplicationSpec, route: Sequence[Position]) -> None:
     """
     if not route:
         return
-    frame = LocalFrame.at(middle_of(route))
+    frame = LocalFrame.at(center_of(route))
     driver, poi = spec.driver, spec.points_of_interest
     rings: list[Sequence[Point]] = []
     if driver is not None:
@@ -110,7 +121,7 @@ def check_crossings(spec: ApplicationSpec, route: Sequence[Position]) -> None:
     else:
         return
     lines = [np.asarray(points_xy(frame, way)) for way in (*ways, *((*ring, ring[0]) for ring in rings))]
-    if crossings(lines, MAX_CROSSINGS) > MAX_CROSSINGS:
+    if count_crossings(lines, MAX_CROSSINGS) > MAX_CROSSINGS:
         raise InvalidObject(
             field,
             f"ways and edges of regions cross more than {MAX_CROSSINGS} times; give fewer waypoints, or regions with fewer corners",
@@ -150,7 +161,7 @@ def control_routes(points: Sequence[ControlPoint], depots: Mapping[str, Depot]) 
         route = [start] if start is not None else []
         route += point.path or ()
         if point.region is not None:
-            centre = middle(point.region)
+            centre = area_center(point.region)
             route.append(Position(lat=centre.lat, lon=centre.lon))
         routes.append(route)
     return routes
@@ -174,7 +185,7 @@ def route_of(spec: ApplicationSpec, depots: Mapping[str, Depot]) -> list[Positio
         return []
     if poi.ordered:
         return list(poi.points)
-    frame = LocalFrame.at(middle_of(poi.points))
+    frame = LocalFrame.at(center_of(poi.points))
     return [poi.points[i] for i in short_tour([frame.xy(p.lat, p.lon) for p in poi.points])]
 
 
@@ -183,19 +194,19 @@ def _control_area(
 ) -> BaseGeometry:
     if point.region is not None:
         try:
-            return polygon(frame, point.region)
+            return area_polygon(frame, point.region)
         except InvalidObject as error:
             raise InvalidObject(f"{field}.region.{error.field}", error.problem) from None
-    path = [ground(p) for p in point.path or ()]
+    path = [ground_point(p) for p in point.path or ()]
     area = corridor(frame, path, radius_m)
     start = start_of(point, depots)
     if start is None:
         return area
     if point.point is not None and point.point.depot is not None:
         depot = depots[point.point.depot].spec
-        stand = polygon(frame, Area(circle=Circle(center=depot.location, radius=depot.radius + radius_m)))
+        stand = area_polygon(frame, Area(circle=Circle(center=depot.location, radius=depot.radius + radius_m)))
         return area.union(shapely.union(stand, corridor(frame, path[:1], radius_m)).convex_hull)
-    return area.union(corridor(frame, [ground(start), *path], radius_m))
+    return area.union(corridor(frame, [ground_point(start), *path], radius_m))
 
 
 def length_m(frame: LocalFrame, points: Sequence[Point]) -> float:

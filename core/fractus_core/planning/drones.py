@@ -9,7 +9,7 @@ from fractus_core.api.components import Component
 from fractus_core.api.geometry import Point
 from fractus_core.api.nodes import Drone
 from fractus_core.api.plans import Alternative, DroneChoice, Mission
-from fractus_core.geo import ground
+from fractus_core.geo import ground_point
 from fractus_core.planning.area import OperationArea, start_of
 from fractus_core.planning.candidates import SUITABLE, Check, check_host, check_resources, check_services, readiness
 from fractus_core.planning.draft import Draft
@@ -159,7 +159,7 @@ def _standing(draft: Draft, area: OperationArea, leader: Component, flying: Sequ
     first = leader.control_points[0] if leader.control_points else None
     start = start_of(first, draft.inventory.depots) if first is not None else None
     named = first.point.depot if first is not None and first.point is not None else None
-    centre = ground(start) if start is not None else area.start
+    centre = ground_point(start) if start is not None else area.start
     inside = draft.inventory.depots[named].spec.radius if named is not None else settings.safety_radius_m
     kept = located.kept_in(named) if named is not None else frozenset()
     if start is None or leader.control == "partial":

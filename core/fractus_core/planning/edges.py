@@ -11,7 +11,7 @@ from fractus_core.api.components import Component
 from fractus_core.api.geometry import Point
 from fractus_core.api.nodes import Drone, EdgeNode, Interface, direct_interface
 from fractus_core.api.plans import PlannedInstance, Serves
-from fractus_core.geo import distance_m, ground
+from fractus_core.geo import distance_m, ground_point
 from fractus_core.planning.area import OperationArea
 from fractus_core.planning.candidates import Check, direct_range_m, direct_reach_m
 from fractus_core.planning.coverage import CoverScene, Samples, greedy_cover
@@ -64,7 +64,7 @@ def _beside(draft: Draft, component: Component, here: EdgeNode) -> list[str]:
     found = []
     if ours is None:
         return []
-    for name, distance in draft.located.edge_nodes.within(ground(here.spec.location), ours):
+    for name, distance in draft.located.edge_nodes.within(ground_point(here.spec.location), ours):
         if name == here.name or name not in draft.inventory.edge_nodes:
             continue
         reach = direct_reach_m(here.spec.interfaces, draft.inventory.edge_nodes[name].spec.interfaces)
@@ -83,7 +83,7 @@ def _reaches(here: EdgeNode, node: EdgeNode) -> bool:
     if here.name == node.name:
         return True
     reach = direct_reach_m(here.spec.interfaces, node.spec.interfaces)
-    return reach is not None and distance_m(ground(here.spec.location), ground(node.spec.location)) <= reach
+    return reach is not None and distance_m(ground_point(here.spec.location), ground_point(node.spec.location)) <= reach
 
 
 # -- along the drone's way --

@@ -16,7 +16,7 @@ from fractus_core.api.geometry import Point, Position, Reference
 from fractus_core.api.nodes import Depot, Drone
 from fractus_core.api.plans import TransitLeg
 from fractus_core.exhaustive import exhaustive
-from fractus_core.geo import LocalFrame, distance_m, middle_of
+from fractus_core.geo import LocalFrame, center_of, distance_m
 from fractus_core.planning.area import OperationArea, control_routes
 from fractus_core.planning.inventory import Flight, Settings
 
@@ -207,7 +207,7 @@ def ahead(flight: Flight, place: Position, radius_m: float) -> Flight | None:
     if not flight.legs:
         return None
     path = [p for leg in flight.legs for p in leg]
-    frame = LocalFrame.at(middle_of([*path, place]))
+    frame = LocalFrame.at(center_of([*path, place]))
     starts, ends = _segments(frame, replace(flight, reached=0))
     near = np.flatnonzero(np.isfinite(_passages(starts, ends, _spot(frame, place, None), radius_m)[:, 0]))
     if not len(near):
@@ -238,7 +238,7 @@ def first_missed(points: Sequence[Position], flight: Flight, radius_m: float, *,
     path = [p for leg in flight.legs for p in leg]
     if len(path) <= flight.reached:
         return 0
-    frame = LocalFrame.at(middle_of([*path, *points]))
+    frame = LocalFrame.at(center_of([*path, *points]))
     starts, ends = _segments(frame, flight)
     at = 0.0
     for i, point in enumerate(points):

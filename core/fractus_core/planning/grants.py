@@ -21,13 +21,13 @@ from fractus_core.api.plans import (
     PlannedInstance,
 )
 from fractus_core.api.policies import PolicySpec
-from fractus_core.geo import area_of, ground, middle, polygon
+from fractus_core.geo import area_center, area_polygon, areas_of_shape, ground_point
 from fractus_core.planning.area import OperationArea, operation_area
 from fractus_core.planning.inventory import Inventory, Settings
 from fractus_core.planning.zones import SoundZone, check_united, sound, surely_beyond
-from fractus_core.policy.access import SEEING
+from fractus_core.policy.engine import PICTURE_METHODS
 from fractus_core.policy.footprint import MAX_SIGHT_M
-from fractus_core.policy.selectors import holds, node_attributes, owner_of
+from fractus_core.policy.selectors import application_reference, node_attributes, policy_applies
 
 ROUNDING_M = 0.01
 """How far the outline of a granted area may be from the planned one: a third of the points do."""
@@ -132,7 +132,7 @@ def flight_grant(application: Application, drone: Drone, inventory: Inventory, a
     """
     leader = application.spec.leader or next(application.spec.on("drone"))
     grant = _drone_grant(application, drone, inventory, area, component=leader.name, instance=leader.name)
-    corners = shapely.get_coordinates([polygon(area.frame, part) for part in grant.corridor])
+    corners = shapely.get_coordinates([area_polygon(area.frame, part) for part in grant.corridor])
     reach_m = float(np.hypot(*corners.T).max()) + AROUND_WAY_M
     middle_of_way = Point(lat=area.frame.lat, lon=area.frame.lon)
     policies = _policies(grant, inventory, (), (middle_of_way, reach_m))
@@ -146,17 +146,17 @@ def _drone_grant(
     mobility = drone.spec.services.mobility
     depot = inventory.depots.get(drone.spec.depot or "")
     home = drone.spec.home
-    base = ground(home) if home is not None else depot.spec.location if depot is not None else area.start
+    base = ground_point(home) if home is not None else depot.spec.location if depot is not None else area.start
     stand = Area(circle=Circle(center=base, radius=depot.spec.radius if depot is not None else 30.0))
     shape = _outlined(area.shape)
-    way = shapely.union(shape, polygon(area.frame, stand)).convex_hull
+    way = shapely.union(shape, area_polygon(area.frame, stand)).convex_hull
     return GrantSpec(
         node=drone.name,
-        application=owner_of(application),
+        application=application_reference(application),
         component=component,
         instance=instance,
-        operation_area=area_of(area.frame, shape),
-        corridor=area_of(area.frame, way.simplify(ROUNDING_M)),
+        operation_area=areas_of_shape(area.frame, shape),
+        corridor=areas_of_shape(area.frame, way.simplify(ROUNDING_M)),
         depot=depot.spec.location if depot is not None else None,
         home=home,
         limits=GrantedLimits(max_altitude=mobility.max_altitude, max_speed=mobility.max_speed) if mobility else None,
@@ -228,7 +228,7 @@ def _edge_grant(
     node = inventory.edge_nodes[placed.node or ""]
     return GrantSpec(
         node=node.name,
-        application=owner_of(application),
+        application=application_reference(application),
         component=component.name,
         instance=placed.instance,
         services=component.services,
@@ -262,7 +262,7 @@ def _policies(
     for name, policy in inventory.policies.items():
         # The attributes of a node without a description are unknown: what held for it goes on.
         known = node is not None or name not in kept or not policy.spec.selector.nodes
-        if known and not holds(policy.spec, grant.application, grant.component, attributes):
+        if known and not policy_applies(policy.spec, grant.application, grant.component, attributes):
             continue
         try:
             found = _granted(policy, inventory, bounds, beyond)
@@ -311,7 +311,7 @@ def _granted(
 
 def _regards_pictures(spec: PolicySpec) -> bool:
     """Whether a policy counts also for zones that a camera sees from afar."""
-    return spec.type == "PrivacyControl" or not SEEING.isdisjoint(spec.methods)
+    return spec.type == "PrivacyControl" or not PICTURE_METHODS.isdisjoint(spec.methods)
 
 
 def _bounds(grant: GrantSpec, node: Drone | EdgeNode | None, inventory: Inventory) -> _Bounds | None:
@@ -320,17 +320,17 @@ def _bounds(grant: GrantSpec, node: Drone | EdgeNode | None, inventory: Inventor
     It is made of what a grant keeps, so that it is the same when a grant is made and when it is refreshed.
     """
     if isinstance(node, EdgeNode):
-        return ground(node.spec.location), FIXED_NODE_REACH_M
+        return ground_point(node.spec.location), FIXED_NODE_REACH_M
     if node is None:
         return None
     depot = inventory.depots.get(node.spec.depot or "")
     mobility = node.spec.services.mobility
     reach_m = mobility.max_speed * mobility.max_flight_time * 60 if mobility is not None else FIXED_NODE_REACH_M
     if node.spec.home is not None:
-        return ground(node.spec.home), reach_m
+        return ground_point(node.spec.home), reach_m
     if depot is not None:
         return depot.spec.location, reach_m
-    return (middle(grant.operation_area[0]), reach_m) if grant.operation_area else None
+    return (area_center(grant.operation_area[0]), reach_m) if grant.operation_area else None
 
 
 def _zone(policy: Policy, index: int, name: str, inventory: Inventory) -> SoundZone:

@@ -13,7 +13,7 @@ from shapely.geometry.base import BaseGeometry
 
 from fractus_core.api.geometry import Point
 from fractus_core.geo import LocalFrame, geodesic_m
-from fractus_core.geo.frames import CHORDS_TO_M, FLATTENING, SEMI_MAJOR_AXIS_M, ecef
+from fractus_core.geo.local_frame import CHORDS_TO_M, FLATTENING, SEMI_MAJOR_AXIS_M, ecef
 
 Near = tuple[str, float]
 """A name and its geodesic distance in metres."""

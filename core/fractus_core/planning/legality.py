@@ -14,11 +14,9 @@ from fractus_core.planning.area import OperationArea, operation_area
 from fractus_core.planning.flight import Estimate, MissionEstimator, MissionLeg, home_of, mission_legs, stay_minutes
 from fractus_core.planning.grants import flight_grant
 from fractus_core.planning.inventory import Inventory, Settings
-from fractus_core.policy.compiled import CompiledGrant, compile_grant, height_m
-from fractus_core.policy.engine import judge
-from fractus_core.policy.routes import quick_route
-from fractus_core.policy.selectors import holds, node_attributes, owner_of
-from fractus_core.policy.values import (
+from fractus_core.policy.altitude import altitude_above_home_m
+from fractus_core.policy.compiled_grant import CompiledGrant, compile_grant
+from fractus_core.policy.decision_types import (
     Airframe,
     Call,
     GotoArgs,
@@ -29,6 +27,9 @@ from fractus_core.policy.values import (
     Verdict,
     distinct,
 )
+from fractus_core.policy.engine import judge
+from fractus_core.policy.route_search import quick_route
+from fractus_core.policy.selectors import application_reference, node_attributes, policy_applies
 
 MAX_LISTED = 50
 """Legs that a plan lists at most."""
@@ -123,8 +124,10 @@ class WayJudge:
         mobility, time_s = drone.spec.services.mobility, self._settings.time_s
         if time_s is None or home is None or mobility is None or leader is None or mission is None:
             return None
-        owner, attributes = owner_of(self._application), node_attributes(drone)
-        held = tuple(p.name for p in self._inventory.policies.values() if holds(p.spec, owner, leader.name, attributes))
+        owner, attributes = application_reference(self._application), node_attributes(drone)
+        held = tuple(
+            p.name for p in self._inventory.policies.values() if policy_applies(p.spec, owner, leader.name, attributes)
+        )
         base = drone.spec.home.alt if drone.spec.home is not None else None
         key = (home, base, drone.spec.depot, mobility.max_altitude, mobility.max_speed, held)
         if key not in self._known and not held:
@@ -145,8 +148,8 @@ class WayJudge:
             granted = flight_grant(self._application, drone, self._inventory, self._area)
             own = compile_grant(granted, home, self._settings.flat_terrain)
             # The system flies wherever the application's drone may be; a driver with partial control stays where it works.
-            system = replace(own, operation=own.passage, operation_border=own.passage_border)
-            stays = replace(own, passage=own.operation, passage_border=own.operation_border)
+            system = replace(own, operation_area=own.flight_area, operation_area_border=own.flight_area_border)
+            stays = replace(own, flight_area=own.operation_area, flight_area_border=own.operation_area_border)
             flight = _Flight(now, system, stays if leader.control == "partial" else own, self._searches)
             flight.fly(list(mission_legs(self._application.spec, self._area, home, self._inventory.depots)))
             self._searches = flight.searches
@@ -209,7 +212,7 @@ class _Flight:
         first = legs[0].end
         height: float | None = TAKEOFF_ALTITUDE_M
         if first.alt is not None:
-            height = height_m(first.alt, first.altitude_reference, self.now.home, self.grant.flat_terrain)
+            height = altitude_above_home_m(first.alt, first.altitude_reference, self.now.home, self.grant.flat_terrain)
         height = TAKEOFF_ALTITUDE_M if height is None else max(height, 0.5)
         verdict = judge(Call("Takeoff", TakeoffArgs(height)), self.now, self.grant)
         if verdict.action != "allow":
@@ -260,7 +263,9 @@ class _Flight:
         begin = grant.locate(self.now)
         present_m = self.now.altitude_m
         wanted = (
-            present_m if asked.alt is None else height_m(asked.alt, asked.reference, self.now.home, grant.flat_terrain)
+            present_m
+            if asked.alt is None
+            else altitude_above_home_m(asked.alt, asked.reference, self.now.home, grant.flat_terrain)
         )
         goal = grant.frame.xy(asked.lat, asked.lon)
         for height in dict.fromkeys((present_m if wanted is None else wanted, present_m)):
@@ -289,7 +294,7 @@ class _Flight:
         now, frame = self.now, self.grant.frame
         height = None
         if flown.alt is not None:
-            height = height_m(flown.alt, flown.reference, now.home, self.grant.flat_terrain)
+            height = altitude_above_home_m(flown.alt, flown.reference, now.home, self.grant.flat_terrain)
         height = now.altitude_m if height is None else height
         distance_m = math.dist(frame.xy(now.lat or 0.0, now.lon or 0.0), frame.xy(flown.lat, flown.lon))
         self.distance_m += distance_m

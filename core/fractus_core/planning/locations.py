@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 
 from fractus_core.api.geometry import Point
 from fractus_core.api.nodes import Depot, Drone, EdgeNode
-from fractus_core.geo import ground
+from fractus_core.geo import ground_point
 from fractus_core.planning.index import SpatialIndex
 
 
@@ -106,7 +106,7 @@ class NodeLocations:
         self.widest_depot_m = max(self.widest_depot_m, depot.spec.radius)
 
     def _note_drone(self, drone: Drone) -> Point | None:
-        home = ground(drone.spec.home) if drone.spec.home is not None else None
+        home = ground_point(drone.spec.home) if drone.spec.home is not None else None
         self._drones[drone.name] = (drone.spec.depot, home)
         if drone.spec.depot is not None:
             self._kept_in.setdefault(drone.spec.depot, set()).add(drone.name)

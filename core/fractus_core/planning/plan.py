@@ -9,7 +9,7 @@ from fractus_core.api.applications import Application
 from fractus_core.api.components import Component, Placement
 from fractus_core.api.plans import DeploymentPlanSpec, DroneChoice
 from fractus_core.exhaustive import exhaustive
-from fractus_core.geo import geojson
+from fractus_core.geo import multipolygon_geojson
 from fractus_core.planning.area import OperationArea, operation_area
 from fractus_core.planning.candidates import check_host, check_resources
 from fractus_core.planning.draft import Draft, Infeasible, instance_name
@@ -109,7 +109,7 @@ def _drafted(draft: Draft) -> Generator[str, None, DeploymentPlanSpec]:
         application=application.name,
         application_generation=application.metadata.generation,
         application_digest=application.spec.mission_digest,
-        operation_area=geojson(area.frame, area.shape.simplify(_ROUNDING_M)) if area is not None else None,
+        operation_area=multipolygon_geojson(area.frame, area.shape.simplify(_ROUNDING_M)) if area is not None else None,
         drone=choice,
         placements=tuple(draft.placements),
         rejected=rejected,

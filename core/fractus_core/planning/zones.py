@@ -14,7 +14,7 @@ import shapely
 from fractus_core.api import InvalidObject, Policy, Zone
 from fractus_core.api.geometry import Area, Point
 from fractus_core.api.plans import GrantedZone
-from fractus_core.geo import LocalFrame, crossings, distance_m, middle, polygon
+from fractus_core.geo import LocalFrame, area_center, area_polygon, count_crossings, distance_m
 from fractus_core.planning.area import MAX_CROSSINGS
 
 _GENEROUS = 1.05
@@ -61,8 +61,8 @@ _SOUND: dict[int, SoundZone] = {}
 def _looked_at(zone: Zone) -> SoundZone:
     name, spec = zone.name, zone.spec
     try:
-        frame = LocalFrame.at(middle(spec.area))
-        outline = polygon(frame, spec.area)
+        frame = LocalFrame.at(area_center(spec.area))
+        outline = area_polygon(frame, spec.area)
     except InvalidObject as error:
         raise InvalidObject(f"Zone {name} spec.area.{error.field}", error.problem) from None
     granted = GrantedZone(name=name, area=spec.area, altitude=spec.altitude, schedule=spec.schedule)
@@ -94,7 +94,7 @@ def zone_crossings(zones: tuple[SoundZone, ...], at_most: int) -> int:
     middle_lon = float(lines[0][0, 0]) if lines else 0.0
     for line in lines:
         line[:, 0] = (line[:, 0] - middle_lon + 540.0) % 360.0 - 180.0
-    return crossings(lines, at_most)
+    return count_crossings(lines, at_most)
 
 
 def check_united(policy: Policy, zones: Sequence[SoundZone]) -> None:

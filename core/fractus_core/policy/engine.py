@@ -9,16 +9,12 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 
+import shapely
+
 from fractus_core.api.methods import CONTROL_METHODS, Method
 from fractus_core.exhaustive import exhaustive
-from fractus_core.policy.access import judge_access
-from fractus_core.policy.compiled import CompiledGrant
-from fractus_core.policy.corrections import settled
-from fractus_core.policy.legs import judge_goto
-from fractus_core.policy.monitoring import must_rest
-from fractus_core.policy.motion import moving
-from fractus_core.policy.privacy import judge_privacy
-from fractus_core.policy.values import (
+from fractus_core.policy.compiled_grant import OPERATION_AREA, AirVolume, CompiledGrant, PolicyIndex, Rule
+from fractus_core.policy.decision_types import (
     Call,
     CaptureArgs,
     GotoArgs,
@@ -29,9 +25,16 @@ from fractus_core.policy.values import (
     VelocityArgs,
     Verdict,
     deny,
+    earliest_time,
+    format_distance,
 )
-from fractus_core.policy.velocities import judge_speed, judge_velocity
-from fractus_core.policy.vertical import judge_arm, judge_disarm, judge_land, judge_takeoff
+from fractus_core.policy.goto_rules import judge_goto
+from fractus_core.policy.kinematics import is_moving
+from fractus_core.policy.limits import settle_correction
+from fractus_core.policy.monitoring import must_stop_first
+from fractus_core.policy.picture_rules import by_priority, judge_privacy, rule_names, rules_in_view
+from fractus_core.policy.takeoff_landing_rules import judge_arm, judge_disarm, judge_land, judge_takeoff
+from fractus_core.policy.velocity_rules import judge_speed, judge_velocity
 
 MAX_ALTITUDE_M = 20_000.0
 MIN_SPEED_MPS = 0.1
@@ -55,7 +58,7 @@ def judge(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     Returns:
         The verdict; an internal error is the caller's to turn into refusal and hover.
     """
-    if not now.sound:
+    if not now.is_plausible:
         now = _unsound(now)
     verdict = _judge_once(call, now, grant)
     if verdict.action == "correct" and call.method in _ARGS:
@@ -65,7 +68,7 @@ def judge(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
 
 def _settle(call: Call, correction: Verdict, now: Situation, grant: CompiledGrant) -> Verdict:
     """A correction that holds; apart from `judge`, which a closure would have to allocate for on every call."""
-    return settled(call, correction, lambda again: _judge_once(again, now, grant))
+    return settle_correction(call, correction, lambda again: _judge_once(again, now, grant))
 
 
 def _judge_once(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
@@ -80,10 +83,10 @@ def _judge_once(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
 
 def _must_brake(call: Call, verdict: Verdict, now: Situation, grant: CompiledGrant) -> bool:
     """Whether a moving drone must stop before anything else: it is taken over, or on its way into a fence."""
-    if verdict.brake_first or not moving(now):
+    if verdict.brake_first or not is_moving(now):
         return verdict.brake_first
     if verdict.permits:
-        return call.method in _COURSES and must_rest(now, grant)
+        return call.method in _COURSES and must_stop_first(now, grant)
     return verdict.action == "takeover"
 
 
@@ -96,6 +99,96 @@ def _unsound(now: Situation) -> Situation:
     if not math.isfinite(now.time_s):
         raise ValueError("the time is not a number")
     return Situation(time_s=now.time_s, armed=now.armed, in_air=now.in_air, vertical=now.vertical)
+
+
+# Access to methods
+
+PICTURE_METHODS = frozenset({"CaptureImage", "RetrieveImage"})
+"""Methods that are denied by what a picture may show, and used only while the drone is where the application works; motion
+is judged by its leg."""
+
+
+def judge_access(call: Call, now: Situation, grant: CompiledGrant) -> Verdict | None:
+    """The refusal of a method, or None when it may be used."""
+    method = call.method
+    if method not in grant.methods:
+        return deny(
+            "MethodNotGranted",
+            f"the grant of {grant.identity} does not include {method}; add it to the component's services",
+        )
+    denied = judge_denials(method, now, grant)
+    if denied is not None:
+        return denied
+    allowances = grant.allowances.get(method)
+    if allowances is not None and not _allowing(allowances, now, grant):
+        rules = by_priority(
+            {p.rule.name: p.rule for p in allowances.zones} | {r.name: r for r in allowances.everywhere}
+        )
+        return deny("MethodNotGrantedHere", f"{method} is granted elsewhere or at other times only", rule_names(rules))
+    if method in PICTURE_METHODS and grant.operation_area is not None:
+        return _outside_operation_area(method, now, grant)
+    return None
+
+
+def judge_denials(method: str, now: Situation, grant: CompiledGrant) -> Verdict | None:
+    """The denial of a method where the drone is; of one of `PICTURE_METHODS`, by what a picture from there may show."""
+    denials = grant.denials.get(method)
+    if denials is None:
+        return None
+    forbidding = (
+        rules_in_view(denials, now, grant)
+        if method in PICTURE_METHODS
+        else _matching(denials, now, grant, now.position_error_m)
+    )
+    if not forbidding:
+        return None
+    return deny("MethodDenied", f"policy {forbidding[0].name} denies {method} here", rule_names(forbidding))
+
+
+def _outside_operation_area(method: str, now: Situation, grant: CompiledGrant) -> Verdict | None:
+    if now.lat is None or now.lon is None:
+        return deny("PositionUnknown", f"{method} needs a known position; wait for a fix")
+    here = shapely.points(grant.frame.xy(now.lat, now.lon))
+    if grant.operation_area is None or grant.operation_area.covers(here):
+        return None
+    away_m = grant.operation_area.distance(here)
+    return deny(
+        "OutsideOperationArea",
+        f"{method} is granted inside the operation area, which is {format_distance(away_m)} away",
+        (OPERATION_AREA,),
+    )
+
+
+def _allowing(index: PolicyIndex, now: Situation, grant: CompiledGrant) -> bool:
+    """Whether some policy of an index surely holds, whichever reading of a doubtful clock is right."""
+    readings = {float(now.time_s), earliest_time(now.time_s)}
+    return all(_matching(index, replace(now, time_s=t), grant, 0.0, certain=True) for t in readings)
+
+
+def _matching(
+    index: PolicyIndex,
+    now: Situation,
+    grant: CompiledGrant,
+    distance_m: float,
+    *,
+    certain: bool = False,
+) -> list[Rule]:
+    """Policies of an index that hold at the present position.
+
+    While the position is unknown every policy in force may hold; with `certain`, none of those with zones does.
+    """
+    found = {rule.name: rule for rule in index.everywhere if rule.in_force(now.time_s)}
+    if now.lat is None or now.lon is None:
+        if not certain:
+            found |= {p.rule.name: p.rule for p in index.zones if p.in_force(now.time_s)}
+        return by_priority(found)
+    if index.zones:
+        here = shapely.points(grant.frame.xy(now.lat, now.lon))
+        slack_m = 0.0 if certain else now.altitude_error_m
+        air = AirVolume(here, distance_m, now.altitude_m - slack_m, now.altitude_m + slack_m)
+        for zone in index.near(air, now, grant.flat_terrain):
+            found[zone.rule.name] = zone.rule
+    return by_priority(found)
 
 
 # Arguments

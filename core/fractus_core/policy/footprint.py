@@ -11,8 +11,8 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from fractus_core.geo import LocalFrame
-from fractus_core.policy.motion import XY
-from fractus_core.policy.values import Attitude, Lens, Situation
+from fractus_core.policy.decision_types import Attitude, Lens, Situation
+from fractus_core.policy.kinematics import XY
 
 MAX_SIGHT_M = 10_000.0
 """Nothing is told apart from further away: at 5 degrees of view, 8 megapixels resolve 0.3 m there."""
@@ -74,7 +74,7 @@ class Footprint:
         return bool(shape.dwithin(_hull(points), self.margin_m))
 
 
-def joined(views: Sequence[Footprint]) -> Footprint:
+def joined_footprint(views: Sequence[Footprint]) -> Footprint:
     """What is shown by a picture that is taken while the camera moves through these, one after the other."""
     if len(views) == 1:
         return views[0]
@@ -86,11 +86,11 @@ def joined(views: Sequence[Footprint]) -> Footprint:
     )
 
 
-def seen_from(poses: Sequence[Situation], frame: LocalFrame) -> Footprint | None:
+def exposure_footprint(poses: Sequence[Situation], frame: LocalFrame) -> Footprint | None:
     """What a picture may show that is taken while the camera moves through these; None where one of them is unknown."""
     views = [footprint(now, frame) for now in poses]
     known = [view for view in views if view is not None]
-    return joined(known) if known and len(known) == len(views) else None
+    return joined_footprint(known) if known and len(known) == len(views) else None
 
 
 def footprint(now: Situation, frame: LocalFrame) -> Footprint | None:
@@ -99,7 +99,7 @@ def footprint(now: Situation, frame: LocalFrame) -> Footprint | None:
     The ground is taken for level, between home's height and `relief_m` below it. Whatever is unknown - attitude, lens,
     ground - makes the camera see everything around it.
     """
-    if now.lat is None or now.lon is None or not now.sound:
+    if now.lat is None or now.lon is None or not now.is_plausible:
         return None
     at = frame.xy(now.lat, now.lon)
     attitude = _attitude(now)

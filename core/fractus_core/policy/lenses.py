@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from fractus_core.api.nodes import CameraFeatures, CameraLens
-from fractus_core.policy.values import Lens
+from fractus_core.policy.decision_types import Lens
 
 MOUNT_ERROR_DEG = 2.0
 """Bound of the error of a mount's direction."""
@@ -18,7 +18,7 @@ _MAX_TAN = math.tan(math.radians(80.0))
 """Rays further from the axis than that (`footprint.MAX_HALF_VIEW_DEG`) make a view count as everything anyway."""
 
 
-def lens_of(camera: CameraFeatures | None) -> Lens | None:
+def bounding_lens(camera: CameraFeatures | None) -> Lens | None:
     """What a description tells of a camera; None where it does not tell enough."""
     if camera is None or camera.horizontal_field_of_view is None or camera.mount is None:
         return None

@@ -8,21 +8,29 @@ from dataclasses import dataclass, replace
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from fractus_core.api.geometry import AltitudeBand
 from fractus_core.api.policies import GeofenceAction
-from fractus_core.policy.compiled import (
-    OPERATION_AREA,
-    Air,
-    CompiledGrant,
-    Inclusion,
-    PolicyZone,
-    band_meets,
-    height_m,
+from fractus_core.policy.altitude import altitude_above_home_m, band_depth_m, band_may_overlap
+from fractus_core.policy.compiled_grant import OPERATION_AREA, AirVolume, CompiledGrant, Inclusion, PolicyZone
+from fractus_core.policy.decision_types import GotoArgs, SetSpeedArgs, Situation, Verdict
+from fractus_core.policy.geofences import SEVERITY, TAKEOVERS, find_breaches, signed_depth_m
+from fractus_core.policy.kinematics import (
+    XY,
+    is_moving,
+    margin_m,
+    pending_outcomes,
+    reaction_s,
+    stop_altitude_m,
+    stop_point,
+    vertical_leg,
 )
-from fractus_core.policy.fences import SEVERITY, TAKEOVERS, breaches, signed_depth_m
-from fractus_core.policy.limits import Bound, altitude_bounds, can_be_kept, datum_unknown, speed_bounds, strictest
-from fractus_core.policy.motion import XY, margin_m, moving, outlooks, reaction_s, standing, stop_altitude_m, stop_point
-from fractus_core.policy.values import GotoArgs, SetSpeedArgs, Situation, Verdict
+from fractus_core.policy.limits import (
+    Bound,
+    altitude_bounds,
+    deny_unknown_datum,
+    is_achievable,
+    speed_bounds,
+    strictest_bound,
+)
 
 TRACKING_SHARE = 0.3
 """Share of the tracking margin of accepted legs that the monitor keeps as well."""
@@ -71,13 +79,13 @@ def monitor(
     """
     if not now.in_air:
         return None
-    if not now.sound and not math.isfinite(now.time_s):
+    if not now.is_plausible and not math.isfinite(now.time_s):
         raise ValueError("the time is not a number")
     lat, lon = now.lat, now.lon
-    if lat is None or lon is None or not now.sound:
+    if lat is None or lon is None or not now.is_plausible:
         return Verdict("takeover", None, "PositionUnknown", "the drone's position is unknown", (), "hover")
     start, margin = grant.frame.xy(lat, lon), now.position_error_m + TRACKING_SHARE * now.airframe.tracking_m
-    surging = [(start, now), *outlooks(now, start)] if changed else []
+    surging = [(start, now), *pending_outcomes(now, start)] if changed else []
     # A drone that speeds up does so on a way that was judged with room for it, and brakes at its end in time.
     now = replace(now, forward_mps2=min(now.forward_mps2 or 0.0, 0.0))
     stop = stop_point(now, start)
@@ -85,7 +93,7 @@ def monitor(
     level_m = _level_m(now, bound_for, grant)
     worst = _worst(_fences(now, grant, _look_ahead(now, start, ahead, margin, level_m), leaving=leaving))
     if worst is not None:
-        return replace(worst, brake_first=worst.action == "takeover" and moving(now))
+        return replace(worst, brake_first=worst.action == "takeover" and is_moving(now))
     for begin, then in surging:
         # Its way may end before the fence: it is stopped, and taken over only if it really goes too far.
         further = _look_ahead(then, begin, stop_point(then, begin), margin, _level_m(then, bound_for, grant))
@@ -96,7 +104,7 @@ def monitor(
         # A leg that is illegal by now is stopped at once: to stop it when it has to be takes a link at that moment.
         worst = _worst(_fences(now, grant, _rest_of_leg(now, grant, start, bound_for, margin), leaving=leaving))
         if worst is not None:
-            return replace(worst, brake_first=worst.action == "takeover" and moving(now))
+            return replace(worst, brake_first=worst.action == "takeover" and is_moving(now))
     rest_m = _told_m(now, level_m)
     # A climb of the autopilot's own was never judged and may end anywhere, so less than the whole slack is left to it.
     unasked = leaving and bound_for is None and now.down_mps < -CLIMBING_MPS
@@ -136,7 +144,7 @@ def _level_m(now: Situation, bound_for: GotoArgs | None, grant: CompiledGrant) -
     rest_m, climb = stop_altitude_m(now), -now.down_mps
     if bound_for is None or bound_for.alt is None or climb == 0.0:
         return rest_m
-    target_m = height_m(bound_for.alt, bound_for.reference, now.home, grant.flat_terrain)
+    target_m = altitude_above_home_m(bound_for.alt, bound_for.reference, now.home, grant.flat_terrain)
     if target_m is None:
         return rest_m
     up, strays = math.copysign(1.0, climb), now.airframe.tracking_m
@@ -158,16 +166,16 @@ def _told_m(now: Situation, rest_m: float) -> float:
     return rest_m - math.copysign(late_m, climb)
 
 
-def must_rest(now: Situation, grant: CompiledGrant) -> bool:
+def must_stop_first(now: Situation, grant: CompiledGrant) -> bool:
     """Whether a moving drone must come to rest before it begins anything else, legal though that is.
 
     Its way to rest comes so near to a fence that the monitor may stop it on the new course, too: with the margin of legs,
     and without the braking that has begun already, which a new command may interrupt.
     """
     at = grant.locate(now)
-    if at is None or not now.in_air or not moving(now):
+    if at is None or not now.in_air or not is_moving(now):
         return False
-    ways = [(at, replace(now, forward_mps2=0.0)), *outlooks(now, at)]
+    ways = [(at, replace(now, forward_mps2=0.0)), *pending_outcomes(now, at)]
     return any(
         _fences(
             then,
@@ -185,11 +193,13 @@ def _look_ahead(now: Situation, start: XY, stop: XY, margin: float, rest_m: floa
     upper = max(now.altitude_m, rest_m) + now.altitude_error_m
     # Who lands is not kept in the air by what is below.
     ends_m = max(rest_m, now.altitude_m) if now.vertical else rest_m
-    return _Ahead(Air(way, margin, lower, upper), shapely.points(start), shapely.points(stop), now.altitude_m, ends_m)
+    return _Ahead(
+        AirVolume(way, margin, lower, upper), shapely.points(start), shapely.points(stop), now.altitude_m, ends_m
+    )
 
 
 def _rest_of_leg(now: Situation, grant: CompiledGrant, start: XY, leg: GotoArgs, margin: float) -> _Ahead:
-    level_m = None if leg.alt is None else height_m(leg.alt, leg.reference, now.home, grant.flat_terrain)
+    level_m = None if leg.alt is None else altitude_above_home_m(leg.alt, leg.reference, now.home, grant.flat_terrain)
     end = grant.frame.xy(leg.lat, leg.lon)
     return _look_ahead(now, start, end, margin, now.altitude_m if level_m is None else level_m)
 
@@ -198,7 +208,7 @@ def _rest_of_leg(now: Situation, grant: CompiledGrant, start: XY, leg: GotoArgs,
 class _Ahead:
     """The way to where the drone can stop, with its ends, and their altitudes above home."""
 
-    air: Air
+    air: AirVolume
     here: BaseGeometry
     rest: BaseGeometry
     here_m: float
@@ -232,11 +242,11 @@ def _fences(now: Situation, grant: CompiledGrant, ahead: _Ahead, *, leaving: boo
         (zone.rule.spec.priority, _kept_out(zone, ahead, now, grant.flat_terrain))
         for zone in grant.exclusions.near(ahead.air, now, grant.flat_terrain)
     ]
-    if grant.passage is not None and grant.passage_border is not None:
+    if grant.flight_area is not None and grant.flight_area_border is not None:
         area = _Fence(
             OPERATION_AREA, "ignore", "the operation area", "OutsideOperationArea", "OperationAreaBorderAhead"
         )
-        found.append((0, _kept_in(grant.passage, grant.passage_border, ahead, area, leaves=False)))
+        found.append((0, _kept_in(grant.flight_area, grant.flight_area_border, ahead, area, leaves=False)))
     for inclusion in grant.inclusions:
         if inclusion.rule.in_force(now.time_s):
             shape, border = inclusion.at(ahead.air.lower_m, ahead.air.upper_m, now, grant.flat_terrain)
@@ -254,13 +264,13 @@ def _kept_out(zone: PolicyZone, ahead: _Ahead, now: Situation, flat: bool) -> _F
     shape, border = zone.shape, zone.shape.boundary
     around, crosses = bool(shape.intersects(ahead.here)), bool(shape.intersects(ahead.air.ground))
     error_m = now.altitude_error_m
-    inside = around and band_meets(zone.band, ahead.here_m - error_m, ahead.here_m + error_m, now.home, flat)
+    inside = around and band_may_overlap(zone.band, ahead.here_m - error_m, ahead.here_m + error_m, now.home, flat)
     rest_m, here_m = (signed_depth_m(shape, border, point) for point in (ahead.rest, ahead.here))
     worse = rest_m > here_m + DEEPER_M or (crosses and not around)
     if crosses and zone.band is not None:
         # From above or from below; where it is in the zone as seen from above, the lesser depth counts.
         rest_m, here_m = (
-            min(depth_m, _depth_in_band_m(zone.band, altitude_m, now, flat))
+            min(depth_m, band_depth_m(zone.band, altitude_m, now.home, flat))
             for depth_m, altitude_m in ((rest_m, ahead.rest_m), (here_m, ahead.here_m))
         )
         worse = worse or here_m < 0.0 <= rest_m or (rest_m > here_m + DEEPER_M and rest_m > -error_m)
@@ -269,22 +279,11 @@ def _kept_out(zone: PolicyZone, ahead: _Ahead, now: Situation, flat: bool) -> _F
     return _Finding(fence, inside, worse, "is inside" if inside else "is about to enter")
 
 
-def _depth_in_band_m(band: AltitudeBand | None, altitude_m: float, now: Situation, flat: bool) -> float:
-    """How deep an altitude above home is between those of a band, negative outside; an edge of unknown datum is none."""
-    if band is None:
-        return math.inf
-    floor, ceiling = (
-        None if edge is None else height_m(edge, band.reference, now.home, flat) for edge in (band.lower, band.upper)
-    )
-    above = math.inf if floor is None else altitude_m - floor
-    return min(above, math.inf if ceiling is None else ceiling - altitude_m)
-
-
 def _leaves_by_height(fence: Inclusion, ahead: _Ahead, now: Situation, flat: bool) -> bool:
     """Whether a drone above or below the zones to stay in, or about to be, gets further from all of them by its height."""
     around = [zone.band for zone in fence.zones if zone.shape.intersects(ahead.here)]
     rest_m, here_m = (
-        max((_depth_in_band_m(band, m, now, flat) for band in around), default=math.inf)
+        max((band_depth_m(band, m, now.home, flat) for band in around), default=math.inf)
         for m in (ahead.rest_m, ahead.here_m)
     )
     return rest_m < 0.0 <= here_m or (rest_m < here_m - DEEPER_M and rest_m < now.altitude_error_m)
@@ -332,17 +331,17 @@ def _heights(
     """
     if grant.max_altitude_m is None and not grant.altitude_limits:
         return None
-    bounds, unknown = altitude_bounds(grant, now, Air(shapely.points(start), 0.0, now.altitude_m, now.altitude_m))
+    bounds, unknown = altitude_bounds(grant, now, AirVolume(shapely.points(start), 0.0, now.altitude_m, now.altitude_m))
     slack = now.altitude_error_m + now.airframe.tracking_m
     sinks_back = sinks_back and now.down_mps > SINKING_MPS
-    over, under = strictest(bounds, above=True), strictest(bounds, above=False)
+    over, under = strictest_bound(bounds, above=True), strictest_bound(bounds, above=False)
     high, low = max(now.altitude_m, rest_m), min(now.altitude_m, rest_m)
     if over is not None and over.upper is not None and high > over.upper + share * slack and not sinks_back:
         reason = f"the drone climbs to {high:.1f} m, above the limit of {over.upper:.1f} m"
         return _changed_height(_Trespass(over, over.upper, "AltitudeAboveLimit", reason), now, grant, stop)
     if unknown:
         sinking = now.down_mps > -SINKING_MPS
-        return None if sinking else replace(datum_unknown(unknown[0]), takeover="hover")
+        return None if sinking else replace(deny_unknown_datum(unknown[0]), takeover="hover")
     if under is not None and under.lower is not None and low < under.lower - slack and not now.vertical:
         if over is not None and over.upper is not None and over.upper < under.lower:
             return None
@@ -364,8 +363,8 @@ class _Trespass:
 def _changed_height(found: _Trespass, now: Situation, grant: CompiledGrant, stop: XY) -> Verdict:
     """The correction to a height, or a stop where zones leave no way to it."""
     names = (found.bound.name,) if found.bound.name else ()
-    column = standing(stop, min(now.altitude_m, found.height_m), max(now.altitude_m, found.height_m))
-    if breaches(column, now, grant, 0.0, 0.0):
+    column = vertical_leg(stop, min(now.altitude_m, found.height_m), max(now.altitude_m, found.height_m))
+    if find_breaches(column, now, grant, 0.0, 0.0):
         reason = f"{found.reason}; zones leave no way back, so it stays"
         return Verdict("deny", None, found.code, reason, names, "hover")
     lat, lon = grant.frame.latlon(*stop)
@@ -377,13 +376,13 @@ def _speeds(now: Situation, grant: CompiledGrant, start: XY) -> Verdict | None:
     if grant.max_speed_mps is None and not grant.speed_limits:
         return None
     speed = math.hypot(now.north_mps, now.east_mps)
-    bounds = speed_bounds(grant, now, Air(shapely.points(start), 0.0, now.altitude_m, now.altitude_m))
-    over = strictest(bounds, above=True)
+    bounds = speed_bounds(grant, now, AirVolume(shapely.points(start), 0.0, now.altitude_m, now.altitude_m))
+    over = strictest_bound(bounds, above=True)
     # Gusts push a drone that keeps its setpoint beyond it for a moment: a tenth and 1 m/s are not its doing.
     if over is None or over.upper is None or speed <= over.upper * 1.1 + 1.0:
         return None
     reason = f"the drone flies at {speed:.1f} m/s, above the limit of {over.upper:.1f} m/s"
     names = (over.name,) if over.name else ()
-    if not can_be_kept("Speed", over.upper):
+    if not is_achievable("Speed", over.upper):
         return Verdict("deny", None, "SpeedAboveLimit", f"{reason}; the motion is stopped", names, "hover")
     return Verdict("correct", SetSpeedArgs(over.upper), "SpeedAboveLimit", reason, names)

@@ -15,15 +15,17 @@ from fractus_core.api.plans import ApplicationReference
 from fractus_core.api.policies import NodeExpression, PolicySpec
 
 
-def selects(
+def policy_selects(
     policy: PolicySpec, application: Application, component: Component, attributes: Mapping[str, object]
 ) -> bool:
     """Whether a policy holds for a component of an application on a node (its zones are judged in flight)."""
-    return holds(policy, owner_of(application), component.name, attributes)
+    return policy_applies(policy, application_reference(application), component.name, attributes)
 
 
-def holds(policy: PolicySpec, owner: ApplicationReference, component: str, attributes: Mapping[str, object]) -> bool:
-    """As `selects`, by what a grant keeps of its application and component."""
+def policy_applies(
+    policy: PolicySpec, owner: ApplicationReference, component: str, attributes: Mapping[str, object]
+) -> bool:
+    """As `policy_selects`, by what a grant keeps of its application and component."""
     wanted = policy.selector.applications
     unknown = policy.kind != "grant"
     if wanted is not None:
@@ -109,7 +111,7 @@ def _paths(prefix: str, model: type[BaseModel]) -> Iterable[str]:
                 yield from _paths(path, part)
 
 
-def owner_of(application: Application) -> ApplicationReference:
+def application_reference(application: Application) -> ApplicationReference:
     """The application as its grants name it."""
     namespace, name = application.key
     return ApplicationReference(namespace=namespace, name=name, uid=application.metadata.uid or "")

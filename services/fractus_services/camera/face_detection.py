@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
-from fractus_core.policy.values import Lens
+from fractus_core.policy.decision_types import Lens
 
 from fractus_services.camera.pixels import Pixels, opencv
 from fractus_services.errors import PreconditionFailed

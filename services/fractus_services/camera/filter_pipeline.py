@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import assert_never
 
-from fractus_core.policy.privacy import compose
-from fractus_core.policy.values import Filter
+from fractus_core.policy.decision_types import Filter
+from fractus_core.policy.picture_rules import combine_filters
 
 from fractus_services.camera import filters
 from fractus_services.camera.face_detection import Detector
@@ -53,7 +53,7 @@ def plan_filters(required: tuple[Filter, ...], face_px: float, detector: Detecto
     if faces.fallback == "refuse":
         raise FacesNotReliable(f"{note}; go closer, or ask for more pixels")
     rest = [one for one in required if one is not faces]
-    return FilterPlan(compose([*rest, Filter(faces.fallback)]), f"{note}, so {faces.fallback} instead")
+    return FilterPlan(combine_filters([*rest, Filter(faces.fallback)]), f"{note}, so {faces.fallback} instead")
 
 
 def apply_filters(

@@ -8,7 +8,7 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
-from fractus_core.policy.values import CaptureArgs
+from fractus_core.policy.decision_types import CaptureArgs
 from fractus_proto.v1 import camera_pb2, camera_pb2_grpc
 
 from fractus_services.admission import CallAdmission

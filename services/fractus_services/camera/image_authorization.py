@@ -6,10 +6,9 @@ import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 
-from fractus_core.policy.access import judge_denials
-from fractus_core.policy.engine import judge
-from fractus_core.policy.privacy import compose, judge_privacy
-from fractus_core.policy.values import Call, Situation, Verdict
+from fractus_core.policy.decision_types import Call, Situation, Verdict
+from fractus_core.policy.engine import judge, judge_denials
+from fractus_core.policy.picture_rules import combine_filters, judge_privacy
 from fractus_runtime import spans
 from fractus_runtime.audit import AuditLog
 
@@ -134,7 +133,7 @@ def taken_at(poses: Iterable[Pose], now: Situation) -> Situation:
 
 def combined(verdicts: Sequence[Verdict]) -> Verdict:
     """What several verdicts that permit a picture require together."""
-    filters = compose(one for verdict in verdicts for one in verdict.filters)
+    filters = combine_filters(one for verdict in verdicts for one in verdict.filters)
     if not filters:
         return verdicts[0]
     names = tuple(dict.fromkeys(name for verdict in verdicts for name in verdict.policies))

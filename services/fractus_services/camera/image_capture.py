@@ -10,9 +10,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 
-from fractus_core.policy.footprint import seen_from
-from fractus_core.policy.privacy import judge_privacy
-from fractus_core.policy.values import Call, CaptureArgs, Situation, UncertainTime, Verdict, earliest
+from fractus_core.policy.decision_types import Call, CaptureArgs, Situation, UncertainTime, Verdict, earliest_time
+from fractus_core.policy.footprint import exposure_footprint
+from fractus_core.policy.picture_rules import judge_privacy
 from fractus_runtime import spans
 
 from fractus_services.background import Background
@@ -179,7 +179,7 @@ class ImageCapture:
             self._judge.judge(call, grant, moment, record=False)
             for moment in (after, replace(after, time_s=before.time_s))
         ]
-        first_s = UncertainTime(before.time_s, earliest(before.time_s) - self._shutter.latency_s)
+        first_s = UncertainTime(before.time_s, earliest_time(before.time_s) - self._shutter.latency_s)
         return [*verdicts, self._judge.judge_view(call, grant, replace(after, time_s=first_s))]
 
     def _name(self, after: Situation) -> str:
@@ -188,7 +188,7 @@ class ImageCapture:
 
     async def _store(self, args: CaptureArgs, exposure: _Exposure) -> tuple[Verdict, ImageRecord]:
         grant, after, frames = exposure.grant, exposure.after, exposure.frames
-        view = seen_from(after.exposure, grant.compiled.frame)
+        view = exposure_footprint(after.exposure, grant.compiled.frame)
         farthest_m = view.farthest_m if view is not None else math.inf
         face_px = smallest_face_px(after.lens, farthest_m, exposure.view_width_px)
         call, camera = Call("CaptureImage", args), self._camera

@@ -6,7 +6,7 @@ import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from fractus_core.policy.values import Filter, Situation
+from fractus_core.policy.decision_types import Filter, Situation
 
 from fractus_services.camera.pose import Pose
 
@@ -57,9 +57,11 @@ class ImageRecord:
                 body = {**body, "face_px": 0.0}
             poses = tuple(Pose.parse(pose) for pose in body["poses"])
             shot = cls(**{**body, "poses": poses, "filters": tuple(Filter(**one) for one in body["filters"])})
-            sound = all(pose.at(Situation(0.0)).sound for pose in poses) and math.isfinite(shot.face_px + shot.time_s)
+            is_plausible = all(pose.at(Situation(0.0)).is_plausible for pose in poses) and math.isfinite(
+                shot.face_px + shot.time_s
+            )
         except (KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"no shot: {error}") from None
-        if not poses or not sound:
+        if not poses or not is_plausible:
             raise ValueError("no shot: it does not tell where it was taken")
         return shot

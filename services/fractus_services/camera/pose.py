@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from fractus_core.policy.decision_types import Attitude, Home, Lens, Situation
 from fractus_core.policy.footprint import camera_axes
-from fractus_core.policy.values import Attitude, Home, Lens, Situation
 
 _MIN_UPRIGHT_PITCH_DEG = -45.0
 _MAX_UPRIGHT_ROLL_DEG = 15.0

@@ -11,8 +11,8 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+from fractus_core.policy.decision_types import Attitude, Lens, Situation
 from fractus_core.policy.footprint import camera_axes
-from fractus_core.policy.values import Attitude, Lens, Situation
 
 MAX_AGE_S = 1.0
 """A measurement that is older says nothing about the present."""

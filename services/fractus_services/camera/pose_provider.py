@@ -6,8 +6,8 @@ from dataclasses import replace
 from typing import Protocol
 
 from fractus_core.api.nodes import EdgeNodeSpec
-from fractus_core.policy.lenses import lens_of
-from fractus_core.policy.values import Attitude, Home, Situation
+from fractus_core.policy.decision_types import Attitude, Home, Situation
+from fractus_core.policy.lenses import bounding_lens
 
 SURVEY_ERROR_M = 0.5
 """Error of a position that was measured when the camera was mounted."""
@@ -43,7 +43,7 @@ class FixedPose:
             position_error_m=SURVEY_ERROR_M,
             altitude_error_m=SURVEY_ERROR_M,
             attitude=Attitude(0.0, 0.0, 0.0, 0.0, 0.0),
-            lens=lens_of(camera) if camera is not None and height_m is not None else None,
+            lens=bounding_lens(camera) if camera is not None and height_m is not None else None,
             relief_m=relief_m,
         )
 

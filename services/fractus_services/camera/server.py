@@ -12,7 +12,7 @@ from functools import partial
 from typing import Any
 
 from fractus_core.api.nodes import Drone, EdgeNode
-from fractus_core.policy.lenses import lens_of
+from fractus_core.policy.lenses import bounding_lens
 from fractus_proto.v1 import camera_pb2_grpc
 from fractus_runtime.audit import AuditLog
 from fractus_runtime.exposition import LastRead, serving
@@ -168,7 +168,9 @@ async def _serve(
         poses = FixedPose(description.value.spec, options.relief)
     else:
         gimbal = described is not None and described.mount is not None and described.mount.gimbal
-        poses = history = PoseHistory(time.monotonic, lens=lens_of(described), relief_m=options.relief, gimbal=gimbal)
+        poses = history = PoseHistory(
+            time.monotonic, lens=bounding_lens(described), relief_m=options.relief, gimbal=gimbal
+        )
         watched.history = history
         parts.append(follow_telemetry(options.mobility, node, tls, history.add, clock=clock, gimbal=gimbal))
     admission = CallAdmission(grants, clock)

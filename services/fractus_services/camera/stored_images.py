@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from fractus_core.policy.privacy import remaining
-from fractus_core.policy.values import Call, Situation, Verdict
+from fractus_core.policy.decision_types import Call, Situation, Verdict
+from fractus_core.policy.picture_rules import remaining_filters
 from fractus_runtime import spans
 
 from fractus_services.background import Background
@@ -72,7 +72,7 @@ class StoredImages:
         owner = owner_of(grant)
         shot = await asyncio.to_thread(self._album.find, owner, name)
         verdict = self._judge.judge_stored(call, grant, shot.poses, known, now)
-        missing = remaining(verdict.filters, shot.filters)
+        missing = remaining_filters(verdict.filters, shot.filters)
         path = self._album.path(owner, name)
         if not missing:
             return verdict, shot, path
@@ -104,7 +104,7 @@ class StoredImages:
         call, now = Call("RetrieveImage"), self._now()
         verdict = self._judge.judge(call, grant, now, record=False)
         verdict = self._judge.judge_stored(call, grant, shot.poses, verdict, now)
-        if remaining(verdict.filters, shot.filters):
+        if remaining_filters(verdict.filters, shot.filters):
             reason = f"{verdict.reason}, which it did not when this picture was asked for; ask again"
             refusal = Verdict("deny", None, "PrivacyZone", reason, verdict.policies)
             self._judge.require(call, grant, refusal, now)

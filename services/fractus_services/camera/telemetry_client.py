@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import grpc
 from fractus_core.api.names import node_server_name
-from fractus_core.policy.values import Attitude, Home, Situation
+from fractus_core.policy.decision_types import Attitude, Home, Situation
 from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc
 
 from fractus_services.auth import TlsFiles

@@ -15,8 +15,8 @@ from typing import Protocol
 from fractus_core.api.plans import GrantSpec
 from fractus_core.control.values import FlightMode, ModeKind, TaskKind
 from fractus_core.geo import LocalFrame
-from fractus_core.policy.returning import ReturnBounds
-from fractus_core.policy.values import STANDING_MPS, Airframe, Attitude, Home
+from fractus_core.policy.decision_types import STATIONARY_MPS, Airframe, Attitude, Home
+from fractus_core.policy.return_route import ReturnBounds
 from fractus_mavlink.enums import GPS_FIX_TYPE, MAV_LANDED_STATE
 
 Permit = Callable[[], None]
@@ -161,11 +161,11 @@ class VehicleState:
 
     def keeps_place(self, now: float) -> bool:
         """Whether it surely stays above one place."""
-        return self.position_fresh(now) and self.speed_mps < STANDING_MPS
+        return self.position_fresh(now) and self.speed_mps < STATIONARY_MPS
 
     def at_rest(self, now: float) -> bool:
         """Whether it surely stands, in the sense of the policy engine."""
-        return self.keeps_place(now) and abs(self.down_mps) < STANDING_MPS
+        return self.keeps_place(now) and abs(self.down_mps) < STATIONARY_MPS
 
     def distance_m(self, lat: float, lon: float) -> float:
         """How far away a place is over ground; infinite while the position is unknown."""

@@ -11,9 +11,9 @@ from datetime import UTC, datetime
 from typing import Any
 
 from fractus_core.api.plans import GrantSpec
-from fractus_core.policy.compiled import CompiledGrant, compile_grant
+from fractus_core.policy.compiled_grant import CompiledGrant, compile_grant
+from fractus_core.policy.decision_types import Call, GotoArgs, Home, Situation
 from fractus_core.policy.engine import judge
-from fractus_core.policy.values import Call, GotoArgs, Home, Situation
 
 Entry = Mapping[str, Any]
 

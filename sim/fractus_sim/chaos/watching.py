@@ -9,7 +9,7 @@ from pathlib import Path
 
 from fractus_core.api import Grant
 from fractus_core.api.plans import GrantSpec
-from fractus_core.policy.values import Home
+from fractus_core.policy.decision_types import Home
 from fractus_mavlink.enums import MAV_CMD
 
 from fractus_sim.chaos.invariants import Seen

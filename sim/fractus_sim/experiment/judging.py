@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import shapely
-from fractus_core.geo import LocalFrame, polygon
+from fractus_core.geo import LocalFrame, area_polygon
 from fractus_vehicle.earth import Place
 
 from fractus_sim.experiment import checks as kinds
@@ -185,7 +185,7 @@ def _distances_m(zone: NamedZone, samples: Sequence[Sample]) -> np.ndarray:
     if not samples:
         return np.empty(0)
     frame = LocalFrame(samples[0].place.lat, samples[0].place.lon)
-    shape = polygon(frame, zone.area)
+    shape = area_polygon(frame, zone.area)
     points = shapely.points([frame.xy(s.place.lat, s.place.lon) for s in samples])
     flat = np.where(shapely.contains(shape, points), -1.0, 1.0) * shapely.distance(shape.boundary, points)
     band = zone.altitude

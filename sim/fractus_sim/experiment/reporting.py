@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from fractus_core.geo import LocalFrame, geojson, polygon
+from fractus_core.geo import LocalFrame, area_polygon, multipolygon_geojson
 
 from fractus_sim.experiment.checks import AltitudeBand, SpeedLimit
 from fractus_sim.experiment.injection import Occurrence
@@ -55,7 +55,7 @@ def scene_of(outcome: Outcome) -> Scene:
     tracks = _tracks(outcome)
     first = tracks[0].samples[0].place
     frame = LocalFrame(first.lat, first.lon)
-    zones = tuple(DrawnZone(z.name, z.kind, polygon(frame, z.area)) for z in outcome.experiment.zones)
+    zones = tuple(DrawnZone(z.name, z.kind, area_polygon(frame, z.area)) for z in outcome.experiment.zones)
     marks: list[Mark] = []
     for letter, occurrence in _lettered(outcome):
         for track in tracks:
@@ -155,7 +155,11 @@ def features(outcome: Outcome) -> dict[str, Any]:
     found: list[dict[str, Any]] = [path(track) for track in _tracks(outcome)]
     for zone in outcome.experiment.zones:
         frame = LocalFrame(*_middle(outcome))
-        found.append(feature(geojson(frame, polygon(frame, zone.area)), what="zone", name=zone.name, kind=zone.kind))
+        found.append(
+            feature(
+                multipolygon_geojson(frame, area_polygon(frame, zone.area)), what="zone", name=zone.name, kind=zone.kind
+            )
+        )
     for occurrence in outcome.occurrences:
         track = _by_name(outcome).get(occurrence.vehicle)
         at = _sample_at(track, occurrence.begin_s) if track is not None else None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from fractus_core.geo import geojson, polygon
+from fractus_core.geo import area_polygon, multipolygon_geojson
 
 from fractus_sim.report.geojson import feature, lonlat, path, point
 from fractus_sim.report.record import Judgement, Record
@@ -19,7 +19,7 @@ def features(record: Record) -> dict[str, Any]:
         found += _request(number, judged)
     for zone in record.zones:
         policies = [p.name for p in record.policies if zone.name in p.spec.selector.zones]
-        shape = geojson(record.frame, polygon(record.frame, zone.spec.area))
+        shape = multipolygon_geojson(record.frame, area_polygon(record.frame, zone.spec.area))
         found.append(feature(shape, what="zone", name=zone.name, policies=policies))
     if record.plan is not None and record.plan.spec.operation_area is not None:
         found.append(feature(record.plan.spec.operation_area, what="operationArea"))

@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 import shapely.geometry
 from fractus_core.api import EdgeNode, Policy
-from fractus_core.geo import LocalFrame, polygon
+from fractus_core.geo import LocalFrame, area_polygon
 
 from fractus_sim.report.profile import Limit, Profile, Request, Span
 from fractus_sim.report.record import Judgement, Record
@@ -85,7 +85,7 @@ def _zones(record: Record) -> Iterable[DrawnZone]:
         kinds = {_kind(p) for p in record.policies_in_force if zone.name in p.spec.selector.zones}
         strictest = next((kind for kind in _STRICTEST if kind in kinds), None)
         if strictest is not None:
-            yield DrawnZone(zone.name, strictest, polygon(record.frame, zone.spec.area))
+            yield DrawnZone(zone.name, strictest, area_polygon(record.frame, zone.spec.area))
 
 
 def _kind(policy: Policy) -> str:

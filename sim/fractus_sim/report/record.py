@@ -13,7 +13,7 @@ from typing import Any
 from fractus_core.api import Application, DeploymentPlan, Depot, Drone, EdgeNode, Policy, Resource, Zone
 from fractus_core.api.geometry import Point
 from fractus_core.geo import LocalFrame
-from fractus_core.policy.selectors import node_attributes, selects
+from fractus_core.policy.selectors import node_attributes, policy_selects
 
 from fractus_sim.report.track import Place, Sample, Track
 
@@ -155,7 +155,7 @@ class Record:
         attributes = node_attributes(self.drone)
         components = self.application.spec.components
         return tuple(
-            p for p in self.policies if any(selects(p.spec, self.application, c, attributes) for c in components)
+            p for p in self.policies if any(policy_selects(p.spec, self.application, c, attributes) for c in components)
         )
 
     @property

@@ -1,4 +1,24 @@
-"""Zones in the formats of others, each in a module of its own; `every` has them all.
+"""All formats: GeoJSON, KML, QGroundControl plans and ED-269."""
 
-Nothing is imported here: a service that draws zones into its recordings needs no reader of XML.
-"""
+from fractus_core.geo.formats.ed269 import read_ed269, write_ed269
+from fractus_core.geo.formats.geojson import read_geojson, write_geojson, zone_feature
+from fractus_core.geo.formats.kml import kml_document, read_kml, write_kml, zone_placemark
+from fractus_core.geo.formats.qgc_plan import read_qgc_plan, write_qgc_plan
+from fractus_core.geo.formats.zone_builder import Exported, Imported, InexactFeatures
+
+__all__ = [
+    "Exported",
+    "Imported",
+    "InexactFeatures",
+    "kml_document",
+    "read_ed269",
+    "read_geojson",
+    "read_kml",
+    "read_qgc_plan",
+    "write_ed269",
+    "write_geojson",
+    "write_kml",
+    "write_qgc_plan",
+    "zone_feature",
+    "zone_placemark",
+]

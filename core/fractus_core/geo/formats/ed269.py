@@ -11,19 +11,19 @@ from typing import Any
 from fractus_core.api import InvalidObject, Zone
 from fractus_core.api.geometry import AltitudeBand
 from fractus_core.api.schedules import ActiveTime
-from fractus_core.geo.formats.drafts import (
-    Drafts,
+from fractus_core.geo.formats.zone_builder import (
     Exported,
     Imported,
+    ZoneBuilder,
+    circle_area,
     cut_rings,
-    fields,
-    number,
-    objects,
-    only,
+    is_number,
+    object_list,
+    optional_object,
     parse_json,
-    place,
-    round_area,
-    unsaid,
+    parse_point,
+    reject_unknown_fields,
+    unsupported_parts,
 )
 
 _UNITS_M = {"M": 1.0, "FT": 0.3048}
@@ -58,15 +58,15 @@ def read_ed269(text: str, without: Collection[str] = ()) -> Imported:
     whole = parse_json(text)
     if "features" not in whole:
         raise InvalidObject("features", "is missing; this is not an ED-269 file")
-    drafts = Drafts(without)
-    for i, feature in enumerate(objects(whole["features"], "features")):
+    drafts = ZoneBuilder(without)
+    for i, feature in enumerate(object_list(whole["features"], "features")):
         field = f"features[{i}]"
         title = str(feature.get("identifier") or feature.get("name") or field)
         drafts.take(title, functools.partial(_read_feature, drafts, title, feature, field))
     return drafts.result()
 
 
-def _read_feature(drafts: Drafts, title: str, feature: dict[str, Any], field: str) -> None:
+def _read_feature(drafts: ZoneBuilder, title: str, feature: dict[str, Any], field: str) -> None:
     told = [str(feature[key]) for key in ("name", "restriction", "message") if feature.get(key)]
     spec: dict[str, Any] = {"description": drafts.described(title, ": ".join(told))} if told else {}
     drafts.unmapped(title, (key for key, value in feature.items() if value not in (None, "", [], {})), _USED)
@@ -75,29 +75,29 @@ def _read_feature(drafts: Drafts, title: str, feature: dict[str, Any], field: st
     schedule = _schedule(feature, field)
     if schedule:
         spec["schedule"] = schedule
-    volumes = objects(feature.get("geometry"), f"{field}.geometry")
+    volumes = object_list(feature.get("geometry"), f"{field}.geometry")
     if not volumes:
         raise InvalidObject(f"{field}.geometry", "is missing; give at least one volume")
     for j, volume in enumerate(volumes):
         where = f"{field}.geometry[{j}]"
-        only(volume, _OF_VOLUME, where)
+        reject_unknown_fields(volume, _OF_VOLUME, where)
         band = _band(volume, where)
         drafts.add(title, {**spec, "area": _area(drafts, volume, where), **({"altitude": band} if band else {})}, where)
 
 
-def _area(drafts: Drafts, volume: dict[str, Any], field: str) -> dict[str, Any]:
+def _area(drafts: ZoneBuilder, volume: dict[str, Any], field: str) -> dict[str, Any]:
     where = f"{field}.horizontalProjection"
-    projection = fields(volume.get("horizontalProjection"), where)
+    projection = optional_object(volume.get("horizontalProjection"), where)
     shape = projection.get("type")
     if shape not in _OF_PROJECTION:
         raise InvalidObject(f"{where}.type", f"must be Polygon or Circle, not {shape!r}")
-    only(projection, _OF_PROJECTION[shape], where)
+    reject_unknown_fields(projection, _OF_PROJECTION[shape], where)
     if shape == "Polygon":
         return drafts.rings(projection.get("coordinates"), f"{where}.coordinates")
     if volume.get("uomDimensions") not in (None, "M"):
         raise InvalidObject(f"{where}.radius", "may be metres or feet; give the volume in metres (uomDimensions M)")
-    centre = place(projection.get("center"), f"{where}.center")
-    return round_area(centre, projection.get("radius"), f"{where}.radius")
+    centre = parse_point(projection.get("center"), f"{where}.center")
+    return circle_area(centre, projection.get("radius"), f"{where}.radius")
 
 
 def _band(volume: dict[str, Any], field: str) -> dict[str, Any]:
@@ -111,7 +111,7 @@ def _band(volume: dict[str, Any], field: str) -> dict[str, Any]:
         value, datum = volume.get(f"{side}Limit"), volume.get(f"{side}VerticalReference")
         if value is None:
             continue
-        if not number(value):
+        if not is_number(value):
             raise InvalidObject(f"{field}.{side}Limit", f"must be a number, not {value!r:.40}")
         if side == "lower" and value <= 0 and datum == "AGL":
             continue
@@ -132,15 +132,15 @@ def _band(volume: dict[str, Any], field: str) -> dict[str, Any]:
 def _schedule(feature: dict[str, Any], field: str) -> list[dict[str, Any]]:
     """When the zone is active; empty: always."""
     times: list[dict[str, Any]] = []
-    for i, period in enumerate(objects(feature.get("applicability"), f"{field}.applicability")):
+    for i, period in enumerate(object_list(feature.get("applicability"), f"{field}.applicability")):
         where = f"{field}.applicability[{i}]"
-        only(period, _OF_PERIOD, where)
+        reject_unknown_fields(period, _OF_PERIOD, where)
         valid = {
             ours: period[theirs]
             for ours, theirs in (("validFrom", "startDateTime"), ("validUntil", "endDateTime"))
             if period.get(theirs)
         }
-        daily = objects(period.get("schedule"), f"{where}.schedule")
+        daily = object_list(period.get("schedule"), f"{where}.schedule")
         found = [{**valid, **_daily(day, f"{where}.schedule[{j}]")} for j, day in enumerate(daily)] or [valid]
         permanent = period.get("permanent", "NO")
         if permanent not in ("YES", "NO"):
@@ -153,7 +153,7 @@ def _schedule(feature: dict[str, Any], field: str) -> list[dict[str, Any]]:
 
 def _daily(day: dict[str, Any], field: str) -> dict[str, Any]:
     """Days and times of day in UTC; empty: the whole of every day."""
-    only(day, _OF_DAY, field)
+    reject_unknown_fields(day, _OF_DAY, field)
     given = day.get("day") or []
     named = given if isinstance(given, list) else [given]
     unknown = [name for name in named if name not in (*_DAYS, "ANY")]
@@ -197,7 +197,7 @@ def write_ed269(zones: Iterable[Zone], *, country: str = "XXX", restriction: str
         InvalidObject: an altitude is measured from home, for which ED-269 has no datum.
     """
     zones = tuple(zones)
-    notes = unsaid(zones)
+    notes = unsupported_parts(zones)
     features = []
     for i, zone in enumerate(zones):
         feature = {

@@ -8,19 +8,19 @@ from collections.abc import Collection, Iterable
 from typing import Any
 
 from fractus_core.api import InvalidObject, Zone
-from fractus_core.geo.formats.drafts import (
-    Drafts,
+from fractus_core.geo.formats.zone_builder import (
     Exported,
     Imported,
+    ZoneBuilder,
+    circle_area,
     cut_rings,
-    fields,
-    number,
-    objects,
-    only,
+    is_number,
+    object_list,
+    optional_object,
     parse_json,
-    place,
-    round_area,
-    unsaid,
+    parse_point,
+    reject_unknown_fields,
+    unsupported_parts,
 )
 
 _KNOWN = frozenset({"name", "title", "description", "radius", "altitude", "schedule"})
@@ -54,14 +54,14 @@ def read_geojson(text: str, without: Collection[str] = (), drop: Collection[str]
     kind = whole.get("type")
     _check_system(whole, "crs")
     if kind == "FeatureCollection":
-        features, field = objects(whole.get("features"), "features"), "features[{}]"
+        features, field = object_list(whole.get("features"), "features"), "features[{}]"
     elif kind == "Feature":
         features, field = [whole], ""
     elif kind in _AREAS:
         features, field = [{"type": "Feature", "geometry": whole, "properties": {}}], ""
     else:
         raise InvalidObject("type", f"{kind!r} is not GeoJSON of zones; expected a FeatureCollection of polygons")
-    drafts = Drafts(without, drop)
+    drafts = ZoneBuilder(without, drop)
     for i, feature in enumerate(features):
         where = field.format(i)
         properties = feature.get("properties")
@@ -82,28 +82,28 @@ def _check_system(found: dict[str, Any], field: str) -> None:
         raise InvalidObject(field, f"must be WGS 84, not {name or 'an unnamed one'}; convert the file to OGC:CRS84")
 
 
-def _read_feature(drafts: Drafts, title: str, feature: dict[str, Any], field: str) -> None:
+def _read_feature(drafts: ZoneBuilder, title: str, feature: dict[str, Any], field: str) -> None:
     inside = f"{field}." if field else ""
     if feature.get("type") != "Feature":
         raise InvalidObject(f"{inside}type", f"must be Feature, not {feature.get('type')!r}")
-    properties = fields(feature.get("properties"), f"{inside}properties")
+    properties = optional_object(feature.get("properties"), f"{inside}properties")
     _check_system(feature, f"{inside}crs")
     known = ("altitude", "schedule", "description")
     spec = {k: properties[k] for k in known if properties.get(k) is not None and properties[k] != ""}
     if isinstance(spec.get("description"), str):
         spec["description"] = drafts.described(title, spec["description"])
     drafts.properties(title, properties, _KNOWN | _STYLE, f"{inside}properties")
-    geometry = fields(feature.get("geometry"), f"{inside}geometry")
+    geometry = optional_object(feature.get("geometry"), f"{inside}geometry")
     if properties.get("radius") is not None and geometry.get("type") != "Point":
         raise InvalidObject(f"{inside}properties.radius", "goes with a Point; draw the area of others as a polygon")
     _read_geometry(drafts, title, geometry, spec | {"radius": properties.get("radius")}, f"{inside}geometry")
 
 
-def _read_geometry(drafts: Drafts, title: str, geometry: dict[str, Any], said: dict[str, Any], field: str) -> None:
+def _read_geometry(drafts: ZoneBuilder, title: str, geometry: dict[str, Any], said: dict[str, Any], field: str) -> None:
     """Make zones of a geometry, each with what was said of the feature."""
     spec = {key: value for key, value in said.items() if key != "radius"}
     coordinates, where = geometry.get("coordinates"), f"{field}.coordinates"
-    only(geometry, _OF_GEOMETRY, field)
+    reject_unknown_fields(geometry, _OF_GEOMETRY, field)
     _check_system(geometry, f"{field}.crs")
     if "altitude" in spec and _heights(coordinates):
         drafts.note(title, "heights of its points are not taken over, properties.altitude is")
@@ -118,9 +118,11 @@ def _read_geometry(drafts: Drafts, title: str, geometry: dict[str, Any], said: d
                 drafts.add(title, {**spec, "area": drafts.rings(part, f"{where}[{j}]")}, f"{where}[{j}]")
         case "Point" if said["radius"] is not None:
             radius = f"{field.removesuffix('geometry')}properties.radius"
-            drafts.add(title, {**spec, "area": round_area(place(coordinates, where), said["radius"], radius)}, field)
+            drafts.add(
+                title, {**spec, "area": circle_area(parse_point(coordinates, where), said["radius"], radius)}, field
+            )
         case "GeometryCollection":
-            for j, part in enumerate(objects(geometry.get("geometries"), f"{field}.geometries")):
+            for j, part in enumerate(object_list(geometry.get("geometries"), f"{field}.geometries")):
                 _read_geometry(drafts, title, part, said, f"{field}.geometries[{j}]")
         case other:
             drafts.note(title, f"a geometry of type {other} is not a zone; left out")
@@ -132,7 +134,7 @@ def _heights(coordinates: Any) -> bool:
     while pending:
         found = pending.pop()
         if isinstance(found, list):
-            if len(found) > 2 and all(map(number, found[:3])) and found[2]:
+            if len(found) > 2 and all(map(is_number, found[:3])) and found[2]:
                 return True
             pending += [item for item in found if isinstance(item, list)]
     return False
@@ -140,7 +142,7 @@ def _heights(coordinates: Any) -> bool:
 
 def _flat(coordinates: Any) -> Any:
     """The coordinates without heights."""
-    if isinstance(coordinates, list) and coordinates and number(coordinates[0]):
+    if isinstance(coordinates, list) and coordinates and is_number(coordinates[0]):
         return coordinates[:2]
     return [_flat(item) for item in coordinates] if isinstance(coordinates, list) else coordinates
 
@@ -148,7 +150,7 @@ def _flat(coordinates: Any) -> Any:
 def write_geojson(zones: Iterable[Zone]) -> Exported:
     """A FeatureCollection with a polygon for each zone, cut at the antimeridian (RFC 7946); read_geojson takes it back."""
     zones = tuple(zones)
-    notes = unsaid(zones, "circle")
+    notes = unsupported_parts(zones, "circle")
     features = [zone_feature(zone, notes) for zone in zones]
     text = json.dumps({"type": "FeatureCollection", "features": features}, indent=1) + "\n"
     return Exported(text, tuple(notes))

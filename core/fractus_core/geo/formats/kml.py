@@ -9,7 +9,14 @@ from xml.etree import ElementTree
 from xml.sax.saxutils import escape
 
 from fractus_core.api import InvalidObject, Zone
-from fractus_core.geo.formats.drafts import Drafts, Exported, Imported, cut_rings, ring, unsaid
+from fractus_core.geo.formats.zone_builder import (
+    Exported,
+    Imported,
+    ZoneBuilder,
+    cut_rings,
+    parse_ring,
+    unsupported_parts,
+)
 
 _KNOWN = frozenset({"name", "description", "Polygon", "MultiGeometry"})
 _LOOK = frozenset({"Style", "StyleMap", "styleUrl", "visibility", "open", "Snippet", "LookAt", "Camera"})
@@ -44,7 +51,7 @@ def read_kml(text: str, without: Collection[str] = (), drop: Collection[str] = (
         if _tag(holder) == "NetworkLink":
             raise InvalidObject(title, "a NetworkLink leads to another file, which is not read; save all as one file")
         _check_always(holder, title)
-    drafts = Drafts(without, drop)
+    drafts = ZoneBuilder(without, drop)
     for count, mark in enumerate(e for e in root.iter() if _tag(e) == "Placemark"):
         title = _text(mark, "name") or f"placemark {count + 1}"
         drafts.take(title, functools.partial(_read_placemark, drafts, title, mark))
@@ -56,7 +63,7 @@ def _check_always(element: ElementTree.Element, field: str) -> None:
         raise InvalidObject(field, "has a time, which a Zone says otherwise; remove it, and give the Zone a schedule")
 
 
-def _read_placemark(drafts: Drafts, title: str, mark: ElementTree.Element) -> None:
+def _read_placemark(drafts: ZoneBuilder, title: str, mark: ElementTree.Element) -> None:
     described = drafts.described(title, _text(mark, "description"))
     polygons = [e for e in mark.iter() if _tag(e) == "Polygon"]
     others = sorted({_tag(e) for e in mark.iter()} & set(_OTHERS) - ({"LinearRing"} if polygons else set()))
@@ -99,7 +106,7 @@ def _ring(text: str, field: str) -> list[dict[str, float]]:
         positions = [[float(v) for v in group.split(",")][:2] for group in text.split()]
     except ValueError:
         raise InvalidObject(field, "must be lon,lat[,alt] groups") from None
-    return ring(positions, field)
+    return parse_ring(positions, field)
 
 
 def _tag(element: ElementTree.Element) -> str:
@@ -113,7 +120,7 @@ def _text(element: ElementTree.Element, child: str) -> str:
 def write_kml(zones: Iterable[Zone]) -> Exported:
     """A document with a placemark for each zone, clamped to the ground."""
     zones = tuple(zones)
-    notes = unsaid(zones, "altitude", "schedule", "circle")
+    notes = unsupported_parts(zones, "altitude", "schedule", "circle")
     return Exported(kml_document(zone_placemark(zone, notes) for zone in zones), tuple(notes))
 
 

@@ -8,18 +8,18 @@ from collections.abc import Collection, Iterable
 from typing import Any
 
 from fractus_core.api import InvalidObject, Zone
-from fractus_core.geo.formats.drafts import (
-    Drafts,
+from fractus_core.geo.formats.zone_builder import (
     Exported,
     Imported,
-    fields,
-    objects,
-    only,
+    ZoneBuilder,
+    circle_area,
+    object_list,
+    optional_object,
     parse_json,
-    place,
-    ring,
-    round_area,
-    unsaid,
+    parse_point,
+    parse_ring,
+    reject_unknown_fields,
+    unsupported_parts,
 )
 
 _FENCE_VERSION = 2
@@ -39,24 +39,24 @@ def read_qgc_plan(text: str, without: Collection[str] = ()) -> Imported:
     whole = parse_json(text)
     if whole.get("fileType") != "Plan":
         raise InvalidObject("fileType", f"must be Plan, not {whole.get('fileType')!r}")
-    fence = fields(whole.get("geoFence"), "geoFence")
+    fence = optional_object(whole.get("geoFence"), "geoFence")
     if fence and fence.get("version") != _FENCE_VERSION:
         raise InvalidObject(
             "geoFence.version", f"must be {_FENCE_VERSION}, not {fence.get('version')!r}; save the plan again"
         )
-    only(fence, _OF_FENCE, "geoFence")
-    drafts = Drafts(without)
-    for i, item in enumerate(objects(fence.get("polygons"), "geoFence.polygons")):
+    reject_unknown_fields(fence, _OF_FENCE, "geoFence")
+    drafts = ZoneBuilder(without)
+    for i, item in enumerate(object_list(fence.get("polygons"), "geoFence.polygons")):
         field = f"geoFence.polygons[{i}]"
         title, kind = f"polygon {i + 1}", _kind(item, field)
         drafts.take(f"{kind} {title}", functools.partial(_read_polygon, drafts, f"{kind} {title}", item, field, kind))
-    for i, item in enumerate(objects(fence.get("circles"), "geoFence.circles")):
+    for i, item in enumerate(object_list(fence.get("circles"), "geoFence.circles")):
         field = f"geoFence.circles[{i}]"
         title, kind = f"circle {i + 1}", _kind(item, field)
         drafts.take(f"{kind} {title}", functools.partial(_read_circle, drafts, f"{kind} {title}", item, field, kind))
-    if fields(whole.get("mission"), "mission").get("items"):
+    if optional_object(whole.get("mission"), "mission").get("items"):
         drafts.note("mission", "its items are not zones; left out")
-    if fields(whole.get("rallyPoints"), "rallyPoints").get("points"):
+    if optional_object(whole.get("rallyPoints"), "rallyPoints").get("points"):
         drafts.note("rallyPoints", "its points are not zones; left out")
     if fence.get("breachReturn"):
         drafts.note("geoFence.breachReturn", "is not a zone; left out")
@@ -70,21 +70,21 @@ def _kind(item: dict[str, Any], field: str) -> str:
     return "inclusion" if found else "exclusion"
 
 
-def _read_polygon(drafts: Drafts, title: str, item: dict[str, Any], field: str, kind: str) -> None:
-    only(item, ("polygon", "inclusion", "version"), field)
-    exterior = ring(item.get("polygon"), f"{field}.polygon", lat_first=True)
+def _read_polygon(drafts: ZoneBuilder, title: str, item: dict[str, Any], field: str, kind: str) -> None:
+    reject_unknown_fields(item, ("polygon", "inclusion", "version"), field)
+    exterior = parse_ring(item.get("polygon"), f"{field}.polygon", lat_first=True)
     _add(drafts, title, {"polygon": {"exterior": exterior}}, field, kind)
 
 
-def _read_circle(drafts: Drafts, title: str, item: dict[str, Any], field: str, kind: str) -> None:
-    only(item, ("circle", "inclusion", "version"), field)
-    circle = fields(item.get("circle"), f"{field}.circle")
-    only(circle, ("center", "radius"), f"{field}.circle")
-    centre = place(circle.get("center"), f"{field}.circle.center", lat_first=True)
-    _add(drafts, title, round_area(centre, circle.get("radius"), f"{field}.circle.radius"), field, kind)
+def _read_circle(drafts: ZoneBuilder, title: str, item: dict[str, Any], field: str, kind: str) -> None:
+    reject_unknown_fields(item, ("circle", "inclusion", "version"), field)
+    circle = optional_object(item.get("circle"), f"{field}.circle")
+    reject_unknown_fields(circle, ("center", "radius"), f"{field}.circle")
+    centre = parse_point(circle.get("center"), f"{field}.circle.center", lat_first=True)
+    _add(drafts, title, circle_area(centre, circle.get("radius"), f"{field}.circle.radius"), field, kind)
 
 
-def _add(drafts: Drafts, title: str, area: dict[str, object], field: str, kind: str) -> None:
+def _add(drafts: ZoneBuilder, title: str, area: dict[str, object], field: str, kind: str) -> None:
     drafts.add(title, {"area": area, "description": f"From a QGroundControl plan, for {kind}."}, field)
     drafts.note(title, f"a Zone forbids nothing by itself; add a GeofenceControl policy of kind {kind}")
 
@@ -96,7 +96,7 @@ def write_qgc_plan(zones: Iterable[Zone], *, inclusion: bool = False) -> Exporte
         InvalidObject: without what the format cannot say, a fence to stay in would hold more than its zone.
     """
     zones = tuple(zones)
-    lost = unsaid(zones, "altitude", "holes") if inclusion else []
+    lost = unsupported_parts(zones, "altitude", "holes") if inclusion else []
     if lost:
         raise InvalidObject(
             "", f"{lost[0].removesuffix('; left out')}; a fence to stay in would be larger than the zone"
@@ -123,4 +123,6 @@ def write_qgc_plan(zones: Iterable[Zone], *, inclusion: bool = False) -> Exporte
         "rallyPoints": {"points": [], "version": 2},
         "version": 1,
     }
-    return Exported(json.dumps(whole, indent=2) + "\n", tuple(unsaid(zones, "altitude", "schedule", "holes")))
+    return Exported(
+        json.dumps(whole, indent=2) + "\n", tuple(unsupported_parts(zones, "altitude", "schedule", "holes"))
+    )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
-from fractus_core.policy.values import Situation
+from fractus_core.policy.decision_types import Situation
 
 from fractus_services.camera.pixels import Pixels
 from fractus_services.errors import Unavailable

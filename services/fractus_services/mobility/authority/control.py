@@ -28,8 +28,8 @@ from fractus_core.control.events import (
     TourBegan,
     TransitBegan,
 )
-from fractus_core.policy.compiled import CompiledGrant, for_transit
-from fractus_core.policy.values import Verdict
+from fractus_core.policy.compiled_grant import CompiledGrant, compile_transit_grant
+from fractus_core.policy.decision_types import Verdict
 from fractus_runtime.audit import AuditLog
 
 from fractus_services.grant_files import ActiveGrant, GrantFiles
@@ -234,7 +234,7 @@ class Control:
     def for_transit(self, grant: ActiveGrant) -> CompiledGrant:
         """The fences of a grant for what the system flies."""
         if self._transit is None or self._transit[0] is not grant:
-            self._transit = grant, for_transit(grant.spec, flat_terrain=grant.compiled.flat_terrain)
+            self._transit = grant, compile_transit_grant(grant.spec, flat_terrain=grant.compiled.flat_terrain)
         return self._transit[1]
 
     # Motions

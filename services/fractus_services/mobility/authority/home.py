@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from fractus_core.control import Authority, ControlState
 from fractus_core.geo import LocalFrame
-from fractus_core.policy.values import Home
+from fractus_core.policy.decision_types import Home
 
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.autopilot import Autopilot, VehicleState

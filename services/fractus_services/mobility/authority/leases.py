@@ -7,8 +7,8 @@ import itertools
 from dataclasses import dataclass, field
 
 from fractus_core.control import ControlEvent
-from fractus_core.policy.compiled import CompiledGrant
-from fractus_core.policy.values import GotoArgs
+from fractus_core.policy.compiled_grant import CompiledGrant
+from fractus_core.policy.decision_types import GotoArgs
 
 from fractus_services.errors import Refused
 from fractus_services.grant_files import ActiveGrant

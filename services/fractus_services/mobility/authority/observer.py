@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import replace
 
 from fractus_core.control.events import Heartbeat, VehicleFound
-from fractus_core.policy.values import Verdict
+from fractus_core.policy.decision_types import Verdict
 
 from fractus_services.errors import AutopilotError
 from fractus_services.grant_files import ActiveGrant

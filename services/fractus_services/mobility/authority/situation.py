@@ -6,8 +6,8 @@ import math
 from dataclasses import replace
 
 from fractus_core.control import Authority
-from fractus_core.policy.compiled import CompiledGrant
-from fractus_core.policy.values import Airframe, Situation
+from fractus_core.policy.compiled_grant import CompiledGrant
+from fractus_core.policy.decision_types import Airframe, Situation
 
 from fractus_services.mobility.authority.control import Control
 from fractus_services.mobility.authority.home import home_moved

@@ -6,7 +6,7 @@ import asyncio
 import time
 from collections.abc import Callable
 
-from fractus_core.policy.values import POSITION_UNKNOWN, Call, Verdict
+from fractus_core.policy.decision_types import POSITION_UNKNOWN, Call, Verdict
 
 from fractus_services.errors import Aborted, Unavailable, denied
 from fractus_services.grant_files import ActiveGrant

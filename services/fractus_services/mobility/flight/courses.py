@@ -12,11 +12,12 @@ from typing import Protocol
 import shapely
 from fractus_core.api.geometry import Position, Reference
 from fractus_core.control.values import FlightMode
-from fractus_core.policy.compiled import Air, CompiledGrant, height_m
+from fractus_core.policy.altitude import altitude_above_home_m
+from fractus_core.policy.compiled_grant import AirVolume, CompiledGrant
+from fractus_core.policy.decision_types import Call, GotoArgs, Home, Situation
+from fractus_core.policy.kinematics import margin_m
 from fractus_core.policy.limits import speed_bounds
-from fractus_core.policy.motion import margin_m
-from fractus_core.policy.routes import searching
-from fractus_core.policy.values import Call, GotoArgs, Home, Situation
+from fractus_core.policy.route_search import route_steps
 
 from fractus_services.background import in_slices
 from fractus_services.errors import Aborted, PreconditionFailed, Refused, Unavailable
@@ -79,7 +80,7 @@ def above_home_m(altitude_m: float, reference: Reference, home: Home | None, gra
     Raises:
         Refused: it is given above terrain, which is not known.
     """
-    height = height_m(altitude_m, reference, home, grant.flat_terrain)
+    height = altitude_above_home_m(altitude_m, reference, home, grant.flat_terrain)
     if height is None:
         raise PreconditionFailed(
             "TerrainUnknown", "the altitude is given above terrain, and no terrain model is loaded"
@@ -159,7 +160,7 @@ async def _first_leg(
     frame = grant.frame
     begin, end = frame.xy(now.lat or 0.0, now.lon or 0.0), frame.xy(*goal)
     for height in heights_m:
-        way = await in_slices(searching(begin, end, now, grant, height, from_m=now.altitude_m))
+        way = await in_slices(route_steps(begin, end, now, grant, height, from_m=now.altitude_m))
         if way is not None:
             # From a place this near to a waypoint the next leg is legal, and this one would change nothing but the height.
             there = math.dist(begin, way[0]) <= NEAR_M and abs(now.altitude_m - height) <= HEIGHT_REACHED_M
@@ -185,7 +186,7 @@ def limited_mps(speed_mps: float, leg: GotoArgs, now: Situation, grant: Compiled
     target = grant.frame.xy(leg.lat, leg.lon)
     heights = (now.altitude_m, now.altitude_m if leg.alt is None else leg.alt)
     ground = shapely.points(at) if at == target else shapely.linestrings((at, target))
-    air = Air(ground, margin_m(now), min(heights), max(heights))
+    air = AirVolume(ground, margin_m(now), min(heights), max(heights))
     return min([speed_mps, *(bound.upper for bound in speed_bounds(grant, now, air) if bound.upper is not None)])
 
 

@@ -6,9 +6,9 @@ import logging
 from collections.abc import Callable
 from dataclasses import asdict
 
-from fractus_core.policy.compiled import CompiledGrant
+from fractus_core.policy.compiled_grant import CompiledGrant
+from fractus_core.policy.decision_types import Call, Situation, Verdict
 from fractus_core.policy.engine import judge
-from fractus_core.policy.values import Call, Situation, Verdict
 from fractus_runtime import spans
 from fractus_runtime.audit import AuditLog
 

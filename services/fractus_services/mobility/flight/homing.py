@@ -9,14 +9,14 @@ from contextlib import aclosing
 from dataclasses import replace
 
 from fractus_core.control.values import FlightMode, ModeKind, TaskKind
-from fractus_core.policy.compiled import CompiledGrant
-from fractus_core.policy.motion import height_margin_m, margin_m
-from fractus_core.policy.returning import (
-    CONE,
-    descent_enters,
-    homeward_heights_m,
-    may_change_height,
-    straight_home_blocked,
+from fractus_core.policy.compiled_grant import CompiledGrant
+from fractus_core.policy.kinematics import height_margin_m, margin_m
+from fractus_core.policy.return_route import (
+    RTL_CONE_SLOPE,
+    check_straight_return,
+    descent_enters_fence,
+    may_change_altitude,
+    return_altitudes_m,
 )
 
 from fractus_services.errors import AutopilotError, PreconditionFailed, Refused, Unavailable
@@ -181,7 +181,7 @@ class Homing:
 
     def _lands_in_zone(self, grant: ActiveGrant) -> bool:
         """Whether the drone, over ground that is closed to it, would come down into what it is above."""
-        return descent_enters(self._guard.situation(), self._control.for_transit(grant))
+        return descent_enters_fence(self._guard.situation(), self._control.for_transit(grant))
 
     def _blind(self) -> bool:
         """Whether there is nothing to plan with; the autopilot's own estimate is the better one then."""
@@ -194,7 +194,7 @@ class Homing:
         if now.lat is None or now.lon is None or now.home is None:
             return True
         room = {"margin": margin_m(now), "slack": height_margin_m(now)}
-        return straight_home_blocked(grant.frame.xy(now.lat, now.lon), now.altitude_m, now, grant, **room) is None
+        return check_straight_return(grant.frame.xy(now.lat, now.lon), now.altitude_m, now, grant, **room) is None
 
     def _home_m(self) -> float:
         """How far home is."""
@@ -212,8 +212,8 @@ class Homing:
         now, away_m = self._guard.situation(), self._home_m()
         if now.lat is None or now.lon is None or now.home is None or away_m <= REACHED_M:
             return None
-        for height in homeward_heights_m(now, trip.constraints.compiled, CONE * away_m):
-            turns = may_change_height(now, trip.constraints.compiled, height)
+        for height in return_altitudes_m(now, trip.constraints.compiled, RTL_CONE_SLOPE * away_m):
+            turns = may_change_altitude(now, trip.constraints.compiled, height)
             # All of it is flown by us, so the autopilot's own straight return need not be legal from its waypoints:
             # `retraces` takes that condition out of the search.
             free = replace(

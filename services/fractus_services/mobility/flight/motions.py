@@ -8,7 +8,7 @@ from collections.abc import AsyncGenerator
 from contextlib import aclosing
 from dataclasses import dataclass
 
-from fractus_core.policy.values import GotoArgs
+from fractus_core.policy.decision_types import GotoArgs
 
 from fractus_services.errors import Aborted, AutopilotError, Unavailable
 from fractus_services.mobility.authority.leases import Motion

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fractus_core.policy.values import Call, PointGimbalArgs, Verdict
+from fractus_core.policy.decision_types import Call, PointGimbalArgs, Verdict
 
 from fractus_services.errors import PreconditionFailed
 from fractus_services.grant_files import ActiveGrant

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 
-from fractus_core.policy.values import VelocityArgs
+from fractus_core.policy.decision_types import VelocityArgs
 
 from fractus_services.errors import Refused
 from fractus_services.mobility.authority.control import Control

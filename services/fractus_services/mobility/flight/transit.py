@@ -9,8 +9,8 @@ from contextlib import aclosing
 from fractus_core.api.components import ControlPoint
 from fractus_core.api.geometry import Position
 from fractus_core.control.events import TransitFailed
-from fractus_core.geo import middle
-from fractus_core.policy.values import Call, TakeoffArgs
+from fractus_core.geo import area_center
+from fractus_core.policy.decision_types import Call, TakeoffArgs
 
 from fractus_services.errors import AutopilotError, PreconditionFailed, Refused
 from fractus_services.mobility.authority.arming import Arming
@@ -37,7 +37,7 @@ def start_of(point: ControlPoint) -> Position:
     if point.path:
         return point.path[0]
     if point.region is not None:
-        centre = middle(point.region)
+        centre = area_center(point.region)
         return Position(lat=centre.lat, lon=centre.lon)
     raise PreconditionFailed("NoStart", "the control point has neither position, path nor region")
 

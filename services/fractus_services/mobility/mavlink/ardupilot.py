@@ -6,8 +6,8 @@ import math
 from collections.abc import Mapping
 
 from fractus_core.control.values import FlightMode, ModeKind
-from fractus_core.policy.returning import CONE, ReturnBounds
-from fractus_core.policy.values import Airframe
+from fractus_core.policy.decision_types import Airframe
+from fractus_core.policy.return_route import RTL_CONE_SLOPE, ReturnBounds
 from fractus_mavlink.enums import COPTER_MODE, FENCE_TYPE, MAV_AUTOPILOT, MAV_TYPE
 
 from fractus_services.mobility.mavlink.companion import SYSTEM_ID
@@ -106,7 +106,12 @@ class ArduCopter:
         ),
         # 0 switches that cone off; what is more than three times as high only climbs higher.
         Setting(
-            ("RTL_CONE_SLOPE",), CONE, frozenset({0.0}), False, "climbs far enough before it returns", span=(CONE, 10.0)
+            ("RTL_CONE_SLOPE",),
+            RTL_CONE_SLOPE,
+            frozenset({0.0}),
+            False,
+            "climbs far enough before it returns",
+            span=(RTL_CONE_SLOPE, 10.0),
         ),
         Setting(("RTL_ALT_FINAL", "RTL_ALT_FINAL_M"), 0, frozenset(), False, "lands when it has returned"),
         Setting(("RALLY_LIMIT_KM",), _NO_RALLY_KM, frozenset(), False, "returns to home and to no rally point"),

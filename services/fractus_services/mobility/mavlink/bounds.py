@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import shapely
 from fractus_core.api.plans import GrantSpec
-from fractus_core.geo import LocalFrame, middle, polygon
+from fractus_core.geo import LocalFrame, area_center, area_polygon
 from fractus_mavlink.enums import MAV_CMD
 
 ROOM_M = 10.0
@@ -62,8 +62,8 @@ def bounds_of(spec: GrantSpec, vertices: int = MAX_VERTICES[0]) -> Bounds | None
     altitude = spec.limits.max_altitude + HEADROOM_M if spec.limits is not None else None
     items: tuple[Item, ...] = ()
     if spec.operation_area:
-        frame = LocalFrame.at(middle(spec.operation_area[0]))
-        whole = shapely.union_all([polygon(frame, area) for area in (*spec.operation_area, *spec.corridor)])
+        frame = LocalFrame.at(area_center(spec.operation_area[0]))
+        whole = shapely.union_all([area_polygon(frame, area) for area in (*spec.operation_area, *spec.corridor)])
         corners = [frame.latlon(x, y) for x, y in list(_outline(whole, vertices).exterior.coords)[:-1]]
         count = len(corners)
         items = tuple(

@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
-from fractus_core.policy.values import Airframe
+from fractus_core.policy.decision_types import Airframe
 
 from fractus_services.mobility.autopilot import Checked
 from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from fractus_core.control.values import FlightMode
-from fractus_core.policy.returning import ReturnBounds
-from fractus_core.policy.values import Airframe
+from fractus_core.policy.decision_types import Airframe
+from fractus_core.policy.return_route import ReturnBounds
 
 
 @dataclass(frozen=True, slots=True)

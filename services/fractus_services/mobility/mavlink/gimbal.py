@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from fractus_core.policy.values import Attitude
+from fractus_core.policy.decision_types import Attitude
 from fractus_mavlink import Message
 from fractus_mavlink.enums import GIMBAL_DEVICE_FLAGS
 

@@ -6,7 +6,7 @@ import math
 from collections import deque
 
 from fractus_core.geo import LocalFrame
-from fractus_core.policy.values import STANDING_MPS
+from fractus_core.policy.decision_types import STATIONARY_MPS
 
 from fractus_services.mobility.autopilot import LEG_MPS, VehicleState
 
@@ -70,7 +70,7 @@ def turns(velocity: Velocity, order: Velocity) -> bool:
     """Whether a vehicle in motion does not yet fly in the direction that it was told to."""
     (north, east, _), (to_north, to_east, _) = velocity, order
     length = math.hypot(to_north, to_east)
-    if math.hypot(north, east) < STANDING_MPS or length < STANDING_MPS:
+    if math.hypot(north, east) < STATIONARY_MPS or length < STATIONARY_MPS:
         return False
     along, aside = (north * to_north + east * to_east) / length, (north * to_east - east * to_north) / length
     return along < -TURNED_MPS or abs(aside) > TURNED_MPS
@@ -79,4 +79,4 @@ def turns(velocity: Velocity, order: Velocity) -> bool:
 def moves(velocity: Velocity) -> bool:
     """Whether a vehicle with this velocity does not stand."""
     north, east, down = velocity
-    return math.hypot(north, east) >= STANDING_MPS or abs(down) >= STANDING_MPS
+    return math.hypot(north, east) >= STATIONARY_MPS or abs(down) >= STATIONARY_MPS

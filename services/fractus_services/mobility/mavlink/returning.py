@@ -8,7 +8,7 @@ import logging
 from collections.abc import Callable
 from pathlib import Path
 
-from fractus_core.policy.returning import ReturnBounds
+from fractus_core.policy.return_route import ReturnBounds
 from fractus_runtime.files import write_file
 
 from fractus_services.errors import AutopilotError

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from fractus_core.policy.values import Home
+from fractus_core.policy.decision_types import Home
 from fractus_mavlink import Message
 from fractus_mavlink.enums import (
     EKF_STATUS_FLAGS,

@@ -11,7 +11,7 @@ from fractus_core.api.geometry import Area, Point, Reference
 from fractus_core.api.methods import CONTROL_METHODS, MOBILITY_METHODS, Method
 from fractus_core.control import ControlEvent, StreamState
 from fractus_core.exhaustive import exhaustive
-from fractus_core.policy.values import (
+from fractus_core.policy.decision_types import (
     Args,
     Call,
     CaptureArgs,

@@ -10,7 +10,7 @@ from typing import Any
 
 from fractus_core.api.names import node_identity
 from fractus_core.control import Authority
-from fractus_core.policy.values import Call, PointGimbalArgs, SetSpeedArgs, TakeoffArgs, Verdict
+from fractus_core.policy.decision_types import Call, PointGimbalArgs, SetSpeedArgs, TakeoffArgs, Verdict
 from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc
 
 from fractus_services.admission import CallAdmission

@@ -6,7 +6,7 @@ from collections.abc import Awaitable, Callable
 from functools import partial
 
 from fractus_core.control import ControlState
-from fractus_core.policy.returning import return_bounds
+from fractus_core.policy.return_route import return_bounds
 from fractus_runtime.audit import AuditLog
 
 from fractus_services.grant_files import ActiveGrant, GrantFiles

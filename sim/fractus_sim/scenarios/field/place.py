@@ -15,7 +15,7 @@ import shapely
 from fractus_core.api import Application, Drone, Policy, Zone
 from fractus_core.api.plans import GrantSpec
 from fractus_core.documents import BadDocument, dump_documents, parse_documents
-from fractus_core.geo import LocalFrame, polygon
+from fractus_core.geo import LocalFrame, area_polygon
 
 from fractus_sim.experiment.errors import ExperimentError
 from fractus_sim.experiment.services import grant_manifest, granted, read
@@ -102,7 +102,7 @@ class Field:
     def zone(self, name: str) -> Any:
         """A zone's shape in metres."""
         body = next(d for d in self.objects("Zone") if d["metadata"]["name"] == name)
-        return polygon(self.frame, Zone.from_body(body).spec.area)
+        return area_polygon(self.frame, Zone.from_body(body).spec.area)
 
     @cached_property
     def environment(self) -> dict[str, str]:
@@ -148,7 +148,7 @@ class Field:
     def operation_area(self, grants: Sequence[Mapping[str, Any]]) -> list[Any]:
         """Shapes of the operation area that the Grants name, in metres."""
         spec = GrantSpec.model_validate(grants[0]["spec"])
-        return [polygon(self.frame, area) for area in spec.operation_area]
+        return [area_polygon(self.frame, area) for area in spec.operation_area]
 
     def _unbound(self, spec: GrantSpec) -> GrantSpec:
         body = spec.to_dict()

@@ -5,21 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Literal, assert_never
+from typing import Literal
 
 import shapely
 from shapely.geometry.base import BaseGeometry
 
 from fractus_core.api.components import ServiceRequest
-from fractus_core.api.geometry import AltitudeBand, Area, Point, Reference
+from fractus_core.api.geometry import AltitudeBand, Area, Point
 from fractus_core.api.methods import METHODS_OF, MOBILITY_METHODS
 from fractus_core.api.plans import GrantedPolicy, GrantSpec
 from fractus_core.api.policies import PolicySpec
 from fractus_core.api.schedules import ActiveTime, active_at
-from fractus_core.geo import LocalFrame, check_extent, middle, polygon
-from fractus_core.policy.values import Home, Situation, UncertainTime, earliest
+from fractus_core.geo import LocalFrame, area_center, area_polygon, check_extent
+from fractus_core.policy.altitude import band_may_overlap, band_surely_contains
+from fractus_core.policy.decision_types import Situation, UncertainTime, earliest_time
 
-REACH_M = 500_000.0
+MAX_FRAME_REACH_M = 500_000.0
 """Ground further than this from the origin is left out of the frame: no drone of ours gets there."""
 MAX_UNINDEXED = 4
 """Up to this many zones are faster to test one by one than through an index."""
@@ -45,7 +46,7 @@ class Rule:
 
     def in_force(self, time_s: float) -> bool:
         """Whether the policy is in its validity window."""
-        return self.valid_from_s <= time_s and earliest(time_s) < self.valid_until_s
+        return self.valid_from_s <= time_s and earliest_time(time_s) < self.valid_until_s
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,21 +68,8 @@ class PolicyZone:
         )
 
 
-def height_m(value: float, reference: Reference, home: Home | None, flat_terrain: bool) -> float | None:
-    """An altitude as metres above home; None where nothing tells how high that datum lies."""
-    match reference:
-        case "home":
-            return value
-        case "amsl":
-            return None if home is None else value - home.amsl_m
-        case "terrain":
-            return value if flat_terrain else None
-        case _:
-            assert_never(reference)
-
-
 @dataclass(frozen=True, slots=True)
-class Air:
+class AirVolume:
     """Where a decision looks: a piece of ground, how far around it, and between which altitudes above home."""
 
     ground: BaseGeometry
@@ -104,7 +92,7 @@ class PolicyIndex:
     def __bool__(self) -> bool:
         return bool(self.zones or self.everywhere)
 
-    def near(self, air: Air, now: Situation, flat: bool) -> Iterator[PolicyZone]:
+    def near(self, air: AirVolume, now: Situation, flat: bool) -> Iterator[PolicyZone]:
         """Zones in force that come within the margin of a piece of air.
 
         A band whose datum is unknown reaches from the ground to the sky.
@@ -115,46 +103,12 @@ class PolicyIndex:
         else:
             near = [self.zones[i] for i in self._tree.query(air.ground, predicate="dwithin", distance=air.margin_m)]
         for zone in near:
-            if zone.in_force(now.time_s) and band_meets(zone.band, air.lower_m, air.upper_m, now.home, flat):
+            if zone.in_force(now.time_s) and band_may_overlap(zone.band, air.lower_m, air.upper_m, now.home, flat):
                 yield zone
 
 
-def band_meets(band: AltitudeBand | None, lower_m: float, upper_m: float, home: Home | None, flat: bool) -> bool:
-    """Whether altitudes from lower to upper (above home) may touch a band; unknown datums may."""
-    if band is None:
-        return True
-    if band.lower is not None:
-        floor = height_m(band.lower, band.reference, home, flat)
-        if floor is not None and upper_m < floor:
-            return False
-    if band.upper is not None:
-        ceiling = height_m(band.upper, band.reference, home, flat)
-        if ceiling is not None and lower_m > ceiling:
-            return False
-    return True
-
-
-def band_gap_m(band: AltitudeBand | None, lower_m: float, upper_m: float, home: Home | None, flat: bool) -> float:
-    """How far altitudes from lower to upper (above home) stay below or above a band; 0 where they may touch it."""
-    if band is None:
-        return 0.0
-    floor, ceiling = (
-        None if edge is None else height_m(edge, band.reference, home, flat) for edge in (band.lower, band.upper)
-    )
-    return max(0.0 if floor is None else floor - upper_m, 0.0 if ceiling is None else lower_m - ceiling, 0.0)
-
-
-def band_holds(band: AltitudeBand | None, lower_m: float, upper_m: float, home: Home | None, flat: bool) -> bool:
-    """Whether altitudes from lower to upper (above home) surely lie inside a band; unknown datums do not."""
-    if band is None:
-        return True
-    floor = -math.inf if band.lower is None else height_m(band.lower, band.reference, home, flat)
-    ceiling = math.inf if band.upper is None else height_m(band.upper, band.reference, home, flat)
-    return floor is not None and ceiling is not None and floor <= lower_m and upper_m <= ceiling
-
-
 def _surely_active(zone: PolicyZone, time_s: float) -> bool:
-    return active_at(zone.schedule, time_s) and active_at(zone.schedule, earliest(time_s))
+    return active_at(zone.schedule, time_s) and active_at(zone.schedule, earliest_time(time_s))
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,7 +128,7 @@ class Inclusion:
         kept = [
             p.shape
             for p in self.zones
-            if band_holds(p.band, lower_m, upper_m, now.home, flat) and _surely_active(p, now.time_s)
+            if band_surely_contains(p.band, lower_m, upper_m, now.home, flat) and _surely_active(p, now.time_s)
         ]
         shape = shapely.union_all(kept) if kept else shapely.Polygon()
         return shape, shape.boundary
@@ -209,18 +163,18 @@ class CompiledGrant:
     exclusions: PolicyIndex
     inclusions: tuple[Inclusion, ...]
     privacy: PolicyIndex
-    operation: BaseGeometry | None
-    operation_border: BaseGeometry | None
-    passage: BaseGeometry | None
-    passage_border: BaseGeometry | None
-    homeward: BaseGeometry | None
-    homeward_border: BaseGeometry | None
+    operation_area: BaseGeometry | None
+    operation_area_border: BaseGeometry | None
+    flight_area: BaseGeometry | None
+    flight_area_border: BaseGeometry | None
+    return_area: BaseGeometry | None
+    return_area_border: BaseGeometry | None
     flat_terrain: bool
-    timed: tuple[PolicyZone, ...]
+    timed_zones: tuple[PolicyZone, ...]
 
     def fences_in_force(self, time_s: float) -> tuple[bool, ...]:
         """Which of the fences that are limited in time hold at a moment, in seconds since 1970."""
-        return tuple(zone.in_force(time_s) for zone in self.timed)
+        return tuple(zone.in_force(time_s) for zone in self.timed_zones)
 
     def locate(self, now: Situation) -> tuple[float, float] | None:
         """Where the drone is, in metres of the frame; None while it is unknown."""
@@ -242,11 +196,11 @@ def compile_grant(spec: GrantSpec, origin: Point | None = None, flat_terrain: bo
     frame = LocalFrame.at(origin or _origin(spec))
     zoned = [(_rule(policy), policy) for policy in spec.policies]
     methods = frozenset().union(*(spec.methods(service) for service in METHODS_OF))
-    operation = _union(frame, spec.operation_area)
-    homeward = operation
-    if operation is not None and spec.corridor:
-        homeward = shapely.union(operation, _union(frame, spec.corridor))
-    passage = operation if spec.control == "partial" else homeward
+    operation_area = _union(frame, spec.operation_area)
+    return_area = operation_area
+    if operation_area is not None and spec.corridor:
+        return_area = shapely.union(operation_area, _union(frame, spec.corridor))
+    flight_area = operation_area if spec.control == "partial" else return_area
     exclusions = _index(frame, zoned, "GeofenceControl", "exclusion")
     inclusions = tuple(_inclusion(frame, r, p) for r, p in zoned if p.spec.kind == "inclusion")
     fences = (*exclusions.zones, *(zone for fence in inclusions for zone in fence.zones))
@@ -264,18 +218,18 @@ def compile_grant(spec: GrantSpec, origin: Point | None = None, flat_terrain: bo
         exclusions=exclusions,
         inclusions=inclusions,
         privacy=_index(frame, zoned, "PrivacyControl", "camera"),
-        operation=operation,
-        operation_border=_prepared(operation.boundary) if operation is not None else None,
-        passage=_prepared(passage) if passage is not None else None,
-        passage_border=_prepared(passage.boundary) if passage is not None else None,
-        homeward=_prepared(homeward) if homeward is not None else None,
-        homeward_border=_prepared(homeward.boundary) if homeward is not None else None,
+        operation_area=operation_area,
+        operation_area_border=_prepared(operation_area.boundary) if operation_area is not None else None,
+        flight_area=_prepared(flight_area) if flight_area is not None else None,
+        flight_area_border=_prepared(flight_area.boundary) if flight_area is not None else None,
+        return_area=_prepared(return_area) if return_area is not None else None,
+        return_area_border=_prepared(return_area.boundary) if return_area is not None else None,
         flat_terrain=flat_terrain,
-        timed=tuple(zone for zone in fences if zone.schedule or zone.rule.limited_in_time),
+        timed_zones=tuple(zone for zone in fences if zone.schedule or zone.rule.limited_in_time),
     )
 
 
-def for_transit(spec: GrantSpec, origin: Point | None = None, flat_terrain: bool = False) -> CompiledGrant:
+def compile_transit_grant(spec: GrantSpec, origin: Point | None = None, flat_terrain: bool = False) -> CompiledGrant:
     """The grant under which the system itself flies an application's drone: to its control points and home.
 
     It is under the application's fences and limits, has every method of the mobility service, and may be anywhere in the
@@ -284,7 +238,7 @@ def for_transit(spec: GrantSpec, origin: Point | None = None, flat_terrain: bool
     own = ServiceRequest(service="mobility", methods=MOBILITY_METHODS)
     system = spec.model_copy(update={"services": (own,), "control": "full"})
     grant = compile_grant(system, origin, flat_terrain)
-    return replace(grant, operation=grant.passage, operation_border=grant.passage_border)
+    return replace(grant, operation_area=grant.flight_area, operation_area_border=grant.flight_area_border)
 
 
 def _origin(spec: GrantSpec) -> Point:
@@ -293,10 +247,10 @@ def _origin(spec: GrantSpec) -> Point:
     if spec.depot is not None:
         return spec.depot
     if spec.operation_area:
-        return middle(spec.operation_area[0])
+        return area_center(spec.operation_area[0])
     for policy in spec.policies:
         if policy.zones:
-            return middle(policy.zones[0].area)
+            return area_center(policy.zones[0].area)
     return Point(lat=0.0, lon=0.0)
 
 
@@ -314,13 +268,15 @@ def _union(frame: LocalFrame, areas: tuple[Area, ...]) -> BaseGeometry | None:
     """Ground to stay on."""
     if not areas:
         return None
-    return _prepared(shapely.union_all([polygon(frame, area, within=True) for area in areas]))
+    return _prepared(shapely.union_all([area_polygon(frame, area, within=True) for area in areas]))
 
 
 def _policy_zones(frame: LocalFrame, rule: Rule, policy: GrantedPolicy) -> list[PolicyZone]:
     within = rule.spec.kind in _WITHIN
     return [
-        PolicyZone(rule, zone.name, _prepared(polygon(frame, zone.area, within=within)), zone.altitude, zone.schedule)
+        PolicyZone(
+            rule, zone.name, _prepared(area_polygon(frame, zone.area, within=within)), zone.altitude, zone.schedule
+        )
         for zone in policy.zones
         if _within_reach(frame, zone.area)
     ]
@@ -331,7 +287,7 @@ def _within_reach(frame: LocalFrame, area: Area) -> bool:
     if area.circle is not None:
         center = LocalFrame.at(area.circle.center)
         x, y = center.xy(frame.lat, frame.lon)
-        near = abs(frame.lat - area.circle.center.lat) < 60 and abs(x) + abs(y) < REACH_M + area.circle.radius
+        near = abs(frame.lat - area.circle.center.lat) < 60 and abs(x) + abs(y) < MAX_FRAME_REACH_M + area.circle.radius
         return near and _same_side(frame, area.circle.center)
     ring = area.polygon.exterior if area.polygon is not None else ()
     if not all(_same_side(frame, point) for point in ring):
@@ -340,7 +296,12 @@ def _within_reach(frame: LocalFrame, area: Area) -> bool:
         return False
     xy = [frame.xy(p.lat, p.lon) for p in ring]
     (west, east), (south, north) = ((min(a), max(a)) for a in zip(*xy, strict=True))
-    return bool(west < REACH_M and east > -REACH_M and south < REACH_M and north > -REACH_M)
+    return bool(
+        west < MAX_FRAME_REACH_M
+        and east > -MAX_FRAME_REACH_M
+        and south < MAX_FRAME_REACH_M
+        and north > -MAX_FRAME_REACH_M
+    )
 
 
 def _same_side(frame: LocalFrame, point: Point) -> bool:

@@ -9,9 +9,10 @@ import shapely
 
 from fractus_core.api.policies import FaceMethod, Fallback, FilterAction
 from fractus_core.exhaustive import exhaustive
-from fractus_core.policy.compiled import Air, CompiledGrant, PolicyIndex, PolicyZone, Rule, height_m
-from fractus_core.policy.footprint import seen_from
-from fractus_core.policy.values import Filter, Situation, Verdict, deny
+from fractus_core.policy.altitude import band_limits_m
+from fractus_core.policy.compiled_grant import AirVolume, CompiledGrant, PolicyIndex, Rule
+from fractus_core.policy.decision_types import Filter, Situation, Verdict, deny
+from fractus_core.policy.footprint import exposure_footprint
 
 _IN_ORDER: tuple[FilterAction, ...] = exhaustive(
     FilterAction, ("blurFaces", "removeBackground", "blurMedian", "blurAverage", "black")
@@ -29,24 +30,24 @@ def judge_privacy(now: Situation, grant: CompiledGrant) -> Verdict:
         now: where the camera is and how it is turned, and where it was during the exposure.
         grant: whose policies hold.
     """
-    rules = seen(grant.privacy, now, grant) if grant.privacy else []
+    rules = rules_in_view(grant.privacy, now, grant) if grant.privacy else []
     refusing = [rule for rule in rules if rule.spec.action == "refuse"]
     if refusing:
-        return deny("PrivacyZone", f"policy {refusing[0].name} forbids pictures here", names(refusing))
+        return deny("PrivacyZone", f"policy {refusing[0].name} forbids pictures here", rule_names(refusing))
     if not rules:
         return Verdict("allow")
-    filters = compose(filter_of(rule) for rule in rules)
+    filters = combine_filters(rule_filter(rule) for rule in rules)
     reason = f"policy {rules[0].name} asks for {', '.join(f.action for f in filters)} here"
-    return Verdict("correct", None, "PrivacyFilter", reason, names(rules), None, filters)
+    return Verdict("correct", None, "PrivacyFilter", reason, rule_names(rules), None, filters)
 
 
-def filter_of(rule: Rule) -> Filter:
+def rule_filter(rule: Rule) -> Filter:
     """What a rule asks for; one that names no filter blacks the picture out."""
     spec = rule.spec
     return Filter(spec.filter_action or "black", spec.faces or "pixelate", spec.fallback or "blurAverage")
 
 
-def compose(filters: Iterable[Filter]) -> tuple[Filter, ...]:
+def combine_filters(filters: Iterable[Filter]) -> tuple[Filter, ...]:
     """The filters that satisfy all of these, in the order in which they are applied.
 
     Black satisfies everything. A blur of the whole picture hides its faces as well. Of two ways to hide faces the
@@ -67,7 +68,7 @@ def _strictest(alike: list[Filter]) -> Filter:
     return Filter(alike[0].action, method, max((one.fallback for one in alike), key=_FALLBACKS.index))
 
 
-def remaining(asked: Iterable[Filter], applied: Iterable[Filter]) -> tuple[Filter, ...]:
+def remaining_filters(asked: Iterable[Filter], applied: Iterable[Filter]) -> tuple[Filter, ...]:
     """What must still be done to a picture that was filtered before.
 
     Faces that were hidden in a milder way than is asked for must still be hidden.
@@ -75,7 +76,7 @@ def remaining(asked: Iterable[Filter], applied: Iterable[Filter]) -> tuple[Filte
     done = tuple(applied)
     if any(one.action == "black" for one in done):
         return ()
-    return tuple(one for one in compose(asked) if not _satisfied(one, done))
+    return tuple(one for one in combine_filters(asked) if not _satisfied(one, done))
 
 
 def _satisfied(asked: Filter, done: Sequence[Filter]) -> bool:
@@ -86,43 +87,35 @@ def _satisfied(asked: Filter, done: Sequence[Filter]) -> bool:
     return any(one.action == "blurFaces" and (one.faces == "pixelate" or asked.faces == "gaussian") for one in done)
 
 
-def seen(index: PolicyIndex, now: Situation, grant: CompiledGrant) -> list[Rule]:
+def rules_in_view(index: PolicyIndex, now: Situation, grant: CompiledGrant) -> list[Rule]:
     """Policies of an index that hold where the camera is, or of which a picture may show a zone.
 
     While the position is unknown every policy in force may hold.
     """
     found = {rule.name: rule for rule in index.everywhere if rule.in_force(now.time_s)}
-    view = seen_from([*now.exposure, now], grant.frame)
+    view = exposure_footprint([*now.exposure, now], grant.frame)
     if now.lat is None or now.lon is None or view is None:
-        return ordered(found | {p.rule.name: p.rule for p in index.zones if p.in_force(now.time_s)})
+        return by_priority(found | {p.rule.name: p.rule for p in index.zones if p.in_force(now.time_s)})
     if not index.zones:
-        return ordered(found)
+        return by_priority(found)
     here = shapely.Point(grant.frame.xy(now.lat, now.lon))
     lower_m, upper_m = now.altitude_m - now.altitude_error_m, now.altitude_m + now.altitude_error_m
-    for zone in index.near(Air(here, now.position_error_m, lower_m, upper_m), now, grant.flat_terrain):
+    for zone in index.near(AirVolume(here, now.position_error_m, lower_m, upper_m), now, grant.flat_terrain):
         found[zone.rule.name] = zone.rule
-    air = Air(view.sight, view.margin_m, -math.inf, view.upper_m)
+    air = AirVolume(view.sight, view.margin_m, -math.inf, view.upper_m)
     for zone in index.near(air, now, grant.flat_terrain):
-        if zone.rule.name not in found and view.shows(zone.shape, *_heights(zone, now, grant.flat_terrain)):
+        if zone.rule.name not in found and view.shows(
+            zone.shape, *band_limits_m(zone.band, now.home, grant.flat_terrain)
+        ):
             found[zone.rule.name] = zone.rule
-    return ordered(found)
+    return by_priority(found)
 
 
-def _heights(zone: PolicyZone, now: Situation, flat_terrain: bool) -> tuple[float, float]:
-    """Floor and ceiling of a zone above home; one that is unknown reaches from the ground to the sky."""
-    band = zone.band
-    if band is None:
-        return -math.inf, math.inf
-    floor = None if band.lower is None else height_m(band.lower, band.reference, now.home, flat_terrain)
-    ceiling = None if band.upper is None else height_m(band.upper, band.reference, now.home, flat_terrain)
-    return -math.inf if floor is None else floor, math.inf if ceiling is None else ceiling
-
-
-def ordered(rules: dict[str, Rule]) -> list[Rule]:
+def by_priority(rules: dict[str, Rule]) -> list[Rule]:
     """Policies by falling priority, then by name."""
     return sorted(rules.values(), key=lambda r: (-r.spec.priority, r.name))
 
 
-def names(rules: Iterable[Rule]) -> tuple[str, ...]:
+def rule_names(rules: Iterable[Rule]) -> tuple[str, ...]:
     """The names of policies."""
     return tuple(rule.name for rule in rules)

@@ -11,17 +11,10 @@ from shapely.geometry.base import BaseGeometry
 
 from fractus_core.api.policies import GeofenceAction
 from fractus_core.exhaustive import exhaustive
-from fractus_core.policy.compiled import (
-    OPERATION_AREA,
-    Air,
-    CompiledGrant,
-    Inclusion,
-    PolicyZone,
-    band_gap_m,
-    band_meets,
-)
-from fractus_core.policy.motion import Leg, coming_heights_m, earliest_stop
-from fractus_core.policy.values import Situation, Takeover, Verdict, deny, distinct, metres
+from fractus_core.policy.altitude import band_gap_m, band_may_overlap
+from fractus_core.policy.compiled_grant import OPERATION_AREA, AirVolume, CompiledGrant, Inclusion, PolicyZone
+from fractus_core.policy.decision_types import Situation, Takeover, Verdict, deny, distinct, format_distance
+from fractus_core.policy.kinematics import Leg, altitude_range_to_stop_m, shortest_stop_point
 
 SEVERITY: dict[GeofenceAction, int] = exhaustive(
     GeofenceAction, {"adjust": 0, "ignore": 1, "hover": 2, "returnToLaunch": 3, "land": 4, "revoke": 5}
@@ -32,16 +25,16 @@ HOME_RADIUS_M = 5.0
 """A target this near to home is the way home, and a leg that begins this near to it the way from there, wherever the operation
 area lies."""
 
-ON_THE_SPOT_M = 0.5
+STATIONARY_LEG_M = 0.5
 """A leg that covers no more ground than this only changes the height."""
 
-INSIDE_M = 0.25
+EXTRA_MARGIN_M = 0.25
 """A corrected target keeps this much more than the margin, so that it never lies on a border."""
 
-LEVEL_M = 0.5
+ALTITUDE_TOLERANCE_M = 0.5
 """Heights this close are one: neither a barometer nor a controller holds them any better."""
 
-HALVINGS = 24
+BISECTION_STEPS = 24
 """Steps of the search for where a leg is far enough from a fence: right within a millimetre."""
 
 _SAMPLES = 24
@@ -71,9 +64,11 @@ class Breach:
         return SEVERITY[self.action] if self.enters else min(SEVERITY[self.action], SEVERITY["ignore"])
 
 
-def breaches(leg: Leg, now: Situation, grant: CompiledGrant, margin_m: float, height_margin_m: float) -> list[Breach]:
+def find_breaches(
+    leg: Leg, now: Situation, grant: CompiledGrant, margin_m: float, height_margin_m: float
+) -> list[Breach]:
     """Every fence that a leg breaks, most restrictive first."""
-    air = Air(leg.ground, margin_m, leg.lower_m - height_margin_m, leg.upper_m + height_margin_m)
+    air = AirVolume(leg.ground, margin_m, leg.lower_m - height_margin_m, leg.upper_m + height_margin_m)
     found = [
         *_operation_area(leg, now, grant, margin_m),
         *_exclusions(leg, now, grant, air),
@@ -82,7 +77,7 @@ def breaches(leg: Leg, now: Situation, grant: CompiledGrant, margin_m: float, he
     return sorted(found, key=lambda b: (-b.severity, -b.priority, b.policy))
 
 
-def broken(found: list[Breach]) -> Verdict:
+def breach_verdict(found: list[Breach]) -> Verdict:
     """What becomes of a request that breaks fences, most restrictive first."""
     worst = found[0]
     names = distinct(b.policy for b in found)
@@ -118,40 +113,41 @@ _EFFECTS: dict[Takeover, str] = exhaustive(
 
 def _operation_area(leg: Leg, now: Situation, grant: CompiledGrant, margin_m: float) -> Iterator[Breach]:
     """The fence that the grant itself implies: fly to where the application works, and stay there."""
-    operation, border = grant.operation, grant.operation_border
-    if operation is None or border is None or grant.passage is None or grant.passage_border is None:
+    operation_area, border = grant.operation_area, grant.operation_area_border
+    if operation_area is None or border is None or grant.flight_area is None or grant.flight_area_border is None:
         return
     target = shapely.points(leg.target)
-    homeward = outward = False
+    homeward = False
+    outward = False
     if now.home is not None:
         home = grant.frame.xy(now.home.lat, now.home.lon)
         homeward, outward = (math.dist(end, home) <= HOME_RADIUS_M for end in (leg.target, leg.start))
     vertical = leg.start == leg.target
-    within = operation.covers(target) and not border.dwithin(target, margin_m)
-    homeward = homeward or (leg.drifts and _approaches(leg, now, grant, operation))
+    within = operation_area.covers(target) and not border.dwithin(target, margin_m)
+    homeward = homeward or (leg.follows_velocity and _approaches(leg, now, grant, operation_area))
     if not within and not homeward and not vertical:
-        inside = operation.covers(target)
+        inside = operation_area.covers(target)
         away_m = border.distance(target)
         reason = (
-            f"the target is {metres(away_m)} from the border of the operation area; keep {margin_m:.1f} m inside it"
+            f"the target is {format_distance(away_m)} from the border of the operation area; keep {margin_m:.1f} m inside it"
             if inside
-            else f"the target is {metres(away_m)} outside the operation area"
+            else f"the target is {format_distance(away_m)} outside the operation area"
         )
         yield _area_breach(reason, not inside)
         return
-    working = operation.covers(leg.unavoidable) and not homeward and not outward and not vertical
-    shape, edge = (operation, border) if working else (grant.passage, grant.passage_border)
+    working = operation_area.covers(leg.braking_path) and not homeward and not outward and not vertical
+    shape, edge = (operation_area, border) if working else (grant.flight_area, grant.flight_area_border)
     if not _stays_inside(shape, edge, leg, now, margin_m):
         reason = f"the leg leaves the {'operation area' if working else 'way to the operation area'} or comes within {margin_m:.1f} m of its border"
         yield _area_breach(reason, not shape.covers(leg.ground))
 
 
-def _approaches(leg: Leg, now: Situation, grant: CompiledGrant, operation: BaseGeometry) -> bool:
+def _approaches(leg: Leg, now: Situation, grant: CompiledGrant, operation_area: BaseGeometry) -> bool:
     """Whether a drone outside the operation area comes nearer to it, or to its home."""
     stop, end = shapely.points(leg.stop), shapely.points(leg.target)
-    if operation.covers(stop):
+    if operation_area.covers(stop):
         return False
-    if operation.distance(end) < operation.distance(stop):
+    if operation_area.distance(end) < operation_area.distance(stop):
         return True
     if now.home is None:
         return False
@@ -163,13 +159,13 @@ def _area_breach(reason: str, enters: bool) -> Breach:
     return Breach(OPERATION_AREA, 0, "ignore", "OutsideOperationArea", reason, enters, lambda _part: False)
 
 
-def _exclusions(leg: Leg, now: Situation, grant: CompiledGrant, air: Air) -> Iterator[Breach]:
+def _exclusions(leg: Leg, now: Situation, grant: CompiledGrant, air: AirVolume) -> Iterator[Breach]:
     if not grant.exclusions.zones:
         return
     margin_m, certain = air.margin_m, _certain_way(leg, now)
     for zone in grant.exclusions.near(air, now, grant.flat_terrain):
         shape = zone.shape
-        clearance_m = _clearance_outside(shape, leg.unavoidable)
+        clearance_m = _clearance_outside(shape, leg.braking_path)
         level, height_margin_m = _is_level_with(zone, now, grant), leg.lower_m - air.lower_m
         if shape.dwithin(certain, margin_m):
             if not level and _leaves_height(zone, leg, now, grant, height_margin_m):
@@ -190,13 +186,13 @@ def _certain_way(leg: Leg, now: Situation) -> BaseGeometry:
 
     Its way to rest is overestimated, which must not open ways past a fence.
     """
-    end = earliest_stop(now, leg.start)
+    end = shortest_stop_point(now, leg.start)
     return shapely.points(leg.start) if end == leg.start else shapely.linestrings((leg.start, end))
 
 
 def _is_level_with(zone: PolicyZone, now: Situation, grant: CompiledGrant) -> bool:
     """Whether the drone is, or comes to rest, between the altitudes of a zone."""
-    return band_meets(zone.band, *coming_heights_m(now), now.home, grant.flat_terrain)
+    return band_may_overlap(zone.band, *altitude_range_to_stop_m(now), now.home, grant.flat_terrain)
 
 
 def _comes_level(zone: PolicyZone, leg: Leg, now: Situation, grant: CompiledGrant, height_margin_m: float) -> bool:
@@ -206,10 +202,10 @@ def _comes_level(zone: PolicyZone, leg: Leg, now: Situation, grant: CompiledGran
     never into the nearer half of the margin, however many legs it asks for.
     """
     gap_m = band_gap_m(zone.band, leg.lower_m, leg.upper_m, now.home, grant.flat_terrain)
-    present_m = band_gap_m(zone.band, *coming_heights_m(now), now.home, grant.flat_terrain)
+    present_m = band_gap_m(zone.band, *altitude_range_to_stop_m(now), now.home, grant.flat_terrain)
     kept_m = height_margin_m
     if present_m < height_margin_m:
-        kept_m = min(present_m, max(present_m - LEVEL_M, height_margin_m / 2))
+        kept_m = min(present_m, max(present_m - ALTITUDE_TOLERANCE_M, height_margin_m / 2))
     # Heights converted between datums differ in their last digits.
     return gap_m <= 0.0 or gap_m < kept_m - 1e-6
 
@@ -220,9 +216,9 @@ def _leaves_height(zone: PolicyZone, leg: Leg, now: Situation, grant: CompiledGr
     Not on its way to somewhere else: the axes move independently, so from beside a zone it could be over or under it first.
     """
     west, south, east, north = shapely.bounds(leg.ground)
-    if max(east - west, north - south) > ON_THE_SPOT_M:
+    if max(east - west, north - south) > STATIONARY_LEG_M:
         return False
-    present = coming_heights_m(now)
+    present = altitude_range_to_stop_m(now)
 
     def gap_m(lower_m: float, upper_m: float) -> float:
         return band_gap_m(zone.band, lower_m, upper_m, now.home, grant.flat_terrain)
@@ -238,7 +234,7 @@ def _exclusion_breach(zone: PolicyZone, leg: Leg, margin_m: float, enters: bool)
     target = shapely.points(leg.target)
     if shape.intersects(target):
         depth_m = shape.boundary.distance(target)
-        code, reason = "InsideExclusionZone", f"the target is {metres(depth_m)} inside zone {zone.name}"
+        code, reason = "InsideExclusionZone", f"the target is {format_distance(depth_m)} inside zone {zone.name}"
     elif shape.intersects(leg.ground):
         code, reason = "LegThroughExclusionZone", _crossing(zone, leg)
     else:
@@ -252,7 +248,7 @@ def _exclusion_breach(zone: PolicyZone, leg: Leg, margin_m: float, enters: bool)
         code,
         f"{reason} of policy {name}",
         enters,
-        lambda part: not shape.dwithin(part, margin_m + INSIDE_M),
+        lambda part: not shape.dwithin(part, margin_m + EXTRA_MARGIN_M),
     )
 
 
@@ -264,7 +260,7 @@ def _crossing(zone: PolicyZone, leg: Leg) -> str:
     return f"the {'leg' if zone.shape.intersects(leg.line) else 'turn onto the leg'} touches zone {zone.name}"
 
 
-def _inclusions(leg: Leg, now: Situation, grant: CompiledGrant, air: Air) -> Iterator[Breach]:
+def _inclusions(leg: Leg, now: Situation, grant: CompiledGrant, air: AirVolume) -> Iterator[Breach]:
     for fence in grant.inclusions:
         if not fence.rule.in_force(now.time_s):
             continue
@@ -282,8 +278,8 @@ def _leaves_by_height(fence: Inclusion, shape: BaseGeometry, leg: Leg, now: Situ
     """
     if shape.covers(leg.ground):
         return False
-    present, _ = fence.at(*coming_heights_m(now), now, grant.flat_terrain)
-    return bool(present.covers(leg.unavoidable))
+    present, _ = fence.at(*altitude_range_to_stop_m(now), now, grant.flat_terrain)
+    return bool(present.covers(leg.braking_path))
 
 
 def _inclusion_breach(fence: Inclusion, shape: BaseGeometry, border: BaseGeometry, leg: Leg, margin_m: float) -> Breach:
@@ -293,14 +289,17 @@ def _inclusion_breach(fence: Inclusion, shape: BaseGeometry, border: BaseGeometr
     if shape.is_empty:
         code, reason = "OutsideInclusionZone", f"none of {zones} allows this altitude"
     elif not shape.covers(target):
-        code, reason = "OutsideInclusionZone", f"the target is {metres(shape.distance(target))} outside {zones}"
+        code, reason = (
+            "OutsideInclusionZone",
+            f"the target is {format_distance(shape.distance(target))} outside {zones}",
+        )
     elif not shape.covers(leg.ground):
         code, reason = "LegOutsideInclusionZone", f"the leg leaves {zones}"
     else:
         away_m = border.distance(leg.ground)
         code = "TooCloseToInclusionBorder"
         reason = f"the leg comes within {max(away_m, 0.1):.1f} m of the border of {zones}; keep {margin_m:.1f} m inside"
-    enters = shape.covers(leg.unavoidable) and not shape.covers(leg.ground)
+    enters = shape.covers(leg.braking_path) and not shape.covers(leg.ground)
     return Breach(
         name,
         fence.rule.spec.priority,
@@ -308,12 +307,12 @@ def _inclusion_breach(fence: Inclusion, shape: BaseGeometry, border: BaseGeometr
         code,
         f"{reason} (policy {name})",
         enters,
-        lambda part: bool(shape.covers(part)) and not border.dwithin(part, margin_m + INSIDE_M),
+        lambda part: bool(shape.covers(part)) and not border.dwithin(part, margin_m + EXTRA_MARGIN_M),
     )
 
 
-def _clearance_outside(shape: BaseGeometry, unavoidable: BaseGeometry) -> float:
-    return 0.0 if shape.intersects(unavoidable) else float(shape.distance(unavoidable))
+def _clearance_outside(shape: BaseGeometry, braking_path: BaseGeometry) -> float:
+    return 0.0 if shape.intersects(braking_path) else float(shape.distance(braking_path))
 
 
 def _stays_inside(shape: BaseGeometry, border: BaseGeometry, leg: Leg, now: Situation, margin_m: float) -> bool:
@@ -324,7 +323,7 @@ def _stays_inside(shape: BaseGeometry, border: BaseGeometry, leg: Leg, now: Situ
     least = _certain_way(leg, now)
     if shape.covers(least) and not border.dwithin(least, margin_m):
         return False
-    if shape.covers(leg.unavoidable) and not shape.covers(ground):
+    if shape.covers(leg.braking_path) and not shape.covers(ground):
         return False
     if shape.covers(least) and not shape.covers(_from_rest(least, leg)):
         return False
@@ -371,7 +370,7 @@ def _gains(leg: Leg, keeps: Callable[[BaseGeometry], bool], clearance: Callable[
     if keeps(shapely.points(leg.stop)) or not keeps(shapely.points(leg.target)):
         return False
     low, high = 0.0, 1.0
-    for _ in range(HALVINGS):
+    for _ in range(BISECTION_STEPS):
         share = (low + high) / 2
         kept = keeps(shapely.linestrings(((x + (tx - x) * share, y + (ty - y) * share), (tx, ty))))
         low, high = (low, share) if kept else (share, high)

@@ -10,12 +10,12 @@ import shapely
 from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
-from fractus_core.policy.compiled import Air, CompiledGrant, PolicyZone
-from fractus_core.policy.fences import breaches
-from fractus_core.policy.limits import forbids_height
-from fractus_core.policy.motion import XY, Leg, height_margin_m, margin_m
-from fractus_core.policy.returning import straight_home_blocked
-from fractus_core.policy.values import Situation
+from fractus_core.policy.compiled_grant import AirVolume, CompiledGrant, PolicyZone
+from fractus_core.policy.decision_types import Situation
+from fractus_core.policy.geofences import find_breaches
+from fractus_core.policy.kinematics import XY, Leg, height_margin_m, margin_m
+from fractus_core.policy.limits import limit_forbids_altitudes
+from fractus_core.policy.return_route import check_straight_return
 
 Floats = NDArray[np.float64]
 
@@ -31,7 +31,7 @@ _SEGMENTS = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Space:
+class FreeSpace:
     """Where a way may lead: the air between two altitudes, and the fences in it."""
 
     now: Situation
@@ -40,68 +40,69 @@ class Space:
     upper_m: float
     margin_m: float
     height_margin_m: float
-    kept_in: tuple[tuple[BaseGeometry, BaseGeometry], ...]
+    required_areas: tuple[tuple[BaseGeometry, BaseGeometry], ...]
 
     @classmethod
-    def around(cls, now: Situation, grant: CompiledGrant, lower_m: float, upper_m: float, room_m: float) -> Space:
+    def between(cls, now: Situation, grant: CompiledGrant, lower_m: float, upper_m: float, room_m: float) -> FreeSpace:
         """The space that a grant leaves, with this much room beyond the engine's margin."""
-        moving = replace(grant, operation=grant.passage, operation_border=grant.passage_border)
+        moving = replace(grant, operation_area=grant.flight_area, operation_area_border=grant.flight_area_border)
         slack = height_margin_m(now)
-        kept_in = [
+        required_areas = [
             fence.at(lower_m - slack, upper_m + slack, now, grant.flat_terrain)
             for fence in grant.inclusions
             if fence.rule.in_force(now.time_s)
         ]
-        if grant.passage is not None and grant.passage_border is not None:
-            kept_in.append((grant.passage, grant.passage_border))
-        return cls(now, moving, lower_m, upper_m, margin_m(now) + room_m, slack, tuple(kept_in))
+        if grant.flight_area is not None and grant.flight_area_border is not None:
+            required_areas.append((grant.flight_area, grant.flight_area_border))
+        return cls(now, moving, lower_m, upper_m, margin_m(now) + room_m, slack, tuple(required_areas))
 
     def blockers(self, line: BaseGeometry) -> list[PolicyZone | int]:
         """What stands in the way of a line: zones to keep out of, and numbers of areas to stay in."""
         slack, flat = self.height_margin_m, self.grant.flat_terrain
-        air = Air(line, self.margin_m, self.lower_m - slack, self.upper_m + slack)
+        air = AirVolume(line, self.margin_m, self.lower_m - slack, self.upper_m + slack)
         found: list[PolicyZone | int] = list(self.grant.exclusions.near(air, self.now, flat))
         if self.grant.altitude_limits.zones:
             low, high = self.lower_m, self.upper_m
             limiting = self.grant.altitude_limits.near(air, self.now, flat)
-            found += [zone for zone in limiting if forbids_height(zone, low, high, self.now, flat)]
-        for i, (shape, border) in enumerate(self.kept_in):
+            found += [zone for zone in limiting if limit_forbids_altitudes(zone, low, high, self.now, flat)]
+        for i, (shape, border) in enumerate(self.required_areas):
             if not shape.covers(line) or border.dwithin(line, self.margin_m):
                 found.append(i)
         return found
 
-    def permits(self, start: XY, end: XY) -> bool:
+    def allows_leg(self, start: XY, end: XY) -> bool:
         """Whether a leg from or to an end of the way is legal, which may lie too close to a fence or at home."""
         leg = Leg(start, start, start, end, self.lower_m, self.upper_m)
-        if breaches(leg, self.now, self.grant, self.margin_m, self.height_margin_m):
+        if find_breaches(leg, self.now, self.grant, self.margin_m, self.height_margin_m):
             return False
-        air = Air(leg.ground, self.margin_m, self.lower_m, self.upper_m)
+        air = AirVolume(leg.ground, self.margin_m, self.lower_m, self.upper_m)
         limiting = self.grant.altitude_limits.near(air, self.now, self.grant.flat_terrain)
         return not any(
-            forbids_height(zone, self.lower_m, self.upper_m, self.now, self.grant.flat_terrain) for zone in limiting
+            limit_forbids_altitudes(zone, self.lower_m, self.upper_m, self.now, self.grant.flat_terrain)
+            for zone in limiting
         )
 
-    def returns(self, place: XY) -> bool:
+    def allows_return_from(self, place: XY) -> bool:
         """Whether the autopilot's own way home from a place is legal."""
         if self.now.airframe.retraces:
             return True
         margin, slack = self.margin_m, self.height_margin_m
-        return straight_home_blocked(place, self.upper_m, self.now, self.grant, margin=margin, slack=slack) is None
+        return check_straight_return(place, self.upper_m, self.now, self.grant, margin=margin, slack=slack) is None
 
     def corners(self, obstacle: PolicyZone | int) -> Floats:
         """Where ways may turn around an obstacle: rows of x, y of a corner, the one before it and the one after."""
         away = self.margin_m + CORNER_M
         if isinstance(obstacle, PolicyZone):
             return _corners(_outline(obstacle.shape, away), 1.0)
-        return _corners(_outline(self.kept_in[obstacle][0], -away), -1.0)
+        return _corners(_outline(self.required_areas[obstacle][0], -away), -1.0)
 
-    def way_out(self, obstacle: PolicyZone | int, begin: shapely.Point) -> Floats:
+    def nearest_exit(self, obstacle: PolicyZone | int, begin: shapely.Point) -> Floats:
         """The nearest place that an obstacle leaves free, as a corner without neighbours; none may be left."""
         away = self.margin_m + CORNER_M
         outline = (
             _outline(obstacle.shape, away)
             if isinstance(obstacle, PolicyZone)
-            else _outline(self.kept_in[obstacle][0], -away)
+            else _outline(self.required_areas[obstacle][0], -away)
         )
         if outline.is_empty:
             return np.empty((0, 6))

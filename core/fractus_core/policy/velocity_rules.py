@@ -7,27 +7,8 @@ from dataclasses import dataclass, field, replace
 
 import shapely
 
-from fractus_core.policy.compiled import Air, CompiledGrant
-from fractus_core.policy.corrections import caused
-from fractus_core.policy.fences import Breach, breaches, broken
-from fractus_core.policy.legs import way_home_blocked
-from fractus_core.policy.limits import (
-    MIN_LEG_ALTITUDE_M,
-    SLACK,
-    Bound,
-    Clamped,
-    altitude_bounds,
-    clamp,
-    conflict,
-    corrected,
-    datum_unknown,
-    height_on_entry,
-    lower_is_fine,
-    speed_bounds,
-    strictest,
-)
-from fractus_core.policy.motion import XY, Leg, height_margin_m, margin_m, stop_altitude_m, swept
-from fractus_core.policy.values import (
+from fractus_core.policy.compiled_grant import AirVolume, CompiledGrant
+from fractus_core.policy.decision_types import (
     POSITION_UNKNOWN,
     Call,
     SetSpeedArgs,
@@ -36,6 +17,25 @@ from fractus_core.policy.values import (
     Verdict,
     deny,
     distinct,
+)
+from fractus_core.policy.geofences import Breach, breach_verdict, find_breaches
+from fractus_core.policy.goto_rules import check_return
+from fractus_core.policy.kinematics import XY, Leg, height_margin_m, margin_m, stop_altitude_m, velocity_leg
+from fractus_core.policy.limits import (
+    MIN_LEG_ALTITUDE_M,
+    ROUNDING_SLACK,
+    Bound,
+    Correction,
+    allows_low_altitude,
+    altitude_bounds,
+    check_altitude_on_entry,
+    check_contradiction,
+    choose_objection,
+    clamp,
+    correction_verdict,
+    deny_unknown_datum,
+    speed_bounds,
+    strictest_bound,
 )
 
 RETURN_CLIMB_MPS = 1.0
@@ -55,9 +55,9 @@ def judge_speed(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
         return deny("InvalidArgument", "SetSpeed needs its arguments")
     if at is None:
         return POSITION_UNKNOWN
-    bounds = speed_bounds(grant, now, Air(shapely.points(at), margin_m(now), now.altitude_m, now.altitude_m))
+    bounds = speed_bounds(grant, now, AirVolume(shapely.points(at), margin_m(now), now.altitude_m, now.altitude_m))
     clamped = clamp("Speed", "m/s", args.speed_mps, bounds)
-    return clamped if isinstance(clamped, Verdict) else corrected(SetSpeedArgs(clamped.value), [clamped])
+    return clamped if isinstance(clamped, Verdict) else correction_verdict(SetSpeedArgs(clamped.value), [clamped])
 
 
 @dataclass(slots=True)
@@ -68,7 +68,7 @@ class _Setpoint:
     now: Situation
     grant: CompiledGrant
     at: XY
-    notes: list[Clamped] = field(default_factory=list)
+    notes: list[Correction] = field(default_factory=list)
     _legs: dict[VelocityArgs, Leg] = field(default_factory=dict)
 
     @property
@@ -79,14 +79,14 @@ class _Setpoint:
     def sweep(self, args: VelocityArgs) -> Leg:
         """What a velocity sweeps."""
         if args not in self._legs:
-            self._legs[args] = swept(self.now, self.at, args)
+            self._legs[args] = velocity_leg(self.now, self.at, args)
         return self._legs[args]
 
     @property
-    def air(self) -> Air:
+    def air(self) -> AirVolume:
         """Where limits may hold for it."""
         leg = self.leg
-        return Air(leg.ground, _margin_m(self.now), leg.lower_m, leg.upper_m)
+        return AirVolume(leg.ground, _margin_m(self.now), leg.lower_m, leg.upper_m)
 
 
 def judge_velocity(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
@@ -108,19 +108,21 @@ def judge_velocity(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     limits = len(setpoint.notes)
     problem = _within_fences(setpoint) or _way_home_blocked(setpoint)
     if problem is None:
-        return corrected(setpoint.args, setpoint.notes)
+        return correction_verdict(setpoint.args, setpoint.notes)
     if not limits:
         return problem
     setpoint.args = args
     found = _breached(setpoint, args)
-    return caused(
-        problem, broken(found) if found else _way_home_blocked(setpoint), corrected(None, setpoint.notes[:limits])
+    return choose_objection(
+        problem,
+        breach_verdict(found) if found else _way_home_blocked(setpoint),
+        correction_verdict(None, setpoint.notes[:limits]),
     )
 
 
 def _way_home_blocked(setpoint: _Setpoint) -> Verdict | None:
     leg = setpoint.leg
-    return way_home_blocked(leg.target, leg.upper_m, setpoint.now, setpoint.grant)
+    return check_return(leg.target, leg.upper_m, setpoint.now, setpoint.grant)
 
 
 def _within_speed(setpoint: _Setpoint) -> Verdict | None:
@@ -142,22 +144,22 @@ def _within_heights(setpoint: _Setpoint) -> Verdict | None:
     now, grant = setpoint.now, setpoint.grant
     bounds, unknown = altitude_bounds(grant, now, setpoint.air)
     if unknown:
-        return datum_unknown(unknown[0])
-    problem = conflict("Altitude", "m", bounds) or height_on_entry(
+        return deny_unknown_datum(unknown[0])
+    problem = check_contradiction("Altitude", "m", bounds) or check_altitude_on_entry(
         shapely.points(setpoint.at), (now.altitude_m, stop_altitude_m(now)), bounds, height_margin_m(now)
     )
     if problem is not None:
         return problem
-    floor = -math.inf if lower_is_fine(bounds) else min(MIN_LEG_ALTITUDE_M, now.altitude_m)
+    floor = -math.inf if allows_low_altitude(bounds) else min(MIN_LEG_ALTITUDE_M, now.altitude_m)
     ground = Bound("", 0, floor, None, refuses=False)
     for above in (True, False):
         every = bounds if above else [*bounds, ground]
-        bound = strictest(every, above=above)
+        bound = strictest_bound(every, above=above)
         if bound is not None:
             asked = setpoint.args
             problem = _lead_back(setpoint, bound, above=above)
             if problem is None and not above and setpoint.args != asked:
-                problem = _no_room(setpoint, bound, strictest(bounds, above=True))
+                problem = _no_room(setpoint, bound, strictest_bound(bounds, above=True))
             if problem is not None:
                 return problem
     return None
@@ -201,13 +203,13 @@ def _lead_back(setpoint: _Setpoint, bound: Bound, *, above: bool) -> Verdict | N
     if new.down_mps != args.down_mps:
         setpoint.args = new
         note = f"{reason}; its vertical speed is corrected from {args.down_mps:.1f} to {new.down_mps:.1f} m/s down"
-        setpoint.notes.append(Clamped(new.down_mps, f"Altitude{word}Limit", note, names))
+        setpoint.notes.append(Correction(new.down_mps, f"Altitude{word}Limit", note, names))
     return None
 
 
 def _beyond(setpoint: _Setpoint, args: VelocityArgs, edge: float, *, above: bool) -> bool:
     leg = setpoint.sweep(args)
-    return leg.upper_m > edge + SLACK if above else leg.lower_m < edge - SLACK
+    return leg.upper_m > edge + ROUNDING_SLACK if above else leg.lower_m < edge - ROUNDING_SLACK
 
 
 def _scaled_climb(setpoint: _Setpoint, edge: float, *, above: bool) -> VelocityArgs:
@@ -231,7 +233,7 @@ def _within_fences(setpoint: _Setpoint) -> Verdict | None:
     args = setpoint.args
     asked = math.hypot(args.north_mps, args.east_mps, args.down_mps)
     if any(b.action != "adjust" for b in found) or asked < MIN_SCALED_MPS:
-        return broken(found)
+        return breach_verdict(found)
     best, low, high = None, MIN_SCALED_MPS / asked, 1.0
     for _ in range(_HALVINGS):
         share = (low + high) / 2
@@ -241,10 +243,10 @@ def _within_fences(setpoint: _Setpoint) -> Verdict | None:
         else:
             low, best = share, scaled
     if best is None:
-        return broken(found)
+        return breach_verdict(found)
     setpoint.args = best
     names = distinct(b.policy for b in found)
-    setpoint.notes.append(Clamped(low, "VelocityScaled", f"{found[0].reason}; scaled to {low:.0%}", names))
+    setpoint.notes.append(Correction(low, "VelocityScaled", f"{found[0].reason}; scaled to {low:.0%}", names))
     return None
 
 
@@ -257,7 +259,7 @@ def _scaled(args: VelocityArgs, share: float) -> VelocityArgs:
 def _breached(setpoint: _Setpoint, args: VelocityArgs) -> list[Breach]:
     now = setpoint.now
     slack = height_margin_m(now) + now.airframe.tracking_m
-    return breaches(setpoint.sweep(args), now, setpoint.grant, _margin_m(now), slack)
+    return find_breaches(setpoint.sweep(args), now, setpoint.grant, _margin_m(now), slack)
 
 
 def _margin_m(now: Situation) -> float:

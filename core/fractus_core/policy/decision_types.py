@@ -11,7 +11,7 @@ from fractus_core.api.geometry import Reference
 from fractus_core.api.methods import METHODS_OF, Service
 from fractus_core.api.policies import FaceMethod, Fallback, FilterAction
 
-STANDING_MPS = 0.5
+STATIONARY_MPS = 0.5
 """A drone slower than this, on the ground and vertically, stands: it turns on the spot, within its tracking margin."""
 
 Action = Literal["allow", "correct", "deny", "takeover"]
@@ -112,7 +112,7 @@ class UncertainTime(float):
         return moment
 
 
-def earliest(time_s: float) -> float:
+def earliest_time(time_s: float) -> float:
     """The earliest that a time may be."""
     return time_s.earliest if isinstance(time_s, UncertainTime) else time_s
 
@@ -260,7 +260,7 @@ class Situation:
     exposure: tuple[Situation, ...] = ()
 
     @property
-    def sound(self) -> bool:
+    def is_plausible(self) -> bool:
         """Whether every figure is a number, and one that can be of this world."""
         figures = (*_FIGURES(self), *_MOTION(self.airframe))
         if self.home is not None:
@@ -315,7 +315,7 @@ class Verdict:
             internal error.
         filters: what must be done to a picture before it is handed out, in this order.
         brake_first: the drone must be brought to a stop before anything else, for it is too fast for the turn that
-            follows. With `allow` and `correct`: stop (as Hover does), wait until the drone is slower than `STANDING_MPS`,
+            follows. With `allow` and `correct`: stop (as Hover does), wait until the drone is slower than `STATIONARY_MPS`,
             judge the call as it was asked again, and carry out that verdict; never send these `args` before. With
             `takeover`: stop, wait for the same, then land or return.
     """
@@ -340,7 +340,7 @@ def distinct(names: Iterable[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(name for name in names if name))
 
 
-def metres(distance_m: float) -> str:
+def format_distance(distance_m: float) -> str:
     """A distance for people, who would read "0.0 m" as none at all."""
     return "less than 0.1 m" if distance_m < 0.05 else f"{distance_m:.1f} m"
 

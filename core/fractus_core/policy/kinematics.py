@@ -10,14 +10,14 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from fractus_core.geo import LocalFrame
-from fractus_core.policy.values import STANDING_MPS, Airframe, Situation, VelocityArgs
+from fractus_core.policy.decision_types import STATIONARY_MPS, Airframe, Situation, VelocityArgs
 
 XY = tuple[float, float]
 
 _TURNING = (0.25, 0.5, 0.75)
 """Shares of a turn at which a stop is looked at."""
 
-OVERSHOOT = 0.35
+OVERSHOOT_SHARE = 0.35
 """Share of the stopping distance that a drone which turns in flight may overshoot its target by."""
 
 
@@ -51,7 +51,7 @@ def height_margin_m(now: Situation) -> float:
     return now.altitude_error_m + now.airframe.tracking_m
 
 
-def moving(now: Situation) -> bool:
+def is_moving(now: Situation) -> bool:
     """Whether the drone is too fast to turn on the spot, or may be by the time it is told to."""
     if _fast(now.north_mps, now.east_mps, now.down_mps):
         return True
@@ -59,10 +59,10 @@ def moving(now: Situation) -> bool:
 
 
 def _fast(north_mps: float, east_mps: float, down_mps: float) -> bool:
-    return math.hypot(north_mps, east_mps) >= STANDING_MPS or abs(down_mps) >= STANDING_MPS
+    return math.hypot(north_mps, east_mps) >= STATIONARY_MPS or abs(down_mps) >= STATIONARY_MPS
 
 
-def outlooks(now: Situation, at: XY) -> list[tuple[XY, Situation]]:
+def pending_outcomes(now: Situation, at: XY) -> list[tuple[XY, Situation]]:
     """Where else the drone may be when it hears of a decision, in frame metres, and how it moves by then.
 
     It may do what it was told last from this moment on, as hard as it can. These are the ends of what it may have done by
@@ -94,18 +94,18 @@ def _taken_up(present: XY, wanted: XY, accel: float, jerk: float, lasting_s: flo
     return (wanted[0] - present[0]) * share, (wanted[1] - present[1]) * share
 
 
-MAX_PENDING = 4
+MAX_PENDING_VELOCITIES = 4
 """Of more velocities than this the corners of the smallest box around them are looked at instead."""
 
 
 def _extremes(velocities: tuple[tuple[float, float, float], ...]) -> tuple[tuple[float, float, float], ...]:
-    if len(velocities) <= MAX_PENDING:
+    if len(velocities) <= MAX_PENDING_VELOCITIES:
         return velocities
     (south, north), (west, east), (up, down) = ((min(axis), max(axis)) for axis in zip(*velocities, strict=True))
     return (south, west, up), (south, east, down), (north, west, down), (north, east, up)
 
 
-def at_rest(now: Situation, grant_frame: LocalFrame, at: XY) -> Situation:
+def situation_at_rest(now: Situation, grant_frame: LocalFrame, at: XY) -> Situation:
     """The situation after the drone was told to stop now, wherever its latency lets it come to rest."""
     lat, lon = grant_frame.latlon(*stop_point(now, at))
     return replace(
@@ -114,7 +114,7 @@ def at_rest(now: Situation, grant_frame: LocalFrame, at: XY) -> Situation:
 
 
 @dataclass(frozen=True, slots=True)
-class Surge:
+class MotionBeforeReaction:
     """What a drone does before a command takes effect.
 
     Attributes:
@@ -126,7 +126,7 @@ class Surge:
     run_m: float
 
 
-def surge(situation: Situation) -> Surge:
+def motion_before_reaction(situation: Situation) -> MotionBeforeReaction:
     """How far a drone flies on, and how much faster it may get, before it does what it is told.
 
     A drone that speeds up goes on speeding up for the latency, and then as long as its jerk limit takes to end that. Where
@@ -137,7 +137,7 @@ def surge(situation: Situation) -> Surge:
     bite_s = frame.accel_mps2 / (2 * frame.jerk_mps3)
     forward = situation.forward_mps2
     if forward is None:
-        forward = frame.accel_mps2 if STANDING_MPS <= speed < situation.speed_setpoint_mps else 0.0
+        forward = frame.accel_mps2 if STATIONARY_MPS <= speed < situation.speed_setpoint_mps else 0.0
     elif forward < 0.0 and any(_fast(*velocity) for velocity in situation.pending):
         forward = 0.0  # It may have been told to brake no longer.
     forward = min(max(forward, -frame.accel_mps2), frame.accel_mps2)
@@ -145,7 +145,7 @@ def surge(situation: Situation) -> Surge:
         # A drone that brakes already goes on braking: its speed is lower when the command takes effect.
         left = max(speed + forward * situation.latency_s, 0.0)
         bite_s *= 1.0 + forward / frame.accel_mps2
-        return Surge(left, (speed + left) / 2 * situation.latency_s + left * bite_s)
+        return MotionBeforeReaction(left, (speed + left) / 2 * situation.latency_s + left * bite_s)
     late_s, easing_s = situation.latency_s, forward / frame.jerk_mps3
     first = speed + forward * late_s
     last = first + forward * easing_s / 2
@@ -153,7 +153,7 @@ def surge(situation: Situation) -> Surge:
     if situation.forward_mps2 is None and last > situation.speed_setpoint_mps:
         last = max(situation.speed_setpoint_mps, speed)
         run = min(run, last * (late_s + easing_s))
-    return Surge(last, run + last * bite_s)
+    return MotionBeforeReaction(last, run + last * bite_s)
 
 
 def stop_point(situation: Situation, at: XY) -> XY:
@@ -162,12 +162,12 @@ def stop_point(situation: Situation, at: XY) -> XY:
     # Below the noise of a GNSS velocity its direction says nothing.
     if speed < 0.05:
         return at
-    frame, begin = situation.airframe, surge(situation)
+    frame, begin = situation.airframe, motion_before_reaction(situation)
     run = begin.run_m + stopping_distance_m(begin.speed_mps, frame.accel_mps2, frame.position_gain)
     return at[0] + situation.east_mps / speed * run, at[1] + situation.north_mps / speed * run
 
 
-def earliest_stop(situation: Situation, at: XY) -> XY:
+def shortest_stop_point(situation: Situation, at: XY) -> XY:
     """Where the drone comes to rest, in frame metres, that brakes already, as hard as it can."""
     run = math.hypot(situation.north_mps, situation.east_mps) / (2 * situation.airframe.accel_mps2)
     return at[0] + situation.east_mps * run, at[1] + situation.north_mps * run
@@ -183,9 +183,9 @@ def turn_point(situation: Situation, at: XY, target: XY) -> XY:
     speed = math.hypot(situation.north_mps, situation.east_mps)
     frame = situation.airframe
     stop = stop_point(situation, at)
-    if speed < STANDING_MPS:
+    if speed < STATIONARY_MPS:
         return stop
-    begin = surge(situation)
+    begin = motion_before_reaction(situation)
     east, north = situation.east_mps / speed * begin.speed_mps, situation.north_mps / speed * begin.speed_mps
     change = begin.speed_mps
     for origin in (at, stop):
@@ -206,9 +206,9 @@ def turning_stops(situation: Situation, at: XY, target: XY) -> tuple[XY, ...]:
     It stops along its velocity of that moment, which may lead out of the triangle that the turn itself stays in.
     """
     speed = math.hypot(situation.north_mps, situation.east_mps)
-    if speed < STANDING_MPS:
+    if speed < STATIONARY_MPS:
         return ()
-    frame, begin, stop = situation.airframe, surge(situation), stop_point(situation, at)
+    frame, begin, stop = situation.airframe, motion_before_reaction(situation), stop_point(situation, at)
     ahead = (situation.east_mps / speed, situation.north_mps / speed)
     away = math.dist(stop, target)
     cruise = min(situation.speed_setpoint_mps, math.sqrt(2 * frame.accel_mps2 * away))
@@ -239,7 +239,7 @@ def stop_altitude_m(situation: Situation) -> float:
     return situation.altitude_m + math.copysign(run, climb)
 
 
-def coming_heights_m(situation: Situation) -> tuple[float, float]:
+def altitude_range_to_stop_m(situation: Situation) -> tuple[float, float]:
     """The lowest and the highest altitude above home at which the drone is until it comes to rest."""
     rest_m = stop_altitude_m(situation)
     return min(situation.altitude_m, rest_m), max(situation.altitude_m, rest_m)
@@ -270,7 +270,7 @@ class Leg:
     lower_m: float
     upper_m: float
     corners: tuple[XY, ...] = ()
-    drifts: bool = False
+    follows_velocity: bool = False
 
     @cached_property
     def ground(self) -> BaseGeometry:
@@ -290,17 +290,17 @@ class Leg:
     @property
     def _beyond(self) -> XY:
         """How far the drone may overshoot: one that turns on its way arrives askew and swings past the target."""
-        if self.drifts:
+        if self.follows_velocity:
             return self.target
         (tx, ty), (x, y) = self.turn, self.target
         along = math.hypot(x - tx, y - ty)
-        over = OVERSHOOT * math.hypot(self.stop[0] - self.start[0], self.stop[1] - self.start[1])
+        over = OVERSHOOT_SHARE * math.hypot(self.stop[0] - self.start[0], self.stop[1] - self.start[1])
         if over == 0 or along < 1e-6:
             return self.target
         return x + (x - tx) / along * over, y + (y - ty) / along * over
 
     @cached_property
-    def unavoidable(self) -> BaseGeometry:
+    def braking_path(self) -> BaseGeometry:
         """The part that the drone flies whatever it is told."""
         return shapely.points(self.start) if self.start == self.stop else shapely.linestrings((self.start, self.stop))
 
@@ -310,18 +310,18 @@ class Leg:
         return shapely.points(self.stop) if self.stop == self.target else shapely.linestrings((self.stop, self.target))
 
 
-def standing(at: XY, lower_m: float, upper_m: float) -> Leg:
+def vertical_leg(at: XY, lower_m: float, upper_m: float) -> Leg:
     """A drone that stays above one place."""
     return Leg(at, at, at, at, lower_m, upper_m)
 
 
-def swept(now: Situation, at: XY, asked: VelocityArgs) -> Leg:
+def velocity_leg(now: Situation, at: XY, asked: VelocityArgs) -> Leg:
     """What a drone sweeps that takes up a velocity, holds it to the end of its hold, and stops.
 
     The ground is the convex hull of where it may be, whether latency delays the beginning, the end, or neither. The leg's
     target is where it comes to rest at the latest.
     """
-    frame, begin = now.airframe, surge(now)
+    frame, begin = now.airframe, motion_before_reaction(now)
     wanted = (asked.east_mps, asked.north_mps)
     speed = math.hypot(now.north_mps, now.east_mps)
     ahead = (now.east_mps / speed, now.north_mps / speed) if speed > 0 else (0.0, 0.0)
@@ -339,7 +339,7 @@ def swept(now: Situation, at: XY, asked: VelocityArgs) -> Leg:
     climbs = _course((climb, 0.0), (-asked.down_mps, 0.0), lasting_s, frame, (frame.climb_accel_mps2, 1.0))
     late_m = climb * reaction_s(now, frame.climb_accel_mps2)
     climbs += [(up + late_m, 0.0) for up, _ in climbs]
-    for (x, y), other in outlooks(now, (0.0, 0.0)):
+    for (x, y), other in pending_outcomes(now, (0.0, 0.0)):
         taken = _course((other.east_mps, other.north_mps), wanted, lasting_s, frame, control)
         ways[:0] = [(x, y), stop_point(other, (x, y)), *((x + dx, y + dy) for dx, dy in taken)]
         rise = other.altitude_m - now.altitude_m
@@ -348,7 +348,7 @@ def swept(now: Situation, at: XY, asked: VelocityArgs) -> Leg:
     heights = [now.altitude_m, stop_altitude_m(now), *(now.altitude_m + climb for climb, _ in climbs)]
     corners = tuple((at[0] + x, at[1] + y) for x, y in ways)
     stop = stop_point(now, at)
-    return Leg(at, stop, stop, corners[-1], min(heights), max(heights), corners, drifts=True)
+    return Leg(at, stop, stop, corners[-1], min(heights), max(heights), corners, follows_velocity=True)
 
 
 def _course(present: XY, wanted: XY, lasting_s: float, frame: Airframe, control: tuple[float, float]) -> list[XY]:

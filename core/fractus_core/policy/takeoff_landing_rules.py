@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import shapely
 
-from fractus_core.policy.compiled import Air, CompiledGrant
-from fractus_core.policy.corrections import caused
-from fractus_core.policy.fences import breaches
-from fractus_core.policy.legs import way_home_blocked
-from fractus_core.policy.limits import altitude_bounds, clamp, corrected, datum_unknown
-from fractus_core.policy.motion import XY, height_margin_m, margin_m, standing, stop_point
-from fractus_core.policy.values import POSITION_UNKNOWN, Call, Situation, TakeoffArgs, Verdict, deny, distinct
+from fractus_core.policy.compiled_grant import AirVolume, CompiledGrant
+from fractus_core.policy.decision_types import POSITION_UNKNOWN, Call, Situation, TakeoffArgs, Verdict, deny, distinct
+from fractus_core.policy.geofences import find_breaches
+from fractus_core.policy.goto_rules import check_return
+from fractus_core.policy.kinematics import XY, height_margin_m, margin_m, stop_point, vertical_leg
+from fractus_core.policy.limits import altitude_bounds, choose_objection, clamp, correction_verdict, deny_unknown_datum
 
 
 def judge_takeoff(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
@@ -19,22 +18,22 @@ def judge_takeoff(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     if at is None or not isinstance(args, TakeoffArgs):
         return POSITION_UNKNOWN if at is None else deny("InvalidArgument", "Takeoff needs its arguments")
     lower, upper = sorted((now.altitude_m, args.altitude_m))
-    bounds, unknown = altitude_bounds(grant, now, Air(shapely.points(at), margin_m(now), lower, upper))
+    bounds, unknown = altitude_bounds(grant, now, AirVolume(shapely.points(at), margin_m(now), lower, upper))
     if unknown:
-        return datum_unknown(unknown[0])
+        return deny_unknown_datum(unknown[0])
     clamped = clamp("Altitude", "m above home", args.altitude_m, bounds)
     if isinstance(clamped, Verdict):
         return clamped
-    correction = corrected(TakeoffArgs(clamped.value), [clamped])
+    correction = correction_verdict(TakeoffArgs(clamped.value), [clamped])
     problem = _climb(at, now, grant, clamped.value)
     if problem is None or not clamped.code:
         return problem or correction
-    return caused(problem, _climb(at, now, grant, args.altitude_m), correction)
+    return choose_objection(problem, _climb(at, now, grant, args.altitude_m), correction)
 
 
 def _climb(at: XY, now: Situation, grant: CompiledGrant, altitude_m: float) -> Verdict | None:
     """What fences and the way home have against a climb."""
-    return _column(at, now, grant, now.altitude_m, altitude_m) or way_home_blocked(at, altitude_m, now, grant)
+    return _column(at, now, grant, now.altitude_m, altitude_m) or check_return(at, altitude_m, now, grant)
 
 
 def judge_arm(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
@@ -56,8 +55,8 @@ def judge_land(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
 
 def _column(at: XY, now: Situation, grant: CompiledGrant, lower_m: float, upper_m: float) -> Verdict | None:
     """The denial of a vertical motion, or of standing, where fences forbid it; no such request is a takeover."""
-    leg = standing(at, min(lower_m, upper_m), max(lower_m, upper_m))
-    found = breaches(leg, now, grant, margin_m(now), height_margin_m(now))
+    leg = vertical_leg(at, min(lower_m, upper_m), max(lower_m, upper_m))
+    found = find_breaches(leg, now, grant, margin_m(now), height_margin_m(now))
     if not found:
         return None
     return deny(found[0].code, found[0].reason, distinct(b.policy for b in found))

@@ -7,38 +7,39 @@ from dataclasses import dataclass, replace
 
 import shapely
 
-from fractus_core.policy.compiled import Air, CompiledGrant, height_m
-from fractus_core.policy.corrections import caused
-from fractus_core.policy.fences import HALVINGS, Breach, breaches, broken
-from fractus_core.policy.limits import (
-    MIN_LEG_ALTITUDE_M,
-    SLACK,
-    Clamped,
-    altitude_bounds,
-    clamp,
-    corrected,
-    datum_unknown,
-    height_on_entry,
-    lower_is_fine,
-    speed_bounds,
-)
-from fractus_core.policy.motion import (
+from fractus_core.policy.altitude import altitude_above_home_m
+from fractus_core.policy.compiled_grant import AirVolume, CompiledGrant
+from fractus_core.policy.decision_types import POSITION_UNKNOWN, Call, GotoArgs, Situation, Verdict, deny, distinct
+from fractus_core.policy.geofences import BISECTION_STEPS, Breach, breach_verdict, find_breaches
+from fractus_core.policy.kinematics import (
     XY,
     Leg,
-    at_rest,
     height_margin_m,
+    is_moving,
     margin_m,
-    moving,
-    outlooks,
-    standing,
+    pending_outcomes,
+    situation_at_rest,
     stop_altitude_m,
     stop_point,
     turn_point,
     turning_stops,
+    vertical_leg,
 )
-from fractus_core.policy.returning import straight_home_blocked
-from fractus_core.policy.routes import leads
-from fractus_core.policy.values import POSITION_UNKNOWN, Call, GotoArgs, Situation, Verdict, deny, distinct
+from fractus_core.policy.limits import (
+    MIN_LEG_ALTITUDE_M,
+    ROUNDING_SLACK,
+    Correction,
+    allows_low_altitude,
+    altitude_bounds,
+    check_altitude_on_entry,
+    choose_objection,
+    clamp,
+    correction_verdict,
+    deny_unknown_datum,
+    speed_bounds,
+)
+from fractus_core.policy.return_route import check_straight_return
+from fractus_core.policy.route_search import route_exists
 
 MAX_RANGE_M = 100_000.0
 """Farther than any drone here flies, and well inside what the grant's frame shows true to scale."""
@@ -65,7 +66,7 @@ def judge_goto(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     if args.speed_mps is not None and args.speed_mps > now.speed_setpoint_mps:
         now = replace(now, speed_setpoint_mps=args.speed_mps)
     verdict = _judge_from(_Request(args, now, grant, at), target)
-    if verdict.action == "allow" or not moving(now) or not _turns_too_wide(verdict, args):
+    if verdict.action == "allow" or not is_moving(now) or not _turns_too_wide(verdict, args):
         return verdict
     stopped = _judge_after_stop(_Request(args, now, grant, at), target)
     return stopped if stopped is not None and stopped.permits and not _shortened(stopped, args) else verdict
@@ -86,33 +87,39 @@ def _judge_after_stop(request: _Request, target: XY) -> Verdict | None:
     now, grant, at = request.now, request.grant, request.at
     stop = stop_point(now, at)
     heights, corners = [now.altitude_m, stop_altitude_m(now)], list[XY]()
-    for place, other in outlooks(now, at):
+    for place, other in pending_outcomes(now, at):
         corners += (place, stop_point(other, place))
         heights += (other.altitude_m, stop_altitude_m(other))
     braking = Leg(at, stop, stop, stop, min(heights), max(heights), tuple(corners))
-    on_its_way = replace(grant, operation=grant.passage, operation_border=grant.passage_border)
-    if breaches(braking, now, on_its_way, margin_m(now), height_margin_m(now)):
+    on_its_way = replace(grant, operation_area=grant.flight_area, operation_area_border=grant.flight_area_border)
+    if find_breaches(braking, now, on_its_way, margin_m(now), height_margin_m(now)):
         return None
     # The leg begins where the drone stands: what it brakes into would count as where it has been.
-    bounds, unknown = altitude_bounds(grant, now, Air(braking.ground, margin_m(now), braking.lower_m, braking.upper_m))
+    bounds, unknown = altitude_bounds(
+        grant, now, AirVolume(braking.ground, margin_m(now), braking.lower_m, braking.upper_m)
+    )
     reach = braking.lower_m, braking.upper_m
-    if unknown or height_on_entry(shapely.points(at), reach, bounds, height_margin_m(now)) is not None:
+    if unknown or check_altitude_on_entry(shapely.points(at), reach, bounds, height_margin_m(now)) is not None:
         return None
-    verdict = _judge_from(replace(request, now=at_rest(now, grant.frame, at), at=stop), target)
+    verdict = _judge_from(replace(request, now=situation_at_rest(now, grant.frame, at), at=stop), target)
     return replace(verdict, brake_first=True)
 
 
 def _judge_from(request: _Request, target: XY) -> Verdict:
     args, now, grant = request.args, request.now, request.grant
-    altitude = now.altitude_m if args.alt is None else height_m(args.alt, args.reference, now.home, grant.flat_terrain)
+    altitude = (
+        now.altitude_m
+        if args.alt is None
+        else altitude_above_home_m(args.alt, args.reference, now.home, grant.flat_terrain)
+    )
     if altitude is None:
         return deny(
             "TerrainUnknown", "the target is given above terrain, and no terrain model is loaded; use home or amsl"
         )
-    notes: list[Clamped] = []
+    notes: list[Correction] = []
     if args.alt is not None and args.reference == "terrain":
         reason = "no terrain model is loaded; the ground is taken as level with home"
-        notes.append(Clamped(altitude, "TerrainAssumedFlat", reason))
+        notes.append(Correction(altitude, "TerrainAssumedFlat", reason))
     flown = _fly_leg(request, _Aim(target, altitude), notes, adjusting=True)
     return flown if isinstance(flown, Verdict) else _outcome(args, flown, notes, grant)
 
@@ -146,7 +153,7 @@ def _beyond(args: GotoArgs, grant: CompiledGrant) -> bool:
     return abs(lat - args.lat) > 1e-6 or abs((lon - args.lon + 180.0) % 360.0 - 180.0) > 1e-5
 
 
-def _fly_leg(request: _Request, aim: _Aim, notes: list[Clamped], adjusting: bool) -> _Aim | Verdict:
+def _fly_leg(request: _Request, aim: _Aim, notes: list[Correction], adjusting: bool) -> _Aim | Verdict:
     """What may be flown of a leg, or the verdict that forbids it."""
     now, grant = request.now, request.grant
     leg = _leg(request.at, aim.target, now, aim.altitude_m)
@@ -154,16 +161,16 @@ def _fly_leg(request: _Request, aim: _Aim, notes: list[Clamped], adjusting: bool
     if isinstance(within, Verdict):
         return within
     leg = _leg(request.at, aim.target, now, within.altitude_m)
-    found = breaches(leg, now, grant, margin_m(now), height_margin_m(now))
+    found = find_breaches(leg, now, grant, margin_m(now), height_margin_m(now))
     adjustable = adjusting and bool(found) and all(b.action == "adjust" for b in found)
     shorter = _last_legal(leg, found) if adjustable else None
     if shorter is None:
-        problem = broken(found) if found else way_home_blocked(aim.target, within.altitude_m, now, grant)
+        problem = breach_verdict(found) if found else check_return(aim.target, within.altitude_m, now, grant)
         if problem is None or within.altitude_m == aim.altitude_m:
             return problem or within
-        return caused(problem, _objection(request, aim), corrected(None, notes))
+        return choose_objection(problem, _objection(request, aim), correction_verdict(None, notes))
     names = distinct(b.policy for b in found)
-    notes.append(Clamped(0.0, "LegShortened", f"{found[0].reason}; the leg ends at the last legal point", names))
+    notes.append(Correction(0.0, "LegShortened", f"{found[0].reason}; the leg ends at the last legal point", names))
     return _fly_leg(request, replace(within, target=shorter), notes, adjusting=False)
 
 
@@ -171,21 +178,21 @@ def _objection(request: _Request, aim: _Aim) -> Verdict | None:
     """What fences and the way home have against a leg, its limits left aside."""
     now, grant = request.now, request.grant
     leg = _leg(request.at, aim.target, now, aim.altitude_m)
-    found = breaches(leg, now, grant, margin_m(now), height_margin_m(now))
-    return broken(found) if found else way_home_blocked(aim.target, aim.altitude_m, now, grant)
+    found = find_breaches(leg, now, grant, margin_m(now), height_margin_m(now))
+    return breach_verdict(found) if found else check_return(aim.target, aim.altitude_m, now, grant)
 
 
-def _within_limits(request: _Request, leg: Leg, aim: _Aim, notes: list[Clamped]) -> _Aim | Verdict:
+def _within_limits(request: _Request, leg: Leg, aim: _Aim, notes: list[Correction]) -> _Aim | Verdict:
     """The aim inside the limits of altitude and speed, or the verdict that forbids it."""
     now, grant = request.now, request.grant
-    air = Air(leg.ground, margin_m(now), leg.lower_m, leg.upper_m)
+    air = AirVolume(leg.ground, margin_m(now), leg.lower_m, leg.upper_m)
     bounds, unknown = altitude_bounds(grant, now, air)
     if unknown:
-        return datum_unknown(unknown[0])
+        return deny_unknown_datum(unknown[0])
     height = clamp("Altitude", "m above home", aim.altitude_m, bounds)
     if isinstance(height, Verdict):
         return height
-    if height.value < MIN_LEG_ALTITUDE_M - SLACK and not lower_is_fine(bounds):
+    if height.value < MIN_LEG_ALTITUDE_M - ROUNDING_SLACK and not allows_low_altitude(bounds):
         return deny(
             "AltitudeTooLow",
             f"a leg ends at least {MIN_LEG_ALTITUDE_M:.0f} m above home, not at {height.value:.1f} m; use land to come down",
@@ -193,7 +200,7 @@ def _within_limits(request: _Request, leg: Leg, aim: _Aim, notes: list[Clamped])
     asked = request.args.speed_mps if aim.speed_mps is None else aim.speed_mps
     speed = clamp("Speed", "m/s", now.speed_setpoint_mps if asked is None else asked, speed_bounds(grant, now, air))
     heights = (now.altitude_m, stop_altitude_m(now))
-    problem = height_on_entry(shapely.points(request.at), heights, bounds, height_margin_m(now))
+    problem = check_altitude_on_entry(shapely.points(request.at), heights, bounds, height_margin_m(now))
     if problem is not None:
         return problem
     if isinstance(speed, Verdict):
@@ -205,29 +212,29 @@ def _within_limits(request: _Request, leg: Leg, aim: _Aim, notes: list[Clamped])
 def _leg(at: XY, target: XY, now: Situation, altitude_m: float) -> Leg:
     heights = [now.altitude_m, stop_altitude_m(now), altitude_m]
     turn, stops = turn_point(now, at, target), turning_stops(now, at, target)
-    for place, other in outlooks(now, at):
+    for place, other in pending_outcomes(now, at):
         stops += (place, turn_point(other, place, target), *turning_stops(other, place, target))
         heights += (other.altitude_m, stop_altitude_m(other))
     return Leg(at, stop_point(now, at), turn, target, min(heights), max(heights), stops)
 
 
-def way_home_blocked(target: XY, altitude_m: float, now: Situation, grant: CompiledGrant) -> Verdict | None:
+def check_return(target: XY, altitude_m: float, now: Situation, grant: CompiledGrant) -> Verdict | None:
     """The denial of a target from which the autopilot's way home is not legal.
 
     A drone that is on the wrong side of a fence may leave it wherever its home lies.
     """
-    problem = straight_home_blocked(target, altitude_m, now, grant, margin=margin_m(now), slack=height_margin_m(now))
+    problem = check_straight_return(target, altitude_m, now, grant, margin=margin_m(now), slack=height_margin_m(now))
     at = grant.locate(now)
     if problem is None or now.home is None or at is None:
         return problem
-    here = standing(at, now.altitude_m, now.altitude_m)
-    if breaches(here, now, grant, margin_m(now), height_margin_m(now)):
+    here = vertical_leg(at, now.altitude_m, now.altitude_m)
+    if find_breaches(here, now, grant, margin_m(now), height_margin_m(now)):
         return None
     if not now.airframe.retraces:
         return problem
     home = grant.frame.xy(now.home.lat, now.home.lon)
-    system = replace(grant, passage=grant.homeward, passage_border=grant.homeward_border)
-    if leads(target, home, now, system, altitude_m):
+    system = replace(grant, flight_area=grant.return_area, flight_area_border=grant.return_area_border)
+    if route_exists(target, home, now, system, altitude_m):
         return None
     return replace(problem, reason=f"{problem.reason}, and no legal way is found around it")
 
@@ -241,17 +248,17 @@ def _last_legal(leg: Leg, found: list[Breach]) -> XY | None:
         return x + (tx - x) * share, y + (ty - y) * share
 
     low, high = 0.0, 1.0
-    for _ in range(HALVINGS):
+    for _ in range(BISECTION_STEPS):
         share = (low + high) / 2
         part = shapely.linestrings((leg.stop, along(share)))
         low, high = (share, high) if all(breach.permits(part) for breach in found) else (low, share)
     return along(low - 0.01 / length_m) if low * length_m >= MIN_LEG_M else None
 
 
-def _outcome(args: GotoArgs, flown: _Aim, notes: list[Clamped], grant: CompiledGrant) -> Verdict:
+def _outcome(args: GotoArgs, flown: _Aim, notes: list[Correction], grant: CompiledGrant) -> Verdict:
     moved = any(note.code == "LegShortened" for note in notes)
     lat, lon = grant.frame.latlon(*flown.target) if moved else (args.lat, args.lon)
     new = replace(args, lat=lat, lon=lon, alt=flown.altitude_m, reference="home", speed_mps=flown.speed_mps)
-    verdict = corrected(new, sorted(notes, key=lambda note: note.code == "TerrainAssumedFlat"))
+    verdict = correction_verdict(new, sorted(notes, key=lambda note: note.code == "TerrainAssumedFlat"))
     # Ground that is taken for flat is told, but changes nothing that was asked for.
     return replace(verdict, action="allow") if verdict.code == "TerrainAssumedFlat" else verdict

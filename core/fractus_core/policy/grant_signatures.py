@@ -22,7 +22,6 @@ from cryptography.x509.oid import ObjectIdentifier
 from fractus_core.api.model import GROUP, InvalidObject
 from fractus_core.api.names import OPERATOR_IDENTITY
 from fractus_core.api.plans import Grant
-from fractus_core.policy.trust import BadSignature, UnknownAuthority
 
 SIGNATURE_ANNOTATION = f"{GROUP}/signature"
 SIGNER_ANNOTATION = f"{GROUP}/signed-by"
@@ -36,7 +35,15 @@ MAX_CLOCK_SKEW = timedelta(minutes=5)
 _CONTEXT = b"fractus.dev grant 1\n"
 
 
-def canonical(grant: Grant) -> bytes:
+class BadSignature(Exception):
+    """The operator did not sign this Grant as it stands; the message says why."""
+
+
+class UnknownAuthority(BadSignature):
+    """The signer's certificate comes from an authority that this node does not know (yet)."""
+
+
+def signed_bytes(grant: Grant) -> bytes:
     """What is signed: name and spec as JSON with sorted keys, without fields that have their default value.
 
     So a field that a later release adds breaks no signature where it is not used, and neither the API server nor a disk
@@ -65,7 +72,7 @@ def sign(
     grant = Grant.from_body({**body, "spec": spec})
     if grant.spec.unbounded:
         raise InvalidObject("spec.operationArea", f"{grant.spec.unbounded}; say where its drone may be")
-    signature = key.sign(canonical(grant), ec.ECDSA(hashes.SHA256()))
+    signature = key.sign(signed_bytes(grant), ec.ECDSA(hashes.SHA256()))
     signer = certificate.public_bytes(serialization.Encoding.DER)
     metadata = dict(body["metadata"])
     metadata["annotations"] = {
@@ -108,7 +115,7 @@ def verify(grant: Grant, authorities: Sequence[x509.Certificate]) -> datetime:
     key = _signing_key(signer)
     _check_time(issued_at, signer, _issuer(signer, authorities))
     try:
-        key.verify(signature, canonical(grant), ec.ECDSA(hashes.SHA256()))
+        key.verify(signature, signed_bytes(grant), ec.ECDSA(hashes.SHA256()))
     except InvalidSignature:
         raise BadSignature("it was changed after it was signed") from None
     return issued_at

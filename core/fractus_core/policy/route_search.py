@@ -11,10 +11,10 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from fractus_core.policy.compiled import CompiledGrant, PolicyZone
-from fractus_core.policy.motion import XY
-from fractus_core.policy.spaces import Floats, Space
-from fractus_core.policy.values import Situation
+from fractus_core.policy.compiled_grant import CompiledGrant, PolicyZone
+from fractus_core.policy.decision_types import Situation
+from fractus_core.policy.free_space import Floats, FreeSpace
+from fractus_core.policy.kinematics import XY
 
 CLEARANCES_M = (1.5, 0.25)
 """What legs keep beyond the engine's margin, where there is room, and else: a drone that reached a waypoint within a metre
@@ -35,16 +35,16 @@ _ROUNDING = 1e-6
 _START, _TARGET = 0, 1
 
 
-Steps = Generator[None, None, tuple[XY, ...] | None]
+RouteSteps = Generator[None, None, tuple[XY, ...] | None]
 
 
-def route(
+def find_route(
     start: XY, target: XY, now: Situation, grant: CompiledGrant, altitude_m: float, *, from_m: float | None = None
 ) -> tuple[XY, ...] | None:
     """The shortest legal way from one place to another, flown at one altitude with a stop at each waypoint.
 
     It keeps out of exclusion zones, out of zones whose altitude limits `altitude_m` breaks, and inside inclusion zones and
-    `grant.passage` (operation area and corridor), each with the engine's margin. From a start that is itself too close to
+    `grant.flight_area` (operation area and corridor), each with the engine's margin. From a start that is itself too close to
     a fence the first leg leads away from it. Where the autopilot's way home is a straight line (not
     `now.airframe.retraces`), it must be legal from every waypoint, the target included.
 
@@ -71,15 +71,15 @@ def route(
         target, the start is left out. None when there is no legal way, when home or a limit's datum is unknown, or when
         the search gives up.
     """
-    return _finished(searching(start, target, now, grant, altitude_m, from_m=from_m))
+    return _finished(route_steps(start, target, now, grant, altitude_m, from_m=from_m))
 
 
-def searching(
+def route_steps(
     start: XY, target: XY, now: Situation, grant: CompiledGrant, altitude_m: float, *, from_m: float | None = None
-) -> Steps:
-    """`route` in steps of a fraction of a millisecond, for callers that have other things to do meanwhile; returns the way."""
+) -> RouteSteps:
+    """`find_route` in steps of a fraction of a millisecond, for callers that have other things to do meanwhile; returns the way."""
     figures = (*start, *target, altitude_m, altitude_m if from_m is None else from_m)
-    if now.home is None or not now.sound or not all(math.isfinite(figure) for figure in figures):
+    if now.home is None or not now.is_plausible or not all(math.isfinite(figure) for figure in figures):
         return None
     roomy, narrow = (_Search(start, target, _spaces(now, grant, figures[-2:], room_m)) for room_m in CLEARANCES_M)
     found = yield from roomy.steps()
@@ -91,8 +91,8 @@ def searching(
     return (yield from roomy.rounded(found)) if found is not None else None
 
 
-def leads(start: XY, target: XY, now: Situation, grant: CompiledGrant, altitude_m: float) -> bool:
-    """Whether a short search, of `QUICK_MAX_LEGS_TESTED` legs, finds any legal way from one place to another; see `route`."""
+def route_exists(start: XY, target: XY, now: Situation, grant: CompiledGrant, altitude_m: float) -> bool:
+    """Whether a short search, of `QUICK_MAX_LEGS_TESTED` legs, finds any legal way from one place to another; see `find_route`."""
     return quick_route(start, target, now, grant, altitude_m, max_excess=QUICK_MAX_EXCESS) is not None
 
 
@@ -106,22 +106,24 @@ def quick_route(
     from_m: float | None = None,
     max_excess: float = MAX_EXCESS,
 ) -> tuple[XY, ...] | None:
-    """As `route`, but gives up after `QUICK_MAX_LEGS_TESTED` legs, and keeps no more room than it must."""
-    if now.home is None or not now.sound:
+    """As `find_route`, but gives up after `QUICK_MAX_LEGS_TESTED` legs, and keeps no more room than it must."""
+    if now.home is None or not now.is_plausible:
         return None
     heights_m = (altitude_m, altitude_m if from_m is None else from_m)
     spaces = _spaces(now, grant, heights_m, CLEARANCES_M[1])
     return _finished(_Search(start, target, spaces, max_excess=max_excess, max_legs=QUICK_MAX_LEGS_TESTED).steps())
 
 
-def _spaces(now: Situation, grant: CompiledGrant, heights_m: tuple[float, float], room_m: float) -> tuple[Space, Space]:
+def _spaces(
+    now: Situation, grant: CompiledGrant, heights_m: tuple[float, float], room_m: float
+) -> tuple[FreeSpace, FreeSpace]:
     """The space of a way at the first altitude, and that of its first leg, which comes from the second one."""
     low, high = sorted(heights_m)
-    cruise = Space.around(now, grant, heights_m[0], heights_m[0], room_m)
-    return cruise, cruise if low == high else Space.around(now, grant, low, high, room_m)
+    cruise = FreeSpace.between(now, grant, heights_m[0], heights_m[0], room_m)
+    return cruise, cruise if low == high else FreeSpace.between(now, grant, low, high, room_m)
 
 
-def _finished(search: Steps) -> tuple[XY, ...] | None:
+def _finished(search: RouteSteps) -> tuple[XY, ...] | None:
     while True:
         try:
             next(search)
@@ -153,7 +155,7 @@ class _Search:
         self,
         start: XY,
         target: XY,
-        spaces: tuple[Space, Space],
+        spaces: tuple[FreeSpace, FreeSpace],
         *,
         max_excess: float = MAX_EXCESS,
         max_legs: int = MAX_LEGS_TESTED,
@@ -174,18 +176,20 @@ class _Search:
         # Ends that are too close to a fence themselves: legs to and from them are judged by the engine's own rules.
         self._odd: set[int] = set()
 
-    def steps(self) -> Steps:
+    def steps(self) -> RouteSteps:
         """Look for the way, leg by leg; returns it, or None."""
         if self._ends[0] == self._ends[1]:
-            return (self._ends[1],) if self._leaving.permits(*self._ends) else None
+            return (self._ends[1],) if self._leaving.allows_leg(*self._ends) else None
         begin = shapely.points(self._ends[0])
         around, about = self._leaving.blockers(begin), self._space.blockers(shapely.points(self._ends[1]))
         self._odd = {node for node, found in ((_START, around), (_TARGET, about)) if found}
-        if not self._space.returns(self._ends[1]) or (about and not self._space.permits(self._ends[1], self._ends[1])):
+        if not self._space.allows_return_from(self._ends[1]) or (
+            about and not self._space.allows_leg(self._ends[1], self._ends[1])
+        ):
             return None
         for obstacle in around:
             # Out of it the nearest way first: no corner need lie there.
-            self._add(self._leaving.way_out(obstacle, begin))
+            self._add(self._leaving.nearest_exit(obstacle, begin))
             self._learn([obstacle], self._ends[0], self._leaving)
         self._expand(_START)
         while self._heap and not self.exhausted:
@@ -204,7 +208,7 @@ class _Search:
         """Whether it gave up."""
         return len(self._clear) >= self._max_legs
 
-    def rounded(self, way: tuple[XY, ...]) -> Steps:
+    def rounded(self, way: tuple[XY, ...]) -> RouteSteps:
         """The way with neighbouring waypoints made one where the legs meet a little further on: each costs a stop."""
         points = [self._ends[0], *way]
         i = 1
@@ -221,8 +225,8 @@ class _Search:
     def _clears(self, a: XY, b: XY) -> bool:
         odd = (_START in self._odd and a == self._ends[0]) or (_TARGET in self._odd and b == self._ends[1])
         space = self._leaving if a == self._ends[0] else self._space
-        free = not space.blockers(shapely.linestrings((a, b))) or (odd and space.permits(a, b))
-        return free and space.returns(b)
+        free = not space.blockers(shapely.linestrings((a, b))) or (odd and space.allows_leg(a, b))
+        return free and space.allows_return_from(b)
 
     def _way(self) -> tuple[XY, ...]:
         at, way = _TARGET, []
@@ -262,18 +266,18 @@ class _Search:
         a, b = (self._ends[n] if n <= _TARGET else self._place(n) for n in (begin, end))
         space = self._leaving if begin == _START else self._space
         blockers = space.blockers(shapely.linestrings((a, b)))
-        if blockers and (self._odd.isdisjoint((begin, end)) or not space.permits(a, b)):
+        if blockers and (self._odd.isdisjoint((begin, end)) or not space.allows_leg(a, b)):
             self._learn(blockers, a, space)
             return False
         if end > _TARGET and end not in self._returns:
-            self._returns[end] = self._space.returns(b)
+            self._returns[end] = self._space.allows_return_from(b)
         return self._returns.get(end, True)
 
     def _place(self, node: int) -> XY:
         x, y = self._nodes[node, :2]
         return float(x), float(y)
 
-    def _learn(self, obstacles: list[PolicyZone | int], begin: XY, space: Space) -> None:
+    def _learn(self, obstacles: list[PolicyZone | int], begin: XY, space: FreeSpace) -> None:
         """Take in what blocks a leg: areas to stay in, and of the zones the nearest: a way around it meets the next."""
 
         def key(obstacle: PolicyZone | int) -> tuple[int, int]:

@@ -12,9 +12,8 @@ from typing import Any, TypeGuard
 from fractus_core.api import API_VERSION, InvalidObject, Zone
 from fractus_core.api.geometry import MAX_RING_POINTS, Area, Circle, Point, Polygon
 from fractus_core.documents import BadDocument, parse_documents
-from fractus_core.geo.areas import geojson, middle, polygon
-from fractus_core.geo.formats.properties import says_height_or_time
-from fractus_core.geo.frames import LocalFrame
+from fractus_core.geo.areas import area_center, area_polygon, multipolygon_geojson
+from fractus_core.geo.local_frame import LocalFrame
 
 DESCRIPTION_LENGTH = 1024
 """Characters that the description of a zone takes."""
@@ -49,7 +48,7 @@ class Exported:
     notes: tuple[str, ...]
 
 
-class Inexact(InvalidObject):
+class InexactFeatures(InvalidObject):
     """Features that are no zones as they are: the first of them.
 
     Attributes:
@@ -65,7 +64,7 @@ class _TooLarge(InvalidObject):
     """The file as a whole is too large."""
 
 
-class Drafts:
+class ZoneBuilder:
     """Zones while a file is read: each gets a name of its own, and is checked as it is made.
 
     A zone is where, how high and when the file says, or there is none: one that is larger keeps out what may come in, and
@@ -110,7 +109,7 @@ class Drafts:
         manifest = {"apiVersion": API_VERSION, "kind": "Zone", "metadata": {"name": name}, "spec": dict(spec)}
         try:
             zone = Zone.from_body(manifest)
-            polygon(LocalFrame.at(middle(zone.spec.area)), zone.spec.area)
+            area_polygon(LocalFrame.at(area_center(zone.spec.area)), zone.spec.area)
         except InvalidObject as error:
             raise InvalidObject(where, f"{error.field.removeprefix('spec.')}: {error.problem}") from None
         self._zones.append(zone)
@@ -131,7 +130,7 @@ class Drafts:
             raise InvalidObject(field, "must be a list of rings")
         made = []
         for i, one in enumerate(found):
-            made.append(ring(one, f"{field}[{i}]", planar=True))
+            made.append(parse_ring(one, f"{field}[{i}]", planar=True))
             self._points += len(made[-1])
             if self._points > MAX_POINTS:
                 raise _TooLarge(
@@ -149,7 +148,7 @@ class Drafts:
         self._dropped.update(set(found) & set(self._drop))
         said = {name for name, value in found.items() if value not in (None, "", [], {})}
         for name in sorted(said - set(known) - set(self._drop)):
-            if says_height_or_time(name):
+            if suggests_altitude_or_time(name):
                 raise InvalidObject(
                     f"{field}.{name}",
                     "seems to say how high or when the zone counts, in other words than a Zone; say it as altitude or schedule,"
@@ -173,11 +172,11 @@ class Drafts:
         """All that was read.
 
         Raises:
-            Inexact: there are features that cannot be kept as they are.
+            InexactFeatures: there are features that cannot be kept as they are.
             InvalidObject: a feature that is to be left out, or a property that is to be dropped, is not there.
         """
         if self._wrong:
-            raise Inexact(self._wrong)
+            raise InexactFeatures(self._wrong)
         missing = sorted(set(self._without) - self._left_out)
         if missing:
             raise InvalidObject("", f"there is no feature {missing[0]} to leave out; correct its name")
@@ -211,7 +210,7 @@ def parse_json(text: str) -> dict[str, Any]:
     return found
 
 
-def objects(found: Any, field: str) -> list[dict[str, Any]]:
+def object_list(found: Any, field: str) -> list[dict[str, Any]]:
     """A list of JSON objects; absent is empty.
 
     Raises:
@@ -224,7 +223,7 @@ def objects(found: Any, field: str) -> list[dict[str, Any]]:
     return found
 
 
-def fields(found: Any, field: str) -> dict[str, Any]:
+def optional_object(found: Any, field: str) -> dict[str, Any]:
     """A JSON object; absent is empty.
 
     Raises:
@@ -237,7 +236,7 @@ def fields(found: Any, field: str) -> dict[str, Any]:
     return found
 
 
-def only(found: Mapping[str, Any], known: Collection[str], field: str) -> None:
+def reject_unknown_fields(found: Mapping[str, Any], known: Collection[str], field: str) -> None:
     """Refuse fields that say of a zone what is not understood.
 
     Raises:
@@ -250,7 +249,7 @@ def only(found: Mapping[str, Any], known: Collection[str], field: str) -> None:
             )
 
 
-def number(found: Any) -> TypeGuard[float]:
+def is_number(found: Any) -> TypeGuard[float]:
     """Whether this is a number; true and false are none."""
     return isinstance(found, (int, float)) and not isinstance(found, bool)
 
@@ -260,14 +259,14 @@ def _shown(found: Any) -> str:
     return text if len(text) <= 40 else text[:37] + "..."
 
 
-def place(found: Any, field: str, *, lat_first: bool = False) -> Point:
+def parse_point(found: Any, field: str, *, lat_first: bool = False) -> Point:
     """A pair of degrees as a point.
 
     Raises:
         InvalidObject: it is none, or out of range.
     """
     pair = found if isinstance(found, (list, tuple)) else ()
-    if len(pair) < 2 or not all(map(number, pair[:2])):
+    if len(pair) < 2 or not all(map(is_number, pair[:2])):
         raise InvalidObject(field, "must be two numbers, degrees")
     if any(pair[2:]):
         raise InvalidObject(field, "has a height; say how high the zone is in its altitude, and remove the heights")
@@ -280,7 +279,7 @@ def place(found: Any, field: str, *, lat_first: bool = False) -> Point:
     return Point(lat=lat, lon=lon)
 
 
-def ring(found: Any, field: str, *, lat_first: bool = False, planar: bool = False) -> list[dict[str, float]]:
+def parse_ring(found: Any, field: str, *, lat_first: bool = False, planar: bool = False) -> list[dict[str, float]]:
     """A ring as manifests spell it: open, without the repetition of its first point.
 
     Args:
@@ -295,7 +294,7 @@ def ring(found: Any, field: str, *, lat_first: bool = False, planar: bool = Fals
     """
     if not isinstance(found, (list, tuple)):
         raise InvalidObject(field, "must be a list of positions")
-    points = [place(p, f"{field}[{i}]", lat_first=lat_first) for i, p in enumerate(found)]
+    points = [parse_point(p, f"{field}[{i}]", lat_first=lat_first) for i, p in enumerate(found)]
     if len(points) > 1 and points[0] == points[-1]:
         points = points[:-1]
     if len(points) < 3:
@@ -327,13 +326,13 @@ def _along_degrees(sides: Iterable[tuple[Point, Point]]) -> Iterator[Point]:
             yield Point(lat=round(lat_deg, 9), lon=round(lon_deg, 9))
 
 
-def round_area(centre: Point, radius_m: Any, field: str) -> dict[str, Any]:
+def circle_area(centre: Point, radius_m: Any, field: str) -> dict[str, Any]:
     """A circle as an area.
 
     Raises:
         InvalidObject: the radius is not a length.
     """
-    if not number(radius_m) or not 0 < radius_m <= MAX_RADIUS_M:
+    if not is_number(radius_m) or not 0 < radius_m <= MAX_RADIUS_M:
         raise InvalidObject(field, f"must be 0 to {MAX_RADIUS_M:.0f} metres, not {_shown(radius_m)}")
     return {"circle": {"center": centre.to_dict(), "radius": float(radius_m)}}
 
@@ -355,9 +354,11 @@ def cut_rings(zone: Zone, notes: list[str]) -> list[list[list[list[float]]]]:
     if crossings % 2:
         notes.append(f"{zone.name}: it contains a pole; programs that draw degrees on a plane show it wrong")
     elif crossings:
-        frame = LocalFrame.at(middle(zone.spec.area))
+        frame = LocalFrame.at(area_center(zone.spec.area))
         notes.append(f"{zone.name}: it crosses the antimeridian and is cut there, into parts")
-        parts: list[list[list[list[float]]]] = geojson(frame, polygon(frame, zone.spec.area))["coordinates"]
+        parts: list[list[list[list[float]]]] = multipolygon_geojson(frame, area_polygon(frame, zone.spec.area))[
+            "coordinates"
+        ]
         return parts
     return [outline]
 
@@ -375,7 +376,7 @@ def _circumscribed(circle: Circle | None) -> Polygon:
     return Polygon(exterior=tuple(points))
 
 
-def unsaid(zones: Iterable[Zone], *parts: str) -> list[str]:
+def unsupported_parts(zones: Iterable[Zone], *parts: str) -> list[str]:
     """Notes of the parts of zones that a format cannot say: altitude, schedule, holes, circle, description."""
     notes = []
     for zone in zones:
@@ -392,3 +393,21 @@ def unsaid(zones: Iterable[Zone], *parts: str) -> list[str]:
         if "circle" in parts and spec.area.circle is not None:
             notes.append(f"{zone.name}: the circle is written as a polygon of {CORNERS} corners around it")
     return notes
+
+
+_WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])")
+_SAYING = re.compile(
+    r"""(
+    alt | altitudes? | heights? | elevation | levels? | floor | ceiling | lower | upper | bottom | top | base | vertical |
+    agl | [am]msl | asl | msl | fl | feet | ft |
+    times? | timespan | dates? | datetime | starts? | begins? | ends? | from | until | valid | validity | active |
+    activation | applicability | periods? | hours? | days? | weekdays? | months? | season | expires | expiry | expiration |
+    effective | permanent | temporary | when | duration | schedules?
+    )""",
+    re.VERBOSE,
+)
+
+
+def suggests_altitude_or_time(name: str) -> bool:
+    """Whether the name of a property has a word of heights or times: `upperLimit`, `VALID_FROM`, `height (AGL)`."""
+    return any(_SAYING.fullmatch(word.lower()) for word in _WORD.findall(name))

@@ -7,7 +7,7 @@ from collections.abc import Callable, Coroutine
 from typing import Any
 
 from control_flights import Flight, missions_of
-from fractus_core.control.values import FlightMode
+from fractus_core.control.state import FlightMode
 from fractus_core.policy.decision_types import SetSpeedArgs, TakeoffArgs, VelocityArgs
 from mobility_world import GUIDED, LAND, LOITER, RTL, partial, spec, touring, zone
 

@@ -14,7 +14,7 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
-from fractus_core.control.values import FlightMode
+from fractus_core.control.state import FlightMode
 from fractus_core.policy.decision_types import TakeoffArgs
 from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority import drivers

@@ -12,7 +12,7 @@ from typing import Any
 import shapely
 from fractus_core.api.plans import GrantSpec
 from fractus_core.control import ControlEvent, ControlState, StreamState
-from fractus_core.control.values import FlightMode
+from fractus_core.control.state import FlightMode
 from fractus_core.geo import LocalFrame
 from fractus_core.policy.compiled_grant import compile_grant
 from fractus_core.policy.decision_types import Airframe, GotoArgs, Home, TakeoffArgs

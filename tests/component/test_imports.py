@@ -57,5 +57,5 @@ def test_the_first_heartbeats_of_a_start_wait_for_no_large_import() -> None:
 
 def test_an_agent_reads_outcomes_without_what_decides_them() -> None:
     said, _ = after("import fractus_agent.__main__; print(*sys.modules)")
-    assert "fractus_core.control.values" in said.split()
+    assert "fractus_core.control.state" in said.split()
     assert "fractus_core.control.machine" not in said.split()

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from fractus_core.control import Authority, StreamState
-from fractus_core.control.values import FlightMode
+from fractus_core.control.state import FlightMode
 from fractus_core.policy.decision_types import Call, GotoArgs, SetSpeedArgs, TakeoffArgs, Verdict
 from fractus_mavlink.enums import MAV_CMD
 from fractus_services.errors import AutopilotError, Refused

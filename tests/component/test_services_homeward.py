@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fractus_core.control.values import FlightMode
+from fractus_core.control.state import FlightMode
 from fractus_core.policy.decision_types import GotoArgs, TakeoffArgs
 from fractus_mavlink import message
 from fractus_mavlink.enums import MAV_CMD

@@ -11,7 +11,7 @@ import pytest
 import virtual_time
 from closed_loop import Sky
 from fractus_core.control import Authority, StreamState
-from fractus_core.control.values import FlightMode
+from fractus_core.control.state import FlightMode
 from fractus_core.policy.decision_types import TakeoffArgs
 from fractus_mavlink import Endpoint
 from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_COMPONENT, MAV_MODE_FLAG

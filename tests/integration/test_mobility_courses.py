@@ -93,7 +93,7 @@ async def test_the_transit_flies_around_zones_to_the_control_point_and_home(rig:
     assert math.dist(xy(landed.position), (0, 0)) < 2.0
     assert trace.distance_m(*WALL) > 1.0
     assert trace.attitudes > 0.9 * len(trace.points)
-    idle = "failed: nothing of its path was flown: no leg of the driver came to its end"
+    idle = "failed: no part of the path was flown: no leg of the driver was completed"
     assert outcomes(landed) == {NAVIGATOR_MISSION: idle}
     assert not rig.log("service").count("Traceback")
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import grpc
 import pytest
-from fractus_core.control.values import FlightMode
+from fractus_core.control.state import FlightMode
 from fractus_mavlink.enums import COPTER_MODE
 from fractus_proto.v1 import mobility_pb2 as pb
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER

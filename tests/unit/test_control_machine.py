@@ -19,7 +19,7 @@ from fractus_core.control.actions import (
     StopMotion,
 )
 from fractus_core.control.machine import transition
-from fractus_core.control.values import (
+from fractus_core.control.state import (
     FlightMode,
     ModeKind,
     TaskKind,
@@ -40,7 +40,7 @@ FACTS = (
     GROUND, ARMED, FLYING, replace(FLYING, mode=LOITER), replace(FLYING, mode=RTL), replace(FLYING, mode=LAND),
     replace(FLYING, mode=RTL, failsafe=True), replace(FLYING, connected=False),
 )  # fmt: skip
-DRIVER, TOUR = told.GrantRef("a", leads=True), told.GrantRef("t", leads=True)
+DRIVER, TOUR = told.GrantRef("a", commands_vehicle=True), told.GrantRef("t", commands_vehicle=True)
 
 EVENTS: tuple[told.Event, ...] = (
     told.StreamOpened(1, "a", "A"), told.StreamOpened(2, "b", "B"), told.StreamOpened(3, "a", "A"),

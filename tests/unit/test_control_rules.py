@@ -16,7 +16,7 @@ from fractus_core.control.actions import (
     StartSystemTask,
 )
 from fractus_core.control.machine import transition
-from fractus_core.control.values import (
+from fractus_core.control.state import (
     ActiveMotion,
     FlightMode,
     Grace,
@@ -26,7 +26,7 @@ from fractus_core.control.values import (
     VehicleFacts,
     ended_refusal,
 )
-from fractus_core.control.vehicles import UNCONFIRMED_S
+from fractus_core.control.vehicle_events import UNCONFIRMED_S
 from test_control_machine import ARMED, DRIVER, FLYING, FOUND, GROUND, GUIDED, LAND, LATE_S, LOITER, RTL
 
 
@@ -140,7 +140,7 @@ def test_what_is_found_or_taken_again_and_again_gets_no_more_time_for_its_driver
 
 
 def test_a_driver_that_waits_for_anothers_vehicle_takes_none_of_its_time() -> None:
-    other = told.GrantRef("b", leads=True)
+    other = told.GrantRef("b", commands_vehicle=True)
     waits = (told.GrantChanged(None, other), told.StreamOpened(2, "b", "B"))
     landed = (told.VehicleObserved(GROUND), told.Heartbeat(), told.StreamClosed(1))
     waiting, _ = told_of(*FLIES, *landed, *waits)
@@ -426,7 +426,7 @@ def test_a_mission_that_a_pilot_landed_is_not_granted_again() -> None:
 
 
 def test_a_waiting_driver_that_loses_its_grant_ends_no_other_mission() -> None:
-    other = told.GrantRef("b", leads=True)
+    other = told.GrantRef("b", commands_vehicle=True)
     grounded = (*ASKS, told.StreamClosed(1), told.GrantChanged(None, other), told.StreamOpened(2, "b", "B"))
     state, _ = told_of(*grounded)
     assert (state.active, state.lease is not None) == ("a", True)

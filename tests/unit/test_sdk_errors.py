@@ -10,7 +10,7 @@ import pytest
 from fractus import Busy, ControlLost, FractusError, InvalidRequest, MissionEnded, PolicyDenied, StateError
 from fractus.errors import translate
 from fractus_core.control import Outcome, OutcomeKind
-from fractus_core.control.values import ended_refusal
+from fractus_core.control.state import ended_refusal
 from fractus_core.policy.decision_types import Verdict
 from fractus_services import errors
 from fractus_services.error_details import abort

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from fractus_core.control.values import FlightMode, ModeKind
+from fractus_core.control.state import FlightMode, ModeKind
 from fractus_mavlink import Message, message
 from fractus_mavlink.enums import COPTER_MODE, MAV_CMD
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER, ArduCopter

@@ -1,9 +1,10 @@
-"""Who may command a vehicle: transition(state, event, now) -> (state, actions), in `machine`.
+"""Control authority over a vehicle: a pure state machine, `machine.transition(state, event, now) -> (state, actions)`.
 
-Here are its values alone: who only reads how a mission ended, as an agent, does without the megabyte of the rest.
+This package exports the values only. A process that merely reads mission outcomes, such as the agent, does not load the
+state machine.
 """
 
-from fractus_core.control.values import (
+from fractus_core.control.state import (
     Authority,
     ControlEvent,
     ControlState,

@@ -1,18 +1,18 @@
-"""What the service carries out after an event, in the order given."""
+"""Actions of the control state machine: the service carries them out after a transition, in order."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
 
-from fractus_core.control.values import ControlEvent, SystemTask
+from fractus_core.control.state import ControlEvent, SystemTask
 
 
 class StopKind(Enum):
-    """What the caller of a stopped motion can do about it.
+    """Class of error that the caller of a stopped motion receives.
 
-    ABORTED: the motion itself was wrong, or another took its place. LOST: the caller does not have the vehicle any more.
-    PASSING: the same may work in a moment.
+    ABORTED: the motion itself was wrong, or another motion replaced it. LOST: the caller no longer has control.
+    PASSING: the same call may succeed in a moment.
     """
 
     ABORTED = "aborted"
@@ -22,7 +22,7 @@ class StopKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class StopMotion:
-    """End a motion; its caller is told why."""
+    """End a motion and report the reason to its caller."""
 
     motion_id: int
     kind: StopKind
@@ -33,7 +33,7 @@ class StopMotion:
 
 @dataclass(frozen=True, slots=True)
 class SendEvent:
-    """Tell a stream."""
+    """Send an event on a control stream."""
 
     lease_id: int
     event: ControlEvent
@@ -41,14 +41,14 @@ class SendEvent:
 
 @dataclass(frozen=True, slots=True)
 class EndStream:
-    """End a stream without an event."""
+    """End a control stream without an event."""
 
     lease_id: int
 
 
 @dataclass(frozen=True, slots=True)
 class RefuseStream:
-    """A stream that was opened gets neither the vehicle nor a place to wait for it."""
+    """Refuse a control stream that was opened: the driver may neither command the vehicle nor wait for it."""
 
     lease_id: int
     code: str
@@ -57,36 +57,39 @@ class RefuseStream:
 
 @dataclass(frozen=True, slots=True)
 class StartSystemTask:
-    """Hover, return or land, until done or stopped."""
+    """Start to hover, return or land, until done or stopped."""
 
     task: SystemTask
 
 
 @dataclass(frozen=True, slots=True)
 class StopSystemTask:
-    """Cancel a system task, unless it is the one that asked."""
+    """Cancel a system task, unless the task itself dispatched the event."""
 
     task_id: int
 
 
 @dataclass(frozen=True, slots=True)
 class Brake:
-    """Brake until the vehicle stands; authority stays where it is."""
+    """Brake until the vehicle is at rest. Control authority does not change."""
 
 
 @dataclass(frozen=True, slots=True)
 class HoldPosition:
-    """Hover for the driver, unless something else begins before."""
+    """Hover for the driver, unless something else begins first."""
 
 
 @dataclass(frozen=True, slots=True)
 class RecordAudit:
-    """Write a change of control down.
+    """Write a change of control to the audit log.
 
     Attributes:
-        kind: control, or takeover where the vehicle is taken from who had it.
-        action: what happens.
-        controller: who commands.
+        kind: `control`, or `takeover` if the vehicle is taken from its controller.
+        action: Action of the entry.
+        controller: Party that has control authority after the change.
+        reason: Reason in plain text.
+        code: Code of the reason; empty if there is none.
+        policies: Names of the policies that caused the change.
     """
 
     kind: str
@@ -99,17 +102,17 @@ class RecordAudit:
 
 @dataclass(frozen=True, slots=True)
 class SaveJournal:
-    """Write the missions to disk."""
+    """Write the missions to the journal."""
 
 
 @dataclass(frozen=True, slots=True)
 class WakeWaiters:
-    """Let everyone that waits for the vehicle look again."""
+    """Wake every task that waits for a change of control."""
 
 
 @dataclass(frozen=True, slots=True)
 class SetStreamRates:
-    """Ask the autopilot for its telemetry at the rates of a flying vehicle, or of one that stands."""
+    """Request telemetry at the rates for a flying or a standing vehicle."""
 
     flying: bool
 
@@ -118,4 +121,4 @@ Action = (
     StopMotion | SendEvent | EndStream | RefuseStream | StartSystemTask | StopSystemTask | Brake | HoldPosition
     | RecordAudit | SaveJournal | WakeWaiters | SetStreamRates
 )  # fmt: skip
-"""Everything that control asks for."""
+"""Every action of the state machine."""

@@ -1,10 +1,10 @@
-"""What happens to a vehicle's control: events from drivers, the engine, the vehicle, grants, the system and the clock."""
+"""Events of the control state machine: from drivers, the policy engine, the vehicle, grants, the system and the clock."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fractus_core.control.values import FlightMode, Outcome, VehicleFacts
+from fractus_core.control.state import FlightMode, Outcome, VehicleFacts
 from fractus_core.policy.decision_types import Takeover
 
 # Drivers
@@ -12,7 +12,7 @@ from fractus_core.policy.decision_types import Takeover
 
 @dataclass(frozen=True, slots=True)
 class StreamOpened:
-    """A driver asks for control."""
+    """A driver opened a control stream."""
 
     lease_id: int
     key: str
@@ -21,21 +21,21 @@ class StreamOpened:
 
 @dataclass(frozen=True, slots=True)
 class StreamClosed:
-    """A driver's stream is over; without ControlReturned that means the driver is lost."""
+    """A driver's control stream ended. Without a preceding ControlReturned the driver is lost."""
 
     lease_id: int
 
 
 @dataclass(frozen=True, slots=True)
 class TransitRequested:
-    """The system is to bring the vehicle to where a waiting driver takes over."""
+    """The system is about to bring the vehicle to the control point of a waiting driver."""
 
     lease_id: int
 
 
 @dataclass(frozen=True, slots=True)
 class TransitFailed:
-    """A fault of the service would end the transit again and again."""
+    """The transit flight failed by an internal error, which every retry would repeat."""
 
     lease_id: int
     reason: str
@@ -43,18 +43,19 @@ class TransitFailed:
 
 @dataclass(frozen=True, slots=True)
 class GrantControl:
-    """All that a waiting driver waits for is there."""
+    """Every precondition for granting control to a waiting driver holds."""
 
     lease_id: int
 
 
 @dataclass(frozen=True, slots=True)
 class ControlReturned:
-    """A driver returns control at the end of a control point.
+    """A driver returned control at the end of a control point.
 
     Attributes:
-        control_points: how many of them its grant names.
-        paths: whether one of them has a path.
+        key: Key of the mission.
+        control_points: Number of control points in the driver's grant.
+        paths: True if at least one of them has a path.
     """
 
     key: str
@@ -64,11 +65,12 @@ class ControlReturned:
 
 @dataclass(frozen=True, slots=True)
 class WaypointsDone:
-    """The driver is done with the first waypoints of its control point's task.
+    """The driver completed the first waypoints of its control point.
 
     Attributes:
-        waypoints: how many, reached or passed over.
-        leg: whether a leg of the driver has ended, there or elsewhere.
+        key: Key of the mission.
+        waypoints: Number of waypoints that were reached or passed over.
+        leg: True if a leg of the driver ended, at a waypoint or elsewhere.
     """
 
     key: str
@@ -78,7 +80,7 @@ class WaypointsDone:
 
 @dataclass(frozen=True, slots=True)
 class CruiseSpeedSet:
-    """The driver set the speed of legs that name none."""
+    """The driver set the speed for legs that specify none."""
 
     speed_mps: float
 
@@ -88,7 +90,7 @@ class CruiseSpeedSet:
 
 @dataclass(frozen=True, slots=True)
 class MotionBegan:
-    """A motion begins; the one under way is replaced."""
+    """A motion began. It replaces the current motion."""
 
     motion_id: int
     kind: str
@@ -96,28 +98,28 @@ class MotionBegan:
 
 @dataclass(frozen=True, slots=True)
 class MotionFinished:
-    """A motion is complete, or over."""
+    """A motion completed or ended."""
 
     motion_id: int
 
 
 @dataclass(frozen=True, slots=True)
 class MotionFailed:
-    """A motion ended with an error, and the autopilot may fly on for it."""
+    """A motion ended with an error. The autopilot may still be executing it."""
 
     motion_id: int
 
 
 @dataclass(frozen=True, slots=True)
 class MotionCancelled:
-    """The caller of a motion gave it up."""
+    """The caller of a motion cancelled it."""
 
     motion_id: int
 
 
 @dataclass(frozen=True, slots=True)
 class MotionStopped:
-    """Another motion of the same flight takes over from the one under way, for a reason that its caller is told."""
+    """Another motion of the same flight replaces the current one. The caller receives the reason."""
 
     code: str
     reason: str
@@ -129,10 +131,13 @@ class MotionStopped:
 
 @dataclass(frozen=True, slots=True)
 class TakeoverDemanded:
-    """A policy or the monitor demands that the system takes the vehicle.
+    """A policy or the monitor requires that the system takes over the vehicle.
 
     Attributes:
-        takeover: what it does with the vehicle.
+        takeover: Task of the system after the takeover.
+        code: Code of the verdict.
+        reason: Reason of the verdict.
+        policies: Names of the policies that require it.
     """
 
     takeover: Takeover
@@ -143,7 +148,7 @@ class TakeoverDemanded:
 
 @dataclass(frozen=True, slots=True)
 class BrakeDemanded:
-    """A policy or the monitor demands that the present motion stops; authority stays where it is."""
+    """A policy or the monitor requires that the current motion stops. Control authority does not change."""
 
     code: str
     reason: str
@@ -152,32 +157,32 @@ class BrakeDemanded:
 
 @dataclass(frozen=True, slots=True)
 class GrantRef:
-    """A grant as control knows it.
+    """Reference to a grant.
 
     Attributes:
-        key: the mission.
-        leads: whether it flies the vehicle: a driver's, or that of a tour.
+        key: Key of the mission.
+        commands_vehicle: True if the grant commands the vehicle: the grant of a driver, or of a mission over points of interest.
     """
 
     key: str
-    leads: bool
+    commands_vehicle: bool
 
 
 @dataclass(frozen=True, slots=True)
 class PositionLost:
-    """The flying vehicle's position is not known, or not in time."""
+    """The position of the flying vehicle is unknown or stale."""
 
     reason: str
 
 
 @dataclass(frozen=True, slots=True)
 class PositionFound:
-    """The flying vehicle's position is known."""
+    """The position of the flying vehicle is known."""
 
 
 @dataclass(frozen=True, slots=True)
 class GrantChanged:
-    """A grant came, changed or went."""
+    """A grant was added, changed or removed."""
 
     before: GrantRef | None
     after: GrantRef | None
@@ -188,19 +193,19 @@ class GrantChanged:
 
 @dataclass(frozen=True, slots=True)
 class VehicleObserved:
-    """The vehicle as it is now; nothing is decided on it alone."""
+    """The present state of the vehicle. No decision depends on this event alone."""
 
     vehicle: VehicleFacts
 
 
 @dataclass(frozen=True, slots=True)
 class VehicleFound:
-    """The autopilot is heard, for the first time or again after its link broke."""
+    """The link to the autopilot came up, for the first time or again."""
 
 
 @dataclass(frozen=True, slots=True)
 class Heartbeat:
-    """The autopilot told its mode, and whether the motors run."""
+    """The autopilot reported its mode and armed state."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,19 +215,20 @@ class Airborne:
 
 @dataclass(frozen=True, slots=True)
 class ModeChangeBegan:
-    """The system changes the mode."""
+    """The system requested a mode change."""
 
     mode: FlightMode
 
 
 @dataclass(frozen=True, slots=True)
 class ModeChangeEnded:
-    """The change of mode is over.
+    """A mode change of the system ended.
 
     Attributes:
-        before: what was expected before it.
-        done: whether the autopilot confirmed it.
-        refused: whether it said that it does not; neither: its answers may have been lost.
+        mode: Requested mode.
+        before: Mode that was expected before the request.
+        done: True if the autopilot confirmed the change.
+        refused: True if the autopilot refused the change. If neither is True, its answers may have been lost.
     """
 
     mode: FlightMode
@@ -236,7 +242,7 @@ class ModeChangeEnded:
 
 @dataclass(frozen=True, slots=True)
 class ArmingRequested:
-    """The vehicle is to be armed for a mission, whose home is this."""
+    """The vehicle is about to be armed for a mission with this home (latitude, longitude, metres above sea level)."""
 
     key: str
     identity: str
@@ -245,17 +251,18 @@ class ArmingRequested:
 
 @dataclass(frozen=True, slots=True)
 class ArmingPrepared:
-    """Preparing to arm begins, or is over."""
+    """The preparation of arming begins or ends."""
 
     begins: bool
 
 
 @dataclass(frozen=True, slots=True)
 class MotorStart:
-    """Starting the motors begins, or is over.
+    """The start of the motors begins or ends.
 
     Attributes:
-        unanswered: whether the autopilot was asked to and has not refused: only its answers may have been lost.
+        begins: True at the beginning.
+        unanswered: True if the autopilot received the request and did not refuse. Its answers may have been lost.
     """
 
     begins: bool
@@ -267,7 +274,7 @@ class MotorStart:
 
 @dataclass(frozen=True, slots=True)
 class TransitBegan:
-    """The system flies for an application, and keeps to its fences."""
+    """The system began to fly for an application, under the application's flight constraints."""
 
     flight_id: int
     key: str
@@ -276,7 +283,7 @@ class TransitBegan:
 
 @dataclass(frozen=True, slots=True)
 class SystemFlightBegan:
-    """What is flown from now on keeps to the fences of a grant, as they are at each moment."""
+    """A flight under the constraints of a grant began. The constraints follow changes of the grant."""
 
     flight_id: int
     key: str
@@ -284,21 +291,21 @@ class SystemFlightBegan:
 
 @dataclass(frozen=True, slots=True)
 class SystemFlightEnded:
-    """The system has stopped flying under constraints."""
+    """The system ended its flight under constraints."""
 
     flight_id: int
 
 
 @dataclass(frozen=True, slots=True)
 class TourBegan:
-    """The system begins, or goes on with, a mission that has no driver."""
+    """The system began or resumed a mission over points of interest, which has no driver."""
 
     key: str
 
 
 @dataclass(frozen=True, slots=True)
 class TourPointVisited:
-    """The tour has visited the first `visited` of its points."""
+    """The mission visited the first `visited` of its points of interest."""
 
     key: str
     visited: int
@@ -306,7 +313,7 @@ class TourPointVisited:
 
 @dataclass(frozen=True, slots=True)
 class TourInterrupted:
-    """The tour cannot go on now, and may in a moment."""
+    """The mission over points of interest cannot continue now, but may continue in a moment."""
 
     key: str
     reason: str
@@ -314,7 +321,7 @@ class TourInterrupted:
 
 @dataclass(frozen=True, slots=True)
 class TourEnded:
-    """The tour is over."""
+    """The mission over points of interest ended."""
 
     key: str
     outcome: Outcome
@@ -322,10 +329,11 @@ class TourEnded:
 
 @dataclass(frozen=True, slots=True)
 class SystemTaskEnded:
-    """A system task is over.
+    """A system task ended.
 
     Attributes:
-        finished: whether it came to its end; otherwise it broke.
+        task_id: Id of the task.
+        finished: True if the task completed, False if it failed or was cancelled.
     """
 
     task_id: int
@@ -334,7 +342,7 @@ class SystemTaskEnded:
 
 @dataclass(frozen=True, slots=True)
 class PassengerBoarded:
-    """An instance whose mission the system flies asks how far it is."""
+    """A passenger for whom the system flies a mission opened its control stream."""
 
     key: str
     identity: str
@@ -361,4 +369,4 @@ SystemEvent = (
     | SystemTaskEnded | PassengerBoarded
 )  # fmt: skip
 Event = DriverEvent | MotionEvent | PolicyEvent | VehicleEvent | ArmingEvent | SystemEvent | Tick
-"""Everything that control is told."""
+"""Every event of the state machine."""

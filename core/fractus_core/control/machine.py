@@ -1,26 +1,46 @@
-"""Who may command a vehicle: transition(state, event, now) -> (state, actions).
+"""State machine of control authority: `transition(state, event, now) -> (state, actions)`.
 
-The system takes the vehicle whenever no one else rightly has it, and never lets go of a flying vehicle before it is home or a
-driver or a pilot has it.
+The system takes over the vehicle whenever no other party rightfully has it. It never gives up a flying vehicle before the
+vehicle is home, or a driver or pilot has it.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import assert_never
 
-from fractus_core.control.actions import Action, Brake, SaveJournal, StopKind, WakeWaiters
-from fractus_core.control.drivers import hover_after_cancelled, on_driver, on_motion
+from fractus_core.control.actions import (
+    Action,
+    Brake,
+    EndStream,
+    HoldPosition,
+    RefuseStream,
+    SaveJournal,
+    SendEvent,
+    StopKind,
+    WakeWaiters,
+)
 from fractus_core.control.events import (
     ArmingEvent,
     BrakeDemanded,
+    ControlReturned,
+    CruiseSpeedSet,
     DriverEvent,
     Event,
     GrantChanged,
+    GrantControl,
+    MotionBegan,
+    MotionCancelled,
     MotionEvent,
+    MotionFailed,
+    MotionFinished,
+    MotionStopped,
     PassengerBoarded,
     PolicyEvent,
     PositionFound,
     PositionLost,
+    StreamClosed,
+    StreamOpened,
     SystemEvent,
     SystemFlightBegan,
     SystemFlightEnded,
@@ -32,11 +52,28 @@ from fractus_core.control.events import (
     TourInterrupted,
     TourPointVisited,
     TransitBegan,
+    TransitFailed,
+    TransitRequested,
     VehicleEvent,
+    WaypointsDone,
 )
-from fractus_core.control.step import DRIVER_LOST, GRANT_REMOVED, Step
-from fractus_core.control.values import Authority, ControlState, OutcomeKind, SystemFlight, SystemTask, TaskKind
-from fractus_core.control.vehicles import on_arming, on_vehicle
+from fractus_core.control.state import (
+    COMPLETE,
+    NOTHING_FLOWN,
+    ActiveMotion,
+    Authority,
+    ControlEvent,
+    ControlLease,
+    ControlState,
+    OutcomeKind,
+    StreamState,
+    SystemFlight,
+    SystemTask,
+    TaskKind,
+    ended_refusal,
+)
+from fractus_core.control.state_update import DRIVER_LOST, GRANT_REMOVED, StateUpdate
+from fractus_core.control.vehicle_events import on_arming, on_vehicle
 from fractus_core.exhaustive import exhaustive
 from fractus_core.policy.decision_types import Takeover
 
@@ -49,254 +86,432 @@ TAKEOVERS: dict[Takeover, tuple[TaskKind, OutcomeKind | None]] = exhaustive(
         "revoke": (TaskKind.RETURN, OutcomeKind.REVOKED),
     },
 )
-"""What each takeover that policies name does with the vehicle, and with the mission."""
+"""System task and mission outcome of each takeover that a policy can demand."""
 
 POSITION_UNKNOWN = "PositionUnknown"
-"""Code of a vehicle that hovers, as far as it hears, until its position is known."""
+"""Code of the takeover of a vehicle that hovers, as far as it receives commands, until its position is known."""
 
 UNATTENDED = "NoControlAuthority"
-"""Code of the takeover of a vehicle that no one has: by a fault of the service, and the last line behind all others."""
+"""Code of the takeover of a vehicle without control authority. It results from a fault of the service."""
 
 MAX_UNATTENDED = 3
-"""How many times a vehicle that no one has is taken: a task that fails each time would be begun again indefinitely. After that
-the supervisor's heartbeats end, and the autopilot's own failsafe brings it home."""
+"""Number of such takeovers in one flight, because a task that always fails would be restarted forever.
+
+After that the supervisor stops the heartbeats, and the autopilot's own failsafe brings the vehicle home.
+"""
+
+CANCELLED_DESCENT_S = 0.3
+"""Seconds for which a cancelled descent continues.
+
+The driver's stream may be about to break too, and in that case the vehicle must come down.
+"""
+
+DESCENTS = frozenset({"Land", "ReturnToLaunch"})
+"""Motions that end on the ground."""
 
 
 def transition(state: ControlState, event: Event, now: float) -> tuple[ControlState, tuple[Action, ...]]:
-    """What an event makes of the state, and what is to be done.
+    """Return the state after an event and the actions to carry out.
 
-    Every event is defined in every state; one that comes too late, of a lease, motion or task that is over, changes nothing.
+    Every event is defined in every state. A late event, of a lease, motion or task that has ended, changes nothing.
 
     Args:
-        state: before.
-        event: what happened.
-        now: monotonic seconds; never earlier than in the events before.
+        state: State before the event.
+        event: The event.
+        now: Monotonic seconds, not earlier than in previous events.
     """
-    step = Step(state, now)
+    update = StateUpdate(state, now)
     if isinstance(event, DriverEvent):
-        on_driver(step, event)
+        _on_driver(update, event)
     elif isinstance(event, MotionEvent):
-        on_motion(step, event)
+        _on_motion(update, event)
     elif isinstance(event, PolicyEvent):
-        _on_policy(step, event)
+        _on_policy(update, event)
     elif isinstance(event, VehicleEvent):
-        on_vehicle(step, event)
+        on_vehicle(update, event)
     elif isinstance(event, ArmingEvent):
-        on_arming(step, event)
+        on_arming(update, event)
     elif isinstance(event, SystemEvent):
-        _on_system(step, event)
+        _on_system(update, event)
     elif isinstance(event, Tick):
-        _on_tick(step)
+        _on_tick(update)
     else:
         assert_never(event)
-    _end_lease_of_ended_mission(step)
-    return step.state, tuple(step.actions)
-
-
-def _end_lease_of_ended_mission(step: Step) -> None:
-    """No driver has or waits for the vehicle for a mission that is over: it could arm beside the pilot who landed it."""
-    lease = step.state.lease
-    mission = step.state.missions.get(lease.key) if lease is not None else None
+    # A driver must not keep or wait for the vehicle of an ended mission: it could arm beside the pilot who landed it.
+    lease = update.state.lease
+    mission = update.state.missions.get(lease.key) if lease is not None else None
     if mission is not None and mission.outcome is not None:
-        step.lose_lease(str(mission.outcome))
+        update.lose_lease(str(mission.outcome))
+    return update.state, tuple(update.actions)
+
+
+# Drivers
+
+
+def _on_driver(update: StateUpdate, event: DriverEvent) -> None:
+    match event:
+        case StreamOpened():
+            _open_stream(update, event)
+        case StreamClosed():
+            _close_stream(update, event)
+        case TransitRequested(lease_id):
+            lease = update.state.lease
+            if lease is not None and lease.lease_id == lease_id and update.state.authority is not Authority.PILOT:
+                update.set(lease=replace(lease, transit=True))
+        case TransitFailed():
+            _fail_transit(update, event)
+        case GrantControl(lease_id):
+            _grant_control(update, lease_id)
+        case ControlReturned():
+            _return_control(update, event)
+        case WaypointsDone(key):
+            mission = update.state.missions.get(key)
+            if mission is not None and (event.waypoints > mission.waypoints or (event.leg and not mission.leg_flown)):
+                waypoints = max(event.waypoints, mission.waypoints)
+                update.update_mission(mission, waypoints=waypoints, leg_flown=mission.leg_flown or event.leg)
+                update.act(SaveJournal())
+        case CruiseSpeedSet(speed_mps):
+            update.set(speed_mps=speed_mps)
+        case _:
+            assert_never(event)
+
+
+def _open_stream(update: StateUpdate, event: StreamOpened) -> None:
+    """Create a lease for the driver or refuse its stream. A second stream of the same instance replaces the first."""
+    mission = update.mission(event.key, event.identity)
+    if mission.outcome is not None:
+        update.act(RefuseStream(event.lease_id, *ended_refusal(mission.outcome)))
+        return
+    lease = update.state.lease
+    if lease is not None and lease.key != event.key and not lease.granted and update.state.flies_for(event.key):
+        update.lose_lease("another application has the drone")
+        lease = None
+    if (lease is not None and lease.key != event.key) or update.state.taken(event.key):
+        reason = "another application has the drone; try again when it is back"
+        update.act(RefuseStream(event.lease_id, "ControlHeld", reason))
+        return
+    if lease is not None:
+        lost = ControlEvent(StreamState.LOST, reason="another stream of the same instance took over")
+        update.act(SendEvent(lease.lease_id, lost))
+    update.set(lease=ControlLease(event.lease_id, event.key, event.identity))
+
+
+def _grant_control(update: StateUpdate, lease_id: int) -> None:
+    """Grant control to the driver, unless a pilot, a return flight or another mission has the vehicle."""
+    state = update.state
+    lease = state.lease
+    if lease is None or lease.lease_id != lease_id or lease.granted:
+        return
+    if state.authority is Authority.PILOT or state.home_for_good or not state.decided or state.taken(lease.key):
+        return
+    mission = update.mission(lease.key, lease.identity)
+    update.stop_task()
+    update.set(grace=None, authority=Authority.DRIVER, lease=replace(lease, granted=True), unattended=0)
+    update.adopt(mission)
+    update.audit("control", "granted", lease.identity, f"control point {mission.points_done}")
+    granted = ControlEvent(StreamState.GRANTED, mission.points_done, "", mission.waypoints)
+    update.act(SendEvent(lease_id, granted))
+
+
+def _return_control(update: StateUpdate, event: ControlReturned) -> None:
+    """Return home after the last control point. Otherwise hover until the driver requests the next one."""
+    lease = update.state.lease
+    if lease is None or lease.key != event.key or not update.state.drives:
+        return
+    mission = update.mission(lease.key, lease.identity)
+    mission = update.update_mission(mission, points_done=mission.points_done + 1, waypoints=0)
+    last = mission.points_done >= event.control_points
+    update.set(lease=None, authority=Authority.SYSTEM)
+    update.stop_motion(StopKind.ABORTED, "ControlReturned", "control was returned")
+    outcome = NOTHING_FLOWN if event.paths and not mission.leg_flown else COMPLETE
+    update.audit("control", "returned", lease.identity, f"the mission is {outcome}" if last else "")
+    if last:
+        update.update_mission(mission, outcome=outcome)
+        done = ControlEvent(StreamState.COMPLETE, mission.points_done - 1, "every control point is done")
+        update.act(SendEvent(lease.lease_id, done))
+        update.start(TaskKind.RETURN)
+    else:
+        update.act(EndStream(lease.lease_id))
+        if update.state.vehicle.armed:
+            update.start(TaskKind.HOVER)
+        update.begin_grace(mission, "the driver did not request its next control point")
+    update.act(SaveJournal())
+
+
+def _close_stream(update: StateUpdate, event: StreamClosed) -> None:
+    """Handle the loss of a driver that had control or for which the system was flying.
+
+    The system completes a return that the driver started. It does not interrupt a landing, because a stop in mid-air does
+    not help.
+    """
+    lease = update.state.lease
+    motion = update.state.motion
+    if lease is None or lease.lease_id != event.lease_id:
+        return
+    update.drop_lease()
+    mission = update.state.missions.get(lease.key)
+    if mission is None or not (lease.granted or lease.transit):
+        return
+    update.set(authority=Authority.SYSTEM)
+    update.audit("control", DRIVER_LOST, lease.identity, "its stream broke")
+    returns = motion is not None and motion.kind == "ReturnToLaunch"
+    lands = motion is not None and motion.kind == "Land" and update.state.vehicle.mode.comes_down
+    update.stop_motion(StopKind.LOST, "ControlLost", "the driver's stream broke")
+    if update.state.vehicle.armed and not lands:
+        update.start(TaskKind.RETURN if returns else TaskKind.HOVER)
+    update.begin_grace(mission, DRIVER_LOST)
+
+
+def _fail_transit(update: StateUpdate, event: TransitFailed) -> None:
+    lease = update.state.lease
+    if lease is None or lease.lease_id != event.lease_id or update.state.authority is not Authority.SYSTEM:
+        return
+    mission = update.mission(lease.key, lease.identity)
+    if mission.outcome is not None:
+        return
+    update.end_mission(mission, OutcomeKind.FAILED, event.reason)
+    update.audit("takeover", TaskKind.RETURN.value, "system", event.reason, "InternalError")
+    update.lose_lease(event.reason)
+    update.start(TaskKind.RETURN)
+
+
+# Motions
+
+
+def _on_motion(update: StateUpdate, event: MotionEvent) -> None:
+    """Handle the beginning or end of a motion. The end of a motion that was already replaced changes nothing."""
+    motion = update.state.motion
+    match event:
+        case MotionBegan(motion_id, kind):
+            update.stop_motion(StopKind.ABORTED, "Replaced", f"{kind} replaced it")
+            update.set(motion=ActiveMotion(motion_id, kind), motion_began_at=update.now)
+        case MotionStopped(code, reason, policies):
+            update.stop_motion(StopKind.ABORTED, code, reason, policies)
+        case MotionFinished(motion_id):
+            if motion is not None and motion.motion_id == motion_id:
+                update.set(motion=None)
+        case MotionFailed(motion_id):
+            if motion is not None and motion.motion_id == motion_id:
+                update.set(motion=None)
+                if update.state.authority is Authority.DRIVER and update.state.vehicle.in_air:
+                    update.act(HoldPosition())
+        case MotionCancelled(motion_id):
+            if motion is not None and motion.motion_id == motion_id:
+                wait_s = CANCELLED_DESCENT_S if motion.kind in DESCENTS else 0.0
+                update.set(motion=replace(motion, hover_at=update.now + wait_s))
+        case _:
+            assert_never(event)
+
+
+def _hover_after_cancellation(update: StateUpdate) -> None:
+    """Hover after a cancelled motion, if the driver still has control."""
+    if update.state.authority is Authority.DRIVER:
+        update.stop_motion(StopKind.ABORTED, "Cancelled", "the call was cancelled")
+        update.act(HoldPosition())
+    elif update.state.motion is not None:
+        update.set(motion=replace(update.state.motion, hover_at=None))
 
 
 # Policies and grants
 
 
-def _on_policy(step: Step, event: PolicyEvent) -> None:
+def _on_policy(update: StateUpdate, event: PolicyEvent) -> None:
     match event:
         case TakeoverDemanded(takeover, code, reason, policies):
             kind, outcome = TAKEOVERS[takeover]
-            if step.state.authority is not Authority.PILOT:  # policies bind applications, never a human pilot
-                step.seize(kind, code, reason, policies, outcome)
+            if update.state.authority is not Authority.PILOT:  # policies apply to applications, never to a human pilot
+                update.seize(kind, code, reason, policies, outcome)
         case BrakeDemanded(code, reason, policies):
-            step.audit("control", "brake", step.state.controller, reason, code, policies=policies)
-            step.stop_motion(StopKind.ABORTED, code, reason, policies)
-            step.act(Brake())
+            update.audit("control", "brake", update.state.controller, reason, code, policies=policies)
+            update.stop_motion(StopKind.ABORTED, code, reason, policies)
+            update.act(Brake())
         case PositionLost(reason):
-            _position_lost(step, reason)
+            _lose_position(update, reason)
         case PositionFound():
-            if step.state.grace is not None and step.state.grace.code == POSITION_UNKNOWN:
-                step.set(grace=None)
-                step.audit("control", "resumed", step.state.controller, "the position is known again")
+            if update.state.grace is not None and update.state.grace.code == POSITION_UNKNOWN:
+                update.set(grace=None)
+                update.audit("control", "resumed", update.state.controller, "the position is known again")
         case GrantChanged():
-            _grant_changed(step, event)
+            _change_grant(update, event)
         case _:
             assert_never(event)
 
 
-def _position_lost(step: Step, reason: str) -> None:
-    """Hover; a driver keeps the vehicle and may fly again when the position is known within the grace.
+def _lose_position(update: StateUpdate, reason: str) -> None:
+    """Hover. A driver keeps control and may fly again if the position is known within the grace.
 
-    The motion may be asked for again: a position that is not known now may be known in a moment.
+    The motion may be requested again, because the position may be known again in a moment.
     """
-    step.audit("control", "brake", step.state.controller, reason, POSITION_UNKNOWN)
-    step.stop_motion(StopKind.PASSING, POSITION_UNKNOWN, reason)
-    step.act(Brake())
-    mission = step.state.mission
-    if step.state.drives and step.state.grace is None and mission is not None:
-        step.begin_grace(mission, reason, POSITION_UNKNOWN)
+    update.audit("control", "brake", update.state.controller, reason, POSITION_UNKNOWN)
+    update.stop_motion(StopKind.PASSING, POSITION_UNKNOWN, reason)
+    update.act(Brake())
+    mission = update.state.mission
+    if update.state.drives and update.state.grace is None and mission is not None:
+        update.begin_grace(mission, reason, POSITION_UNKNOWN)
 
 
-def _grant_changed(step: Step, event: GrantChanged) -> None:
-    """A mission whose grant went away is revoked, even under a pilot; one that only changed goes on."""
-    before, after = event.before, event.after
-    gone = frozenset({before.key} if before is not None else ())
-    step.set(grants=(step.state.grants - gone) | ({after.key} if after is not None else set()))
+def _change_grant(update: StateUpdate, event: GrantChanged) -> None:
+    """Revoke the mission of a removed grant, even under a pilot. The mission of a changed grant continues."""
+    before = event.before
+    after = event.after
+    removed = frozenset({before.key} if before is not None else ())
+    update.set(grants=(update.state.grants - removed) | ({after.key} if after is not None else set()))
     if before is not None and after is not None and before.key == after.key:
         return
-    step.act(WakeWaiters())
-    if before is None or not before.leads:
+    update.act(WakeWaiters())
+    if before is None or not before.commands_vehicle:
         return
-    lease, mission = step.state.lease, step.state.missions.get(before.key)
-    concerned = (lease is not None and lease.key == before.key) or step.state.active == before.key
+    lease = update.state.lease
+    mission = update.state.missions.get(before.key)
+    concerned = (lease is not None and lease.key == before.key) or update.state.active == before.key
     if mission is None or mission.outcome is not None or not concerned:
         return
-    if step.state.active not in {None, before.key}:
-        # It only waited for a vehicle that is another mission's: that one goes on.
-        step.lose_lease(GRANT_REMOVED)
-        step.end_mission(mission, OutcomeKind.REVOKED, GRANT_REMOVED)
+    if update.state.active not in {None, before.key}:
+        # The driver only waited for a vehicle that flies for another mission. That mission continues.
+        update.lose_lease(GRANT_REMOVED)
+        update.end_mission(mission, OutcomeKind.REVOKED, GRANT_REMOVED)
         return
-    step.set(active=before.key, removed=before.key)
-    if step.state.authority is Authority.PILOT:
-        step.end_mission(mission, OutcomeKind.REVOKED, GRANT_REMOVED)
+    update.set(active=before.key, removed=before.key)
+    if update.state.authority is Authority.PILOT:
+        update.end_mission(mission, OutcomeKind.REVOKED, GRANT_REMOVED)
     else:
-        step.seize(TaskKind.RETURN, "GrantRevoked", GRANT_REMOVED, (), OutcomeKind.REVOKED)
+        update.seize(TaskKind.RETURN, "GrantRevoked", GRANT_REMOVED, (), OutcomeKind.REVOKED)
 
 
 # The system
 
 
-def _on_system(step: Step, event: SystemEvent) -> None:
+def _on_system(update: StateUpdate, event: SystemEvent) -> None:
     match event:
         case TransitBegan(flight_id, key, identity):
-            if step.state.authority is Authority.PILOT or step.state.drives or _is_over(step, key):
-                return  # the system flies only for missions that go on, and where no one else has authority
-            if step.state.touring != key:  # a tour begins its own transit, and must not end itself
-                step.stop_task()
-            grace = step.state.grace
-            # A transit that is refused again and again must not begin the grace again each time.
+            if update.state.authority is Authority.PILOT or update.state.drives or _has_ended(update, key):
+                return  # the system flies only for missions that continue, and while no other party has authority
+            if update.state.touring != key:  # a mission over points of interest must not stop its own task
+                update.stop_task()
+            grace = update.state.grace
+            # A transit that is refused repeatedly must not restart the grace each time.
             kept = grace if grace is not None and grace.key == key else None
-            step.set(grace=kept, authority=Authority.SYSTEM)
-            step.adopt(step.mission(key, identity))
-            step.set(flight=SystemFlight(flight_id, key))
+            update.set(grace=kept, authority=Authority.SYSTEM)
+            update.adopt(update.mission(key, identity))
+            update.set(flight=SystemFlight(flight_id, key))
         case SystemFlightBegan(flight_id, key):
-            step.set(flight=SystemFlight(flight_id, key))
+            update.set(flight=SystemFlight(flight_id, key))
         case SystemFlightEnded(flight_id):
-            if step.state.flight is not None and step.state.flight.flight_id == flight_id:
-                step.set(flight=None)
+            if update.state.flight is not None and update.state.flight.flight_id == flight_id:
+                update.set(flight=None)
         case TourPointVisited(key, visited):
-            mission = step.state.missions.get(key)
+            mission = update.state.missions.get(key)
             if mission is not None:
-                step.update_mission(mission, waypoints=visited)
-            step.act(SaveJournal())
-            step.act(WakeWaiters())
+                update.update_mission(mission, waypoints=visited)
+            update.act(SaveJournal())
+            update.act(WakeWaiters())
         case PassengerBoarded(key, identity):
-            step.mission(key, identity)
+            update.mission(key, identity)
         case SystemTaskEnded(task_id, finished):
-            _task_ended(step, task_id, finished)
+            _end_task(update, task_id, finished)
         case TourBegan() | TourInterrupted() | TourEnded():
-            _on_tour(step, event)
+            _on_tour(update, event)
         case _:
             assert_never(event)
 
 
-def _is_over(step: Step, key: str) -> bool:
-    mission = step.state.missions.get(key)
+def _has_ended(update: StateUpdate, key: str) -> bool:
+    mission = update.state.missions.get(key)
     return mission is not None and mission.outcome is not None
 
 
-def _on_tour(step: Step, event: TourBegan | TourInterrupted | TourEnded) -> None:
-    """A tour is flown by a task of its own; what it reports counts only while it has the vehicle."""
+def _on_tour(update: StateUpdate, event: TourBegan | TourInterrupted | TourEnded) -> None:
+    """Handle an event of a mission over points of interest. Its reports count only while its task has the vehicle."""
     match event:
         case TourBegan(key):
-            if step.state.authority is Authority.PILOT:
+            if update.state.authority is Authority.PILOT:
                 return
-            step.stop_task()
-            task = SystemTask(step.state.last_task_id + 1, TaskKind.TOUR, key)
-            step.set(grace=None, task=task, last_task_id=task.task_id)
+            update.stop_task()
+            task = SystemTask(update.state.last_task_id + 1, TaskKind.TOUR, key)
+            update.set(grace=None, task=task, last_task_id=task.task_id)
         case TourInterrupted(key, reason):
-            mission = step.state.missions.get(key)
-            if mission is not None and _tours(step, key):
-                step.start(TaskKind.HOVER)
-                step.begin_grace(mission, reason)
+            mission = update.state.missions.get(key)
+            if mission is not None and _flies_tour(update, key):
+                update.start(TaskKind.HOVER)
+                update.begin_grace(mission, reason)
         case TourEnded(key, outcome):
-            mission = step.state.missions.get(key)
-            if mission is not None and _tours(step, key):
-                step.update_mission(mission, outcome=outcome)
-                step.audit("control", TaskKind.RETURN.value, "system", str(outcome))
-                step.act(SaveJournal())
-                step.start(TaskKind.RETURN)
+            mission = update.state.missions.get(key)
+            if mission is not None and _flies_tour(update, key):
+                update.update_mission(mission, outcome=outcome)
+                update.audit("control", TaskKind.RETURN.value, "system", str(outcome))
+                update.act(SaveJournal())
+                update.start(TaskKind.RETURN)
         case _:
             assert_never(event)
 
 
-def _tours(step: Step, key: str) -> bool:
-    """Whether the system still flies this tour: otherwise others have taken the vehicle, and have said why."""
-    mission = step.state.missions.get(key)
-    goes_on = mission is not None and mission.outcome is None
-    return goes_on and step.state.authority is Authority.SYSTEM and step.state.touring == key
+def _flies_tour(update: StateUpdate, key: str) -> bool:
+    """Return True if the system still flies this mission. Otherwise another event has ended it and stated the reason."""
+    mission = update.state.missions.get(key)
+    continues = mission is not None and mission.outcome is None
+    return continues and update.state.authority is Authority.SYSTEM and update.state.touring == key
 
 
-def _task_ended(step: Step, task_id: int, finished: bool) -> None:
-    task = step.state.task
+def _end_task(update: StateUpdate, task_id: int, finished: bool) -> None:
+    task = update.state.task
     if task is None or task.task_id != task_id:
         return
-    step.set(task=None)
+    update.set(task=None)
     if finished and task.kind is not TaskKind.HOVER:
-        step.set(returning=False)
-        step.act(WakeWaiters())
+        update.set(returning=False)
+        update.act(WakeWaiters())
 
 
 # The clock
 
 
-def _on_tick(step: Step) -> None:
-    """Deadlines that have come, and the last look: an armed vehicle that no one answers for is taken by the system."""
-    grace, motion = step.state.grace, step.state.motion
-    if grace is not None and step.now >= grace.until and not step.state.in_transit:
-        _end_grace(step)
+def _on_tick(update: StateUpdate) -> None:
+    """Handle expired deadlines, and take over an armed vehicle for which no party is responsible."""
+    grace = update.state.grace
+    motion = update.state.motion
+    if grace is not None and update.now >= grace.until and not update.state.in_transit:
+        _end_grace(update)
     if (
-        motion is step.state.motion
+        motion is update.state.motion
         and motion is not None
         and motion.hover_at is not None
-        and step.now >= motion.hover_at
+        and update.now >= motion.hover_at
     ):
-        hover_after_cancelled(step)
-    if step.state.attended:
-        step.set(unattended_since=None)
-    elif step.state.decided:
-        if step.state.unattended_since is None:
-            step.set(unattended_since=step.now)
-        if step.state.unattended < MAX_UNATTENDED:
-            step.set(unattended=step.state.unattended + 1)
-            _attend(step)
+        _hover_after_cancellation(update)
+    if update.state.attended:
+        update.set(unattended_since=None)
+    elif update.state.decided:
+        if update.state.unattended_since is None:
+            update.set(unattended_since=update.now)
+        if update.state.unattended < MAX_UNATTENDED:
+            update.set(unattended=update.state.unattended + 1)
+            _attend(update)
 
 
-def _end_grace(step: Step) -> None:
-    """The driver did not come back, or the position: the mission has failed."""
-    grace = step.state.grace
-    step.set(grace=None)
-    mission = step.state.missions.get(grace.key) if grace is not None else None
+def _end_grace(update: StateUpdate) -> None:
+    """Fail the mission, because the driver or the position did not come back in time."""
+    grace = update.state.grace
+    update.set(grace=None)
+    mission = update.state.missions.get(grace.key) if grace is not None else None
     if grace is None or mission is None or mission.outcome is not None:
         return
-    step.end_mission(mission, OutcomeKind.FAILED, grace.reason)
-    step.audit("takeover", TaskKind.RETURN.value, "system", grace.reason, grace.code)
-    if step.state.drives:
-        step.lose_lease(grace.reason)
-    if step.state.authority is Authority.SYSTEM and not step.state.returning:
-        step.start(TaskKind.RETURN)
+    update.end_mission(mission, OutcomeKind.FAILED, grace.reason)
+    update.audit("takeover", TaskKind.RETURN.value, "system", grace.reason, grace.code)
+    if update.state.drives:
+        update.lose_lease(grace.reason)
+    if update.state.authority is Authority.SYSTEM and not update.state.returning:
+        update.start(TaskKind.RETURN)
 
 
-def _attend(step: Step) -> None:
-    """Hover and wait for the driver of a mission that goes on; bring every other vehicle home."""
-    mission, state = step.state.mission, step.state
-    step.set(authority=Authority.SYSTEM)
-    step.stop_motion(StopKind.LOST, "ControlLost", "the system took the drone")
-    goes_on = mission is not None and mission.outcome is None and state.grant_in_force
-    kind = TaskKind.HOVER if goes_on and state.vehicle.in_air else TaskKind.RETURN
-    step.audit("takeover", kind.value, "system", "no one had the drone", UNATTENDED)
-    step.start(kind)
+def _attend(update: StateUpdate) -> None:
+    """Take over the vehicle: hover and wait for the driver of a mission that continues, otherwise return."""
+    mission = update.state.mission
+    state = update.state
+    update.set(authority=Authority.SYSTEM)
+    update.stop_motion(StopKind.LOST, "ControlLost", "the system took the drone")
+    continues = mission is not None and mission.outcome is None and state.grant_in_force
+    kind = TaskKind.HOVER if continues and state.vehicle.in_air else TaskKind.RETURN
+    update.audit("takeover", kind.value, "system", "no party had control authority", UNATTENDED)
+    update.start(kind)
     if kind is TaskKind.HOVER and mission is not None:
-        step.begin_grace(mission, DRIVER_LOST)
+        update.begin_grace(mission, DRIVER_LOST)

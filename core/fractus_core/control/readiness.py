@@ -1,24 +1,24 @@
-"""Whether the vehicle can fly for a mission now, and what it waits for."""
+"""Readiness of the vehicle for a mission."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fractus_core.control.values import Authority, ControlState
+from fractus_core.control.state import Authority, ControlState
 
 NOT_CONNECTED = "the autopilot is not connected"
 
 
 @dataclass(frozen=True, slots=True)
 class Readiness:
-    """What else an application must wait for.
+    """Preconditions of a flight that are not part of the control state. Empty reasons mean that there is no problem.
 
     Attributes:
-        unverified: why the autopilot's failsafes do not count as set; empty when they do.
-        unready: why the autopilot would not arm; empty when it would.
-        located: whether position and home are known.
-        link: what is wrong with the link to the autopilot; empty when nothing is.
-        absent: why what is heard is not the autopilot, while that is not connected; empty when nothing is heard.
+        unverified: Reason why the autopilot's failsafes are not verified.
+        unready: Reason why the autopilot would refuse to arm.
+        located: True if position and home are known.
+        link: Problem of the link to the autopilot.
+        absent: Reason why the source of received messages is not the autopilot, while the autopilot is not connected.
     """
 
     unverified: str
@@ -29,11 +29,11 @@ class Readiness:
 
 
 def not_ready_reason(state: ControlState, key: str, readiness: Readiness) -> str | None:
-    """Why the vehicle cannot fly for a mission now; None when it can."""
+    """Return why the vehicle cannot fly for a mission now, or None if it can."""
     vehicle = state.vehicle
     reasons = (
         (not vehicle.connected, readiness.absent or NOT_CONNECTED),
-        (not state.decided, "it is not known yet what the drone does"),
+        (not state.decided, "it is not known yet who has control of the drone"),
         (state.taken(key), "another application has the drone"),
         (bool(readiness.unverified), f"the autopilot's failsafes are not verified: {readiness.unverified}"),
         (state.authority is Authority.PILOT, f"a human pilot has the drone ({vehicle.mode.name})"),

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from fractus_core.api.plans import GrantSpec
-from fractus_core.control.values import FlightMode, ModeKind, TaskKind
+from fractus_core.control.state import FlightMode, ModeKind, TaskKind
 from fractus_core.geo import LocalFrame
 from fractus_core.policy.decision_types import STATIONARY_MPS, Airframe, Attitude, Home
 from fractus_core.policy.return_route import ReturnBounds

@@ -9,7 +9,7 @@ from collections.abc import AsyncGenerator, Awaitable, Callable
 
 from fractus_core.control import Mission
 from fractus_core.control.events import ArmingPrepared, ArmingRequested, MotorStart
-from fractus_core.control.values import ended_refusal
+from fractus_core.control.state import ended_refusal
 from fractus_core.geo import LocalFrame
 
 from fractus_services.errors import AutopilotError, PreconditionFailed, Refused, Unavailable

@@ -295,4 +295,4 @@ class Control:
 def _reference(grant: ActiveGrant | None) -> GrantRef | None:
     if grant is None:
         return None
-    return GrantRef(grant.key, leads=grant.spec.class_ == "driver" or bool(grant.spec.tour))
+    return GrantRef(grant.key, commands_vehicle=grant.spec.class_ == "driver" or bool(grant.spec.tour))

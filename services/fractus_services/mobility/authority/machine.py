@@ -9,7 +9,7 @@ from fractus_core.control import ControlState
 from fractus_core.control.actions import Action
 from fractus_core.control.events import Event, Tick
 from fractus_core.control.machine import transition
-from fractus_core.control.values import VehicleFacts
+from fractus_core.control.state import VehicleFacts
 
 from fractus_services.mobility.autopilot import Autopilot
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 from fractus_core.control import ControlState
 from fractus_core.control.events import Event, ModeChangeBegan, ModeChangeEnded
-from fractus_core.control.values import FlightMode, TaskKind
+from fractus_core.control.state import FlightMode, TaskKind
 
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.autopilot import Approach, Autopilot, Permit, always

@@ -25,8 +25,8 @@ from fractus_core.control.actions import (
     WakeWaiters,
 )
 from fractus_core.control.events import Event, SystemTaskEnded
-from fractus_core.control.step import DRIVER_LOST
-from fractus_core.control.values import FlightMode, SystemTask, TaskKind
+from fractus_core.control.state import FlightMode, SystemTask, TaskKind
+from fractus_core.control.state_update import DRIVER_LOST
 from fractus_runtime.audit import AuditLog
 
 from fractus_services.background import Background

@@ -11,7 +11,7 @@ from typing import Protocol
 
 import shapely
 from fractus_core.api.geometry import Position, Reference
-from fractus_core.control.values import FlightMode
+from fractus_core.control.state import FlightMode
 from fractus_core.policy.altitude import altitude_above_home_m
 from fractus_core.policy.compiled_grant import AirVolume, CompiledGrant
 from fractus_core.policy.decision_types import Call, GotoArgs, Home, Situation

@@ -8,7 +8,7 @@ from collections.abc import AsyncGenerator, Callable
 from contextlib import aclosing
 from dataclasses import replace
 
-from fractus_core.control.values import FlightMode, ModeKind, TaskKind
+from fractus_core.control.state import FlightMode, ModeKind, TaskKind
 from fractus_core.policy.compiled_grant import CompiledGrant
 from fractus_core.policy.kinematics import height_margin_m, margin_m
 from fractus_core.policy.return_route import (

@@ -9,7 +9,7 @@ from collections.abc import AsyncGenerator, Callable
 from fractus_core.api.geometry import Position
 from fractus_core.control import Outcome, OutcomeKind
 from fractus_core.control.events import TourEnded, TourInterrupted, TourPointVisited
-from fractus_core.control.values import COMPLETE
+from fractus_core.control.state import COMPLETE
 
 from fractus_services.errors import AutopilotError, Refused, Unavailable
 from fractus_services.grant_files import ActiveGrant, GrantFiles

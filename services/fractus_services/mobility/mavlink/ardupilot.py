@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from fractus_core.control.values import FlightMode, ModeKind
+from fractus_core.control.state import FlightMode, ModeKind
 from fractus_core.policy.decision_types import Airframe
 from fractus_core.policy.return_route import RTL_CONE_SLOPE, ReturnBounds
 from fractus_mavlink.enums import COPTER_MODE, FENCE_TYPE, MAV_AUTOPILOT, MAV_TYPE

@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable
 from contextlib import nullcontext, suppress
 
-from fractus_core.control.values import FlightMode
+from fractus_core.control.state import FlightMode
 from fractus_mavlink import Message, Value, layout_named, message
 from fractus_mavlink.enums import (
     MAV_CMD,

@@ -7,7 +7,7 @@ from contextlib import aclosing
 
 from fractus_core.control import ControlEvent, OutcomeKind, StreamState
 from fractus_core.control.events import PassengerBoarded, TransitRequested
-from fractus_core.control.values import ended_refusal
+from fractus_core.control.state import ended_refusal
 
 from fractus_services.errors import PolicyDenied, PreconditionFailed
 from fractus_services.grant_files import ActiveGrant

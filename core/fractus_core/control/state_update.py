@@ -1,4 +1,4 @@
-"""One transition under way: the state as it is by now, the actions so far, and the moves that transitions are made of."""
+"""Working copy of the control state during one transition, and the steps that transitions are composed of."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from fractus_core.control.actions import (
     StopSystemTask,
     WakeWaiters,
 )
-from fractus_core.control.values import (
+from fractus_core.control.state import (
     Authority,
     ControlEvent,
     ControlState,
@@ -29,18 +29,20 @@ from fractus_core.control.values import (
     TaskKind,
 )
 
-REMEMBERED_MISSIONS = 200
+MAX_MISSIONS = 200
+"""Number of missions that are remembered."""
+
 DRIVER_LOST = "driver lost"
 GRANT_REMOVED = "the grant was removed"
 
 
-class Step:
-    """Collects what one event changes; nothing outside of it sees what is not finished.
+class StateUpdate:
+    """Collects the changes and actions of one event. Nothing is visible outside before the transition is complete.
 
     Attributes:
-        state: as it is by now.
-        actions: to be carried out, in order.
-        now: monotonic seconds.
+        state: State with the changes so far.
+        actions: Actions so far, in order of execution.
+        now: Time of the event in monotonic seconds.
     """
 
     def __init__(self, state: ControlState, now: float) -> None:
@@ -49,11 +51,11 @@ class Step:
         self.now = now
 
     def set(self, **changes: Any) -> None:
-        """Change the state."""
+        """Change fields of the state."""
         self.state = replace(self.state, **changes)
 
     def act(self, action: Action) -> None:
-        """Ask for an action."""
+        """Add an action."""
         self.actions.append(action)
 
     def audit(
@@ -66,30 +68,30 @@ class Step:
         *,
         policies: tuple[str, ...] = (),
     ) -> None:
-        """Write a change of control down."""
+        """Record a change of control in the audit log."""
         self.act(RecordAudit(kind, action, controller, reason, code, policies))
 
     # Missions
 
     def mission(self, key: str, identity: str) -> Mission:
-        """The mission of a grant, begun when it is new; the oldest are forgotten."""
-        found = self.state.missions.get(key)
-        if found is None:
-            found = Mission(key, identity)
-            missions = {**self.state.missions, key: found}
-            for old in list(missions)[: max(len(missions) - REMEMBERED_MISSIONS, 0)]:
-                del missions[old]
+        """Return the mission of a grant. Create it if it is new, and drop the oldest missions above the limit."""
+        mission = self.state.missions.get(key)
+        if mission is None:
+            mission = Mission(key, identity)
+            missions = {**self.state.missions, key: mission}
+            for oldest in list(missions)[: max(len(missions) - MAX_MISSIONS, 0)]:
+                del missions[oldest]
             self.set(missions=missions)
-        return found
+        return mission
 
     def update_mission(self, mission: Mission, **changes: Any) -> Mission:
-        """Change a mission."""
+        """Change fields of a mission and return it."""
         changed = replace(mission, **changes)
         self.set(missions={**self.state.missions, mission.key: changed})
         return changed
 
     def end_mission(self, mission: Mission | None, kind: OutcomeKind, reason: str) -> Mission | None:
-        """Give a mission its outcome and keep it, unless it has one; no one is waited for any more."""
+        """Set the outcome of a mission that has none, save it, and end the grace of its driver."""
         if mission is None or mission.outcome is not None:
             return mission
         if self.state.grace is not None and self.state.grace.key == mission.key:
@@ -98,7 +100,7 @@ class Step:
         return self.update_mission(mission, outcome=Outcome(kind, reason))
 
     def adopt(self, mission: Mission) -> None:
-        """The vehicle flies for this mission."""
+        """Make a mission the active one: the vehicle flies for it from now on."""
         if self.state.active != mission.key:
             self.set(speed_mps=None)
         self.set(active=mission.key, removed=None)
@@ -107,13 +109,13 @@ class Step:
     # Motions and leases
 
     def stop_motion(self, kind: StopKind, code: str, reason: str, policies: tuple[str, ...] = ()) -> None:
-        """End the motion under way."""
+        """End the current motion."""
         if self.state.motion is not None:
             self.act(StopMotion(self.state.motion.motion_id, kind, code, reason, policies))
             self.set(motion=None)
 
     def lose_lease(self, reason: str) -> None:
-        """Take the vehicle from the driver, or from who waits for it, and say why."""
+        """Take the lease from a driver that has control or waits for it, and report the reason to it."""
         lease = self.state.lease
         self.stop_motion(StopKind.LOST, "ControlLost", reason)
         self.drop_lease()
@@ -122,10 +124,10 @@ class Step:
         self.act(WakeWaiters())
 
     def drop_lease(self) -> None:
-        """No driver has or waits for the vehicle any more.
+        """Remove the lease.
 
-        A driver whose second stream waits has authority without a granted lease: with that stream its authority ends too, or
-        a pilot who arms the vehicle would be taken for the driver.
+        A driver whose second stream still waits has authority without a granted lease. Its authority ends with that stream:
+        otherwise a pilot who arms the vehicle would be mistaken for the driver.
         """
         self.set(lease=None)
         if self.state.authority is Authority.DRIVER:
@@ -134,9 +136,10 @@ class Step:
     # The system
 
     def start(self, kind: TaskKind, *, found: bool = False) -> None:
-        """Begin what the system wants of the vehicle; what it did before ends.
+        """Start a system task in place of the current one.
 
-        Coming down counts as returning from here on, so that no monitor or supervisor interferes before the task runs.
+        A task that comes down counts as returning immediately, so that neither monitor nor supervisor intervenes before the
+        task runs.
         """
         self.stop_task()
         task = SystemTask(self.state.last_task_id + 1, kind, found=found)
@@ -145,30 +148,32 @@ class Step:
         self.act(StartSystemTask(task))
 
     def stop_task(self) -> None:
-        """End what the system does with the vehicle; a way home of the autopilot's own goes on, and is no one's."""
+        """Stop the system task. A return by the autopilot itself continues, without a responsible party."""
         if self.state.task is not None:
             self.act(StopSystemTask(self.state.task.task_id))
         self.set(task=None, returning=False)
 
     def begin_grace(self, mission: Mission, reason: str, code: str = "DriverLost") -> None:
-        """Give a lost driver or position its time to come back; on the ground, before any flight, there is nothing to save.
+        """Start the time within which a lost driver or position must come back.
 
-        A mission that is waited for already gets no more time: what is lost and found again and again comes home.
+        There is no grace on the ground before any flight, because nothing has to be saved. A mission that already has a
+        grace keeps its deadline: a driver that is lost repeatedly does not keep the drone in the air.
         """
-        before, until = self.state.grace, self.now + self.state.grace_s
-        if before is not None and before.key == mission.key:
-            until = min(before.until, until)
+        current = self.state.grace
+        until = self.now + self.state.grace_s
+        if current is not None and current.key == mission.key:
+            until = min(current.until, until)
         waits = mission.flown or self.state.vehicle.armed
         self.set(grace=Grace(until, mission.key, reason, code) if waits else None)
 
     def follow_descent(self, kind: TaskKind, *, found: bool = False) -> None:
-        """The autopilot comes down by itself: the system watches it to the ground, and does the rest if it stops."""
+        """Supervise a descent that the autopilot started by itself, and complete it if the autopilot stops."""
         self.set(authority=Authority.SYSTEM)
         self.start(kind, found=found)
         self.set(returning=True)
 
     def take_back(self, mission: Mission) -> None:
-        """Hover and wait for the driver of a mission that goes on; fly home otherwise."""
+        """Hover and wait for the driver if the mission continues. Otherwise return."""
         if mission.outcome is not None or not self.state.grant_in_force:
             self.end_mission(mission, OutcomeKind.REVOKED, GRANT_REMOVED)
             self.start(TaskKind.RETURN)
@@ -179,7 +184,7 @@ class Step:
     def seize(
         self, kind: TaskKind, code: str, reason: str, policies: tuple[str, ...], outcome: OutcomeKind | None
     ) -> None:
-        """The system takes the vehicle from its driver, or goes on with another task; a mission without outcome gets its grace."""
+        """Take the vehicle from its driver and start a system task. A mission without an outcome gets its grace."""
         mission = self.state.mission
         self.audit("takeover", kind.value, "system", reason, code, policies=policies)
         self.lose_lease(reason)
@@ -190,9 +195,13 @@ class Step:
         if mission is not None and mission.outcome is None:
             self.begin_grace(mission, reason)
 
-    def give_to_pilot(self, what: str) -> None:
-        """A human pilot has the vehicle: applications lose it at once, and the system commands nothing any more."""
-        reason = f"a human pilot {what}"
+    def give_to_pilot(self, event: str) -> None:
+        """Give control authority to a human pilot. Applications lose it at once, and the system sends no more commands.
+
+        Args:
+            event: Action of the pilot, as the end of the sentence "a human pilot ...".
+        """
+        reason = f"a human pilot {event}"
         if self.state.authority is not Authority.PILOT:
             self.audit("takeover", "pilot", "pilot", reason, "PilotTookOver")
         self.stop_task()

@@ -16,6 +16,8 @@ PROGRAMS := buildah:buildah containerd:containerd runc:runc nft:nftables iptable
 
 UV := $(shell uv --version 2> /dev/null | grep -q '^uv ' && command -v uv || echo .tools/bin/uv)
 RUN := $(UV) run --frozen --all-extras
+# The simulator and the embedded cluster, without the tools for development.
+SIM := $(UV) run --frozen --no-dev --package fractus-sim
 GO_PATH := $(PATH):/usr/local/go/bin
 export PATH := $(GO_PATH)
 # Tests start hundreds of Python processes: each would compile all its modules again.
@@ -27,7 +29,7 @@ help: ## List the targets
 
 .PHONY: demo
 demo: packages uv ## Fly the traffic-monitoring example and leave its report in out/demo (CLUSTER=embedded|current)
-	$(UV) run --frozen --extra sim python -m fractus_sim.demo --cluster $(CLUSTER) --out $(OUT)/demo
+	$(SIM) python -m fractus_sim.demo --cluster $(CLUSTER) --out $(OUT)/demo
 
 # AUTOPILOT=tcp:HOST:PORT flies an ArduCopter that runs already (SITL or a vehicle), at SPEEDUP=1, instead of simulated ones.
 SPEEDUP ?= $(if $(AUTOPILOT),1,3)
@@ -38,13 +40,13 @@ scenario-field: env ## Fly the field experiment and leave its report in out/fiel
 
 .PHONY: scenario-links
 scenario-links: packages uv ## Fly past edge nodes with WiFi on an embedded cluster and leave the report in out/links (FACTOR=1: real by declared range)
-	$(UV) run --frozen --extra sim python -m fractus_sim.scenarios.links --out $(OUT)/links --factor $(or $(FACTOR),1)
+	$(SIM) python -m fractus_sim.scenarios.links --out $(OUT)/links --factor $(or $(FACTOR),1)
 
 SEEDS ?= 1
 MINUTES ?= 5
 .PHONY: chaos
 chaos: packages uv ## Fly missions on an embedded cluster while its parts fail (SEEDS=20 MINUTES=30 FIRST=1), report in out/chaos
-	$(UV) run --frozen --extra sim python -m fractus_sim.chaos --seeds $(SEEDS) --minutes $(MINUTES) \
+	$(SIM) python -m fractus_sim.chaos --seeds $(SEEDS) --minutes $(MINUTES) \
 		--first-seed $(or $(FIRST),1) --out $(OUT)/chaos
 
 .PHONY: compare-vehicle
@@ -152,7 +154,7 @@ bench: env ## Run every benchmark
 .PHONY: release
 release: env ## Set VERSION=X.Y.Z of the package and the charts; describe it in CHANGELOG.md, commit and tag
 	@[[ "$${VERSION:-}" =~ ^[0-9]+\.[0-9]+\.[0-9]+$$ ]] || { echo "give VERSION=X.Y.Z" >&2; exit 1; }
-	sed -i 's/^version = ".*"/version = "$(VERSION)"/' pyproject.toml
+	sed -i 's/^version = ".*"/version = "$(VERSION)"/' pyproject.toml sim/pyproject.toml
 	sed -i 's/^version: .*/version: $(VERSION)/' charts/*/Chart.yaml
 	$(UV) lock --quiet
 
@@ -193,11 +195,11 @@ endif
 
 TAG ?= $(shell git describe --tags --exact-match --match 'v[0-9]*' 2> /dev/null)
 .PHONY: dist
-dist: $(if $(PLATFORMS),,packages) env ## Build all of a release into dist/: wheel, charts, images, dependencies and licences, checksums
+dist: $(if $(PLATFORMS),,packages) env ## Build all of a release into dist/: wheels, charts, images, dependencies and licences, checksums
 	@[ "$(or $(TAG),v$(PACKAGED))" = "v$(PACKAGED)" ] || { echo "the tag $(TAG) is not that of version $(PACKAGED) in pyproject.toml:" \
 		"make release VERSION=$(TAG:v%=%), commit, and tag that" >&2; exit 1; }
 	rm -rf dist
-	$(UV) build --quiet --out-dir dist
+	$(UV) build --quiet --all-packages --out-dir dist
 	command -v helm > /dev/null || $(RUN) fractus cluster binaries
 	$(MAKE) charts archives
 	$(UV) export --quiet $(SHIPPED) --no-emit-project --format cyclonedx1.5 > dist/dependencies.cdx.json
@@ -242,7 +244,7 @@ packages: ## Install the Debian packages whose programs are missing (root); noth
 env: .venv/.synced
 uv: $(if $(filter .tools/bin/uv,$(UV)),.tools/bin/uv)
 
-.venv/.synced: pyproject.toml uv.lock | uv
+.venv/.synced: pyproject.toml sim/pyproject.toml uv.lock | uv
 	$(UV) sync --frozen --all-extras --quiet
 	@touch $@
 

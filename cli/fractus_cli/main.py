@@ -15,7 +15,7 @@ from fractus_cli import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK
 from fractus_cli.output import printable
 
 _MARKERS = {
-    "core": "shapely",
+    "geometry": "shapely",
     "kube": "kubernetes",
     "operator": "cryptography",
     "services": "cv2",
@@ -34,7 +34,7 @@ class Entry:
     Attributes:
         place: MODULE:ATTRIBUTE.
         summary: its line in `fractus --help`.
-        extra: what has to be installed for it; empty for the base.
+        extra: the extra of fractus-drones that the command needs; "sim" for the distribution fractus-sim; empty for the base.
     """
 
     place: str
@@ -46,6 +46,13 @@ class Entry:
         """Whether the command can probably be imported."""
         modules = [self.place.partition(":")[0].partition(".")[0], *filter(None, [_MARKERS.get(self.extra)])]
         return all(importlib.util.find_spec(module) for module in modules)
+
+    @property
+    def requirement(self) -> str:
+        """The distribution, with its extra, that provides the command, as pip takes it."""
+        if self.extra == "sim":
+            return "fractus-sim"
+        return f"fractus-drones[{self.extra}]" if self.extra else "fractus-drones"
 
 
 COMMANDS: dict[str, Entry] = {
@@ -62,13 +69,13 @@ COMMANDS: dict[str, Entry] = {
     "images": Entry("fractus_cluster.images.cli:images", "Build the container images of Fractus with buildah.", "sim"),
     "logs": Entry("fractus_cli.logs:logs", "Show what the pods of an Application print.", "kube"),
     "mobility": Entry("fractus_services.commands:mobility", "The mobility service of a drone.", "services"),
-    "plan": Entry("fractus_cli.plan:plan", "Plan the Applications in some manifests, without a cluster.", "core"),
-    "policy": Entry("fractus_cli.policy:policy", "Ask the policy engine, without a cluster.", "core"),
+    "plan": Entry("fractus_cli.plan:plan", "Plan the Applications in some manifests, without a cluster.", "geometry"),
+    "policy": Entry("fractus_cli.policy:policy", "Ask the policy engine, without a cluster.", "geometry"),
     "status": Entry("fractus_cli.status:status", "Show the drones and applications of a cluster.", "kube"),
     "telemetry": Entry("fractus_cli.telemetry:telemetry", "Print the state of a drone until interrupted."),
     "vehicle": Entry("fractus_vehicle.__main__:vehicle", "Simulate ArduCopter-compatible vehicles.", "sim"),
     "view": Entry("fractus_view.command:view", "Show flights on a web page, as they happen or from recordings.", "view"),
-    "zones": Entry("fractus_cli.zones:zones", "Read and write Zones in other formats.", "core"),
+    "zones": Entry("fractus_cli.zones:zones", "Read and write Zones in other formats.", "geometry"),
 }  # fmt: skip
 
 
@@ -115,8 +122,9 @@ def _missing(name: str, entry: Entry, error: ImportError) -> click.Command:
     @click.argument("rest", nargs=-1, type=click.UNPROCESSED)
     def hint(rest: tuple[str, ...]) -> None:
         del rest
-        wanted = f"fractus-drones[{entry.extra}]" if entry.extra else "fractus-drones"
-        raise click.ClickException(f"`fractus {name}` needs {lacking}; install it with: pip install '{wanted}'")
+        raise click.ClickException(
+            f"`fractus {name}` needs {lacking}; install it with: pip install '{entry.requirement}'"
+        )
 
     return hint
 

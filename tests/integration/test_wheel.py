@@ -1,35 +1,70 @@
-"""What a user installs: the examples are typed against the wheel, strictly."""
+"""Wheels: contents and requirements, and strict type checks of the examples against the shipped one."""
 
 from __future__ import annotations
 
+import email
 import shutil
 import subprocess
 import sys
 import venv
 from pathlib import Path
+from zipfile import ZipFile
 
 import pytest
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = sorted({path.parent for path in (ROOT / "examples").rglob("*.py")})
+SIMULATOR = ("cluster", "radio", "sim", "vehicle", "world")
+SHIPPED = ("agent", "cli", "core", "mavlink", "operator", "proto", "runtime", "services", "view")
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 
 
 @pytest.fixture(scope="module")
-def interpreter(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A Python that has the wheel alone."""
-    folder = tmp_path_factory.mktemp("wheel")
+def wheels(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The wheels of both distributions, by name."""
+    folder = tmp_path_factory.mktemp("wheels")
     uv = shutil.which("uv") or str(ROOT / ".tools" / "bin" / "uv")
     built = subprocess.run(
-        [uv, "build", "--wheel", "--offline", "--out-dir", folder, ROOT], capture_output=True, text=True, check=False
-    )
+        [uv, "build", "--wheel", "--all-packages", "--offline", "--out-dir", folder, ROOT],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
     if built.returncode != 0:
-        pytest.skip(f"the wheel cannot be built without the build backend in uv's cache: {built.stderr[-300:]}")
-    (wheel,) = folder.glob("*.whl")
+        pytest.skip(f"the wheels cannot be built without the build backend in uv's cache: {built.stderr[-300:]}")
+    return {path.name.partition("-")[0]: path for path in folder.glob("*.whl")}
+
+
+@pytest.fixture(scope="module")
+def interpreter(wheels: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A Python that has only the wheel fractus-drones."""
+    folder = tmp_path_factory.mktemp("wheel")
     venv.create(folder / "venv", with_pip=False)
     (packages,) = (folder / "venv" / "lib").glob("python*/site-packages")
-    shutil.unpack_archive(wheel, packages, format="zip")
+    shutil.unpack_archive(wheels["fractus_drones"], packages, format="zip")
     return folder / "venv" / "bin" / "python"
+
+
+def contents(wheel: Path) -> set[str]:
+    """Top-level names in a wheel, except its metadata."""
+    with ZipFile(wheel) as archive:
+        return {name.split("/")[0] for name in archive.namelist() if ".dist-info/" not in name}
+
+
+def test_shipped_wheel_has_no_simulator(wheels: dict[str, Path]) -> None:
+    assert wheels.keys() == {"fractus_drones", "fractus_sim"}
+    shipped = {"fractus"} | {f"fractus_{name}" for name in SHIPPED}
+    assert contents(wheels["fractus_drones"]) == shipped
+    assert contents(wheels["fractus_sim"]) == {f"fractus_{name}" for name in SIMULATOR}
+
+
+def test_shipped_wheel_requires_nothing_of_the_simulator(wheels: dict[str, Path]) -> None:
+    with ZipFile(wheels["fractus_drones"]) as archive:
+        (name,) = (name for name in archive.namelist() if name.endswith("METADATA"))
+        metadata = email.message_from_bytes(archive.read(name))
+    required = " ".join(metadata.get_all("Requires-Dist", []))
+    assert not [library for library in ("fractus-sim", "matplotlib", "pytest", "scipy") if library in required]
+    assert set(metadata.get_all("Provides-Extra", [])) == {
+        "agent", "geometry", "keys", "kube", "mobility", "model", "operator", "services", "tracing", "view",
+    }  # fmt: skip
 
 
 def checked(interpreter: Path, folder: Path, *files: Path) -> subprocess.CompletedProcess[str]:
@@ -43,12 +78,12 @@ def checked(interpreter: Path, folder: Path, *files: Path) -> subprocess.Complet
 
 
 @pytest.mark.parametrize("folder", EXAMPLES, ids=lambda folder: folder.name)
-def test_examples_are_typed_against_the_wheel(interpreter: Path, folder: Path) -> None:
+def test_examples_pass_strict_type_checks_against_the_wheel(interpreter: Path, folder: Path) -> None:
     done = checked(interpreter, folder, *folder.glob("*.py"))
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_the_wheel_brings_its_types(interpreter: Path, tmp_path: Path) -> None:
+def test_wheel_has_type_information(interpreter: Path, tmp_path: Path) -> None:
     program = tmp_path / "program.py"
     program.write_text(
         "import fractus\n\n\nasync def fly(drone: fractus.Mobility) -> None:\n    await drone.takeoff('high')\n"

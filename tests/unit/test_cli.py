@@ -94,7 +94,7 @@ def test_a_command_whose_extra_is_missing_is_hidden_and_says_what_to_install(
     assert "cluster" not in out
     code, _, err = fractus("cluster", "up", "--nodes", "3")
     assert code == 1
-    assert "pip install 'fractus-drones[sim]'" in err
+    assert "pip install 'fractus-sim'" in err
 
 
 def test_version_and_bare_command(fractus: Callable[..., tuple[int, str, str]]) -> None:

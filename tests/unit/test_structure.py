@@ -102,6 +102,6 @@ def test_no_document_installs_another_projects_distribution() -> None:
     folders = (*SOURCE_ROOTS, "docs", "examples", "tests", "bench")
     ours = [path for name in folders for path in (ROOT / name).rglob("*") if path.suffix in {".md", ".py"}]
     ours += [*ROOT.glob("*.md"), ROOT / "pyproject.toml", ROOT / "Dockerfile"]
-    foreign = re.compile(r"(pip install|uv add|uv pip install)[^\n]*\bfractus(?!-drones|_)\b|[\"']fractus\[")
+    foreign = re.compile(r"(pip install|uv add|uv pip install)[^\n]*(?<!/)\bfractus(?!-drones|-sim|_)\b|[\"']fractus\[")
     assert ours
     assert [str(path) for path in ours if path != Path(__file__) and foreign.search(path.read_text())] == []

@@ -1,4 +1,4 @@
-"""What Fractus takes of a drone's companion computer in flight: memory of agent, mobility and camera, and sizes of images.
+"""What Fractus takes of a drone's companion computer in flight: memory of agent, mobility and camera.
 
 The three run from their images as containers do, each in a root of its own over the layers that they share, with the commands
 and settings of the chart, an API server, the simulated vehicle and its camera. A component flies around a square and takes a
@@ -33,7 +33,7 @@ import fractus
 import yaml
 from fractus_cli.standalone import StandalonePki
 from fractus_cluster.commands import run
-from fractus_cluster.images.build import SIZE_LIMITS_MB, image_name
+from fractus_cluster.images.build import image_name
 from fractus_cluster.ports import free_port
 from fractus_core.api import Grant
 from fractus_core.geo import LocalFrame
@@ -166,10 +166,6 @@ class Images:
                 ["buildah", "from", "--pull-never", image_name(name, self._tag)]
             ).stdout.strip()
         return Path(run(["buildah", "mount", self._containers[name]]).stdout.strip())
-
-    def size_mb(self, name: str) -> float:
-        """What its files take."""
-        return int(run(["du", "-sx", "--block-size=1", str(self.root(name))]).stdout.split()[0]) / 1e6
 
     def command(self, name: str, folder: Path, *words: str, **environment: str) -> list[str]:
         """How a command is run in an image, with the directories of the node that are below a folder."""
@@ -341,7 +337,6 @@ def main() -> int:
     parser.add_argument("--json", type=Path, help="write the claims to a file")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as directory, Images(options.tag) as images:
-        sizes = {name: images.size_mb(name) for name in SIZE_LIMITS_MB}
         libraries = libraries_mb(Path(directory) / "libraries", images)
         with node_in(Path(directory), images) as (node, processes):
             found = watched(node, processes, 20.0 if options.quick else options.seconds)
@@ -350,13 +345,12 @@ def main() -> int:
         shared, own = (statistics.mean(column) for column in zip(*seen, strict=True))
         alone = f"{libraries[name]:7.1f} MB" if name in libraries else ""
         print(f"{name:12} {shared:6.1f} MB {own:7.1f} MB {max(seen)[0]:7.1f} MB {alone}")
-    ours = {name: [pss for pss, _ in seen] for name, seen in found.items() if name in SIZE_LIMITS_MB}
+    ours = {name: [pss for pss, _ in seen] for name, seen in found.items() if name != "MAVProxy"}
     together = statistics.mean(map(sum, zip(*ours.values(), strict=True)))
     theirs = statistics.mean(pss for pss, _ in found["MAVProxy"]) + K3S_AGENT_MB
     print(f"the libraries alone, idle: {sum(libraries.values()):.1f} MB")
     print(f"together {together:.1f} MB; MAVProxy and a k3s agent ({K3S_AGENT_MB:.0f} MB) {theirs:.1f} MB")
     claims = [claim("agent, mobility and camera in flight", together, TARGET_MB, theirs)]
-    claims += [claim(f"image {name}", sizes[name], limit) for name, limit in SIZE_LIMITS_MB.items()]
     for one in claims:
         print(
             f"{one['name']:40} {one['ours']:6.1f} MB (target {one['target']:.0f}){'' if one['holds'] else '  MISSED'}"

@@ -38,6 +38,11 @@ pytestmark = [
 ROOT = Path(__file__).parents[2]
 NAME = f"ct{os.getpid()}"
 IMAGE = "localhost/fractus/component:dev"
+FETCH = (
+    "python3",
+    "-c",
+    "import sys, urllib.request; print(urllib.request.urlopen(sys.argv[1], timeout=20).read().decode())",
+)
 
 WORKLOAD = f"""
 apiVersion: apps/v1
@@ -169,9 +174,9 @@ def test_services_and_names_work_across_nodes(small: Cluster) -> None:
     found = pods(small)
     for node, other in (("drone-1", "edge-1"), ("edge-1", "drone-1")):
         name, address = found[node]["metadata"]["name"], found[other]["status"]["podIP"]
-        fetched = small.kubectl("exec", name, "--", "wget", "-qO-", f"http://{address}:8080/hostname")
+        fetched = small.kubectl("exec", name, "--", *FETCH, f"http://{address}:8080/hostname")
         assert fetched.stdout.strip() == found[other]["metadata"]["name"]
-        small.kubectl("exec", name, "--", "wget", "-qO-", "http://web.default.svc.cluster.local/hostname")
+        small.kubectl("exec", name, "--", *FETCH, "http://web.default.svc.cluster.local/hostname")
     assert "GET /hostname" in small.kubectl("logs", found["edge-1"]["metadata"]["name"]).stdout
 
 

@@ -9,7 +9,7 @@ set -euo pipefail
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 source=$(cd "$here/../.." && pwd)
 kind_module=sigs.k8s.io/kind@v0.32.0
-base=debian:bookworm-slim
+base=debian:trixie-slim
 node=localhost/kind/node:dev
 network=fractus-kind
 home=${FRACTUS_KIND:-$(mktemp -d /var/tmp/fractus-kind.XXXXXX)}
@@ -92,12 +92,12 @@ debian() {
   docker image inspect "$base" > /dev/null 2>&1 || {
     say "making $base"
     "$source/.venv/bin/python" -c 'from fractus_cluster.images.build import ensure_base; ensure_base(report=print)'
-    buildah push --quiet localhost/fractus/base:bookworm "docker-archive:$home/base.tar:$base"
+    buildah push --quiet localhost/fractus/base:trixie "docker-archive:$home/base.tar:$base"
     docker load --quiet --input "$home/base.tar"
     rm "$home/base.tar"
     printf 'FROM %s\nCOPY ca-certificates.crt /opt/ca.crt\n' "$base" | docker build --quiet --tag "$base" --file - /etc/ssl/certs
   }
-  export BUILD_OPTIONS="--build-arg SSL_CERT_FILE=/opt/ca.crt --build-arg PIP_CERT=/opt/ca.crt"
+  export BUILD_OPTIONS="--build-arg SSL_CERT_FILE=/opt/ca.crt"
 }
 
 nodes() {

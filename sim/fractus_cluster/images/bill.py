@@ -1,4 +1,4 @@
-"""The bill of materials of an image: the Debian packages and Python distributions that its root file system tells of."""
+"""Bill of materials of an image: Debian packages and Python distributions, in CycloneDX."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from urllib.parse import quote
 
 from fractus_cluster.commands import run
 
-_PACKAGES = Path("var/lib/dpkg/status.d")
-_DISTRIBUTIONS = Path("usr/local/lib/python3.11/dist-packages")
+_PACKAGES = Path("var/lib/dpkg/status")
+_DISTRIBUTIONS = Path("opt/fractus/lib/python3.13/site-packages")
 
 
 def image_bill(image: str) -> str:
     """Return the bill of materials of an image in buildah's storage, as CycloneDX in JSON.
 
     Raises:
-        ClusterError: There is no such image.
+        ClusterError: buildah has no image of that name.
     """
     container = run(["buildah", "from", "--pull-never", image]).stdout.strip()
     try:
@@ -30,15 +30,20 @@ def image_bill(image: str) -> str:
 
 
 def bill_of_materials(image: str, root: Path) -> str:
-    """Return what the root file system of an image consists of, as CycloneDX in JSON: the same for the same content."""
-    found = dict(sorted([*_packages(root), *_distributions(root)]))
+    """Return the components of an image's root file system as CycloneDX in JSON. Equal contents give equal text.
+
+    Args:
+        image: Name of the image.
+        root: Its root file system.
+    """
+    components = dict(sorted([*_packages(root), *_distributions(root)]))
     document = {
         "$schema": "http://cyclonedx.org/schema/bom-1.5.schema.json",
         "bomFormat": "CycloneDX",
         "specVersion": "1.5",
         "version": 1,
         "metadata": {"component": {"type": "container", "bom-ref": image, "name": image}},
-        "components": list(found.values()),
+        "components": list(components.values()),
     }
     return json.dumps(document, indent=2) + "\n"
 
@@ -47,26 +52,28 @@ def _packages(root: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     release = dict(
         line.replace('"', "").split("=", 1) for line in (root / "usr/lib/os-release").read_text().splitlines()
     )
-    for path in (root / _PACKAGES).iterdir():
-        if path.suffix != ".md5sums":
-            stanza = email.message_from_string(path.read_text())
-            # Advisories name the package of the sources, which is in the stanza where its name is another.
-            source = stanza.get("Source", "").split(" ")[0]
-            qualifiers = {
-                "arch": stanza["Architecture"],
-                "distro": f"{release['ID']}-{release['VERSION_ID']}",
-                "upstream": source,
-            }
-            yield _component("deb/debian", stanza["Package"], stanza["Version"], qualifiers)
+    for paragraph in (root / _PACKAGES).read_text().split("\n\n"):
+        if not paragraph.strip():
+            continue
+        package = email.message_from_string(paragraph.lstrip("\n"))
+        # Advisories use the name of the source package. Debian omits the field if it equals the package's name.
+        source = package.get("Source", "").split(" ")[0]
+        qualifiers = {
+            "arch": package["Architecture"],
+            "distro": f"{release['ID']}-{release['VERSION_ID']}",
+            "upstream": source,
+        }
+        yield _component("deb/debian", package["Package"], package["Version"], qualifiers)
 
 
 def _distributions(root: Path) -> Iterator[tuple[str, dict[str, Any]]]:
-    for each in distributions(path=[str(root / _DISTRIBUTIONS)]):
-        yield _component("pypi", each.metadata["Name"].lower().replace("_", "-"), each.version, {})
+    for distribution in distributions(path=[str(root / _DISTRIBUTIONS)]):
+        name = distribution.metadata["Name"].lower().replace("_", "-")
+        yield _component("pypi", name, distribution.version, {})
 
 
-def _component(kind: str, name: str, version: str, qualifiers: dict[str, str]) -> tuple[str, dict[str, Any]]:
-    """Return a component by its package URL."""
-    said = "&".join(f"{key}={quote(value, safe='')}" for key, value in qualifiers.items() if value)
-    url = f"pkg:{kind}/{quote(name, safe='')}@{quote(version, safe='')}" + (f"?{said}" if said else "")
+def _component(type_: str, name: str, version: str, qualifiers: dict[str, str]) -> tuple[str, dict[str, Any]]:
+    """Return the package URL of a component, and the component."""
+    query = "&".join(f"{key}={quote(value, safe='')}" for key, value in qualifiers.items() if value)
+    url = f"pkg:{type_}/{quote(name, safe='')}@{quote(version, safe='')}" + (f"?{query}" if query else "")
     return url, {"type": "library", "bom-ref": url, "name": name, "version": version, "purl": url}

@@ -21,33 +21,33 @@ from fractus_cluster.locking import locked
 from fractus_cluster.prerequisites import check_root
 
 PREFIX = "localhost/fractus"
-BASE_IMAGE = f"{PREFIX}/base:bookworm"
+BASE_IMAGE = f"{PREFIX}/base:trixie"
 
-_RECIPE = (
-    "Dockerfile", ".dockerignore", "pyproject.toml", "uv.lock", "README.md", "LICENSE",
-    "sim/fractus_cluster/images/bytecode.py",
+_SOURCES = (
+    "Dockerfile", ".dockerignore", "pyproject.toml", "uv.lock", "sim/pyproject.toml", "README.md", "LICENSE",
+    "core", "runtime", "operator", "agent", "mavlink", "services", "cli", "view/fractus_view", "sdk", "proto",
 )  # fmt: skip
-_CODE: Mapping[str, tuple[str, ...]] = MappingProxyType(
+"""Sources of every image: each has the whole distribution fractus-drones."""
+_MORE_SOURCES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
-        "component": ("sdk", "cli", "proto"),
-        "operator": ("core", "runtime", "operator", "proto"),
-        "agent": ("core", "runtime", "agent", "proto"),
-        "mobility": ("core", "mavlink", "runtime", "services", "sdk", "cli", "proto"),
-        "camera": ("core", "mavlink", "runtime", "services", "sdk", "cli", "proto"),
-        "view": ("core", "runtime", "cli", "view/fractus_view", "proto"),
-        "sim": ("core", "mavlink", "runtime", "services", "sdk", "cli", "proto", "sim"),
-        "example-traffic-monitoring": ("sdk", "cli", "proto", "examples/traffic-monitoring"),
-        "example-field": ("sdk", "cli", "proto", "examples/field"),
-        "example-links": ("sdk", "cli", "proto", "examples/links"),
+        "component": (),
+        "operator": (),
+        "agent": (),
+        "mobility": (),
+        "camera": (),
+        "view": (),
+        "sim": ("sim",),
+        "example-traffic-monitoring": ("examples/traffic-monitoring",),
+        "example-field": ("examples/field",),
+        "example-links": ("examples/links",),
     }
 )
-TARGETS = tuple(_CODE)
+TARGETS = tuple(_MORE_SOURCES)
 """The targets of the Dockerfile that are images of their own."""
-SIZE_LIMITS_MB: Mapping[str, float] = MappingProxyType(
-    {"agent": 150.0, "mobility": 120.0, "camera": 250.0, "operator": 150.0}
-)
-"""What the files of an image may take."""
-
+_NOT_IN_SLIM = (
+    "usr/share/locale", "usr/share/man", "var/cache/apt/archives", "var/cache/debconf", "var/lib/apt/lists", "var/log",
+)  # fmt: skip
+"""Folders whose contents debian:trixie-slim, of which the base image takes the place, leaves out too."""
 _BUILD_TIMEOUT_S = 1800.0
 _LOCK_TIMEOUT_S = 1800.0
 _HOST_CA = Path("/etc/ssl/certs/ca-certificates.crt")
@@ -130,7 +130,7 @@ def build_images(
 def source_digest(source: Path, target: str) -> str:
     """Return a digest of all files of the checkout that a target's image is made of."""
     digest = hashlib.sha256()
-    for path in _files(source, (*_RECIPE, *_CODE[target])):
+    for path in _files(source, (*_SOURCES, *_MORE_SOURCES[target])):
         digest.update(f"{path.relative_to(source)}\0".encode() + path.read_bytes() + b"\0")
     return digest.hexdigest()
 
@@ -171,9 +171,8 @@ def _remove_replaced(identities: Iterable[str]) -> None:
 def _build(source: Path, target: str, tag: str) -> None:
     argv = ["buildah", "build", "--quiet", "--layers", "--timestamp", "0", "--build-arg", f"BASE={BASE_IMAGE}"]
     if _HOST_CA.is_file():
-        # Package indexes may be behind a proxy whose certificate only this machine's CA bundle confirms; nothing of it is kept.
-        argv += ["--volume", f"{_HOST_CA}:{_CA_IN_BUILD}:ro"]
-        argv += ["--build-arg", f"SSL_CERT_FILE={_CA_IN_BUILD}", "--build-arg", f"PIP_CERT={_CA_IN_BUILD}"]
+        # The package index may be behind a proxy whose CA only this machine trusts. The image does not keep the bundle.
+        argv += ["--volume", f"{_HOST_CA}:{_CA_IN_BUILD}:ro", "--build-arg", f"SSL_CERT_FILE={_CA_IN_BUILD}"]
     argv += ["--target", target, "--tag", image_name(target, tag), str(source)]
     run(argv, timeout_s=_BUILD_TIMEOUT_S, env={**os.environ, "BUILDAH_ISOLATION": "chroot"})
 
@@ -192,7 +191,10 @@ def ensure_base(*, report: Report) -> None:
     report("making the Debian base image (once)")
     with tempfile.TemporaryDirectory(prefix="fractus-base-") as scratch:
         root = Path(scratch) / "root"
-        run(["debootstrap", "--variant=minbase", "bookworm", root], timeout_s=_BUILD_TIMEOUT_S)
+        run(["debootstrap", "--variant=minbase", "trixie", root], timeout_s=_BUILD_TIMEOUT_S)
+        for folder in _NOT_IN_SLIM:
+            shutil.rmtree(root / folder)
+            (root / folder).mkdir()
         container = run(["buildah", "from", "scratch"]).stdout.strip()
         try:
             run(["buildah", "add", "--quiet", container, root, "/"], timeout_s=_BUILD_TIMEOUT_S)

@@ -154,7 +154,7 @@ async def test_a_grant_that_is_not_signed_is_none(rig: Rig) -> None:
     code, why = await denied(rig.stub(DRIVER).GetSpeed(ASK, timeout=20, wait_for_ready=True))
     assert (code, why.code) == (Status.PERMISSION_DENIED, "NoGrant")
     await until(lambda: rig.entries("grant"), "the refusal in the audit log")
-    assert "it is not signed; the operator signs Grants" in rig.entries("grant")[-1]["reason"]
+    assert "the Grant is not signed" in rig.entries("grant")[-1]["reason"]
     rig.write_grant(grant())
     await until(lambda: rig.entries("grant")[-1]["change"] == "added", "the grant")
 

@@ -349,7 +349,7 @@ async def test_a_grant_that_is_not_signed_is_not_stored_and_takes_away_the_one_b
     doubting: GrantKeeper, doubter: Doubter, store: FakeStore, tmp_path: Path
 ) -> None:
     doubting.take(granted(manifest()))
-    doubter.error = BadSignature("it was changed after it was signed")
+    doubter.error = BadSignature("the Grant was changed after signing")
     doubting.take(granted(manifest(spec={"control": "full"})))
     assert on_disk(tmp_path) == set()
     await doubting.report_once()

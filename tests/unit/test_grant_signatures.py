@@ -114,12 +114,12 @@ def of_data(data: dict[str, str]) -> tuple[ec.EllipticCurvePrivateKey, x509.Cert
 @pytest.mark.parametrize(
     ("who", "why"),
     [
-        (of_data(CA.issue_component(IDENTITY, NOW)), "not by the operator"),
-        (of_data(CA.issue_component("spiffe://fractus.dev/operator", NOW)), "not for signing Grants"),
-        (of_data(CA.issue_node("drone-1", NOW)), "not by the operator"),
-        ((CA.key, CA.certificate), "not for signing Grants"),
+        (of_data(CA.issue_component(IDENTITY, NOW)), "instead of the operator"),
+        (of_data(CA.issue_component("spiffe://fractus.dev/operator", NOW)), "not valid for signing Grants"),
+        (of_data(CA.issue_node("drone-1", NOW)), "instead of the operator"),
+        ((CA.key, CA.certificate), "not valid for signing Grants"),
         (OTHER_CA.issue_signer(NOW), "authority that is not in ca.crt"),
-        ((SIGNER[0], CA.issue_signer(NOW)[1]), "changed after it was signed"),
+        ((SIGNER[0], CA.issue_signer(NOW)[1]), "changed after signing"),
     ],
 )
 def test_no_one_else_signs(who: tuple[ec.EllipticCurvePrivateKey, x509.Certificate], why: str) -> None:
@@ -418,14 +418,14 @@ def test_a_drone_without_an_area_is_neither_signed_for_nor_believed(who: str) ->
         signed(operationArea=[], **{"class": who})
     body = signed()
     body["spec"].pop("operationArea")
-    with pytest.raises(BadSignature, match="bounds no drone"):
+    with pytest.raises(BadSignature, match="does not bound its drone"):
         verify(grant(body), CAS)
 
 
 def test_a_zone_without_its_area_is_refused() -> None:
     fence = {"name": "pool", "spec": {"type": "GeofenceControl", "kind": "exclusion", "selector": {"zones": ["pool"]}}}
     for zones in ([], [{"name": "pol", "area": {"circle": {"center": {"lat": 39.36, "lon": 22.95}, "radius": 20}}}]):
-        with pytest.raises(InvalidObject, match="policy pool selects pool; give the area"):
+        with pytest.raises(InvalidObject, match="policy pool selects pool; add the area"):
             signed(policies=[{**fence, "zones": zones}])
 
 

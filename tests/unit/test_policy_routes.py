@@ -205,7 +205,7 @@ def test_a_target_behind_a_wall_is_legal_for_a_drone_that_retraces_its_path() ->
     court = inclusion(box(-300, 60, 300, 300), name="court")
     shut = judge(goto(0, 100), retracing, free(exclusion(box(-100, 40, 30, 50)), court))
     assert shut.code == "WayHomeBlocked"
-    assert "no legal way is found" in shut.reason
+    assert "no legal route around it was found" in shut.reason
 
 
 def test_from_below_a_zone_too_close_overhead_the_first_leg_sinks() -> None:

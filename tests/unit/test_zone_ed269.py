@@ -32,7 +32,7 @@ def test_ed269_of_others():
     assert (spec.altitude.lower, spec.altitude.upper, spec.altitude.reference) == (None, 120, "terrain")
     assert spec.description == "Hospital: PROHIBITED: keep out"
     assert notes == (
-        "BEL0001: no place for country; left out",
+        "BEL0001: country cannot be imported; left out",
         "BEL0001: a Zone forbids nothing by itself; add a policy for restriction PROHIBITED",
     )
     square = {"type": "Polygon", "coordinates": [SQUARE]}
@@ -107,20 +107,20 @@ NO = {"permanent": "NO"}
         ([], {"upperVerticalReference": None}, "geometry[0].upperVerticalReference: must be AGL or AMSL, not None"),
         ([], {"lowerLimit": 30, "upperVerticalReference": "AMSL"}, "geometry[0].lowerVerticalReference: differs from"),
         ([], {"upperLimit": 1e6}, "geometry[0]: altitude.upper: must be less than or equal to 20000"),
-        ([], {"layer": 3}, "geometry[0].layer: a Zone has no place for it; remove it if it means nothing"),
+        ([], {"layer": 3}, "geometry[0].layer: a Zone cannot represent this field; remove it if it does not"),
         (
             [],
             {"horizontalProjection": {"type": "Circle", "center": [4, 50], "radius": 5, "from": 90}},
-            "geometry[0].horizontalProjection.from: a Zone has no place for it",
+            "geometry[0].horizontalProjection.from: a Zone cannot represent this field",
         ),
         (
             [],
             {"horizontalProjection": {"type": "Polygon", "coordinates": [[[4, 50, 9], [5, 50, 9], [5, 51, 9]]]}},
-            "geometry[0].horizontalProjection.coordinates[0][0]: has a height; say how high",
+            "geometry[0].horizontalProjection.coordinates[0][0]: has a height; remove the heights",
         ),
         ([NO | {"schedule": [{"day": ["MON", "HOL"]}]}], {}, "applicability[0].schedule[0].day: 'HOL' is not MON to SUN or ANY"),
         ([NO | {"schedule": [{"day": [{}]}]}], {}, "applicability[0].schedule[0].day: {} is not MON to SUN"),
-        ([NO | {"schedule": [{"startEvent": "BMCT"}]}], {}, "applicability[0].schedule[0].startEvent: a Zone has no place"),
+        ([NO | {"schedule": [{"startEvent": "BMCT"}]}], {}, "applicability[0].schedule[0].startEvent: a Zone cannot represent this field"),
         ([NO | {"schedule": [daily([], "dawn", "dusk")]}], {}, "applicability[0].schedule[0].startTime: must be a time of day"),
         ([NO | {"schedule": [daily([], "08:00", "09:00")]}], {}, "applicability[0].schedule[0].startTime: must be a time of day"),
         ([NO | {"schedule": [daily([], "24:00Z", "09:00Z")]}], {}, "applicability[0].schedule[0].startTime: must be a time of"),
@@ -129,8 +129,8 @@ NO = {"permanent": "NO"}
         ([NO | {"schedule": [daily([], "08:00:30Z", "09:00Z")]}], {}, "applicability[0].schedule[0].startTime: must be a whole"),
         ([NO | {"startDateTime": "2026-03-01T00:00:00"}], {}, "geometry[0]: schedule[0].validFrom: must be a time with its zone"),
         ([{"permanent": "MAYBE"}], {}, "applicability[0].permanent: must be YES or NO, not 'MAYBE'"),
-        ([{"permanent": "YES", "endDateTime": "2026-03-01T00:00:00Z"}], {}, "applicability[0].permanent: is YES, but there are"),
-        ([NO | {"season": "winter"}], {}, "applicability[0].season: a Zone has no place for it"),
+        ([{"permanent": "YES", "endDateTime": "2026-03-01T00:00:00Z"}], {}, "applicability[0].permanent: is YES although times are given"),
+        ([NO | {"season": "winter"}], {}, "applicability[0].season: a Zone cannot represent this field"),
     ],
 )  # fmt: skip
 def test_ed269_refuses_what_a_zone_cannot_keep(applicability, volume, sentence):

@@ -114,7 +114,7 @@ def test_geojson_of_others():
     assert [z.name for z in found.zones] == ["old-town", "old-town-2", "old-town-3"]
     assert found.zones[2].spec.area.circle.radius == 20
     assert found.notes == (
-        "Old Town: no place for properties owner; left out",
+        "Old Town: properties owner cannot be imported; left out",
         "road: a geometry of type LineString is not a zone; left out",
     )
 
@@ -158,7 +158,7 @@ def test_geojson_takes_the_reference_system_that_it_has_anyway_and_heights_besid
     whole = feature(HIGH, id="a", properties={"altitude": {"upper": 30, "reference": "terrain"}}) | {"crs": named}
     found = formats.read_geojson("\ufeff" + json.dumps(whole))
     assert found.zones[0].spec.altitude.upper == 30
-    assert found.notes == ("a: heights of its points are not taken over, properties.altitude is",)
+    assert found.notes == ("a: heights of its points are ignored; properties.altitude is used",)
 
 
 def test_geojson_keeps_every_polygon_of_a_collection():
@@ -199,15 +199,15 @@ LAMBERT = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::31370"}
             {"type": "FeatureCollection", "features": [feature(FLAT) | {"crs": LAMBERT}]},
             "features[0].crs: must be WGS 84",
         ),
-        (feature(HIGH), "geometry.coordinates[0][0]: has a height; say how high the zone is in its altitude"),
-        (feature(FLAT | {"layer": {"upper": 50}}), "geometry.layer: a Zone has no place for it"),
+        (feature(HIGH), "geometry.coordinates[0][0]: has a height; remove the heights"),
+        (feature(FLAT | {"layer": {"upper": 50}}), "geometry.layer: a Zone cannot represent this field"),
         (
             feature({"type": "Point", "coordinates": [4, 50], "extent": {"radius": 5}}),
-            "geometry.extent: a Zone has no place for it",
+            "geometry.extent: a Zone cannot represent this field",
         ),
         (
             feature({"type": "LineString", "coordinates": SQUARE}, properties={"radius": 5}),
-            "properties.radius: goes with a Point",
+            "properties.radius: is valid for a Point only",
         ),
         (feature(FLAT, properties={"altitude": 0}), "geometry: altitude: must be an object with named fields"),
         (
@@ -249,7 +249,7 @@ def test_every_refused_feature_is_told_with_its_line_and_can_be_left_out(tmp_pat
     without = ["--leave-out", "a", "--leave-out", "c"]
     found = CliRunner().invoke(command, ["import", str(source), "--from", "geojson", *without])
     assert [m["metadata"]["name"] for m in yaml.safe_load_all(found.stdout)] == ["b"]
-    assert "a: left out, as asked for" in found.stderr
+    assert "a: left out as requested" in found.stderr
     lost = CliRunner().invoke(command, ["import", str(source), "--from", "geojson", *without, "--leave-out", "d"])
     assert "there is no feature d to leave out; correct its name" in lost.stderr
 
@@ -271,15 +271,13 @@ def test_every_refused_feature_is_told_with_its_line_and_can_be_left_out(tmp_pat
     ],
 )
 def test_properties_that_say_how_high_or_when_in_other_words_are_refused(name, tmp_path):
-    sentence = (
-        "seems to say how high or when the zone counts, in other words than a Zone; say it as altitude or schedule"
-    )
+    sentence = "seems to state the altitude or time of the zone; write it as altitude or schedule"
     text = json.dumps(feature(FLAT, properties={"name": "a", "owner": "x", name: 120}))
     with pytest.raises(InvalidObject, match=sentence) as refused:
         formats.read_geojson(text)
     assert refused.value.field == f"properties.{name}"
     dropped = formats.read_geojson(text, drop=[name])
-    assert dropped.notes == (f"a: no place for properties {', '.join(sorted([name, 'owner']))}; left out",)
+    assert dropped.notes == (f"a: properties {', '.join(sorted([name, 'owner']))} cannot be imported; left out",)
     assert formats.read_geojson(text.replace("120", "null")).zones == dropped.zones
     data = f'<ExtendedData><Data name="{name}"><value>120</value></Data></ExtendedData>'
     with pytest.raises(InvalidObject, match=sentence):
@@ -295,7 +293,7 @@ def test_properties_that_say_how_high_or_when_in_other_words_are_refused(name, t
 @pytest.mark.parametrize("name", ["owner", "kind", "fromage", "timer", "status", "id", "restriction"])
 def test_other_properties_are_told(name):
     found = formats.read_geojson(json.dumps(feature(FLAT, properties={"name": "a", name: "x"})))
-    assert found.notes == (f"a: no place for properties {name}; left out",)
+    assert found.notes == (f"a: properties {name} cannot be imported; left out",)
 
 
 def test_what_is_to_be_dropped_has_to_be_there(tmp_path):
@@ -430,7 +428,7 @@ def test_the_command_imports_and_exports(tmp_path):
     assert "left out" in written.stderr
     larger = CliRunner().invoke(command, ["export", str(target), "--to", "qgc-plan", "--inclusion"])
     assert larger.exit_code == 1
-    assert "town-block: the format has no altitude and no holes; a fence to stay in would be larger" in larger.stderr
+    assert "town-block: the format has no altitude and no holes; an inclusion fence would be larger" in larger.stderr
     wrong = CliRunner().invoke(command, ["import", str(source), "--from", "kml"])
     assert wrong.exit_code == 1
     assert f"{source}: this is not XML" in wrong.stderr

@@ -18,7 +18,7 @@ def test_kml_of_others():
     assert [(z.name, z.spec.description) for z in found.zones] == [("school-yard", "no pictures")]
     assert len(found.zones[0].spec.area.polygon.exterior) == 4
     assert found.notes == (
-        "School & yard: no place for properties owner; left out",
+        "School & yard: properties owner cannot be imported; left out",
         "pin: Point is not a zone; left out",
     )
 
@@ -57,16 +57,16 @@ def test_kml_keeps_all_holes_and_every_polygon_of_a_multigeometry():
     [
         (
             kml("<Polygon><altitudeMode>absolute</altitudeMode>EDGE</Polygon>"),
-            "Polygon[0].altitudeMode: absolute has heights",
+            "Polygon[0].altitudeMode: absolute uses heights",
         ),
         (
             kml("<TimeSpan><begin>2026</begin></TimeSpan><Polygon>EDGE</Polygon>"),
-            "has a time, which a Zone says otherwise",
+            "has a time, which cannot be imported",
         ),
         (kml("<Polygon>EDGE</Polygon>", "<Folder><name>f</name><TimeStamp/></Folder>"), "f: has a time, which"),
         (
             kml("<Polygon>EDGE</Polygon>", "<NetworkLink><name>n</name></NetworkLink>"),
-            "n: a NetworkLink leads to another file",
+            "n: a NetworkLink refers to another file",
         ),
         (kml("<Polygon>EDGEEDGE</Polygon>"), "Polygon[0].outerBoundaryIs: a polygon has exactly one"),
         (kml("<Polygon/>"), "Polygon[0].outerBoundaryIs: a polygon has exactly one"),
@@ -84,14 +84,14 @@ def test_kml_refuses_what_a_zone_cannot_keep(text, sentence):
         ({"polygons": [{"polygon": SQUARE}]}, "geoFence.polygons[0].inclusion: must be true or false, not None"),
         (
             {"polygons": [{"polygon": SQUARE, "inclusion": True, "maxAltitude": 50}]},
-            "geoFence.polygons[0].maxAltitude: a Zone has",
+            "geoFence.polygons[0].maxAltitude: a Zone cannot represent",
         ),
         ({"polygons": [{"polygon": [[1, 2, 3]], "inclusion": True}]}, "geoFence.polygons[0].polygon[0]: has a height"),
         (
             {"circles": [{"circle": {"center": [1, 2], "radius": 3, "units": "ft"}, "inclusion": True}]},
-            "geoFence.circles[0].circle.units: a Zone has no place for it",
+            "geoFence.circles[0].circle.units: a Zone cannot represent this field",
         ),
-        ({"corridors": [1]}, "geoFence.corridors: a Zone has no place for it"),
+        ({"corridors": [1]}, "geoFence.corridors: a Zone cannot represent this field"),
     ],
 )
 def test_qgc_plan_refuses_what_a_zone_cannot_keep(fence, sentence):

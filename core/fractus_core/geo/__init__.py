@@ -1,4 +1,4 @@
-"""Frames, distances and areas."""
+"""Local frames, distances and areas on the WGS 84 ellipsoid."""
 
 from fractus_core.geo.areas import area_center as area_center
 from fractus_core.geo.areas import area_polygon as area_polygon

@@ -1,4 +1,4 @@
-"""Areas of manifests as shapely geometries in a local frame, and back as GeoJSON."""
+"""Conversion between areas of manifests, shapely geometries in a local frame, and GeoJSON. Crossings of lines."""
 
 from __future__ import annotations
 
@@ -17,36 +17,36 @@ from fractus_core.api.model import InvalidObject
 from fractus_core.geo.local_frame import LocalFrame, distance_m
 
 _SEGMENTS = (8, 32)
-"""Straight pieces per quarter of a circle, minimum and maximum: the area is right within 0.4 %."""
+"""Straight pieces per quarter of a circle, minimum and maximum. The area is accurate to 0.4 %."""
 
 _CORNER_M = 0.01
-"""Between these, as few pieces as keep the corners within this distance of the circle."""
+"""Between these limits, the number of pieces keeps the corners within this distance of the circle."""
 
 MAX_EXTENT_M = 1_000_000.0
-"""No point of an area may be further from its middle: beyond, a local frame means nothing."""
+"""Largest distance of a point of an area from its center. A local frame is meaningless beyond it."""
 
 _MIN_CURVATURE_M = 6_335_000.0
-"""The ellipsoid bends no more than a sphere of this radius."""
+"""Smallest radius of curvature of the ellipsoid."""
 
 _SNAPPED = 1e-5
-"""GEOS merges corners that are closer than about a millionth of the radius, which would cut short a leg as short."""
+"""GEOS merges corners closer than about a millionth of the radius, which would cut short a leg of that length."""
 
 
 def points_xy(frame: LocalFrame, points: Iterable[Point]) -> list[tuple[float, float]]:
-    """Metres east and north of each point."""
+    """Return metres east and north of each point."""
     return [frame.xy(p.lat, p.lon) for p in points]
 
 
 def area_polygon(frame: LocalFrame, area: Area, *, within: bool = False) -> shapely.Polygon:
-    """The area in metres east and north of the frame's origin; a circle is circumscribed, never cut short.
+    """Return the area in metres east and north of the frame's origin. A circle is circumscribed.
 
     Args:
-        frame: where.
-        area: what.
-        within: a circle is inscribed instead, and never exceeded.
+        frame: Frame of the result.
+        area: Polygon or circle.
+        within: Inscribe a circle instead, so that the result never exceeds it.
 
     Raises:
-        InvalidObject: a ring crosses itself, encloses nothing, or a hole leaves the exterior.
+        InvalidObject: A ring crosses itself or encloses nothing, or a hole leaves the exterior.
     """
     if area.circle is not None:
         return _circle(frame, area.circle, within=within)
@@ -59,7 +59,7 @@ def _circle(frame: LocalFrame, circle: Circle, *, within: bool) -> shapely.Polyg
     x, y = frame.xy(circle.center.lat, circle.center.lon)
     radius_m, segments = _circumscribed(circle.radius)
     if within:
-        # The frame shows what is far from its origin too small, so that as many of its metres reach too far.
+        # The frame shortens distances far from its origin, so the same number of its metres would exceed the circle.
         furthest = (math.hypot(x, y) + circle.radius) / _MIN_CURVATURE_M
         radius_m = circle.radius * math.sqrt(max(1.0 - furthest * furthest, 0.0))
     return shapely.Point(x, y).buffer(radius_m, quad_segs=segments)
@@ -95,9 +95,9 @@ def _ring(frame: LocalFrame, ring: Sequence[Point], field: str) -> shapely.Polyg
 
 
 def corridor(frame: LocalFrame, points: Iterable[Point], radius_m: float) -> BaseGeometry:
-    """A path dilated by a radius, in metres; the boundary is circumscribed.
+    """Return a path dilated by a radius in metres, with a circumscribed boundary.
 
-    Legs are dilated one by one and then united: dilating a path that crosses itself a thousand times as a whole takes
+    Legs are dilated one by one and then united, because dilating a path that crosses itself a thousand times takes
     minutes.
     """
     xy = points_xy(frame, points)
@@ -109,7 +109,7 @@ def corridor(frame: LocalFrame, points: Iterable[Point], radius_m: float) -> Bas
 
 
 def _circumscribed(radius_m: float) -> tuple[float, int]:
-    """How far the corners of a polygon around a circle lie from its middle, and how many pieces a quarter has."""
+    """Return the corner distance of a polygon around a circle, and its number of pieces per quarter."""
     needed = math.ceil(math.pi / 4 / math.acos(radius_m / (radius_m + _CORNER_M)))
     fewest, maximum = _SEGMENTS
     segments = min(max(needed, fewest), maximum)
@@ -117,10 +117,10 @@ def _circumscribed(radius_m: float) -> tuple[float, int]:
 
 
 def check_extent(area: Area) -> None:
-    """Refuse an area of continental size.
+    """Reject an area of continental size.
 
     Raises:
-        InvalidObject: naming the first point that is too far away.
+        InvalidObject: Names the first point that is too far away.
     """
     centre = area_center(area)
     for i, point in enumerate(area.polygon.exterior if area.polygon is not None else ()):
@@ -130,7 +130,7 @@ def check_extent(area: Area) -> None:
 
 
 def area_center(area: Area) -> Point:
-    """A point that serves as the origin of a frame for the area."""
+    """Return a point that serves as the origin of a frame for the area."""
     if area.circle is not None:
         return area.circle.center
     if area.polygon is None:
@@ -139,7 +139,7 @@ def area_center(area: Area) -> Point:
 
 
 def center_of(points: Iterable[Point]) -> Point:
-    """The middle of points on the sphere; it is right across the antimeridian and near the poles."""
+    """Return the center of points on the sphere. It is also correct across the antimeridian and near the poles."""
     rad = np.radians([(p.lat, p.lon) for p in points])
     lat, lon = rad[:, 0], rad[:, 1]
     vector = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)]).mean(axis=1)
@@ -152,7 +152,7 @@ def center_of(points: Iterable[Point]) -> Point:
 
 
 def areas_of_shape(frame: LocalFrame, shape: BaseGeometry) -> tuple[Area, ...]:
-    """A (multi)polygon in metres as areas of the API."""
+    """Return a (multi)polygon in metres as areas of the API."""
     return tuple(
         Area(
             polygon=Polygon(
@@ -166,7 +166,10 @@ def areas_of_shape(frame: LocalFrame, shape: BaseGeometry) -> tuple[Area, ...]:
 
 
 def multipolygon_geojson(frame: LocalFrame, shape: BaseGeometry) -> dict[str, Any]:
-    """A (multi)polygon in metres as a GeoJSON MultiPolygon, lon before lat, split at the antimeridian (RFC 7946)."""
+    """Return a (multi)polygon in metres as a GeoJSON MultiPolygon, lon before lat.
+
+    The result is cut at the antimeridian (RFC 7946).
+    """
     polygons = []
     for part in shapely.get_parts(shape):
         rings = [_unwrapped(frame, ring) for ring in (part.exterior, *part.interiors)]
@@ -174,7 +177,8 @@ def multipolygon_geojson(frame: LocalFrame, shape: BaseGeometry) -> dict[str, An
         rings = [_shifted(ring, _near(ring[0][0], reference) - ring[0][0]) for ring in rings]
         whole = shapely.Polygon(rings[0], rings[1:])
         if any(_turns(ring) for ring in rings) or not whole.is_valid:
-            # On the grid of what is written: slivers that a straight way past the pole leaves would round to nothing.
+            # Use the precision of the output, because slivers left by a straight edge past the pole would round to
+            # nothing.
             polygons += _parts(shapely.set_precision(part, 1e-7) for part in _parts(_cut(_beside_pole(rings))))
         else:
             polygons += _parts(_cut(whole))
@@ -186,7 +190,7 @@ def multipolygon_geojson(frame: LocalFrame, shape: BaseGeometry) -> dict[str, An
 
 
 def line_geojson(points: Sequence[Point]) -> dict[str, Any]:
-    """A polyline as a GeoJSON MultiLineString, lon before lat, cut at the antimeridian (RFC 7946)."""
+    """Return a polyline as a GeoJSON MultiLineString, lon before lat, cut at the antimeridian (RFC 7946)."""
     unwrapped: list[tuple[float, float]] = []
     for p in points:
         unwrapped.append((_near(p.lon, unwrapped[-1][0]) if unwrapped else p.lon, p.lat))
@@ -196,16 +200,16 @@ def line_geojson(points: Sequence[Point]) -> dict[str, Any]:
 
 
 def _cut(whole: BaseGeometry) -> Iterator[BaseGeometry]:
-    """The parts of what crosses the antimeridian, each with longitudes from -180 to 180."""
+    """Yield the parts of a shape that crosses the antimeridian, each with longitudes from -180 to 180."""
     for shift in (0.0, 360.0, -360.0):
         moved = shapely.transform(whole, lambda c, s=shift: c + np.array([s, 0.0]))
         yield from shapely.get_parts(moved.intersection(shapely.box(-180.0, -90.0, 180.0, 90.0)))
 
 
 def _unwrapped(frame: LocalFrame, ring: BaseGeometry) -> list[tuple[float, float]]:
-    """Lon, lat of a ring, each longitude within 180 degrees of its neighbour."""
+    """Return lon, lat of a ring, each longitude within 180 degrees of its neighbour."""
     lats, lons = frame.latlon_array(shapely.get_coordinates(ring))
-    # By whole turns, which are exact: so the ring stays closed.
+    # Whole turns are exact, so the ring stays closed.
     lons[1:] -= 360.0 * np.cumsum(np.round(np.diff(lons) / 360.0))
     return list(zip(lons.tolist(), lats.tolist(), strict=True))
 
@@ -216,14 +220,14 @@ def _parts(shapes: Iterable[BaseGeometry]) -> list[shapely.Polygon]:
 
 
 def _turns(ring: Sequence[tuple[float, float]]) -> bool:
-    """Whether an unwrapped ring goes around a pole: it ends a whole turn from where it began."""
+    """Return True if an unwrapped ring encloses a pole: it ends a whole turn from its start."""
     return abs(ring[-1][0] - ring[0][0]) > 180.0
 
 
 def _beside_pole(rings: Iterable[Sequence[tuple[float, float]]]) -> BaseGeometry:
-    """What the rings enclose on a map of degrees, where a pole is a line and a straight way past it is none."""
+    """Return the area enclosed by rings on a map of degrees, in which a pole is a line that no edge can pass."""
     exterior, *holes = rings
-    # A hole may lie a whole turn from where the exterior begins.
+    # A hole may lie a whole turn from the start of the exterior.
     turned = (_closed(_shifted(hole, shift)) for hole in holes for shift in (-360.0, 0.0, 360.0))
     return _closed(exterior).difference(shapely.union_all(list(turned)))
 
@@ -245,7 +249,7 @@ def _near(lon: float, reference: float) -> float:
 
 
 def _points(frame: LocalFrame, ring: BaseGeometry) -> tuple[Point, ...]:
-    """The corners of a ring, without the first once more."""
+    """Return the corners of a ring without the repetition of the first."""
     lats, lons = frame.latlon_array(shapely.get_coordinates(ring)[:-1])
     return tuple(
         Point(lat=round(lat, 9), lon=round(lon, 9)) for lat, lon in zip(lats.tolist(), lons.tolist(), strict=True)
@@ -253,27 +257,29 @@ def _points(frame: LocalFrame, ring: BaseGeometry) -> tuple[Point, ...]:
 
 
 def ground_point(position: Position) -> Point:
-    """The place on the ground below a position."""
+    """Return the point on the ground below a position."""
     return Point(lat=position.lat, lon=position.lon)
 
 
 Line = npt.NDArray[np.float64]
-"""The corners of a line in order, in metres: one a row."""
+"""The corners of a line in order, in metres, one per row."""
 
 _AT_ONCE = 64
-"""Pieces that are compared with all others at a time: of 30,000, these make a million pairs."""
+"""Number of pieces compared with all others at a time. For 30,000 pieces this makes a million pairs."""
 _MAX_PAIRS = 2_500_000
-"""Pairs of pieces that are looked at, within a second: as many as a way of two thousand pieces side by side has."""
+"""Number of pairs of pieces examined at most, within a second. A route of two thousand parallel pieces has this many.
+"""
 
 
 def count_crossings(lines: Sequence[Line], at_most: int) -> int:
-    """How many pairs of straight pieces cross, within a line and between lines; pieces that only touch do not.
+    """Count the pairs of straight pieces that cross, within a line and between lines. Touching pieces do not count.
 
-    Pieces are looked up by their bounding boxes: n pieces of which k pairs are near each other cost O(n log n + k).
+    The count is a cheap check before computations that take longer the more often lines cross. Pieces are looked up by
+    their bounding boxes: n pieces with k nearby pairs cost O(n log n + k).
 
     Args:
-        lines: of two corners or more each.
-        at_most: where the count ends; there are more, or more than can be looked at, where the result is larger.
+        lines: Lines of two or more corners each.
+        at_most: Count at which the search ends. A larger result means more crossings, or too many pairs to examine.
     """
     starts = np.concatenate([line[:-1] for line in lines]) if lines else np.empty((0, 2))
     ends = np.concatenate([line[1:] for line in lines]) if lines else np.empty((0, 2))
@@ -291,12 +297,15 @@ def count_crossings(lines: Sequence[Line], at_most: int) -> int:
 
 
 def _cross(a: Line, b: Line, c: Line, d: Line) -> npt.NDArray[np.bool_]:
-    """Whether the pieces from a to b cross those from c to d: the ends of each are on both sides of the other."""
+    """Return True if the pieces from a to b cross those from c to d.
+
+    Two pieces cross if the ends of each are on both sides of the other.
+    """
     apart = _side(a, b, c) * _side(a, b, d) < 0
     return apart & (_side(c, d, a) * _side(c, d, b) < 0)
 
 
 def _side(start: Line, end: Line, place: Line) -> npt.NDArray[np.float64]:
-    """On which side of the way from start to end a place is: positive on the left."""
+    """Return the side of the line from start to end on which a place is: positive on the left."""
     way, there = end - start, place - start
     return np.sign(way[:, 0] * there[:, 1] - way[:, 1] * there[:, 0])

@@ -18,14 +18,14 @@ _E2 = FLATTENING * (2 - FLATTENING)
 _PER_A2, _PER_B2 = SEMI_MAJOR_AXIS_M**-2, (SEMI_MAJOR_AXIS_M * (1 - FLATTENING)) ** -2
 
 CHORDS_TO_M = 200_000.0
-"""Up to here geodesic distances come from chords; beyond from Karney's algorithm."""
+"""Up to this distance, geodesic distances are computed from chords, beyond it by Karney's algorithm."""
 
 Coordinates = NDArray[np.float64]
 Metres = TypeVar("Metres", float, Coordinates)
 
 
 def geodesic_m(a: Point, b: Point) -> float:
-    """Length in metres of the shortest line between two points on the WGS 84 ellipsoid.
+    """Return the length in metres of the shortest line between two points on the WGS 84 ellipsoid.
 
     Source: C. F. F. Karney, "Algorithms for geodesics", J. Geodesy 87 (2013).
     """
@@ -33,9 +33,10 @@ def geodesic_m(a: Point, b: Point) -> float:
 
 
 def distance_m(a: Point, b: Point) -> float:
-    """The geodesic distance in metres, twenty times faster than `geodesic_m` and within a micrometre of it up to 50 km.
+    """Return the geodesic distance in metres, twenty times faster than `geodesic_m`.
 
-    Found from the chord, bent by the ellipsoid's curvature along it; beyond 200 km it is `geodesic_m`.
+    The error is below a micrometre up to 50 km. The distance is computed from the chord, bent by the ellipsoid's
+    curvature along it. Beyond 200 km the function calls `geodesic_m`.
     """
     (ax, ay, az), (bx, by, bz) = ecef(a.lat, a.lon), ecef(b.lat, b.lon)
     across, up = (bx - ax) ** 2 + (by - ay) ** 2, (bz - az) ** 2
@@ -52,12 +53,12 @@ def distance_m(a: Point, b: Point) -> float:
 
 
 def ecef(lat: Metres, lon: Metres, of: ModuleType = math) -> tuple[Metres, Metres, Metres]:
-    """Earth-centred, Earth-fixed coordinates in metres of a point on the ellipsoid in degrees.
+    """Return Earth-centred, Earth-fixed coordinates in metres of a point on the ellipsoid in degrees.
 
     Args:
-        lat: degrees north.
-        lon: degrees east.
-        of: whose functions to use: `math` for one point, `numpy` for arrays of them.
+        lat: Degrees north.
+        lon: Degrees east.
+        of: Module with the functions to use: `math` for one point, `numpy` for arrays.
     """
     phi, lam = of.radians(lat), of.radians(lon)
     sin_phi = of.sin(phi)
@@ -69,9 +70,9 @@ def ecef(lat: Metres, lon: Metres, of: ModuleType = math) -> tuple[Metres, Metre
 class LocalFrame:
     """Orthographic projection of the WGS 84 ellipsoid around an origin: metres east and north.
 
-    Planar distances fall short of geodesic ones by a factor of about (s/R)^2/6 at a distance s from the origin:
-    1e-5 at 50 km, nothing that matters within a flight. Neither the antimeridian nor the poles are special.
-    Points beyond the horizon (a quarter of the globe away) have no meaning in it.
+    Planar distances are shorter than geodesic ones by a factor of about (s/R)^2/6 at a distance s from the origin: 1e-5
+    at 50 km, which is negligible for a flight. The antimeridian and the poles need no special treatment. Points beyond
+    the horizon (a quarter of the globe away) cannot be represented.
     """
 
     __slots__ = ("_cos_lat", "_cos_lon", "_origin", "_sin_lat", "_sin_lon", "_up", "lat", "lon")
@@ -87,12 +88,12 @@ class LocalFrame:
 
     @classmethod
     def at(cls, point: Point) -> LocalFrame:
-        """The frame whose origin is a point."""
+        """Return the frame with a point as its origin."""
         return cls(point.lat, point.lon)
 
     def xy(self, lat: float, lon: float) -> tuple[float, float]:
-        """Metres east and north of the origin, of a point on the ellipsoid in degrees."""
-        # Written out, and not by `ecef`: every judgement passes here several times.
+        """Return metres east and north of the origin, of a point on the ellipsoid in degrees."""
+        # This repeats `ecef` inline, because every judgement calls it several times.
         phi, lam = math.radians(lat), math.radians(lon)
         sin_phi, cos_phi = math.sin(phi), math.cos(phi)
         n = SEMI_MAJOR_AXIS_M / math.sqrt(1 - _E2 * sin_phi * sin_phi)
@@ -104,7 +105,7 @@ class LocalFrame:
         return east, north
 
     def xy_array(self, lats: Coordinates, lons: Coordinates) -> Coordinates:
-        """Metres east and north, shape (n, 2), of points on the ellipsoid in degrees, shapes (n,)."""
+        """Return metres east and north, shape (n, 2), of points on the ellipsoid in degrees, shapes (n,)."""
         x, y, z = ecef(lats, lons, np)
         dx, dy, dz = x - self._origin[0], y - self._origin[1], z - self._origin[2]
         east = -self._sin_lon * dx + self._cos_lon * dy
@@ -112,10 +113,10 @@ class LocalFrame:
         return np.column_stack((east, north))
 
     def latlon(self, x: float, y: float) -> tuple[float, float]:
-        """Degrees north and east of the point x metres east and y metres north; the inverse of xy.
+        """Return degrees north and east of the point x metres east and y metres north. The inverse of `xy`.
 
         Raises:
-            ValueError: the point lies beyond the horizon of the frame.
+            ValueError: The point lies beyond the horizon of the frame.
         """
         u, v, w = self._up
         p, q, z = self._plane(x, y)
@@ -127,10 +128,10 @@ class LocalFrame:
         return math.degrees(math.atan2(z, (1 - _E2) * math.hypot(p, q))), math.degrees(math.atan2(q, p))
 
     def latlon_array(self, xy: Coordinates) -> tuple[Coordinates, Coordinates]:
-        """Degrees north and degrees east, shapes (n,), of points x metres east and y metres north, shape (n, 2).
+        """Return degrees north and degrees east, shapes (n,), of points x metres east and y metres north, shape (n, 2).
 
         Raises:
-            ValueError: a point lies beyond the horizon of the frame.
+            ValueError: A point lies beyond the horizon of the frame.
         """
         x, y = xy[:, 0], xy[:, 1]
         u, v, w = self._up
@@ -145,10 +146,11 @@ class LocalFrame:
         return np.degrees(np.arctan2(z, (1 - _E2) * np.hypot(p, q))), np.degrees(np.arctan2(q, p))
 
     def _above(self, p: Metres, q: Metres, z: Metres) -> tuple[Metres, Metres, Metres]:
-        """What tells where the frame's vertical through a point meets the ellipsoid: a quadratic equation in the height.
+        """Return the quadratic equation for the height of a point above the ellipsoid along the frame's vertical.
 
         Returns:
-            Its constant term, half its linear one, and a quarter of its discriminant, which is negative beyond the horizon.
+            Its constant term, half its linear term, and a quarter of its discriminant, which is negative beyond the
+            horizon.
         """
         u, v, w = self._up
         curve = (u * u + v * v) * _PER_A2 + w * w * _PER_B2
@@ -160,7 +162,7 @@ class LocalFrame:
         return ValueError(f"({x:.0f}, {y:.0f}) m is beyond the horizon of the frame at {self.lat}, {self.lon}")
 
     def _plane(self, east: Metres, north: Metres) -> tuple[Metres, Metres, Metres]:
-        """Earth-centred coordinates of what lies in the plane that touches the ellipsoid at the origin."""
+        """Return Earth-centred coordinates of points in the plane that touches the ellipsoid at the origin."""
         return (
             self._origin[0] - self._sin_lon * east - self._sin_lat * self._cos_lon * north,
             self._origin[1] + self._cos_lon * east - self._sin_lat * self._sin_lon * north,

@@ -1,1 +1,1 @@
-"""Policies and plan to Grant; call, situation and Grant to Verdict."""
+"""Policy engine: compiles Grants and decides on calls and on the motion of a flying drone."""

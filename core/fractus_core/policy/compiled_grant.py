@@ -1,4 +1,7 @@
-"""A grant made ready for the engine: geometries in metres, indexed, so that a check takes microseconds."""
+"""Grants compiled for the engine: geometries in metres of a local frame, with spatial indexes.
+
+A check then takes microseconds.
+"""
 
 from __future__ import annotations
 
@@ -21,18 +24,19 @@ from fractus_core.policy.altitude import band_may_overlap, band_surely_contains
 from fractus_core.policy.decision_types import Situation, UncertainTime, earliest_time
 
 MAX_FRAME_REACH_M = 500_000.0
-"""Ground further than this from the origin is left out of the frame: no drone of ours gets there."""
+"""Zones farther than this from the origin are left out of the frame, because no drone reaches them."""
 MAX_UNINDEXED = 4
-"""Up to this many zones are faster to test one by one than through an index."""
+"""Up to this number of zones, testing each zone is faster than an index."""
 _WITHIN = frozenset({"inclusion", "grant"})
-"""Kinds of policies that allow something in their zones: what stands for a zone must not be larger."""
+"""Kinds of policies that permit something inside their zones. Approximations of these zones must not be larger than the
+zone."""
 OPERATION_AREA = "operation-area"
-"""Name under which verdicts list the fence that every grant implies."""
+"""Policy name that verdicts use for the fence that every grant implies."""
 
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """A policy that holds for the instance, without its zones."""
+    """A policy that applies to the instance, without its zones."""
 
     name: str
     spec: PolicySpec
@@ -41,17 +45,17 @@ class Rule:
 
     @property
     def limited_in_time(self) -> bool:
-        """Whether the policy has a validity window."""
+        """True if the policy has a validity window."""
         return math.isfinite(self.valid_from_s) or math.isfinite(self.valid_until_s)
 
     def in_force(self, time_s: float) -> bool:
-        """Whether the policy is in its validity window."""
+        """Return True if the policy may be in its validity window at a time."""
         return self.valid_from_s <= time_s and earliest_time(time_s) < self.valid_until_s
 
 
 @dataclass(frozen=True, slots=True)
 class PolicyZone:
-    """One zone of one policy."""
+    """A zone of a policy."""
 
     rule: Rule
     name: str
@@ -60,7 +64,7 @@ class PolicyZone:
     schedule: tuple[ActiveTime, ...] = ()
 
     def in_force(self, time_s: float) -> bool:
-        """Whether the policy is in its validity window, and the zone active."""
+        """Return True if the policy may be in its validity window and the zone active at a time."""
         if not self.rule.in_force(time_s):
             return False
         return active_at(self.schedule, time_s) or (
@@ -70,7 +74,7 @@ class PolicyZone:
 
 @dataclass(frozen=True, slots=True)
 class AirVolume:
-    """Where a decision looks: a piece of ground, how far around it, and between which altitudes above home."""
+    """Search volume of a decision: a ground shape, the margin around it, and an altitude range above home."""
 
     ground: BaseGeometry
     margin_m: float
@@ -79,7 +83,7 @@ class AirVolume:
 
 
 class PolicyIndex:
-    """Zones of policies in a spatial index, and the policies that hold everywhere."""
+    """Spatial index of the zones of policies, and the policies without zones, which hold everywhere."""
 
     __slots__ = ("_tree", "everywhere", "zones")
 
@@ -93,11 +97,11 @@ class PolicyIndex:
         return bool(self.zones or self.everywhere)
 
     def near(self, air: AirVolume, now: Situation, flat: bool) -> Iterator[PolicyZone]:
-        """Zones in force that come within the margin of a piece of air.
+        """Yield the zones in force within the margin of a volume.
 
-        A band whose datum is unknown reaches from the ground to the sky.
+        An altitude limit of unknown datum does not exclude a zone.
         """
-        # Distances, not bounding boxes: a box around a long slanted zone would hold half the sky, and deny it.
+        # Use distances instead of bounding boxes, because the box of a long slanted zone would cover much of the map.
         if self._tree is None:
             near = [z for z in self.zones if z.shape.dwithin(air.ground, air.margin_m)]
         else:
@@ -122,7 +126,7 @@ class Inclusion:
     banded: bool
 
     def at(self, lower_m: float, upper_m: float, now: Situation, flat: bool) -> tuple[BaseGeometry, BaseGeometry]:
-        """The allowed ground and its border for a range of altitudes above home."""
+        """Return the allowed ground and its border for a range of altitudes above home."""
         if not self.banded:
             return self.shape, self.border
         kept = [
@@ -136,18 +140,18 @@ class Inclusion:
 
 @dataclass(frozen=True, slots=True)
 class CompiledGrant:
-    """What the engine knows of one component instance.
+    """Permissions and restrictions of one component instance.
 
     Attributes:
-        methods: granted methods of all services.
-        denials: per method, policies that forbid it.
-        allowances: per method, policies that say where and when it is granted; a method that none of them names is
-            granted by the grant itself.
-        operation: where services may be used; None: anywhere.
-        passage: where the instance may fly: operation area and the way between it and home, or under partial control the
-            operation area alone; None: anywhere.
-        timed: the zones of geofences that have a schedule, or whose policy has a validity window.
-        homeward: where the system flies the drone home: operation area and the way between it and home; None: anywhere.
+        methods: Granted methods of all services.
+        denials: Per method, the policies that forbid it.
+        allowances: Per method, the policies that say where and when it is granted. A method without an entry is granted
+            by the grant itself.
+        operation_area: Area in which services may be used. None means anywhere.
+        flight_area: Area in which the instance may fly: operation area and corridor to home, or only the operation area
+            under partial control. None means anywhere.
+        return_area: Area in which the system flies the drone home: operation area and corridor. None means anywhere.
+        timed_zones: Zones of geofences that have a schedule, or whose policy has a validity window.
     """
 
     identity: str
@@ -173,25 +177,25 @@ class CompiledGrant:
     timed_zones: tuple[PolicyZone, ...]
 
     def fences_in_force(self, time_s: float) -> tuple[bool, ...]:
-        """Which of the fences that are limited in time hold at a moment, in seconds since 1970."""
+        """Return, for each of the time-limited fences, whether it holds at a Unix time."""
         return tuple(zone.in_force(time_s) for zone in self.timed_zones)
 
     def locate(self, now: Situation) -> tuple[float, float] | None:
-        """Where the drone is, in metres of the frame; None while it is unknown."""
+        """Return the drone's position in metres of the frame, or None while it is unknown."""
         return None if now.lat is None or now.lon is None else self.frame.xy(now.lat, now.lon)
 
 
 def compile_grant(spec: GrantSpec, origin: Point | None = None, flat_terrain: bool = False) -> CompiledGrant:
-    """Prepare a grant for the engine.
+    """Compile a grant for the engine.
 
     Args:
-        spec: the grant as the operator wrote it.
-        origin: origin of the metric frame, the drone's home say; by default the grant's own home, depot or area.
-        flat_terrain: take the ground everywhere for as high as home. Otherwise what is measured from terrain is unknown,
-            and policies that need it refuse.
+        spec: Grant as written by the operator.
+        origin: Origin of the metric frame, for example the drone's home. Default: the grant's own home, depot or area.
+        flat_terrain: Take the ground everywhere as level with home. Otherwise altitudes above terrain are unknown, and
+            policies that need them deny.
 
     Raises:
-        InvalidObject: an area of the grant has no sound geometry.
+        InvalidObject: An area of the grant has an invalid geometry.
     """
     frame = LocalFrame.at(origin or _origin(spec))
     zoned = [(_rule(policy), policy) for policy in spec.policies]
@@ -230,10 +234,10 @@ def compile_grant(spec: GrantSpec, origin: Point | None = None, flat_terrain: bo
 
 
 def compile_transit_grant(spec: GrantSpec, origin: Point | None = None, flat_terrain: bool = False) -> CompiledGrant:
-    """The grant under which the system itself flies an application's drone: to its control points and home.
+    """Compile the grant under which the system itself flies an application's drone to control points and home.
 
-    It is under the application's fences and limits, has every method of the mobility service, and may be anywhere in the
-    operation area and the corridor.
+    It has the application's fences and limits, every method of the mobility service, and an operation area that
+    includes the corridor.
     """
     own = ServiceRequest(service="mobility", methods=MOBILITY_METHODS)
     system = spec.model_copy(update={"services": (own,), "control": "full"})
@@ -259,13 +263,13 @@ def _rule(policy: GrantedPolicy) -> Rule:
 
 
 def _prepared(shape: BaseGeometry) -> BaseGeometry:
-    # GEOS indexes the edges of a prepared shape: thousands of checks against it pay for that once.
+    """Index the edges of a shape in place (GEOS). Thousands of checks against the shape pay for it once."""
     shapely.prepare(shape)
     return shape
 
 
 def _union(frame: LocalFrame, areas: tuple[Area, ...]) -> BaseGeometry | None:
-    """Ground to stay on."""
+    """Return the union of areas to stay in. Circles are inscribed."""
     if not areas:
         return None
     return _prepared(shapely.union_all([area_polygon(frame, area, within=True) for area in areas]))
@@ -283,7 +287,10 @@ def _policy_zones(frame: LocalFrame, rule: Rule, policy: GrantedPolicy) -> list[
 
 
 def _within_reach(frame: LocalFrame, area: Area) -> bool:
-    """Whether the frame can show the area: some of it is near, or it may reach around the frame."""
+    """Return True if the frame can represent the area.
+
+    Part of the area is near the origin, or the area may reach around the globe to it.
+    """
     if area.circle is not None:
         center = LocalFrame.at(area.circle.center)
         x, y = center.xy(frame.lat, frame.lon)
@@ -291,7 +298,8 @@ def _within_reach(frame: LocalFrame, area: Area) -> bool:
         return near and _same_side(frame, area.circle.center)
     ring = area.polygon.exterior if area.polygon is not None else ()
     if not all(_same_side(frame, point) for point in ring):
-        # Far away, unless it is so large that it may reach around the globe to here.
+        # The area is far away, unless it is so large that it reaches around the globe. `check_extent` rejects such
+        # areas.
         check_extent(area)
         return False
     xy = [frame.xy(p.lat, p.lon) for p in ring]
@@ -305,7 +313,7 @@ def _within_reach(frame: LocalFrame, area: Area) -> bool:
 
 
 def _same_side(frame: LocalFrame, point: Point) -> bool:
-    """Whether a point lies on the frame's half of the globe."""
+    """Return True if a point lies on the frame's half of the globe."""
     apart = abs((point.lon - frame.lon + 180.0) % 360.0 - 180.0)
     return apart < 80.0 or (abs(frame.lat) > 60.0 and abs(point.lat) > 30.0)
 

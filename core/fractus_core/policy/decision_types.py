@@ -1,4 +1,4 @@
-"""What the policy engine takes and gives: calls, situations, verdicts."""
+"""Inputs and outputs of the policy engine: calls, situations, verdicts."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from fractus_core.api.methods import METHODS_OF, Service
 from fractus_core.api.policies import FaceMethod, Fallback, FilterAction
 
 STATIONARY_MPS = 0.5
-"""A drone slower than this, on the ground and vertically, stands: it turns on the spot, within its tracking margin."""
+"""Below this horizontal and vertical speed a drone counts as stationary: it turns on the spot, within its tracking
+margin."""
 
 Action = Literal["allow", "correct", "deny", "takeover"]
 Takeover = Literal["hover", "land", "returnToLaunch", "revoke"]
@@ -23,7 +24,7 @@ class TakeoffArgs:
     """Climb from the ground.
 
     Attributes:
-        altitude_m: metres above home.
+        altitude_m: Metres above home.
     """
 
     altitude_m: float
@@ -34,12 +35,12 @@ class GotoArgs:
     """Fly straight to a point.
 
     Attributes:
-        lat: degrees north, WGS 84.
-        lon: degrees east, WGS 84.
-        alt: metres in the datum of `reference`; None keeps the present altitude.
-        reference: what `alt` is measured from.
-        yaw_deg: heading to hold, degrees clockwise from true north; None leaves it to the autopilot.
-        speed_mps: horizontal speed to fly at; None keeps the speed in force.
+        lat: Degrees north, WGS 84.
+        lon: Degrees east, WGS 84.
+        alt: Metres in the datum of `reference`. None keeps the present altitude.
+        reference: Datum of `alt`.
+        yaw_deg: Heading to hold, degrees clockwise from true north. None leaves the heading to the autopilot.
+        speed_mps: Horizontal speed to fly at. None keeps the current speed setpoint.
     """
 
     lat: float
@@ -59,14 +60,14 @@ class SetSpeedArgs:
 
 @dataclass(frozen=True, slots=True)
 class VelocityArgs:
-    """Fly with a velocity until the next one comes, or until the hold is over and the drone stops by itself.
+    """Fly with a velocity until the next setpoint arrives or the hold time ends, after which the drone is stopped.
 
     Attributes:
-        north_mps: velocity over ground.
-        east_mps: velocity over ground.
-        down_mps: velocity, positive down.
-        yaw_deg: heading to hold, degrees clockwise from true north; None leaves it to the autopilot.
-        hold_s: seconds after which the drone is stopped when no other setpoint has come.
+        north_mps: Velocity over ground.
+        east_mps: Velocity over ground.
+        down_mps: Vertical velocity, positive down.
+        yaw_deg: Heading to hold, degrees clockwise from true north. None leaves the heading to the autopilot.
+        hold_s: Seconds after which the drone is stopped if no other setpoint has arrived.
     """
 
     north_mps: float
@@ -78,11 +79,11 @@ class VelocityArgs:
 
 @dataclass(frozen=True, slots=True)
 class PointGimbalArgs:
-    """Turn the camera by the gimbal.
+    """Point the camera with the gimbal.
 
     Attributes:
-        pitch_deg: over the horizon: 0 looks ahead, -90 straight down.
-        yaw_deg: clockwise from the nose, which the camera follows.
+        pitch_deg: Angle above the horizon: 0 looks ahead, -90 straight down.
+        yaw_deg: Degrees clockwise from the nose. The camera follows the nose.
     """
 
     pitch_deg: float
@@ -91,29 +92,30 @@ class PointGimbalArgs:
 
 @dataclass(frozen=True, slots=True)
 class CaptureArgs:
-    """Take a picture of this size in pixels; 0 means the camera's default."""
+    """Take a picture of this size in pixels. 0 means the camera's default."""
 
     width: int = 0
     height: int = 0
 
 
 class UncertainTime(float):
-    """Unix time of a clock that was set back: the later reading, and the earlier one that may be right instead.
+    """Unix time of a clock that was set back. Its value is the later reading.
 
-    Restrictions hold from the earlier to the later reading, permissions only when they hold at both.
+    The earlier reading may be right instead. A restriction holds if it holds at any time between the readings. A
+    permission holds only if it holds at both readings.
     """
 
     earliest: float
 
     def __new__(cls, latest: float, earliest: float) -> UncertainTime:
-        """A time between two readings."""
+        """Create the time between two readings."""
         moment = super().__new__(cls, latest)
         moment.earliest = min(earliest, latest)
         return moment
 
 
 def earliest_time(time_s: float) -> float:
-    """The earliest that a time may be."""
+    """Return the earlier reading of an uncertain time, or the time itself."""
     return time_s.earliest if isinstance(time_s, UncertainTime) else time_s
 
 
@@ -122,7 +124,7 @@ Args = TakeoffArgs | GotoArgs | SetSpeedArgs | VelocityArgs | PointGimbalArgs | 
 
 @dataclass(frozen=True, slots=True)
 class Call:
-    """One service method with its arguments, as a component asked for it."""
+    """A call of a service method by a component."""
 
     method: str
     args: Args = None
@@ -135,7 +137,7 @@ class Call:
 
 @dataclass(frozen=True, slots=True)
 class Home:
-    """Where the drone took off and returns to: degrees, and metres above mean sea level."""
+    """Takeoff and return location: degrees, and metres above mean sea level."""
 
     lat: float
     lon: float
@@ -144,17 +146,17 @@ class Home:
 
 @dataclass(frozen=True, slots=True)
 class Airframe:
-    """How the autopilot moves the drone; the defaults are ArduCopter's.
+    """Motion parameters of the autopilot. The defaults are those of ArduCopter.
 
     Attributes:
-        accel_mps2: horizontal acceleration it brakes with.
-        position_gain: proportional gain of the position controller, 1/s.
-        climb_accel_mps2: vertical acceleration.
-        jerk_mps3: how fast it changes its acceleration.
-        return_altitude_m: altitude above home at which it returns to launch.
-        tracking_m: how far it strays from a straight leg, sideways and in height.
-        retraces: whether it returns to launch on the path that it came (ArduPilot's SmartRTL), not straight; then a
-            target is legal when some legal way home exists.
+        accel_mps2: Horizontal acceleration when braking.
+        position_gain: Proportional gain of the position controller, 1/s.
+        climb_accel_mps2: Vertical acceleration.
+        jerk_mps3: Rate of change of the acceleration.
+        return_altitude_m: Altitude above home of return to launch.
+        tracking_m: Largest deviation from a straight leg, sideways and in altitude.
+        retraces: True if the autopilot returns along the path it flew (ArduPilot's SmartRTL) instead of in a straight
+            line. A target is then legal if any legal route home exists.
     """
 
     accel_mps2: float = 2.5
@@ -168,14 +170,14 @@ class Airframe:
 
 @dataclass(frozen=True, slots=True)
 class Attitude:
-    """How the airframe is turned, or the camera on a gimbal: yaw, then pitch, then roll.
+    """Rotation of the airframe, or of a camera on a gimbal: yaw, then pitch, then roll.
 
     Attributes:
-        roll_deg: right side down is positive.
-        pitch_deg: nose up is positive.
-        yaw_deg: clockwise from true north.
-        tilt_error_deg: bound of the errors of roll and pitch, added up.
-        yaw_error_deg: bound of the error of yaw.
+        roll_deg: Positive with the right side down.
+        pitch_deg: Positive with the nose up.
+        yaw_deg: Clockwise from true north.
+        tilt_error_deg: Bound of the sum of the errors of roll and pitch.
+        yaw_error_deg: Bound of the error of yaw.
     """
 
     roll_deg: float
@@ -187,15 +189,15 @@ class Attitude:
 
 @dataclass(frozen=True, slots=True)
 class Lens:
-    """What a camera sees of the world around its airframe, or around its fixed node.
+    """Field of view of a camera and its orientation relative to the airframe, or to the fixed node.
 
     Attributes:
-        horizontal_deg: field of view from side to side.
-        vertical_deg: field of view from top to bottom.
-        pitch_deg: of the mount: 0 forward, -90 straight down.
-        yaw_deg: of the mount: clockwise from the nose; on a fixed node from true north.
-        stabilised: whether a gimbal keeps the mount level, so that roll and pitch of the airframe do not matter.
-        error_deg: bound of the error of the mount's direction.
+        horizontal_deg: Field of view from side to side.
+        vertical_deg: Field of view from top to bottom.
+        pitch_deg: Pitch of the mount: 0 forward, -90 straight down.
+        yaw_deg: Yaw of the mount, clockwise from the nose, or from true north on a fixed node.
+        stabilised: True if a gimbal keeps the mount level, so that roll and pitch of the airframe have no effect.
+        error_deg: Bound of the error of the mount's direction.
     """
 
     horizontal_deg: float
@@ -208,32 +210,32 @@ class Lens:
 
 @dataclass(frozen=True, slots=True)
 class Situation:
-    """The state of node and drone at the moment of a decision.
+    """State of node and drone at the moment of a decision.
 
     Attributes:
-        time_s: Unix time in seconds; a `UncertainTime` when the clock is in doubt.
-        lat: degrees north; None while the position is unknown.
-        lon: degrees east; None while the position is unknown.
-        altitude_m: metres above home.
-        north_mps: velocity over ground.
-        east_mps: velocity over ground.
-        down_mps: velocity over ground.
+        time_s: Unix time in seconds. An `UncertainTime` if the clock is in doubt.
+        lat: Degrees north. None while the position is unknown.
+        lon: Degrees east. None while the position is unknown.
+        altitude_m: Metres above home.
+        north_mps: Velocity over ground.
+        east_mps: Velocity over ground.
+        down_mps: Velocity over ground, positive down.
         home: None while it is unknown, and on fixed nodes.
-        position_error_m: bound of the horizontal position error.
-        altitude_error_m: bound of the vertical position error.
-        latency_s: time from this state to the effect of a decision on the motion, at most.
-        speed_setpoint_mps: horizontal speed that the autopilot flies legs with, or that of the velocity it was told to
-            hold, when that is higher: the speed that the present motion tends to.
-        forward_mps2: how much the drone speeds up along its course (negative: slows down), from the last velocities; None
-            while it is unknown.
-        pending: velocities north, east and down that it was told to take up a moment ago, which it may do at once or has
-            begun to, though neither velocity nor acceleration show it yet; the latest last.
-        vertical: whether the drone is taking off or landing, when lower altitude limits do not hold.
-        attitude: None while it is unknown; the camera may look anywhere then, unless a gimbal keeps it level.
-        lens: None on a node whose camera is not described: it may see everything around it.
-        relief_m: how far the ground around may lie below home.
-        exposure: states since a picture began to be taken, one after the other: it may show what is seen from each of
-            these, and between them.
+        position_error_m: Bound of the horizontal position error.
+        altitude_error_m: Bound of the vertical position error.
+        latency_s: Longest time from this state until a decision affects the motion.
+        speed_setpoint_mps: Horizontal speed of legs, or of the current velocity setpoint if that is higher: the speed
+            that the present motion tends to.
+        forward_mps2: Acceleration along the course, from the last velocities. Negative while slowing down, None if
+            unknown.
+        pending: Recent velocity setpoints (north, east, down) that neither velocity nor acceleration show yet. The
+            drone may take them up at any moment. The latest is last.
+        vertical: True if the drone is taking off or landing. Lower altitude limits do not apply then.
+        attitude: None if unknown. The camera may then look anywhere, unless a gimbal keeps it level.
+        lens: None if the node's camera is not described. It may then see everything around it.
+        relief_m: How far the surrounding ground may lie below home.
+        exposure: Successive states since the capture of a picture began. The picture may show everything seen from each
+            of these states and between them.
     """
 
     time_s: float
@@ -261,7 +263,7 @@ class Situation:
 
     @property
     def is_plausible(self) -> bool:
-        """Whether every figure is a number, and one that can be of this world."""
+        """True if every number is finite and of a physically possible size."""
         figures = (*_FIGURES(self), *_MOTION(self.airframe))
         if self.home is not None:
             figures += (self.home.lat, self.home.lon, self.home.amsl_m)
@@ -269,13 +271,13 @@ class Situation:
             figures += _TURNS(self.attitude)
         if self.lens is not None:
             figures += _VIEW(self.lens)
-        # A sum of sizes is small only if all of them are; with NaN it is not less than anything.
+        # The sum is small only if every term is small. A comparison with NaN is false.
         size: float = sum(abs(figure) for figure in figures if figure is not None)
         return size < _ABSURD
 
 
 _ABSURD = 1e12
-"""More than any figure of a Situation, also its time (s since 1970)."""
+"""Larger than any number of a Situation, including its time (seconds since 1970)."""
 
 _FIGURES = attrgetter(
     "time_s", "lat", "lon", "altitude_m", "north_mps", "east_mps", "down_mps", "position_error_m", "altitude_error_m",
@@ -288,12 +290,12 @@ _VIEW = attrgetter(*(f.name for f in fields(Lens)))
 
 @dataclass(frozen=True, slots=True)
 class Filter:
-    """What is done to a picture before it is handed out.
+    """Processing of a picture before it is returned to a component.
 
     Attributes:
-        action: black it out, blur all of it, hide faces, or keep only what moves.
-        faces: how faces are hidden; means something with blurFaces only.
-        fallback: what is done where faces cannot be found reliably; means something with blurFaces only.
+        action: Black out the picture, blur all of it, hide faces, or keep only moving objects.
+        faces: Method of hiding faces. Used by blurFaces only.
+        fallback: Processing used if faces cannot be found reliably. Used by blurFaces only.
     """
 
     action: FilterAction
@@ -303,21 +305,21 @@ class Filter:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What becomes of a call, and why.
+    """Decision of the engine on a call, with its reason.
 
     Attributes:
-        action: allow as asked, correct the arguments, deny, or take the drone over.
-        args: the arguments to carry out, after correction.
-        code: CamelCase and stable, for programs; empty when allowed.
-        reason: one sentence with figures, for people; empty when allowed.
-        policies: names of the policies that decided, most restrictive first.
-        takeover: what the system does with the drone; set with action takeover, and with a denial after an
-            internal error.
-        filters: what must be done to a picture before it is handed out, in this order.
-        brake_first: the drone must be brought to a stop before anything else, for it is too fast for the turn that
-            follows. With `allow` and `correct`: stop (as Hover does), wait until the drone is slower than `STATIONARY_MPS`,
-            judge the call as it was asked again, and carry out that verdict; never send these `args` before. With
-            `takeover`: stop, wait for the same, then land or return.
+        action: Allow as requested, correct the arguments, deny, or take over the drone.
+        args: Arguments to carry out, after correction.
+        code: Stable CamelCase identifier for programs. Empty if allowed.
+        reason: One sentence with numbers for people. Empty if allowed.
+        policies: Names of the policies that decided, most restrictive first.
+        takeover: What the system does with the drone. Set for the action takeover, and for a denial that also stops the
+            motion.
+        filters: Processing of a picture before it is returned, in this order.
+        brake_first: True if the drone must stop before anything else, because it is too fast for the turn that follows.
+            With `allow` and `correct`: stop (as Hover does), wait until the drone is slower than `STATIONARY_MPS`,
+            judge the requested call again and carry out that verdict. Never send these `args` before that. With
+            `takeover`: stop, wait for the same condition, then land or return.
     """
 
     action: Action
@@ -331,22 +333,22 @@ class Verdict:
 
     @property
     def permits(self) -> bool:
-        """Whether something is carried out."""
+        """True if the call is carried out, as requested or corrected."""
         return self.action in {"allow", "correct"}
 
 
 def distinct(names: Iterable[str]) -> tuple[str, ...]:
-    """Names in their order, each once; those that are empty are left out."""
+    """Return the names in their order, each once, without empty ones."""
     return tuple(dict.fromkeys(name for name in names if name))
 
 
 def format_distance(distance_m: float) -> str:
-    """A distance for people, who would read "0.0 m" as none at all."""
+    """Format a distance for people. Distances below 0.05 m are not shown as "0.0 m"."""
     return "less than 0.1 m" if distance_m < 0.05 else f"{distance_m:.1f} m"
 
 
 def deny(code: str, reason: str, policies: tuple[str, ...] = ()) -> Verdict:
-    """A refusal."""
+    """Return a denial."""
     return Verdict("deny", None, code, reason, policies)
 
 

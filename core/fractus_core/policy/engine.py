@@ -1,6 +1,7 @@
-"""The policy engine: a call in a situation under a grant becomes a verdict that explains itself (thesis 8.7).
+"""Policy engine: judges a call in a situation under a grant and returns a verdict with its reason (thesis 8.7).
 
-Deny by default; the most restrictive policy wins, and among equals the one of higher priority.
+Calls are denied by default. The most restrictive policy wins. Among equally restrictive policies the one of higher
+priority wins.
 """
 
 from __future__ import annotations
@@ -41,22 +42,21 @@ MIN_SPEED_MPS = 0.1
 MAX_SPEED_MPS = 100.0
 MAX_PIXELS = 20_000
 MIN_TAKEOFF_ALTITUDE_M = 0.5
-"""A takeoff goes at least this high."""
+"""Lowest permitted takeoff altitude above home."""
 MAX_CLIMB_MPS = 20.0
 HOLD_S = (0.1, 2.0)
-"""A velocity setpoint is held this long."""
+"""Shortest and longest hold time of a velocity setpoint."""
 
 
 def judge(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     """Decide on a call.
 
-    Args:
-        call: method and arguments as the component gave them.
-        now: state of drone and node.
-        grant: what the component may do.
+    Exceptions propagate. The caller must deny the call and hover.
 
-    Returns:
-        The verdict; an internal error is the caller's to turn into refusal and hover.
+    Args:
+        call: Method and arguments as requested by the component.
+        now: State of drone and node.
+        grant: Permissions and restrictions of the component.
     """
     if not now.is_plausible:
         now = _unsound(now)
@@ -67,12 +67,15 @@ def judge(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
 
 
 def _settle(call: Call, correction: Verdict, now: Situation, grant: CompiledGrant) -> Verdict:
-    """A correction that holds; apart from `judge`, which a closure would have to allocate for on every call."""
+    """Return a correction that passes the whole judgement.
+
+    Separate from `judge`, where a closure would be allocated for every call.
+    """
     return settle_correction(call, correction, lambda again: _judge_once(again, now, grant))
 
 
 def _judge_once(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
-    """The verdict on a call; what it corrects is not judged again."""
+    """Judge a call without judging its correction again."""
     problem = _check_arguments(call) or judge_access(call, now, grant)
     if problem is not None:
         return problem
@@ -82,7 +85,7 @@ def _judge_once(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
 
 
 def _must_brake(call: Call, verdict: Verdict, now: Situation, grant: CompiledGrant) -> bool:
-    """Whether a moving drone must stop before anything else: it is taken over, or on its way into a fence."""
+    """Return True if a moving drone must stop first, because it is taken over or on its way into a fence."""
     if verdict.brake_first or not is_moving(now):
         return verdict.brake_first
     if verdict.permits:
@@ -91,10 +94,10 @@ def _must_brake(call: Call, verdict: Verdict, now: Situation, grant: CompiledGra
 
 
 def _unsound(now: Situation) -> Situation:
-    """A state with a figure that is not a number: nothing is known of where the drone is and how it moves.
+    """Return a situation with unknown position and motion, to be used instead of one with implausible numbers.
 
     Raises:
-        ValueError: not even the time is known.
+        ValueError: The time is not a number.
     """
     if not math.isfinite(now.time_s):
         raise ValueError("the time is not a number")
@@ -104,12 +107,12 @@ def _unsound(now: Situation) -> Situation:
 # Access to methods
 
 PICTURE_METHODS = frozenset({"CaptureImage", "RetrieveImage"})
-"""Methods that are denied by what a picture may show, and used only while the drone is where the application works; motion
-is judged by its leg."""
+"""Methods that return pictures. They are denied by what a picture may show, and permitted only inside the operation
+area."""
 
 
 def judge_access(call: Call, now: Situation, grant: CompiledGrant) -> Verdict | None:
-    """The refusal of a method, or None when it may be used."""
+    """Return the denial of a method that may not be used here and now, or None."""
     method = call.method
     if method not in grant.methods:
         return deny(
@@ -131,7 +134,10 @@ def judge_access(call: Call, now: Situation, grant: CompiledGrant) -> Verdict | 
 
 
 def judge_denials(method: str, now: Situation, grant: CompiledGrant) -> Verdict | None:
-    """The denial of a method where the drone is; of one of `PICTURE_METHODS`, by what a picture from there may show."""
+    """Return the denial of a method by a policy at the drone's position, or None.
+
+    Methods of `PICTURE_METHODS` are judged by what a picture from this position may show.
+    """
     denials = grant.denials.get(method)
     if denials is None:
         return None
@@ -160,7 +166,7 @@ def _outside_operation_area(method: str, now: Situation, grant: CompiledGrant) -
 
 
 def _allowing(index: PolicyIndex, now: Situation, grant: CompiledGrant) -> bool:
-    """Whether some policy of an index surely holds, whichever reading of a doubtful clock is right."""
+    """Return True if some policy of an index certainly holds at both readings of an uncertain time."""
     readings = {float(now.time_s), earliest_time(now.time_s)}
     return all(_matching(index, replace(now, time_s=t), grant, 0.0, certain=True) for t in readings)
 
@@ -173,9 +179,9 @@ def _matching(
     *,
     certain: bool = False,
 ) -> list[Rule]:
-    """Policies of an index that hold at the present position.
+    """Return the policies of an index that hold at the present position, by priority.
 
-    While the position is unknown every policy in force may hold; with `certain`, none of those with zones does.
+    While the position is unknown, every policy in force counts. With `certain`, only policies without zones do.
     """
     found = {rule.name: rule for rule in index.everywhere if rule.in_force(now.time_s)}
     if now.lat is None or now.lon is None:
@@ -208,7 +214,7 @@ _Figure = tuple[str, float | None, float, float, str]
 
 
 def _figures(call: Call) -> tuple[_Figure, ...]:  # noqa: PLR0911 - one line a method
-    """The figures among the arguments, each with its bounds and unit."""
+    """Return the numbers among the arguments, each with name, bounds and unit."""
     match call.args:
         case TakeoffArgs(altitude_m):
             return (("altitude", altitude_m, MIN_TAKEOFF_ALTITUDE_M, MAX_ALTITUDE_M, "m above home"),)
@@ -239,9 +245,9 @@ def _figures(call: Call) -> tuple[_Figure, ...]:  # noqa: PLR0911 - one line a m
 
 
 _COURSES = frozenset({"Goto", "SetVelocity"})
-"""Methods that give a flying drone another course."""
+"""Methods that change the course of a flying drone."""
 
-# What of a picture is corrected is the picture, not the call.
+# Picture methods are missing here because their correction changes the picture, not the arguments.
 _ARGS: dict[str, type] = {
     "Takeoff": TakeoffArgs,
     "Goto": GotoArgs,
@@ -256,15 +262,15 @@ _ARGS: dict[str, type] = {
 
 def _judge_picture(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     if call.method == "CaptureImage" and (now.lat is None or now.lon is None):
-        return deny("PositionUnknown", "what the camera sees is unknown while its position is unknown; wait for a fix")
+        return deny("PositionUnknown", "the camera footprint is unknown while the position is unknown; wait for a fix")
     verdict = judge_privacy(now, grant)
     return verdict if verdict.action == "deny" else replace(verdict, args=call.args)
 
 
 def _judge_access_only(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
-    """A method that stops the drone, brings it home, or moves nothing of it: access to it is enough.
+    """Allow a method for which the access check is sufficient: it stops the drone, brings it home, or does not move it.
 
-    Where a gimbal points is no matter of the call: pictures are judged by what it measures, no matter who moved it.
+    PointGimbal belongs here because pictures are judged by the measured camera direction.
     """
     return Verdict("allow", call.args)
 

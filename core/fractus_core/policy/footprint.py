@@ -1,4 +1,4 @@
-"""What a camera sees: the ground that a picture may show, and the air that it looks through (design, section 6)."""
+"""Camera footprint: the ground and the air that a picture may show (design, section 6)."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ from fractus_core.policy.decision_types import Attitude, Lens, Situation
 from fractus_core.policy.kinematics import XY
 
 MAX_SIGHT_M = 10_000.0
-"""Nothing is told apart from further away: at 5 degrees of view, 8 megapixels resolve 0.3 m there."""
+"""Nothing is recognisable from farther away: at a field of view of 5 degrees, 8 megapixels resolve 0.3 m there."""
 MAX_HALF_VIEW_DEG = 80.0
-"""A view that reaches further to one side, errors included, is taken to see everything."""
+"""A view that reaches farther to one side, errors included, counts as seeing everything."""
 _MAX_TURN_DEG = 60.0
-"""Up to this yaw error the hull of turned corners follows the tangents, which run off beyond; then a circle does."""
+"""Up to this yaw error the hull of turned corners follows the tangents, which diverge beyond it. A circle is used then.
+"""
 _ARC_DEG = 15.0
 """Step of the arc that closes a sector."""
 _SIDES = 24
@@ -35,13 +36,13 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class Footprint:
-    """What a picture may show, in metres east and north in the frame of a grant.
+    """Ground and air that a picture may show, in metres east and north in the frame of a grant.
 
     Attributes:
-        sight: plan of the air between the camera and the ground that it shows, both included.
-        margin_m: how far the camera may be from where it is thought to be; counts around `sight`.
-        upper_m: nothing above this height, over home, is seen; infinite where the picture may show sky.
-        farthest_m: how far the ground is that is shown furthest from the camera; infinite at the horizon.
+        sight: Plan of the air between the camera and the ground that it shows, both included.
+        margin_m: Bound of the camera's position error. It applies around `sight`.
+        upper_m: Height above home of the highest visible point. Infinite if the picture may show sky.
+        farthest_m: Distance from the camera to the farthest ground shown. Infinite at the horizon.
     """
 
     sight: BaseGeometry
@@ -54,18 +55,18 @@ class Footprint:
     _highest_m: float = 0.0
 
     def shows(self, shape: BaseGeometry, lower_m: float = -math.inf, upper_m: float = math.inf) -> bool:
-        """Whether a picture may show something of a piece of air, or of the ground below it.
+        """Return True if a picture may show part of a volume, or of the ground below it.
 
         Args:
-            shape: its plan.
-            lower_m: its floor above home.
-            upper_m: its ceiling above home.
+            shape: Plan of the volume.
+            lower_m: Floor of the volume above home.
+            upper_m: Ceiling of the volume above home.
         """
         if lower_m > self.upper_m or not shape.dwithin(self.sight, self.margin_m):
             return False
         if self._at is None or not (upper_m < self._lowest_m or lower_m > 0.0):
             return True
-        # All rays go down and straight, so what is seen at a depth is what is seen at depth 1, enlarged.
+        # All rays are straight and lead down, so the view at a depth is the view at depth 1, enlarged.
         far, near = self._highest_m - max(lower_m, 0.0), max(self._lowest_m - upper_m, 0.0)
         if far < 0.0:
             return False
@@ -75,7 +76,7 @@ class Footprint:
 
 
 def joined_footprint(views: Sequence[Footprint]) -> Footprint:
-    """What is shown by a picture that is taken while the camera moves through these, one after the other."""
+    """Return the footprint of a picture taken while the camera moves through these views in order."""
     if len(views) == 1:
         return views[0]
     return Footprint(
@@ -87,17 +88,17 @@ def joined_footprint(views: Sequence[Footprint]) -> Footprint:
 
 
 def exposure_footprint(poses: Sequence[Situation], frame: LocalFrame) -> Footprint | None:
-    """What a picture may show that is taken while the camera moves through these; None where one of them is unknown."""
+    """Return the footprint of a picture taken while the camera moves through these poses. None if one is unknown."""
     views = [footprint(now, frame) for now in poses]
     known = [view for view in views if view is not None]
     return joined_footprint(known) if known and len(known) == len(views) else None
 
 
 def footprint(now: Situation, frame: LocalFrame) -> Footprint | None:
-    """What the camera may see at present, for every error inside the bounds; None while its position is unknown.
+    """Return the present footprint for every error inside the bounds, or None while the position is unknown.
 
-    The ground is taken for level, between home's height and `relief_m` below it. Whatever is unknown - attitude, lens,
-    ground - makes the camera see everything around it.
+    The ground counts as level, between home's altitude and `relief_m` below it. If attitude, lens or ground is unknown,
+    the camera counts as seeing everything around it.
     """
     if now.lat is None or now.lon is None or not now.is_plausible:
         return None
@@ -129,7 +130,7 @@ def footprint(now: Situation, frame: LocalFrame) -> Footprint | None:
 
 
 def _attitude(now: Situation) -> Attitude | None:
-    """How the airframe is turned, as far as it matters; None where the ground below the camera is unknown."""
+    """Return the attitude as far as it matters, or None if the ground below the camera is unknown."""
     if now.altitude_m + now.altitude_error_m + now.relief_m < 0.0:
         return None
     if now.attitude is None and now.lens is not None and now.lens.stabilised:
@@ -148,9 +149,9 @@ def _everything(at: XY, now: Situation) -> Footprint:
 
 
 def _widened(lens: Lens, error_deg: float) -> tuple[float, float] | None:
-    """Tangents of the half views that hold every ray, when the camera is turned by the error in any direction.
+    """Return the tangents of the half views that contain every ray for every direction of the error.
 
-    On the sphere of directions a turn by e moves a ray sideways by asin(sin e / cos elevation) at most.
+    On the sphere of directions a turn by e moves a ray sideways by at most asin(sin e / cos elevation).
     """
     wide, tall, error = (math.radians(v) for v in (lens.horizontal_deg / 2, lens.vertical_deg / 2, error_deg))
     limit = math.radians(MAX_HALF_VIEW_DEG)
@@ -164,7 +165,7 @@ def _widened(lens: Lens, error_deg: float) -> tuple[float, float] | None:
 
 
 def camera_axes(lens: Lens, attitude: Attitude) -> tuple[Vector, Vector, Vector]:
-    """Where the camera looks, and where right and up of its pictures point: north, east, down."""
+    """Return the viewing direction, and the right and up directions of pictures, as north, east, down."""
     pitch, yaw = math.radians(lens.pitch_deg), math.radians(lens.yaw_deg)
     cp, sp, cy, sy = math.cos(pitch), math.sin(pitch), math.cos(yaw), math.sin(yaw)
     mounted = ((cp * cy, cp * sy, -sp), (-sy, cy, 0.0), (sp * cy, sp * sy, cp))
@@ -186,13 +187,13 @@ def camera_axes(lens: Lens, attitude: Attitude) -> tuple[Vector, Vector, Vector]
 
 
 def _sees_vertical(axis: Vector, right: Vector, up: Vector, half: tuple[float, float]) -> bool:
-    """Whether straight down or straight up is in the picture."""
+    """Return True if straight down or straight up is in the picture."""
     depth = abs(axis[2])
     return abs(right[2]) <= half[0] * depth and abs(up[2]) <= half[1] * depth
 
 
 def _sector(at: XY, now: Situation, axis: Vector, corners: list[Vector], error_deg: float) -> Footprint:
-    """Everything within sight between the left and the right of a picture that shows the horizon."""
+    """Return everything within sight between the left and right sides of a picture that shows the horizon."""
     ahead = math.atan2(axis[1], axis[0])
     turns = [math.remainder(math.atan2(east, north) - ahead, 2 * math.pi) for north, east, _ in corners]
     left, right = min(turns) - math.radians(error_deg), max(turns) + math.radians(error_deg)
@@ -207,7 +208,7 @@ def _sector(at: XY, now: Situation, axis: Vector, corners: list[Vector], error_d
 
 
 def _turned(corners: list[XY], error_deg: float) -> list[XY]:
-    """Points whose hull holds the corners of a piece of ground, turned around the camera by every error of yaw."""
+    """Return points whose hull contains the corners of a piece of ground for every yaw error."""
     if error_deg <= 0.0:
         return corners
     if error_deg > _MAX_TURN_DEG:
@@ -215,7 +216,7 @@ def _turned(corners: list[XY], error_deg: float) -> list[XY]:
         return [(reach * e, reach * n) for e, n in _CIRCLE]
     turn = math.radians(error_deg)
     c, s = math.cos(turn), math.sin(turn)
-    # The ends of each corner's arc, and where the tangents there meet.
+    # The ends of each corner's arc, and the intersection of the tangents there.
     return [
         point
         for e, n in corners

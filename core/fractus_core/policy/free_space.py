@@ -1,4 +1,4 @@
-"""The free space that routes are searched in: what blocks a leg, and the corners around it."""
+"""Free space of the route search: obstacles of a leg, and the corners around them."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from fractus_core.policy.return_route import check_straight_return
 Floats = NDArray[np.float64]
 
 CORNER_M = 0.1
-"""Waypoints lie this much further out than their legs must, so that rounding costs no leg."""
+"""Distance of waypoints beyond the margin of their legs, so that rounding makes no leg illegal."""
 
 _SIMPLER_M = 0.2
-"""How far the outline of a shape of many corners is simplified; it is grown by as much first."""
+"""Tolerance when simplifying a shape with many corners. The shape is grown by this amount first."""
 _MAX_PLAIN_CORNERS = 24
-"""Shapes of no more corners are taken as they are."""
+"""Shapes with at most this number of corners are not simplified."""
 _SEGMENTS = 3
-"""Straight pieces around a corner, per quarter of a circle: each more is a corner more to search."""
+"""Straight pieces around a corner, per quarter of a circle. Each additional piece is an additional corner to search."""
 
 
 @dataclass(frozen=True, slots=True)
 class FreeSpace:
-    """Where a way may lead: the air between two altitudes, and the fences in it."""
+    """Air between two altitudes in which a route may lead, and the fences in it."""
 
     now: Situation
     grant: CompiledGrant
@@ -44,7 +44,7 @@ class FreeSpace:
 
     @classmethod
     def between(cls, now: Situation, grant: CompiledGrant, lower_m: float, upper_m: float, room_m: float) -> FreeSpace:
-        """The space that a grant leaves, with this much room beyond the engine's margin."""
+        """Return the space that a grant permits between two altitudes, with a clearance beyond the engine's margin."""
         moving = replace(grant, operation_area=grant.flight_area, operation_area_border=grant.flight_area_border)
         slack = height_margin_m(now)
         required_areas = [
@@ -57,7 +57,7 @@ class FreeSpace:
         return cls(now, moving, lower_m, upper_m, margin_m(now) + room_m, slack, tuple(required_areas))
 
     def blockers(self, line: BaseGeometry) -> list[PolicyZone | int]:
-        """What stands in the way of a line: zones to keep out of, and numbers of areas to stay in."""
+        """Return the obstacles of a line: zones to keep out of, and indexes of areas to stay in."""
         slack, flat = self.height_margin_m, self.grant.flat_terrain
         air = AirVolume(line, self.margin_m, self.lower_m - slack, self.upper_m + slack)
         found: list[PolicyZone | int] = list(self.grant.exclusions.near(air, self.now, flat))
@@ -71,7 +71,10 @@ class FreeSpace:
         return found
 
     def allows_leg(self, start: XY, end: XY) -> bool:
-        """Whether a leg from or to an end of the way is legal, which may lie too close to a fence or at home."""
+        """Return True if the engine permits a leg from or to an end of the route.
+
+        The end may be too close to a fence, or at home.
+        """
         leg = Leg(start, start, start, end, self.lower_m, self.upper_m)
         if find_breaches(leg, self.now, self.grant, self.margin_m, self.height_margin_m):
             return False
@@ -83,21 +86,25 @@ class FreeSpace:
         )
 
     def allows_return_from(self, place: XY) -> bool:
-        """Whether the autopilot's own way home from a place is legal."""
+        """Return True if the autopilot's own return from a place is legal."""
         if self.now.airframe.retraces:
             return True
         margin, slack = self.margin_m, self.height_margin_m
         return check_straight_return(place, self.upper_m, self.now, self.grant, margin=margin, slack=slack) is None
 
     def corners(self, obstacle: PolicyZone | int) -> Floats:
-        """Where ways may turn around an obstacle: rows of x, y of a corner, the one before it and the one after."""
+        """Return the corners at which routes may turn around an obstacle.
+
+        Returns:
+            Rows of x and y of a corner, of the corner before it and of the corner after it.
+        """
         away = self.margin_m + CORNER_M
         if isinstance(obstacle, PolicyZone):
             return _corners(_outline(obstacle.shape, away), 1.0)
         return _corners(_outline(self.required_areas[obstacle][0], -away), -1.0)
 
     def nearest_exit(self, obstacle: PolicyZone | int, begin: shapely.Point) -> Floats:
-        """The nearest place that an obstacle leaves free, as a corner without neighbours; none may be left."""
+        """Return the nearest free place outside an obstacle, as a corner without neighbours. Empty if none is free."""
         away = self.margin_m + CORNER_M
         outline = (
             _outline(obstacle.shape, away)
@@ -111,8 +118,8 @@ class FreeSpace:
 
 
 def _outline(shape: BaseGeometry, away_m: float) -> BaseGeometry:
-    """A shape grown or shrunk, with few corners, none nearer than that."""
-    # GEOS rounds the number of pieces, so one may span half as much again as a quarter circle's share.
+    """Return a shape grown or shrunk by at least a distance, with few corners."""
+    # GEOS rounds the number of pieces, so a piece may span half as much again as its share of a quarter circle.
     away_m /= math.cos(0.75 * math.pi / 2 / _SEGMENTS)
     if shapely.get_num_coordinates(shape) > _MAX_PLAIN_CORNERS:
         return shape.buffer(away_m + math.copysign(_SIMPLER_M, away_m), quad_segs=_SEGMENTS).simplify(_SIMPLER_M)
@@ -120,7 +127,10 @@ def _outline(shape: BaseGeometry, away_m: float) -> BaseGeometry:
 
 
 def _corners(shape: BaseGeometry, turning: float) -> Floats:
-    """Corners that turn one way (1: left, with the shape on the left), each with its neighbours, shape (n, 6)."""
+    """Return the corners that turn one way, with their neighbours, shape (n, 6).
+
+    Direction 1 is left, with the shape on the left.
+    """
     found = [np.empty((0, 6))]
     for part in shapely.get_parts(shape):
         if not isinstance(part, shapely.Polygon) or part.is_empty:

@@ -1,4 +1,4 @@
-"""Geofences against a leg: what it breaks, and how far along it is legal."""
+"""Geofences: checks which fences a leg breaks, and how far the leg is legal."""
 
 from __future__ import annotations
 
@@ -19,35 +19,37 @@ from fractus_core.policy.kinematics import Leg, altitude_range_to_stop_m, shorte
 SEVERITY: dict[GeofenceAction, int] = exhaustive(
     GeofenceAction, {"adjust": 0, "ignore": 1, "hover": 2, "returnToLaunch": 3, "land": 4, "revoke": 5}
 )
-"""The more a reaction takes from the application, the more restrictive it is."""
+"""Severity of each action. A higher value takes more control from the application."""
 
 HOME_RADIUS_M = 5.0
-"""A target this near to home is the way home, and a leg that begins this near to it the way from there, wherever the operation
-area lies."""
+"""A leg that ends within this distance of home is a return, and a leg that starts within it a departure.
+
+Both are permitted regardless of the position of the operation area.
+"""
 
 STATIONARY_LEG_M = 0.5
-"""A leg that covers no more ground than this only changes the height."""
+"""A leg that covers no more ground than this counts as a pure change of altitude."""
 
 EXTRA_MARGIN_M = 0.25
-"""A corrected target keeps this much more than the margin, so that it never lies on a border."""
+"""Distance beyond the margin that a corrected target keeps, so that it never lies on a border."""
 
 ALTITUDE_TOLERANCE_M = 0.5
-"""Heights this close are one: neither a barometer nor a controller holds them any better."""
+"""Altitudes closer than this count as equal. Neither a barometer nor a controller is more accurate."""
 
 BISECTION_STEPS = 24
-"""Steps of the search for where a leg is far enough from a fence: right within a millimetre."""
+"""Steps of the search for the point where a leg is far enough from a fence. The result is accurate to a millimetre."""
 
 _SAMPLES = 24
-"""Points of a leg's illegal part at which its distance to the border must not shrink."""
+"""Number of sample points on the illegal part of a leg at which its distance to the border must not shrink."""
 
 
 @dataclass(frozen=True, slots=True)
 class Breach:
-    """What a leg does to one fence.
+    """Violation of a fence by a leg.
 
     Attributes:
-        enters: the motion asked for itself breaks the fence; otherwise it only comes too close.
-        permits: whether the fence would have no objection to a piece of ground (in frame metres), which keeps its margin.
+        enters: True if the requested motion itself breaks the fence, False if it only comes too close.
+        permits: Returns True if the fence permits a piece of ground (in frame metres) with its margin.
     """
 
     policy: str
@@ -60,14 +62,14 @@ class Breach:
 
     @property
     def severity(self) -> int:
-        """How much the reaction takes; coming too close never costs more than the request."""
+        """Severity of the reaction. A leg that only comes too close costs no more than the request."""
         return SEVERITY[self.action] if self.enters else min(SEVERITY[self.action], SEVERITY["ignore"])
 
 
 def find_breaches(
     leg: Leg, now: Situation, grant: CompiledGrant, margin_m: float, height_margin_m: float
 ) -> list[Breach]:
-    """Every fence that a leg breaks, most restrictive first."""
+    """Return every fence that a leg breaks, most restrictive first."""
     air = AirVolume(leg.ground, margin_m, leg.lower_m - height_margin_m, leg.upper_m + height_margin_m)
     found = [
         *_operation_area(leg, now, grant, margin_m),
@@ -78,7 +80,7 @@ def find_breaches(
 
 
 def breach_verdict(found: list[Breach]) -> Verdict:
-    """What becomes of a request that breaks fences, most restrictive first."""
+    """Return the verdict on a request that breaks fences, given most restrictive first."""
     worst = found[0]
     names = distinct(b.policy for b in found)
     takeover = TAKEOVERS[worst.action] if worst.enters else None
@@ -98,7 +100,7 @@ TAKEOVERS: dict[GeofenceAction, Takeover | None] = exhaustive(
         "revoke": "revoke",
     },
 )
-"""How actions of policies take the drone from the application; None: they do not."""
+"""Takeover of each action, or None if the application keeps the drone."""
 
 _EFFECTS: dict[Takeover, str] = exhaustive(
     Takeover,
@@ -112,7 +114,7 @@ _EFFECTS: dict[Takeover, str] = exhaustive(
 
 
 def _operation_area(leg: Leg, now: Situation, grant: CompiledGrant, margin_m: float) -> Iterator[Breach]:
-    """The fence that the grant itself implies: fly to where the application works, and stay there."""
+    """Check the fence that every grant implies: fly to the operation area and stay there."""
     operation_area, border = grant.operation_area, grant.operation_area_border
     if operation_area is None or border is None or grant.flight_area is None or grant.flight_area_border is None:
         return
@@ -138,12 +140,12 @@ def _operation_area(leg: Leg, now: Situation, grant: CompiledGrant, margin_m: fl
     working = operation_area.covers(leg.braking_path) and not homeward and not outward and not vertical
     shape, edge = (operation_area, border) if working else (grant.flight_area, grant.flight_area_border)
     if not _stays_inside(shape, edge, leg, now, margin_m):
-        reason = f"the leg leaves the {'operation area' if working else 'way to the operation area'} or comes within {margin_m:.1f} m of its border"
+        reason = f"the leg leaves the {'operation area' if working else 'corridor to the operation area'} or comes within {margin_m:.1f} m of its border"
         yield _area_breach(reason, not shape.covers(leg.ground))
 
 
 def _approaches(leg: Leg, now: Situation, grant: CompiledGrant, operation_area: BaseGeometry) -> bool:
-    """Whether a drone outside the operation area comes nearer to it, or to its home."""
+    """Return True if a drone outside the operation area comes closer to it or to its home."""
     stop, end = shapely.points(leg.stop), shapely.points(leg.target)
     if operation_area.covers(stop):
         return False
@@ -176,44 +178,46 @@ def _exclusions(leg: Leg, now: Situation, grant: CompiledGrant, air: AirVolume) 
                 and _leads_away(shape, leg, certain)
             ):
                 continue
-        # A drone that is inside already, or cannot stop outside, does not enter by this request: it costs the request only.
+        # A drone that is already inside, or cannot stop outside, does not enter by this request. Only the request is
+        # denied.
         enters = (clearance_m > 0 or not level) and shape.intersects(air.ground)
         yield _exclusion_breach(zone, leg, margin_m, enters)
 
 
 def _certain_way(leg: Leg, now: Situation) -> BaseGeometry:
-    """The part of a leg that the drone certainly flies, even if it brakes already, as hard as it can.
+    """Return the part of a leg that the drone certainly flies, even if it is already braking as hard as it can.
 
-    Its way to rest is overestimated, which must not open ways past a fence.
+    `Leg.braking_path` overestimates the way to rest. An overestimate must not permit legs past a fence.
     """
     end = shortest_stop_point(now, leg.start)
     return shapely.points(leg.start) if end == leg.start else shapely.linestrings((leg.start, end))
 
 
 def _is_level_with(zone: PolicyZone, now: Situation, grant: CompiledGrant) -> bool:
-    """Whether the drone is, or comes to rest, between the altitudes of a zone."""
+    """Return True if the drone is between the altitudes of a zone, or comes to rest there."""
     return band_may_overlap(zone.band, *altitude_range_to_stop_m(now), now.home, grant.flat_terrain)
 
 
 def _comes_level(zone: PolicyZone, leg: Leg, now: Situation, grant: CompiledGrant, height_margin_m: float) -> bool:
-    """Whether a leg of a drone below or above a zone comes between its altitudes, or too close to them.
+    """Return True if a leg of a drone below or above a zone comes between its altitudes, or too close to them.
 
-    A drone that is too close already may fly on at its height, as well as that is known: closer by no more than LEVEL_M, and
-    never into the nearer half of the margin, however many legs it asks for.
+    A drone that is already too close may fly on at its altitude within measurement accuracy: closer by at most
+    ALTITUDE_TOLERANCE_M, and never into the nearer half of the margin, regardless of the number of legs requested.
     """
     gap_m = band_gap_m(zone.band, leg.lower_m, leg.upper_m, now.home, grant.flat_terrain)
     present_m = band_gap_m(zone.band, *altitude_range_to_stop_m(now), now.home, grant.flat_terrain)
     kept_m = height_margin_m
     if present_m < height_margin_m:
         kept_m = min(present_m, max(present_m - ALTITUDE_TOLERANCE_M, height_margin_m / 2))
-    # Heights converted between datums differ in their last digits.
+    # Altitudes converted between datums differ in their last digits.
     return gap_m <= 0.0 or gap_m < kept_m - 1e-6
 
 
 def _leaves_height(zone: PolicyZone, leg: Leg, now: Situation, grant: CompiledGrant, height_margin_m: float) -> bool:
-    """Whether a leg of a drone too close below or above a zone sinks or climbs away from it on the spot, until it is far enough.
+    """Return True if a leg too close below or above a zone sinks or climbs on the spot until it is far enough.
 
-    Not on its way to somewhere else: the axes move independently, so from beside a zone it could be over or under it first.
+    This excludes legs to another place. The axes move independently, so a drone beside a zone could be over or under it
+    first.
     """
     west, south, east, north = shapely.bounds(leg.ground)
     if max(east - west, north - south) > STATIONARY_LEG_M:
@@ -223,7 +227,8 @@ def _leaves_height(zone: PolicyZone, leg: Leg, now: Situation, grant: CompiledGr
     def gap_m(lower_m: float, upper_m: float) -> float:
         return band_gap_m(zone.band, lower_m, upper_m, now.home, grant.flat_terrain)
 
-    # It ends at that of its heights which is further from the zone if it passes all where the drone could come to rest.
+    # The leg ends at the altitude farther from the zone if it passes all altitudes at which the drone could come to
+    # rest.
     end_m, rest_m = (max(map(gap_m, heights, heights)) for heights in ((leg.lower_m, leg.upper_m), present))
     closest_m = gap_m(leg.lower_m, leg.upper_m)
     return 0.0 < closest_m >= gap_m(*present) - 1e-6 and end_m >= height_margin_m and end_m > rest_m + 1e-6
@@ -256,7 +261,7 @@ def _crossing(zone: PolicyZone, leg: Leg) -> str:
     inside_m = zone.shape.intersection(leg.line).length
     if inside_m >= 0.05:
         return f"the leg crosses zone {zone.name} for {inside_m:.1f} m"
-    # What a moving drone sweeps is wider than the line from where it could rest.
+    # The ground that a moving drone sweeps is wider than the line from where it could come to rest.
     return f"the {'leg' if zone.shape.intersects(leg.line) else 'turn onto the leg'} touches zone {zone.name}"
 
 
@@ -272,9 +277,9 @@ def _inclusions(leg: Leg, now: Situation, grant: CompiledGrant, air: AirVolume) 
 
 
 def _leaves_by_height(fence: Inclusion, shape: BaseGeometry, leg: Leg, now: Situation, grant: CompiledGrant) -> bool:
-    """Whether a drone that is inside at its present altitude would not be at all altitudes of a leg.
+    """Return True if a drone inside at its present altitude would not be inside at all altitudes of a leg.
 
-    Such a leg does not lead back in, though it may look so from above.
+    Such a leg does not lead back into the zones, although it does in the horizontal plane.
     """
     if shape.covers(leg.ground):
         return False
@@ -316,7 +321,7 @@ def _clearance_outside(shape: BaseGeometry, braking_path: BaseGeometry) -> float
 
 
 def _stays_inside(shape: BaseGeometry, border: BaseGeometry, leg: Leg, now: Situation, margin_m: float) -> bool:
-    """Whether a leg keeps its margin inside a shape, or leads back into it."""
+    """Return True if a leg keeps its margin inside a shape, or leads back into it."""
     ground = leg.ground
     if shape.covers(ground) and not border.dwithin(ground, margin_m):
         return True
@@ -335,7 +340,7 @@ def _stays_inside(shape: BaseGeometry, border: BaseGeometry, leg: Leg, now: Situ
 
 
 def _leads_out(shape: BaseGeometry, leg: Leg, margin_m: float, clearance_m: float) -> bool:
-    """Whether a leg that starts in or too close to an excluded shape leads away from it."""
+    """Return True if a leg that starts in or too close to an excluded shape leads away from it."""
     if clearance_m > 0 and shape.distance(leg.ground) < clearance_m - 1e-6:
         return False
     border = shape.boundary
@@ -347,7 +352,7 @@ def _leads_out(shape: BaseGeometry, leg: Leg, margin_m: float, clearance_m: floa
 
 
 def _leads_away(shape: BaseGeometry, leg: Leg, certain: BaseGeometry) -> bool:
-    """Whether a leg leads away from a shape also for a drone that comes to rest before it, though it need not."""
+    """Return True if a leg leads away from a shape even if the drone comes to rest as early as possible."""
     clearance_m = _clearance_outside(shape, certain)
     if clearance_m == 0:
         return True
@@ -355,14 +360,14 @@ def _leads_away(shape: BaseGeometry, leg: Leg, certain: BaseGeometry) -> bool:
 
 
 def _from_rest(certain: BaseGeometry, leg: Leg) -> BaseGeometry:
-    """From where the drone comes to rest at the earliest straight to the target."""
+    """Return the line from the earliest point of rest to the target."""
     return shapely.linestrings((shapely.get_coordinates(certain)[-1], leg.target))
 
 
 def _gains(leg: Leg, keeps: Callable[[BaseGeometry], bool], clearance: Callable[[BaseGeometry], float]) -> bool:
-    """Whether a leg that begins too close only gets better, until it keeps its distance to the end.
+    """Return True if a leg that begins too close only gains distance, until it keeps its distance to the end.
 
-    The fence is asked about, and not grown or shrunk: of a shape of ten thousand corners that takes seconds.
+    The fence is tested as it is, because growing or shrinking a shape of ten thousand corners takes seconds.
     """
     if keeps(leg.line):
         return True
@@ -385,6 +390,6 @@ def _gains(leg: Leg, keeps: Callable[[BaseGeometry], bool], clearance: Callable[
 
 
 def signed_depth_m(shape: BaseGeometry, border: BaseGeometry, point: BaseGeometry) -> float:
-    """Distance to the border: positive inside the shape, negative outside."""
+    """Return the distance to the border: positive inside the shape, negative outside."""
     distance = float(border.distance(point)) if not border.is_empty else math.inf
     return distance if shape.covers(point) else -distance

@@ -1,4 +1,4 @@
-"""Gotos: the leg to a target against limits, fences and the way home."""
+"""Rules for Goto: the leg to the target against limits, fences and the return route."""
 
 from __future__ import annotations
 
@@ -42,18 +42,18 @@ from fractus_core.policy.return_route import check_straight_return
 from fractus_core.policy.route_search import route_exists
 
 MAX_RANGE_M = 100_000.0
-"""Farther than any drone here flies, and well inside what the grant's frame shows true to scale."""
+"""Largest distance of a target. No drone flies farther, and the grant's frame is accurate up to this distance."""
 MIN_LEG_M = 0.5
-"""A leg that could be flown no further is not worth it."""
+"""Shortest leg to which a longer leg is shortened."""
 NEAR_DEG = 30.0
-"""A target this near, in degrees, certainly lies on the frame's side of the globe."""
+"""A target within this difference of latitude and longitude certainly lies on the frame's side of the globe."""
 
 
 def judge_goto(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
-    """The verdict on a goto.
+    """Judge a Goto.
 
-    A leg that a moving drone cannot begin, for its turn is too wide, may be flown after a stop when both the stop and the
-    leg from there are legal: see `Verdict.brake_first`.
+    A moving drone may be unable to begin a leg because its turn is too wide. The leg is then permitted after a stop if
+    both the stop and the leg from the point of rest are legal: see `Verdict.brake_first`.
     """
     args, at = call.args, grant.locate(now)
     if not isinstance(args, GotoArgs):
@@ -73,7 +73,7 @@ def judge_goto(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
 
 
 def _turns_too_wide(verdict: Verdict, args: GotoArgs) -> bool:
-    """Whether a leg from standstill may fare better."""
+    """Return True if a leg from standstill may get a better verdict."""
     return not verdict.permits or _shortened(verdict, args)
 
 
@@ -83,7 +83,7 @@ def _shortened(verdict: Verdict, args: GotoArgs) -> bool:
 
 
 def _judge_after_stop(request: _Request, target: XY) -> Verdict | None:
-    """The verdict on a leg that begins with a stop; None when the stop itself breaks a fence or a limit of altitude."""
+    """Judge a leg that begins with a stop. None if the stop itself breaks a fence or an altitude limit."""
     now, grant, at = request.now, request.grant, request.at
     stop = stop_point(now, at)
     heights, corners = [now.altitude_m, stop_altitude_m(now)], list[XY]()
@@ -94,7 +94,7 @@ def _judge_after_stop(request: _Request, target: XY) -> Verdict | None:
     on_its_way = replace(grant, operation_area=grant.flight_area, operation_area_border=grant.flight_area_border)
     if find_breaches(braking, now, on_its_way, margin_m(now), height_margin_m(now)):
         return None
-    # The leg begins where the drone stands: what it brakes into would count as where it has been.
+    # The leg begins at the point of rest, so a zone entered while braking would count as already entered.
     bounds, unknown = altitude_bounds(
         grant, now, AirVolume(braking.ground, margin_m(now), braking.lower_m, braking.upper_m)
     )
@@ -126,7 +126,7 @@ def _judge_from(request: _Request, target: XY) -> Verdict:
 
 @dataclass(frozen=True, slots=True)
 class _Request:
-    """A goto, by whom and from where."""
+    """A Goto with the situation, the grant and the start of its leg."""
 
     args: GotoArgs
     now: Situation
@@ -136,7 +136,7 @@ class _Request:
 
 @dataclass(frozen=True, slots=True)
 class _Aim:
-    """Where a leg goes; speed None keeps the one in force."""
+    """End of a leg. Speed None keeps the current speed setpoint."""
 
     target: XY
     altitude_m: float
@@ -144,7 +144,7 @@ class _Aim:
 
 
 def _beyond(args: GotoArgs, grant: CompiledGrant) -> bool:
-    """Whether the target lies on the far side of the globe, where the frame folds over."""
+    """Return True if the target lies on the far side of the globe, which the frame cannot represent."""
     frame = grant.frame
     if abs(args.lat - frame.lat) < NEAR_DEG and abs(args.lon - frame.lon) < NEAR_DEG:
         return False
@@ -154,7 +154,7 @@ def _beyond(args: GotoArgs, grant: CompiledGrant) -> bool:
 
 
 def _fly_leg(request: _Request, aim: _Aim, notes: list[Correction], adjusting: bool) -> _Aim | Verdict:
-    """What may be flown of a leg, or the verdict that forbids it."""
+    """Return the permitted part of a leg, or the verdict that forbids it."""
     now, grant = request.now, request.grant
     leg = _leg(request.at, aim.target, now, aim.altitude_m)
     within = _within_limits(request, leg, aim, notes)
@@ -175,7 +175,7 @@ def _fly_leg(request: _Request, aim: _Aim, notes: list[Correction], adjusting: b
 
 
 def _objection(request: _Request, aim: _Aim) -> Verdict | None:
-    """What fences and the way home have against a leg, its limits left aside."""
+    """Return the objection of fences and the return route to a leg, without its limits."""
     now, grant = request.now, request.grant
     leg = _leg(request.at, aim.target, now, aim.altitude_m)
     found = find_breaches(leg, now, grant, margin_m(now), height_margin_m(now))
@@ -183,7 +183,7 @@ def _objection(request: _Request, aim: _Aim) -> Verdict | None:
 
 
 def _within_limits(request: _Request, leg: Leg, aim: _Aim, notes: list[Correction]) -> _Aim | Verdict:
-    """The aim inside the limits of altitude and speed, or the verdict that forbids it."""
+    """Return the aim corrected to the limits of altitude and speed, or the verdict that forbids it."""
     now, grant = request.now, request.grant
     air = AirVolume(leg.ground, margin_m(now), leg.lower_m, leg.upper_m)
     bounds, unknown = altitude_bounds(grant, now, air)
@@ -195,7 +195,7 @@ def _within_limits(request: _Request, leg: Leg, aim: _Aim, notes: list[Correctio
     if height.value < MIN_LEG_ALTITUDE_M - ROUNDING_SLACK and not allows_low_altitude(bounds):
         return deny(
             "AltitudeTooLow",
-            f"a leg ends at least {MIN_LEG_ALTITUDE_M:.0f} m above home, not at {height.value:.1f} m; use land to come down",
+            f"a leg ends at least {MIN_LEG_ALTITUDE_M:.0f} m above home, not at {height.value:.1f} m; use Land to descend",
         )
     asked = request.args.speed_mps if aim.speed_mps is None else aim.speed_mps
     speed = clamp("Speed", "m/s", now.speed_setpoint_mps if asked is None else asked, speed_bounds(grant, now, air))
@@ -219,9 +219,9 @@ def _leg(at: XY, target: XY, now: Situation, altitude_m: float) -> Leg:
 
 
 def check_return(target: XY, altitude_m: float, now: Situation, grant: CompiledGrant) -> Verdict | None:
-    """The denial of a target from which the autopilot's way home is not legal.
+    """Return the denial of a target from which the return is not legal, or None.
 
-    A drone that is on the wrong side of a fence may leave it wherever its home lies.
+    A drone on the wrong side of a fence may leave it regardless of the position of its home.
     """
     problem = check_straight_return(target, altitude_m, now, grant, margin=margin_m(now), slack=height_margin_m(now))
     at = grant.locate(now)
@@ -236,11 +236,11 @@ def check_return(target: XY, altitude_m: float, now: Situation, grant: CompiledG
     system = replace(grant, flight_area=grant.return_area, flight_area_border=grant.return_area_border)
     if route_exists(target, home, now, system, altitude_m):
         return None
-    return replace(problem, reason=f"{problem.reason}, and no legal way is found around it")
+    return replace(problem, reason=f"{problem.reason}, and no legal route around it was found")
 
 
 def _last_legal(leg: Leg, found: list[Breach]) -> XY | None:
-    """The furthest point of a leg that no breached fence objects to, or None when there is none worth flying to."""
+    """Return the farthest point of a leg that no breached fence forbids, or None if the leg to it is too short."""
     length_m = math.dist(leg.stop, leg.target)
     (x, y), (tx, ty) = leg.stop, leg.target
 
@@ -260,5 +260,5 @@ def _outcome(args: GotoArgs, flown: _Aim, notes: list[Correction], grant: Compil
     lat, lon = grant.frame.latlon(*flown.target) if moved else (args.lat, args.lon)
     new = replace(args, lat=lat, lon=lon, alt=flown.altitude_m, reference="home", speed_mps=flown.speed_mps)
     verdict = correction_verdict(new, sorted(notes, key=lambda note: note.code == "TerrainAssumedFlat"))
-    # Ground that is taken for flat is told, but changes nothing that was asked for.
+    # Flat terrain is mentioned in the reason, but it changes none of the requested arguments.
     return replace(verdict, action="allow") if verdict.code == "TerrainAssumedFlat" else verdict

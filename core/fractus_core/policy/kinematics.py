@@ -1,4 +1,4 @@
-"""How far a drone travels before it can stop, and the ground that a leg sweeps."""
+"""Kinematics: how far a drone travels before it can stop, and the ground that a leg sweeps."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ from fractus_core.policy.decision_types import STATIONARY_MPS, Airframe, Situati
 XY = tuple[float, float]
 
 _TURNING = (0.25, 0.5, 0.75)
-"""Shares of a turn at which a stop is looked at."""
+"""Fractions of a turn at which a stop is evaluated."""
 
 OVERSHOOT_SHARE = 0.35
-"""Share of the stopping distance that a drone which turns in flight may overshoot its target by."""
+"""Fraction of the stopping distance by which a drone that turns in flight may overshoot its target."""
 
 
 def stopping_distance_m(speed_mps: float, accel_mps2: float, position_gain: float) -> float:
-    """Distance ArduPilot's position controller needs to stop from a speed.
+    """Return the distance in which ArduPilot's position controller stops from a speed.
 
-    It follows a square-root controller: v/kP while v < a/kP, else a/(2 kP^2) + v^2/(2 a).
+    The controller limits the speed by a square-root function of the distance. The distance is v/kP while v < a/kP,
+    otherwise a/(2 kP^2) + v^2/(2 a).
     """
     speed = abs(speed_mps)
     if speed < accel_mps2 / position_gain:
@@ -33,26 +34,26 @@ def stopping_distance_m(speed_mps: float, accel_mps2: float, position_gain: floa
 
 
 def reaction_s(situation: Situation, accel_mps2: float) -> float:
-    """Time at unchanged speed before the brakes bite: latency, and half the time that the jerk limit takes."""
+    """Return the time at unchanged speed before braking takes effect: latency, and half the time of the jerk limit."""
     return situation.latency_s + accel_mps2 / (2 * situation.airframe.jerk_mps3)
 
 
 def margin_m(now: Situation) -> float:
-    """How far a leg keeps from fences: position error, and how far the drone strays from a leg.
+    """Return the horizontal distance that a leg keeps from fences: position error plus tracking error.
 
-    The stopping distance enters along the direction of motion, where it belongs: a leg sweeps the triangle of present
-    position, turning point and target.
+    The stopping distance is not part of the margin. It counts along the direction of motion: a leg sweeps the triangle
+    of present position, turning point and target.
     """
     return now.position_error_m + now.airframe.tracking_m
 
 
 def height_margin_m(now: Situation) -> float:
-    """How far a leg keeps from floors and ceilings of zones."""
+    """Return the vertical distance that a leg keeps from floors and ceilings of zones."""
     return now.altitude_error_m + now.airframe.tracking_m
 
 
 def is_moving(now: Situation) -> bool:
-    """Whether the drone is too fast to turn on the spot, or may be by the time it is told to."""
+    """Return True if the drone is too fast to turn on the spot, or may be when a command takes effect."""
     if _fast(now.north_mps, now.east_mps, now.down_mps):
         return True
     return bool(now.pending) and any(_fast(*velocity) for velocity in now.pending)
@@ -63,10 +64,13 @@ def _fast(north_mps: float, east_mps: float, down_mps: float) -> bool:
 
 
 def pending_outcomes(now: Situation, at: XY) -> list[tuple[XY, Situation]]:
-    """Where else the drone may be when it hears of a decision, in frame metres, and how it moves by then.
+    """Return the states the drone may reach by its pending velocity setpoints before a decision takes effect.
 
-    It may do what it was told last from this moment on, as hard as it can. These are the ends of what it may have done by
-    then: in between it may have done part of it, one after the other.
+    The drone may take up a pending setpoint from now on, with full acceleration. The results are the extreme cases. In
+    between it may have followed several setpoints in succession.
+
+    Returns:
+        Position in frame metres and situation, for each extreme case.
     """
     if not now.pending:
         return []
@@ -88,14 +92,14 @@ def pending_outcomes(now: Situation, at: XY) -> list[tuple[XY, Situation]]:
 
 
 def _taken_up(present: XY, wanted: XY, accel: float, jerk: float, lasting_s: float) -> XY:
-    """How far a velocity changes toward a wanted one, with what it changes further while the acceleration ends."""
+    """Return the change of a velocity toward a wanted one, including the change while the acceleration decays."""
     change = math.dist(present, wanted)
     share = min(accel * (lasting_s + accel / (2 * jerk)) / change, 1.0) if change > 0 else 0.0
     return (wanted[0] - present[0]) * share, (wanted[1] - present[1]) * share
 
 
 MAX_PENDING_VELOCITIES = 4
-"""Of more velocities than this the corners of the smallest box around them are looked at instead."""
+"""Above this number of pending velocities, the corners of their bounding box replace them."""
 
 
 def _extremes(velocities: tuple[tuple[float, float, float], ...]) -> tuple[tuple[float, float, float], ...]:
@@ -106,7 +110,7 @@ def _extremes(velocities: tuple[tuple[float, float, float], ...]) -> tuple[tuple
 
 
 def situation_at_rest(now: Situation, grant_frame: LocalFrame, at: XY) -> Situation:
-    """The situation after the drone was told to stop now, wherever its latency lets it come to rest."""
+    """Return the situation after a stop commanded now, at the point of rest that the latency allows."""
     lat, lon = grant_frame.latlon(*stop_point(now, at))
     return replace(
         now, lat=lat, lon=lon, altitude_m=stop_altitude_m(now), north_mps=0.0, east_mps=0.0, down_mps=0.0, pending=()
@@ -115,11 +119,11 @@ def situation_at_rest(now: Situation, grant_frame: LocalFrame, at: XY) -> Situat
 
 @dataclass(frozen=True, slots=True)
 class MotionBeforeReaction:
-    """What a drone does before a command takes effect.
+    """Motion of a drone before a command takes effect.
 
     Attributes:
-        speed_mps: how fast it is when the change begins.
-        run_m: how far it went by then, the time included that the brakes take to bite.
+        speed_mps: Speed when the command takes effect.
+        run_m: Distance covered until then, including the time until braking takes effect.
     """
 
     speed_mps: float
@@ -127,10 +131,10 @@ class MotionBeforeReaction:
 
 
 def motion_before_reaction(situation: Situation) -> MotionBeforeReaction:
-    """How far a drone flies on, and how much faster it may get, before it does what it is told.
+    """Return how far a drone flies, and how fast it may become, before it obeys a command.
 
-    A drone that speeds up goes on speeding up for the latency, and then as long as its jerk limit takes to end that. Where
-    its acceleration is unknown it is taken to speed up as much as it can, unless it flies as fast as it was told to.
+    An accelerating drone keeps accelerating for the latency, and then until its jerk limit ends the acceleration. If
+    its acceleration is unknown, full acceleration is assumed, unless the drone flies at its speed setpoint.
     """
     frame = situation.airframe
     speed = math.hypot(situation.north_mps, situation.east_mps)
@@ -139,10 +143,10 @@ def motion_before_reaction(situation: Situation) -> MotionBeforeReaction:
     if forward is None:
         forward = frame.accel_mps2 if STATIONARY_MPS <= speed < situation.speed_setpoint_mps else 0.0
     elif forward < 0.0 and any(_fast(*velocity) for velocity in situation.pending):
-        forward = 0.0  # It may have been told to brake no longer.
+        forward = 0.0  # A pending setpoint may have ended the braking.
     forward = min(max(forward, -frame.accel_mps2), frame.accel_mps2)
     if forward <= 0.0:
-        # A drone that brakes already goes on braking: its speed is lower when the command takes effect.
+        # A braking drone keeps braking, so its speed is lower when the command takes effect.
         left = max(speed + forward * situation.latency_s, 0.0)
         bite_s *= 1.0 + forward / frame.accel_mps2
         return MotionBeforeReaction(left, (speed + left) / 2 * situation.latency_s + left * bite_s)
@@ -157,9 +161,9 @@ def motion_before_reaction(situation: Situation) -> MotionBeforeReaction:
 
 
 def stop_point(situation: Situation, at: XY) -> XY:
-    """Where the drone comes to rest, in frame metres, when it is told to stop now."""
+    """Return the point of rest in frame metres if the drone is commanded to stop now."""
     speed = math.hypot(situation.north_mps, situation.east_mps)
-    # Below the noise of a GNSS velocity its direction says nothing.
+    # Below the noise of a GNSS velocity its direction is meaningless.
     if speed < 0.05:
         return at
     frame, begin = situation.airframe, motion_before_reaction(situation)
@@ -168,17 +172,17 @@ def stop_point(situation: Situation, at: XY) -> XY:
 
 
 def shortest_stop_point(situation: Situation, at: XY) -> XY:
-    """Where the drone comes to rest, in frame metres, that brakes already, as hard as it can."""
+    """Return the point of rest in frame metres of a drone that is already braking as hard as it can."""
     run = math.hypot(situation.north_mps, situation.east_mps) / (2 * situation.airframe.accel_mps2)
     return at[0] + situation.east_mps * run, at[1] + situation.north_mps * run
 
 
 def turn_point(situation: Situation, at: XY, target: XY) -> XY:
-    """The corner of the triangle in which a drone turns from its present velocity toward a target.
+    """Return the corner of the triangle in which a drone turns from its present velocity toward a target.
 
-    While the velocity changes from v to w with an acceleration of bounded size a, the drone flies a parabola: a Bezier
-    curve of second degree whose middle control point lies v * T / 2 ahead, with T = |w - v| / a, and which never leaves
-    the triangle of its control points.
+    While the velocity changes from v to w with an acceleration of size a, the drone flies a parabola: a Bezier curve of
+    second degree whose middle control point lies v * T / 2 ahead, with T = |w - v| / a. The curve never leaves the
+    triangle of its control points.
     """
     speed = math.hypot(situation.north_mps, situation.east_mps)
     frame = situation.airframe
@@ -201,9 +205,9 @@ def turn_point(situation: Situation, at: XY, target: XY) -> XY:
 
 
 def turning_stops(situation: Situation, at: XY, target: XY) -> tuple[XY, ...]:
-    """Where a drone comes to rest that is told to stop while it turns toward a target.
+    """Return the points of rest of a drone that is stopped while it turns toward a target.
 
-    It stops along its velocity of that moment, which may lead out of the triangle that the turn itself stays in.
+    It stops along its velocity at that moment, possibly outside the triangle of the turn.
     """
     speed = math.hypot(situation.north_mps, situation.east_mps)
     if speed < STATIONARY_MPS:
@@ -230,7 +234,7 @@ def turning_stops(situation: Situation, at: XY, target: XY) -> tuple[XY, ...]:
 
 
 def stop_altitude_m(situation: Situation) -> float:
-    """Altitude above home at which the drone comes to rest when it is told to stop now."""
+    """Return the altitude above home at which the drone comes to rest if it is commanded to stop now."""
     climb = -situation.down_mps
     if abs(climb) < 0.05:
         return situation.altitude_m
@@ -240,27 +244,27 @@ def stop_altitude_m(situation: Situation) -> float:
 
 
 def altitude_range_to_stop_m(situation: Situation) -> tuple[float, float]:
-    """The lowest and the highest altitude above home at which the drone is until it comes to rest."""
+    """Return the lowest and the highest altitude above home until the drone comes to rest."""
     rest_m = stop_altitude_m(situation)
     return min(situation.altitude_m, rest_m), max(situation.altitude_m, rest_m)
 
 
 @dataclass(frozen=True)
 class Leg:
-    """A motion in frame metres: from where the drone is, by where it can turn, to a target.
+    """A motion in frame metres from the drone's position, via its turning point, to a target.
 
     The drone may be anywhere in the triangle of present position, turning point and target, at any altitude between
-    lower and upper: autopilots shape the axes independently, so no straighter promise can be made.
+    lower and upper, because autopilots control the axes independently.
 
     Attributes:
-        start: where the drone is.
-        stop: where it comes to rest when it brakes now, on the way to `turn`.
-        turn: see `turn_point`.
-        target: where it is to go.
-        lower_m: lowest altitude above home on the way.
-        upper_m: highest altitude above home on the way.
-        corners: further places that the ground below stretches to.
-        drifts: whether it is flown with a velocity, not to a target that was asked for.
+        start: Position of the drone.
+        stop: Point of rest if the drone brakes now, on the way to `turn`.
+        turn: See `turn_point`.
+        target: End of the leg.
+        lower_m: Lowest altitude above home on the leg.
+        upper_m: Highest altitude above home on the leg.
+        corners: Further points that the ground below includes.
+        follows_velocity: True if the leg results from a velocity setpoint and its target was not requested.
     """
 
     start: XY
@@ -274,7 +278,7 @@ class Leg:
 
     @cached_property
     def ground(self) -> BaseGeometry:
-        """The ground below the leg: a triangle, a line or a point."""
+        """Ground below the leg: a triangle, a line or a point."""
         start, turn, target = self.start, self.turn, self._beyond
         if self.corners:
             return shapely.convex_hull(shapely.multipoints((start, turn, self.target, target, *self.corners)))
@@ -289,7 +293,7 @@ class Leg:
 
     @property
     def _beyond(self) -> XY:
-        """How far the drone may overshoot: one that turns on its way arrives askew and swings past the target."""
+        """Farthest point of an overshoot. A drone that turns on its way swings past the target."""
         if self.follows_velocity:
             return self.target
         (tx, ty), (x, y) = self.turn, self.target
@@ -301,25 +305,25 @@ class Leg:
 
     @cached_property
     def braking_path(self) -> BaseGeometry:
-        """The part that the drone flies whatever it is told."""
+        """Part of the leg that the drone flies regardless of any command."""
         return shapely.points(self.start) if self.start == self.stop else shapely.linestrings((self.start, self.stop))
 
     @cached_property
     def line(self) -> BaseGeometry:
-        """From where the drone comes to rest straight to the target."""
+        """Straight line from the point of rest to the target."""
         return shapely.points(self.stop) if self.stop == self.target else shapely.linestrings((self.stop, self.target))
 
 
 def vertical_leg(at: XY, lower_m: float, upper_m: float) -> Leg:
-    """A drone that stays above one place."""
+    """Return the leg of a drone that stays above one point."""
     return Leg(at, at, at, at, lower_m, upper_m)
 
 
 def velocity_leg(now: Situation, at: XY, asked: VelocityArgs) -> Leg:
-    """What a drone sweeps that takes up a velocity, holds it to the end of its hold, and stops.
+    """Return the leg of a drone that takes up a velocity, keeps it for its hold time, and stops.
 
-    The ground is the convex hull of where it may be, whether latency delays the beginning, the end, or neither. The leg's
-    target is where it comes to rest at the latest.
+    The ground is the convex hull of the possible positions, whether latency delays the beginning, the end, or neither.
+    The target is the last possible point of rest.
     """
     frame, begin = now.airframe, motion_before_reaction(now)
     wanted = (asked.east_mps, asked.north_mps)
@@ -328,7 +332,7 @@ def velocity_leg(now: Situation, at: XY, asked: VelocityArgs) -> Leg:
     present = (ahead[0] * begin.speed_mps, ahead[1] * begin.speed_mps)
     lasting_s = asked.hold_s + now.latency_s
     control = (frame.accel_mps2, frame.position_gain)
-    # At the earliest it obeys at once, and slower than it may be by the latest: so it comes furthest the new way.
+    # If the drone obeys at once, its initial speed is lowest and it flies farthest in the new direction.
     known = now.forward_mps2 is not None and not now.pending
     braked = begin.speed_mps if known else speed - frame.accel_mps2 * now.latency_s
     slowest = max(min(speed, braked), 0.0)
@@ -352,7 +356,10 @@ def velocity_leg(now: Situation, at: XY, asked: VelocityArgs) -> Leg:
 
 
 def _course(present: XY, wanted: XY, lasting_s: float, frame: Airframe, control: tuple[float, float]) -> list[XY]:
-    """Displacements whose hull holds the motion from one velocity to another and to rest; the last is the rest."""
+    """Return displacements whose hull contains the motion from one velocity to another and to rest.
+
+    The last is the rest.
+    """
     accel, gain = control
     change_s = math.dist(present, wanted) / accel
     found = []

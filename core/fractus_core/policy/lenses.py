@@ -1,4 +1,7 @@
-"""What a camera's description tells of its view: for each lens, a pinhole's view that holds every ray of a picture."""
+"""Fields of view from camera descriptions.
+
+For each lens model, the view is that of a pinhole which contains every ray of a picture.
+"""
 
 from __future__ import annotations
 
@@ -12,14 +15,14 @@ from fractus_core.policy.decision_types import Lens
 MOUNT_ERROR_DEG = 2.0
 """Bound of the error of a mount's direction."""
 OFF_AXIS_DEG = 1.0
-"""By how much more the axis of a lens that is not described may be off the middle of the picture."""
+"""Additional error if the lens is not described, because its axis may be off the middle of the picture."""
 _STEPS = 4000
 _MAX_TAN = math.tan(math.radians(80.0))
-"""Rays further from the axis than that (`footprint.MAX_HALF_VIEW_DEG`) make a view count as everything anyway."""
+"""Beyond this angle from the axis (`footprint.MAX_HALF_VIEW_DEG`) a view counts as seeing everything anyway."""
 
 
 def bounding_lens(camera: CameraFeatures | None) -> Lens | None:
-    """What a description tells of a camera; None where it does not tell enough."""
+    """Return the view of a described camera, or None if the description is incomplete."""
     if camera is None or camera.horizontal_field_of_view is None or camera.mount is None:
         return None
     width, height = camera.pixels
@@ -27,18 +30,18 @@ def bounding_lens(camera: CameraFeatures | None) -> Lens | None:
     wide, tall = (2 * math.degrees(math.atan(side)) for side in half) if half is not None else (180.0, 180.0)
     mount, error_deg = camera.mount, MOUNT_ERROR_DEG + (OFF_AXIS_DEG if camera.lens is None else 0.0)
     if mount.gimbal:
-        # Its attitude is the camera's own: nothing is mounted on it at an angle.
+        # The attitude of a gimbal is that of the camera, so no mounting angle applies.
         return Lens(wide, tall, 0.0, 0.0, False, error_deg)
     return Lens(wide, tall, mount.pitch, mount.yaw, mount.stabilised, error_deg)
 
 
 def _half_view(lens: CameraLens | None, half: float, aspect: float) -> tuple[float, float] | None:
-    """Tangents of the half views that hold every ray of a picture; None where there are none.
+    """Return the tangents of the half views that contain every ray of a picture, or None if no such view exists.
 
     Args:
-        lens: None where it is not described.
-        half: angle from the middle of the picture to the middle of a side.
-        aspect: height over width.
+        lens: Description of the lens, or None.
+        half: Angle from the middle of the picture to the middle of a side.
+        aspect: Height over width.
     """
     if lens is None:
         return _any_lens(half, aspect)
@@ -50,7 +53,10 @@ def _half_view(lens: CameraLens | None, half: float, aspect: float) -> tuple[flo
 
 
 def _corner(angle: float, aspect: float) -> tuple[float, float] | None:
-    """The tangents of a corner at an angle: the largest ones, where rays bend outwards more the further out they are."""
+    """Return the tangents of a corner at an angle.
+
+    They are the largest ones if rays bend outward more the farther out they are.
+    """
     if angle >= math.pi / 2:
         return None
     far = math.tan(angle) / math.hypot(1.0, aspect)
@@ -58,11 +64,12 @@ def _corner(angle: float, aspect: float) -> tuple[float, float] | None:
 
 
 def _any_lens(half: float, aspect: float) -> tuple[float, float] | None:
-    """For every lens that has an axis, and shows at its corners no more than an orthographic fisheye does.
+    """Return bounds for every lens that has an axis and shows at its corners no more than an orthographic fisheye.
 
-    Of all lenses with the same angle at their sides, that one compresses what is further out the most; so within are pinholes,
-    the other fisheyes (stereographic, equidistant, equisolid) and what Brown and Conrady's model tells of real lenses. What is
-    nearer to the middle than the sides is at a smaller angle, which is all that is known of it.
+    Of all lenses with the same angle at their sides, an orthographic fisheye compresses the outer parts most. The
+    bounds therefore cover pinholes, the other fisheyes (stereographic, equidistant, equisolid) and real lenses in the
+    Brown-Conrady model. Rays closer to the middle than the sides have a smaller angle, and nothing else is known of
+    them.
     """
     sine = math.sin(half) * math.hypot(1.0, aspect)
     corner = _corner(math.asin(sine), aspect) if sine < 1.0 else None
@@ -71,10 +78,11 @@ def _any_lens(half: float, aspect: float) -> tuple[float, float] | None:
 
 
 def _distorted(lens: CameraLens, side: float, aspect: float) -> tuple[float, float] | None:
-    """Brown and Conrady: a ray with tangent r is shown at g(r) = r (1 + k1 r² + k2 r⁴ + k3 r⁶), and off that by t r² at most.
+    """Return bounds for the Brown-Conrady model.
 
-    So a ray that is shown is no further out than where g(r) - t r² reaches the corner of the picture; where it never does,
-    or turns back before, the model does not tell what is shown there.
+    A ray with tangent r is shown at g(r) = r (1 + k1 r² + k2 r⁴ + k3 r⁶), displaced by at most t r². A shown ray is
+    therefore no farther out than the r at which g(r) - t r² reaches the corner of the picture. If g never reaches it,
+    or turns back before, the model does not define what is shown there.
     """
     k1, k2, k3, p1, p2 = (getattr(lens, name) or 0.0 for name in ("k1", "k2", "k3", "p1", "p2"))
     tangential = 3.0 * (abs(p1) + abs(p2))
@@ -90,7 +98,8 @@ def _distorted(lens: CameraLens, side: float, aspect: float) -> tuple[float, flo
     if r[last] < side or shown[0] <= 0.0 or not (outwards > 0.0).all():
         return None
     slack, shrunk = tangential * r[last] ** 2, 1.001 / stretch[: last + 1].min()
-    # Where a lens makes things smaller than that, a wider view stands for it, too: faces are looked for by their size.
+    # If a lens shows objects smaller than the pinhole does, a wider view replaces it, because faces are searched by
+    # their size.
     least = float((outwards * (1.0 + r[1 : last + 1] ** 2)).min())
     x, y = ((extent + slack) * shrunk for extent in (wide, wide * aspect))
     return max(min(x, float(r[last])), wide / least), min(y, float(r[last]))

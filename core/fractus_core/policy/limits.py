@@ -1,4 +1,8 @@
-"""Limits on altitude and speed: clamp what may be enforced, refuse the rest."""
+"""Limits on altitude and speed.
+
+Values are corrected to enforced limits and denied by the others. Corrections are judged again until nothing is left to
+correct.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +19,9 @@ from fractus_core.policy.compiled_grant import AirVolume, CompiledGrant, PolicyI
 from fractus_core.policy.decision_types import Args, Call, Situation, Verdict, deny, distinct
 
 ROUNDING_SLACK = 1e-6
-"""Rounding of a value that was corrected to a limit exactly must not break that limit."""
+"""Tolerance that keeps a value corrected to a limit from breaking the limit by rounding."""
 MIN_LEG_ALTITUDE_M = 2.0
-"""A motion other than landing ends at least this high above home, where no altitude limit says that lower is fine."""
+"""Lowest altitude above home at the end of a motion other than landing, unless an altitude limit permits less."""
 
 
 _REFUSES: dict[LimitAction, bool] = exhaustive(LimitAction, {"enforce": False, "refuse": True})
@@ -25,7 +29,7 @@ _REFUSES: dict[LimitAction, bool] = exhaustive(LimitAction, {"enforce": False, "
 
 @dataclass(frozen=True, slots=True)
 class Bound:
-    """One limit in force; heights above home, or speeds."""
+    """A limit in force: altitudes above home, or speeds."""
 
     name: str
     priority: int
@@ -37,7 +41,7 @@ class Bound:
 
 @dataclass(frozen=True, slots=True)
 class Correction:
-    """A value inside all limits, and what had to be done for it."""
+    """A value inside all limits. Code, reason and policies are set if the value was changed."""
 
     value: float
     code: str = ""
@@ -46,7 +50,7 @@ class Correction:
 
 
 def correction_verdict(args: Args, notes: Sequence[Correction]) -> Verdict:
-    """The verdict on a call that is carried out with these arguments, after all that had to be done for them."""
+    """Return the verdict on a call that is carried out with these arguments, from the corrections made."""
     done = [note for note in notes if note.code]
     if not done:
         return Verdict("allow", args)
@@ -55,7 +59,11 @@ def correction_verdict(args: Args, notes: Sequence[Correction]) -> Verdict:
 
 
 def altitude_bounds(grant: CompiledGrant, now: Situation, air: AirVolume) -> tuple[list[Bound], list[Rule]]:
-    """Altitude limits, in metres above home, in a piece of air; and the rules whose datum lies at no known height."""
+    """Return the altitude limits that apply in a volume.
+
+    Returns:
+        The limits in metres above home, and the rules whose datum has an unknown height.
+    """
     bounds, unknown = [], list[Rule]()
     if grant.max_altitude_m is not None:
         bounds.append(Bound("", 0, None, grant.max_altitude_m, refuses=False))
@@ -79,13 +87,16 @@ def altitude_bounds(grant: CompiledGrant, now: Situation, air: AirVolume) -> tup
 
 
 def lowest_ceiling_m(bounds: Sequence[Bound], unknown: Sequence[Rule], here_m: float) -> float:
-    """The lowest upper limit above home; where one of them lies at no known height, a drone does not climb from `here_m`."""
+    """Return the lowest upper limit above home.
+
+    If one has an unknown datum, the result is at most `here_m`, so the drone does not climb.
+    """
     ceiling = min((bound.upper for bound in bounds if bound.upper is not None), default=math.inf)
     return min(ceiling, here_m) if any(rule.spec.upper_limit is not None for rule in unknown) else ceiling
 
 
 def deny_unknown_datum(rule: Rule) -> Verdict:
-    """The denial of a motion by a limit of altitude whose datum lies at no known height."""
+    """Return the denial of a motion under an altitude limit whose datum has an unknown height."""
     terrain = rule.spec.altitude_reference == "terrain"
     what, code = ("no terrain model is loaded", "TerrainUnknown") if terrain else ("home is unknown", "HomeUnknown")
     return deny(
@@ -96,7 +107,7 @@ def deny_unknown_datum(rule: Rule) -> Verdict:
 
 
 def limit_forbids_altitudes(zone: PolicyZone, lower_m: float, upper_m: float, now: Situation, flat: bool) -> bool:
-    """Whether the altitude limit of a zone does not allow all heights from lower to upper (above home)."""
+    """Return True if the altitude limit of a zone forbids any altitude from `lower_m` to `upper_m` above home."""
     spec = zone.rule.spec
     highest, lowest = (
         edge if edge is None else altitude_above_home_m(edge, spec.altitude_reference, now.home, flat)
@@ -108,7 +119,7 @@ def limit_forbids_altitudes(zone: PolicyZone, lower_m: float, upper_m: float, no
 
 
 def speed_bounds(grant: CompiledGrant, now: Situation, air: AirVolume) -> list[Bound]:
-    """Speed limits, in metres per second, in a piece of air."""
+    """Return the speed limits, in metres per second, that apply in a volume."""
     bounds = []
     if grant.max_speed_mps is not None:
         bounds.append(Bound("", 0, None, grant.max_speed_mps, refuses=False))
@@ -129,19 +140,19 @@ def _in_force(
 
 
 def clamp(quantity: str, unit: str, value: float, bounds: list[Bound]) -> Correction | Verdict:
-    """Bring a value inside every limit.
+    """Correct a value to all limits.
 
     Args:
         quantity: "Altitude" or "Speed", for codes and sentences.
-        unit: its unit, for sentences.
-        value: what was asked for.
-        bounds: the limits in force.
+        unit: Unit of the value, for sentences.
+        value: Requested value.
+        bounds: Limits in force.
 
     Returns:
-        The nearest value that every limit allows, or the denial of a limit that refuses, or that leaves no value, or of
-        limits that contradict each other.
+        The nearest value that every limit permits, or a denial. A denial results from a limit that refuses, from limits
+        that contradict each other, and from limits that no motion can keep.
     """
-    # Not `>` and `<`: a limit that is not a number would never be broken.
+    # Negated `<=` and `>=`, so that a limit that is NaN counts as broken.
     above = sorted(
         (b for b in bounds if b.upper is not None and not value <= b.upper + ROUNDING_SLACK), key=_strictest_upper
     )
@@ -160,14 +171,14 @@ def clamp(quantity: str, unit: str, value: float, bounds: list[Bound]) -> Correc
         code = f"{quantity}{'Above' if bound in above else 'Below'}Limit"
         return deny(
             code,
-            f"{quantity.lower()} {value:.1f} {unit} breaks the limit of {limit:.1f} {unit} of {_source(bound)}, which refuses it",
+            f"{quantity.lower()} {value:.1f} {unit} breaks the limit of {limit:.1f} {unit} of {_source(bound)} (action refuse)",
             distinct(b.name for b in refusing),
         )
     for bound in (*above, *below):
         limit = bound.upper if bound in above else bound.lower
         if not is_achievable(quantity, limit):
             reason = f"{quantity.lower()} {value:.1f} {unit} breaks the limit of {limit} {unit} of {_source(bound)}"
-            return deny(code, f"{reason}, which no motion can keep; correct the limit", distinct((bound.name,)))
+            return deny(code, f"{reason}; no motion can comply with this limit, so correct it", distinct((bound.name,)))
     problem = check_contradiction(quantity, unit, bounds)
     if problem is not None:
         return problem
@@ -183,12 +194,12 @@ def clamp(quantity: str, unit: str, value: float, bounds: list[Bound]) -> Correc
 
 
 def is_achievable(quantity: str, limit: float | None) -> bool:
-    """Whether a value may be corrected to a limit: any altitude that is a number, and any speed that moves a drone."""
+    """Return True if a value may be corrected to a limit: any finite altitude, and any speed above zero."""
     return limit is not None and math.isfinite(limit) and (quantity != "Speed" or limit > 0)
 
 
 def check_contradiction(quantity: str, unit: str, bounds: list[Bound]) -> Verdict | None:
-    """The denial of any value, where limits contradict each other."""
+    """Return the denial of every value if limits contradict each other, or None."""
     highest, lowest = _highest(bounds), _lowest(bounds)
     if lowest <= highest + ROUNDING_SLACK:
         return None
@@ -196,8 +207,8 @@ def check_contradiction(quantity: str, unit: str, bounds: list[Bound]) -> Verdic
     low = [b for b in bounds if b.lower == lowest]
     return deny(
         "ConflictingLimits",
-        f"no {quantity.lower()} is at least {lowest:.1f} (as {_sources(low)} asks) and at most {highest:.1f} {unit}"
-        f" (as {_sources(high)} asks); ask for another place",
+        f"no {quantity.lower()} is at least {lowest:.1f} ({_sources(low)}) and at most {highest:.1f} {unit}"
+        f" ({_sources(high)}); choose another position",
         distinct(b.name for b in bounds if b in low or b in high),
     )
 
@@ -211,14 +222,14 @@ def _lowest(bounds: list[Bound]) -> float:
 
 
 def strictest_bound(bounds: list[Bound], *, above: bool) -> Bound | None:
-    """The bound with the lowest upper edge, or the highest lower edge."""
+    """Return the bound with the lowest upper limit, or with the highest lower limit."""
     if above:
         return min((b for b in bounds if b.upper is not None), key=_strictest_upper, default=None)
     return min((b for b in bounds if b.lower is not None), key=_strictest_lower, default=None)
 
 
 def allows_low_altitude(bounds: list[Bound]) -> bool:
-    """Whether an altitude limit in force allows heights below `MIN_LEG_ALTITUDE_M`."""
+    """Return True if an altitude limit in force permits altitudes below `MIN_LEG_ALTITUDE_M`."""
     return any(
         edge is not None and edge < MIN_LEG_ALTITUDE_M for bound in bounds for edge in (bound.lower, bound.upper)
     )
@@ -227,13 +238,13 @@ def allows_low_altitude(bounds: list[Bound]) -> bool:
 def check_altitude_on_entry(
     here: BaseGeometry, heights_m: tuple[float, float], bounds: list[Bound], slack_m: float
 ) -> Verdict | None:
-    """The denial of a leg that would carry the present altitude into a zone where it is not allowed.
+    """Return the denial of a leg that would enter a zone at an altitude that the zone does not permit, or None.
 
     Args:
-        here: where the leg begins.
-        heights_m: the altitude there, and that at which a drone that climbs or sinks comes to rest.
-        bounds: limits of altitude along the leg.
-        slack_m: how far they may be missed.
+        here: Start of the leg.
+        heights_m: Present altitude, and the altitude at which a climbing or sinking drone comes to rest.
+        bounds: Altitude limits along the leg.
+        slack_m: Permitted deviation from the limits.
     """
     low, high = min(heights_m), max(heights_m)
     for bound in bounds:
@@ -275,23 +286,24 @@ def _source(bound: Bound) -> str:
 # Corrections of corrections
 
 MAX_ROUNDS = 8
-"""Corrections of a correction at most: each climbs or sinks into the limits of further zones, and few zones are stacked."""
+"""Maximum number of successive corrections. Each may climb or sink into the limits of further zones, and few zones
+overlap."""
 
 
 def settle_correction(call: Call, first: Verdict, judge: Callable[[Call], Verdict]) -> Verdict:
-    """A correction carried on until nothing is left to correct.
+    """Judge a correction again until nothing is left to correct.
 
-    An altitude that is corrected may lie in the band of another zone, whose limits of altitude and speed were not looked
-    at before. So whatever comes out is judged like a call that asks for it.
+    A corrected altitude may lie in the band of another zone whose limits were not considered before. So each correction
+    is judged like a call that requests it.
 
     Args:
-        call: what was asked for.
-        first: the correction of it.
-        judge: the whole judgement of a call, in the same situation and under the same grant.
+        call: Requested call.
+        first: Its correction.
+        judge: Judgement of a call in the same situation and under the same grant.
 
     Returns:
-        A correction to arguments that are allowed as they are; or the denial of limits that cannot be met together. It is
-        never a takeover: the application did not ask for what its call was corrected to.
+        A correction to arguments that are permitted unchanged, or the denial of limits that cannot be met together. It
+        is never a takeover, because the application did not request the corrected arguments.
     """
     done = [first]
     for _ in range(MAX_ROUNDS):
@@ -315,25 +327,25 @@ def _summed_up(done: Sequence[Verdict], allowed: Verdict) -> Verdict:
 
 
 def choose_objection(problem: Verdict, asked: Verdict | None, correction: Verdict) -> Verdict:
-    """The verdict on a call of which only the correction is objected to, or both it and what was asked for.
+    """Return the verdict on a corrected call that is not permitted.
 
     Args:
-        problem: the objection to what the call was corrected to.
-        asked: the objection to what was asked for; None when there is none.
-        correction: what was done to the call.
+        problem: Objection to the corrected arguments.
+        asked: Objection to the requested arguments, or None.
+        correction: Correction of the call.
     """
     if asked is None:
         return deny_conflict((correction,), problem)
-    # A drone is taken over for what its application asked for, not for what its call was corrected to.
+    # A drone is taken over for requested arguments only, never for corrected ones.
     return asked if problem.action == "takeover" else problem
 
 
 def deny_conflict(done: Sequence[Verdict], problem: Verdict) -> Verdict:
-    """The denial of a call whose corrections lead to another objection."""
+    """Return the denial of a call whose corrections lead to another objection."""
     names = distinct(name for step in (*done, problem) for name in step.policies)
     what = (
         f"policies {', '.join(names)}" if len(names) > 1 else f"the limits of policy {names[0]}" if names else "limits"
     )
-    # The last correction is what the objection is about; those before it led there.
-    reason = f"{what} cannot be met together: {done[-1].reason}, and then {problem.reason}; ask for something else"
+    # The objection concerns the last correction.
+    reason = f"{what} cannot be met together: {done[-1].reason}, and then {problem.reason}; change the request"
     return deny("ConflictingLimits", reason, names)

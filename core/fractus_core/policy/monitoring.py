@@ -1,4 +1,4 @@
-"""The continuous check of a flying drone's present state, with a look ahead to where it can stop."""
+"""Continuous check of a flying drone's state, including its way to the point where it can stop."""
 
 from __future__ import annotations
 
@@ -33,20 +33,21 @@ from fractus_core.policy.limits import (
 )
 
 TRACKING_SHARE = 0.3
-"""Share of the tracking margin of accepted legs that the monitor keeps as well."""
+"""Fraction of the tracking margin of permitted legs that the monitor keeps as well."""
 
 AIM_SHARE = 0.1
-"""A drone flies to a target that it would miss by no more than this share of its distance: gusts turn its velocity."""
+"""A drone whose course misses a target by at most this fraction of the distance counts as flying to it, because gusts
+turn its velocity."""
 
 SINKING_MPS = 0.5
-"""A drone that climbs no faster than this may go on while its altitude limits cannot be worked out; one that the system
-flies, and that sinks faster, is on its way back under a limit."""
+"""Vertical speed in two rules. A drone that climbs no faster may continue while its altitude limits are unknown. A
+drone that the system flies, and that sinks faster, is returning below a limit."""
 
 CLIMBING_MPS = 0.2
-"""A drone that holds its height climbs no faster than this."""
+"""A drone that holds its altitude climbs no faster than this."""
 
 DEEPER_M = 0.6
-"""A drone on the wrong side of a fence is stopped again only when it moves this much further in."""
+"""A drone on the wrong side of a fence is stopped again only if it moves this much farther in."""
 
 
 def monitor(
@@ -57,25 +58,26 @@ def monitor(
     changed: bool = False,
     bound_for: GotoArgs | None = None,
 ) -> Verdict | None:
-    """What the system must do about a flying drone at this moment.
+    """Return what the system must do about a flying drone now.
 
-    Judged is the way from the present position to where the drone comes to rest if it is told to stop now, with the
-    position error around it: a smaller margin than that of accepted legs, so that a leg flown as accepted never triggers it.
+    The check covers the way from the present position to the point of rest after a stop commanded now, with the
+    position error around it. This margin is smaller than that of permitted legs, so that a leg flown as permitted never
+    triggers the monitor.
 
     Args:
-        now: the state of the drone.
-        grant: whose fences.
-        leaving: whether the system flies the drone already, or the autopilot by itself, so that only what gets worse
-            counts: where it is on the wrong side of a fence, or above a limit, the system's way leads back.
-        changed: whether other fences may have been in force when the drone's way was judged. A drone that speeds up is
-            faster before it hears of a stop, and whether there is room for that has not been judged: it is stopped in time;
-            and so is a leg whose rest is not legal any more.
-        bound_for: the leg under way, when it was accepted under this grant: the autopilot brakes for its end by itself,
-            before it would hear of a stop.
+        now: State of the drone.
+        grant: Permissions and restrictions that apply.
+        leaving: True if the system or the autopilot already flies the drone. Only a deterioration counts then, because
+            the system's way leads back from the wrong side of a fence or from above a limit.
+        changed: True if other fences may have been in force when the drone's motion was judged. An accelerating drone
+            is faster when it receives a stop, and the room for that has not been judged, so it is stopped early. A leg
+            whose remaining part is no longer legal is stopped too.
+        bound_for: Leg under way if it was permitted under this grant. The autopilot then brakes for its end without a
+            command.
 
     Returns:
-        None when all is well; a takeover; a denial with `hover`, when the motion is to be stopped and the application
-        keeps control; or a correction, with the arguments to carry out.
+        None if nothing must be done. A takeover. A denial with `hover`, if the motion must stop and the application
+        keeps control. Or a correction with the arguments to carry out.
     """
     if not now.in_air:
         return None
@@ -86,7 +88,7 @@ def monitor(
         return Verdict("takeover", None, "PositionUnknown", "the drone's position is unknown", (), "hover")
     start, margin = grant.frame.xy(lat, lon), now.position_error_m + TRACKING_SHARE * now.airframe.tracking_m
     surging = [(start, now), *pending_outcomes(now, start)] if changed else []
-    # A drone that speeds up does so on a way that was judged with room for it, and brakes at its end in time.
+    # An accelerating drone flies on a leg that was judged with room for it, and brakes at its end in time.
     now = replace(now, forward_mps2=min(now.forward_mps2 or 0.0, 0.0))
     stop = stop_point(now, start)
     ahead = stop if bound_for is None else _arrival(now, start, stop, grant.frame.xy(bound_for.lat, bound_for.lon))
@@ -95,25 +97,25 @@ def monitor(
     if worst is not None:
         return replace(worst, brake_first=worst.action == "takeover" and is_moving(now))
     for begin, then in surging:
-        # Its way may end before the fence: it is stopped, and taken over only if it really goes too far.
+        # The drone's way may end before the fence. It is stopped now, and taken over only if it really goes too far.
         further = _look_ahead(then, begin, stop_point(then, begin), margin, _level_m(then, bound_for, grant))
         worst = _worst(_fences(then, grant, further, leaving=True))
         if worst is not None:
             return replace(worst, action="deny", takeover="hover")
     if changed and bound_for is not None:
-        # A leg that is illegal by now is stopped at once: to stop it when it has to be takes a link at that moment.
+        # A leg that has become illegal is stopped at once. A later stop would depend on the link at that moment.
         worst = _worst(_fences(now, grant, _rest_of_leg(now, grant, start, bound_for, margin), leaving=leaving))
         if worst is not None:
             return replace(worst, brake_first=worst.action == "takeover" and is_moving(now))
     rest_m = _told_m(now, level_m)
-    # A climb of the autopilot's own was never judged and may end anywhere, so less than the whole slack is left to it.
+    # A climb initiated by the autopilot was never judged and may end anywhere, so it gets only part of the tolerance.
     unasked = leaving and bound_for is None and now.down_mps < -CLIMBING_MPS
     found = _heights(now, grant, start, stop, rest_m, sinks_back=leaving, share=0.5 if unasked else 1.0)
     return found or _speeds(now, grant, start)
 
 
 def _worst(found: list[tuple[int, Verdict]]) -> Verdict | None:
-    """What takes most from the application; of equals what has the highest priority."""
+    """Return the verdict that takes most control from the application. Among equals the one of highest priority."""
     ranked = [
         (-SEVERITY[v.takeover] if v.action == "takeover" and v.takeover is not None else 0, -priority, i)
         for i, (priority, v) in enumerate(found)
@@ -122,10 +124,11 @@ def _worst(found: list[tuple[int, Verdict]]) -> Verdict | None:
 
 
 def _arrival(now: Situation, start: XY, stop: XY, target: XY) -> XY:
-    """Where a drone comes to rest that flies to a target: there, while it can still brake for it as it was going to.
+    """Return the point of rest of a drone that flies to a target.
 
-    Told to stop now it flies on for its reaction; that it brakes for the target it knows already. So no further than that,
-    and as it strays from its leg, may the way to rest lead beyond the target.
+    This is the target itself as long as the drone can brake for it as planned. A drone commanded to stop flies on for
+    its reaction time, but it already brakes for the target. So its way to rest may lead beyond the target only by that
+    reaction and by its tracking error.
     """
     (dx, dy), (tx, ty) = ((x - start[0], y - start[1]) for x, y in (stop, target))
     run = math.hypot(dx, dy)
@@ -140,7 +143,7 @@ def _arrival(now: Situation, start: XY, stop: XY, target: XY) -> XY:
 
 
 def _level_m(now: Situation, bound_for: GotoArgs | None, grant: CompiledGrant) -> float:
-    """The altitude at which a drone comes to rest that climbs or sinks to that of its leg; see `_arrival`."""
+    """Return the altitude of rest of a drone that climbs or sinks to the altitude of its leg. See `_arrival`."""
     rest_m, climb = stop_altitude_m(now), -now.down_mps
     if bound_for is None or bound_for.alt is None or climb == 0.0:
         return rest_m
@@ -154,10 +157,10 @@ def _level_m(now: Situation, bound_for: GotoArgs | None, grant: CompiledGrant) -
 
 
 def _told_m(now: Situation, rest_m: float) -> float:
-    """The altitude at which a drone comes to rest that was told already to climb or sink no further.
+    """Return the altitude of rest of a drone that was already commanded to climb or sink no further.
 
-    It reacts to that from then on; a correction to a limit that it was permitted to come to rest at would come later still.
-    Zones get no such allowance: they are judged by where it rests if it is told only now.
+    The drone reacts to that command, and a correction to a limit at which it may rest would arrive even later. Zones
+    get no such allowance: they are judged by the altitude of rest after a command given now.
     """
     climb = -now.down_mps
     if not now.pending or -now.pending[-1][2] * climb > 0.0:
@@ -167,10 +170,10 @@ def _told_m(now: Situation, rest_m: float) -> float:
 
 
 def must_stop_first(now: Situation, grant: CompiledGrant) -> bool:
-    """Whether a moving drone must come to rest before it begins anything else, legal though that is.
+    """Return True if a moving drone must come to rest before it begins anything else, even a legal motion.
 
-    Its way to rest comes so near to a fence that the monitor may stop it on the new course, too: with the margin of legs,
-    and without the braking that has begun already, which a new command may interrupt.
+    This is the case if its way to rest comes so close to a fence that the monitor may stop it on the new course, too.
+    The check uses the margin of legs, and ignores braking that has begun, because a new command may interrupt it.
     """
     at = grant.locate(now)
     if at is None or not now.in_air or not is_moving(now):
@@ -191,7 +194,7 @@ def _look_ahead(now: Situation, start: XY, stop: XY, margin: float, rest_m: floa
     way = shapely.points(start) if start == stop else shapely.linestrings((start, stop))
     lower = min(now.altitude_m, rest_m) - now.altitude_error_m
     upper = max(now.altitude_m, rest_m) + now.altitude_error_m
-    # Who lands is not kept in the air by what is below.
+    # A fence below does not keep a landing drone in the air.
     ends_m = max(rest_m, now.altitude_m) if now.vertical else rest_m
     return _Ahead(
         AirVolume(way, margin, lower, upper), shapely.points(start), shapely.points(stop), now.altitude_m, ends_m
@@ -206,7 +209,7 @@ def _rest_of_leg(now: Situation, grant: CompiledGrant, start: XY, leg: GotoArgs,
 
 @dataclass(frozen=True, slots=True)
 class _Ahead:
-    """The way to where the drone can stop, with its ends, and their altitudes above home."""
+    """Way to the point where the drone can stop, with its ends and their altitudes above home."""
 
     air: AirVolume
     here: BaseGeometry
@@ -217,7 +220,7 @@ class _Ahead:
 
 @dataclass(frozen=True, slots=True)
 class _Fence:
-    """What a fence is called, what its policy does, and how its breach is called once it is there and before."""
+    """Name and action of a fence, and the codes of its breach after and before it happens."""
 
     policy: str
     action: GeofenceAction
@@ -228,7 +231,7 @@ class _Fence:
 
 @dataclass(frozen=True, slots=True)
 class _Finding:
-    """What a drone does to a fence: it is on the wrong side, or its motion makes things worse, or both."""
+    """Effect of a drone's motion on a fence: it is on the wrong side, or its motion makes things worse, or both."""
 
     fence: _Fence
     broken: bool
@@ -237,7 +240,7 @@ class _Finding:
 
 
 def _fences(now: Situation, grant: CompiledGrant, ahead: _Ahead, *, leaving: bool) -> list[tuple[int, Verdict]]:
-    """What fences ask for, each with its policy's priority."""
+    """Return the reactions of fences, each with the priority of its policy."""
     found: list[tuple[int, _Finding | None]] = [
         (zone.rule.spec.priority, _kept_out(zone, ahead, now, grant.flat_terrain))
         for zone in grant.exclusions.near(ahead.air, now, grant.flat_terrain)
@@ -268,7 +271,8 @@ def _kept_out(zone: PolicyZone, ahead: _Ahead, now: Situation, flat: bool) -> _F
     rest_m, here_m = (signed_depth_m(shape, border, point) for point in (ahead.rest, ahead.here))
     worse = rest_m > here_m + DEEPER_M or (crosses and not around)
     if crosses and zone.band is not None:
-        # From above or from below; where it is in the zone as seen from above, the lesser depth counts.
+        # The drone may approach from above or below. If its position is inside the zone's outline, the smaller depth
+        # counts.
         rest_m, here_m = (
             min(depth_m, band_depth_m(zone.band, altitude_m, now.home, flat))
             for depth_m, altitude_m in ((rest_m, ahead.rest_m), (here_m, ahead.here_m))
@@ -280,7 +284,7 @@ def _kept_out(zone: PolicyZone, ahead: _Ahead, now: Situation, flat: bool) -> _F
 
 
 def _leaves_by_height(fence: Inclusion, ahead: _Ahead, now: Situation, flat: bool) -> bool:
-    """Whether a drone above or below the zones to stay in, or about to be, gets further from all of them by its height."""
+    """Return True if a drone moves farther away from the altitudes of all zones it must stay in."""
     around = [zone.band for zone in fence.zones if zone.shape.intersects(ahead.here)]
     rest_m, here_m = (
         max((band_depth_m(band, m, now.home, flat) for band in around), default=math.inf)
@@ -305,9 +309,9 @@ def _kept_in(
 
 
 def _reaction(found: _Finding, *, leaving: bool) -> Verdict | None:
-    """What follows from a fence that is broken or about to be.
+    """Return the verdict on a fence that is broken or about to be broken.
 
-    A policy that takes the drone over does so for both; one that ignores requests only stops the motion that makes
+    A policy that takes over the drone does so in both cases. A policy with action ignore only stops motion that makes
     things worse.
     """
     fence = found.fence
@@ -324,10 +328,17 @@ def _reaction(found: _Finding, *, leaving: bool) -> Verdict | None:
 def _heights(
     now: Situation, grant: CompiledGrant, start: XY, stop: XY, rest_m: float, *, sinks_back: bool, share: float
 ) -> Verdict | None:
-    """The correction of an altitude that breaks limits, when the drone has come to rest at `stop` and `rest_m`.
+    """Return the correction of an altitude that breaks limits, or None.
 
-    Lower limits do not hold for a drone that takes off or lands; `sinks_back`: nor upper ones for one that sinks. `share`: how
-    much of its slack a drone may come to rest above an upper limit by.
+    Args:
+        now: State of the drone.
+        grant: Permissions and restrictions that apply.
+        start: Present position.
+        stop: Point of rest.
+        rest_m: Altitude of rest.
+        sinks_back: True if a sinking drone is exempt from upper limits. Lower limits do not apply during takeoff and
+            landing.
+        share: Fraction of the tolerance by which a drone may come to rest above an upper limit.
     """
     if grant.max_altitude_m is None and not grant.altitude_limits:
         return None
@@ -352,7 +363,7 @@ def _heights(
 
 @dataclass(frozen=True, slots=True)
 class _Trespass:
-    """A limit of altitude that is broken, and the height that keeps it."""
+    """A broken altitude limit, and the altitude that complies with it."""
 
     bound: Bound
     height_m: float
@@ -361,24 +372,24 @@ class _Trespass:
 
 
 def _changed_height(found: _Trespass, now: Situation, grant: CompiledGrant, stop: XY) -> Verdict:
-    """The correction to a height, or a stop where zones leave no way to it."""
+    """Return the correction to an altitude, or a stop if zones block the way to it."""
     names = (found.bound.name,) if found.bound.name else ()
     column = vertical_leg(stop, min(now.altitude_m, found.height_m), max(now.altitude_m, found.height_m))
     if find_breaches(column, now, grant, 0.0, 0.0):
-        reason = f"{found.reason}; zones leave no way back, so it stays"
+        reason = f"{found.reason}; zones block the way back, so the drone hovers"
         return Verdict("deny", None, found.code, reason, names, "hover")
     lat, lon = grant.frame.latlon(*stop)
     return Verdict("correct", GotoArgs(lat, lon, found.height_m), found.code, found.reason, names)
 
 
 def _speeds(now: Situation, grant: CompiledGrant, start: XY) -> Verdict | None:
-    """The correction of a speed that breaks limits."""
+    """Return the correction of a speed that breaks limits, or None."""
     if grant.max_speed_mps is None and not grant.speed_limits:
         return None
     speed = math.hypot(now.north_mps, now.east_mps)
     bounds = speed_bounds(grant, now, AirVolume(shapely.points(start), 0.0, now.altitude_m, now.altitude_m))
     over = strictest_bound(bounds, above=True)
-    # Gusts push a drone that keeps its setpoint beyond it for a moment: a tenth and 1 m/s are not its doing.
+    # Gusts push a drone beyond its speed setpoint for a moment, so a tenth and 1 m/s are tolerated.
     if over is None or over.upper is None or speed <= over.upper * 1.1 + 1.0:
         return None
     reason = f"the drone flies at {speed:.1f} m/s, above the limit of {over.upper:.1f} m/s"

@@ -1,4 +1,4 @@
-"""What privacy asks of a picture: nothing, filters in a fixed order, or refusal (thesis Table 8.1, PrivacyControl)."""
+"""Privacy rules for pictures: no change, filters in a fixed order, or denial (thesis Table 8.1, PrivacyControl)."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from fractus_core.policy.footprint import exposure_footprint
 _IN_ORDER: tuple[FilterAction, ...] = exhaustive(
     FilterAction, ("blurFaces", "removeBackground", "blurMedian", "blurAverage", "black")
 )
-"""Filters from the mildest to the strictest, which is also the order in which they are applied."""
+"""Filters from mildest to strictest, which is also the order of their application."""
 _FALLBACKS: tuple[Fallback, ...] = exhaustive(Fallback, ("blurAverage", "black", "refuse"))
 _WHOLE: frozenset[FilterAction] = frozenset({"blurMedian", "blurAverage", "black"})
-"""Filters of the whole picture, which leave no face to find."""
+"""Filters of the whole picture. They leave no face to find."""
 
 
 def judge_privacy(now: Situation, grant: CompiledGrant) -> Verdict:
-    """What privacy policies ask of a picture taken or handed out here: nothing, filters, or refusal.
+    """Judge a picture taken or returned at the present position.
 
     Args:
-        now: where the camera is and how it is turned, and where it was during the exposure.
-        grant: whose policies hold.
+        now: Position and orientation of the camera, and its earlier states during the exposure.
+        grant: Permissions and restrictions that apply.
     """
     rules = rules_in_view(grant.privacy, now, grant) if grant.privacy else []
     refusing = [rule for rule in rules if rule.spec.action == "refuse"]
@@ -37,21 +37,21 @@ def judge_privacy(now: Situation, grant: CompiledGrant) -> Verdict:
     if not rules:
         return Verdict("allow")
     filters = combine_filters(rule_filter(rule) for rule in rules)
-    reason = f"policy {rules[0].name} asks for {', '.join(f.action for f in filters)} here"
+    reason = f"policy {rules[0].name} requires {', '.join(f.action for f in filters)} here"
     return Verdict("correct", None, "PrivacyFilter", reason, rule_names(rules), None, filters)
 
 
 def rule_filter(rule: Rule) -> Filter:
-    """What a rule asks for; one that names no filter blacks the picture out."""
+    """Return the filter that a rule requires. A rule that names no filter blacks out the picture."""
     spec = rule.spec
     return Filter(spec.filter_action or "black", spec.faces or "pixelate", spec.fallback or "blurAverage")
 
 
 def combine_filters(filters: Iterable[Filter]) -> tuple[Filter, ...]:
-    """The filters that satisfy all of these, in the order in which they are applied.
+    """Return the filters that satisfy all given filters, in the order of their application.
 
     Black satisfies everything. A blur of the whole picture hides its faces as well. Of two ways to hide faces the
-    stricter stands: pixels rather than a soft blur, and the stricter fallback.
+    stricter one is used: pixelation instead of a soft blur, and the stricter fallback.
     """
     asked: dict[FilterAction, list[Filter]] = {}
     for one in filters:
@@ -69,9 +69,9 @@ def _strictest(alike: list[Filter]) -> Filter:
 
 
 def remaining_filters(asked: Iterable[Filter], applied: Iterable[Filter]) -> tuple[Filter, ...]:
-    """What must still be done to a picture that was filtered before.
+    """Return the filters that must still be applied to an already filtered picture.
 
-    Faces that were hidden in a milder way than is asked for must still be hidden.
+    Faces hidden by a milder method than required must be hidden again.
     """
     done = tuple(applied)
     if any(one.action == "black" for one in done):
@@ -88,9 +88,9 @@ def _satisfied(asked: Filter, done: Sequence[Filter]) -> bool:
 
 
 def rules_in_view(index: PolicyIndex, now: Situation, grant: CompiledGrant) -> list[Rule]:
-    """Policies of an index that hold where the camera is, or of which a picture may show a zone.
+    """Return the policies of an index that hold at the camera's position, or whose zones a picture may show.
 
-    While the position is unknown every policy in force may hold.
+    While the position is unknown, every policy in force counts.
     """
     found = {rule.name: rule for rule in index.everywhere if rule.in_force(now.time_s)}
     view = exposure_footprint([*now.exposure, now], grant.frame)
@@ -112,10 +112,10 @@ def rules_in_view(index: PolicyIndex, now: Situation, grant: CompiledGrant) -> l
 
 
 def by_priority(rules: dict[str, Rule]) -> list[Rule]:
-    """Policies by falling priority, then by name."""
+    """Return policies by falling priority, then by name."""
     return sorted(rules.values(), key=lambda r: (-r.spec.priority, r.name))
 
 
 def rule_names(rules: Iterable[Rule]) -> tuple[str, ...]:
-    """The names of policies."""
+    """Return the names of policies."""
     return tuple(rule.name for rule in rules)

@@ -1,4 +1,4 @@
-"""Ways home: the heights that the system flies them at, and whether the autopilot's own straight one is legal."""
+"""Return flights: the altitudes at which the system flies them, and the legality of the autopilot's straight return."""
 
 from __future__ import annotations
 
@@ -16,29 +16,31 @@ from fractus_core.policy.kinematics import XY, Leg, height_margin_m, margin_m, s
 from fractus_core.policy.limits import altitude_bounds, lowest_ceiling_m, speed_bounds
 
 MIN_RETURN_ALTITUDE_M = 10.0
-"""No way home below a zone is looked for lower than this above home, for the terrain is not known."""
+"""Lowest altitude above home of a return flight below a zone, because the terrain is not known."""
 
 RTL_CONE_SLOPE = 3.0
-"""An autopilot climbs to its return altitude as far as that is worth it: to three times its distance from home, or higher where its
-owner wants that (ArduPilot: RTL_CONE_SLOPE)."""
+"""Slope of the autopilot's return cone: it climbs at most to this multiple of its distance from home, or higher if its
+owner configures that (ArduPilot parameter RTL_CONE_SLOPE)."""
 
 ZONE_FLOOR_CLEARANCE_M = 0.5
-"""How much lower than it must a drone flies home below a zone: it does not hold its height exactly."""
+"""Distance below a zone's floor beyond the margin, because a drone does not hold its altitude exactly."""
 
 MAX_LOWERED_ALTITUDES = 4
-"""Below how many zones a way home is looked for: a search that finds none takes a second or two, and the drone waits."""
+"""Maximum number of zones below which a return route is searched. A search without a result takes a second or two, and
+the drone waits."""
 
 
 def return_altitudes_m(now: Situation, grant: CompiledGrant, worth_m: float) -> tuple[float, ...]:
-    """Altitudes above home at which the system flies home, the best one first.
+    """Return the altitudes above home at which the system flies a drone home, best first.
 
-    The return altitude, or the present one if that is higher, as the limits of altitude on the straight way allow it; then
-    as those that hold here, or everywhere, do; then just below the zones around it.
+    First comes the return altitude, or the present one if that is higher, within the altitude limits of the straight
+    route. Then the same within the limits at the present position, and within the limits that hold everywhere. Then
+    altitudes just below the surrounding zones.
 
     Args:
-        now: position, home and airframe; both places are known.
-        grant: whose limits.
-        worth_m: how high a climb is worth it.
+        now: Position, home and airframe. Position and home are known.
+        grant: Permissions and restrictions that apply.
+        worth_m: Altitude up to which a climb is worthwhile.
     """
     at = grant.locate(now)
     if at is None or now.home is None:
@@ -57,7 +59,10 @@ def return_altitudes_m(now: Situation, grant: CompiledGrant, worth_m: float) -> 
 
 
 def _heights_below_m(lane: BaseGeometry, now: Situation, grant: CompiledGrant) -> list[float]:
-    """Altitudes above home just below the zones no further off a lane than it is long, the highest first."""
+    """Return altitudes above home just below the zones around a lane, highest first.
+
+    The zones are at most the lane's length away.
+    """
     room_m, flat = height_margin_m(now) + ZONE_FLOOR_CLEARANCE_M, grant.flat_terrain
     around = grant.exclusions.near(AirVolume(lane, lane.length + margin_m(now), -math.inf, math.inf), now, flat)
     bands = [zone.band for zone in around if zone.band is not None and zone.band.lower is not None]
@@ -69,17 +74,22 @@ def _heights_below_m(lane: BaseGeometry, now: Situation, grant: CompiledGrant) -
 
 @dataclass(frozen=True, slots=True)
 class ReturnBounds:
-    """How high, in metres above home, and how fast a drone may come home that knows neither zones nor policies."""
+    """Altitude and speed limits of a return by an autopilot that knows neither zones nor policies.
+
+    Attributes:
+        height_m: Highest altitude above home.
+        speed_mps: Highest speed.
+    """
 
     height_m: float = math.inf
     speed_mps: float = math.inf
 
 
 def return_bounds(now: Situation, grant: CompiledGrant) -> ReturnBounds:
-    """The strictest limits of altitude and speed in force anywhere between home and the operation area.
+    """Return the strictest limits of altitude and speed in force anywhere between home and the operation area.
 
-    Where the datum of a limit is not known, it may not climb at all: then the height is 0, as for an autopilot that returns
-    at the altitude it has.
+    If the datum of a limit is unknown, the drone must not climb. The altitude is then 0, with which an autopilot
+    returns at its present altitude.
     """
     anywhere = shapely.box(-MAX_FRAME_REACH_M, -MAX_FRAME_REACH_M, MAX_FRAME_REACH_M, MAX_FRAME_REACH_M)
     air = AirVolume(anywhere if grant.flight_area is None else grant.flight_area, margin_m(now), -math.inf, math.inf)
@@ -90,9 +100,10 @@ def return_bounds(now: Situation, grant: CompiledGrant) -> ReturnBounds:
 
 
 def may_change_altitude(now: Situation, grant: CompiledGrant, altitude_m: float) -> bool:
-    """Whether the drone may climb or sink to an altitude where it is.
+    """Return True if the drone may climb or sink to an altitude at its position.
 
-    From too close below or above a zone it leaves that first, also beside another one: it comes no closer to that.
+    A drone too close below or above a zone may leave that zone first, even beside another zone, because it comes no
+    closer to that.
     """
     at = grant.locate(now)
     if at is None:
@@ -101,7 +112,7 @@ def may_change_altitude(now: Situation, grant: CompiledGrant, altitude_m: float)
     here = vertical_leg(at, now.altitude_m, now.altitude_m)
 
     def broken(leg: Leg, room_m: float) -> set[str]:
-        # What a zone's breach is called depends on the ground alone, which is the same.
+        # The reason of a zone's breach depends on the ground only, which is the same here.
         return {breach.reason for breach in find_breaches(leg, now, grant, margin_m(now), room_m)}
 
     left = broken(column, height_margin_m(now))
@@ -109,7 +120,7 @@ def may_change_altitude(now: Situation, grant: CompiledGrant, altitude_m: float)
 
 
 def descent_enters_fence(now: Situation, grant: CompiledGrant) -> bool:
-    """Whether a drone that breaks no fence where it comes to rest would break one on its way down from there."""
+    """Return True if a drone whose point of rest breaks no fence would break one during its descent from there."""
     at = grant.locate(now)
     if at is None:
         return False
@@ -121,22 +132,21 @@ def descent_enters_fence(now: Situation, grant: CompiledGrant) -> bool:
 def check_straight_return(
     target: XY, altitude_m: float, now: Situation, grant: CompiledGrant, *, margin: float, slack: float
 ) -> Verdict | None:
-    """The denial of a target from which the straight way home is not legal.
+    """Return the denial of a target from which the autopilot's straight return is not legal, or None.
 
-    That way is the autopilot's: it climbs to its return altitude, or less high near home (`RTL_CONE_SLOPE`), flies straight, and descends at home.
+    The autopilot climbs to its return altitude, or to a lower one near home (`RTL_CONE_SLOPE`), flies straight, and
+    descends at home.
 
     Args:
-        target: where it begins, in metres of the grant's frame.
-        altitude_m: the target's altitude above home.
-        now: home, airframe and time.
-        grant: whose fences.
-        margin: metres to keep from zones.
-        slack: metres to keep from their floors and ceilings.
+        target: Start of the return, in metres of the grant's frame.
+        altitude_m: Altitude of the target above home.
+        now: Home, airframe and time.
+        grant: Permissions and restrictions that apply.
+        margin: Distance to keep from zones in metres.
+        slack: Distance to keep from floors and ceilings of zones in metres.
     """
     if now.home is None:
-        return deny(
-            "HomeUnknown", "home is unknown, so nothing can be said of the way back; wait for the home position"
-        )
+        return deny("HomeUnknown", "home is unknown, so the return cannot be checked; wait for the home position")
     if not grant.exclusions.zones and not grant.inclusions:
         return None
     home = grant.frame.xy(now.home.lat, now.home.lon)
@@ -165,4 +175,4 @@ def check_straight_return(
 
 
 def _blocked(how: str, policy: str) -> Verdict:
-    return deny("WayHomeBlocked", f"from the target the straight way home, {how}", (policy,))
+    return deny("WayHomeBlocked", f"the straight return from the target, {how}", (policy,))

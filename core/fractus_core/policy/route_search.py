@@ -1,4 +1,4 @@
-"""Legal shortest ways around exclusion zones, inside inclusion zones and the operation area with its corridor."""
+"""Shortest legal routes around exclusion zones, inside inclusion zones and the operation area with its corridor."""
 
 from __future__ import annotations
 
@@ -17,17 +17,18 @@ from fractus_core.policy.free_space import Floats, FreeSpace
 from fractus_core.policy.kinematics import XY
 
 CLEARANCES_M = (1.5, 0.25)
-"""What legs keep beyond the engine's margin, where there is room, and else: a drone that reached a waypoint within a metre
-finds the next leg legal."""
+"""Clearances of legs beyond the engine's margin: the preferred one, and the smallest. A drone that reached a waypoint
+within a metre then finds its next leg legal."""
 
 MAX_LEGS_TESTED = 3000
-"""A search gives up after this many legs, half a second's work or so."""
+"""A search gives up after this number of legs, about half a second of work."""
 
 MAX_EXCESS = 1.2
-"""A way may be longer than the shortest one by this factor, for the sake of a quicker search; a percent or two is usual."""
+"""Factor by which a route may be longer than the shortest one, for the sake of a quicker search. A percent or two is
+usual."""
 
 QUICK_MAX_LEGS_TESTED, QUICK_MAX_EXCESS = 250, 5.0
-"""The same where it only matters whether there is a way, and a caller waits for the answer: some 25 ms."""
+"""The same limits for a search that only decides if a route exists while a caller waits: about 25 ms."""
 
 _MAX_DETOUR = 1.2
 _MAX_ROUNDING_M = 1.5
@@ -41,35 +42,36 @@ RouteSteps = Generator[None, None, tuple[XY, ...] | None]
 def find_route(
     start: XY, target: XY, now: Situation, grant: CompiledGrant, altitude_m: float, *, from_m: float | None = None
 ) -> tuple[XY, ...] | None:
-    """The shortest legal way from one place to another, flown at one altitude with a stop at each waypoint.
+    """Return the shortest legal route between two points, flown at one altitude with a stop at each waypoint.
 
-    It keeps out of exclusion zones, out of zones whose altitude limits `altitude_m` breaks, and inside inclusion zones and
-    `grant.flight_area` (operation area and corridor), each with the engine's margin. From a start that is itself too close to
-    a fence the first leg leads away from it. Where the autopilot's way home is a straight line (not
-    `now.airframe.retraces`), it must be legal from every waypoint, the target included.
+    The route keeps out of exclusion zones and of zones whose altitude limits `altitude_m` breaks, and inside inclusion
+    zones and `grant.flight_area` (operation area and corridor), each with the engine's margin. From a start that is
+    itself too close to a fence the first leg leads away from it. If the autopilot returns in a straight line (not
+    `now.airframe.retraces`), its return must be legal from every waypoint, including the target.
 
-    Where the way with room to spare is a fifth longer than one without, the latter is taken.
+    If the route with the preferred clearance is a fifth longer than one with the smallest clearance, the latter is
+    returned.
 
-    The same inputs always give the same way. `judge` permits each leg as a `Goto` from standstill, unless limits that hold
-    everywhere correct its altitude or speed, under a grant whose operation area includes the corridor (`for_transit`): an
-    application's own Gotos must end inside the operation area.
+    The result is deterministic. `judge` permits each leg as a `Goto` from standstill, unless limits that hold
+    everywhere correct its altitude or speed, under a grant whose operation area includes the corridor
+    (`compile_transit_grant`). An application's own Gotos must end inside the operation area.
 
-    Source: shortest paths among polygons turn at convex corners of obstacles only (Lozano-Perez and Wesley 1979). The search
-    is A* (weighted: at most a fifth too long) over tangents between such corners; an obstacle joins when it first blocks a
-    promising leg, so the time depends on the obstacles along the way, not on how many there are.
+    Source: shortest paths among polygons turn at convex corners of obstacles only (Lozano-Perez and Wesley 1979). The
+    search is A* (weighted: at most a fifth too long) over tangents between such corners. An obstacle joins when it
+    first blocks a promising leg, so the time depends on the obstacles along the route and not on their total number.
 
     Args:
-        start: where the way begins, in metres of `grant.frame`; need not be where the drone is now.
-        target: where it ends.
-        now: time, position errors, airframe and home; the position in it is not used.
-        grant: whose fences.
-        altitude_m: altitude of the whole way, metres above home.
-        from_m: altitude at the start, when it is another; the first leg is then legal at all altitudes between.
+        start: Start of the route, in metres of `grant.frame`. It may differ from the drone's position.
+        target: End of the route.
+        now: Time, position errors, airframe and home. The position in it is not used.
+        grant: Permissions and restrictions that apply.
+        altitude_m: Altitude of the whole route, metres above home.
+        from_m: Altitude at the start if it differs. The first leg is then legal at all altitudes between.
 
     Returns:
-        The waypoints in metres of `grant.frame` (`grant.frame.latlon(x, y)` gives degrees), in order; the last one is the
-        target, the start is left out. None when there is no legal way, when home or a limit's datum is unknown, or when
-        the search gives up.
+        The waypoints in metres of `grant.frame` (`grant.frame.latlon(x, y)` returns degrees), in order. The last one is
+        the target. The start is not included. None if no legal route exists, if home or a limit's datum is unknown, or
+        if the search gives up.
     """
     return _finished(route_steps(start, target, now, grant, altitude_m, from_m=from_m))
 
@@ -77,7 +79,7 @@ def find_route(
 def route_steps(
     start: XY, target: XY, now: Situation, grant: CompiledGrant, altitude_m: float, *, from_m: float | None = None
 ) -> RouteSteps:
-    """`find_route` in steps of a fraction of a millisecond, for callers that have other things to do meanwhile; returns the way."""
+    """Search as `find_route` in steps of a fraction of a millisecond. The generator returns the route."""
     figures = (*start, *target, altitude_m, altitude_m if from_m is None else from_m)
     if now.home is None or not now.is_plausible or not all(math.isfinite(figure) for figure in figures):
         return None
@@ -92,7 +94,7 @@ def route_steps(
 
 
 def route_exists(start: XY, target: XY, now: Situation, grant: CompiledGrant, altitude_m: float) -> bool:
-    """Whether a short search, of `QUICK_MAX_LEGS_TESTED` legs, finds any legal way from one place to another; see `find_route`."""
+    """Return True if a short search, of `QUICK_MAX_LEGS_TESTED` legs, finds any legal route between two points."""
     return quick_route(start, target, now, grant, altitude_m, max_excess=QUICK_MAX_EXCESS) is not None
 
 
@@ -106,7 +108,7 @@ def quick_route(
     from_m: float | None = None,
     max_excess: float = MAX_EXCESS,
 ) -> tuple[XY, ...] | None:
-    """As `find_route`, but gives up after `QUICK_MAX_LEGS_TESTED` legs, and keeps no more room than it must."""
+    """Search as `find_route`, but give up after `QUICK_MAX_LEGS_TESTED` legs and use the smallest clearance."""
     if now.home is None or not now.is_plausible:
         return None
     heights_m = (altitude_m, altitude_m if from_m is None else from_m)
@@ -117,7 +119,10 @@ def quick_route(
 def _spaces(
     now: Situation, grant: CompiledGrant, heights_m: tuple[float, float], room_m: float
 ) -> tuple[FreeSpace, FreeSpace]:
-    """The space of a way at the first altitude, and that of its first leg, which comes from the second one."""
+    """Return the free space of a route at the first altitude, and that of its first leg.
+
+    The first leg starts at the second altitude.
+    """
     low, high = sorted(heights_m)
     cruise = FreeSpace.between(now, grant, heights_m[0], heights_m[0], room_m)
     return cruise, cruise if low == high else FreeSpace.between(now, grant, low, high, room_m)
@@ -137,7 +142,7 @@ def _length_m(start: XY, way: tuple[XY, ...]) -> float:
 
 
 def _meeting(before: XY, first: XY, second: XY, after: XY) -> XY | None:
-    """Where two legs meet when both go on; None when that is far off or behind."""
+    """Return the intersection of two legs when both are extended. None if it is far away or behind."""
     ux, uy, vx, vy = first[0] - before[0], first[1] - before[1], second[0] - after[0], second[1] - after[1]
     across = ux * vy - uy * vx
     if abs(across) < 1e-9:
@@ -149,7 +154,7 @@ def _meeting(before: XY, first: XY, second: XY, after: XY) -> XY | None:
 
 
 class _Search:
-    """A* from start to target over tangents between corners; obstacles are found on the way."""
+    """A* search from start to target over tangents between corners. Obstacles are added when they block a leg."""
 
     def __init__(
         self,
@@ -164,7 +169,7 @@ class _Search:
         self._max_excess = max_excess
         self._max_legs = max_legs
         self._ends = (start, target)
-        # The ends count as corners without neighbours: anything is tangent to them.
+        # The ends count as corners without neighbours, so that every line is tangent to them.
         self._nodes: Floats = np.asarray([start * 3, target * 3])
         self._cost = np.asarray([0.0, math.inf])
         self._parent = [-1, -1]
@@ -173,11 +178,11 @@ class _Search:
         self._known: set[tuple[int, int]] = set()
         self._clear: dict[tuple[int, int], bool] = {}
         self._returns: dict[int, bool] = {}
-        # Ends that are too close to a fence themselves: legs to and from them are judged by the engine's own rules.
+        # Ends that are too close to a fence themselves. Legs from and to them are judged by the engine's own rules.
         self._odd: set[int] = set()
 
     def steps(self) -> RouteSteps:
-        """Look for the way, leg by leg; returns it, or None."""
+        """Search leg by leg. The generator returns the route, or None."""
         if self._ends[0] == self._ends[1]:
             return (self._ends[1],) if self._leaving.allows_leg(*self._ends) else None
         begin = shapely.points(self._ends[0])
@@ -188,7 +193,7 @@ class _Search:
         ):
             return None
         for obstacle in around:
-            # Out of it the nearest way first: no corner need lie there.
+            # Add the nearest exit first, because no corner need lie there.
             self._add(self._leaving.nearest_exit(obstacle, begin))
             self._learn([obstacle], self._ends[0], self._leaving)
         self._expand(_START)
@@ -205,11 +210,11 @@ class _Search:
 
     @property
     def exhausted(self) -> bool:
-        """Whether it gave up."""
+        """True if the search gave up."""
         return len(self._clear) >= self._max_legs
 
     def rounded(self, way: tuple[XY, ...]) -> RouteSteps:
-        """The way with neighbouring waypoints made one where the legs meet a little further on: each costs a stop."""
+        """Merge neighbouring waypoints if their legs meet a little farther on, because each waypoint costs a stop."""
         points = [self._ends[0], *way]
         i = 1
         while i + 2 < len(points):
@@ -262,7 +267,7 @@ class _Search:
         return self._clear[key]
 
     def _test(self, begin: int, end: int) -> bool:
-        """Whether a leg is legal; what blocks it joins the obstacles."""
+        """Return True if a leg is legal. Obstacles that block it are added."""
         a, b = (self._ends[n] if n <= _TARGET else self._place(n) for n in (begin, end))
         space = self._leaving if begin == _START else self._space
         blockers = space.blockers(shapely.linestrings((a, b)))
@@ -278,10 +283,13 @@ class _Search:
         return float(x), float(y)
 
     def _learn(self, obstacles: list[PolicyZone | int], begin: XY, space: FreeSpace) -> None:
-        """Take in what blocks a leg: areas to stay in, and of the zones the nearest: a way around it meets the next."""
+        """Add the obstacles that block a leg: all areas to stay in, and the nearest zone.
+
+        A route around the nearest zone meets the next one.
+        """
 
         def key(obstacle: PolicyZone | int) -> tuple[int, int]:
-            # An area to stay in has another shape at other altitudes.
+            # The shape of an area to stay in depends on the altitude.
             return (obstacle, id(space)) if isinstance(obstacle, int) else (id(obstacle), 0)
 
         new = [o for o in obstacles if key(o) not in self._known]
@@ -305,7 +313,7 @@ class _Search:
 
 
 def _tangent(along: Floats, corners: Floats) -> NDArray[np.bool_]:
-    """Whether lines through corners leave both neighbours of the corner on one side; shapes broadcast."""
+    """Return True for lines through corners that leave both neighbours of the corner on one side. Shapes broadcast."""
     before, after = corners[..., 2:4] - corners[..., :2], corners[..., 4:] - corners[..., :2]
     left = along[..., 0] * before[..., 1] - along[..., 1] * before[..., 0]
     right = along[..., 0] * after[..., 1] - along[..., 1] * after[..., 0]

@@ -1,4 +1,4 @@
-"""For which nodes, applications and components a policy holds (thesis Table 8.1, Listing 11)."""
+"""Policy selectors: the nodes, applications and components to which a policy applies (thesis Table 8.1, Listing 11)."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from fractus_core.api.policies import NodeExpression, PolicySpec
 def policy_selects(
     policy: PolicySpec, application: Application, component: Component, attributes: Mapping[str, object]
 ) -> bool:
-    """Whether a policy holds for a component of an application on a node (its zones are judged in flight)."""
+    """Return True if a policy applies to a component of an application on a node. Its zones are judged in flight."""
     return policy_applies(policy, application_reference(application), component.name, attributes)
 
 
 def policy_applies(
     policy: PolicySpec, owner: ApplicationReference, component: str, attributes: Mapping[str, object]
 ) -> bool:
-    """As `policy_selects`, by what a grant keeps of its application and component."""
+    """Return True if a policy applies, as `policy_selects`, given the references that a grant contains."""
     wanted = policy.selector.applications
     unknown = policy.kind != "grant"
     if wanted is not None:
@@ -39,10 +39,10 @@ def policy_applies(
 
 
 def matches(expression: NodeExpression, attributes: Mapping[str, object], *, unknown: bool) -> bool:
-    """Whether a node's attributes satisfy an expression; `unknown` is the answer for an attribute not stated.
+    """Return True if a node's attributes satisfy an expression. `unknown` is the result for an unset attribute.
 
-    A restriction holds for a node that does not say whether it is concerned (a drone of unknown mass is a heavy one);
-    a permission does not. So it is with an attribute that no node has, such as a mistyped one.
+    A restriction applies to a node that leaves the attribute unset (a drone of unknown mass counts as heavy). A
+    permission does not. The same holds for an attribute that no node has, such as a mistyped one.
     """
     value = attributes.get(expression.key)
     if expression.operator == "Exists":
@@ -66,10 +66,10 @@ def matches(expression: NodeExpression, attributes: Mapping[str, object], *, unk
 
 
 def node_attributes(node: Drone | EdgeNode) -> dict[str, object]:
-    """Attributes of a node for selectors: dotted paths of its spec, and the last part alone where that is unique.
+    """Return the attributes of a node for selectors: dotted paths of its spec, and their last part if that is unique.
 
-    So `physicalFeatures.mtom` is also `mtom`; `name` and `kind` come from the object. What has parts, such as
-    `services.camera`, is there to exist.
+    For example, `physicalFeatures.mtom` is also `mtom`. `name` and `kind` come from the object. Attributes with parts,
+    such as `services.camera`, can only be tested for existence.
     """
     flat = dict(_flatten("", node.spec.to_dict()))
     short: dict[str, list[object]] = {}
@@ -90,7 +90,7 @@ def _flatten(prefix: str, value: object) -> Iterable[tuple[str, object]]:
 
 
 def is_attribute(key: str) -> bool:
-    """Whether a Drone or EdgeNode can have an attribute; any label may be."""
+    """Return True if a Drone or EdgeNode can have an attribute. Every label counts as possible."""
     return key in _attribute_keys() or key.startswith("labels.")
 
 
@@ -104,7 +104,7 @@ def _paths(prefix: str, model: type[BaseModel]) -> Iterable[str]:
     for name, field in model.model_fields.items():
         path = f"{prefix}.{field.alias or to_camel(name)}".lstrip(".")
         yield path
-        # What is in lists is not seen.
+        # Elements of lists are not attributes.
         listed = get_origin(field.annotation) is tuple
         for part in () if listed else (field.annotation, *get_args(field.annotation)):
             if isinstance(part, type) and issubclass(part, BaseModel):
@@ -112,6 +112,6 @@ def _paths(prefix: str, model: type[BaseModel]) -> Iterable[str]:
 
 
 def application_reference(application: Application) -> ApplicationReference:
-    """The application as its grants name it."""
+    """Return the reference to an application that its grants contain."""
     namespace, name = application.key
     return ApplicationReference(namespace=namespace, name=name, uid=application.metadata.uid or "")

@@ -1,4 +1,4 @@
-"""Motions up and down: arming, taking off, landing, disarming."""
+"""Rules for Arm, Takeoff, Land and Disarm."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fractus_core.policy.limits import altitude_bounds, choose_objection, clamp,
 
 
 def judge_takeoff(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
-    """A climb from the ground."""
+    """Judge a climb from the ground."""
     args, at = call.args, grant.locate(now)
     if at is None or not isinstance(args, TakeoffArgs):
         return POSITION_UNKNOWN if at is None else deny("InvalidArgument", "Takeoff needs its arguments")
@@ -32,12 +32,12 @@ def judge_takeoff(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
 
 
 def _climb(at: XY, now: Situation, grant: CompiledGrant, altitude_m: float) -> Verdict | None:
-    """What fences and the way home have against a climb."""
+    """Return the objection of fences and the return route to a climb, or None."""
     return _column(at, now, grant, now.altitude_m, altitude_m) or check_return(at, altitude_m, now, grant)
 
 
 def judge_arm(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
-    """Motors that start where the drone stands."""
+    """Judge arming at the drone's position."""
     at = grant.locate(now)
     if at is None:
         return POSITION_UNKNOWN
@@ -45,7 +45,7 @@ def judge_arm(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
 
 
 def judge_land(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
-    """A descent to the ground from where the drone comes to rest."""
+    """Judge a descent to the ground from the point of rest."""
     at = grant.locate(now)
     if at is None:
         return POSITION_UNKNOWN
@@ -54,7 +54,7 @@ def judge_land(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
 
 
 def _column(at: XY, now: Situation, grant: CompiledGrant, lower_m: float, upper_m: float) -> Verdict | None:
-    """The denial of a vertical motion, or of standing, where fences forbid it; no such request is a takeover."""
+    """Return the denial of a vertical motion, or of standing, by fences. It is never a takeover."""
     leg = vertical_leg(at, min(lower_m, upper_m), max(lower_m, upper_m))
     found = find_breaches(leg, now, grant, margin_m(now), height_margin_m(now))
     if not found:
@@ -63,7 +63,7 @@ def _column(at: XY, now: Situation, grant: CompiledGrant, lower_m: float, upper_
 
 
 def judge_disarm(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
-    """Motors that stop."""
+    """Judge disarming."""
     if now.in_air:
         return deny("InAir", f"the drone is in the air at {now.altitude_m:.1f} m; land before disarming")
     return Verdict("allow", call.args)

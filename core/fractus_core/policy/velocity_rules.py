@@ -1,4 +1,4 @@
-"""Speeds and velocity setpoints: what is scaled, what is refused."""
+"""Rules for SetSpeed and SetVelocity: values are scaled or denied."""
 
 from __future__ import annotations
 
@@ -39,17 +39,17 @@ from fractus_core.policy.limits import (
 )
 
 RETURN_CLIMB_MPS = 1.0
-"""A drone above or below its limits is led back with this vertical speed."""
+"""Vertical speed with which a drone beyond an altitude limit is led back."""
 
 MIN_SCALED_MPS = 0.3
-"""A velocity that would be scaled below this is refused instead."""
+"""A velocity that would be scaled below this speed is denied."""
 
 _HALVINGS = 8
-"""Steps of the bisection for the largest legal share of a velocity: right within 0.4 %."""
+"""Bisection steps for the largest legal fraction of a velocity. The result is accurate to 0.4 %."""
 
 
 def judge_speed(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
-    """A change of the speed that legs are flown with."""
+    """Judge a change of the speed of legs."""
     args, at = call.args, grant.locate(now)
     if not isinstance(args, SetSpeedArgs):
         return deny("InvalidArgument", "SetSpeed needs its arguments")
@@ -62,7 +62,7 @@ def judge_speed(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
 
 @dataclass(slots=True)
 class _Setpoint:
-    """A velocity on its way through limits and fences."""
+    """A velocity setpoint while it is corrected to limits and fences."""
 
     args: VelocityArgs
     now: Situation
@@ -73,28 +73,28 @@ class _Setpoint:
 
     @property
     def leg(self) -> Leg:
-        """What it sweeps as it stands."""
+        """Leg of the present arguments."""
         return self.sweep(self.args)
 
     def sweep(self, args: VelocityArgs) -> Leg:
-        """What a velocity sweeps."""
+        """Return the leg of a velocity."""
         if args not in self._legs:
             self._legs[args] = velocity_leg(self.now, self.at, args)
         return self._legs[args]
 
     @property
     def air(self) -> AirVolume:
-        """Where limits may hold for it."""
+        """Volume in which limits may apply."""
         leg = self.leg
         return AirVolume(leg.ground, _margin_m(self.now), leg.lower_m, leg.upper_m)
 
 
 def judge_velocity(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
-    """A velocity setpoint, judged by all that the drone sweeps until it stops by itself after the hold.
+    """Judge a velocity setpoint by everything the drone sweeps until it stops after the hold time.
 
-    Limits that are enforced scale the horizontal or the vertical part; fences that adjust scale the whole. A drone beyond
-    an altitude limit is led back whatever vertical speed was asked for. Lower speed limits do not hold: to hover is always
-    allowed.
+    Enforced limits scale the horizontal or the vertical part. Fences with action adjust scale the whole velocity. A
+    drone beyond an altitude limit is led back regardless of the requested vertical speed. Lower speed limits do not
+    apply, because hovering is always permitted.
     """
     args, at = call.args, grant.locate(now)
     if not isinstance(args, VelocityArgs):
@@ -140,7 +140,7 @@ def _within_speed(setpoint: _Setpoint) -> Verdict | None:
 
 
 def _within_heights(setpoint: _Setpoint) -> Verdict | None:
-    """Bring the vertical part within the limits of altitude, or deny."""
+    """Correct the vertical part to the altitude limits, or return a denial."""
     now, grant = setpoint.now, setpoint.grant
     bounds, unknown = altitude_bounds(grant, now, setpoint.air)
     if unknown:
@@ -166,7 +166,7 @@ def _within_heights(setpoint: _Setpoint) -> Verdict | None:
 
 
 def _no_room(setpoint: _Setpoint, lower: Bound, upper: Bound | None) -> Verdict | None:
-    """Deny where what was turned up to keep above one limit would rise beyond the other."""
+    """Return a denial if a vertical speed corrected to stay above one limit would exceed another."""
     edge = math.inf if upper is None or upper.upper is None else upper.upper
     if upper is None or not _beyond(setpoint, setpoint.args, edge, above=True):
         return None
@@ -187,7 +187,7 @@ def _lead_back(setpoint: _Setpoint, bound: Bound, *, above: bool) -> Verdict | N
     toward = args.down_mps < 0 if above else args.down_mps > 0
     reason = f"the drone would come {side} the limit of {edge:.1f} m of {source}"
     if bound.refuses and toward:
-        return deny(f"Altitude{word}Limit", f"{reason}, which refuses it", names)
+        return deny(f"Altitude{word}Limit", f"{reason} (action refuse)", names)
     back = RETURN_CLIMB_MPS if above else -RETURN_CLIMB_MPS
     strays_m = setpoint.now.airframe.tracking_m
     near = edge + strays_m if above else edge - strays_m
@@ -213,7 +213,7 @@ def _beyond(setpoint: _Setpoint, args: VelocityArgs, edge: float, *, above: bool
 
 
 def _scaled_climb(setpoint: _Setpoint, edge: float, *, above: bool) -> VelocityArgs:
-    """The largest share of the vertical part that stays within a limit; none of it does."""
+    """Return the largest fraction of the vertical part that stays within a limit. Zero always does."""
     args = setpoint.args
     best, low, high = replace(args, down_mps=0.0), 0.0, 1.0
     for _ in range(_HALVINGS):
@@ -263,8 +263,8 @@ def _breached(setpoint: _Setpoint, args: VelocityArgs) -> list[Breach]:
 
 
 def _margin_m(now: Situation) -> float:
-    """What a velocity keeps from fences.
+    """Return the margin that a velocity keeps from fences.
 
-    It leads on from wherever wind has the drone at this moment, not to a place: what the drone strays counts twice.
+    A velocity starts at a position displaced by wind and leads to no fixed point, so the tracking error counts twice.
     """
     return margin_m(now) + now.airframe.tracking_m

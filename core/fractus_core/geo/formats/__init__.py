@@ -1,4 +1,4 @@
-"""All formats: GeoJSON, KML, QGroundControl plans and ED-269."""
+"""Import and export of Zones: GeoJSON, KML, QGroundControl plans and ED-269."""
 
 from fractus_core.geo.formats.ed269 import read_ed269, write_ed269
 from fractus_core.geo.formats.geojson import read_geojson, write_geojson, zone_feature

@@ -46,14 +46,14 @@ _DAY_MIN = 1440
 
 
 def read_ed269(text: str, without: Collection[str] = ()) -> Imported:
-    """Zones from features: identifier, name, message, restriction (told in the description), applicability, geometry.
+    """Read zones from features: identifier, name, message, restriction (in the description), applicability, geometry.
 
     Args:
-        text: the file.
-        without: identifiers of features to leave out.
+        text: Content of the file.
+        without: Identifiers of features to leave out.
 
     Raises:
-        InvalidObject: this is not an ED-269 file, a geometry is broken, or a feature cannot be kept exactly.
+        InvalidObject: The text is not an ED-269 file, a geometry is broken, or a feature cannot be represented exactly.
     """
     whole = parse_json(text)
     if "features" not in whole:
@@ -101,7 +101,7 @@ def _area(drafts: ZoneBuilder, volume: dict[str, Any], field: str) -> dict[str, 
 
 
 def _band(volume: dict[str, Any], field: str) -> dict[str, Any]:
-    """The altitude band; with a lower limit of 0 above ground it reaches from the ground up."""
+    """Return the altitude band. A lower limit of 0 above ground means that it starts at the ground."""
     unit = volume.get("uomDimensions") or "M"
     if unit not in _UNITS_M:
         raise InvalidObject(f"{field}.uomDimensions", f"must be M or FT, not {unit!r:.40}; convert the limits")
@@ -130,7 +130,7 @@ def _band(volume: dict[str, Any], field: str) -> dict[str, Any]:
 
 
 def _schedule(feature: dict[str, Any], field: str) -> list[dict[str, Any]]:
-    """When the zone is active; empty: always."""
+    """Return the active times of the zone. Empty means always."""
     times: list[dict[str, Any]] = []
     for i, period in enumerate(object_list(feature.get("applicability"), f"{field}.applicability")):
         where = f"{field}.applicability[{i}]"
@@ -146,13 +146,13 @@ def _schedule(feature: dict[str, Any], field: str) -> list[dict[str, Any]]:
         if permanent not in ("YES", "NO"):
             raise InvalidObject(f"{where}.permanent", f"must be YES or NO, not {permanent!r:.40}")
         if permanent == "YES" and {} not in found:
-            raise InvalidObject(f"{where}.permanent", "is YES, but there are times; remove them, or say NO")
+            raise InvalidObject(f"{where}.permanent", "is YES although times are given; remove the times or set NO")
         times += found
     return [] if {} in times else times
 
 
 def _daily(day: dict[str, Any], field: str) -> dict[str, Any]:
-    """Days and times of day in UTC; empty: the whole of every day."""
+    """Return days and times of day in UTC. Empty means always."""
     reject_unknown_fields(day, _OF_DAY, field)
     given = day.get("day") or []
     named = given if isinstance(given, list) else [given]
@@ -164,7 +164,7 @@ def _daily(day: dict[str, Any], field: str) -> dict[str, Any]:
     found: dict[str, Any] = {}
     if start or end:
         begin_min, finish_min = _minutes(start, f"{field}.startTime"), _minutes(end, f"{field}.endTime", last=True)
-        # East of Greenwich a day begins on the day before, in UTC.
+        # East of Greenwich, a day begins on the previous day in UTC.
         days = [(index + begin_min // _DAY_MIN) % 7 for index in days]
         begin_min, finish_min = begin_min % _DAY_MIN, finish_min % _DAY_MIN
         if begin_min or finish_min:
@@ -174,7 +174,10 @@ def _daily(day: dict[str, Any], field: str) -> dict[str, Any]:
 
 
 def _minutes(given: Any, field: str, *, last: bool = False) -> int:
-    """Minutes from midnight UTC of the day that is named, negative on the day before; the 60th second ends a minute."""
+    """Return minutes from midnight UTC of the named day, negative on the previous day.
+
+    Second 59 counts as the end of its minute.
+    """
     found = _TIME.fullmatch(given) if isinstance(given, str) else None
     minutes = int(found[1]) * 60 + int(found[2]) if found is not None else _DAY_MIN + 1
     if found is None or minutes > (_DAY_MIN if last else _DAY_MIN - 1):
@@ -191,10 +194,10 @@ def _clock(minutes: int) -> str:
 
 
 def write_ed269(zones: Iterable[Zone], *, country: str = "XXX", restriction: str = "CONDITIONAL") -> Exported:
-    """A feature for each zone; what ED-269 asks for and a Zone does not know is filled in, and noted.
+    """Return a feature for each zone. Required fields that a Zone does not have are filled in, with a note.
 
     Raises:
-        InvalidObject: an altitude is measured from home, for which ED-269 has no datum.
+        InvalidObject: An altitude is measured from home, for which ED-269 has no datum.
     """
     zones = tuple(zones)
     notes = unsupported_parts(zones)

@@ -35,20 +35,20 @@ _WGS84 = frozenset(
         "urn:ogc:def:crs:EPSG::4326",
     }
 )
-"""Names of the one reference system: older GeoJSON (2008) names it, and has lon before lat whatever its name says."""
+"""Names of WGS 84. GeoJSON of 2008 may name a reference system, and has lon before lat for each of these names."""
 _STYLE = frozenset({"fill", "fill-opacity", "stroke", "stroke-width", "stroke-opacity", "marker-color"})
 
 
 def read_geojson(text: str, without: Collection[str] = (), drop: Collection[str] = ()) -> Imported:
-    """Zones from features; altitude and schedule come from properties of these names, spelt as in a Zone.
+    """Read zones from features. Altitude and schedule are read from properties of these names, spelt as in a Zone.
 
     Args:
-        text: the file.
-        without: titles of features to leave out.
-        drop: names of properties to leave out, though they seem to say how high or when a zone counts.
+        text: Content of the file.
+        without: Titles of features to leave out.
+        drop: Names of properties to leave out although they seem to state the altitude or time of a zone.
 
     Raises:
-        InvalidObject: this is not GeoJSON, a geometry is broken, or a feature cannot be kept exactly.
+        InvalidObject: The text is not GeoJSON, a geometry is broken, or a feature cannot be represented exactly.
     """
     whole = parse_json(text)
     kind = whole.get("type")
@@ -72,7 +72,7 @@ def read_geojson(text: str, without: Collection[str] = (), drop: Collection[str]
 
 
 def _check_system(found: dict[str, Any], field: str) -> None:
-    """Refuse coordinates in another reference system."""
+    """Reject coordinates in another reference system."""
     system = found.get("crs")
     if system is None:
         return
@@ -95,18 +95,18 @@ def _read_feature(drafts: ZoneBuilder, title: str, feature: dict[str, Any], fiel
     drafts.properties(title, properties, _KNOWN | _STYLE, f"{inside}properties")
     geometry = optional_object(feature.get("geometry"), f"{inside}geometry")
     if properties.get("radius") is not None and geometry.get("type") != "Point":
-        raise InvalidObject(f"{inside}properties.radius", "goes with a Point; draw the area of others as a polygon")
+        raise InvalidObject(f"{inside}properties.radius", "is valid for a Point only; draw other areas as polygons")
     _read_geometry(drafts, title, geometry, spec | {"radius": properties.get("radius")}, f"{inside}geometry")
 
 
 def _read_geometry(drafts: ZoneBuilder, title: str, geometry: dict[str, Any], said: dict[str, Any], field: str) -> None:
-    """Make zones of a geometry, each with what was said of the feature."""
+    """Add zones of a geometry, each with the properties of the feature."""
     spec = {key: value for key, value in said.items() if key != "radius"}
     coordinates, where = geometry.get("coordinates"), f"{field}.coordinates"
     reject_unknown_fields(geometry, _OF_GEOMETRY, field)
     _check_system(geometry, f"{field}.crs")
     if "altitude" in spec and _heights(coordinates):
-        drafts.note(title, "heights of its points are not taken over, properties.altitude is")
+        drafts.note(title, "heights of its points are ignored; properties.altitude is used")
         coordinates = _flat(coordinates)
     match geometry.get("type"):
         case "Polygon":
@@ -129,7 +129,7 @@ def _read_geometry(drafts: ZoneBuilder, title: str, geometry: dict[str, Any], sa
 
 
 def _heights(coordinates: Any) -> bool:
-    """Whether a position has a third number other than 0."""
+    """Return True if a position has a third number other than 0."""
     pending = [coordinates]
     while pending:
         found = pending.pop()
@@ -141,14 +141,17 @@ def _heights(coordinates: Any) -> bool:
 
 
 def _flat(coordinates: Any) -> Any:
-    """The coordinates without heights."""
+    """Return the coordinates without heights."""
     if isinstance(coordinates, list) and coordinates and is_number(coordinates[0]):
         return coordinates[:2]
     return [_flat(item) for item in coordinates] if isinstance(coordinates, list) else coordinates
 
 
 def write_geojson(zones: Iterable[Zone]) -> Exported:
-    """A FeatureCollection with a polygon for each zone, cut at the antimeridian (RFC 7946); read_geojson takes it back."""
+    """Return a FeatureCollection with a polygon for each zone, cut at the antimeridian.
+
+    `read_geojson` reads it back.
+    """
     zones = tuple(zones)
     notes = unsupported_parts(zones, "circle")
     features = [zone_feature(zone, notes) for zone in zones]
@@ -157,7 +160,7 @@ def write_geojson(zones: Iterable[Zone]) -> Exported:
 
 
 def zone_feature(zone: Zone, notes: list[str]) -> dict[str, Any]:
-    """One zone as a feature; notes what a polygon shows otherwise."""
+    """Return a zone as a feature. Adds notes on differences between the zone and its polygon."""
     spec = zone.spec.to_dict()
     properties = {"name": zone.name} | {k: spec[k] for k in ("altitude", "schedule", "description") if spec.get(k)}
     parts = cut_rings(zone, notes)

@@ -28,15 +28,15 @@ _OTHERS = ("Point", "LineString", "LinearRing", "Model", "Track")
 
 
 def read_kml(text: str, without: Collection[str] = (), drop: Collection[str] = ()) -> Imported:
-    """Zones from the polygons of placemarks; styles are not taken over.
+    """Read zones from the polygons of placemarks. Styles are ignored.
 
     Args:
-        text: the file.
-        without: names of placemarks to leave out.
-        drop: names of their data to leave out, though they seem to say how high or when a zone counts.
+        text: Content of the file.
+        without: Names of placemarks to leave out.
+        drop: Names of placemark data to leave out although they seem to state the altitude or time of a zone.
 
     Raises:
-        InvalidObject: this is not KML, a polygon is broken, or a placemark cannot be kept exactly.
+        InvalidObject: The text is not KML, a polygon is broken, or a placemark cannot be represented exactly.
     """
     if re.search(r"<!(DOCTYPE|ENTITY)", text):
         raise InvalidObject("", "a KML file must not declare entities")
@@ -49,7 +49,9 @@ def read_kml(text: str, without: Collection[str] = (), drop: Collection[str] = (
     for holder in (e for e in root.iter() if _tag(e) in _HOLDERS):
         title = _text(holder, "name") or _tag(holder)
         if _tag(holder) == "NetworkLink":
-            raise InvalidObject(title, "a NetworkLink leads to another file, which is not read; save all as one file")
+            raise InvalidObject(
+                title, "a NetworkLink refers to another file, which is not imported; save everything in one file"
+            )
         _check_always(holder, title)
     drafts = ZoneBuilder(without, drop)
     for count, mark in enumerate(e for e in root.iter() if _tag(e) == "Placemark"):
@@ -60,7 +62,7 @@ def read_kml(text: str, without: Collection[str] = (), drop: Collection[str] = (
 
 def _check_always(element: ElementTree.Element, field: str) -> None:
     if any(_tag(child) in _TIMES for child in element):
-        raise InvalidObject(field, "has a time, which a Zone says otherwise; remove it, and give the Zone a schedule")
+        raise InvalidObject(field, "has a time, which cannot be imported; remove it and add a schedule to the Zone")
 
 
 def _read_placemark(drafts: ZoneBuilder, title: str, mark: ElementTree.Element) -> None:
@@ -82,27 +84,28 @@ def _read_placemark(drafts: ZoneBuilder, title: str, mark: ElementTree.Element) 
         mode = _text(shape, "altitudeMode")
         if mode not in {"", "clampToGround"}:
             raise InvalidObject(
-                f"{field}.altitudeMode", f"{mode} has heights, which a Zone says otherwise; clamp it to the ground"
+                f"{field}.altitudeMode",
+                f"{mode} uses heights, which cannot be imported; clamp the polygon to the ground",
             )
         area = {"polygon": {"exterior": exterior[0]} | ({"holes": holes} if holes else {})}
         drafts.add(title, {"area": area} | ({"description": described} if described else {}), field)
 
 
 def _data(mark: ElementTree.Element) -> dict[str, str]:
-    """What a placemark says by names of others."""
+    """Return the custom data of a placemark by name."""
     data = (e for child in mark if _tag(child) in _DATA for e in child.iter() if _tag(e) not in _AROUND_DATA)
     return {e.get("name") or _tag(e): "".join(e.itertext()).strip() for e in data}
 
 
 def _rings(shape: ElementTree.Element, boundary: str, field: str) -> list[list[dict[str, float]]]:
-    """All rings of a polygon's boundaries of one kind: some programs put several into one boundary."""
+    """Return all rings of a polygon's boundaries of one kind. Some programs write several rings into one boundary."""
     texts = [e.text or "" for b in shape if _tag(b) == boundary for e in b.iter() if _tag(e) == "coordinates"]
     return [_ring(text, f"{field}.{boundary}.coordinates") for text in texts]
 
 
 def _ring(text: str, field: str) -> list[dict[str, float]]:
     try:
-        # Of what is clamped to the ground, heights mean nothing.
+        # Heights are ignored because the polygon is clamped to the ground.
         positions = [[float(v) for v in group.split(",")][:2] for group in text.split()]
     except ValueError:
         raise InvalidObject(field, "must be lon,lat[,alt] groups") from None
@@ -118,14 +121,14 @@ def _text(element: ElementTree.Element, child: str) -> str:
 
 
 def write_kml(zones: Iterable[Zone]) -> Exported:
-    """A document with a placemark for each zone, clamped to the ground."""
+    """Return a document with a placemark for each zone, clamped to the ground."""
     zones = tuple(zones)
     notes = unsupported_parts(zones, "altitude", "schedule", "circle")
     return Exported(kml_document(zone_placemark(zone, notes) for zone in zones), tuple(notes))
 
 
 def kml_document(marks: Iterable[str]) -> str:
-    """The file that placemarks make."""
+    """Return the KML document of placemarks."""
     return (
         '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2">\n<Document>\n'
         f"{''.join(marks)}</Document>\n</kml>\n"
@@ -133,7 +136,7 @@ def kml_document(marks: Iterable[str]) -> str:
 
 
 def zone_placemark(zone: Zone, notes: list[str]) -> str:
-    """One zone as a placemark; notes what a polygon shows otherwise."""
+    """Return a zone as a placemark. Adds notes on differences between the zone and its polygon."""
     polygons = "".join(map(_polygon, cut_rings(zone, notes)))
     description = f"<description>{escape(zone.spec.description)}</description>" if zone.spec.description else ""
     return (

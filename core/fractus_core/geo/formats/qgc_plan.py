@@ -27,14 +27,16 @@ _OF_FENCE = frozenset({"version", "polygons", "circles", "breachReturn"})
 
 
 def read_qgc_plan(text: str, without: Collection[str] = ()) -> Imported:
-    """Zones from the fence's polygons and circles; whether each is for inclusion is told in its description.
+    """Read zones from the polygons and circles of the fence.
+
+    The description of a zone states if it is for inclusion.
 
     Args:
-        text: the file.
-        without: titles of shapes to leave out, such as `exclusion polygon 1`.
+        text: Content of the file.
+        without: Titles of shapes to leave out, such as `exclusion polygon 1`.
 
     Raises:
-        InvalidObject: this is not a plan file, or a shape is broken.
+        InvalidObject: The text is not a plan file, or a shape is broken.
     """
     whole = parse_json(text)
     if whole.get("fileType") != "Plan":
@@ -90,16 +92,17 @@ def _add(drafts: ZoneBuilder, title: str, area: dict[str, object], field: str, k
 
 
 def write_qgc_plan(zones: Iterable[Zone], *, inclusion: bool = False) -> Exported:
-    """A plan file without a mission whose fence has all zones, for exclusion or for inclusion.
+    """Return a plan file without a mission, whose fence contains all zones, for exclusion or for inclusion.
 
     Raises:
-        InvalidObject: without what the format cannot say, a fence to stay in would hold more than its zone.
+        InvalidObject: A part of a zone that the format cannot represent would make an inclusion fence larger than the
+            zone.
     """
     zones = tuple(zones)
     lost = unsupported_parts(zones, "altitude", "holes") if inclusion else []
     if lost:
         raise InvalidObject(
-            "", f"{lost[0].removesuffix('; left out')}; a fence to stay in would be larger than the zone"
+            "", f"{lost[0].removesuffix('; left out')}; an inclusion fence would be larger than the zone"
         )
     polygons, circles = [], []
     for zone in zones:

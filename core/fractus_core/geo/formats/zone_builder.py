@@ -1,4 +1,4 @@
-"""What reading and writing zones has in common: names, rings, and a note of everything that does not map."""
+"""Common parts of zone import and export: names, rings, and notes on everything that cannot be represented."""
 
 from __future__ import annotations
 
@@ -16,25 +16,27 @@ from fractus_core.geo.areas import area_center, area_polygon, multipolygon_geojs
 from fractus_core.geo.local_frame import LocalFrame
 
 DESCRIPTION_LENGTH = 1024
-"""Characters that the description of a zone takes."""
+"""Longest description of a zone, in characters."""
 
 MAX_RADIUS_M = 200_000.0
-"""Of a circle."""
+"""Largest radius of a circle."""
 
 EARTH_RADIUS_M = 6_371_000.0
 MAX_BEND_M = 0.5
-"""A parallel is not straight: what GeoJSON draws along one gets a point wherever it would leave it by more."""
+"""Largest deviation of an edge from the straight line of degrees that GeoJSON defines. Longer edges get intermediate
+points."""
 
 MAX_POINTS = 300_000
-"""Points of all rings of one file at most, with those along parallels: a small file may ask for thousands of times its size."""
+"""Maximum number of points of all rings of a file, including intermediate points. A small file may need thousands of
+times its size."""
 
 CORNERS = 64
-"""Corners of the polygon that stands for a circle where a format has none."""
+"""Corners of the polygon that replaces a circle in formats without circles."""
 
 
 @dataclass(frozen=True, slots=True)
 class Imported:
-    """Zones that were read, and a sentence for everything that was not taken over."""
+    """Imported zones, and a note for everything that was not imported."""
 
     zones: tuple[Zone, ...]
     notes: tuple[str, ...]
@@ -42,17 +44,17 @@ class Imported:
 
 @dataclass(frozen=True, slots=True)
 class Exported:
-    """A file, and a sentence for everything that the format cannot say."""
+    """Content of a file, and a note for everything that the format cannot represent."""
 
     text: str
     notes: tuple[str, ...]
 
 
 class InexactFeatures(InvalidObject):
-    """Features that are no zones as they are: the first of them.
+    """Features that cannot be imported exactly. Field and problem are those of the first.
 
     Attributes:
-        every: what is wrong with each of them.
+        every: The problem of each of these features.
     """
 
     def __init__(self, every: Sequence[InvalidObject]) -> None:
@@ -65,14 +67,14 @@ class _TooLarge(InvalidObject):
 
 
 class ZoneBuilder:
-    """Zones while a file is read: each gets a name of its own, and is checked as it is made.
+    """Zones while a file is read: each gets a unique name and is validated.
 
-    A zone is where, how high and when the file says, or there is none: one that is larger keeps out what may come in, and
-    lets out what must stay in.
+    A zone has exactly the area, altitude and time of the file, or the import fails. A larger zone would exclude
+    permitted drones, or release drones that must stay inside.
 
     Args:
-        without: titles of features that are left out.
-        drop: names of properties that are left out though they seem to say how high or when a zone counts.
+        without: Titles of features that are left out.
+        drop: Names of properties that are left out although they seem to state the altitude or time of a zone.
     """
 
     def __init__(self, without: Collection[str] = (), drop: Collection[str] = ()) -> None:
@@ -87,10 +89,10 @@ class ZoneBuilder:
         self._wrong: list[InvalidObject] = []
 
     def take(self, title: str, read: Callable[[], None]) -> None:
-        """Read a feature, unless it is to be left out; what is wrong with it is told of with all others."""
+        """Read a feature unless it is to be left out. Its problem is reported with those of all others."""
         if title in self._without:
             self._left_out.add(title)
-            self.note(title, "left out, as asked for")
+            self.note(title, "left out as requested")
             return
         try:
             read()
@@ -100,10 +102,10 @@ class ZoneBuilder:
             self._wrong.append(InvalidObject(error.field, f"{error.problem} (in {title})"))
 
     def add(self, title: str, spec: Mapping[str, Any], where: str) -> None:
-        """Make a zone.
+        """Add a zone.
 
         Raises:
-            InvalidObject: its area is broken, or something is out of range.
+            InvalidObject: Its area is broken, or a value is out of range.
         """
         name = self._name(title)
         manifest = {"apiVersion": API_VERSION, "kind": "Zone", "metadata": {"name": name}, "spec": dict(spec)}
@@ -115,16 +117,16 @@ class ZoneBuilder:
         self._zones.append(zone)
 
     def described(self, title: str, text: str) -> str:
-        """The description of a zone, as long as it may be; notes if that cuts it."""
+        """Return the description of a zone, cut to the maximum length with a note."""
         if len(text) > DESCRIPTION_LENGTH:
             self.note(title, f"its description is cut after {DESCRIPTION_LENGTH} characters")
         return text[:DESCRIPTION_LENGTH]
 
     def rings(self, found: Any, field: str) -> dict[str, Any]:
-        """The rings of a GeoJSON polygon as an area.
+        """Return the rings of a GeoJSON polygon as an area.
 
         Raises:
-            InvalidObject: one of them is none, or the file has too many points.
+            InvalidObject: A ring is invalid, or the file has too many points.
         """
         if not isinstance(found, (list, tuple)) or not found:
             raise InvalidObject(field, "must be a list of rings")
@@ -140,10 +142,10 @@ class ZoneBuilder:
         return {"polygon": {"exterior": exterior} | ({"holes": holes} if holes else {})}
 
     def properties(self, title: str, found: Mapping[str, Any], known: Collection[str], field: str) -> None:
-        """Note the properties for which a zone has no place, and refuse those that say how high or when it counts.
+        """Note the properties that a Zone cannot represent, and reject those that state its altitude or time.
 
         Raises:
-            InvalidObject: there is one that is not to be dropped.
+            InvalidObject: A property states altitude or time and is not to be dropped.
         """
         self._dropped.update(set(found) & set(self._drop))
         said = {name for name, value in found.items() if value not in (None, "", [], {})}
@@ -151,29 +153,29 @@ class ZoneBuilder:
             if suggests_altitude_or_time(name):
                 raise InvalidObject(
                     f"{field}.{name}",
-                    "seems to say how high or when the zone counts, in other words than a Zone; say it as altitude or schedule,"
-                    " spelt as in a Zone, or drop it (--drop)",
+                    "seems to state the altitude or time of the zone; write it as altitude or schedule in the form of a Zone,"
+                    " or drop it (--drop)",
                 )
         dropped = sorted(set(found) - set(known))
         if dropped:
-            self.note(title, f"no place for properties {', '.join(dropped)}; left out")
+            self.note(title, f"properties {', '.join(dropped)} cannot be imported; left out")
 
     def unmapped(self, title: str, found: Iterable[str], known: Iterable[str]) -> None:
-        """Note the fields for which a zone has no place."""
+        """Note the fields that a Zone cannot represent."""
         dropped = sorted(set(found) - set(known))
         if dropped:
-            self.note(title, f"no place for {', '.join(dropped)}; left out")
+            self.note(title, f"{', '.join(dropped)} cannot be imported; left out")
 
     def note(self, title: str, problem: str) -> None:
-        """Say what of a zone is not taken over."""
+        """Note a part of a zone that is not imported."""
         self.notes.append(f"{title}: {problem}")
 
     def result(self) -> Imported:
-        """All that was read.
+        """Return the imported zones.
 
         Raises:
-            InexactFeatures: there are features that cannot be kept as they are.
-            InvalidObject: a feature that is to be left out, or a property that is to be dropped, is not there.
+            InexactFeatures: Some features cannot be represented exactly.
+            InvalidObject: A feature to leave out, or a property to drop, does not exist.
         """
         if self._wrong:
             raise InexactFeatures(self._wrong)
@@ -196,10 +198,10 @@ class ZoneBuilder:
 
 
 def parse_json(text: str) -> dict[str, Any]:
-    """A JSON object.
+    """Parse a JSON object.
 
     Raises:
-        InvalidObject: it is none.
+        InvalidObject: The text is not a JSON object.
     """
     try:
         (found,) = parse_documents(text.encode(), "", is_json=True).values or (None,)
@@ -211,10 +213,10 @@ def parse_json(text: str) -> dict[str, Any]:
 
 
 def object_list(found: Any, field: str) -> list[dict[str, Any]]:
-    """A list of JSON objects; absent is empty.
+    """Return a list of JSON objects. A missing value is an empty list.
 
     Raises:
-        InvalidObject: it is something else.
+        InvalidObject: The value has another type.
     """
     if found is None:
         return []
@@ -224,10 +226,10 @@ def object_list(found: Any, field: str) -> list[dict[str, Any]]:
 
 
 def optional_object(found: Any, field: str) -> dict[str, Any]:
-    """A JSON object; absent is empty.
+    """Return a JSON object. A missing value is an empty object.
 
     Raises:
-        InvalidObject: it is something else.
+        InvalidObject: The value has another type.
     """
     if found is None:
         return {}
@@ -237,20 +239,20 @@ def optional_object(found: Any, field: str) -> dict[str, Any]:
 
 
 def reject_unknown_fields(found: Mapping[str, Any], known: Collection[str], field: str) -> None:
-    """Refuse fields that say of a zone what is not understood.
+    """Reject unknown fields with a value.
 
     Raises:
-        InvalidObject: there is one that says something.
+        InvalidObject: An unknown field has a value.
     """
     for key, value in found.items():
         if key not in known and value not in (None, "", [], {}):
             raise InvalidObject(
-                f"{field}.{key}", "a Zone has no place for it; remove it if it means nothing for the zone"
+                f"{field}.{key}", "a Zone cannot represent this field; remove it if it does not affect the zone"
             )
 
 
 def is_number(found: Any) -> TypeGuard[float]:
-    """Whether this is a number; true and false are none."""
+    """Return True for a number. Booleans are not numbers."""
     return isinstance(found, (int, float)) and not isinstance(found, bool)
 
 
@@ -260,16 +262,16 @@ def _shown(found: Any) -> str:
 
 
 def parse_point(found: Any, field: str, *, lat_first: bool = False) -> Point:
-    """A pair of degrees as a point.
+    """Return a pair of degrees as a point.
 
     Raises:
-        InvalidObject: it is none, or out of range.
+        InvalidObject: The value is not a pair of numbers, or is out of range.
     """
     pair = found if isinstance(found, (list, tuple)) else ()
     if len(pair) < 2 or not all(map(is_number, pair[:2])):
         raise InvalidObject(field, "must be two numbers, degrees")
     if any(pair[2:]):
-        raise InvalidObject(field, "has a height; say how high the zone is in its altitude, and remove the heights")
+        raise InvalidObject(field, "has a height; remove the heights and state them in the altitude of the zone")
     lat, lon = (pair[0], pair[1]) if lat_first else (pair[1], pair[0])
     if not (-90 <= lat <= 90 and -180 <= lon <= 180):
         order = "lat, lon" if lat_first else "lon, lat"
@@ -280,17 +282,17 @@ def parse_point(found: Any, field: str, *, lat_first: bool = False) -> Point:
 
 
 def parse_ring(found: Any, field: str, *, lat_first: bool = False, planar: bool = False) -> list[dict[str, float]]:
-    """A ring as manifests spell it: open, without the repetition of its first point.
+    """Return a ring as manifests spell it: open, without the repetition of its first point.
 
     Args:
-        found: the ring.
-        field: where it is.
-        lat_first: the order of its degrees.
-        planar: whether its edges are straight lines of degrees, which never cross the antimeridian.
+        found: The ring.
+        field: Its path in the file.
+        lat_first: True if latitude comes first.
+        planar: True if its edges are straight lines of degrees, which never cross the antimeridian.
 
     Raises:
-        InvalidObject: it has fewer than three points, or one that is none, or crosses the antimeridian where none can, or its
-            sides are too long to follow.
+        InvalidObject: The ring has fewer than three points or an invalid point, crosses the antimeridian although it is
+            planar, or has sides that need too many intermediate points.
     """
     if not isinstance(found, (list, tuple)):
         raise InvalidObject(field, "must be a list of positions")
@@ -310,14 +312,14 @@ def parse_ring(found: Any, field: str, *, lat_first: bool = False, planar: bool 
 
 
 def _pieces(start: Point, end: Point) -> int:
-    """Into how many parts a straight line of degrees is cut, so that none bends by more than `MAX_BEND_M`."""
+    """Return the number of parts of a straight line of degrees that bend by at most `MAX_BEND_M` each."""
     lat = math.radians(min(max(abs(start.lat), abs(end.lat)), 89.0))
     width_m = math.radians(abs(end.lon - start.lon)) * math.cos(lat) * EARTH_RADIUS_M
     return max(math.ceil(math.sqrt(width_m**2 * math.tan(lat) / (8 * EARTH_RADIUS_M) / MAX_BEND_M)), 1)
 
 
 def _along_degrees(sides: Iterable[tuple[Point, Point]]) -> Iterator[Point]:
-    """The corners of a ring, and points between where a straight line of degrees bends."""
+    """Yield the corners of a ring, and intermediate points on straight lines of degrees that bend."""
     for start, end in sides:
         yield start
         pieces = _pieces(start, end)
@@ -327,10 +329,10 @@ def _along_degrees(sides: Iterable[tuple[Point, Point]]) -> Iterator[Point]:
 
 
 def circle_area(centre: Point, radius_m: Any, field: str) -> dict[str, Any]:
-    """A circle as an area.
+    """Return a circle as an area.
 
     Raises:
-        InvalidObject: the radius is not a length.
+        InvalidObject: The radius is not a length.
     """
     if not is_number(radius_m) or not 0 < radius_m <= MAX_RADIUS_M:
         raise InvalidObject(field, f"must be 0 to {MAX_RADIUS_M:.0f} metres, not {_shown(radius_m)}")
@@ -338,7 +340,7 @@ def circle_area(centre: Point, radius_m: Any, field: str) -> dict[str, Any]:
 
 
 def area_rings(area: Area) -> list[list[list[float]]]:
-    """Closed rings of an area, lon before lat; a circle becomes a polygon around it."""
+    """Return closed rings of an area, lon before lat. A circle becomes a polygon around it."""
     shape = area.polygon if area.polygon is not None else _circumscribed(area.circle)
     closed = []
     for points in (shape.exterior, *shape.holes):
@@ -348,7 +350,7 @@ def area_rings(area: Area) -> list[list[list[float]]]:
 
 
 def cut_rings(zone: Zone, notes: list[str]) -> list[list[list[list[float]]]]:
-    """Closed rings of the parts of an area, cut at the antimeridian where it crosses it; notes if it does."""
+    """Return closed rings of the parts of an area, cut at the antimeridian. Adds a note if it is cut."""
     outline = area_rings(zone.spec.area)
     crossings = sum(abs(a[0] - b[0]) > 180 for a, b in itertools.pairwise(outline[0]))
     if crossings % 2:
@@ -377,7 +379,12 @@ def _circumscribed(circle: Circle | None) -> Polygon:
 
 
 def unsupported_parts(zones: Iterable[Zone], *parts: str) -> list[str]:
-    """Notes of the parts of zones that a format cannot say: altitude, schedule, holes, circle, description."""
+    """Return notes on the parts of zones that a format cannot represent.
+
+    Args:
+        zones: Zones to check.
+        parts: Parts that the format lacks: altitude, schedule, holes, circle, description.
+    """
     notes = []
     for zone in zones:
         spec = zone.spec
@@ -409,5 +416,8 @@ _SAYING = re.compile(
 
 
 def suggests_altitude_or_time(name: str) -> bool:
-    """Whether the name of a property has a word of heights or times: `upperLimit`, `VALID_FROM`, `height (AGL)`."""
+    """Return True if the name of a property contains a word for altitude or time.
+
+    Examples are `upperLimit`, `VALID_FROM` and `height (AGL)`.
+    """
     return any(_SAYING.fullmatch(word.lower()) for word in _WORD.findall(name))

@@ -17,7 +17,6 @@ from typing import Any
 from fractus_core.control.state import FlightMode
 from fractus_core.policy.decision_types import TakeoffArgs
 from fractus_services.grant_files import ActiveGrant
-from fractus_services.mobility.authority import drivers
 from mobility_world import World, goto
 from virtual_time import fly
 
@@ -172,7 +171,7 @@ class Flight:
         return self.call("Goto", lambda: self.world.service.goto(held, goto(x, y), 0))
 
     async def give_back(self, held: ActiveGrant) -> None:
-        await self.do("ReturnControl", lambda: drivers.give_back(self.world.control, held))
+        await self.do("ReturnControl", lambda: self.world.control.return_control(held))
 
     def failsafe(self, mode: FlightMode) -> None:
         """The autopilot's own failsafe acts."""

@@ -12,7 +12,6 @@ from fractus_core.control.events import Airborne, ArmingRequested
 from fractus_core.policy.decision_types import Airframe, TakeoffArgs
 from fractus_mavlink.enums import MAV_CMD
 from fractus_services.errors import AutopilotError
-from fractus_services.mobility.authority import drivers
 from fractus_services.mobility.autopilot import Checked
 from mobility_world import BRAKE, World, end, partial, refusal, spec
 from virtual_time import fly
@@ -57,7 +56,7 @@ def test_who_waits_to_arm_must_still_be_allowed_to(tmp_path: Path) -> None:
             slow = world.fence.raise_around = Slow(world)
             calls = [asyncio.ensure_future(world.service.arm(grant)) for _ in range(2)]
             await asyncio.sleep(1)
-            await drivers.give_back(world.control, grant)
+            await world.control.return_control(grant)
             for call in calls:
                 await refusal(call)
             assert slow.began_armed == [False]

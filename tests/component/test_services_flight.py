@@ -14,7 +14,6 @@ from fractus_core.policy.decision_types import Call, GotoArgs, SetSpeedArgs, Tak
 from fractus_mavlink.enums import MAV_CMD
 from fractus_services.errors import AutopilotError, Refused
 from fractus_services.grant_files import ActiveGrant
-from fractus_services.mobility.authority import drivers
 from mobility_world import (
     GUIDED,
     LAND,
@@ -47,7 +46,7 @@ def test_the_transit_flies_around_a_wall_there_and_home(tmp_path: Path) -> None:
             assert [n.reason for n in world.events if n.state is StreamState.WAITING][
                 -1
             ] == "the system flies to the control point"
-            assert await drivers.give_back(world.control, grant)
+            assert await world.control.return_control(grant)
             await world.until(lambda: not world.plane.vehicle.armed)
             assert math.dist(world.plane.xy, (0, 0)) < 1.5
             assert clear_m(world, *WALL) > 1.0
@@ -172,7 +171,7 @@ def test_without_any_legal_way_home_the_drone_comes_home_all_the_same(
             world.grants.put(spec(zone("home", "ignore", -15, -15, 15, 15)))
             why = await refusal(world.service.return_to_launch(grant)) if not retraces else None
             assert why is None or why.verdict.code == "NoLegalWay"
-            await drivers.give_back(world.control, grant)
+            await world.control.return_control(grant)
             await world.until(lambda: world.plane.vehicle.mode == mode)
             assert "NoLegalWay" in {e["code"] for e in world.kinds("control")}
             await world.until(lambda: not world.plane.vehicle.armed)
@@ -235,7 +234,7 @@ def test_a_new_wall_on_the_way_home_is_flown_around(tmp_path: Path) -> None:
             await world.up(grant)
             for x, y in ((60, 30), (60, 70), (0, 70)):
                 await end(world.service.goto(grant, goto(x, y), 0))
-            await drivers.give_back(world.control, grant)
+            await world.control.return_control(grant)
             await world.until(lambda: math.hypot(*world.plane.velocity) > 3)
             east = world.plane.velocity[0] > 0
             second = (41.0, 20.0, 90.0, 60.0) if east else (-90.0, 20.0, -41.0, 60.0)
@@ -337,7 +336,7 @@ def test_a_tour_waits_while_a_driver_has_the_drone(tmp_path: Path) -> None:
             world.grants.put(touring(tour=((0, 30),)), "m2")
             await asyncio.sleep(10)
             assert world.control.state.controller == grant.identity
-            await drivers.give_back(world.control, grant)
+            await world.control.return_control(grant)
             await world.until(lambda: world.outcome("m2"))
 
     fly(flight)
@@ -390,14 +389,14 @@ def test_a_command_that_waits_is_not_sent_once_it_is_stale(tmp_path: Path, event
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
             stream = await world.up(grant)
-            assert world.control.taken_because() == "", "a driver has control"
+            assert world.control.effects.takeover_reason == "", "a driver has control"
             world.plane.deaf = True  # the autopilot neither acts nor answers: commands are tried again
             asking = asyncio.ensure_future(refusal(world.service.set_speed(grant, SetSpeedArgs(3.0))))
             await asyncio.sleep(0.3)
             if event == "takeover":
                 world.control.take_over(world.service.calls.check(Call("Goto", goto(0, 5000)), grant))
             elif event == "returned":
-                await drivers.give_back(world.control, grant)
+                await world.control.return_control(grant)
             elif event == "revoked":
                 world.grants.remove(grant)
             else:
@@ -407,10 +406,12 @@ def test_a_command_that_waits_is_not_sent_once_it_is_stale(tmp_path: Path, event
             why = await asking
             assert why.verdict.code in {"NotInControl", "ControlLost"}
             assert MAV_CMD.DO_CHANGE_SPEED not in world.plane.commands, "the retry was dropped"
-            assert world.control.taken_because(), "the node is told why the system has control"
+            assert world.control.effects.takeover_reason, "the node is told why the system has control"
             await world.until(lambda: not world.plane.vehicle.armed)
             world.control.note("landed", "the motors are stopped")
-            assert not world.control.taken_because(), "what was so in this flight is not why the system flies the next"
+            assert not world.control.effects.takeover_reason, (
+                "what was so in this flight is not why the system flies the next"
+            )
 
     fly(flight)
 
@@ -519,7 +520,7 @@ def test_a_journal_that_fails_in_flight_ends_no_flight(tmp_path: Path) -> None:
 
             world.journal._write = full  # type: ignore[method-assign]
             await end(world.service.goto(grant, goto(0, 30), 0))
-            await drivers.give_back(world.control, grant)
+            await world.control.return_control(grant)
             await world.until(lambda: not world.plane.vehicle.armed)
 
     fly(flight)
@@ -551,8 +552,8 @@ def test_a_planner_that_fails_brings_the_drone_home_straight(tmp_path: Path, mon
             grant = world.grants.put(spec(zone("far", "ignore", 150, 150, 160, 160)))
             await world.up(grant)
             await end(world.service.goto(grant, goto(0, 30), 0))
-            monkeypatch.setattr("fractus_services.mobility.flight.homing.straight_home_blocked", broken)
-            await drivers.give_back(world.control, grant)
+            monkeypatch.setattr("fractus_services.mobility.flight.homing.check_straight_return", broken)
+            await world.control.return_control(grant)
             await world.until(lambda: not world.plane.vehicle.armed)
             assert math.dist(world.plane.xy, (0, 0)) < 1.5
 

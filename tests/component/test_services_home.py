@@ -17,7 +17,6 @@ from fractus_mavlink import Endpoint, Parser, layout_named, message
 from fractus_mavlink.enums import COPTER_MODE, MAV_AUTOPILOT, MAV_CMD, MAV_COMPONENT, MAV_FRAME, MAV_MODE_FLAG, MAV_TYPE
 from fractus_services.errors import AutopilotError, Refused, Unavailable
 from fractus_services.grant_files import ActiveGrant
-from fractus_services.mobility.authority import drivers
 from fractus_services.mobility.authority.home import home_moved
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.home_watch import HomeWatch
@@ -84,7 +83,7 @@ def test_home_that_is_moved_in_flight_is_set_back_before_the_drone_flies_on(
             await end(world.service.goto(grant, GotoArgs(*at(0, 90), 12.0), 0))
             assert len(said(world)) == 1
             assert max(height for _, _, height in world.plane.trace) < 16
-            await drivers.give_back(world.control, grant)
+            await world.control.return_control(grant)
             await world.until(lambda: not world.plane.vehicle.armed)
             assert abs(world.plane.xy[1]) < 3
             assert "failed" not in world.outcome()
@@ -96,7 +95,7 @@ def test_the_way_home_leads_to_where_home_was_fixed(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world, flying(world) as grant:
             await end(world.service.goto(grant, GotoArgs(*at(0, 90), 12.0), 0))
-            await drivers.give_back(world.control, grant)
+            await world.control.return_control(grant)
             await world.until(lambda: world.plane.xy[1] < 60)
             move(world, (80.0, 60.0, 0.0))
             await world.until(lambda: not world.plane.vehicle.armed)
@@ -133,7 +132,7 @@ def test_a_home_that_does_not_stay_set_back_keeps_no_drone_in_the_air(tmp_path: 
             if refused:
                 world.plane.refuses.add(MAV_CMD.DO_SET_HOME)
             moving = asyncio.ensure_future(again_and_again(world))
-            await drivers.give_back(world.control, grant)
+            await world.control.return_control(grant)
             await world.until(lambda: world.plane.vehicle.mode == SMART_RTL, 120)
             await world.until(lambda: not world.plane.vehicle.armed, 200)
             moving.cancel()

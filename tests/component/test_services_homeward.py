@@ -13,7 +13,6 @@ from fractus_core.control.state import FlightMode
 from fractus_core.policy.decision_types import GotoArgs, TakeoffArgs
 from fractus_mavlink import message
 from fractus_mavlink.enums import MAV_CMD
-from fractus_services.mobility.authority import drivers
 from mobility_world import (
     GUIDED,
     LAND,
@@ -42,7 +41,7 @@ async def beyond_the_wall(world: World) -> None:
     await world.up(grant)
     for x, y in ((60, 30), (60, 70), (0, 70)):
         await end(world.service.goto(grant, GotoArgs(*at(x, y), 10.0), 0))
-    await drivers.give_back(world.control, grant)
+    await world.control.return_control(grant)
 
 
 def test_a_driver_turns_home_from_standstill(tmp_path: Path) -> None:
@@ -117,7 +116,7 @@ def test_an_autopilot_that_refuses_again_and_again_brings_the_drone_home_itself(
                 await world.up(grant)
                 await end(world.service.goto(grant, GotoArgs(*at(0, 70), 10.0), 0))
                 world.grants.put(spec(zone("wall", "ignore", *WALL)))
-                await drivers.give_back(world.control, grant)
+                await world.control.return_control(grant)
             plane.commands.clear()
             plane.refuses.add(REPOSITION)
             await world.until(lambda: plane.vehicle.mode in {RTL, SMART_RTL, LAND})
@@ -151,7 +150,7 @@ def test_no_fence_outlives_its_mission(tmp_path: Path, how: str) -> None:
                 await asyncio.sleep(15)
                 assert world.fence.raised, "the driver may take off again"
                 if how == "returned":
-                    await drivers.give_back(world.control, grant)
+                    await world.control.return_control(grant)
                 elif how == "grace":
                     stream.cancel()
                 else:
@@ -238,7 +237,7 @@ def test_a_fault_of_ours_ends_the_mission_once(tmp_path: Path, monkeypatch: pyte
 
     async def flight() -> None:
         async with World(tmp_path) as world:
-            monkeypatch.setattr("fractus_services.mobility.flight.courses.searching", broken)
+            monkeypatch.setattr("fractus_services.mobility.flight.courses.route_steps", broken)
             grant = world.grants.put(touring(tour=((0.0, 60.0),)) if who == "tour" else partial())
             if who == "driver":
                 why = await refusal(world.drive(grant))
@@ -266,7 +265,7 @@ def test_what_appears_on_the_way_home_is_flown_around_as_fast_as_allowed(tmp_pat
             await end(world.service.goto(grant, GotoArgs(*at(0, 120), 10.0), 0))
             homeward = None
             if who == "system":
-                await drivers.give_back(world.control, grant)
+                await world.control.return_control(grant)
             elif who == "driver":
                 homeward = asyncio.ensure_future(end(world.service.return_to_launch(grant)))
             else:
@@ -359,7 +358,7 @@ def test_the_way_home_keeps_limits_of_height_and_speed(tmp_path: Path, who: str,
             plane.trace.clear()
             fastest = 0.0
             if who == "system":
-                await drivers.give_back(world.control, grant)
+                await world.control.return_control(grant)
             else:
                 homeward = asyncio.ensure_future(end(world.service.return_to_launch(grant)))
             while plane.vehicle.armed:
@@ -429,7 +428,7 @@ def test_what_is_the_last_line_already_is_not_ended(tmp_path: Path) -> None:
             await world.up(grant)
             await end(world.service.goto(grant, GotoArgs(*at(0, 120), 10.0), 0))
             world.grants.put(spec(zone("all-around", "ignore", -20, -20, 20, 20)))
-            await drivers.give_back(world.control, grant)
+            await world.control.return_control(grant)
             await world.until(lambda: not plane.vehicle.armed)
             assert plane.vehicle.mode == RTL
             alarms = [(entry["action"], entry["code"]) for entry in world.kinds("monitor")]
@@ -483,7 +482,7 @@ def test_an_autopilot_that_lands_by_itself_breaks_no_lower_limit(tmp_path: Path)
             low = {"type": "LimitControl", "kind": "altitude", "lowerLimit": 5.0}
             grant = world.grants.put(spec({"name": "low", "spec": low, "zones": []}))
             await world.up(grant)
-            await drivers.give_back(world.control, grant)
+            await world.control.return_control(grant)
             await world.until(lambda: not world.plane.vehicle.armed)
             assert not world.kinds("monitor")
 
@@ -592,7 +591,7 @@ def test_it_flies_home_below_a_zone_that_appears_close_overhead(tmp_path: Path) 
             overhead["zones"][0]["altitude"] = {"lower": 21.5, "reference": "home"}
             beside = zone("beside", "ignore", -30.0, 61.5, 30.0, 80.0)
             grant = world.grants.put(spec(overhead, beside))
-            await drivers.give_back(world.control, grant)
+            await world.control.return_control(grant)
             await world.until(lambda: not world.plane.vehicle.armed)
             assert math.hypot(*world.plane.xy) < 2.0
             assert "NoLegalWay" not in {entry["code"] for entry in world.kinds("control") if "code" in entry}

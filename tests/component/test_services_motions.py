@@ -15,9 +15,7 @@ from fractus_core.policy.engine import judge
 from fractus_core.policy.monitoring import monitor
 from fractus_mavlink.enums import MAV_CMD
 from fractus_services.errors import AutopilotError, PreconditionFailed, Refused, Unavailable
-from fractus_services.mobility.authority import drivers
 from fractus_services.mobility.authority.leases import FlightConstraints
-from fractus_services.mobility.authority.readiness import not_ready_reason
 from fractus_services.mobility.flight import monitor as monitoring
 from fractus_services.mobility.flight.courses import Courses, Trip
 from mobility_world import GUIDED, LOITER, World, area, clear_m, end, goto, partial, refusal, spec, zone
@@ -171,7 +169,7 @@ def test_the_next_driver_does_not_inherit_a_speed(tmp_path: Path) -> None:
             await world.up(grant)
             await world.service.set_speed(grant, SetSpeedArgs(2.0))
             assert world.guard.situation().speed_setpoint_mps == 2.0
-            await drivers.give_back(world.control, grant)
+            await world.control.return_control(grant)
             await world.until(lambda: not world.plane.vehicle.armed)
             grant = world.grants.put(spec(), "m2")
             await world.up(grant)
@@ -194,7 +192,7 @@ def test_the_system_flies_home_at_the_speed_of_the_vehicle_within_limits(
             await world.service.set_speed(grant, SetSpeedArgs(driven_mps))
             if limited:
                 world.grants.put(spec(wall, limit("speed", 3.0)))
-            await drivers.give_back(world.control, grant)
+            await world.control.return_control(grant)
             await world.until(lambda: world.control.motion is not None and world.control.motion.speed_mps is not None)
             told = 3.0 if limited else 8.0
             assert world.guard.situation().speed_setpoint_mps == 8.0
@@ -249,7 +247,7 @@ def test_a_correction_that_came_too_late_for_its_motion_is_made_for_the_next(tmp
             await world.until(lambda: world.plane.velocity[1] > 7)
             world.grants.put(spec(limit("speed", 3.0)))
             world.monitor.look()
-            world.control.begin("Goto").speed_mps = 8.0  # before the correction has begun
+            world.control.begin_motion("Goto").speed_mps = 8.0  # before the correction has begun
             begun = world.plane.now
             await world.until(lambda: world.plane.speed_mps == 3.0, 5)
             assert world.plane.now - begun < 0.5
@@ -307,7 +305,7 @@ def test_what_the_system_may_not_fly_ends_no_motion(tmp_path: Path, what: str) -
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
             await world.up(grant)
-            flown = world.control.begin("Goto")
+            flown = world.control.begin_motion("Goto")
             trip = Trip(FlightConstraints(grant, grant.compiled), "Transit", forbidden)
             away = goto(0, 50)
             with pytest.raises(PreconditionFailed, match="is gone"):
@@ -442,7 +440,7 @@ async def homeward(world: World) -> bool:
     await world.up(grant)
     for x, y in ((60, 30), (60, 70), (0, 70)):
         await end(world.service.goto(grant, goto(x, y), 0))
-    await drivers.give_back(world.control, grant)
+    await world.control.return_control(grant)
     await world.until(lambda: abs(world.plane.velocity[0]) > 3)
     return world.plane.velocity[0] > 0
 
@@ -651,6 +649,6 @@ def test_a_slow_link_lets_no_one_arm(tmp_path: Path) -> None:
             world.plane.uplink_s = world.plane.downlink_s = 0.7
             await asyncio.sleep(6)
             grant = world.grants.put(spec())
-            assert "delays by 1.4 s there and back" in str(not_ready_reason(world.control, grant.key))
+            assert "delays by 1.4 s there and back" in str(world.control.not_ready_reason(grant.key))
 
     fly(flight)

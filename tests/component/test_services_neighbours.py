@@ -13,7 +13,6 @@ from fractus_core.policy.decision_types import TakeoffArgs
 from fractus_mavlink import Endpoint, Parser
 from fractus_mavlink.enums import COPTER_MODE, MAV_AUTOPILOT, MAV_CMD, MAV_COMPONENT, MAV_MODE_FLAG, MAV_STATE, MAV_TYPE
 from fractus_services.errors import Refused
-from fractus_services.mobility.authority.readiness import arming_problem
 from fractus_services.mobility.mavlink.neighbours import SURE_S, Memory
 from mobility_world import end, goto
 from sky_drone import fly, ready, until
@@ -179,7 +178,7 @@ def test_a_stranger_on_a_new_link_is_neither_prepared_nor_brought_home(tmp_path:
             await asyncio.sleep(1.0)
         assert not told
         assert not drone.autopilot.found
-        assert "unknown vehicle with running motors is heard (MAVLink system 2)" in arming_problem(drone.control)
+        assert "unknown vehicle with running motors is heard (MAVLink system 2)" in drone.control.arming_problem
         await drone.close()
 
     fly(work, tmp_path)

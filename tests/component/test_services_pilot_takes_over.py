@@ -12,7 +12,6 @@ from fractus_core.control import Authority
 from fractus_core.policy.decision_types import TakeoffArgs
 from fractus_mavlink import Parser
 from fractus_mavlink.enums import COPTER_MODE, MAV_CMD
-from fractus_services.mobility.authority import drivers
 from mobility_world import end, goto
 from sky_drone import fly, ready, until
 
@@ -45,7 +44,7 @@ def test_a_pilot_who_takes_over_while_the_system_changes_the_mode_keeps_the_dron
             await end(drone.service.take_off(grant, TakeoffArgs(15.0)))
             await end(drone.service.goto(grant, goto(0, 40, 15), 0.0))
             sent_at = lose_mode_changes(sky.wires[0], 3, monkeypatch)
-            await drivers.give_back(drone.control, grant)
+            await drone.control.return_control(grant)
             await until(lambda: sent_at)
             await asyncio.sleep(after_s)
             assert sky.truth.mode is COPTER_MODE.GUIDED

@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 from fractus_core.policy.decision_types import Airframe
 from fractus_core.policy.return_route import ReturnBounds, return_altitudes_m, return_bounds
-from fractus_services.mobility.authority import drivers
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from mobility_world import World, area, end, goto, refusal, spec
 from policy_world import altitude, at, box, compiled, exclusion, speed, zone
@@ -98,7 +97,7 @@ def test_it_is_limited_while_a_mission_lasts(tmp_path: Path, restarted: bool) ->
             assert world.guard.situation().airframe.return_altitude_m == 12.0
             await end(world.service.goto(grant, goto(0, 30, 8.0), 0))
             if not restarted:
-                await drivers.give_back(world.control, grant)
+                await world.control.return_control(grant)
                 await world.until(lambda: not world.plane.vehicle.armed)
                 await world.until(lambda: held(world) == OWNED, 30)
         if restarted:
@@ -149,7 +148,7 @@ def test_what_a_mission_needs_otherwise_holds_while_it_lasts_and_is_the_owners_b
             await world.until(lambda: found(world) == HELD, 30)
             await end(world.service.goto(grant, goto(0, 30, 8.0), 0))
             if not restarted:
-                await drivers.give_back(world.control, grant)
+                await world.control.return_control(grant)
                 await world.until(lambda: not world.plane.vehicle.armed)
                 await world.until(lambda: found(world) == FLOWN, 30)
         if restarted:
@@ -188,7 +187,7 @@ def test_it_is_put_back_although_the_fence_is_not(tmp_path: Path) -> None:
                 raise OSError("no space left on device")
 
             world.fence.lower = fails  # type: ignore[method-assign]
-            await drivers.give_back(world.control, grant)
+            await world.control.return_control(grant)
             await world.until(lambda: not world.plane.vehicle.armed)
             await world.until(lambda: held(world) == OWNED, 30)
             assert world.fence.raised
@@ -244,7 +243,7 @@ def test_values_of_a_release_with_other_names_are_left_alone(tmp_path: Path) -> 
             grant = world.grants.put(spec(limits=LIMITS))
             await world.up(grant, 8.0)
             assert held(world) == LOW
-            await drivers.give_back(world.control, grant)
+            await world.control.return_control(grant)
             await world.until(lambda: not world.plane.vehicle.armed)
             await world.until(lambda: held(world) == OWNED, 30)
         assert "WP_SPD" not in world.plane.parameters

@@ -11,7 +11,6 @@ import pytest
 from closed_loop import Sky
 from fractus_core.policy.decision_types import TakeoffArgs
 from fractus_mavlink import Parser
-from fractus_services.mobility.authority import drivers
 from mobility_world import FRAME, end, goto
 from sky_drone import fly, ready, until
 
@@ -39,7 +38,7 @@ def test_a_position_at_home_from_long_ago_is_not_where_a_drone_on_its_way_home_i
             await end(drone.service.goto(grant, goto(0, 60, 15), 0.0))
             deliver(kept[0])
             assert drone.autopilot.vehicle.distance_m(*FRAME.latlon(0, 0)) > 50.0
-            await drivers.give_back(drone.control, grant)
+            await drone.control.return_control(grant)
             for _ in range(50):
                 deliver(kept[0])
                 await asyncio.sleep(0.02)

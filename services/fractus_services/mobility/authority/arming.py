@@ -1,4 +1,4 @@
-"""Starting the motors: only with every failsafe in place, and only while the caller may."""
+"""Arming: the motors start only with every failsafe in place and while the caller has control."""
 
 from __future__ import annotations
 
@@ -14,18 +14,28 @@ from fractus_core.geo import LocalFrame
 
 from fractus_services.errors import AutopilotError, PreconditionFailed, Refused, Unavailable
 from fractus_services.grant_files import ActiveGrant
-from fractus_services.mobility.authority.control import Control
+from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.autopilot import BEING_SET, Checked, Failsafes, Fence, Permit
 
 ARMING_TIMEOUT_S = 3.0
-AGAIN_S = 2.0
-WAIT_S = 0.5
-FENCE_TIMEOUT_S = 45.0
-HOME_M = 5.0
-STRAY_M = 50.0
-"""A drone that stands further than this from the home of its grant would be brought to the wrong place."""
+"""Seconds to wait for the journal, and for the armed state after the autopilot accepted the command."""
 
-_PASSING = frozenset(
+RETRY_S = 2.0
+"""Seconds between arming attempts."""
+
+UPDATE_TIMEOUT_S = 0.5
+"""Seconds to wait for one message of the vehicle."""
+
+FENCE_TIMEOUT_S = 45.0
+"""Seconds within which the vehicle's fence must be loaded and verified."""
+
+AT_HOME_M = 5.0
+"""Distance from home within which the autopilot may return on the path it flew."""
+
+MAX_HOME_DISTANCE_M = 50.0
+"""Distance from the home of the grant above which arming is refused, because the drone would return to a wrong place."""
+
+_TRANSIENT_CODES = frozenset(
     {"NotReady", "PositionUnknown", "LinkTooSlow", "FailsafesNotVerified", "FenceNotRaised", "ReturnNotLimited"}
 )
 
@@ -33,18 +43,18 @@ log = logging.getLogger(__name__)
 
 
 class Arming:
-    """Starts the motors.
+    """Arms the drone.
 
     Args:
-        control: the drone.
-        failsafes: the autopilot's own, one by one.
-        fence: the vehicle's own.
-        limit_return: lets the autopilot fly home no higher and no faster than a grant allows.
+        control: Control state.
+        failsafes: Failsafes of the autopilot.
+        fence: Fence of the vehicle.
+        limit_return: Limits altitude and speed of the autopilot's own return to what a grant allows.
     """
 
     def __init__(
         self,
-        control: Control,
+        control: ControlStore,
         failsafes: Failsafes,
         fence: Fence,
         limit_return: Callable[[ActiveGrant], Awaitable[tuple[str, ...]]],
@@ -57,47 +67,49 @@ class Arming:
     async def arm(
         self, grant: ActiveGrant, permit: Permit, judge: Callable[[], object], patience_s: float
     ) -> AsyncGenerator[str, None]:
-        """Arm in GUIDED, unless it is armed by then; one caller at a time. What may pass is tried again.
+        """Arm in GUIDED, unless the drone is armed already. Retry transient failures.
 
-        Each try goes on to its end when the caller hangs up, so that nothing stays armed that no one asks for.
+        Attempts are exclusive. Each attempt is completed even if the caller cancels, so that no drone stays armed without a
+        caller.
 
         Args:
-            grant: the grant to fly under.
-            permit: raises when the caller may not arm any more.
-            judge: raises when policies forbid it; asked before each try.
-            patience_s: how long the caller waits.
+            grant: Grant of the flight.
+            permit: Raises if the caller may no longer arm.
+            judge: Raises if policies forbid arming. It is called before each attempt.
+            patience_s: Seconds for which the caller waits.
 
         Yields:
-            Why the drone is not armed yet.
+            The reason why the drone is not armed yet.
 
         Raises:
-            Refused: a failsafe is not verified, audit log or journal cannot be written, or the caller may no more.
-            AutopilotError: the autopilot refuses.
+            Refused: A failsafe is not verified, the audit log or the journal cannot be written, or the caller may no longer
+                arm.
+            AutopilotError: The autopilot refused.
         """
         control = self._control
         until = control.autopilot.now + patience_s
         while True:
             try:
                 judge()
-                await control.tasks.complete(self._in_turn(grant, permit))
+                await control.tasks.complete(self._arm_exclusively(grant, permit))
             except (AutopilotError, Refused) as error:
-                if not _passing(error) or control.autopilot.now + AGAIN_S > until:
+                if not _is_transient(error) or control.autopilot.now + RETRY_S > until:
                     raise
-                log.warning("arming: not yet, trying again (identity=%s, error=%s)", grant.identity, error)
+                log.warning("arming: attempt failed, retrying (identity=%s error=%s)", grant.identity, error)
                 yield str(error)
             else:
                 return
-            await asyncio.sleep(AGAIN_S)
+            await asyncio.sleep(RETRY_S)
 
-    async def _in_turn(self, grant: ActiveGrant, permit: Permit) -> None:
-        """Arm when no one else does: what is prepared on the ground must not be prepared under a drone that flies."""
+    async def _arm_exclusively(self, grant: ActiveGrant, permit: Permit) -> None:
+        """Arm while no other caller arms, because preparations for the ground must not run on a flying drone."""
         async with self._control.autopilot.starting:
             permit()
             if not self._control.autopilot.vehicle.armed:
                 await self._arm(grant, permit)
 
     async def _arm(self, grant: ActiveGrant, permit: Permit) -> None:
-        self._check()
+        self._require_verified()
         autopilot = self._control.autopilot
         if unready := autopilot.vehicle.unready(autopilot.now):
             raise PreconditionFailed("NotReady", f"the autopilot is not ready to arm: {unready}")
@@ -112,32 +124,32 @@ class Arming:
         permit()
         self._control.dispatch(ArmingPrepared(begins=True))
         try:
-            checked = await self._prepare_ways_home(grant, home)
+            checked = await self._prepare_return(grant, home)
 
-            def still() -> None:
+            def still_permitted() -> None:
                 permit()
-                self._check(checked)
+                self._require_verified(checked)
 
-            still()
-            await self._start(home, still)
+            still_permitted()
+            await self._start(home, still_permitted)
         finally:
             self._control.dispatch(ArmingPrepared(begins=False))
 
     async def _start(self, home: tuple[float, float, float], permit: Permit) -> None:
-        """Start the motors; stop them again when anything fails before the drone flies."""
-        autopilot, modes = self._control.autopilot, self._control.modes
+        """Start the motors. Stop them again if a later step fails before the drone flies."""
+        autopilot = self._control.autopilot
         self._control.dispatch(MotorStart(begins=True))
         unanswered = False
         try:
-            await modes.enter_guided(permit)
+            await self._control.modes.enter_guided(permit)
             try:
                 unanswered = True
                 await autopilot.arm(permit)
                 deadline = autopilot.now + ARMING_TIMEOUT_S
                 while not autopilot.vehicle.armed:
                     if autopilot.now > deadline:
-                        raise AutopilotError("the autopilot accepted to arm and did not")
-                    await autopilot.update(WAIT_S)
+                        raise AutopilotError("the autopilot acknowledged arming but did not arm")
+                    await autopilot.update(UPDATE_TIMEOUT_S)
                 unanswered = False
                 await autopilot.set_home(*home)
                 await self._control.tasks.attempt(autopilot.ask_home)
@@ -150,46 +162,46 @@ class Arming:
         finally:
             self._control.dispatch(MotorStart(begins=False, unanswered=unanswered))
 
-    async def _prepare_ways_home(self, grant: ActiveGrant, home: tuple[float, float, float]) -> Checked:
-        """Choose how the autopilot comes home by itself, raise its own fence around the mission, and learn how high it returns.
+    async def _prepare_return(self, grant: ActiveGrant, home: tuple[float, float, float]) -> Checked:
+        """Choose the autopilot's return mode, raise its fence around the mission, and read the altitude of its return.
 
-        A vehicle remembers its path from where it was armed last: armed elsewhere than at home, it must not go back on it.
+        A vehicle records its path from where it armed last. If it arms away from home, it must not return on that path.
 
         Returns:
-            The failsafes to arm with; others that are set meanwhile were not chosen for this flight.
+            The verified failsafes. Failsafes that are set later were not chosen for this flight.
         """
-        at_home = self._control.autopilot.vehicle.distance_m(home[0], home[1]) <= HOME_M
-        checked = self._check()
-        checked = self._learnt(checked, await self._failsafes.choose_return(checked, retrace=at_home))
+        at_home = self._control.autopilot.vehicle.distance_m(home[0], home[1]) <= AT_HOME_M
+        checked = self._require_verified()
+        checked = self._update_checked(checked, await self._failsafes.choose_return(checked, retrace=at_home))
         try:
             async with asyncio.timeout(FENCE_TIMEOUT_S):
                 await self._fence.raise_around(grant.spec, retraces=self._control.retraces)
         except (AutopilotError, OSError) as error:
-            said = str(error) or f"it takes longer than {FENCE_TIMEOUT_S:.0f} s"
-            why = f"the vehicle's own fence cannot be raised around the operation area: {said}"
-            raise PreconditionFailed("FenceNotRaised", why) from error
-        self._check(checked)
+            problem = str(error) or f"timeout after {FENCE_TIMEOUT_S:.0f} s"
+            reason = f"the vehicle's own fence cannot be raised around the operation area: {problem}"
+            raise PreconditionFailed("FenceNotRaised", reason) from error
+        self._require_verified(checked)
         try:
             lowered = await self._limit_return(grant)
         except (AutopilotError, OSError) as error:
-            why = f"the autopilot would not fly, or fly home, as it must: {error}"
-            raise PreconditionFailed("ReturnNotLimited", why) from error
+            reason = f"cannot limit speed and altitude of the autopilot's return: {error}"
+            raise PreconditionFailed("ReturnNotLimited", reason) from error
         if lowered or not self._fence.missing:
-            checked = self._learnt(checked, await self._failsafes.learn_return(checked))
+            checked = self._update_checked(checked, await self._failsafes.learn_return(checked))
         return checked
 
-    def _learnt(self, before: Checked, after: Checked) -> Checked:
-        """Take over what is known about the failsafes by now, unless they were set again meanwhile."""
+    def _update_checked(self, before: Checked, after: Checked) -> Checked:
+        """Store an updated result, unless the failsafes were set again meanwhile."""
         if self._control.checked is before:
             self._control.set_checked(after)
-        return self._check(after)
+        return self._require_verified(after)
 
-    def _check(self, chosen: Checked | None = None) -> Checked:
-        """The failsafes, if they are verified, and are those that were chosen."""
+    def _require_verified(self, chosen: Checked | None = None) -> Checked:
+        """Return the failsafes if they are verified and, if given, are the chosen ones."""
         checked = self._control.checked
         if checked is None or checked.problem or (chosen is not None and checked is not chosen):
-            why = (checked.problem if checked is not None else "") or BEING_SET
-            raise PreconditionFailed("FailsafesNotVerified", f"the autopilot's failsafes are not verified: {why}")
+            problem = (checked.problem if checked is not None else "") or BEING_SET
+            raise PreconditionFailed("FailsafesNotVerified", f"the autopilot's failsafes are not verified: {problem}")
         if self._control.autopilot.link_problem:
             raise PreconditionFailed("LinkTooSlow", self._control.autopilot.link_problem)
         if self._control.audit.failure:
@@ -197,25 +209,26 @@ class Arming:
         return checked
 
     def _home_of(self, grant: ActiveGrant, mission: Mission) -> tuple[float, float, float]:
-        """Home is where the mission took off first: landing on the way and arming again does not move it.
+        """Return the home of the mission: where it armed for its first takeoff.
 
-        A drone that was carried away, or whose estimate has settled, after an attempt that came to nothing begins where it stands.
+        Landing on the way and arming again does not move home. After an attempt that did not lead to a flight, home is the
+        present position, because the drone may have been moved or its estimate may have settled.
         """
         vehicle = self._control.autopilot.vehicle
         if vehicle.lat is None or vehicle.lon is None:
             raise PreconditionFailed("PositionUnknown", "the position is not known yet")
-        began = mission.home if mission.flown else None
-        lat, lon, amsl_m = began or (vehicle.lat, vehicle.lon, vehicle.amsl_m)
+        origin = mission.home if mission.flown else None
+        lat, lon, amsl_m = origin or (vehicle.lat, vehicle.lon, vehicle.amsl_m)
         base = grant.spec.home or grant.spec.depot
         if base is not None:
-            away = math.hypot(*LocalFrame(base.lat, base.lon).xy(lat, lon))
-            if away > STRAY_M:
+            distance_m = math.hypot(*LocalFrame(base.lat, base.lon).xy(lat, lon))
+            if distance_m > MAX_HOME_DISTANCE_M:
                 raise PreconditionFailed(
-                    "NotAtHome", f"the drone would return to a place {away:.0f} m away from the home of its grant"
+                    "NotAtHome", f"the drone would return to a place {distance_m:.0f} m away from the home of its grant"
                 )
         return lat, lon, amsl_m
 
 
-def _passing(error: AutopilotError | Refused) -> bool:
-    """Whether the next try may succeed without anyone's doing."""
-    return isinstance(error, AutopilotError | Unavailable) or error.verdict.code in _PASSING
+def _is_transient(error: AutopilotError | Refused) -> bool:
+    """Return True if the next attempt may succeed without intervention."""
+    return isinstance(error, AutopilotError | Unavailable) or error.verdict.code in _TRANSIENT_CODES

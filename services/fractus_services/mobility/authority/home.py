@@ -1,72 +1,75 @@
-"""Home, from which altitudes count and to which all ways home lead: where the mission armed for its first takeoff, also when others move it."""
+"""Home position: where the mission armed for its first takeoff, also if another station moves it in flight.
+
+Altitudes are measured from home, and every return flight leads there.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 from fractus_core.control import Authority, ControlState
 from fractus_core.geo import LocalFrame
 from fractus_core.policy.decision_types import Home
 
 from fractus_services.errors import AutopilotError
+from fractus_services.mobility.authority.mode_controller import ControlAccess
 from fractus_services.mobility.autopilot import Autopilot, VehicleState
 
 MOVED_M = 2.0
-"""A home further away than this, in space, was moved; less is within what legs keep from zones and limits anyway."""
+"""Distance in space above which home counts as moved. Smaller distances are within the margins of legs."""
 
-TOLD_TIMEOUT_S = 2.0
+HOME_TIMEOUT_S = 2.0
+"""Seconds to wait for HOME_POSITION after home was set."""
 
 
 def home_moved(state: ControlState, vehicle: VehicleState) -> bool:
-    """Whether another station has moved home under a flying drone; under a pilot that is the pilot's affair.
+    """Return True if another station moved home under a drone in flight. A pilot may move it.
 
-    Until it is set back, neither is it known how high above home the drone is, nor where the autopilot would return to.
+    Until home is restored, neither the altitude above home nor the destination of the autopilot's return is known.
     """
-    home, mission = vehicle.home, state.mission
+    home = vehicle.home
+    mission = state.mission
     if home is None or mission is None or mission.home is None:
         return False
     if not vehicle.in_air or state.authority is Authority.PILOT:
         return False
-    return _apart(home, mission.home)
+    return _differs(home, mission.home)
 
 
-def heights_mislead(state: ControlState, vehicle: VehicleState) -> bool:
-    """Whether home is not where the flight began, also where a pilot moved it: altitudes do not count from the ground then.
+def home_altitude_inconsistent(state: ControlState, vehicle: VehicleState) -> bool:
+    """Return True if home is not where the flight began, so that altitudes are not measured from the ground there.
 
-    So it is with a home that was not told since the vehicle was armed.
+    The same holds if home was not reported since the vehicle armed. A home moved by a pilot counts too.
     """
-    home, mission, ground = vehicle.home, state.mission, vehicle.ground_home
+    home = vehicle.home
+    mission = state.mission
+    ground = vehicle.ground_home
     if home is None or not vehicle.in_air:
         return False
-    began = mission.home if mission is not None and not state.armed_by_others else None
-    if began is None and ground is not None:
-        began = ground.lat, ground.lon, ground.amsl_m
-    return began is None or _apart(home, began)
+    origin = mission.home if mission is not None and not state.armed_by_others else None
+    if origin is None and ground is not None:
+        origin = ground.lat, ground.lon, ground.amsl_m
+    return origin is None or _differs(home, origin)
 
 
-def _apart(home: Home, began: tuple[float, float, float]) -> bool:
-    lat, lon, amsl_m = began
+def _differs(home: Home, origin: tuple[float, float, float]) -> bool:
+    lat, lon, amsl_m = origin
     return math.hypot(*LocalFrame(lat, lon).xy(home.lat, home.lon), home.amsl_m - amsl_m) > MOVED_M
 
 
-async def keep_home(autopilot: Autopilot, state: Callable[[], ControlState]) -> None:
+async def restore_home(autopilot: Autopilot, control: ControlAccess) -> None:
     """Set home back to where the mission armed for its first takeoff, if it was moved.
 
-    Args:
-        autopilot: the link.
-        state: of control, at any moment.
-
     Raises:
-        AutopilotError: the autopilot refuses, or does not tell its home.
+        AutopilotError: The autopilot refused, or reported no new home.
     """
-    mission = state().mission
-    if mission is None or mission.home is None or not home_moved(state(), autopilot.vehicle):
+    mission = control.state.mission
+    if mission is None or mission.home is None or not home_moved(control.state, autopilot.vehicle):
         return
     await autopilot.set_home(*mission.home)
     await autopilot.ask_home()
-    deadline = autopilot.now + TOLD_TIMEOUT_S
-    while home_moved(state(), autopilot.vehicle):
+    deadline = autopilot.now + HOME_TIMEOUT_S
+    while home_moved(control.state, autopilot.vehicle):
         if autopilot.now > deadline:
-            raise AutopilotError("the autopilot accepted its home and does not tell it", link=True)
-        await autopilot.update(TOLD_TIMEOUT_S)
+            raise AutopilotError("autopilot acknowledged DO_SET_HOME but sent no HOME_POSITION", link=True)
+        await autopilot.update(HOME_TIMEOUT_S)

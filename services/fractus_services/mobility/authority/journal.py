@@ -1,4 +1,4 @@
-"""What must survive the death of the service: missions, their progress and their outcomes."""
+"""Journal of missions, their progress and their outcomes, which survives a restart of the service."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _FIELDS = frozenset(field.name for field in fields(Mission))
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """What is remembered.
+    """Content of the journal.
 
     Attributes:
-        missions: by key, the oldest first.
-        active: key of the mission that the drone is armed or in the air for.
-        armed_by_others: whether others started the motors that run.
+        missions: Missions by key, oldest first.
+        active: Key of the mission for which the drone is armed or in the air.
+        armed_by_others: True if the running motors were not started by the system.
     """
 
     missions: Mapping[str, Mission] = field(default_factory=dict)
@@ -34,21 +34,21 @@ class Record:
 
 
 def _outcome(stored: Any) -> Outcome:
-    """How a mission ended; version 1 of the journal had it as text, such as "failed: driver lost"."""
+    """Return a stored outcome. Version 1 of the journal stores it as text, such as "failed: driver lost"."""
     try:
         if isinstance(stored, str):
             kind, _, reason = stored.partition(": ")
             return Outcome(OutcomeKind(kind), reason)
         return Outcome(OutcomeKind(stored["kind"]), str(stored["reason"]))
     except (ValueError, KeyError, TypeError):
-        # It ended, and must not begin again.
-        return Outcome(OutcomeKind.FAILED, "the journal tells in a way that this release does not know how it ended")
+        # The mission has ended and must not start again.
+        return Outcome(OutcomeKind.FAILED, "the journal contains an outcome that this release cannot read")
 
 
 def _mission(stored: dict[str, Any]) -> Mission:
-    """A stored mission; what a newer release wrote beside it is left out."""
+    """Return a stored mission without the fields that only a newer release knows."""
     known = {name: value for name, value in stored.items() if name in _FIELDS}
-    # Earlier releases did not count legs: one that was in the air may have flown some.
+    # Earlier releases did not record legs. A mission that was in the air may have flown some.
     known.setdefault("leg_flown", known.get("flown", False))
     if known.get("outcome"):
         known["outcome"] = _outcome(known["outcome"])
@@ -62,34 +62,34 @@ def _mission(stored: dict[str, Any]) -> Mission:
 
 def _stored(mission: Mission) -> dict[str, Any]:
     outcome = mission.outcome
-    told = None if outcome is None else {"kind": outcome.kind.value, "reason": outcome.reason}
-    return asdict(replace(mission, outcome=None)) | {"outcome": told}
+    stored = None if outcome is None else {"kind": outcome.kind.value, "reason": outcome.reason}
+    return asdict(replace(mission, outcome=None)) | {"outcome": stored}
 
 
 def _read(path: Path) -> Record:
     try:
         stored = json.loads(path.read_bytes())
     except RecursionError:
-        raise ValueError("it is nested too deeply") from None
+        raise ValueError("nested too deeply") from None
     missions = {m["key"]: _mission(m) for m in stored["missions"]}
-    # Earlier releases did not tell who had armed.
+    # Earlier releases did not record who armed.
     return Record(missions, stored["active"], bool(stored.get("armed_by_others", False)))
 
 
 def record_of(state: ControlState) -> Record:
-    """What is to be remembered of control."""
+    """Return the part of the control state that the journal stores."""
     return Record(state.missions, state.active, state.armed_by_others)
 
 
 class Journal:
-    """Missions on disk, replaced atomically; the copy before the last is kept, for a disk that loses the last.
+    """Missions on disk, replaced atomically. The previous copy is kept in case the disk loses the last one.
 
     Args:
-        directory: the service's state directory.
+        directory: State directory of the service.
 
     Attributes:
-        record: what was read at the beginning, or given to be written last.
-        failure: why the last writing failed; empty when it did not.
+        record: Content as read at the start or as passed to the last save.
+        failure: Reason why the last save failed; empty if it succeeded.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -112,29 +112,29 @@ class Journal:
             except FileNotFoundError:
                 continue
             except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-                log.critical("journal: cannot be read (path=%s, error=%s)", path, error)
+                log.critical("journal: cannot read file (path=%s error=%s)", path, error)
                 unreadable = True
                 continue
             return
         if unreadable:
             log.critical(
-                "journal: the missions before are forgotten, also those that are over; remove Grants that must not fly again"
+                "journal: previous missions are unknown, including ended ones; remove Grants that must not fly again"
             )
 
     async def save(self, record: Record, timeout_s: float | None = None) -> None:
-        """Write everything; on disk when this returns, unless `failure` says why not.
+        """Write the record. When this returns, it is on disk or `failure` is set.
 
-        The writing goes on when the caller gives up.
+        The write continues if the caller is cancelled or the time is over.
         """
         task = self.save_soon(record)
         try:
             async with asyncio.timeout(timeout_s):
                 await asyncio.shield(task)
         except TimeoutError:
-            self.failure = f"the journal {self._path} is not written within {timeout_s:g} s"
+            self.failure = f"the journal {self._path} was not written within {timeout_s:g} s"
 
     def save_soon(self, record: Record) -> asyncio.Task[None]:
-        """Write in the background; one writing at a time, and at most one waiting, which writes what was given last."""
+        """Write in the background. At most one write runs and one waits. The waiting one writes the latest record."""
         self.record = record
         if self._queued is None:
             self._queued = asyncio.get_running_loop().create_task(self._save())
@@ -157,9 +157,9 @@ class Journal:
                 self.failure = ""
 
     def _write(self, data: bytes) -> None:
-        write_file(self._path, data, former=self._last if self._path.exists() and self._sound() else None)
+        write_file(self._path, data, former=self._last if self._path.exists() and self._readable() else None)
 
-    def _sound(self) -> bool:
+    def _readable(self) -> bool:
         try:
             _read(self._path)
         except (ValueError, KeyError, TypeError, AttributeError):

@@ -1,4 +1,4 @@
-"""What callers hold of the drone: the lease of a driver's stream, the motion that runs, the flight constraints of the system."""
+"""Runtime objects that the control state refers to by id: control leases, motions and flight constraints."""
 
 from __future__ import annotations
 
@@ -14,15 +14,14 @@ from fractus_services.errors import Refused
 from fractus_services.grant_files import ActiveGrant
 
 _ids = itertools.count(1)
-"""Names what control is told of: the state machine knows leases, motions and flights by their numbers alone."""
 
 
 class Lease:
-    """A driver's stream of GetControl: its grant, and the events that it is still to be told.
+    """Control lease of one driver: its grant, and the events that its control stream still has to send.
 
     Attributes:
-        lease_id: by which control knows it.
-        grant: as it is now.
+        lease_id: Id in the control state.
+        grant: Current grant of the driver.
     """
 
     def __init__(self, grant: ActiveGrant) -> None:
@@ -32,18 +31,18 @@ class Lease:
 
     @property
     def key(self) -> str:
-        """The mission."""
+        """Key of the mission."""
         return self.grant.key
 
-    def tell(self, event: ControlEvent | None) -> None:
-        """Send an event to the driver; None ends the stream without one."""
+    def send(self, event: ControlEvent | None) -> None:
+        """Queue an event for the driver. None ends the stream without an event."""
         self._events.put_nowait(event)
 
-    async def next(self, timeout_s: float) -> ControlEvent | None:
-        """The next event, or None when the stream ends.
+    async def receive(self, timeout_s: float) -> ControlEvent | None:
+        """Return the next event, or None at the end of the stream.
 
         Raises:
-            TimeoutError: nothing happened.
+            TimeoutError: No event was queued in time.
         """
         async with asyncio.timeout(timeout_s):
             return await self._events.get()
@@ -51,7 +50,7 @@ class Lease:
 
 @dataclass(eq=False, slots=True)
 class FlightConstraints:
-    """The fences under which the system flies an application's drone; they follow the grant when it changes."""
+    """Flight constraints of a system flight. They follow changes of the grant."""
 
     grant: ActiveGrant
     compiled: CompiledGrant
@@ -59,15 +58,15 @@ class FlightConstraints:
 
 
 class Motion:
-    """A motion call that is being carried out, until it is complete or it is stopped.
+    """Motion call in progress, until it completes or is stopped.
 
     Attributes:
-        motion_id: by which control knows it.
-        kind: what it is called.
-        braking: whether the drone comes to rest first, so that nothing stops the motion before it begins.
-        leg: what it flies at present; None while it flies none.
-        under_way: whether the autopilot has acknowledged that leg.
-        speed_mps: with what that leg is flown.
+        motion_id: Id in the control state.
+        kind: Name of the method.
+        braking: True while the drone comes to rest before the motion, so that the monitor does not stop the motion.
+        leg: Leg being flown; None if there is none.
+        under_way: True if the autopilot acknowledged the leg.
+        speed_mps: Speed of the leg.
     """
 
     def __init__(self, kind: str) -> None:
@@ -77,17 +76,17 @@ class Motion:
         self.leg: GotoArgs | None = None
         self.under_way = False
         self.speed_mps: float | None = None
-        self._stopped: Refused | None = None
+        self._refusal: Refused | None = None
 
-    def stop(self, why: Refused) -> None:
-        """End it; the caller's stream ends with the reason."""
-        self._stopped = self._stopped or why
+    def stop(self, refusal: Refused) -> None:
+        """End the motion. Its caller receives the first refusal."""
+        self._refusal = self._refusal or refusal
 
     def check(self) -> None:
-        """Go on, or raise why not.
+        """Return if the motion may continue.
 
         Raises:
-            Refused: it was stopped.
+            Refused: The motion was stopped.
         """
-        if self._stopped is not None:
-            raise self._stopped
+        if self._refusal is not None:
+            raise self._refusal

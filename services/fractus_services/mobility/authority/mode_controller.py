@@ -1,10 +1,14 @@
-"""Modes and stops: what the system itself changes, so that it is not taken for a pilot's doing."""
+"""Mode changes, braking and descent by the system.
+
+Every mode change is dispatched to the control state, so that it is not attributed to a pilot.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import logging
 from collections.abc import Callable
+from typing import Protocol
 
 from fractus_core.control import ControlState
 from fractus_core.control.events import Event, ModeChangeBegan, ModeChangeEnded
@@ -16,42 +20,60 @@ from fractus_services.mobility.autopilot import Approach, Autopilot, Permit, alw
 log = logging.getLogger(__name__)
 
 RETRY_S = 0.5
-MAX_RETURN_TRIES = 6
-"""How many times the autopilot may refuse to turn home; after that the drone lands where it is."""
+"""Seconds between attempts of a system task."""
+
+MAX_RETURN_ATTEMPTS = 6
+"""Number of refused attempts to return, after which the drone lands where it is."""
+
 SETTLE_TIMEOUT_S = 10.0
-BRAKE_TIMEOUT_S, BRAKE_AGAIN_S = 8.0, 0.1
+"""Seconds for which braking continues until the drone is at rest."""
+
 SETTLED_MPS = 0.2
-"""Well below the speed at which the policy engine takes a drone to stand."""
+"""Speed below which the drone counts as settled; well below the speed at which the policy engine considers it at rest."""
+
+BRAKE_TIMEOUT_S = 8.0
+"""Seconds to wait for the drone to come to rest before a return."""
+
+BRAKE_RESEND_S = 0.1
+"""Seconds of the vehicle's clock between stop setpoints."""
+
+
+class ControlAccess(Protocol):
+    """Access to the control state."""
+
+    @property
+    def state(self) -> ControlState:
+        """The present state."""
+
+    def dispatch(self, event: Event) -> object:
+        """Apply an event to the state."""
 
 
 class ModeController:
-    """Changes modes and brakes; control is told of each change, so that it is not taken for a pilot's.
+    """Changes modes and brakes.
 
     Args:
-        autopilot: the link.
-        state: of control, at any moment.
-        dispatch: tells control.
+        autopilot: Autopilot interface.
+        control: Control state, to which every mode change is dispatched.
     """
 
-    def __init__(
-        self, autopilot: Autopilot, state: Callable[[], ControlState], dispatch: Callable[[Event], object]
-    ) -> None:
+    def __init__(self, autopilot: Autopilot, control: ControlAccess) -> None:
         self._autopilot = autopilot
-        self._state = state
-        self._dispatch = dispatch
+        self._control = control
 
     async def change_mode(self, mode: FlightMode, permit: Permit = always) -> None:
         """Change the flight mode.
 
         Raises:
-            AutopilotError: it does not.
+            AutopilotError: The autopilot did not change the mode.
         """
         permit()
-        before = self._state().expected_mode
+        before = self._control.state.expected_mode
         if self._autopilot.vehicle.mode == mode and before == mode:
             return
-        done = refused = False
-        self._dispatch(ModeChangeBegan(mode))
+        done = False
+        refused = False
+        self._control.dispatch(ModeChangeBegan(mode))
         try:
             await self._autopilot.set_mode(mode, permit)
             done = True
@@ -59,13 +81,13 @@ class ModeController:
             refused = error.refused
             raise
         finally:
-            self._dispatch(ModeChangeEnded(mode, before, done, refused))
+            self._control.dispatch(ModeChangeEnded(mode, before, done, refused))
 
     async def enter_guided(self, permit: Permit = always) -> None:
-        """Change to the mode in which the autopilot obeys.
+        """Change to the mode in which the autopilot follows the companion.
 
         Raises:
-            AutopilotError: it does not.
+            AutopilotError: The autopilot did not change the mode.
         """
         await self.change_mode(self._autopilot.stack.guided, permit)
 
@@ -73,7 +95,7 @@ class ModeController:
         """Brake and hover.
 
         Raises:
-            AutopilotError: the mode cannot be changed.
+            AutopilotError: The autopilot did not change the mode.
         """
         permit()
         self._autopilot.stop()
@@ -81,18 +103,18 @@ class ModeController:
         self._autopilot.stop()
 
     async def settle(self) -> None:
-        """Keep braking until the drone stands: a single velocity setpoint times out in the autopilot."""
+        """Repeat the stop setpoint until the drone is at rest, because a single setpoint times out in the autopilot."""
         autopilot = self._autopilot
         deadline = autopilot.now + SETTLE_TIMEOUT_S
-        while self._state().motion is None and autopilot.vehicle.mode.commanded and autopilot.now < deadline:
+        while self._control.state.motion is None and autopilot.vehicle.mode.commanded and autopilot.now < deadline:
             speeds = autopilot.vehicle.speed_mps, abs(autopilot.vehicle.down_mps)
             if autopilot.at_rest and max(speeds) < SETTLED_MPS:
                 return
             autopilot.stop()
-            await asyncio.sleep(BRAKE_AGAIN_S / autopilot.pace)
+            await asyncio.sleep(BRAKE_RESEND_S / autopilot.pace)
 
     async def disarm(self) -> bool:
-        """Stop the motors; False when the autopilot refuses, as it does in the air."""
+        """Disarm. Return False if the autopilot refuses, as it does in the air."""
         try:
             await self._autopilot.disarm()
         except AutopilotError as error:
@@ -102,17 +124,19 @@ class ModeController:
         return True
 
     async def carry_out(self, kind: TaskKind, wanted: Callable[[], bool], approach: Approach) -> None:
-        """Do what the system wants, however often the link fails: hover, or bring the drone to the ground.
+        """Hover, or bring the drone to the ground. Retry as long as the link fails.
 
         Args:
-            kind: what.
-            wanted: whether the system still has the drone.
-            approach: flies the way home.
+            kind: Kind of the system task.
+            wanted: Returns True while the task is current.
+            approach: Return flight up to the final descent.
         """
-        vehicle, tries, refused = self._autopilot.vehicle, 0, False
-        while (vehicle.armed or self._state().starting_motors) and wanted():
+        vehicle = self._autopilot.vehicle
+        attempts = 0
+        refused = False
+        while (vehicle.armed or self._control.state.starting_motors) and wanted():
             try:
-                if self._state().starting_motors:
+                if self._control.state.starting_motors:
                     await self._autopilot.update(RETRY_S)
                     continue
                 if kind is TaskKind.HOVER:
@@ -121,38 +145,39 @@ class ModeController:
                 if (vehicle.standing or not vehicle.in_air) and not refused:
                     refused = not await self.disarm()
                 else:
-                    await self._come_down(kind, tries, wanted, approach)
+                    await self._come_down(kind, attempts, wanted, approach)
             except AutopilotError as error:
-                tries += 0 if error.link else 1
-                log.warning("modes: the autopilot does not follow yet (task=%s, error=%s)", kind.value, error)
+                attempts += 0 if error.link else 1
+                log.warning("modes: autopilot does not follow, retrying (task=%s error=%s)", kind.value, error)
             await asyncio.sleep(RETRY_S)
 
-    async def _come_down(self, kind: TaskKind, tries: int, wanted: Callable[[], bool], approach: Approach) -> None:
-        """Land here, or bring the drone home: by the autopilot's own doing, where that has begun, or else by ours first."""
+    async def _come_down(self, kind: TaskKind, attempts: int, wanted: Callable[[], bool], approach: Approach) -> None:
+        """Land or return. A descent that the autopilot has already begun is only supervised."""
         vehicle = self._autopilot.vehicle
-        expected = self._state().expected_mode == vehicle.mode
+        expected = self._control.state.expected_mode == vehicle.mode
         if kind is TaskKind.LAND or not vehicle.mode.comes_down or not expected:
             await self._brake(wanted)
             mode = self._autopilot.stack.land
-            if tries < MAX_RETURN_TRIES:
-                mode = await approach(kind, wanted, tries)
-            await self.change_mode(mode, lambda: _check(wanted))
+            if attempts < MAX_RETURN_ATTEMPTS:
+                mode = await approach(kind, wanted, attempts)
+            await self.change_mode(mode, lambda: _require(wanted))
         while vehicle.armed and vehicle.mode.comes_down:
             await self._autopilot.update(1.0)
 
     async def _brake(self, wanted: Callable[[], bool]) -> None:
-        """Bring the drone to rest where that is ours to do, so that it turns home on the spot and not in a wide arc."""
-        autopilot, vehicle = self._autopilot, self._autopilot.vehicle
+        """Brake in GUIDED until the drone is at rest, so that it turns home on the spot and not in a wide arc."""
+        autopilot = self._autopilot
+        vehicle = autopilot.vehicle
         deadline = autopilot.now + BRAKE_TIMEOUT_S
         autopilot.stop()
         while wanted() and vehicle.in_air and vehicle.mode.commanded and autopilot.now < deadline:
             if autopilot.at_rest or not vehicle.position_fresh(autopilot.now):
                 return
             autopilot.stop()
-            await autopilot.update(BRAKE_AGAIN_S / autopilot.pace)
+            await autopilot.update(BRAKE_RESEND_S / autopilot.pace)
 
     async def _hover(self) -> None:
-        """Hold at once, and again when a takeoff under way gets off the ground."""
+        """Hold now, and again when a takeoff in progress leaves the ground."""
         await self.hold()
         while self._autopilot.vehicle.armed and not self._autopilot.vehicle.in_air:
             await self._autopilot.update(RETRY_S)
@@ -161,6 +186,6 @@ class ModeController:
             await self.settle()
 
 
-def _check(wanted: Callable[[], bool]) -> None:
+def _require(wanted: Callable[[], bool]) -> None:
     if not wanted():
-        raise AutopilotError("the system has lost the control of the drone")
+        raise AutopilotError("the system has lost control of the drone")

@@ -9,12 +9,12 @@ from fractus_core.control import Authority
 from fractus_core.policy.compiled_grant import CompiledGrant
 from fractus_core.policy.decision_types import Airframe, Situation
 
-from fractus_services.mobility.authority.control import Control
+from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.authority.home import home_moved
 from fractus_services.mobility.autopilot import LEG_MPS
 
 
-def fences_of(control: Control) -> CompiledGrant | None:
+def fences_of(control: ControlStore) -> CompiledGrant | None:
     """The fences by which the present flight is judged; None where no grant says anything of it.
 
     What the system flies, or the autopilot by itself, may be anywhere on the way between home and operation area.
@@ -27,7 +27,7 @@ def fences_of(control: Control) -> CompiledGrant | None:
     return control.for_transit(control.last_grant) if control.last_grant is not None else None
 
 
-def situation_of(control: Control, time_s: float) -> Situation:
+def situation_of(control: ControlStore, time_s: float) -> Situation:
     """The state of the drone at this moment.
 
     A position that is stale, comes over too slow a link, or counts from a home that was moved, is unknown.
@@ -68,7 +68,7 @@ def situation_of(control: Control, time_s: float) -> Situation:
     )
 
 
-def _pending(control: Control) -> tuple[tuple[float, float, float], ...]:
+def _pending(control: ControlStore) -> tuple[tuple[float, float, float], ...]:
     """What the drone was told of late; a leg is flown no faster than it was told to."""
     pending, motion = control.autopilot.pending, control.motion
     most = max(control.cruise_mps, (motion.speed_mps or 0.0) if motion is not None else 0.0)

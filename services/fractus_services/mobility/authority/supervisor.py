@@ -1,4 +1,7 @@
-"""The last look: an armed drone without authority is brought home, and no fence outlives its mission."""
+"""Supervision of control authority, which the companion heartbeats depend on.
+
+An armed drone without control authority is brought home, and the fence and limits of a mission are removed after it.
+"""
 
 from __future__ import annotations
 
@@ -8,60 +11,68 @@ import math
 
 from fractus_core.control.events import Tick
 
-from fractus_services.mobility.authority.control import Control
+from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.autopilot import Fence, ReturnLimits
 
 log = logging.getLogger(__name__)
 
 TICK_TIMEOUT_S = 1.0
-"""A loop that has not looked for this long may hang: the autopilot must not rely on it."""
+"""Seconds without a tick after which the event loop may hang, so that the autopilot must not rely on it."""
 
 UNATTENDED_TIMEOUT_S = 3.0
-"""How long an armed drone may be without authority though control tries to take it: then its own failsafe brings it home."""
+"""Seconds for which an armed drone may have no control authority although the state machine tries to take it over.
 
-LOWER_AGAIN_S = 10.0
+After that the heartbeats stop, and the autopilot's own failsafe brings the drone home.
+"""
+
+LOWER_RETRY_S = 10.0
+"""Seconds between attempts to remove the fence and limits of a mission."""
+
 LOWER_AFTER_S = 5.0
-"""How long nothing needs the fence before it is put back: an arming that is tried again finds it as it was."""
+"""Seconds without need for the fence after which it is removed, so that a repeated arming attempt still finds it."""
 
 
 class Supervisor:
-    """Runs in every turn of the monitor's loop, and tells the autopilot whether it may rely on the service.
+    """Runs in every iteration of the monitor's loop and decides whether heartbeats are sent.
 
-    The heartbeats that hold off the autopilot's own failsafe are sent only while this is sound.
+    The heartbeats that hold off the autopilot's own failsafe are sent only while `alive` returns True.
     """
 
-    def __init__(self, control: Control, fence: Fence, limits: ReturnLimits) -> None:
+    def __init__(self, control: ControlStore, fence: Fence, limits: ReturnLimits) -> None:
         self._control = control
         self._fence = fence
         self._limits = limits
         self._ticked_at = -math.inf
         self._lowering: asyncio.Task[None] | None = None
-        self._lower_at = self._needed_at = -math.inf
+        self._lower_at = -math.inf
+        self._needed_at = -math.inf
 
     def tick(self) -> None:
-        """Let control take a drone that no one answers for. Put back the fence and the limits that no mission needs.
+        """Take over a drone without control authority. Remove the fence and limits that no mission needs.
 
         Raises:
-            Exception: control failed; the heartbeats end until it works again.
+            Exception: The control state failed. No heartbeats are sent until it works again.
         """
-        control, now = self._control, self._control.autopilot.now
-        mute = not self.alive()
+        control = self._control
+        now = control.autopilot.now
+        was_alive = self.alive()
         control.dispatch(Tick())
         self._ticked_at = now
-        if mute and self.alive():
+        if not was_alive and self.alive():
             control.autopilot.beat()
         needed = not self._idle()
         if needed:
             self._needed_at = now
         due = now >= max(self._lower_at, self._needed_at + LOWER_AFTER_S)
         if not needed and due and (self._fence.raised or self._limits.limited):
-            self._lower_at = now + LOWER_AGAIN_S
+            self._lower_at = now + LOWER_RETRY_S
             if self._lowering is None or self._lowering.done():
                 self._lowering = control.tasks.spawn(self._lower())
 
     def alive(self) -> bool:
-        """Whether the autopilot may rely on this companion."""
-        state, autopilot = self._control.state, self._control.autopilot
+        """Return True if the autopilot may rely on this companion."""
+        state = self._control.state
+        autopilot = self._control.autopilot
         since = state.unattended_since
         return (
             autopilot.found
@@ -71,16 +82,17 @@ class Supervisor:
         )
 
     def _idle(self) -> bool:
-        """Whether the drone stands, and no mission that began goes on."""
-        state, mission = self._control.state, self._control.state.mission
+        """Return True if the drone is disarmed and no mission that has flown continues."""
+        state = self._control.state
+        mission = state.mission
         if not (state.decided and state.vehicle.connected) or state.vehicle.armed:
             return False
-        over = mission is None or mission.outcome is not None or not mission.flown
-        return over and not state.preparing
+        ended = mission is None or mission.outcome is not None or not mission.flown
+        return ended and not state.preparing
 
     async def _lower(self) -> None:
-        for put_back in (self._fence.lower, self._limits.lift):
+        for restore in (self._fence.lower, self._limits.lift):
             try:
-                await self._control.tasks.attempt(put_back, self._idle)
+                await self._control.tasks.attempt(restore, self._idle)
             except Exception:
-                log.exception("supervisor: the owner's fence or limits were not put back, trying again")
+                log.exception("supervisor: cannot restore the owner's fence or limits, retrying")

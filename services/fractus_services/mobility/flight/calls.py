@@ -10,7 +10,7 @@ from fractus_core.policy.decision_types import POSITION_UNKNOWN, Call, Verdict
 
 from fractus_services.errors import Aborted, Unavailable, denied
 from fractus_services.grant_files import ActiveGrant
-from fractus_services.mobility.authority.control import Control
+from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.flight.guard import Guard
 
 REST_FACTORS = {True: 1.0, False: 4.0}
@@ -47,7 +47,7 @@ class CallJudge:
         require: refuses a caller that does not have the drone.
     """
 
-    def __init__(self, control: Control, guard: Guard, require: Callable[[ActiveGrant], object]) -> None:
+    def __init__(self, control: ControlStore, guard: Guard, require: Callable[[ActiveGrant], object]) -> None:
         self._control = control
         self._guard = guard
         self._require = require

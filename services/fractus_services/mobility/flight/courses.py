@@ -22,7 +22,7 @@ from fractus_core.policy.route_search import route_steps
 from fractus_services.background import in_slices
 from fractus_services.errors import Aborted, PreconditionFailed, Refused, Unavailable
 from fractus_services.grant_files import ActiveGrant
-from fractus_services.mobility.authority.control import Control
+from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.authority.leases import FlightConstraints, Motion
 from fractus_services.mobility.autopilot import Permit
 from fractus_services.mobility.flight.guard import Guard
@@ -209,7 +209,7 @@ class WayHome(Protocol):
 class Courses:
     """Flies the system's trips."""
 
-    def __init__(self, control: Control, guard: Guard) -> None:
+    def __init__(self, control: ControlStore, guard: Guard) -> None:
         self._control = control
         self._guard = guard
 
@@ -233,7 +233,7 @@ class Courses:
         """
         replans = Replans(trip.constraints)
         while True:
-            motion = self._control.begin(trip.kind, trip.permit)
+            motion = self._control.begin_motion(trip.kind, trip.permit)
             try:
                 async with aclosing(self.legs(trip, motion, search)) as steps:
                     async for step in steps:
@@ -244,7 +244,7 @@ class Courses:
             else:
                 return
             finally:
-                self._control.finish(motion)
+                self._control.finish_motion(motion)
 
     async def legs(self, trip: Trip, motion: Motion, search: Search) -> AsyncGenerator[Step, None]:
         """One attempt of `follow`, as one motion."""

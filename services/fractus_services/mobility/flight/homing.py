@@ -21,8 +21,8 @@ from fractus_core.policy.return_route import (
 
 from fractus_services.errors import AutopilotError, PreconditionFailed, Refused, Unavailable
 from fractus_services.grant_files import ActiveGrant
-from fractus_services.mobility.authority.control import Control
-from fractus_services.mobility.authority.home import home_moved, keep_home
+from fractus_services.mobility.authority.control_store import ControlStore
+from fractus_services.mobility.authority.home import home_moved, restore_home
 from fractus_services.mobility.authority.leases import Motion
 from fractus_services.mobility.flight.courses import STOPPED, Courses, NextLeg, Trip, first_leg, limited_mps
 from fractus_services.mobility.flight.guard import Guard
@@ -44,7 +44,7 @@ back the way it came (SmartRTL), and when that is refused too, straight (RTL).""
 class Homing:
     """Brings the drone home, see `WayHome`."""
 
-    def __init__(self, control: Control, guard: Guard, courses: Courses) -> None:
+    def __init__(self, control: ControlStore, guard: Guard, courses: Courses) -> None:
         self._control = control
         self._guard = guard
         self._courses = courses
@@ -105,7 +105,7 @@ class Homing:
         """
         control = self._control
         try:
-            await keep_home(control.autopilot, lambda: control.state)
+            await restore_home(control.autopilot, control)
         except AutopilotError as error:
             raise AutopilotError(str(error), link=not control.autopilot.connected) from error
 
@@ -154,7 +154,7 @@ class Homing:
             AutopilotError: the autopilot refuses.
         """
         self.given_up = None
-        await keep_home(self._control.autopilot, lambda: self._control.state)
+        await restore_home(self._control.autopilot, self._control)
         if self._blind():
             return
         try:

@@ -20,7 +20,7 @@ from fractus_runtime.audit import AuditLog
 
 from fractus_services.errors import Aborted, AutopilotError, Refused
 from fractus_services.grant_files import ActiveGrant
-from fractus_services.mobility.authority.control import CORRECTION, Control
+from fractus_services.mobility.authority.control_store import CORRECTION, ControlStore
 from fractus_services.mobility.authority.leases import Motion
 from fractus_services.mobility.authority.situation import fences_of
 from fractus_services.mobility.authority.supervisor import Supervisor
@@ -54,7 +54,7 @@ class MotionMonitor:
     """Judges the flying drone's present state, and acts on what it finds."""
 
     def __init__(
-        self, control: Control, guard: Guard, audit: AuditLog, supervisor: Supervisor, way_home: WayHome
+        self, control: ControlStore, guard: Guard, audit: AuditLog, supervisor: Supervisor, way_home: WayHome
     ) -> None:
         self._control = control
         self._guard = guard
@@ -266,16 +266,16 @@ class MotionMonitor:
         """Fly to where the limits hold, as a motion that follows the one that left them."""
         control = self._control
         control.stop_motion(verdict)
-        motion = control.begin(CORRECTION)
+        motion = control.begin_motion(CORRECTION)
         speed = limited_mps(control.cruise_mps, place, self._guard.situation(), compiled)
         leg = replace(place, speed_mps=speed)
         try:
             async for _ in fly_to(control.autopilot, motion, leg, REACHED_M, permits(motion)):
                 pass
         except Exception:
-            control.failed(motion)
+            control.fail_motion(motion)
             raise
-        control.finish(motion)
+        control.finish_motion(motion)
 
     async def record(self) -> None:
         """The flight recorder, until cancelled."""
@@ -285,7 +285,7 @@ class MotionMonitor:
                 self._audit.append("state", recorded(self._control), now=False)
 
 
-def recorded(control: Control) -> dict[str, Any]:
+def recorded(control: ControlStore) -> dict[str, Any]:
     """One entry of the flight recorder."""
     vehicle = control.autopilot.vehicle
     return {

@@ -6,13 +6,12 @@ from fractus_core.policy.decision_types import Call, PointGimbalArgs, Verdict
 
 from fractus_services.errors import PreconditionFailed
 from fractus_services.grant_files import ActiveGrant
-from fractus_services.mobility.authority.control import Control
-from fractus_services.mobility.authority.drivers import driver_permit
+from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.flight.calls import CallJudge
 
 
 async def point_gimbal(
-    control: Control, calls: CallJudge, grant: ActiveGrant, args: PointGimbalArgs, *, fixed_camera: bool
+    control: ControlStore, calls: CallJudge, grant: ActiveGrant, args: PointGimbalArgs, *, fixed_camera: bool
 ) -> Verdict:
     """Turn the camera by the gimbal, on the ground and in the air; the motion under way goes on.
 
@@ -33,5 +32,5 @@ async def point_gimbal(
             "CameraFixed",
             "the node's description says that its camera does not move; set services.camera.mount.gimbal of the Drone",
         )
-    await control.autopilot.point_gimbal(args.pitch_deg, args.yaw_deg, driver_permit(control, grant))
+    await control.autopilot.point_gimbal(args.pitch_deg, args.yaw_deg, control.driver_permit(grant))
     return verdict

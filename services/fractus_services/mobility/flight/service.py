@@ -12,10 +12,8 @@ from fractus_core.policy.decision_types import Call, GotoArgs, SetSpeedArgs, Tak
 
 from fractus_services.errors import Aborted, PreconditionFailed, Refused
 from fractus_services.grant_files import ActiveGrant
-from fractus_services.mobility.authority import drivers
 from fractus_services.mobility.authority.arming import Arming
-from fractus_services.mobility.authority.control import Control
-from fractus_services.mobility.authority.drivers import driver_permit
+from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.authority.leases import Motion
 from fractus_services.mobility.autopilot import Autopilot, Permit
 from fractus_services.mobility.flight.calls import CallJudge
@@ -69,7 +67,7 @@ class MobilityService:
 
     def __init__(
         self,
-        control: Control,
+        control: ControlStore,
         arming: Arming,
         calls: CallJudge,
         way_home: WayHome,
@@ -83,7 +81,7 @@ class MobilityService:
 
     async def arm(self, grant: ActiveGrant, patience_s: float = 0.0) -> Verdict:
         """Start the motors; what may pass, as that the autopilot is not ready yet, is tried again for so long."""
-        permit, call = driver_permit(self._control, grant), Call("Arm")
+        permit, call = self._control.driver_permit(grant), Call("Arm")
         async for _ in self._arming.arm(grant, permit, lambda: self.calls.allow_motion(call, grant), patience_s):
             pass
         return Verdict("allow")
@@ -92,7 +90,7 @@ class MobilityService:
         """Stop the motors on the ground."""
         self.calls.supersede(grant)
         verdict = self.calls.allow_motion(Call("Disarm"), grant)
-        await self._autopilot.disarm(driver_permit(self._control, grant))
+        await self._autopilot.disarm(self._control.driver_permit(grant))
         return verdict
 
     async def hover(self, grant: ActiveGrant) -> Verdict:
@@ -100,8 +98,8 @@ class MobilityService:
         self.calls.supersede(grant)
         verdict = self.calls.allow_motion(Call("Hover"), grant)
         _require_air(self._autopilot, "Hover")
-        self._control.finish(self._control.begin("Hover"))
-        await self._control.hold(driver_permit(self._control, grant))
+        self._control.finish_motion(self._control.begin_motion("Hover"))
+        await self._control.effects.hover(self._control.driver_permit(grant))
         return verdict
 
     async def set_speed(self, grant: ActiveGrant, args: SetSpeedArgs) -> tuple[Verdict, float]:
@@ -109,8 +107,8 @@ class MobilityService:
         verdict = self.calls.allow_motion(Call("SetSpeed", args), grant)
         wanted = verdict.args.speed_mps if isinstance(verdict.args, SetSpeedArgs) else args.speed_mps
         verdict, speed = self._on_leg(grant, verdict, wanted)
-        self._control.cruise(wanted, speed)
-        await self._autopilot.set_speed(speed, driver_permit(self._control, grant))
+        self._control.set_cruise_speed(wanted, speed)
+        await self._autopilot.set_speed(speed, self._control.driver_permit(grant))
         return verdict, speed
 
     def _on_leg(self, grant: ActiveGrant, verdict: Verdict, wanted: float) -> tuple[Verdict, float]:
@@ -136,12 +134,12 @@ class MobilityService:
         verdict = self.calls.allow_motion(call, grant)
 
         async def steps(motion: Motion) -> AsyncGenerator[Progress, None]:
-            permit, final, vehicle = driver_permit(self._control, grant, motion), verdict, self._autopilot.vehicle
+            permit, final, vehicle = self._control.driver_permit(grant, motion), verdict, self._autopilot.vehicle
             await self._control.modes.enter_guided(permit)
             climbs: Callable[[Autopilot, Motion, float, Permit], AsyncGenerator[Step, None]] = climb
             if vehicle.in_air and not vehicle.standing:
                 await come_to_rest(self._autopilot, motion, permit)
-                final = self.calls.allow_motion(call, drivers.require(self._control, grant).grant, verdict)
+                final = self.calls.allow_motion(call, self._control.require_control(grant).grant, verdict)
                 climbs = partial(rise, self._control.cruise_mps, judged=self._judged(call, grant, final, permit))
             altitude_m = final.args.altitude_m if isinstance(final.args, TakeoffArgs) else args.altitude_m
             async with aclosing(climbs(self._autopilot, motion, altitude_m, permit)) as climbing:
@@ -157,7 +155,7 @@ class MobilityService:
         radius = min(max(reached_m, 0.3), MAX_REACHED_M) if reached_m > 0 else REACHED_M
 
         async def steps(motion: Motion) -> AsyncGenerator[Progress, None]:
-            permit = driver_permit(self._control, grant, motion)
+            permit = self._control.driver_permit(grant, motion)
             call, final = Call("Goto", args), verdict
             for _ in range(MAX_JUDGEMENTS):
                 final = await self._settled(call, grant, final, motion, permit)
@@ -166,7 +164,7 @@ class MobilityService:
                     async with aclosing(fly_to(self._autopilot, motion, leg, radius, permit, judged=judged)) as flying:
                         async for step in flying:
                             if step.complete:
-                                drivers.reached(self._control, grant, args.lat, args.lon)
+                                self._control.count_leg(grant, args.lat, args.lon)
                             yield Progress(final, step)
                 except _Outdated as outdated:
                     final = outdated.verdict
@@ -186,7 +184,7 @@ class MobilityService:
             if self._autopilot.now - judged_at <= JUDGE_AGAIN_S / self._autopilot.pace:
                 return
             judged_at = self._autopilot.now
-            again = self.calls.allow_motion(call, drivers.require(self._control, grant).grant, verdict)
+            again = self.calls.allow_motion(call, self._control.require_control(grant).grant, verdict)
             if again.brake_first or again.args != verdict.args:
                 raise _Outdated(again)
 
@@ -210,22 +208,22 @@ class MobilityService:
             elif self._autopilot.now - begun <= JUDGE_AGAIN_S / self._autopilot.pace:
                 return verdict
             permit()
-            verdict = self.calls.allow_motion(call, drivers.require(self._control, grant).grant, verdict)
+            verdict = self.calls.allow_motion(call, self._control.require_control(grant).grant, verdict)
         raise Aborted("NotStopping", "the drone does not come to rest, and could not begin its leg otherwise")
 
     async def set_velocity(self, grant: ActiveGrant, args: VelocityArgs) -> tuple[Verdict, VelocityArgs]:
         """Fly with a velocity until the next one, or until its hold is over."""
         verdict = self.calls.allow_motion(Call("SetVelocity", args), grant)
         _require_air(self._autopilot, "SetVelocity")
-        motion = self._control.begin("SetVelocity")
-        permit = driver_permit(self._control, grant, motion)
+        motion = self._control.begin_motion("SetVelocity")
+        permit = self._control.driver_permit(grant, motion)
         try:
             final = await self._settled(Call("SetVelocity", args), grant, verdict, motion, permit)
             setpoint = final.args if isinstance(final.args, VelocityArgs) else args
             self._steering.steer(setpoint, motion, permit)
-            drivers.steered(self._control, grant)
+            self._control.count_velocity_flight(grant)
         except BaseException:  # a caller that hangs up while the drone brakes leaves it hovering, too
-            self._control.failed(motion)
+            self._control.fail_motion(motion)
             raise
         return final, setpoint
 
@@ -237,7 +235,7 @@ class MobilityService:
 
         async def steps(motion: Motion) -> AsyncGenerator[Progress, None]:
             await self._control.modes.change_mode(
-                self._control.autopilot.stack.land, driver_permit(self._control, grant, motion)
+                self._control.autopilot.stack.land, self._control.driver_permit(grant, motion)
             )
             async for step in come_down(self._autopilot, motion):
                 yield Progress(verdict, step)
@@ -253,8 +251,8 @@ class MobilityService:
 
     async def _return(self, grant: ActiveGrant, verdict: Verdict) -> AsyncGenerator[Progress, None]:
         control = self._control
-        constraints = control.begin_system_flight(drivers.require(control, grant).grant)
-        trip = Trip(constraints, "ReturnToLaunch", lambda motion: driver_permit(control, grant, motion))
+        constraints = control.begin_system_flight(control.require_control(grant).grant)
+        trip = Trip(constraints, "ReturnToLaunch", lambda motion: control.driver_permit(grant, motion))
         replans, goes_on = Replans(constraints), True
         try:
             while goes_on:
@@ -288,25 +286,25 @@ class MobilityService:
         """
         if grant.spec.class_ != "driver" or call.method not in grant.compiled.methods:
             return
-        drivers.require(self._control, grant)
+        self._control.require_control(grant)
         if not self._autopilot.vehicle.armed:
             raise PreconditionFailed("NotArmed", "the motors are off; arm first")
 
     async def _run(
         self, kind: str, grant: ActiveGrant, steps: Callable[[Motion], AsyncGenerator[Progress, None]]
     ) -> AsyncGenerator[Progress, None]:
-        motion = self._control.begin(kind, lambda motion: driver_permit(self._control, grant, motion))
+        motion = self._control.begin_motion(kind, lambda motion: self._control.driver_permit(grant, motion))
         try:
             async with aclosing(steps(motion)) as running:
                 async for progress in running:
                     yield progress
         except (asyncio.CancelledError, GeneratorExit):
-            self._control.cancelled(motion)
+            self._control.cancel_motion(motion)
             raise
         except Exception:
-            self._control.failed(motion)
+            self._control.fail_motion(motion)
             raise
-        self._control.finish(motion)
+        self._control.finish_motion(motion)
 
 
 def _leg(verdict: Verdict, args: GotoArgs, cruise_mps: float) -> GotoArgs:

@@ -8,7 +8,7 @@ import logging
 from fractus_core.policy.decision_types import VelocityArgs
 
 from fractus_services.errors import Refused
-from fractus_services.mobility.authority.control import Control
+from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.authority.leases import Motion
 from fractus_services.mobility.autopilot import Permit
 
@@ -25,7 +25,7 @@ OVER_S = 1e-3
 class Steering:
     """Keeps one setpoint in force until the next one, until its hold is over, or until another motion begins."""
 
-    def __init__(self, control: Control) -> None:
+    def __init__(self, control: ControlStore) -> None:
         self._control = control
         self._watchdog: asyncio.Task[None] | None = None
 
@@ -57,5 +57,5 @@ class Steering:
             if control.motion is motion and control.autopilot.now < until:
                 self._send(setpoint)
         if control.motion is motion:
-            control.finish(motion)
-            await control.tasks.attempt(control.hold, control.undisturbed)
+            control.finish_motion(motion)
+            await control.tasks.attempt(control.effects.hover, control.effects.require_undisturbed)

@@ -13,9 +13,7 @@ from fractus_core.control.state import COMPLETE
 
 from fractus_services.errors import AutopilotError, Refused, Unavailable
 from fractus_services.grant_files import ActiveGrant, GrantFiles
-from fractus_services.mobility.authority.control import Control
-from fractus_services.mobility.authority.permits import tour_permit
-from fractus_services.mobility.authority.readiness import not_ready_reason
+from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.flight.courses import FAULT, Courses, Trip, target_of
 
 log = logging.getLogger(__name__)
@@ -38,7 +36,7 @@ class Tours:
 
     def __init__(
         self,
-        control: Control,
+        control: ControlStore,
         grants: GrantFiles,
         launch: Callable[[Trip, Position], AsyncGenerator[str, None]],
         courses: Courses,
@@ -57,7 +55,7 @@ class Tours:
         uid = grant.spec.application.uid
         if uid not in self._aboard:
             self._aboard.add(uid)
-            self._control.wake()
+            self._control.changes.notify()
 
     async def run(self) -> None:
         """Look for tours to fly until cancelled."""
@@ -66,7 +64,7 @@ class Tours:
             grant = self._due()
             if grant is not None:
                 control.begin_tour(grant, self._fly(grant))
-            await control.wait(CHECK_S)
+            await control.changes.wait(CHECK_S)
 
     def _due(self) -> ActiveGrant | None:
         """The grant whose tour is to begin, or to go on."""
@@ -84,13 +82,13 @@ class Tours:
             return False
         if other is not None and other.key != grant.key and other.outcome is None:
             return False
-        if not_ready_reason(control, grant.key) is not None or (state.vehicle.armed and not state.flies_for(grant.key)):
+        if control.not_ready_reason(grant.key) is not None or (state.vehicle.armed and not state.flies_for(grant.key)):
             return False
         aboard = grant.spec.application.uid in self._aboard
         return aboard or mission.flown or control.autopilot.now - self._since[grant.key] >= self._boarding_s
 
     async def _fly(self, grant: ActiveGrant) -> None:
-        """The system task of a tour. Control counts how it ends only while the tour still has the drone."""
+        """The system task of a tour. ControlStore counts how it ends only while the tour still has the drone."""
         control = self._control
         control.note("tour", f"{len(grant.spec.tour)} points of interest for {grant.identity}")
         try:
@@ -107,13 +105,13 @@ class Tours:
         else:
             self._end(grant, COMPLETE)
         finally:
-            control.wake()
+            control.changes.notify()
 
     async def _visit(self, grant: ActiveGrant) -> None:
         """Fly to each point that was not visited yet."""
         control = self._control
         constraints = control.begin_transit(grant)
-        trip = Trip(constraints, "Tour", lambda motion: tour_permit(control, constraints, motion))
+        trip = Trip(constraints, "Tour", lambda motion: control.system_permit(constraints, motion))
         access = grant.spec.points_of_interest
         stay_s = STAY_S if access is not None and access.service_access == "points" else 0.0
         places, visited = grant.spec.tour, control.mission(grant).waypoints

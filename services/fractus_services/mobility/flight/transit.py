@@ -14,9 +14,8 @@ from fractus_core.policy.decision_types import Call, TakeoffArgs
 
 from fractus_services.errors import AutopilotError, PreconditionFailed, Refused
 from fractus_services.mobility.authority.arming import Arming
-from fractus_services.mobility.authority.control import Control
+from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.authority.leases import Lease
-from fractus_services.mobility.authority.permits import transit_permit
 from fractus_services.mobility.flight.courses import FAULT, Courses, Trip, above_home_m, target_of
 from fractus_services.mobility.flight.guard import Guard
 from fractus_services.mobility.flight.motions import climb
@@ -45,7 +44,7 @@ def start_of(point: ControlPoint) -> Position:
 class TransitFlight:
     """Arms, takes off and flies to where the driver takes over; judged by the same policies as a driver."""
 
-    def __init__(self, control: Control, arming: Arming, guard: Guard, courses: Courses) -> None:
+    def __init__(self, control: ControlStore, arming: Arming, guard: Guard, courses: Courses) -> None:
         self._control = control
         self._arming = arming
         self._guard = guard
@@ -64,7 +63,7 @@ class TransitFlight:
         control = self._control
         start = start_of(lease.grant.spec.control_points[control.mission(lease.grant).points_done])
         constraints = control.begin_transit(lease.grant)
-        trip = Trip(constraints, "Transit", lambda motion: transit_permit(control, lease, motion))
+        trip = Trip(constraints, "Transit", lambda motion: control.transit_permit(lease, motion))
         try:
             async for doing in self.launch(trip, start):
                 yield doing
@@ -93,7 +92,7 @@ class TransitFlight:
         """
         control, autopilot = self._control, self._control.autopilot
         vehicle = autopilot.vehicle
-        motion = control.begin("Takeoff", trip.permit)
+        motion = control.begin_motion("Takeoff", trip.permit)
         permit = trip.permit(motion)
         try:
             # `standing` is the autopilot's own word, `in_air` counts doubt as flying: an armed drone on a raised pad is both.
@@ -115,7 +114,7 @@ class TransitFlight:
                     pass
             await control.modes.enter_guided(permit)
         finally:
-            control.finish(motion)
+            control.finish_motion(motion)
 
     def _height_m(self, place: Position, trip: Trip) -> float:
         if place.alt is None:

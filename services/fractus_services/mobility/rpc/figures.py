@@ -8,11 +8,11 @@ from fractus_core.control import Authority
 from fractus_runtime.figures import Figure, gauge
 
 from fractus_services.metrics import telemetry_age
-from fractus_services.mobility.authority.control import Control
+from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.authority.supervisor import Supervisor
 
 
-def flight_figures(control: Control, supervisor: Supervisor) -> Iterator[Figure]:
+def flight_figures(control: ControlStore, supervisor: Supervisor) -> Iterator[Figure]:
     """What holds of the drone now."""
     autopilot, vehicle = control.autopilot, control.autopilot.vehicle
     yield telemetry_age(max(autopilot.now - vehicle.position_at, 0.0))

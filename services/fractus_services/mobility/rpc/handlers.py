@@ -19,9 +19,7 @@ from fractus_services.clock import Clock
 from fractus_services.error_details import decision
 from fractus_services.errors import AutopilotError, PreconditionFailed, Refused, Unavailable
 from fractus_services.grant_files import ActiveGrant, GrantFiles
-from fractus_services.mobility.authority import drivers
-from fractus_services.mobility.authority.control import Control
-from fractus_services.mobility.authority.readiness import arming_problem
+from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.flight.pointing import point_gimbal
 from fractus_services.mobility.flight.service import MobilityService, Progress
 from fractus_services.mobility.rpc.arguments import (
@@ -62,7 +60,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
     def __init__(
         self,
         service: MobilityService,
-        control: Control,
+        control: ControlStore,
         streams: Streams,
         *,
         grants: GrantFiles,
@@ -116,13 +114,13 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
             grant = self._grant_of(caller)
             self._service.calls.supersede(grant)
             self._service.calls.allow(Call("ReturnControl"), grant)
-            last = await drivers.give_back(self._control, grant)
+            last = await self._control.return_control(grant)
             return mobility_pb2.ReturnControlResponse(mission_complete=last)
 
     async def ReportProgress(self, request: Any, context: Any) -> Any:  # noqa: N802
         """See mobility.proto."""
         async with self.admission.call(context) as caller:
-            await drivers.report(self._control, self._grant_of(caller), request.waypoints)
+            await self._control.report_waypoints(self._grant_of(caller), request.waypoints)
             return mobility_pb2.ReportProgressResponse()
 
     # Calls that answer at once
@@ -261,7 +259,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
     def _sample(self, *, missions: bool, heard: int) -> mobility_pb2.Telemetry:
         control = self._control
         message = telemetry_of(
-            control, self._clock(), missions=missions, not_ready_reason=arming_problem(control), heard=heard
+            control, self._clock(), missions=missions, not_ready_reason=control.arming_problem, heard=heard
         )
         message.recording_problem = self._recording_problem()
         return message

@@ -11,10 +11,8 @@ from fractus_core.control.state import ended_refusal
 
 from fractus_services.errors import PolicyDenied, PreconditionFailed
 from fractus_services.grant_files import ActiveGrant
-from fractus_services.mobility.authority import drivers
-from fractus_services.mobility.authority.control import Control
+from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.authority.leases import Lease
-from fractus_services.mobility.authority.readiness import not_ready_reason
 
 CHECK_S = 0.5
 """How often a waiting caller looks whether it can go on when nothing wakes it: the autopilot's readiness wakes no one."""
@@ -30,7 +28,7 @@ class Streams:
         bring: flies the drone to where a driver with partial control takes over, and says what it does meanwhile.
     """
 
-    def __init__(self, control: Control, bring: Callable[[Lease], AsyncGenerator[str, None]]) -> None:
+    def __init__(self, control: ControlStore, bring: Callable[[Lease], AsyncGenerator[str, None]]) -> None:
         self._control = control
         self._bring = bring
 
@@ -49,17 +47,17 @@ class Streams:
         control = self._control
         if grant.spec.class_ != "driver":
             raise PolicyDenied("NotADriver", "only a driver gets control; passengers ride along")
-        lease = drivers.open_lease(control, grant)
+        lease = control.open_lease(grant)
         try:
             while control.lease is lease and not control.state.granted:
                 async with aclosing(self._until_ready(lease)) as waiting:
                     async for reason in waiting:
                         yield ControlEvent(StreamState.WAITING, control.mission(grant).points_done, reason)
-                if not_ready_reason(control, lease.key) is None:
-                    drivers.grant_control(control, lease)
+                if control.not_ready_reason(lease.key) is None:
+                    control.grant_control(lease)
             while True:
                 try:
-                    event = await lease.next(EVENT_TIMEOUT_S)
+                    event = await lease.receive(EVENT_TIMEOUT_S)
                 except TimeoutError:
                     continue
                 if event is None:
@@ -68,12 +66,12 @@ class Streams:
                 if event.final:
                     return
         finally:
-            drivers.close_lease(control, lease)
+            control.close_lease(lease)
 
     async def _until_ready(self, lease: Lease) -> AsyncGenerator[str, None]:
         control, said = self._control, ""
         while control.lease is lease:
-            reason = not_ready_reason(control, lease.key)
+            reason = control.not_ready_reason(lease.key)
             if control.state.taken(lease.key):
                 raise PreconditionFailed("ControlHeld", "another application has the drone; try again when it is back")
             if reason is None:
@@ -87,7 +85,7 @@ class Streams:
             if reason != said:
                 said = reason
                 yield reason
-            await control.wait(CHECK_S)
+            await control.changes.wait(CHECK_S)
 
     # Passengers
 
@@ -106,7 +104,7 @@ class Streams:
                 yield event
             if event.final:
                 return
-            await control.wait(CHECK_S)
+            await control.changes.wait(CHECK_S)
 
     def _ridden(self, grant: ActiveGrant) -> ControlEvent:
         mission = self._control.mission(grant)
@@ -117,5 +115,5 @@ class Streams:
             return ControlEvent(StreamState.LOST, done, str(outcome), done)
         if self._control.state.touring == grant.key:
             return ControlEvent(StreamState.RIDING, done, "the system flies through the points of interest", done)
-        reason = not_ready_reason(self._control, grant.key) or "the system is about to take off"
+        reason = self._control.not_ready_reason(grant.key) or "the system is about to take off"
         return ControlEvent(StreamState.WAITING, done, reason, done)

@@ -7,8 +7,8 @@ import math
 from fractus_core.control import Outcome, OutcomeKind
 from fractus_proto.v1 import mobility_pb2, types_pb2
 
-from fractus_services.mobility.authority.control import Control
-from fractus_services.mobility.authority.home import heights_mislead
+from fractus_services.mobility.authority.control_store import ControlStore
+from fractus_services.mobility.authority.home import home_altitude_inconsistent
 from fractus_services.mobility.autopilot import MAX_POSITION_AGE_S, WIND_MAX_AGE_S, VehicleState
 
 
@@ -24,12 +24,12 @@ def velocity_of(vehicle: VehicleState) -> types_pb2.Velocity:
     return types_pb2.Velocity(north_mps=vehicle.north_mps, east_mps=vehicle.east_mps, down_mps=vehicle.down_mps)
 
 
-def position_age_s(control: Control) -> float:
+def position_age_s(control: ControlStore) -> float:
     """How old the position is; infinite while there was none."""
     return control.autopilot.now - control.autopilot.vehicle.position_at
 
 
-def located(control: Control) -> bool:
+def located(control: ControlStore) -> bool:
     """Whether the position is known and fresh, and its altitude counts from where home was when the flight began.
 
     Pictures are judged by it, also while a pilot flies.
@@ -38,7 +38,7 @@ def located(control: Control) -> bool:
     return (
         vehicle.lat is not None
         and vehicle.position_fresh(control.autopilot.now)
-        and not heights_mislead(control.state, vehicle)
+        and not home_altitude_inconsistent(control.state, vehicle)
     )
 
 
@@ -54,7 +54,7 @@ def _ended(outcome: Outcome) -> mobility_pb2.MissionOutcome:
 
 
 def telemetry_of(
-    control: Control, time_s: float, *, missions: bool, not_ready_reason: str, heard: int
+    control: ControlStore, time_s: float, *, missions: bool, not_ready_reason: str, heard: int
 ) -> mobility_pb2.Telemetry:
     """The message that subscribers get.
 
@@ -79,7 +79,7 @@ def telemetry_of(
         not_ready_reason=not_ready_reason,
         flight_state=vehicle.flight_state,
         controller=control.state.controller,
-        controller_reason=control.taken_because() if missions else "",
+        controller_reason=control.effects.takeover_reason if missions else "",
         autopilot_connected=control.autopilot.connected,
         missions={key: _ended(outcome) for key, outcome in control.state.outcomes.items()} if missions else {},
     )

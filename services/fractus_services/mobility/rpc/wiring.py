@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
-from functools import partial
 
 from fractus_core.control import ControlState
 from fractus_core.policy.return_route import return_bounds
@@ -11,13 +10,11 @@ from fractus_runtime.audit import AuditLog
 
 from fractus_services.grant_files import ActiveGrant, GrantFiles
 from fractus_services.mobility.authority.arming import Arming
-from fractus_services.mobility.authority.control import Control
-from fractus_services.mobility.authority.drivers import require
+from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.authority.journal import Journal
-from fractus_services.mobility.authority.mode_controller import ModeController
-from fractus_services.mobility.authority.observer import Observer
 from fractus_services.mobility.authority.situation import situation_of
 from fractus_services.mobility.authority.supervisor import Supervisor
+from fractus_services.mobility.authority.vehicle_observer import VehicleObserver
 from fractus_services.mobility.autopilot import Autopilot, Failsafes, Fence, ReturnLimits
 from fractus_services.mobility.flight.calls import CallJudge
 from fractus_services.mobility.flight.courses import Courses
@@ -62,14 +59,13 @@ class Parts:
         boarding_s: float,
         state: ControlState | None = None,
     ) -> None:
-        # Control asks the mode controller to move the drone, and that tells control of each change; control asks for the way
+        # ControlStore asks the mode controller to move the drone, and that tells control of each change; control asks for the way
         # home, which is flown under control. So these are looked up when they are called, which is after all are made.
-        control = self.control = Control(
+        control = self.control = ControlStore(
             autopilot,
             journal,
             grants,
             audit,
-            modes=ModeController(autopilot, lambda: control.state, lambda event: control.dispatch(event)),  # noqa: PLW0108
             approach=lambda kind, wanted, tries: homing.approach(kind, wanted, tries),  # noqa: PLW0108
             grace_s=grace_s,
             state=state,
@@ -83,10 +79,10 @@ class Parts:
 
         arming = Arming(control, failsafes, fence, limit_return)
         transit = TransitFlight(control, arming, guard, courses)
-        self.service = MobilityService(control, arming, CallJudge(control, guard, partial(require, control)), homing)
+        self.service = MobilityService(control, arming, CallJudge(control, guard, control.require_control), homing)
         self.streams = Streams(control, transit.bring)
         self.tours = Tours(control, grants, transit.launch, courses, boarding_s)
         self.supervisor = Supervisor(control, fence, limits)
         self.monitor = MotionMonitor(control, guard, audit, self.supervisor, homing)
-        self.observer = Observer(control, failsafes, fence, limit_return)
+        self.observer = VehicleObserver(control, failsafes, fence, limit_return)
         grants.listen(self.observer.grant_changed)

@@ -1,0 +1,497 @@
+"""Holder of the control state: the driver that has the lease, the system, or a human pilot.
+
+`fractus_core.control` makes the decisions. The store applies events to the state and has the resulting actions carried out.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import Callable, Coroutine
+from dataclasses import replace
+from typing import Any
+
+from fractus_core.control import Authority, ControlState, Mission
+from fractus_core.control.actions import Action, RecordAudit, RefuseStream
+from fractus_core.control.events import (
+    BrakeDemanded,
+    ControlReturned,
+    CruiseSpeedSet,
+    Event,
+    GrantChanged,
+    GrantControl,
+    GrantRef,
+    MotionBegan,
+    MotionCancelled,
+    MotionFailed,
+    MotionFinished,
+    MotionStopped,
+    StreamClosed,
+    StreamOpened,
+    SystemFlightBegan,
+    SystemFlightEnded,
+    TakeoverDemanded,
+    Tick,
+    TourBegan,
+    TransitBegan,
+    WaypointsDone,
+)
+from fractus_core.control.machine import transition
+from fractus_core.control.readiness import NOT_CONNECTED, Readiness, not_ready_reason
+from fractus_core.control.state import VehicleFacts
+from fractus_core.geo import LocalFrame
+from fractus_core.policy.compiled_grant import CompiledGrant, compile_transit_grant
+from fractus_core.policy.decision_types import Verdict
+from fractus_runtime.audit import AuditLog
+
+from fractus_services.errors import PreconditionFailed, Unavailable
+from fractus_services.grant_files import ActiveGrant, GrantFiles
+from fractus_services.mobility.authority.effects import ChangeSignal, EffectRunner
+from fractus_services.mobility.authority.journal import Journal, record_of
+from fractus_services.mobility.authority.leases import FlightConstraints, Lease, Motion
+from fractus_services.mobility.authority.mode_controller import ModeController
+from fractus_services.mobility.autopilot import BEING_SET, Approach, Autopilot, Checked, Permit, always
+
+CORRECTION = "Correction"
+"""Kind of the motions by which the monitor leads a driver's drone back into its limits."""
+
+DEFAULT_SPEED_MPS = 5.0
+"""Assumed speed of legs while the vehicle's parameters are unknown."""
+
+WAYPOINT_RADIUS_M = 5.0
+"""A leg that ends within this distance of the next waypoint of the path counts as reaching it."""
+
+
+class ControlStore:
+    """The only holder of a drone's control state.
+
+    Args:
+        autopilot: Autopilot interface. Its clock is the clock of the events.
+        journal: Journal of missions, from which the state is restored.
+        grants: Grants of this node.
+        audit: Audit log for changes of control.
+        approach: Return flight up to the final descent.
+        grace_s: Seconds within which a lost driver may come back.
+        state: Initial state; by default only what the journal contains.
+
+    Attributes:
+        modes: Mode changes, braking and descent.
+        changes: Signal of changes that drivers and passengers wait for.
+        effects: Execution of the state machine's actions.
+        tasks: Background tasks.
+    """
+
+    def __init__(
+        self,
+        autopilot: Autopilot,
+        journal: Journal,
+        grants: GrantFiles,
+        audit: AuditLog,
+        *,
+        approach: Approach,
+        grace_s: float,
+        state: ControlState | None = None,
+    ) -> None:
+        self.autopilot = autopilot
+        self.audit = audit
+        self.modes = ModeController(autopilot, self)
+        self.changes = ChangeSignal()
+        self.effects = EffectRunner(
+            self, autopilot, self.modes, approach, audit=audit, journal=journal, changes=self.changes
+        )
+        self.tasks = self.effects.tasks
+        self._journal = journal
+        self._grants = grants
+        self._state = replace(
+            state or ControlState(),
+            grace_s=grace_s,
+            missions=journal.record.missions,
+            active=journal.record.active,
+            armed_by_others=journal.record.armed_by_others,
+            grants=frozenset(grant.key for grant in grants.active.values()),
+        )
+        self._timer: asyncio.TimerHandle | None = None
+        self._closed = False
+        self._checked: Checked | None = None
+        self._constraints: FlightConstraints | None = None
+        self._removed: ActiveGrant | None = None
+        self._transit: tuple[ActiveGrant, CompiledGrant] | None = None
+        grants.listen(self._grant_changed)
+
+    # The state machine
+
+    @property
+    def state(self) -> ControlState:
+        """The control state, with the present state of the vehicle."""
+        vehicle = self.autopilot.vehicle
+        facts = VehicleFacts(
+            connected=self.autopilot.connected,
+            armed=vehicle.armed,
+            in_air=vehicle.in_air,
+            mode=vehicle.mode,
+            failsafe=vehicle.failsafe,
+            failsafe_text=vehicle.failsafe_text,
+            failsafe_text_at=vehicle.failsafe_text_at,
+            silent_s=vehicle.silent_s * self.autopilot.pace,
+        )
+        self._state = self._state.observed(facts)
+        return self._state
+
+    def dispatch(self, event: Event) -> tuple[Action, ...]:
+        """Apply an event to the state and carry out the resulting actions.
+
+        Raises:
+            Exception: An action failed. All other actions were carried out.
+        """
+        self._state, actions = transition(self.state, event, self.autopilot.now)
+        try:
+            self.effects.run_all(actions)
+        finally:
+            self._set_timer()
+        return actions
+
+    def close(self) -> None:
+        """Disable all deadlines, because the service ends and the autopilot's failsafe takes over."""
+        self._closed = True
+        self._set_timer()
+
+    def _set_timer(self) -> None:
+        """Schedule a Tick for the next deadline of the state."""
+        deadline = None if self._closed else self._state.deadline
+        if self._timer is not None and self._timer.when() == deadline and not self._timer.cancelled():
+            return
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        if deadline is not None:
+            self._timer = asyncio.get_running_loop().call_at(deadline, self._tick)
+
+    def _tick(self) -> None:
+        self._timer = None
+        self.dispatch(Tick())
+
+    # Queries
+
+    @property
+    def authority(self) -> Authority:
+        """Party that may command the vehicle."""
+        return self._state.authority
+
+    @property
+    def lease(self) -> Lease | None:
+        """Lease of the driver that has control or waits for it."""
+        lease = self._state.lease
+        return self.effects.leases.get(lease.lease_id) if lease is not None else None
+
+    @property
+    def motion(self) -> Motion | None:
+        """Current motion."""
+        active = self._state.motion
+        motion = self.effects.motion
+        return motion if active is not None and motion is not None and motion.motion_id == active.motion_id else None
+
+    @property
+    def constraints(self) -> FlightConstraints | None:
+        """Constraints of the current system flight; None if there is none."""
+        flight = self._state.flight
+        constraints = self._constraints
+        return constraints if constraints and flight and constraints.flight_id == flight.flight_id else None
+
+    @property
+    def mission_grant(self) -> ActiveGrant | None:
+        """Grant of the lease, or of the active mission."""
+        lease = self.lease
+        mission = self._state.mission
+        if lease is not None:
+            return lease.grant
+        grant = self._grants.of(mission.identity) if mission is not None else None
+        return grant if grant is not None and mission is not None and grant.key == mission.key else None
+
+    @property
+    def last_grant(self) -> ActiveGrant | None:
+        """Grant whose constraints apply to the return flight: the mission's, or the one that was removed in flight."""
+        return self.mission_grant or (self._removed if self._state.removed is not None else None)
+
+    @property
+    def checked(self) -> Checked | None:
+        """Result of the last failsafe verification; None if it is outdated."""
+        return self._checked
+
+    def set_checked(self, checked: Checked | None) -> None:
+        """Store the result of a failsafe verification. None discards it."""
+        self._checked = checked
+
+    @property
+    def retraces(self) -> bool:
+        """True if the autopilot can return on the path it flew (SmartRTL)."""
+        capable = self._checked is not None and self._checked.airframe.retraces
+        return capable and not self.autopilot.vehicle.path_lost
+
+    @property
+    def cruise_mps(self) -> float:
+        """Speed of legs that specify none: the driver's setting for its own legs, otherwise the vehicle's."""
+        state = self._state
+        corrects = state.motion is not None and state.motion.kind == CORRECTION
+        if state.speed_mps is not None and state.authority is Authority.DRIVER and not corrects:
+            return state.speed_mps
+        return self._checked.speed_mps if self._checked is not None else DEFAULT_SPEED_MPS
+
+    def mission(self, grant: ActiveGrant) -> Mission:
+        """Return the mission of a grant, or a new one if it is unknown."""
+        return self._state.missions.get(grant.key) or Mission(grant.key, grant.identity)
+
+    def is_valid(self, grant: ActiveGrant) -> bool:
+        """Return True if the grant is still in force."""
+        current = self._grants.of(grant.identity)
+        return current is not None and current.key == grant.key
+
+    def not_ready_reason(self, key: str) -> str | None:
+        """Return why the drone cannot fly for a mission now, or None if it can."""
+        vehicle = self.autopilot.vehicle
+        located = vehicle.lat is not None and vehicle.home is not None
+        # In flight, the last known result stands in for a verification that is not possible at the moment.
+        problem = "" if self._checked is None or vehicle.armed else self._checked.problem
+        unverified = BEING_SET if self._checked is None else problem
+        readiness = Readiness(
+            unverified, vehicle.unready(self.autopilot.now), located, self.autopilot.link_problem, vehicle.unclear
+        )
+        return not_ready_reason(self.state, key, readiness)
+
+    @property
+    def arming_problem(self) -> str:
+        """Reason why the motors could not be armed now by any caller; empty if there is none."""
+        vehicle = self.autopilot.vehicle
+        if not self.autopilot.connected:
+            return vehicle.unclear or NOT_CONNECTED
+        unverified = BEING_SET if self._checked is None else self._checked.problem
+        if unverified:
+            return f"the autopilot's failsafes are not verified: {unverified}"
+        return vehicle.unready(self.autopilot.now) or self.autopilot.link_problem
+
+    def note(self, action: str, reason: str, code: str = "") -> None:
+        """Record an action of the system in the audit log."""
+        self.effects.run_all((RecordAudit("control", action, "system", reason, code),))
+
+    async def save(self, timeout_s: float | None = None) -> str:
+        """Write the missions to the journal and return the reason of a failure, or an empty string."""
+        await self._journal.save(record_of(self._state), timeout_s)
+        return self._journal.failure
+
+    # Drivers
+
+    def open_lease(self, grant: ActiveGrant) -> Lease:
+        """Create a lease for a driver that requests control.
+
+        Raises:
+            PreconditionFailed: The mission has ended, or another application has the drone.
+        """
+        lease = Lease(grant)
+        self.effects.leases[lease.lease_id] = lease
+        for action in self.dispatch(StreamOpened(lease.lease_id, grant.key, grant.identity)):
+            if isinstance(action, RefuseStream):
+                del self.effects.leases[lease.lease_id]
+                raise PreconditionFailed(action.code, action.reason)
+        return lease
+
+    def grant_control(self, lease: Lease) -> None:
+        """Grant control to a waiting driver."""
+        if self.lease is lease:
+            self.dispatch(GrantControl(lease.lease_id))
+
+    def close_lease(self, lease: Lease) -> None:
+        """End the lease of a driver whose stream ended."""
+        self.dispatch(StreamClosed(lease.lease_id))
+        self.effects.leases.pop(lease.lease_id, None)
+
+    def require_control(self, grant: ActiveGrant) -> Lease:
+        """Return the lease of a caller that moves the drone.
+
+        Raises:
+            PreconditionFailed: The caller does not have control.
+            Unavailable: The autopilot is not connected.
+        """
+        lease = self.lease
+        state = self.state
+        if lease is None or lease.key != grant.key or not state.drives:
+            reason = f"you do not have control of the drone, {state.controller} has it; call GetControl first"
+            raise PreconditionFailed("NotInControl", reason)
+        if not self.autopilot.connected:
+            raise Unavailable("AutopilotUnavailable", "the autopilot is not connected")
+        return lease
+
+    def driver_permit(self, grant: ActiveGrant, motion: Motion | None = None) -> Permit:
+        """Return a permit that holds while the driver has control.
+
+        Args:
+            grant: Grant of the driver.
+            motion: Motion that sends the commands; None for calls that are not motions.
+        """
+        lease = self.lease
+
+        def check() -> None:
+            if motion is not None:
+                motion.check()
+            if self.require_control(grant) is not lease or not self.is_valid(grant):
+                raise PreconditionFailed("ControlLost", "you do not have control of the drone any more")
+
+        return check
+
+    def transit_permit(self, lease: Lease, motion: Motion) -> Permit:
+        """Return a permit for transit flights that holds while the driver that requested the transit is waiting."""
+
+        def check() -> None:
+            motion.check()
+            if self.lease is not lease or self.authority is not Authority.SYSTEM or not self.is_valid(lease.grant):
+                raise PreconditionFailed("ControlLost", "the driver no longer waits for the drone")
+
+        return check
+
+    def system_permit(self, constraints: FlightConstraints, motion: Motion) -> Permit:
+        """Return a permit for flights without a driver that holds while no other party has the drone."""
+
+        def check() -> None:
+            motion.check()
+            if (
+                self.constraints is not constraints
+                or self.authority is not Authority.SYSTEM
+                or not self.is_valid(constraints.grant)
+            ):
+                raise PreconditionFailed("ControlLost", "the system no longer flies this mission")
+
+        return check
+
+    async def return_control(self, grant: ActiveGrant) -> bool:
+        """End the control point of a driver. Return True if it was the last one.
+
+        Raises:
+            Refused: The driver does not have control.
+        """
+        self.require_control(grant)
+        points = len(grant.spec.control_points)
+        paths = any(point.path for point in grant.spec.control_points)
+        self.dispatch(ControlReturned(grant.key, points, paths))
+        last = self.mission(grant).points_done >= points
+        await self.save()
+        return last
+
+    async def report_waypoints(self, grant: ActiveGrant, waypoints: int) -> None:
+        """Record that a driver completed the first waypoints of its control point, and save that.
+
+        Raises:
+            Refused: The driver does not have control.
+        """
+        self.require_control(grant)
+        self.dispatch(WaypointsDone(grant.key, waypoints))
+        await self.save()
+
+    def count_leg(self, grant: ActiveGrant, lat: float, lon: float) -> None:
+        """Record the end of a driver's leg, and the next waypoint of the path if the leg ended near it."""
+        mission = self.mission(grant)
+        points = grant.spec.control_points
+        path = points[mission.points_done].path if mission.points_done < len(points) else None
+        ahead = (path or ())[mission.waypoints : mission.waypoints + 1]
+        near = any(math.hypot(*LocalFrame(lat, lon).xy(point.lat, point.lon)) <= WAYPOINT_RADIUS_M for point in ahead)
+        if near or not mission.leg_flown:
+            self.dispatch(WaypointsDone(grant.key, mission.waypoints + near, leg=True))
+
+    def count_velocity_flight(self, grant: ActiveGrant) -> None:
+        """Record a velocity setpoint of a driver. It counts as a leg, because velocity flights have no end point."""
+        mission = self.mission(grant)
+        if not mission.leg_flown:
+            self.dispatch(WaypointsDone(grant.key, mission.waypoints, leg=True))
+
+    # System flights
+
+    def begin_transit(self, grant: ActiveGrant) -> FlightConstraints:
+        """Begin to fly for an application, under its flight constraints."""
+        constraints = self._constrain(grant)
+        self.dispatch(TransitBegan(constraints.flight_id, grant.key, grant.identity))
+        return constraints
+
+    def begin_system_flight(self, grant: ActiveGrant) -> FlightConstraints:
+        """Begin a flight under the constraints of a grant."""
+        constraints = self._constrain(grant)
+        self.dispatch(SystemFlightBegan(constraints.flight_id, grant.key))
+        return constraints
+
+    def end_system_flight(self, constraints: FlightConstraints) -> None:
+        """End the flight under these constraints."""
+        self.dispatch(SystemFlightEnded(constraints.flight_id))
+
+    def begin_tour(self, grant: ActiveGrant, work: Coroutine[Any, Any, None]) -> None:
+        """Run a mission over points of interest. The task dispatches how the mission ends."""
+        self.dispatch(TourBegan(grant.key))
+        if self._state.task is not None:
+            self.effects.run_task(self._state.task, work)
+
+    def _constrain(self, grant: ActiveGrant) -> FlightConstraints:
+        self._constraints = FlightConstraints(grant, self.for_transit(grant))
+        return self._constraints
+
+    def for_transit(self, grant: ActiveGrant) -> CompiledGrant:
+        """Return the constraints of a grant for system flights."""
+        if self._transit is None or self._transit[0] is not grant:
+            self._transit = grant, compile_transit_grant(grant.spec, flat_terrain=grant.compiled.flat_terrain)
+        return self._transit[1]
+
+    # Motions
+
+    def set_cruise_speed(self, speed_mps: float, leg_mps: float) -> None:
+        """Set the speed of future legs, and the speed that is legal along the rest of the current leg."""
+        self.dispatch(CruiseSpeedSet(speed_mps))
+        motion = self.motion
+        if motion is not None and motion.speed_mps is not None:
+            motion.speed_mps = leg_mps
+
+    def begin_motion(self, kind: str, permit: Callable[[Motion], Permit] = lambda _motion: always) -> Motion:
+        """Begin a motion in place of the current one, if its permit holds."""
+        motion = Motion(kind)
+        permit(motion)()
+        self.dispatch(MotionBegan(motion.motion_id, kind))
+        self.effects.motion = motion
+        return motion
+
+    def finish_motion(self, motion: Motion) -> None:
+        """End a motion that completed or was stopped."""
+        self.dispatch(MotionFinished(motion.motion_id))
+
+    def cancel_motion(self, motion: Motion) -> None:
+        """End a motion that its caller cancelled. The drone hovers, unless the driver is lost and the drone returns."""
+        self.dispatch(MotionCancelled(motion.motion_id))
+
+    def fail_motion(self, motion: Motion) -> None:
+        """End a motion that failed. The drone hovers, because the autopilot may still be executing the motion."""
+        self.dispatch(MotionFailed(motion.motion_id))
+
+    def stop_motion(self, verdict: Verdict) -> None:
+        """End the current motion in favour of the next one."""
+        self.dispatch(MotionStopped(verdict.code, verdict.reason, verdict.policies))
+
+    # Policies and grants
+
+    def brake(self, verdict: Verdict) -> None:
+        """Stop the current motion. The driver keeps control."""
+        self.dispatch(BrakeDemanded(verdict.code, verdict.reason, verdict.policies))
+
+    def take_over(self, verdict: Verdict) -> None:
+        """Take the drone from its driver, as a policy or the monitor requires."""
+        self.dispatch(TakeoverDemanded(verdict.takeover or "hover", verdict.code, verdict.reason, verdict.policies))
+
+    def _grant_changed(self, old: ActiveGrant | None, new: ActiveGrant | None) -> None:
+        lease = self.lease
+        constraints = self.constraints
+        if old is not None and new is not None and old.key == new.key:
+            if lease is not None and lease.key == new.key:
+                lease.grant = new
+            if constraints is not None and constraints.grant.key == new.key:
+                constraints.grant = new
+                constraints.compiled = self.for_transit(new)
+        self.dispatch(GrantChanged(_reference(old), _reference(new)))
+        if old is not None and self._state.removed == old.key:
+            self._removed = old
+
+
+def _reference(grant: ActiveGrant | None) -> GrantRef | None:
+    if grant is None:
+        return None
+    return GrantRef(grant.key, commands_vehicle=grant.spec.class_ == "driver" or bool(grant.spec.tour))

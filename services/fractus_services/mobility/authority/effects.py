@@ -1,0 +1,222 @@
+"""Execution of the actions of the control state machine: streams, motions, system tasks, audit log, journal."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Coroutine, Sequence
+from typing import Any, assert_never
+
+from fractus_core.control import Authority
+from fractus_core.control.actions import (
+    Action,
+    Brake,
+    EndStream,
+    HoldPosition,
+    RecordAudit,
+    RefuseStream,
+    SaveJournal,
+    SendEvent,
+    SetStreamRates,
+    StartSystemTask,
+    StopKind,
+    StopMotion,
+    StopSystemTask,
+    WakeWaiters,
+)
+from fractus_core.control.events import SystemTaskEnded
+from fractus_core.control.state import SystemTask
+from fractus_core.control.state_update import DRIVER_LOST
+from fractus_runtime.audit import AuditLog
+
+from fractus_services.background import Background
+from fractus_services.errors import Aborted, AutopilotError, PreconditionFailed, Refused, Unavailable
+from fractus_services.mobility.authority.journal import Journal, record_of
+from fractus_services.mobility.authority.leases import Lease, Motion
+from fractus_services.mobility.authority.mode_controller import ControlAccess, ModeController
+from fractus_services.mobility.autopilot import Approach, Autopilot, Permit
+
+log = logging.getLogger(__name__)
+
+
+class ChangeSignal:
+    """Wakes every task that waits for a change of control."""
+
+    def __init__(self) -> None:
+        self._event = asyncio.Event()
+
+    async def wait(self, timeout_s: float) -> None:
+        """Wait for the next change, at most `timeout_s` seconds."""
+        try:
+            async with asyncio.timeout(timeout_s):
+                await self._event.wait()
+        except TimeoutError:
+            return
+
+    def notify(self) -> None:
+        """Wake all waiting tasks."""
+        self._event.set()
+        self._event = asyncio.Event()
+
+
+class EffectRunner:
+    """Owns the runtime objects (streams, motions, tasks) that the state machine refers to by id.
+
+    Args:
+        control: State and events of the state machine.
+        autopilot: Autopilot interface.
+        modes: Mode changes, braking and descent.
+        approach: Return flight up to the final descent.
+        audit: Audit log for changes of control.
+        journal: Journal of missions.
+        changes: Signal for waiting tasks.
+
+    Attributes:
+        tasks: Background tasks.
+        leases: Leases of open control streams, by id.
+        motion: Latest motion.
+        takeover_reason: Reason why no driver has control. Empty while a driver has control or if the reason is unknown.
+    """
+
+    def __init__(
+        self,
+        control: ControlAccess,
+        autopilot: Autopilot,
+        modes: ModeController,
+        approach: Approach,
+        *,
+        audit: AuditLog,
+        journal: Journal,
+        changes: ChangeSignal,
+    ) -> None:
+        self.tasks = Background()
+        self.leases: dict[int, Lease] = {}
+        self.motion: Motion | None = None
+        self.takeover_reason = ""
+        self._control = control
+        self._autopilot = autopilot
+        self._modes = modes
+        self._approach = approach
+        self._audit = audit
+        self._journal = journal
+        self._changes = changes
+        self._running: dict[int, asyncio.Task[None]] = {}
+
+    def run_all(self, actions: Sequence[Action]) -> None:
+        """Carry out all actions in order.
+
+        The state already reflects all of them. One failure, for example of the audit log, must not prevent the others,
+        least of all a return flight.
+
+        Raises:
+            Exception: The first failure, after all actions were tried.
+        """
+        failure: Exception | None = None
+        for action in actions:
+            try:
+                self._run(action)
+            except Exception as error:
+                log.exception("control: action failed (action=%s)", type(action).__name__)
+                failure = failure or error
+        if failure is not None:
+            raise failure
+
+    def _run(self, action: Action) -> None:
+        match action:
+            case StopMotion():
+                if self.motion is not None and self.motion.motion_id == action.motion_id:
+                    self.motion.stop(_refusal(action))
+            case SendEvent() | EndStream() | RefuseStream():
+                self._send(action)
+            case StartSystemTask(task):
+                self.run_task(task, self._carry_out(task))
+            case StopSystemTask(task_id):
+                self.tasks.drop(self._running.pop(task_id, None))
+            case Brake():
+                self._autopilot.stop()
+                self.tasks.spawn(self._modes.settle())
+            case HoldPosition():
+                self.tasks.spawn(self.tasks.attempt(self.hover, self.require_undisturbed))
+            case RecordAudit():
+                self._record(action)
+            case SaveJournal():
+                self._journal.save_soon(record_of(self._control.state))
+            case WakeWaiters():
+                self._changes.notify()
+            case SetStreamRates(flying):
+                self.tasks.spawn(self.tasks.attempt(self._autopilot.set_rates, flying=flying))
+            case _:
+                assert_never(action)
+
+    def _send(self, action: SendEvent | EndStream | RefuseStream) -> None:
+        """Send to a control stream. A refused stream reads the refusal from the result of the transition instead."""
+        lease = self.leases.get(action.lease_id)
+        if lease is not None and not isinstance(action, RefuseStream):
+            lease.send(action.event if isinstance(action, SendEvent) else None)
+
+    # System tasks
+
+    def run_task(self, task: SystemTask, work: Coroutine[Any, Any, None]) -> None:
+        """Run a system task. Its end is always dispatched, so that a failed task does not count as running."""
+        running = self._running[task.task_id] = self.tasks.spawn(work)
+
+        def ended(_done: asyncio.Task[None]) -> None:
+            self._running.pop(task.task_id, None)
+            self._control.dispatch(SystemTaskEnded(task.task_id, finished=False))
+
+        running.add_done_callback(ended)
+
+    async def _carry_out(self, task: SystemTask) -> None:
+        await self._modes.carry_out(task.kind, lambda: self._is_current(task), self._approach)
+        self._control.dispatch(SystemTaskEnded(task.task_id, finished=True))
+
+    def _is_current(self, task: SystemTask) -> bool:
+        """Return True if a task may still command. A stopped task must not fly against its successor."""
+        state = self._control.state
+        return state.task == task and state.authority is Authority.SYSTEM
+
+    # Hovering after a motion
+
+    async def hover(self, permit: Permit) -> None:
+        """Brake and hover."""
+        await self._modes.hold(permit)
+        self.tasks.spawn(self._modes.settle())
+
+    def require_undisturbed(self) -> None:
+        """Permit for hovering after a driver's motion: no other motion has begun.
+
+        Raises:
+            AutopilotError: Another motion has begun, or the driver has lost control.
+        """
+        state = self._control.state
+        if state.motion is not None or state.authority is not Authority.DRIVER:
+            raise AutopilotError("another motion has begun")
+
+    # The audit log
+
+    def _record(self, entry: RecordAudit) -> None:
+        if entry.kind == "takeover" or entry.action in {"returned", DRIVER_LOST}:
+            self.takeover_reason = entry.reason or "its driver returned control"
+        elif entry.action in {"granted", "landed"}:
+            self.takeover_reason = ""
+        vehicle = self._autopilot.vehicle
+        self._audit.append(
+            entry.kind,
+            {
+                "action": entry.action, "controller": entry.controller, "reason": entry.reason, "code": entry.code,
+                "policies": list(entry.policies), "lat": vehicle.lat, "lon": vehicle.lon, "alt": vehicle.altitude_m,
+            },
+        )  # fmt: skip
+
+
+def _refusal(stop: StopMotion) -> Refused:
+    """Return the error for the caller of a stopped motion."""
+    match stop.kind:
+        case StopKind.ABORTED:
+            return Aborted(stop.code, stop.reason, stop.policies)
+        case StopKind.LOST:
+            return PreconditionFailed(stop.code, stop.reason)
+        case StopKind.PASSING:
+            return Unavailable("AutopilotUnavailable", stop.reason)
+        case _:
+            assert_never(stop.kind)

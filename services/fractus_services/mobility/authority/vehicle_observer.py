@@ -1,0 +1,215 @@
+"""Reaction to the autopilot's link, heartbeats and parameters: failsafes are set, verified and kept in flight."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+from collections.abc import Awaitable, Callable
+from contextlib import suppress
+from dataclasses import replace
+
+from fractus_core.control.events import Heartbeat, VehicleFound
+from fractus_core.policy.decision_types import Verdict
+
+from fractus_services.errors import AutopilotError
+from fractus_services.grant_files import ActiveGrant
+from fractus_services.mobility.authority.control_store import ControlStore
+from fractus_services.mobility.authority.home import home_moved, restore_home
+from fractus_services.mobility.autopilot import BEING_SET, Failsafes, Fence
+
+log = logging.getLogger(__name__)
+
+MIN_RETRY_S = 0.5
+"""Shortest time between two checks whether the failsafes have to be verified."""
+
+MAX_RETRY_S = 30.0
+"""Longest time between two verifications on the ground, after repeated failures."""
+
+VERIFY_S = 10.0
+"""Seconds between verifications in flight, because the message about a change by another station may be lost."""
+
+UNVERIFIED_TIMEOUT_S = 60.0
+"""Seconds for which the failsafes of a connected, flying vehicle may be unverified before the system brings it home."""
+
+
+class VehicleObserver:
+    """Dispatches vehicle events to the control state, and keeps failsafes, fence and home as the mission needs them.
+
+    Args:
+        control: Control state.
+        failsafes: Failsafes of the autopilot, set when it connects and verified in flight.
+        fence: Fence of the vehicle, verified in flight.
+        limit_return: Limits altitude and speed of the autopilot's own return to what a grant allows.
+    """
+
+    def __init__(
+        self,
+        control: ControlStore,
+        failsafes: Failsafes,
+        fence: Fence,
+        limit_return: Callable[[ActiveGrant], Awaitable[tuple[str, ...]]],
+    ) -> None:
+        self._control = control
+        self._failsafes = failsafes
+        self._fence = fence
+        self._limit_return = limit_return
+        self._preparing: asyncio.Task[None] | None = None
+        self._changed = asyncio.Event()
+        self._verified_at = -math.inf
+        self._unverified_since: float | None = None
+        self._home_moved = False
+        self._restoring_home: asyncio.Task[None] | None = None
+
+    def found(self) -> None:
+        """Handle a link to the autopilot that came up, for the first time or again."""
+        checked = self._control.checked
+        flying = self._control.autopilot.vehicle.armed
+        self._control.set_checked(replace(checked, problem=BEING_SET) if flying and checked is not None else None)
+        self._control.dispatch(VehicleFound())
+        self._control.tasks.drop(self._preparing)
+        self._preparing = self._control.tasks.spawn(self._prepare())
+        self._unverified_since = None
+
+    def heartbeat(self) -> None:
+        """Handle a heartbeat, which reports the mode and the armed state."""
+        self._control.dispatch(Heartbeat())
+        autopilot = self._control.autopilot
+        since = self._unverified_since
+        if not autopilot.vehicle.armed:
+            self._unverified_since = None
+        elif since is not None and autopilot.now - since > UNVERIFIED_TIMEOUT_S:
+            self._bring_home(f"it has not reported its parameters for {UNVERIFIED_TIMEOUT_S:.0f} s")
+        self._check_home()
+
+    def _check_home(self) -> None:
+        """Restore home if another station moved it in flight."""
+        control = self._control
+        home = control.autopilot.vehicle.home
+        noted = self._home_moved
+        self._home_moved = home_moved(control.state, control.autopilot.vehicle)
+        if not self._home_moved or home is None:
+            return
+        if not noted:
+            position = f"{home.lat:.7f}, {home.lon:.7f}, {home.amsl_m:.1f} m above mean sea level"
+            log.warning("observer: home moved by another station (home=%s)", position)
+            control.note(
+                "restored", f"set back in flight: home, which another station moved to {position}", "HomeMoved"
+            )
+        if self._restoring_home is None or self._restoring_home.done():
+            self._restoring_home = control.tasks.spawn(self._restore_home())
+
+    async def _restore_home(self) -> None:
+        try:
+            await restore_home(self._control.autopilot, self._control)
+        except AutopilotError as error:
+            log.warning("observer: home not restored yet (error=%s)", error)
+            if not error.link:
+                self._bring_home(f"another station moved home, and it cannot be set back: {error}")
+
+    def grant_changed(self, _old: ActiveGrant | None, _new: ActiveGrant | None) -> None:
+        """Apply the limits of a changed grant to the autopilot's own return immediately."""
+        if self._control.autopilot.vehicle.armed:
+            self._changed.set()
+
+    def parameter(self, name: str) -> None:
+        """Handle a parameter change by another station: update the known values and restore required ones."""
+        control = self._control
+        checked = control.checked
+        if checked is None or not self._failsafes.concerns(name):
+            return
+        log.warning("observer: parameter changed by another station (name=%s)", name)
+        flying = control.autopilot.vehicle.armed
+        control.set_checked(self._failsafes.learn(checked) if flying else replace(checked, problem=BEING_SET))
+        self._changed.set()
+
+    async def _prepare(self) -> None:
+        """Set and verify the failsafes. Repeat until they are verified, because messages may be lost, and in flight."""
+        autopilot = self._control.autopilot
+        retry_s = MIN_RETRY_S
+        while autopilot.found:
+            if autopilot.connected and self._verification_due():
+                self._changed.clear()
+                try:
+                    await autopilot.set_rates(flying=autopilot.vehicle.armed)
+                    await self._verify()
+                    self._control.changes.notify()
+                    if autopilot.vehicle.home is None:
+                        await self._control.tasks.attempt(autopilot.ask_home)
+                except AutopilotError as error:
+                    log.warning("observer: autopilot not prepared yet, retrying (error=%s)", error)
+                except Exception:
+                    log.exception("observer: preparing the autopilot failed, retrying")
+                else:
+                    retry_s = min(2 * retry_s, VERIFY_S if autopilot.vehicle.armed else MAX_RETRY_S)
+            else:
+                retry_s = MIN_RETRY_S
+                if autopilot.connected:
+                    await self._control.tasks.attempt(autopilot.set_rates, flying=autopilot.vehicle.armed)
+            await asyncio.sleep(MIN_RETRY_S)
+            with suppress(TimeoutError):
+                async with asyncio.timeout(retry_s - MIN_RETRY_S):
+                    await self._changed.wait()
+
+    async def _verify(self) -> None:
+        """Set and read back the failsafes, and the fence in flight. A drone that cannot keep them is brought home."""
+        control = self._control
+        before = control.checked
+        flying = control.autopilot.vehicle.armed
+        self._verified_at = -math.inf
+        if flying and self._unverified_since is None:
+            self._unverified_since = control.autopilot.now
+        checked = await self._failsafes.configure(flying=flying, before=before)
+        if not checked.lost:
+            self._unverified_since = None
+        if not flying:
+            control.set_checked(checked)
+            return
+        problems = ["" if checked.lost else checked.problem]
+        restored = checked.changed
+        link_error: AutopilotError | None = None
+        for keep in (self._keep_return, self._keep_fence):
+            # A failure of one check must not hide the results of the others.
+            try:
+                restored += await keep()
+            except AutopilotError as error:
+                link_error = link_error or (error if error.link else None)
+                problems.append("" if error.link else str(error))
+            except OSError as error:
+                problems.append(f"cannot store the owner's settings: {error}")
+        checked = self._failsafes.learn(checked)
+        control.set_checked(checked)
+        for setting in restored:
+            control.note("restored", f"set back in flight: {setting}", "SettingChanged")
+        if before is not None and before.airframe != checked.airframe:
+            control.note("airframe", f"the vehicle's flight parameters changed: {checked.airframe}", "SettingChanged")
+        if any(problems):
+            self._bring_home("; ".join(filter(None, problems)))
+        if link_error is not None:
+            raise link_error
+        self._verified_at = control.autopilot.now
+
+    def _bring_home(self, problem: str) -> None:
+        """Take over a drone whose autopilot alone would not bring it home, unless the system returns it already."""
+        if not self._control.state.returning:
+            reason = f"the autopilot's own failsafes no longer protect the drone: {problem}"
+            self._control.take_over(Verdict("takeover", None, "FailsafeLost", reason, (), "returnToLaunch"))
+
+    async def _keep_return(self) -> tuple[str, ...]:
+        control = self._control
+        if control.last_grant is not None:
+            for setting in await self._limit_return(control.last_grant):
+                control.note("limited", f"flight and return of the autopilot: {setting}", "ReturnLimited")
+        return ()
+
+    async def _keep_fence(self) -> tuple[str, ...]:
+        return await self._fence.hold() if self._fence.raised else ()
+
+    def _verification_due(self) -> bool:
+        control = self._control
+        checked = control.checked
+        if checked is None or checked.problem == BEING_SET or self._changed.is_set():
+            return True
+        if control.autopilot.vehicle.armed:
+            return bool(checked.problem) or control.autopilot.now - self._verified_at >= VERIFY_S
+        return bool(checked.problem) and not control.state.preparing

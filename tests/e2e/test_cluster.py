@@ -19,7 +19,7 @@ from typing import Any
 
 import pytest
 import yaml
-from docs_commands import typed_lines
+from docs_pages import shell_lines
 from fractus_cluster.cluster import Cluster
 from fractus_cluster.errors import ClusterError
 from fractus_cluster.images.build import build_images
@@ -243,7 +243,7 @@ def test_cut_link_loses_contact_and_nothing_else(healthy: Cluster) -> None:
 
 def test_the_commands_of_its_page_do_what_they_say(healthy: Cluster) -> None:
     drone, edge = healthy.node("drone-1"), healthy.node("edge-1")
-    typed_words = [shlex.split(line, comments=True) for line in typed_lines("docs/embedded-cluster.md")]
+    typed_words = [shlex.split(line, comments=True) for line in shell_lines("docs/embedded-cluster.md")]
     lines = {words[2]: words for words in typed_words if len(words) > 3}
 
     def typed(verb: str, *instead: str) -> str:

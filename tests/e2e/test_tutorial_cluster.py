@@ -1,4 +1,4 @@
-"""docs/tutorial.md on a cluster, typed as it stands: one's own image flies, an update and a lowered ceiling are survived."""
+"""Procedure of docs/tutorial.md on a cluster: an image of the reader flies, and an update and a lowered ceiling take effect."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ pytestmark = [
 
 
 def files(text: str) -> dict[str, str]:
-    """What the page has the reader write, by name."""
+    """Return the files that the text shows, by name."""
     return dict(re.findall(r"`([\w.]+)`[^`\n]*:\n```\w+\n(.*?)```", text, re.DOTALL))
 
 
 def typed(text: str) -> list[tuple[str, list[str]]]:
-    """Every command of the page, with what it is said to print."""
+    """Return the commands of the text, each with the output that it shows."""
     found: list[tuple[str, list[str]]] = []
     shell: bool | None = None  # None: outside of blocks
     for line in text.splitlines():
@@ -46,13 +46,13 @@ def typed(text: str) -> list[tuple[str, list[str]]]:
 
 
 def on_own_cluster(command: str) -> str:
-    """The command for this test's cluster: there may be others on this machine."""
+    """Return the command with the name of the test's cluster, because this machine may have others."""
     return re.sub(r"fractus cluster ([\w-]+)", rf"fractus cluster \1 --name {NAME}", command)
 
 
 @pytest.fixture
 def checkout(tmp_path: Path) -> Iterator[Path]:
-    """A fresh checkout: what is checked in, or about to be."""
+    """A copy of the checkout with all files that Git does not ignore."""
     folder = tmp_path / "checkout"
     listed = ["git", "ls-files", "--cached", "--others", "--exclude-standard", "-z"]
     names = subprocess.run(listed, cwd=ROOT, capture_output=True, text=True, check=True, timeout=60).stdout
@@ -70,7 +70,7 @@ def checkout(tmp_path: Path) -> Iterator[Path]:
 
 
 @pytest.mark.timeout(TIMEOUT_S + 250)
-def test_the_tutorial_flies_on_a_cluster(checkout: Path) -> None:
+def test_application_of_the_tutorial_flies_on_a_cluster(checkout: Path) -> None:
     begin, end = PAGE.index(BEGINS), PAGE.index(ENDS)
     page = PAGE[begin:end]
     (checkout / "patrol.py").write_text(files(PAGE[:begin])["patrol.py"])

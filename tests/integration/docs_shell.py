@@ -1,4 +1,4 @@
-"""A reader's shell: what a page says is typed there as it stands, with kubectl, helm and fractus on the PATH."""
+"""A shell for commands of the documentation, with kubectl, helm and fractus on the PATH."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ TIMEOUT_S = 60
 
 
 class Shell:
-    """Types lines in a directory.
+    """Runs command lines in a directory.
 
     Args:
-        folder: where they are typed.
-        plane: the cluster of its KUBECONFIG.
+        folder: The working directory.
+        plane: The control plane that KUBECONFIG names; unset for none.
     """
 
     def __init__(self, folder: Path, plane: ControlPlane | None = None) -> None:
@@ -31,7 +31,7 @@ class Shell:
             self.environment["KUBECONFIG"] = str(plane.kubeconfig)
 
     def type(self, line: str, code: int = 0) -> str:
-        """What a line prints to standard output; it ends with this code, also where a command before a pipe fails."""
+        """Return the standard output of a line. Fail unless it ends with the exit code; a failure inside a pipe counts too."""
         done = subprocess.run(
             ["bash", "-o", "pipefail", "-c", line], cwd=self._folder, env=self.environment, capture_output=True, text=True,
             timeout=TIMEOUT_S, check=False,

@@ -1,4 +1,4 @@
-"""docs/backup.md as it is typed: what was in a cluster that is lost is in another one, under the same authority, until it is removed."""
+"""Procedure of docs/backup.md: a second cluster gets the objects and the authority of a lost one; then Fractus is uninstalled."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 import yaml
 from control_plane import ControlPlane, programs, wait_for
 from cryptography import x509
-from docs_commands import ROOT, typed_lines
+from docs_pages import ROOT, shell_lines
 from docs_shell import Shell
 from fractus_core.api import Grant
 from fractus_core.policy.grant_signatures import verify
@@ -21,23 +21,23 @@ from operator_world import FRACTUS, SYSTEM, Body, OperatorProcess, World, at, ou
 pytestmark = pytest.mark.slow
 
 PAGE = "docs/backup.md"
-*BACK_UP, VALUES = (line for line in typed_lines(PAGE, "Back up") if "MOBILITY-POD" not in line)
-RESTORE = typed_lines(PAGE, "Restore")
+*BACK_UP, VALUES = (line for line in shell_lines(PAGE, "Back up") if "MOBILITY-POD" not in line)
+RESTORE = shell_lines(PAGE, "Restore")
 KEPT = ("policies", "zones", "depots", "drones", "edgenodes", "applications")
 SERVER_S = {"uid", "resourceVersion", "generation", "creationTimestamp", "managedFields", "annotations"}
-"""What an API server writes into metadata by itself, and kubectl: what it was given last."""
+"""Metadata that an API server or kubectl writes."""
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Where all is typed: a checkout."""
+    """A folder with the charts, as in a checkout."""
     (tmp_path / "charts").symlink_to(ROOT / "charts")
     return tmp_path
 
 
 @pytest.fixture
 def found(folder: Path, namespace: str) -> Iterator[World]:
-    """A cluster that has nothing of Fractus, but nodes, and the namespace of the Applications."""
+    """A cluster without Fractus that has nodes and the namespace of the Applications."""
     plane = ControlPlane(programs(), folder / "found")
     try:
         plane.start(kinds=False)
@@ -54,7 +54,7 @@ def found(folder: Path, namespace: str) -> Iterator[World]:
 
 
 def written(world: World) -> dict[str, Body]:
-    """What users and authorities wrote, by kind and name, without what the API server adds, and without status."""
+    """Return the objects of users and authorities by kind and name, without status and server metadata."""
     found = {}
     for body in (body for plural in KEPT for body in world.api.list(f"{FRACTUS}/{plural}")):
         metadata = {key: value for key, value in body["metadata"].items() if key not in SERVER_S}
@@ -63,7 +63,7 @@ def written(world: World) -> dict[str, Body]:
 
 
 def granted(world: World, namespace: str) -> dict[str, Body]:
-    """What the instances of the application may do; the mission is another one, and granted later."""
+    """Return the specs of the application's Grants without the fields that differ between missions."""
     grants = {body["metadata"]["name"]: dict(body["spec"]) for body in world.grants(namespace)}
     for spec in grants.values():
         del spec["mission"], spec["application"]["uid"], spec["issuedAt"]
@@ -71,12 +71,12 @@ def granted(world: World, namespace: str) -> dict[str, Body]:
 
 
 def authority(world: World) -> bytes:
-    """The certificate that nodes take Grants by."""
+    """Return the CA certificate that nodes verify Grants with."""
     public = world.api.get(f"/api/v1/namespaces/{SYSTEM}/configmaps/fractus-ca") or {}
     return str(public["data"]["ca.crt"]).encode()
 
 
-def test_what_was_backed_up_is_restored_and_removed(
+def test_backup_is_restored_into_another_cluster_and_uninstalled(
     world: World, operator: OperatorProcess, found: World, namespace: str, folder: Path
 ) -> None:
     world.put(ours("Zone", "school", {"area": {"circle": {"center": at(40, 180), "radius": 30}}}))
@@ -123,7 +123,7 @@ def test_what_was_backed_up_is_restored_and_removed(
     remove(found, shell)
 
 
-REMOVE = typed_lines("docs/upgrades.md", "Uninstalling")
+REMOVE = shell_lines("docs/upgrades.md", "Uninstalling")
 EVERYWHERE = "clusterroles,clusterrolebindings,validatingadmissionpolicies,validatingadmissionpolicybindings,priorityclasses,crds"
 INSIDE = "deployments,daemonsets,jobs,services,serviceaccounts,roles,rolebindings,secrets,configmaps,leases"
 

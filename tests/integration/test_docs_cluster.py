@@ -1,4 +1,4 @@
-"""What pages have an operator of a cluster type, on a real API server with an operator, an application and reports of nodes."""
+"""Commands by which pages look at a cluster, on a real API server with an operator, an application and reports of nodes."""
 
 from __future__ import annotations
 
@@ -10,25 +10,20 @@ from pathlib import Path
 import pytest
 from browser import serving, told_to_pages
 from control_plane import wait_for
-from docs_commands import ROOT, every_command, typed_lines
+from docs_pages import ROOT, shell_lines
 from docs_shell import Shell
 from operator_world import FRACTUS, SYSTEM, OperatorProcess, World
 
 pytestmark = pytest.mark.slow
 
-PAGES = {f"docs/{name}.md" for name in ("alerts", "applications", "ardupilot", "direct-links", "logs", "upgrades")}
-LOOK = {
-    ("kubectl", "get"), ("kubectl", "describe"), ("kubectl", "explain"), ("kubectl", "api-resources"),
-    ("fractus", "status"), ("fractus", "explain"),
-}  # fmt: skip
 DRONE = f"{FRACTUS}/drones/drone-1"
 NAME = "traffic-monitoring"
 PODS = 7
-"""Of that application."""
+"""Pods of that application."""
 
 HEAD = f"mobility:7:{'a' * 64}"
 
-SHOWN = {
+COMMANDS = {
     "fractus explain APP": "drone-1",
     "fractus explain traffic-monitoring": "drone-1",
     "fractus status": r"(?s)LAST SEEN.*drone-1 .*default/traffic-monitoring",
@@ -50,20 +45,11 @@ SHOWN = {
     "kubectl get grants": "traffic-monitoring-navigator",
     "kubectl get policies,zones,depots,drones,edgenodes,applications -A -o yaml": "kind: List",
 }
-"""What each command shows, as a pattern; NAME is an object of its kind."""
-
-
-def looks() -> list[str]:
-    """The commands of the pages that look at a cluster and change nothing, each once; without what a sentence only names."""
-    every = {command.argv for command in every_command() if command.page in PAGES}
-    verbs = {argv: tuple(word for word in argv if word not in {"-n", SYSTEM})[:2] for argv in every}
-    return sorted(
-        " ".join(argv) for argv, verb in verbs.items() if verb in LOOK and (len(argv) > 2 or verb[1] == "status")
-    )
+"""Commands of the pages, with a pattern of their output. NAME stands for an object of the kind."""
 
 
 def furnish(world: World, shell: Shell) -> None:
-    """The nodes of the example, as agents and kubelets report them."""
+    """Create the nodes of the example and set their status as agents and kubelets report it."""
     for name in ("depot", "zones", "policies", "drone", "edge-nodes"):
         shell.type(f"kubectl apply -f examples/traffic-monitoring/{name}.yaml")
     world.api.merge(DRONE, {"spec": {"home": None}})
@@ -78,11 +64,13 @@ def furnish(world: World, shell: Shell) -> None:
     world.bound_pod(SYSTEM, "fractus-agent-drone-1", "drone-1")
 
 
-def test_what_pages_look_at_is_there(world: World, operator: OperatorProcess, tmp_path: Path) -> None:
+def test_documented_commands_show_the_state_of_the_cluster(
+    world: World, operator: OperatorProcess, tmp_path: Path
+) -> None:
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     shell = Shell(tmp_path, world.plane)
     furnish(world, shell)
-    typed = [line for line in typed_lines("docs/applications.md") if line.startswith("kubectl")]
+    typed = [line for line in shell_lines("docs/applications.md") if line.startswith("kubectl")]
     dry_run, apply, _, delete = typed
     shell.type(dry_run)
     assert world.application("default", NAME) is None
@@ -96,22 +84,21 @@ def test_what_pages_look_at_is_there(world: World, operator: OperatorProcess, tm
         (link, *_) = wait_for(lambda: list(world.links("default", NAME).values()), operator.log)
         (grant,) = (body for body in world.grants("default", NAME) if body["spec"]["component"] == "Navigator")
         names = {"dlk": link["metadata"]["name"], "grant": grant["metadata"]["name"], "drone": "drone-1"}
-        assert looks() == sorted(SHOWN)
-        shown: dict[str, str] = {}
-        for line, pattern in SHOWN.items():
+        outputs: dict[str, str] = {}
+        for line, pattern in COMMANDS.items():
             chosen = re.sub(r"(\w+) NAME", lambda found: f"{found[1]} {names[found[1]]}", line).replace("APP", NAME)
-            shown[chosen] = shown.get(chosen) or shell.type(chosen)
-            assert re.search(pattern, shown[chosen]), f"{chosen} does not show {pattern}:\n{shown[chosen]}"
-        checks(shell, tmp_path)
+            outputs[chosen] = outputs.get(chosen) or shell.type(chosen)
+            assert re.search(pattern, outputs[chosen]), f"{chosen} does not show {pattern}:\n{outputs[chosen]}"
+        assert_plan_names_refused_field(shell, tmp_path)
     finally:
         world.drone_status("drone-1", "inactive")
         shell.type(delete)
     assert world.application("default", NAME) is None
 
 
-def checks(shell: Shell, folder: Path) -> None:
-    """Before an upgrade, `fractus plan` names the file, the line and the field of what the new version refuses."""
-    (everything,) = (line for line in SHOWN if line.endswith("applications -A -o yaml"))
+def assert_plan_names_refused_field(shell: Shell, folder: Path) -> None:
+    """Check that `fractus plan` names file, line and field of an object that the new version refuses."""
+    (everything,) = (line for line in COMMANDS if line.endswith("applications -A -o yaml"))
     shell.type(f"{everything} > all.yaml")
     shell.type("fractus plan -f all.yaml")
     file = folder / "all.yaml"
@@ -119,9 +106,9 @@ def checks(shell: Shell, folder: Path) -> None:
     assert re.match(r"fractus: all.yaml:\d+: Policy .*upperLimit", shell.type("fractus plan -f all.yaml 2>&1", code=1))
 
 
-def test_the_view_is_opened_with_the_token_of_its_secret(world: World, tmp_path: Path) -> None:
+def test_view_opens_with_the_token_of_its_secret(world: World, tmp_path: Path) -> None:
     shell = Shell(tmp_path, world.plane)
-    create, _forward, open_ = (line for line in typed_lines("docs/view.md") if "fractus-view" in line)
+    create, _forward, open_ = (line for line in shell_lines("docs/view.md") if "fractus-view" in line)
     secret = f"/api/v1/namespaces/{SYSTEM}/secrets/fractus-view"
     shell.type(create)
     try:
@@ -133,8 +120,8 @@ def test_the_view_is_opened_with_the_token_of_its_secret(world: World, tmp_path:
     assert len(stored) == 48
 
 
-def test_the_view_of_a_cluster_takes_kubeconfig(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
-    line, *_ = (line for line in typed_lines("docs/view.md") if line.startswith("fractus view"))
+def test_view_shows_the_cluster_of_kubeconfig(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    line, *_ = (line for line in shell_lines("docs/view.md") if line.startswith("fractus view"))
     monkeypatch.setenv("KUBECONFIG", str(world.plane.kubeconfig))
     with serving(*shlex.split(line, comments=True)[2:]) as address:
         told_to_pages(address, '"drone-1"', '"edge-3"', '"base"')

@@ -1,4 +1,4 @@
-"""docs/standalone.md as it is typed, but for ports: a flight without Kubernetes, and what other pages do with its files."""
+"""Procedure of docs/standalone.md, a flight without Kubernetes, and commands of other pages for its files."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import yaml
 from browser import serving, told_to_pages
-from docs_commands import ROOT, typed_lines
+from docs_pages import ROOT, shell_lines, shown_file
 from docs_shell import Shell
 from fractus_cli.standalone import StandalonePki
 from fractus_cluster.ports import free_port
@@ -26,41 +26,34 @@ pytestmark = pytest.mark.slow
 
 PAGE = "docs/standalone.md"
 TEXT = (ROOT / PAGE).read_text()
-INIT, SIGN, MOBILITY, CAMERA, FLY, SINCE, SINCE_STATUS = typed_lines(PAGE)
-_CLUSTER, LIVE, REPLAY = (line for line in typed_lines("docs/view.md") if line.startswith("fractus view"))
+INIT, SIGN, MOBILITY, CAMERA, FLY, SINCE, SINCE_STATUS = shell_lines(PAGE)
+_CLUSTER, LIVE, REPLAY = (line for line in shell_lines("docs/view.md") if line.startswith("fractus view"))
 FLIGHT_TIMEOUT_S = 120
 
 
 @dataclass(frozen=True)
 class Flown:
-    """What a flight has left.
+    """Results of a flight.
 
     Attributes:
-        folder: where all was typed.
-        said: what the component printed.
+        folder: Working directory of the commands.
+        output: Output of the component.
     """
 
     folder: Path
-    said: str
+    output: str
 
 
-def written(name: str) -> str:
-    """A file that the page shows."""
-    found = re.search(rf"`{name}`[^`\n]*:\n```\w+\n(.*?)```", TEXT, re.DOTALL)
-    assert found is not None, name
-    return found[1]
-
-
-def in_sentence(begins: str) -> str:
-    """A command between backticks."""
-    found = re.search(rf"`({begins}[^`]*)`", TEXT)
-    assert found is not None, begins
+def command_in_sentence(beginning: str) -> str:
+    """Return the command between backticks with this beginning."""
+    found = re.search(rf"`({beginning}[^`]*)`", TEXT)
+    assert found is not None, beginning
     return found[1]
 
 
 @contextlib.contextmanager
-def serves(shell: Shell, folder: Path, line: str) -> Iterator[None]:
-    """Have a line serve until the end of the block, and end it as Ctrl-C does."""
+def serving_process(shell: Shell, folder: Path, line: str) -> Iterator[None]:
+    """Run a service until the end of the block, and then terminate it."""
     program = shlex.split(line)
     with (folder / f"{program[1]}.log").open("wb") as log:
         process = subprocess.Popen(program, cwd=folder, env=shell.environment, stdout=log, stderr=log)
@@ -73,7 +66,7 @@ def serves(shell: Shell, folder: Path, line: str) -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
-    """The flight of the page, with recordings as another page has them."""
+    """The flight of the page, with recordings enabled as docs/recordings.md does."""
     folder = tmp_path_factory.mktemp("standalone")
     shell = Shell(folder)
     ports = {known: str(free_port()) for known in ("50051", "50052", "5760")}
@@ -85,16 +78,18 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
         return f" --listen 127.0.0.1:{ports[port]} --description none.yaml"
 
     for name in ("survey.yaml", "navigator.py"):
-        (folder / name).write_text(written(name))
+        (folder / name).write_text(shown_file(PAGE, name))
     shell.type(INIT)
-    shell.type(in_sentence("cp -r"))
+    shell.type(command_in_sentence("cp -r"))
     shell.type(SIGN)
-    vehicle = f"{in_sentence('fractus vehicle')} --listen tcp:127.0.0.1:{ports['5760']} --ready-after 2 --speedup 3"
-    mobility = re.sub(r"--autopilot \S+", own(in_sentence("--autopilot tcp")), MOBILITY)
+    vehicle = (
+        f"{command_in_sentence('fractus vehicle')} --listen tcp:127.0.0.1:{ports['5760']} --ready-after 2 --speedup 3"
+    )
+    mobility = re.sub(r"--autopilot \S+", own(command_in_sentence("--autopilot tcp")), MOBILITY)
     with (
-        serves(shell, folder, vehicle),
-        serves(shell, folder, f"{mobility} --recordings recordings/mobility{listens('50051')}"),
-        serves(
+        serving_process(shell, folder, vehicle),
+        serving_process(shell, folder, f"{mobility} --recordings recordings/mobility{listens('50051')}"),
+        serving_process(
             shell, folder,
             f"{CAMERA} --recordings recordings/camera --mobility 127.0.0.1:{ports['50051']}{listens('50052')}",
         ),
@@ -108,19 +103,21 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
     return Flown(folder, done.stdout + done.stderr)
 
 
-def test_the_program_meets_its_policies(flown: Flown) -> None:
-    assert re.search(r"^climbed to 15 m: .*policy low", flown.said, re.MULTILINE), flown.said
-    assert re.search(r"^going on without it: .*zone pool of policy pool", flown.said, re.MULTILINE), flown.said
-    assert re.search(r"^a picture of \d{4,} bytes$", flown.said, re.MULTILINE), flown.said
-    assert "the mission is over; nothing is left to fly" in flown.said
+def test_component_reports_corrected_and_denied_calls(flown: Flown) -> None:
+    assert re.search(r"^climbed to 15 m: .*policy low", flown.output, re.MULTILINE), flown.output
+    assert re.search(r"^going on without it: .*zone pool of policy pool", flown.output, re.MULTILINE), flown.output
+    assert re.search(r"^a picture of \d{4,} bytes$", flown.output, re.MULTILINE), flown.output
+    assert "the mission is over; nothing is left to fly" in flown.output
 
 
-def test_the_audit_log_tells_of_it_and_shows_what_is_cut_off(flown: Flown, world: World, tmp_path: Path) -> None:
+def test_audit_log_has_the_verdicts_and_verification_finds_removed_entries(
+    flown: Flown, world: World, tmp_path: Path
+) -> None:
     shutil.copytree(flown.folder, tmp_path, dirs_exist_ok=True)
     shell = Shell(tmp_path, world.plane)
-    told = shell.type(in_sentence("fractus audit show"))
-    assert re.search(r"Takeoff.*\blow\b", told), told
-    assert re.search(r"Goto.*\bpool\b", told), told
+    verdicts = shell.type(command_in_sentence("fractus audit show"))
+    assert re.search(r"Takeoff.*\blow\b", verdicts), verdicts
+    assert re.search(r"Goto.*\bpool\b", verdicts), verdicts
     kept = tmp_path / "kept"
     kept.mkdir()
     for name in ("mobility", "camera"):
@@ -130,7 +127,7 @@ def test_the_audit_log_tells_of_it_and_shows_what_is_cut_off(flown: Flown, world
     assert head is not None
     reported = {"status": {"audit": [f"mobility:{head.sequence}:{head.hash}"]}}
     world.api.merge(f"{FRACTUS}/drones/drone-1/status", reported)
-    alone = in_sentence("fractus audit verify audit")
+    alone = command_in_sentence("fractus audit verify audit")
     for line in (alone, SINCE, SINCE_STATUS):
         shell.type(line)
     log.write_text("".join(log.read_text().splitlines(keepends=True)[:-3]))
@@ -140,10 +137,10 @@ def test_the_audit_log_tells_of_it_and_shows_what_is_cut_off(flown: Flown, world
         shell.type(line, code=1)
 
 
-def test_grants_are_made_from_python(flown: Flown, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_grants_are_signed_from_python(flown: Flown, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.copytree(flown.folder / "pki", tmp_path / "pki")
     monkeypatch.chdir(tmp_path)
-    names = {"manifest": yaml.safe_load(written("survey.yaml")), "Grant": Grant}
+    names = {"manifest": yaml.safe_load(shown_file(PAGE, "survey.yaml")), "Grant": Grant}
     exec(re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)[-1], names)
     assert names["StandalonePki"] is StandalonePki
     assert (tmp_path / "grants/default.survey-navigator.json").is_file()
@@ -152,7 +149,7 @@ def test_grants_are_made_from_python(flown: Flown, tmp_path: Path, monkeypatch: 
 
 
 @pytest.mark.parametrize("line", [LIVE, REPLAY], ids=["live", "replay"])
-def test_its_recordings_are_viewed(flown: Flown, line: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_view_shows_the_recordings(flown: Flown, line: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(flown.folder)
     folder = flown.folder / "recordings"
     for name, recorded in (("flight", "mobility"), ("camera", "camera")):

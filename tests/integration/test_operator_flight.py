@@ -11,7 +11,7 @@ import pytest
 import yaml
 from chart import operator_token, render
 from control_plane import ControlPlane, wait_for
-from docs_commands import typed_lines
+from docs_pages import shell_lines
 from docs_shell import Shell
 from fractus_runtime.kubernetes import KubeError
 from operator_world import FRACTUS, NODES, SYSTEM, OperatorProcess, World, traffic
@@ -172,7 +172,7 @@ def test_on_the_ground_all_of_it_is_allowed(guarded: World) -> None:
 
 
 def test_a_silent_drone_is_in_the_air_until_someone_sees_it_on_the_ground(guarded: World, tmp_path: Path) -> None:
-    (line,) = (typed for typed in typed_lines("docs/upgrades.md") if "fractus.dev/grounded" in typed)
+    (line,) = (typed for typed in shell_lines("docs/upgrades.md") if "fractus.dev/grounded" in typed)
     path = f"{FRACTUS}/drones/drone-1"
     seen = "2026-01-01T00:00:00Z"
     status = {"flightState": "unknown", "lastFlightState": "landing", "lastSeen": seen}

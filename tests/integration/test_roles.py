@@ -13,7 +13,7 @@ import pytest
 import yaml
 from chart import CHARTS, path_of, render
 from control_plane import wait_for
-from docs_commands import ROOT, typed_lines
+from docs_pages import ROOT, shell_lines
 from docs_shell import Shell
 from operator_world import World
 
@@ -126,7 +126,7 @@ def test_the_page_tells_of_each_kind() -> None:
 
 def test_an_authority_writes_zones_and_policies_by_the_commands_of_the_page(roles: World, tmp_path: Path) -> None:
     shell = Shell(tmp_path, roles.plane)
-    lines = typed_lines(PAGE)
+    lines = shell_lines(PAGE)
     for line in lines:
         shell.type(line)
     try:

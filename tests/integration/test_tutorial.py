@@ -1,4 +1,4 @@
-"""docs/tutorial.md does what it says: its program flies its Grant, by its commands."""
+"""Procedure of docs/tutorial.md without a cluster: its program flies under its Grant."""
 
 from __future__ import annotations
 
@@ -13,26 +13,21 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from docs_pages import ROOT, shell_lines, shown_file
 from fractus_cluster.ports import free_port
 
-PAGE = (Path(__file__).parents[2] / "docs" / "tutorial.md").read_text()
+PAGE_NAME = "docs/tutorial.md"
+PAGE = (ROOT / PAGE_NAME).read_text()
 FLIGHT_TIMEOUT_S = 180
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 
 
-def block(kind: str) -> str:
-    """The first block of a kind."""
-    match = re.search(rf"```{kind}\n(.*?)```", PAGE, re.DOTALL)
-    assert match is not None
-    return match[1]
-
-
 def commands(ports: dict[str, str]) -> list[list[str]]:
-    """What is typed after `$ fractus`, in order, on ports of this test's own."""
-    typed = re.findall(r"^\$ fractus ((?:.*\\\n)*.*)$", PAGE, re.MULTILINE)
+    """Return the arguments of the page's `fractus` commands, in order, with ports replaced."""
+    lines = [line.removeprefix("fractus ") for line in shell_lines(PAGE_NAME) if line.startswith("fractus ")]
     for known, own in ports.items():
-        typed = [line.replace(known, own) for line in typed]
-    return [shlex.split(line.replace("\\\n", " ")) for line in typed]
+        lines = [line.replace(known, own) for line in lines]
+    return [shlex.split(line) for line in lines]
 
 
 @contextmanager
@@ -48,11 +43,11 @@ def running(folder: Path, *arguments: str) -> Iterator[None]:
             process.wait(10)
 
 
-def test_the_tutorial_s_program_flies(tmp_path: Path) -> None:
+def test_program_of_the_tutorial_flies_its_mission(tmp_path: Path) -> None:
     vehicle_port, service_port = str(free_port()), str(free_port())
     init, sign, vehicle, mobility, *_ = commands({"5760": vehicle_port})
-    (tmp_path / "patrol.py").write_text(block("python"))
-    (tmp_path / "patrol.yaml").write_text(block("yaml"))
+    (tmp_path / "patrol.py").write_text(shown_file(PAGE_NAME, "patrol.py"))
+    (tmp_path / "patrol.yaml").write_text(shown_file(PAGE_NAME, "patrol.yaml"))
     for command in (init, sign):
         subprocess.run([sys.executable, "-m", "fractus_cli", *command], cwd=tmp_path, check=True, timeout=60)
     exported = dict(re.findall(r"(FRACTUS_\w+)=(\S+)", PAGE)) | {
@@ -68,10 +63,10 @@ def test_the_tutorial_s_program_flies(tmp_path: Path) -> None:
             [sys.executable, "patrol.py"], cwd=tmp_path, env={**os.environ, **exported}, capture_output=True, text=True,
             timeout=FLIGHT_TIMEOUT_S, check=False,
         )  # fmt: skip
-    said = done.stdout + done.stderr
-    assert done.returncode == 0, said + (tmp_path / "mobility.log").read_text()
+    output = done.stdout + done.stderr
+    assert done.returncode == 0, output + (tmp_path / "mobility.log").read_text()
     expected = re.search(r"\$ python patrol.py\n(.*?)```", PAGE, re.DOTALL)
     assert expected is not None
     for line in filter(lambda line: "waiting" not in line, expected[1].splitlines()):
-        assert line.split(" ", 1)[1] in said
+        assert line.split(" ", 1)[1] in output
     assert time.monotonic() - begun < FLIGHT_TIMEOUT_S

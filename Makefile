@@ -123,9 +123,8 @@ format: env ## Format the code
 	$(RUN) ruff format
 
 .PHONY: generate
-generate: env ## Generate the CRDs, the stubs of the .proto files, the MAVLink codec's tables, the SDK's reference, the chart's defaults and the charts' README.md
+generate: env ## Generate the CRDs, the stubs of the .proto files, the SDK's reference, the chart's defaults and the charts' README.md
 	$(RUN) python -m fractus_core.api.crd crds
-	$(RUN) python -m fractus_mavlink.generate
 	$(RUN) python -m grpc_tools.protoc -Iproto --python_out=proto --pyi_out=proto --grpc_python_out=proto \
 		proto/fractus_proto/v1/*.proto
 	$(RUN) python -m fractus.reference docs/reference/sdk.md
@@ -160,6 +159,7 @@ release: env ## Set VERSION=X.Y.Z of the package and the charts; describe it in 
 
 # What a user installs, without what only builds and tests it.
 SHIPPED := --frozen --no-dev --extra operator --extra agent --extra services --extra view --extra tracing
+LICENSES = $(UV) run --quiet --isolated $(SHIPPED) --with pip-licenses==5.5.5 pip-licenses
 
 # The charts of a checkout take the images that are built from it (localhost/fractus/NAME:dev), those of a release its own.
 REGISTRY ?= localhost/fractus
@@ -203,16 +203,16 @@ dist: $(if $(PLATFORMS),,packages) env ## Build all of a release into dist/: whe
 	command -v helm > /dev/null || $(RUN) fractus cluster binaries
 	$(MAKE) charts archives
 	$(UV) export --quiet $(SHIPPED) --no-emit-project --format cyclonedx1.5 > dist/dependencies.cdx.json
-	# A licence that asks more than to be named would bind what is built on Fractus.
-	$(UV) run --quiet --isolated $(SHIPPED) --with pip-licenses==5.5.5 pip-licenses --ignore-packages fractus-drones \
-		--format=markdown --with-urls --order=license --partial-match --fail-on=GPL --output-file=dist/LICENSES.md > /dev/null
+	# A copyleft licence would bind applications that are built on Fractus. The LGPL of pymavlink binds changes to pymavlink only.
+	$(LICENSES) --ignore-packages fractus-drones pymavlink --partial-match --fail-on=GPL > /dev/null
+	$(LICENSES) --ignore-packages fractus-drones --format=markdown --with-urls --order=license --output-file=dist/LICENSES.md > /dev/null
 	cd dist && sha256sum -- *.whl *.tar.gz *.tgz *.image.tar *.json *.md > SHA256SUMS
 
 # Of what it ranks low, ruff's rules S judge the same in `make lint`. It takes too long for that target.
 .PHONY: bandit
 bandit: uv ## Look for insecure code in what is shipped
 	$(UV) tool run bandit==1.9.2 --quiet --severity-level medium --recursive \
-		core runtime operator agent mavlink services cli view/fractus_view sdk sim proto examples
+		core runtime operator agent services cli view/fractus_view sdk sim proto examples
 
 # Where a proxy passes on packages alone, pip-audit would call the first of them unknown.
 ADVISORIES := https://pypi.org/pypi/pip-audit/2.10.1/json

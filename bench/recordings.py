@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from fractus_mavlink import Endpoint
+    from fractus_runtime.mavlink_codec import Endpoint
     from fractus_services.recording.flight_writer import FlightWriter
 
 MAX_CPU, MAX_MB = 2.0, 16.0
@@ -70,7 +70,7 @@ def main() -> int:
     options = parser.parse_args()
     seconds = 20 if options.quick else options.seconds
     # What the service has loaded without a recording, so that memory is only what recording adds.
-    from fractus_mavlink import Endpoint  # noqa: PLC0415
+    from fractus_runtime.mavlink_codec import Endpoint  # noqa: PLC0415
     from fractus_services.mobility.rpc import server as _server  # noqa: F401, PLC0415
     from fractus_services.recording.segment_directory import SegmentDirectory  # noqa: PLC0415
 

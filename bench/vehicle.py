@@ -22,12 +22,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fractus_cluster.ports import free_port
-from fractus_mavlink import Endpoint
-from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_COMPONENT, MAV_MODE_FLAG
+from fractus_runtime.mavlink_codec import Endpoint
 from fractus_vehicle.earth import Place
 from fractus_vehicle.readiness import arming_refusals
 from fractus_vehicle.simulation import Simulation, formation
 from fractus_vehicle.state import CONTROL_STEP_S, VehicleConfig
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "component"))
 from vehicle_pilot import Pilot
@@ -84,7 +84,7 @@ def motion() -> list[Claim]:
         peak = max(peak, math.hypot(vehicle.body.vn, vehicle.body.ve))
     leg_s = simulation.time_s - begun
     pilot.fly_on(6.0)
-    pilot.command(MAV_CMD.NAV_RETURN_TO_LAUNCH)
+    pilot.command(mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH)
     home_s = pilot.wait(lambda: not vehicle.armed, 120.0)
     return [
         near("takeoff to 9.5 m", climb_s, 9.5, "s"),
@@ -104,7 +104,7 @@ def memory_and_start() -> list[Claim]:
     while listed < count:
         listed += sum(message.name == "PARAM_VALUE" for message in pilot.step())
     list_s = simulation.time_s - begun
-    pilot.mode(COPTER_MODE.GUIDED)
+    pilot.mode(mavlink.COPTER_MODE_GUIDED)
     ready_s = begun + pilot.wait(lambda: not arming_refusals(simulation.crafts[0].vehicle.state), 60.0)
     logs = [_log(seed) for seed in (3, 3, 4)]
     differs = sum(a != b for a, b in zip(logs[0], logs[1], strict=False)) + abs(len(logs[0]) - len(logs[1]))
@@ -144,10 +144,15 @@ def speed(flight_s: float) -> list[Claim]:
         for pilot in pilots:
             pilot.send(
                 "COMMAND_LONG",
-                _order(pilot, MAV_CMD.DO_SET_MODE, MAV_MODE_FLAG.CUSTOM_MODE_ENABLED, COPTER_MODE.GUIDED),
+                _order(
+                    pilot,
+                    mavlink.MAV_CMD_DO_SET_MODE,
+                    mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED,
+                    mavlink.COPTER_MODE_GUIDED,
+                ),
             )
-            pilot.send("COMMAND_LONG", _order(pilot, MAV_CMD.COMPONENT_ARM_DISARM, 1.0))
-            pilot.send("COMMAND_LONG", _order(pilot, MAV_CMD.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 10.0))
+            pilot.send("COMMAND_LONG", _order(pilot, mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0))
+            pilot.send("COMMAND_LONG", _order(pilot, mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 10.0))
             pilot.channel.take()
         simulation.advance(6.0)
         begun = time.process_time()
@@ -178,7 +183,7 @@ class Link:
 
     def __init__(self, port: int) -> None:
         self.socket = socket.create_connection(("127.0.0.1", port), timeout=5.0)
-        self.endpoint = Endpoint(255, MAV_COMPONENT.MISSIONPLANNER)
+        self.endpoint = Endpoint(255, mavlink.MAV_COMP_ID_MISSIONPLANNER)
 
     def send(self, name: str, **values: float) -> None:
         """Send one message to the vehicle."""
@@ -213,9 +218,13 @@ def process(duration_s: float) -> list[Claim]:
         idle = (_cpu_s(child.pid) - before) / duration_s * 100.0
         link.send("REQUEST_DATA_STREAM", req_message_rate=4, start_stop=1)
         for values in (
-            {"command": MAV_CMD.DO_SET_MODE, "param1": MAV_MODE_FLAG.CUSTOM_MODE_ENABLED, "param2": COPTER_MODE.GUIDED},
-            {"command": MAV_CMD.COMPONENT_ARM_DISARM, "param1": 1},
-            {"command": MAV_CMD.NAV_TAKEOFF, "param7": 20},
+            {
+                "command": mavlink.MAV_CMD_DO_SET_MODE,
+                "param1": mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED,
+                "param2": mavlink.COPTER_MODE_GUIDED,
+            },
+            {"command": mavlink.MAV_CMD_COMPONENT_ARM_DISARM, "param1": 1},
+            {"command": mavlink.MAV_CMD_NAV_TAKEOFF, "param7": 20},
         ):
             link.send("COMMAND_LONG", **values)
             link.read(1.0, until="COMMAND_ACK")
@@ -227,7 +236,7 @@ def process(duration_s: float) -> list[Claim]:
         for at in range(100):
             link.read(0.0037 * (1 + at % 5))
             begun = time.perf_counter()
-            link.send("COMMAND_LONG", command=MAV_CMD.REQUEST_AUTOPILOT_CAPABILITIES, param1=1)
+            link.send("COMMAND_LONG", command=mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, param1=1)
             link.read(1.0, until="COMMAND_ACK")
             waits.append((time.perf_counter() - begun) * 1000.0)
         return [

@@ -6,7 +6,7 @@ import asyncio
 import random
 from collections.abc import Collection, Mapping
 
-from fractus_mavlink import Message, message
+from fractus_runtime.mavlink_codec import Message, message
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import NamedTuple, Protocol
 
 import click
-from fractus_mavlink import frame_length
+from fractus_runtime.mavlink_codec import frame_length
 
 _STAMP = struct.Struct(">Q")
 _MAGICS = frozenset({0xFD, 0xFE})

@@ -10,8 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from fractus_agent.redirector.netlink import in_namespace
-from fractus_mavlink import Endpoint, Message, layout_named
-from fractus_mavlink.enums import MAV_AUTOPILOT, MAV_CMD
+from fractus_runtime.mavlink_codec import Endpoint, Message
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 log = logging.getLogger(__name__)
 
@@ -74,7 +74,7 @@ class Follower:
             if not data:
                 return
             for message in endpoint.decode(data):
-                if message.name == "HEARTBEAT" and message.integer("autopilot") != MAV_AUTOPILOT.INVALID:
+                if message.name == "HEARTBEAT" and message.integer("autopilot") != mavlink.MAV_AUTOPILOT_INVALID:
                     autopilot = message.sysid
                 elif message.name == "GLOBAL_POSITION_INT" and message.sysid == autopilot:
                     self._heard(message)
@@ -96,8 +96,8 @@ def _ask(endpoint: Endpoint, autopilot: int) -> bytes:
         {
             "target_system": autopilot,
             "target_component": 1,
-            "command": int(MAV_CMD.SET_MESSAGE_INTERVAL),
-            "param1": float(layout_named("GLOBAL_POSITION_INT").msgid),
+            "command": int(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL),
+            "param1": float(mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT),
             "param2": 1e6 / RATE_HZ,
         },
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_SEVERITY
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.breadcrumbs import Point
 from fractus_vehicle.descent import descend
@@ -18,13 +18,13 @@ from fractus_vehicle.spline import SplineLeg
 from fractus_vehicle.state import CONTROL_STEP_S, VehicleState
 
 # Legs that need not stop at their end.
-CURVES = frozenset({MAV_CMD.NAV_WAYPOINT, MAV_CMD.NAV_SPLINE_WAYPOINT})
+CURVES = frozenset({mavlink.MAV_CMD_NAV_WAYPOINT, mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT})
 
 
 class AutoFlight(Flight):
     """AUTO mode: runs NAV commands one after the other, DO commands at once when reached."""
 
-    def __init__(self, set_mode: Callable[[COPTER_MODE], bool]) -> None:
+    def __init__(self, set_mode: Callable[[int], bool]) -> None:
         self._set_mode = set_mode
         self._item: Item | None = None
         self._index = 0
@@ -76,7 +76,7 @@ class AutoFlight(Flight):
         index = v.mission.first_navigating(v.mission.current)
         if index is not None:
             v.mission.current = index
-            v.say(MAV_SEVERITY.INFO, f"Mission: {index} {title(v.mission.items[index])}")
+            v.say(mavlink.MAV_SEVERITY_INFO, f"Mission: {index} {title(v.mission.items[index])}")
 
     def pause(self, v: VehicleState, *, paused: bool) -> None:
         """DO_PAUSE_CONTINUE: stop where it is; continuing repeats the current item."""
@@ -106,7 +106,7 @@ class AutoFlight(Flight):
             if item.navigates:
                 v.mission.current = index
                 self._commands.begin(v, waiting)
-                v.say(MAV_SEVERITY.INFO, f"Mission: {index} {title(item)}")
+                v.say(mavlink.MAV_SEVERITY_INFO, f"Mission: {index} {title(item)}")
                 self._begin_item(v, index, item)
                 return
             waiting.append(index)
@@ -127,32 +127,32 @@ class AutoFlight(Flight):
         self._returning = self._leg = None
         track, self._track = self._track, (0.0, 0.0, 0.0)
         if item.has_place and v.altitude_base_m(item.frame) is None:
-            v.say(MAV_SEVERITY.CRITICAL, "Failsafe: Terrain data missing")
-            if not self._set_mode(COPTER_MODE.RTL):
-                self._set_mode(COPTER_MODE.LAND)
+            v.say(mavlink.MAV_SEVERITY_CRITICAL, "Failsafe: Terrain data missing")
+            if not self._set_mode(mavlink.COPTER_MODE_RTL):
+                self._set_mode(mavlink.COPTER_MODE_LAND)
             return
         north, east, down = item_target(v, item)
         match item.command:
-            case MAV_CMD.NAV_TAKEOFF:
+            case mavlink.MAV_CMD_NAV_TAKEOFF:
                 if v.landed:
                     v.begin_takeoff(down)
                 else:
                     v.control.go_to(*v.control.target, down)
-            case MAV_CMD.NAV_RETURN_TO_LAUNCH:
+            case mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH:
                 self._returning = ReturnToLaunch()
                 self._returning.begin(v)
-            case MAV_CMD.NAV_LOITER_TURNS:
+            case mavlink.MAV_CMD_NAV_LOITER_TURNS:
                 self._circle_centre = (north, east)
                 self._turned = 0.0
                 self._angle = math.atan2(v.est.east - east, v.est.north - north)
                 v.control.go_to(north, east, down)
-            case MAV_CMD.NAV_DELAY:
+            case mavlink.MAV_CMD_NAV_DELAY:
                 self._arrived_s = v.time_s
-            case MAV_CMD.NAV_SPLINE_WAYPOINT:
+            case mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT:
                 here = (v.control.pos[0], v.control.pos[1], v.control.pos[2])
                 self._track = self._arrival(v, item, here, (north, east, down))
                 self._leg = SplineLeg(v, (north, east, down), track, self._track)
-            case MAV_CMD.NAV_LAND:
+            case mavlink.MAV_CMD_NAV_LAND:
                 v.control.go_to(north, east)
             case _:
                 here = (v.control.pos[0], v.control.pos[1], v.control.pos[2])
@@ -174,7 +174,7 @@ class AutoFlight(Flight):
         if following is None:
             return (0.0, 0.0, 0.0)
         north, east, down = item_target(v, following)
-        base = start if following.command == MAV_CMD.NAV_SPLINE_WAYPOINT else end
+        base = start if following.command == mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT else end
         return (north - base[0], east - base[1], down - base[2])
 
     def step(self, v: VehicleState) -> None:
@@ -191,14 +191,14 @@ class AutoFlight(Flight):
         self._commands.step(v)
         if self._leg is not None:
             self._leg.step(v)
-        if item.command == MAV_CMD.NAV_LAND:
+        if item.command == mavlink.MAV_CMD_NAV_LAND:
             self._land(v)
-        elif item.command == MAV_CMD.NAV_LOITER_TURNS and self._circle_centre is not None:
+        elif item.command == mavlink.MAV_CMD_NAV_LOITER_TURNS and self._circle_centre is not None:
             self._turn(v, item)
         elif self._done(v, item):
             v.item_reached = self._index
-            if item.command != MAV_CMD.NAV_TAKEOFF:
-                v.say(MAV_SEVERITY.INFO, f"Reached command #{self._index}")
+            if item.command != mavlink.MAV_CMD_NAV_TAKEOFF:
+                v.say(mavlink.MAV_SEVERITY_INFO, f"Reached command #{self._index}")
             self._start_from(v, v.mission.next_after(self._index))
         v.heading.step(v.est, CONTROL_STEP_S)
 
@@ -235,11 +235,11 @@ class AutoFlight(Flight):
             self._start_from(v, v.mission.next_after(self._index))
 
     def _done(self, v: VehicleState, item: Item) -> bool:
-        if item.command == MAV_CMD.NAV_TAKEOFF:
+        if item.command == mavlink.MAV_CMD_NAV_TAKEOFF:
             return v.takeoff_done()
-        if item.command == MAV_CMD.NAV_LOITER_UNLIM:
+        if item.command == mavlink.MAV_CMD_NAV_LOITER_UNLIM:
             return False
-        if item.command == MAV_CMD.NAV_DELAY:
+        if item.command == mavlink.MAV_CMD_NAV_DELAY:
             return v.time_s - (self._arrived_s or 0.0) >= max(item.param1, 0.0)
         if self._arrived_s is None:
             if self._leg is None or not self._leg.reached(v, max(v.params["WPNAV_RADIUS"] / 100.0, 0.3)):

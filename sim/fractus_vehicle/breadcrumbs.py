@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
-from fractus_mavlink.enums import COPTER_MODE, MAV_SEVERITY
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 POINTS_MAX = 500
 UPDATE_INTERVAL_S = 1.0 / 3.0
@@ -39,7 +39,7 @@ class Loop:
 class Breadcrumbs:
     """The recorded path in local metres, home first."""
 
-    def __init__(self, params: Mapping[str, float], say: Callable[[MAV_SEVERITY, str], None]) -> None:
+    def __init__(self, params: Mapping[str, float], say: Callable[[int, str], None]) -> None:
         self._params = params
         self._say = say
         self.active = False
@@ -68,7 +68,7 @@ class Breadcrumbs:
             self._good_s = self._saved_s = now_s
             self.path.append(here)
 
-    def step(self, now_s: float, here: Point | None, mode: COPTER_MODE, *, armed: bool) -> None:
+    def step(self, now_s: float, here: Point | None, mode: int, *, armed: bool) -> None:
         """Record, three times a second while armed, and tidy up; SMART_RTL itself leaves no crumbs.
 
         Args:
@@ -81,7 +81,7 @@ class Breadcrumbs:
             self._next_s = now_s + UPDATE_INTERVAL_S
             if not self.path and not armed and here is not None:
                 self.restart(now_s, here)
-            if self.active and armed and mode is not COPTER_MODE.SMART_RTL:
+            if self.active and armed and mode != mavlink.COPTER_MODE_SMART_RTL:
                 self._record(now_s, here)
                 self._work = self._work or self._routine()
         if self._work is not None:
@@ -103,12 +103,12 @@ class Breadcrumbs:
             return
         if len(self.path) >= self._limit - LOW_SPACE + 1 and now_s - self._low_said_s > LOW_SPACE_SAID_EVERY_S:
             self._low_said_s = now_s
-            self._say(MAV_SEVERITY.INFO, "SmartRTL Low on space!")
+            self._say(mavlink.MAV_SEVERITY_INFO, "SmartRTL Low on space!")
 
     def _give_up(self, reason: str) -> None:
         self.active = False
         self._work = None
-        self._say(MAV_SEVERITY.WARNING, f"SmartRTL deactivated: {reason}")
+        self._say(mavlink.MAV_SEVERITY_WARNING, f"SmartRTL deactivated: {reason}")
 
     def add(self, point: Point) -> bool:
         """Append a point unless it is too near to the last one; False when there is no room."""

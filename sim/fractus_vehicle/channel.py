@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from fractus_mavlink import Endpoint, Message, Value
+from fractus_runtime.mavlink_codec import Endpoint, Message, Value
 
 # A client that does not read costs at most this much memory; what does not fit is dropped, as on a radio.
 OUTBOX_LIMIT = 256 * 1024

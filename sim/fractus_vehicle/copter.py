@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fractus_mavlink.enums import COPTER_MODE, MAV_FRAME, MAV_PROTOCOL_CAPABILITY, POSITION_TARGET_TYPEMASK
+from fractus_runtime.mavlink_codec import enum_name
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,82 +18,96 @@ class ModeTraits:
 
 
 TRAITS = {
-    COPTER_MODE.STABILIZE: ModeTraits(needs_position=False, manual_throttle=True, arms=True),
-    COPTER_MODE.ACRO: ModeTraits(needs_position=False, manual_throttle=True, arms=True),
-    COPTER_MODE.ALT_HOLD: ModeTraits(needs_position=False, arms=True),
-    COPTER_MODE.AUTO: ModeTraits(),
-    COPTER_MODE.GUIDED: ModeTraits(arms=True),
-    COPTER_MODE.LOITER: ModeTraits(arms=True),
-    COPTER_MODE.RTL: ModeTraits(),
-    COPTER_MODE.CIRCLE: ModeTraits(),
-    COPTER_MODE.LAND: ModeTraits(needs_position=False),
-    COPTER_MODE.DRIFT: ModeTraits(arms=True),
-    COPTER_MODE.POSHOLD: ModeTraits(arms=True),
-    COPTER_MODE.BRAKE: ModeTraits(),
-    COPTER_MODE.THROW: ModeTraits(arms=True),
-    COPTER_MODE.AVOID_ADSB: ModeTraits(),
-    COPTER_MODE.GUIDED_NOGPS: ModeTraits(needs_position=False, arms=True),
-    COPTER_MODE.SMART_RTL: ModeTraits(),
-    COPTER_MODE.ZIGZAG: ModeTraits(arms=True),
+    mavlink.COPTER_MODE_STABILIZE: ModeTraits(needs_position=False, manual_throttle=True, arms=True),
+    mavlink.COPTER_MODE_ACRO: ModeTraits(needs_position=False, manual_throttle=True, arms=True),
+    mavlink.COPTER_MODE_ALT_HOLD: ModeTraits(needs_position=False, arms=True),
+    mavlink.COPTER_MODE_AUTO: ModeTraits(),
+    mavlink.COPTER_MODE_GUIDED: ModeTraits(arms=True),
+    mavlink.COPTER_MODE_LOITER: ModeTraits(arms=True),
+    mavlink.COPTER_MODE_RTL: ModeTraits(),
+    mavlink.COPTER_MODE_CIRCLE: ModeTraits(),
+    mavlink.COPTER_MODE_LAND: ModeTraits(needs_position=False),
+    mavlink.COPTER_MODE_DRIFT: ModeTraits(arms=True),
+    mavlink.COPTER_MODE_POSHOLD: ModeTraits(arms=True),
+    mavlink.COPTER_MODE_BRAKE: ModeTraits(),
+    mavlink.COPTER_MODE_THROW: ModeTraits(arms=True),
+    mavlink.COPTER_MODE_AVOID_ADSB: ModeTraits(),
+    mavlink.COPTER_MODE_GUIDED_NOGPS: ModeTraits(needs_position=False, arms=True),
+    mavlink.COPTER_MODE_SMART_RTL: ModeTraits(),
+    mavlink.COPTER_MODE_ZIGZAG: ModeTraits(arms=True),
 }
 SUPPORTED_MODES = frozenset(TRAITS)
 # The modes that take targets from a companion, and those that a command makes take off.
-GUIDED_MODES = frozenset({COPTER_MODE.GUIDED, COPTER_MODE.GUIDED_NOGPS, COPTER_MODE.AVOID_ADSB})
-TAKES_OFF = GUIDED_MODES | {COPTER_MODE.LOITER, COPTER_MODE.POSHOLD, COPTER_MODE.ZIGZAG}
+GUIDED_MODES = frozenset({mavlink.COPTER_MODE_GUIDED, mavlink.COPTER_MODE_GUIDED_NOGPS, mavlink.COPTER_MODE_AVOID_ADSB})
+TAKES_OFF = GUIDED_MODES | {mavlink.COPTER_MODE_LOITER, mavlink.COPTER_MODE_POSHOLD, mavlink.COPTER_MODE_ZIGZAG}
 # The modes that it has, but cannot enter without a pilot, a sensor or a setting: what it says before it refuses, and why.
-UNAVAILABLE: dict[COPTER_MODE, tuple[tuple[str, ...], str]] = {
-    COPTER_MODE.FLIP: ((), "init failed"),
-    COPTER_MODE.AUTOTUNE: ((), "init failed"),
-    COPTER_MODE.FLOWHOLD: ((), "init failed"),
-    COPTER_MODE.FOLLOW: (("Set FOLL_ENABLE = 1",), "init failed"),
-    COPTER_MODE.SYSTEMID: (("No axis selected, SID_AXIS = 0",), "init failed"),
-    COPTER_MODE.AUTO_RTL: (("Unable to start landing sequence",), "No return path or landing sequence found"),
-    COPTER_MODE.TURTLE: ((), "init failed"),
+UNAVAILABLE: dict[int, tuple[tuple[str, ...], str]] = {
+    mavlink.COPTER_MODE_FLIP: ((), "init failed"),
+    mavlink.COPTER_MODE_AUTOTUNE: ((), "init failed"),
+    mavlink.COPTER_MODE_FLOWHOLD: ((), "init failed"),
+    mavlink.COPTER_MODE_FOLLOW: (("Set FOLL_ENABLE = 1",), "init failed"),
+    mavlink.COPTER_MODE_SYSTEMID: (("No axis selected, SID_AXIS = 0",), "init failed"),
+    mavlink.COPTER_MODE_AUTO_RTL: (("Unable to start landing sequence",), "No return path or landing sequence found"),
+    mavlink.COPTER_MODE_TURTLE: ((), "init failed"),
 }
 
 
-def mode_title(mode: COPTER_MODE) -> str:
+def mode_title(mode: int) -> str:
     """What the autopilot calls a mode in its texts."""
-    return _TITLES.get(mode, mode.name)
+    return _TITLES.get(mode) or enum_name("COPTER_MODE", mode)
 
 
-_TITLES = {COPTER_MODE.SMART_RTL: "SMARTRTL", COPTER_MODE.AUTO_RTL: "AUTO RTL"}
+_TITLES = {mavlink.COPTER_MODE_SMART_RTL: "SMARTRTL", mavlink.COPTER_MODE_AUTO_RTL: "AUTO RTL"}
 
 
 # Altitudes of the sea, of home, and of the ground; the deprecated *_INT frames mean the same.
-ABSOLUTE_FRAMES = frozenset({MAV_FRAME.GLOBAL, MAV_FRAME.GLOBAL_INT})
-TERRAIN_FRAMES = frozenset({MAV_FRAME.GLOBAL_TERRAIN_ALT, MAV_FRAME.GLOBAL_TERRAIN_ALT_INT})
-GLOBAL_FRAMES = ABSOLUTE_FRAMES | TERRAIN_FRAMES | {MAV_FRAME.GLOBAL_RELATIVE_ALT, MAV_FRAME.GLOBAL_RELATIVE_ALT_INT}
+ABSOLUTE_FRAMES = frozenset({mavlink.MAV_FRAME_GLOBAL, mavlink.MAV_FRAME_GLOBAL_INT})
+TERRAIN_FRAMES = frozenset({mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT, mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT_INT})
+GLOBAL_FRAMES = (
+    ABSOLUTE_FRAMES
+    | TERRAIN_FRAMES
+    | {mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT, mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT}
+)
 
 # The second parameter of MAV_CMD_COMPONENT_ARM_DISARM: disarm in flight, and arm in spite of the checks.
 FORCE_MAGIC = 21196
 FORCE_ARM_MAGIC = 2989
 
-_MASK = POSITION_TARGET_TYPEMASK
-IGNORE_POSITION = _MASK.X_IGNORE | _MASK.Y_IGNORE | _MASK.Z_IGNORE
-IGNORE_VELOCITY = _MASK.VX_IGNORE | _MASK.VY_IGNORE | _MASK.VZ_IGNORE
-IGNORE_ACCELERATION = _MASK.AX_IGNORE | _MASK.AY_IGNORE | _MASK.AZ_IGNORE
-IGNORE_HEADING = _MASK.YAW_IGNORE | _MASK.YAW_RATE_IGNORE
+IGNORE_POSITION = (
+    mavlink.POSITION_TARGET_TYPEMASK_X_IGNORE
+    | mavlink.POSITION_TARGET_TYPEMASK_Y_IGNORE
+    | mavlink.POSITION_TARGET_TYPEMASK_Z_IGNORE
+)
+IGNORE_VELOCITY = (
+    mavlink.POSITION_TARGET_TYPEMASK_VX_IGNORE
+    | mavlink.POSITION_TARGET_TYPEMASK_VY_IGNORE
+    | mavlink.POSITION_TARGET_TYPEMASK_VZ_IGNORE
+)
+IGNORE_ACCELERATION = (
+    mavlink.POSITION_TARGET_TYPEMASK_AX_IGNORE
+    | mavlink.POSITION_TARGET_TYPEMASK_AY_IGNORE
+    | mavlink.POSITION_TARGET_TYPEMASK_AZ_IGNORE
+)
+IGNORE_HEADING = mavlink.POSITION_TARGET_TYPEMASK_YAW_IGNORE | mavlink.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE
 POSITION_ONLY = IGNORE_VELOCITY | IGNORE_ACCELERATION | IGNORE_HEADING
 # POSITION_TARGET_GLOBAL_INT sets the unused bits, too.
 GLOBAL_TARGET_ONLY = 0xF000 | POSITION_ONLY
 VELOCITY_ONLY = IGNORE_POSITION | IGNORE_ACCELERATION | IGNORE_HEADING
 
-_CAN = MAV_PROTOCOL_CAPABILITY
 CAPABILITIES = (
-    _CAN.MISSION_FLOAT
-    | _CAN.PARAM_FLOAT
-    | _CAN.MISSION_INT
-    | _CAN.COMMAND_INT
-    | _CAN.SET_ATTITUDE_TARGET
-    | _CAN.SET_POSITION_TARGET_LOCAL_NED
-    | _CAN.SET_POSITION_TARGET_GLOBAL_INT
-    | _CAN.TERRAIN
-    | _CAN.FLIGHT_TERMINATION
-    | _CAN.COMPASS_CALIBRATION
-    | _CAN.MAVLINK2
-    | _CAN.MISSION_FENCE
-    | _CAN.MISSION_RALLY
+    mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_FLOAT
+    | mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
+    | mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_INT
+    | mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
+    | mavlink.MAV_PROTOCOL_CAPABILITY_SET_ATTITUDE_TARGET
+    | mavlink.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_LOCAL_NED
+    | mavlink.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_GLOBAL_INT
+    | mavlink.MAV_PROTOCOL_CAPABILITY_TERRAIN
+    | mavlink.MAV_PROTOCOL_CAPABILITY_FLIGHT_TERMINATION
+    | mavlink.MAV_PROTOCOL_CAPABILITY_COMPASS_CALIBRATION
+    | mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+    | mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_FENCE
+    | mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_RALLY
 )
 # Flight software version 4.6.3, release type official (255).
 FLIGHT_VERSION = 4 << 24 | 6 << 16 | 3 << 8 | 255

@@ -5,15 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from fractus_mavlink import Message, Signing
-from fractus_mavlink.enums import (
-    MAV_DATA_STREAM,
-    MAV_FTP_ERR,
-    MAV_FTP_OPCODE,
-    MAV_MISSION_RESULT,
-    MAV_MISSION_TYPE,
-    MAV_SEVERITY,
-)
+from fractus_runtime.mavlink_codec import Message
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.channel import Channel
 from fractus_vehicle.commands import handle_command, set_mode_number
@@ -79,7 +72,7 @@ def _request_stream(vehicle: Vehicle, m: Message, c: Channel) -> None:
     v = vehicle.state
     group = m.integer("req_stream_id")
     rate = m.integer("req_message_rate") if m.integer("start_stop") else 0
-    for number in ALL_GROUPS if group == MAV_DATA_STREAM.ALL else (group,):
+    for number in ALL_GROUPS if group == mavlink.MAV_DATA_STREAM_ALL else (group,):
         label, names = GROUPS.get(number, ("", ()))
         if label and c.port is not None:
             v.params.assign(f"SR{min(c.port, 6)}_{label}", rate)
@@ -105,9 +98,9 @@ def _parameter_set(vehicle: Vehicle, m: Message, c: Channel) -> None:
     if not math.isfinite(value):
         return
     if not v.params.set(name, value) and v.params.find(name) is not None:
-        v.say(MAV_SEVERITY.WARNING, f"Param write denied ({name})")
+        v.say(mavlink.MAV_SEVERITY_WARNING, f"Param write denied ({name})")
     for channel in v.channels:
-        if channel is c or not channel.signing:
+        if channel is c or not channel.signed:
             send_parameter(v, channel, name, -1, UNKNOWN_U16)
 
 
@@ -122,7 +115,7 @@ def _file_transfer(_vehicle: Vehicle, m: Message, c: Channel) -> None:
     request = bytes(int(value) for value in m.array("payload"))
     sequence = (int.from_bytes(request[:2], "little") + 1) & 0xFFFF
     answer = sequence.to_bytes(2, "little") + bytes(
-        (request[2], MAV_FTP_OPCODE.NAK, 1, request[3], 0, 0, 0, 0, 0, 0, MAV_FTP_ERR.UNKNOWNCOMMAND)
+        (request[2], mavlink.MAV_FTP_OPCODE_NAK, 1, request[3], 0, 0, 0, 0, 0, 0, mavlink.MAV_FTP_ERR_UNKNOWNCOMMAND)
     )
     c.send(
         "FILE_TRANSFER_PROTOCOL",
@@ -140,8 +133,8 @@ def _mission(vehicle: Vehicle, m: Message, c: Channel) -> None:
         {
             "target_system": m.sysid,
             "target_component": m.compid,
-            "type": int(MAV_MISSION_RESULT.ACCEPTED if taken else MAV_MISSION_RESULT.ERROR),
-            "mission_type": int(MAV_MISSION_TYPE.MISSION),
+            "type": int(mavlink.MAV_MISSION_ACCEPTED if taken else mavlink.MAV_MISSION_ERROR),
+            "mission_type": int(mavlink.MAV_MISSION_TYPE_MISSION),
         },
     )
 
@@ -179,14 +172,14 @@ def _setup_signing(vehicle: Vehicle, m: Message, _c: Channel) -> None:
     """A key of zeros turns signing off; refused while armed, as ArduPilot."""
     v = vehicle.state
     if v.armed:
-        v.say(MAV_SEVERITY.DEBUG, "ERROR: Won't setup signing when armed")
+        v.say(mavlink.MAV_SEVERITY_DEBUG, "ERROR: Won't setup signing when armed")
         return
     key = bytes(int(value) for value in m.array("secret_key"))
     started = m.integer("initial_timestamp")
     for channel in v.channels:
-        channel.signing = Signing(key, started) if any(key) else None
+        channel.set_signing(key if any(key) else None, started)
     vehicle.signing_key = key if any(key) else None
-    v.say(MAV_SEVERITY.INFO, "Signing key set" if any(key) else "Signing off")
+    v.say(mavlink.MAV_SEVERITY_INFO, "Signing key set" if any(key) else "Signing off")
 
 
 HANDLERS: dict[str, Handler] = {

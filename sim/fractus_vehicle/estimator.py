@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 from collections.abc import Callable
 
-from fractus_mavlink.enums import EKF_STATUS_FLAGS, GPS_FIX_TYPE, MAV_SEVERITY
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.body import Body, euler_of
 from fractus_vehicle.control import Estimate
@@ -47,21 +47,18 @@ ANNOUNCEMENTS = (
 FINAL_ALIGNMENT_M = 2.5
 
 _FLAGS_STARTING = (
-    EKF_STATUS_FLAGS.ATTITUDE
-    | EKF_STATUS_FLAGS.VELOCITY_VERT
-    | EKF_STATUS_FLAGS.POS_VERT_ABS
-    | EKF_STATUS_FLAGS.CONST_POS_MODE
+    mavlink.EKF_ATTITUDE | mavlink.EKF_VELOCITY_VERT | mavlink.EKF_POS_VERT_ABS | mavlink.EKF_CONST_POS_MODE
 )
-_FLAGS_NO_POSITION = _FLAGS_STARTING | EKF_STATUS_FLAGS.VELOCITY_HORIZ
+_FLAGS_NO_POSITION = _FLAGS_STARTING | mavlink.EKF_VELOCITY_HORIZ
 _FLAGS_READY = (
-    EKF_STATUS_FLAGS.ATTITUDE
-    | EKF_STATUS_FLAGS.VELOCITY_HORIZ
-    | EKF_STATUS_FLAGS.VELOCITY_VERT
-    | EKF_STATUS_FLAGS.POS_HORIZ_REL
-    | EKF_STATUS_FLAGS.POS_HORIZ_ABS
-    | EKF_STATUS_FLAGS.POS_VERT_ABS
-    | EKF_STATUS_FLAGS.PRED_POS_HORIZ_REL
-    | EKF_STATUS_FLAGS.PRED_POS_HORIZ_ABS
+    mavlink.EKF_ATTITUDE
+    | mavlink.EKF_VELOCITY_HORIZ
+    | mavlink.EKF_VELOCITY_VERT
+    | mavlink.EKF_POS_HORIZ_REL
+    | mavlink.EKF_POS_HORIZ_ABS
+    | mavlink.EKF_POS_VERT_ABS
+    | mavlink.EKF_PRED_POS_HORIZ_REL
+    | mavlink.EKF_PRED_POS_HORIZ_ABS
 )
 
 
@@ -83,7 +80,7 @@ class Estimator:
         noise_m: float,
         rng: random.Random,
         params: Parameters,
-        say: Callable[[MAV_SEVERITY, str], None],
+        say: Callable[[int, str], None],
     ) -> None:
         self._start = start
         self._ready_after_s = ready_after_s
@@ -126,12 +123,12 @@ class Estimator:
         return self.since_boot(ACCELS_CONSISTENT_S)
 
     @property
-    def flags(self) -> EKF_STATUS_FLAGS:
+    def flags(self) -> int:
         """What EKF_STATUS_REPORT says of the filter."""
         if self.position_ok:
             return _FLAGS_READY
         if not self.aligned:
-            return EKF_STATUS_FLAGS.UNINITIALIZED
+            return mavlink.EKF_UNINITIALIZED
         return _FLAGS_NO_POSITION if self.origin is not None else _FLAGS_STARTING
 
     def estimate(self, body: Body) -> Estimate:
@@ -169,7 +166,7 @@ class Estimator:
                 satellites=int(self._params["SIM_GPS_NUMSATS"]),
                 rng=self._rng,
             )
-            if self.gps.fix_type >= GPS_FIX_TYPE.TYPE_3D_FIX:
+            if self.gps.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX:
                 self._fix_s = time_s
         elif self.since_boot(FILTER_STARTED_S):
             self.gps.lose()
@@ -187,12 +184,12 @@ class Estimator:
                 self._inform(f"EKF3 IMU{unit} MAG0 in-flight yaw alignment complete")
 
     def _inform(self, text: str) -> None:
-        self._say(MAV_SEVERITY.INFO, text)
+        self._say(mavlink.MAV_SEVERITY_INFO, text)
 
     def _judge(self, time_s: float) -> None:
         age_s = time_s - self._fix_s
         self._drift.step(GPS_INTERVAL_S, aided=self.origin is None or age_s <= 2.0 * GPS_INTERVAL_S)
-        if self.origin is None and self.gps.fix_type >= GPS_FIX_TYPE.TYPE_3D_FIX and self.since_boot(ORIGIN_SET_S):
+        if self.origin is None and self.gps.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX and self.since_boot(ORIGIN_SET_S):
             self.origin = self._start
             self._inform("EKF3 IMU0 origin set")
             self._inform(f"Field Elevation Set: {self._start.alt_m:.0f}m")

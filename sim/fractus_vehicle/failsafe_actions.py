@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from fractus_mavlink.enums import COPTER_MODE, MAV_SEVERITY
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.landing import Land
 from fractus_vehicle.modes import FlightModes
@@ -63,29 +63,29 @@ def act(v: VehicleState, modes: FlightModes, action: Action) -> None:
         case Action.RTL:
             _return(v, modes)
         case Action.SMART_RTL:
-            if not modes.change(COPTER_MODE.SMART_RTL):
-                v.say(MAV_SEVERITY.WARNING, "SmartRTL Unavailable, Trying RTL Mode")
+            if not modes.change(mavlink.COPTER_MODE_SMART_RTL):
+                v.say(mavlink.MAV_SEVERITY_WARNING, "SmartRTL Unavailable, Trying RTL Mode")
                 _return(v, modes)
         case Action.SMART_RTL_LAND:
-            if not modes.change(COPTER_MODE.SMART_RTL):
-                v.say(MAV_SEVERITY.WARNING, "SmartRTL Unavailable, Using Land Mode")
+            if not modes.change(mavlink.COPTER_MODE_SMART_RTL):
+                v.say(mavlink.MAV_SEVERITY_WARNING, "SmartRTL Unavailable, Using Land Mode")
                 _land(v, modes)
         case Action.AUTO_LAND_START:
             # Missions with a landing sequence to jump to are not flown here: the autopilot's own fallback.
-            v.say(MAV_SEVERITY.WARNING, "Trying RTL Mode")
+            v.say(mavlink.MAV_SEVERITY_WARNING, "Trying RTL Mode")
             _return(v, modes)
         case Action.BRAKE_LAND:
-            if not modes.change(COPTER_MODE.BRAKE):
-                v.say(MAV_SEVERITY.WARNING, "Trying Land Mode")
+            if not modes.change(mavlink.COPTER_MODE_BRAKE):
+                v.say(mavlink.MAV_SEVERITY_WARNING, "Trying Land Mode")
                 _land(v, modes)
 
 
 def _return(v: VehicleState, modes: FlightModes) -> None:
-    if not modes.change(COPTER_MODE.RTL):
+    if not modes.change(mavlink.COPTER_MODE_RTL):
         _land(v, modes)
 
 
 def _land(v: VehicleState, modes: FlightModes) -> None:
-    modes.change(COPTER_MODE.LAND)
+    modes.change(mavlink.COPTER_MODE_LAND)
     if isinstance(modes.flight, Land):
         modes.flight.pause(v)

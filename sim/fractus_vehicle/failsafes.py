@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from enum import IntFlag
 
-from fractus_mavlink.enums import COPTER_MODE, MAV_SEVERITY
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.copter import mode_title
 from fractus_vehicle.failsafe_actions import FENCE_ACTIONS, GCS_ACTIONS, RADIO_ACTIONS, Action, act
@@ -25,7 +25,7 @@ EKF_REPORTS_ONLY, EKF_HOLDS_ALTITUDE, EKF_LANDS_ALWAYS = 0, 2, 3
 # Full throttle for so long, level, and still sinking: a motor no longer pulls.
 THRUST_LOST_S = 1.0
 THRUST_LOST_SHARE = 0.9
-_PILOT_MODES = frozenset({COPTER_MODE.STABILIZE, COPTER_MODE.ALT_HOLD, COPTER_MODE.LOITER})
+_PILOT_MODES = frozenset({mavlink.COPTER_MODE_STABILIZE, mavlink.COPTER_MODE_ALT_HOLD, mavlink.COPTER_MODE_LOITER})
 _LAND_ACTIONS = frozenset({Action.LAND, Action.TERMINATE})
 
 
@@ -85,7 +85,7 @@ class Failsafes:
         if v.time_s - self._weak_since_s >= THRUST_LOST_S:
             self._weak_since_s = None
             hardest = max(range(len(v.body.motors)), key=lambda at: v.control.wanted_n[at])
-            v.say(MAV_SEVERITY.EMERGENCY, f"Potential Thrust Loss ({hardest + 1})")
+            v.say(mavlink.MAV_SEVERITY_EMERGENCY, f"Potential Thrust Loss ({hardest + 1})")
 
     def _check_crash(self, v: VehicleState) -> None:
         roll, pitch, _ = v.body.euler()
@@ -97,7 +97,7 @@ class Failsafes:
         self._crash_since_s = v.time_s if self._crash_since_s is None else self._crash_since_s
         if v.time_s - self._crash_since_s >= CRASH_CONFIRMED_S:
             v.say(
-                MAV_SEVERITY.EMERGENCY,
+                mavlink.MAV_SEVERITY_EMERGENCY,
                 f"Crash: Disarming: AngErr={error_deg:.0f}>{CRASH_ANGLE_DEG:.0f}, Accel=0.0<3.0",
             )
             v.land_complete()
@@ -112,11 +112,11 @@ class Failsafes:
             return
         v.failsafes.gcs = silent
         if not silent:
-            v.say(MAV_SEVERITY.WARNING, "GCS Failsafe Cleared")
+            v.say(mavlink.MAV_SEVERITY_WARNING, "GCS Failsafe Cleared")
             return
         v.receiver.release()
         options = Option(int(v.params["FS_OPTIONS"]) & 31)
-        if v.armed and v.mode is COPTER_MODE.AUTO and Option.AUTO_ON_GCS in options:
+        if v.armed and v.mode == mavlink.COPTER_MODE_AUTO and Option.AUTO_ON_GCS in options:
             self._announce(v, "GCS", "Continuing Auto Mode")
         elif v.armed and not v.landed and v.mode in _PILOT_MODES and Option.PILOT_ON_GCS in options:
             self._announce(v, "GCS", "Continuing Pilot Control")
@@ -134,13 +134,13 @@ class Failsafes:
             return
         v.failsafes.radio = lost
         if not lost:
-            v.say(MAV_SEVERITY.WARNING, "Radio Failsafe Cleared")
+            v.say(mavlink.MAV_SEVERITY_WARNING, "Radio Failsafe Cleared")
             return
         options = Option(int(v.params["FS_OPTIONS"]) & 31)
         watched = int(v.params["FS_GCS_ENABLE"]) != 0
-        if v.armed and v.mode is COPTER_MODE.AUTO and Option.AUTO_ON_RADIO in options:
+        if v.armed and v.mode == mavlink.COPTER_MODE_AUTO and Option.AUTO_ON_RADIO in options:
             self._announce(v, "Radio", "Continuing Auto Mode")
-        elif v.armed and v.mode is COPTER_MODE.GUIDED and Option.GUIDED_ON_RADIO in options and watched:
+        elif v.armed and v.mode == mavlink.COPTER_MODE_GUIDED and Option.GUIDED_ON_RADIO in options and watched:
             self._announce(v, "Radio", "Continuing Guided Mode")
         else:
             self._take_over(v, "Radio", RADIO_ACTIONS.get(setting, Action.LAND))
@@ -165,7 +165,7 @@ class Failsafes:
 
     @staticmethod
     def _announce(v: VehicleState, what: str, done: str = "") -> None:
-        v.say(MAV_SEVERITY.WARNING, f"{what} Failsafe - {done}" if done else f"{what} Failsafe")
+        v.say(mavlink.MAV_SEVERITY_WARNING, f"{what} Failsafe - {done}" if done else f"{what} Failsafe")
 
     def _check_battery(self, v: VehicleState) -> None:
         if not v.armed:
@@ -192,7 +192,7 @@ class Failsafes:
     def _battery_event(self, v: VehicleState, level: str, setting: int) -> None:
         battery = v.battery
         v.say(
-            MAV_SEVERITY.WARNING,
+            mavlink.MAV_SEVERITY_WARNING,
             f"Battery 1 is {level} {battery.voltage_v:.2f}V used {battery.used_mah:.0f} mAh",
         )
         action = Action(setting) if setting in set(Action) else Action.NONE
@@ -212,22 +212,22 @@ class Failsafes:
         if v.position_ok or v.origin is None:
             if v.failsafes.ekf:
                 v.failsafes.ekf = False
-                v.say(MAV_SEVERITY.CRITICAL, "EKF Failsafe Cleared")
+                v.say(mavlink.MAV_SEVERITY_CRITICAL, "EKF Failsafe Cleared")
             self._lost_since_s = None
             return
         self._lost_since_s = self._lost_since_s if self._lost_since_s is not None else v.time_s
         if v.failsafes.ekf or not v.armed or v.time_s - self._lost_since_s < POSITION_LOST_S:
             return
         v.failsafes.ekf = True
-        v.say(MAV_SEVERITY.CRITICAL, "EKF variance")
+        v.say(mavlink.MAV_SEVERITY_CRITICAL, "EKF variance")
         setting = int(v.params["FS_EKF_ACTION"])
-        if setting == EKF_REPORTS_ONLY or v.landed or v.mode is COPTER_MODE.LAND:
+        if setting == EKF_REPORTS_ONLY or v.landed or v.mode == mavlink.COPTER_MODE_LAND:
             return
-        if v.mode in (COPTER_MODE.STABILIZE, COPTER_MODE.ALT_HOLD) and setting != EKF_LANDS_ALWAYS:
+        if v.mode in (mavlink.COPTER_MODE_STABILIZE, mavlink.COPTER_MODE_ALT_HOLD) and setting != EKF_LANDS_ALWAYS:
             return
-        if setting != EKF_HOLDS_ALTITUDE or v.failsafes.radio or not self._modes.change(COPTER_MODE.ALT_HOLD):
+        if setting != EKF_HOLDS_ALTITUDE or v.failsafes.radio or not self._modes.change(mavlink.COPTER_MODE_ALT_HOLD):
             act(v, self._modes, Action.LAND)
-        v.say(MAV_SEVERITY.CRITICAL, f"EKF Failsafe: changed to {mode_title(v.mode)} Mode")
+        v.say(mavlink.MAV_SEVERITY_CRITICAL, f"EKF Failsafe: changed to {mode_title(v.mode)} Mode")
 
     def _check_fence(self, v: VehicleState) -> None:
         fence = v.fence
@@ -239,11 +239,11 @@ class Failsafes:
         before = fence.breaches
         new = fence.check(v.est.north, v.est.east, v.altitude_m, v.home_xy, v.time_s)
         if before and not fence.breaches:
-            v.say(MAV_SEVERITY.NOTICE, "Fence breach cleared")
+            v.say(mavlink.MAV_SEVERITY_NOTICE, "Fence breach cleared")
         if not new:
             return
-        v.say(MAV_SEVERITY.NOTICE, f"{breach_names(new)} breached")
+        v.say(mavlink.MAV_SEVERITY_NOTICE, f"{breach_names(new)} breached")
         action = FENCE_ACTIONS.get(int(v.params["FENCE_ACTION"]), Action.NONE)
-        if action is not Action.NONE and v.mode is not COPTER_MODE.LAND:
+        if action is not Action.NONE and v.mode != mavlink.COPTER_MODE_LAND:
             far = fence.distance_m(v.est.north, v.est.east, v.altitude_m, v.home_xy) > FENCE_GIVE_UP_M
             act(v, self._modes, Action.LAND if far else action)

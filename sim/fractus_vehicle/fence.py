@@ -6,14 +6,14 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from fractus_mavlink.enums import FENCE_BREACH, FENCE_TYPE, MAV_CMD
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-NO_BREACH = FENCE_TYPE(0)
+NO_BREACH = 0
 NAMES = {
-    FENCE_TYPE.ALT_MAX: "Max Alt",
-    FENCE_TYPE.CIRCLE: "Circle",
-    FENCE_TYPE.POLYGON: "Polygon",
-    FENCE_TYPE.ALT_MIN: "Min Alt",
+    mavlink.FENCE_TYPE_ALT_MAX: "Max Alt",
+    mavlink.FENCE_TYPE_CIRCLE: "Circle",
+    mavlink.FENCE_TYPE_POLYGON: "Polygon",
+    mavlink.FENCE_TYPE_ALT_MIN: "Min Alt",
 }
 
 Vertex = tuple[float, float]
@@ -122,29 +122,29 @@ def build_shapes(items: Sequence[FenceItem]) -> tuple[Shape, ...]:
         FenceShapeError: with the autopilot's own words for what is wrong.
     """
     shapes: list[Shape] = []
-    if sum(item.command == MAV_CMD.NAV_FENCE_RETURN_POINT for item in items) > 1:
+    if sum(item.command == mavlink.MAV_CMD_NAV_FENCE_RETURN_POINT for item in items) > 1:
         raise FenceShapeError("Multiple return points")
     at = 0
     while at < len(items):
         item = items[at]
         if not item.valid:
             raise FenceShapeError("Bad lat or lon")
-        if item.command in (MAV_CMD.NAV_FENCE_CIRCLE_INCLUSION, MAV_CMD.NAV_FENCE_CIRCLE_EXCLUSION):
+        if item.command in (mavlink.MAV_CMD_NAV_FENCE_CIRCLE_INCLUSION, mavlink.MAV_CMD_NAV_FENCE_CIRCLE_EXCLUSION):
             # A real autopilot aborts in the simulator where the radius is not a number.
             if not item.param1 > 0.0:
                 raise FenceShapeError("Non-positive circle radius")
-            inclusion = item.command == MAV_CMD.NAV_FENCE_CIRCLE_INCLUSION
+            inclusion = item.command == mavlink.MAV_CMD_NAV_FENCE_CIRCLE_INCLUSION
             shapes.append(Circle(item.north, item.east, item.param1, inclusion))
             at += 1
         elif item.command in (
-            MAV_CMD.NAV_FENCE_POLYGON_VERTEX_INCLUSION,
-            MAV_CMD.NAV_FENCE_POLYGON_VERTEX_EXCLUSION,
+            mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION,
+            mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_EXCLUSION,
         ):
             group = _vertices(items, at)
-            inclusion = item.command == MAV_CMD.NAV_FENCE_POLYGON_VERTEX_INCLUSION
+            inclusion = item.command == mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION
             shapes.append(Polygon(tuple((g.north, g.east) for g in group), inclusion))
             at += len(group)
-        elif item.command == MAV_CMD.NAV_FENCE_RETURN_POINT:
+        elif item.command == mavlink.MAV_CMD_NAV_FENCE_RETURN_POINT:
             at += 1
         else:
             raise FenceShapeError(f"Bad command ({item.command})")
@@ -180,7 +180,7 @@ class Fence:
     alt_min_m: float = -10.0
     radius_m: float = 300.0
     shapes: tuple[Shape, ...] = ()
-    breaches: FENCE_TYPE = NO_BREACH
+    breaches: int = NO_BREACH
     breach_count: int = 0
     breach_time_s: float = 0.0
     margin_m: float = 2.0
@@ -191,34 +191,36 @@ class Fence:
     @property
     def present(self) -> bool:
         """Whether there is anything to enable: a limit, or a shape."""
-        return bool(self.types & ~FENCE_TYPE.POLYGON) or (bool(self.types & FENCE_TYPE.POLYGON) and bool(self.shapes))
+        return bool(self.types & ~mavlink.FENCE_TYPE_POLYGON) or (
+            bool(self.types & mavlink.FENCE_TYPE_POLYGON) and bool(self.shapes)
+        )
 
-    def outside(self, north: float, east: float, altitude_m: float, home: Vertex = (0.0, 0.0)) -> FENCE_TYPE:
+    def outside(self, north: float, east: float, altitude_m: float, home: Vertex = (0.0, 0.0)) -> int:
         """What a point (local metres, altitude above home) would breach if the fence is enabled."""
         found = NO_BREACH
         if not self.enabled:
             return found
-        if self.types & FENCE_TYPE.ALT_MAX and altitude_m >= self.alt_max_m:
-            found |= FENCE_TYPE.ALT_MAX
-        if self.types & FENCE_TYPE.ALT_MIN and altitude_m <= self.alt_min_m:
-            found |= FENCE_TYPE.ALT_MIN
-        if self.types & FENCE_TYPE.CIRCLE and math.hypot(north - home[0], east - home[1]) >= self.radius_m:
-            found |= FENCE_TYPE.CIRCLE
-        if self.types & FENCE_TYPE.POLYGON and any(s.contains(north, east) != s.inclusion for s in self.shapes):
-            found |= FENCE_TYPE.POLYGON
+        if self.types & mavlink.FENCE_TYPE_ALT_MAX and altitude_m >= self.alt_max_m:
+            found |= mavlink.FENCE_TYPE_ALT_MAX
+        if self.types & mavlink.FENCE_TYPE_ALT_MIN and altitude_m <= self.alt_min_m:
+            found |= mavlink.FENCE_TYPE_ALT_MIN
+        if self.types & mavlink.FENCE_TYPE_CIRCLE and math.hypot(north - home[0], east - home[1]) >= self.radius_m:
+            found |= mavlink.FENCE_TYPE_CIRCLE
+        if self.types & mavlink.FENCE_TYPE_POLYGON and any(s.contains(north, east) != s.inclusion for s in self.shapes):
+            found |= mavlink.FENCE_TYPE_POLYGON
         return found
 
     def distance_m(self, north: float, east: float, altitude_m: float, home: Vertex = (0.0, 0.0)) -> float:
         """How far a point lies beyond the limits that it breaches, at least; 0 inside."""
         found = self.outside(north, east, altitude_m, home)
         beyond = [0.0]
-        if FENCE_TYPE.ALT_MAX in found:
+        if found & mavlink.FENCE_TYPE_ALT_MAX:
             beyond.append(altitude_m - self.alt_max_m)
-        if FENCE_TYPE.ALT_MIN in found:
+        if found & mavlink.FENCE_TYPE_ALT_MIN:
             beyond.append(self.alt_min_m - altitude_m)
-        if FENCE_TYPE.CIRCLE in found:
+        if found & mavlink.FENCE_TYPE_CIRCLE:
             beyond.append(math.hypot(north - home[0], east - home[1]) - self.radius_m)
-        if FENCE_TYPE.POLYGON in found:
+        if found & mavlink.FENCE_TYPE_POLYGON:
             wrong = [shape for shape in self.shapes if shape.contains(north, east) != shape.inclusion]
             beyond += [shape.edge_distance_m(north, east) for shape in wrong]
         return max(beyond)
@@ -232,8 +234,8 @@ class Fence:
         """
         if not (self.enabled and self.avoid):
             return math.inf
-        shapes: list[Shape] = list(self.shapes) if self.types & FENCE_TYPE.POLYGON else []
-        if self.types & FENCE_TYPE.CIRCLE:
+        shapes: list[Shape] = list(self.shapes) if self.types & mavlink.FENCE_TYPE_POLYGON else []
+        if self.types & mavlink.FENCE_TYPE_CIRCLE:
             shapes.append(Circle(home[0], home[1], self.radius_m, inclusion=True))
         allowed = math.inf
         for shape in shapes:
@@ -244,7 +246,7 @@ class Fence:
                 allowed = min(allowed, brake(max(ahead - self.margin_m, 0.0)))
         return allowed
 
-    def check(self, north: float, east: float, altitude_m: float, home: Vertex, now_s: float) -> FENCE_TYPE:
+    def check(self, north: float, east: float, altitude_m: float, home: Vertex, now_s: float) -> int:
         """Update the breaches and return the new ones."""
         found = self.outside(north, east, altitude_m, home)
         new = found & ~self.breaches
@@ -255,16 +257,16 @@ class Fence:
         return new
 
     @property
-    def breach_type(self) -> FENCE_BREACH:
+    def breach_type(self) -> int:
         """What FENCE_STATUS says of the breaches."""
-        if self.breaches & FENCE_TYPE.ALT_MIN:
-            return FENCE_BREACH.MINALT
-        if self.breaches & FENCE_TYPE.ALT_MAX:
-            return FENCE_BREACH.MAXALT
-        return FENCE_BREACH.BOUNDARY if self.breaches else FENCE_BREACH.NONE
+        if self.breaches & mavlink.FENCE_TYPE_ALT_MIN:
+            return mavlink.FENCE_BREACH_MINALT
+        if self.breaches & mavlink.FENCE_TYPE_ALT_MAX:
+            return mavlink.FENCE_BREACH_MAXALT
+        return mavlink.FENCE_BREACH_BOUNDARY if self.breaches else mavlink.FENCE_BREACH_NONE
 
 
-def breach_names(breaches: FENCE_TYPE) -> str:
+def breach_names(breaches: int) -> str:
     """The breaches as ArduPilot writes them: `Max Alt and Circle fences`."""
     names = [name for bit, name in NAMES.items() if breaches & bit]
     if len(names) <= 1:

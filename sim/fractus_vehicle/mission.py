@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_FRAME, MAV_MISSION_TYPE, MISSION_STATE
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.earth import Place
 from fractus_vehicle.mission_items import Item, ItemStore, home_item
@@ -12,18 +12,20 @@ class Mission:
     """The stored mission and the item it is at; item 0 is home, as in ArduPilot."""
 
     def __init__(self) -> None:
-        self.store = ItemStore(MAV_MISSION_TYPE.MISSION, home=Item(MAV_CMD.NAV_WAYPOINT, frame=MAV_FRAME.GLOBAL))
+        self.store = ItemStore(
+            mavlink.MAV_MISSION_TYPE_MISSION, home=Item(mavlink.MAV_CMD_NAV_WAYPOINT, frame=mavlink.MAV_FRAME_GLOBAL)
+        )
         self.current = 0
         self.complete = False
         self._jumps: dict[int, int] = {}
 
-    def state(self, mode: COPTER_MODE) -> MISSION_STATE:
+    def state(self, mode: int) -> int:
         """MISSION_STATE of MISSION_CURRENT."""
         if len(self.items) <= 1:
-            return MISSION_STATE.NO_MISSION
+            return mavlink.MISSION_STATE_NO_MISSION
         if self.complete:
-            return MISSION_STATE.COMPLETE
-        return MISSION_STATE.ACTIVE if mode is COPTER_MODE.AUTO else MISSION_STATE.NOT_STARTED
+            return mavlink.MISSION_STATE_COMPLETE
+        return mavlink.MISSION_STATE_ACTIVE if mode == mavlink.COPTER_MODE_AUTO else mavlink.MISSION_STATE_NOT_STARTED
 
     @property
     def items(self) -> list[Item]:
@@ -43,9 +45,9 @@ class Mission:
     def takes_off(self, *, restart: bool) -> bool:
         """Whether the mission, from the item on with which it would begin, takes off before it flies anywhere."""
         at = self.first_navigating(0 if restart else self.current)
-        while at is not None and self.items[at].command == MAV_CMD.NAV_DELAY:
+        while at is not None and self.items[at].command == mavlink.MAV_CMD_NAV_DELAY:
             at = self.first_navigating(at + 1)
-        return at is not None and self.items[at].command == MAV_CMD.NAV_TAKEOFF
+        return at is not None and self.items[at].command == mavlink.MAV_CMD_NAV_TAKEOFF
 
     def peek_after(self, index: int) -> int | None:
         """The next item that navigates, without counting jumps as done; None where jumps only lead in a circle."""
@@ -67,9 +69,9 @@ class Mission:
             if at >= len(self.items):
                 return None
             item = self.items[at]
-            if item.command not in (MAV_CMD.DO_JUMP, MAV_CMD.DO_JUMP_TAG):
+            if item.command not in (mavlink.MAV_CMD_DO_JUMP, mavlink.MAV_CMD_DO_JUMP_TAG):
                 return at
-            target = self.tagged(int(item.param1)) if item.command == MAV_CMD.DO_JUMP_TAG else int(item.param1)
+            target = self.tagged(int(item.param1)) if item.command == mavlink.MAV_CMD_DO_JUMP_TAG else int(item.param1)
             if target is None or not 0 < target < len(self.items):
                 return None
             done = self._jumps.get(at, 0)
@@ -82,7 +84,9 @@ class Mission:
 
     def tagged(self, tag: int) -> int | None:
         """The first item that carries a tag."""
-        marks = (at for at, item in enumerate(self.items) if item.command == MAV_CMD.JUMP_TAG and item.param1 == tag)
+        marks = (
+            at for at, item in enumerate(self.items) if item.command == mavlink.MAV_CMD_JUMP_TAG and item.param1 == tag
+        )
         return next(marks, None)
 
     def with_home(self, home: Place) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 
-from fractus_mavlink.enums import FENCE_TYPE, MAV_CMD, MAV_SEVERITY
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.accessories import set_servo
 from fractus_vehicle.home import set_home_at, set_home_here
@@ -39,7 +39,7 @@ class MissionCommands:
             item = v.mission.items[index]
             if self._begun_s is None:
                 self._begun_s = v.time_s
-                v.say(MAV_SEVERITY.INFO, f"Mission: {index} {title(item)}")
+                v.say(mavlink.MAV_SEVERITY_INFO, f"Mission: {index} {title(item)}")
                 _do(v, item)
             if not _fulfilled(v, item, v.time_s - self._begun_s):
                 return
@@ -50,12 +50,12 @@ class MissionCommands:
 
 def _fulfilled(v: VehicleState, item: Item, waited_s: float) -> bool:
     match item.command:
-        case MAV_CMD.CONDITION_DELAY:
+        case mavlink.MAV_CMD_CONDITION_DELAY:
             return waited_s >= item.param1
-        case MAV_CMD.CONDITION_DISTANCE:
+        case mavlink.MAV_CMD_CONDITION_DISTANCE:
             target = v.control.target
             return math.hypot(target[0] - v.est.north, target[1] - v.est.east) <= max(item.param1, 0.0)
-        case MAV_CMD.CONDITION_YAW:
+        case mavlink.MAV_CMD_CONDITION_YAW:
             return v.heading.turned and abs(wrap_pi(v.control.target_yaw - v.est.yaw)) <= YAW_REACHED_RAD
         case _:
             return True
@@ -63,20 +63,20 @@ def _fulfilled(v: VehicleState, item: Item, waited_s: float) -> bool:
 
 def _do(v: VehicleState, item: Item) -> None:
     match item.command:
-        case MAV_CMD.DO_CHANGE_SPEED:
+        case mavlink.MAV_CMD_DO_CHANGE_SPEED:
             v.control.limits.change_speed(int(item.param1), item.param2)
-        case MAV_CMD.CONDITION_YAW:
+        case mavlink.MAV_CMD_CONDITION_YAW:
             v.heading.turn_to(item.param1, item.param2, int(item.param3), relative=item.param4 > 0.5)
-        case MAV_CMD.DO_SET_ROI | MAV_CMD.DO_SET_ROI_LOCATION:
+        case mavlink.MAV_CMD_DO_SET_ROI | mavlink.MAV_CMD_DO_SET_ROI_LOCATION:
             north, east, _ = item_target(v, item)
             v.heading.look_at((north, east) if item.has_place else None)
-        case MAV_CMD.DO_SET_ROI_NONE:
+        case mavlink.MAV_CMD_DO_SET_ROI_NONE:
             v.heading.look_at(None)
-        case MAV_CMD.DO_FENCE_ENABLE:
+        case mavlink.MAV_CMD_DO_FENCE_ENABLE:
             switch_fence(v, item.param1)
-        case MAV_CMD.DO_SET_SERVO | MAV_CMD.DO_REPEAT_SERVO:
+        case mavlink.MAV_CMD_DO_SET_SERVO | mavlink.MAV_CMD_DO_REPEAT_SERVO:
             set_servo(v, item.param1, item.param2)
-        case MAV_CMD.DO_SET_HOME:
+        case mavlink.MAV_CMD_DO_SET_HOME:
             set_home_here(v) if item.param1 > 0.5 else set_home_at(v, item.x, item.y, item.z)
         case _:
             pass  # nothing hangs on them: cameras, mounts, grippers
@@ -85,7 +85,7 @@ def _do(v: VehicleState, item: Item) -> None:
 def switch_fence(v: VehicleState, action: float) -> bool:
     """DO_FENCE_ENABLE: 0 off, 1 on, 2 only the floor off; False when there is nothing to switch on, or no such action."""
     if action == 2.0:
-        v.fence.types &= ~FENCE_TYPE.ALT_MIN
+        v.fence.types &= ~mavlink.FENCE_TYPE_ALT_MIN
         return True
     if action not in (0.0, 1.0) or (action == 1.0 and not v.fence.present):
         return False
@@ -107,39 +107,39 @@ def item_target(v: VehicleState, item: Item) -> tuple[float, float, float]:
 
 
 _TITLES: dict[int, str] = {
-    MAV_CMD.NAV_WAYPOINT: "WP",
-    MAV_CMD.NAV_SPLINE_WAYPOINT: "SplineWP",
-    MAV_CMD.NAV_TAKEOFF: "Takeoff",
-    MAV_CMD.NAV_LAND: "Land",
-    MAV_CMD.NAV_RETURN_TO_LAUNCH: "RTL",
-    MAV_CMD.NAV_LOITER_UNLIM: "LoitUnlim",
-    MAV_CMD.NAV_LOITER_TIME: "LoitTime",
-    MAV_CMD.NAV_LOITER_TURNS: "LoitTurns",
-    MAV_CMD.NAV_LOITER_TO_ALT: "LoitAltitude",
-    MAV_CMD.NAV_DELAY: "Delay",
-    MAV_CMD.CONDITION_DELAY: "CondDelay",
-    MAV_CMD.CONDITION_DISTANCE: "CondDist",
-    MAV_CMD.CONDITION_YAW: "CondYaw",
-    MAV_CMD.DO_CHANGE_SPEED: "ChangeSpeed",
-    MAV_CMD.DO_SET_HOME: "SetHome",
-    MAV_CMD.DO_SET_SERVO: "SetServo",
-    MAV_CMD.DO_SET_RELAY: "SetRelay",
-    MAV_CMD.DO_SET_ROI: "SetROI",
-    MAV_CMD.DO_REPEAT_SERVO: "RepeatServo",
-    MAV_CMD.DO_REPEAT_RELAY: "RepeatRelay",
-    MAV_CMD.DO_DIGICAM_CONFIGURE: "DigiCamCfg",
-    MAV_CMD.DO_DIGICAM_CONTROL: "DigiCamCtrl",
-    MAV_CMD.DO_SET_CAM_TRIGG_DIST: "SetCamTrigDst",
-    MAV_CMD.DO_FENCE_ENABLE: "FenceEnable",
-    MAV_CMD.DO_LAND_START: "LandStart",
-    MAV_CMD.DO_MOUNT_CONTROL: "MountControl",
-    MAV_CMD.DO_GRIPPER: "Gripper",
-    MAV_CMD.DO_PARACHUTE: "Parachute",
-    MAV_CMD.DO_SPRAYER: "Sprayer",
-    MAV_CMD.DO_AUX_FUNCTION: "AuxFunction",
-    MAV_CMD.DO_WINCH: "Winch",
-    MAV_CMD.DO_GUIDED_LIMITS: "GuidedLimits",
-    MAV_CMD.JUMP_TAG: "JumpTag",
+    mavlink.MAV_CMD_NAV_WAYPOINT: "WP",
+    mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT: "SplineWP",
+    mavlink.MAV_CMD_NAV_TAKEOFF: "Takeoff",
+    mavlink.MAV_CMD_NAV_LAND: "Land",
+    mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH: "RTL",
+    mavlink.MAV_CMD_NAV_LOITER_UNLIM: "LoitUnlim",
+    mavlink.MAV_CMD_NAV_LOITER_TIME: "LoitTime",
+    mavlink.MAV_CMD_NAV_LOITER_TURNS: "LoitTurns",
+    mavlink.MAV_CMD_NAV_LOITER_TO_ALT: "LoitAltitude",
+    mavlink.MAV_CMD_NAV_DELAY: "Delay",
+    mavlink.MAV_CMD_CONDITION_DELAY: "CondDelay",
+    mavlink.MAV_CMD_CONDITION_DISTANCE: "CondDist",
+    mavlink.MAV_CMD_CONDITION_YAW: "CondYaw",
+    mavlink.MAV_CMD_DO_CHANGE_SPEED: "ChangeSpeed",
+    mavlink.MAV_CMD_DO_SET_HOME: "SetHome",
+    mavlink.MAV_CMD_DO_SET_SERVO: "SetServo",
+    mavlink.MAV_CMD_DO_SET_RELAY: "SetRelay",
+    mavlink.MAV_CMD_DO_SET_ROI: "SetROI",
+    mavlink.MAV_CMD_DO_REPEAT_SERVO: "RepeatServo",
+    mavlink.MAV_CMD_DO_REPEAT_RELAY: "RepeatRelay",
+    mavlink.MAV_CMD_DO_DIGICAM_CONFIGURE: "DigiCamCfg",
+    mavlink.MAV_CMD_DO_DIGICAM_CONTROL: "DigiCamCtrl",
+    mavlink.MAV_CMD_DO_SET_CAM_TRIGG_DIST: "SetCamTrigDst",
+    mavlink.MAV_CMD_DO_FENCE_ENABLE: "FenceEnable",
+    mavlink.MAV_CMD_DO_LAND_START: "LandStart",
+    mavlink.MAV_CMD_DO_MOUNT_CONTROL: "MountControl",
+    mavlink.MAV_CMD_DO_GRIPPER: "Gripper",
+    mavlink.MAV_CMD_DO_PARACHUTE: "Parachute",
+    mavlink.MAV_CMD_DO_SPRAYER: "Sprayer",
+    mavlink.MAV_CMD_DO_AUX_FUNCTION: "AuxFunction",
+    mavlink.MAV_CMD_DO_WINCH: "Winch",
+    mavlink.MAV_CMD_DO_GUIDED_LIMITS: "GuidedLimits",
+    mavlink.MAV_CMD_JUMP_TAG: "JumpTag",
 }
 
 

@@ -5,55 +5,55 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from fractus_mavlink import Message
-from fractus_mavlink.enums import MAV_CMD, MAV_FRAME, MAV_MISSION_RESULT, MAV_MISSION_TYPE
+from fractus_runtime.mavlink_codec import Message
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.copter import GLOBAL_FRAMES
 from fractus_vehicle.earth import ALTITUDE_MAX_M, Place, valid_coordinates
 
 # Commands whose fourth parameter, a heading, may be NaN; no other parameter may.
-NAN_HEADINGS = frozenset({MAV_CMD.NAV_WAYPOINT, MAV_CMD.NAV_LAND, MAV_CMD.NAV_TAKEOFF})
+NAN_HEADINGS = frozenset({mavlink.MAV_CMD_NAV_WAYPOINT, mavlink.MAV_CMD_NAV_LAND, mavlink.MAV_CMD_NAV_TAKEOFF})
 FENCE_COMMANDS = frozenset(range(5000, 5005))
 SUPPORTED = frozenset(
     {
-        MAV_CMD.NAV_WAYPOINT,
-        MAV_CMD.NAV_SPLINE_WAYPOINT,
-        MAV_CMD.NAV_LOITER_UNLIM,
-        MAV_CMD.NAV_LOITER_TURNS,
-        MAV_CMD.NAV_LOITER_TIME,
-        MAV_CMD.NAV_LOITER_TO_ALT,
-        MAV_CMD.NAV_RETURN_TO_LAUNCH,
-        MAV_CMD.NAV_LAND,
-        MAV_CMD.NAV_TAKEOFF,
-        MAV_CMD.NAV_DELAY,
-        MAV_CMD.CONDITION_DELAY,
-        MAV_CMD.CONDITION_DISTANCE,
-        MAV_CMD.CONDITION_YAW,
-        MAV_CMD.DO_JUMP,
-        MAV_CMD.DO_CHANGE_SPEED,
-        MAV_CMD.DO_SET_HOME,
-        MAV_CMD.DO_SET_RELAY,
-        MAV_CMD.DO_SET_SERVO,
-        MAV_CMD.DO_REPEAT_RELAY,
-        MAV_CMD.DO_REPEAT_SERVO,
-        MAV_CMD.DO_PARACHUTE,
-        MAV_CMD.DO_GRIPPER,
-        MAV_CMD.DO_SPRAYER,
-        MAV_CMD.DO_AUX_FUNCTION,
-        MAV_CMD.DO_WINCH,
-        MAV_CMD.DO_DIGICAM_CONFIGURE,
-        MAV_CMD.DO_GUIDED_LIMITS,
-        MAV_CMD.DO_LAND_START,
-        MAV_CMD.DO_SET_ROI_LOCATION,
-        MAV_CMD.DO_SET_ROI_NONE,
-        MAV_CMD.DO_SET_ROI,
-        MAV_CMD.DO_DIGICAM_CONTROL,
-        MAV_CMD.DO_MOUNT_CONTROL,
-        MAV_CMD.DO_SET_CAM_TRIGG_DIST,
-        MAV_CMD.DO_FENCE_ENABLE,
-        MAV_CMD.DO_PAUSE_CONTINUE,
-        MAV_CMD.JUMP_TAG,
-        MAV_CMD.DO_JUMP_TAG,
+        mavlink.MAV_CMD_NAV_WAYPOINT,
+        mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT,
+        mavlink.MAV_CMD_NAV_LOITER_UNLIM,
+        mavlink.MAV_CMD_NAV_LOITER_TURNS,
+        mavlink.MAV_CMD_NAV_LOITER_TIME,
+        mavlink.MAV_CMD_NAV_LOITER_TO_ALT,
+        mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH,
+        mavlink.MAV_CMD_NAV_LAND,
+        mavlink.MAV_CMD_NAV_TAKEOFF,
+        mavlink.MAV_CMD_NAV_DELAY,
+        mavlink.MAV_CMD_CONDITION_DELAY,
+        mavlink.MAV_CMD_CONDITION_DISTANCE,
+        mavlink.MAV_CMD_CONDITION_YAW,
+        mavlink.MAV_CMD_DO_JUMP,
+        mavlink.MAV_CMD_DO_CHANGE_SPEED,
+        mavlink.MAV_CMD_DO_SET_HOME,
+        mavlink.MAV_CMD_DO_SET_RELAY,
+        mavlink.MAV_CMD_DO_SET_SERVO,
+        mavlink.MAV_CMD_DO_REPEAT_RELAY,
+        mavlink.MAV_CMD_DO_REPEAT_SERVO,
+        mavlink.MAV_CMD_DO_PARACHUTE,
+        mavlink.MAV_CMD_DO_GRIPPER,
+        mavlink.MAV_CMD_DO_SPRAYER,
+        mavlink.MAV_CMD_DO_AUX_FUNCTION,
+        mavlink.MAV_CMD_DO_WINCH,
+        mavlink.MAV_CMD_DO_DIGICAM_CONFIGURE,
+        mavlink.MAV_CMD_DO_GUIDED_LIMITS,
+        mavlink.MAV_CMD_DO_LAND_START,
+        mavlink.MAV_CMD_DO_SET_ROI_LOCATION,
+        mavlink.MAV_CMD_DO_SET_ROI_NONE,
+        mavlink.MAV_CMD_DO_SET_ROI,
+        mavlink.MAV_CMD_DO_DIGICAM_CONTROL,
+        mavlink.MAV_CMD_DO_MOUNT_CONTROL,
+        mavlink.MAV_CMD_DO_SET_CAM_TRIGG_DIST,
+        mavlink.MAV_CMD_DO_FENCE_ENABLE,
+        mavlink.MAV_CMD_DO_PAUSE_CONTINUE,
+        mavlink.MAV_CMD_JUMP_TAG,
+        mavlink.MAV_CMD_DO_JUMP_TAG,
         531,
         532,
         1000,
@@ -70,7 +70,7 @@ class Item:
     """One item of a list; x and y are degrees times 1e7."""
 
     command: int
-    frame: int = MAV_FRAME.GLOBAL_RELATIVE_ALT
+    frame: int = mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT
     param1: float = 0.0
     param2: float = 0.0
     param3: float = 0.0
@@ -88,19 +88,24 @@ class Item:
     @property
     def navigates(self) -> bool:
         """Whether this is a NAV command: one with a position, which a mission waits for."""
-        return MAV_CMD.NAV_WAYPOINT <= self.command < MAV_CMD.NAV_LAST or self.command >= MAV_CMD.NAV_FENCE_RETURN_POINT
+        return (
+            mavlink.MAV_CMD_NAV_WAYPOINT <= self.command < mavlink.MAV_CMD_NAV_LAST
+            or self.command >= mavlink.MAV_CMD_NAV_FENCE_RETURN_POINT
+        )
 
 
 def home_item(home: Place) -> Item:
     """Item 0 of every mission: home, as ArduPilot keeps it."""
-    return Item(MAV_CMD.NAV_WAYPOINT, frame=MAV_FRAME.GLOBAL, x=home.lat_e7, y=home.lon_e7, z=home.alt_m)
+    return Item(
+        mavlink.MAV_CMD_NAV_WAYPOINT, frame=mavlink.MAV_FRAME_GLOBAL, x=home.lat_e7, y=home.lon_e7, z=home.alt_m
+    )
 
 
 @dataclass(slots=True)
 class ItemStore:
     """One list; `home` stands for item 0 while a mission is empty."""
 
-    kind: MAV_MISSION_TYPE
+    kind: int
     items: list[Item] = field(default_factory=list)
     home: Item | None = None
 
@@ -111,38 +116,38 @@ def _finite(value: float) -> float:
 
 # The *_INT frames are deprecated, and are stored as what replaces them.
 _CURRENT_FRAMES: dict[int, int] = {
-    MAV_FRAME.GLOBAL_INT: MAV_FRAME.GLOBAL,
-    MAV_FRAME.GLOBAL_RELATIVE_ALT_INT: MAV_FRAME.GLOBAL_RELATIVE_ALT,
-    MAV_FRAME.GLOBAL_TERRAIN_ALT_INT: MAV_FRAME.GLOBAL_TERRAIN_ALT,
-    MAV_FRAME.MISSION: MAV_FRAME.GLOBAL,
+    mavlink.MAV_FRAME_GLOBAL_INT: mavlink.MAV_FRAME_GLOBAL,
+    mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT: mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT,
+    mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT_INT: mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT,
+    mavlink.MAV_FRAME_MISSION: mavlink.MAV_FRAME_GLOBAL,
 }
 
 
 # Commands whose items have a place; of the others no frame is kept.
 PLACED = frozenset(
     {
-        MAV_CMD.NAV_WAYPOINT,
-        MAV_CMD.NAV_LOITER_UNLIM,
-        MAV_CMD.NAV_LOITER_TURNS,
-        MAV_CMD.NAV_LOITER_TIME,
-        MAV_CMD.NAV_LOITER_TO_ALT,
-        MAV_CMD.NAV_LAND,
-        MAV_CMD.NAV_TAKEOFF,
-        MAV_CMD.NAV_SPLINE_WAYPOINT,
-        MAV_CMD.DO_SET_HOME,
-        MAV_CMD.DO_LAND_START,
-        MAV_CMD.DO_SET_ROI,
-        MAV_CMD.DO_SET_ROI_LOCATION,
+        mavlink.MAV_CMD_NAV_WAYPOINT,
+        mavlink.MAV_CMD_NAV_LOITER_UNLIM,
+        mavlink.MAV_CMD_NAV_LOITER_TURNS,
+        mavlink.MAV_CMD_NAV_LOITER_TIME,
+        mavlink.MAV_CMD_NAV_LOITER_TO_ALT,
+        mavlink.MAV_CMD_NAV_LAND,
+        mavlink.MAV_CMD_NAV_TAKEOFF,
+        mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT,
+        mavlink.MAV_CMD_DO_SET_HOME,
+        mavlink.MAV_CMD_DO_LAND_START,
+        mavlink.MAV_CMD_DO_SET_ROI,
+        mavlink.MAV_CMD_DO_SET_ROI_LOCATION,
     }
 )
 
 
 # Of these, only a count of the parameters is stored: the first, a delay in whole seconds, or none.
 STORED_PARAMETERS: dict[int, int] = {
-    MAV_CMD.NAV_WAYPOINT: 1,
-    MAV_CMD.NAV_SPLINE_WAYPOINT: 1,
-    MAV_CMD.NAV_TAKEOFF: 1,
-    MAV_CMD.NAV_RETURN_TO_LAUNCH: 0,
+    mavlink.MAV_CMD_NAV_WAYPOINT: 1,
+    mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT: 1,
+    mavlink.MAV_CMD_NAV_TAKEOFF: 1,
+    mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH: 0,
 }
 _UINT16_MAX = 65535
 
@@ -168,8 +173,8 @@ def item_from(message: Message) -> Item:
     return Item(
         command=command,
         frame=_CURRENT_FRAMES.get(frame, frame)
-        if command in PLACED or command >= MAV_CMD.NAV_FENCE_RETURN_POINT
-        else MAV_FRAME.GLOBAL,
+        if command in PLACED or command >= mavlink.MAV_CMD_NAV_FENCE_RETURN_POINT
+        else mavlink.MAV_FRAME_GLOBAL,
         param1=param1,
         param2=param2,
         param3=param3,
@@ -181,32 +186,32 @@ def item_from(message: Message) -> Item:
     )
 
 
-def judge(item: Item, kind: MAV_MISSION_TYPE) -> MAV_MISSION_RESULT:
+def judge(item: Item, kind: int) -> int:
     """Whether an item may be stored in a list of that kind."""
-    if kind is MAV_MISSION_TYPE.FENCE:
+    if kind == mavlink.MAV_MISSION_TYPE_FENCE:
         known = item.command in FENCE_COMMANDS
-    elif kind is MAV_MISSION_TYPE.RALLY:
-        known = item.command == MAV_CMD.NAV_RALLY_POINT
+    elif kind == mavlink.MAV_MISSION_TYPE_RALLY:
+        known = item.command == mavlink.MAV_CMD_NAV_RALLY_POINT
     else:
         known = item.command in SUPPORTED
     if not known:
-        return MAV_MISSION_RESULT.UNSUPPORTED
-    if kind is MAV_MISSION_TYPE.MISSION and item.command not in PLACED:
-        return MAV_MISSION_RESULT.ACCEPTED
-    if kind is not MAV_MISSION_TYPE.FENCE:  # a fence is judged as a whole
+        return mavlink.MAV_MISSION_UNSUPPORTED
+    if kind == mavlink.MAV_MISSION_TYPE_MISSION and item.command not in PLACED:
+        return mavlink.MAV_MISSION_ACCEPTED
+    if kind != mavlink.MAV_MISSION_TYPE_FENCE:  # a fence is judged as a whole
         if not valid_coordinates(item.x, item.y):
             beyond = abs(item.x) > 900_000_000
-            return MAV_MISSION_RESULT.INVALID_PARAM5_X if beyond else MAV_MISSION_RESULT.INVALID_PARAM6_Y
+            return mavlink.MAV_MISSION_INVALID_PARAM5_X if beyond else mavlink.MAV_MISSION_INVALID_PARAM6_Y
         if not abs(item.z) < ALTITUDE_MAX_M:
-            return MAV_MISSION_RESULT.INVALID_PARAM7
-    return MAV_MISSION_RESULT.ACCEPTED if item.frame in GLOBAL_FRAMES else MAV_MISSION_RESULT.UNSUPPORTED_FRAME
+            return mavlink.MAV_MISSION_INVALID_PARAM7
+    return mavlink.MAV_MISSION_ACCEPTED if item.frame in GLOBAL_FRAMES else mavlink.MAV_MISSION_UNSUPPORTED_FRAME
 
 
-def judge_numbers(message: Message) -> MAV_MISSION_RESULT:
+def judge_numbers(message: Message) -> int:
     """Whether the parameters of a mission's item are numbers, as ArduPilot wants them."""
     may_be_nan = message.integer("command") in NAN_HEADINGS
     for at in range(1, 5):
         value = message.real(f"param{at}")
         if not math.isfinite(value) and not (at == 4 and may_be_nan and math.isnan(value)):
-            return MAV_MISSION_RESULT(MAV_MISSION_RESULT.INVALID_PARAM1 + at - 1)
-    return MAV_MISSION_RESULT.ACCEPTED
+            return mavlink.MAV_MISSION_INVALID_PARAM1 + at - 1
+    return mavlink.MAV_MISSION_ACCEPTED

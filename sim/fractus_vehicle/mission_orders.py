@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from fractus_mavlink.enums import COPTER_MODE, MAV_RESULT, MAV_SEVERITY
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.auto import AutoFlight
 from fractus_vehicle.channel import Channel
@@ -16,41 +16,41 @@ from fractus_vehicle.vehicle import Vehicle
 MAX_TAG = 65535
 
 
-def start_mission(vehicle: Vehicle, o: Order, _c: Channel) -> MAV_RESULT:
+def start_mission(vehicle: Vehicle, o: Order, _c: Channel) -> int:
     """MISSION_START, of the whole mission only."""
     if o.params[:2] != (0.0, 0.0):
-        return MAV_RESULT.DENIED
-    if not vehicle.modes.change(COPTER_MODE.AUTO):
-        return MAV_RESULT.FAILED
+        return mavlink.MAV_RESULT_DENIED
+    if not vehicle.modes.change(mavlink.COPTER_MODE_AUTO):
+        return mavlink.MAV_RESULT_FAILED
     flight = vehicle.modes.flight
     if isinstance(flight, AutoFlight):
         flight.start_by_command(vehicle.state)
-    return MAV_RESULT.ACCEPTED
+    return mavlink.MAV_RESULT_ACCEPTED
 
 
-def choose_item(vehicle: Vehicle, o: Order, c: Channel) -> MAV_RESULT:
+def choose_item(vehicle: Vehicle, o: Order, c: Channel) -> int:
     """DO_SET_MISSION_CURRENT; with 1 as the second parameter, the mission starts over first."""
     v, number = vehicle.state, o.params[0]
     if not (math.isfinite(number) and 0 <= int(number) < len(v.mission.items)):
-        return MAV_RESULT.DENIED
+        return mavlink.MAV_RESULT_DENIED
     if o.params[1] == 1.0:
         v.mission.rewind()
     if not set_current(vehicle, int(number)):
-        return MAV_RESULT.FAILED
+        return mavlink.MAV_RESULT_FAILED
     send(v, c, "MISSION_CURRENT")
-    return MAV_RESULT.ACCEPTED
+    return mavlink.MAV_RESULT_ACCEPTED
 
 
-def jump_to_tag(vehicle: Vehicle, o: Order, c: Channel) -> MAV_RESULT:
+def jump_to_tag(vehicle: Vehicle, o: Order, c: Channel) -> int:
     """DO_JUMP_TAG."""
     v, tag = vehicle.state, o.params[0]
     if not 0.0 <= tag <= MAX_TAG:
-        return MAV_RESULT.DENIED
+        return mavlink.MAV_RESULT_DENIED
     index = v.mission.tagged(int(tag))
     if index is None or not set_current(vehicle, index):
-        return MAV_RESULT.FAILED
+        return mavlink.MAV_RESULT_FAILED
     send(v, c, "MISSION_CURRENT")
-    return MAV_RESULT.ACCEPTED
+    return mavlink.MAV_RESULT_ACCEPTED
 
 
 def set_current(vehicle: Vehicle, index: int) -> bool:
@@ -68,27 +68,27 @@ def set_current(vehicle: Vehicle, index: int) -> bool:
     return found is not None
 
 
-def pause(vehicle: Vehicle, o: Order, _c: Channel) -> MAV_RESULT:
+def pause(vehicle: Vehicle, o: Order, _c: Channel) -> int:
     """DO_PAUSE_CONTINUE, in the modes that fly by themselves."""
     v, flight = vehicle.state, vehicle.modes.flight
     if not math.isfinite(o.params[0]) or int(o.params[0]) not in (0, 1):
-        return MAV_RESULT.DENIED
+        return mavlink.MAV_RESULT_DENIED
     paused = int(o.params[0]) == 0
     if not isinstance(flight, (AutoFlight, GuidedFlight)):
-        v.say(MAV_SEVERITY.INFO, f"Failed to {'pause' if paused else 'resume'}")
-        return MAV_RESULT.FAILED
+        v.say(mavlink.MAV_SEVERITY_INFO, f"Failed to {'pause' if paused else 'resume'}")
+        return mavlink.MAV_RESULT_FAILED
     flight.pause(v, paused=paused)
-    return MAV_RESULT.ACCEPTED
+    return mavlink.MAV_RESULT_ACCEPTED
 
 
-def begin_landing_sequence(vehicle: Vehicle, _o: Order, _c: Channel) -> MAV_RESULT:
+def begin_landing_sequence(vehicle: Vehicle, _o: Order, _c: Channel) -> int:
     """DO_LAND_START: no mission here has a landing sequence to jump to."""
-    vehicle.state.say(MAV_SEVERITY.WARNING, "Unable to start landing sequence")
-    vehicle.state.say(MAV_SEVERITY.WARNING, "Mode change to AUTO RTL failed: No landing sequence found")
-    return MAV_RESULT.FAILED
+    vehicle.state.say(mavlink.MAV_SEVERITY_WARNING, "Unable to start landing sequence")
+    vehicle.state.say(mavlink.MAV_SEVERITY_WARNING, "Mode change to AUTO RTL failed: No landing sequence found")
+    return mavlink.MAV_RESULT_FAILED
 
 
-def begin_return_path(vehicle: Vehicle, _o: Order, _c: Channel) -> MAV_RESULT:
+def begin_return_path(vehicle: Vehicle, _o: Order, _c: Channel) -> int:
     """DO_RETURN_PATH_START: no mission here has a path to join."""
-    vehicle.state.say(MAV_SEVERITY.WARNING, "Mode change to AUTO RTL failed: No return path found")
-    return MAV_RESULT.FAILED
+    vehicle.state.say(mavlink.MAV_SEVERITY_WARNING, "Mode change to AUTO RTL failed: No return path found")
+    return mavlink.MAV_RESULT_FAILED

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fractus_mavlink.enums import COPTER_MODE, MAV_SEVERITY
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.auto import AutoFlight
 from fractus_vehicle.copter import TRAITS, UNAVAILABLE, mode_title
@@ -19,23 +19,23 @@ from fractus_vehicle.telemetry import send_on_all
 # After a change of mode in a breach, the fence is not checked for so long.
 MANUAL_RECOVERY_S = 10.0
 
-_FLIGHTS: dict[COPTER_MODE, type[Flight]] = {
-    COPTER_MODE.GUIDED: GuidedFlight,
-    COPTER_MODE.STABILIZE: Stabilize,
-    COPTER_MODE.ALT_HOLD: AltHold,
-    COPTER_MODE.LOITER: Loiter,
-    COPTER_MODE.BRAKE: Brake,
-    COPTER_MODE.LAND: Land,
-    COPTER_MODE.RTL: ReturnToLaunch,
-    COPTER_MODE.SMART_RTL: SmartReturn,
-    COPTER_MODE.ACRO: Acro,
-    COPTER_MODE.CIRCLE: Circle,
-    COPTER_MODE.DRIFT: Stabilize,
-    COPTER_MODE.POSHOLD: Loiter,
-    COPTER_MODE.THROW: Throw,
-    COPTER_MODE.AVOID_ADSB: Hold,
-    COPTER_MODE.GUIDED_NOGPS: GuidedWithoutGps,
-    COPTER_MODE.ZIGZAG: Loiter,
+_FLIGHTS: dict[int, type[Flight]] = {
+    mavlink.COPTER_MODE_GUIDED: GuidedFlight,
+    mavlink.COPTER_MODE_STABILIZE: Stabilize,
+    mavlink.COPTER_MODE_ALT_HOLD: AltHold,
+    mavlink.COPTER_MODE_LOITER: Loiter,
+    mavlink.COPTER_MODE_BRAKE: Brake,
+    mavlink.COPTER_MODE_LAND: Land,
+    mavlink.COPTER_MODE_RTL: ReturnToLaunch,
+    mavlink.COPTER_MODE_SMART_RTL: SmartReturn,
+    mavlink.COPTER_MODE_ACRO: Acro,
+    mavlink.COPTER_MODE_CIRCLE: Circle,
+    mavlink.COPTER_MODE_DRIFT: Stabilize,
+    mavlink.COPTER_MODE_POSHOLD: Loiter,
+    mavlink.COPTER_MODE_THROW: Throw,
+    mavlink.COPTER_MODE_AVOID_ADSB: Hold,
+    mavlink.COPTER_MODE_GUIDED_NOGPS: GuidedWithoutGps,
+    mavlink.COPTER_MODE_ZIGZAG: Loiter,
 }
 
 
@@ -46,21 +46,21 @@ class FlightModes:
         self._state = state
         self.flight = self._new_flight(state.mode)
 
-    def _refusal(self, mode: COPTER_MODE) -> str | None:
+    def _refusal(self, mode: int) -> str | None:
         """Why a mode cannot be entered now, or None; on the ground with the motors off nearly every mode can."""
         v = self._state
         if mode in UNAVAILABLE:
             for text in UNAVAILABLE[mode][0]:
-                v.say(MAV_SEVERITY.WARNING, text)
+                v.say(mavlink.MAV_SEVERITY_WARNING, text)
             return UNAVAILABLE[mode][1]
         if v.armed and TRAITS[mode].needs_position and not v.position_ok:
             return "requires position"
         match mode:
-            case COPTER_MODE.SMART_RTL:
+            case mavlink.COPTER_MODE_SMART_RTL:
                 begins = v.breadcrumbs.active
-            case COPTER_MODE.THROW:
+            case mavlink.COPTER_MODE_THROW:
                 begins = not v.armed
-            case COPTER_MODE.AUTO:
+            case mavlink.COPTER_MODE_AUTO:
                 begins = not v.armed or self._has_mission()
             case _:
                 begins = True
@@ -72,22 +72,22 @@ class FlightModes:
         if len(v.mission.items) <= 1:
             return False
         if v.landed and not v.mission.takes_off(restart=int(v.params["MIS_RESTART"]) == 1):
-            v.say(MAV_SEVERITY.CRITICAL, "Auto: Missing Takeoff Cmd")
+            v.say(mavlink.MAV_SEVERITY_CRITICAL, "Auto: Missing Takeoff Cmd")
             return False
         return True
 
-    def change(self, mode: COPTER_MODE) -> bool:
+    def change(self, mode: int) -> bool:
         """Change the mode as a ground station asks; False when it is refused."""
-        if mode is self._state.mode:
+        if mode == self._state.mode:
             return True
         refusal = self._refusal(mode)
         if refusal is not None:
-            self._state.say(MAV_SEVERITY.WARNING, f"Mode change to {mode_title(mode)} failed: {refusal}")
+            self._state.say(mavlink.MAV_SEVERITY_WARNING, f"Mode change to {mode_title(mode)} failed: {refusal}")
             return False
         self.force(mode)
         return True
 
-    def force(self, mode: COPTER_MODE) -> None:
+    def force(self, mode: int) -> None:
         """Change the mode without asking."""
         v = self._state
         self.flight.end(v)
@@ -101,10 +101,10 @@ class FlightModes:
         v.taking_off_until_m = None
         if v.fence.breaches:
             v.fence.recovery_until_s = v.time_s + MANUAL_RECOVERY_S
-            v.say(MAV_SEVERITY.INFO, "Manual recovery started")
+            v.say(mavlink.MAV_SEVERITY_INFO, "Manual recovery started")
         self.flight.begin(v)
         send_on_all(v, "HEARTBEAT")
 
-    def _new_flight(self, mode: COPTER_MODE) -> Flight:
+    def _new_flight(self, mode: int) -> Flight:
         # A mission may end itself by another mode.
-        return AutoFlight(self.change) if mode is COPTER_MODE.AUTO else _FLIGHTS[mode]()
+        return AutoFlight(self.change) if mode == mavlink.COPTER_MODE_AUTO else _FLIGHTS[mode]()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from fractus_mavlink.enums import COPTER_MODE, MAV_SEVERITY
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.state import ARMING_DELAY_S, CONTROL_STEP_S, VehicleState
 
@@ -49,7 +49,7 @@ def move(v: VehicleState) -> None:
     if body.impacts > v.impacts_told:
         v.impacts_told = body.impacts
         if v.time_s - v.impact_told_s > IMPACT_TEXTS_S:
-            v.say(MAV_SEVERITY.INFO, f"SIM Hit ground at {body.impact_mps:f} m/s")
+            v.say(mavlink.MAV_SEVERITY_INFO, f"SIM Hit ground at {body.impact_mps:f} m/s")
         v.impact_told_s = v.time_s
     if v.landed and not body.on_ground:
         v.landed = False
@@ -60,4 +60,4 @@ def _may_lift(v: VehicleState) -> bool:
         return True
     if v.flying_wanted:
         return v.time_s >= v.lift_after_s
-    return v.mode is COPTER_MODE.STABILIZE and v.sticks[2] > LIFT_THROTTLE_US
+    return v.mode == mavlink.COPTER_MODE_STABILIZE and v.sticks[2] > LIFT_THROTTLE_US

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from fractus_mavlink import Value
-from fractus_mavlink.enums import COPTER_MODE, GIMBAL_DEVICE_FLAGS, MAV_AUTOPILOT, MAV_FRAME, MAV_TYPE
+from fractus_runtime.mavlink_codec import Value
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.control import Axis
 from fractus_vehicle.copter import GLOBAL_TARGET_ONLY, POSITION_ONLY, VELOCITY_ONLY
@@ -15,7 +15,9 @@ from fractus_vehicle.report_units import UNKNOWN_U16, Values, boot_ms, boot_us, 
 from fractus_vehicle.state import VehicleState
 
 ENDS = ("min", "max")
-_AUTOMATIC = frozenset({COPTER_MODE.GUIDED, COPTER_MODE.AUTO, COPTER_MODE.RTL, COPTER_MODE.SMART_RTL})
+_AUTOMATIC = frozenset(
+    {mavlink.COPTER_MODE_GUIDED, mavlink.COPTER_MODE_AUTO, mavlink.COPTER_MODE_RTL, mavlink.COPTER_MODE_SMART_RTL}
+)
 
 
 def global_position_int(v: VehicleState) -> Values:
@@ -82,7 +84,11 @@ def gimbal_device_attitude_status(v: VehicleState) -> Values | None:
     """GIMBAL_DEVICE_ATTITUDE_STATUS, where there is a gimbal: over the horizon, and from the nose."""
     if not v.gimbal.kind:
         return None
-    flags = GIMBAL_DEVICE_FLAGS.ROLL_LOCK | GIMBAL_DEVICE_FLAGS.PITCH_LOCK | GIMBAL_DEVICE_FLAGS.YAW_IN_VEHICLE_FRAME
+    flags = (
+        mavlink.GIMBAL_DEVICE_FLAGS_ROLL_LOCK
+        | mavlink.GIMBAL_DEVICE_FLAGS_PITCH_LOCK
+        | mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME
+    )
     unknown = {f"angular_velocity_{axis}": math.nan for axis in "xyz"}
     return {"time_boot_ms": boot_ms(v), "flags": int(flags), "q": v.gimbal.told, "gimbal_device_id": 1, **unknown}
 
@@ -135,7 +141,7 @@ def position_target_global_int(v: VehicleState) -> Values | None:
     place = v.origin.offset(*v.control.target, v.control.target_down)
     return {
         "time_boot_ms": boot_ms(v),
-        "coordinate_frame": MAV_FRAME.GLOBAL,
+        "coordinate_frame": mavlink.MAV_FRAME_GLOBAL,
         "type_mask": GLOBAL_TARGET_ONLY,
         "lat_int": place.lat_e7,
         "lon_int": place.lon_e7,
@@ -145,10 +151,10 @@ def position_target_global_int(v: VehicleState) -> Values | None:
 
 def position_target_local_ned(v: VehicleState) -> Values | None:
     """POSITION_TARGET_LOCAL_NED while in GUIDED: a place, or a velocity."""
-    if v.origin is None or v.mode is not COPTER_MODE.GUIDED or v.landed:
+    if v.origin is None or v.mode != mavlink.COPTER_MODE_GUIDED or v.landed:
         return None
     c = v.control
-    values: dict[str, Value] = {"time_boot_ms": boot_ms(v), "coordinate_frame": MAV_FRAME.LOCAL_NED}
+    values: dict[str, Value] = {"time_boot_ms": boot_ms(v), "coordinate_frame": mavlink.MAV_FRAME_LOCAL_NED}
     if c.horizontal is Axis.VELOCITY:
         north, east = c.target_velocity
         return values | {"type_mask": VELOCITY_ONLY, "vx": north, "vy": east, "vz": c.target_vd}
@@ -261,8 +267,8 @@ def high_latency2(v: VehicleState) -> Values:
     place, speed = v.place, math.hypot(v.est.vn, v.est.ve)
     return {
         "timestamp": boot_ms(v),
-        "type": MAV_TYPE.QUADROTOR,
-        "autopilot": MAV_AUTOPILOT.ARDUPILOTMEGA,
+        "type": mavlink.MAV_TYPE_QUADROTOR,
+        "autopilot": mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
         "custom_mode": int(v.mode),
         "latitude": place.lat_e7,
         "longitude": place.lon_e7,

@@ -5,13 +5,20 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from fractus_mavlink import Message
-from fractus_mavlink.enums import MAV_CMD, MAV_FRAME
+from fractus_runtime.mavlink_codec import Message
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.mission_items import Item
 
 # The commands whose fifth and sixth parameters are degrees; of all others they are plain integers.
-PLACED = frozenset({MAV_CMD.DO_SET_HOME, MAV_CMD.DO_SET_ROI, MAV_CMD.DO_SET_ROI_LOCATION, MAV_CMD.DO_REPOSITION})
+PLACED = frozenset(
+    {
+        mavlink.MAV_CMD_DO_SET_HOME,
+        mavlink.MAV_CMD_DO_SET_ROI,
+        mavlink.MAV_CMD_DO_SET_ROI_LOCATION,
+        mavlink.MAV_CMD_DO_REPOSITION,
+    }
+)
 _INT32_MAX = 2147483647
 
 
@@ -49,7 +56,9 @@ def read_order(message: Message) -> Order:
         return Order(command, numbers, x, y, z, frame, x != 0 or y != 0, integer=True)
     scale = 1e7 if command in PLACED else 1.0
     x, y = _integer(message.real("param5") * scale), _integer(message.real("param6") * scale)
-    frame = MAV_FRAME.GLOBAL if command == MAV_CMD.DO_SET_HOME else MAV_FRAME.GLOBAL_RELATIVE_ALT
+    frame = (
+        mavlink.MAV_FRAME_GLOBAL if command == mavlink.MAV_CMD_DO_SET_HOME else mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT
+    )
     return Order(command, numbers, x, y, message.real("param7"), frame, x != 0 or y != 0, integer=False)
 
 

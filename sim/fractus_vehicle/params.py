@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 
-from fractus_mavlink.enums import MAV_PARAM_TYPE
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 RANGES = {
     "INT8": (-128.0, 127.0),
@@ -18,6 +18,13 @@ RANGES = {
     "INT32": (-2147483648.0, 2147483647.0),
     "REAL32": (-3.4028234e38, 3.4028234e38),
 }
+WIRE_TYPES = {
+    "INT8": mavlink.MAV_PARAM_TYPE_INT8,
+    "INT16": mavlink.MAV_PARAM_TYPE_INT16,
+    "INT32": mavlink.MAV_PARAM_TYPE_INT32,
+    "REAL32": mavlink.MAV_PARAM_TYPE_REAL32,
+}
+"""MAV_PARAM_TYPE that PARAM_VALUE reports for each type of the table."""
 # Names of later ArduCopter releases for the same thing, accepted beside the ones of this release.
 ALIASES = {"MAV_GCS_SYSID": "SYSID_MYGCS", "MAV_SYSID": "SYSID_THISMAV"}
 # These describe what is stored or who the vehicle is on its links; a real autopilot lets a client overwrite them.
@@ -35,9 +42,9 @@ class Parameter:
     kind: str
 
     @property
-    def wire_type(self) -> MAV_PARAM_TYPE:
+    def wire_type(self) -> int:
         """What PARAM_VALUE says of its type."""
-        return MAV_PARAM_TYPE[self.kind]
+        return WIRE_TYPES[self.kind]
 
     def coerce(self, value: float) -> float:
         """The value as this type stores it: without its fraction, and the nearest one that fits.

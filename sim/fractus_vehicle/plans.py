@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import assert_never
 
-from fractus_mavlink.enums import COPTER_MODE, MAV_MISSION_RESULT, MAV_MISSION_TYPE, MAV_SEVERITY, MISSION_STATE
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.earth import Place, valid_coordinates
 from fractus_vehicle.fence import FenceItem, FenceShapeError, build_shapes
@@ -13,7 +12,7 @@ from fractus_vehicle.mission_items import Item, ItemStore, home_item
 from fractus_vehicle.state import VehicleState
 
 
-def stores_of(v: VehicleState) -> dict[MAV_MISSION_TYPE, ItemStore]:
+def stores_of(v: VehicleState) -> dict[int, ItemStore]:
     """The three lists of one vehicle."""
     return {store.kind: store for store in (v.mission.store, v.fence_items, v.rally)}
 
@@ -25,45 +24,49 @@ def restore(v: VehicleState, kept: VehicleState) -> None:
             replace_items(v, mine, list(theirs.items))
 
 
-def replace_items(v: VehicleState, store: ItemStore, items: list[Item]) -> MAV_MISSION_RESULT:
+def replace_items(v: VehicleState, store: ItemStore, items: list[Item]) -> int:
     """Store a list in place of what is there, unless the vehicle cannot use it."""
     result = _accept(v, store.kind, items)
-    if result is MAV_MISSION_RESULT.ACCEPTED:
+    if result == mavlink.MAV_MISSION_ACCEPTED:
         store.items = items
     return result
 
 
-def clear_items(v: VehicleState, store: ItemStore) -> MAV_MISSION_RESULT:
+def clear_items(v: VehicleState, store: ItemStore) -> int:
     """Empty a list; a mission is kept while it is flown."""
-    if store.kind is MAV_MISSION_TYPE.MISSION and v.armed and v.mission.state(v.mode) is MISSION_STATE.ACTIVE:
-        return MAV_MISSION_RESULT.ERROR
+    if (
+        store.kind == mavlink.MAV_MISSION_TYPE_MISSION
+        and v.armed
+        and v.mission.state(v.mode) == mavlink.MISSION_STATE_ACTIVE
+    ):
+        return mavlink.MAV_MISSION_ERROR
     return replace_items(v, store, [])
 
 
-def _accept(v: VehicleState, kind: MAV_MISSION_TYPE, items: list[Item]) -> MAV_MISSION_RESULT:
+def _accept(v: VehicleState, kind: int, items: list[Item]) -> int:
     match kind:
-        case MAV_MISSION_TYPE.MISSION:
+        case mavlink.MAV_MISSION_TYPE_MISSION:
             if items and v.home is not None:
                 items[0] = home_item(v.home)
             v.params.assign("MIS_TOTAL", len(items))
-            if v.mode is not COPTER_MODE.AUTO:
+            if v.mode != mavlink.COPTER_MODE_AUTO:
                 v.mission.rewind()
-        case MAV_MISSION_TYPE.FENCE:
+        case mavlink.MAV_MISSION_TYPE_FENCE:
             try:
                 v.fence.shapes = build_shapes(_local(v, items))
             except FenceShapeError as error:
-                severity = MAV_SEVERITY.INFO if "item count" in str(error) else MAV_SEVERITY.WARNING
+                severity = mavlink.MAV_SEVERITY_INFO if "item count" in str(error) else mavlink.MAV_SEVERITY_WARNING
                 v.say(severity, str(error))
-                v.say(MAV_SEVERITY.WARNING, "Fence validation failed")
-                return MAV_MISSION_RESULT.ERROR
+                v.say(mavlink.MAV_SEVERITY_WARNING, "Fence validation failed")
+                return mavlink.MAV_MISSION_ERROR
             v.params.assign("FENCE_TOTAL", len(items))
-        case MAV_MISSION_TYPE.RALLY:
+        case mavlink.MAV_MISSION_TYPE_RALLY:
             v.params.assign("RALLY_TOTAL", len(items))
-        case MAV_MISSION_TYPE.ALL:
+        case mavlink.MAV_MISSION_TYPE_ALL:
             raise ValueError("plans: a list has one kind; only MISSION_CLEAR_ALL names all of them")
         case _:
-            assert_never(kind)
-    return MAV_MISSION_RESULT.ACCEPTED
+            raise ValueError(f"plans: unknown MAV_MISSION_TYPE {kind}")
+    return mavlink.MAV_MISSION_ACCEPTED
 
 
 def _local(v: VehicleState, items: Sequence[Item]) -> list[FenceItem]:

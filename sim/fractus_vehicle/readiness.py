@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from enum import IntFlag
 
-from fractus_mavlink.enums import FENCE_TYPE, GPS_FIX_TYPE
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.copter import TRAITS, mode_title
 from fractus_vehicle.state import VehicleState
@@ -67,7 +67,7 @@ def _sensor_refusals(v: VehicleState) -> Iterator[str]:
         if not v.estimator.aligned:
             yield "EKF attitude is bad"
     needs_position = TRAITS[v.mode].needs_position or _fence_needs_position(v)
-    no_fix = needs_position and v.estimator.consistent and v.gps.fix_type < GPS_FIX_TYPE.TYPE_3D_FIX
+    no_fix = needs_position and v.estimator.consistent and v.gps.fix_type < mavlink.GPS_FIX_TYPE_3D_FIX
     if no_fix and _checks(v, Check.GPS):
         yield "GPS 1: Bad fix"
     else:
@@ -88,7 +88,7 @@ def _position_refusals(v: VehicleState) -> Iterator[str]:
 
 
 def _fence_needs_position(v: VehicleState) -> bool:
-    return v.fence.enabled and bool(v.fence.types & (FENCE_TYPE.CIRCLE | FENCE_TYPE.POLYGON))
+    return v.fence.enabled and bool(v.fence.types & (mavlink.FENCE_TYPE_CIRCLE | mavlink.FENCE_TYPE_POLYGON))
 
 
 def _battery_refusals(v: VehicleState) -> Iterator[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from fractus_mavlink import Value
+from fractus_runtime.mavlink_codec import Value
 
 from fractus_vehicle.shaping import clamp
 from fractus_vehicle.state import VehicleState

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from fractus_mavlink import layout_of
-from fractus_mavlink.enums import MAV_CMD, MAV_RESULT, MAV_SEVERITY
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.accessories import (
     ABSENT,
@@ -24,7 +23,7 @@ from fractus_vehicle.state import VehicleState
 from fractus_vehicle.streams import BUILDERS, SILENT
 from fractus_vehicle.telemetry import send
 
-Answer = Callable[[VehicleState, Order, Channel], MAV_RESULT]
+Answer = Callable[[VehicleState, Order, Channel], int]
 
 # Messages may come at this share of the main loop's rate.
 MAX_LOOP_SHARE = 0.8
@@ -34,115 +33,119 @@ EKF_SOURCE_SETS = 3
 FRAMES = {0: "PLUS", 1: "X"}
 
 
-def _get_home(v: VehicleState, _o: Order, c: Channel) -> MAV_RESULT:
+def _get_home(v: VehicleState, _o: Order, c: Channel) -> int:
     if v.home is None:
-        return MAV_RESULT.FAILED
+        return mavlink.MAV_RESULT_FAILED
     send(v, c, "HOME_POSITION")
     send(v, c, "GPS_GLOBAL_ORIGIN")
-    return MAV_RESULT.ACCEPTED
+    return mavlink.MAV_RESULT_ACCEPTED
 
 
 def _message_name(number: float) -> str | None:
-    layout = layout_of(int(number)) if math.isfinite(number) and number >= 0.0 else None
-    return layout.name if layout is not None and (layout.name in BUILDERS or layout.name in SILENT) else None
+    if not math.isfinite(number) or number < 0.0:
+        return None
+    message = mavlink.mavlink_map.get(int(number))
+    if message is None or (message.msgname not in BUILDERS and message.msgname not in SILENT):
+        return None
+    return message.msgname
 
 
 def _named(v: VehicleState, number: float) -> str | None:
     """The message of a number; one that ArduCopter does not have is complained about."""
     name = _message_name(number)
     if name is None and math.isfinite(number):
-        v.say(MAV_SEVERITY.INFO, f"No ap_message for mavlink id ({int(number)})")
+        v.say(mavlink.MAV_SEVERITY_INFO, f"No ap_message for mavlink id ({int(number)})")
     return name
 
 
-def _set_interval(v: VehicleState, o: Order, c: Channel) -> MAV_RESULT:
+def _set_interval(v: VehicleState, o: Order, c: Channel) -> int:
     interval_us = o.params[1]
     name = _named(v, o.params[0])
     # A real autopilot aborts in the simulator where the interval is not a number.
     if name is None or not math.isfinite(interval_us) or interval_us < -1.0:
-        return MAV_RESULT.DENIED
+        return mavlink.MAV_RESULT_DENIED
     if interval_us < 0.0:
         c.set_interval(name, None)
     elif interval_us == 0.0:
         c.reset_interval(name)
     elif interval_us < 1e6 / (MAX_LOOP_SHARE * max(v.params["SCHED_LOOP_RATE"], 1.0)):
         text = f"Requested rate for message ID {int(o.params[0])} too fast. Increase SCHED_LOOP_RATE"
-        v.say(MAV_SEVERITY.INFO, text)
-        return MAV_RESULT.DENIED
+        v.say(mavlink.MAV_SEVERITY_INFO, text)
+        return mavlink.MAV_RESULT_DENIED
     else:
         c.set_interval(name, min(max(int(interval_us) // 1000, MIN_INTERVAL_MS), MAX_INTERVAL_MS) / 1e3)
-    return MAV_RESULT.ACCEPTED
+    return mavlink.MAV_RESULT_ACCEPTED
 
 
-def _get_interval(_v: VehicleState, o: Order, c: Channel) -> MAV_RESULT:
+def _get_interval(_v: VehicleState, o: Order, c: Channel) -> int:
     name = _message_name(o.params[0])
     stream = c.streams.get(name) if name is not None else None
     interval = 0 if name is None else -1 if stream is None else round(stream.interval_s * 1e6)
     number = int(o.params[0]) & 0xFFFF if math.isfinite(o.params[0]) else 0
     c.send("MESSAGE_INTERVAL", {"message_id": number, "interval_us": interval})
-    return MAV_RESULT.ACCEPTED if name is not None else MAV_RESULT.FAILED
+    return mavlink.MAV_RESULT_ACCEPTED if name is not None else mavlink.MAV_RESULT_FAILED
 
 
-def _request_message(v: VehicleState, o: Order, c: Channel) -> MAV_RESULT:
+def _request_message(v: VehicleState, o: Order, c: Channel) -> int:
     name = _message_name(o.params[0])
     if name is None:
-        return MAV_RESULT.FAILED
+        return mavlink.MAV_RESULT_FAILED
     send(v, c, name)  # accepted even where there is nothing to send now
-    return MAV_RESULT.ACCEPTED
+    return mavlink.MAV_RESULT_ACCEPTED
 
 
-def _capabilities(v: VehicleState, o: Order, c: Channel) -> MAV_RESULT:
+def _capabilities(v: VehicleState, o: Order, c: Channel) -> int:
     if o.params[0] != 1.0:
-        return MAV_RESULT.FAILED
+        return mavlink.MAV_RESULT_FAILED
     send(v, c, "AUTOPILOT_VERSION")
-    return MAV_RESULT.ACCEPTED
+    return mavlink.MAV_RESULT_ACCEPTED
 
 
-def _banner(v: VehicleState, _o: Order, _c: Channel) -> MAV_RESULT:
+def _banner(v: VehicleState, _o: Order, _c: Channel) -> int:
     for text in (VERSION_TEXT, f"Frame: QUAD/{FRAMES.get(int(v.params['FRAME_TYPE']), 'UNSUPPORTED')}"):
-        v.say(MAV_SEVERITY.INFO, text)
-    return MAV_RESULT.ACCEPTED
+        v.say(mavlink.MAV_SEVERITY_INFO, text)
+    return mavlink.MAV_RESULT_ACCEPTED
 
 
-def _high_latency(v: VehicleState, o: Order, _c: Channel) -> MAV_RESULT:
+def _high_latency(v: VehicleState, o: Order, _c: Channel) -> int:
     if o.params[0] not in (0.0, 1.0):
-        return MAV_RESULT.DENIED
-    v.say(MAV_SEVERITY.NOTICE, f"High Latency {'enabled' if o.params[0] else 'disabled'}")
-    return MAV_RESULT.ACCEPTED
+        return mavlink.MAV_RESULT_DENIED
+    v.say(mavlink.MAV_SEVERITY_NOTICE, f"High Latency {'enabled' if o.params[0] else 'disabled'}")
+    return mavlink.MAV_RESULT_ACCEPTED
 
 
-def _parachute(_v: VehicleState, o: Order, _c: Channel) -> MAV_RESULT:
+def _parachute(_v: VehicleState, o: Order, _c: Channel) -> int:
     """There is none to release, but the switches are there."""
-    return MAV_RESULT.ACCEPTED if o.params[0] in (0.0, 1.0, 2.0) else MAV_RESULT.FAILED
+    return mavlink.MAV_RESULT_ACCEPTED if o.params[0] in (0.0, 1.0, 2.0) else mavlink.MAV_RESULT_FAILED
 
 
-def _ekf_sources(_v: VehicleState, o: Order, _c: Channel) -> MAV_RESULT:
+def _ekf_sources(_v: VehicleState, o: Order, _c: Channel) -> int:
     """All sets are the same here."""
-    return MAV_RESULT.ACCEPTED if 1.0 <= o.params[0] < EKF_SOURCE_SETS + 1 else MAV_RESULT.DENIED
+    return mavlink.MAV_RESULT_ACCEPTED if 1.0 <= o.params[0] < EKF_SOURCE_SETS + 1 else mavlink.MAV_RESULT_DENIED
 
 
-def _always(result: MAV_RESULT) -> Answer:
+def _always(result: int) -> Answer:
     return lambda _v, _order, _channel: result
 
 
 ANSWERS: dict[int, Answer] = {
-    MAV_CMD.GET_HOME_POSITION: _get_home,
-    MAV_CMD.SET_MESSAGE_INTERVAL: _set_interval,
-    MAV_CMD.GET_MESSAGE_INTERVAL: _get_interval,
-    MAV_CMD.REQUEST_MESSAGE: _request_message,
-    MAV_CMD.REQUEST_AUTOPILOT_CAPABILITIES: _capabilities,
-    MAV_CMD.DO_SEND_BANNER: _banner,
-    MAV_CMD.DO_PARACHUTE: _parachute,
-    MAV_CMD.CONTROL_HIGH_LATENCY: _high_latency,
-    MAV_CMD.SET_EKF_SOURCE_SET: _ekf_sources,
-    MAV_CMD.DEBUG_TRAP: _always(MAV_RESULT.DENIED),
-    MAV_CMD.DO_GIMBAL_MANAGER_PITCHYAW: lambda v, o, _c: point_gimbal(v, *o.params[:2], o.x),
-    MAV_CMD.DO_SET_SERVO: lambda v, o, _c: set_servo(v, *o.params[:2]),
-    MAV_CMD.DO_REPEAT_SERVO: lambda v, o, _c: set_servo(v, *o.params[:2]),
-    MAV_CMD.DO_SET_RELAY: lambda v, o, _c: set_relay(v, o.params[0]),
-    MAV_CMD.DO_REPEAT_RELAY: lambda v, o, _c: set_relay(v, o.params[0]),
-    MAV_CMD.DO_MOTOR_TEST: lambda v, o, _c: start_motor_test(v, o.params[0], o.params[3]),
-    MAV_CMD.BATTERY_RESET: lambda v, o, _c: reset_battery(v, *o.params[:2]),
-    **dict.fromkeys(ABSENT, _always(MAV_RESULT.FAILED)),
-    **dict.fromkeys(TAKEN, _always(MAV_RESULT.ACCEPTED)),
+    mavlink.MAV_CMD_GET_HOME_POSITION: _get_home,
+    mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: _set_interval,
+    mavlink.MAV_CMD_GET_MESSAGE_INTERVAL: _get_interval,
+    mavlink.MAV_CMD_REQUEST_MESSAGE: _request_message,
+    mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: _capabilities,
+    mavlink.MAV_CMD_DO_SEND_BANNER: _banner,
+    mavlink.MAV_CMD_DO_PARACHUTE: _parachute,
+    mavlink.MAV_CMD_CONTROL_HIGH_LATENCY: _high_latency,
+    mavlink.MAV_CMD_SET_EKF_SOURCE_SET: _ekf_sources,
+    mavlink.MAV_CMD_DEBUG_TRAP: _always(mavlink.MAV_RESULT_DENIED),
+    mavlink.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW: lambda v, o, _c: point_gimbal(v, *o.params[:2], o.x),
+    mavlink.MAV_CMD_DO_SET_SERVO: lambda v, o, _c: set_servo(v, *o.params[:2]),
+    mavlink.MAV_CMD_DO_REPEAT_SERVO: lambda v, o, _c: set_servo(v, *o.params[:2]),
+    mavlink.MAV_CMD_DO_SET_RELAY: lambda v, o, _c: set_relay(v, o.params[0]),
+    mavlink.MAV_CMD_DO_REPEAT_RELAY: lambda v, o, _c: set_relay(v, o.params[0]),
+    mavlink.MAV_CMD_DO_MOTOR_TEST: lambda v, o, _c: start_motor_test(v, o.params[0], o.params[3]),
+    mavlink.MAV_CMD_BATTERY_RESET: lambda v, o, _c: reset_battery(v, *o.params[:2]),
+    **dict.fromkeys(ABSENT, _always(mavlink.MAV_RESULT_FAILED)),
+    **dict.fromkeys(TAKEN, _always(mavlink.MAV_RESULT_ACCEPTED)),
 }

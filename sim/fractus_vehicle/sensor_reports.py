@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from fractus_mavlink import Value
-from fractus_mavlink.enums import GPS_FIX_TYPE, MAV_BATTERY_CHARGE_STATE, MAV_BATTERY_FUNCTION, MAV_BATTERY_TYPE
+from fractus_runtime.mavlink_codec import Value
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle import noise
 from fractus_vehicle.body import GRAVITY
@@ -20,7 +20,7 @@ SERVOS_REPORTED = 16
 def gps_raw_int(v: VehicleState) -> Values:
     """GPS_RAW_INT: the receiver's own fix, with its noise."""
     g = v.gps
-    if g.fix_type < GPS_FIX_TYPE.TYPE_2D_FIX or g.place is None:
+    if g.fix_type < mavlink.GPS_FIX_TYPE_2D_FIX or g.place is None:
         return {
             "time_usec": boot_us(v),
             "fix_type": g.fix_type,
@@ -153,8 +153,8 @@ def battery_status(v: VehicleState) -> Values:
     cells = (round(v.battery.voltage_v * 1000.0),) + (UNKNOWN_U16,) * 9
     return {
         "id": 0,
-        "battery_function": MAV_BATTERY_FUNCTION.UNKNOWN,
-        "type": MAV_BATTERY_TYPE.UNKNOWN,
+        "battery_function": mavlink.MAV_BATTERY_FUNCTION_UNKNOWN,
+        "type": mavlink.MAV_BATTERY_TYPE_UNKNOWN,
         "temperature": 32767,
         "voltages": cells,
         "current_battery": int(clamp(round(v.battery.current_a * 100.0), -1, 32767)),
@@ -166,10 +166,10 @@ def battery_status(v: VehicleState) -> Values:
     }
 
 
-def _charge_state(v: VehicleState) -> MAV_BATTERY_CHARGE_STATE:
+def _charge_state(v: VehicleState) -> int:
     if v.failsafes.battery_critical:
-        return MAV_BATTERY_CHARGE_STATE.CRITICAL
-    return MAV_BATTERY_CHARGE_STATE.LOW if v.failsafes.battery else MAV_BATTERY_CHARGE_STATE.OK
+        return mavlink.MAV_BATTERY_CHARGE_STATE_CRITICAL
+    return mavlink.MAV_BATTERY_CHARGE_STATE_LOW if v.failsafes.battery else mavlink.MAV_BATTERY_CHARGE_STATE_OK
 
 
 def ekf_status_report(v: VehicleState) -> Values:

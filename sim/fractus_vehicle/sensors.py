@@ -7,7 +7,7 @@ import math
 import random
 from dataclasses import dataclass
 
-from fractus_mavlink.enums import GPS_FIX_TYPE
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.earth import Place
 from fractus_vehicle.shaping import clamp
@@ -80,7 +80,7 @@ class Battery:
 class Gps:
     """The receiver: when it has a fix, where it believes to be."""
 
-    fix_type: GPS_FIX_TYPE = GPS_FIX_TYPE.NO_GPS
+    fix_type: int = mavlink.GPS_FIX_TYPE_NO_GPS
     satellites: int = 0
     place: Place | None = None
     vn: float = 0.0
@@ -96,13 +96,13 @@ class Gps:
         self.vn, self.ve = velocity
         self.satellites = satellites
         if satellites >= 10:
-            self.fix_type = GPS_FIX_TYPE.RTK_FIXED
+            self.fix_type = mavlink.GPS_FIX_TYPE_RTK_FIXED
         else:
-            self.fix_type = GPS_FIX_TYPE.TYPE_3D_FIX if satellites >= 6 else GPS_FIX_TYPE.NO_FIX
+            self.fix_type = mavlink.GPS_FIX_TYPE_3D_FIX if satellites >= 6 else mavlink.GPS_FIX_TYPE_NO_FIX
 
     def lose(self) -> None:
         """Lose the fix."""
-        self.fix_type = GPS_FIX_TYPE.NO_FIX
+        self.fix_type = mavlink.GPS_FIX_TYPE_NO_FIX
         self.satellites = 0
 
 

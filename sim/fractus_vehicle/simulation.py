@@ -7,7 +7,7 @@ import struct
 from dataclasses import replace
 from typing import BinaryIO
 
-from fractus_mavlink import Message, Signing
+from fractus_runtime.mavlink_codec import Message
 
 from fractus_vehicle.channel import Channel
 from fractus_vehicle.dispatch import dispatch
@@ -33,7 +33,7 @@ class Craft:
         channel = Channel(self.config.sysid, name=name, port=port)
         key = self.vehicle.signing_key
         if key is not None:
-            channel.signing = Signing(key, signing_clock(self.vehicle.state.unix_us))
+            channel.set_signing(key, signing_clock(self.vehicle.state.unix_us))
         self.vehicle.attach(channel)
         return channel
 

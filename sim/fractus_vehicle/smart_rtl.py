@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from enum import Enum
 
-from fractus_mavlink.enums import MAV_SEVERITY
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.breadcrumbs import Point
 from fractus_vehicle.descent import descend
@@ -54,7 +54,7 @@ class SmartReturn(Flight):
     def end(self, v: VehicleState) -> None:
         """Give back the point that was not reached, so that the path remains whole."""
         if self.stage is SmartStage.PATH_FOLLOW and self._popped is not None and not v.breadcrumbs.add(self._popped):
-            v.say(MAV_SEVERITY.ERROR, "SmartRTL: lost one point")
+            v.say(mavlink.MAV_SEVERITY_ERROR, "SmartRTL: lost one point")
 
     def step(self, v: VehicleState) -> None:
         """Go through the stages."""

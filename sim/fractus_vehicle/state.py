@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from fractus_mavlink import Value
-from fractus_mavlink.enums import COPTER_MODE, MAV_LANDED_STATE, MAV_MISSION_TYPE, MAV_SEVERITY
+from fractus_runtime.mavlink_codec import Value
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.body import Airframe, Body, Wind
 from fractus_vehicle.breadcrumbs import Breadcrumbs
@@ -98,8 +98,8 @@ class VehicleState:
         self.fence = Fence()
         self.failsafes = ActiveFailsafes()
         self.mission = Mission()
-        self.fence_items = ItemStore(MAV_MISSION_TYPE.FENCE)
-        self.rally = ItemStore(MAV_MISSION_TYPE.RALLY)
+        self.fence_items = ItemStore(mavlink.MAV_MISSION_TYPE_FENCE)
+        self.rally = ItemStore(mavlink.MAV_MISSION_TYPE_RALLY)
         self.breadcrumbs = Breadcrumbs(self.params, self.say)
         self.heading = Heading(self.control, self.params)
         self.gimbal = Gimbal(int(self.params["MNT1_TYPE"]))
@@ -112,7 +112,7 @@ class VehicleState:
         self.armed = False
         self.armed_at_s = 0.0
         self.armed_heading = math.radians(config.heading_deg)
-        self.mode = COPTER_MODE.STABILIZE
+        self.mode = mavlink.COPTER_MODE_STABILIZE
         self.landed = True
         self.touch_time_s = 0.0
         self.taking_off_until_m: float | None = None
@@ -233,13 +233,17 @@ class VehicleState:
         return self.taking_off_until_m is not None
 
     @property
-    def landed_state(self) -> MAV_LANDED_STATE:
+    def landed_state(self) -> int:
         """MAV_LANDED_STATE."""
         if self.landed:
-            return MAV_LANDED_STATE.ON_GROUND
+            return mavlink.MAV_LANDED_STATE_ON_GROUND
         if self.flying_wanted:
-            return MAV_LANDED_STATE.TAKEOFF
-        return MAV_LANDED_STATE.LANDING if self.mode is COPTER_MODE.LAND else MAV_LANDED_STATE.IN_AIR
+            return mavlink.MAV_LANDED_STATE_TAKEOFF
+        return (
+            mavlink.MAV_LANDED_STATE_LANDING
+            if self.mode == mavlink.COPTER_MODE_LAND
+            else mavlink.MAV_LANDED_STATE_IN_AIR
+        )
 
     # -- texts -------------------------------------------------------------------------------------------------
 
@@ -248,7 +252,7 @@ class VehicleState:
         for channel in self.channels:
             channel.send(name, values)
 
-    def say(self, severity: MAV_SEVERITY, text: str) -> None:
+    def say(self, severity: int, text: str) -> None:
         """Send a STATUSTEXT on every link, in chunks when it is long."""
         data = text.encode("ascii", "replace")
         # MAVLink: chunks of one text share an id other than 0.
@@ -267,7 +271,7 @@ class VehicleState:
         self.taking_off_until_m = None
         if force or self.landed:
             self.landed = self.landed or self.body.on_ground
-        self.say(MAV_SEVERITY.INFO, "Disarming motors")
+        self.say(mavlink.MAV_SEVERITY_INFO, "Disarming motors")
 
     def land_complete(self) -> None:
         """The vehicle rests on the ground."""

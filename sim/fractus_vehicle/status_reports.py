@@ -2,16 +2,7 @@
 
 from __future__ import annotations
 
-from fractus_mavlink.enums import (
-    COPTER_MODE,
-    GPS_FIX_TYPE,
-    MAV_AUTOPILOT,
-    MAV_MODE_FLAG,
-    MAV_STATE,
-    MAV_SYS_STATUS_SENSOR,
-    MAV_TYPE,
-    MAV_VTOL_STATE,
-)
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.copter import CAPABILITIES, FLIGHT_VERSION
 from fractus_vehicle.readiness import arming_refusals
@@ -19,46 +10,62 @@ from fractus_vehicle.report_units import UNKNOWN_U16, Values, boot_ms
 from fractus_vehicle.shaping import clamp
 from fractus_vehicle.state import VehicleState
 
-_SENSOR = MAV_SYS_STATUS_SENSOR
-_POSITION_CONTROLS = _SENSOR.SENSOR_Z_ALTITUDE_CONTROL | _SENSOR.SENSOR_XY_POSITION_CONTROL
-_CONTROLS = (
-    _SENSOR.SENSOR_ANGULAR_RATE_CONTROL | _SENSOR.SENSOR_ATTITUDE_STABILIZATION | _SENSOR.SENSOR_YAW_POSITION
-) | _SENSOR.SENSOR_MOTOR_OUTPUTS
-_SENSORS = (
-    _SENSOR.SENSOR_3D_GYRO
-    | _SENSOR.SENSOR_3D_ACCEL
-    | _SENSOR.SENSOR_3D_MAG
-    | _SENSOR.SENSOR_ABSOLUTE_PRESSURE
-    | _SENSOR.SENSOR_GPS
-    | _SENSOR.SENSOR_RC_RECEIVER
-    | _SENSOR.AHRS
-    | _SENSOR.TERRAIN
-    | _SENSOR.SENSOR_BATTERY
-    | _SENSOR.PREARM_CHECK
-    | _SENSOR.SENSOR_PROPULSION
+_POSITION_CONTROLS = (
+    mavlink.MAV_SYS_STATUS_SENSOR_Z_ALTITUDE_CONTROL | mavlink.MAV_SYS_STATUS_SENSOR_XY_POSITION_CONTROL
 )
-_PRESENT = _SENSORS | _CONTROLS | _POSITION_CONTROLS | _SENSOR.GEOFENCE | _SENSOR.LOGGING
-_HEALTHY = _SENSORS | _SENSOR.GEOFENCE | _SENSOR.LOGGING | _SENSOR.SENSOR_PROXIMITY
-_ALTITUDE_ONLY = frozenset({COPTER_MODE.ALT_HOLD, COPTER_MODE.GUIDED_NOGPS})
-WITHOUT_POSITION_CONTROL = _ALTITUDE_ONLY | {COPTER_MODE.STABILIZE, COPTER_MODE.ACRO, COPTER_MODE.DRIFT}
+_CONTROLS = (
+    mavlink.MAV_SYS_STATUS_SENSOR_ANGULAR_RATE_CONTROL
+    | mavlink.MAV_SYS_STATUS_SENSOR_ATTITUDE_STABILIZATION
+    | mavlink.MAV_SYS_STATUS_SENSOR_YAW_POSITION
+) | mavlink.MAV_SYS_STATUS_SENSOR_MOTOR_OUTPUTS
+_SENSORS = (
+    mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO
+    | mavlink.MAV_SYS_STATUS_SENSOR_3D_ACCEL
+    | mavlink.MAV_SYS_STATUS_SENSOR_3D_MAG
+    | mavlink.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE
+    | mavlink.MAV_SYS_STATUS_SENSOR_GPS
+    | mavlink.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
+    | mavlink.MAV_SYS_STATUS_AHRS
+    | mavlink.MAV_SYS_STATUS_TERRAIN
+    | mavlink.MAV_SYS_STATUS_SENSOR_BATTERY
+    | mavlink.MAV_SYS_STATUS_PREARM_CHECK
+    | mavlink.MAV_SYS_STATUS_SENSOR_PROPULSION
+)
+_PRESENT = _SENSORS | _CONTROLS | _POSITION_CONTROLS | mavlink.MAV_SYS_STATUS_GEOFENCE | mavlink.MAV_SYS_STATUS_LOGGING
+_HEALTHY = (
+    _SENSORS
+    | mavlink.MAV_SYS_STATUS_GEOFENCE
+    | mavlink.MAV_SYS_STATUS_LOGGING
+    | mavlink.MAV_SYS_STATUS_SENSOR_PROXIMITY
+)
+_ALTITUDE_ONLY = frozenset({mavlink.COPTER_MODE_ALT_HOLD, mavlink.COPTER_MODE_GUIDED_NOGPS})
+WITHOUT_POSITION_CONTROL = _ALTITUDE_ONLY | {
+    mavlink.COPTER_MODE_STABILIZE,
+    mavlink.COPTER_MODE_ACRO,
+    mavlink.COPTER_MODE_DRIFT,
+}
 
 
 def heartbeat(v: VehicleState) -> Values:
     """HEARTBEAT as ArduCopter fills it."""
-    flags = MAV_MODE_FLAG.CUSTOM_MODE_ENABLED | MAV_MODE_FLAG.STABILIZE_ENABLED | MAV_MODE_FLAG.MANUAL_INPUT_ENABLED
+    flags = (
+        mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+        | mavlink.MAV_MODE_FLAG_STABILIZE_ENABLED
+        | mavlink.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED
+    )
     # Set while the position controller runs, and before the main loop does.
     if v.mode not in WITHOUT_POSITION_CONTROL or not v.estimator.initialised:
-        flags |= MAV_MODE_FLAG.GUIDED_ENABLED
+        flags |= mavlink.MAV_MODE_FLAG_GUIDED_ENABLED
     if v.armed or v.motor_test_until_s is not None:
-        flags |= MAV_MODE_FLAG.SAFETY_ARMED
-    state = MAV_STATE.STANDBY if v.landed else MAV_STATE.ACTIVE
+        flags |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED
+    state = mavlink.MAV_STATE_STANDBY if v.landed else mavlink.MAV_STATE_ACTIVE
     if not v.estimator.initialised:
-        state = MAV_STATE.BOOT
+        state = mavlink.MAV_STATE_BOOT
     elif v.failsafes.any:
-        state = MAV_STATE.CRITICAL
+        state = mavlink.MAV_STATE_CRITICAL
     return {
-        "type": MAV_TYPE.QUADROTOR,
-        "autopilot": MAV_AUTOPILOT.ARDUPILOTMEGA,
+        "type": mavlink.MAV_TYPE_QUADROTOR,
+        "autopilot": mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
         "base_mode": int(flags),
         "custom_mode": int(v.mode),
         "system_status": int(state),
@@ -70,25 +77,27 @@ def sys_status(v: VehicleState) -> Values:
     """SYS_STATUS with the health bits that clients look at."""
     controls = _CONTROLS
     if v.mode in _ALTITUDE_ONLY:
-        controls |= _SENSOR.SENSOR_Z_ALTITUDE_CONTROL
+        controls |= mavlink.MAV_SYS_STATUS_SENSOR_Z_ALTITUDE_CONTROL
     elif v.mode not in WITHOUT_POSITION_CONTROL:
         controls |= _POSITION_CONTROLS
     healthy = _HEALTHY | controls
-    if v.gps.fix_type < GPS_FIX_TYPE.TYPE_3D_FIX:
-        healthy &= ~_SENSOR.SENSOR_GPS
+    if v.gps.fix_type < mavlink.GPS_FIX_TYPE_3D_FIX:
+        healthy &= ~mavlink.MAV_SYS_STATUS_SENSOR_GPS
     if not v.estimator.active:
-        healthy &= ~_SENSOR.AHRS
+        healthy &= ~mavlink.MAV_SYS_STATUS_AHRS
     if v.failsafes.radio:
-        healthy &= ~_SENSOR.SENSOR_RC_RECEIVER
+        healthy &= ~mavlink.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
     if v.failsafes.battery:
-        healthy &= ~_SENSOR.SENSOR_BATTERY
+        healthy &= ~mavlink.MAV_SYS_STATUS_SENSOR_BATTERY
     if v.fence.breaches:
-        healthy &= ~_SENSOR.GEOFENCE
+        healthy &= ~mavlink.MAV_SYS_STATUS_GEOFENCE
     if not v.armed and arming_refusals(v):
-        healthy &= ~_SENSOR.PREARM_CHECK
+        healthy &= ~mavlink.MAV_SYS_STATUS_PREARM_CHECK
     return {
         "onboard_control_sensors_present": _PRESENT,
-        "onboard_control_sensors_enabled": _SENSORS | controls | (_SENSOR.GEOFENCE if v.fence.enabled else 0),
+        "onboard_control_sensors_enabled": _SENSORS
+        | controls
+        | (mavlink.MAV_SYS_STATUS_GEOFENCE if v.fence.enabled else 0),
         "onboard_control_sensors_health": healthy,
         "load": 250,
         "voltage_battery": round(v.battery.voltage_v * 1000.0),
@@ -101,7 +110,7 @@ def sys_status(v: VehicleState) -> Values:
 
 def extended_sys_state(v: VehicleState) -> Values:
     """EXTENDED_SYS_STATE."""
-    return {"vtol_state": MAV_VTOL_STATE.MC, "landed_state": int(v.landed_state)}
+    return {"vtol_state": mavlink.MAV_VTOL_STATE_MC, "landed_state": int(v.landed_state)}
 
 
 def autopilot_version(_v: VehicleState) -> Values:
@@ -123,7 +132,7 @@ def mission_current(v: VehicleState) -> Values:
         "seq": v.mission.current,
         "total": total,
         "mission_state": v.mission.state(v.mode),
-        "mission_mode": 1 if v.mode is COPTER_MODE.AUTO else 0,
+        "mission_mode": 1 if v.mode == mavlink.COPTER_MODE_AUTO else 0,
     }
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fractus_mavlink.enums import MAV_DATA_STREAM
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle import motion_reports, sensor_reports, status_reports
 from fractus_vehicle.report_units import Builder
@@ -94,11 +94,11 @@ SILENT = frozenset(
 
 # MAV_DATA_STREAM groups as ArduCopter fills them; the second column names the SRn_ parameter.
 GROUPS: dict[int, tuple[str, tuple[str, ...]]] = {
-    MAV_DATA_STREAM.RAW_SENSORS: (
+    mavlink.MAV_DATA_STREAM_RAW_SENSORS: (
         "RAW_SENS",
         ("RAW_IMU", "SCALED_IMU2", "SCALED_IMU3", "SCALED_PRESSURE", "SCALED_PRESSURE2"),
     ),
-    MAV_DATA_STREAM.EXTENDED_STATUS: (
+    mavlink.MAV_DATA_STREAM_EXTENDED_STATUS: (
         "EXT_STAT",
         (
             "SYS_STATUS",
@@ -111,12 +111,12 @@ GROUPS: dict[int, tuple[str, tuple[str, ...]]] = {
             "POSITION_TARGET_GLOBAL_INT",
         ),
     ),
-    MAV_DATA_STREAM.RC_CHANNELS: ("RC_CHAN", ("SERVO_OUTPUT_RAW", "RC_CHANNELS")),
-    MAV_DATA_STREAM.RAW_CONTROLLER: ("RAW_CTRL", ()),
-    MAV_DATA_STREAM.POSITION: ("POSITION", ("GLOBAL_POSITION_INT", "LOCAL_POSITION_NED")),
-    MAV_DATA_STREAM.EXTRA1: ("EXTRA1", ("ATTITUDE", "SIMSTATE", "AHRS2")),
-    MAV_DATA_STREAM.EXTRA2: ("EXTRA2", ("VFR_HUD",)),
-    MAV_DATA_STREAM.EXTRA3: (
+    mavlink.MAV_DATA_STREAM_RC_CHANNELS: ("RC_CHAN", ("SERVO_OUTPUT_RAW", "RC_CHANNELS")),
+    mavlink.MAV_DATA_STREAM_RAW_CONTROLLER: ("RAW_CTRL", ()),
+    mavlink.MAV_DATA_STREAM_POSITION: ("POSITION", ("GLOBAL_POSITION_INT", "LOCAL_POSITION_NED")),
+    mavlink.MAV_DATA_STREAM_EXTRA1: ("EXTRA1", ("ATTITUDE", "SIMSTATE", "AHRS2")),
+    mavlink.MAV_DATA_STREAM_EXTRA2: ("EXTRA2", ("VFR_HUD",)),
+    mavlink.MAV_DATA_STREAM_EXTRA3: (
         "EXTRA3",
         (
             "AHRS",

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from fractus_mavlink import Message
-from fractus_mavlink.enums import ATTITUDE_TARGET_TYPEMASK, MAV_FRAME, MAV_SEVERITY, POSITION_TARGET_TYPEMASK
+from fractus_runtime.mavlink_codec import Message
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.copter import GLOBAL_FRAMES, IGNORE_ACCELERATION, IGNORE_POSITION, IGNORE_VELOCITY
 from fractus_vehicle.earth import Place, valid_coordinates
@@ -16,19 +16,19 @@ from fractus_vehicle.mission_items import item_from
 from fractus_vehicle.shaping import clamp, wrap_pi
 from fractus_vehicle.state import VehicleState
 
-_BODY_FRAMES = frozenset({MAV_FRAME.BODY_NED, MAV_FRAME.BODY_OFFSET_NED})
-_OFFSET_FRAMES = frozenset({MAV_FRAME.LOCAL_OFFSET_NED}) | _BODY_FRAMES
-_LOCAL_FRAMES = frozenset({MAV_FRAME.LOCAL_NED}) | _OFFSET_FRAMES
+_BODY_FRAMES = frozenset({mavlink.MAV_FRAME_BODY_NED, mavlink.MAV_FRAME_BODY_OFFSET_NED})
+_OFFSET_FRAMES = frozenset({mavlink.MAV_FRAME_LOCAL_OFFSET_NED}) | _BODY_FRAMES
+_LOCAL_FRAMES = frozenset({mavlink.MAV_FRAME_LOCAL_NED}) | _OFFSET_FRAMES
 
 # A faster velocity is taken for a mistake.
 SANE_MPS = 1000.0
 
-_NO_ATTITUDE = ATTITUDE_TARGET_TYPEMASK.ATTITUDE_IGNORE
-_NO_THRUST = ATTITUDE_TARGET_TYPEMASK.THROTTLE_IGNORE
+_NO_ATTITUDE = mavlink.ATTITUDE_TARGET_TYPEMASK_ATTITUDE_IGNORE
+_NO_THRUST = mavlink.ATTITUDE_TARGET_TYPEMASK_THROTTLE_IGNORE
 _RATES = (
-    ATTITUDE_TARGET_TYPEMASK.BODY_ROLL_RATE_IGNORE
-    | ATTITUDE_TARGET_TYPEMASK.BODY_PITCH_RATE_IGNORE
-    | ATTITUDE_TARGET_TYPEMASK.BODY_YAW_RATE_IGNORE
+    mavlink.ATTITUDE_TARGET_TYPEMASK_BODY_ROLL_RATE_IGNORE
+    | mavlink.ATTITUDE_TARGET_TYPEMASK_BODY_PITCH_RATE_IGNORE
+    | mavlink.ATTITUDE_TARGET_TYPEMASK_BODY_YAW_RATE_IGNORE
 )
 # How far from 1 the square of a quaternion's length may be.
 UNIT_TOLERANCE = 1e-3
@@ -82,7 +82,7 @@ def global_target(v: VehicleState, flight: Flight, m: Message) -> None:
             return
         base = v.altitude_base_m(frame)
         if frame not in GLOBAL_FRAMES:
-            v.say(MAV_SEVERITY.INFO, f"Unknown mavlink coordinate frame {frame}")
+            v.say(mavlink.MAV_SEVERITY_INFO, f"Unknown mavlink coordinate frame {frame}")
         if base is None:
             _stop(v, flight)
             return
@@ -110,11 +110,11 @@ def _target(v: VehicleState, flight: Flight, m: Message, asked: Setpoint) -> Non
     velocity = asked.velocity if not mask & IGNORE_VELOCITY else None
     accel = asked.accel if not mask & IGNORE_ACCELERATION else None
     understood = velocity is not None or (position is None) != (accel is None)
-    if not understood or (mask & POSITION_TARGET_TYPEMASK.FORCE_SET and accel is not None):
+    if not understood or (mask & mavlink.POSITION_TARGET_TYPEMASK_FORCE_SET and accel is not None):
         flight.stop(v)
         return
-    yaw = m.real("yaw") if not mask & POSITION_TARGET_TYPEMASK.YAW_IGNORE else None
-    yaw_rate = m.real("yaw_rate") if not mask & POSITION_TARGET_TYPEMASK.YAW_RATE_IGNORE else None
+    yaw = m.real("yaw") if not mask & mavlink.POSITION_TARGET_TYPEMASK_YAW_IGNORE else None
+    yaw_rate = m.real("yaw_rate") if not mask & mavlink.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE else None
     if velocity is not None and not all(abs(value) <= SANE_MPS for value in velocity):
         flight.stop(v)
         return

@@ -5,28 +5,36 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from fractus_mavlink import Message, Value
-from fractus_mavlink.enums import MAV_CMD, MAV_MISSION_RESULT, MAV_MISSION_TYPE, MAV_SEVERITY
+from fractus_runtime.mavlink_codec import Message, Value
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.channel import Channel
 from fractus_vehicle.mission_items import Item, ItemStore, item_from, judge, judge_numbers
 
 # What the storage of the autopilot holds.
-MAX_ITEMS = {MAV_MISSION_TYPE.MISSION: 650, MAV_MISSION_TYPE.FENCE: 70, MAV_MISSION_TYPE.RALLY: 46}
+MAX_ITEMS = {
+    mavlink.MAV_MISSION_TYPE_MISSION: 650,
+    mavlink.MAV_MISSION_TYPE_FENCE: 70,
+    mavlink.MAV_MISSION_TYPE_RALLY: 46,
+}
 UPLOAD_TIMEOUT_S = 8.0
 RETRY_S = 1.0
 # What is said when a list is stored.
 RECEIVED = {
-    MAV_MISSION_TYPE.MISSION: (MAV_SEVERITY.INFO, "Flight plan received"),
-    MAV_MISSION_TYPE.FENCE: (MAV_SEVERITY.DEBUG, "Fence Indexed OK"),
+    mavlink.MAV_MISSION_TYPE_MISSION: (mavlink.MAV_SEVERITY_INFO, "Flight plan received"),
+    mavlink.MAV_MISSION_TYPE_FENCE: (mavlink.MAV_SEVERITY_DEBUG, "Fence Indexed OK"),
 }
 # What the lists are called in texts.
-TITLES = {MAV_MISSION_TYPE.MISSION: "Mission", MAV_MISSION_TYPE.FENCE: "Fence", MAV_MISSION_TYPE.RALLY: "Rally"}
+TITLES = {
+    mavlink.MAV_MISSION_TYPE_MISSION: "Mission",
+    mavlink.MAV_MISSION_TYPE_FENCE: "Fence",
+    mavlink.MAV_MISSION_TYPE_RALLY: "Rally",
+}
 # What is refused until an upload of the same list has ended (the older MISSION_REQUEST is answered all the same).
 NOT_WHILE_UPLOADED = {
-    "MISSION_REQUEST_LIST": MAV_MISSION_RESULT.DENIED,
-    "MISSION_REQUEST_INT": MAV_MISSION_RESULT.DENIED,
-    "MISSION_CLEAR_ALL": MAV_MISSION_RESULT.ERROR,
+    "MISSION_REQUEST_LIST": mavlink.MAV_MISSION_DENIED,
+    "MISSION_REQUEST_INT": mavlink.MAV_MISSION_DENIED,
+    "MISSION_CLEAR_ALL": mavlink.MAV_MISSION_ERROR,
 }
 
 
@@ -37,7 +45,7 @@ class Upload:
     channel: Channel
     sysid: int
     compid: int
-    kind: MAV_MISSION_TYPE
+    kind: int
     next: int
     last: int
     items: list[Item]
@@ -60,20 +68,20 @@ class Transfers:
 
     def __init__(
         self,
-        stores: Mapping[MAV_MISSION_TYPE, ItemStore],
-        replace_items: Callable[[ItemStore, list[Item]], MAV_MISSION_RESULT],
-        clear: Callable[[ItemStore], MAV_MISSION_RESULT],
-        say: Callable[[MAV_SEVERITY, str], None],
+        stores: Mapping[int, ItemStore],
+        replace_items: Callable[[ItemStore, list[Item]], int],
+        clear: Callable[[ItemStore], int],
+        say: Callable[[int, str], None],
     ) -> None:
         self._stores = stores
         self._replace = replace_items
         self._clear = clear
         self._say = say
-        self.uploads: dict[MAV_MISSION_TYPE, Upload] = {}
+        self.uploads: dict[int, Upload] = {}
         self.now_s = 0.0
 
     @staticmethod
-    def _ack(channel: Channel, peer: Message | Upload, kind: int, result: MAV_MISSION_RESULT) -> None:
+    def _ack(channel: Channel, peer: Message | Upload, kind: int, result: int) -> None:
         channel.send("MISSION_ACK", _address(peer, kind) | {"type": int(result)})
 
     def handle(self, channel: Channel, message: Message, now_s: float) -> None:
@@ -81,11 +89,11 @@ class Transfers:
         self.now_s = now_s
         kind_number = message.integer("mission_type") if message.has("mission_type") else 0
         if kind_number not in self._stores:
-            self._ack(channel, message, kind_number, MAV_MISSION_RESULT.UNSUPPORTED)
+            self._ack(channel, message, kind_number, mavlink.MAV_MISSION_UNSUPPORTED)
         elif kind_number in self.uploads and message.name in NOT_WHILE_UPLOADED:
             self._ack(channel, message, kind_number, NOT_WHILE_UPLOADED[message.name])
         else:
-            self._handle(channel, message, self._stores[MAV_MISSION_TYPE(kind_number)])
+            self._handle(channel, message, self._stores[kind_number])
 
     def detach(self, channel: Channel) -> None:
         """Give up uploads from a link that closes."""
@@ -102,14 +110,14 @@ class Transfers:
                 if 0 <= start <= end <= len(store.items):
                     self._begin(channel, message, store, range(start, end + 1))
                 else:
-                    self._say(MAV_SEVERITY.WARNING, "Flight plan update rejected")
-                    self._ack(channel, message, kind, MAV_MISSION_RESULT.ERROR)
+                    self._say(mavlink.MAV_SEVERITY_WARNING, "Flight plan update rejected")
+                    self._ack(channel, message, kind, mavlink.MAV_MISSION_ERROR)
             case "MISSION_ITEM" | "MISSION_ITEM_INT":
                 self._take(channel, message, store)
             case "MISSION_REQUEST_LIST":
                 channel.send("MISSION_COUNT", _address(message, kind) | {"count": len(store.items)})
             case "MISSION_REQUEST_PARTIAL_LIST":
-                self._ack(channel, message, kind, MAV_MISSION_RESULT.UNSUPPORTED)
+                self._ack(channel, message, kind, mavlink.MAV_MISSION_UNSUPPORTED)
             case "MISSION_REQUEST" | "MISSION_REQUEST_INT":
                 self._give(channel, message, store)
             case "MISSION_CLEAR_ALL":
@@ -121,10 +129,10 @@ class Transfers:
         """Begin to ask for the items of `wanted`; all of a new list, or a part of the stored one."""
         going_on = self.uploads.get(store.kind)
         if going_on is not None and not going_on.is_from(message):
-            self._ack(channel, message, store.kind, MAV_MISSION_RESULT.DENIED)
+            self._ack(channel, message, store.kind, mavlink.MAV_MISSION_DENIED)
         elif wanted.stop > MAX_ITEMS[store.kind]:
-            self._say(MAV_SEVERITY.WARNING, f"Only {MAX_ITEMS[store.kind]} items are supported")
-            self._ack(channel, message, store.kind, MAV_MISSION_RESULT.NO_SPACE)
+            self._say(mavlink.MAV_SEVERITY_WARNING, f"Only {MAX_ITEMS[store.kind]} items are supported")
+            self._ack(channel, message, store.kind, mavlink.MAV_MISSION_NO_SPACE)
         elif not wanted:
             self._complete(channel, message, store, [])
         else:
@@ -150,25 +158,25 @@ class Transfers:
     def _take(self, channel: Channel, message: Message, store: ItemStore) -> None:
         up = self.uploads.get(store.kind)
         if up is None:
-            self._ack(channel, message, store.kind, MAV_MISSION_RESULT.ERROR)
+            self._ack(channel, message, store.kind, mavlink.MAV_MISSION_ERROR)
             return
         if message.name == "MISSION_ITEM" and not up.old_format:
             up.old_format = True
-            self._say(MAV_SEVERITY.WARNING, "got MISSION_ITEM; GCS should send MISSION_ITEM_INT")
+            self._say(mavlink.MAV_SEVERITY_WARNING, "got MISSION_ITEM; GCS should send MISSION_ITEM_INT")
         seq = message.integer("seq")
         if seq != up.next or not up.is_from(message):
             # The upload goes on; an item that comes twice is told so, too.
-            refusal = MAV_MISSION_RESULT.INVALID_SEQUENCE if seq != up.next else MAV_MISSION_RESULT.DENIED
+            refusal = mavlink.MAV_MISSION_INVALID_SEQUENCE if seq != up.next else mavlink.MAV_MISSION_DENIED
             self._ack(channel, message, store.kind, refusal)
             return
         item = item_from(message)
         verdict = self._judge(message, item, store, up)
-        if verdict is not MAV_MISSION_RESULT.ACCEPTED:
+        if verdict != mavlink.MAV_MISSION_ACCEPTED:
             del self.uploads[store.kind]
             self._ack(channel, message, store.kind, verdict)
             return
         up.items[seq : seq + 1] = [item]
-        if store.kind is MAV_MISSION_TYPE.MISSION and up.next < up.last:
+        if store.kind == mavlink.MAV_MISSION_TYPE_MISSION and up.next < up.last:
             # A mission is written as it arrives: an upload that ends here leaves so much of it, and nothing of the old one.
             self._replace(store, list(up.items))
         up.next += 1
@@ -183,19 +191,19 @@ class Transfers:
         """Store a list that has arrived, and say so."""
         verdict = self._replace(store, items)
         self._ack(channel, message, store.kind, verdict)
-        if verdict is MAV_MISSION_RESULT.ACCEPTED and store.kind in RECEIVED:
+        if verdict == mavlink.MAV_MISSION_ACCEPTED and store.kind in RECEIVED:
             self._say(*RECEIVED[store.kind])
 
     @staticmethod
-    def _judge(message: Message, item: Item, store: ItemStore, up: Upload) -> MAV_MISSION_RESULT:
-        if store.kind is MAV_MISSION_TYPE.MISSION:
+    def _judge(message: Message, item: Item, store: ItemStore, up: Upload) -> int:
+        if store.kind == mavlink.MAV_MISSION_TYPE_MISSION:
             if message.integer("seq") == 0:
-                return MAV_MISSION_RESULT.ACCEPTED
+                return mavlink.MAV_MISSION_ACCEPTED
             verdict = judge_numbers(message)
-            if verdict is not MAV_MISSION_RESULT.ACCEPTED:
+            if verdict != mavlink.MAV_MISSION_ACCEPTED:
                 return verdict
-            if item.command == MAV_CMD.DO_JUMP and not 0 < int(item.param1) < max(len(up.items), up.last + 1):
-                return MAV_MISSION_RESULT.ERROR
+            if item.command == mavlink.MAV_CMD_DO_JUMP and not 0 < int(item.param1) < max(len(up.items), up.last + 1):
+                return mavlink.MAV_MISSION_ERROR
         return judge(item, store.kind)
 
     def _give(self, channel: Channel, message: Message, store: ItemStore) -> None:
@@ -203,7 +211,7 @@ class Transfers:
         # Item 0 of a mission is home, and may be read even when there is no mission.
         homes = [store.home] if store.home is not None and not store.items else store.items
         if not 0 <= seq < len(homes):
-            self._ack(channel, message, store.kind, MAV_MISSION_RESULT.ERROR)
+            self._ack(channel, message, store.kind, mavlink.MAV_MISSION_ERROR)
             return
         item = homes[seq]
         integers = message.name == "MISSION_REQUEST_INT"
@@ -215,7 +223,7 @@ class Transfers:
                 "frame": item.frame,
                 "command": item.command,
                 "current": 0,
-                "autocontinue": 1 if store.kind is MAV_MISSION_TYPE.MISSION else 0,
+                "autocontinue": 1 if store.kind == mavlink.MAV_MISSION_TYPE_MISSION else 0,
                 "param1": item.param1,
                 "param2": item.param2,
                 "param3": item.param3,
@@ -232,7 +240,7 @@ class Transfers:
         for kind, up in list(self.uploads.items()):
             if now_s - up.heard_s > UPLOAD_TIMEOUT_S:
                 del self.uploads[kind]
-                self._ack(up.channel, up, up.kind, MAV_MISSION_RESULT.OPERATION_CANCELLED)
-                self._say(MAV_SEVERITY.WARNING, f"{TITLES[kind]} upload timeout")
+                self._ack(up.channel, up, up.kind, mavlink.MAV_MISSION_OPERATION_CANCELLED)
+                self._say(mavlink.MAV_SEVERITY_WARNING, f"{TITLES[kind]} upload timeout")
             elif now_s - up.asked_s > RETRY_S:
                 self._ask(up)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fractus_mavlink.enums import COPTER_MODE, MAV_SEVERITY
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.accessories import end_motor_test
 from fractus_vehicle.channel import Channel
@@ -20,7 +20,7 @@ from fractus_vehicle.telemetry import attach, follow_rate, send_parameter, serve
 from fractus_vehicle.transfers import Transfers
 
 # The modes that switch the motors off as soon as they have landed.
-_LANDING_MODES = frozenset({COPTER_MODE.LAND, COPTER_MODE.RTL, COPTER_MODE.SMART_RTL})
+_LANDING_MODES = frozenset({mavlink.COPTER_MODE_LAND, mavlink.COPTER_MODE_RTL, mavlink.COPTER_MODE_SMART_RTL})
 
 # How often a disarmed vehicle tells why it would not arm, and the pressure that it measures on the ground.
 CHECKS_TOLD_S = 30.0
@@ -70,7 +70,7 @@ class Vehicle:
             set_home(v, v.place)
         v.control.reset(v.est)
         v.breadcrumbs.restart(v.time_s, v.known_position)
-        v.say(MAV_SEVERITY.INFO, "Arming motors")
+        v.say(mavlink.MAV_SEVERITY_INFO, "Arming motors")
 
     def step(self) -> None:
         """Advance by one control step."""
@@ -105,7 +105,7 @@ class Vehicle:
         if v.time_s >= self._next_checks_s:
             self._next_checks_s += CHECKS_TOLD_S
             for refusal in arming_refusals(v):
-                v.say(MAV_SEVERITY.CRITICAL, f"PreArm: {refusal}")
+                v.say(mavlink.MAV_SEVERITY_CRITICAL, f"PreArm: {refusal}")
         if v.time_s >= self._next_pressure_s:
             self._next_pressure_s = v.time_s + PRESSURE_TOLD_S
             for channel in v.channels:

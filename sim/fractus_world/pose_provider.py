@@ -11,8 +11,8 @@ import time
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-from fractus_mavlink import Endpoint, Message, layout_named
-from fractus_mavlink.enums import GIMBAL_DEVICE_FLAGS, MAV_AUTOPILOT, MAV_CMD, MAV_COMPONENT
+from fractus_runtime.mavlink_codec import Endpoint, Message, message_id
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_world.optics import Mount, Pose
 
@@ -25,7 +25,7 @@ SILENCE_S = 5.0
 """A link that brings nothing for so long is opened again."""
 RETRY_S = (0.2, 3.0)
 ASK_EVERY_S = 5.0
-SYSTEM, COMPONENT = 242, MAV_COMPONENT.CAMERA
+SYSTEM, COMPONENT = 242, mavlink.MAV_COMP_ID_CAMERA
 """MAVLink ids of a camera; no heartbeats are sent, so that none can hold off an autopilot's failsafe."""
 _STREAMS = {"GLOBAL_POSITION_INT": 20.0, "ATTITUDE": 20.0, "GIMBAL_DEVICE_ATTITUDE_STATUS": 10.0}
 
@@ -145,7 +145,7 @@ class VehiclePose:
                 heard_s = now_s
                 if (
                     message.name == "HEARTBEAT"
-                    and message.integer("autopilot") != MAV_AUTOPILOT.INVALID
+                    and message.integer("autopilot") != mavlink.MAV_AUTOPILOT_INVALID
                     and autopilot is None
                 ):
                     autopilot = (message.sysid, message.compid)
@@ -174,8 +174,8 @@ def _ask(link: socket.socket, endpoint: Endpoint, autopilot: tuple[int, int]) ->
         values = {
             "target_system": autopilot[0],
             "target_component": autopilot[1],
-            "command": MAV_CMD.SET_MESSAGE_INTERVAL,
-            "param1": layout_named(name).msgid,
+            "command": mavlink.MAV_CMD_SET_MESSAGE_INTERVAL,
+            "param1": message_id(name),
             "param2": 1e6 / rate_hz,
         }
         link.sendall(endpoint.encode("COMMAND_LONG", values))
@@ -206,8 +206,11 @@ def _gimbal(message: Message, attitude: Message | None) -> Mount | None:
     pitch = math.degrees(math.asin(min(max(2 * (w * y - z * x) / norm**2, -1.0), 1.0)))
     yaw = math.degrees(math.atan2(2 * (w * z + x * y), norm**2 - 2 * (y * y + z * z)))
     flags = message.integer("flags")
-    lock, vehicle = flags & GIMBAL_DEVICE_FLAGS.YAW_LOCK, flags & GIMBAL_DEVICE_FLAGS.YAW_IN_VEHICLE_FRAME
-    earth = flags & GIMBAL_DEVICE_FLAGS.YAW_IN_EARTH_FRAME or (lock and not vehicle)
+    lock, vehicle = (
+        flags & mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK,
+        flags & mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME,
+    )
+    earth = flags & mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME or (lock and not vehicle)
     if earth and attitude is not None:
         yaw -= math.degrees(attitude.real("yaw"))
     return Mount(pitch, (yaw + 180.0) % 360.0 - 180.0, stabilised=True)

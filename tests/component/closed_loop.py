@@ -22,7 +22,7 @@ import shapely
 from fractus_core.api.plans import GrantSpec
 from fractus_core.control import ControlEvent, ControlState, StreamState
 from fractus_core.policy.decision_types import SetSpeedArgs, TakeoffArgs, VelocityArgs
-from fractus_mavlink import Parser
+from fractus_runtime.mavlink_codec import Parser
 from fractus_services.errors import AutopilotError, Refused
 from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.journal import Journal

@@ -16,8 +16,7 @@ from fractus_core.control.state import FlightMode
 from fractus_core.geo import LocalFrame
 from fractus_core.policy.compiled_grant import compile_grant
 from fractus_core.policy.decision_types import Airframe, GotoArgs, Home, TakeoffArgs
-from fractus_mavlink import Message, message
-from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_RESULT
+from fractus_runtime.mavlink_codec import Message, message
 from fractus_services.errors import Refused
 from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.journal import Journal
@@ -30,10 +29,12 @@ from fractus_services.mobility.mavlink.returning import MavlinkReturn
 from fractus_services.mobility.mavlink.timing import PROBE_S
 from fractus_services.mobility.rpc.wiring import Parts
 from parameter_vehicle import FAILSAFES, MOVEMENT, told
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 FRAME = LocalFrame(39.36, 22.95)
 BRAKE, GUIDED, LAND, LOITER, RTL, SMART_RTL = (
-    ARDUCOPTER.mode(COPTER_MODE[name]) for name in ("BRAKE", "GUIDED", "LAND", "LOITER", "RTL", "SMART_RTL")
+    ARDUCOPTER.mode(getattr(mavlink, f"COPTER_MODE_{name}"))
+    for name in ("BRAKE", "GUIDED", "LAND", "LOITER", "RTL", "SMART_RTL")
 )
 STEP_S = 0.1
 """Between two positions of the vehicle, unless a test is of what happens in between."""
@@ -111,7 +112,11 @@ class Plane(MavlinkAutopilot):
             if not refused:
                 self._obey(outgoing)
             self._reply(
-                message("COMMAND_ACK", command=command, result=MAV_RESULT.FAILED if refused else MAV_RESULT.ACCEPTED)
+                message(
+                    "COMMAND_ACK",
+                    command=command,
+                    result=mavlink.MAV_RESULT_FAILED if refused else mavlink.MAV_RESULT_ACCEPTED,
+                )
             )
         elif kind == "TIMESYNC":
             self._reply(message("TIMESYNC", tc1=round(self.now * 1e9), ts1=outgoing.integer("ts1")))
@@ -126,26 +131,26 @@ class Plane(MavlinkAutopilot):
 
     def _obey(self, outgoing: Message) -> None:
         number = outgoing.integer("command")
-        if number == MAV_CMD.DO_SET_MODE:
+        if number == mavlink.MAV_CMD_DO_SET_MODE:
             self.set_to(self.stack.mode(int(outgoing.real("param2"))))
-        elif number == MAV_CMD.COMPONENT_ARM_DISARM:
+        elif number == mavlink.MAV_CMD_COMPONENT_ARM_DISARM:
             self.vehicle.armed = outgoing.real("param1") == 1
-        elif number == MAV_CMD.NAV_TAKEOFF:
+        elif number == mavlink.MAV_CMD_NAV_TAKEOFF:
             self.goal, self.goal_height, self.wanted = (
                 (self.xy[0], self.xy[1]),
                 outgoing.real("param7") + self.raised_m,
                 None,
             )
-        elif number == MAV_CMD.DO_CHANGE_SPEED:
+        elif number == mavlink.MAV_CMD_DO_CHANGE_SPEED:
             self.speed_mps = outgoing.real("param2")
-        elif number == MAV_CMD.DO_REPOSITION:
+        elif number == mavlink.MAV_CMD_DO_REPOSITION:
             if not self.positions:
                 self.positions, self.speed_mps = True, DEFAULT_MPS  # its position controller begins again
             self.goal = FRAME.xy(outgoing.integer("x") / 1e7, outgoing.integer("y") / 1e7)
             self.goal_height, self.wanted = outgoing.real("z") + self.raised_m, None
-        elif number == MAV_CMD.CONDITION_YAW:
+        elif number == mavlink.MAV_CMD_CONDITION_YAW:
             self.heading = outgoing.real("param1")
-        elif number == MAV_CMD.DO_SET_HOME:
+        elif number == mavlink.MAV_CMD_DO_SET_HOME:
             self.move_home(outgoing.integer("x"), outgoing.integer("y"), outgoing.real("z"))
 
     @property

@@ -16,7 +16,7 @@ from click.testing import CliRunner
 from fractus_cli import forward, tlog_tail
 from fractus_cli.forward import Outlet, Player
 from fractus_cli.tlog_tail import Folder, Frame, Node, Tail, first_record, split
-from fractus_mavlink import Endpoint
+from fractus_runtime.mavlink_codec import Endpoint
 
 NAME = "000001-20260601T120000Z.tlog"
 START_US = 1_780_000_000_000_000

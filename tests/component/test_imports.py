@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
 from fractus_cli.main import COMMANDS
 
 
@@ -51,8 +52,17 @@ def test_plain_pictures_need_no_opencv() -> None:
 def test_the_first_heartbeats_of_a_start_wait_for_no_large_import() -> None:
     """A drone in flight waits for them: what takes a small computer seconds to import comes afterwards."""
     _, imported = after("import fractus_services.commands, fractus_services.mobility.mavlink.startup")
-    assert "fractus_mavlink" in imported
+    assert "pymavlink" in imported
     assert not imported & {"grpc", "google", "numpy", "shapely", "pydantic", "yaml", "cryptography", "fractus_core"}
+
+
+def test_environment_cannot_turn_off_the_checksums_of_mavlink(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MAV_IGNORE_CRC", "1")
+    printed, _ = after(
+        "from fractus_runtime.mavlink_codec import Endpoint, Parser; "
+        "frame = bytearray(Endpoint(1, 1).encode('HEARTBEAT', {})); frame[-1] ^= 1; print(len(Parser().feed(bytes(frame))))"
+    )
+    assert printed.strip() == "0"
 
 
 def test_an_agent_reads_outcomes_without_what_decides_them() -> None:

@@ -7,13 +7,13 @@ import math
 from pathlib import Path
 
 import pytest
-from fractus_mavlink import Message
-from fractus_mavlink.enums import MAV_CMD
+from fractus_runtime.mavlink_codec import Message
 from fractus_services.errors import AutopilotError
 from mobility_world import GUIDED, LAND, LOITER, RTL, Plane, World, spec
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from virtual_time import fly
 
-MODE, SPEED = MAV_CMD.DO_SET_MODE, MAV_CMD.DO_CHANGE_SPEED
+MODE, SPEED = mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_CMD_DO_CHANGE_SPEED
 
 
 def slow(plane: Plane, each_way_s: float) -> None:

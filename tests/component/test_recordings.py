@@ -25,10 +25,9 @@ from fractus_agent.registration.evidence import recording_problems
 from fractus_agent.registration.status import Observed, node_status
 from fractus_agent.telemetry.feed import snapshot
 from fractus_core.api import Grant
-from fractus_mavlink import Endpoint, Parser
-from fractus_mavlink.enums import MAV_AUTOPILOT, MAV_MODE_FLAG
 from fractus_proto.v1.mobility_pb2 import Telemetry
 from fractus_runtime.audit import AuditLog
+from fractus_runtime.mavlink_codec import Endpoint, Parser
 from fractus_services.recording import flight_writer, recorder
 from fractus_services.recording.flight_writer import FlightWriter
 from fractus_services.recording.mcap_file import completed
@@ -36,6 +35,7 @@ from fractus_services.recording.recorder import Recorder
 from fractus_services.recording.segment_directory import MIN_SEGMENT_BYTES, SegmentDirectory, segments_in
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.writer import MCAP0_MAGIC
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 S = 1_000_000_000
 T0 = 1_780_000_000 * S
@@ -51,9 +51,10 @@ class Vehicle:
         self.boot_ms = 0
 
     def heartbeat(self, armed: bool) -> bytes:
-        mode = MAV_MODE_FLAG.SAFETY_ARMED if armed else 0
+        mode = mavlink.MAV_MODE_FLAG_SAFETY_ARMED if armed else 0
         return self.endpoint.encode(
-            "HEARTBEAT", {"type": 2, "autopilot": MAV_AUTOPILOT.ARDUPILOTMEGA, "base_mode": mode, "mavlink_version": 3}
+            "HEARTBEAT",
+            {"type": 2, "autopilot": mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, "base_mode": mode, "mavlink_version": 3},
         )
 
     def position(self, lat: float, lon: float, amsl_m: float) -> bytes:

@@ -10,10 +10,10 @@ import pytest
 from fractus_core.api.plans import GrantSpec
 from fractus_core.control.events import Airborne, ArmingRequested
 from fractus_core.policy.decision_types import Airframe, TakeoffArgs
-from fractus_mavlink.enums import MAV_CMD
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.autopilot import Checked
 from mobility_world import BRAKE, World, end, partial, refusal, spec
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from virtual_time import fly
 
 
@@ -42,7 +42,7 @@ def test_who_asks_twice_arms_once(tmp_path: Path) -> None:
             await end(world.service.take_off(grant, TakeoffArgs(10.0)))
             await second
             assert slow.began_armed == [False], "nothing is prepared under a drone that flies"
-            assert world.plane.commands.count(MAV_CMD.COMPONENT_ARM_DISARM) == 1
+            assert world.plane.commands.count(mavlink.MAV_CMD_COMPONENT_ARM_DISARM) == 1
             assert world.plane.vehicle.armed
 
     fly(flight)
@@ -60,7 +60,7 @@ def test_who_waits_to_arm_must_still_be_allowed_to(tmp_path: Path) -> None:
             for call in calls:
                 await refusal(call)
             assert slow.began_armed == [False]
-            assert MAV_CMD.COMPONENT_ARM_DISARM not in world.plane.commands
+            assert mavlink.MAV_CMD_COMPONENT_ARM_DISARM not in world.plane.commands
 
     fly(flight)
 
@@ -105,7 +105,7 @@ def test_failsafes_that_are_set_again_meanwhile_forbid_arming(
             obey, motors = plane._obey, list[float]()
 
             def noted(outgoing: Any) -> None:
-                if outgoing.integer("command") == MAV_CMD.COMPONENT_ARM_DISARM:
+                if outgoing.integer("command") == mavlink.MAV_CMD_COMPONENT_ARM_DISARM:
                     motors.append(outgoing.real("param1"))
                 obey(outgoing)
 
@@ -151,7 +151,7 @@ def test_nothing_arms_without_its_fence(tmp_path: Path) -> None:
             why = await refusal(world.service.arm(grant))
             assert why.verdict.code == "FenceNotRaised"
             assert "no space" in str(why)
-            assert MAV_CMD.COMPONENT_ARM_DISARM not in world.plane.commands
+            assert mavlink.MAV_CMD_COMPONENT_ARM_DISARM not in world.plane.commands
             world.fence.problem = None
             await world.service.arm(grant)
 
@@ -168,7 +168,7 @@ def test_nothing_arms_far_from_the_home_of_its_grant(tmp_path: Path) -> None:
             why = await refusal(world.service.arm(grant))
             assert why.verdict.code == "NotAtHome"
             assert "60 m away" in str(why)
-            assert MAV_CMD.COMPONENT_ARM_DISARM not in world.plane.commands
+            assert mavlink.MAV_CMD_COMPONENT_ARM_DISARM not in world.plane.commands
 
     fly(flight)
 
@@ -190,7 +190,7 @@ def test_nothing_arms_that_leaves_no_trace(tmp_path: Path, monkeypatch: pytest.M
             why = await refusal(world.service.arm(grant))
             assert why.verdict.code in {"JournalUnavailable", "AuditUnavailable"}
             assert "No space left" in str(why)
-            assert MAV_CMD.COMPONENT_ARM_DISARM not in world.plane.commands
+            assert mavlink.MAV_CMD_COMPONENT_ARM_DISARM not in world.plane.commands
 
     fly(flight)
 
@@ -200,7 +200,7 @@ def test_a_refused_arming_is_tried_again_while_the_caller_waits(tmp_path: Path) 
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
             await world.drive(grant)
-            plane, arm = world.plane, MAV_CMD.COMPONENT_ARM_DISARM
+            plane, arm = world.plane, mavlink.MAV_CMD_COMPONENT_ARM_DISARM
             plane.refuses.add(arm)
             begun = plane.now
             with pytest.raises(AutopilotError, match="failed"):
@@ -219,7 +219,7 @@ def test_nothing_arms_for_a_caller_that_has_hung_up(tmp_path: Path) -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
             await world.drive(grant)
-            plane, arm = world.plane, MAV_CMD.COMPONENT_ARM_DISARM
+            plane, arm = world.plane, mavlink.MAV_CMD_COMPONENT_ARM_DISARM
             plane.refuses.add(arm)
             call = asyncio.ensure_future(world.service.arm(grant, 60.0))
             await asyncio.sleep(5.0)
@@ -237,7 +237,7 @@ def test_nothing_arms_for_a_caller_that_has_hung_up(tmp_path: Path) -> None:
 def test_a_waiting_driver_is_told_why_the_system_does_not_arm(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            plane, arm, heard = world.plane, MAV_CMD.COMPONENT_ARM_DISARM, list[str]()
+            plane, arm, heard = world.plane, mavlink.MAV_CMD_COMPONENT_ARM_DISARM, list[str]()
             plane.refuses.add(arm)
 
             async def follow() -> None:
@@ -262,7 +262,7 @@ def test_what_is_not_ready_is_not_asked_to_arm(tmp_path: Path) -> None:
             world.plane.vehicle.estimated = False
             why = await refusal(world.service.arm(grant))
             assert why.verdict.code == "NotReady"
-            assert MAV_CMD.COMPONENT_ARM_DISARM not in world.plane.commands
+            assert mavlink.MAV_CMD_COMPONENT_ARM_DISARM not in world.plane.commands
             assert not world.fence.raised
 
     fly(flight)

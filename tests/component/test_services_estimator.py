@@ -9,18 +9,18 @@ import pytest
 import shapely
 from closed_loop import Account, Oracle, Sky
 from fractus_core.policy.decision_types import TakeoffArgs
-from fractus_mavlink.enums import EKF_STATUS_FLAGS
 from fractus_services.mobility.rpc.telemetry import located
 from fractus_vehicle.body import Body
 from fractus_vehicle.control import Estimate
 from fractus_vehicle.estimator import Estimator
 from mobility_world import goto, spec, zone
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sky_drone import fly, ready, until
 
 WALL = shapely.box(-100.0, 40.0, 100.0, 70.0)
 FLOW = (
-    EKF_STATUS_FLAGS.ATTITUDE | EKF_STATUS_FLAGS.VELOCITY_HORIZ | EKF_STATUS_FLAGS.VELOCITY_VERT
-    | EKF_STATUS_FLAGS.POS_HORIZ_REL | EKF_STATUS_FLAGS.POS_VERT_ABS | EKF_STATUS_FLAGS.PRED_POS_HORIZ_REL
+    mavlink.EKF_ATTITUDE | mavlink.EKF_VELOCITY_HORIZ | mavlink.EKF_VELOCITY_VERT
+    | mavlink.EKF_POS_HORIZ_REL | mavlink.EKF_POS_VERT_ABS | mavlink.EKF_PRED_POS_HORIZ_REL
 )  # fmt: skip
 """Of a vehicle with optical flow that takes its GPS for jammed, or whose pilot has switched to other sources: it stays in GUIDED."""
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from closed_loop import Sky
 from fractus_core.policy.decision_types import TakeoffArgs
-from fractus_mavlink import Endpoint
-from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_COMPONENT
+from fractus_runtime.mavlink_codec import Endpoint
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sky_drone import fly, ready, until
 
 FENCE_SWITCH, OFF = 11.0, 0.0
@@ -16,9 +16,9 @@ FENCE_SWITCH, OFF = 11.0, 0.0
 
 def test_it_is_switched_on_again_in_flight_and_before_the_next_one(tmp_path: Path) -> None:
     async def work(sky: Sky, directory: Path) -> None:
-        station = Endpoint(255, MAV_COMPONENT.MISSIONPLANNER)
+        station = Endpoint(255, mavlink.MAV_COMP_ID_MISSIONPLANNER)
 
-        def switch_off(command: MAV_CMD, *params: float) -> None:
+        def switch_off(command: int, *params: float) -> None:
             values: dict[str, float] = {f"param{i}": value for i, value in enumerate(params, 1)}
             values |= {"target_system": 1, "target_component": 1, "command": command}
             sky.craft.receive(sky.wires[0]._channel, station.encode("COMMAND_LONG", values))
@@ -29,15 +29,15 @@ def test_it_is_switched_on_again_in_flight_and_before_the_next_one(tmp_path: Pat
             await drone.service.arm(grant, 120.0)
             async for _ in drone.service.take_off(grant, TakeoffArgs(15.0)):
                 pass
-            switch_off(MAV_CMD.DO_FENCE_ENABLE, OFF)
+            switch_off(mavlink.MAV_CMD_DO_FENCE_ENABLE, OFF)
             await until(lambda: sky.truth.fence.enabled, timeout_s=20.0)
             await until(lambda: any("SettingChanged" in event for event in drone._account.events))
             landing = drone.service.land(grant)
             async for _ in landing:
-                if sky.truth.mode is COPTER_MODE.LAND and sky.truth.fence.enabled:
-                    switch_off(MAV_CMD.DO_FENCE_ENABLE, OFF)
+                if sky.truth.mode == mavlink.COPTER_MODE_LAND and sky.truth.fence.enabled:
+                    switch_off(mavlink.MAV_CMD_DO_FENCE_ENABLE, OFF)
             assert not sky.truth.fence.enabled, "an autopilot may switch it off itself to land"
-            switch_off(MAV_CMD.DO_AUX_FUNCTION, FENCE_SWITCH, OFF)
+            switch_off(mavlink.MAV_CMD_DO_AUX_FUNCTION, FENCE_SWITCH, OFF)
             await asyncio.sleep(2.0)
             await drone.service.arm(grant, 120.0)
             assert sky.truth.armed

@@ -11,7 +11,6 @@ import pytest
 from fractus_core.control import Authority, StreamState
 from fractus_core.control.state import FlightMode
 from fractus_core.policy.decision_types import Call, GotoArgs, SetSpeedArgs, TakeoffArgs, Verdict
-from fractus_mavlink.enums import MAV_CMD
 from fractus_services.errors import AutopilotError, Refused
 from fractus_services.grant_files import ActiveGrant
 from mobility_world import (
@@ -29,6 +28,7 @@ from mobility_world import (
     touring,
     zone,
 )
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from virtual_time import fly
 
 WALL = (-40.0, 25.0, 40.0, 40.0)
@@ -405,7 +405,7 @@ def test_a_command_that_waits_is_not_sent_once_it_is_stale(tmp_path: Path, event
             world.plane.deaf = False
             why = await asking
             assert why.verdict.code in {"NotInControl", "ControlLost"}
-            assert MAV_CMD.DO_CHANGE_SPEED not in world.plane.commands, "the retry was dropped"
+            assert mavlink.MAV_CMD_DO_CHANGE_SPEED not in world.plane.commands, "the retry was dropped"
             assert world.control.effects.takeover_reason, "the node is told why the system has control"
             await world.until(lambda: not world.plane.vehicle.armed)
             world.control.note("landed", "the motors are stopped")
@@ -481,7 +481,7 @@ def test_a_leg_with_a_heading_waits_for_the_nose(tmp_path: Path) -> None:
             await world.up(grant)
             await end(world.service.goto(grant, goto(0, 30, yaw_deg=90.0), 0))
             assert world.plane.heading == 90.0
-            world.plane.refuses.add(MAV_CMD.CONDITION_YAW)
+            world.plane.refuses.add(mavlink.MAV_CMD_CONDITION_YAW)
             with pytest.raises(AutopilotError, match="failed command CONDITION_YAW"):
                 await end(world.service.goto(grant, goto(0, 40, yaw_deg=180.0), 0))
 

@@ -13,8 +13,7 @@ import sky_drone
 from closed_loop import Sky
 from fractus_core.control import Authority
 from fractus_core.policy.decision_types import GotoArgs, TakeoffArgs
-from fractus_mavlink import Endpoint, Parser, layout_named, message
-from fractus_mavlink.enums import COPTER_MODE, MAV_AUTOPILOT, MAV_CMD, MAV_COMPONENT, MAV_FRAME, MAV_MODE_FLAG, MAV_TYPE
+from fractus_runtime.mavlink_codec import Endpoint, Parser, message
 from fractus_services.errors import AutopilotError, Refused, Unavailable
 from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.home import home_moved
@@ -23,6 +22,7 @@ from fractus_services.mobility.mavlink.home_watch import HomeWatch
 from fractus_services.mobility.mavlink.vehicle import Vehicle
 from fractus_services.mobility.rpc.telemetry import located
 from mobility_world import FRAME, GROUND_M, GUIDED, LOITER, SMART_RTL, World, at, end, refusal, spec
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sky_drone import ready, until
 from virtual_time import fly
 
@@ -108,7 +108,7 @@ def test_the_way_home_leads_to_where_home_was_fixed(tmp_path: Path) -> None:
 def test_a_home_that_cannot_be_set_back_ends_the_flight(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world, flying(world):
-            world.plane.refuses.add(MAV_CMD.DO_SET_HOME)
+            world.plane.refuses.add(mavlink.MAV_CMD_DO_SET_HOME)
             move(world, AWAY)
             await world.until(world.outcome)
             assert "cannot be set back" in world.kinds("takeover")[0]["reason"]
@@ -130,7 +130,7 @@ def test_a_home_that_does_not_stay_set_back_keeps_no_drone_in_the_air(tmp_path: 
         async with World(tmp_path, retraces=True) as world, flying(world) as grant:
             await end(world.service.goto(grant, GotoArgs(*at(0, 60), 12.0), 0))
             if refused:
-                world.plane.refuses.add(MAV_CMD.DO_SET_HOME)
+                world.plane.refuses.add(mavlink.MAV_CMD_DO_SET_HOME)
             moving = asyncio.ensure_future(again_and_again(world))
             await world.control.return_control(grant)
             await world.until(lambda: world.plane.vehicle.mode == SMART_RTL, 120)
@@ -186,8 +186,8 @@ def heartbeat(world: World, *, armed: bool) -> None:
     """As the vehicle sends it in a pilot's mode."""
     world.plane.take(
         message(
-            "HEARTBEAT", type=MAV_TYPE.QUADROTOR, autopilot=MAV_AUTOPILOT.ARDUPILOTMEGA, custom_mode=COPTER_MODE.LOITER,
-            base_mode=MAV_MODE_FLAG.SAFETY_ARMED if armed else 0,
+            "HEARTBEAT", type=mavlink.MAV_TYPE_QUADROTOR, autopilot=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, custom_mode=mavlink.COPTER_MODE_LOITER,
+            base_mode=mavlink.MAV_MODE_FLAG_SAFETY_ARMED if armed else 0,
         )
     )  # fmt: skip
     world.observer.heartbeat()
@@ -242,7 +242,7 @@ def test_an_attempt_to_arm_that_came_to_nothing_leaves_no_home_behind(tmp_path: 
         async with World(tmp_path) as world:
             plane, grant = world.plane, world.grants.put(spec())
             await world.drive(grant)
-            plane.refuses.add(MAV_CMD.COMPONENT_ARM_DISARM)
+            plane.refuses.add(mavlink.MAV_CMD_COMPONENT_ARM_DISARM)
             with pytest.raises(AutopilotError):
                 await world.service.arm(grant)
             plane.xy[:] = [30.0, 0.0]
@@ -271,7 +271,7 @@ def test_home_that_is_moved_up_or_down_is_noticed_though_the_news_of_it_is_lost(
     """Another station on the same port has stopped the stream that tells of home, and the one message about its move is lost."""
 
     async def work(sky: Sky, directory: Path) -> None:
-        station, parser, lost = Endpoint(255, MAV_COMPONENT.MISSIONPLANNER), Parser(), []
+        station, parser, lost = Endpoint(255, mavlink.MAV_COMP_ID_MISSIONPLANNER), Parser(), []
         async with ready(sky, directory) as (drone, grant):
             (wire,) = sky.wires
             deliver = wire._protocol.data_received
@@ -289,13 +289,13 @@ def test_home_that_is_moved_up_or_down_is_noticed_though_the_news_of_it_is_lost(
 
             await drone.service.arm(grant, 120.0)
             await end(drone.service.take_off(grant, TakeoffArgs(15.0)))
-            kind = float(layout_named("HOME_POSITION").msgid)
-            tell("COMMAND_LONG", command=MAV_CMD.SET_MESSAGE_INTERVAL, param1=kind, param2=-1.0)
+            kind = float(mavlink.MAVLINK_MSG_ID_HOME_POSITION)
+            tell("COMMAND_LONG", command=mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, param1=kind, param2=-1.0)
             await asyncio.sleep(0.3)
             monkeypatch.setattr(wire._protocol, "data_received", lose_the_first)
             lat, lon = (round(degrees * 1e7) for degrees in at(0, 0))
             place = {"x": lat, "y": lon, "z": GROUND_M + up_m}
-            tell("COMMAND_INT", command=MAV_CMD.DO_SET_HOME, frame=MAV_FRAME.GLOBAL, **place)
+            tell("COMMAND_INT", command=mavlink.MAV_CMD_DO_SET_HOME, frame=mavlink.MAV_FRAME_GLOBAL, **place)
             await until(lambda: lost, 2.0)
             with contextlib.suppress(Refused):
                 await end(drone.service.goto(grant, GotoArgs(*at(0, 20), 15.0), 0.0))

@@ -11,8 +11,7 @@ from typing import Any
 import pytest
 from fractus_core.control.state import FlightMode
 from fractus_core.policy.decision_types import GotoArgs, TakeoffArgs
-from fractus_mavlink import message
-from fractus_mavlink.enums import MAV_CMD
+from fractus_runtime.mavlink_codec import message
 from mobility_world import (
     GUIDED,
     LAND,
@@ -29,6 +28,7 @@ from mobility_world import (
     touring,
     zone,
 )
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from virtual_time import fly
 
 WALL = (-40.0, 25.0, 40.0, 40.0)
@@ -135,7 +135,7 @@ def test_no_fence_outlives_its_mission(tmp_path: Path, how: str) -> None:
             grant = world.grants.put(spec())
             if how in {"refused", "unused"}:
                 await world.drive(grant)
-                world.plane.refuses |= {MAV_CMD.COMPONENT_ARM_DISARM} if how == "refused" else set()
+                world.plane.refuses |= {mavlink.MAV_CMD_COMPONENT_ARM_DISARM} if how == "refused" else set()
                 arming = asyncio.ensure_future(world.service.arm(grant))
                 await world.until(lambda: world.fence.raised)
                 await asyncio.wait([arming])
@@ -245,9 +245,9 @@ def test_a_fault_of_ours_ends_the_mission_once(tmp_path: Path, monkeypatch: pyte
             await world.until(world.outcome)
             assert world.outcome().startswith("failed: the mobility service has a fault")
             await world.until(lambda: not world.plane.vehicle.armed)
-            assert world.plane.commands.count(MAV_CMD.COMPONENT_ARM_DISARM) == 1, "not armed again"
+            assert world.plane.commands.count(mavlink.MAV_CMD_COMPONENT_ARM_DISARM) == 1, "not armed again"
             await asyncio.sleep(20)
-            assert world.plane.commands.count(MAV_CMD.COMPONENT_ARM_DISARM) == 1
+            assert world.plane.commands.count(mavlink.MAV_CMD_COMPONENT_ARM_DISARM) == 1
 
     fly(flight)
 
@@ -310,7 +310,7 @@ def test_what_appears_before_a_pilot_who_chose_to_return_is_told_and_left(
             assert {("alarm", "ExclusionZoneAhead"), ("alarm", "SpeedAboveLimit")} <= set(alarms)
             assert len(alarms) < 10, "each is told once while it lasts"
             assert "zone wall-zone" in caplog.text
-            assert MAV_CMD.DO_SET_MODE not in plane.commands[commands:]
+            assert mavlink.MAV_CMD_DO_SET_MODE not in plane.commands[commands:]
 
     fly(flight)
 
@@ -335,7 +335,7 @@ def test_a_return_that_a_new_service_finds_is_left_unless_a_failsafe_began_it(tm
             await again.until(lambda: not again.plane.vehicle.armed)
             told = "takeBack" if failsafe else "alarm"
             assert (told, "ExclusionZoneAhead") in [(e["action"], e["code"]) for e in again.kinds("monitor")]
-            assert (MAV_CMD.DO_SET_MODE in again.plane.commands[commands:]) is failsafe
+            assert (mavlink.MAV_CMD_DO_SET_MODE in again.plane.commands[commands:]) is failsafe
             assert (clear_m(again, *WALL) > 1.0) is failsafe
 
     fly(flight)

@@ -13,12 +13,12 @@ from fractus_core.control import Authority
 from fractus_core.policy.decision_types import Call, SetSpeedArgs, TakeoffArgs, VelocityArgs
 from fractus_core.policy.engine import judge
 from fractus_core.policy.monitoring import monitor
-from fractus_mavlink.enums import MAV_CMD
 from fractus_services.errors import AutopilotError, PreconditionFailed, Refused, Unavailable
 from fractus_services.mobility.authority.leases import FlightConstraints
 from fractus_services.mobility.flight import monitor as monitoring
 from fractus_services.mobility.flight.courses import Courses, Trip
 from mobility_world import GUIDED, LOITER, World, area, clear_m, end, goto, partial, refusal, spec, zone
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from virtual_time import fly
 
 WALL = (-40.0, 25.0, 40.0, 40.0)
@@ -287,7 +287,7 @@ def test_a_correction_that_a_pilot_came_before_is_not_made(tmp_path: Path) -> No
             commands = len(world.plane.commands)
             await asyncio.sleep(5)
             assert world.control.authority is Authority.PILOT
-            assert MAV_CMD.DO_REPOSITION not in world.plane.commands[commands:]
+            assert mavlink.MAV_CMD_DO_REPOSITION not in world.plane.commands[commands:]
             assert world.control.motion is None
 
     fly(flight)
@@ -366,7 +366,7 @@ def test_a_leg_whose_speed_is_lost_is_stopped_and_begun_once_more(tmp_path: Path
                 top = max(top, math.hypot(*plane.velocity))
                 if (
                     outgoing.name == "COMMAND_LONG"
-                    and outgoing.integer("command") == MAV_CMD.DO_CHANGE_SPEED
+                    and outgoing.integer("command") == mavlink.MAV_CMD_DO_CHANGE_SPEED
                     and left > 0
                 ):
                     left -= 1
@@ -552,9 +552,9 @@ def test_a_takeoff_whose_acknowledgement_is_lost_goes_on(tmp_path: Path) -> None
 
             def once(outgoing: Any) -> None:
                 nonlocal heard
-                if outgoing.integer("command") == MAV_CMD.NAV_TAKEOFF:
+                if outgoing.integer("command") == mavlink.MAV_CMD_NAV_TAKEOFF:
                     heard += 1
-                    plane.refuses.add(MAV_CMD.NAV_TAKEOFF)
+                    plane.refuses.add(mavlink.MAV_CMD_NAV_TAKEOFF)
                     if heard == 1:
                         plane._reply = lambda _: None  # type: ignore[method-assign]
                         asyncio.get_running_loop().call_later(0.1, delattr, plane, "_reply")
@@ -563,7 +563,7 @@ def test_a_takeoff_whose_acknowledgement_is_lost_goes_on(tmp_path: Path) -> None
             plane._obey = once  # type: ignore[method-assign]
             await end(world.service.take_off(grant, TakeoffArgs(10.0)))
             assert plane.height > 9.0
-            assert plane.commands.count(MAV_CMD.NAV_TAKEOFF) == 2
+            assert plane.commands.count(mavlink.MAV_CMD_NAV_TAKEOFF) == 2
 
     fly(flight)
 

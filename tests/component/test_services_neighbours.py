@@ -10,26 +10,34 @@ import pytest
 from closed_loop import Account, Drone, Sky, Wire
 from fractus_core.control import StreamState
 from fractus_core.policy.decision_types import TakeoffArgs
-from fractus_mavlink import Endpoint, Parser
-from fractus_mavlink.enums import COPTER_MODE, MAV_AUTOPILOT, MAV_CMD, MAV_COMPONENT, MAV_MODE_FLAG, MAV_STATE, MAV_TYPE
+from fractus_runtime.mavlink_codec import Endpoint, Parser
 from fractus_services.errors import Refused
 from fractus_services.mobility.mavlink.neighbours import SURE_S, Memory
 from mobility_world import end, goto
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sky_drone import fly, ready, until
 
 
-def heartbeat(sysid: int, compid: int, kind: MAV_TYPE, autopilot: MAV_AUTOPILOT, **more: int) -> bytes:
-    values = {"type": kind, "autopilot": autopilot, "system_status": MAV_STATE.STANDBY, "mavlink_version": 3, **more}
+def heartbeat(sysid: int, compid: int, kind: int, autopilot: int, **more: int) -> bytes:
+    values = {
+        "type": kind,
+        "autopilot": autopilot,
+        "system_status": mavlink.MAV_STATE_STANDBY,
+        "mavlink_version": 3,
+        **more,
+    }
     return Endpoint(sysid, compid).encode("HEARTBEAT", values)
 
 
-GIMBAL = heartbeat(1, MAV_COMPONENT.GIMBAL, MAV_TYPE.GIMBAL, MAV_AUTOPILOT.GENERIC)
-TRACKER = heartbeat(9, MAV_COMPONENT.AUTOPILOT1, MAV_TYPE.ANTENNA_TRACKER, MAV_AUTOPILOT.ARDUPILOTMEGA)
-OTHER = heartbeat(2, MAV_COMPONENT.AUTOPILOT1, MAV_TYPE.QUADROTOR, MAV_AUTOPILOT.ARDUPILOTMEGA)
+GIMBAL = heartbeat(1, mavlink.MAV_COMP_ID_GIMBAL, mavlink.MAV_TYPE_GIMBAL, mavlink.MAV_AUTOPILOT_GENERIC)
+TRACKER = heartbeat(
+    9, mavlink.MAV_COMP_ID_AUTOPILOT1, mavlink.MAV_TYPE_ANTENNA_TRACKER, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
+)
+OTHER = heartbeat(2, mavlink.MAV_COMP_ID_AUTOPILOT1, mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA)
 
 FLYING = heartbeat(
-    2, MAV_COMPONENT.AUTOPILOT1, MAV_TYPE.QUADROTOR, MAV_AUTOPILOT.ARDUPILOTMEGA,
-    base_mode=MAV_MODE_FLAG.SAFETY_ARMED | MAV_MODE_FLAG.CUSTOM_MODE_ENABLED, custom_mode=COPTER_MODE.GUIDED,
+    2, mavlink.MAV_COMP_ID_AUTOPILOT1, mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
+    base_mode=mavlink.MAV_MODE_FLAG_SAFETY_ARMED | mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, custom_mode=mavlink.COPTER_MODE_GUIDED,
 )  # fmt: skip
 
 
@@ -63,7 +71,7 @@ def test_in_flight_no_one_else_takes_the_place_of_the_autopilot_whose_link_broke
             await asyncio.sleep(5.0)
             await end(drone.service.goto(grant, goto(20, 0, 15), 0.0))
             assert drone.state is StreamState.GRANTED
-            assert sky.truth.mode is COPTER_MODE.GUIDED
+            assert sky.truth.mode == mavlink.COPTER_MODE_GUIDED
 
     fly(work, tmp_path)
 
@@ -98,14 +106,14 @@ def test_what_another_station_is_answered_acknowledges_no_command_of_ours(tmp_pa
             theirs = {
                 "target_system": 1,
                 "target_component": 1,
-                "command": MAV_CMD.SET_MESSAGE_INTERVAL,
+                "command": mavlink.MAV_CMD_SET_MESSAGE_INTERVAL,
                 "param1": 147.0,
             }
-            station = Endpoint(255, MAV_COMPONENT.MISSIONPLANNER).encode("COMMAND_LONG", theirs | {"param2": 1e6})
+            station = Endpoint(255, mavlink.MAV_COMP_ID_MISSIONPLANNER).encode("COMMAND_LONG", theirs | {"param2": 1e6})
 
             def lose_the_first(data: Any) -> None:
                 for sent in parser.feed(bytes(data)):
-                    if sent.name == "COMMAND_LONG" and sent.integer("command") == MAV_CMD.SET_MESSAGE_INTERVAL:
+                    if sent.name == "COMMAND_LONG" and sent.integer("command") == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
                         if not arrived:
                             write(station)
                         arrived.append(sent.real("param2"))
@@ -114,7 +122,7 @@ def test_what_another_station_is_answered_acknowledges_no_command_of_ours(tmp_pa
                 write(data)
 
             wire.write = lose_the_first  # type: ignore[method-assign]
-            await drone.autopilot.command(MAV_CMD.SET_MESSAGE_INTERVAL, 147.0, 2e6)
+            await drone.autopilot.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 147.0, 2e6)
             assert arrived == [2e6, 2e6]
 
     fly(work, tmp_path)

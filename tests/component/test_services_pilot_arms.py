@@ -13,27 +13,27 @@ from closed_loop import Sky
 from fractus_core.control import Authority, StreamState
 from fractus_core.control.state import FlightMode
 from fractus_core.policy.decision_types import TakeoffArgs
-from fractus_mavlink import Endpoint
-from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_COMPONENT, MAV_MODE_FLAG
+from fractus_runtime.mavlink_codec import Endpoint
 from fractus_services.errors import AutopilotError, Refused
 from mobility_world import GUIDED, RTL, World, spec
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sky_drone import fly, ready, until
 
 
-@pytest.mark.parametrize("mode", [COPTER_MODE.LOITER, COPTER_MODE.GUIDED])
-def test_a_driver_does_not_fly_what_others_have_armed(mode: COPTER_MODE, tmp_path: Path) -> None:
+@pytest.mark.parametrize("mode", [mavlink.COPTER_MODE_LOITER, mavlink.COPTER_MODE_GUIDED])
+def test_a_driver_does_not_fly_what_others_have_armed(mode: int, tmp_path: Path) -> None:
     async def work(sky: Sky, directory: Path) -> None:
-        station = Endpoint(255, MAV_COMPONENT.MISSIONPLANNER)
+        station = Endpoint(255, mavlink.MAV_COMP_ID_MISSIONPLANNER)
 
-        def tell(command: MAV_CMD, *params: float) -> None:
+        def tell(command: int, *params: float) -> None:
             values = {f"param{i}": value for i, value in enumerate(params, 1)}
             values |= {"target_system": 1, "target_component": 1, "command": command}
             sky.craft.receive(sky.wires[0]._channel, station.encode("COMMAND_LONG", values))
 
         async with ready(sky, directory) as (drone, grant):
-            tell(MAV_CMD.DO_SET_MODE, MAV_MODE_FLAG.CUSTOM_MODE_ENABLED, mode)
+            tell(mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, mode)
             await until(lambda: drone.autopilot.vehicle.mode.name == mode.name)
-            tell(MAV_CMD.COMPONENT_ARM_DISARM, 1)
+            tell(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1)
             await until(lambda: drone.autopilot.vehicle.armed)
             await until(lambda: drone.state is StreamState.LOST)
             assert drone.control.authority is Authority.PILOT
@@ -97,7 +97,7 @@ def test_what_others_have_armed_is_theirs_also_after_a_restart_of_the_service(mo
             again.observer.found()
             assert (again.control.authority, again.control.state.armed_by_others) == (Authority.PILOT, True)
             await again.plane.update(5.0)
-            assert MAV_CMD.DO_SET_MODE not in again.plane.commands
+            assert mavlink.MAV_CMD_DO_SET_MODE not in again.plane.commands
             again.plane.vehicle.armed = False
             again.observer.heartbeat()
             assert (again.control.authority, again.journal.record.armed_by_others) == (Authority.SYSTEM, False)

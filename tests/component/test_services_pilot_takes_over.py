@@ -10,9 +10,9 @@ import pytest
 from closed_loop import Sky, Wire
 from fractus_core.control import Authority
 from fractus_core.policy.decision_types import TakeoffArgs
-from fractus_mavlink import Parser
-from fractus_mavlink.enums import COPTER_MODE, MAV_CMD
+from fractus_runtime.mavlink_codec import Parser
 from mobility_world import end, goto
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sky_drone import fly, ready, until
 
 
@@ -22,7 +22,7 @@ def lose_mode_changes(wire: Wire, count: int, monkeypatch: pytest.MonkeyPatch) -
 
     def noted(data: Any) -> None:
         for sent in parser.feed(bytes(data)):
-            if sent.name == "COMMAND_LONG" and sent.integer("command") == MAV_CMD.DO_SET_MODE:
+            if sent.name == "COMMAND_LONG" and sent.integer("command") == mavlink.MAV_CMD_DO_SET_MODE:
                 sent_at.append(asyncio.get_running_loop().time())
                 if len(sent_at) <= count:
                     return
@@ -47,11 +47,11 @@ def test_a_pilot_who_takes_over_while_the_system_changes_the_mode_keeps_the_dron
             await drone.control.return_control(grant)
             await until(lambda: sent_at)
             await asyncio.sleep(after_s)
-            assert sky.truth.mode is COPTER_MODE.GUIDED
-            assert sky.craft.vehicle.modes.change(COPTER_MODE.LOITER)
+            assert sky.truth.mode == mavlink.COPTER_MODE_GUIDED
+            assert sky.craft.vehicle.modes.change(mavlink.COPTER_MODE_LOITER)
             await until(lambda: drone.control.authority is Authority.PILOT, 2.0)
             await asyncio.sleep(10.0)
-            assert sky.truth.mode is COPTER_MODE.LOITER
+            assert sky.truth.mode == mavlink.COPTER_MODE_LOITER
             assert drone.control.authority is Authority.PILOT
 
     fly(work, tmp_path)

@@ -11,10 +11,10 @@ import shapely
 import virtual_time
 from closed_loop import Account, Oracle, Sky
 from fractus_core.policy.decision_types import TakeoffArgs
-from fractus_mavlink import Endpoint
-from fractus_mavlink.enums import MAV_CMD, MAV_COMPONENT, MAV_FRAME, SPEED_TYPE
+from fractus_runtime.mavlink_codec import Endpoint
 from fractus_services.mobility.autopilot import COURSE_S
 from mobility_world import FRAME, World, end, goto, spec, zone
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sky_drone import fly, ready, until
 
 WALL = shapely.box(-100.0, 40.0, 100.0, 70.0)
@@ -24,7 +24,7 @@ KEPT_M = 1.0
 @pytest.mark.parametrize("action", ["ignore", "returnToLaunch"])
 def test_a_drone_that_another_station_sends_into_a_zone_is_stopped_before_it(action: str, tmp_path: Path) -> None:
     async def work(sky: Sky, directory: Path) -> None:
-        station, oracle = Endpoint(255, MAV_COMPONENT.MISSIONPLANNER), Oracle(sky, Account(0))
+        station, oracle = Endpoint(255, mavlink.MAV_COMP_ID_MISSIONPLANNER), Oracle(sky, Account(0))
 
         def tell(name: str, **values: float) -> None:
             frame = station.encode(name, {"target_system": 1, "target_component": 1, **values})
@@ -41,11 +41,15 @@ def test_a_drone_that_another_station_sends_into_a_zone_is_stopped_before_it(act
             sky.witnesses.append(lambda: kept_m.append(WALL.distance(shapely.Point(*oracle.place()[:2]))))
             lat, lon = FRAME.latlon(0.0, 90.0)
             tell(
-                "COMMAND_INT", command=MAV_CMD.DO_REPOSITION, frame=MAV_FRAME.GLOBAL_RELATIVE_ALT, param1=12.0,
+                "COMMAND_INT", command=mavlink.MAV_CMD_DO_REPOSITION, frame=mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT, param1=12.0,
                 param4=math.nan, x=round(lat * 1e7), y=round(lon * 1e7), z=15.0,
             )  # fmt: skip
             tell(
-                "COMMAND_LONG", command=MAV_CMD.DO_CHANGE_SPEED, param1=SPEED_TYPE.GROUNDSPEED, param2=12.0, param3=-1.0
+                "COMMAND_LONG",
+                command=mavlink.MAV_CMD_DO_CHANGE_SPEED,
+                param1=mavlink.SPEED_TYPE_GROUNDSPEED,
+                param2=12.0,
+                param3=-1.0,
             )
             await until(lambda: oracle.speeds()[0] > 5.0)
             await until(lambda: oracle.speeds()[0] < 0.2 or not sky.truth.armed)

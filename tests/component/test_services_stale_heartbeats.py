@@ -11,9 +11,9 @@ import pytest
 from closed_loop import Sky
 from fractus_core.control import StreamState
 from fractus_core.policy.decision_types import TakeoffArgs
-from fractus_mavlink import Parser
-from fractus_mavlink.enums import COPTER_MODE
+from fractus_runtime.mavlink_codec import Parser
 from mobility_world import end, goto
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sky_drone import fly, ready, until
 
 
@@ -57,7 +57,7 @@ def test_motors_that_stop_in_the_air_are_seen_to(tmp_path: Path) -> None:
             await end(drone.service.take_off(grant, TakeoffArgs(15.0)))
             sky.truth.armed = False
             await until(lambda: not drone.autopilot.vehicle.armed, 3.0)
-            assert sky.truth.mode is COPTER_MODE.GUIDED
+            assert sky.truth.mode == mavlink.COPTER_MODE_GUIDED
 
     fly(work, tmp_path)
 

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from closed_loop import Sky
 from fractus_core.policy.decision_types import TakeoffArgs
-from fractus_mavlink import Parser
+from fractus_runtime.mavlink_codec import Parser
 from mobility_world import FRAME, end, goto
 from sky_drone import fly, ready, until
 

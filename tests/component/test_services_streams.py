@@ -10,10 +10,10 @@ import pytest
 from closed_loop import Sky
 from fractus_core.control import StreamState
 from fractus_core.policy.decision_types import TakeoffArgs
-from fractus_mavlink import Endpoint, Parser, layout_named
-from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_COMPONENT, MAV_DATA_STREAM, MAV_RESULT
+from fractus_runtime.mavlink_codec import Endpoint, Parser, message_id
 from fractus_services.mobility.mavlink.companion import SYSTEM_ID
 from mobility_world import end, goto
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sky_drone import fly, ready, until
 
 STATION = 255
@@ -43,10 +43,10 @@ def test_streams_that_another_station_stopped_come_again(tmp_path: Path) -> None
         async with ready(sky, directory) as (drone, grant):
             await drone.service.arm(grant, 120.0)
             await end(drone.service.take_off(grant, TakeoffArgs(15.0)))
-            frame = Endpoint(STATION, MAV_COMPONENT.MISSIONPLANNER).encode(
+            frame = Endpoint(STATION, mavlink.MAV_COMP_ID_MISSIONPLANNER).encode(
                 "REQUEST_DATA_STREAM",
                 {
-                    "target_system": 1, "target_component": 1, "req_stream_id": MAV_DATA_STREAM.ALL,
+                    "target_system": 1, "target_component": 1, "req_stream_id": mavlink.MAV_DATA_STREAM_ALL,
                     "req_message_rate": 0, "start_stop": 0,
                 },
             )  # fmt: skip
@@ -55,7 +55,7 @@ def test_streams_that_another_station_stopped_come_again(tmp_path: Path) -> None
             await asyncio.sleep(10.0)
             await end(drone.service.goto(grant, goto(20, 0, 15), 0.0))
             assert drone.state is StreamState.GRANTED
-            assert sky.truth.mode is COPTER_MODE.GUIDED
+            assert sky.truth.mode == mavlink.COPTER_MODE_GUIDED
 
     fly(work, tmp_path)
 
@@ -65,9 +65,13 @@ def test_a_stream_whose_request_was_lost_comes_though_the_answer_to_another_one_
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def work(sky: Sky, directory: Path) -> None:
-        connect, wanted, lost = sky.create_connection, float(layout_named(kind).msgid), []
-        answer = {"command": MAV_CMD.SET_MESSAGE_INTERVAL, "result": MAV_RESULT.ACCEPTED, "target_system": SYSTEM_ID}
-        twice = Endpoint(1, MAV_COMPONENT.AUTOPILOT1).encode("COMMAND_ACK", answer)
+        connect, wanted, lost = sky.create_connection, float(message_id(kind)), []
+        answer = {
+            "command": mavlink.MAV_CMD_SET_MESSAGE_INTERVAL,
+            "result": mavlink.MAV_RESULT_ACCEPTED,
+            "target_system": SYSTEM_ID,
+        }
+        twice = Endpoint(1, mavlink.MAV_COMP_ID_AUTOPILOT1).encode("COMMAND_ACK", answer)
 
         async def create_connection(*args: Any, **kwargs: Any) -> Any:
             wire, protocol = await connect(*args, **kwargs)
@@ -75,7 +79,9 @@ def test_a_stream_whose_request_was_lost_comes_though_the_answer_to_another_one_
 
             def lose_the_first(data: Any) -> None:
                 for sent in parser.feed(bytes(data)):
-                    asks = sent.name == "COMMAND_LONG" and sent.integer("command") == MAV_CMD.SET_MESSAGE_INTERVAL
+                    asks = (
+                        sent.name == "COMMAND_LONG" and sent.integer("command") == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
+                    )
                     if asks and sent.real("param1") == wanted and not lost:
                         lost.append(sent)
                         sky.call_later(0.01, protocol.data_received, twice)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import pytest
-from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_MISSION_RESULT, MAV_RESULT
 from fractus_vehicle.shaping import wrap_pi
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from vehicle_world import START, airborne, alone, distance_m, upload
 
 HERE = {"target_system": 1, "target_component": 1}
@@ -22,26 +22,26 @@ def _waypoint(north: float, **more: float) -> dict[str, float]:
 @pytest.mark.parametrize(
     ("command", "params", "result"),
     [
-        (MAV_CMD.CONDITION_YAW, (90, 10, 1, 0), MAV_RESULT.ACCEPTED),
-        (MAV_CMD.CONDITION_YAW, (361, 10, 1, 0), MAV_RESULT.FAILED),
-        (MAV_CMD.MISSION_START, (0, 2), MAV_RESULT.DENIED),
-        (MAV_CMD.DO_PAUSE_CONTINUE, (2,), MAV_RESULT.DENIED),
-        (MAV_CMD.DO_SET_HOME, (2, 0, 0, 0, 48.2, 16.37, 150.0), MAV_RESULT.FAILED),
-        (MAV_CMD.DO_SET_HOME, (0, 0, 0, 0, 48.2, 16.37, math.nan), MAV_RESULT.DENIED),
-        (MAV_CMD.DO_SET_HOME, (0, 0, 0, 0, 95.0, 16.37, 150.0), MAV_RESULT.FAILED),
-        (MAV_CMD.DO_SET_ROI_LOCATION, (0, 0, 0, 0, 95.0, 16.37, 0.0), MAV_RESULT.FAILED),
-        (MAV_CMD.PREFLIGHT_CALIBRATION, (1,), MAV_RESULT.ACCEPTED),
-        (MAV_CMD.PREFLIGHT_CALIBRATION, (0, 0, 0, 0, 2), MAV_RESULT.ACCEPTED),
-        (MAV_CMD.PREFLIGHT_CALIBRATION, (), MAV_RESULT.UNSUPPORTED),
-        (MAV_CMD.SET_EKF_SOURCE_SET, (2,), MAV_RESULT.ACCEPTED),
-        (MAV_CMD.SET_EKF_SOURCE_SET, (4,), MAV_RESULT.DENIED),
-        (MAV_CMD.DO_JUMP_TAG, (70_000,), MAV_RESULT.DENIED),
-        (MAV_CMD.DO_WINCH, (), MAV_RESULT.FAILED),
-        (MAV_CMD.DO_SPRAYER, (1,), MAV_RESULT.ACCEPTED),
-        (MAV_CMD.GET_MESSAGE_INTERVAL, (70_000,), MAV_RESULT.FAILED),
+        (mavlink.MAV_CMD_CONDITION_YAW, (90, 10, 1, 0), mavlink.MAV_RESULT_ACCEPTED),
+        (mavlink.MAV_CMD_CONDITION_YAW, (361, 10, 1, 0), mavlink.MAV_RESULT_FAILED),
+        (mavlink.MAV_CMD_MISSION_START, (0, 2), mavlink.MAV_RESULT_DENIED),
+        (mavlink.MAV_CMD_DO_PAUSE_CONTINUE, (2,), mavlink.MAV_RESULT_DENIED),
+        (mavlink.MAV_CMD_DO_SET_HOME, (2, 0, 0, 0, 48.2, 16.37, 150.0), mavlink.MAV_RESULT_FAILED),
+        (mavlink.MAV_CMD_DO_SET_HOME, (0, 0, 0, 0, 48.2, 16.37, math.nan), mavlink.MAV_RESULT_DENIED),
+        (mavlink.MAV_CMD_DO_SET_HOME, (0, 0, 0, 0, 95.0, 16.37, 150.0), mavlink.MAV_RESULT_FAILED),
+        (mavlink.MAV_CMD_DO_SET_ROI_LOCATION, (0, 0, 0, 0, 95.0, 16.37, 0.0), mavlink.MAV_RESULT_FAILED),
+        (mavlink.MAV_CMD_PREFLIGHT_CALIBRATION, (1,), mavlink.MAV_RESULT_ACCEPTED),
+        (mavlink.MAV_CMD_PREFLIGHT_CALIBRATION, (0, 0, 0, 0, 2), mavlink.MAV_RESULT_ACCEPTED),
+        (mavlink.MAV_CMD_PREFLIGHT_CALIBRATION, (), mavlink.MAV_RESULT_UNSUPPORTED),
+        (mavlink.MAV_CMD_SET_EKF_SOURCE_SET, (2,), mavlink.MAV_RESULT_ACCEPTED),
+        (mavlink.MAV_CMD_SET_EKF_SOURCE_SET, (4,), mavlink.MAV_RESULT_DENIED),
+        (mavlink.MAV_CMD_DO_JUMP_TAG, (70_000,), mavlink.MAV_RESULT_DENIED),
+        (mavlink.MAV_CMD_DO_WINCH, (), mavlink.MAV_RESULT_FAILED),
+        (mavlink.MAV_CMD_DO_SPRAYER, (1,), mavlink.MAV_RESULT_ACCEPTED),
+        (mavlink.MAV_CMD_GET_MESSAGE_INTERVAL, (70_000,), mavlink.MAV_RESULT_FAILED),
     ],
 )
-def test_results_by_value(command: int, params: tuple[float, ...], result: MAV_RESULT):
+def test_results_by_value(command: int, params: tuple[float, ...], result: int):
     vehicle, pilot = alone()
     pilot.wait(lambda: vehicle.position_ok, 5.0)
     assert pilot.command(command, *params) is result
@@ -50,10 +50,10 @@ def test_results_by_value(command: int, params: tuple[float, ...], result: MAV_R
 @pytest.mark.parametrize(
     ("command", "params", "texts"),
     [
-        (MAV_CMD.DO_PAUSE_CONTINUE, (0,), ["Failed to pause"]),
-        (MAV_CMD.DO_PAUSE_CONTINUE, (1,), ["Failed to resume"]),
+        (mavlink.MAV_CMD_DO_PAUSE_CONTINUE, (0,), ["Failed to pause"]),
+        (mavlink.MAV_CMD_DO_PAUSE_CONTINUE, (1,), ["Failed to resume"]),
         (
-            MAV_CMD.PREFLIGHT_CALIBRATION,
+            mavlink.MAV_CMD_PREFLIGHT_CALIBRATION,
             (0, 0, 1),
             ["Updating barometer calibration", "Barometer calibration complete"],
         ),
@@ -69,58 +69,62 @@ def test_texts_by_value(command: int, params: tuple[float, ...], texts: list[str
 def test_an_armed_vehicle_starts_only_missions_that_take_off():
     vehicle, pilot = alone()
     upload(pilot, 0, [HOME, _waypoint(20.0)])
-    pilot.mode(COPTER_MODE.GUIDED)
+    pilot.mode(mavlink.COPTER_MODE_GUIDED)
     pilot.wait(lambda: vehicle.position_ok, 5.0)
-    pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0)
-    assert pilot.mode(COPTER_MODE.AUTO) is MAV_RESULT.FAILED
+    pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0)
+    assert pilot.mode(mavlink.COPTER_MODE_AUTO) == mavlink.MAV_RESULT_FAILED
     assert pilot.texts[-2:] == ["Auto: Missing Takeoff Cmd", "Mode change to AUTO failed: init failed"]
     upload(pilot, 0, [HOME, {"command": 93, "param1": 1.0}, TAKEOFF, _waypoint(20.0)])
-    assert pilot.mode(COPTER_MODE.AUTO) is MAV_RESULT.ACCEPTED
+    assert pilot.mode(mavlink.COPTER_MODE_AUTO) == mavlink.MAV_RESULT_ACCEPTED
 
 
 def test_a_takeoff_that_is_sent_twice_climbs_as_soon():
     vehicle, pilot = alone()
-    pilot.mode(COPTER_MODE.GUIDED)
+    pilot.mode(mavlink.COPTER_MODE_GUIDED)
     pilot.wait(lambda: vehicle.position_ok, 5.0)
-    pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0)
-    takeoff = (MAV_CMD.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 5)
-    assert pilot.command(*takeoff) is MAV_RESULT.ACCEPTED
+    pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0)
+    takeoff = (mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 5)
+    assert pilot.command(*takeoff) == mavlink.MAV_RESULT_ACCEPTED
     first = vehicle.lift_after_s
     pilot.fly_on(1.0)
-    assert pilot.command(*takeoff) is MAV_RESULT.ACCEPTED
+    assert pilot.command(*takeoff) == mavlink.MAV_RESULT_ACCEPTED
     assert vehicle.lift_after_s == first
     pilot.wait(lambda: not vehicle.landed, 10.0)
-    assert pilot.command(*takeoff) is MAV_RESULT.FAILED
+    assert pilot.command(*takeoff) == mavlink.MAV_RESULT_FAILED
 
 
 @pytest.mark.parametrize(
     ("mode", "keep_place", "result"),
     [
-        (COPTER_MODE.ALT_HOLD, 0.0, MAV_RESULT.FAILED),
-        (COPTER_MODE.ALT_HOLD, 1.0, MAV_RESULT.ACCEPTED),
-        (COPTER_MODE.POSHOLD, 0.0, MAV_RESULT.ACCEPTED),
-        (COPTER_MODE.ZIGZAG, 0.0, MAV_RESULT.ACCEPTED),
-        (COPTER_MODE.DRIFT, 0.0, MAV_RESULT.FAILED),
+        (mavlink.COPTER_MODE_ALT_HOLD, 0.0, mavlink.MAV_RESULT_FAILED),
+        (mavlink.COPTER_MODE_ALT_HOLD, 1.0, mavlink.MAV_RESULT_ACCEPTED),
+        (mavlink.COPTER_MODE_POSHOLD, 0.0, mavlink.MAV_RESULT_ACCEPTED),
+        (mavlink.COPTER_MODE_ZIGZAG, 0.0, mavlink.MAV_RESULT_ACCEPTED),
+        (mavlink.COPTER_MODE_DRIFT, 0.0, mavlink.MAV_RESULT_FAILED),
     ],
 )
-def test_takeoff_by_mode(mode: COPTER_MODE, keep_place: float, result: MAV_RESULT):
+def test_takeoff_by_mode(mode: int, keep_place: float, result: int):
     vehicle, pilot = alone()
     pilot.wait(lambda: vehicle.position_ok, 5.0)
-    assert pilot.mode(mode) is MAV_RESULT.ACCEPTED
-    assert pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0) is MAV_RESULT.ACCEPTED
-    assert pilot.command(MAV_CMD.NAV_TAKEOFF, 0, 0, keep_place, 0, 0, 0, 5) is result
+    assert pilot.mode(mode) == mavlink.MAV_RESULT_ACCEPTED
+    assert pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0) == mavlink.MAV_RESULT_ACCEPTED
+    assert pilot.command(mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, keep_place, 0, 0, 0, 5) is result
 
 
 def test_takeoff_knows_one_frame():
     _, pilot = alone()
-    for frame, result in ((0, MAV_RESULT.DENIED), (6, MAV_RESULT.DENIED), (3, MAV_RESULT.FAILED)):
-        assert pilot.command_int(MAV_CMD.NAV_TAKEOFF, {"frame": frame, "z": 5.0}) is result
+    for frame, result in (
+        (0, mavlink.MAV_RESULT_DENIED),
+        (6, mavlink.MAV_RESULT_DENIED),
+        (3, mavlink.MAV_RESULT_FAILED),
+    ):
+        assert pilot.command_int(mavlink.MAV_CMD_NAV_TAKEOFF, {"frame": frame, "z": 5.0}) is result
 
 
 @pytest.mark.parametrize(("direction", "way"), [(0, 1.0), (1, 1.0), (-1, -1.0)])
 def test_a_heading_is_turned_to_the_way_that_is_asked_for(direction: int, way: float):
     vehicle, pilot = airborne(8.0)
-    assert pilot.command(MAV_CMD.CONDITION_YAW, 90, 30, direction, 0) is MAV_RESULT.ACCEPTED
+    assert pilot.command(mavlink.MAV_CMD_CONDITION_YAW, 90, 30, direction, 0) == mavlink.MAV_RESULT_ACCEPTED
     pilot.fly_on(2.0)
     assert vehicle.est.yaw == pytest.approx(way * math.radians(55.0), abs=math.radians(10.0))
     pilot.fly_on(9.0)
@@ -129,7 +133,7 @@ def test_a_heading_is_turned_to_the_way_that_is_asked_for(direction: int, way: f
 
 def test_a_heading_in_the_bodys_frame_counts_from_the_nose():
     vehicle, pilot = airborne(8.0)
-    pilot.command(MAV_CMD.CONDITION_YAW, 90, 0, 0, 0)
+    pilot.command(mavlink.MAV_CMD_CONDITION_YAW, 90, 0, 0, 0)
     pilot.fly_on(4.0)
     values = {"coordinate_frame": 9, "type_mask": 0x9F8, "yaw": 0.5}
     pilot.send("SET_POSITION_TARGET_LOCAL_NED", HERE | values)
@@ -142,8 +146,8 @@ def test_reposition_needs_a_place_and_keeps_its_own_heading():
     place = START.offset(0.0, 15.0)
     target = {"frame": 3, "x": place.lat_e7, "y": place.lon_e7, "z": 8.0}
     for bad in ({"z": 0.0}, {"x": 0, "y": 0}, {"z": math.nan}, {"x": 950_000_000}):
-        assert pilot.command_int(MAV_CMD.DO_REPOSITION, target | bad) is MAV_RESULT.DENIED
-    assert pilot.command_int(MAV_CMD.DO_REPOSITION, target | {"param4": 180.0}) is MAV_RESULT.ACCEPTED
+        assert pilot.command_int(mavlink.MAV_CMD_DO_REPOSITION, target | bad) == mavlink.MAV_RESULT_DENIED
+    assert pilot.command_int(mavlink.MAV_CMD_DO_REPOSITION, target | {"param4": 180.0}) == mavlink.MAV_RESULT_ACCEPTED
     pilot.fly_on(5.0)
     assert vehicle.est.yaw == pytest.approx(math.pi / 2, abs=0.2), "along the way it flies"
 
@@ -171,7 +175,7 @@ def test_a_senseless_velocity_stops(speed: float):
 
 def test_without_gps_positions_move_nothing():
     vehicle, pilot = airborne(8.0)
-    assert pilot.mode(COPTER_MODE.GUIDED_NOGPS) is MAV_RESULT.ACCEPTED
+    assert pilot.mode(mavlink.COPTER_MODE_GUIDED_NOGPS) == mavlink.MAV_RESULT_ACCEPTED
     pilot.go_to(30.0, 0.0, 8.0)
     pilot.fly_on(5.0)
     assert distance_m(vehicle, 0.0, 0.0) < 5.0
@@ -183,10 +187,10 @@ def test_an_item_that_comes_twice_is_out_of_sequence_and_the_upload_goes_on():
     pilot.expect("MISSION_REQUEST")
     for _ in range(2):
         pilot.send("MISSION_ITEM_INT", HERE | {"seq": 0} | HOME)
-    assert pilot.expect("MISSION_ACK").integer("type") == MAV_MISSION_RESULT.INVALID_SEQUENCE
+    assert pilot.expect("MISSION_ACK").integer("type") == mavlink.MAV_MISSION_INVALID_SEQUENCE
     pilot.read()
     pilot.send("MISSION_ITEM_INT", HERE | {"seq": 1} | _waypoint(9.0))
-    assert pilot.expect("MISSION_ACK").integer("type") == MAV_MISSION_RESULT.ACCEPTED
+    assert pilot.expect("MISSION_ACK").integer("type") == mavlink.MAV_MISSION_ACCEPTED
     assert len(vehicle.mission.items) == 2
 
 
@@ -195,7 +199,7 @@ def test_a_fence_may_be_uploaded_while_a_mission_is():
     pilot.send("MISSION_COUNT", HERE | {"count": 2})
     assert pilot.expect("MISSION_REQUEST").integer("mission_type") == 0
     circle = {"command": 5003, "frame": 0, "param1": 50.0, "x": START.lat_e7, "y": START.lon_e7}
-    assert upload(pilot, 1, [circle]) == MAV_MISSION_RESULT.ACCEPTED
+    assert upload(pilot, 1, [circle]) == mavlink.MAV_MISSION_ACCEPTED
     for seq, item in enumerate((HOME, _waypoint(9.0))):
         pilot.send("MISSION_ITEM_INT", HERE | {"seq": seq} | item)
         pilot.step()
@@ -214,10 +218,12 @@ def test_the_current_item_is_one_that_navigates():
     vehicle, pilot = alone()
     upload(pilot, 0, [HOME, TAKEOFF, {"command": 178, "param2": 3.0}, _waypoint(9.0), {"command": 178, "param2": 3.0}])
     for chosen, current in ((0, 1), (2, 3)):
-        assert pilot.command(MAV_CMD.DO_SET_MISSION_CURRENT, chosen) is MAV_RESULT.ACCEPTED
+        assert pilot.command(mavlink.MAV_CMD_DO_SET_MISSION_CURRENT, chosen) == mavlink.MAV_RESULT_ACCEPTED
         assert vehicle.mission.current == current
-    assert pilot.command(MAV_CMD.DO_SET_MISSION_CURRENT, 4) is MAV_RESULT.FAILED, "nothing navigates after it"
-    assert pilot.command(MAV_CMD.DO_SET_MISSION_CURRENT, 5) is MAV_RESULT.DENIED
+    assert pilot.command(mavlink.MAV_CMD_DO_SET_MISSION_CURRENT, 4) == mavlink.MAV_RESULT_FAILED, (
+        "nothing navigates after it"
+    )
+    assert pilot.command(mavlink.MAV_CMD_DO_SET_MISSION_CURRENT, 5) == mavlink.MAV_RESULT_DENIED
     pilot.send("MISSION_SET_CURRENT", HERE | {"seq": 2})
     assert pilot.expect("MISSION_CURRENT").integer("seq") == 2, "the number that was sent is the answer"
 
@@ -225,21 +231,21 @@ def test_the_current_item_is_one_that_navigates():
 def test_a_mission_that_is_flown_is_not_cleared():
     vehicle, pilot = airborne(8.0)
     upload(pilot, 0, [HOME, _waypoint(60.0), _waypoint(90.0)])
-    pilot.mode(COPTER_MODE.AUTO)
+    pilot.mode(mavlink.COPTER_MODE_AUTO)
     pilot.fly_on(1.0)
     pilot.read()
     pilot.send("MISSION_CLEAR_ALL", HERE)
-    assert pilot.expect("MISSION_ACK").integer("type") == MAV_MISSION_RESULT.ERROR
+    assert pilot.expect("MISSION_ACK").integer("type") == mavlink.MAV_MISSION_ERROR
     assert len(vehicle.mission.items) == 3
 
 
 def test_items_are_judged_by_what_is_stored_of_them():
     for item, result in (
-        ({"command": 22, "frame": 99, "z": 9.0}, MAV_MISSION_RESULT.UNSUPPORTED_FRAME),
-        ({"command": 20, "frame": 99, "z": math.nan}, MAV_MISSION_RESULT.ACCEPTED),
-        ({"command": 201, "frame": 3, "x": 950_000_000}, MAV_MISSION_RESULT.INVALID_PARAM5_X),
-        ({"command": 178, "frame": 99, "x": 950_000_000}, MAV_MISSION_RESULT.ACCEPTED),
-        ({"command": 218, "param1": 9.0}, MAV_MISSION_RESULT.ACCEPTED),
+        ({"command": 22, "frame": 99, "z": 9.0}, mavlink.MAV_MISSION_UNSUPPORTED_FRAME),
+        ({"command": 20, "frame": 99, "z": math.nan}, mavlink.MAV_MISSION_ACCEPTED),
+        ({"command": 201, "frame": 3, "x": 950_000_000}, mavlink.MAV_MISSION_INVALID_PARAM5_X),
+        ({"command": 178, "frame": 99, "x": 950_000_000}, mavlink.MAV_MISSION_ACCEPTED),
+        ({"command": 218, "param1": 9.0}, mavlink.MAV_MISSION_ACCEPTED),
     ):
         _, pilot = alone()
         assert upload(pilot, 0, [HOME, item]) == result, item
@@ -263,7 +269,7 @@ def test_all_streams_set_all_their_parameters():
 def test_a_spline_stops_at_its_end():
     vehicle, pilot = airborne(10.0)
     upload(pilot, 0, [HOME, _waypoint(25.0, command=82)])
-    pilot.mode(COPTER_MODE.AUTO)
+    pilot.mode(mavlink.COPTER_MODE_AUTO)
     took = pilot.wait(lambda: vehicle.mission.complete, 20.0)
     assert math.hypot(vehicle.est.vn, vehicle.est.ve) < 0.5
     assert took < 12.0
@@ -273,10 +279,10 @@ def test_a_spline_stops_at_its_end():
 
 def test_what_is_asked_for_during_a_pause_waits_for_its_end():
     vehicle, pilot = airborne(8.0)
-    assert pilot.command(MAV_CMD.DO_PAUSE_CONTINUE, 0) is MAV_RESULT.ACCEPTED
+    assert pilot.command(mavlink.MAV_CMD_DO_PAUSE_CONTINUE, 0) == mavlink.MAV_RESULT_ACCEPTED
     pilot.go_to(15.0, 0.0, 8.0)
     pilot.fly_on(4.0)
     assert distance_m(vehicle, 0.0, 0.0) < 1.0
-    assert pilot.command(MAV_CMD.DO_PAUSE_CONTINUE, 1) is MAV_RESULT.ACCEPTED
+    assert pilot.command(mavlink.MAV_CMD_DO_PAUSE_CONTINUE, 1) == mavlink.MAV_RESULT_ACCEPTED
     pilot.fly_on(9.0)
     assert distance_m(vehicle, 15.0, 0.0) < 1.0

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import pytest
-from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_RESULT
 from fractus_vehicle.state import VehicleState
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from vehicle_pilot import Pilot
 from vehicle_world import START, airborne, alone, distance_m, upload
 
@@ -20,7 +20,7 @@ def test_silent_ground_station_brings_it_home():
     pilot.go_to(30.0, 0.0, 10.0)
     pilot.fly_on(5.0)
     pilot.heartbeats = False
-    lost_s = pilot.wait(lambda: vehicle.mode is COPTER_MODE.RTL, 10.0)
+    lost_s = pilot.wait(lambda: vehicle.mode == mavlink.COPTER_MODE_RTL, 10.0)
     assert 3.9 < lost_s <= 5.2
     assert pilot.texts[-1] == "GCS Failsafe"
     pilot.wait(lambda: not vehicle.armed, 90.0)
@@ -31,26 +31,26 @@ def test_only_the_chosen_system_counts_as_ground_station():
     vehicle, pilot = airborne(10.0, FS_GCS_ENABLE=1, SYSID_MYGCS=255)
     other = Pilot(pilot.simulation, pilot.craft, sysid=42)
     pilot.heartbeats = False
-    other.wait(lambda: vehicle.mode is COPTER_MODE.RTL, 10.0)
+    other.wait(lambda: vehicle.mode == mavlink.COPTER_MODE_RTL, 10.0)
     assert "GCS Failsafe" in other.texts
     pilot.heartbeats = True
     pilot.fly_on(2.0)
     assert "GCS Failsafe Cleared" in pilot.texts
-    assert vehicle.mode is COPTER_MODE.RTL, "clearing the failsafe does not change the mode back"
+    assert vehicle.mode == mavlink.COPTER_MODE_RTL, "clearing the failsafe does not change the mode back"
 
 
 def test_failsafe_timeout_follows_its_parameter():
     vehicle, pilot = airborne(10.0, FS_GCS_ENABLE=5)
     assert pilot.parameter("FS_GCS_TIMEOUT", 2.0) == 2.0
     pilot.heartbeats = False
-    assert pilot.wait(lambda: vehicle.mode is COPTER_MODE.LAND, 10.0) < 2.3
+    assert pilot.wait(lambda: vehicle.mode == mavlink.COPTER_MODE_LAND, 10.0) < 2.3
 
 
 def test_without_the_failsafe_silence_changes_nothing():
     vehicle, pilot = airborne(10.0)
     pilot.heartbeats = False
     pilot.fly_on(20.0)
-    assert vehicle.mode is COPTER_MODE.GUIDED
+    assert vehicle.mode == mavlink.COPTER_MODE_GUIDED
 
 
 def test_low_and_critical_battery():
@@ -60,22 +60,22 @@ def test_low_and_critical_battery():
     pilot.go_to(60.0, 0.0, 10.0)
     pilot.fly_on(8.0)
     pilot.parameter("SIM_BATT_VOLTAGE", 11.4)
-    pilot.wait(lambda: vehicle.mode is COPTER_MODE.RTL, 10.0)
+    pilot.wait(lambda: vehicle.mode == mavlink.COPTER_MODE_RTL, 10.0)
     assert any(text.startswith("Battery 1 is low 11.") for text in pilot.texts)
     assert pilot.texts[-1] == "Battery Failsafe"
     pilot.parameter("SIM_BATT_VOLTAGE", 10.7)
-    pilot.wait(lambda: vehicle.mode is COPTER_MODE.LAND, 10.0)
+    pilot.wait(lambda: vehicle.mode == mavlink.COPTER_MODE_LAND, 10.0)
     assert any(text.startswith("Battery 1 is critical 10.") for text in pilot.texts)
     pilot.wait(lambda: not vehicle.armed, 60.0)
-    assert pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0) is MAV_RESULT.FAILED
+    assert pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0) == mavlink.MAV_RESULT_FAILED
 
 
 def test_lost_gps_lands_it():
     vehicle, pilot = airborne(15.0)
     pilot.parameter("SIM_GPS_DISABLE", 1)
-    pilot.wait(lambda: vehicle.mode is COPTER_MODE.LAND, 15.0)
+    pilot.wait(lambda: vehicle.mode == mavlink.COPTER_MODE_LAND, 15.0)
     assert "EKF Failsafe: changed to LAND Mode" in pilot.texts
-    assert pilot.mode(COPTER_MODE.GUIDED) is MAV_RESULT.FAILED
+    assert pilot.mode(mavlink.COPTER_MODE_GUIDED) == mavlink.MAV_RESULT_FAILED
     pilot.wait(lambda: not vehicle.armed, 90.0)
     assert vehicle.body.on_ground
 
@@ -86,23 +86,23 @@ def test_short_gps_loss_is_ridden_out():
     pilot.fly_on(3.0)
     pilot.parameter("SIM_GPS_DISABLE", 0)
     pilot.fly_on(10.0)
-    assert vehicle.mode is COPTER_MODE.GUIDED
+    assert vehicle.mode == mavlink.COPTER_MODE_GUIDED
     assert distance_m(vehicle, 0.0, 0.0) < 2.0
 
 
 def test_crossing_the_fence_brings_it_back():
     vehicle, pilot = airborne(10.0)
-    assert upload(pilot, 1, _square(MAV_CMD.NAV_FENCE_POLYGON_VERTEX_INCLUSION, 20.0)) == 0
-    assert pilot.command(MAV_CMD.DO_FENCE_ENABLE, 1) is MAV_RESULT.ACCEPTED
+    assert upload(pilot, 1, _square(mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION, 20.0)) == 0
+    assert pilot.command(mavlink.MAV_CMD_DO_FENCE_ENABLE, 1) == mavlink.MAV_RESULT_ACCEPTED
     for _ in range(200):
         pilot.send(
             "SET_POSITION_TARGET_LOCAL_NED",
             {"target_system": 1, "target_component": 1, "coordinate_frame": 1, "type_mask": 0xDC7, "vx": 9.0},
         )
         pilot.fly_on(0.1)
-        if vehicle.mode is COPTER_MODE.RTL:
+        if vehicle.mode == mavlink.COPTER_MODE_RTL:
             break
-    assert vehicle.mode is COPTER_MODE.RTL
+    assert vehicle.mode == mavlink.COPTER_MODE_RTL
     assert vehicle.body.north > 20.0, "it reacts only after crossing"
     assert "Polygon fence breached" in pilot.texts
     assert vehicle.fence.breach_type == 3
@@ -112,8 +112,8 @@ def test_crossing_the_fence_brings_it_back():
 
 def test_target_outside_the_fence_is_dropped_without_an_answer():
     vehicle, pilot = airborne(10.0)
-    upload(pilot, 1, _square(MAV_CMD.NAV_FENCE_POLYGON_VERTEX_INCLUSION, 20.0))
-    pilot.command(MAV_CMD.DO_FENCE_ENABLE, 1)
+    upload(pilot, 1, _square(mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION, 20.0))
+    pilot.command(mavlink.MAV_CMD_DO_FENCE_ENABLE, 1)
     pilot.fly_on(1.0)
     texts = list(pilot.texts)
     pilot.last.clear()
@@ -123,7 +123,7 @@ def test_target_outside_the_fence_is_dropped_without_an_answer():
     assert (pilot.texts, pilot.last.keys() - {"HEARTBEAT"}) == (texts, set())
     place = START.offset(60.0, 0.0)
     values = {"frame": 6, "x": place.lat_e7, "y": place.lon_e7, "z": 10.0}
-    assert pilot.command_int(MAV_CMD.DO_REPOSITION, values) is MAV_RESULT.FAILED
+    assert pilot.command_int(mavlink.MAV_CMD_DO_REPOSITION, values) == mavlink.MAV_RESULT_FAILED
     pilot.go_to(10.0, 0.0, 10.0)
     pilot.fly_on(8.0)
     assert distance_m(vehicle, 10.0, 0.0) < 0.7
@@ -132,15 +132,15 @@ def test_target_outside_the_fence_is_dropped_without_an_answer():
 def test_the_fence_is_switched_as_a_whole_or_only_its_floor():
     vehicle, pilot = alone(FENCE_TYPE=12, FENCE_ENABLE=1)
     assert vehicle.fence.outside(0.0, 0.0, -20.0)
-    assert pilot.command(MAV_CMD.DO_FENCE_ENABLE, 2) is MAV_RESULT.ACCEPTED
+    assert pilot.command(mavlink.MAV_CMD_DO_FENCE_ENABLE, 2) == mavlink.MAV_RESULT_ACCEPTED
     assert vehicle.fence.enabled
     assert not vehicle.fence.outside(0.0, 0.0, -20.0)
-    assert pilot.command(MAV_CMD.DO_FENCE_ENABLE, 0) is MAV_RESULT.ACCEPTED
+    assert pilot.command(mavlink.MAV_CMD_DO_FENCE_ENABLE, 0) == mavlink.MAV_RESULT_ACCEPTED
     assert not vehicle.fence.enabled
     pilot.parameter("FENCE_TYPE", 4)
-    assert pilot.command(MAV_CMD.DO_FENCE_ENABLE, 1) is MAV_RESULT.FAILED, "there is no polygon"
-    upload(pilot, 1, _square(MAV_CMD.NAV_FENCE_POLYGON_VERTEX_INCLUSION, 20.0))
-    assert pilot.command(MAV_CMD.DO_FENCE_ENABLE, 1) is MAV_RESULT.ACCEPTED
+    assert pilot.command(mavlink.MAV_CMD_DO_FENCE_ENABLE, 1) == mavlink.MAV_RESULT_FAILED, "there is no polygon"
+    upload(pilot, 1, _square(mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION, 20.0))
+    assert pilot.command(mavlink.MAV_CMD_DO_FENCE_ENABLE, 1) == mavlink.MAV_RESULT_ACCEPTED
     assert vehicle.fence.enabled
 
 
@@ -172,7 +172,7 @@ def test_altitude_fence_and_home_circle():
             {"target_system": 1, "target_component": 1, "coordinate_frame": 1, "type_mask": 0xDC7, "vz": -2.0},
         )
         pilot.fly_on(0.2)
-    assert vehicle.mode is COPTER_MODE.BRAKE
+    assert vehicle.mode == mavlink.COPTER_MODE_BRAKE
     assert "Max Alt fence breached" in pilot.texts
 
 
@@ -187,7 +187,7 @@ def test_altitude_fence_and_home_circle():
 )
 def test_bad_fences_are_refused_and_the_old_one_stays(items: list[dict[str, float]]):
     vehicle, pilot = alone()
-    upload(pilot, 1, _square(MAV_CMD.NAV_FENCE_POLYGON_VERTEX_INCLUSION, 20.0))
+    upload(pilot, 1, _square(mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION, 20.0))
     shapes = vehicle.fence.shapes
     assert upload(pilot, 1, [{"frame": 0, "x": START.lat_e7, "y": START.lon_e7} | item for item in items]) != 0
     assert vehicle.fence.shapes == shapes
@@ -213,27 +213,27 @@ def test_a_low_battery_forbids_arming_and_its_failsafe_stays_until_a_restart():
     pilot.wait(lambda: not vehicle.armed, 60.0)
     assert "Battery 1 is low 10.30V used" in " ".join(pilot.texts)
     before = len(pilot.texts)
-    pilot.mode(COPTER_MODE.GUIDED)
-    assert pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0) is MAV_RESULT.FAILED
+    pilot.mode(mavlink.COPTER_MODE_GUIDED)
+    assert pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0) == mavlink.MAV_RESULT_FAILED
     assert pilot.texts[before:] == ["Arm: Battery 1 low voltage failsafe", "Arm: Battery failsafe"]
     pilot.parameter("SIM_BATT_VOLTAGE", 12.6)
     pilot.fly_on(1.0)
-    assert pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0) is MAV_RESULT.FAILED
+    assert pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0) == mavlink.MAV_RESULT_FAILED
     assert pilot.texts[-1] == "Arm: Battery failsafe"
 
 
 def test_a_change_of_mode_in_a_breach_suspends_the_fence_and_its_end_is_told():
     vehicle, pilot = airborne(10.0, FENCE_RADIUS=30, FENCE_TYPE=2, AVOID_ENABLE=0, FENCE_ENABLE=1)
-    while vehicle.mode is COPTER_MODE.GUIDED:
+    while vehicle.mode == mavlink.COPTER_MODE_GUIDED:
         pilot.send(
             "SET_POSITION_TARGET_LOCAL_NED",
             {"target_system": 1, "target_component": 1, "coordinate_frame": 1, "type_mask": 0xDC7, "vx": 6.0},
         )
         pilot.fly_on(0.2)
     assert pilot.texts[-2:] == ["Circle fence breached", "Manual recovery started"]
-    pilot.mode(COPTER_MODE.LOITER)
+    pilot.mode(mavlink.COPTER_MODE_LOITER)
     assert pilot.texts[-1] == "Manual recovery started"
-    pilot.mode(COPTER_MODE.RTL)
+    pilot.mode(mavlink.COPTER_MODE_RTL)
     pilot.wait(lambda: "Fence breach cleared" in pilot.texts, 30.0)
     assert pilot.texts.count("Circle fence breached") == 1
 
@@ -246,6 +246,6 @@ def test_velocities_are_slowed_before_the_fence():
             {"target_system": 1, "target_component": 1, "coordinate_frame": 1, "type_mask": 0xDC7, "vx": 3.0},
         )
         pilot.fly_on(0.2)
-    assert vehicle.mode is COPTER_MODE.GUIDED
+    assert vehicle.mode == mavlink.COPTER_MODE_GUIDED
     assert 26.0 < vehicle.est.north < 30.0
     assert vehicle.fence.limiting

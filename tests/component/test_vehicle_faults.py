@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import pytest
-from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_RESULT, MAV_SEVERITY
 from fractus_vehicle.readiness import arming_refusals
 from fractus_vehicle.state import VehicleState
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from vehicle_pilot import Pilot
 from vehicle_world import START, airborne, alone, distance_m, upload
 
@@ -28,18 +28,20 @@ def _waypoint(north_m: float, altitude_m: float = 10.0) -> dict[str, float]:
 def _in_mission(**parameters: float) -> tuple[VehicleState, Pilot]:
     vehicle, pilot = airborne(10.0, **parameters)
     assert upload(pilot, 0, [HOME, _waypoint(150.0), _waypoint(0.0)]) == 0
-    assert pilot.mode(COPTER_MODE.AUTO) is MAV_RESULT.ACCEPTED
+    assert pilot.mode(mavlink.COPTER_MODE_AUTO) == mavlink.MAV_RESULT_ACCEPTED
     pilot.fly_on(3.0)
     return vehicle, pilot
 
 
-@pytest.mark.parametrize("mode", [COPTER_MODE.GUIDED, COPTER_MODE.LOITER, COPTER_MODE.RTL, COPTER_MODE.AUTO])
-def test_gps_loss_lands_after_a_pause(mode: COPTER_MODE):
-    vehicle, pilot = _in_mission() if mode is COPTER_MODE.AUTO else airborne(15.0)
-    if mode is not COPTER_MODE.AUTO:
+@pytest.mark.parametrize(
+    "mode", [mavlink.COPTER_MODE_GUIDED, mavlink.COPTER_MODE_LOITER, mavlink.COPTER_MODE_RTL, mavlink.COPTER_MODE_AUTO]
+)
+def test_gps_loss_lands_after_a_pause(mode: int):
+    vehicle, pilot = _in_mission() if mode == mavlink.COPTER_MODE_AUTO else airborne(15.0)
+    if mode != mavlink.COPTER_MODE_AUTO:
         pilot.mode(mode)
     pilot.parameter("SIM_GPS_DISABLE", 1)
-    pilot.wait(lambda: vehicle.mode is COPTER_MODE.LAND, 12.0)
+    pilot.wait(lambda: vehicle.mode == mavlink.COPTER_MODE_LAND, 12.0)
     assert _in_order(
         pilot.texts,
         "EKF3 IMU0 stopped aiding",
@@ -56,33 +58,33 @@ def test_gps_loss_lands_after_a_pause(mode: COPTER_MODE):
 def test_gps_loss_may_hold_altitude_instead():
     vehicle, pilot = airborne(15.0, FS_EKF_ACTION=2)
     pilot.parameter("SIM_GPS_DISABLE", 1)
-    pilot.wait(lambda: vehicle.mode is COPTER_MODE.ALT_HOLD, 12.0)
+    pilot.wait(lambda: vehicle.mode == mavlink.COPTER_MODE_ALT_HOLD, 12.0)
     assert "EKF Failsafe: changed to ALT_HOLD Mode" in pilot.texts
     pilot.parameter("SIM_GPS_DISABLE", 0)
     pilot.wait(lambda: "EKF Failsafe Cleared" in pilot.texts, 10.0)
     assert "EKF3 IMU0 is using GPS" in pilot.texts[-3:]
-    assert vehicle.mode is COPTER_MODE.ALT_HOLD
-    assert pilot.mode(COPTER_MODE.GUIDED) is MAV_RESULT.ACCEPTED
+    assert vehicle.mode == mavlink.COPTER_MODE_ALT_HOLD
+    assert pilot.mode(mavlink.COPTER_MODE_GUIDED) == mavlink.MAV_RESULT_ACCEPTED
 
 
 def test_too_few_satellites_are_no_position():
     vehicle, pilot = airborne(15.0)
     pilot.parameter("SIM_GPS_NUMSATS", 3)
-    pilot.wait(lambda: vehicle.mode is COPTER_MODE.LAND, 12.0)
+    pilot.wait(lambda: vehicle.mode == mavlink.COPTER_MODE_LAND, 12.0)
     assert "EKF Failsafe: changed to LAND Mode" in pilot.texts
 
 
 @pytest.mark.parametrize(
     ("setting", "mode", "text"),
     [
-        (1, COPTER_MODE.RTL, "GCS Failsafe"),
-        (2, COPTER_MODE.RTL, "GCS Failsafe"),
-        (5, COPTER_MODE.LAND, "GCS Failsafe"),
-        (6, COPTER_MODE.RTL, "Trying RTL Mode"),
-        (7, COPTER_MODE.BRAKE, "GCS Failsafe"),
+        (1, mavlink.COPTER_MODE_RTL, "GCS Failsafe"),
+        (2, mavlink.COPTER_MODE_RTL, "GCS Failsafe"),
+        (5, mavlink.COPTER_MODE_LAND, "GCS Failsafe"),
+        (6, mavlink.COPTER_MODE_RTL, "Trying RTL Mode"),
+        (7, mavlink.COPTER_MODE_BRAKE, "GCS Failsafe"),
     ],
 )
-def test_a_node_without_power_is_a_companion_that_falls_silent(setting: int, mode: COPTER_MODE, text: str):
+def test_a_node_without_power_is_a_companion_that_falls_silent(setting: int, mode: int, text: str):
     vehicle, pilot = airborne(10.0, FS_GCS_ENABLE=setting)
     pilot.go_to(40.0, 0.0, 10.0)
     pilot.heartbeats = False
@@ -96,14 +98,14 @@ def test_a_node_without_power_is_a_companion_that_falls_silent(setting: int, mod
 @pytest.mark.parametrize(
     ("options", "mode", "stays", "text"),
     [
-        (2, COPTER_MODE.AUTO, True, "GCS Failsafe - Continuing Auto Mode"),
-        (0, COPTER_MODE.AUTO, False, "GCS Failsafe"),
-        (8, COPTER_MODE.LAND, True, "GCS Failsafe - Continuing Landing"),
-        (16, COPTER_MODE.LOITER, True, "GCS Failsafe - Continuing Pilot Control"),
-        (0, COPTER_MODE.LOITER, False, "GCS Failsafe"),
+        (2, mavlink.COPTER_MODE_AUTO, True, "GCS Failsafe - Continuing Auto Mode"),
+        (0, mavlink.COPTER_MODE_AUTO, False, "GCS Failsafe"),
+        (8, mavlink.COPTER_MODE_LAND, True, "GCS Failsafe - Continuing Landing"),
+        (16, mavlink.COPTER_MODE_LOITER, True, "GCS Failsafe - Continuing Pilot Control"),
+        (0, mavlink.COPTER_MODE_LOITER, False, "GCS Failsafe"),
     ],
 )
-def test_a_lost_link_leaves_what_fs_options_says(options: int, mode: COPTER_MODE, stays: bool, text: str):
+def test_a_lost_link_leaves_what_fs_options_says(options: int, mode: int, stays: bool, text: str):
     vehicle, pilot = _in_mission(FS_GCS_ENABLE=1, FS_OPTIONS=options)
     pilot.mode(mode)
     pilot.heartbeats = False
@@ -112,8 +114,10 @@ def test_a_lost_link_leaves_what_fs_options_says(options: int, mode: COPTER_MODE
     assert (vehicle.mode is mode) is stays
 
 
-@pytest.mark.parametrize(("setting", "mode"), [(1, COPTER_MODE.RTL), (3, COPTER_MODE.LAND), (7, COPTER_MODE.BRAKE)])
-def test_a_lost_radio(setting: int, mode: COPTER_MODE):
+@pytest.mark.parametrize(
+    ("setting", "mode"), [(1, mavlink.COPTER_MODE_RTL), (3, mavlink.COPTER_MODE_LAND), (7, mavlink.COPTER_MODE_BRAKE)]
+)
+def test_a_lost_radio(setting: int, mode: int):
     vehicle, pilot = airborne(10.0, FS_THR_ENABLE=setting)
     pilot.go_to(30.0, 0.0, 10.0)
     pilot.fly_on(3.0)
@@ -133,32 +137,32 @@ def test_guided_flight_may_go_on_without_radio_where_the_companion_is_watched(op
     pilot.parameter("SIM_RC_FAIL", 1)
     pilot.wait(lambda: vehicle.failsafes.radio, 3.0)
     assert text in pilot.texts
-    assert (vehicle.mode is COPTER_MODE.GUIDED) is text.endswith("Guided Mode")
+    assert (vehicle.mode == mavlink.COPTER_MODE_GUIDED) is text.endswith("Guided Mode")
 
 
 def test_a_lost_radio_on_the_ground_stops_the_motors_and_forbids_arming():
     vehicle, pilot = alone()
-    pilot.mode(COPTER_MODE.GUIDED)
+    pilot.mode(mavlink.COPTER_MODE_GUIDED)
     pilot.wait(lambda: not arming_refusals(vehicle), 5.0)
-    pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0)
+    pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0)
     pilot.parameter("SIM_RC_FAIL", 1)
     pilot.wait(lambda: not vehicle.armed, 3.0)
     assert "Radio Failsafe - Disarming" in pilot.texts
-    assert pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0) is MAV_RESULT.FAILED
+    assert pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0) == mavlink.MAV_RESULT_FAILED
     assert "Arm: Radio failsafe on" in pilot.texts
 
 
 @pytest.mark.parametrize(
     ("setting", "mode"),
     [
-        (0, COPTER_MODE.GUIDED),
-        (1, COPTER_MODE.LAND),
-        (2, COPTER_MODE.RTL),
-        (6, COPTER_MODE.RTL),
-        (7, COPTER_MODE.BRAKE),
+        (0, mavlink.COPTER_MODE_GUIDED),
+        (1, mavlink.COPTER_MODE_LAND),
+        (2, mavlink.COPTER_MODE_RTL),
+        (6, mavlink.COPTER_MODE_RTL),
+        (7, mavlink.COPTER_MODE_BRAKE),
     ],
 )
-def test_a_battery_that_drops(setting: int, mode: COPTER_MODE):
+def test_a_battery_that_drops(setting: int, mode: int):
     vehicle, pilot = airborne(10.0, BATT_LOW_VOLT=11.5, BATT_FS_LOW_ACT=setting)
     pilot.go_to(30.0, 0.0, 10.0)
     pilot.fly_on(3.0)
@@ -181,11 +185,11 @@ def test_a_terminating_battery_failsafe_stops_the_motors():
 def test_a_landing_for_the_battery_is_not_undone_by_a_lost_link():
     vehicle, pilot = airborne(25.0, BATT_CRT_VOLT=11.5, BATT_FS_CRT_ACT=1, FS_GCS_ENABLE=1, FS_OPTIONS=0)
     pilot.parameter("SIM_BATT_VOLTAGE", 10.4)
-    pilot.wait(lambda: vehicle.mode is COPTER_MODE.LAND, 15.0)
+    pilot.wait(lambda: vehicle.mode == mavlink.COPTER_MODE_LAND, 15.0)
     pilot.heartbeats = False
     pilot.wait(lambda: vehicle.failsafes.gcs, 8.0)
     assert pilot.texts[-1] == "GCS + Battery Failsafe - Continuing Landing"
-    assert vehicle.mode is COPTER_MODE.LAND
+    assert vehicle.mode == mavlink.COPTER_MODE_LAND
 
 
 @pytest.mark.parametrize("motor", [0, 1, 2, 3])
@@ -204,7 +208,7 @@ def test_weak_motors_are_noticed_before_the_ground_is():
     pilot.parameter("SIM_ENGINE_FAIL", 15)
     pilot.wait(lambda: any(text.startswith("Potential Thrust Loss (") for text in pilot.texts), 15.0)
     assert not vehicle.body.on_ground
-    assert pilot.last["STATUSTEXT"].integer("severity") == MAV_SEVERITY.EMERGENCY
+    assert pilot.last["STATUSTEXT"].integer("severity") == mavlink.MAV_SEVERITY_EMERGENCY
 
 
 def test_a_gust_is_leaned_against_and_changes_nothing_else():
@@ -222,7 +226,7 @@ def test_a_gust_is_leaned_against_and_changes_nothing_else():
     assert 0.3 < worst < 5.0
     assert lean > math.radians(5)
     assert distance_m(vehicle, 0.0, 0.0) < 0.8
-    assert (vehicle.mode, pilot.texts[said:]) == (COPTER_MODE.GUIDED, [])
+    assert (vehicle.mode, pilot.texts[said:]) == (mavlink.COPTER_MODE_GUIDED, [])
 
 
 def test_a_storm_carries_it_away_and_it_comes_back():
@@ -233,7 +237,7 @@ def test_a_storm_carries_it_away_and_it_comes_back():
     pilot.parameter("SIM_WIND_SPD", 0)
     pilot.fly_on(40.0)
     assert distance_m(vehicle, 0.0, 0.0) < 5.0
-    assert vehicle.mode is COPTER_MODE.GUIDED
+    assert vehicle.mode == mavlink.COPTER_MODE_GUIDED
     assert not vehicle.body.crashed
 
 
@@ -241,6 +245,6 @@ def test_a_fence_that_is_far_behind_means_landing():
     vehicle, pilot = airborne(10.0, FENCE_RADIUS=50, FENCE_ACTION=1)
     pilot.go_to(200.0, 0.0, 10.0)
     pilot.wait(lambda: vehicle.body.north > 190.0, 60.0)
-    assert pilot.command(MAV_CMD.DO_FENCE_ENABLE, 1) is MAV_RESULT.ACCEPTED
-    pilot.wait(lambda: vehicle.mode is COPTER_MODE.LAND, 3.0)
+    assert pilot.command(mavlink.MAV_CMD_DO_FENCE_ENABLE, 1) == mavlink.MAV_RESULT_ACCEPTED
+    pilot.wait(lambda: vehicle.mode == mavlink.COPTER_MODE_LAND, 3.0)
     assert "Circle fence breached" in pilot.texts

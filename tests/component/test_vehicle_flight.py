@@ -7,10 +7,10 @@ import math
 
 import pytest
 from fractus_core.policy.kinematics import stopping_distance_m
-from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_LANDED_STATE, MAV_RESULT
 from fractus_vehicle.readiness import arming_refusals
 from fractus_vehicle.shaping import sqrt_controller, wrap_pi
 from fractus_vehicle.state import VehicleState
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from vehicle_pilot import Pilot
 from vehicle_world import START, airborne, alone, distance_m
 
@@ -38,7 +38,7 @@ def test_measured_figures_of_the_real_thing_hold_within_20_percent():
     assert 7.44 <= pilot.simulation.time_s - begun <= 11.16
     assert 6.72 <= peak <= 10.08
     pilot.fly_on(6.0)
-    assert pilot.command(MAV_CMD.NAV_RETURN_TO_LAUNCH) is MAV_RESULT.ACCEPTED
+    assert pilot.command(mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH) == mavlink.MAV_RESULT_ACCEPTED
     home_s = pilot.wait(lambda: not vehicle.armed, 120.0)
     assert 39.2 <= home_s <= 58.8
     assert distance_m(vehicle, 0.0, 0.0) < 1.0
@@ -77,51 +77,53 @@ def test_wind_is_held_and_gusts_do_not_carry_it_away():
 
 def test_arming_waits_for_readiness_and_says_why():
     vehicle, pilot = alone()
-    pilot.mode(COPTER_MODE.GUIDED)
-    assert pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0) is MAV_RESULT.FAILED
+    pilot.mode(mavlink.COPTER_MODE_GUIDED)
+    assert pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0) == mavlink.MAV_RESULT_FAILED
     assert any(text.startswith("Arm: ") for text in pilot.texts)
     pilot.wait(lambda: not arming_refusals(vehicle), 5.0)
     assert pilot.simulation.time_s >= 2.0
-    assert pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0) is MAV_RESULT.ACCEPTED
-    assert pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 0.0) is MAV_RESULT.ACCEPTED
-    assert pilot.mode(COPTER_MODE.RTL) is MAV_RESULT.ACCEPTED
-    assert pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0) is MAV_RESULT.FAILED
+    assert pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0) == mavlink.MAV_RESULT_ACCEPTED
+    assert pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0.0) == mavlink.MAV_RESULT_ACCEPTED
+    assert pilot.mode(mavlink.COPTER_MODE_RTL) == mavlink.MAV_RESULT_ACCEPTED
+    assert pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0) == mavlink.MAV_RESULT_FAILED
     assert pilot.texts[-1] == "Arm: RTL mode not armable"
 
 
 def test_idle_vehicle_disarms_by_itself():
     vehicle, pilot = alone()
-    pilot.mode(COPTER_MODE.GUIDED)
+    pilot.mode(mavlink.COPTER_MODE_GUIDED)
     pilot.wait(lambda: not arming_refusals(vehicle), 5.0)
-    pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0)
+    pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0)
     assert 9.0 < pilot.wait(lambda: not vehicle.armed, 15.0) < 11.0
 
 
 def test_takeoff_needs_guided_armed_and_ground():
     vehicle, pilot = alone()
     pilot.wait(lambda: vehicle.position_ok, 5.0)
-    takeoff = (MAV_CMD.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 5)
-    assert pilot.command(*takeoff) is MAV_RESULT.FAILED
-    pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0)
-    assert pilot.command(*takeoff) is MAV_RESULT.FAILED, "STABILIZE has no takeoff"
-    pilot.mode(COPTER_MODE.GUIDED)
-    assert pilot.command(*takeoff[:-1], -3) is MAV_RESULT.FAILED
-    assert pilot.command(*takeoff) is MAV_RESULT.ACCEPTED
+    takeoff = (mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 5)
+    assert pilot.command(*takeoff) == mavlink.MAV_RESULT_FAILED
+    pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0)
+    assert pilot.command(*takeoff) == mavlink.MAV_RESULT_FAILED, "STABILIZE has no takeoff"
+    pilot.mode(mavlink.COPTER_MODE_GUIDED)
+    assert pilot.command(*takeoff[:-1], -3) == mavlink.MAV_RESULT_FAILED
+    assert pilot.command(*takeoff) == mavlink.MAV_RESULT_ACCEPTED
     pilot.wait(lambda: not vehicle.landed, 10.0)
-    assert vehicle.landed_state is MAV_LANDED_STATE.TAKEOFF
-    assert pilot.command(*takeoff) is MAV_RESULT.FAILED
-    assert pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 0.0) is MAV_RESULT.FAILED, "in the air only with the force magic"
+    assert vehicle.landed_state == mavlink.MAV_LANDED_STATE_TAKEOFF
+    assert pilot.command(*takeoff) == mavlink.MAV_RESULT_FAILED
+    assert pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0.0) == mavlink.MAV_RESULT_FAILED, (
+        "in the air only with the force magic"
+    )
     assert vehicle.armed
-    assert pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 0.0, 21196) is MAV_RESULT.ACCEPTED
+    assert pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0.0, 21196) == mavlink.MAV_RESULT_ACCEPTED
     assert not vehicle.armed
 
 
 def test_a_target_during_spool_up_cancels_the_takeoff():
     vehicle, pilot = alone()
-    pilot.mode(COPTER_MODE.GUIDED)
+    pilot.mode(mavlink.COPTER_MODE_GUIDED)
     pilot.wait(lambda: not arming_refusals(vehicle), 5.0)
-    pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0)
-    pilot.command(MAV_CMD.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 5)
+    pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0)
+    pilot.command(mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 5)
     pilot.fly_on(0.5)
     pilot.go_to(10.0, 0.0, 10.0)
     pilot.fly_on(8.0)
@@ -131,13 +133,13 @@ def test_a_target_during_spool_up_cancels_the_takeoff():
 @pytest.mark.parametrize(
     ("command", "result"),
     [
-        (31999, MAV_RESULT.UNSUPPORTED),
-        (MAV_CMD.DO_REPOSITION, MAV_RESULT.UNSUPPORTED),
-        (MAV_CMD.REQUEST_MESSAGE, MAV_RESULT.ACCEPTED),
-        (MAV_CMD.DO_FLIGHTTERMINATION, MAV_RESULT.FAILED),
+        (31999, mavlink.MAV_RESULT_UNSUPPORTED),
+        (mavlink.MAV_CMD_DO_REPOSITION, mavlink.MAV_RESULT_UNSUPPORTED),
+        (mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAV_RESULT_ACCEPTED),
+        (mavlink.MAV_CMD_DO_FLIGHTTERMINATION, mavlink.MAV_RESULT_FAILED),
     ],
 )
-def test_results_of_commands(command: int, result: MAV_RESULT):
+def test_results_of_commands(command: int, result: int):
     _, pilot = alone()
     assert pilot.command(command) is result
 
@@ -174,9 +176,9 @@ def test_global_targets_in_every_frame(frame: int):
 def test_local_targets_in_every_frame(frame: int, north: float, east: float):
     vehicle, pilot = airborne(10.0)
     pilot.go_to(10.0, 0.0, 10.0)
-    pilot.command(MAV_CMD.CONDITION_YAW, 90, 90, 1, 0)
+    pilot.command(mavlink.MAV_CMD_CONDITION_YAW, 90, 90, 1, 0)
     pilot.fly_on(12.0)
-    pilot.command(MAV_CMD.CONDITION_YAW, 90, 90, 1, 0)
+    pilot.command(mavlink.MAV_CMD_CONDITION_YAW, 90, 90, 1, 0)
     pilot.fly_on(4.0)
     assert vehicle.est.yaw == pytest.approx(math.radians(90), abs=0.05)
     z = -10.0 if frame == 1 else 0.0
@@ -218,7 +220,7 @@ def test_nose_follows_the_course_and_looks_at_a_region_of_interest():
     assert vehicle.est.yaw == pytest.approx(math.radians(90), abs=0.1)
     roi = START.offset(100.0, vehicle.body.east)
     values = {"frame": 3, "x": roi.lat_e7, "y": roi.lon_e7, "z": 0.0}
-    assert pilot.command_int(MAV_CMD.DO_SET_ROI_LOCATION, values) is MAV_RESULT.ACCEPTED
+    assert pilot.command_int(mavlink.MAV_CMD_DO_SET_ROI_LOCATION, values) == mavlink.MAV_RESULT_ACCEPTED
     pilot.fly_on(10.0)
     bearing = math.atan2(vehicle.body.east * 0 + START.vector_to(roi)[1] - vehicle.body.east, 100.0)
     assert wrap_pi(vehicle.est.yaw - bearing) == pytest.approx(0.0, abs=0.1)
@@ -226,12 +228,12 @@ def test_nose_follows_the_course_and_looks_at_a_region_of_interest():
 
 def test_reposition_switches_mode_only_when_asked():
     vehicle, pilot = airborne(10.0)
-    assert pilot.mode(COPTER_MODE.LOITER) is MAV_RESULT.ACCEPTED
+    assert pilot.mode(mavlink.COPTER_MODE_LOITER) == mavlink.MAV_RESULT_ACCEPTED
     place = START.offset(10.0, 5.0)
     values = {"frame": 6, "x": place.lat_e7, "y": place.lon_e7, "z": 15.0, "param1": -1.0, "param4": math.nan}
-    assert pilot.command_int(MAV_CMD.DO_REPOSITION, values) is MAV_RESULT.DENIED
-    assert pilot.command_int(MAV_CMD.DO_REPOSITION, values | {"param2": 1.0}) is MAV_RESULT.ACCEPTED
-    assert vehicle.mode is COPTER_MODE.GUIDED
+    assert pilot.command_int(mavlink.MAV_CMD_DO_REPOSITION, values) == mavlink.MAV_RESULT_DENIED
+    assert pilot.command_int(mavlink.MAV_CMD_DO_REPOSITION, values | {"param2": 1.0}) == mavlink.MAV_RESULT_ACCEPTED
+    assert vehicle.mode == mavlink.COPTER_MODE_GUIDED
     pilot.fly_on(15.0)
     assert distance_m(vehicle, 10.0, 5.0) < 0.7
     assert vehicle.altitude_m == pytest.approx(15.0, abs=0.4)
@@ -239,12 +241,12 @@ def test_reposition_switches_mode_only_when_asked():
 
 def test_change_speed_holds_until_the_controller_changes():
     vehicle, pilot = airborne(10.0)
-    assert pilot.command(MAV_CMD.DO_CHANGE_SPEED, 1, 2.0) is MAV_RESULT.ACCEPTED
-    assert pilot.command(MAV_CMD.DO_CHANGE_SPEED, 1, -1.0) is MAV_RESULT.FAILED
+    assert pilot.command(mavlink.MAV_CMD_DO_CHANGE_SPEED, 1, 2.0) == mavlink.MAV_RESULT_ACCEPTED
+    assert pilot.command(mavlink.MAV_CMD_DO_CHANGE_SPEED, 1, -1.0) == mavlink.MAV_RESULT_FAILED
     pilot.go_to(40.0, 0.0, 10.0)
     pilot.fly_on(4.0)
     assert vehicle.body.vn > 5.0, "the first position starts the position controller, with the parameter's speed"
-    assert pilot.command(MAV_CMD.DO_CHANGE_SPEED, 1, 2.0) is MAV_RESULT.ACCEPTED
+    assert pilot.command(mavlink.MAV_CMD_DO_CHANGE_SPEED, 1, 2.0) == mavlink.MAV_RESULT_ACCEPTED
     pilot.fly_on(5.0)
     assert vehicle.body.vn == pytest.approx(2.0, abs=0.2)
     pilot.go_to(-60.0, 0.0, 10.0)
@@ -275,7 +277,7 @@ def _until_slow(vehicle: VehicleState, pilot: Pilot, slow_mps: float = 0.5) -> f
 def test_brake_stops_as_slowly_as_on_the_real_one(speed_mps: float, real_m: float, real_s: float):
     vehicle, pilot = _at_speed(speed_mps)
     at = vehicle.est.north
-    assert pilot.mode(COPTER_MODE.BRAKE) is MAV_RESULT.ACCEPTED
+    assert pilot.mode(mavlink.COPTER_MODE_BRAKE) == mavlink.MAV_RESULT_ACCEPTED
     assert _until_slow(vehicle, pilot) == pytest.approx(real_s, rel=0.15)
     pilot.fly_on(3.0)
     assert vehicle.est.north - at == pytest.approx(real_m, rel=0.15)
@@ -296,14 +298,14 @@ def test_a_velocity_that_is_not_repeated_ends_as_on_the_real_one(timeout_s: floa
     assert 0.25 + _until_slow(vehicle, pilot, 0.1) == pytest.approx(real_s, abs=0.4)
 
 
-@pytest.mark.parametrize("mode", [COPTER_MODE.LOITER, COPTER_MODE.GUIDED])
-def test_stops_about_as_fast_as_the_autopilots_own_formula(mode: COPTER_MODE):
+@pytest.mark.parametrize("mode", [mavlink.COPTER_MODE_LOITER, mavlink.COPTER_MODE_GUIDED])
+def test_stops_about_as_fast_as_the_autopilots_own_formula(mode: int):
     vehicle, pilot = _at_speed(8.0)
     at, speed = vehicle.body.north, vehicle.body.vn
-    if mode is COPTER_MODE.GUIDED:
+    if mode == mavlink.COPTER_MODE_GUIDED:
         _local(pilot, 1, 0xFFF)
     else:
-        assert pilot.mode(mode) is MAV_RESULT.ACCEPTED
+        assert pilot.mode(mode) == mavlink.MAV_RESULT_ACCEPTED
     pilot.fly_on(10.0)
     assert abs(vehicle.body.vn) < 0.2
     assert vehicle.body.north - at < stopping_distance_m(speed, 2.5, 1.0) + 2.0
@@ -312,32 +314,32 @@ def test_stops_about_as_fast_as_the_autopilots_own_formula(mode: COPTER_MODE):
 
 def test_land_disarms_on_the_ground():
     vehicle, pilot = airborne(8.0)
-    assert pilot.command(MAV_CMD.NAV_LAND) is MAV_RESULT.ACCEPTED
+    assert pilot.command(mavlink.MAV_CMD_NAV_LAND) == mavlink.MAV_RESULT_ACCEPTED
     took = pilot.wait(lambda: not vehicle.armed, 60.0)
     assert 14.0 < took < 25.0
     assert vehicle.body.on_ground
-    assert vehicle.landed_state is MAV_LANDED_STATE.ON_GROUND
+    assert vehicle.landed_state == mavlink.MAV_LANDED_STATE_ON_GROUND
     assert vehicle.body.impact_mps < 0.8
 
 
 def test_unknown_modes_are_refused():
     vehicle, pilot = alone()
-    assert pilot.command(MAV_CMD.DO_SET_MODE, 1, 99) is MAV_RESULT.FAILED
+    assert pilot.command(mavlink.MAV_CMD_DO_SET_MODE, 1, 99) == mavlink.MAV_RESULT_FAILED
     assert pilot.texts[-1] == "No such mode 99"
-    assert pilot.command(MAV_CMD.DO_SET_MODE, 0, 4) is MAV_RESULT.DENIED
-    assert vehicle.mode is COPTER_MODE.STABILIZE
+    assert pilot.command(mavlink.MAV_CMD_DO_SET_MODE, 0, 4) == mavlink.MAV_RESULT_DENIED
+    assert vehicle.mode == mavlink.COPTER_MODE_STABILIZE
 
 
 def test_modes_are_checked_once_the_motors_run():
     vehicle, pilot = alone()
-    assert pilot.mode(COPTER_MODE.AUTO) is MAV_RESULT.ACCEPTED, "disarmed, every mode can be selected"
-    assert pilot.mode(COPTER_MODE.GUIDED) is MAV_RESULT.ACCEPTED
+    assert pilot.mode(mavlink.COPTER_MODE_AUTO) == mavlink.MAV_RESULT_ACCEPTED, "disarmed, every mode can be selected"
+    assert pilot.mode(mavlink.COPTER_MODE_GUIDED) == mavlink.MAV_RESULT_ACCEPTED
     pilot.wait(lambda: not arming_refusals(vehicle), 5.0)
-    pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0)
-    assert pilot.mode(COPTER_MODE.AUTO) is MAV_RESULT.FAILED, "there is no mission"
+    pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0)
+    assert pilot.mode(mavlink.COPTER_MODE_AUTO) == mavlink.MAV_RESULT_FAILED, "there is no mission"
     assert pilot.texts[-1] == "Mode change to AUTO failed: init failed"
-    assert pilot.command(MAV_CMD.MISSION_START) is MAV_RESULT.FAILED
-    assert vehicle.mode is COPTER_MODE.GUIDED
+    assert pilot.command(mavlink.MAV_CMD_MISSION_START) == mavlink.MAV_RESULT_FAILED
+    assert vehicle.mode == mavlink.COPTER_MODE_GUIDED
 
 
 def test_nan_targets_are_ignored():

@@ -5,26 +5,26 @@ from __future__ import annotations
 import math
 
 import pytest
-from fractus_mavlink import message
-from fractus_mavlink.enums import MAV_CMD, MAV_RESULT
+from fractus_runtime.mavlink_codec import message
 from fractus_services.mobility.mavlink.gimbal import attitude_of
 from fractus_vehicle.motion_reports import gimbal_device_attitude_status, gimbal_manager_information
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from vehicle_world import alone
 
 SIYI, SERVOS = 8.0, 1.0
-PITCHYAW = MAV_CMD.DO_GIMBAL_MANAGER_PITCHYAW
+PITCHYAW = mavlink.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW
 
 
 def test_a_vehicle_without_a_gimbal_has_none() -> None:
     vehicle, pilot = alone()
-    assert pilot.command(PITCHYAW, -45.0, 0.0, math.nan, math.nan) == MAV_RESULT.FAILED
+    assert pilot.command(PITCHYAW, -45.0, 0.0, math.nan, math.nan) == mavlink.MAV_RESULT_FAILED
     assert gimbal_device_attitude_status(vehicle) is None
     assert gimbal_manager_information(vehicle) is None
 
 
 def test_it_turns_at_its_rate_and_tells_where_it_is() -> None:
     vehicle, pilot = alone(MNT1_TYPE=SIYI)
-    assert pilot.command(PITCHYAW, -90.0, 120.0, math.nan, math.nan) == MAV_RESULT.ACCEPTED
+    assert pilot.command(PITCHYAW, -90.0, 120.0, math.nan, math.nan) == mavlink.MAV_RESULT_ACCEPTED
     begun_s, angles = vehicle.time_s, []
 
     def turned() -> bool:

@@ -7,10 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from fractus_mavlink import Parser, Signing, encode, layout_named
-from fractus_mavlink.enums import MAV_CMD, MAV_RESULT
+from fractus_runtime.mavlink_codec import Endpoint
 from fractus_vehicle.params import Parameters, UnknownParameterError, table
 from fractus_vehicle.readiness import arming_refusals
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from vehicle_world import CONFIG, START, airborne, alone, upload
 
 FENCE = {"command": 5003, "param1": 80.0, "frame": 0, "x": START.lat_e7, "y": START.lon_e7}
@@ -72,8 +72,8 @@ def test_a_reboot_keeps_what_is_stored_and_forgets_the_rest():
     vehicle, pilot = alone()
     pilot.parameter("WPNAV_SPEED", 750.0)
     assert upload(pilot, 1, [FENCE]) == 0
-    pilot.command(MAV_CMD.SET_MESSAGE_INTERVAL, 30, 100_000)
-    assert pilot.command(MAV_CMD.PREFLIGHT_REBOOT_SHUTDOWN, 1) is MAV_RESULT.ACCEPTED
+    pilot.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 30, 100_000)
+    assert pilot.command(mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, 1) == mavlink.MAV_RESULT_ACCEPTED
     pilot.fly_on(0.1)
     rebooted = pilot.craft.vehicle.state
     assert rebooted is not vehicle
@@ -86,10 +86,10 @@ def test_a_reboot_keeps_what_is_stored_and_forgets_the_rest():
 def test_erased_parameters_have_their_defaults_after_the_next_boot():
     vehicle, pilot = alone()
     pilot.parameter("WPNAV_SPEED", 750.0)
-    assert pilot.command(MAV_CMD.PREFLIGHT_STORAGE, 2) is MAV_RESULT.ACCEPTED
+    assert pilot.command(mavlink.MAV_CMD_PREFLIGHT_STORAGE, 2) == mavlink.MAV_RESULT_ACCEPTED
     assert vehicle.params["WPNAV_SPEED"] == 750.0
     pilot.parameter("RTL_ALT", 2500.0)
-    pilot.command(MAV_CMD.PREFLIGHT_REBOOT_SHUTDOWN, 1)
+    pilot.command(mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, 1)
     pilot.fly_on(0.1)
     rebooted = pilot.craft.vehicle.state
     assert rebooted.params["WPNAV_SPEED"] == Parameters()["WPNAV_SPEED"]
@@ -98,7 +98,7 @@ def test_erased_parameters_have_their_defaults_after_the_next_boot():
 
 def test_it_does_not_reboot_in_the_air():
     vehicle, pilot = airborne(5.0)
-    assert pilot.command(MAV_CMD.PREFLIGHT_REBOOT_SHUTDOWN, 1) is MAV_RESULT.FAILED
+    assert pilot.command(mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, 1) == mavlink.MAV_RESULT_FAILED
     pilot.fly_on(0.1)
     assert pilot.craft.vehicle.state is vehicle
 
@@ -111,18 +111,22 @@ def test_signing_shuts_out_clients_without_a_key():
     pilot.fly_on(0.1)
     order = target | {"command": 512, "param1": 0.0}
 
-    def answers(signing: Signing | None) -> bool:
+    def station(signing_key: bytes | None, timestamp: int = 0) -> Endpoint:
+        endpoint = Endpoint(255, 190)
+        endpoint.set_signing(signing_key, timestamp)
+        return endpoint
+
+    def answers(endpoint: Endpoint) -> bool:
         pilot.channel.take()
-        frame = encode(layout_named("COMMAND_LONG"), order, sequence=0, sysid=255, compid=190, signing=signing)
-        pilot.craft.receive(pilot.channel, frame)
+        pilot.craft.receive(pilot.channel, endpoint.encode("COMMAND_LONG", order))
         pilot.simulation.step()
-        read = Parser(lambda: Signing(key, 0)).feed(pilot.channel.take())
+        read = station(key).decode(pilot.channel.take())
         return any(message.name == "COMMAND_ACK" and message.signed for message in read)
 
-    assert not answers(None)
-    assert not answers(Signing(hashlib.sha256(b"other").digest(), 9_000))
-    mine = Signing(key, 9_000)
+    assert not answers(station(None))
+    assert not answers(station(hashlib.sha256(b"other").digest(), 9_000))
+    mine = station(key, 9_000)
     assert answers(mine)
-    assert not answers(Signing(key, 8_000)), "a replayed time must not pass"
+    assert not answers(station(key, 8_000)), "a replayed time must not pass"
     assert answers(mine)
     assert pilot.craft.vehicle.signing_key == key

@@ -6,10 +6,10 @@ import itertools
 import math
 
 import pytest
-from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_MISSION_RESULT, MAV_RESULT
 from fractus_vehicle.profile import Profile
 from fractus_vehicle.readiness import arming_refusals
 from fractus_vehicle.state import VehicleState
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from vehicle_pilot import Pilot
 from vehicle_world import START, airborne, alone, distance_m, upload
 
@@ -46,17 +46,17 @@ MISSION = [
 
 def test_a_mission_is_flown_with_its_jump_and_return():
     vehicle, pilot = alone()
-    assert upload(pilot, 0, MISSION) == MAV_MISSION_RESULT.ACCEPTED
-    pilot.mode(COPTER_MODE.GUIDED)
+    assert upload(pilot, 0, MISSION) == mavlink.MAV_MISSION_ACCEPTED
+    pilot.mode(mavlink.COPTER_MODE_GUIDED)
     pilot.wait(lambda: not arming_refusals(vehicle), 5.0)
-    assert pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0) is MAV_RESULT.ACCEPTED
-    assert pilot.command(MAV_CMD.MISSION_START) is MAV_RESULT.ACCEPTED
+    assert pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0) == mavlink.MAV_RESULT_ACCEPTED
+    assert pilot.command(mavlink.MAV_CMD_MISSION_START) == mavlink.MAV_RESULT_ACCEPTED
     reached: list[int] = []
     fastest_after_change = 0.0
     for _ in range(20_000):
         messages = pilot.step()
         reached += [message.integer("seq") for message in messages if message.name == "MISSION_ITEM_REACHED"]
-        if 3 in reached[-1:] and vehicle.mode is COPTER_MODE.AUTO:
+        if 3 in reached[-1:] and vehicle.mode == mavlink.COPTER_MODE_AUTO:
             fastest_after_change = max(fastest_after_change, abs(vehicle.body.ve))
         if not vehicle.armed:
             break
@@ -69,7 +69,7 @@ def test_a_mission_is_flown_with_its_jump_and_return():
 
 def test_download_returns_what_was_uploaded_with_home_in_front():
     vehicle, pilot = airborne(5.0)
-    assert upload(pilot, 0, MISSION) == MAV_MISSION_RESULT.ACCEPTED
+    assert upload(pilot, 0, MISSION) == mavlink.MAV_MISSION_ACCEPTED
     items = _download(pilot)
     assert [item["command"] for item in items] == [item["command"] for item in MISSION]
     assert items[2]["x"] == MISSION[2]["x"]
@@ -86,12 +86,12 @@ def test_partial_upload_replaces_a_part():
     pilot.send("MISSION_WRITE_PARTIAL_LIST", target | {"start_index": 2, "end_index": 2})
     pilot.expect("MISSION_REQUEST")
     pilot.send("MISSION_ITEM_INT", target | {"seq": 2} | new)
-    assert pilot.expect("MISSION_ACK").integer("type") == MAV_MISSION_RESULT.ACCEPTED
+    assert pilot.expect("MISSION_ACK").integer("type") == mavlink.MAV_MISSION_ACCEPTED
     items = _download(pilot)
     assert len(items) == len(MISSION)
     assert items[2]["z"] == 12.0
     pilot.send("MISSION_WRITE_PARTIAL_LIST", target | {"start_index": 3, "end_index": 99})
-    assert pilot.expect("MISSION_ACK").integer("type") == MAV_MISSION_RESULT.ERROR
+    assert pilot.expect("MISSION_ACK").integer("type") == mavlink.MAV_MISSION_ERROR
 
 
 def test_old_float_items_are_understood():
@@ -102,7 +102,7 @@ def test_old_float_items_are_understood():
         pilot.expect("MISSION_REQUEST")
         values = {"seq": seq, "command": 16, "frame": 3, "x": 48.2001, "y": 16.3702, "z": 10.0}
         pilot.send("MISSION_ITEM", target | values)
-    assert pilot.expect("MISSION_ACK").integer("type") == MAV_MISSION_RESULT.ACCEPTED
+    assert pilot.expect("MISSION_ACK").integer("type") == mavlink.MAV_MISSION_ACCEPTED
     assert vehicle.mission.items[1].x == pytest.approx(482_001_000, abs=50)
     pilot.send("MISSION_REQUEST", target | {"seq": 1})
     assert pilot.expect("MISSION_ITEM").real("x") == pytest.approx(48.2001, abs=1e-5)
@@ -115,25 +115,25 @@ def test_a_stalled_upload_is_repeated_then_given_up_and_changes_nothing():
     pilot.expect("MISSION_REQUEST")
     pilot.expect("MISSION_REQUEST", 2.0)
     pilot.expect("MISSION_ACK", 12.0)
-    assert pilot.last["MISSION_ACK"].integer("type") != MAV_MISSION_RESULT.ACCEPTED
+    assert pilot.last["MISSION_ACK"].integer("type") != mavlink.MAV_MISSION_ACCEPTED
     assert len(vehicle.mission.items) == len(MISSION)
 
 
 @pytest.mark.parametrize(
     ("item", "result"),
     [
-        ({"command": 4000, "frame": 3}, MAV_MISSION_RESULT.UNSUPPORTED),
-        ({"command": 16, "frame": 1, "x": 5, "y": 5}, MAV_MISSION_RESULT.UNSUPPORTED_FRAME),
-        ({"command": 16, "frame": 3, "x": 950_000_000, "y": 5}, MAV_MISSION_RESULT.INVALID_PARAM5_X),
-        ({"command": 16, "frame": 3, "x": 5, "y": 1_850_000_000}, MAV_MISSION_RESULT.INVALID_PARAM6_Y),
-        ({"command": 16, "frame": 3, "x": 5, "y": 5, "z": math.nan}, MAV_MISSION_RESULT.INVALID_PARAM7),
-        ({"command": 16, "frame": 3, "x": 5, "y": 5, "param1": math.nan}, MAV_MISSION_RESULT.INVALID_PARAM1),
-        ({"command": 16, "frame": 3, "x": 5, "y": 5, "param4": math.inf}, MAV_MISSION_RESULT.INVALID_PARAM4),
-        ({"command": 19, "frame": 3, "x": 5, "y": 5, "param4": math.nan}, MAV_MISSION_RESULT.INVALID_PARAM4),
-        ({"command": 177, "param1": 2, "param2": 1}, MAV_MISSION_RESULT.ERROR),
+        ({"command": 4000, "frame": 3}, mavlink.MAV_MISSION_UNSUPPORTED),
+        ({"command": 16, "frame": 1, "x": 5, "y": 5}, mavlink.MAV_MISSION_UNSUPPORTED_FRAME),
+        ({"command": 16, "frame": 3, "x": 950_000_000, "y": 5}, mavlink.MAV_MISSION_INVALID_PARAM5_X),
+        ({"command": 16, "frame": 3, "x": 5, "y": 1_850_000_000}, mavlink.MAV_MISSION_INVALID_PARAM6_Y),
+        ({"command": 16, "frame": 3, "x": 5, "y": 5, "z": math.nan}, mavlink.MAV_MISSION_INVALID_PARAM7),
+        ({"command": 16, "frame": 3, "x": 5, "y": 5, "param1": math.nan}, mavlink.MAV_MISSION_INVALID_PARAM1),
+        ({"command": 16, "frame": 3, "x": 5, "y": 5, "param4": math.inf}, mavlink.MAV_MISSION_INVALID_PARAM4),
+        ({"command": 19, "frame": 3, "x": 5, "y": 5, "param4": math.nan}, mavlink.MAV_MISSION_INVALID_PARAM4),
+        ({"command": 177, "param1": 2, "param2": 1}, mavlink.MAV_MISSION_ERROR),
     ],
 )
-def test_bad_items_end_the_upload(item: dict[str, float], result: MAV_MISSION_RESULT):
+def test_bad_items_end_the_upload(item: dict[str, float], result: int):
     vehicle, pilot = alone()
     assert upload(pilot, 0, [HOME, item]) == result
     assert len(vehicle.mission.items) == 1, "what had arrived is left"
@@ -141,7 +141,7 @@ def test_bad_items_end_the_upload(item: dict[str, float], result: MAV_MISSION_RE
 
 def test_a_heading_may_be_nan():
     _, pilot = alone()
-    assert upload(pilot, 0, [HOME, _waypoint(5.0, 0.0, 10.0, param4=math.nan)]) == MAV_MISSION_RESULT.ACCEPTED
+    assert upload(pilot, 0, [HOME, _waypoint(5.0, 0.0, 10.0, param4=math.nan)]) == mavlink.MAV_MISSION_ACCEPTED
 
 
 def test_a_partial_upload_may_append_one_item():
@@ -152,7 +152,7 @@ def test_a_partial_upload_may_append_one_item():
     pilot.send("MISSION_WRITE_PARTIAL_LIST", target | {"start_index": end, "end_index": end})
     assert pilot.expect("MISSION_REQUEST").integer("seq") == end
     pilot.send("MISSION_ITEM_INT", target | {"seq": end} | _waypoint(1.0, 2.0, 3.0))
-    assert pilot.expect("MISSION_ACK").integer("type") == MAV_MISSION_RESULT.ACCEPTED
+    assert pilot.expect("MISSION_ACK").integer("type") == mavlink.MAV_MISSION_ACCEPTED
     assert [item.z for item in vehicle.mission.items[end - 1 :]] == [0.0, 3.0]
 
 
@@ -162,9 +162,9 @@ def test_a_list_that_is_being_uploaded_is_neither_read_nor_cleared():
     target = {"target_system": 1, "target_component": 1}
     pilot.send("MISSION_COUNT", target | {"count": 3})
     for name, more, result in (
-        ("MISSION_REQUEST_LIST", {}, MAV_MISSION_RESULT.DENIED),
-        ("MISSION_REQUEST_INT", {"seq": 1}, MAV_MISSION_RESULT.DENIED),
-        ("MISSION_CLEAR_ALL", {}, MAV_MISSION_RESULT.ERROR),
+        ("MISSION_REQUEST_LIST", {}, mavlink.MAV_MISSION_DENIED),
+        ("MISSION_REQUEST_INT", {"seq": 1}, mavlink.MAV_MISSION_DENIED),
+        ("MISSION_CLEAR_ALL", {}, mavlink.MAV_MISSION_ERROR),
     ):
         pilot.send(name, target | more)
         assert pilot.expect("MISSION_ACK").integer("type") == result
@@ -177,15 +177,15 @@ def test_jumps_lead_to_tags():
     jump = {"command": 601, "param1": 7.0, "param2": 1.0}
     lost = {"command": 601, "param1": 8.0, "param2": -1.0}
     points = [_waypoint(north, 0.0, 10.0) for north in (1.0, 2.0, 3.0)]
-    assert upload(pilot, 0, [HOME, points[0], tag, points[1], jump, lost, points[2]]) == MAV_MISSION_RESULT.ACCEPTED
+    assert upload(pilot, 0, [HOME, points[0], tag, points[1], jump, lost, points[2]]) == mavlink.MAV_MISSION_ACCEPTED
     mission, at, order = vehicle.mission, 0, []
     while (following := mission.next_after(at)) is not None:
         at = following
         order.append(at)
     assert order == [1, 2, 3, 2, 3]  # a jump to a tag that is missing ends the mission
-    assert pilot.command(MAV_CMD.DO_JUMP_TAG, 7.0) is MAV_RESULT.ACCEPTED
+    assert pilot.command(mavlink.MAV_CMD_DO_JUMP_TAG, 7.0) == mavlink.MAV_RESULT_ACCEPTED
     assert mission.current == 3, "the first item after the tag that navigates"
-    assert pilot.command(MAV_CMD.DO_JUMP_TAG, 9.0) is MAV_RESULT.FAILED
+    assert pilot.command(mavlink.MAV_CMD_DO_JUMP_TAG, 9.0) == mavlink.MAV_RESULT_FAILED
 
 
 @pytest.mark.parametrize(("times", "following"), [(-1.0, None), (1.0, 4)])
@@ -194,7 +194,7 @@ def test_jumps_that_pass_no_waypoint_come_to_an_end(times, following):
     tag = {"command": 600, "param1": 1.0}
     jump = {"command": 601, "param1": 1.0, "param2": times}
     points = [_waypoint(north, 0.0, 10.0) for north in (1.0, 2.0)]
-    assert upload(pilot, 0, [HOME, points[0], tag, jump, points[1]]) == MAV_MISSION_RESULT.ACCEPTED
+    assert upload(pilot, 0, [HOME, points[0], tag, jump, points[1]]) == mavlink.MAV_MISSION_ACCEPTED
     assert vehicle.mission.peek_after(1) == following
     assert vehicle.mission.peek_after(1) == following, "nothing was counted as done"
 
@@ -202,7 +202,7 @@ def test_jumps_that_pass_no_waypoint_come_to_an_end(times, following):
 def test_too_many_items_are_refused():
     _, pilot = alone()
     pilot.send("MISSION_COUNT", {"target_system": 1, "target_component": 1, "count": 5000})
-    assert pilot.expect("MISSION_ACK").integer("type") == MAV_MISSION_RESULT.NO_SPACE
+    assert pilot.expect("MISSION_ACK").integer("type") == mavlink.MAV_MISSION_NO_SPACE
 
 
 def test_a_second_uploader_has_to_wait():
@@ -210,17 +210,17 @@ def test_a_second_uploader_has_to_wait():
     other = Pilot(pilot.simulation, pilot.craft, sysid=200)
     pilot.send("MISSION_COUNT", {"target_system": 1, "target_component": 1, "count": 2})
     other.send("MISSION_COUNT", {"target_system": 1, "target_component": 1, "count": 2})
-    assert other.expect("MISSION_ACK").integer("type") == MAV_MISSION_RESULT.DENIED
+    assert other.expect("MISSION_ACK").integer("type") == mavlink.MAV_MISSION_DENIED
 
 
 def test_rtl_goes_to_the_nearest_rally_point():
     vehicle, pilot = airborne(10.0)
     rally = START.offset(60.0, 10.0)
     item = {"command": 5100, "frame": 3, "x": rally.lat_e7, "y": rally.lon_e7, "z": 10.0}
-    assert upload(pilot, 2, [item]) == MAV_MISSION_RESULT.ACCEPTED
+    assert upload(pilot, 2, [item]) == mavlink.MAV_MISSION_ACCEPTED
     pilot.go_to(50.0, 0.0, 10.0)
     pilot.fly_on(15.0)
-    pilot.command(MAV_CMD.NAV_RETURN_TO_LAUNCH)
+    pilot.command(mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH)
     pilot.wait(lambda: not vehicle.armed, 90.0)
     assert distance_m(vehicle, 60.0, 10.0) < 1.0
 
@@ -228,21 +228,21 @@ def test_rtl_goes_to_the_nearest_rally_point():
 def test_pause_and_continue_and_set_current():
     vehicle, pilot = airborne(10.0)
     upload(pilot, 0, [HOME, _waypoint(60.0, 0.0, 10.0), _waypoint(60.0, 30.0, 10.0)])
-    assert pilot.mode(COPTER_MODE.AUTO) is MAV_RESULT.ACCEPTED
+    assert pilot.mode(mavlink.COPTER_MODE_AUTO) == mavlink.MAV_RESULT_ACCEPTED
     pilot.fly_on(4.0)
-    assert pilot.command(MAV_CMD.DO_PAUSE_CONTINUE, 0) is MAV_RESULT.ACCEPTED
+    assert pilot.command(mavlink.MAV_CMD_DO_PAUSE_CONTINUE, 0) == mavlink.MAV_RESULT_ACCEPTED
     pilot.fly_on(6.0)
     paused_at = vehicle.body.north
     assert 5.0 < paused_at < 50.0
     assert abs(vehicle.body.vn) < 0.2
-    assert pilot.command(MAV_CMD.DO_PAUSE_CONTINUE, 1) is MAV_RESULT.ACCEPTED
+    assert pilot.command(mavlink.MAV_CMD_DO_PAUSE_CONTINUE, 1) == mavlink.MAV_RESULT_ACCEPTED
     pilot.fly_on(4.0)
     assert vehicle.body.north > paused_at + 3.0
-    assert pilot.command(MAV_CMD.DO_SET_MISSION_CURRENT, 2) is MAV_RESULT.ACCEPTED
+    assert pilot.command(mavlink.MAV_CMD_DO_SET_MISSION_CURRENT, 2) == mavlink.MAV_RESULT_ACCEPTED
     assert pilot.last["MISSION_CURRENT"].integer("seq") == 2
     pilot.wait(lambda: vehicle.mission.state(vehicle.mode) == 5, 60.0)
     pilot.fly_on(3.0)
-    assert vehicle.mode is COPTER_MODE.AUTO, "it holds where the mission ended"
+    assert vehicle.mode == mavlink.COPTER_MODE_AUTO, "it holds where the mission ended"
     assert distance_m(vehicle, 60.0, 30.0) < 3.0
 
 
@@ -255,7 +255,7 @@ def test_land_item_lands_and_loiter_time_waits():
         {"command": 21, "frame": 3, "x": place.lat_e7, "y": place.lon_e7},
     ]
     upload(pilot, 0, items)
-    pilot.mode(COPTER_MODE.AUTO)
+    pilot.mode(mavlink.COPTER_MODE_AUTO)
     took = pilot.wait(lambda: not vehicle.armed, 90.0)
     assert 24.0 < took < 45.0
     assert distance_m(vehicle, 15.0, 0.0) < 1.0
@@ -266,8 +266,8 @@ def _fly_mission(
 ) -> tuple[VehicleState, Pilot, list[tuple[float, ...]]]:
     """Fly a mission to its end; the way flown, with the speed."""
     vehicle, pilot = airborne(10.0, **parameters)
-    assert upload(pilot, 0, [HOME, *items]) == MAV_MISSION_RESULT.ACCEPTED
-    assert pilot.mode(COPTER_MODE.AUTO) is MAV_RESULT.ACCEPTED
+    assert upload(pilot, 0, [HOME, *items]) == mavlink.MAV_MISSION_ACCEPTED
+    assert pilot.mode(mavlink.COPTER_MODE_AUTO) == mavlink.MAV_RESULT_ACCEPTED
     way = []
     for _ in range(12_000):
         pilot.step()
@@ -346,12 +346,12 @@ def test_a_part_of_a_mission_is_replaced():
     for seq in (2, 3):
         assert pilot.expect("MISSION_REQUEST").integer("seq") == seq
         pilot.send("MISSION_ITEM_INT", target | {"seq": seq} | _waypoint(33.0, seq, 9.0))
-    assert pilot.expect("MISSION_ACK").integer("type") == MAV_MISSION_RESULT.ACCEPTED
+    assert pilot.expect("MISSION_ACK").integer("type") == mavlink.MAV_MISSION_ACCEPTED
     assert len(vehicle.mission.items) == len(MISSION)
     assert [item.z for item in vehicle.mission.items[2:4]] == [9.0, 9.0]
     assert vehicle.mission.items[4].z == 15.0
     pilot.send("MISSION_WRITE_PARTIAL_LIST", target | {"start_index": 5, "end_index": 50})
-    assert pilot.expect("MISSION_ACK").integer("type") == MAV_MISSION_RESULT.ERROR
+    assert pilot.expect("MISSION_ACK").integer("type") == mavlink.MAV_MISSION_ERROR
 
 
 @pytest.mark.parametrize(("near_home", "include", "north"), [(True, 1, 0.0), (True, 0, 60.0), (False, 1, 60.0)])
@@ -361,7 +361,7 @@ def test_home_counts_as_a_rally_point_where_it_is_included(near_home: bool, incl
     upload(pilot, 2, [{"command": 5100, "frame": 3, "x": rally.lat_e7, "y": rally.lon_e7, "z": 25.0}])
     pilot.go_to(20.0 if near_home else 45.0, 0.0, 10.0)
     pilot.fly_on(12.0)
-    pilot.command(MAV_CMD.NAV_RETURN_TO_LAUNCH)
+    pilot.command(mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH)
     highest = 0.0
     while vehicle.armed:
         pilot.step()
@@ -377,7 +377,7 @@ def test_a_rally_point_that_is_too_far_is_none():
     upload(pilot, 2, [{"command": 5100, "frame": 3, "x": rally.lat_e7, "y": rally.lon_e7, "z": 25.0}])
     pilot.go_to(10.0, 0.0, 10.0)
     pilot.fly_on(5.0)
-    pilot.command(MAV_CMD.NAV_RETURN_TO_LAUNCH)
+    pilot.command(mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH)
     pilot.wait(lambda: not vehicle.armed, 90.0)
     assert distance_m(vehicle, 0.0, 0.0) < 1.0
 
@@ -387,11 +387,11 @@ def test_a_mission_tells_its_items_in_the_order_of_the_real_one():
     speed = {"command": 178, "param1": 1.0, "param2": 4.0}
     assert upload(pilot, 0, [HOME, MISSION[1], speed, _waypoint(10.0, 0.0, 10.0), {"command": 20}]) == 0
     assert pilot.texts[-1] == "Flight plan received"
-    pilot.mode(COPTER_MODE.GUIDED)
+    pilot.mode(mavlink.COPTER_MODE_GUIDED)
     pilot.wait(lambda: not arming_refusals(vehicle), 5.0)
-    assert pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0) is MAV_RESULT.ACCEPTED
+    assert pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0) == mavlink.MAV_RESULT_ACCEPTED
     before = len(pilot.texts)
-    assert pilot.command(MAV_CMD.MISSION_START) is MAV_RESULT.ACCEPTED
+    assert pilot.command(mavlink.MAV_CMD_MISSION_START) == mavlink.MAV_RESULT_ACCEPTED
     pilot.wait(lambda: not vehicle.armed, 120.0)
     told = [text for text in pilot.texts[before:] if text.startswith(("Mission", "Reached"))]
     start = ["Mission: 1 Takeoff", "Mission: 1 Takeoff"]

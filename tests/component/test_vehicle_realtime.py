@@ -7,7 +7,7 @@ import math
 import socket
 
 import pytest
-from fractus_mavlink import Parser, encode, layout_named
+from fractus_runtime.mavlink_codec import Endpoint, Parser
 from fractus_vehicle import __main__ as realtime
 from fractus_vehicle.channel import Channel
 from fractus_vehicle.links import Hub
@@ -41,7 +41,7 @@ class Line(Hub):
         self.clock, self.craft = clock, craft
         self.letters = {clock.now_s + at_s: data for at_s, data in letters.items()}
         self.channel: Channel = craft.open("line")
-        self.parser = Parser(lambda: None)
+        self.parser = Parser()
         self.heard: list[tuple[float, float, str]] = []
         self.flushes: list[float] = []
 
@@ -65,13 +65,8 @@ class Line(Hub):
 
 def _command(number: int, *parameters: float) -> bytes:
     values = {f"param{at}": value for at, value in enumerate(parameters, 1)}
-    return encode(
-        layout_named("COMMAND_LONG"),
-        {"target_system": 1, "target_component": 1, "command": number} | values,
-        sequence=0,
-        sysid=255,
-        compid=190,
-    )
+    target = {"target_system": 1, "target_component": 1}
+    return Endpoint(255, 190).encode("COMMAND_LONG", target | {"command": number} | values)
 
 
 def _ran(

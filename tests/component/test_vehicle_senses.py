@@ -9,17 +9,17 @@ import struct
 from dataclasses import replace
 
 import pytest
-from fractus_mavlink import Message, Parser
-from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_RESULT
+from fractus_runtime.mavlink_codec import Message, Parser
 from fractus_vehicle.noise import gaussian
 from fractus_vehicle.state import VehicleState
 from fractus_vehicle.telemetry import send
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from vehicle_pilot import Pilot
 from vehicle_world import CONFIG, START, airborne, alone, distance_m, upload
 
 
 def _heard(pilot: Pilot, number: int, name: str, duration_s: float) -> list[Message]:
-    assert pilot.command(MAV_CMD.SET_MESSAGE_INTERVAL, number, 20_000) is MAV_RESULT.ACCEPTED
+    assert pilot.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, number, 20_000) == mavlink.MAV_RESULT_ACCEPTED
     return [m for _ in range(round(duration_s * 100)) for m in pilot.step() if m.name == name]
 
 
@@ -114,8 +114,8 @@ def test_targets_above_terrain_need_terrain(known: int, altitude_m: float):
     pilot.fly_on(12.0)
     assert vehicle.altitude_m == pytest.approx(altitude_m, abs=0.5)
     values = {"frame": 11, "x": place.lat_e7, "y": place.lon_e7, "z": 12.0}
-    wanted = MAV_RESULT.ACCEPTED if known else MAV_RESULT.DENIED
-    assert pilot.command_int(MAV_CMD.DO_REPOSITION, values) is wanted
+    wanted = mavlink.MAV_RESULT_ACCEPTED if known else mavlink.MAV_RESULT_DENIED
+    assert pilot.command_int(mavlink.MAV_CMD_DO_REPOSITION, values) is wanted
     assert send(vehicle, pilot.channel, "TERRAIN_REPORT") is bool(known)
 
 
@@ -125,8 +125,8 @@ def test_a_mission_above_unknown_terrain_is_given_up():
     home = {"command": 16, "frame": 0, "x": START.lat_e7, "y": START.lon_e7, "z": 150.0}
     waypoint = {"command": 16, "frame": 10, "x": place.lat_e7, "y": place.lon_e7, "z": 12.0}
     assert upload(pilot, 0, [home, waypoint]) == 0
-    pilot.mode(COPTER_MODE.AUTO)
-    pilot.wait(lambda: vehicle.mode is COPTER_MODE.RTL, 2.0)
+    pilot.mode(mavlink.COPTER_MODE_AUTO)
+    pilot.wait(lambda: vehicle.mode == mavlink.COPTER_MODE_RTL, 2.0)
     assert "Failsafe: Terrain data missing" in pilot.texts
 
 

@@ -8,9 +8,9 @@ import random
 
 import pytest
 from depth import examples
-from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_RESULT
 from fractus_vehicle.breadcrumbs import Breadcrumbs, Point, distance_to_segment, segment_gap
 from fractus_vehicle.state import VehicleState
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from vehicle_pilot import Pilot
 from vehicle_world import airborne, alone, distance_m
 
@@ -136,17 +136,17 @@ def _farthest_from_flown(vehicle: VehicleState, pilot: Pilot, flown: list[Point]
 def test_it_flies_back_along_the_path_and_lands_where_it_began():
     vehicle, pilot, flown = _detour()
     assert vehicle.breadcrumbs.active
-    assert pilot.mode(COPTER_MODE.SMART_RTL) is MAV_RESULT.ACCEPTED
+    assert pilot.mode(mavlink.COPTER_MODE_SMART_RTL) == mavlink.MAV_RESULT_ACCEPTED
     assert _farthest_from_flown(vehicle, pilot, flown) < 2.5
     assert distance_m(vehicle, 0.0, 0.0) < 1.0
-    assert vehicle.mode is COPTER_MODE.SMART_RTL
-    assert pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0) is MAV_RESULT.FAILED
+    assert vehicle.mode == mavlink.COPTER_MODE_SMART_RTL
+    assert pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0) == mavlink.MAV_RESULT_FAILED
     assert pilot.texts[-1] == "Arm: SMARTRTL mode not armable"
 
 
 def test_it_waits_two_metres_above_the_start_before_it_lands():
     vehicle, pilot, _ = _detour()
-    pilot.mode(COPTER_MODE.SMART_RTL)
+    pilot.mode(mavlink.COPTER_MODE_SMART_RTL)
     pilot.wait(lambda: pilot.craft.vehicle.modes.flight.landing, 120.0)
     assert vehicle.altitude_m == pytest.approx(2.0, abs=2.1)
     assert distance_m(vehicle, 0.0, 0.0) < 2.5
@@ -154,7 +154,7 @@ def test_it_waits_two_metres_above_the_start_before_it_lands():
 
 def test_a_final_altitude_is_held_instead_of_landing():
     vehicle, pilot, _ = _detour(RTL_ALT_FINAL=400)
-    pilot.mode(COPTER_MODE.SMART_RTL)
+    pilot.mode(mavlink.COPTER_MODE_SMART_RTL)
     pilot.fly_on(90.0)
     assert vehicle.armed
     assert vehicle.altitude_m == pytest.approx(4.0, abs=0.5)
@@ -165,7 +165,7 @@ def test_a_final_altitude_is_held_instead_of_landing():
 def test_a_silent_companion_is_brought_home_along_the_path(setting: int):
     vehicle, pilot, flown = _detour(FS_GCS_ENABLE=setting)
     pilot.heartbeats = False
-    pilot.wait(lambda: vehicle.mode is COPTER_MODE.SMART_RTL, 7.0)
+    pilot.wait(lambda: vehicle.mode == mavlink.COPTER_MODE_SMART_RTL, 7.0)
     assert pilot.texts[-1] == "GCS Failsafe"
     assert _farthest_from_flown(vehicle, pilot, flown) < 2.5
 
@@ -173,17 +173,17 @@ def test_a_silent_companion_is_brought_home_along_the_path(setting: int):
 @pytest.mark.parametrize(
     ("parameter", "setting", "mode", "text"),
     [
-        ("FS_GCS_ENABLE", 3, COPTER_MODE.RTL, "SmartRTL Unavailable, Trying RTL Mode"),
-        ("FS_GCS_ENABLE", 4, COPTER_MODE.LAND, "SmartRTL Unavailable, Using Land Mode"),
-        ("FS_THR_ENABLE", 4, COPTER_MODE.RTL, "SmartRTL Unavailable, Trying RTL Mode"),
-        ("FS_THR_ENABLE", 5, COPTER_MODE.LAND, "SmartRTL Unavailable, Using Land Mode"),
-        ("BATT_FS_LOW_ACT", 3, COPTER_MODE.RTL, "SmartRTL Unavailable, Trying RTL Mode"),
-        ("BATT_FS_LOW_ACT", 4, COPTER_MODE.LAND, "SmartRTL Unavailable, Using Land Mode"),
+        ("FS_GCS_ENABLE", 3, mavlink.COPTER_MODE_RTL, "SmartRTL Unavailable, Trying RTL Mode"),
+        ("FS_GCS_ENABLE", 4, mavlink.COPTER_MODE_LAND, "SmartRTL Unavailable, Using Land Mode"),
+        ("FS_THR_ENABLE", 4, mavlink.COPTER_MODE_RTL, "SmartRTL Unavailable, Trying RTL Mode"),
+        ("FS_THR_ENABLE", 5, mavlink.COPTER_MODE_LAND, "SmartRTL Unavailable, Using Land Mode"),
+        ("BATT_FS_LOW_ACT", 3, mavlink.COPTER_MODE_RTL, "SmartRTL Unavailable, Trying RTL Mode"),
+        ("BATT_FS_LOW_ACT", 4, mavlink.COPTER_MODE_LAND, "SmartRTL Unavailable, Using Land Mode"),
     ],
 )
-def test_without_memory_it_falls_back_and_says_so(parameter: str, setting: int, mode: COPTER_MODE, text: str):
+def test_without_memory_it_falls_back_and_says_so(parameter: str, setting: int, mode: int, text: str):
     vehicle, pilot = airborne(10.0, SRTL_POINTS=0, BATT_LOW_VOLT=11.5, **{parameter: setting})
-    assert pilot.mode(COPTER_MODE.SMART_RTL) is MAV_RESULT.FAILED
+    assert pilot.mode(mavlink.COPTER_MODE_SMART_RTL) == mavlink.MAV_RESULT_FAILED
     assert pilot.texts[-1] == "Mode change to SMARTRTL failed: init failed"
     _provoke(parameter, pilot)
     pilot.wait(lambda: vehicle.mode is mode, 25.0)
@@ -207,7 +207,7 @@ def test_other_failsafes_may_use_it_too(parameter: str, setting: int):
     pilot.go_to(20.0, 0.0, 10.0)
     pilot.fly_on(5.0)
     _provoke(parameter, pilot)
-    pilot.wait(lambda: vehicle.mode is COPTER_MODE.SMART_RTL, 25.0)
+    pilot.wait(lambda: vehicle.mode == mavlink.COPTER_MODE_SMART_RTL, 25.0)
     pilot.wait(lambda: not vehicle.armed, 90.0)
     assert distance_m(vehicle, 0.0, 0.0) < 1.0
 
@@ -220,8 +220,8 @@ def test_a_full_memory_ends_it_for_the_flight():
         pilot.fly_on(6.0)
     assert "SmartRTL Low on space!" in pilot.texts
     pilot.wait(lambda: "SmartRTL deactivated: buffer full" in pilot.texts, 60.0)
-    assert pilot.mode(COPTER_MODE.SMART_RTL) is MAV_RESULT.FAILED
-    assert vehicle.mode is COPTER_MODE.GUIDED
+    assert pilot.mode(mavlink.COPTER_MODE_SMART_RTL) == mavlink.MAV_RESULT_FAILED
+    assert vehicle.mode == mavlink.COPTER_MODE_GUIDED
 
 
 def test_a_long_time_without_position_ends_it():
@@ -231,36 +231,36 @@ def test_a_long_time_without_position_ends_it():
     pilot.parameter("SIM_GPS_DISABLE", 0)
     pilot.fly_on(3.0)
     assert not vehicle.breadcrumbs.active
-    assert pilot.mode(COPTER_MODE.SMART_RTL) is MAV_RESULT.FAILED
+    assert pilot.mode(mavlink.COPTER_MODE_SMART_RTL) == mavlink.MAV_RESULT_FAILED
 
 
 def test_leaving_it_midway_keeps_the_path_whole():
     vehicle, pilot, _ = _detour()
-    pilot.mode(COPTER_MODE.SMART_RTL)
+    pilot.mode(mavlink.COPTER_MODE_SMART_RTL)
     pilot.fly_on(8.0)
-    assert pilot.mode(COPTER_MODE.LOITER) is MAV_RESULT.ACCEPTED
+    assert pilot.mode(mavlink.COPTER_MODE_LOITER) == mavlink.MAV_RESULT_ACCEPTED
     nearest = min(math.dist(point[:2], (60.0, 0.0)) for point in vehicle.breadcrumbs.path)
     assert nearest < 3.0, "the corner is there again"
     pilot.fly_on(4.0)
-    pilot.mode(COPTER_MODE.SMART_RTL)
+    pilot.mode(mavlink.COPTER_MODE_SMART_RTL)
     pilot.wait(lambda: not vehicle.armed, 120.0)
     assert distance_m(vehicle, 0.0, 0.0) < 1.0
 
 
 def test_a_new_flight_begins_a_new_path():
     vehicle, pilot, _ = _detour()
-    pilot.command(MAV_CMD.NAV_LAND)
+    pilot.command(mavlink.MAV_CMD_NAV_LAND)
     pilot.wait(lambda: not vehicle.armed, 90.0)
     pilot.take_off(8.0)
     assert distance_m(vehicle, *vehicle.breadcrumbs.path[0][:2]) < 1.5
-    pilot.mode(COPTER_MODE.SMART_RTL)
+    pilot.mode(mavlink.COPTER_MODE_SMART_RTL)
     pilot.wait(lambda: not vehicle.armed, 90.0)
     assert distance_m(vehicle, 60.0, 60.0) < 2.0
 
 
 def test_before_there_is_a_position_it_cannot_be_chosen():
     vehicle, pilot = alone()
-    assert pilot.mode(COPTER_MODE.SMART_RTL) is MAV_RESULT.FAILED
+    assert pilot.mode(mavlink.COPTER_MODE_SMART_RTL) == mavlink.MAV_RESULT_FAILED
     pilot.wait(lambda: vehicle.position_ok, 5.0)
     pilot.fly_on(0.5)
-    assert pilot.mode(COPTER_MODE.SMART_RTL) is MAV_RESULT.ACCEPTED
+    assert pilot.mode(mavlink.COPTER_MODE_SMART_RTL) == mavlink.MAV_RESULT_ACCEPTED

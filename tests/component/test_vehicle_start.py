@@ -5,15 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from fractus_mavlink.enums import (
-    COPTER_MODE,
-    MAV_CMD,
-    MAV_MODE_FLAG,
-    MAV_RESULT,
-    MAV_STATE,
-    MAV_SYS_STATUS_SENSOR,
-)
 from fractus_vehicle.state import VehicleConfig, VehicleState
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from vehicle_pilot import Pilot
 from vehicle_world import START, alone
 
@@ -44,19 +37,19 @@ EKF3 IMU1 is using GPS"""
 def _cold() -> tuple[VehicleState, Pilot]:
     vehicle, pilot = alone(config=COLD)
     for number in (1, 193):
-        pilot.command(MAV_CMD.SET_MESSAGE_INTERVAL, number, 200_000)
+        pilot.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, number, 200_000)
     return vehicle, pilot
 
 
 def _prearm(pilot: Pilot) -> bool:
     return bool(
-        pilot.expect("SYS_STATUS").integer("onboard_control_sensors_health") & MAV_SYS_STATUS_SENSOR.PREARM_CHECK
+        pilot.expect("SYS_STATUS").integer("onboard_control_sensors_health") & mavlink.MAV_SYS_STATUS_PREARM_CHECK
     )
 
 
 def _refusals(pilot: Pilot) -> list[str]:
     before = len(pilot.texts)
-    assert pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0) is MAV_RESULT.FAILED
+    assert pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0) == mavlink.MAV_RESULT_FAILED
     return [text for text in pilot.texts[before:] if text.startswith("Arm: ")]
 
 
@@ -78,13 +71,13 @@ def test_the_prearm_bit_is_healthy_long_before_guided_may_arm():
     pilot.wait(lambda: _prearm(pilot), 60.0)
     assert vehicle.time_s == pytest.approx(22.0, abs=1.0)
     assert pilot.expect("EKF_STATUS_REPORT").integer("flags") == WITHOUT_POSITION
-    pilot.mode(COPTER_MODE.GUIDED)
+    pilot.mode(mavlink.COPTER_MODE_GUIDED)
     assert _refusals(pilot) == ["Arm: Need Position Estimate"]
     assert not _prearm(pilot)
     pilot.wait(lambda: _prearm(pilot), 60.0)
     assert vehicle.time_s == pytest.approx(41.0, abs=1.0)
     assert pilot.expect("EKF_STATUS_REPORT").integer("flags") == WITH_POSITION
-    assert pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0) is MAV_RESULT.ACCEPTED
+    assert pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0) == mavlink.MAV_RESULT_ACCEPTED
 
 
 def test_all_checks_that_fail_are_told_and_depend_on_the_mode():
@@ -93,32 +86,32 @@ def test_all_checks_that_fail_are_told_and_depend_on_the_mode():
     first = ["Arm: Accels inconsistent", "Arm: EKF attitude is bad", "Arm: AHRS: not using configured AHRS type"]
     assert _refusals(pilot) == first
     pilot.fly_on(2.0)
-    pilot.mode(COPTER_MODE.GUIDED)
+    pilot.mode(mavlink.COPTER_MODE_GUIDED)
     later = ["Need Alt Estimate", "Accels inconsistent", "EKF attitude is bad", "AHRS: waiting for home"]
     assert _refusals(pilot) == [f"Arm: {text}" for text in later]
     pilot.fly_on(2.0)
     before = len(pilot.texts)
-    assert pilot.command(MAV_CMD.RUN_PREARM_CHECKS) is MAV_RESULT.ACCEPTED
+    assert pilot.command(mavlink.MAV_CMD_RUN_PREARM_CHECKS) == mavlink.MAV_RESULT_ACCEPTED
     assert pilot.texts[before:] == ["PreArm: Accels inconsistent", "PreArm: AHRS: waiting for home"]
 
 
 def test_without_checks_or_by_force_a_position_is_still_needed():
     _, pilot = _cold()
     pilot.parameter("ARMING_CHECK", 0.0)
-    pilot.mode(COPTER_MODE.GUIDED)
+    pilot.mode(mavlink.COPTER_MODE_GUIDED)
     pilot.fly_on(25.0)
     assert _refusals(pilot) == ["Arm: Need Position Estimate"]
-    assert pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0, 2989.0) is MAV_RESULT.FAILED
-    pilot.mode(COPTER_MODE.STABILIZE)
-    assert pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0) is MAV_RESULT.ACCEPTED
+    assert pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0, 2989.0) == mavlink.MAV_RESULT_FAILED
+    pilot.mode(mavlink.COPTER_MODE_STABILIZE)
+    assert pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0) == mavlink.MAV_RESULT_ACCEPTED
 
 
 def test_the_first_heartbeats_tell_of_a_start():
     _, pilot = _cold()
     beat = pilot.expect("HEARTBEAT")
-    assert beat.integer("system_status") == MAV_STATE.BOOT
-    assert beat.integer("base_mode") & MAV_MODE_FLAG.GUIDED_ENABLED
+    assert beat.integer("system_status") == mavlink.MAV_STATE_BOOT
+    assert beat.integer("base_mode") & mavlink.MAV_MODE_FLAG_GUIDED_ENABLED
     pilot.fly_on(3.0)
     beat = pilot.expect("HEARTBEAT")
-    assert beat.integer("system_status") == MAV_STATE.STANDBY
-    assert not beat.integer("base_mode") & MAV_MODE_FLAG.GUIDED_ENABLED
+    assert beat.integer("system_status") == mavlink.MAV_STATE_STANDBY
+    assert not beat.integer("base_mode") & mavlink.MAV_MODE_FLAG_GUIDED_ENABLED

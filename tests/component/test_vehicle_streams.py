@@ -5,10 +5,10 @@ from __future__ import annotations
 import itertools
 
 import pytest
-from fractus_mavlink.enums import MAV_CMD, MAV_RESULT
 from fractus_vehicle.channel import OUTBOX_LIMIT, Channel
 from fractus_vehicle.streams import ALL_GROUPS, BUILDERS, GROUPS
 from fractus_vehicle.telemetry import send
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from vehicle_world import airborne, alone
 
 
@@ -16,7 +16,7 @@ from vehicle_world import airborne, alone
 def test_intervals_are_exact_in_whole_milliseconds(interval_us: int):
     interval_ms = interval_us // 1000
     vehicle, pilot = alone()
-    assert pilot.command(MAV_CMD.SET_MESSAGE_INTERVAL, 30, interval_us) is MAV_RESULT.ACCEPTED
+    assert pilot.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 30, interval_us) == mavlink.MAV_RESULT_ACCEPTED
     times = []
     for _ in range(3000):
         times += [m.integer("time_boot_ms") for m in pilot.step() if m.name == "ATTITUDE"]
@@ -39,15 +39,15 @@ def test_every_stream_at_4_hz_gives_the_measured_rate():
 
 def test_stopping_a_stream_and_asking_for_the_unknown():
     _, pilot = alone()
-    pilot.command(MAV_CMD.SET_MESSAGE_INTERVAL, 30, 100_000)
+    pilot.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 30, 100_000)
     pilot.fly_on(1.0)
-    assert pilot.command(MAV_CMD.SET_MESSAGE_INTERVAL, 30, -1) is MAV_RESULT.ACCEPTED
+    assert pilot.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 30, -1) == mavlink.MAV_RESULT_ACCEPTED
     pilot.last.clear()
     pilot.fly_on(2.0)
     assert pilot.last.keys() <= {"HEARTBEAT", "STATUSTEXT", "HOME_POSITION"}
-    assert pilot.command(MAV_CMD.SET_MESSAGE_INTERVAL, 9999, 1000) is MAV_RESULT.DENIED
-    assert pilot.command(MAV_CMD.REQUEST_MESSAGE, 9999) is MAV_RESULT.FAILED
-    assert pilot.command(MAV_CMD.REQUEST_MESSAGE, float("nan")) is MAV_RESULT.FAILED
+    assert pilot.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 9999, 1000) == mavlink.MAV_RESULT_DENIED
+    assert pilot.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 9999) == mavlink.MAV_RESULT_FAILED
+    assert pilot.command(mavlink.MAV_CMD_REQUEST_MESSAGE, float("nan")) == mavlink.MAV_RESULT_FAILED
 
 
 @pytest.mark.parametrize("name", sorted(BUILDERS))
@@ -81,7 +81,7 @@ def test_a_deaf_client_costs_bounded_memory_and_loses_only_its_own_messages():
     deaf = pilot.craft.open("deaf")
     for name in BUILDERS:
         deaf.set_interval(name, 0.01)
-    pilot.command(MAV_CMD.SET_MESSAGE_INTERVAL, 30, 100_000)
+    pilot.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 30, 100_000)
     seen = 0
     for _ in range(3000):
         seen += sum(m.name == "ATTITUDE" for m in pilot.step())

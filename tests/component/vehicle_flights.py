@@ -8,10 +8,10 @@ import random
 from collections.abc import Callable
 from dataclasses import replace
 
-from fractus_mavlink import Message
-from fractus_mavlink.enums import COPTER_MODE, MAV_CMD
+from fractus_runtime.mavlink_codec import Message
 from fractus_vehicle.copter import SUPPORTED_MODES
 from fractus_vehicle.simulation import Simulation
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from vehicle_pilot import Pilot, PilotTimeoutError
 from vehicle_world import CONFIG, START, upload
 
@@ -42,7 +42,7 @@ def pilot_of(seed: int, **parameters: float) -> RecordingPilot:
     pilot = RecordingPilot(Simulation([replace(CONFIG, seed=seed, parameters=parameters)]))
     pilot.send("REQUEST_DATA_STREAM", TARGET | {"req_stream_id": 0, "req_message_rate": 10, "start_stop": 1})
     for number in (31, 83, 85, 87, 141, 245):  # what is in no stream
-        pilot.command(MAV_CMD.SET_MESSAGE_INTERVAL, number, 200_000)
+        pilot.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, number, 200_000)
     return pilot
 
 
@@ -63,41 +63,41 @@ def mission(pilot: Pilot) -> None:
         pilot,
         MISSION,
         [
-            _item(MAV_CMD.NAV_WAYPOINT),
-            _item(MAV_CMD.NAV_TAKEOFF, alt=12.0),
-            _item(MAV_CMD.DO_CHANGE_SPEED, 0.0, 0.0, 0.0, 1.0, 6.0),
-            _item(MAV_CMD.NAV_WAYPOINT, 20.0, 0.0, 15.0),
-            _item(MAV_CMD.NAV_SPLINE_WAYPOINT, 30.0, 15.0, 12.0),
-            _item(MAV_CMD.NAV_SPLINE_WAYPOINT, 15.0, 25.0, 10.0, 1.0),
-            _item(MAV_CMD.DO_SET_ROI_LOCATION, 5.0, 5.0),
-            _item(MAV_CMD.NAV_LOITER_TURNS, 10.0, 10.0, 10.0, 1.0, 0.0, -8.0),
-            _item(MAV_CMD.CONDITION_YAW, 0.0, 0.0, 0.0, 90.0, 60.0, 1.0),
-            _item(MAV_CMD.DO_JUMP, 0.0, 0.0, 0.0, 7.0, 1.0),
-            _item(MAV_CMD.NAV_DELAY, 0.0, 0.0, 0.0, 2.0),
-            _item(MAV_CMD.NAV_LAND, 4.0, 2.0),
+            _item(mavlink.MAV_CMD_NAV_WAYPOINT),
+            _item(mavlink.MAV_CMD_NAV_TAKEOFF, alt=12.0),
+            _item(mavlink.MAV_CMD_DO_CHANGE_SPEED, 0.0, 0.0, 0.0, 1.0, 6.0),
+            _item(mavlink.MAV_CMD_NAV_WAYPOINT, 20.0, 0.0, 15.0),
+            _item(mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT, 30.0, 15.0, 12.0),
+            _item(mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT, 15.0, 25.0, 10.0, 1.0),
+            _item(mavlink.MAV_CMD_DO_SET_ROI_LOCATION, 5.0, 5.0),
+            _item(mavlink.MAV_CMD_NAV_LOITER_TURNS, 10.0, 10.0, 10.0, 1.0, 0.0, -8.0),
+            _item(mavlink.MAV_CMD_CONDITION_YAW, 0.0, 0.0, 0.0, 90.0, 60.0, 1.0),
+            _item(mavlink.MAV_CMD_DO_JUMP, 0.0, 0.0, 0.0, 7.0, 1.0),
+            _item(mavlink.MAV_CMD_NAV_DELAY, 0.0, 0.0, 0.0, 2.0),
+            _item(mavlink.MAV_CMD_NAV_LAND, 4.0, 2.0),
         ],
     )
     pilot.take_off(3.0)
-    pilot.command(MAV_CMD.MISSION_START)
+    pilot.command(mavlink.MAV_CMD_MISSION_START)
     pilot.fly_on(20.0)
-    pilot.command(MAV_CMD.DO_PAUSE_CONTINUE, 0.0)
+    pilot.command(mavlink.MAV_CMD_DO_PAUSE_CONTINUE, 0.0)
     pilot.fly_on(2.0)
-    pilot.command(MAV_CMD.DO_PAUSE_CONTINUE, 1.0)
+    pilot.command(mavlink.MAV_CMD_DO_PAUSE_CONTINUE, 1.0)
     pilot.fly_on(60.0)
 
 
 def by_hand(pilot: Pilot) -> None:
     """STABILIZE, ALT_HOLD, LOITER, BRAKE and LAND under the sticks of a ground station, in gusts."""
-    pilot.mode(COPTER_MODE.LOITER)
+    pilot.mode(mavlink.COPTER_MODE_LOITER)
     pilot.fly_on(3.0)
-    pilot.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0)
+    pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0)
     pilot.fly_on(2.5)
     sticks = {
-        COPTER_MODE.LOITER: ((1500, 1500, 1900, 1500), (1600, 1300, 1500, 1700)),
-        COPTER_MODE.ALT_HOLD: ((1550, 1450, 1600, 1400), (1500, 1500, 1450, 1500)),
-        COPTER_MODE.STABILIZE: ((1520, 1480, 1560, 1500), (1500, 1500, 1540, 1600)),
-        COPTER_MODE.BRAKE: ((1500, 1500, 1500, 1500),),
-        COPTER_MODE.LAND: ((1500, 1500, 1500, 1500),),
+        mavlink.COPTER_MODE_LOITER: ((1500, 1500, 1900, 1500), (1600, 1300, 1500, 1700)),
+        mavlink.COPTER_MODE_ALT_HOLD: ((1550, 1450, 1600, 1400), (1500, 1500, 1450, 1500)),
+        mavlink.COPTER_MODE_STABILIZE: ((1520, 1480, 1560, 1500), (1500, 1500, 1540, 1600)),
+        mavlink.COPTER_MODE_BRAKE: ((1500, 1500, 1500, 1500),),
+        mavlink.COPTER_MODE_LAND: ((1500, 1500, 1500, 1500),),
     }
     for mode, positions in sticks.items():
         pilot.mode(mode)
@@ -115,7 +115,7 @@ def smart_return(pilot: Pilot) -> None:
     for north, east in ((15.0, 0.0), (15.0, 15.0), (-3.0, 15.0), (-3.0, -8.0), (5.0, -8.0)):
         pilot.go_to(north, east, 10.0)
         pilot.fly_on(6.0)
-    pilot.mode(COPTER_MODE.SMART_RTL)
+    pilot.mode(mavlink.COPTER_MODE_SMART_RTL)
     pilot.wait(lambda: "Disarming motors" in pilot.texts, 90.0)
 
 
@@ -123,7 +123,7 @@ def breaches(pilot: Pilot) -> None:
     """A polygon that is left with a velocity, a target outside it, the return to a rally point, and a position that is lost."""
     corners = ((-40.0, -40.0), (-40.0, 40.0), (40.0, 40.0), (40.0, -40.0))
     upload(pilot, FENCE, [_item(5001, north, east, 0.0, 4.0) for north, east in corners])
-    upload(pilot, RALLY, [_item(MAV_CMD.NAV_RALLY_POINT, 12.0, -6.0, 8.0)])
+    upload(pilot, RALLY, [_item(mavlink.MAV_CMD_NAV_RALLY_POINT, 12.0, -6.0, 8.0)])
     pilot.parameter("FENCE_ENABLE", 1.0)
     pilot.take_off(10.0)
     pilot.go_to(60.0, 0.0, 10.0)  # outside: not flown
@@ -152,12 +152,12 @@ def failing(pilot: Pilot) -> None:
     pilot.fly_on(4.0)
     pilot.parameter("SIM_RC_FAIL", 0.0)
     pilot.fly_on(2.0)
-    pilot.mode(COPTER_MODE.GUIDED)
+    pilot.mode(mavlink.COPTER_MODE_GUIDED)
     pilot.heartbeats = False
     pilot.fly_on(9.0)
     pilot.heartbeats = True
     pilot.fly_on(2.0)
-    pilot.mode(COPTER_MODE.GUIDED)
+    pilot.mode(mavlink.COPTER_MODE_GUIDED)
     pilot.parameter("BATT_LOW_TIMER", 1.0)
     pilot.parameter("BATT_FS_LOW_ACT", 2.0)
     pilot.parameter("SIM_BATT_VOLTAGE", 10.4)
@@ -169,8 +169,8 @@ def failing(pilot: Pilot) -> None:
 
 _RANDOM_ORDERS: tuple[Callable[[Pilot, random.Random], object], ...] = (
     lambda p, r: p.mode(r.choice(sorted(SUPPORTED_MODES))),
-    lambda p, r: p.command(MAV_CMD.COMPONENT_ARM_DISARM, float(r.random() < 0.9)),
-    lambda p, r: p.command(MAV_CMD.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, r.uniform(1.0, 20.0)),
+    lambda p, r: p.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, float(r.random() < 0.9)),
+    lambda p, r: p.command(mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, r.uniform(1.0, 20.0)),
     lambda p, r: p.go_to(r.uniform(-60.0, 60.0), r.uniform(-60.0, 60.0), r.uniform(2.0, 30.0)),
     lambda p, r: p.send(
         "SET_POSITION_TARGET_LOCAL_NED",
@@ -182,19 +182,19 @@ _RANDOM_ORDERS: tuple[Callable[[Pilot, random.Random], object], ...] = (
         "SET_ATTITUDE_TARGET", TARGET | {"type_mask": 0, "q": (1.0, r.uniform(-0.2, 0.2), r.uniform(-0.2, 0.2), 0.1)}
     ),
     lambda p, r: _sticks(p, *(r.randrange(1000, 2000) for _ in range(4))),
-    lambda p, r: p.command(MAV_CMD.DO_CHANGE_SPEED, r.choice((0, 1, 2, 3)), r.uniform(-1.0, 12.0)),
-    lambda p, r: p.command(MAV_CMD.CONDITION_YAW, r.uniform(0.0, 360.0), r.uniform(0.0, 90.0), r.choice((-1, 1)), r.choice((0, 1))),
-    lambda p, r: p.command(MAV_CMD.DO_PAUSE_CONTINUE, r.choice((0, 1))),
-    lambda p, r: p.command(MAV_CMD.DO_SET_ROI_LOCATION, 0, 0, 0, 0, 48.2 + r.uniform(-1e-3, 1e-3), 16.37, 0),
+    lambda p, r: p.command(mavlink.MAV_CMD_DO_CHANGE_SPEED, r.choice((0, 1, 2, 3)), r.uniform(-1.0, 12.0)),
+    lambda p, r: p.command(mavlink.MAV_CMD_CONDITION_YAW, r.uniform(0.0, 360.0), r.uniform(0.0, 90.0), r.choice((-1, 1)), r.choice((0, 1))),
+    lambda p, r: p.command(mavlink.MAV_CMD_DO_PAUSE_CONTINUE, r.choice((0, 1))),
+    lambda p, r: p.command(mavlink.MAV_CMD_DO_SET_ROI_LOCATION, 0, 0, 0, 0, 48.2 + r.uniform(-1e-3, 1e-3), 16.37, 0),
     lambda p, r: p.command_int(
-        MAV_CMD.DO_REPOSITION,
+        mavlink.MAV_CMD_DO_REPOSITION,
         {"param2": 1.0, "frame": r.choice((0, 3, 10)), "x": START.lat_e7 + r.randrange(3000), "y": START.lon_e7, "z": 20.0},
     ),
-    lambda p, r: p.command(MAV_CMD.DO_SET_HOME, 1.0),
-    lambda p, r: p.command(MAV_CMD.MISSION_START),
-    lambda p, r: p.command(MAV_CMD.DO_SET_MISSION_CURRENT, r.randrange(8)),
-    lambda p, r: p.command(MAV_CMD.REQUEST_MESSAGE, r.choice((24, 30, 148, 242, 49))),
-    lambda p, r: p.command(MAV_CMD.RUN_PREARM_CHECKS),
+    lambda p, r: p.command(mavlink.MAV_CMD_DO_SET_HOME, 1.0),
+    lambda p, r: p.command(mavlink.MAV_CMD_MISSION_START),
+    lambda p, r: p.command(mavlink.MAV_CMD_DO_SET_MISSION_CURRENT, r.randrange(8)),
+    lambda p, r: p.command(mavlink.MAV_CMD_REQUEST_MESSAGE, r.choice((24, 30, 148, 242, 49))),
+    lambda p, r: p.command(mavlink.MAV_CMD_RUN_PREARM_CHECKS),
     lambda p, r: p.parameter(
         *r.choice(
             (
@@ -216,19 +216,19 @@ def at_random(pilot: Pilot, orders: int = 60) -> None:
         pilot,
         MISSION,
         [
-            _item(MAV_CMD.NAV_WAYPOINT),
-            _item(MAV_CMD.NAV_TAKEOFF, alt=8.0),
-            _item(MAV_CMD.NAV_WAYPOINT, 10.0, 5.0, 9.0),
-            _item(MAV_CMD.CONDITION_DELAY, 0.0, 0.0, 0.0, 1.0),
-            _item(MAV_CMD.NAV_SPLINE_WAYPOINT, 20.0, -5.0, 14.0),
-            _item(MAV_CMD.NAV_LOITER_TIME, 3.0, -9.0, 6.0, 3.0),
-            _item(MAV_CMD.NAV_RETURN_TO_LAUNCH),
+            _item(mavlink.MAV_CMD_NAV_WAYPOINT),
+            _item(mavlink.MAV_CMD_NAV_TAKEOFF, alt=8.0),
+            _item(mavlink.MAV_CMD_NAV_WAYPOINT, 10.0, 5.0, 9.0),
+            _item(mavlink.MAV_CMD_CONDITION_DELAY, 0.0, 0.0, 0.0, 1.0),
+            _item(mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT, 20.0, -5.0, 14.0),
+            _item(mavlink.MAV_CMD_NAV_LOITER_TIME, 3.0, -9.0, 6.0, 3.0),
+            _item(mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH),
         ],
     )
     for number in range(orders):
         if number % 30 == 0:
             with contextlib.suppress(PilotTimeoutError):
-                pilot.mode(COPTER_MODE.GUIDED)
+                pilot.mode(mavlink.COPTER_MODE_GUIDED)
                 pilot.take_off(6.0, 20.0)
         with contextlib.suppress(PilotTimeoutError):
             chance.choice(_RANDOM_ORDERS)(pilot, chance)

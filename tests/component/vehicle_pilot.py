@@ -4,21 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from fractus_mavlink import Endpoint, Message, Value
-from fractus_mavlink.enums import (
-    COPTER_MODE,
-    MAV_AUTOPILOT,
-    MAV_CMD,
-    MAV_COMPONENT,
-    MAV_FRAME,
-    MAV_MODE_FLAG,
-    MAV_PARAM_TYPE,
-    MAV_RESULT,
-    MAV_TYPE,
-)
+from fractus_runtime.mavlink_codec import Endpoint, Message, Value
 from fractus_vehicle.copter import POSITION_ONLY
 from fractus_vehicle.readiness import arming_refusals
 from fractus_vehicle.simulation import Craft, Simulation
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 HEARTBEAT_INTERVAL_S = 1.0
 
@@ -31,7 +21,7 @@ class Pilot:
     """One link to one vehicle; every wait advances the whole simulation."""
 
     def __init__(
-        self, simulation: Simulation, craft: Craft, sysid: int = 255, compid: int = MAV_COMPONENT.MISSIONPLANNER
+        self, simulation: Simulation, craft: Craft, sysid: int = 255, compid: int = mavlink.MAV_COMP_ID_MISSIONPLANNER
     ) -> None:
         self.simulation = simulation
         self.craft = craft
@@ -59,7 +49,10 @@ class Pilot:
         """Advance by one control step and read; beats the heart once a second."""
         if self.heartbeats and self.simulation.time_s >= self._next_heartbeat_s:
             self._next_heartbeat_s = self.simulation.time_s + HEARTBEAT_INTERVAL_S
-            self.send("HEARTBEAT", {"type": MAV_TYPE.GCS, "autopilot": MAV_AUTOPILOT.INVALID, "mavlink_version": 3})
+            self.send(
+                "HEARTBEAT",
+                {"type": mavlink.MAV_TYPE_GCS, "autopilot": mavlink.MAV_AUTOPILOT_INVALID, "mavlink_version": 3},
+            )
         self.simulation.step()
         return self.read()
 
@@ -96,22 +89,22 @@ class Pilot:
             found = [message for message in self.step() if message.name == name]
         return found[-1]
 
-    def command(self, command: int, *params: float) -> MAV_RESULT:
+    def command(self, command: int, *params: float) -> int:
         """Send COMMAND_LONG and return the result."""
         values: dict[str, Value] = {f"param{at}": float(value) for at, value in enumerate(params, start=1)}
         target: dict[str, Value] = {"target_system": self.craft.config.sysid, "target_component": 1}
         self.send("COMMAND_LONG", values | target | {"command": command})
-        return MAV_RESULT(self.expect("COMMAND_ACK").integer("result"))
+        return self.expect("COMMAND_ACK").integer("result")
 
-    def command_int(self, command: int, values: Mapping[str, Value]) -> MAV_RESULT:
+    def command_int(self, command: int, values: Mapping[str, Value]) -> int:
         """Send COMMAND_INT and return the result."""
         target: dict[str, Value] = {"target_system": self.craft.config.sysid, "target_component": 1}
         self.send("COMMAND_INT", dict(values) | target | {"command": command})
-        return MAV_RESULT(self.expect("COMMAND_ACK").integer("result"))
+        return self.expect("COMMAND_ACK").integer("result")
 
-    def mode(self, mode: COPTER_MODE) -> MAV_RESULT:
+    def mode(self, mode: int) -> int:
         """Ask for a mode."""
-        return self.command(MAV_CMD.DO_SET_MODE, MAV_MODE_FLAG.CUSTOM_MODE_ENABLED, mode)
+        return self.command(mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, mode)
 
     def parameter(self, name: str, value: float) -> float:
         """Set a parameter and return what the vehicle answers."""
@@ -122,7 +115,7 @@ class Pilot:
                 "target_component": 1,
                 "param_id": name.encode("ascii"),
                 "param_value": value,
-                "param_type": MAV_PARAM_TYPE.REAL32,
+                "param_type": mavlink.MAV_PARAM_TYPE_REAL32,
             },
         )
         while True:
@@ -137,12 +130,12 @@ class Pilot:
             PilotTimeoutError: a step was refused or took too long.
         """
         v = self.craft.vehicle.state
-        if self.mode(COPTER_MODE.GUIDED) is not MAV_RESULT.ACCEPTED:
+        if self.mode(mavlink.COPTER_MODE_GUIDED) != mavlink.MAV_RESULT_ACCEPTED:
             raise PilotTimeoutError("GUIDED was refused")
         self.wait(lambda: not arming_refusals(v), timeout_s)
-        if self.command(MAV_CMD.COMPONENT_ARM_DISARM, 1.0) is not MAV_RESULT.ACCEPTED:
+        if self.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0) != mavlink.MAV_RESULT_ACCEPTED:
             raise PilotTimeoutError(f"arming was refused: {self.texts[-1:]}")
-        if self.command(MAV_CMD.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude_m) is not MAV_RESULT.ACCEPTED:
+        if self.command(mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude_m) != mavlink.MAV_RESULT_ACCEPTED:
             raise PilotTimeoutError("takeoff was refused")
         return self.wait(lambda: v.altitude_m > 0.95 * altitude_m, timeout_s)
 
@@ -153,7 +146,7 @@ class Pilot:
             {
                 "target_system": self.craft.config.sysid,
                 "target_component": 1,
-                "coordinate_frame": MAV_FRAME.LOCAL_NED,
+                "coordinate_frame": mavlink.MAV_FRAME_LOCAL_NED,
                 "type_mask": POSITION_ONLY,
                 "x": north_m,
                 "y": east_m,

@@ -20,18 +20,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from fractus_mavlink import Endpoint, Message, Value, layout_named, layout_of
-from fractus_mavlink.enums import (
-    MAV_CMD,
-    MAV_COMPONENT,
-    MAV_MISSION_RESULT,
-    MAV_RESULT,
-    MAV_SYS_STATUS_SENSOR,
-    MAV_TYPE,
-)
+from fractus_runtime.mavlink_codec import Endpoint, Message, Value, enum_name, message_id
 from fractus_vehicle.earth import Place
 from fractus_vehicle.simulation import Simulation
 from fractus_vehicle.state import VehicleConfig
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 STEPS = Path(__file__).parents[1] / "golden/vehicle/arducopter-4.6.3.tsv"
 HOME = Place.from_degrees(50.864, 4.679, 0.1)
@@ -99,6 +92,11 @@ LISTS: dict[str, list[Row]] = {
 }
 
 
+def mission_result(value: int) -> str:
+    """Return the name of a MAV_MISSION_RESULT without its prefix."""
+    return enum_name("MAV_MISSION_RESULT", value).removeprefix("MAV_MISSION_")
+
+
 class Line(Protocol):
     """A conversation with one autopilot."""
 
@@ -118,7 +116,7 @@ class SimulatedLine:
         self._simulation = Simulation([VehicleConfig(start=HOME, throttle_us=1000)])
         self._craft = self._simulation.crafts[0]
         self._channel = self._craft.open("script", 0)
-        self._endpoint = Endpoint(255, MAV_COMPONENT.MISSIONPLANNER, saturate=True)
+        self._endpoint = Endpoint(255, mavlink.MAV_COMP_ID_MISSIONPLANNER, saturate=True)
         self.now_s = 0.0
 
     def send(self, name: str, values: dict[str, Value]) -> None:
@@ -138,7 +136,7 @@ class TcpLine:
     def __init__(self, address: str) -> None:
         _, host, port = address.split(":")
         self._socket = socket.create_connection((host, int(port)), 10.0)
-        self._endpoint = Endpoint(255, MAV_COMPONENT.MISSIONPLANNER, saturate=True)
+        self._endpoint = Endpoint(255, mavlink.MAV_COMP_ID_MISSIONPLANNER, saturate=True)
         self._begun_s = time.monotonic()
         self.now_s = 0.0
 
@@ -207,7 +205,7 @@ class Player:
     def _hear(self) -> list[Message]:
         if self.line.now_s >= self._next_beat_s:
             self._next_beat_s = self.line.now_s + 1.0
-            self.line.send("HEARTBEAT", {"type": MAV_TYPE.GCS, "autopilot": 8, "mavlink_version": 3})
+            self.line.send("HEARTBEAT", {"type": mavlink.MAV_TYPE_GCS, "autopilot": 8, "mavlink_version": 3})
         messages = self.line.hear()
         for message in messages:
             self.last[message.name] = message
@@ -247,7 +245,7 @@ class Player:
 
     def _ack(self, command: int) -> str:
         ack = self._until("COMMAND_ACK", 3.0, lambda m: m.integer("command") == command)
-        return "no ack" if ack is None else MAV_RESULT(ack.integer("result")).name
+        return "no ack" if ack is None else enum_name("MAV_RESULT", ack.integer("result"))
 
     def _ordered(self, command: int, params: list[float], component: int = 1) -> str:
         before = len(self.texts)
@@ -310,8 +308,8 @@ class Player:
 
     def do_prearm(self) -> str:
         before = len(self.texts)
-        self.line.send("COMMAND_LONG", TARGET | {"command": MAV_CMD.RUN_PREARM_CHECKS})
-        result = self._ack(MAV_CMD.RUN_PREARM_CHECKS)
+        self.line.send("COMMAND_LONG", TARGET | {"command": mavlink.MAV_CMD_RUN_PREARM_CHECKS})
+        result = self._ack(mavlink.MAV_CMD_RUN_PREARM_CHECKS)
         self._said(before)
         return f"{result} | {'; '.join(t for t in self.texts[before:] if t[4:].startswith('PreArm'))}"
 
@@ -323,14 +321,14 @@ class Player:
         return self._ack(int(command)) + self._said(before)
 
     def do_mode(self, number: str) -> str:
-        answer = self._ordered(MAV_CMD.DO_SET_MODE, [1.0, float(number)])
+        answer = self._ordered(mavlink.MAV_CMD_DO_SET_MODE, [1.0, float(number)])
         return f"{answer} -> {self._mode()}"
 
     def do_arm(self, number: str) -> str:
-        self._ordered(MAV_CMD.DO_SET_MODE, [1.0, float(number)])
-        mode, answer = self._mode(), self._ordered(MAV_CMD.COMPONENT_ARM_DISARM, [1.0])
+        self._ordered(mavlink.MAV_CMD_DO_SET_MODE, [1.0, float(number)])
+        mode, answer = self._mode(), self._ordered(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, [1.0])
         if answer.startswith("ACCEPTED"):
-            self._ordered(MAV_CMD.COMPONENT_ARM_DISARM, [0.0])
+            self._ordered(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, [0.0])
         return f"mode={mode} {answer}"
 
     def do_list(self) -> str:
@@ -354,28 +352,28 @@ class Player:
 
     def do_request(self, name: str) -> str:
         self.line.send(
-            "COMMAND_LONG", TARGET | {"command": MAV_CMD.REQUEST_MESSAGE, "param1": layout_named(name).msgid}
+            "COMMAND_LONG", TARGET | {"command": mavlink.MAV_CMD_REQUEST_MESSAGE, "param1": message_id(name)}
         )
         messages = list(self._stream(1.0))
         acks = [m for m in messages if m.name == "COMMAND_ACK"]
-        result = MAV_RESULT(acks[-1].integer("result")).name if acks else "no ack"
+        result = enum_name("MAV_RESULT", acks[-1].integer("result")) if acks else "no ack"
         return f"{result} sent={'yes' if any(m.name == name for m in messages) else 'no'}"
 
     def do_fields(self, name: str, *fields: str) -> str:
         self.line.send(
-            "COMMAND_LONG", TARGET | {"command": MAV_CMD.REQUEST_MESSAGE, "param1": layout_named(name).msgid}
+            "COMMAND_LONG", TARGET | {"command": mavlink.MAV_CMD_REQUEST_MESSAGE, "param1": message_id(name)}
         )
         message = self._until(name, 2.0)
         return "none" if message is None else " ".join(f"{field}={message.integer(field):#x}" for field in fields)
 
     def do_interval(self, number: str, interval_us: str) -> str:
-        return self._ordered(MAV_CMD.SET_MESSAGE_INTERVAL, [float(number), float(interval_us)])
+        return self._ordered(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, [float(number), float(interval_us)])
 
     def do_rate(self, number: str, interval_us: str) -> str:
-        result = self._ordered(MAV_CMD.SET_MESSAGE_INTERVAL, [float(number), float(interval_us)])
-        layout, duration_s = layout_of(int(number)), 3.0
+        result = self._ordered(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, [float(number), float(interval_us)])
+        layout, duration_s = mavlink.mavlink_map.get(int(number)), 3.0
         assert layout is not None
-        count = sum(message.name == layout.name for message in self._stream(duration_s))
+        count = sum(message.name == layout.msgname for message in self._stream(duration_s))
         return f"{result.split(' ')[0]} hz={count / duration_s:.1f}"
 
     def do_streams(self, rate: str) -> str:
@@ -386,10 +384,10 @@ class Player:
 
     def do_ready(self) -> str:
         """Wait in a mode that flies by itself until the checks pass; tell the filter's flags before and after."""
-        self._ordered(MAV_CMD.DO_SET_MODE, [1.0, GUIDED])
+        self._ordered(mavlink.MAV_CMD_DO_SET_MODE, [1.0, GUIDED])
         for number in (1, 193):
-            self._ordered(MAV_CMD.SET_MESSAGE_INTERVAL, [float(number), 250_000.0])
-        bit = MAV_SYS_STATUS_SENSOR.PREARM_CHECK
+            self._ordered(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, [float(number), 250_000.0])
+        bit = mavlink.MAV_SYS_STATUS_PREARM_CHECK
         healthy = self._until("SYS_STATUS", 120.0, lambda m: bool(m.integer("onboard_control_sensors_health") & bit))
         flags = self._until("EKF_STATUS_REPORT", 2.0)
         assert flags is not None
@@ -429,7 +427,7 @@ class Player:
                         item |= {"x": float(str(item["x"])) * 1e-7, "y": float(str(item["y"])) * 1e-7}
                     self.line.send("MISSION_ITEM" if old else "MISSION_ITEM_INT", item)
                 elif message.name == "MISSION_ACK":
-                    result = MAV_MISSION_RESULT(message.integer("type")).name
+                    result = mission_result(message.integer("type"))
                     return f"{result} mt={message.integer('mission_type')} after {asked}{self._said(before)}"
         return f"no ack after {asked} requests"
 
@@ -437,14 +435,14 @@ class Player:
         before = len(self.texts)
         self.line.send("MISSION_COUNT", TARGET | {"count": int(count), "mission_type": KINDS[kind_name]})
         ack = self._until("MISSION_ACK", 2.0)
-        result = "no ack" if ack is None else MAV_MISSION_RESULT(ack.integer("type")).name
+        result = "no ack" if ack is None else mission_result(ack.integer("type"))
         return f"{result}{self._said(before)}"
 
     def do_clear(self, kind: str) -> str:
         self.line.send("MISSION_CLEAR_ALL", TARGET | {"mission_type": int(kind)})
         ack = self._until("MISSION_ACK", 2.0)
         assert ack is not None
-        return f"{MAV_MISSION_RESULT(ack.integer('type')).name} mt={ack.integer('mission_type')}"
+        return f"{mission_result(ack.integer('type'))} mt={ack.integer('mission_type')}"
 
     def do_left(self, kind_name: str, bad: str = "") -> str:
         """How many items are stored; after an upload that fails, where one is named."""
@@ -467,11 +465,11 @@ class Player:
 
     def do_fly(self, altitude: str) -> str:
         """Arm in GUIDED, climb, and hover there."""
-        self._ordered(MAV_CMD.SET_MESSAGE_INTERVAL, [33.0, 100_000.0])
+        self._ordered(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, [33.0, 100_000.0])
         self.do_ready()
-        armed, up_m = self._ordered(MAV_CMD.COMPONENT_ARM_DISARM, [1.0]), float(altitude)
+        armed, up_m = self._ordered(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, [1.0]), float(altitude)
         begun_s = self.line.now_s
-        taken = self._ordered(MAV_CMD.NAV_TAKEOFF, [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, up_m])
+        taken = self._ordered(mavlink.MAV_CMD_NAV_TAKEOFF, [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, up_m])
         while self.line.now_s < begun_s + 40.0 and self._position()[2] < up_m - 0.5:
             pass
         reached_s = self.line.now_s - begun_s
@@ -563,7 +561,7 @@ class Player:
         self._run(float(speed))
         self.line.send("SET_MODE", {"target_system": 1, "base_mode": 1, "custom_mode": BRAKE})
         stop_s, way_m = self._stopped(0.5)
-        self._ordered(MAV_CMD.DO_SET_MODE, [1.0, GUIDED])
+        self._ordered(mavlink.MAV_CMD_DO_SET_MODE, [1.0, GUIDED])
         return f"stop_s={stop_s:.2f} dist={way_m:.1f}"
 
     def do_stop(self, speed: str) -> str:
@@ -590,16 +588,16 @@ class Player:
     def do_home(self) -> str:
         """RTL, and the seconds until the motors are off."""
         begun_s = self.line.now_s
-        self._ordered(MAV_CMD.DO_SET_MODE, [1.0, RTL])
+        self._ordered(mavlink.MAV_CMD_DO_SET_MODE, [1.0, RTL])
         self._until("HEARTBEAT", 150.0, lambda m: not m.integer("base_mode") & 128)
         return f"s={self.line.now_s - begun_s:.0f}"
 
     def do_tour(self, last: str) -> str:
         """Arm in GUIDED and fly the stored mission to its last item; what was reached and told, in order, repeated or not."""
-        self._ordered(MAV_CMD.DO_SET_MODE, [1.0, GUIDED])
-        self._ordered(MAV_CMD.COMPONENT_ARM_DISARM, [1.0])
+        self._ordered(mavlink.MAV_CMD_DO_SET_MODE, [1.0, GUIDED])
+        self._ordered(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, [1.0])
         before, seen = len(self.texts), {"MISSION_ITEM_REACHED": [""], "MISSION_CURRENT": [""]}
-        self._ordered(MAV_CMD.MISSION_START, [])
+        self._ordered(mavlink.MAV_CMD_MISSION_START, [])
         for message in self._stream(150.0):
             if message.name in seen and seen[message.name][-1] != str(message.integer("seq")):
                 seen[message.name].append(str(message.integer("seq")))

@@ -1,6 +1,6 @@
-"""Bytes of an autopilot, a ground station or a broken cable: the same messages however they are cut, and again as frames.
+"""Fuzz the MAVLink parser: the same messages however the bytes are cut, and no exception on any of them.
 
-Frames that are recorded are found in the tlog again while it grows, and none that was changed is believed on a signed link.
+Also checks that recorded frames are found in a tlog while it grows, and that no changed frame is accepted on a signed link.
 """
 
 from __future__ import annotations
@@ -10,101 +10,90 @@ import sys
 
 import atheris
 
-with atheris.instrument_imports(include=["fractus_mavlink", "fractus_cli.tlog_tail"]):
+with atheris.instrument_imports(include=["fractus_runtime.mavlink_codec", "pymavlink", "fractus_cli.tlog_tail"]):
     from fractus_cli.tlog_tail import Tail, split
-    from fractus_mavlink import Message, Parser, Signing, encode, layout_of
-    from fractus_mavlink.framing import MAGIC_V1, MAGIC_V2
-    from fractus_mavlink.messages import Layout
-from fastcrc.crc16 import mcrf4xx
+    from fractus_runtime.mavlink_codec import MAX_FRAME_LENGTH, Endpoint, Message, Parser
+    from mavlink_frames import MESSAGE_CLASSES, MessageClass, frame_v1, frame_v2
+    from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-LAYOUTS = [layout for layout in map(layout_of, range(1 << 16)) if layout is not None]
-MAGICS = bytes((MAGIC_V1, MAGIC_V2))
+MARKERS = bytes((mavlink.PROTOCOL_MARKER_V1, mavlink.PROTOCOL_MARKER_V2))
 KEY = bytes(range(32))
 STAMP = struct.pack(">Q", 1_790_000_000_000_000)
 NAME = "000001-20260601T120000Z.tlog"
 
 
 def one(data: bytes) -> None:
-    """Bytes as they are, as a tlog, and as the payload of sound frames."""
-    pieces(data)
-    tlog(data)
+    """Check one input as a stream, as a tlog, and as the payload of intact frames."""
+    parsed(data)
+    check_tlog(data)
     if len(data) > 3:
-        layout = LAYOUTS[int.from_bytes(data[:2], "little") % len(LAYOUTS)]
-        # Any length: none at all, what a sender cuts off, what a newer dialect adds.
+        kind = MESSAGE_CLASSES[int.from_bytes(data[:2], "little") % len(MESSAGE_CLASSES)]
+        # Any length: empty, cut by the sender, or extended by a newer dialect.
         payload = data[3 : 3 + data[2]]
-        frame = framed(layout, payload)
-        again(heard(frame, data))
-        recorded(frame, data)
-        signed(frame, data)
-        if layout.msgid <= 0xFF:
-            old = framed_v1(layout, payload)
-            assert repr(heard(old, data).values) == repr(layout.unpack(payload))
-            recorded(old, data)
-            unsigned(old, layout)
-        unsigned(frame, layout)
+        frame = frame_v2(kind, payload)
+        check_encoded_again(accepted(frame, data))
+        check_growing_tlog(frame, data)
+        check_signed(kind, payload, data)
+        if kind.id <= 0xFF:
+            old = frame_v1(kind, payload)
+            assert repr(accepted(old, data).values) == repr(accepted(frame, data).values)
+            check_growing_tlog(old, data)
+            check_unsigned(old, kind)
+        check_unsigned(frame, kind)
 
 
-def framed(layout: Layout, payload: bytes) -> bytes:
-    """A frame of MAVLink 2."""
-    body = struct.pack("<BBBBBBHB", len(payload), 0, 0, 0, 1, 1, layout.msgid & 0xFFFF, layout.msgid >> 16) + payload
-    return bytes((MAGIC_V2,)) + body + struct.pack("<H", mcrf4xx(body + bytes((layout.crc_extra,))))
+def signed_link() -> Endpoint:
+    """Return the end of a signed link."""
+    endpoint = Endpoint(1, 1)
+    endpoint.set_signing(KEY, 1000)
+    return endpoint
 
 
-def framed_v1(layout: Layout, payload: bytes) -> bytes:
-    """A frame of MAVLink 1."""
-    body = struct.pack("<BBBBB", len(payload), 0, 1, 1, layout.msgid) + payload
-    return bytes((MAGIC_V1,)) + body + struct.pack("<H", mcrf4xx(body + bytes((layout.crc_extra,))))
-
-
-def heard(frame: bytes, noise: bytes) -> Message:
-    """A sound frame is one message, also behind bytes that begin none and before any."""
-    (message,) = pieces(noise[:16].translate(None, MAGICS) + frame)
-    (first, *_) = pieces(frame + noise[:16])
+def accepted(frame: bytes, noise: bytes) -> Message:
+    """Check that an intact frame is one message, also behind bytes that start no frame and before any bytes."""
+    (message,) = parsed(noise[:16].translate(None, MARKERS) + frame)
+    (first, *_) = parsed(frame + noise[:16])
     assert message.frame == first.frame == frame
     return message
 
 
-def unsigned(frame: bytes, layout: Layout) -> None:
-    """A frame without a signature is not believed on a signed link, but of a modem that has no key."""
-    signing = Signing(KEY, 1000)
-    messages = Parser(lambda: signing).feed(frame)
-    assert [one.name for one in messages] == ["RADIO_STATUS"] * (layout.name == "RADIO_STATUS")
-    assert not any(one.signed for one in messages)
+def check_unsigned(frame: bytes, kind: MessageClass) -> None:
+    """Check that a signed link accepts no frame without a signature except that of a modem."""
+    messages = signed_link().decode(frame)
+    assert [message.name for message in messages] == ["RADIO_STATUS"] * (kind.msgname == "RADIO_STATUS")
+    assert not any(message.signed for message in messages)
 
 
-def pieces(data: bytes) -> list[Message]:
-    """Messages of a stream: whole, in two parts and byte by byte; what is none is counted alike."""
+def parsed(data: bytes) -> list[Message]:
+    """Return the messages of a stream, which must not depend on the way it is cut."""
     half = len(data) // 2
-    outcomes, told = [], []
+    outcomes, reported = [], []
     for cuts in ([data[i : i + 1] for i in range(len(data))], [data[:half], data[half:]], [data]):
-        foreign: list[bytes] = []
-        parser = Parser(unknown=foreign.append)
+        unknown: list[bytes] = []
+        parser = Parser(unknown=unknown.append)
         messages = [message for part in cuts for message in parser.feed(part)]
-        assert parser.pending <= 280, parser.pending
-        outcomes.append((repr(messages), parser.bad, parser.lost))
-        told.append(foreign)
+        assert parser.pending <= MAX_FRAME_LENGTH, parser.pending
+        outcomes.append((repr(messages), parser.bad))
+        reported.append(unknown)
     assert outcomes[0] == outcomes[1] == outcomes[2], outcomes
-    # While no byte is behind it, what ends as noise may be told as a frame of another dialect.
-    assert {*told[2]} <= {*told[1]} <= {*told[0]}, told
-    assert all(frame in data for frame in told[0])
+    # Noise at the end of the received bytes may be reported as a frame of another dialect.
+    assert {*reported[2]} <= {*reported[1]} <= {*reported[0]}, reported
+    assert all(frame in data for frame in reported[0])
     return messages
 
 
-def again(message: Message) -> None:
-    """A message that was read can be sent, and is read as the same."""
-    layout = layout_of(message.msgid)
-    assert layout is not None
-    frame = encode(layout, message.values, sequence=0, sysid=1, compid=1)
-    (read,) = Parser().feed(frame)
-    assert repr(read.values) == repr(message.values)
+def check_encoded_again(message: Message) -> None:
+    """Check that a received message can be sent and is received as the same."""
+    (again,) = Parser().feed(Endpoint(1, 1).encode(message.name, message.values))
+    assert repr(again.values) == repr(message.values)
 
 
-def tlog(data: bytes) -> None:
-    """Any bytes as a part of a tlog: what is found is a part of it, and no more than a frame is kept for later."""
+def check_tlog(data: bytes) -> None:
+    """Check that any bytes are split into parts of themselves, and that at most one frame is kept for later."""
     frames, rest = split(data)
-    assert all(one.data in data for one in frames)
-    assert sum(len(STAMP) + len(one.data) for one in frames) + len(rest) <= len(data)
-    assert len(rest) < len(STAMP) + 280, len(rest)
+    assert all(frame.data in data for frame in frames)
+    assert sum(len(STAMP) + len(frame.data) for frame in frames) + len(rest) <= len(data)
+    assert len(rest) < len(STAMP) + MAX_FRAME_LENGTH, len(rest)
 
 
 class Growing:
@@ -120,8 +109,8 @@ class Growing:
         return (self.data or b"")[offset:]
 
 
-def recorded(frame: bytes, cuts: bytes) -> None:
-    """Records of a frame: each is found once, wherever the file ended when it was looked at."""
+def check_growing_tlog(frame: bytes, cuts: bytes) -> None:
+    """Check that each record is found once, wherever the file ended when it was read."""
     whole, directory = (STAMP + frame) * 3, Growing()
     tail = Tail(directory)
     tail.read()
@@ -129,24 +118,25 @@ def recorded(frame: bytes, cuts: bytes) -> None:
     for end in sorted({*(cut * len(whole) // 255 for cut in cuts[:8]), len(whole)}):
         directory.data = whole[:end]
         found += tail.read()
-    assert [one.data for one in found] == [frame] * 3, found
+    assert [record.data for record in found] == [frame] * 3, found
 
 
-def signed(frame: bytes, data: bytes) -> None:
-    """A frame as it was signed is believed once; one that was changed, or has no signature, never."""
-    flagged = frame[:2] + b"\x01" + frame[3:-2]
-    layout = layout_of(int.from_bytes(frame[7:10], "little"))
-    assert layout is not None
-    flagged += struct.pack("<H", mcrf4xx(flagged[1:] + bytes((layout.crc_extra,))))
-    whole = Signing(KEY, 1000).sign(flagged)
-    signing = Signing(KEY, 1000)
-    parser = Parser(lambda: signing)
+def check_signed(kind: MessageClass, payload: bytes, data: bytes) -> None:
+    """Check that a signed frame is accepted once, and never if it was changed."""
+    sender = mavlink.MAVLink(None, 1, 1)
+    sender.signing.secret_key = KEY
+    sender.signing.timestamp = 1001
+    unsigned = mavlink.MAVLink_bad_data(frame_v2(kind, payload, flags=mavlink.MAVLINK_IFLAG_SIGNED), "")
+    unsigned.sign_packet(sender)
+    whole = bytes(unsigned.get_msgbuf())
     at = int.from_bytes(data[:2], "big") % len(whole)
     bad = whole[:at] + bytes((whole[at] ^ (data[-1] or 1),)) + whole[at + 1 :]
-    assert not [one for one in parser.feed(bad + bytes(300)) if one.signed]
-    (read,) = (one for one in Parser(lambda: signing).feed(whole) if one.signed)
-    assert read.frame == whole
-    assert not [one for one in Parser(lambda: signing).feed(whole) if one.signed], "a replay"
+    link = signed_link()
+    assert not [message for message in link.decode(bad + bytes(300)) if message.signed]
+    link = signed_link()
+    (received,) = (message for message in link.decode(whole) if message.signed)
+    assert received.frame == whole
+    assert not [message for message in link.decode(whole) if message.signed], "a replay"
 
 
 if __name__ == "__main__":

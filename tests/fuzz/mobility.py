@@ -24,8 +24,9 @@ from mobility_world import World, spec, touring, zone
 with atheris.instrument_imports(include=["fractus_services.mobility.rpc", "fractus_services.admission"]):
     from fractus_services.mobility.rpc.handlers import MobilityHandlers
 from fractus_core.api.names import node_identity
-from fractus_mavlink import encode, layout_named, layout_of
 from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc
+from fractus_runtime.mavlink_codec import message_class
+from mavlink_frames import MESSAGE_CLASSES, frame_v2
 from virtual_time import fly
 from wire import DEADLINES_S, STRANGE, Context, Registry, called, certificate, request
 
@@ -53,7 +54,6 @@ SAID = [
 ]  # fmt: skip
 OTHERS = [(255, 190), (1, 154), (1, 191), (2, 1), (244, 191), (0, 0)]
 """Who else speaks on a link: a ground station, a gimbal, another companion, another vehicle, someone with our own address, no one."""
-LAYOUTS = [layout for layout in map(layout_of, range(1 << 16)) if layout is not None]
 logging.disable(logging.CRITICAL)
 
 
@@ -142,10 +142,14 @@ class Flight:
         if not given.ConsumeIntInRange(0, 7):
             world.plane._received(given.ConsumeBytes(given.ConsumeIntInRange(0, 300)))
             return True
-        layout = layout_named(given.PickValueInList(SAID)) if given.ConsumeBool() else given.PickValueInList(LAYOUTS)
+        kind = (
+            message_class(given.PickValueInList(SAID))
+            if given.ConsumeBool()
+            else given.PickValueInList(MESSAGE_CLASSES)
+        )
         source = given.PickValueInList(OTHERS) if given.ConsumeBool() else world.plane.target or (1, 1)
-        values = layout.unpack(given.ConsumeBytes(layout.packer.size))
-        world.plane._received(encode(layout, values, sequence=0, sysid=source[0], compid=source[1]))
+        payload = given.ConsumeBytes(kind.unpacker.size)
+        world.plane._received(frame_v2(kind, payload or b"\0", source=source))
         return source not in OTHERS
 
 

@@ -9,9 +9,9 @@ import time
 from pathlib import Path
 
 from fractus_cluster.ports import free_port
-from fractus_mavlink import Endpoint
-from fractus_mavlink.enums import MAV_CMD
+from fractus_runtime.mavlink_codec import Endpoint
 from mobility_rig import Driver, Rig, grant
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 FORCE = 21196
 """Param 2 of MAV_CMD_COMPONENT_ARM_DISARM: also in flight."""
@@ -39,7 +39,7 @@ async def test_a_ground_station_sees_the_flight_and_cannot_end_it(tmp_path: Path
         {
             "target_system": 1,
             "target_component": 1,
-            "command": MAV_CMD.COMPONENT_ARM_DISARM,
+            "command": mavlink.MAV_CMD_COMPONENT_ARM_DISARM,
             "param1": 0,
             "param2": FORCE,
         },

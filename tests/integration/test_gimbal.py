@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 import yaml
 from fractus_cluster.ports import free_port
-from fractus_mavlink import Endpoint
-from fractus_mavlink.enums import MAV_CMD, MAV_PARAM_TYPE
 from fractus_proto.v1 import camera_pb2, camera_pb2_grpc, types_pb2
 from fractus_proto.v1 import mobility_pb2 as pb
+from fractus_runtime.mavlink_codec import Endpoint
 from mobility_rig import HOME, NODE, PASSENGER, Driver, Rig, area, denied, grant, passenger_grant
 from PIL import Image
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 SIYI, SERVOS = 8, 1
 METHODS = ["CaptureImage", "RetrieveImage", "DeleteImage"]
@@ -49,10 +49,10 @@ class Station:
     def point(self, pitch_deg: float, yaw_deg: float) -> None:
         nan = float("nan")
         angles = {"param1": pitch_deg, "param2": yaw_deg, "param3": nan, "param4": nan}
-        self._send("COMMAND_LONG", command=MAV_CMD.DO_GIMBAL_MANAGER_PITCHYAW, **angles)
+        self._send("COMMAND_LONG", command=mavlink.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW, **angles)
 
     def set_type(self, kind: int) -> None:
-        self._send("PARAM_SET", param_id=b"MNT1_TYPE", param_value=kind, param_type=MAV_PARAM_TYPE.INT8)
+        self._send("PARAM_SET", param_id=b"MNT1_TYPE", param_value=kind, param_type=mavlink.MAV_PARAM_TYPE_INT8)
 
     def close(self) -> None:
         self._link.close()

@@ -27,7 +27,7 @@ MAX_FILES = 59
 MAX_FUNCTIONS = 196
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-FOLDERS = ("agent", "core", "mavlink", "proto", "runtime", "sdk", "services")
+FOLDERS = ("agent", "core", "proto", "runtime", "sdk", "services")
 
 _traced: contextvars.ContextVar[bool] = contextvars.ContextVar("traced", default=False)
 

@@ -10,11 +10,11 @@ from typing import Any
 import grpc
 import pytest
 from fractus_core.control.state import FlightMode
-from fractus_mavlink.enums import COPTER_MODE
 from fractus_proto.v1 import mobility_pb2 as pb
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
 from mobility_rig import DRIVER, FRAME, NAVIGATOR_MISSION, Driver, Rig, denied, fence, flown, grant, outcomes, xy
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 LOST = pb.ControlEvent.STATE_LOST
 
@@ -205,7 +205,7 @@ async def test_a_pilot_takes_the_drone_and_keeps_it(rig: Rig) -> None:
     async with asyncio.timeout(5):
         while not pilot.connected:
             await pilot.update(0.5)
-    await pilot.set_mode(ARDUCOPTER.mode(COPTER_MODE.LOITER))
+    await pilot.set_mode(ARDUCOPTER.mode(mavlink.COPTER_MODE_LOITER))
     event = await driver.next(LOST, 15)
     assert event.reason == "a human pilot changed the mode to LOITER"
     code, why = await denied(flown(going))

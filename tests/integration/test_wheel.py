@@ -15,7 +15,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 EXAMPLES = sorted({path.parent for path in (ROOT / "examples").rglob("*.py")})
 SIMULATOR = ("cluster", "radio", "sim", "vehicle", "world")
-SHIPPED = ("agent", "cli", "core", "mavlink", "operator", "proto", "runtime", "services", "view")
+SHIPPED = ("agent", "cli", "core", "operator", "proto", "runtime", "services", "view")
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 
 

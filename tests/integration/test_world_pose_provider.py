@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 
 import pytest
-from fractus_mavlink import Parser, encode, layout_named
+from fractus_runtime.mavlink_codec import Endpoint, Parser
 from fractus_world import pose_provider
 from fractus_world.pose_provider import CameraPose, VehiclePose, parse_address
 
@@ -30,8 +30,7 @@ class Autopilot:
 
     def say(self, name: str, **values: object) -> None:
         assert self.link is not None
-        layout = layout_named(name)
-        self.link.sendall(encode(layout, values, sequence=0, sysid=1, compid=1))  # type: ignore[arg-type]
+        self.link.sendall(Endpoint(1, 1).encode(name, values))  # type: ignore[arg-type]
 
     def fly(self, yaw_deg: float = 0.0, **gpi: int) -> None:
         """A heartbeat, a position 50 m above home on 200 m, and an attitude."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 
-from fractus_mavlink.enums import MAV_CMD
 from fractus_services.mobility.mavlink.streams import LOOK_S, MAX_LOOK_S, MAX_UNHEARD, STREAMS, Streams
 
 STEP_S = 0.5
@@ -16,9 +15,9 @@ class SlowAutopilot:
     def __init__(self, *lacks: str) -> None:
         self.has = STREAMS.keys() - set(lacks)
         self.now = 0.0
-        self.asked: list[tuple[float, MAV_CMD]] = []
+        self.asked: list[tuple[float, int]] = []
 
-    async def command(self, command: MAV_CMD, *params: float, attempts: int = 1) -> None:
+    async def command(self, command: int, *params: float, attempts: int = 1) -> None:
         self.asked.append((self.now, command))
 
 

@@ -6,8 +6,7 @@ import math
 from collections.abc import Callable
 
 import pytest
-from fractus_mavlink import Endpoint, Message, Parser, message
-from fractus_mavlink.enums import MAV_CMD, MAV_RESULT
+from fractus_runtime.mavlink_codec import Endpoint, Message, Parser, message
 from fractus_services.mobility.mavlink.acknowledgements import (
     ACK_TIMEOUT_S,
     MAX_ACK_TIMEOUT_S,
@@ -16,12 +15,13 @@ from fractus_services.mobility.mavlink.acknowledgements import (
     Answer,
 )
 from fractus_services.mobility.mavlink.timing import Timing
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-SPEED, MODE = MAV_CMD.DO_CHANGE_SPEED, MAV_CMD.DO_SET_MODE
-ACCEPTED, DENIED, IN_PROGRESS = MAV_RESULT.ACCEPTED, MAV_RESULT.DENIED, MAV_RESULT.IN_PROGRESS
+SPEED, MODE = mavlink.MAV_CMD_DO_CHANGE_SPEED, mavlink.MAV_CMD_DO_SET_MODE
+ACCEPTED, DENIED, IN_PROGRESS = mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_DENIED, mavlink.MAV_RESULT_IN_PROGRESS
 
 
-def ack(result: MAV_RESULT = ACCEPTED, command: MAV_CMD = SPEED, target: int = 245) -> Message:
+def ack(result: int = ACCEPTED, command: int = SPEED, target: int = 245) -> Message:
     return message("COMMAND_ACK", command=command, result=result, target_system=target)
 
 
@@ -162,7 +162,7 @@ async def test_answers_to_others_and_of_other_commands_are_left_alone() -> None:
 async def test_a_frame_that_a_network_doubles_answers_once() -> None:
     autopilot, parser, acks, first, later = Endpoint(1, 1), Parser(), link(0.05), Answer(), Answer()
 
-    def heard(result: MAV_RESULT) -> Message:
+    def heard(result: int) -> Message:
         (incoming,) = parser.feed(autopilot.encode("COMMAND_ACK", ack(result).values))
         return incoming
 

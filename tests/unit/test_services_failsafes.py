@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import pytest
 from fractus_core.policy.decision_types import Airframe
-from fractus_mavlink import message
+from fractus_runtime.mavlink_codec import message
 from fractus_services.mobility.autopilot import Checked
 from fractus_services.mobility.mavlink.companion import SYSTEM_ID
 from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes

@@ -4,24 +4,24 @@ from __future__ import annotations
 
 import pytest
 from fractus_core.control.state import FlightMode, ModeKind
-from fractus_mavlink import Message, message
-from fractus_mavlink.enums import COPTER_MODE, MAV_CMD
+from fractus_runtime.mavlink_codec import Message, enum_names, message
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER, ArduCopter
 from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 
 def test_each_mode_means_what_the_vehicle_does_in_it() -> None:
-    kinds = {mode: ARDUCOPTER.mode(mode).kind for mode in COPTER_MODE}
-    assert kinds.pop(COPTER_MODE.GUIDED) is ModeKind.COMMANDED
-    assert kinds.pop(COPTER_MODE.LAND) is ModeKind.LANDING
-    assert kinds.pop(COPTER_MODE.BRAKE) is ModeKind.BRAKING
-    for mode in (COPTER_MODE.RTL, COPTER_MODE.SMART_RTL, COPTER_MODE.AUTO_RTL):
+    kinds = {mode: ARDUCOPTER.mode(mode).kind for mode in enum_names("COPTER_MODE")}
+    assert kinds.pop(mavlink.COPTER_MODE_GUIDED) is ModeKind.COMMANDED
+    assert kinds.pop(mavlink.COPTER_MODE_LAND) is ModeKind.LANDING
+    assert kinds.pop(mavlink.COPTER_MODE_BRAKE) is ModeKind.BRAKING
+    for mode in (mavlink.COPTER_MODE_RTL, mavlink.COPTER_MODE_SMART_RTL, mavlink.COPTER_MODE_AUTO_RTL):
         assert kinds.pop(mode) is ModeKind.RETURNING
     assert set(kinds.values()) == {ModeKind.OTHER}, "in every other mode a pilot flies"
 
 
 def test_modes_are_asked_for_by_their_numbers() -> None:
-    for mode in COPTER_MODE:
+    for mode in enum_names("COPTER_MODE"):
         assert ARDUCOPTER.mode_parameters(ARDUCOPTER.mode(mode)) == (float(mode),)
     assert ARDUCOPTER.mode(99) == FlightMode("MODE99"), "a later release's: a pilot's until it is known"
 
@@ -71,5 +71,5 @@ async def test_another_firmware_needs_only_its_own_stack() -> None:
     await vehicle.set_mode(stack.land)
     assert vehicle.vehicle.mode == stack.land
     (order,) = sent
-    assert order.integer("command") == MAV_CMD.DO_SET_MODE
+    assert order.integer("command") == mavlink.MAV_CMD_DO_SET_MODE
     assert [order.real(f"param{at}") for at in (1, 2, 3, 4)] == [1.0, 4.0, 6.0, 0.0]

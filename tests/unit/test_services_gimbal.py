@@ -9,9 +9,7 @@ import pytest
 from depth import examples
 from fractus_core.policy.decision_types import Attitude, Lens
 from fractus_core.policy.footprint import camera_axes
-from fractus_mavlink import message
-from fractus_mavlink.enums import GIMBAL_DEVICE_FLAGS as FLAGS
-from fractus_mavlink.enums import MAV_CMD
+from fractus_runtime.mavlink_codec import message
 from fractus_services.errors import AutopilotError, PreconditionFailed
 from fractus_services.mobility.autopilot import Permit, always
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
@@ -20,11 +18,12 @@ from fractus_services.mobility.mavlink.pointing import point
 from fractus_services.mobility.mavlink.vehicle import Vehicle
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 CAMERA = Lens(1.0, 1.0, pitch_deg=0.0)
-KEPT = FLAGS.ROLL_LOCK | FLAGS.PITCH_LOCK
-ARDUPILOT_4_4, ARDUPILOT_4_6 = KEPT, KEPT | FLAGS.YAW_IN_VEHICLE_FRAME
-NORTH = KEPT | FLAGS.YAW_IN_EARTH_FRAME
+KEPT = mavlink.GIMBAL_DEVICE_FLAGS_ROLL_LOCK | mavlink.GIMBAL_DEVICE_FLAGS_PITCH_LOCK
+ARDUPILOT_4_4, ARDUPILOT_4_6 = KEPT, KEPT | mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME
+NORTH = KEPT | mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME
 SIYI, SERVO = 8.0, 1.0
 
 
@@ -76,7 +75,12 @@ def test_the_quaternion_turns_the_camera(roll: float, pitch: float, yaw: float, 
 
 @pytest.mark.parametrize(
     ("flags", "yaw_deg"),
-    [(ARDUPILOT_4_4, 120.0), (ARDUPILOT_4_6, 120.0), (NORTH, 30.0), (NORTH | FLAGS.YAW_LOCK, 30.0)],
+    [
+        (ARDUPILOT_4_4, 120.0),
+        (ARDUPILOT_4_6, 120.0),
+        (NORTH, 30.0),
+        (NORTH | mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK, 30.0),
+    ],
 )
 def test_yaw_counts_from_where_the_flags_say(flags: int, yaw_deg: float) -> None:
     found = report(vehicle(heading_deg=90.0), flags=flags)
@@ -87,11 +91,11 @@ def test_yaw_counts_from_where_the_flags_say(flags: int, yaw_deg: float) -> None
 @pytest.mark.parametrize(
     "told",
     [
-        {"flags": ARDUPILOT_4_6 | FLAGS.YAW_LOCK},
-        {"flags": KEPT | FLAGS.YAW_LOCK},
-        {"flags": ARDUPILOT_4_6 | FLAGS.YAW_IN_EARTH_FRAME},
-        {"flags": ARDUPILOT_4_6 | FLAGS.RETRACT},
-        {"flags": FLAGS.YAW_IN_VEHICLE_FRAME | FLAGS.ROLL_LOCK},
+        {"flags": ARDUPILOT_4_6 | mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK},
+        {"flags": KEPT | mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK},
+        {"flags": ARDUPILOT_4_6 | mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME},
+        {"flags": ARDUPILOT_4_6 | mavlink.GIMBAL_DEVICE_FLAGS_RETRACT},
+        {"flags": mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME | mavlink.GIMBAL_DEVICE_FLAGS_ROLL_LOCK},
         {"flags": 0},
         {"failure_flags": 4},
         {"q": (math.nan,) * 4},
@@ -146,10 +150,10 @@ class Commanded:
         self.sent: list[tuple[float, ...]] = []
         self._error, self._limits = error, limits
 
-    async def command(self, command: MAV_CMD, *params: float, permit: Permit = always, attempts: int = 4) -> None:
+    async def command(self, command: int, *params: float, permit: Permit = always, attempts: int = 4) -> None:
         del attempts
         permit()
-        if command == MAV_CMD.REQUEST_MESSAGE:
+        if command == mavlink.MAV_CMD_REQUEST_MESSAGE:
             if self._limits is not None:
                 told = {end: math.radians(deg) for end, deg in self._limits.items()}
                 self.vehicle.take(message("GIMBAL_MANAGER_INFORMATION", gimbal_device_id=1, **told), 10.0)
@@ -166,7 +170,7 @@ LIMITS = {"pitch_min": -90.0, "pitch_max": 20.0, "yaw_min": -180.0, "yaw_max": 1
 async def test_it_is_pointed_without_rates(limits: dict[str, float] | None) -> None:
     autopilot = Commanded(limits=limits)
     await point(autopilot, -90.0, 180.0, always)
-    assert autopilot.sent[0][:3] == (MAV_CMD.DO_GIMBAL_MANAGER_PITCHYAW, -90.0, 180.0)
+    assert autopilot.sent[0][:3] == (mavlink.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW, -90.0, 180.0)
     assert all(math.isnan(rate) for rate in autopilot.sent[0][3:])
 
 

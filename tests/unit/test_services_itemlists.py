@@ -5,8 +5,7 @@ from __future__ import annotations
 import asyncio
 
 import pytest
-from fractus_mavlink import Message, message
-from fractus_mavlink.enums import MAV_MISSION_RESULT, MAV_MISSION_TYPE
+from fractus_runtime.mavlink_codec import Message, message
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.mavlink import itemlists
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
@@ -14,6 +13,7 @@ from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
 from fractus_services.mobility.mavlink.bounds import Item
 from fractus_services.mobility.mavlink.companion import COMPONENT_ID, SYSTEM_ID
 from fractus_services.mobility.mavlink.itemlists import NoLists, NoSpace, download, upload
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 ITEMS = tuple(Item(5001, 3.0, 393600000 + i, 229500000 - i) for i in range(3))
 
@@ -39,27 +39,29 @@ class Keeper(MavlinkAutopilot):
         if self._passes():
             answer = self._answer(outgoing)
             if answer is not None and self._passes():
-                self.take(message("MISSION_ACK", mission_type=MAV_MISSION_TYPE.MISSION))  # of another list: not ours
+                self.take(
+                    message("MISSION_ACK", mission_type=mavlink.MAV_MISSION_TYPE_MISSION)
+                )  # of another list: not ours
                 self.take(answer)
 
     def _answer(self, outgoing: Message) -> Message | None:
         kind = outgoing.name
         if self.result:
-            return message("MISSION_ACK", type=self.result, mission_type=MAV_MISSION_TYPE.FENCE)
+            return message("MISSION_ACK", type=self.result, mission_type=mavlink.MAV_MISSION_TYPE_FENCE)
         if kind == "MISSION_COUNT":
             self.items, self.wanted = [], outgoing.integer("count")
         elif kind == "MISSION_ITEM_INT" and outgoing.integer("seq") == len(self.items):
             self.items.append(outgoing)
         elif kind == "MISSION_REQUEST_LIST":
-            return message("MISSION_COUNT", count=len(self.items), mission_type=MAV_MISSION_TYPE.FENCE)
+            return message("MISSION_COUNT", count=len(self.items), mission_type=mavlink.MAV_MISSION_TYPE_FENCE)
         elif kind == "MISSION_REQUEST_INT":
             back = {"target_system": SYSTEM_ID, "target_component": COMPONENT_ID}
             return message("MISSION_ITEM_INT", **self.items[outgoing.integer("seq")].values | back)
         elif kind == "MISSION_ACK":
             return None
         if len(self.items) < self.wanted:
-            return message("MISSION_REQUEST", seq=len(self.items), mission_type=MAV_MISSION_TYPE.FENCE)
-        return message("MISSION_ACK", mission_type=MAV_MISSION_TYPE.FENCE)
+            return message("MISSION_REQUEST", seq=len(self.items), mission_type=mavlink.MAV_MISSION_TYPE_FENCE)
+        return message("MISSION_ACK", mission_type=mavlink.MAV_MISSION_TYPE_FENCE)
 
 
 @pytest.fixture(autouse=True)
@@ -107,9 +109,9 @@ async def test_without_a_vehicle_nothing_is_sent() -> None:
 
 
 @pytest.mark.parametrize(
-    ("result", "kind"), [(MAV_MISSION_RESULT.ERROR, AutopilotError), (MAV_MISSION_RESULT.NO_SPACE, NoSpace)]
+    ("result", "kind"), [(mavlink.MAV_MISSION_ERROR, AutopilotError), (mavlink.MAV_MISSION_NO_SPACE, NoSpace)]
 )
-async def test_a_refusal_says_what_the_autopilot_says(result: MAV_MISSION_RESULT, kind: type[AutopilotError]) -> None:
+async def test_a_refusal_says_what_the_autopilot_says(result: int, kind: type[AutopilotError]) -> None:
     keeper = Keeper(result=result)
     text = message("STATUSTEXT", severity=4, text=b"Invalid vertex count (2)")
     asyncio.get_running_loop().call_later(0.1, keeper.take, text)
@@ -123,7 +125,9 @@ async def test_a_lost_answer_to_the_last_item_is_no_refusal() -> None:
 
         def _answer(self, outgoing: Message) -> Message | None:
             if outgoing.name == "MISSION_ITEM_INT" and len(self.items) == self.wanted:
-                return message("MISSION_ACK", type=MAV_MISSION_RESULT.ERROR, mission_type=MAV_MISSION_TYPE.FENCE)
+                return message(
+                    "MISSION_ACK", type=mavlink.MAV_MISSION_ERROR, mission_type=mavlink.MAV_MISSION_TYPE_FENCE
+                )
             return super()._answer(outgoing)
 
     keeper = Finished(8)
@@ -138,7 +142,9 @@ async def test_an_item_that_came_twice_ends_no_upload() -> None:
         def _answer(self, outgoing: Message) -> Message | None:
             if outgoing.name == "MISSION_ITEM_INT" and outgoing.integer("seq") < len(self.items):
                 return message(
-                    "MISSION_ACK", type=MAV_MISSION_RESULT.INVALID_SEQUENCE, mission_type=MAV_MISSION_TYPE.FENCE
+                    "MISSION_ACK",
+                    type=mavlink.MAV_MISSION_INVALID_SEQUENCE,
+                    mission_type=mavlink.MAV_MISSION_TYPE_FENCE,
                 )
             answer = super()._answer(outgoing)
             if answer is not None and answer.name == "MISSION_REQUEST" and answer.integer("seq") == 1:
@@ -152,4 +158,4 @@ async def test_an_item_that_came_twice_ends_no_upload() -> None:
 
 async def test_a_vehicle_that_finds_everything_out_of_order_ends_it() -> None:
     with pytest.raises(AutopilotError, match="stopped answering"):
-        await upload(Keeper(result=MAV_MISSION_RESULT.INVALID_SEQUENCE), ITEMS)
+        await upload(Keeper(result=mavlink.MAV_MISSION_INVALID_SEQUENCE), ITEMS)

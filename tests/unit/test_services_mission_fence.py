@@ -13,7 +13,7 @@ import shapely
 from depth import examples
 from fractus_core.api.plans import GrantSpec
 from fractus_core.geo import LocalFrame
-from fractus_mavlink import Message
+from fractus_runtime.mavlink_codec import Message
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.mavlink import fence as module
 from fractus_services.mobility.mavlink.bounds import ROOM_M, Item, bounds_of

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import pytest
 from depth import examples
 from fractus_core.policy.decision_types import Airframe
-from fractus_mavlink import message
+from fractus_runtime.mavlink_codec import message
 from fractus_services.mobility.autopilot import Checked
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes, Reader

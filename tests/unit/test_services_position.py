@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 from fractus_core.control import ControlState, Mission, Outcome, OutcomeKind
-from fractus_mavlink import Message, Value, message
 from fractus_proto.v1.mobility_pb2 import MissionOutcome
+from fractus_runtime.mavlink_codec import Message, Value, message
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
 from fractus_services.mobility.mavlink.vehicle import Vehicle

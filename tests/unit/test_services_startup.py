@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fractus_mavlink import Endpoint, Parser
-from fractus_mavlink.enums import COPTER_MODE, MAV_AUTOPILOT, MAV_MODE_FLAG, MAV_STATE, MAV_TYPE
+from fractus_runtime.mavlink_codec import Endpoint, Parser
 from fractus_services.mobility.mavlink import startup
 from fractus_services.mobility.mavlink.companion import COMPONENT_ID, SYSTEM_ID
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from virtual_time import Loop
 
 URL = "udpout:192.168.1.2:14550"
@@ -21,11 +21,11 @@ URL = "udpout:192.168.1.2:14550"
 class Air:
     """A link, and a vehicle that tells its heartbeat once a second once it was spoken to."""
 
-    def __init__(self, *, state: MAV_STATE = MAV_STATE.ACTIVE, armed: bool = True, sysid: int = 1) -> None:
+    def __init__(self, *, state: int = mavlink.MAV_STATE_ACTIVE, armed: bool = True, sysid: int = 1) -> None:
         self._vehicle = Endpoint(sysid, 1)
         self._told = {
-            "type": MAV_TYPE.QUADROTOR, "autopilot": MAV_AUTOPILOT.ARDUPILOTMEGA, "custom_mode": COPTER_MODE.GUIDED,
-            "system_status": state, "base_mode": MAV_MODE_FLAG.SAFETY_ARMED if armed else 0,
+            "type": mavlink.MAV_TYPE_QUADROTOR, "autopilot": mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, "custom_mode": mavlink.COPTER_MODE_GUIDED,
+            "system_status": state, "base_mode": mavlink.MAV_MODE_FLAG_SAFETY_ARMED if armed else 0,
         }  # fmt: skip
         self._receive: Callable[[bytes], None] | None = None
         self.opened: list[str] = []
@@ -100,7 +100,7 @@ def test_a_start_that_fails_leaves_the_next_one_no_heartbeats(tmp_path: Path, mo
 
 @pytest.mark.parametrize(
     "air",
-    [Air(armed=False), Air(state=MAV_STATE.STANDBY), Air(state=MAV_STATE.CRITICAL), Air(sysid=2)],
+    [Air(armed=False), Air(state=mavlink.MAV_STATE_STANDBY), Air(state=mavlink.MAV_STATE_CRITICAL), Air(sysid=2)],
     ids=["stands", "on the ground", "failsafe acts", "another vehicle"],
 )
 def test_no_one_else_hears_heartbeats(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, air: Air) -> None:

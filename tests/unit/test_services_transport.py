@@ -8,16 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fractus_mavlink import Endpoint
-from fractus_mavlink.enums import MAV_AUTOPILOT, MAV_STATE, MAV_TYPE
+from fractus_runtime.mavlink_codec import Endpoint
 from fractus_services.mobility.mavlink import transport
 from fractus_services.mobility.mavlink.transport import BadUrl, open_link
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 AUTOPILOT, STRANGER = ("127.0.0.1", 14550), ("127.0.0.1", 40000)
 
 
-def heartbeat(autopilot: MAV_AUTOPILOT = MAV_AUTOPILOT.ARDUPILOTMEGA) -> bytes:
-    values = {"type": MAV_TYPE.QUADROTOR, "autopilot": autopilot, "system_status": MAV_STATE.STANDBY}
+def heartbeat(autopilot: int = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA) -> bytes:
+    values = {"type": mavlink.MAV_TYPE_QUADROTOR, "autopilot": autopilot, "system_status": mavlink.MAV_STATE_STANDBY}
     return Endpoint(1, 1).encode("HEARTBEAT", values)
 
 
@@ -49,7 +49,7 @@ def test_a_listening_link_belongs_to_the_first_autopilot(monkeypatch: pytest.Mon
     monkeypatch.setattr(transport.time, "monotonic", lambda: now[0])
     made, socket, heard = link(connected=False)
     made.datagram_received(b"x", STRANGER)
-    made.datagram_received(heartbeat(MAV_AUTOPILOT.INVALID), STRANGER)
+    made.datagram_received(heartbeat(mavlink.MAV_AUTOPILOT_INVALID), STRANGER)
     made.write(b"lost")
     assert not heard
     assert not socket.sent

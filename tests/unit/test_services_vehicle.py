@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import pytest
-from fractus_mavlink import message
-from fractus_mavlink.enums import MAV_MODE_FLAG
+from fractus_runtime.mavlink_codec import message
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.vehicle import Vehicle
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 
 @pytest.mark.parametrize(
@@ -143,7 +143,7 @@ def test_it_tells_of_satellites_wind_and_what_it_says() -> None:
 @pytest.mark.parametrize(("flags", "lost"), [(POSITIONED, False), (BOOTED, True)])
 def test_a_path_is_kept_over_a_restart_of_the_service_where_the_position_is_known(flags: int, lost: bool) -> None:
     vehicle = Vehicle(stack=ARDUCOPTER)
-    vehicle.take(message("HEARTBEAT", base_mode=MAV_MODE_FLAG.SAFETY_ARMED), 100.0)
+    vehicle.take(message("HEARTBEAT", base_mode=mavlink.MAV_MODE_FLAG_SAFETY_ARMED), 100.0)
     vehicle.take(message("EKF_STATUS_REPORT", flags=flags), 100.5)
     vehicle.take(message("EKF_STATUS_REPORT", flags=POSITIONED), 101.5)
     assert vehicle.path_lost is lost

@@ -6,18 +6,18 @@ import asyncio
 from pathlib import Path
 
 import pytest
-from fractus_mavlink import Endpoint, Message, Parser
-from fractus_mavlink.enums import MAV_AUTOPILOT, MAV_MODE_FLAG, MAV_TYPE
+from fractus_runtime.mavlink_codec import Endpoint, Message, Parser
 from fractus_services.mobility.mavlink.neighbours import CHOICE_S, GONE_S, SURE_S, Memory, Neighbours
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 URL = "udpin:127.0.0.1:14550"
 
 
-def heartbeat(sysid: int, compid: int = 1, *, kind: MAV_TYPE = MAV_TYPE.QUADROTOR, armed: bool = False) -> Message:
+def heartbeat(sysid: int, compid: int = 1, *, kind: int = mavlink.MAV_TYPE_QUADROTOR, armed: bool = False) -> Message:
     values = {
         "type": kind,
-        "autopilot": MAV_AUTOPILOT.ARDUPILOTMEGA,
-        "base_mode": MAV_MODE_FLAG.SAFETY_ARMED if armed else 0,
+        "autopilot": mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
+        "base_mode": mavlink.MAV_MODE_FLAG_SAFETY_ARMED if armed else 0,
     }
     (heard,) = Parser().feed(Endpoint(sysid, compid).encode("HEARTBEAT", values))
     return heard
@@ -105,8 +105,8 @@ def test_an_unknown_vehicle_that_flies_is_left_alone(tmp_path: Path) -> None:
 
 def test_an_autopilot_with_another_component_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     link = Neighbours(memory(tmp_path))
-    assert not link.finds(heartbeat(1, 154, kind=MAV_TYPE.GIMBAL), 0.0, flying=False)
-    assert not link.problem(heartbeat(1, 154, kind=MAV_TYPE.GIMBAL), 0.0)
+    assert not link.finds(heartbeat(1, 154, kind=mavlink.MAV_TYPE_GIMBAL), 0.0, flying=False)
+    assert not link.problem(heartbeat(1, 154, kind=mavlink.MAV_TYPE_GIMBAL), 0.0)
     assert not link.finds(heartbeat(1, 25), 1.0, flying=False)
     assert "heard as component 25 of MAVLink system 1" in link.problem(heartbeat(1, 25), 1.0)
     assert "component 25" in caplog.text

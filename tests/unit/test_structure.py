@@ -13,7 +13,7 @@ import grimp
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-SOURCE_ROOTS = ("core", "runtime", "mavlink", "operator", "agent", "services", "cli", "view", "sdk", "sim")
+SOURCE_ROOTS = ("core", "runtime", "operator", "agent", "services", "cli", "view", "sdk", "sim")
 
 MAX_SILENCED_TYPES = 15
 

@@ -17,7 +17,7 @@ from fractus_core.control.state import FlightMode, ModeKind, TaskKind
 from fractus_core.geo import LocalFrame
 from fractus_core.policy.decision_types import STATIONARY_MPS, Airframe, Attitude, Home
 from fractus_core.policy.return_route import ReturnBounds
-from fractus_mavlink.enums import GPS_FIX_TYPE, MAV_LANDED_STATE
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 Permit = Callable[[], None]
 """Asked before each sending of a command; raises when it must not be sent any more."""
@@ -28,7 +28,9 @@ BEING_SET = "they are being set"
 LANDED_MAX_AGE_S = 2.0
 SURELY_M, UNTOLD_M = 1.5, 0.5
 """Above the first a drone flies though it says it stands on the ground; above the second when it does not say."""
-_IN_AIR = frozenset({MAV_LANDED_STATE.IN_AIR, MAV_LANDED_STATE.TAKEOFF, MAV_LANDED_STATE.LANDING})
+_IN_AIR = frozenset(
+    {mavlink.MAV_LANDED_STATE_IN_AIR, mavlink.MAV_LANDED_STATE_TAKEOFF, mavlink.MAV_LANDED_STATE_LANDING}
+)
 DEFAULT_ERROR_M = 1.5
 """Position error, 1 sigma, of a GPS that tells none."""
 
@@ -95,7 +97,7 @@ class VehicleState:
     armed: bool = False
     failsafe: bool = False
     heartbeat_at: float = -math.inf
-    landed_state: int = MAV_LANDED_STATE.UNDEFINED
+    landed_state: int = mavlink.MAV_LANDED_STATE_UNDEFINED
     landed_at: float = -math.inf
     battery_remaining: float = math.nan
     battery_v: float = math.nan
@@ -104,7 +106,7 @@ class VehicleState:
     checks_at: float = -math.inf
     estimated: bool = False
     estimated_at: float = -math.inf
-    fix_type: int = GPS_FIX_TYPE.NO_GPS
+    fix_type: int = mavlink.GPS_FIX_TYPE_NO_GPS
     located: bool = False
     position_error_m: float = DEFAULT_ERROR_M
     courses: deque[tuple[float, float, float]] = field(default_factory=deque)
@@ -124,7 +126,7 @@ class VehicleState:
     def standing(self) -> bool:
         """Whether the autopilot says, as lately as it says the rest, that it stands on the ground."""
         told = max(self.heartbeat_at, self.position_at) - self.landed_at <= LANDED_MAX_AGE_S
-        return told and self.landed_state == MAV_LANDED_STATE.ON_GROUND
+        return told and self.landed_state == mavlink.MAV_LANDED_STATE_ON_GROUND
 
     @property
     def in_air(self) -> bool:
@@ -189,9 +191,9 @@ class VehicleState:
         """inactive, takingOff, flying or landing."""
         if not self.in_air:
             return "inactive"
-        if self.landed_state == MAV_LANDED_STATE.TAKEOFF:
+        if self.landed_state == mavlink.MAV_LANDED_STATE_TAKEOFF:
             return "takingOff"
-        landing = self.landed_state == MAV_LANDED_STATE.LANDING or self.mode.kind is ModeKind.LANDING
+        landing = self.landed_state == mavlink.MAV_LANDED_STATE_LANDING or self.mode.kind is ModeKind.LANDING
         return "landing" if landing else "flying"
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from fractus_core.api.plans import GrantSpec
-from fractus_mavlink import Parser
+from fractus_runtime.mavlink_codec import Parser
 
 from fractus_services.recording import messages
 from fractus_services.recording.map_features import features

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 
-from fractus_mavlink import Message
-from fractus_mavlink.enums import MAV_AUTOPILOT, MAV_MODE_FLAG
+from fractus_runtime.mavlink_codec import Message
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_services.recording.messages import DEBUG, ERROR, FATAL, INFO, WARNING, Record, attitude, location, text
 
@@ -32,6 +32,6 @@ def records_of(message: Message, time_ns: int, node: str) -> Iterable[Record]:
 
 def armed(message: Message) -> bool | None:
     """Whether the motors run, by an autopilot's heartbeat; None for every other message."""
-    if message.name != "HEARTBEAT" or message.integer("autopilot") == MAV_AUTOPILOT.INVALID:
+    if message.name != "HEARTBEAT" or message.integer("autopilot") == mavlink.MAV_AUTOPILOT_INVALID:
         return None
-    return bool(message.integer("base_mode") & MAV_MODE_FLAG.SAFETY_ARMED)
+    return bool(message.integer("base_mode") & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)

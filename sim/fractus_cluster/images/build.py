@@ -25,7 +25,7 @@ BASE_IMAGE = f"{PREFIX}/base:trixie"
 
 _SOURCES = (
     "Dockerfile", ".dockerignore", "pyproject.toml", "uv.lock", "sim/pyproject.toml", "README.md", "LICENSE",
-    "core", "runtime", "operator", "agent", "mavlink", "services", "cli", "view/fractus_view", "sdk", "proto",
+    "core", "runtime", "operator", "agent", "services", "cli", "view/fractus_view", "sdk", "proto",
 )  # fmt: skip
 """Sources of every image: each has the whole distribution fractus-drones."""
 _MORE_SOURCES: Mapping[str, tuple[str, ...]] = MappingProxyType(

@@ -10,7 +10,7 @@ from pathlib import Path
 from fractus_core.api import Grant
 from fractus_core.api.plans import GrantSpec
 from fractus_core.policy.decision_types import Home
-from fractus_mavlink.enums import MAV_CMD
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_sim.chaos.invariants import Seen
 from fractus_sim.experiment.errors import ExperimentError
@@ -75,7 +75,7 @@ class Watch:
         messages = self._station.poll(time.monotonic(), int(now_s * 1e6))
         state = self._station.state
         if state.heard and not (state.armed or state.flying) and state.battery < MIN_BATTERY:
-            self._station.command(MAV_CMD.BATTERY_RESET, _EVERY_BATTERY, 100)
+            self._station.command(mavlink.MAV_CMD_BATTERY_RESET, _EVERY_BATTERY, 100)
         if any(message.name == "GLOBAL_POSITION_INT" for message in messages) and (state.lat or state.lon):
             if self.home is None:
                 self.home = Home(state.lat, state.lon, state.amsl_m - state.alt_m)

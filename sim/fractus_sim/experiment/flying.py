@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Generator, Sequence
 
-from fractus_mavlink.enums import COPTER_MODE, MAV_CMD, MAV_FRAME, MAV_RESULT, SPEED_TYPE
+from fractus_runtime.mavlink_codec import enum_name, enum_names
 from fractus_vehicle import earth
 from fractus_vehicle.copter import POSITION_ONLY
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_sim.experiment.station import Station
 from fractus_sim.experiment.tasks import (
@@ -26,9 +27,10 @@ from fractus_sim.experiment.tasks import (
 ANSWER_S = 1.0
 ATTEMPTS = 5
 ARM_S = 60.0
-RELATIVE_FRAME = MAV_FRAME.GLOBAL_RELATIVE_ALT_INT
+RELATIVE_FRAME = mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT
 REMIND_S = 5.0
 CLIMBED = 0.95
+_MODES = {name: mode for mode, name in enum_names("COPTER_MODE").items()}
 Flight = Generator[None, None, None]
 
 
@@ -57,20 +59,22 @@ def fly(station: Station, steps: Sequence[Step], tell: Callable[[str], None]) ->
                 yield from _go(station, step, speed_mps)
             case Speed():
                 speed_mps = step.speed
-                yield from _command(station, MAV_CMD.DO_CHANGE_SPEED, SPEED_TYPE.GROUNDSPEED, speed_mps, -1)
+                yield from _command(
+                    station, mavlink.MAV_CMD_DO_CHANGE_SPEED, mavlink.SPEED_TYPE_GROUNDSPEED, speed_mps, -1
+                )
             case Hold():
                 yield from _hold(station, step.seconds)
             case SetMode():
-                yield from _enter(station, COPTER_MODE[step.mode])
+                yield from _enter(station, _MODES[step.mode])
             case FlyMission():
                 yield from _mission(station, step)
             case ReturnToLaunch():
-                yield from _down(station, COPTER_MODE.RTL)
+                yield from _down(station, mavlink.COPTER_MODE_RTL)
             case Land():
-                yield from _down(station, COPTER_MODE.LAND)
+                yield from _down(station, mavlink.COPTER_MODE_LAND)
 
 
-def _command(station: Station, command: MAV_CMD, *params: float) -> Flight:
+def _command(station: Station, command: int, *params: float) -> Flight:
     """Send a command until it is answered.
 
     Raises:
@@ -82,27 +86,31 @@ def _command(station: Station, command: MAV_CMD, *params: float) -> Flight:
         while station.now_s < deadline:
             yield
             if command in station.acks:
-                result = MAV_RESULT(station.acks[command])
-                if result is not MAV_RESULT.ACCEPTED:
+                result = station.acks[command]
+                if result != mavlink.MAV_RESULT_ACCEPTED:
                     said = f": {station.state.texts[-1][2]}" if station.state.texts else ""
-                    raise TaskFailed(f"{command.name} was answered {result.name}{said}")
+                    raise TaskFailed(
+                        f"{enum_name('MAV_CMD', command)} was answered {enum_name('MAV_RESULT', result)}{said}"
+                    )
                 return
-    raise TaskFailed(f"{command.name} was not answered")
+    raise TaskFailed(f"{enum_name('MAV_CMD', command)} was not answered")
 
 
-def _enter(station: Station, mode: COPTER_MODE) -> Flight:
-    yield from _command(station, MAV_CMD.DO_SET_MODE, 1, mode)
+def _enter(station: Station, mode: int) -> Flight:
+    yield from _command(station, mavlink.MAV_CMD_DO_SET_MODE, 1, mode)
     deadline = station.now_s + 3.0
-    while station.state.mode != mode.name:
+    while station.state.mode != enum_name("COPTER_MODE", mode):
         if station.now_s > deadline:
-            raise TaskFailed(f"mode {mode.name} was accepted, but the vehicle is in {station.state.mode}")
+            raise TaskFailed(
+                f"mode {enum_name('COPTER_MODE', mode)} was accepted, but the vehicle is in {station.state.mode}"
+            )
         yield
 
 
 def _arm(station: Station) -> Flight:
     deadline = station.now_s + ARM_S
     while not station.state.armed:
-        station.command(MAV_CMD.COMPONENT_ARM_DISARM, 1)
+        station.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1)
         again = station.now_s + ANSWER_S
         while station.now_s < again and not station.state.armed:
             yield
@@ -112,11 +120,11 @@ def _arm(station: Station) -> Flight:
 
 
 def _take_off(station: Station, altitude_m: float) -> Flight:
-    yield from _enter(station, COPTER_MODE.GUIDED)
+    yield from _enter(station, mavlink.COPTER_MODE_GUIDED)
     yield from _arm(station)
-    yield from _command(station, MAV_CMD.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude_m)
+    yield from _command(station, mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude_m)
     while station.state.alt_m < CLIMBED * altitude_m:
-        _expect(station, COPTER_MODE.GUIDED)
+        _expect(station, mavlink.COPTER_MODE_GUIDED)
         yield
 
 
@@ -131,9 +139,9 @@ def _go(station: Station, step: Goto, speed_mps: float | None) -> Flight:
             frame = {"coordinate_frame": int(RELATIVE_FRAME), "type_mask": int(POSITION_ONLY)}
             station.tell("SET_POSITION_TARGET_GLOBAL_INT", {**where, **frame})
             if speed_mps is not None:  # the first leg begins with the parameters' speed, whatever was set before
-                station.command(MAV_CMD.DO_CHANGE_SPEED, SPEED_TYPE.GROUNDSPEED, speed_mps, -1)
+                station.command(mavlink.MAV_CMD_DO_CHANGE_SPEED, mavlink.SPEED_TYPE_GROUNDSPEED, speed_mps, -1)
         yield
-        _expect(station, COPTER_MODE.GUIDED)
+        _expect(station, mavlink.COPTER_MODE_GUIDED)
         here = earth.Place.from_degrees(station.state.lat, station.state.lon, 0.0)
         north, east, _ = here.vector_to(target)
         if math.hypot(north, east, step.alt - station.state.alt_m) <= step.within:
@@ -148,16 +156,16 @@ def _hold(station: Station, seconds: float) -> Flight:
             raise TaskFailed(f"the autopilot changed to {station.state.mode}")
 
 
-def _down(station: Station, mode: COPTER_MODE) -> Flight:
+def _down(station: Station, mode: int) -> Flight:
     yield from _enter(station, mode)
     while station.state.armed:
-        if station.state.mode not in {mode.name, "LAND"}:
+        if station.state.mode not in {enum_name("COPTER_MODE", mode), "LAND"}:
             raise TaskFailed(f"the autopilot changed to {station.state.mode}")
         yield
 
 
-def _expect(station: Station, mode: COPTER_MODE) -> None:
-    if station.state.mode != mode.name:
+def _expect(station: Station, mode: int) -> None:
+    if station.state.mode != enum_name("COPTER_MODE", mode):
         raise TaskFailed(f"the autopilot changed to {station.state.mode}")
     if not station.state.armed:
         raise TaskFailed("the vehicle disarmed")
@@ -179,10 +187,10 @@ def _point(station: Station, place: Place) -> earth.Place:
 
 def _mission(station: Station, step: FlyMission) -> Flight:
     yield from _upload(station, _items(station, step))
-    yield from _enter(station, COPTER_MODE.GUIDED)
+    yield from _enter(station, mavlink.COPTER_MODE_GUIDED)
     yield from _arm(station)
-    yield from _enter(station, COPTER_MODE.AUTO)
-    yield from _command(station, MAV_CMD.MISSION_START, 0, 0)
+    yield from _enter(station, mavlink.COPTER_MODE_AUTO)
+    yield from _command(station, mavlink.MAV_CMD_MISSION_START, 0, 0)
     while station.state.armed:
         if station.state.mode != "AUTO":
             raise TaskFailed(f"the autopilot changed to {station.state.mode}")
@@ -191,16 +199,18 @@ def _mission(station: Station, step: FlyMission) -> Flight:
 
 def _items(station: Station, step: FlyMission) -> list[dict[str, float]]:
     """The mission as MISSION_ITEM_INT fields; the first is home, as ArduPilot keeps it."""
-    first: dict[str, float] = {"command": int(MAV_CMD.NAV_WAYPOINT), "frame": MAV_FRAME.GLOBAL}
+    first: dict[str, float] = {"command": int(mavlink.MAV_CMD_NAV_WAYPOINT), "frame": mavlink.MAV_FRAME_GLOBAL}
     items: list[dict[str, float]] = [
         first,
-        {"command": int(MAV_CMD.NAV_TAKEOFF), "frame": RELATIVE_FRAME, "z": step.takeoff},
+        {"command": int(mavlink.MAV_CMD_NAV_TAKEOFF), "frame": RELATIVE_FRAME, "z": step.takeoff},
     ]
     for waypoint in step.waypoints:
         at = _point(station, waypoint)
         place = {"x": at.lat_e7, "y": at.lon_e7, "z": waypoint.alt}
-        items.append({"command": int(MAV_CMD.NAV_WAYPOINT), "frame": RELATIVE_FRAME, "param1": waypoint.hold, **place})
-    last = MAV_CMD.NAV_RETURN_TO_LAUNCH if step.land == "home" else MAV_CMD.NAV_LAND
+        items.append(
+            {"command": int(mavlink.MAV_CMD_NAV_WAYPOINT), "frame": RELATIVE_FRAME, "param1": waypoint.hold, **place}
+        )
+    last = mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH if step.land == "home" else mavlink.MAV_CMD_NAV_LAND
     return [*items, {"command": int(last), "frame": RELATIVE_FRAME}]
 
 

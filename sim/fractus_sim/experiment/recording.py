@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from fractus_mavlink import Message
+from fractus_runtime.mavlink_codec import Message
 from fractus_services.recording.mcap_file import McapWriter
 from fractus_services.recording.messages import Record, location, schema, text
 

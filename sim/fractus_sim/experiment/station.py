@@ -9,30 +9,21 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from fractus_mavlink import Endpoint, Message, Value, layout_named
-from fractus_mavlink.enums import (
-    COPTER_MODE,
-    EKF_STATUS_FLAGS,
-    MAV_AUTOPILOT,
-    MAV_CMD,
-    MAV_COMPONENT,
-    MAV_LANDED_STATE,
-    MAV_MODE_FLAG,
-    MAV_PARAM_TYPE,
-    MAV_SYS_STATUS_SENSOR,
-    MAV_TYPE,
-)
+from fractus_runtime.mavlink_codec import Endpoint, Message, Value, enum_names, message_id
 from fractus_vehicle.channel import Channel
 from fractus_vehicle.simulation import Craft
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_sim.experiment.errors import ExperimentError
 from fractus_sim.experiment.tlog import TlogWriter
 
 GROUND_STATION_ID = 255
 OBSERVER_ID = 254
-STATION_COMPONENT = MAV_COMPONENT.MISSIONPLANNER
+STATION_COMPONENT = mavlink.MAV_COMP_ID_MISSIONPLANNER
 HEARTBEAT_S = 1.0
-FLYING_STATES = frozenset({MAV_LANDED_STATE.IN_AIR, MAV_LANDED_STATE.TAKEOFF, MAV_LANDED_STATE.LANDING})
+FLYING_STATES = frozenset(
+    {mavlink.MAV_LANDED_STATE_IN_AIR, mavlink.MAV_LANDED_STATE_TAKEOFF, mavlink.MAV_LANDED_STATE_LANDING}
+)
 RATES_HZ: Mapping[str, float] = {
     "GLOBAL_POSITION_INT": 5.0,
     "ATTITUDE": 5.0,
@@ -208,7 +199,7 @@ class Station:
         self.now_s, self._unix_us = now_s, unix_us
         data = self._link.receive()
         messages = [] if self.cut else self._endpoint.decode(data)
-        self.inbox = [m for m in messages if m.sysid == self._system_id and m.compid == MAV_COMPONENT.AUTOPILOT1]
+        self.inbox = [m for m in messages if m.sysid == self._system_id and m.compid == mavlink.MAV_COMP_ID_AUTOPILOT1]
         for message in messages:
             if self._log is not None:
                 self._log.write(unix_us, message.frame)
@@ -218,7 +209,10 @@ class Station:
                 reader(self, message)
         if self._beats and now_s >= self._next_beat_s:
             self._next_beat_s = now_s + HEARTBEAT_S
-            self.send("HEARTBEAT", {"type": MAV_TYPE.GCS, "autopilot": MAV_AUTOPILOT.INVALID, "mavlink_version": 3})
+            self.send(
+                "HEARTBEAT",
+                {"type": mavlink.MAV_TYPE_GCS, "autopilot": mavlink.MAV_AUTOPILOT_INVALID, "mavlink_version": 3},
+            )
         if self.state.heard and not self._asked:
             self._asked = True
             self._ask_for_streams()
@@ -252,7 +246,8 @@ class Station:
         """Set a parameter; what the vehicle made of it will be in `parameters`."""
         self.parameters.pop(name, None)
         self.tell(
-            "PARAM_SET", {"param_id": name.encode("ascii"), "param_value": value, "param_type": MAV_PARAM_TYPE.REAL32}
+            "PARAM_SET",
+            {"param_id": name.encode("ascii"), "param_value": value, "param_type": mavlink.MAV_PARAM_TYPE_REAL32},
         )
 
     def close(self) -> None:
@@ -263,15 +258,15 @@ class Station:
 
     def _ask_for_streams(self) -> None:
         for name, rate_hz in RATES_HZ.items():
-            self.command(MAV_CMD.SET_MESSAGE_INTERVAL, layout_named(name).msgid, 1e6 / rate_hz)
+            self.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id(name), 1e6 / rate_hz)
 
 
 def _heartbeat(station: Station, message: Message) -> None:
     state = station.state
     state.heard = True
-    state.armed = bool(message.integer("base_mode") & MAV_MODE_FLAG.SAFETY_ARMED)
+    state.armed = bool(message.integer("base_mode") & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
     number = message.integer("custom_mode")
-    state.mode = COPTER_MODE(number).name if number in set(COPTER_MODE) else f"MODE_{number}"
+    state.mode = enum_names("COPTER_MODE").get(number, f"MODE_{number}")
 
 
 def _position(station: Station, message: Message) -> None:
@@ -286,7 +281,7 @@ def _position(station: Station, message: Message) -> None:
 
 def _sys_status(station: Station, message: Message) -> None:
     state = station.state
-    state.checked = bool(message.integer("onboard_control_sensors_health") & MAV_SYS_STATUS_SENSOR.PREARM_CHECK)
+    state.checked = bool(message.integer("onboard_control_sensors_health") & mavlink.MAV_SYS_STATUS_PREARM_CHECK)
     state.voltage_v = message.integer("voltage_battery") / 1000.0
     state.current_a = message.integer("current_battery") / 100.0
     remaining = message.integer("battery_remaining")
@@ -298,7 +293,7 @@ def _extended(station: Station, message: Message) -> None:
 
 
 def _estimate(station: Station, message: Message) -> None:
-    known = EKF_STATUS_FLAGS.POS_HORIZ_ABS | EKF_STATUS_FLAGS.PRED_POS_HORIZ_ABS
+    known = mavlink.EKF_POS_HORIZ_ABS | mavlink.EKF_PRED_POS_HORIZ_ABS
     station.state.located = message.integer("flags") & known == known
 
 

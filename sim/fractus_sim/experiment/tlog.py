@@ -6,7 +6,7 @@ import struct
 import threading
 from pathlib import Path
 
-from fractus_mavlink import Parser
+from fractus_runtime.mavlink_codec import Parser
 
 _STAMP = struct.Struct(">Q")
 

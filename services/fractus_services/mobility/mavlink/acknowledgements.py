@@ -7,8 +7,8 @@ import logging
 import math
 from collections import deque
 
-from fractus_mavlink import Message
-from fractus_mavlink.enums import MAV_RESULT
+from fractus_runtime.mavlink_codec import Message
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_services.mobility.mavlink.timing import Timing
 
@@ -86,7 +86,7 @@ class Acknowledgements:
         sent_at, answer = sendings.popleft()
         # That of a command which was given up measures the link as well.
         self._timing.acknowledged(sent_at, now)
-        if result == MAV_RESULT.IN_PROGRESS:
+        if result == mavlink.MAV_RESULT_IN_PROGRESS:
             sendings.appendleft((now, answer))  # the final answer is still to come
         elif answer.done():
             log.debug("commands: an acknowledgement of an earlier sending (command=%d, result=%d)", command, result)

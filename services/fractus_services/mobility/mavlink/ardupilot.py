@@ -8,24 +8,25 @@ from collections.abc import Mapping
 from fractus_core.control.state import FlightMode, ModeKind
 from fractus_core.policy.decision_types import Airframe
 from fractus_core.policy.return_route import RTL_CONE_SLOPE, ReturnBounds
-from fractus_mavlink.enums import COPTER_MODE, FENCE_TYPE, MAV_AUTOPILOT, MAV_TYPE
+from fractus_runtime.mavlink_codec import enum_names
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_services.mobility.mavlink.companion import SYSTEM_ID
 from fractus_services.mobility.mavlink.flight_stack import Names, ParameterReader, Setting
 
 _KINDS = {
-    COPTER_MODE.GUIDED: ModeKind.COMMANDED,
-    COPTER_MODE.RTL: ModeKind.RETURNING,
-    COPTER_MODE.SMART_RTL: ModeKind.RETURNING,
-    COPTER_MODE.AUTO_RTL: ModeKind.RETURNING,
-    COPTER_MODE.LAND: ModeKind.LANDING,
-    COPTER_MODE.BRAKE: ModeKind.BRAKING,
+    mavlink.COPTER_MODE_GUIDED: ModeKind.COMMANDED,
+    mavlink.COPTER_MODE_RTL: ModeKind.RETURNING,
+    mavlink.COPTER_MODE_SMART_RTL: ModeKind.RETURNING,
+    mavlink.COPTER_MODE_AUTO_RTL: ModeKind.RETURNING,
+    mavlink.COPTER_MODE_LAND: ModeKind.LANDING,
+    mavlink.COPTER_MODE_BRAKE: ModeKind.BRAKING,
 }
-_MODES = {int(mode): FlightMode(mode.name, _KINDS.get(mode, ModeKind.OTHER)) for mode in COPTER_MODE}
+_MODES = {mode: FlightMode(name, _KINDS.get(mode, ModeKind.OTHER)) for mode, name in enum_names("COPTER_MODE").items()}
 _COPTERS = frozenset(
     {
-        MAV_TYPE.QUADROTOR, MAV_TYPE.COAXIAL, MAV_TYPE.HELICOPTER, MAV_TYPE.HEXAROTOR, MAV_TYPE.OCTOROTOR,
-        MAV_TYPE.TRICOPTER, MAV_TYPE.DODECAROTOR, MAV_TYPE.DECAROTOR, MAV_TYPE.GENERIC_MULTIROTOR,
+        mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_TYPE_COAXIAL, mavlink.MAV_TYPE_HELICOPTER, mavlink.MAV_TYPE_HEXAROTOR, mavlink.MAV_TYPE_OCTOROTOR,
+        mavlink.MAV_TYPE_TRICOPTER, mavlink.MAV_TYPE_DODECAROTOR, mavlink.MAV_TYPE_DECAROTOR, mavlink.MAV_TYPE_GENERIC_MULTIROTOR,
     }
 )  # fmt: skip
 _NUMBERS = {mode: number for number, mode in _MODES.items()}
@@ -51,7 +52,7 @@ ENABLE, TYPE, ALTITUDE, ACTION, OPTIONS = "FENCE_ENABLE", "FENCE_TYPE", "FENCE_A
 AUTOENABLE, MARGIN = "FENCE_AUTOENABLE", "FENCE_MARGIN"
 _UNION = 2
 """Bit of FENCE_OPTIONS: it is enough to be inside one of the polygons."""
-_DEFAULT_FENCES = float(FENCE_TYPE.ALT_MAX | FENCE_TYPE.CIRCLE | FENCE_TYPE.POLYGON)
+_DEFAULT_FENCES = float(mavlink.FENCE_TYPE_ALT_MAX | mavlink.FENCE_TYPE_CIRCLE | mavlink.FENCE_TYPE_POLYGON)
 _DEFAULT_MARGIN_M = 2.0
 
 _ACCEL: Names = (("WPNAV_ACCEL", 0.01), ("WP_ACC", 1.0))
@@ -80,10 +81,10 @@ _NO_RALLY_KM = 2.0**-10
 class ArduCopter:
     """The seam's side of ArduCopter, see `FlightStack`."""
 
-    guided = _MODES[COPTER_MODE.GUIDED]
-    land = _MODES[COPTER_MODE.LAND]
-    return_straight = _MODES[COPTER_MODE.RTL]
-    return_retracing = _MODES[COPTER_MODE.SMART_RTL]
+    guided = _MODES[mavlink.COPTER_MODE_GUIDED]
+    land = _MODES[mavlink.COPTER_MODE_LAND]
+    return_straight = _MODES[mavlink.COPTER_MODE_RTL]
+    return_retracing = _MODES[mavlink.COPTER_MODE_SMART_RTL]
 
     witness = "FS_GCS_ENABLE"
     failsafes: tuple[Setting, ...] = (
@@ -148,7 +149,7 @@ class ArduCopter:
 
     def foreign(self, vehicle_type: int, autopilot: int) -> str:
         """Modes and parameters of ArduPilot's rovers and planes mean something else, as do all of other firmware."""
-        if autopilot == MAV_AUTOPILOT.ARDUPILOTMEGA and vehicle_type in _COPTERS:
+        if autopilot == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA and vehicle_type in _COPTERS:
             return ""
         return f"the vehicle is no ArduCopter (MAV_AUTOPILOT {autopilot}, MAV_TYPE {vehicle_type})"
 
@@ -209,7 +210,7 @@ class ArduCopter:
         wrong = len(reader.problems)
         height_m = reader.read(_RETURN_ALTITUDE, known_m)
         fenced = read(ENABLE, 0.0) or read(AUTOENABLE, 0.0)
-        if fenced and int(read(TYPE, _DEFAULT_FENCES)) & FENCE_TYPE.ALT_MAX:
+        if fenced and int(read(TYPE, _DEFAULT_FENCES)) & mavlink.FENCE_TYPE_ALT_MAX:
             height_m = min(height_m, read(ALTITUDE, known_m, needed=True) - read(MARGIN, _DEFAULT_MARGIN_M))
         return known_m if len(reader.problems) > wrong else height_m
 
@@ -218,13 +219,15 @@ class ArduCopter:
     ) -> dict[str, float]:
         """The lower ceiling, both kinds of fence, the owner's action if it brings the drone down; and inside every polygon, not only inside one."""
         action = _RETRACE if retraces else _RETURN
-        kinds = (FENCE_TYPE.ALT_MAX if ceiling_m is not None else 0) | (FENCE_TYPE.POLYGON if polygon else 0)
+        kinds = (mavlink.FENCE_TYPE_ALT_MAX if ceiling_m is not None else 0) | (
+            mavlink.FENCE_TYPE_POLYGON if polygon else 0
+        )
         values = {ENABLE: 1.0, TYPE: float(kinds), ACTION: action}
         if owned.get(ENABLE, 0.0) != 0.0:
             before = int(owned.get(TYPE, 0))
             values[TYPE] = float(before | kinds)
             values[ACTION] = owned[ACTION] if owned.get(ACTION) in _COMES_DOWN else action
-            if before & FENCE_TYPE.ALT_MAX and ALTITUDE in owned:
+            if before & mavlink.FENCE_TYPE_ALT_MAX and ALTITUDE in owned:
                 ceiling_m = owned[ALTITUDE] if ceiling_m is None else min(ceiling_m, owned[ALTITUDE])
         if ceiling_m is not None:
             values[ALTITUDE] = ceiling_m

@@ -9,15 +9,8 @@ from collections.abc import Callable
 from contextlib import nullcontext, suppress
 
 from fractus_core.control.state import FlightMode
-from fractus_mavlink import Message, Value, layout_named, message
-from fractus_mavlink.enums import (
-    MAV_CMD,
-    MAV_FRAME,
-    MAV_MODE_FLAG,
-    MAV_RESULT,
-    POSITION_TARGET_TYPEMASK,
-    SPEED_TYPE,
-)
+from fractus_runtime.mavlink_codec import Message, Value, enum_name, message
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.autopilot import COURSE_S, Permit, always
@@ -39,21 +32,23 @@ REJECTED_RETRY_S = 0.3
 TAKEOFF_TIMEOUT_S = 3.0
 ATTEMPTS = 4
 
-_AT_ONCE = frozenset({MAV_CMD.DO_SET_MODE})
+# In common.xml, but not in the dialect that pymavlink 2.4.50 ships.
+_MAV_RESULT_CANCELLED = 6
+
+_AT_ONCE = frozenset({mavlink.MAV_CMD_DO_SET_MODE})
 _RESULTS: dict[int, str] = {
-    MAV_RESULT.TEMPORARILY_REJECTED: "temporarily rejected",
-    MAV_RESULT.DENIED: "denied",
-    MAV_RESULT.UNSUPPORTED: "unsupported",
-    MAV_RESULT.FAILED: "failed",
-    MAV_RESULT.CANCELLED: "cancelled",
+    mavlink.MAV_RESULT_TEMPORARILY_REJECTED: "temporarily rejected",
+    mavlink.MAV_RESULT_DENIED: "denied",
+    mavlink.MAV_RESULT_UNSUPPORTED: "unsupported",
+    mavlink.MAV_RESULT_FAILED: "failed",
+    _MAV_RESULT_CANCELLED: "cancelled",
 }
-_MASK = POSITION_TARGET_TYPEMASK
 _VELOCITY_AND_YAW = (
-    _MASK.X_IGNORE | _MASK.Y_IGNORE | _MASK.Z_IGNORE
-    | _MASK.AX_IGNORE | _MASK.AY_IGNORE | _MASK.AZ_IGNORE
-    | _MASK.YAW_RATE_IGNORE
+    mavlink.POSITION_TARGET_TYPEMASK_X_IGNORE | mavlink.POSITION_TARGET_TYPEMASK_Y_IGNORE | mavlink.POSITION_TARGET_TYPEMASK_Z_IGNORE
+    | mavlink.POSITION_TARGET_TYPEMASK_AX_IGNORE | mavlink.POSITION_TARGET_TYPEMASK_AY_IGNORE | mavlink.POSITION_TARGET_TYPEMASK_AZ_IGNORE
+    | mavlink.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE
 )  # fmt: skip
-_VELOCITY_ONLY = _VELOCITY_AND_YAW | _MASK.YAW_IGNORE
+_VELOCITY_ONLY = _VELOCITY_AND_YAW | mavlink.POSITION_TARGET_TYPEMASK_YAW_IGNORE
 
 
 class MavlinkAutopilot(Link):
@@ -127,7 +122,7 @@ class MavlinkAutopilot(Link):
 
     async def _probe_by_command(self) -> None:
         with suppress(AutopilotError):
-            await self.command(MAV_CMD.REQUEST_MESSAGE, layout_named("HEARTBEAT").msgid, attempts=1)
+            await self.command(mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_HEARTBEAT, attempts=1)
 
     def _lost(self) -> None:
         self.vehicle.gimbal_measured = self.vehicle.gimbal_limits = None
@@ -151,10 +146,10 @@ class MavlinkAutopilot(Link):
 
     async def command(
         self,
-        command: MAV_CMD,
+        command: int,
         *params: float,
         place: tuple[float, float, float] | None = None,
-        frame: MAV_FRAME = MAV_FRAME.GLOBAL_RELATIVE_ALT_INT,
+        frame: int = mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT,
         permit: Permit = always,
         attempts: int = ATTEMPTS,
     ) -> None:
@@ -178,7 +173,8 @@ class MavlinkAutopilot(Link):
                 permit()
                 if attempt and self._acknowledgements.overtaken(command, answer):
                     raise AutopilotError(
-                        f"a later command {command.name} has overtaken one that was not answered", link=True
+                        f"a later command {enum_name('MAV_CMD', command)} has overtaken one that was not answered",
+                        link=True,
                     )
                 answer = Answer() if answer.done() else answer
                 result = await self._attempt(
@@ -186,15 +182,15 @@ class MavlinkAutopilot(Link):
                 )
                 if result is None:
                     continue
-                if result == MAV_RESULT.ACCEPTED:
+                if result == mavlink.MAV_RESULT_ACCEPTED:
                     return
-                if result == MAV_RESULT.TEMPORARILY_REJECTED and attempt + 1 < attempts:
+                if result == mavlink.MAV_RESULT_TEMPORARILY_REJECTED and attempt + 1 < attempts:
                     await asyncio.sleep(REJECTED_RETRY_S)
                     continue
                 raise AutopilotError(self._refusal(command, result), refused=True)
-        raise AutopilotError(f"the autopilot did not answer command {command.name}", link=True)
+        raise AutopilotError(f"the autopilot did not answer command {enum_name('MAV_CMD', command)}", link=True)
 
-    async def _attempt(self, outgoing: Message, command: MAV_CMD, answer: Answer) -> int | None:
+    async def _attempt(self, outgoing: Message, command: int, answer: Answer) -> int | None:
         """The result of a command that is sent, for the first time or again; None without one in time."""
         self._acknowledgements.sent(command, answer, self.now)
         self.send(outgoing)
@@ -202,15 +198,18 @@ class MavlinkAutopilot(Link):
             await asyncio.wait([answer], timeout=self._acknowledgements.timeout_s)
         return answer.result() if answer.done() else None
 
-    def _refusal(self, command: MAV_CMD, result: int) -> str:
+    def _refusal(self, command: int, result: int) -> str:
         why = [t for t in self.vehicle.texts[-4:] if self.stack.explains_refusal(t)]
         said = f": {why[-1]}" if why else ""
-        return f"the autopilot {_RESULTS.get(result, 'refused')} command {command.name}{said}"
+        return f"the autopilot {_RESULTS.get(result, 'refused')} command {enum_name('MAV_CMD', command)}{said}"
 
     async def set_mode(self, mode: FlightMode, permit: Permit = always) -> None:
         """Change the flight mode and wait until the autopilot flies it."""
         await self.command(
-            MAV_CMD.DO_SET_MODE, MAV_MODE_FLAG.CUSTOM_MODE_ENABLED, *self.stack.mode_parameters(mode), permit=permit
+            mavlink.MAV_CMD_DO_SET_MODE,
+            mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED,
+            *self.stack.mode_parameters(mode),
+            permit=permit,
         )
         deadline = self.now + MODE_TIMEOUT_S
         while self.vehicle.mode != mode:
@@ -221,21 +220,21 @@ class MavlinkAutopilot(Link):
     async def arm(self, permit: Permit = always) -> None:
         """Start the motors."""
         self.vehicle.texts.clear()
-        await self.command(MAV_CMD.COMPONENT_ARM_DISARM, 1, permit=permit)
+        await self.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1, permit=permit)
 
     async def disarm(self, permit: Permit = always) -> None:
         """Stop the motors; the autopilot refuses in the air."""
-        await self.command(MAV_CMD.COMPONENT_ARM_DISARM, 0, permit=permit)
+        await self.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0, permit=permit)
 
     async def set_home(self, lat: float, lon: float, amsl_m: float) -> None:
         """Fix home, so that arming elsewhere does not move it."""
-        await self.command(MAV_CMD.DO_SET_HOME, place=(lat, lon, amsl_m), frame=MAV_FRAME.GLOBAL)
+        await self.command(mavlink.MAV_CMD_DO_SET_HOME, place=(lat, lon, amsl_m), frame=mavlink.MAV_FRAME_GLOBAL)
 
     async def take_off(self, altitude_m: float, permit: Permit = always) -> None:
         """Begin to climb to an altitude above home."""
         for attempt in range(ATTEMPTS):
             try:
-                await self.command(MAV_CMD.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude_m, permit=permit, attempts=1)
+                await self.command(mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude_m, permit=permit, attempts=1)
             except AutopilotError as error:
                 # A vehicle that takes off already, though its acknowledgement was lost, refuses to do so again.
                 if attempt and not error.link and await self._takes_off():
@@ -264,15 +263,17 @@ class MavlinkAutopilot(Link):
             permit()
             self._orders.go_to(lat, lon, altitude_m, self.vehicle, self.now)
 
-        await self.command(MAV_CMD.DO_REPOSITION, -1, 0, 0, yaw, place=(lat, lon, altitude_m), permit=ordered)
+        await self.command(mavlink.MAV_CMD_DO_REPOSITION, -1, 0, 0, yaw, place=(lat, lon, altitude_m), permit=ordered)
 
     async def turn(self, yaw_deg: float, permit: Permit = always) -> None:
         """Point the nose, on the leg under way."""
-        await self.command(MAV_CMD.CONDITION_YAW, yaw_deg % 360.0, 0, 0, 0, permit=permit)
+        await self.command(mavlink.MAV_CMD_CONDITION_YAW, yaw_deg % 360.0, 0, 0, 0, permit=permit)
 
     async def set_speed(self, speed_mps: float, permit: Permit = always) -> None:
         """Fly the leg under way with this horizontal speed over ground; one to a place may begin with the default again."""
-        await self.command(MAV_CMD.DO_CHANGE_SPEED, SPEED_TYPE.GROUNDSPEED, speed_mps, -1, permit=permit)
+        await self.command(
+            mavlink.MAV_CMD_DO_CHANGE_SPEED, mavlink.SPEED_TYPE_GROUNDSPEED, speed_mps, -1, permit=permit
+        )
 
     async def point_gimbal(self, pitch_deg: float, yaw_deg: float, permit: Permit = always) -> None:
         """Turn the camera: pitch over the horizon, yaw clockwise from the nose."""
@@ -289,7 +290,7 @@ class MavlinkAutopilot(Link):
             self.send(
                 message(
                     "SET_POSITION_TARGET_LOCAL_NED",
-                    coordinate_frame=MAV_FRAME.LOCAL_NED,
+                    coordinate_frame=mavlink.MAV_FRAME_LOCAL_NED,
                     type_mask=_VELOCITY_ONLY if yaw_deg is None else _VELOCITY_AND_YAW,
                     vx=north_mps,
                     vy=east_mps,
@@ -305,14 +306,14 @@ class MavlinkAutopilot(Link):
 
     async def ask_home(self) -> None:
         """Ask for the home position now."""
-        await self.command(MAV_CMD.REQUEST_MESSAGE, layout_named("HOME_POSITION").msgid)
+        await self.command(mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_HOME_POSITION)
 
 
 def _outgoing(
-    command: MAV_CMD,
+    command: int,
     params: tuple[float, ...],
     place: tuple[float, float, float] | None,
-    frame: MAV_FRAME,
+    frame: int,
     *,
     confirmation: int,
     **address: int,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import shapely
 from fractus_core.api.plans import GrantSpec
 from fractus_core.geo import LocalFrame, area_center, area_polygon
-from fractus_mavlink.enums import MAV_CMD
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 ROOM_M = 10.0
 """The fence lies so far outside of what is granted: the service's own monitor acts long before it."""
@@ -67,7 +67,7 @@ def bounds_of(spec: GrantSpec, vertices: int = MAX_VERTICES[0]) -> Bounds | None
         corners = [frame.latlon(x, y) for x, y in list(_outline(whole, vertices).exterior.coords)[:-1]]
         count = len(corners)
         items = tuple(
-            Item(MAV_CMD.NAV_FENCE_POLYGON_VERTEX_INCLUSION, float(count), round(lat * 1e7), round(lon * 1e7))
+            Item(mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION, float(count), round(lat * 1e7), round(lon * 1e7))
             for lat, lon in corners
         )
     return Bounds(items, altitude) if items or altitude is not None else None

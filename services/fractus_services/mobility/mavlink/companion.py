@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from fractus_mavlink import Message, message
-from fractus_mavlink.enums import MAV_AUTOPILOT, MAV_COMPONENT, MAV_STATE, MAV_TYPE
+from fractus_runtime.mavlink_codec import Message, message
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-SYSTEM_ID, COMPONENT_ID = 244, MAV_COMPONENT.ONBOARD_COMPUTER
+SYSTEM_ID, COMPONENT_ID = 244, mavlink.MAV_COMP_ID_ONBOARD_COMPUTER
 """The companion is a system of its own, whose heartbeats alone hold off the autopilot's failsafe: ground stations, which
 are 255 as a rule, must not."""
 
@@ -17,8 +17,8 @@ def heartbeat() -> Message:
     """What holds off the autopilot's failsafe."""
     return message(
         "HEARTBEAT",
-        type=MAV_TYPE.ONBOARD_CONTROLLER,
-        autopilot=MAV_AUTOPILOT.INVALID,
-        system_status=MAV_STATE.ACTIVE,
+        type=mavlink.MAV_TYPE_ONBOARD_CONTROLLER,
+        autopilot=mavlink.MAV_AUTOPILOT_INVALID,
+        system_status=mavlink.MAV_STATE_ACTIVE,
         mavlink_version=MAVLINK_VERSION,
     )

@@ -11,8 +11,8 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from fractus_core.api.plans import GrantSpec
-from fractus_mavlink.enums import FENCE_TYPE, MAV_CMD
 from fractus_runtime.files import remove_temporary, write_file
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
@@ -26,7 +26,7 @@ _RESTORE_TIMEOUT_S = 5.0
 ITEMS_AGAIN_S = 60.0
 """In flight the items are read again after this time: of others in their place, as many as there were, no message tells."""
 
-_SWITCHED = FENCE_TYPE.ALT_MAX | FENCE_TYPE.CIRCLE | FENCE_TYPE.POLYGON
+_SWITCHED = mavlink.FENCE_TYPE_ALT_MAX | mavlink.FENCE_TYPE_CIRCLE | mavlink.FENCE_TYPE_POLYGON
 """Without the floor, which the autopilot switches by itself."""
 
 _CLOSE_E7 = 2
@@ -153,7 +153,7 @@ class MissionFence:
         left_alone = vehicle.armed and not vehicle.mode.commanded
         if vehicle.fenced is not False or vehicle.checks_at <= self._switched_at or left_alone:
             return ()
-        await self._autopilot.command(MAV_CMD.DO_FENCE_ENABLE, 1, _SWITCHED)
+        await self._autopilot.command(mavlink.MAV_CMD_DO_FENCE_ENABLE, 1, _SWITCHED)
         self._switched_at = self._autopilot.now
         return ("the fence was switched off and is on",)
 

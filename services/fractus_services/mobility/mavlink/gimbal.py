@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 
 from fractus_core.policy.decision_types import Attitude
-from fractus_mavlink import Message
-from fractus_mavlink.enums import GIMBAL_DEVICE_FLAGS
+from fractus_runtime.mavlink_codec import Message
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 MAX_NORM_ERROR = 0.02
 """A quaternion whose length is further from 1 than that is no attitude."""
 
-_LEVELLED = GIMBAL_DEVICE_FLAGS.ROLL_LOCK | GIMBAL_DEVICE_FLAGS.PITCH_LOCK
-_FRAMES = GIMBAL_DEVICE_FLAGS.YAW_IN_VEHICLE_FRAME | GIMBAL_DEVICE_FLAGS.YAW_IN_EARTH_FRAME
+_LEVELLED = mavlink.GIMBAL_DEVICE_FLAGS_ROLL_LOCK | mavlink.GIMBAL_DEVICE_FLAGS_PITCH_LOCK
+_FRAMES = mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME | mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME
 
 
 def attitude_of(status: Message, heading_deg: float) -> Attitude | None:
@@ -27,11 +27,11 @@ def attitude_of(status: Message, heading_deg: float) -> Attitude | None:
         or where it is not sure what its yaw counts from.
     """
     flags = status.integer("flags")
-    locked, frames = bool(flags & GIMBAL_DEVICE_FLAGS.YAW_LOCK), flags & _FRAMES
-    if flags & GIMBAL_DEVICE_FLAGS.RETRACT or flags & _LEVELLED != _LEVELLED or status.integer("failure_flags"):
+    locked, frames = bool(flags & mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK), flags & _FRAMES
+    if flags & mavlink.GIMBAL_DEVICE_FLAGS_RETRACT or flags & _LEVELLED != _LEVELLED or status.integer("failure_flags"):
         return None
     # ArduPilot says that the yaw of a locked gimbal counts from the nose, and hands on the gimbal's own, from north.
-    if frames == _FRAMES or (locked and frames != GIMBAL_DEVICE_FLAGS.YAW_IN_EARTH_FRAME):
+    if frames == _FRAMES or (locked and frames != mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME):
         return None
     w, x, y, z = (float(part) for part in status.array("q") if not isinstance(part, bytes))
     norm = math.sqrt(w * w + x * x + y * y + z * z)
@@ -43,5 +43,5 @@ def attitude_of(status: Message, heading_deg: float) -> Attitude | None:
     if abs(math.degrees(pitch)) > 89.9:
         # Straight down and up roll and yaw are one angle.
         roll, yaw = 0.0, 2 * math.atan2(z, w)
-    counts_from_deg = 0.0 if frames == GIMBAL_DEVICE_FLAGS.YAW_IN_EARTH_FRAME else heading_deg
+    counts_from_deg = 0.0 if frames == mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME else heading_deg
     return Attitude(math.degrees(roll), math.degrees(pitch), (math.degrees(yaw) + counts_from_deg) % 360.0)

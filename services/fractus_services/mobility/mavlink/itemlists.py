@@ -5,8 +5,8 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Sequence
 
-from fractus_mavlink import Message, message
-from fractus_mavlink.enums import MAV_FRAME, MAV_MISSION_RESULT, MAV_MISSION_TYPE
+from fractus_runtime.mavlink_codec import Message, message
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
@@ -17,13 +17,13 @@ TEXT_TIMEOUT_S = 0.3
 ATTEMPTS = 4
 
 _REASONS: dict[int, str] = {
-    MAV_MISSION_RESULT.ERROR: "an error",
-    MAV_MISSION_RESULT.UNSUPPORTED_FRAME: "the frame",
-    MAV_MISSION_RESULT.UNSUPPORTED: "no such lists",
-    MAV_MISSION_RESULT.NO_SPACE: "no space",
-    MAV_MISSION_RESULT.INVALID: "an invalid value",
-    MAV_MISSION_RESULT.INVALID_SEQUENCE: "the order",
-    MAV_MISSION_RESULT.DENIED: "denied",
+    mavlink.MAV_MISSION_ERROR: "an error",
+    mavlink.MAV_MISSION_UNSUPPORTED_FRAME: "the frame",
+    mavlink.MAV_MISSION_UNSUPPORTED: "no such lists",
+    mavlink.MAV_MISSION_NO_SPACE: "no space",
+    mavlink.MAV_MISSION_INVALID: "an invalid value",
+    mavlink.MAV_MISSION_INVALID_SEQUENCE: "the order",
+    mavlink.MAV_MISSION_DENIED: "denied",
 }
 
 
@@ -36,7 +36,7 @@ class NoSpace(AutopilotError):
 
 
 async def upload(
-    autopilot: MavlinkAutopilot, items: Sequence[Item], kind: MAV_MISSION_TYPE = MAV_MISSION_TYPE.FENCE
+    autopilot: MavlinkAutopilot, items: Sequence[Item], kind: int = mavlink.MAV_MISSION_TYPE_FENCE
 ) -> None:
     """Replace a list; it is to be read back.
 
@@ -61,9 +61,9 @@ async def upload(
                 if silent == ATTEMPTS:
                     raise AutopilotError("the autopilot stopped answering while its fence was written", link=True)
             elif answer.name == "MISSION_ACK":
-                if answer.integer("type") == MAV_MISSION_RESULT.ERROR and ended > 1:
+                if answer.integer("type") == mavlink.MAV_MISSION_ERROR and ended > 1:
                     return  # it awaits no item any more: its answer to the last one was lost, and reading back tells which
-                if answer.integer("type") != MAV_MISSION_RESULT.ACCEPTED:
+                if answer.integer("type") != mavlink.MAV_MISSION_ACCEPTED:
                     await asyncio.sleep(TEXT_TIMEOUT_S)  # the texts that say why may follow the answer
                 _check(answer.integer("type"), [texts.get_nowait().text("text") for _ in range(texts.qsize())])
                 return
@@ -74,10 +74,10 @@ async def upload(
 
 
 def _is_repeated(answer: Message) -> bool:
-    return answer.name == "MISSION_ACK" and answer.integer("type") == MAV_MISSION_RESULT.INVALID_SEQUENCE
+    return answer.name == "MISSION_ACK" and answer.integer("type") == mavlink.MAV_MISSION_INVALID_SEQUENCE
 
 
-async def download(autopilot: MavlinkAutopilot, kind: MAV_MISSION_TYPE = MAV_MISSION_TYPE.FENCE) -> tuple[Item, ...]:
+async def download(autopilot: MavlinkAutopilot, kind: int = mavlink.MAV_MISSION_TYPE_FENCE) -> tuple[Item, ...]:
     """Read a list.
 
     Raises:
@@ -122,16 +122,16 @@ async def _answer(answers: asyncio.Queue[Message], kind: int) -> Message | None:
 
 
 def _check(result: int, texts: Sequence[str] = ()) -> None:
-    if result == MAV_MISSION_RESULT.UNSUPPORTED:
+    if result == mavlink.MAV_MISSION_UNSUPPORTED:
         raise NoLists("the autopilot keeps no fence items")
-    if result != MAV_MISSION_RESULT.ACCEPTED:
+    if result != mavlink.MAV_MISSION_ACCEPTED:
         why = ": ".join(filter(None, (_REASONS.get(result, f"result {result}"), "; ".join(texts))))
-        kind = NoSpace if result == MAV_MISSION_RESULT.NO_SPACE else AutopilotError
+        kind = NoSpace if result == mavlink.MAV_MISSION_NO_SPACE else AutopilotError
         raise kind(f"the autopilot refused the fence: {why}")
 
 
-def _item(autopilot: MavlinkAutopilot, item: Item, seq: int, kind: MAV_MISSION_TYPE) -> Message:
+def _item(autopilot: MavlinkAutopilot, item: Item, seq: int, kind: int) -> Message:
     return message(
-        "MISSION_ITEM_INT", seq=seq, frame=MAV_FRAME.GLOBAL, command=item.command, param1=item.param1, x=item.lat_e7, y=item.lon_e7,
+        "MISSION_ITEM_INT", seq=seq, frame=mavlink.MAV_FRAME_GLOBAL, command=item.command, param1=item.param1, x=item.lat_e7, y=item.lon_e7,
         autocontinue=1, mission_type=kind, **autopilot.address(),
     )  # fmt: skip

@@ -9,7 +9,7 @@ import random
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 
-from fractus_mavlink import Endpoint, Message, message
+from fractus_runtime.mavlink_codec import Endpoint, Message, message
 
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.mavlink.companion import COMPONENT_ID, SYSTEM_ID, heartbeat

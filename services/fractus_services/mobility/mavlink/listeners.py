@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from fractus_mavlink import Message
+from fractus_runtime.mavlink_codec import Message
 
 
 class Listeners:

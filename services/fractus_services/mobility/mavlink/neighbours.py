@@ -8,9 +8,9 @@ import logging
 import math
 from pathlib import Path
 
-from fractus_mavlink import Message
-from fractus_mavlink.enums import MAV_AUTOPILOT, MAV_COMPONENT, MAV_MODE_FLAG, MAV_TYPE
 from fractus_runtime.files import write_file
+from fractus_runtime.mavlink_codec import Message
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 log = logging.getLogger(__name__)
 
@@ -23,11 +23,11 @@ CHOICE_S = 3.0
 SURE_S = 10.0
 """One that has been alone for so long after that is the drone's own."""
 
-_NO_VEHICLES = frozenset({MAV_TYPE.ANTENNA_TRACKER, MAV_TYPE.GCS})
+_NO_VEHICLES = frozenset({mavlink.MAV_TYPE_ANTENNA_TRACKER, mavlink.MAV_TYPE_GCS})
 _VEHICLES = frozenset(
     {
-        MAV_TYPE.FIXED_WING, MAV_TYPE.QUADROTOR, MAV_TYPE.COAXIAL, MAV_TYPE.HELICOPTER, MAV_TYPE.GROUND_ROVER, MAV_TYPE.HEXAROTOR,
-        MAV_TYPE.OCTOROTOR, MAV_TYPE.TRICOPTER, MAV_TYPE.DODECAROTOR, MAV_TYPE.DECAROTOR, MAV_TYPE.GENERIC_MULTIROTOR,
+        mavlink.MAV_TYPE_FIXED_WING, mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_TYPE_COAXIAL, mavlink.MAV_TYPE_HELICOPTER, mavlink.MAV_TYPE_GROUND_ROVER, mavlink.MAV_TYPE_HEXAROTOR,
+        mavlink.MAV_TYPE_OCTOROTOR, mavlink.MAV_TYPE_TRICOPTER, mavlink.MAV_TYPE_DODECAROTOR, mavlink.MAV_TYPE_DECAROTOR, mavlink.MAV_TYPE_GENERIC_MULTIROTOR,
     }
 )  # fmt: skip
 """What no camera or gimbal says that it is."""
@@ -41,13 +41,13 @@ def tells_vehicle(message: Message) -> bool:
 
     Components beside it should say that they have no autopilot, and some do not.
     """
-    return _tells_autopilot(message) and message.compid == MAV_COMPONENT.AUTOPILOT1
+    return _tells_autopilot(message) and message.compid == mavlink.MAV_COMP_ID_AUTOPILOT1
 
 
 def _tells_autopilot(message: Message) -> bool:
     return (
         message.name == "HEARTBEAT"
-        and message.integer("autopilot") != MAV_AUTOPILOT.INVALID
+        and message.integer("autopilot") != mavlink.MAV_AUTOPILOT_INVALID
         and message.integer("type") not in _NO_VEHICLES
     )
 
@@ -197,7 +197,7 @@ class Neighbours:
 
     def _note_misplaced(self, message: Message) -> None:
         told = _tells_autopilot(message) and message.integer("type") in _VEHICLES
-        if told and (message.sysid, MAV_COMPONENT.AUTOPILOT1) not in self._heard:
+        if told and (message.sysid, mavlink.MAV_COMP_ID_AUTOPILOT1) not in self._heard:
             where = f"component {message.compid} of MAVLink system {message.sysid}"
             self._wait(f"an autopilot is heard as {where}, and only component 1 (MAV_COMP_ID_AUTOPILOT1) counts as one")
 
@@ -208,4 +208,4 @@ class Neighbours:
 
 
 def _armed(message: Message) -> bool:
-    return bool(message.integer("base_mode") & MAV_MODE_FLAG.SAFETY_ARMED)
+    return bool(message.integer("base_mode") & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)

@@ -7,8 +7,8 @@ import math
 from collections.abc import Callable, Iterable
 from typing import Protocol
 
-from fractus_mavlink import Message, message
-from fractus_mavlink.enums import MAV_PARAM_TYPE
+from fractus_runtime.mavlink_codec import Message, message
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_services.errors import AutopilotError
 
@@ -147,7 +147,7 @@ class Parameters:
                         "PARAM_SET",
                         param_id=name.encode(),
                         param_value=value,
-                        param_type=MAV_PARAM_TYPE.REAL32,
+                        param_type=mavlink.MAV_PARAM_TYPE_REAL32,
                         **self._link.recipient(),
                     )
                 )

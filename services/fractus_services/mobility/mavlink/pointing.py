@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import Protocol
 
-from fractus_mavlink import layout_named
-from fractus_mavlink.enums import MAV_CMD
+from fractus_runtime.mavlink_codec import message_id
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_services.errors import AutopilotError, PreconditionFailed
 from fractus_services.mobility.autopilot import Permit
@@ -20,7 +20,7 @@ class Commander(Protocol):
 
     vehicle: Vehicle
 
-    async def command(self, command: MAV_CMD, *params: float, permit: Permit = ..., attempts: int = ...) -> None:
+    async def command(self, command: int, *params: float, permit: Permit = ..., attempts: int = ...) -> None:
         """Run a MAVLink command and wait for its acknowledgement."""
 
 
@@ -40,7 +40,7 @@ async def point(autopilot: Commander, pitch_deg: float, yaw_deg: float, permit: 
     vehicle = autopilot.vehicle
     if vehicle.gimbal_limits is None:
         try:
-            await autopilot.command(MAV_CMD.REQUEST_MESSAGE, layout_named(_INFORMATION).msgid, attempts=2)
+            await autopilot.command(mavlink.MAV_CMD_REQUEST_MESSAGE, message_id(_INFORMATION), attempts=2)
         except AutopilotError as error:
             if error.link:
                 raise
@@ -51,7 +51,7 @@ async def point(autopilot: Commander, pitch_deg: float, yaw_deg: float, permit: 
     try:
         # NaN: no rates. The fifth parameter has the flags, none of which locks the yaw; the seventh the first gimbal.
         await autopilot.command(
-            MAV_CMD.DO_GIMBAL_MANAGER_PITCHYAW, pitch_deg, yaw_deg, math.nan, math.nan, permit=permit
+            mavlink.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW, pitch_deg, yaw_deg, math.nan, math.nan, permit=permit
         )
     except AutopilotError as error:
         if not error.refused:

@@ -14,9 +14,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar
 
-from fractus_mavlink import Endpoint, Message, message
-from fractus_mavlink.enums import MAV_MODE_FLAG, MAV_STATE
 from fractus_runtime.files import remove_file, write_file
+from fractus_runtime.mavlink_codec import Endpoint, Message, message
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_services.mobility.mavlink.companion import COMPONENT_ID, SYSTEM_ID, heartbeat
 from fractus_services.mobility.mavlink.neighbours import Source, remembered
@@ -144,6 +144,6 @@ class _Speaker:
 def _flies_soundly(told: Message) -> bool:
     """Whether a vehicle flies, by its heartbeat, and none of its failsafes acts: a heartbeat would hide that from the service."""
     return (
-        bool(told.integer("base_mode") & MAV_MODE_FLAG.SAFETY_ARMED)
-        and told.integer("system_status") == MAV_STATE.ACTIVE
+        bool(told.integer("base_mode") & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+        and told.integer("system_status") == mavlink.MAV_STATE_ACTIVE
     )

@@ -7,8 +7,8 @@ import math
 from collections import Counter
 from typing import Protocol
 
-from fractus_mavlink import layout_named
-from fractus_mavlink.enums import MAV_CMD
+from fractus_runtime.mavlink_codec import message_id
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_services.errors import AutopilotError
 
@@ -53,7 +53,7 @@ class Commander(Protocol):
     def now(self) -> float:
         """Monotonic seconds."""
 
-    async def command(self, command: MAV_CMD, *params: float, attempts: int = ...) -> None:
+    async def command(self, command: int, *params: float, attempts: int = ...) -> None:
         """Run a MAVLink command and wait for its acknowledgement."""
 
 
@@ -95,7 +95,7 @@ class Streams:
         for name, rates in STREAMS.items():
             try:
                 interval_us = 1e6 / rates[flying]
-                await autopilot.command(MAV_CMD.SET_MESSAGE_INTERVAL, layout_named(name).msgid, interval_us, attempts=2)
+                await autopilot.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id(name), interval_us, attempts=2)
                 self._accepted.add(name)
             except AutopilotError as error:
                 if error.link and self._flying is flying:

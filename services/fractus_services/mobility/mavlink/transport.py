@@ -13,7 +13,7 @@ import tty
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from fractus_mavlink import Parser
+from fractus_runtime.mavlink_codec import Parser
 
 from fractus_services.mobility.mavlink.neighbours import tells_vehicle
 

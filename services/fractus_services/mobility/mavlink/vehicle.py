@@ -6,14 +6,8 @@ import math
 from dataclasses import dataclass, field
 
 from fractus_core.policy.decision_types import Home
-from fractus_mavlink import Message
-from fractus_mavlink.enums import (
-    EKF_STATUS_FLAGS,
-    GPS_FIX_TYPE,
-    MAV_MODE_FLAG,
-    MAV_STATE,
-    MAV_SYS_STATUS_SENSOR,
-)
+from fractus_runtime.mavlink_codec import Message
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_services.mobility.autopilot import COURSE_S, DEFAULT_ERROR_M, VehicleState
 from fractus_services.mobility.mavlink.flight_stack import FlightStack
@@ -23,7 +17,7 @@ _UNKNOWN_U8 = 0xFF
 _UNKNOWN_U16 = 0xFFFF
 """What 8 and 16 bits say of a value that is not known."""
 
-_POSITIONED = EKF_STATUS_FLAGS.POS_HORIZ_ABS | EKF_STATUS_FLAGS.PRED_POS_HORIZ_ABS
+_POSITIONED = mavlink.EKF_POS_HORIZ_ABS | mavlink.EKF_PRED_POS_HORIZ_ABS
 
 MIN_ERROR_M, MAX_ERROR_M = 0.5, 10.0
 """A GPS that says it is better is not believed; one that is worse gives no position."""
@@ -81,7 +75,7 @@ def _heartbeat(vehicle: Vehicle, message: Message, now: float) -> None:
     vehicle.silent_s = now - vehicle.heartbeat_at if math.isfinite(vehicle.heartbeat_at) else 0.0
     vehicle.heartbeat_at = now
     vehicle.foreign = vehicle.stack.foreign(message.integer("type"), message.integer("autopilot"))
-    armed = bool(message.integer("base_mode") & MAV_MODE_FLAG.SAFETY_ARMED)
+    armed = bool(message.integer("base_mode") & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
     # Those from before the start may come late, or once more, and have no time stamp. Taken for true, they make the next one tell
     # of motors that others have started.
     flies = vehicle.in_air or now - vehicle.started_at < STARTED_S
@@ -96,7 +90,7 @@ def _heartbeat(vehicle: Vehicle, message: Message, now: float) -> None:
         vehicle.started_at = now
     vehicle.armed = armed
     vehicle.path_lost = vehicle.path_lost and vehicle.armed
-    vehicle.failsafe = message.integer("system_status") in {MAV_STATE.CRITICAL, MAV_STATE.EMERGENCY}
+    vehicle.failsafe = message.integer("system_status") in {mavlink.MAV_STATE_CRITICAL, mavlink.MAV_STATE_EMERGENCY}
 
 
 def _place(lat_e7: int, lon_e7: int) -> tuple[float, float] | None:
@@ -183,10 +177,10 @@ def _status(vehicle: Vehicle, message: Message, now: float) -> None:
     vehicle.battery_remaining = percent / 100 if percent >= 0 else math.nan
     vehicle.battery_v = millivolts / 1e3 if millivolts != _UNKNOWN_U16 else math.nan
     vehicle.battery_a = centiamperes / 100 if centiamperes >= 0 else math.nan
-    present = message.integer("onboard_control_sensors_present") & MAV_SYS_STATUS_SENSOR.PREARM_CHECK
-    healthy = message.integer("onboard_control_sensors_health") & MAV_SYS_STATUS_SENSOR.PREARM_CHECK
-    vehicle.ready = bool(healthy) if present else vehicle.fix_type >= GPS_FIX_TYPE.TYPE_3D_FIX
-    fence = MAV_SYS_STATUS_SENSOR.GEOFENCE
+    present = message.integer("onboard_control_sensors_present") & mavlink.MAV_SYS_STATUS_PREARM_CHECK
+    healthy = message.integer("onboard_control_sensors_health") & mavlink.MAV_SYS_STATUS_PREARM_CHECK
+    vehicle.ready = bool(healthy) if present else vehicle.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX
+    fence = mavlink.MAV_SYS_STATUS_GEOFENCE
     has_fence = message.integer("onboard_control_sensors_present") & fence
     vehicle.fenced = bool(message.integer("onboard_control_sensors_enabled") & fence) if has_fence else None
     vehicle.checks_at = now
@@ -210,7 +204,7 @@ def _gps(vehicle: Vehicle, message: Message, now: float) -> None:
     satellites = message.integer("satellites_visible")
     vehicle.satellites = satellites if satellites != _UNKNOWN_U8 else 0
     error = accuracy_mm / 1e3 if accuracy_mm else DEFAULT_ERROR_M
-    vehicle.located = vehicle.fix_type >= GPS_FIX_TYPE.TYPE_3D_FIX and error <= MAX_ERROR_M
+    vehicle.located = vehicle.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX and error <= MAX_ERROR_M
     if vehicle.located:
         vehicle.position_error_m = max(error, MIN_ERROR_M)
 

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from fractus_cli.tlog_tail import split
-from fractus_mavlink import Message, Parser
-from fractus_mavlink.enums import COPTER_MODE, MAV_COMPONENT, MAV_MODE_FLAG
 from fractus_runtime.audit_chain import entries
+from fractus_runtime.mavlink_codec import Message, Parser, enum_names
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_sim.experiment.station import FLYING_STATES
 from fractus_sim.report.track import Place, Sample, Track
@@ -133,12 +133,12 @@ def _flight(path: Path) -> tuple[tuple[Sample, ...], _Clock, list[str]]:
     clock, samples, texts = _Clock(), list[Sample](), list[str]()
     mode, armed, landed, battery = "", False, 0, 1.0
     for unix_s, message in _frames(path):
-        if message.compid != MAV_COMPONENT.AUTOPILOT1:
+        if message.compid != mavlink.MAV_COMP_ID_AUTOPILOT1:
             continue
         if message.name == "HEARTBEAT":
             number = message.integer("custom_mode")
-            mode = COPTER_MODE(number).name if number in set(COPTER_MODE) else f"MODE {number}"
-            armed = bool(message.integer("base_mode") & MAV_MODE_FLAG.SAFETY_ARMED)
+            mode = enum_names("COPTER_MODE").get(number, f"MODE {number}")
+            armed = bool(message.integer("base_mode") & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
         elif message.name == "EXTENDED_SYS_STATE":
             landed = message.integer("landed_state")
         elif message.name == "SYS_STATUS":

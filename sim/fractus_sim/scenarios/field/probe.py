@@ -6,9 +6,9 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from fractus_mavlink import Endpoint, Message, Value, layout_named
-from fractus_mavlink.enums import GPS_FIX_TYPE, MAV_AUTOPILOT, MAV_CMD, MAV_COMPONENT, MAV_MODE_FLAG
 from fractus_radio.follower import parse_address
+from fractus_runtime.mavlink_codec import Endpoint, Message, Value, message_id
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_sim.experiment.errors import ExperimentError
 from fractus_sim.experiment.station import OBSERVER_ID, STATION_COMPONENT, TcpLink
@@ -50,17 +50,17 @@ def look(link: str, tell: Callable[[str], None]) -> ParkedVehicle:
     visitor = _Visitor(TcpLink.connect(host, port, CONNECT_S))
     try:
         heartbeat = visitor.wait(
-            lambda m: m.name == "HEARTBEAT" and m.compid == MAV_COMPONENT.AUTOPILOT1, HEARTBEAT_S, "no heartbeat"
+            lambda m: m.name == "HEARTBEAT" and m.compid == mavlink.MAV_COMP_ID_AUTOPILOT1, HEARTBEAT_S, "no heartbeat"
         )
-        if heartbeat.integer("autopilot") != MAV_AUTOPILOT.ARDUPILOTMEGA:
+        if heartbeat.integer("autopilot") != mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA:
             raise ExperimentError(f"the autopilot at {link} is no ArduPilot")
-        if heartbeat.integer("base_mode") & MAV_MODE_FLAG.SAFETY_ARMED:
+        if heartbeat.integer("base_mode") & mavlink.MAV_MODE_FLAG_SAFETY_ARMED:
             raise ExperimentError(f"the vehicle at {link} is armed; land and disarm it first")
         visitor.system_id = heartbeat.sysid
         tell(f"vehicle {heartbeat.sysid} at {link}; waiting for its position")
         visitor.ask("GPS_RAW_INT")
         visitor.wait(
-            lambda m: m.name == "GPS_RAW_INT" and m.integer("fix_type") >= GPS_FIX_TYPE.TYPE_3D_FIX,
+            lambda m: m.name == "GPS_RAW_INT" and m.integer("fix_type") >= mavlink.GPS_FIX_TYPE_3D_FIX,
             READY_S,
             "no GPS fix",
             "GPS_RAW_INT",
@@ -82,7 +82,7 @@ class _Visitor:
 
     def ask(self, name: str) -> None:
         """Ask for one message of a kind."""
-        values: dict[str, Value] = {"command": int(MAV_CMD.REQUEST_MESSAGE), "param1": float(layout_named(name).msgid)}
+        values: dict[str, Value] = {"command": int(mavlink.MAV_CMD_REQUEST_MESSAGE), "param1": float(message_id(name))}
         values |= {"target_system": self.system_id, "target_component": 1}
         self._link.send(self._endpoint.encode("COMMAND_LONG", values))
 

@@ -573,7 +573,7 @@ def _watch(fleet: Fleet, tally: Tally, flown: Flown, pardoned: Flags) -> None:
         if np.abs(fleet.speed[i]).max() < STANDING_MPS:
             continue
         now = fleet.situation(i, told=told)
-        verdict = monitor(now, fleet.scenes[i].grant, bound_for=None if fleet.held[i] else end)
+        verdict = monitor(now, fleet.scenes[i].grant, current_leg=None if fleet.held[i] else end)
         if verdict is None:
             continue
         del flown[i]

@@ -56,7 +56,7 @@ def test_a_zone_that_appears_while_a_drone_speeds_up_stops_it_in_time(appears_s:
     while True:
         x, y, z = fleet.place[0]
         now = at(x, y, z, north_mps=fleet.speed[0, 1], speed_setpoint_mps=12.0, forward_mps2=fleet.accel[0, 1])
-        verdict = monitor(now, grant, changed=True)
+        verdict = monitor(now, grant, fences_changed=True)
         if verdict is not None:
             break
         assert monitor(now, grant) is None

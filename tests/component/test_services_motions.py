@@ -493,9 +493,9 @@ def changed(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
     """What the monitor is told at each look: whether the drone's way may have been judged by another grant."""
     told: list[bool] = []
 
-    def look(*args: Any, changed: bool, **more: Any) -> Any:
-        told.append(changed)
-        return monitor(*args, changed=changed, **more)
+    def look(*args: Any, fences_changed: bool, **more: Any) -> Any:
+        told.append(fences_changed)
+        return monitor(*args, fences_changed=fences_changed, **more)
 
     monkeypatch.setattr(monitoring, "monitor", look)
     return told

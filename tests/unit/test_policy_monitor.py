@@ -89,19 +89,19 @@ def test_what_the_system_flies_is_stopped_only_where_it_makes_things_worse() -> 
         (at(0, 55, north_mps=6), out, "InsideExclusionZone"),
         (replace(at(), lat=None), out, "PositionUnknown"),
     ):
-        verdict = monitor(state, grant, leaving=True)
+        verdict = monitor(state, grant, system_flies=True)
         assert verdict is not None
         assert (verdict.action, verdict.code) == ("takeover", code)
     for state, grant in ((at(0, 60), kept), (at(0, 60, north_mps=-6), kept), (at(0, 55, north_mps=-6), out)):
-        assert monitor(state, grant, leaving=True) is None, "it leads back"
+        assert monitor(state, grant, system_flies=True) is None, "it leads back"
         assert monitor(state, grant) is not None
 
 
 def test_a_zone_that_is_left_hides_no_zone_ahead() -> None:
     around, ahead = exclusion(box(-50, -50, 50, 10), "revoke", "around"), exclusion(WALL, "ignore", "ahead")
-    verdict = monitor(at(0, 8, north_mps=12), compiled(around, ahead), leaving=True)
+    verdict = monitor(at(0, 8, north_mps=12), compiled(around, ahead), system_flies=True)
     assert verdict is None
-    verdict = monitor(at(0, 9.5, north_mps=16), compiled(around, ahead), leaving=True)
+    verdict = monitor(at(0, 9.5, north_mps=16), compiled(around, ahead), system_flies=True)
     assert verdict is not None
     assert verdict.policies == ("ahead",)
 
@@ -195,16 +195,16 @@ def test_a_climb_to_an_altitude_that_is_allowed_is_let_pass_though_the_link_is_s
     leg = goto(100, 0, 16.0).args
     assert isinstance(leg, GotoArgs)
     climbing = at(0, 0, 12.0, down_mps=-2.6, latency_s=0.77)
-    assert monitor(climbing, grant, bound_for=leg) is None
+    assert monitor(climbing, grant, current_leg=leg) is None
     assert correction(monitor(climbing, grant)) == "AltitudeAboveLimit"
     past = at(0, 0, 17.5, down_mps=-2.6, latency_s=0.77)
-    assert correction(monitor(past, grant, bound_for=leg)) == "AltitudeAboveLimit", (
+    assert correction(monitor(past, grant, current_leg=leg)) == "AltitudeAboveLimit", (
         "it does not brake for the leg's end"
     )
     higher = goto(100, 0, 12.0).args
     assert isinstance(higher, GotoArgs)
     fast = at(0, 0, 14.5, down_mps=-2.6, latency_s=0.77)
-    assert correction(monitor(fast, grant, bound_for=higher)) == "AltitudeAboveLimit"
+    assert correction(monitor(fast, grant, current_leg=higher)) == "AltitudeAboveLimit"
 
 
 def test_a_leg_that_a_new_zone_crosses_is_stopped_at_once() -> None:
@@ -216,15 +216,15 @@ def test_a_leg_that_a_new_zone_crosses_is_stopped_at_once() -> None:
     flying = at(0, 0, 12.0, east_mps=5.0)
     for action, wanted in (("ignore", ("deny", "hover")), ("returnToLaunch", ("takeover", "returnToLaunch"))):
         ahead = compiled(exclusion(box(100, -20, 140, 20), action))
-        verdict = monitor(flying, ahead, bound_for=leg, changed=True)
+        verdict = monitor(flying, ahead, current_leg=leg, fences_changed=True)
         assert verdict is not None
         assert (verdict.action, verdict.takeover) == wanted
-    assert monitor(flying, ahead, bound_for=short, changed=True) is None, "it ends before the zone"
+    assert monitor(flying, ahead, current_leg=short, fences_changed=True) is None, "it ends before the zone"
     above = compiled(exclusion(box(100, -20, 140, 20), lower=20))
-    assert monitor(flying, above, bound_for=leg, changed=True) is None, "it passes below"
-    assert monitor(flying, above, bound_for=climbing, changed=True) is not None
+    assert monitor(flying, above, current_leg=leg, fences_changed=True) is None, "it passes below"
+    assert monitor(flying, above, current_leg=climbing, fences_changed=True) is not None
     around = compiled(exclusion(box(-20, -20, 20, 20)))
-    assert monitor(flying, around, bound_for=leg, changed=True, leaving=True) is None, "it leads out"
+    assert monitor(flying, around, current_leg=leg, fences_changed=True, system_flies=True) is None, "it leads out"
 
 
 def test_a_climb_that_ends_by_a_velocity_is_let_pass_though_the_link_is_slow() -> None:
@@ -284,12 +284,12 @@ def test_a_climb_to_below_a_zone_is_let_pass_and_so_is_a_landing() -> None:
         climb = min(2.5, math.sqrt(2 * max(16.0 - tenths / 10, 0.05)))
         climbing = at(0, 0, tenths / 10, down_mps=-climb, latency_s=0.77)
         for changed in (False, True):
-            assert monitor(climbing, grant, bound_for=leg, changed=changed) is None
-    assert monitor(at(0, 0, 13.0, down_mps=-2.0), compiled(exclusion(AROUND, lower=15)), bound_for=leg) is not None
+            assert monitor(climbing, grant, current_leg=leg, fences_changed=changed) is None
+    assert monitor(at(0, 0, 13.0, down_mps=-2.0), compiled(exclusion(AROUND, lower=15)), current_leg=leg) is not None
     below = compiled(exclusion(AROUND, upper=10))
     landing = at(0, 0, 12.0, down_mps=1.5)
     assert monitor(landing, below) is not None
-    assert monitor(replace(landing, vertical=True), below, leaving=True) is None
+    assert monitor(replace(landing, vertical=True), below, system_flies=True) is None
 
 
 def correction(verdict: Verdict | None) -> str:
@@ -300,9 +300,9 @@ def correction(verdict: Verdict | None) -> str:
 def test_a_climb_that_was_never_judged_is_ended_with_half_the_slack_left() -> None:
     grant = compiled(altitude(upperLimit=10))
     climbing = at(0, 0, 10.8, down_mps=-0.7)
-    assert correction(monitor(climbing, grant, leaving=True)) == "AltitudeAboveLimit"
+    assert correction(monitor(climbing, grant, system_flies=True)) == "AltitudeAboveLimit"
     assert monitor(climbing, grant) is None, "the driver's, which was judged"
     leg = goto(0, 50, 10.0).args
     assert isinstance(leg, GotoArgs)
-    assert monitor(climbing, grant, leaving=True, bound_for=leg) is None, "the system's own leg"
-    assert monitor(at(0, 0, 11.4, down_mps=-0.1), grant, leaving=True) is None, "it holds its height"
+    assert monitor(climbing, grant, system_flies=True, current_leg=leg) is None, "the system's own leg"
+    assert monitor(at(0, 0, 11.4, down_mps=-0.1), grant, system_flies=True) is None, "it holds its height"

@@ -73,10 +73,10 @@ def _polygon(frame: LocalFrame, spec: Polygon) -> shapely.Polygon:
         if not exterior.covers(ring):
             raise InvalidObject(f"polygon.holes[{i}]", "the hole must lie inside the exterior")
         holes.append(ring.exterior.coords)
-    whole = shapely.Polygon(exterior.exterior.coords, holes)
-    if not whole.is_valid:
-        raise InvalidObject("polygon.holes", f"holes must not cross each other ({shapely.is_valid_reason(whole)})")
-    return whole
+    shape = shapely.Polygon(exterior.exterior.coords, holes)
+    if not shape.is_valid:
+        raise InvalidObject("polygon.holes", f"holes must not cross each other ({shapely.is_valid_reason(shape)})")
+    return shape
 
 
 def _ring(frame: LocalFrame, ring: Sequence[Point], field: str) -> shapely.Polygon:
@@ -199,10 +199,10 @@ def line_geojson(points: Sequence[Point]) -> dict[str, Any]:
     return {"type": "MultiLineString", "coordinates": coordinates}
 
 
-def _cut(whole: BaseGeometry) -> Iterator[BaseGeometry]:
+def _cut(shape: BaseGeometry) -> Iterator[BaseGeometry]:
     """Yield the parts of a shape that crosses the antimeridian, each with longitudes from -180 to 180."""
     for shift in (0.0, 360.0, -360.0):
-        moved = shapely.transform(whole, lambda c, s=shift: c + np.array([s, 0.0]))
+        moved = shapely.transform(shape, lambda c, s=shift: c + np.array([s, 0.0]))
         yield from shapely.get_parts(moved.intersection(shapely.box(-180.0, -90.0, 180.0, 90.0)))
 
 
@@ -285,15 +285,19 @@ def count_crossings(lines: Sequence[Line], at_most: int) -> int:
     ends = np.concatenate([line[1:] for line in lines]) if lines else np.empty((0, 2))
     pieces = shapely.linestrings(np.stack([starts, ends], axis=1)) if len(starts) else np.empty(0, dtype=object)
     tree = shapely.STRtree(pieces)
-    found = looked_at = 0
+    count = looked_at = 0
     for first in range(0, len(pieces), _AT_ONCE):
-        one, other = tree.query(pieces[first : first + _AT_ONCE])
-        one, other = one[other > one + first] + first, other[other > one + first]
-        looked_at += len(one)
-        found += int(np.count_nonzero(_cross(starts[one], ends[one], starts[other], ends[other])))
-        if found > at_most or looked_at > _MAX_PAIRS:
+        first_index, second_index = tree.query(pieces[first : first + _AT_ONCE])
+        later = second_index > first_index + first
+        first_index = first_index[later] + first
+        second_index = second_index[later]
+        looked_at += len(first_index)
+        count += int(
+            np.count_nonzero(_cross(starts[first_index], ends[first_index], starts[second_index], ends[second_index]))
+        )
+        if count > at_most or looked_at > _MAX_PAIRS:
             return at_most + 1
-    return found
+    return count
 
 
 def _cross(a: Line, b: Line, c: Line, d: Line) -> npt.NDArray[np.bool_]:
@@ -307,5 +311,6 @@ def _cross(a: Line, b: Line, c: Line, d: Line) -> npt.NDArray[np.bool_]:
 
 def _side(start: Line, end: Line, place: Line) -> npt.NDArray[np.float64]:
     """Return the side of the line from start to end on which a place is: positive on the left."""
-    way, there = end - start, place - start
-    return np.sign(way[:, 0] * there[:, 1] - way[:, 1] * there[:, 0])
+    direction = end - start
+    offset = place - start
+    return np.sign(direction[:, 0] * offset[:, 1] - direction[:, 1] * offset[:, 0])

@@ -15,7 +15,8 @@ from fractus_core.api.geometry import Point
 SEMI_MAJOR_AXIS_M = 6_378_137.0
 FLATTENING = 1 / 298.257223563
 _E2 = FLATTENING * (2 - FLATTENING)
-_PER_A2, _PER_B2 = SEMI_MAJOR_AXIS_M**-2, (SEMI_MAJOR_AXIS_M * (1 - FLATTENING)) ** -2
+_PER_A2 = SEMI_MAJOR_AXIS_M**-2
+_PER_B2 = (SEMI_MAJOR_AXIS_M * (1 - FLATTENING)) ** -2
 
 CHORDS_TO_M = 200_000.0
 """Up to this distance, geodesic distances are computed from chords, beyond it by Karney's algorithm."""
@@ -39,15 +40,18 @@ def distance_m(a: Point, b: Point) -> float:
     curvature along it. Beyond 200 km the function calls `geodesic_m`.
     """
     (ax, ay, az), (bx, by, bz) = ecef(a.lat, a.lon), ecef(b.lat, b.lon)
-    across, up = (bx - ax) ** 2 + (by - ay) ** 2, (bz - az) ** 2
+    across = (bx - ax) ** 2 + (by - ay) ** 2
+    up = (bz - az) ** 2
     chord = math.sqrt(across + up)
     if chord > CHORDS_TO_M:
         return geodesic_m(a, b)
     if chord < 1e-9:
         return chord
     equator, pole = SEMI_MAJOR_AXIS_M**-2, (SEMI_MAJOR_AXIS_M * (1 - FLATTENING)) ** -2
-    middle, height = ((ax + bx) ** 2 + (ay + by) ** 2) / 4, (az + bz) ** 2 / 4
-    depth, slope = middle * equator + height * pole, middle * equator**2 + height * pole**2
+    middle = ((ax + bx) ** 2 + (ay + by) ** 2) / 4
+    height = (az + bz) ** 2 / 4
+    depth = middle * equator + height * pole
+    slope = middle * equator**2 + height * pole**2
     bend = (across * equator + up * pole) / chord**2 * math.sqrt(depth / slope)
     return 2 / bend * math.asin(chord * bend / 2)
 
@@ -81,8 +85,10 @@ class LocalFrame:
         self.lat = lat
         self.lon = lon
         phi, lam = math.radians(lat), math.radians(lon)
-        self._sin_lat, self._cos_lat = math.sin(phi), math.cos(phi)
-        self._sin_lon, self._cos_lon = math.sin(lam), math.cos(lam)
+        self._sin_lat = math.sin(phi)
+        self._cos_lat = math.cos(phi)
+        self._sin_lon = math.sin(lam)
+        self._cos_lon = math.cos(lam)
         self._origin = ecef(lat, lon)
         self._up = (self._cos_lat * self._cos_lon, self._cos_lat * self._sin_lon, self._sin_lat)
 

@@ -198,15 +198,15 @@ def compile_grant(spec: GrantSpec, origin: Point | None = None, flat_terrain: bo
         InvalidObject: An area of the grant has an invalid geometry.
     """
     frame = LocalFrame.at(origin or _origin(spec))
-    zoned = [(_rule(policy), policy) for policy in spec.policies]
+    policies = [(_rule(policy), policy) for policy in spec.policies]
     methods = frozenset().union(*(spec.methods(service) for service in METHODS_OF))
     operation_area = _union(frame, spec.operation_area)
     return_area = operation_area
     if operation_area is not None and spec.corridor:
         return_area = shapely.union(operation_area, _union(frame, spec.corridor))
     flight_area = operation_area if spec.control == "partial" else return_area
-    exclusions = _index(frame, zoned, "GeofenceControl", "exclusion")
-    inclusions = tuple(_inclusion(frame, r, p) for r, p in zoned if p.spec.kind == "inclusion")
+    exclusions = _index(frame, policies, "GeofenceControl", "exclusion")
+    inclusions = tuple(_inclusion(frame, r, p) for r, p in policies if p.spec.kind == "inclusion")
     fences = (*exclusions.zones, *(zone for fence in inclusions for zone in fence.zones))
     return CompiledGrant(
         identity=spec.identity,
@@ -215,13 +215,13 @@ def compile_grant(spec: GrantSpec, origin: Point | None = None, flat_terrain: bo
         driver=spec.class_ == "driver",
         max_altitude_m=spec.limits.max_altitude if spec.limits else None,
         max_speed_mps=spec.limits.max_speed if spec.limits else None,
-        denials=_by_method(frame, zoned, "denial", methods),
-        allowances=_by_method(frame, zoned, "grant", methods),
-        altitude_limits=_index(frame, zoned, "LimitControl", "altitude"),
-        speed_limits=_index(frame, zoned, "LimitControl", "speed"),
+        denials=_by_method(frame, policies, "denial", methods),
+        allowances=_by_method(frame, policies, "grant", methods),
+        altitude_limits=_index(frame, policies, "LimitControl", "altitude"),
+        speed_limits=_index(frame, policies, "LimitControl", "speed"),
         exclusions=exclusions,
         inclusions=inclusions,
-        privacy=_index(frame, zoned, "PrivacyControl", "camera"),
+        privacy=_index(frame, policies, "PrivacyControl", "camera"),
         operation_area=operation_area,
         operation_area_border=_prepared(operation_area.boundary) if operation_area is not None else None,
         flight_area=_prepared(flight_area) if flight_area is not None else None,
@@ -239,8 +239,8 @@ def compile_transit_grant(spec: GrantSpec, origin: Point | None = None, flat_ter
     It has the application's fences and limits, every method of the mobility service, and an operation area that
     includes the corridor.
     """
-    own = ServiceRequest(service="mobility", methods=MOBILITY_METHODS)
-    system = spec.model_copy(update={"services": (own,), "control": "full"})
+    mobility = ServiceRequest(service="mobility", methods=MOBILITY_METHODS)
+    system = spec.model_copy(update={"services": (mobility,), "control": "full"})
     grant = compile_grant(system, origin, flat_terrain)
     return replace(grant, operation_area=grant.flight_area, operation_area_border=grant.flight_area_border)
 
@@ -319,27 +319,31 @@ def _same_side(frame: LocalFrame, point: Point) -> bool:
 
 
 def _index(
-    frame: LocalFrame, zoned: list[tuple[Rule, GrantedPolicy]], kind: str, which: str, method: str | None = None
+    frame: LocalFrame,
+    policies: list[tuple[Rule, GrantedPolicy]],
+    kind: str,
+    policy_kind: str,
+    method: str | None = None,
 ) -> PolicyIndex:
-    chosen = [
+    matching = [
         (rule, policy)
-        for rule, policy in zoned
-        if rule.spec.type == kind and rule.spec.kind == which and (method is None or method in rule.spec.methods)
+        for rule, policy in policies
+        if rule.spec.type == kind and rule.spec.kind == policy_kind and (method is None or method in rule.spec.methods)
     ]
     return PolicyIndex(
-        [zone for rule, policy in chosen for zone in _policy_zones(frame, rule, policy)],
-        [rule for rule, policy in chosen if not policy.zones],
+        [zone for rule, policy in matching for zone in _policy_zones(frame, rule, policy)],
+        [rule for rule, policy in matching if not policy.zones],
     )
 
 
 def _by_method(
     frame: LocalFrame,
-    zoned: list[tuple[Rule, GrantedPolicy]],
-    which: Literal["grant", "denial"],
+    policies: list[tuple[Rule, GrantedPolicy]],
+    policy_kind: Literal["grant", "denial"],
     methods: frozenset[str],
 ) -> dict[str, PolicyIndex]:
-    named = {m for rule, _ in zoned if rule.spec.kind == which for m in rule.spec.methods} & methods
-    return {method: _index(frame, zoned, "AccessControl", which, method) for method in sorted(named)}
+    named = {m for rule, _ in policies if rule.spec.kind == policy_kind for m in rule.spec.methods} & methods
+    return {method: _index(frame, policies, "AccessControl", policy_kind, method) for method in sorted(named)}
 
 
 def _inclusion(frame: LocalFrame, rule: Rule, policy: GrantedPolicy) -> Inclusion:

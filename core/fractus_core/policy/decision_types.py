@@ -352,7 +352,7 @@ def deny(code: str, reason: str, policies: tuple[str, ...] = ()) -> Verdict:
     return Verdict("deny", None, code, reason, policies)
 
 
-POSITION_UNKNOWN = deny(
+DENY_POSITION_UNKNOWN = deny(
     "PositionUnknown",
     "the drone's position is unknown: no recent fix, the delay of its link is not measured yet, or another station moved"
     " its home; wait until it is ready",

@@ -154,13 +154,13 @@ def judge_denials(method: str, now: Situation, grant: CompiledGrant) -> Verdict 
 def _outside_operation_area(method: str, now: Situation, grant: CompiledGrant) -> Verdict | None:
     if now.lat is None or now.lon is None:
         return deny("PositionUnknown", f"{method} needs a known position; wait for a fix")
-    here = shapely.points(grant.frame.xy(now.lat, now.lon))
-    if grant.operation_area is None or grant.operation_area.covers(here):
+    position = shapely.points(grant.frame.xy(now.lat, now.lon))
+    if grant.operation_area is None or grant.operation_area.covers(position):
         return None
-    away_m = grant.operation_area.distance(here)
+    distance_m = grant.operation_area.distance(position)
     return deny(
         "OutsideOperationArea",
-        f"{method} is granted inside the operation area, which is {format_distance(away_m)} away",
+        f"{method} is granted inside the operation area, which is {format_distance(distance_m)} away",
         (OPERATION_AREA,),
     )
 
@@ -183,18 +183,18 @@ def _matching(
 
     While the position is unknown, every policy in force counts. With `certain`, only policies without zones do.
     """
-    found = {rule.name: rule for rule in index.everywhere if rule.in_force(now.time_s)}
+    rules = {rule.name: rule for rule in index.everywhere if rule.in_force(now.time_s)}
     if now.lat is None or now.lon is None:
         if not certain:
-            found |= {p.rule.name: p.rule for p in index.zones if p.in_force(now.time_s)}
-        return by_priority(found)
+            rules |= {p.rule.name: p.rule for p in index.zones if p.in_force(now.time_s)}
+        return by_priority(rules)
     if index.zones:
-        here = shapely.points(grant.frame.xy(now.lat, now.lon))
+        position = shapely.points(grant.frame.xy(now.lat, now.lon))
         slack_m = 0.0 if certain else now.altitude_error_m
-        air = AirVolume(here, distance_m, now.altitude_m - slack_m, now.altitude_m + slack_m)
+        air = AirVolume(position, distance_m, now.altitude_m - slack_m, now.altitude_m + slack_m)
         for zone in index.near(air, now, grant.flat_terrain):
-            found[zone.rule.name] = zone.rule
-    return by_priority(found)
+            rules[zone.rule.name] = zone.rule
+    return by_priority(rules)
 
 
 # Arguments
@@ -204,9 +204,9 @@ def _check_arguments(call: Call) -> Verdict | None:
     expected = _ARGS.get(call.method)
     if expected is not None and not isinstance(call.args, expected):
         return deny("InvalidArgument", f"{call.method} needs its arguments")
-    for what, value, lower, upper, unit in _figures(call):
+    for name, value, lower, upper, unit in _figures(call):
         if value is not None and not (math.isfinite(value) and lower <= value <= upper):
-            return deny("InvalidArgument", f"{what} must be {lower:g} to {upper:g} {unit}, not {value:g}")
+            return deny("InvalidArgument", f"{name} must be {lower:g} to {upper:g} {unit}, not {value:g}")
     return None
 
 

@@ -102,31 +102,31 @@ def footprint(now: Situation, frame: LocalFrame) -> Footprint | None:
     """
     if now.lat is None or now.lon is None or not now.is_plausible:
         return None
-    at = frame.xy(now.lat, now.lon)
+    position = frame.xy(now.lat, now.lon)
     attitude = _attitude(now)
     if now.lens is None or attitude is None:
-        return _everything(at, now)
-    half = _widened(now.lens, now.lens.error_deg + (0.0 if now.lens.stabilised else attitude.tilt_error_deg))
-    if half is None:
-        return _everything(at, now)
+        return _everything(position, now)
+    half_view = _widened(now.lens, now.lens.error_deg + (0.0 if now.lens.stabilised else attitude.tilt_error_deg))
+    if half_view is None:
+        return _everything(position, now)
     axis, right, up = camera_axes(now.lens, attitude)
     corners = [
         (
-            axis[0] + sx * half[0] * right[0] + sy * half[1] * up[0],
-            axis[1] + sx * half[0] * right[1] + sy * half[1] * up[1],
-            axis[2] + sx * half[0] * right[2] + sy * half[1] * up[2],
+            axis[0] + sx * half_view[0] * right[0] + sy * half_view[1] * up[0],
+            axis[1] + sx * half_view[0] * right[1] + sy * half_view[1] * up[1],
+            axis[2] + sx * half_view[0] * right[2] + sy * half_view[1] * up[2],
         )
         for sx, sy in ((1, 1), (1, -1), (-1, -1), (-1, 1))
     ]
     high = max(now.altitude_m + now.altitude_error_m + now.relief_m, 0.1)
     if any(down * MAX_SIGHT_M <= high * math.hypot(north, east, down) for north, east, down in corners):
-        vertical = _sees_vertical(axis, right, up, half)
-        return _everything(at, now) if vertical else _sector(at, now, axis, corners, attitude.yaw_error_deg)
+        vertical = _sees_vertical(axis, right, up, half_view)
+        return _everything(position, now) if vertical else _sector(position, now, axis, corners, attitude.yaw_error_deg)
     below = _turned([(east / down, north / down) for north, east, down in corners], attitude.yaw_error_deg)
-    sight = _hull([at, *((at[0] + e * high, at[1] + n * high) for e, n in below)])
+    sight = _hull([position, *((position[0] + e * high, position[1] + n * high) for e, n in below)])
     farthest_m = high * max(math.hypot(north, east, down) / down for north, east, down in corners)
     low = max(now.altitude_m - now.altitude_error_m, 0.0)
-    return Footprint(sight, now.position_error_m, high - now.relief_m, farthest_m, at, tuple(below), low, high)
+    return Footprint(sight, now.position_error_m, high - now.relief_m, farthest_m, position, tuple(below), low, high)
 
 
 def _attitude(now: Situation) -> Attitude | None:
@@ -138,8 +138,8 @@ def _attitude(now: Situation) -> Attitude | None:
     return now.attitude
 
 
-def _everything(at: XY, now: Situation) -> Footprint:
-    x, y = at
+def _everything(position: XY, now: Situation) -> Footprint:
+    x, y = position
     return Footprint(
         _hull([(x + MAX_SIGHT_M * e, y + MAX_SIGHT_M * n) for e, n in _CIRCLE]),
         now.position_error_m,
@@ -186,24 +186,24 @@ def camera_axes(lens: Lens, attitude: Attitude) -> tuple[Vector, Vector, Vector]
     return turned(axis), turned(right), turned((-down[0], -down[1], -down[2]))
 
 
-def _sees_vertical(axis: Vector, right: Vector, up: Vector, half: tuple[float, float]) -> bool:
+def _sees_vertical(axis: Vector, right: Vector, up: Vector, half_view: tuple[float, float]) -> bool:
     """Return True if straight down or straight up is in the picture."""
     depth = abs(axis[2])
-    return abs(right[2]) <= half[0] * depth and abs(up[2]) <= half[1] * depth
+    return abs(right[2]) <= half_view[0] * depth and abs(up[2]) <= half_view[1] * depth
 
 
-def _sector(at: XY, now: Situation, axis: Vector, corners: list[Vector], error_deg: float) -> Footprint:
+def _sector(position: XY, now: Situation, axis: Vector, corners: list[Vector], error_deg: float) -> Footprint:
     """Return everything within sight between the left and right sides of a picture that shows the horizon."""
     ahead = math.atan2(axis[1], axis[0])
     turns = [math.remainder(math.atan2(east, north) - ahead, 2 * math.pi) for north, east, _ in corners]
     left, right = min(turns) - math.radians(error_deg), max(turns) + math.radians(error_deg)
     if right - left >= math.radians(175):
-        return _everything(at, now)
+        return _everything(position, now)
     steps = math.ceil((right - left) / math.radians(_ARC_DEG))
     step = (right - left) / steps
-    reach_m, (x, y) = MAX_SIGHT_M / math.cos(step / 2), at
+    reach_m, (x, y) = MAX_SIGHT_M / math.cos(step / 2), position
     bearings = [ahead + left + i * step for i in range(steps + 1)]
-    points = [at, *((x + reach_m * math.sin(b), y + reach_m * math.cos(b)) for b in bearings)]
+    points = [position, *((x + reach_m * math.sin(b), y + reach_m * math.cos(b)) for b in bearings)]
     return Footprint(_hull(points), now.position_error_m, math.inf, math.inf)
 
 

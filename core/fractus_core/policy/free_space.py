@@ -58,17 +58,18 @@ class FreeSpace:
 
     def blockers(self, line: BaseGeometry) -> list[PolicyZone | int]:
         """Return the obstacles of a line: zones to keep out of, and indexes of areas to stay in."""
-        slack, flat = self.height_margin_m, self.grant.flat_terrain
+        slack = self.height_margin_m
+        flat = self.grant.flat_terrain
         air = AirVolume(line, self.margin_m, self.lower_m - slack, self.upper_m + slack)
-        found: list[PolicyZone | int] = list(self.grant.exclusions.near(air, self.now, flat))
+        obstacles: list[PolicyZone | int] = list(self.grant.exclusions.near(air, self.now, flat))
         if self.grant.altitude_limits.zones:
             low, high = self.lower_m, self.upper_m
             limiting = self.grant.altitude_limits.near(air, self.now, flat)
-            found += [zone for zone in limiting if limit_forbids_altitudes(zone, low, high, self.now, flat)]
+            obstacles += [zone for zone in limiting if limit_forbids_altitudes(zone, low, high, self.now, flat)]
         for i, (shape, border) in enumerate(self.required_areas):
             if not shape.covers(line) or border.dwithin(line, self.margin_m):
-                found.append(i)
-        return found
+                obstacles.append(i)
+        return obstacles
 
     def allows_leg(self, start: XY, end: XY) -> bool:
         """Return True if the engine permits a leg from or to an end of the route.
@@ -89,7 +90,8 @@ class FreeSpace:
         """Return True if the autopilot's own return from a place is legal."""
         if self.now.airframe.retraces:
             return True
-        margin, slack = self.margin_m, self.height_margin_m
+        margin = self.margin_m
+        slack = self.height_margin_m
         return check_straight_return(place, self.upper_m, self.now, self.grant, margin=margin, slack=slack) is None
 
     def corners(self, obstacle: PolicyZone | int) -> Floats:
@@ -131,7 +133,7 @@ def _corners(shape: BaseGeometry, turning: float) -> Floats:
 
     Direction 1 is left, with the shape on the left.
     """
-    found = [np.empty((0, 6))]
+    corners = [np.empty((0, 6))]
     for part in shapely.get_parts(shape):
         if not isinstance(part, shapely.Polygon) or part.is_empty:
             continue
@@ -141,5 +143,5 @@ def _corners(shape: BaseGeometry, turning: float) -> Floats:
             before, after = np.roll(points, 1, axis=0), np.roll(points, -1, axis=0)
             there, away = points - before, after - points
             turn = there[:, 0] * away[:, 1] - there[:, 1] * away[:, 0]
-            found.append(np.hstack((points, before, after))[turn * turning > 0])
-    return np.vstack(found)
+            corners.append(np.hstack((points, before, after))[turn * turning > 0])
+    return np.vstack(corners)

@@ -71,18 +71,18 @@ def find_breaches(
 ) -> list[Breach]:
     """Return every fence that a leg breaks, most restrictive first."""
     air = AirVolume(leg.ground, margin_m, leg.lower_m - height_margin_m, leg.upper_m + height_margin_m)
-    found = [
+    breaches = [
         *_operation_area(leg, now, grant, margin_m),
         *_exclusions(leg, now, grant, air),
         *_inclusions(leg, now, grant, air),
     ]
-    return sorted(found, key=lambda b: (-b.severity, -b.priority, b.policy))
+    return sorted(breaches, key=lambda b: (-b.severity, -b.priority, b.policy))
 
 
-def breach_verdict(found: list[Breach]) -> Verdict:
+def breach_verdict(breaches: list[Breach]) -> Verdict:
     """Return the verdict on a request that breaks fences, given most restrictive first."""
-    worst = found[0]
-    names = distinct(b.policy for b in found)
+    worst = breaches[0]
+    names = distinct(b.policy for b in breaches)
     takeover = TAKEOVERS[worst.action] if worst.enters else None
     if takeover is None:
         return deny(worst.code, worst.reason, names)
@@ -115,7 +115,8 @@ _EFFECTS: dict[Takeover, str] = exhaustive(
 
 def _operation_area(leg: Leg, now: Situation, grant: CompiledGrant, margin_m: float) -> Iterator[Breach]:
     """Check the fence that every grant implies: fly to the operation area and stay there."""
-    operation_area, border = grant.operation_area, grant.operation_area_border
+    operation_area = grant.operation_area
+    border = grant.operation_area_border
     if operation_area is None or border is None or grant.flight_area is None or grant.flight_area_border is None:
         return
     target = shapely.points(leg.target)
@@ -138,15 +139,17 @@ def _operation_area(leg: Leg, now: Situation, grant: CompiledGrant, margin_m: fl
         yield _area_breach(reason, not inside)
         return
     working = operation_area.covers(leg.braking_path) and not homeward and not outward and not vertical
-    shape, edge = (operation_area, border) if working else (grant.flight_area, grant.flight_area_border)
-    if not _stays_inside(shape, edge, leg, now, margin_m):
+    shape = operation_area if working else grant.flight_area
+    shape_border = border if working else grant.flight_area_border
+    if not _stays_inside(shape, shape_border, leg, now, margin_m):
         reason = f"the leg leaves the {'operation area' if working else 'corridor to the operation area'} or comes within {margin_m:.1f} m of its border"
         yield _area_breach(reason, not shape.covers(leg.ground))
 
 
 def _approaches(leg: Leg, now: Situation, grant: CompiledGrant, operation_area: BaseGeometry) -> bool:
     """Return True if a drone outside the operation area comes closer to it or to its home."""
-    stop, end = shapely.points(leg.stop), shapely.points(leg.target)
+    stop = shapely.points(leg.stop)
+    end = shapely.points(leg.target)
     if operation_area.covers(stop):
         return False
     if operation_area.distance(end) < operation_area.distance(stop):
@@ -164,11 +167,13 @@ def _area_breach(reason: str, enters: bool) -> Breach:
 def _exclusions(leg: Leg, now: Situation, grant: CompiledGrant, air: AirVolume) -> Iterator[Breach]:
     if not grant.exclusions.zones:
         return
-    margin_m, certain = air.margin_m, _certain_way(leg, now)
+    margin_m = air.margin_m
+    certain = _certain_way(leg, now)
     for zone in grant.exclusions.near(air, now, grant.flat_terrain):
         shape = zone.shape
         clearance_m = _clearance_outside(shape, leg.braking_path)
-        level, height_margin_m = _is_level_with(zone, now, grant), leg.lower_m - air.lower_m
+        level = _is_level_with(zone, now, grant)
+        height_margin_m = leg.lower_m - air.lower_m
         if shape.dwithin(certain, margin_m):
             if not level and _leaves_height(zone, leg, now, grant, height_margin_m):
                 continue
@@ -235,13 +240,16 @@ def _leaves_height(zone: PolicyZone, leg: Leg, now: Situation, grant: CompiledGr
 
 
 def _exclusion_breach(zone: PolicyZone, leg: Leg, margin_m: float, enters: bool) -> Breach:
-    shape, name = zone.shape, zone.rule.name
+    shape = zone.shape
+    name = zone.rule.name
     target = shapely.points(leg.target)
     if shape.intersects(target):
         depth_m = shape.boundary.distance(target)
-        code, reason = "InsideExclusionZone", f"the target is {format_distance(depth_m)} inside zone {zone.name}"
+        code = "InsideExclusionZone"
+        reason = f"the target is {format_distance(depth_m)} inside zone {zone.name}"
     elif shape.intersects(leg.ground):
-        code, reason = "LegThroughExclusionZone", _crossing(zone, leg)
+        code = "LegThroughExclusionZone"
+        reason = _crossing(zone, leg)
     else:
         away_m = shape.distance(leg.ground)
         code = "TooCloseToExclusionZone"
@@ -292,14 +300,14 @@ def _inclusion_breach(fence: Inclusion, shape: BaseGeometry, border: BaseGeometr
     target = shapely.points(leg.target)
     zones = ", ".join(dict.fromkeys(p.name for p in fence.zones)) or "its zones"
     if shape.is_empty:
-        code, reason = "OutsideInclusionZone", f"none of {zones} allows this altitude"
+        code = "OutsideInclusionZone"
+        reason = f"none of {zones} allows this altitude"
     elif not shape.covers(target):
-        code, reason = (
-            "OutsideInclusionZone",
-            f"the target is {format_distance(shape.distance(target))} outside {zones}",
-        )
+        code = "OutsideInclusionZone"
+        reason = f"the target is {format_distance(shape.distance(target))} outside {zones}"
     elif not shape.covers(leg.ground):
-        code, reason = "LegOutsideInclusionZone", f"the leg leaves {zones}"
+        code = "LegOutsideInclusionZone"
+        reason = f"the leg leaves {zones}"
     else:
         away_m = border.distance(leg.ground)
         code = "TooCloseToInclusionBorder"
@@ -325,12 +333,12 @@ def _stays_inside(shape: BaseGeometry, border: BaseGeometry, leg: Leg, now: Situ
     ground = leg.ground
     if shape.covers(ground) and not border.dwithin(ground, margin_m):
         return True
-    least = _certain_way(leg, now)
-    if shape.covers(least) and not border.dwithin(least, margin_m):
+    certain_path = _certain_way(leg, now)
+    if shape.covers(certain_path) and not border.dwithin(certain_path, margin_m):
         return False
     if shape.covers(leg.braking_path) and not shape.covers(ground):
         return False
-    if shape.covers(least) and not shape.covers(_from_rest(least, leg)):
+    if shape.covers(certain_path) and not shape.covers(_from_rest(certain_path, leg)):
         return False
 
     def keeps(part: BaseGeometry) -> bool:
@@ -377,15 +385,15 @@ def _gains(leg: Leg, keeps: Callable[[BaseGeometry], bool], clearance: Callable[
     low, high = 0.0, 1.0
     for _ in range(BISECTION_STEPS):
         share = (low + high) / 2
-        kept = keeps(shapely.linestrings(((x + (tx - x) * share, y + (ty - y) * share), (tx, ty))))
-        low, high = (low, share) if kept else (share, high)
-    last = -math.inf
+        keeps_rest = keeps(shapely.linestrings(((x + (tx - x) * share, y + (ty - y) * share), (tx, ty))))
+        low, high = (low, share) if keeps_rest else (share, high)
+    largest_m = -math.inf
     for i in range(_SAMPLES + 1):
         share = high * i / _SAMPLES
-        now = clearance(shapely.points(x + (tx - x) * share, y + (ty - y) * share))
-        if now < last - 1e-6:
+        distance_m = clearance(shapely.points(x + (tx - x) * share, y + (ty - y) * share))
+        if distance_m < largest_m - 1e-6:
             return False
-        last = max(last, now)
+        largest_m = max(largest_m, distance_m)
     return True
 
 

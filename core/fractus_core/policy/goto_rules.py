@@ -9,7 +9,7 @@ import shapely
 
 from fractus_core.policy.altitude import altitude_above_home_m
 from fractus_core.policy.compiled_grant import AirVolume, CompiledGrant
-from fractus_core.policy.decision_types import POSITION_UNKNOWN, Call, GotoArgs, Situation, Verdict, deny, distinct
+from fractus_core.policy.decision_types import DENY_POSITION_UNKNOWN, Call, GotoArgs, Situation, Verdict, deny, distinct
 from fractus_core.policy.geofences import BISECTION_STEPS, Breach, breach_verdict, find_breaches
 from fractus_core.policy.kinematics import (
     XY,
@@ -55,20 +55,21 @@ def judge_goto(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     A moving drone may be unable to begin a leg because its turn is too wide. The leg is then permitted after a stop if
     both the stop and the leg from the point of rest are legal: see `Verdict.brake_first`.
     """
-    args, at = call.args, grant.locate(now)
+    args = call.args
+    position = grant.locate(now)
     if not isinstance(args, GotoArgs):
         return deny("InvalidArgument", "Goto needs its arguments")
-    if at is None:
-        return POSITION_UNKNOWN
+    if position is None:
+        return DENY_POSITION_UNKNOWN
     target = grant.frame.xy(args.lat, args.lon)
-    if not math.dist(target, at) <= MAX_RANGE_M or _beyond(args, grant):
+    if not math.dist(target, position) <= MAX_RANGE_M or _beyond(args, grant):
         return deny("InvalidArgument", f"the target is more than {MAX_RANGE_M / 1000:.0f} km away")
     if args.speed_mps is not None and args.speed_mps > now.speed_setpoint_mps:
         now = replace(now, speed_setpoint_mps=args.speed_mps)
-    verdict = _judge_from(_Request(args, now, grant, at), target)
+    verdict = _judge_from(_Request(args, now, grant, position), target)
     if verdict.action == "allow" or not is_moving(now) or not _turns_too_wide(verdict, args):
         return verdict
-    stopped = _judge_after_stop(_Request(args, now, grant, at), target)
+    stopped = _judge_after_stop(_Request(args, now, grant, position), target)
     return stopped if stopped is not None and stopped.permits and not _shortened(stopped, args) else verdict
 
 
@@ -78,35 +79,40 @@ def _turns_too_wide(verdict: Verdict, args: GotoArgs) -> bool:
 
 
 def _shortened(verdict: Verdict, args: GotoArgs) -> bool:
-    flown = verdict.args
-    return isinstance(flown, GotoArgs) and (flown.lat, flown.lon) != (args.lat, args.lon)
+    result = verdict.args
+    return isinstance(result, GotoArgs) and (result.lat, result.lon) != (args.lat, args.lon)
 
 
 def _judge_after_stop(request: _Request, target: XY) -> Verdict | None:
     """Judge a leg that begins with a stop. None if the stop itself breaks a fence or an altitude limit."""
-    now, grant, at = request.now, request.grant, request.at
-    stop = stop_point(now, at)
-    heights, corners = [now.altitude_m, stop_altitude_m(now)], list[XY]()
-    for place, other in pending_outcomes(now, at):
-        corners += (place, stop_point(other, place))
-        heights += (other.altitude_m, stop_altitude_m(other))
-    braking = Leg(at, stop, stop, stop, min(heights), max(heights), tuple(corners))
-    on_its_way = replace(grant, operation_area=grant.flight_area, operation_area_border=grant.flight_area_border)
-    if find_breaches(braking, now, on_its_way, margin_m(now), height_margin_m(now)):
+    now = request.now
+    grant = request.grant
+    position = request.position
+    stop = stop_point(now, position)
+    altitudes = [now.altitude_m, stop_altitude_m(now)]
+    corners = list[XY]()
+    for outcome_position, outcome in pending_outcomes(now, position):
+        corners += (outcome_position, stop_point(outcome, outcome_position))
+        altitudes += (outcome.altitude_m, stop_altitude_m(outcome))
+    braking = Leg(position, stop, stop, stop, min(altitudes), max(altitudes), tuple(corners))
+    transit_grant = replace(grant, operation_area=grant.flight_area, operation_area_border=grant.flight_area_border)
+    if find_breaches(braking, now, transit_grant, margin_m(now), height_margin_m(now)):
         return None
     # The leg begins at the point of rest, so a zone entered while braking would count as already entered.
     bounds, unknown = altitude_bounds(
         grant, now, AirVolume(braking.ground, margin_m(now), braking.lower_m, braking.upper_m)
     )
     reach = braking.lower_m, braking.upper_m
-    if unknown or check_altitude_on_entry(shapely.points(at), reach, bounds, height_margin_m(now)) is not None:
+    if unknown or check_altitude_on_entry(shapely.points(position), reach, bounds, height_margin_m(now)) is not None:
         return None
-    verdict = _judge_from(replace(request, now=situation_at_rest(now, grant.frame, at), at=stop), target)
+    verdict = _judge_from(replace(request, now=situation_at_rest(now, grant.frame, position), position=stop), target)
     return replace(verdict, brake_first=True)
 
 
 def _judge_from(request: _Request, target: XY) -> Verdict:
-    args, now, grant = request.args, request.now, request.grant
+    args = request.args
+    now = request.now
+    grant = request.grant
     altitude = (
         now.altitude_m
         if args.alt is None
@@ -120,8 +126,8 @@ def _judge_from(request: _Request, target: XY) -> Verdict:
     if args.alt is not None and args.reference == "terrain":
         reason = "no terrain model is loaded; the ground is taken as level with home"
         notes.append(Correction(altitude, "TerrainAssumedFlat", reason))
-    flown = _fly_leg(request, _Aim(target, altitude), notes, adjusting=True)
-    return flown if isinstance(flown, Verdict) else _outcome(args, flown, notes, grant)
+    result = _fly_leg(request, _Aim(target, altitude), notes, adjusting=True)
+    return result if isinstance(result, Verdict) else _outcome(args, result, notes, grant)
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +137,7 @@ class _Request:
     args: GotoArgs
     now: Situation
     grant: CompiledGrant
-    at: XY
+    position: XY
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,36 +161,39 @@ def _beyond(args: GotoArgs, grant: CompiledGrant) -> bool:
 
 def _fly_leg(request: _Request, aim: _Aim, notes: list[Correction], adjusting: bool) -> _Aim | Verdict:
     """Return the permitted part of a leg, or the verdict that forbids it."""
-    now, grant = request.now, request.grant
-    leg = _leg(request.at, aim.target, now, aim.altitude_m)
-    within = _within_limits(request, leg, aim, notes)
-    if isinstance(within, Verdict):
-        return within
-    leg = _leg(request.at, aim.target, now, within.altitude_m)
-    found = find_breaches(leg, now, grant, margin_m(now), height_margin_m(now))
-    adjustable = adjusting and bool(found) and all(b.action == "adjust" for b in found)
-    shorter = _last_legal(leg, found) if adjustable else None
+    now = request.now
+    grant = request.grant
+    leg = _leg(request.position, aim.target, now, aim.altitude_m)
+    limited = _within_limits(request, leg, aim, notes)
+    if isinstance(limited, Verdict):
+        return limited
+    leg = _leg(request.position, aim.target, now, limited.altitude_m)
+    breaches = find_breaches(leg, now, grant, margin_m(now), height_margin_m(now))
+    adjustable = adjusting and bool(breaches) and all(b.action == "adjust" for b in breaches)
+    shorter = _last_legal(leg, breaches) if adjustable else None
     if shorter is None:
-        problem = breach_verdict(found) if found else check_return(aim.target, within.altitude_m, now, grant)
-        if problem is None or within.altitude_m == aim.altitude_m:
-            return problem or within
+        problem = breach_verdict(breaches) if breaches else check_return(aim.target, limited.altitude_m, now, grant)
+        if problem is None or limited.altitude_m == aim.altitude_m:
+            return problem or limited
         return choose_objection(problem, _objection(request, aim), correction_verdict(None, notes))
-    names = distinct(b.policy for b in found)
-    notes.append(Correction(0.0, "LegShortened", f"{found[0].reason}; the leg ends at the last legal point", names))
-    return _fly_leg(request, replace(within, target=shorter), notes, adjusting=False)
+    names = distinct(b.policy for b in breaches)
+    notes.append(Correction(0.0, "LegShortened", f"{breaches[0].reason}; the leg ends at the last legal point", names))
+    return _fly_leg(request, replace(limited, target=shorter), notes, adjusting=False)
 
 
 def _objection(request: _Request, aim: _Aim) -> Verdict | None:
     """Return the objection of fences and the return route to a leg, without its limits."""
-    now, grant = request.now, request.grant
-    leg = _leg(request.at, aim.target, now, aim.altitude_m)
-    found = find_breaches(leg, now, grant, margin_m(now), height_margin_m(now))
-    return breach_verdict(found) if found else check_return(aim.target, aim.altitude_m, now, grant)
+    now = request.now
+    grant = request.grant
+    leg = _leg(request.position, aim.target, now, aim.altitude_m)
+    breaches = find_breaches(leg, now, grant, margin_m(now), height_margin_m(now))
+    return breach_verdict(breaches) if breaches else check_return(aim.target, aim.altitude_m, now, grant)
 
 
 def _within_limits(request: _Request, leg: Leg, aim: _Aim, notes: list[Correction]) -> _Aim | Verdict:
     """Return the aim corrected to the limits of altitude and speed, or the verdict that forbids it."""
-    now, grant = request.now, request.grant
+    now = request.now
+    grant = request.grant
     air = AirVolume(leg.ground, margin_m(now), leg.lower_m, leg.upper_m)
     bounds, unknown = altitude_bounds(grant, now, air)
     if unknown:
@@ -197,25 +206,35 @@ def _within_limits(request: _Request, leg: Leg, aim: _Aim, notes: list[Correctio
             "AltitudeTooLow",
             f"a leg ends at least {MIN_LEG_ALTITUDE_M:.0f} m above home, not at {height.value:.1f} m; use Land to descend",
         )
-    asked = request.args.speed_mps if aim.speed_mps is None else aim.speed_mps
-    speed = clamp("Speed", "m/s", now.speed_setpoint_mps if asked is None else asked, speed_bounds(grant, now, air))
-    heights = (now.altitude_m, stop_altitude_m(now))
-    problem = check_altitude_on_entry(shapely.points(request.at), heights, bounds, height_margin_m(now))
+    requested_mps = request.args.speed_mps if aim.speed_mps is None else aim.speed_mps
+    speed = clamp(
+        "Speed",
+        "m/s",
+        now.speed_setpoint_mps if requested_mps is None else requested_mps,
+        speed_bounds(grant, now, air),
+    )
+    altitudes = (now.altitude_m, stop_altitude_m(now))
+    problem = check_altitude_on_entry(shapely.points(request.position), altitudes, bounds, height_margin_m(now))
     if problem is not None:
         return problem
     if isinstance(speed, Verdict):
         return speed
     notes.extend(note for note in (height, speed) if note.code)
-    return _Aim(aim.target, height.value, speed.value if speed.code or asked is not None else None)
+    return _Aim(aim.target, height.value, speed.value if speed.code or requested_mps is not None else None)
 
 
-def _leg(at: XY, target: XY, now: Situation, altitude_m: float) -> Leg:
-    heights = [now.altitude_m, stop_altitude_m(now), altitude_m]
-    turn, stops = turn_point(now, at, target), turning_stops(now, at, target)
-    for place, other in pending_outcomes(now, at):
-        stops += (place, turn_point(other, place, target), *turning_stops(other, place, target))
-        heights += (other.altitude_m, stop_altitude_m(other))
-    return Leg(at, stop_point(now, at), turn, target, min(heights), max(heights), stops)
+def _leg(position: XY, target: XY, now: Situation, altitude_m: float) -> Leg:
+    altitudes = [now.altitude_m, stop_altitude_m(now), altitude_m]
+    turn = turn_point(now, position, target)
+    stops = turning_stops(now, position, target)
+    for outcome_position, outcome in pending_outcomes(now, position):
+        stops += (
+            outcome_position,
+            turn_point(outcome, outcome_position, target),
+            *turning_stops(outcome, outcome_position, target),
+        )
+        altitudes += (outcome.altitude_m, stop_altitude_m(outcome))
+    return Leg(position, stop_point(now, position), turn, target, min(altitudes), max(altitudes), stops)
 
 
 def check_return(target: XY, altitude_m: float, now: Situation, grant: CompiledGrant) -> Verdict | None:
@@ -224,11 +243,11 @@ def check_return(target: XY, altitude_m: float, now: Situation, grant: CompiledG
     A drone on the wrong side of a fence may leave it regardless of the position of its home.
     """
     problem = check_straight_return(target, altitude_m, now, grant, margin=margin_m(now), slack=height_margin_m(now))
-    at = grant.locate(now)
-    if problem is None or now.home is None or at is None:
+    position = grant.locate(now)
+    if problem is None or now.home is None or position is None:
         return problem
-    here = vertical_leg(at, now.altitude_m, now.altitude_m)
-    if find_breaches(here, now, grant, margin_m(now), height_margin_m(now)):
+    stationary_leg = vertical_leg(position, now.altitude_m, now.altitude_m)
+    if find_breaches(stationary_leg, now, grant, margin_m(now), height_margin_m(now)):
         return None
     if not now.airframe.retraces:
         return problem
@@ -239,7 +258,7 @@ def check_return(target: XY, altitude_m: float, now: Situation, grant: CompiledG
     return replace(problem, reason=f"{problem.reason}, and no legal route around it was found")
 
 
-def _last_legal(leg: Leg, found: list[Breach]) -> XY | None:
+def _last_legal(leg: Leg, breaches: list[Breach]) -> XY | None:
     """Return the farthest point of a leg that no breached fence forbids, or None if the leg to it is too short."""
     length_m = math.dist(leg.stop, leg.target)
     (x, y), (tx, ty) = leg.stop, leg.target
@@ -251,14 +270,14 @@ def _last_legal(leg: Leg, found: list[Breach]) -> XY | None:
     for _ in range(BISECTION_STEPS):
         share = (low + high) / 2
         part = shapely.linestrings((leg.stop, along(share)))
-        low, high = (share, high) if all(breach.permits(part) for breach in found) else (low, share)
+        low, high = (share, high) if all(breach.permits(part) for breach in breaches) else (low, share)
     return along(low - 0.01 / length_m) if low * length_m >= MIN_LEG_M else None
 
 
-def _outcome(args: GotoArgs, flown: _Aim, notes: list[Correction], grant: CompiledGrant) -> Verdict:
+def _outcome(args: GotoArgs, result: _Aim, notes: list[Correction], grant: CompiledGrant) -> Verdict:
     moved = any(note.code == "LegShortened" for note in notes)
-    lat, lon = grant.frame.latlon(*flown.target) if moved else (args.lat, args.lon)
-    new = replace(args, lat=lat, lon=lon, alt=flown.altitude_m, reference="home", speed_mps=flown.speed_mps)
+    lat, lon = grant.frame.latlon(*result.target) if moved else (args.lat, args.lon)
+    new = replace(args, lat=lat, lon=lon, alt=result.altitude_m, reference="home", speed_mps=result.speed_mps)
     verdict = correction_verdict(new, sorted(notes, key=lambda note: note.code == "TerrainAssumedFlat"))
     # Flat terrain is mentioned in the reason, but it changes none of the requested arguments.
     return replace(verdict, action="allow") if verdict.code == "TerrainAssumedFlat" else verdict

@@ -63,7 +63,7 @@ def _fast(north_mps: float, east_mps: float, down_mps: float) -> bool:
     return math.hypot(north_mps, east_mps) >= STATIONARY_MPS or abs(down_mps) >= STATIONARY_MPS
 
 
-def pending_outcomes(now: Situation, at: XY) -> list[tuple[XY, Situation]]:
+def pending_outcomes(now: Situation, position: XY) -> list[tuple[XY, Situation]]:
     """Return the states the drone may reach by its pending velocity setpoints before a decision takes effect.
 
     The drone may take up a pending setpoint from now on, with full acceleration. The results are the extreme cases. In
@@ -74,28 +74,31 @@ def pending_outcomes(now: Situation, at: XY) -> list[tuple[XY, Situation]]:
     """
     if not now.pending:
         return []
-    frame, found = now.airframe, []
+    airframe = now.airframe
+    points = []
     for north, east, down in _extremes(now.pending):
         dn, de = _taken_up(
-            (now.north_mps, now.east_mps), (north, east), frame.accel_mps2, frame.jerk_mps3, now.latency_s
+            (now.north_mps, now.east_mps), (north, east), airframe.accel_mps2, airframe.jerk_mps3, now.latency_s
         )
-        climb, _ = _taken_up((now.down_mps, 0.0), (down, 0.0), frame.climb_accel_mps2, frame.jerk_mps3, now.latency_s)
+        climb, _ = _taken_up(
+            (now.down_mps, 0.0), (down, 0.0), airframe.climb_accel_mps2, airframe.jerk_mps3, now.latency_s
+        )
         begun = (now.north_mps + dn / 2, now.east_mps + de / 2)
-        place = at[0] + begun[1] * now.latency_s, at[1] + begun[0] * now.latency_s
+        place = position[0] + begun[1] * now.latency_s, position[1] + begun[0] * now.latency_s
         altitude_m = now.altitude_m - (now.down_mps + climb / 2) * now.latency_s
         later = replace(
             now, north_mps=now.north_mps + dn, east_mps=now.east_mps + de, down_mps=now.down_mps + climb,
             altitude_m=altitude_m, latency_s=0.0, forward_mps2=0.0, pending=(),
         )  # fmt: skip
-        found.append((place, later))
-    return found
+        points.append((place, later))
+    return points
 
 
-def _taken_up(present: XY, wanted: XY, accel: float, jerk: float, lasting_s: float) -> XY:
+def _taken_up(present: XY, target_velocity: XY, accel: float, jerk: float, lasting_s: float) -> XY:
     """Return the change of a velocity toward a wanted one, including the change while the acceleration decays."""
-    change = math.dist(present, wanted)
+    change = math.dist(present, target_velocity)
     share = min(accel * (lasting_s + accel / (2 * jerk)) / change, 1.0) if change > 0 else 0.0
-    return (wanted[0] - present[0]) * share, (wanted[1] - present[1]) * share
+    return (target_velocity[0] - present[0]) * share, (target_velocity[1] - present[1]) * share
 
 
 MAX_PENDING_VELOCITIES = 4
@@ -109,9 +112,9 @@ def _extremes(velocities: tuple[tuple[float, float, float], ...]) -> tuple[tuple
     return (south, west, up), (south, east, down), (north, west, down), (north, east, up)
 
 
-def situation_at_rest(now: Situation, grant_frame: LocalFrame, at: XY) -> Situation:
+def situation_at_rest(now: Situation, grant_frame: LocalFrame, position: XY) -> Situation:
     """Return the situation after a stop commanded now, at the point of rest that the latency allows."""
-    lat, lon = grant_frame.latlon(*stop_point(now, at))
+    lat, lon = grant_frame.latlon(*stop_point(now, position))
     return replace(
         now, lat=lat, lon=lon, altitude_m=stop_altitude_m(now), north_mps=0.0, east_mps=0.0, down_mps=0.0, pending=()
     )
@@ -136,21 +139,22 @@ def motion_before_reaction(situation: Situation) -> MotionBeforeReaction:
     An accelerating drone keeps accelerating for the latency, and then until its jerk limit ends the acceleration. If
     its acceleration is unknown, full acceleration is assumed, unless the drone flies at its speed setpoint.
     """
-    frame = situation.airframe
+    airframe = situation.airframe
     speed = math.hypot(situation.north_mps, situation.east_mps)
-    bite_s = frame.accel_mps2 / (2 * frame.jerk_mps3)
+    bite_s = airframe.accel_mps2 / (2 * airframe.jerk_mps3)
     forward = situation.forward_mps2
     if forward is None:
-        forward = frame.accel_mps2 if STATIONARY_MPS <= speed < situation.speed_setpoint_mps else 0.0
+        forward = airframe.accel_mps2 if STATIONARY_MPS <= speed < situation.speed_setpoint_mps else 0.0
     elif forward < 0.0 and any(_fast(*velocity) for velocity in situation.pending):
         forward = 0.0  # A pending setpoint may have ended the braking.
-    forward = min(max(forward, -frame.accel_mps2), frame.accel_mps2)
+    forward = min(max(forward, -airframe.accel_mps2), airframe.accel_mps2)
     if forward <= 0.0:
         # A braking drone keeps braking, so its speed is lower when the command takes effect.
         left = max(speed + forward * situation.latency_s, 0.0)
-        bite_s *= 1.0 + forward / frame.accel_mps2
+        bite_s *= 1.0 + forward / airframe.accel_mps2
         return MotionBeforeReaction(left, (speed + left) / 2 * situation.latency_s + left * bite_s)
-    late_s, easing_s = situation.latency_s, forward / frame.jerk_mps3
+    late_s = situation.latency_s
+    easing_s = forward / airframe.jerk_mps3
     first = speed + forward * late_s
     last = first + forward * easing_s / 2
     run = (speed + first) / 2 * late_s + first * easing_s + forward * easing_s**2 / 3
@@ -160,24 +164,25 @@ def motion_before_reaction(situation: Situation) -> MotionBeforeReaction:
     return MotionBeforeReaction(last, run + last * bite_s)
 
 
-def stop_point(situation: Situation, at: XY) -> XY:
+def stop_point(situation: Situation, position: XY) -> XY:
     """Return the point of rest in frame metres if the drone is commanded to stop now."""
     speed = math.hypot(situation.north_mps, situation.east_mps)
     # Below the noise of a GNSS velocity its direction is meaningless.
     if speed < 0.05:
-        return at
-    frame, begin = situation.airframe, motion_before_reaction(situation)
-    run = begin.run_m + stopping_distance_m(begin.speed_mps, frame.accel_mps2, frame.position_gain)
-    return at[0] + situation.east_mps / speed * run, at[1] + situation.north_mps / speed * run
+        return position
+    airframe = situation.airframe
+    reaction = motion_before_reaction(situation)
+    run = reaction.run_m + stopping_distance_m(reaction.speed_mps, airframe.accel_mps2, airframe.position_gain)
+    return position[0] + situation.east_mps / speed * run, position[1] + situation.north_mps / speed * run
 
 
-def shortest_stop_point(situation: Situation, at: XY) -> XY:
+def shortest_stop_point(situation: Situation, position: XY) -> XY:
     """Return the point of rest in frame metres of a drone that is already braking as hard as it can."""
     run = math.hypot(situation.north_mps, situation.east_mps) / (2 * situation.airframe.accel_mps2)
-    return at[0] + situation.east_mps * run, at[1] + situation.north_mps * run
+    return position[0] + situation.east_mps * run, position[1] + situation.north_mps * run
 
 
-def turn_point(situation: Situation, at: XY, target: XY) -> XY:
+def turn_point(situation: Situation, position: XY, target: XY) -> XY:
     """Return the corner of the triangle in which a drone turns from its present velocity toward a target.
 
     While the velocity changes from v to w with an acceleration of size a, the drone flies a parabola: a Bezier curve of
@@ -185,26 +190,28 @@ def turn_point(situation: Situation, at: XY, target: XY) -> XY:
     triangle of its control points.
     """
     speed = math.hypot(situation.north_mps, situation.east_mps)
-    frame = situation.airframe
-    stop = stop_point(situation, at)
+    airframe = situation.airframe
+    stop = stop_point(situation, position)
     if speed < STATIONARY_MPS:
         return stop
-    begin = motion_before_reaction(situation)
-    east, north = situation.east_mps / speed * begin.speed_mps, situation.north_mps / speed * begin.speed_mps
-    change = begin.speed_mps
-    for origin in (at, stop):
+    reaction = motion_before_reaction(situation)
+    east, north = situation.east_mps / speed * reaction.speed_mps, situation.north_mps / speed * reaction.speed_mps
+    change = reaction.speed_mps
+    for origin in (position, stop):
         dx, dy = target[0] - origin[0], target[1] - origin[1]
-        away = math.hypot(dx, dy)
-        cruise = min(situation.speed_setpoint_mps, math.sqrt(2 * frame.accel_mps2 * away)) if away > 0 else 0.0
-        to_east, to_north = (dx / away * cruise, dy / away * cruise) if away > 0 else (0.0, 0.0)
+        distance = math.hypot(dx, dy)
+        cruise = (
+            min(situation.speed_setpoint_mps, math.sqrt(2 * airframe.accel_mps2 * distance)) if distance > 0 else 0.0
+        )
+        to_east, to_north = (dx / distance * cruise, dy / distance * cruise) if distance > 0 else (0.0, 0.0)
         change = max(change, math.hypot(to_east - east, to_north - north))
-    slack = frame.accel_mps2 / (2 * frame.position_gain**2)
-    run = begin.run_m + slack + begin.speed_mps * change / (2 * frame.accel_mps2)
-    run = max(run, math.hypot(stop[0] - at[0], stop[1] - at[1]))
-    return at[0] + situation.east_mps / speed * run, at[1] + situation.north_mps / speed * run
+    slack = airframe.accel_mps2 / (2 * airframe.position_gain**2)
+    run = reaction.run_m + slack + reaction.speed_mps * change / (2 * airframe.accel_mps2)
+    run = max(run, math.hypot(stop[0] - position[0], stop[1] - position[1]))
+    return position[0] + situation.east_mps / speed * run, position[1] + situation.north_mps / speed * run
 
 
-def turning_stops(situation: Situation, at: XY, target: XY) -> tuple[XY, ...]:
+def turning_stops(situation: Situation, position: XY, target: XY) -> tuple[XY, ...]:
     """Return the points of rest of a drone that is stopped while it turns toward a target.
 
     It stops along its velocity at that moment, possibly outside the triangle of the turn.
@@ -212,25 +219,31 @@ def turning_stops(situation: Situation, at: XY, target: XY) -> tuple[XY, ...]:
     speed = math.hypot(situation.north_mps, situation.east_mps)
     if speed < STATIONARY_MPS:
         return ()
-    frame, begin, stop = situation.airframe, motion_before_reaction(situation), stop_point(situation, at)
+    airframe = situation.airframe
+    reaction = motion_before_reaction(situation)
+    stop = stop_point(situation, position)
     ahead = (situation.east_mps / speed, situation.north_mps / speed)
-    away = math.dist(stop, target)
-    cruise = min(situation.speed_setpoint_mps, math.sqrt(2 * frame.accel_mps2 * away))
-    toward = ((target[0] - stop[0]) / away * cruise, (target[1] - stop[1]) / away * cruise) if away > 0 else (0.0, 0.0)
-    present = (ahead[0] * begin.speed_mps, ahead[1] * begin.speed_mps)
-    change_s = math.dist(present, toward) / frame.accel_mps2
-    found = []
+    distance = math.dist(stop, target)
+    cruise = min(situation.speed_setpoint_mps, math.sqrt(2 * airframe.accel_mps2 * distance))
+    toward = (
+        ((target[0] - stop[0]) / distance * cruise, (target[1] - stop[1]) / distance * cruise)
+        if distance > 0
+        else (0.0, 0.0)
+    )
+    present = (ahead[0] * reaction.speed_mps, ahead[1] * reaction.speed_mps)
+    change_s = math.dist(present, toward) / airframe.accel_mps2
+    points = []
     for share in _TURNING:
         vx, vy = (p + (t - p) * share for p, t in zip(present, toward, strict=True))
         fast = math.hypot(vx, vy)
         if fast > 0:
             half = change_s * share / 2
-            on = reaction_s(situation, frame.accel_mps2)
-            on += stopping_distance_m(fast, frame.accel_mps2, frame.position_gain) / fast
-            x = at[0] + ahead[0] * begin.run_m + (present[0] + vx) * half + vx * on
-            y = at[1] + ahead[1] * begin.run_m + (present[1] + vy) * half + vy * on
-            found.append((x, y))
-    return tuple(found)
+            on = reaction_s(situation, airframe.accel_mps2)
+            on += stopping_distance_m(fast, airframe.accel_mps2, airframe.position_gain) / fast
+            x = position[0] + ahead[0] * reaction.run_m + (present[0] + vx) * half + vx * on
+            y = position[1] + ahead[1] * reaction.run_m + (present[1] + vy) * half + vy * on
+            points.append((x, y))
+    return tuple(points)
 
 
 def stop_altitude_m(situation: Situation) -> float:
@@ -279,7 +292,9 @@ class Leg:
     @cached_property
     def ground(self) -> BaseGeometry:
         """Ground below the leg: a triangle, a line or a point."""
-        start, turn, target = self.start, self.turn, self._beyond
+        start = self.start
+        turn = self.turn
+        target = self._beyond
         if self.corners:
             return shapely.convex_hull(shapely.multipoints((start, turn, self.target, target, *self.corners)))
         if start == turn:
@@ -314,68 +329,77 @@ class Leg:
         return shapely.points(self.stop) if self.stop == self.target else shapely.linestrings((self.stop, self.target))
 
 
-def vertical_leg(at: XY, lower_m: float, upper_m: float) -> Leg:
+def vertical_leg(position: XY, lower_m: float, upper_m: float) -> Leg:
     """Return the leg of a drone that stays above one point."""
-    return Leg(at, at, at, at, lower_m, upper_m)
+    return Leg(position, position, position, position, lower_m, upper_m)
 
 
-def velocity_leg(now: Situation, at: XY, asked: VelocityArgs) -> Leg:
+def velocity_leg(now: Situation, position: XY, args: VelocityArgs) -> Leg:
     """Return the leg of a drone that takes up a velocity, keeps it for its hold time, and stops.
 
     The ground is the convex hull of the possible positions, whether latency delays the beginning, the end, or neither.
     The target is the last possible point of rest.
     """
-    frame, begin = now.airframe, motion_before_reaction(now)
-    wanted = (asked.east_mps, asked.north_mps)
+    airframe = now.airframe
+    reaction = motion_before_reaction(now)
+    target_velocity = (args.east_mps, args.north_mps)
     speed = math.hypot(now.north_mps, now.east_mps)
     ahead = (now.east_mps / speed, now.north_mps / speed) if speed > 0 else (0.0, 0.0)
-    present = (ahead[0] * begin.speed_mps, ahead[1] * begin.speed_mps)
-    lasting_s = asked.hold_s + now.latency_s
-    control = (frame.accel_mps2, frame.position_gain)
+    present = (ahead[0] * reaction.speed_mps, ahead[1] * reaction.speed_mps)
+    lasting_s = args.hold_s + now.latency_s
+    control = (airframe.accel_mps2, airframe.position_gain)
     # If the drone obeys at once, its initial speed is lowest and it flies farthest in the new direction.
     known = now.forward_mps2 is not None and not now.pending
-    braked = begin.speed_mps if known else speed - frame.accel_mps2 * now.latency_s
+    braked = reaction.speed_mps if known else speed - airframe.accel_mps2 * now.latency_s
     slowest = max(min(speed, braked), 0.0)
-    ways = _course((ahead[0] * slowest, ahead[1] * slowest), wanted, lasting_s, frame, control)
-    late = (ahead[0] * begin.run_m, ahead[1] * begin.run_m)
-    ways += [(x + late[0], y + late[1]) for x, y in _course(present, wanted, lasting_s, frame, control)]
+    ways = _course((ahead[0] * slowest, ahead[1] * slowest), target_velocity, lasting_s, airframe, control)
+    late = (ahead[0] * reaction.run_m, ahead[1] * reaction.run_m)
+    ways += [(x + late[0], y + late[1]) for x, y in _course(present, target_velocity, lasting_s, airframe, control)]
     climb = -now.down_mps
-    climbs = _course((climb, 0.0), (-asked.down_mps, 0.0), lasting_s, frame, (frame.climb_accel_mps2, 1.0))
-    late_m = climb * reaction_s(now, frame.climb_accel_mps2)
+    climbs = _course((climb, 0.0), (-args.down_mps, 0.0), lasting_s, airframe, (airframe.climb_accel_mps2, 1.0))
+    late_m = climb * reaction_s(now, airframe.climb_accel_mps2)
     climbs += [(up + late_m, 0.0) for up, _ in climbs]
     for (x, y), other in pending_outcomes(now, (0.0, 0.0)):
-        taken = _course((other.east_mps, other.north_mps), wanted, lasting_s, frame, control)
-        ways[:0] = [(x, y), stop_point(other, (x, y)), *((x + dx, y + dy) for dx, dy in taken)]
+        displacements = _course((other.east_mps, other.north_mps), target_velocity, lasting_s, airframe, control)
+        ways[:0] = [(x, y), stop_point(other, (x, y)), *((x + dx, y + dy) for dx, dy in displacements)]
         rise = other.altitude_m - now.altitude_m
-        taken = _course((-other.down_mps, 0.0), (-asked.down_mps, 0.0), lasting_s, frame, (frame.climb_accel_mps2, 1.0))
-        climbs += [(rise, 0.0), (stop_altitude_m(other) - now.altitude_m, 0.0), *((rise + up, 0.0) for up, _ in taken)]
+        displacements = _course(
+            (-other.down_mps, 0.0), (-args.down_mps, 0.0), lasting_s, airframe, (airframe.climb_accel_mps2, 1.0)
+        )
+        climbs += [
+            (rise, 0.0),
+            (stop_altitude_m(other) - now.altitude_m, 0.0),
+            *((rise + up, 0.0) for up, _ in displacements),
+        ]
     heights = [now.altitude_m, stop_altitude_m(now), *(now.altitude_m + climb for climb, _ in climbs)]
-    corners = tuple((at[0] + x, at[1] + y) for x, y in ways)
-    stop = stop_point(now, at)
-    return Leg(at, stop, stop, corners[-1], min(heights), max(heights), corners, follows_velocity=True)
+    corners = tuple((position[0] + x, position[1] + y) for x, y in ways)
+    stop = stop_point(now, position)
+    return Leg(position, stop, stop, corners[-1], min(heights), max(heights), corners, follows_velocity=True)
 
 
-def _course(present: XY, wanted: XY, lasting_s: float, frame: Airframe, control: tuple[float, float]) -> list[XY]:
+def _course(
+    present: XY, target_velocity: XY, lasting_s: float, airframe: Airframe, control: tuple[float, float]
+) -> list[XY]:
     """Return displacements whose hull contains the motion from one velocity to another and to rest.
 
     The last is the rest.
     """
     accel, gain = control
-    change_s = math.dist(present, wanted) / accel
-    found = []
+    change_s = math.dist(present, target_velocity) / accel
+    points = []
     for share in (0.25, 0.5, 0.75, 1.0):
         turning_s = min(change_s * share, lasting_s)
         done = turning_s / change_s if change_s > 0 else 1.0
-        vx, vy = (p + (w - p) * done for p, w in zip(present, wanted, strict=True))
+        vx, vy = (p + (w - p) * done for p, w in zip(present, target_velocity, strict=True))
         half = turning_s / 2
-        found.append((present[0] * half, present[1] * half))
+        points.append((present[0] * half, present[1] * half))
         x, y = (present[0] + vx) * half, (present[1] + vy) * half
         speed = math.hypot(vx, vy)
         if share == 1.0:
-            found.append((x, y))
+            points.append((x, y))
             x, y = x + vx * (lasting_s - turning_s), y + vy * (lasting_s - turning_s)
         if speed > 0:
-            run = accel / (2 * frame.jerk_mps3) + stopping_distance_m(speed, accel, gain) / speed
+            run = accel / (2 * airframe.jerk_mps3) + stopping_distance_m(speed, accel, gain) / speed
             x, y = x + vx * run, y + vy * run
-        found.append((x, y))
-    return found
+        points.append((x, y))
+    return points

@@ -28,7 +28,8 @@ def bounding_lens(camera: CameraFeatures | None) -> Lens | None:
     width, height = camera.pixels
     half = _half_view(camera.lens, math.radians(camera.horizontal_field_of_view) / 2, height / width)
     wide, tall = (2 * math.degrees(math.atan(side)) for side in half) if half is not None else (180.0, 180.0)
-    mount, error_deg = camera.mount, MOUNT_ERROR_DEG + (OFF_AXIS_DEG if camera.lens is None else 0.0)
+    mount = camera.mount
+    error_deg = MOUNT_ERROR_DEG + (OFF_AXIS_DEG if camera.lens is None else 0.0)
     if mount.gimbal:
         # The attitude of a gimbal is that of the camera, so no mounting angle applies.
         return Lens(wide, tall, 0.0, 0.0, False, error_deg)
@@ -97,7 +98,8 @@ def _distorted(lens: CameraLens, side: float, aspect: float) -> tuple[float, flo
     outwards = np.diff(shown[: last + 1]) / np.diff(r[: last + 1])
     if r[last] < side or shown[0] <= 0.0 or not (outwards > 0.0).all():
         return None
-    slack, shrunk = tangential * r[last] ** 2, 1.001 / stretch[: last + 1].min()
+    slack = tangential * r[last] ** 2
+    shrunk = 1.001 / stretch[: last + 1].min()
     # If a lens shows objects smaller than the pinhole does, a wider view replaces it, because faces are searched by
     # their size.
     least = float((outwards * (1.0 + r[1 : last + 1] ** 2)).min())

@@ -49,13 +49,13 @@ class Correction:
     policies: tuple[str, ...] = ()
 
 
-def correction_verdict(args: Args, notes: Sequence[Correction]) -> Verdict:
+def correction_verdict(args: Args, corrections: Sequence[Correction]) -> Verdict:
     """Return the verdict on a call that is carried out with these arguments, from the corrections made."""
-    done = [note for note in notes if note.code]
-    if not done:
+    steps = [note for note in corrections if note.code]
+    if not steps:
         return Verdict("allow", args)
-    names = distinct(name for note in done for name in note.policies)
-    return Verdict("correct", args, done[0].code, "; ".join(note.reason for note in done), names)
+    names = distinct(name for note in steps for name in note.policies)
+    return Verdict("correct", args, steps[0].code, "; ".join(note.reason for note in steps), names)
 
 
 def altitude_bounds(grant: CompiledGrant, now: Situation, air: AirVolume) -> tuple[list[Bound], list[Rule]]:
@@ -64,7 +64,8 @@ def altitude_bounds(grant: CompiledGrant, now: Situation, air: AirVolume) -> tup
     Returns:
         The limits in metres above home, and the rules whose datum has an unknown height.
     """
-    bounds, unknown = [], list[Rule]()
+    bounds = []
+    unknown = list[Rule]()
     if grant.max_altitude_m is not None:
         bounds.append(Bound("", 0, None, grant.max_altitude_m, refuses=False))
     for rule, zone in _in_force(grant.altitude_limits, grant, now, air):
@@ -86,22 +87,22 @@ def altitude_bounds(grant: CompiledGrant, now: Situation, air: AirVolume) -> tup
     return bounds, unknown
 
 
-def lowest_ceiling_m(bounds: Sequence[Bound], unknown: Sequence[Rule], here_m: float) -> float:
+def lowest_ceiling_m(bounds: Sequence[Bound], unknown: Sequence[Rule], present_m: float) -> float:
     """Return the lowest upper limit above home.
 
-    If one has an unknown datum, the result is at most `here_m`, so the drone does not climb.
+    If one has an unknown datum, the result is at most `present_m`, so the drone does not climb.
     """
     ceiling = min((bound.upper for bound in bounds if bound.upper is not None), default=math.inf)
-    return min(ceiling, here_m) if any(rule.spec.upper_limit is not None for rule in unknown) else ceiling
+    return min(ceiling, present_m) if any(rule.spec.upper_limit is not None for rule in unknown) else ceiling
 
 
 def deny_unknown_datum(rule: Rule) -> Verdict:
     """Return the denial of a motion under an altitude limit whose datum has an unknown height."""
     terrain = rule.spec.altitude_reference == "terrain"
-    what, code = ("no terrain model is loaded", "TerrainUnknown") if terrain else ("home is unknown", "HomeUnknown")
+    subject, code = ("no terrain model is loaded", "TerrainUnknown") if terrain else ("home is unknown", "HomeUnknown")
     return deny(
         code,
-        f"policy {rule.name} limits altitude above {rule.spec.altitude_reference} level, and {what}",
+        f"policy {rule.name} limits altitude above {rule.spec.altitude_reference} level, and {subject}",
         (rule.name,),
     )
 
@@ -183,12 +184,12 @@ def clamp(quantity: str, unit: str, value: float, bounds: list[Bound]) -> Correc
     if problem is not None:
         return problem
     highest, lowest = _highest(bounds), _lowest(bounds)
-    new = min(max(value, lowest), highest)
+    corrected_value = min(max(value, lowest), highest)
     word = "above" if above else "below"
     return Correction(
-        new,
+        corrected_value,
         code,
-        f"{quantity.lower()} {value:.1f} {unit} is {word} the limit of {_source(violated[0])}; corrected to {new:.1f} {unit}",
+        f"{quantity.lower()} {value:.1f} {unit} is {word} the limit of {_source(violated[0])}; corrected to {corrected_value:.1f} {unit}",
         names,
     )
 
@@ -236,19 +237,19 @@ def allows_low_altitude(bounds: list[Bound]) -> bool:
 
 
 def check_altitude_on_entry(
-    here: BaseGeometry, heights_m: tuple[float, float], bounds: list[Bound], slack_m: float
+    start: BaseGeometry, heights_m: tuple[float, float], bounds: list[Bound], slack_m: float
 ) -> Verdict | None:
     """Return the denial of a leg that would enter a zone at an altitude that the zone does not permit, or None.
 
     Args:
-        here: Start of the leg.
+        start: Start of the leg.
         heights_m: Present altitude, and the altitude at which a climbing or sinking drone comes to rest.
         bounds: Altitude limits along the leg.
         slack_m: Permitted deviation from the limits.
     """
     low, high = min(heights_m), max(heights_m)
     for bound in bounds:
-        if bound.shape is None or bound.shape.intersects(here):
+        if bound.shape is None or bound.shape.intersects(start):
             continue
         if bound.upper is not None and high > bound.upper + slack_m:
             return deny(
@@ -305,47 +306,48 @@ def settle_correction(call: Call, first: Verdict, judge: Callable[[Call], Verdic
         A correction to arguments that are permitted unchanged, or the denial of limits that cannot be met together. It
         is never a takeover, because the application did not request the corrected arguments.
     """
-    done = [first]
+    steps = [first]
     for _ in range(MAX_ROUNDS):
-        verdict = judge(replace(call, args=done[-1].args))
+        verdict = judge(replace(call, args=steps[-1].args))
         if verdict.action == "allow":
-            return _summed_up(done, verdict)
+            return _summed_up(steps, verdict)
         if verdict.action != "correct":
-            return deny_conflict(done, verdict)
-        done.append(verdict)
-    return deny_conflict(done[:-1], done[-1])
+            return deny_conflict(steps, verdict)
+        steps.append(verdict)
+    return deny_conflict(steps[:-1], steps[-1])
 
 
-def _summed_up(done: Sequence[Verdict], allowed: Verdict) -> Verdict:
+def _summed_up(steps: Sequence[Verdict], allowed: Verdict) -> Verdict:
     return replace(
-        done[0],
+        steps[0],
         args=allowed.args,
-        reason="; ".join(step.reason for step in done),
-        policies=distinct(name for step in done for name in step.policies),
-        brake_first=allowed.brake_first or any(step.brake_first for step in done),
+        reason="; ".join(step.reason for step in steps),
+        policies=distinct(name for step in steps for name in step.policies),
+        brake_first=allowed.brake_first or any(step.brake_first for step in steps),
     )
 
 
-def choose_objection(problem: Verdict, asked: Verdict | None, correction: Verdict) -> Verdict:
+def choose_objection(problem: Verdict, requested: Verdict | None, correction: Verdict) -> Verdict:
     """Return the verdict on a corrected call that is not permitted.
 
     Args:
         problem: Objection to the corrected arguments.
-        asked: Objection to the requested arguments, or None.
+        requested: Objection to the requested arguments, or None.
         correction: Correction of the call.
     """
-    if asked is None:
+    if requested is None:
         return deny_conflict((correction,), problem)
     # A drone is taken over for requested arguments only, never for corrected ones.
-    return asked if problem.action == "takeover" else problem
+    return requested if problem.action == "takeover" else problem
 
 
-def deny_conflict(done: Sequence[Verdict], problem: Verdict) -> Verdict:
+def deny_conflict(steps: Sequence[Verdict], problem: Verdict) -> Verdict:
     """Return the denial of a call whose corrections lead to another objection."""
-    names = distinct(name for step in (*done, problem) for name in step.policies)
-    what = (
-        f"policies {', '.join(names)}" if len(names) > 1 else f"the limits of policy {names[0]}" if names else "limits"
-    )
+    names = distinct(name for step in (*steps, problem) for name in step.policies)
+    if len(names) > 1:
+        subject = f"policies {', '.join(names)}"
+    else:
+        subject = f"the limits of policy {names[0]}" if names else "limits"
     # The objection concerns the last correction.
-    reason = f"{what} cannot be met together: {done[-1].reason}, and then {problem.reason}; change the request"
+    reason = f"{subject} cannot be met together: {steps[-1].reason}, and then {problem.reason}; change the request"
     return deny("ConflictingLimits", reason, names)

@@ -54,9 +54,9 @@ def monitor(
     now: Situation,
     grant: CompiledGrant,
     *,
-    leaving: bool = False,
-    changed: bool = False,
-    bound_for: GotoArgs | None = None,
+    system_flies: bool = False,
+    fences_changed: bool = False,
+    current_leg: GotoArgs | None = None,
 ) -> Verdict | None:
     """Return what the system must do about a flying drone now.
 
@@ -67,12 +67,12 @@ def monitor(
     Args:
         now: State of the drone.
         grant: Permissions and restrictions that apply.
-        leaving: True if the system or the autopilot already flies the drone. Only a deterioration counts then, because
+        system_flies: True if the system or the autopilot already flies the drone. Only a deterioration counts then, because
             the system's way leads back from the wrong side of a fence or from above a limit.
-        changed: True if other fences may have been in force when the drone's motion was judged. An accelerating drone
+        fences_changed: True if other fences may have been in force when the drone's motion was judged. An accelerating drone
             is faster when it receives a stop, and the room for that has not been judged, so it is stopped early. A leg
             whose remaining part is no longer legal is stopped too.
-        bound_for: Leg under way if it was permitted under this grant. The autopilot then brakes for its end without a
+        current_leg: Leg under way if it was permitted under this grant. The autopilot then brakes for its end without a
             command.
 
     Returns:
@@ -86,41 +86,46 @@ def monitor(
     lat, lon = now.lat, now.lon
     if lat is None or lon is None or not now.is_plausible:
         return Verdict("takeover", None, "PositionUnknown", "the drone's position is unknown", (), "hover")
-    start, margin = grant.frame.xy(lat, lon), now.position_error_m + TRACKING_SHARE * now.airframe.tracking_m
-    surging = [(start, now), *pending_outcomes(now, start)] if changed else []
+    start = grant.frame.xy(lat, lon)
+    margin = now.position_error_m + TRACKING_SHARE * now.airframe.tracking_m
+    surging = [(start, now), *pending_outcomes(now, start)] if fences_changed else []
     # An accelerating drone flies on a leg that was judged with room for it, and brakes at its end in time.
     now = replace(now, forward_mps2=min(now.forward_mps2 or 0.0, 0.0))
     stop = stop_point(now, start)
-    ahead = stop if bound_for is None else _arrival(now, start, stop, grant.frame.xy(bound_for.lat, bound_for.lon))
-    level_m = _level_m(now, bound_for, grant)
-    worst = _worst(_fences(now, grant, _look_ahead(now, start, ahead, margin, level_m), leaving=leaving))
+    ahead = (
+        stop if current_leg is None else _arrival(now, start, stop, grant.frame.xy(current_leg.lat, current_leg.lon))
+    )
+    level_m = _level_m(now, current_leg, grant)
+    worst = _worst(_fences(now, grant, _look_ahead(now, start, ahead, margin, level_m), system_flies=system_flies))
     if worst is not None:
         return replace(worst, brake_first=worst.action == "takeover" and is_moving(now))
     for begin, then in surging:
         # The drone's way may end before the fence. It is stopped now, and taken over only if it really goes too far.
-        further = _look_ahead(then, begin, stop_point(then, begin), margin, _level_m(then, bound_for, grant))
-        worst = _worst(_fences(then, grant, further, leaving=True))
+        further = _look_ahead(then, begin, stop_point(then, begin), margin, _level_m(then, current_leg, grant))
+        worst = _worst(_fences(then, grant, further, system_flies=True))
         if worst is not None:
             return replace(worst, action="deny", takeover="hover")
-    if changed and bound_for is not None:
+    if fences_changed and current_leg is not None:
         # A leg that has become illegal is stopped at once. A later stop would depend on the link at that moment.
-        worst = _worst(_fences(now, grant, _rest_of_leg(now, grant, start, bound_for, margin), leaving=leaving))
+        worst = _worst(
+            _fences(now, grant, _rest_of_leg(now, grant, start, current_leg, margin), system_flies=system_flies)
+        )
         if worst is not None:
             return replace(worst, brake_first=worst.action == "takeover" and is_moving(now))
-    rest_m = _told_m(now, level_m)
+    rest_m = _altitude_after_stop_m(now, level_m)
     # A climb initiated by the autopilot was never judged and may end anywhere, so it gets only part of the tolerance.
-    unasked = leaving and bound_for is None and now.down_mps < -CLIMBING_MPS
-    found = _heights(now, grant, start, stop, rest_m, sinks_back=leaving, share=0.5 if unasked else 1.0)
-    return found or _speeds(now, grant, start)
+    unasked = system_flies and current_leg is None and now.down_mps < -CLIMBING_MPS
+    findings = _heights(now, grant, start, stop, rest_m, sinks_back=system_flies, share=0.5 if unasked else 1.0)
+    return findings or _speeds(now, grant, start)
 
 
-def _worst(found: list[tuple[int, Verdict]]) -> Verdict | None:
+def _worst(findings: list[tuple[int, Verdict]]) -> Verdict | None:
     """Return the verdict that takes most control from the application. Among equals the one of highest priority."""
     ranked = [
         (-SEVERITY[v.takeover] if v.action == "takeover" and v.takeover is not None else 0, -priority, i)
-        for i, (priority, v) in enumerate(found)
+        for i, (priority, v) in enumerate(findings)
     ]
-    return found[min(ranked)[2]][1] if ranked else None
+    return findings[min(ranked)[2]][1] if ranked else None
 
 
 def _arrival(now: Situation, start: XY, stop: XY, target: XY) -> XY:
@@ -134,7 +139,8 @@ def _arrival(now: Situation, start: XY, stop: XY, target: XY) -> XY:
     run = math.hypot(dx, dy)
     if run == 0.0:
         return stop
-    along, aside = (dx * tx + dy * ty) / run, abs(dx * ty - dy * tx) / run
+    along = (dx * tx + dy * ty) / run
+    aside = abs(dx * ty - dy * tx) / run
     late = math.hypot(now.north_mps, now.east_mps) * reaction_s(now, now.airframe.accel_mps2)
     strays = now.airframe.tracking_m
     aims = aside <= strays + AIM_SHARE * max(along, 0.0)
@@ -142,21 +148,24 @@ def _arrival(now: Situation, start: XY, stop: XY, target: XY) -> XY:
     return target if arrives else stop
 
 
-def _level_m(now: Situation, bound_for: GotoArgs | None, grant: CompiledGrant) -> float:
+def _level_m(now: Situation, current_leg: GotoArgs | None, grant: CompiledGrant) -> float:
     """Return the altitude of rest of a drone that climbs or sinks to the altitude of its leg. See `_arrival`."""
-    rest_m, climb = stop_altitude_m(now), -now.down_mps
-    if bound_for is None or bound_for.alt is None or climb == 0.0:
+    rest_m = stop_altitude_m(now)
+    climb = -now.down_mps
+    if current_leg is None or current_leg.alt is None or climb == 0.0:
         return rest_m
-    target_m = altitude_above_home_m(bound_for.alt, bound_for.reference, now.home, grant.flat_terrain)
+    target_m = altitude_above_home_m(current_leg.alt, current_leg.reference, now.home, grant.flat_terrain)
     if target_m is None:
         return rest_m
-    up, strays = math.copysign(1.0, climb), now.airframe.tracking_m
+    up = math.copysign(1.0, climb)
+    strays = now.airframe.tracking_m
     late = abs(climb) * reaction_s(now, now.airframe.climb_accel_mps2)
-    ahead, beyond = (target_m - now.altitude_m) * up, (rest_m - target_m) * up
+    ahead = (target_m - now.altitude_m) * up
+    beyond = (rest_m - target_m) * up
     return target_m if ahead >= -strays and 0.0 < beyond <= late + strays else rest_m
 
 
-def _told_m(now: Situation, rest_m: float) -> float:
+def _altitude_after_stop_m(now: Situation, rest_m: float) -> float:
     """Return the altitude of rest of a drone that was already commanded to climb or sink no further.
 
     The drone reacts to that command, and a correction to a limit at which it may rest would arrive even later. Zones
@@ -175,29 +184,29 @@ def must_stop_first(now: Situation, grant: CompiledGrant) -> bool:
     This is the case if its way to rest comes so close to a fence that the monitor may stop it on the new course, too.
     The check uses the margin of legs, and ignores braking that has begun, because a new command may interrupt it.
     """
-    at = grant.locate(now)
-    if at is None or not now.in_air or not is_moving(now):
+    position = grant.locate(now)
+    if position is None or not now.in_air or not is_moving(now):
         return False
-    ways = [(at, replace(now, forward_mps2=0.0)), *pending_outcomes(now, at)]
+    outlooks = [(position, replace(now, forward_mps2=0.0)), *pending_outcomes(now, position)]
     return any(
         _fences(
             then,
             grant,
             _look_ahead(then, begin, stop_point(then, begin), margin_m(then), stop_altitude_m(then)),
-            leaving=True,
+            system_flies=True,
         )
-        for begin, then in ways
+        for begin, then in outlooks
     )
 
 
 def _look_ahead(now: Situation, start: XY, stop: XY, margin: float, rest_m: float) -> _Ahead:
-    way = shapely.points(start) if start == stop else shapely.linestrings((start, stop))
+    path = shapely.points(start) if start == stop else shapely.linestrings((start, stop))
     lower = min(now.altitude_m, rest_m) - now.altitude_error_m
     upper = max(now.altitude_m, rest_m) + now.altitude_error_m
     # A fence below does not keep a landing drone in the air.
     ends_m = max(rest_m, now.altitude_m) if now.vertical else rest_m
     return _Ahead(
-        AirVolume(way, margin, lower, upper), shapely.points(start), shapely.points(stop), now.altitude_m, ends_m
+        AirVolume(path, margin, lower, upper), shapely.points(start), shapely.points(stop), now.altitude_m, ends_m
     )
 
 
@@ -212,9 +221,9 @@ class _Ahead:
     """Way to the point where the drone can stop, with its ends and their altitudes above home."""
 
     air: AirVolume
-    here: BaseGeometry
+    present: BaseGeometry
     rest: BaseGeometry
-    here_m: float
+    present_m: float
     rest_m: float
 
 
@@ -239,9 +248,9 @@ class _Finding:
     what: str
 
 
-def _fences(now: Situation, grant: CompiledGrant, ahead: _Ahead, *, leaving: bool) -> list[tuple[int, Verdict]]:
+def _fences(now: Situation, grant: CompiledGrant, ahead: _Ahead, *, system_flies: bool) -> list[tuple[int, Verdict]]:
     """Return the reactions of fences, each with the priority of its policy."""
-    found: list[tuple[int, _Finding | None]] = [
+    findings: list[tuple[int, _Finding | None]] = [
         (zone.rule.spec.priority, _kept_out(zone, ahead, now, grant.flat_terrain))
         for zone in grant.exclusions.near(ahead.air, now, grant.flat_terrain)
     ]
@@ -249,7 +258,7 @@ def _fences(now: Situation, grant: CompiledGrant, ahead: _Ahead, *, leaving: boo
         area = _Fence(
             OPERATION_AREA, "ignore", "the operation area", "OutsideOperationArea", "OperationAreaBorderAhead"
         )
-        found.append((0, _kept_in(grant.flight_area, grant.flight_area_border, ahead, area, leaves=False)))
+        findings.append((0, _kept_in(grant.flight_area, grant.flight_area_border, ahead, area, leaves=False)))
     for inclusion in grant.inclusions:
         if inclusion.rule.in_force(now.time_s):
             shape, border = inclusion.at(ahead.air.lower_m, ahead.air.upper_m, now, grant.flat_terrain)
@@ -258,24 +267,28 @@ def _fences(now: Situation, grant: CompiledGrant, ahead: _Ahead, *, leaving: boo
             name = f"{zones} of policy {rule.name}"
             fence = _Fence(rule.name, rule.spec.geofence_action, name, "OutsideInclusionZone", "InclusionBorderAhead")
             leaves = inclusion.banded and _leaves_by_height(inclusion, ahead, now, grant.flat_terrain)
-            found.append((rule.spec.priority, _kept_in(shape, border, ahead, fence, leaves=leaves)))
-    reactions = [(priority, _reaction(f, leaving=leaving)) for priority, f in found if f is not None]
+            findings.append((rule.spec.priority, _kept_in(shape, border, ahead, fence, leaves=leaves)))
+    reactions = [(priority, _reaction(f, system_flies=system_flies)) for priority, f in findings if f is not None]
     return [(priority, verdict) for priority, verdict in reactions if verdict is not None]
 
 
 def _kept_out(zone: PolicyZone, ahead: _Ahead, now: Situation, flat: bool) -> _Finding:
-    shape, border = zone.shape, zone.shape.boundary
-    around, crosses = bool(shape.intersects(ahead.here)), bool(shape.intersects(ahead.air.ground))
+    shape = zone.shape
+    border = zone.shape.boundary
+    around = bool(shape.intersects(ahead.present))
+    crosses = bool(shape.intersects(ahead.air.ground))
     error_m = now.altitude_error_m
-    inside = around and band_may_overlap(zone.band, ahead.here_m - error_m, ahead.here_m + error_m, now.home, flat)
-    rest_m, here_m = (signed_depth_m(shape, border, point) for point in (ahead.rest, ahead.here))
+    inside = around and band_may_overlap(
+        zone.band, ahead.present_m - error_m, ahead.present_m + error_m, now.home, flat
+    )
+    rest_m, here_m = (signed_depth_m(shape, border, point) for point in (ahead.rest, ahead.present))
     worse = rest_m > here_m + DEEPER_M or (crosses and not around)
     if crosses and zone.band is not None:
         # The drone may approach from above or below. If its position is inside the zone's outline, the smaller depth
         # counts.
         rest_m, here_m = (
             min(depth_m, band_depth_m(zone.band, altitude_m, now.home, flat))
-            for depth_m, altitude_m in ((rest_m, ahead.rest_m), (here_m, ahead.here_m))
+            for depth_m, altitude_m in ((rest_m, ahead.rest_m), (here_m, ahead.present_m))
         )
         worse = worse or here_m < 0.0 <= rest_m or (rest_m > here_m + DEEPER_M and rest_m > -error_m)
     name = f"zone {zone.name} of policy {zone.rule.name}"
@@ -285,10 +298,10 @@ def _kept_out(zone: PolicyZone, ahead: _Ahead, now: Situation, flat: bool) -> _F
 
 def _leaves_by_height(fence: Inclusion, ahead: _Ahead, now: Situation, flat: bool) -> bool:
     """Return True if a drone moves farther away from the altitudes of all zones it must stay in."""
-    around = [zone.band for zone in fence.zones if zone.shape.intersects(ahead.here)]
+    around = [zone.band for zone in fence.zones if zone.shape.intersects(ahead.present)]
     rest_m, here_m = (
         max((band_depth_m(band, m, now.home, flat) for band in around), default=math.inf)
-        for m in (ahead.rest_m, ahead.here_m)
+        for m in (ahead.rest_m, ahead.present_m)
     )
     return rest_m < 0.0 <= here_m or (rest_m < here_m - DEEPER_M and rest_m < now.altitude_error_m)
 
@@ -296,31 +309,31 @@ def _leaves_by_height(fence: Inclusion, ahead: _Ahead, now: Situation, flat: boo
 def _kept_in(
     shape: BaseGeometry, border: BaseGeometry, ahead: _Ahead, fence: _Fence, *, leaves: bool
 ) -> _Finding | None:
-    way = ahead.air.ground
-    if shape.covers(way) and not border.dwithin(way, ahead.air.margin_m):
+    path = ahead.air.ground
+    if shape.covers(path) and not border.dwithin(path, ahead.air.margin_m):
         return None
-    outside = not shape.covers(ahead.here)
+    outside = not shape.covers(ahead.present)
     worse = leaves
     if not shape.is_empty:
-        deep_m = signed_depth_m(shape, border, ahead.here)
+        deep_m = signed_depth_m(shape, border, ahead.present)
         worse = worse or signed_depth_m(shape, border, ahead.rest) < deep_m - DEEPER_M
-    worse = worse or (not outside and not shape.covers(way))
+    worse = worse or (not outside and not shape.covers(path))
     return _Finding(fence, outside, worse, "is outside" if outside else "is about to leave")
 
 
-def _reaction(found: _Finding, *, leaving: bool) -> Verdict | None:
+def _reaction(findings: _Finding, *, system_flies: bool) -> Verdict | None:
     """Return the verdict on a fence that is broken or about to be broken.
 
     A policy that takes over the drone does so in both cases. A policy with action ignore only stops motion that makes
     things worse.
     """
-    fence = found.fence
+    fence = findings.fence
     takeover = TAKEOVERS[fence.action]
-    code = fence.broken if found.broken else fence.ahead
-    reason = f"the drone {found.what} {fence.name}"
-    if takeover is not None and (found.worse or (found.broken and not leaving)):
+    code = fence.broken if findings.broken else fence.ahead
+    reason = f"the drone {findings.what} {fence.name}"
+    if takeover is not None and (findings.worse or (findings.broken and not system_flies)):
         return Verdict("takeover", None, code, reason, (fence.policy,), takeover)
-    if found.worse:
+    if findings.worse:
         return Verdict("deny", None, code, f"{reason}; the motion is stopped", (fence.policy,), "hover")
     return None
 
@@ -371,15 +384,15 @@ class _Trespass:
     reason: str
 
 
-def _changed_height(found: _Trespass, now: Situation, grant: CompiledGrant, stop: XY) -> Verdict:
+def _changed_height(findings: _Trespass, now: Situation, grant: CompiledGrant, stop: XY) -> Verdict:
     """Return the correction to an altitude, or a stop if zones block the way to it."""
-    names = (found.bound.name,) if found.bound.name else ()
-    column = vertical_leg(stop, min(now.altitude_m, found.height_m), max(now.altitude_m, found.height_m))
+    names = (findings.bound.name,) if findings.bound.name else ()
+    column = vertical_leg(stop, min(now.altitude_m, findings.height_m), max(now.altitude_m, findings.height_m))
     if find_breaches(column, now, grant, 0.0, 0.0):
-        reason = f"{found.reason}; zones block the way back, so the drone hovers"
-        return Verdict("deny", None, found.code, reason, names, "hover")
+        reason = f"{findings.reason}; zones block the way back, so the drone hovers"
+        return Verdict("deny", None, findings.code, reason, names, "hover")
     lat, lon = grant.frame.latlon(*stop)
-    return Verdict("correct", GotoArgs(lat, lon, found.height_m), found.code, found.reason, names)
+    return Verdict("correct", GotoArgs(lat, lon, findings.height_m), findings.code, findings.reason, names)
 
 
 def _speeds(now: Situation, grant: CompiledGrant, start: XY) -> Verdict | None:

@@ -53,38 +53,41 @@ def combine_filters(filters: Iterable[Filter]) -> tuple[Filter, ...]:
     Black satisfies everything. A blur of the whole picture hides its faces as well. Of two ways to hide faces the
     stricter one is used: pixelation instead of a soft blur, and the stricter fallback.
     """
-    asked: dict[FilterAction, list[Filter]] = {}
-    for one in filters:
-        asked.setdefault(one.action, []).append(one)
-    if "black" in asked:
+    required: dict[FilterAction, list[Filter]] = {}
+    for item in filters:
+        required.setdefault(item.action, []).append(item)
+    if "black" in required:
         return (Filter("black"),)
-    if asked.keys() & _WHOLE:
-        asked.pop("blurFaces", None)
-    return tuple(_strictest(asked[action]) for action in _IN_ORDER if action in asked)
+    if required.keys() & _WHOLE:
+        required.pop("blurFaces", None)
+    return tuple(_strictest(required[action]) for action in _IN_ORDER if action in required)
 
 
 def _strictest(alike: list[Filter]) -> Filter:
-    method: FaceMethod = "gaussian" if all(one.faces == "gaussian" for one in alike) else "pixelate"
-    return Filter(alike[0].action, method, max((one.fallback for one in alike), key=_FALLBACKS.index))
+    method: FaceMethod = "gaussian" if all(item.faces == "gaussian" for item in alike) else "pixelate"
+    return Filter(alike[0].action, method, max((item.fallback for item in alike), key=_FALLBACKS.index))
 
 
-def remaining_filters(asked: Iterable[Filter], applied: Iterable[Filter]) -> tuple[Filter, ...]:
+def remaining_filters(required: Iterable[Filter], applied: Iterable[Filter]) -> tuple[Filter, ...]:
     """Return the filters that must still be applied to an already filtered picture.
 
     Faces hidden by a milder method than required must be hidden again.
     """
-    done = tuple(applied)
-    if any(one.action == "black" for one in done):
+    applied_filters = tuple(applied)
+    if any(item.action == "black" for item in applied_filters):
         return ()
-    return tuple(one for one in combine_filters(asked) if not _satisfied(one, done))
+    return tuple(item for item in combine_filters(required) if not _satisfied(item, applied_filters))
 
 
-def _satisfied(asked: Filter, done: Sequence[Filter]) -> bool:
-    if asked.action != "blurFaces":
-        return any(one.action == asked.action for one in done)
-    if any(one.action in _WHOLE for one in done):
+def _satisfied(required: Filter, applied_filters: Sequence[Filter]) -> bool:
+    if required.action != "blurFaces":
+        return any(item.action == required.action for item in applied_filters)
+    if any(item.action in _WHOLE for item in applied_filters):
         return True
-    return any(one.action == "blurFaces" and (one.faces == "pixelate" or asked.faces == "gaussian") for one in done)
+    return any(
+        item.action == "blurFaces" and (item.faces == "pixelate" or required.faces == "gaussian")
+        for item in applied_filters
+    )
 
 
 def rules_in_view(index: PolicyIndex, now: Situation, grant: CompiledGrant) -> list[Rule]:
@@ -92,23 +95,23 @@ def rules_in_view(index: PolicyIndex, now: Situation, grant: CompiledGrant) -> l
 
     While the position is unknown, every policy in force counts.
     """
-    found = {rule.name: rule for rule in index.everywhere if rule.in_force(now.time_s)}
+    rules = {rule.name: rule for rule in index.everywhere if rule.in_force(now.time_s)}
     view = exposure_footprint([*now.exposure, now], grant.frame)
     if now.lat is None or now.lon is None or view is None:
-        return by_priority(found | {p.rule.name: p.rule for p in index.zones if p.in_force(now.time_s)})
+        return by_priority(rules | {p.rule.name: p.rule for p in index.zones if p.in_force(now.time_s)})
     if not index.zones:
-        return by_priority(found)
-    here = shapely.Point(grant.frame.xy(now.lat, now.lon))
+        return by_priority(rules)
+    position = shapely.Point(grant.frame.xy(now.lat, now.lon))
     lower_m, upper_m = now.altitude_m - now.altitude_error_m, now.altitude_m + now.altitude_error_m
-    for zone in index.near(AirVolume(here, now.position_error_m, lower_m, upper_m), now, grant.flat_terrain):
-        found[zone.rule.name] = zone.rule
+    for zone in index.near(AirVolume(position, now.position_error_m, lower_m, upper_m), now, grant.flat_terrain):
+        rules[zone.rule.name] = zone.rule
     air = AirVolume(view.sight, view.margin_m, -math.inf, view.upper_m)
     for zone in index.near(air, now, grant.flat_terrain):
-        if zone.rule.name not in found and view.shows(
+        if zone.rule.name not in rules and view.shows(
             zone.shape, *band_limits_m(zone.band, now.home, grant.flat_terrain)
         ):
-            found[zone.rule.name] = zone.rule
-    return by_priority(found)
+            rules[zone.rule.name] = zone.rule
+    return by_priority(rules)
 
 
 def by_priority(rules: dict[str, Rule]) -> list[Rule]:

@@ -42,20 +42,20 @@ def return_altitudes_m(now: Situation, grant: CompiledGrant, worth_m: float) -> 
         grant: Permissions and restrictions that apply.
         worth_m: Altitude up to which a climb is worthwhile.
     """
-    at = grant.locate(now)
-    if at is None or now.home is None:
+    position = grant.locate(now)
+    if position is None or now.home is None:
         return (now.altitude_m,)
     home = grant.frame.xy(now.home.lat, now.home.lon)
-    lane = shapely.linestrings((at, home)) if at != home else shapely.points(at)
+    lane = shapely.linestrings((position, home)) if position != home else shapely.points(position)
     best = max(now.altitude_m, min(now.airframe.return_altitude_m, worth_m))
-    found = []
-    for ground in (lane, shapely.points(at), shapely.Point()):
+    altitudes = []
+    for ground in (lane, shapely.points(position), shapely.Point()):
         bounds, unknown = altitude_bounds(grant, now, AirVolume(ground, margin_m(now), -math.inf, math.inf))
         lowest = max((b.lower for b in bounds if b.lower is not None), default=-math.inf)
         highest = lowest_ceiling_m(bounds, unknown, now.altitude_m)
-        found += [min(max(wanted, lowest), highest) for wanted in (best, now.altitude_m)]
+        altitudes += [min(max(altitude_m, lowest), highest) for altitude_m in (best, now.altitude_m)]
     below = [lower for lower in _heights_below_m(lane, now, grant) if lowest <= lower <= min(highest, best)]
-    return (*dict.fromkeys((*found, now.altitude_m, *below[:MAX_LOWERED_ALTITUDES])),)
+    return (*dict.fromkeys((*altitudes, now.altitude_m, *below[:MAX_LOWERED_ALTITUDES])),)
 
 
 def _heights_below_m(lane: BaseGeometry, now: Situation, grant: CompiledGrant) -> list[float]:
@@ -63,7 +63,8 @@ def _heights_below_m(lane: BaseGeometry, now: Situation, grant: CompiledGrant) -
 
     The zones are at most the lane's length away.
     """
-    room_m, flat = height_margin_m(now) + ZONE_FLOOR_CLEARANCE_M, grant.flat_terrain
+    room_m = height_margin_m(now) + ZONE_FLOOR_CLEARANCE_M
+    flat = grant.flat_terrain
     around = grant.exclusions.near(AirVolume(lane, lane.length + margin_m(now), -math.inf, math.inf), now, flat)
     bands = [zone.band for zone in around if zone.band is not None and zone.band.lower is not None]
     floors = {
@@ -94,7 +95,7 @@ def return_bounds(now: Situation, grant: CompiledGrant) -> ReturnBounds:
     anywhere = shapely.box(-MAX_FRAME_REACH_M, -MAX_FRAME_REACH_M, MAX_FRAME_REACH_M, MAX_FRAME_REACH_M)
     air = AirVolume(anywhere if grant.flight_area is None else grant.flight_area, margin_m(now), -math.inf, math.inf)
     return ReturnBounds(
-        lowest_ceiling_m(*altitude_bounds(grant, now, air), here_m=0.0),
+        lowest_ceiling_m(*altitude_bounds(grant, now, air), present_m=0.0),
         min((bound.upper for bound in speed_bounds(grant, now, air) if bound.upper is not None), default=math.inf),
     )
 
@@ -105,11 +106,11 @@ def may_change_altitude(now: Situation, grant: CompiledGrant, altitude_m: float)
     A drone too close below or above a zone may leave that zone first, even beside another zone, because it comes no
     closer to that.
     """
-    at = grant.locate(now)
-    if at is None:
+    position = grant.locate(now)
+    if position is None:
         return False
-    column = vertical_leg(at, min(now.altitude_m, altitude_m), max(now.altitude_m, altitude_m))
-    here = vertical_leg(at, now.altitude_m, now.altitude_m)
+    column = vertical_leg(position, min(now.altitude_m, altitude_m), max(now.altitude_m, altitude_m))
+    here = vertical_leg(position, now.altitude_m, now.altitude_m)
 
     def broken(leg: Leg, room_m: float) -> set[str]:
         # The reason of a zone's breach depends on the ground only, which is the same here.
@@ -121,11 +122,13 @@ def may_change_altitude(now: Situation, grant: CompiledGrant, altitude_m: float)
 
 def descent_enters_fence(now: Situation, grant: CompiledGrant) -> bool:
     """Return True if a drone whose point of rest breaks no fence would break one during its descent from there."""
-    at = grant.locate(now)
-    if at is None:
+    position = grant.locate(now)
+    if position is None:
         return False
-    at, room = stop_point(now, at), (margin_m(now), height_margin_m(now))
-    here, column = vertical_leg(at, now.altitude_m, now.altitude_m), vertical_leg(at, 0.0, now.altitude_m)
+    position = stop_point(now, position)
+    room = (margin_m(now), height_margin_m(now))
+    here = vertical_leg(position, now.altitude_m, now.altitude_m)
+    column = vertical_leg(position, 0.0, now.altitude_m)
     return not find_breaches(here, now, grant, *room) and bool(find_breaches(column, now, grant, *room))
 
 
@@ -153,26 +156,26 @@ def check_straight_return(
     return_m = max(altitude_m, now.airframe.return_altitude_m)
     least_m = max(altitude_m, min(return_m, RTL_CONE_SLOPE * math.dist(target, home)))
     lane = shapely.linestrings((target, home)) if target != home else shapely.points(home)
-    anything = grant.exclusions.near(AirVolume(lane, margin, -slack, return_m + slack), now, grant.flat_terrain)
-    if not grant.inclusions and next(anything, None) is None:
+    blocking_zones = grant.exclusions.near(AirVolume(lane, margin, -slack, return_m + slack), now, grant.flat_terrain)
+    if not grant.inclusions and next(blocking_zones, None) is None:
         return None
     parts = (
         Leg(target, target, target, home, least_m, return_m),
         vertical_leg(target, altitude_m, return_m),
         vertical_leg(home, 0.0, return_m),
     )
-    how = f"at {return_m:.1f} m" if least_m == return_m else f"at {least_m:.1f} to {return_m:.1f} m"
+    description = f"at {return_m:.1f} m" if least_m == return_m else f"at {least_m:.1f} to {return_m:.1f} m"
     for part in parts:
         air = AirVolume(part.ground, margin, part.lower_m - slack, part.upper_m + slack)
         for zone in grant.exclusions.near(air, now, grant.flat_terrain):
-            return _blocked(f"{how}, is blocked by zone {zone.name} of policy {zone.rule.name}", zone.rule.name)
+            return _blocked(f"{description}, is blocked by zone {zone.name} of policy {zone.rule.name}", zone.rule.name)
     for fence in grant.inclusions:
         if fence.rule.in_force(now.time_s):
             shape, _ = fence.at(least_m, return_m, now, grant.flat_terrain)
             if not shape.covers(lane):
-                return _blocked(f"{how}, leaves the zones of policy {fence.rule.name}", fence.rule.name)
+                return _blocked(f"{description}, leaves the zones of policy {fence.rule.name}", fence.rule.name)
     return None
 
 
-def _blocked(how: str, policy: str) -> Verdict:
-    return deny("WayHomeBlocked", f"the straight return from the target, {how}", (policy,))
+def _blocked(description: str, policy: str) -> Verdict:
+    return deny("WayHomeBlocked", f"the straight return from the target, {description}", (policy,))

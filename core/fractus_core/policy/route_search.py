@@ -27,13 +27,15 @@ MAX_EXCESS = 1.2
 """Factor by which a route may be longer than the shortest one, for the sake of a quicker search. A percent or two is
 usual."""
 
-QUICK_MAX_LEGS_TESTED, QUICK_MAX_EXCESS = 250, 5.0
+QUICK_MAX_LEGS_TESTED = 250
+QUICK_MAX_EXCESS = 5.0
 """The same limits for a search that only decides if a route exists while a caller waits: about 25 ms."""
 
 _MAX_DETOUR = 1.2
 _MAX_ROUNDING_M = 1.5
 _ROUNDING = 1e-6
-_START, _TARGET = 0, 1
+_START = 0
+_TARGET = 1
 
 
 RouteSteps = Generator[None, None, tuple[XY, ...] | None]
@@ -84,13 +86,13 @@ def route_steps(
     if now.home is None or not now.is_plausible or not all(math.isfinite(figure) for figure in figures):
         return None
     roomy, narrow = (_Search(start, target, _spaces(now, grant, figures[-2:], room_m)) for room_m in CLEARANCES_M)
-    found = yield from roomy.steps()
-    if found is not None and _length_m(start, found) <= _MAX_DETOUR * math.dist(start, target):
-        return (yield from roomy.rounded(found))
+    result = yield from roomy.steps()
+    if result is not None and _length_m(start, result) <= _MAX_DETOUR * math.dist(start, target):
+        return (yield from roomy.rounded(result))
     shorter = (yield from narrow.steps()) if not roomy.exhausted else None
-    if shorter is not None and (found is None or _length_m(start, shorter) < _length_m(start, found) / _MAX_DETOUR):
+    if shorter is not None and (result is None or _length_m(start, shorter) < _length_m(start, result) / _MAX_DETOUR):
         return (yield from narrow.rounded(shorter))
-    return (yield from roomy.rounded(found)) if found is not None else None
+    return (yield from roomy.rounded(result)) if result is not None else None
 
 
 def route_exists(start: XY, target: XY, now: Situation, grant: CompiledGrant, altitude_m: float) -> bool:
@@ -133,12 +135,12 @@ def _finished(search: RouteSteps) -> tuple[XY, ...] | None:
         try:
             next(search)
         except StopIteration as end:
-            found: tuple[XY, ...] | None = end.value
-            return found
+            result: tuple[XY, ...] | None = end.value
+            return result
 
 
-def _length_m(start: XY, way: tuple[XY, ...]) -> float:
-    return sum(math.dist(a, b) for a, b in itertools.pairwise((start, *way)))
+def _length_m(start: XY, route: tuple[XY, ...]) -> float:
+    return sum(math.dist(a, b) for a, b in itertools.pairwise((start, *route)))
 
 
 def _meeting(before: XY, first: XY, second: XY, after: XY) -> XY | None:
@@ -186,13 +188,14 @@ class _Search:
         if self._ends[0] == self._ends[1]:
             return (self._ends[1],) if self._leaving.allows_leg(*self._ends) else None
         begin = shapely.points(self._ends[0])
-        around, about = self._leaving.blockers(begin), self._space.blockers(shapely.points(self._ends[1]))
-        self._odd = {node for node, found in ((_START, around), (_TARGET, about)) if found}
+        start_blockers = self._leaving.blockers(begin)
+        target_blockers = self._space.blockers(shapely.points(self._ends[1]))
+        self._odd = {node for node, result in ((_START, start_blockers), (_TARGET, target_blockers)) if result}
         if not self._space.allows_return_from(self._ends[1]) or (
-            about and not self._space.allows_leg(self._ends[1], self._ends[1])
+            target_blockers and not self._space.allows_leg(self._ends[1], self._ends[1])
         ):
             return None
-        for obstacle in around:
+        for obstacle in start_blockers:
             # Add the nearest exit first, because no corner need lie there.
             self._add(self._leaving.nearest_exit(obstacle, begin))
             self._learn([obstacle], self._ends[0], self._leaving)
@@ -213,9 +216,9 @@ class _Search:
         """True if the search gave up."""
         return len(self._clear) >= self._max_legs
 
-    def rounded(self, way: tuple[XY, ...]) -> RouteSteps:
+    def rounded(self, route: tuple[XY, ...]) -> RouteSteps:
         """Merge neighbouring waypoints if their legs meet a little farther on, because each waypoint costs a stop."""
-        points = [self._ends[0], *way]
+        points = [self._ends[0], *route]
         i = 1
         while i + 2 < len(points):
             yield
@@ -234,12 +237,13 @@ class _Search:
         return free and space.allows_return_from(b)
 
     def _way(self) -> tuple[XY, ...]:
-        at, way = _TARGET, []
+        at = _TARGET
+        route = []
         while at != _START:
             x, y = self._nodes[at, :2]
-            way.append((float(x), float(y)))
+            route.append((float(x), float(y)))
             at = self._parent[at]
-        return (*way[::-1][:-1], self._ends[1])
+        return (*route[::-1][:-1], self._ends[1])
 
     def _expand(self, node: int) -> None:
         if node not in self._expanded:

@@ -26,14 +26,14 @@ def policy_applies(
     policy: PolicySpec, owner: ApplicationReference, component: str, attributes: Mapping[str, object]
 ) -> bool:
     """Return True if a policy applies, as `policy_selects`, given the references that a grant contains."""
-    wanted = policy.selector.applications
+    selected = policy.selector.applications
     unknown = policy.kind != "grant"
-    if wanted is not None:
-        if wanted.namespaces and owner.namespace not in wanted.namespaces:
+    if selected is not None:
+        if selected.namespaces and owner.namespace not in selected.namespaces:
             return False
-        if wanted.names and owner.name not in wanted.names:
+        if selected.names and owner.name not in selected.names:
             return False
-        if wanted.components and component not in wanted.components:
+        if selected.components and component not in selected.components:
             return False
     return all(matches(expression, attributes, unknown=unknown) for expression in policy.selector.nodes)
 
@@ -56,11 +56,11 @@ def matches(expression: NodeExpression, attributes: Mapping[str, object], *, unk
             return str(value) not in expression.values
         case "Gt" | "Lt":
             try:
-                figure = float(str(value))
+                number = float(str(value))
             except ValueError:
                 return unknown
             bound = float(expression.values[0])
-            return figure > bound if expression.operator == "Gt" else figure < bound
+            return number > bound if expression.operator == "Gt" else number < bound
         case _:
             assert_never(expression.operator)
 

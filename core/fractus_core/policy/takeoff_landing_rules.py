@@ -5,7 +5,15 @@ from __future__ import annotations
 import shapely
 
 from fractus_core.policy.compiled_grant import AirVolume, CompiledGrant
-from fractus_core.policy.decision_types import POSITION_UNKNOWN, Call, Situation, TakeoffArgs, Verdict, deny, distinct
+from fractus_core.policy.decision_types import (
+    DENY_POSITION_UNKNOWN,
+    Call,
+    Situation,
+    TakeoffArgs,
+    Verdict,
+    deny,
+    distinct,
+)
 from fractus_core.policy.geofences import find_breaches
 from fractus_core.policy.goto_rules import check_return
 from fractus_core.policy.kinematics import XY, height_margin_m, margin_m, stop_point, vertical_leg
@@ -14,52 +22,53 @@ from fractus_core.policy.limits import altitude_bounds, choose_objection, clamp,
 
 def judge_takeoff(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     """Judge a climb from the ground."""
-    args, at = call.args, grant.locate(now)
-    if at is None or not isinstance(args, TakeoffArgs):
-        return POSITION_UNKNOWN if at is None else deny("InvalidArgument", "Takeoff needs its arguments")
+    args = call.args
+    position = grant.locate(now)
+    if position is None or not isinstance(args, TakeoffArgs):
+        return DENY_POSITION_UNKNOWN if position is None else deny("InvalidArgument", "Takeoff needs its arguments")
     lower, upper = sorted((now.altitude_m, args.altitude_m))
-    bounds, unknown = altitude_bounds(grant, now, AirVolume(shapely.points(at), margin_m(now), lower, upper))
+    bounds, unknown = altitude_bounds(grant, now, AirVolume(shapely.points(position), margin_m(now), lower, upper))
     if unknown:
         return deny_unknown_datum(unknown[0])
     clamped = clamp("Altitude", "m above home", args.altitude_m, bounds)
     if isinstance(clamped, Verdict):
         return clamped
     correction = correction_verdict(TakeoffArgs(clamped.value), [clamped])
-    problem = _climb(at, now, grant, clamped.value)
+    problem = _climb(position, now, grant, clamped.value)
     if problem is None or not clamped.code:
         return problem or correction
-    return choose_objection(problem, _climb(at, now, grant, args.altitude_m), correction)
+    return choose_objection(problem, _climb(position, now, grant, args.altitude_m), correction)
 
 
-def _climb(at: XY, now: Situation, grant: CompiledGrant, altitude_m: float) -> Verdict | None:
+def _climb(position: XY, now: Situation, grant: CompiledGrant, altitude_m: float) -> Verdict | None:
     """Return the objection of fences and the return route to a climb, or None."""
-    return _column(at, now, grant, now.altitude_m, altitude_m) or check_return(at, altitude_m, now, grant)
+    return _column(position, now, grant, now.altitude_m, altitude_m) or check_return(position, altitude_m, now, grant)
 
 
 def judge_arm(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     """Judge arming at the drone's position."""
-    at = grant.locate(now)
-    if at is None:
-        return POSITION_UNKNOWN
-    return _column(at, now, grant, now.altitude_m, now.altitude_m) or Verdict("allow", call.args)
+    position = grant.locate(now)
+    if position is None:
+        return DENY_POSITION_UNKNOWN
+    return _column(position, now, grant, now.altitude_m, now.altitude_m) or Verdict("allow", call.args)
 
 
 def judge_land(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     """Judge a descent to the ground from the point of rest."""
-    at = grant.locate(now)
-    if at is None:
-        return POSITION_UNKNOWN
-    ground = stop_point(now, at)
+    position = grant.locate(now)
+    if position is None:
+        return DENY_POSITION_UNKNOWN
+    ground = stop_point(now, position)
     return _column(ground, now, grant, 0.0, now.altitude_m) or Verdict("allow", call.args)
 
 
-def _column(at: XY, now: Situation, grant: CompiledGrant, lower_m: float, upper_m: float) -> Verdict | None:
+def _column(position: XY, now: Situation, grant: CompiledGrant, lower_m: float, upper_m: float) -> Verdict | None:
     """Return the denial of a vertical motion, or of standing, by fences. It is never a takeover."""
-    leg = vertical_leg(at, min(lower_m, upper_m), max(lower_m, upper_m))
-    found = find_breaches(leg, now, grant, margin_m(now), height_margin_m(now))
-    if not found:
+    leg = vertical_leg(position, min(lower_m, upper_m), max(lower_m, upper_m))
+    breaches = find_breaches(leg, now, grant, margin_m(now), height_margin_m(now))
+    if not breaches:
         return None
-    return deny(found[0].code, found[0].reason, distinct(b.policy for b in found))
+    return deny(breaches[0].code, breaches[0].reason, distinct(b.policy for b in breaches))
 
 
 def judge_disarm(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:

@@ -9,7 +9,7 @@ import shapely
 
 from fractus_core.policy.compiled_grant import AirVolume, CompiledGrant
 from fractus_core.policy.decision_types import (
-    POSITION_UNKNOWN,
+    DENY_POSITION_UNKNOWN,
     Call,
     SetSpeedArgs,
     Situation,
@@ -50,12 +50,15 @@ _HALVINGS = 8
 
 def judge_speed(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     """Judge a change of the speed of legs."""
-    args, at = call.args, grant.locate(now)
+    args = call.args
+    position = grant.locate(now)
     if not isinstance(args, SetSpeedArgs):
         return deny("InvalidArgument", "SetSpeed needs its arguments")
-    if at is None:
-        return POSITION_UNKNOWN
-    bounds = speed_bounds(grant, now, AirVolume(shapely.points(at), margin_m(now), now.altitude_m, now.altitude_m))
+    if position is None:
+        return DENY_POSITION_UNKNOWN
+    bounds = speed_bounds(
+        grant, now, AirVolume(shapely.points(position), margin_m(now), now.altitude_m, now.altitude_m)
+    )
     clamped = clamp("Speed", "m/s", args.speed_mps, bounds)
     return clamped if isinstance(clamped, Verdict) else correction_verdict(SetSpeedArgs(clamped.value), [clamped])
 
@@ -67,7 +70,7 @@ class _Setpoint:
     args: VelocityArgs
     now: Situation
     grant: CompiledGrant
-    at: XY
+    position: XY
     notes: list[Correction] = field(default_factory=list)
     _legs: dict[VelocityArgs, Leg] = field(default_factory=dict)
 
@@ -79,7 +82,7 @@ class _Setpoint:
     def sweep(self, args: VelocityArgs) -> Leg:
         """Return the leg of a velocity."""
         if args not in self._legs:
-            self._legs[args] = velocity_leg(self.now, self.at, args)
+            self._legs[args] = velocity_leg(self.now, self.position, args)
         return self._legs[args]
 
     @property
@@ -96,12 +99,13 @@ def judge_velocity(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     drone beyond an altitude limit is led back regardless of the requested vertical speed. Lower speed limits do not
     apply, because hovering is always permitted.
     """
-    args, at = call.args, grant.locate(now)
+    args = call.args
+    position = grant.locate(now)
     if not isinstance(args, VelocityArgs):
         return deny("InvalidArgument", "SetVelocity needs its arguments")
-    if at is None:
-        return POSITION_UNKNOWN
-    setpoint = _Setpoint(args, now, grant, at)
+    if position is None:
+        return DENY_POSITION_UNKNOWN
+    setpoint = _Setpoint(args, now, grant, position)
     problem = _within_speed(setpoint) or _within_heights(setpoint)
     if problem is not None:
         return problem
@@ -112,10 +116,10 @@ def judge_velocity(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     if not limits:
         return problem
     setpoint.args = args
-    found = _breached(setpoint, args)
+    breaches = _breached(setpoint, args)
     return choose_objection(
         problem,
-        breach_verdict(found) if found else _way_home_blocked(setpoint),
+        breach_verdict(breaches) if breaches else _way_home_blocked(setpoint),
         correction_verdict(None, setpoint.notes[:limits]),
     )
 
@@ -127,13 +131,13 @@ def _way_home_blocked(setpoint: _Setpoint) -> Verdict | None:
 
 def _within_speed(setpoint: _Setpoint) -> Verdict | None:
     args = setpoint.args
-    asked = math.hypot(args.north_mps, args.east_mps)
+    requested = math.hypot(args.north_mps, args.east_mps)
     bounds = [replace(b, lower=None) for b in speed_bounds(setpoint.grant, setpoint.now, setpoint.air)]
-    speed = clamp("Speed", "m/s", asked, bounds)
+    speed = clamp("Speed", "m/s", requested, bounds)
     if isinstance(speed, Verdict):
         return speed
     if speed.code:
-        share = max(speed.value, 0.0) / asked
+        share = max(speed.value, 0.0) / requested
         setpoint.args = replace(args, north_mps=args.north_mps * share, east_mps=args.east_mps * share)
         setpoint.notes.append(speed)
     return None
@@ -141,12 +145,13 @@ def _within_speed(setpoint: _Setpoint) -> Verdict | None:
 
 def _within_heights(setpoint: _Setpoint) -> Verdict | None:
     """Correct the vertical part to the altitude limits, or return a denial."""
-    now, grant = setpoint.now, setpoint.grant
+    now = setpoint.now
+    grant = setpoint.grant
     bounds, unknown = altitude_bounds(grant, now, setpoint.air)
     if unknown:
         return deny_unknown_datum(unknown[0])
     problem = check_contradiction("Altitude", "m", bounds) or check_altitude_on_entry(
-        shapely.points(setpoint.at), (now.altitude_m, stop_altitude_m(now)), bounds, height_margin_m(now)
+        shapely.points(setpoint.position), (now.altitude_m, stop_altitude_m(now)), bounds, height_margin_m(now)
     )
     if problem is not None:
         return problem
@@ -156,9 +161,9 @@ def _within_heights(setpoint: _Setpoint) -> Verdict | None:
         every = bounds if above else [*bounds, ground]
         bound = strictest_bound(every, above=above)
         if bound is not None:
-            asked = setpoint.args
+            requested = setpoint.args
             problem = _lead_back(setpoint, bound, above=above)
-            if problem is None and not above and setpoint.args != asked:
+            if problem is None and not above and setpoint.args != requested:
                 problem = _no_room(setpoint, bound, strictest_bound(bounds, above=True))
             if problem is not None:
                 return problem
@@ -182,7 +187,8 @@ def _lead_back(setpoint: _Setpoint, bound: Bound, *, above: bool) -> Verdict | N
     if not _beyond(setpoint, args, edge, above=above):
         return None
     word, side = ("Above", "above") if above else ("Below", "below")
-    source = f"policy {bound.name}" if bound.name else "the drone" if above else "the ground"
+    default_source = "the drone" if above else "the ground"
+    source = f"policy {bound.name}" if bound.name else default_source
     names = (bound.name,) if bound.name else ()
     toward = args.down_mps < 0 if above else args.down_mps > 0
     reason = f"the drone would come {side} the limit of {edge:.1f} m of {source}"
@@ -215,38 +221,44 @@ def _beyond(setpoint: _Setpoint, args: VelocityArgs, edge: float, *, above: bool
 def _scaled_climb(setpoint: _Setpoint, edge: float, *, above: bool) -> VelocityArgs:
     """Return the largest fraction of the vertical part that stays within a limit. Zero always does."""
     args = setpoint.args
-    best, low, high = replace(args, down_mps=0.0), 0.0, 1.0
+    best = replace(args, down_mps=0.0)
+    low = 0.0
+    high = 1.0
     for _ in range(_HALVINGS):
         share = (low + high) / 2
         scaled = replace(args, down_mps=args.down_mps * share)
         if _beyond(setpoint, scaled, edge, above=above):
             high = share
         else:
-            low, best = share, scaled
+            low = share
+            best = scaled
     return best
 
 
 def _within_fences(setpoint: _Setpoint) -> Verdict | None:
-    found = _breached(setpoint, setpoint.args)
-    if not found:
+    breaches = _breached(setpoint, setpoint.args)
+    if not breaches:
         return None
     args = setpoint.args
-    asked = math.hypot(args.north_mps, args.east_mps, args.down_mps)
-    if any(b.action != "adjust" for b in found) or asked < MIN_SCALED_MPS:
-        return breach_verdict(found)
-    best, low, high = None, MIN_SCALED_MPS / asked, 1.0
+    requested = math.hypot(args.north_mps, args.east_mps, args.down_mps)
+    if any(b.action != "adjust" for b in breaches) or requested < MIN_SCALED_MPS:
+        return breach_verdict(breaches)
+    best = None
+    low = MIN_SCALED_MPS / requested
+    high = 1.0
     for _ in range(_HALVINGS):
         share = (low + high) / 2
         scaled = _scaled(args, share)
         if _breached(setpoint, scaled):
             high = share
         else:
-            low, best = share, scaled
+            low = share
+            best = scaled
     if best is None:
-        return breach_verdict(found)
+        return breach_verdict(breaches)
     setpoint.args = best
-    names = distinct(b.policy for b in found)
-    setpoint.notes.append(Correction(low, "VelocityScaled", f"{found[0].reason}; scaled to {low:.0%}", names))
+    names = distinct(b.policy for b in breaches)
+    setpoint.notes.append(Correction(low, "VelocityScaled", f"{breaches[0].reason}; scaled to {low:.0%}", names))
     return None
 
 

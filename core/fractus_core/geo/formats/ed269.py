@@ -55,23 +55,23 @@ def read_ed269(text: str, without: Collection[str] = ()) -> Imported:
     Raises:
         InvalidObject: The text is not an ED-269 file, a geometry is broken, or a feature cannot be represented exactly.
     """
-    whole = parse_json(text)
-    if "features" not in whole:
+    document = parse_json(text)
+    if "features" not in document:
         raise InvalidObject("features", "is missing; this is not an ED-269 file")
-    drafts = ZoneBuilder(without)
-    for i, feature in enumerate(object_list(whole["features"], "features")):
+    builder = ZoneBuilder(without)
+    for i, feature in enumerate(object_list(document["features"], "features")):
         field = f"features[{i}]"
         title = str(feature.get("identifier") or feature.get("name") or field)
-        drafts.take(title, functools.partial(_read_feature, drafts, title, feature, field))
-    return drafts.result()
+        builder.take(title, functools.partial(_read_feature, builder, title, feature, field))
+    return builder.result()
 
 
-def _read_feature(drafts: ZoneBuilder, title: str, feature: dict[str, Any], field: str) -> None:
-    told = [str(feature[key]) for key in ("name", "restriction", "message") if feature.get(key)]
-    spec: dict[str, Any] = {"description": drafts.described(title, ": ".join(told))} if told else {}
-    drafts.unmapped(title, (key for key, value in feature.items() if value not in (None, "", [], {})), _USED)
+def _read_feature(builder: ZoneBuilder, title: str, feature: dict[str, Any], field: str) -> None:
+    parts = [str(feature[key]) for key in ("name", "restriction", "message") if feature.get(key)]
+    spec: dict[str, Any] = {"description": builder.described(title, ": ".join(parts))} if parts else {}
+    builder.unmapped(title, (key for key, value in feature.items() if value not in (None, "", [], {})), _USED)
     if feature.get("restriction"):
-        drafts.note(title, f"a Zone forbids nothing by itself; add a policy for restriction {feature['restriction']}")
+        builder.note(title, f"a Zone forbids nothing by itself; add a policy for restriction {feature['restriction']}")
     schedule = _schedule(feature, field)
     if schedule:
         spec["schedule"] = schedule
@@ -79,25 +79,25 @@ def _read_feature(drafts: ZoneBuilder, title: str, feature: dict[str, Any], fiel
     if not volumes:
         raise InvalidObject(f"{field}.geometry", "is missing; give at least one volume")
     for j, volume in enumerate(volumes):
-        where = f"{field}.geometry[{j}]"
-        reject_unknown_fields(volume, _OF_VOLUME, where)
-        band = _band(volume, where)
-        drafts.add(title, {**spec, "area": _area(drafts, volume, where), **({"altitude": band} if band else {})}, where)
+        path = f"{field}.geometry[{j}]"
+        reject_unknown_fields(volume, _OF_VOLUME, path)
+        band = _band(volume, path)
+        builder.add(title, {**spec, "area": _area(builder, volume, path), **({"altitude": band} if band else {})}, path)
 
 
-def _area(drafts: ZoneBuilder, volume: dict[str, Any], field: str) -> dict[str, Any]:
-    where = f"{field}.horizontalProjection"
-    projection = optional_object(volume.get("horizontalProjection"), where)
+def _area(builder: ZoneBuilder, volume: dict[str, Any], field: str) -> dict[str, Any]:
+    path = f"{field}.horizontalProjection"
+    projection = optional_object(volume.get("horizontalProjection"), path)
     shape = projection.get("type")
     if shape not in _OF_PROJECTION:
-        raise InvalidObject(f"{where}.type", f"must be Polygon or Circle, not {shape!r}")
-    reject_unknown_fields(projection, _OF_PROJECTION[shape], where)
+        raise InvalidObject(f"{path}.type", f"must be Polygon or Circle, not {shape!r}")
+    reject_unknown_fields(projection, _OF_PROJECTION[shape], path)
     if shape == "Polygon":
-        return drafts.rings(projection.get("coordinates"), f"{where}.coordinates")
+        return builder.rings(projection.get("coordinates"), f"{path}.coordinates")
     if volume.get("uomDimensions") not in (None, "M"):
-        raise InvalidObject(f"{where}.radius", "may be metres or feet; give the volume in metres (uomDimensions M)")
-    centre = parse_point(projection.get("center"), f"{where}.center")
-    return circle_area(centre, projection.get("radius"), f"{where}.radius")
+        raise InvalidObject(f"{path}.radius", "may be metres or feet; give the volume in metres (uomDimensions M)")
+    centre = parse_point(projection.get("center"), f"{path}.center")
+    return circle_area(centre, projection.get("radius"), f"{path}.radius")
 
 
 def _band(volume: dict[str, Any], field: str) -> dict[str, Any]:
@@ -108,7 +108,8 @@ def _band(volume: dict[str, Any], field: str) -> dict[str, Any]:
     limits: dict[str, Any] = {}
     references = set()
     for side in ("lower", "upper"):
-        value, datum = volume.get(f"{side}Limit"), volume.get(f"{side}VerticalReference")
+        value = volume.get(f"{side}Limit")
+        datum = volume.get(f"{side}VerticalReference")
         if value is None:
             continue
         if not is_number(value):
@@ -133,21 +134,21 @@ def _schedule(feature: dict[str, Any], field: str) -> list[dict[str, Any]]:
     """Return the active times of the zone. Empty means always."""
     times: list[dict[str, Any]] = []
     for i, period in enumerate(object_list(feature.get("applicability"), f"{field}.applicability")):
-        where = f"{field}.applicability[{i}]"
-        reject_unknown_fields(period, _OF_PERIOD, where)
+        path = f"{field}.applicability[{i}]"
+        reject_unknown_fields(period, _OF_PERIOD, path)
         valid = {
-            ours: period[theirs]
-            for ours, theirs in (("validFrom", "startDateTime"), ("validUntil", "endDateTime"))
-            if period.get(theirs)
+            key: period[ed269_key]
+            for key, ed269_key in (("validFrom", "startDateTime"), ("validUntil", "endDateTime"))
+            if period.get(ed269_key)
         }
-        daily = object_list(period.get("schedule"), f"{where}.schedule")
-        found = [{**valid, **_daily(day, f"{where}.schedule[{j}]")} for j, day in enumerate(daily)] or [valid]
+        daily = object_list(period.get("schedule"), f"{path}.schedule")
+        active_times = [{**valid, **_daily(day, f"{path}.schedule[{j}]")} for j, day in enumerate(daily)] or [valid]
         permanent = period.get("permanent", "NO")
         if permanent not in ("YES", "NO"):
-            raise InvalidObject(f"{where}.permanent", f"must be YES or NO, not {permanent!r:.40}")
-        if permanent == "YES" and {} not in found:
-            raise InvalidObject(f"{where}.permanent", "is YES although times are given; remove the times or set NO")
-        times += found
+            raise InvalidObject(f"{path}.permanent", f"must be YES or NO, not {permanent!r:.40}")
+        if permanent == "YES" and {} not in active_times:
+            raise InvalidObject(f"{path}.permanent", "is YES although times are given; remove the times or set NO")
+        times += active_times
     return [] if {} in times else times
 
 
@@ -161,16 +162,18 @@ def _daily(day: dict[str, Any], field: str) -> dict[str, Any]:
         raise InvalidObject(f"{field}.day", f"{unknown[0]!r:.40} is not MON to SUN or ANY; name the days of the week")
     days = [] if "ANY" in named else [list(_DAYS.values()).index(_DAYS[name]) for name in named]
     start, end = day.get("startTime"), day.get("endTime")
-    found: dict[str, Any] = {}
+    times: dict[str, Any] = {}
     if start or end:
-        begin_min, finish_min = _minutes(start, f"{field}.startTime"), _minutes(end, f"{field}.endTime", last=True)
+        begin_min = _minutes(start, f"{field}.startTime")
+        finish_min = _minutes(end, f"{field}.endTime", last=True)
         # East of Greenwich, a day begins on the previous day in UTC.
         days = [(index + begin_min // _DAY_MIN) % 7 for index in days]
-        begin_min, finish_min = begin_min % _DAY_MIN, finish_min % _DAY_MIN
+        begin_min = begin_min % _DAY_MIN
+        finish_min = finish_min % _DAY_MIN
         if begin_min or finish_min:
-            found = {"start": _clock(begin_min), "end": _clock(finish_min)}
+            times = {"start": _clock(begin_min), "end": _clock(finish_min)}
     whole_week = len(set(days)) in (0, 7)
-    return found if whole_week else {"days": [list(_DAYS.values())[i] for i in sorted(set(days))], **found}
+    return times if whole_week else {"days": [list(_DAYS.values())[i] for i in sorted(set(days))], **times}
 
 
 def _minutes(given: Any, field: str, *, last: bool = False) -> int:
@@ -178,15 +181,15 @@ def _minutes(given: Any, field: str, *, last: bool = False) -> int:
 
     Second 59 counts as the end of its minute.
     """
-    found = _TIME.fullmatch(given) if isinstance(given, str) else None
-    minutes = int(found[1]) * 60 + int(found[2]) if found is not None else _DAY_MIN + 1
-    if found is None or minutes > (_DAY_MIN if last else _DAY_MIN - 1):
+    match = _TIME.fullmatch(given) if isinstance(given, str) else None
+    minutes = int(match[1]) * 60 + int(match[2]) if match is not None else _DAY_MIN + 1
+    if match is None or minutes > (_DAY_MIN if last else _DAY_MIN - 1):
         raise InvalidObject(field, f"must be a time of day with its zone, such as 08:00Z, not {given!r:.40}")
-    seconds = int(found[3] or 0)
+    seconds = int(match[3] or 0)
     if seconds and not (last and seconds == 59):
         raise InvalidObject(field, f"must be a whole minute, not {given}")
-    offset = int(found[5] or 0) * 60 + int(found[6] or 0)
-    return minutes + bool(seconds) + (offset if found[4] == "-" else -offset)
+    offset = int(match[5] or 0) * 60 + int(match[6] or 0)
+    return minutes + bool(seconds) + (offset if match[4] == "-" else -offset)
 
 
 def _clock(minutes: int) -> str:
@@ -219,8 +222,8 @@ def write_ed269(zones: Iterable[Zone], *, country: str = "XXX", restriction: str
         features.append(feature)
     if zones:
         notes.append(f"every zone: zoneAuthority is unknown; restriction is {restriction}, country {country}")
-    whole = {"title": "Zones", "description": "", "features": features}
-    return Exported(json.dumps(whole, indent=1) + "\n", tuple(notes))
+    document = {"title": "Zones", "description": "", "features": features}
+    return Exported(json.dumps(document, indent=1) + "\n", tuple(notes))
 
 
 def _volumes(zone: Zone, notes: list[str]) -> list[dict[str, Any]]:
@@ -236,20 +239,20 @@ def _volumes(zone: Zone, notes: list[str]) -> list[dict[str, Any]]:
         projections: list[dict[str, Any]] = [{"type": "Circle", "center": centre, "radius": area.circle.radius}]
     else:
         projections = [{"type": "Polygon", "coordinates": part} for part in cut_rings(zone, notes)]
-    found: dict[str, Any] = {
+    volume: dict[str, Any] = {
         "uomDimensions": "M",
         "lowerLimit": band.lower if band.lower is not None else 0,
         "lowerVerticalReference": datum if band.lower is not None else "AGL",
         "upperVerticalReference": datum,
     }
     if band.upper is not None:
-        found["upperLimit"] = band.upper
-    return [{**found, "horizontalProjection": projection} for projection in projections]
+        volume["upperLimit"] = band.upper
+    return [{**volume, "horizontalProjection": projection} for projection in projections]
 
 
 def _applicability(schedule: Iterable[ActiveTime]) -> list[dict[str, Any]]:
     periods = []
-    names = {ours: theirs for theirs, ours in _DAYS.items()}
+    names = {day: ed269_day for ed269_day, day in _DAYS.items()}
     for time in schedule:
         period: dict[str, Any] = {"permanent": "NO"}
         if time.valid_from is not None:

@@ -50,30 +50,33 @@ def read_geojson(text: str, without: Collection[str] = (), drop: Collection[str]
     Raises:
         InvalidObject: The text is not GeoJSON, a geometry is broken, or a feature cannot be represented exactly.
     """
-    whole = parse_json(text)
-    kind = whole.get("type")
-    _check_system(whole, "crs")
+    document = parse_json(text)
+    kind = document.get("type")
+    _check_system(document, "crs")
     if kind == "FeatureCollection":
-        features, field = object_list(whole.get("features"), "features"), "features[{}]"
+        features = object_list(document.get("features"), "features")
+        field = "features[{}]"
     elif kind == "Feature":
-        features, field = [whole], ""
+        features = [document]
+        field = ""
     elif kind in _AREAS:
-        features, field = [{"type": "Feature", "geometry": whole, "properties": {}}], ""
+        features = [{"type": "Feature", "geometry": document, "properties": {}}]
+        field = ""
     else:
         raise InvalidObject("type", f"{kind!r} is not GeoJSON of zones; expected a FeatureCollection of polygons")
-    drafts = ZoneBuilder(without, drop)
+    builder = ZoneBuilder(without, drop)
     for i, feature in enumerate(features):
-        where = field.format(i)
+        path = field.format(i)
         properties = feature.get("properties")
-        said = properties if isinstance(properties, dict) else {}
-        title = str(said.get("name") or said.get("title") or feature.get("id") or f"zone {i}")
-        drafts.take(title, functools.partial(_read_feature, drafts, title, feature, where))
-    return drafts.result()
+        stated = properties if isinstance(properties, dict) else {}
+        title = str(stated.get("name") or stated.get("title") or feature.get("id") or f"zone {i}")
+        builder.take(title, functools.partial(_read_feature, builder, title, feature, path))
+    return builder.result()
 
 
-def _check_system(found: dict[str, Any], field: str) -> None:
+def _check_system(value: dict[str, Any], field: str) -> None:
     """Reject coordinates in another reference system."""
-    system = found.get("crs")
+    system = value.get("crs")
     if system is None:
         return
     named = system.get("properties") if isinstance(system, dict) else None
@@ -82,7 +85,7 @@ def _check_system(found: dict[str, Any], field: str) -> None:
         raise InvalidObject(field, f"must be WGS 84, not {name or 'an unnamed one'}; convert the file to OGC:CRS84")
 
 
-def _read_feature(drafts: ZoneBuilder, title: str, feature: dict[str, Any], field: str) -> None:
+def _read_feature(builder: ZoneBuilder, title: str, feature: dict[str, Any], field: str) -> None:
     inside = f"{field}." if field else ""
     if feature.get("type") != "Feature":
         raise InvalidObject(f"{inside}type", f"must be Feature, not {feature.get('type')!r}")
@@ -91,52 +94,55 @@ def _read_feature(drafts: ZoneBuilder, title: str, feature: dict[str, Any], fiel
     known = ("altitude", "schedule", "description")
     spec = {k: properties[k] for k in known if properties.get(k) is not None and properties[k] != ""}
     if isinstance(spec.get("description"), str):
-        spec["description"] = drafts.described(title, spec["description"])
-    drafts.properties(title, properties, _KNOWN | _STYLE, f"{inside}properties")
+        spec["description"] = builder.described(title, spec["description"])
+    builder.properties(title, properties, _KNOWN | _STYLE, f"{inside}properties")
     geometry = optional_object(feature.get("geometry"), f"{inside}geometry")
     if properties.get("radius") is not None and geometry.get("type") != "Point":
         raise InvalidObject(f"{inside}properties.radius", "is valid for a Point only; draw other areas as polygons")
-    _read_geometry(drafts, title, geometry, spec | {"radius": properties.get("radius")}, f"{inside}geometry")
+    _read_geometry(builder, title, geometry, spec | {"radius": properties.get("radius")}, f"{inside}geometry")
 
 
-def _read_geometry(drafts: ZoneBuilder, title: str, geometry: dict[str, Any], said: dict[str, Any], field: str) -> None:
+def _read_geometry(
+    builder: ZoneBuilder, title: str, geometry: dict[str, Any], stated: dict[str, Any], field: str
+) -> None:
     """Add zones of a geometry, each with the properties of the feature."""
-    spec = {key: value for key, value in said.items() if key != "radius"}
-    coordinates, where = geometry.get("coordinates"), f"{field}.coordinates"
+    spec = {key: value for key, value in stated.items() if key != "radius"}
+    coordinates = geometry.get("coordinates")
+    path = f"{field}.coordinates"
     reject_unknown_fields(geometry, _OF_GEOMETRY, field)
     _check_system(geometry, f"{field}.crs")
     if "altitude" in spec and _heights(coordinates):
-        drafts.note(title, "heights of its points are ignored; properties.altitude is used")
+        builder.note(title, "heights of its points are ignored; properties.altitude is used")
         coordinates = _flat(coordinates)
     match geometry.get("type"):
         case "Polygon":
-            drafts.add(title, {**spec, "area": drafts.rings(coordinates, where)}, field)
+            builder.add(title, {**spec, "area": builder.rings(coordinates, path)}, field)
         case "MultiPolygon":
             if not isinstance(coordinates, list):
-                raise InvalidObject(where, "must be a list of polygons")
+                raise InvalidObject(path, "must be a list of polygons")
             for j, part in enumerate(coordinates):
-                drafts.add(title, {**spec, "area": drafts.rings(part, f"{where}[{j}]")}, f"{where}[{j}]")
-        case "Point" if said["radius"] is not None:
+                builder.add(title, {**spec, "area": builder.rings(part, f"{path}[{j}]")}, f"{path}[{j}]")
+        case "Point" if stated["radius"] is not None:
             radius = f"{field.removesuffix('geometry')}properties.radius"
-            drafts.add(
-                title, {**spec, "area": circle_area(parse_point(coordinates, where), said["radius"], radius)}, field
+            builder.add(
+                title, {**spec, "area": circle_area(parse_point(coordinates, path), stated["radius"], radius)}, field
             )
         case "GeometryCollection":
             for j, part in enumerate(object_list(geometry.get("geometries"), f"{field}.geometries")):
-                _read_geometry(drafts, title, part, said, f"{field}.geometries[{j}]")
+                _read_geometry(builder, title, part, stated, f"{field}.geometries[{j}]")
         case other:
-            drafts.note(title, f"a geometry of type {other} is not a zone; left out")
+            builder.note(title, f"a geometry of type {other} is not a zone; left out")
 
 
 def _heights(coordinates: Any) -> bool:
     """Return True if a position has a third number other than 0."""
     pending = [coordinates]
     while pending:
-        found = pending.pop()
-        if isinstance(found, list):
-            if len(found) > 2 and all(map(is_number, found[:3])) and found[2]:
+        value = pending.pop()
+        if isinstance(value, list):
+            if len(value) > 2 and all(map(is_number, value[:3])) and value[2]:
                 return True
-            pending += [item for item in found if isinstance(item, list)]
+            pending += [item for item in value if isinstance(item, list)]
     return False
 
 

@@ -53,11 +53,11 @@ def read_kml(text: str, without: Collection[str] = (), drop: Collection[str] = (
                 title, "a NetworkLink refers to another file, which is not imported; save everything in one file"
             )
         _check_always(holder, title)
-    drafts = ZoneBuilder(without, drop)
-    for count, mark in enumerate(e for e in root.iter() if _tag(e) == "Placemark"):
-        title = _text(mark, "name") or f"placemark {count + 1}"
-        drafts.take(title, functools.partial(_read_placemark, drafts, title, mark))
-    return drafts.result()
+    builder = ZoneBuilder(without, drop)
+    for count, placemark in enumerate(e for e in root.iter() if _tag(e) == "Placemark"):
+        title = _text(placemark, "name") or f"placemark {count + 1}"
+        builder.take(title, functools.partial(_read_placemark, builder, title, placemark))
+    return builder.result()
 
 
 def _check_always(element: ElementTree.Element, field: str) -> None:
@@ -65,16 +65,16 @@ def _check_always(element: ElementTree.Element, field: str) -> None:
         raise InvalidObject(field, "has a time, which cannot be imported; remove it and add a schedule to the Zone")
 
 
-def _read_placemark(drafts: ZoneBuilder, title: str, mark: ElementTree.Element) -> None:
-    described = drafts.described(title, _text(mark, "description"))
-    polygons = [e for e in mark.iter() if _tag(e) == "Polygon"]
-    others = sorted({_tag(e) for e in mark.iter()} & set(_OTHERS) - ({"LinearRing"} if polygons else set()))
+def _read_placemark(builder: ZoneBuilder, title: str, placemark: ElementTree.Element) -> None:
+    described = builder.described(title, _text(placemark, "description"))
+    polygons = [e for e in placemark.iter() if _tag(e) == "Polygon"]
+    others = sorted({_tag(e) for e in placemark.iter()} & set(_OTHERS) - ({"LinearRing"} if polygons else set()))
     if others:
-        drafts.note(title, f"{', '.join(others)} is not a zone; left out")
-    drafts.unmapped(title, map(_tag, mark), _KNOWN | _LOOK | _DATA | set(_OTHERS))
-    drafts.properties(title, _data(mark), (), "ExtendedData")
+        builder.note(title, f"{', '.join(others)} is not a zone; left out")
+    builder.unmapped(title, map(_tag, placemark), _KNOWN | _LOOK | _DATA | set(_OTHERS))
+    builder.properties(title, _data(placemark), (), "ExtendedData")
     if polygons:
-        _check_always(mark, "")
+        _check_always(placemark, "")
     for i, shape in enumerate(polygons):
         field = f"Polygon[{i}]"
         exterior = _rings(shape, "outerBoundaryIs", field)
@@ -88,12 +88,12 @@ def _read_placemark(drafts: ZoneBuilder, title: str, mark: ElementTree.Element) 
                 f"{mode} uses heights, which cannot be imported; clamp the polygon to the ground",
             )
         area = {"polygon": {"exterior": exterior[0]} | ({"holes": holes} if holes else {})}
-        drafts.add(title, {"area": area} | ({"description": described} if described else {}), field)
+        builder.add(title, {"area": area} | ({"description": described} if described else {}), field)
 
 
-def _data(mark: ElementTree.Element) -> dict[str, str]:
+def _data(placemark: ElementTree.Element) -> dict[str, str]:
     """Return the custom data of a placemark by name."""
-    data = (e for child in mark if _tag(child) in _DATA for e in child.iter() if _tag(e) not in _AROUND_DATA)
+    data = (e for child in placemark if _tag(child) in _DATA for e in child.iter() if _tag(e) not in _AROUND_DATA)
     return {e.get("name") or _tag(e): "".join(e.itertext()).strip() for e in data}
 
 

@@ -38,57 +38,59 @@ def read_qgc_plan(text: str, without: Collection[str] = ()) -> Imported:
     Raises:
         InvalidObject: The text is not a plan file, or a shape is broken.
     """
-    whole = parse_json(text)
-    if whole.get("fileType") != "Plan":
-        raise InvalidObject("fileType", f"must be Plan, not {whole.get('fileType')!r}")
-    fence = optional_object(whole.get("geoFence"), "geoFence")
+    document = parse_json(text)
+    if document.get("fileType") != "Plan":
+        raise InvalidObject("fileType", f"must be Plan, not {document.get('fileType')!r}")
+    fence = optional_object(document.get("geoFence"), "geoFence")
     if fence and fence.get("version") != _FENCE_VERSION:
         raise InvalidObject(
             "geoFence.version", f"must be {_FENCE_VERSION}, not {fence.get('version')!r}; save the plan again"
         )
     reject_unknown_fields(fence, _OF_FENCE, "geoFence")
-    drafts = ZoneBuilder(without)
+    builder = ZoneBuilder(without)
     for i, item in enumerate(object_list(fence.get("polygons"), "geoFence.polygons")):
         field = f"geoFence.polygons[{i}]"
-        title, kind = f"polygon {i + 1}", _kind(item, field)
-        drafts.take(f"{kind} {title}", functools.partial(_read_polygon, drafts, f"{kind} {title}", item, field, kind))
+        title = f"polygon {i + 1}"
+        kind = _kind(item, field)
+        builder.take(f"{kind} {title}", functools.partial(_read_polygon, builder, f"{kind} {title}", item, field, kind))
     for i, item in enumerate(object_list(fence.get("circles"), "geoFence.circles")):
         field = f"geoFence.circles[{i}]"
-        title, kind = f"circle {i + 1}", _kind(item, field)
-        drafts.take(f"{kind} {title}", functools.partial(_read_circle, drafts, f"{kind} {title}", item, field, kind))
-    if optional_object(whole.get("mission"), "mission").get("items"):
-        drafts.note("mission", "its items are not zones; left out")
-    if optional_object(whole.get("rallyPoints"), "rallyPoints").get("points"):
-        drafts.note("rallyPoints", "its points are not zones; left out")
+        title = f"circle {i + 1}"
+        kind = _kind(item, field)
+        builder.take(f"{kind} {title}", functools.partial(_read_circle, builder, f"{kind} {title}", item, field, kind))
+    if optional_object(document.get("mission"), "mission").get("items"):
+        builder.note("mission", "its items are not zones; left out")
+    if optional_object(document.get("rallyPoints"), "rallyPoints").get("points"):
+        builder.note("rallyPoints", "its points are not zones; left out")
     if fence.get("breachReturn"):
-        drafts.note("geoFence.breachReturn", "is not a zone; left out")
-    return drafts.result()
+        builder.note("geoFence.breachReturn", "is not a zone; left out")
+    return builder.result()
 
 
 def _kind(item: dict[str, Any], field: str) -> str:
-    found = item.get("inclusion")
-    if not isinstance(found, bool):
-        raise InvalidObject(f"{field}.inclusion", f"must be true or false, not {found!r:.40}")
-    return "inclusion" if found else "exclusion"
+    value = item.get("inclusion")
+    if not isinstance(value, bool):
+        raise InvalidObject(f"{field}.inclusion", f"must be true or false, not {value!r:.40}")
+    return "inclusion" if value else "exclusion"
 
 
-def _read_polygon(drafts: ZoneBuilder, title: str, item: dict[str, Any], field: str, kind: str) -> None:
+def _read_polygon(builder: ZoneBuilder, title: str, item: dict[str, Any], field: str, kind: str) -> None:
     reject_unknown_fields(item, ("polygon", "inclusion", "version"), field)
     exterior = parse_ring(item.get("polygon"), f"{field}.polygon", lat_first=True)
-    _add(drafts, title, {"polygon": {"exterior": exterior}}, field, kind)
+    _add(builder, title, {"polygon": {"exterior": exterior}}, field, kind)
 
 
-def _read_circle(drafts: ZoneBuilder, title: str, item: dict[str, Any], field: str, kind: str) -> None:
+def _read_circle(builder: ZoneBuilder, title: str, item: dict[str, Any], field: str, kind: str) -> None:
     reject_unknown_fields(item, ("circle", "inclusion", "version"), field)
     circle = optional_object(item.get("circle"), f"{field}.circle")
     reject_unknown_fields(circle, ("center", "radius"), f"{field}.circle")
     centre = parse_point(circle.get("center"), f"{field}.circle.center", lat_first=True)
-    _add(drafts, title, circle_area(centre, circle.get("radius"), f"{field}.circle.radius"), field, kind)
+    _add(builder, title, circle_area(centre, circle.get("radius"), f"{field}.circle.radius"), field, kind)
 
 
-def _add(drafts: ZoneBuilder, title: str, area: dict[str, object], field: str, kind: str) -> None:
-    drafts.add(title, {"area": area, "description": f"From a QGroundControl plan, for {kind}."}, field)
-    drafts.note(title, f"a Zone forbids nothing by itself; add a GeofenceControl policy of kind {kind}")
+def _add(builder: ZoneBuilder, title: str, area: dict[str, object], field: str, kind: str) -> None:
+    builder.add(title, {"area": area, "description": f"From a QGroundControl plan, for {kind}."}, field)
+    builder.note(title, f"a Zone forbids nothing by itself; add a GeofenceControl policy of kind {kind}")
 
 
 def write_qgc_plan(zones: Iterable[Zone], *, inclusion: bool = False) -> Exported:
@@ -104,7 +106,8 @@ def write_qgc_plan(zones: Iterable[Zone], *, inclusion: bool = False) -> Exporte
         raise InvalidObject(
             "", f"{lost[0].removesuffix('; left out')}; an inclusion fence would be larger than the zone"
         )
-    polygons, circles = [], []
+    polygons = []
+    circles = []
     for zone in zones:
         area = zone.spec.area
         if area.circle is not None:
@@ -118,7 +121,7 @@ def write_qgc_plan(zones: Iterable[Zone], *, inclusion: bool = False) -> Exporte
         "cruiseSpeed": 15, "firmwareType": 3, "globalPlanAltitudeMode": 1, "hoverSpeed": 5, "items": [],
         "plannedHomePosition": [0, 0, 0], "vehicleType": 2, "version": 2,
     }  # fmt: skip
-    whole = {
+    document = {
         "fileType": "Plan",
         "geoFence": {"circles": circles, "polygons": polygons, "version": _FENCE_VERSION},
         "groundStation": "QGroundControl",
@@ -127,5 +130,5 @@ def write_qgc_plan(zones: Iterable[Zone], *, inclusion: bool = False) -> Exporte
         "version": 1,
     }
     return Exported(
-        json.dumps(whole, indent=2) + "\n", tuple(unsupported_parts(zones, "altitude", "schedule", "holes"))
+        json.dumps(document, indent=2) + "\n", tuple(unsupported_parts(zones, "altitude", "schedule", "holes"))
     )

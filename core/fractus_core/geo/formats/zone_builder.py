@@ -101,7 +101,7 @@ class ZoneBuilder:
         except InvalidObject as error:
             self._wrong.append(InvalidObject(error.field, f"{error.problem} (in {title})"))
 
-    def add(self, title: str, spec: Mapping[str, Any], where: str) -> None:
+    def add(self, title: str, spec: Mapping[str, Any], location: str) -> None:
         """Add a zone.
 
         Raises:
@@ -113,7 +113,7 @@ class ZoneBuilder:
             zone = Zone.from_body(manifest)
             area_polygon(LocalFrame.at(area_center(zone.spec.area)), zone.spec.area)
         except InvalidObject as error:
-            raise InvalidObject(where, f"{error.field.removeprefix('spec.')}: {error.problem}") from None
+            raise InvalidObject(location, f"{error.field.removeprefix('spec.')}: {error.problem}") from None
         self._zones.append(zone)
 
     def described(self, title: str, text: str) -> str:
@@ -122,49 +122,49 @@ class ZoneBuilder:
             self.note(title, f"its description is cut after {DESCRIPTION_LENGTH} characters")
         return text[:DESCRIPTION_LENGTH]
 
-    def rings(self, found: Any, field: str) -> dict[str, Any]:
+    def rings(self, value: Any, field: str) -> dict[str, Any]:
         """Return the rings of a GeoJSON polygon as an area.
 
         Raises:
             InvalidObject: A ring is invalid, or the file has too many points.
         """
-        if not isinstance(found, (list, tuple)) or not found:
+        if not isinstance(value, (list, tuple)) or not value:
             raise InvalidObject(field, "must be a list of rings")
-        made = []
-        for i, one in enumerate(found):
-            made.append(parse_ring(one, f"{field}[{i}]", planar=True))
-            self._points += len(made[-1])
+        rings = []
+        for i, item in enumerate(value):
+            rings.append(parse_ring(item, f"{field}[{i}]", planar=True))
+            self._points += len(rings[-1])
             if self._points > MAX_POINTS:
                 raise _TooLarge(
                     f"{field}[{i}]", f"the file needs more than {MAX_POINTS} points, for long sides some more; split it"
                 )
-        exterior, *holes = made
+        exterior, *holes = rings
         return {"polygon": {"exterior": exterior} | ({"holes": holes} if holes else {})}
 
-    def properties(self, title: str, found: Mapping[str, Any], known: Collection[str], field: str) -> None:
+    def properties(self, title: str, properties: Mapping[str, Any], known: Collection[str], field: str) -> None:
         """Note the properties that a Zone cannot represent, and reject those that state its altitude or time.
 
         Raises:
             InvalidObject: A property states altitude or time and is not to be dropped.
         """
-        self._dropped.update(set(found) & set(self._drop))
-        said = {name for name, value in found.items() if value not in (None, "", [], {})}
-        for name in sorted(said - set(known) - set(self._drop)):
+        self._dropped.update(set(properties) & set(self._drop))
+        stated = {name for name, value in properties.items() if value not in (None, "", [], {})}
+        for name in sorted(stated - set(known) - set(self._drop)):
             if suggests_altitude_or_time(name):
                 raise InvalidObject(
                     f"{field}.{name}",
                     "seems to state the altitude or time of the zone; write it as altitude or schedule in the form of a Zone,"
                     " or drop it (--drop)",
                 )
-        dropped = sorted(set(found) - set(known))
-        if dropped:
-            self.note(title, f"properties {', '.join(dropped)} cannot be imported; left out")
+        unknown = sorted(set(properties) - set(known))
+        if unknown:
+            self.note(title, f"properties {', '.join(unknown)} cannot be imported; left out")
 
-    def unmapped(self, title: str, found: Iterable[str], known: Iterable[str]) -> None:
+    def unmapped(self, title: str, fields: Iterable[str], known: Iterable[str]) -> None:
         """Note the fields that a Zone cannot represent."""
-        dropped = sorted(set(found) - set(known))
-        if dropped:
-            self.note(title, f"{', '.join(dropped)} cannot be imported; left out")
+        unknown = sorted(set(fields) - set(known))
+        if unknown:
+            self.note(title, f"{', '.join(unknown)} cannot be imported; left out")
 
     def note(self, title: str, problem: str) -> None:
         """Note a part of a zone that is not imported."""
@@ -189,7 +189,8 @@ class ZoneBuilder:
 
     def _name(self, title: str) -> str:
         stem = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")[:56].strip("-") or "zone"
-        name, count = stem, 1
+        name = stem
+        count = 1
         while name in self._names:
             count += 1
             name = f"{stem}-{count}"
@@ -204,70 +205,70 @@ def parse_json(text: str) -> dict[str, Any]:
         InvalidObject: The text is not a JSON object.
     """
     try:
-        (found,) = parse_documents(text.encode(), "", is_json=True).values or (None,)
+        (value,) = parse_documents(text.encode(), "", is_json=True).values or (None,)
     except BadDocument as error:
         raise InvalidObject(f"line {error.line}" if error.line else "", error.problem) from None
-    if not isinstance(found, dict):
+    if not isinstance(value, dict):
         raise InvalidObject("", "this is not a JSON object")
-    return found
+    return value
 
 
-def object_list(found: Any, field: str) -> list[dict[str, Any]]:
+def object_list(value: Any, field: str) -> list[dict[str, Any]]:
     """Return a list of JSON objects. A missing value is an empty list.
 
     Raises:
         InvalidObject: The value has another type.
     """
-    if found is None:
+    if value is None:
         return []
-    if not isinstance(found, list) or not all(isinstance(item, dict) for item in found):
+    if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
         raise InvalidObject(field, "must be a list of objects")
-    return found
+    return value
 
 
-def optional_object(found: Any, field: str) -> dict[str, Any]:
+def optional_object(value: Any, field: str) -> dict[str, Any]:
     """Return a JSON object. A missing value is an empty object.
 
     Raises:
         InvalidObject: The value has another type.
     """
-    if found is None:
+    if value is None:
         return {}
-    if not isinstance(found, dict):
-        raise InvalidObject(field, f"must be an object, not {_shown(found)}")
-    return found
+    if not isinstance(value, dict):
+        raise InvalidObject(field, f"must be an object, not {_shown(value)}")
+    return value
 
 
-def reject_unknown_fields(found: Mapping[str, Any], known: Collection[str], field: str) -> None:
+def reject_unknown_fields(fields: Mapping[str, Any], known: Collection[str], field: str) -> None:
     """Reject unknown fields with a value.
 
     Raises:
         InvalidObject: An unknown field has a value.
     """
-    for key, value in found.items():
+    for key, value in fields.items():
         if key not in known and value not in (None, "", [], {}):
             raise InvalidObject(
                 f"{field}.{key}", "a Zone cannot represent this field; remove it if it does not affect the zone"
             )
 
 
-def is_number(found: Any) -> TypeGuard[float]:
+def is_number(value: Any) -> TypeGuard[float]:
     """Return True for a number. Booleans are not numbers."""
-    return isinstance(found, (int, float)) and not isinstance(found, bool)
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def _shown(found: Any) -> str:
-    text = repr(found) if not isinstance(found, int) or abs(found) < 10**12 else "a number of many digits"
+def _shown(value: Any) -> str:
+    text = repr(value) if not isinstance(value, int) or abs(value) < 10**12 else "a number of many digits"
     return text if len(text) <= 40 else text[:37] + "..."
 
 
-def parse_point(found: Any, field: str, *, lat_first: bool = False) -> Point:
+def parse_point(value: Any, field: str, *, lat_first: bool = False) -> Point:
     """Return a pair of degrees as a point.
 
     Raises:
         InvalidObject: The value is not a pair of numbers, or is out of range.
     """
-    pair = found if isinstance(found, (list, tuple)) else ()
+    pair = value if isinstance(value, (list, tuple)) else ()
     if len(pair) < 2 or not all(map(is_number, pair[:2])):
         raise InvalidObject(field, "must be two numbers, degrees")
     if any(pair[2:]):
@@ -281,11 +282,11 @@ def parse_point(found: Any, field: str, *, lat_first: bool = False) -> Point:
     return Point(lat=lat, lon=lon)
 
 
-def parse_ring(found: Any, field: str, *, lat_first: bool = False, planar: bool = False) -> list[dict[str, float]]:
+def parse_ring(value: Any, field: str, *, lat_first: bool = False, planar: bool = False) -> list[dict[str, float]]:
     """Return a ring as manifests spell it: open, without the repetition of its first point.
 
     Args:
-        found: The ring.
+        value: The ring.
         field: Its path in the file.
         lat_first: True if latitude comes first.
         planar: True if its edges are straight lines of degrees, which never cross the antimeridian.
@@ -294,9 +295,9 @@ def parse_ring(found: Any, field: str, *, lat_first: bool = False, planar: bool 
         InvalidObject: The ring has fewer than three points or an invalid point, crosses the antimeridian although it is
             planar, or has sides that need too many intermediate points.
     """
-    if not isinstance(found, (list, tuple)):
+    if not isinstance(value, (list, tuple)):
         raise InvalidObject(field, "must be a list of positions")
-    points = [parse_point(p, f"{field}[{i}]", lat_first=lat_first) for i, p in enumerate(found)]
+    points = [parse_point(p, f"{field}[{i}]", lat_first=lat_first) for i, p in enumerate(value)]
     if len(points) > 1 and points[0] == points[-1]:
         points = points[:-1]
     if len(points) < 3:

@@ -6,7 +6,7 @@ import asyncio
 import time
 from collections.abc import Callable
 
-from fractus_core.policy.decision_types import POSITION_UNKNOWN, Call, Verdict
+from fractus_core.policy.decision_types import DENY_POSITION_UNKNOWN, Call, Verdict
 
 from fractus_services.errors import Aborted, Unavailable, denied
 from fractus_services.grant_files import ActiveGrant
@@ -119,7 +119,7 @@ class CallJudge:
         if verdict.action == "takeover":
             self._control.take_over(verdict)
             raise denied(verdict)
-        if verdict.code == POSITION_UNKNOWN.code and verdict.action == "deny":
+        if verdict.code == DENY_POSITION_UNKNOWN.code and verdict.action == "deny":
             raise Unavailable("AutopilotUnavailable", verdict.reason, retry_after_s=RETRY_AFTER_S)
         if not verdict.permits:
             if verdict.takeover is not None:

@@ -142,12 +142,12 @@ class MotionMonitor:
         if control.state.returning or not control.autopilot.vehicle.mode.commanded:
             # The autopilot's own ways were judged by no one, whatever the grant was.
             changed = changed or not control.autopilot.vehicle.mode.commanded
-            return monitor(now, compiled, leaving=True, changed=changed, bound_for=bound_for), True
-        verdict = monitor(now, compiled, changed=changed, bound_for=bound_for)
+            return monitor(now, compiled, system_flies=True, fences_changed=changed, current_leg=bound_for), True
+        verdict = monitor(now, compiled, fences_changed=changed, current_leg=bound_for)
         alone = control.constraints is not None and verdict is not None and verdict.action == "correct"
         if verdict is None or (not alone and (verdict.takeover != "hover" or control.authority is Authority.DRIVER)):
             return verdict, False
-        return monitor(now, compiled, leaving=True, changed=changed, bound_for=bound_for), True
+        return monitor(now, compiled, system_flies=True, fences_changed=changed, current_leg=bound_for), True
 
     @property
     def _flown_grant(self) -> ActiveGrant | None:

@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 import skimage.data
 from fractus_services.camera.face_detection import DEFAULT_MIN_PX, Box, CascadeDetector
-from fractus_services.camera.filters import FACE_CELLS, blur_average, blur_median, hide_faces
+from fractus_services.camera.filter_pipeline import FACE_CELLS, blur_average, blur_median, hide_faces
 from fractus_services.camera.pixels import Pixels
 
 SEED = 40
@@ -116,7 +116,7 @@ class Tally:
     hidden: int = 0
 
     def add(self, scene: Scene, detector: CascadeDetector) -> None:
-        boxes = detector.find(scene.picture, scene.width * 0.95, upright=False)
+        boxes = detector.detect(scene.picture, scene.width * 0.95, upright=False)
         ours = found(scene, boxes)
         self.scenes += 1
         self.ours += ours
@@ -171,8 +171,8 @@ def timings(quick: bool) -> None:
         jobs: list[Callable[[], object]] = [
             lambda p=picture: blur_average(p),
             lambda p=picture: blur_median(p),
-            lambda p=picture: detector.find(p, DEFAULT_MIN_PX, upright=True),
-            lambda p=picture: detector.find(p, DEFAULT_MIN_PX, upright=False),
+            lambda p=picture: detector.detect(p, DEFAULT_MIN_PX, upright=True),
+            lambda p=picture: detector.detect(p, DEFAULT_MIN_PX, upright=False),
         ]
         print(f"{name:<12}" + "".join(f"{1000 * timed(job, 1 if i > 1 else 5):>10.1f}" for i, job in enumerate(jobs)))
 
@@ -205,7 +205,7 @@ def claims(tallies: dict[tuple[str, int], Tally]) -> list[dict[str, object]]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="fewer directions, sizes and faces")
+    parser.add_argument("--quick", action="store_true", help="fewer camera_orientation, sizes and faces")
     parser.add_argument("--json", type=Path, help="write the claims to a file")
     options = parser.parse_args()
     cv2.setNumThreads(1)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from fractus_runtime.mavlink_codec import Endpoint
-    from fractus_services.recording.flight_writer import FlightWriter
+    from fractus_services.recording.recorder import FlightWriter
 
 MAX_CPU, MAX_MB = 2.0, 16.0
 """Percent of a core and megabytes that recording may add."""
@@ -75,7 +75,7 @@ def main() -> int:
     from fractus_services.recording.segment_directory import SegmentDirectory  # noqa: PLC0415
 
     vehicle, companion, before_mb = Endpoint(1, 1), Endpoint(244, 191), resident_mb()
-    from fractus_services.recording.flight_writer import FlightWriter  # noqa: PLC0415
+    from fractus_services.recording.recorder import FlightWriter  # noqa: PLC0415
 
     with tempfile.TemporaryDirectory() as directory:
         writer = FlightWriter(SegmentDirectory(Path(directory), 500_000_000, reserve_bytes=0), "drone-1")

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from fractus_services.recording.messages import moment_ns, sentence
+from fractus_services.recording.messages import parse_time_ns, sentence
 
 from fractus_cli.audit_logs import Window, decided, entries, found_logs, judged
 from fractus_cli.output import output_option, printable
@@ -64,7 +64,7 @@ def verify_command(paths: tuple[Path, ...], since: tuple[str, ...], ca: Path | N
 
 def _moment(context: click.Context, option: click.Parameter, text: str | None) -> int | None:
     del context, option
-    found = moment_ns(text)
+    found = parse_time_ns(text)
     if text is not None and found is None:
         raise click.BadParameter(f"{text!r} is no time with its zone, such as 2026-06-01T12:00:00Z")
     return found

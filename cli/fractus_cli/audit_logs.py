@@ -11,7 +11,7 @@ from typing import Any
 
 import click
 from fractus_runtime.audit_chain import Finding, Link, lines_of, logs, verify
-from fractus_services.recording.messages import component_of, moment_ns
+from fractus_services.recording.messages import component_of, parse_time_ns
 
 Entry = dict[str, Any]
 
@@ -83,7 +83,7 @@ def entries(found: dict[Path, list[Path]], window: Window) -> Iterator[Entry]:
 def _entries(log: str, node: str, files: Iterable[Path], window: Window) -> Iterator[Entry]:
     for _, _, line in lines_of(files):
         entry = _read(line)
-        time_ns = moment_ns(entry.get("time"))
+        time_ns = parse_time_ns(entry.get("time"))
         # What began before the window counts in it, too.
         node = _started(entry) or node
         if time_ns is not None and time_ns in window:

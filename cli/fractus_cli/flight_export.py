@@ -13,9 +13,9 @@ from xml.sax.saxutils import escape
 
 from fractus_core.api import Zone
 from fractus_core.geo.formats.kml import kml_document, zone_placemark
-from fractus_services.recording.map_features import Feature, placed
-from fractus_services.recording.mcap_file import McapWriter
-from fractus_services.recording.messages import component_of, location, number, of_audit, sentence, zones
+from fractus_services.recording.map_features import Feature, to_feature
+from fractus_services.recording.messages import audit_records, component_of, finite_number, location, sentence, zones
+from fractus_services.recording.segment_writer import McapWriter
 
 from fractus_cli.audit_logs import Entry, decided, who
 
@@ -37,7 +37,7 @@ class Places:
 
     def features(self) -> list[Feature]:
         """As GeoJSON."""
-        return [placed(zone, kind, **({"component": owner} if owner else {})) for zone, kind, owner in self.areas]
+        return [to_feature(zone, kind, **({"component": owner} if owner else {})) for zone, kind, owner in self.areas]
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,11 +75,15 @@ class _Flown:
 
     def add(self, entry: Entry) -> None:
         """Take the drone's next entry."""
-        lat, lon, alt = number(entry.get("lat")), number(entry.get("lon")), number(entry.get("alt")) or 0.0
+        lat, lon, alt = (
+            finite_number(entry.get("lat")),
+            finite_number(entry.get("lon")),
+            finite_number(entry.get("alt")) or 0.0,
+        )
         if entry.get("kind") == "state":
             if lat is None or lon is None:
                 return
-            amsl = number(entry.get("amsl"))
+            amsl = finite_number(entry.get("amsl"))
             self.home_m = amsl - alt if amsl is not None else self.home_m
             self.last = (lon, lat, self.home_m + alt)
             if not self.paths or entry["time_ns"] - self.paths[-1].times[-1] > GAP_NS:
@@ -190,11 +194,11 @@ def write_mcap(export: Export, out: IO[bytes]) -> None:
     """A file for Foxglove: location, state, decisions and log of each node, and the areas as GeoJSON."""
     # The writer asks how far it is, which a pipe cannot say.
     file = McapWriter(cast(IO[bytes], _Counted(out)))
-    file.describe("audit", {"verified": "no" if export.problems else "yes", "problems": "\n".join(export.problems)})
+    file.add_metadata("audit", {"verified": "no" if export.problems else "yes", "problems": "\n".join(export.problems)})
     features = export.places.features()
     for entry in export.entries:
         time_ns, node = entry["time_ns"], entry["node"]
-        records = list(of_audit(entry, node))
+        records = list(audit_records(entry, node))
         if entry.get("kind") == "state":
             records += _located(entry, node)
         if features:
@@ -224,7 +228,7 @@ class _Counted:
 
 
 def _located(entry: Entry, node: str) -> Iterator[Any]:
-    lat, lon, amsl = number(entry.get("lat")), number(entry.get("lon")), number(entry.get("amsl"))
+    lat, lon, amsl = finite_number(entry.get("lat")), finite_number(entry.get("lon")), finite_number(entry.get("amsl"))
     if lat is not None and lon is not None:
         yield location(entry["time_ns"], node, lat, lon, amsl if amsl is not None else 0.0)
 

@@ -9,8 +9,9 @@ from typing import Any
 
 import click
 
+from fractus_services.camera.settings import CameraSettings
 from fractus_services.launch import DIRECTORY, FILE, address, metrics_address, until_signalled
-from fractus_services.options import CameraOptions, MobilityOptions
+from fractus_services.options import MobilityOptions
 from fractus_services.service_lock import DEFAULT_LOCK_TIMEOUT_S
 
 _DESCRIPTION = click.Path(path_type=Path)
@@ -154,4 +155,4 @@ def serve_camera(**given: Any) -> None:
     """Serve until stopped; waits for certificates."""
     from fractus_services.camera.server import run  # noqa: PLC0415 - the command line stays quick
 
-    until_signalled("camera", run, CameraOptions(**given))
+    until_signalled("camera", run, CameraSettings(**given))

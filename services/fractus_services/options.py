@@ -46,17 +46,3 @@ class MobilityOptions(ServiceOptions):
     driver_grace: float
     boarding: float
     flat_terrain: bool
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CameraOptions(ServiceOptions):
-    """Options of `fractus camera serve`."""
-
-    mobility: str
-    keep: int
-    keep_mb: int
-    keep_total_mb: int
-    camera: str | None
-    face_model: Path | None
-    face_px: float
-    relief: float

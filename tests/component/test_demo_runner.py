@@ -187,13 +187,13 @@ def test_pictures_are_spread_over_the_flight() -> None:
 def test_pictures_of_the_flight_come_from_the_camera_s_recording(tmp_path: Path, whole: bool) -> None:
     record = Record.of(demo_flight.content(), demo_flight.audit())
     paths = [tmp_path / f"{service}-000001-20260601T120000Z.mcap" for service in ("camera", "mobility")]
-    tape = SegmentWriter(paths[0].with_suffix(""), "drone-1")
+    writer = SegmentWriter(paths[0].with_suffix(""), "drone-1")
     for seconds in range(-100, 300, 5):
         at_ns = int((demo_flight.TAKEOFF_S + seconds) * 1e9)
-        tape.write(at_ns, b"", (messages.picture(at_ns, "drone-1", b"\xff\xd8%d" % seconds),))
-    tape.flush()
+        writer.write(at_ns, b"", (messages.picture(at_ns, "drone-1", b"\xff\xd8%d" % seconds),))
+    writer.flush()
     if whole:
-        tape.close()
+        writer.close()
     paths[1].write_bytes(b"not read")
     collect.keep_pictures(paths, record, tmp_path / "out")
     kept = sorted((tmp_path / "out" / "pictures").iterdir())

@@ -33,20 +33,10 @@ def test_help_and_verification_of_audit_logs_import_no_geometry() -> None:
 def test_what_flies_needs_no_library_of_pictures() -> None:
     """The mobility image has none: importing the service with all that it may use later must not ask for one."""
     _, imported = after(
-        "import fractus_services.commands, fractus_services.mobility.rpc.server, fractus_services.recording.flight_writer"
+        "import fractus_services.commands, fractus_services.mobility.rpc.server, fractus_services.recording.recorder"
     )
     assert "fractus_services" in imported
     assert not imported & {"cv2", "PIL", "scipy", "matplotlib", "kubernetes", "aiohttp"}
-
-
-def test_plain_pictures_need_no_opencv() -> None:
-    _, imported = after(
-        "import numpy as np; from fractus_services.camera.pixels import decoded, encoded, fitted; "
-        "from fractus_services.camera.filters import blur_average; "
-        "decoded(encoded(blur_average(fitted(np.zeros((90, 120, 3), np.uint8), 50, 40))))"
-    )
-    assert "PIL" in imported
-    assert "cv2" not in imported
 
 
 def test_the_first_heartbeats_of_a_start_wait_for_no_large_import() -> None:

@@ -28,11 +28,10 @@ from fractus_core.api import Grant
 from fractus_proto.v1.mobility_pb2 import Telemetry
 from fractus_runtime.audit import AuditLog
 from fractus_runtime.mavlink_codec import Endpoint, Parser
-from fractus_services.recording import flight_writer, recorder
-from fractus_services.recording.flight_writer import FlightWriter
-from fractus_services.recording.mcap_file import completed
-from fractus_services.recording.recorder import Recorder
+from fractus_services.recording import recorder
+from fractus_services.recording.recorder import FlightWriter, Recorder
 from fractus_services.recording.segment_directory import MIN_SEGMENT_BYTES, SegmentDirectory, segments_in
+from fractus_services.recording.segment_writer import rebuild_index
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.writer import MCAP0_MAGIC
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -80,7 +79,7 @@ def steady() -> Iterator[None]:
     Steady.now_s = 0.0
     yield
     while opened:
-        opened.pop().segments.release()
+        opened.pop().segments.unlock()
 
 
 opened: list[FlightWriter] = []
@@ -89,7 +88,7 @@ opened: list[FlightWriter] = []
 def writer_in(directory: Path, megabytes: float = 4.0, *, always: bool = False) -> FlightWriter:
     """A writer of a process that takes the place of the one before."""
     while opened:
-        opened.pop().segments.release()
+        opened.pop().segments.unlock()
     segments = SegmentDirectory(directory, int(megabytes * 1e6), reserve_bytes=0)
     opened.append(FlightWriter(segments, "drone-1", always=always, steady=lambda: Steady.now_s))
     opened[-1].begin()
@@ -245,13 +244,13 @@ def test_the_oldest_make_room_and_no_other_user_reads_them(tmp_path: Path) -> No
         if second % 5 == 0:
             writer._flush_due_s = 0.0
         writer.tick()
-        found = writer.segments.found()
+        found = writer.segments.by_number()
         seen |= set(found)
         used = sum(path.stat().st_size for paths in found.values() for path in paths)
         # What is written between two looks comes on top.
         assert used <= limit_mb * 1e6 + 50_000
     writer.end()
-    assert len(seen) > 8 and min(writer.segments.found()) > 1, "the oldest are gone"
+    assert len(seen) > 8 and min(writer.segments.by_number()) > 1, "the oldest are gone"
     assert stat.S_IMODE(directory.stat().st_mode) == 0o700
     assert {stat.S_IMODE(path.stat().st_mode) for path in directory.iterdir()} == {0o600}
     for path in files(directory, ".mcap"):
@@ -262,7 +261,7 @@ def test_what_a_crash_leaves_can_be_read_and_is_completed(tmp_path: Path) -> Non
     writer, vehicle = writer_in(tmp_path), Vehicle()
     for second in range(20):
         writer.received(T0 + second * S, vehicle.heartbeat(True) + vehicle.position(39.0, 22.0, 100.0))
-    tape = writer._tape
+    tape = writer._segment
     assert tape is not None
     tape.flush()
     writer.received(T0 + 20 * S, vehicle.position(39.0, 22.0, 100.0))
@@ -284,7 +283,7 @@ def test_what_a_crash_leaves_can_be_read_and_is_completed(tmp_path: Path) -> Non
         made_whole(again, messages)
         assert len(mcap(messages)["/drone-1/location foxglove.LocationFix"]) == 20
         assert stat.S_IMODE(messages.stat().st_mode) == 0o600
-        assert again.segments.begin(T0).name.startswith("000002")
+        assert again.segments.new_segment(T0).name.startswith("000002")
     done = messages.read_bytes()
     writer_in(tmp_path).tick()
     assert messages.read_bytes() == done, "what is complete is left alone"
@@ -303,7 +302,7 @@ def crashed(directory: Path, seconds: int = 200) -> Path:
 def test_nothing_is_completed_while_a_drone_flies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     broken = crashed(tmp_path)
     left = broken.read_bytes()
-    monkeypatch.setattr(flight_writer, "COMPLETE_S", 0.0001)
+    monkeypatch.setattr(recorder, "INDEX_SLICE_S", 0.0001)
     writer, vehicle = writer_in(tmp_path), Vehicle()
     for second in range(100):
         Steady.now_s += 0.25
@@ -326,7 +325,7 @@ def test_nothing_is_completed_while_a_drone_flies(tmp_path: Path, monkeypatch: p
 
 def test_a_file_that_made_room_meanwhile_does_not_come_back(tmp_path: Path) -> None:
     broken = crashed(tmp_path)
-    steps = completed(broken)
+    steps = rebuild_index(broken)
     next(steps)
     broken.unlink()
     list(steps)
@@ -368,9 +367,9 @@ def test_a_directory_has_one_writer(tmp_path: Path) -> None:
     until(lambda: taken.problem)
     assert f"another service records into {tmp_path}" in taken.problem
     asyncio.run(taken.close())
-    first.release()
+    first.unlock()
     second.prepare()
-    second.release()
+    second.unlock()
 
 
 def test_only_a_directory_that_it_makes_gets_its_mode(tmp_path: Path) -> None:
@@ -401,7 +400,7 @@ def test_a_clock_that_is_set_back_lets_nothing_grow(tmp_path: Path) -> None:
         Steady.now_s = float(second)
         writer.received(T0 - second * S, vehicle.heartbeat(False))
         writer.tick()
-    assert len(writer._before) <= 11
+    assert len(writer._pending) <= 11
     fly(writer, 0, 5)
     fly(writer, -10_000, 5)
     assert [path.name[:6] for path in files(tmp_path, ".mcap")] == ["000001", "000002"]
@@ -427,9 +426,9 @@ def until(condition: Callable[[], object]) -> None:
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recorder, "DRAIN_S", 0.005)
+    monkeypatch.setattr(recorder, "POLL_INTERVAL_S", 0.005)
     monkeypatch.setattr(recorder, "RETRY_S", 0.02)
-    monkeypatch.setattr(flight_writer, "FLUSH_S", 0.0)
+    monkeypatch.setattr(recorder, "FLUSH_INTERVAL_S", 0.0)
 
 
 def test_nothing_is_recorded_without_a_directory_or_room(tmp_path: Path) -> None:
@@ -501,7 +500,7 @@ def test_a_disk_that_hangs_delays_no_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     hangs, monotonic = threading.Event(), time.monotonic
-    monkeypatch.setattr(recorder, "DRAIN_S", 0.005)
+    monkeypatch.setattr(recorder, "POLL_INTERVAL_S", 0.005)
     monkeypatch.setattr(FlightWriter, "received", lambda _self, _now, _data: hangs.wait(60))
     taken = Recorder(SegmentDirectory(tmp_path, 4_000_000, reserve_bytes=0), "drone-1", max_waiting=50)
     taken.take_received(b"")
@@ -510,7 +509,7 @@ def test_a_disk_that_hangs_delays_no_one(
         taken.take_received(bytes(100))
     assert taken._waiting.qsize() == 50
     monkeypatch.setattr(recorder.time, "monotonic", lambda: monotonic() + 100.0)
-    assert "the disk has not answered for" in taken.problem
+    assert "the disk has not responded for" in taken.problem
     monkeypatch.undo()
     hangs.set()
     until(lambda: not taken.problem)
@@ -546,9 +545,9 @@ def test_the_agent_is_told_what_is_not_recorded(tmp_path: Path, monkeypatch: pyt
             raise OSError(errno.ENOSPC, "no room")
 
     monkeypatch.setattr(SegmentDirectory, "check_space", check)
-    Recorder(None, "drone-1", told=state / "recording.problem")
+    Recorder(None, "drone-1", problem_file=state / "recording.problem")
     assert recording_problems(tmp_path) == []
-    taken = Recorder(SegmentDirectory(tmp_path / "r", 4_000_000), "drone-1", told=state / "recording.problem")
+    taken = Recorder(SegmentDirectory(tmp_path / "r", 4_000_000), "drone-1", problem_file=state / "recording.problem")
     until(lambda: recording_problems(tmp_path) == ["camera: recording stopped: no room"])
     full.clear()
     until(lambda: recording_problems(tmp_path) == [])

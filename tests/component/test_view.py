@@ -22,8 +22,8 @@ from exposed import scraped, values
 from fractus_cluster.ports import free_port
 from fractus_runtime.figures import text_of
 from fractus_services.recording import messages
-from fractus_services.recording.mcap_file import McapWriter
 from fractus_services.recording.messages import Record
+from fractus_services.recording.segment_writer import McapWriter
 from fractus_view import command, server
 from fractus_view.command import Site, view
 from fractus_view.events import Event, Fix, Problem, State, Verdict
@@ -48,8 +48,8 @@ def records(seconds: int = 4) -> list[Record]:
         "kind": "call", "time": "2026-05-28T20:26:42+00:00", "caller": "spiffe://f/ns/d/app/a/component/Navigator/instance/n",
         "method": "Goto", "action": "deny", "code": "InsideExclusionZone", "reason": "inside", "policies": ["school"],
     }  # fmt: skip
-    found += messages.of_audit(entry, "drone-1")
-    found += messages.of_audit({"kind": "grant", "time": entry["time"]}, "drone-1")
+    found += messages.audit_records(entry, "drone-1")
+    found += messages.audit_records({"kind": "grant", "time": entry["time"]}, "drone-1")
     found.append(messages.picture(START_NS + 10**9, "drone-1", JPEG))
     return found
 

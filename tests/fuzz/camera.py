@@ -21,10 +21,10 @@ from typing import Any
 import atheris
 
 with atheris.instrument_imports(include=["fractus_services.camera"]):
-    from fractus_services.camera.fair_queue import MAX_PER_OWNER, FairQueue
+    from fractus_services.camera.fair_queue import FairQueue
     from fractus_services.camera.handlers import CameraHandlers
     from fractus_services.camera.image_authorization import ImageAuthorizer
-    from fractus_services.camera.image_capture import MAX_FILTERING, ImageCapture
+    from fractus_services.camera.image_capture import ImageCapture
     from fractus_services.camera.image_store import ImageStore
     from fractus_services.camera.stored_images import StoredImages
 import numpy as np
@@ -33,7 +33,7 @@ from fractus_proto.v1 import camera_pb2, camera_pb2_grpc
 from fractus_services.admission import CallAdmission
 from fractus_services.camera.camera_properties import CameraProperties
 from fractus_services.camera.drivers.driver import CameraFailed, CaptureRequest
-from fractus_services.camera.pixels import Pixels, reduced
+from fractus_services.camera.pixels import Pixels, limit_width
 from fractus_services.grant_files import ActiveGrant
 from mobility_world import Grants
 from policy_world import NOW
@@ -61,12 +61,12 @@ class Shutter:
     def __init__(self) -> None:
         self.broken = False
 
-    async def expose(self, wanted: CaptureRequest, count: int = 1, apart_s: float = 0.0) -> list[Pixels]:
-        await asyncio.sleep(count * apart_s)
+    async def expose(self, request: CaptureRequest, count: int = 1, interval_s: float = 0.0) -> list[Pixels]:
+        await asyncio.sleep(count * interval_s)
         if self.broken:
-            raise CameraFailed("the camera gave no picture; check it and its connection")
-        picture = np.full((wanted.height, wanted.width, 3), 128, np.uint8)
-        return [picture if i == count // 2 else reduced(picture, 64) for i in range(count)]
+            raise CameraFailed("the camera returned no image")
+        picture = np.full((request.height, request.width, 3), 128, np.uint8)
+        return [picture if i == count // 2 else limit_width(picture, 64) for i in range(count)]
 
 
 class Service:
@@ -77,17 +77,17 @@ class Service:
         self.names: dict[str, list[str]] = {}
         for grant in (FIRST, SECOND):
             self.grants.active[grant.identity] = grant
-        shutil.rmtree(FOLDER / "album", ignore_errors=True)
-        album = ImageStore(FOLDER / "album", 5, 10**6)
+        shutil.rmtree(FOLDER / "images", ignore_errors=True)
+        store = ImageStore(FOLDER / "images", 5, 10**6)
         audit: Any = SimpleNamespace(append=lambda _kind, _content: None)
         finder = Finder()
         shared: Any = {
-            "detector": finder, "filter_queue": FairQueue(MAX_PER_OWNER, MAX_FILTERING), "album": album,
-            "judge": ImageAuthorizer(audit, finder), "clock": lambda: NOW,
+            "detector": finder, "filter_queue": FairQueue(4, 8), "store": store,
+            "authorizer": ImageAuthorizer(audit, finder), "clock": lambda: NOW,
         }  # fmt: skip
         admission = CallAdmission(self.grants, time.time)  # type: ignore[arg-type]
         handlers = CameraHandlers(
-            ImageCapture(self.drone, self.shutter, CameraProperties((64, 48)), **shared),  # type: ignore[arg-type]
+            ImageCapture(self.drone, self.shutter, CameraProperties((64, 48)), capture_queue=FairQueue(4, 8), **shared),  # type: ignore[arg-type]
             StoredImages(self.drone, **shared), admission,
         )  # fmt: skip
         registry = Registry(admission)

@@ -375,8 +375,8 @@ async def test_a_face_in_the_simulated_world_is_hidden_and_the_rest_stays(rig: R
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (("--face-model", "/nowhere.onnx"), "there is no such file"),
-        (("--camera", "gopher://x"), "names no camera"),
+        (("--face-model", "/nowhere.onnx"), "file not found"),
+        (("--camera", "gopher://x"), "names no supported camera"),
     ],
 )
 async def test_what_cannot_work_is_refused_at_start(rig: Rig, arguments: tuple[str, ...], sentence: str) -> None:

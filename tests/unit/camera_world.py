@@ -16,18 +16,18 @@ from fractus_runtime.audit import AuditLog
 from fractus_services.camera.camera_properties import CameraProperties
 from fractus_services.camera.drivers.driver import CaptureRequest
 from fractus_services.camera.face_detection import Box
-from fractus_services.camera.fair_queue import MAX_PER_OWNER, FairQueue
+from fractus_services.camera.fair_queue import FairQueue
 from fractus_services.camera.image_authorization import ImageAuthorizer
-from fractus_services.camera.image_capture import MAX_FILTERING, ImageCapture
-from fractus_services.camera.image_record import ImageRecord
-from fractus_services.camera.image_store import ImageStore, owner_of
-from fractus_services.camera.pixels import Pixels, decoded
+from fractus_services.camera.image_capture import ImageCapture
+from fractus_services.camera.image_store import ImageRecord, ImageStore, owner_of
+from fractus_services.camera.pixels import Pixels, decode_image
 from fractus_services.camera.shutter import Shutter
 from fractus_services.camera.stored_images import StoredImages
 from fractus_services.errors import Refused
 from fractus_services.grant_files import ActiveGrant
 from policy_world import NOW, at, box, compiled, policy, spec, zone
 
+MAX_PER_OWNER = 4
 SEEING = Lens(60.0, 60.0, stabilised=True, error_deg=0.0)
 
 
@@ -67,11 +67,11 @@ class Scene:
     async def begun(self) -> None:
         assert await asyncio.to_thread(self._begun.wait, 10)
 
-    def capture(self, wanted: CaptureRequest) -> Pixels:
-        self.taken.append(wanted)
+    def capture(self, request: CaptureRequest) -> Pixels:
+        self.taken.append(request)
         self._begun.set()
         self.during()
-        noise = np.random.default_rng(1).integers(0, 256, (wanted.height, wanted.width, 3))
+        noise = np.random.default_rng(1).integers(0, 256, (request.height, request.width, 3))
         return noise.astype(np.uint8)
 
     def close(self) -> None:
@@ -87,7 +87,7 @@ class Finder:
     def __init__(self) -> None:
         self.boxes: list[Box] = []
 
-    def find(self, picture: Pixels, smallest_px: float, *, upright: bool) -> list[Box]:
+    def detect(self, picture: Pixels, smallest_px: float, *, upright: bool) -> list[Box]:
         assert smallest_px >= self.min_px
         assert not upright
         return self.boxes
@@ -109,29 +109,36 @@ class World:
     def __init__(
         self, directory: Path, resolution: tuple[int, int] = (64, 64), keep: int = 50, pinhole: bool = False
     ) -> None:
-        self.directory = directory / "album"
+        self.directory = directory / "images"
         self.drone, self.scene, self.finder = Drone(), Scene(), Finder()
         self.shutter = Shutter(self.scene, timeout_s=5.0)
         self.audit = AuditLog(directory / "audit.jsonl", lambda: NOW)
-        self.album = ImageStore(self.directory, keep, 10**9)
-        judge, queue = ImageAuthorizer(self.audit, self.finder), FairQueue(MAX_PER_OWNER, MAX_FILTERING)
+        self.store = ImageStore(self.directory, keep, 10**9)
+        authorizer = ImageAuthorizer(self.audit, self.finder)
+        filter_queue = FairQueue(MAX_PER_OWNER, 8)
+        capture_queue = FairQueue(MAX_PER_OWNER, 8)
         self.camera = ImageCapture(
-            self.drone, self.shutter, CameraProperties(resolution, pinhole=pinhole), detector=self.finder, filter_queue=queue,
-            album=self.album, judge=judge, clock=lambda: NOW,
+            self.drone, self.shutter, CameraProperties(resolution, pinhole=pinhole), detector=self.finder, filter_queue=filter_queue,
+            capture_queue=capture_queue, store=self.store, authorizer=authorizer, clock=lambda: NOW,
         )  # fmt: skip
-        self.library = StoredImages(
-            self.drone, self.album, detector=self.finder, filter_queue=queue, judge=judge, clock=lambda: NOW
+        self.stored_images = StoredImages(
+            self.drone,
+            self.store,
+            detector=self.finder,
+            filter_queue=filter_queue,
+            authorizer=authorizer,
+            clock=lambda: NOW,
         )
 
     async def capture(self, grant: ActiveGrant, **size: int) -> ImageRecord:
         return (await self.camera.capture(grant, CaptureArgs(**size)))[1]
 
-    async def pixels(self, grant: ActiveGrant, shot: ImageRecord) -> Pixels:
-        source = (await self.library.retrieve(grant, shot.name))[2]
-        return decoded(source if isinstance(source, bytes) else source.read_bytes())
+    async def pixels(self, grant: ActiveGrant, record: ImageRecord) -> Pixels:
+        source = (await self.stored_images.retrieve(grant, record.name))[2]
+        return decode_image(source if isinstance(source, bytes) else source.read_bytes())
 
-    def stored(self, grant: ActiveGrant, shot: ImageRecord) -> Pixels:
-        return decoded(self.album.path(owner_of(grant), shot.name).read_bytes())
+    def stored(self, grant: ActiveGrant, record: ImageRecord) -> Pixels:
+        return decode_image(self.store.path(owner_of(grant), record.name).read_bytes())
 
 
 async def refusal(work: Any) -> str:

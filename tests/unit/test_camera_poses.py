@@ -15,7 +15,7 @@ from fractus_core.policy.lenses import bounding_lens
 from fractus_proto.v1 import mobility_pb2
 from fractus_services.camera import pose_history
 from fractus_services.camera.pose_history import PoseHistory
-from fractus_services.camera.telemetry_client import STEP_S, ArrivalClock, measurement
+from fractus_services.camera.telemetry_client import STEP_WINDOW_S, ArrivalClock, to_measurement
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from policy_world import FRAME, HOME
@@ -54,7 +54,7 @@ class Drone:
         if ages is not None:
             message.position_age_s, message.attitude_age_s = ages
         message.time.FromNanoseconds(round((NOW_S + at_s - late_s) * 1e9))
-        self.poses.add(measurement(message, at_s, NOW_S + at_s))
+        self.poses.add(to_measurement(message, at_s, NOW_S + at_s))
 
     def way(self, begun_s: float) -> tuple[Situation, ...]:
         return self.poses.situations_since(begun_s, 1.0)
@@ -180,7 +180,7 @@ def gimbal_told(poses: PoseHistory, at_s: float, turned: tuple[float, float, flo
     if turned is not None:
         message.gimbal.roll_deg, message.gimbal.pitch_deg, message.gimbal.yaw_deg = turned
         message.gimbal_age_s = age_s
-    poses.add(measurement(message, at_s, NOW_S + at_s, gimbal=True))
+    poses.add(to_measurement(message, at_s, NOW_S + at_s, gimbal=True))
 
 
 def test_a_message_from_the_future_says_nothing(drone: Drone) -> None:
@@ -197,7 +197,7 @@ def test_a_clock_that_is_stepped_back_makes_no_late_message_younger() -> None:
     assert arrival() == NOW_S
     now_s, step_s = 2.0, -0.9
     assert arrival() == NOW_S + 2.0, "a message that was made at 1 s has waited for a second"
-    now_s = 2.1 + STEP_S
+    now_s = 2.1 + STEP_WINDOW_S
     assert arrival() == pytest.approx(NOW_S + now_s - 0.9)
     step_s = 30.0
     assert arrival() == pytest.approx(NOW_S + now_s + 30.0)

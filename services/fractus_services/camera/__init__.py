@@ -1,1 +1,1 @@
-"""The camera service: policy-checked pictures from a drone or an edge node."""
+"""The camera service: takes, filters, stores and returns images of a drone or an edge node under policies."""

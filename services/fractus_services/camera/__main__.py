@@ -1,4 +1,4 @@
-"""`python -m fractus_services.camera`: the camera service of a node."""
+"""Run the camera service of a node with `python -m fractus_services.camera`."""
 
 from fractus_services.commands import camera
 

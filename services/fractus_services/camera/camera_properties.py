@@ -1,4 +1,4 @@
-"""A camera's own properties, and which sizes of pictures it allows."""
+"""Properties of the node's camera, and the image sizes that it supports."""
 
 from __future__ import annotations
 
@@ -10,21 +10,22 @@ from fractus_core.api.nodes import Drone, EdgeNode
 from fractus_services.camera.pixels import source_size
 from fractus_services.errors import InvalidRequest
 
-MIN_PX, MAX_PX = 16, 8192
+MIN_PX = 16
+MAX_PX = 8192
 MIN_ALLOWED_PIXELS = 8_300_000
-"""Pixels that may be asked for of any camera, also of one that has fewer."""
+"""Number of pixels that any camera may be asked for, even if its own resolution is lower."""
 
 
 @dataclass(frozen=True, slots=True)
 class CameraProperties:
-    """A camera as its node describes it.
+    """Properties of a camera, taken from the node description.
 
     Attributes:
-        resolution: its width and height.
-        model: make and model; may be empty.
-        sensor: what it sees.
-        fixed: it does not move.
-        pinhole: its lens is described as one, so that the field of view tells its focal length.
+        resolution: Width and height in pixels.
+        model: Make and model, or an empty string.
+        sensor: Spectral band.
+        fixed: True if the camera does not move.
+        pinhole: True if the description has a pinhole lens, so that the field of view gives the focal length.
     """
 
     resolution: tuple[int, int] = (1280, 720)
@@ -34,8 +35,8 @@ class CameraProperties:
     pinhole: bool = False
 
     @classmethod
-    def of(cls, description: Drone | EdgeNode | None) -> CameraProperties:
-        """The properties of a node's camera; defaults where the node describes none."""
+    def from_description(cls, description: Drone | EdgeNode | None) -> CameraProperties:
+        """Return the properties of a node's camera, or the defaults if the node describes no camera."""
         camera = description.spec.services.camera if description is not None else None
         fixed = isinstance(description, EdgeNode)
         if camera is None:
@@ -44,26 +45,27 @@ class CameraProperties:
         return cls(camera.pixels, camera.model, camera.sensor_type, fixed, pinhole)
 
     def source_size(self, width: int, height: int) -> tuple[int, int]:
-        """Pixels to ask the camera for, in its own proportions, so that they can be cropped to a width and height."""
+        """Return the size to request from the camera, in its own aspect ratio, for an image of `width` and `height`."""
         return source_size(width, height, self.resolution)
 
     def check_size(self, width: int, height: int) -> None:
-        """Refuse sizes for which the camera's picture, before it is cropped, would take too much memory.
+        """Check the size of a requested image.
 
         Raises:
-            InvalidRequest: too small, too large, or cut from too large a picture.
+            InvalidRequest: The size is out of range, or the image before cropping would take too much memory.
         """
         if not (MIN_PX <= width <= MAX_PX and MIN_PX <= height <= MAX_PX):
             raise InvalidRequest(
                 "InvalidArgument",
-                f"{width}x{height} pixels is not between {MIN_PX}x{MIN_PX} and {MAX_PX}x{MAX_PX}; ask for another size",
+                f"{width}x{height} pixels is not between {MIN_PX}x{MIN_PX} and {MAX_PX}x{MAX_PX}; request another size",
             )
-        native, source = self.resolution, self.source_size(width, height)
+        native = self.resolution
+        source = self.source_size(width, height)
         limit = max(native[0] * native[1], MIN_ALLOWED_PIXELS)
-        # One per cent for sizes that were rounded up to whole pixels.
+        # Allow one per cent more, because sizes are rounded up to whole pixels.
         if source[0] * source[1] > limit * 1.01:
             raise InvalidRequest(
                 "InvalidArgument",
-                f"{width}x{height} pixels would be cut from {source[0]}x{source[1]}, more than {limit / 1e6:.1f}"
-                f" megapixels; ask for less, or for the proportions of {native[0]}x{native[1]}",
+                f"{width}x{height} pixels would be cropped from {source[0]}x{source[1]}, more than {limit / 1e6:.1f}"
+                f" megapixels; request fewer pixels, or the aspect ratio of {native[0]}x{native[1]}",
             )

@@ -1,4 +1,4 @@
-"""A lock that is handed from owner to owner in rounds, so that a flood from one does not stall the others."""
+"""Round-robin lock: requests of one owner do not delay the requests of others."""
 
 from __future__ import annotations
 
@@ -9,23 +9,20 @@ from contextlib import asynccontextmanager
 
 from fractus_services.errors import ResourceExhausted
 
-MAX_PER_OWNER = 4
-"""Requests of one component instance that wait or are being served."""
-
 
 class QueueFull(ResourceExhausted):
-    """A caller has as many requests waiting as it may have."""
+    """The maximum number of requests of one owner or of all owners is reached."""
 
     def __init__(self, reason: str) -> None:
         super().__init__("ShutterBusy", reason)
 
 
 class FairQueue:
-    """One request at a time, in rounds over the owners of requests.
+    """Serves one request at a time, round-robin over the owners of requests.
 
     Args:
-        max_per_owner: requests of one owner that may wait or be served.
-        max_requests: requests of all owners that may.
+        max_per_owner: Requests of one owner that may wait or be served.
+        max_requests: Requests of all owners that may wait or be served.
     """
 
     def __init__(self, max_per_owner: int, max_requests: int) -> None:
@@ -36,59 +33,60 @@ class FairQueue:
         self._busy = False
 
     def __len__(self) -> int:
-        """Requests that wait or are being served."""
+        """Return the number of requests that wait or are being served."""
         return sum(self._count.values())
 
     @asynccontextmanager
     async def turn(self, owner: str) -> AsyncIterator[None]:
-        """Wait for a turn and hold it.
+        """Wait for the owner's turn, and hold it within the block.
 
         Raises:
-            QueueFull: too many of this owner, or of all owners, wait already.
+            QueueFull: Too many requests of this owner, or of all owners, wait or are being served.
         """
         if self._count.get(owner, 0) >= self._max_per_owner:
             raise QueueFull(
-                f"{self._max_per_owner} pictures of this component are under way; wait for them and try again"
+                f"{self._max_per_owner} images of this component are in progress; wait for them and try again"
             )
         if len(self) >= self._max_requests:
-            raise QueueFull(f"{self._max_requests} pictures are under way on this node; try again")
+            raise QueueFull(f"{self._max_requests} images are in progress on this node; try again")
         self._count[owner] = self._count.get(owner, 0) + 1
         try:
-            await self._take(owner)
+            await self._acquire(owner)
             try:
                 yield
             finally:
-                self._pass_on(owner)
+                self._release(owner)
         finally:
             self._count[owner] -= 1
             if not self._count[owner]:
                 del self._count[owner]
 
-    async def _take(self, owner: str) -> None:
+    async def _acquire(self, owner: str) -> None:
         if not self._busy:
             self._busy = True
             return
-        place: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._waiting.setdefault(owner, deque()).append(place)
+        turn: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._waiting.setdefault(owner, deque()).append(turn)
         try:
-            await place
+            await turn
         except asyncio.CancelledError:
-            # The turn may have been handed to this request just before it was cancelled: it must not be lost.
-            if place.done() and not place.cancelled():
-                self._pass_on(owner)
+            # The turn may have been granted just before the cancellation. Pass it on, because it would be lost otherwise.
+            if turn.done() and not turn.cancelled():
+                self._release(owner)
             raise
 
-    def _pass_on(self, last: str) -> None:
-        if last in self._waiting:
-            # Who just had a turn goes to the end of the round: dictionaries keep the order of insertion.
-            self._waiting[last] = self._waiting.pop(last)
+    def _release(self, last_owner: str) -> None:
+        """Grant the turn to the next owner."""
+        if last_owner in self._waiting:
+            # Move the last owner to the end of the round. Dictionaries keep the order of insertion.
+            self._waiting[last_owner] = self._waiting.pop(last_owner)
         while self._waiting:
             owner = next(iter(self._waiting))
-            queue = self._waiting.pop(owner)
-            place = queue.popleft()
-            if queue:
-                self._waiting[owner] = queue
-            if not place.done():
-                place.set_result(None)
+            turns = self._waiting.pop(owner)
+            turn = turns.popleft()
+            if turns:
+                self._waiting[owner] = turns
+            if not turn.done():
+                turn.set_result(None)
                 return
         self._busy = False

@@ -1,4 +1,4 @@
-"""The filter pipeline: which filters can be trusted with a picture, and their application in order."""
+"""Filter pipeline: selects the filters that are reliable for an image, and applies them irreversibly."""
 
 from __future__ import annotations
 
@@ -6,91 +6,172 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import assert_never
 
+import cv2
+import numpy as np
+from fractus_core.api.policies import FaceMethod
 from fractus_core.policy.decision_types import Filter
 from fractus_core.policy.picture_rules import combine_filters
 
-from fractus_services.camera import filters
-from fractus_services.camera.face_detection import Detector
-from fractus_services.camera.pixels import Pixels
+from fractus_services.camera.face_detection import Box, FaceDetector
+from fractus_services.camera.motion_detection import Mask, detect_motion
+from fractus_services.camera.pixels import Pixels, resize
+
+BLUR_CELLS = 16
+"""Number of averages along the longer side of a blurred image. A face that fills its height is nine cells wide, too few for
+people or programs to recognise anyone."""
+FACE_CELLS = 4
+"""Number of colours across a hidden face."""
+FACE_MARGIN = 0.35
+"""Margin that is hidden around a face, as a share of the face's width."""
+_MEDIAN_SAMPLES = 33
+"""Side of the square of pixels whose median becomes one cell. The image is first reduced to this many pixels per cell."""
 
 
-class FacesNotReliable(Exception):
-    """Faces cannot be found reliably, and a policy allows no picture then."""
+class FaceDetectionUnreliable(Exception):
+    """Faces cannot be detected reliably, and a policy then permits no image."""
 
 
 @dataclass(frozen=True, slots=True)
 class FilterPlan:
-    """The filters that a picture gets.
+    """Filters to apply to an image.
 
     Attributes:
-        filters: in this order; none of them needs a detector that cannot be trusted here.
-        note: why a fallback is among them; empty when none is.
+        filters: Filters in order of application. None of them relies on an unreliable face detector.
+        note: Reason why a fallback filter is among them, or an empty string.
     """
 
     filters: tuple[Filter, ...]
     note: str = ""
 
 
-def plan_filters(required: tuple[Filter, ...], face_px: float, detector: Detector) -> FilterPlan:
-    """The filters that can be trusted to do what policies require.
+def plan_filters(required: tuple[Filter, ...], face_px: float, detector: FaceDetector) -> FilterPlan:
+    """Select the filters that reliably do what policies require.
 
-    A detector misses faces that are too small for it, and one missed face is a failure of privacy. So where faces may be
-    smaller than it finds reliably, it does not run at all, and the policy's fallback hides everything instead.
+    A detector misses faces that are too small for it, and each missed face is a failure of privacy. If the image may show
+    faces below the reliable size, the detector is not used. The policy's fallback filter hides everything instead.
 
     Args:
-        required: what policies require.
-        face_px: width of the smallest face that the picture may show; 0 when it is unknown.
-        detector: finds faces.
+        required: Filters that policies require.
+        face_px: Width of the smallest face that the image may show, in pixels, or 0 if it is unknown.
+        detector: Face detector.
 
     Raises:
-        FacesNotReliable: faces cannot be found reliably, and the fallback of a policy is to refuse.
+        FaceDetectionUnreliable: Faces cannot be detected reliably, and the fallback of a policy is to refuse.
     """
-    faces = next((one for one in required if one.action == "blurFaces"), None)
-    if faces is None or face_px >= detector.min_px:
+    blur_faces = next((required_filter for required_filter in required if required_filter.action == "blurFaces"), None)
+    if blur_faces is None or face_px >= detector.min_px:
         return FilterPlan(required)
-    width = f"faces may be as small as {face_px:.0f} pixels" if face_px else "it is unknown how small faces may be"
-    note = f"{width}, and they are found reliably from {detector.min_px:.0f} pixels on"
-    if faces.fallback == "refuse":
-        raise FacesNotReliable(f"{note}; go closer, or ask for more pixels")
-    rest = [one for one in required if one is not faces]
-    return FilterPlan(combine_filters([*rest, Filter(faces.fallback)]), f"{note}, so {faces.fallback} instead")
+    size = f"faces may be as small as {face_px:.0f} pixels" if face_px else "the size of faces is unknown"
+    note = f"{size}, and detection is reliable from {detector.min_px:.0f} pixels"
+    if blur_faces.fallback == "refuse":
+        raise FaceDetectionUnreliable(f"{note}; go closer, or request more pixels")
+    others = [required_filter for required_filter in required if required_filter is not blur_faces]
+    return FilterPlan(
+        combine_filters([*others, Filter(blur_faces.fallback)]), f"{note}, so {blur_faces.fallback} is applied"
+    )
 
 
 def apply_filters(
     frames: Sequence[Pixels],
     plan: FilterPlan,
-    detector: Detector,
+    detector: FaceDetector,
     face_px: float,
     *,
     upright: bool,
     fixed: bool = False,
 ) -> Pixels:
-    """A picture with its filters applied.
+    """Apply filters to an image.
 
     Args:
-        frames: one; or three of the same view, when motion is to be detected. The middle one is the picture.
-        plan: what to do.
-        detector: finds faces.
-        face_px: width of the smallest face.
-        upright: people stand upright in it.
-        fixed: the camera does not move.
+        frames: One frame, or three frames of the same view for motion detection. The middle frame is the image.
+        plan: Filters to apply.
+        detector: Face detector.
+        face_px: Width of the smallest face that the image may show, in pixels.
+        upright: True if people stand upright in the image.
+        fixed: True if the camera does not move.
     """
-    middle = frames[len(frames) // 2]
-    picture = middle
-    for one in plan.filters:
-        match one.action:
+    original = frames[len(frames) // 2]
+    picture = original
+    for planned in plan.filters:
+        match planned.action:
             case "black":
-                picture = filters.black(picture)
+                picture = blacken(picture)
             case "blurAverage":
-                picture = filters.blur_average(picture)
+                picture = blur_average(picture)
             case "blurMedian":
-                picture = filters.blur_median(picture)
+                picture = blur_median(picture)
             case "blurFaces":
-                picture = filters.hide_faces(picture, detector.find(picture, face_px, upright=upright), one.faces)
+                picture = hide_faces(picture, detector.detect(picture, face_px, upright=upright), planned.faces)
             case "removeBackground":
-                # Motion is detected in the frames as the camera gave them: a filter applied before would hide it.
-                mask = filters.moving(frames[0], middle, frames[2], fixed=fixed) if len(frames) == 3 else None
-                picture = filters.remove_background(picture, mask)
+                # Detect motion in the original frames, because the filters applied so far hide it.
+                mask = detect_motion(frames[0], original, frames[2], fixed=fixed) if len(frames) == 3 else None
+                picture = remove_background(picture, mask)
             case _:
-                assert_never(one.action)
+                assert_never(planned.action)
     return picture
+
+
+def blacken(picture: Pixels) -> Pixels:
+    """Return a black image of the same size."""
+    return np.zeros_like(picture)
+
+
+def blur_average(picture: Pixels) -> Pixels:
+    """Replace an image by averages over squares, `BLUR_CELLS` along the longer side, with smooth transitions."""
+    return _enlarge(resize(picture, *_cell_counts(picture)), picture)
+
+
+def blur_median(picture: Pixels) -> Pixels:
+    """Replace an image by medians over squares, `BLUR_CELLS` along the longer side, with smooth transitions."""
+    columns, rows = _cell_counts(picture)
+    samples = (columns * _MEDIAN_SAMPLES, rows * _MEDIAN_SAMPLES)
+    smooth = cv2.medianBlur(cv2.resize(picture, samples, interpolation=cv2.INTER_NEAREST), _MEDIAN_SAMPLES)
+    middle = _MEDIAN_SAMPLES // 2
+    return _enlarge(np.ascontiguousarray(smooth[middle::_MEDIAN_SAMPLES, middle::_MEDIAN_SAMPLES]), picture)
+
+
+def _cell_counts(picture: Pixels) -> tuple[int, int]:
+    """Return the number of columns and rows of blur cells."""
+    rows, columns = picture.shape[:2]
+    cell_px = max(rows, columns) / BLUR_CELLS
+    return max(round(columns / cell_px), 1), max(round(rows / cell_px), 1)
+
+
+def _enlarge(cells: Pixels, picture: Pixels) -> Pixels:
+    rows, columns = picture.shape[:2]
+    return resize(cells, columns, rows)
+
+
+def hide_faces(picture: Pixels, boxes: Sequence[Box], method: FaceMethod) -> Pixels:
+    """Reduce each face and a margin around it to `FACE_CELLS` colours across, as pixels or as a smooth blur."""
+    hidden = picture.copy()
+    rows, columns = picture.shape[:2]
+    for left, top, width, height in boxes:
+        x0 = max(int(left - FACE_MARGIN * width), 0)
+        y0 = max(int(top - FACE_MARGIN * height), 0)
+        x1 = min(int(left + (1 + FACE_MARGIN) * width) + 1, columns)
+        y1 = min(int(top + (1 + FACE_MARGIN) * height) + 1, rows)
+        if x1 <= x0 or y1 <= y0:
+            continue
+        # Read from the partly hidden image: detectors also find small faces within large ones, and the finer cells of a small
+        # face must not restore the original.
+        region = hidden[y0:y1, x0:x1]
+        # The region includes the margins, or ends at the image border, so its number of cells is in proportion.
+        cell_columns = min(max(round(FACE_CELLS * (x1 - x0) / max(width, 1)), 1), x1 - x0)
+        cell_rows = min(max(round(FACE_CELLS * (y1 - y0) / max(height, 1)), 1), y1 - y0)
+        cells = cv2.resize(region, (cell_columns, cell_rows), interpolation=cv2.INTER_AREA)
+        if method == "gaussian":
+            smooth = cv2.resize(cells, (x1 - x0, y1 - y0), interpolation=cv2.INTER_CUBIC)
+            hidden[y0:y1, x0:x1] = cv2.GaussianBlur(smooth, (0, 0), max((x1 - x0) / cell_columns, 0.8))
+        else:
+            hidden[y0:y1, x0:x1] = cv2.resize(cells, (x1 - x0, y1 - y0), interpolation=cv2.INTER_NEAREST)
+    return hidden
+
+
+def remove_background(picture: Pixels, moving: Mask | None) -> Pixels:
+    """Blacken all pixels that do not move, or the entire image if the motion is unknown."""
+    if moving is None:
+        return blacken(picture)
+    kept = picture.copy()
+    kept[~moving] = 0
+    return kept

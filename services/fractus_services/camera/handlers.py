@@ -10,12 +10,12 @@ from typing import Any
 
 from fractus_core.policy.decision_types import CaptureArgs
 from fractus_proto.v1 import camera_pb2, camera_pb2_grpc
+from grpc.aio import ServicerContext
 
 from fractus_services.admission import CallAdmission
 from fractus_services.auth import Caller
 from fractus_services.camera.image_capture import ImageCapture
-from fractus_services.camera.image_record import ImageRecord
-from fractus_services.camera.image_store import NoSuchImage, owner_of
+from fractus_services.camera.image_store import ImageRecord, NoSuchImage, owner_of
 from fractus_services.camera.stored_images import StoredImages
 from fractus_services.error_details import decision
 from fractus_services.errors import ResourceExhausted
@@ -25,68 +25,77 @@ READ_BYTES = 4 * CHUNK_BYTES
 
 
 class CameraHandlers(camera_pb2_grpc.CameraServiceServicer):
-    """The service on the wire."""
+    """Servicer of `CameraService`. Methods are documented in camera.proto."""
 
-    def __init__(self, capture: ImageCapture, library: StoredImages, calls: CallAdmission) -> None:
+    def __init__(self, capture: ImageCapture, stored: StoredImages, admission: CallAdmission) -> None:
         self._capture = capture
-        self._library = library
-        self._admission = calls
+        self._stored = stored
+        self._admission = admission
 
     @asynccontextmanager
-    async def _call(self, context: Any) -> AsyncIterator[Caller]:
+    async def _call(self, context: ServicerContext) -> AsyncIterator[Caller]:
         async with self._admission.call(context) as caller:
             try:
                 yield caller
             except OSError as error:
                 raise storage_failed(error) from error
 
-    async def CaptureImage(self, request: Any, context: Any) -> Any:  # noqa: N802 - the protocol's name
+    async def CaptureImage(  # noqa: N802
+        self, request: camera_pb2.CaptureImageRequest, context: ServicerContext
+    ) -> camera_pb2.CaptureImageResponse:
         """See camera.proto."""
         async with self._call(context) as caller:
             grant = self._admission.grant_of(caller)
             args = CaptureArgs(request.width, request.height)
-            verdict, shot = await self._capture.capture(grant, args, lambda: self._admission.grant_of(caller))
-            return camera_pb2.CaptureImageResponse(decision=decision(verdict), image=_info(shot))
+            verdict, record = await self._capture.capture(grant, args, lambda: self._admission.grant_of(caller))
+            return camera_pb2.CaptureImageResponse(decision=decision(verdict), image=_image_info(record))
 
-    async def RetrieveImage(self, request: Any, context: Any) -> None:  # noqa: N802
+    async def RetrieveImage(  # noqa: N802
+        self, request: camera_pb2.RetrieveImageRequest, context: ServicerContext
+    ) -> None:
         """See camera.proto."""
         async with self._call(context) as caller:
             grant = self._admission.grant_of(caller)
-            verdict, shot, source = await self._library.retrieve(
+            verdict, record, source = await self._stored.retrieve(
                 grant, request.name, lambda: self._admission.grant_of(caller)
             )
-            head: dict[str, Any] = {"decision": decision(verdict), "image": _info(shot)}
-            async for piece in _pieces(source, request.name):
-                for at in range(0, len(piece), CHUNK_BYTES):
-                    # A reader sets the pace, and a deadline may be far away: what was permitted may not be any more.
-                    self._library.judge_again(self._admission.grant_of(caller), owner_of(grant), shot)
-                    await context.write(camera_pb2.ImageChunk(data=piece[at : at + CHUNK_BYTES], **head))
+            head: dict[str, Any] = {"decision": decision(verdict), "image": _image_info(record)}
+            async for block in _read_blocks(source, request.name):
+                for start in range(0, len(block), CHUNK_BYTES):
+                    # Authorize each chunk: a slow reader can extend the transfer until the image is no longer permitted.
+                    self._stored.authorize_transfer(self._admission.grant_of(caller), owner_of(grant), record)
+                    await context.write(camera_pb2.ImageChunk(data=block[start : start + CHUNK_BYTES], **head))
                     head = {}
 
-    async def ListImages(self, _request: Any, context: Any) -> Any:  # noqa: N802
+    async def ListImages(  # noqa: N802
+        self, _request: camera_pb2.ListImagesRequest, context: ServicerContext
+    ) -> camera_pb2.ListImagesResponse:
         """See camera.proto."""
         async with self._call(context) as caller:
-            verdict, shots = await self._library.list(self._admission.grant_of(caller))
-            return camera_pb2.ListImagesResponse(decision=decision(verdict), images=[_info(shot) for shot in shots])
+            verdict, records = await self._stored.list(self._admission.grant_of(caller))
+            images = [_image_info(record) for record in records]
+            return camera_pb2.ListImagesResponse(decision=decision(verdict), images=images)
 
-    async def DeleteImage(self, request: Any, context: Any) -> Any:  # noqa: N802
+    async def DeleteImage(  # noqa: N802
+        self, request: camera_pb2.DeleteImageRequest, context: ServicerContext
+    ) -> camera_pb2.DeleteImageResponse:
         """See camera.proto."""
         async with self._call(context) as caller:
-            verdict = await self._library.delete(self._admission.grant_of(caller), request.name)
+            verdict = await self._stored.delete(self._admission.grant_of(caller), request.name)
             return camera_pb2.DeleteImageResponse(decision=decision(verdict))
 
 
 def storage_failed(error: OSError) -> ResourceExhausted:
-    """A failure of the disk as a refusal."""
-    reason = f"the picture cannot be stored: {error.strerror or error}; delete pictures, or make room on the node"
+    """Convert a disk error to a refusal."""
+    reason = f"cannot store the image: {error.strerror or error}; delete images, or free disk space on the node"
     return ResourceExhausted("StorageFailed", reason)
 
 
-async def _pieces(source: bytes | Path, name: str) -> AsyncIterator[bytes]:
-    """The bytes of a picture; a file is read in pieces, so that slow readers cost no memory.
+async def _read_blocks(source: bytes | Path, name: str) -> AsyncIterator[bytes]:
+    """Yield the bytes of an image. A file is read in blocks, so that slow readers use little memory.
 
     Raises:
-        NoSuchImage: it was deleted meanwhile.
+        NoSuchImage: The image was deleted.
     """
     if isinstance(source, bytes):
         yield source
@@ -94,20 +103,25 @@ async def _pieces(source: bytes | Path, name: str) -> AsyncIterator[bytes]:
     try:
         file = await asyncio.to_thread(source.open, "rb")
     except FileNotFoundError:
-        raise NoSuchImage(f"picture {name[:64]!r} was deleted") from None
+        raise NoSuchImage(f"image {name[:64]!r} was deleted") from None
     with file:
-        while piece := await asyncio.to_thread(file.read, READ_BYTES):
-            yield piece
+        while block := await asyncio.to_thread(file.read, READ_BYTES):
+            yield block
 
 
-def _info(shot: ImageRecord) -> camera_pb2.ImageInfo:
+def _image_info(record: ImageRecord) -> camera_pb2.ImageInfo:
     info = camera_pb2.ImageInfo(
-        name=shot.name, width=shot.width, height=shot.height, size_bytes=shot.size_bytes, media_type="image/jpeg"
+        name=record.name,
+        width=record.width,
+        height=record.height,
+        size_bytes=record.size_bytes,
+        media_type="image/jpeg",
     )
-    info.time.FromNanoseconds(int(shot.time_s * 1e9))
-    taken = shot.poses[-1]
-    # Where a filtered picture was taken is private too: a policy asked for the filter there.
-    if taken.lat is not None and taken.lon is not None and not shot.filters:
-        info.position.latitude_deg, info.position.longitude_deg = taken.lat, taken.lon
-        info.position.altitude_m = taken.altitude_m
+    info.time.FromNanoseconds(int(record.time_s * 1e9))
+    pose = record.poses[-1]
+    # Omit the position of a filtered image: it is private too, because a policy required the filter there.
+    if pose.lat is not None and pose.lon is not None and not record.filters:
+        info.position.latitude_deg = pose.lat
+        info.position.longitude_deg = pose.lon
+        info.position.altitude_m = pose.altitude_m
     return info

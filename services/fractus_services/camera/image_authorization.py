@@ -1,4 +1,4 @@
-"""Judges the calls of the camera service, and writes each decision to the audit log."""
+"""Policy decisions about images. Each decision is written to the audit log."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from fractus_core.policy.picture_rules import combine_filters, judge_privacy
 from fractus_runtime import spans
 from fractus_runtime.audit import AuditLog
 
-from fractus_services.camera.face_detection import Detector
-from fractus_services.camera.filter_pipeline import FacesNotReliable, FilterPlan, plan_filters
+from fractus_services.camera.face_detection import FaceDetector
+from fractus_services.camera.filter_pipeline import FaceDetectionUnreliable, FilterPlan, plan_filters
 from fractus_services.camera.pose import Pose
 from fractus_services.errors import denied
 from fractus_services.grant_files import ActiveGrant
@@ -22,93 +22,93 @@ log = logging.getLogger(__name__)
 
 
 class ImageAuthorizer:
-    """The policy engine as the camera service asks it: a denial is an exception.
+    """Authorizes calls of the camera service with the policy engine. A denial is raised as an exception.
 
     Args:
-        audit: where decisions are recorded.
-        detector: finds faces; where it cannot be trusted, policies may deny.
+        audit: Audit log that records decisions.
+        detector: Face detector. Policies may deny an image for which it is unreliable.
     """
 
-    def __init__(self, audit: AuditLog, detector: Detector) -> None:
+    def __init__(self, audit: AuditLog, detector: FaceDetector) -> None:
         self._audit = audit
         self.detector = detector
 
-    def judge(self, call: Call, grant: ActiveGrant, now: Situation, *, record: bool = True) -> Verdict:
-        """The verdict on a call, which permits it.
+    def authorize(self, call: Call, grant: ActiveGrant, situation: Situation, *, record: bool = True) -> Verdict:
+        """Judge a call, and return a verdict that permits it.
 
         Args:
-            call: method and arguments.
-            grant: the caller's.
-            now: where the camera is.
-            record: whether a verdict that permits is written down too; later looks at the same call are not.
+            call: Method and arguments.
+            grant: Grant of the caller.
+            situation: Situation of the camera.
+            record: True to record a verdict that permits, False if the call was recorded before. Denials are always recorded.
 
         Raises:
-            Refused: it is denied, or the engine failed.
+            Refused: The call is denied, or the engine failed.
         """
         with spans.call().child("policy.judge") as span:
             try:
-                verdict = judge(call, now, grant.compiled)
+                verdict = judge(call, situation, grant.compiled)
             except Exception:
-                log.exception("policy: the engine failed, call refused (method=%s)", call.method)
+                log.exception("policy: engine failed, call denied (method=%s)", call.method)
                 verdict = Verdict("deny", None, "InternalError", f"the policy engine failed on {call.method}")
             span.verdict(verdict.action, verdict.code, verdict.policies)
-        return self.require(call, grant, verdict, now, record=record)
+        return self.enforce(call, grant, verdict, situation, record=record)
 
-    def judge_view(self, call: Call, grant: ActiveGrant, seen: Situation) -> Verdict:
-        """The verdict on what the camera saw in a situation: of privacy policies, and of those that deny the method.
+    def authorize_view(self, call: Call, grant: ActiveGrant, seen: Situation) -> Verdict:
+        """Judge the view of the camera in a situation by privacy policies and by policies that deny the method.
 
         Raises:
-            Refused: no picture may be taken or returned there.
+            Refused: No image of this view may be taken or returned.
         """
         verdict = judge_denials(call.method, seen, grant.compiled) or judge_privacy(seen, grant.compiled)
-        return self.require(call, grant, verdict, seen)
+        return self.enforce(call, grant, verdict, seen)
 
-    def judge_stored(
+    def authorize_stored(
         self, call: Call, grant: ActiveGrant, poses: Sequence[Pose], verdict: Verdict, now: Situation
     ) -> Verdict:
-        """A verdict on a call together with that on the place where its picture was taken, under today's policies.
+        """Combine a verdict on a call with the current policies' verdict on the view of a stored image.
 
         Raises:
-            Refused: no picture of that place may be returned.
+            Refused: No image of this view may be returned.
         """
-        return combined([verdict, self.judge_view(call, grant, taken_at(poses, now))])
+        return combine_verdicts([verdict, self.authorize_view(call, grant, situation_of(poses, now))])
 
-    def plan(
-        self, call: Call, grant: ActiveGrant, verdict: Verdict, seen: Situation, *, face_px: float, known: Verdict
+    def plan_filters(
+        self, call: Call, grant: ActiveGrant, verdict: Verdict, seen: Situation, *, face_px: float, recorded: Verdict
     ) -> tuple[FilterPlan, Verdict]:
-        """The filters that a verdict requires of a picture, and the verdict that names a fallback among them.
+        """Return the filters that a verdict requires of an image, and the verdict with a note about fallbacks.
 
-        It is written down if these filters are others than the audit log tells by now.
+        The verdict is recorded if it differs from the verdict in the audit log.
 
         Args:
-            call: method and arguments.
-            grant: the caller's.
-            verdict: with the required filters.
-            seen: where the picture was taken.
-            face_px: width of the smallest face that the picture may show; 0 when it is unknown.
-            known: the verdict on the call that was written down.
+            call: Method and arguments.
+            grant: Grant of the caller.
+            verdict: Verdict with the required filters.
+            seen: Situation in which the image was taken.
+            face_px: Width of the smallest face that the image may show, in pixels, or 0 if it is unknown.
+            recorded: Verdict on the call that the audit log contains.
 
         Raises:
-            Refused: faces cannot be hidden reliably, and a policy allows no picture then.
+            Refused: Faces cannot be detected reliably, and a policy then permits no image.
         """
         try:
             plan = plan_filters(verdict.filters, face_px, self.detector)
-        except FacesNotReliable as error:
+        except FaceDetectionUnreliable as error:
             refusal = Verdict("deny", None, "FacesNotFound", f"{verdict.reason}; {error}", verdict.policies)
-            self.require(call, grant, refusal, seen)
+            self.enforce(call, grant, refusal, seen)
             raise AssertionError("a denial always raises") from error
         noted = replace(verdict, reason=f"{verdict.reason}; {plan.note}") if plan.note else verdict
-        if (plan.filters, verdict.policies) != (known.filters, known.policies):
-            self.require(call, grant, replace(noted, filters=plan.filters), seen, record=True)
+        if (plan.filters, verdict.policies) != (recorded.filters, recorded.policies):
+            self.enforce(call, grant, replace(noted, filters=plan.filters), seen, record=True)
         return plan, noted
 
-    def require(
-        self, call: Call, grant: ActiveGrant, verdict: Verdict, now: Situation, *, record: bool = False
+    def enforce(
+        self, call: Call, grant: ActiveGrant, verdict: Verdict, situation: Situation, *, record: bool = False
     ) -> Verdict:
-        """A verdict that permits; one that does not is written down and raised.
+        """Return a verdict that permits. Record and raise a verdict that denies.
 
         Raises:
-            Refused: it denies the call.
+            Refused: The verdict denies the call.
         """
         if record or not verdict.permits:
             self._audit.append(
@@ -116,8 +116,9 @@ class ImageAuthorizer:
                 {
                     "caller": grant.identity, "method": call.method, "args": asdict(call.args) if call.args else {},
                     "action": verdict.action, "code": verdict.code, "reason": verdict.reason,
-                    "policies": list(verdict.policies), "filters": [one.action for one in verdict.filters],
-                    "lat": now.lat, "lon": now.lon, "alt": now.altitude_m,
+                    "policies": list(verdict.policies),
+                    "filters": [required.action for required in verdict.filters],
+                    "lat": situation.lat, "lon": situation.lon, "alt": situation.altitude_m,
                 },
             )  # fmt: skip
         if not verdict.permits:
@@ -125,17 +126,18 @@ class ImageAuthorizer:
         return verdict
 
 
-def taken_at(poses: Iterable[Pose], now: Situation) -> Situation:
-    """The situation of stored poses, at the present time: policies that are active now apply to a picture from then."""
-    way = tuple(pose.at(now) for pose in poses)
-    return replace(way[-1], exposure=way)
+def situation_of(poses: Iterable[Pose], now: Situation) -> Situation:
+    """Return the situation of stored poses with the current time, so that current policies apply to an old image."""
+    exposure = tuple(pose.apply_to(now) for pose in poses)
+    return replace(exposure[-1], exposure=exposure)
 
 
-def combined(verdicts: Sequence[Verdict]) -> Verdict:
-    """What several verdicts that permit a picture require together."""
-    filters = combine_filters(one for verdict in verdicts for one in verdict.filters)
+def combine_verdicts(verdicts: Sequence[Verdict]) -> Verdict:
+    """Combine verdicts that permit an image: all their filters are required."""
+    filters = combine_filters(required for verdict in verdicts for required in verdict.filters)
     if not filters:
         return verdicts[0]
     names = tuple(dict.fromkeys(name for verdict in verdicts for name in verdict.policies))
-    reason = f"policy {names[0]} asks for {', '.join(one.action for one in filters)}" if names else ""
+    actions = ", ".join(required.action for required in filters)
+    reason = f"policy {names[0]} requires {actions}" if names else ""
     return replace(verdicts[0], action="correct", code="PrivacyFilter", reason=reason, policies=names, filters=filters)

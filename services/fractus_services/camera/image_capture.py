@@ -1,4 +1,4 @@
-"""Takes a picture: judged when the shutter is free and again once it is taken, filtered before it is stored."""
+"""Takes images: authorized before and after the exposure, and filtered before they are stored."""
 
 from __future__ import annotations
 
@@ -18,67 +18,61 @@ from fractus_runtime import spans
 from fractus_services.background import Background
 from fractus_services.camera.camera_properties import CameraProperties
 from fractus_services.camera.drivers.driver import CaptureRequest
-from fractus_services.camera.face_detection import Detector, smallest_face_px
-from fractus_services.camera.fair_queue import MAX_PER_OWNER, FairQueue
+from fractus_services.camera.face_detection import FaceDetector, smallest_face_px
+from fractus_services.camera.fair_queue import FairQueue
 from fractus_services.camera.filter_pipeline import apply_filters
-from fractus_services.camera.filters import MOTION_PX
-from fractus_services.camera.image_authorization import ImageAuthorizer, combined
+from fractus_services.camera.image_authorization import ImageAuthorizer, combine_verdicts
 from fractus_services.camera.image_metadata import with_metadata
-from fractus_services.camera.image_record import ImageRecord
-from fractus_services.camera.image_store import ImageStore, ImageStoreFull, owner_of
-from fractus_services.camera.pixels import Pixels, cropped, encoded, fitted
-from fractus_services.camera.pose import Pose, is_upright
-from fractus_services.camera.pose_provider import PoseProvider
+from fractus_services.camera.image_store import ImageRecord, ImageStore, ImageStoreFull, owner_of
+from fractus_services.camera.motion_detection import MAX_MOTION_WIDTH_PX
+from fractus_services.camera.pixels import Pixels, crop_and_resize, crop_to_aspect_ratio, encode_jpeg
+from fractus_services.camera.pose import Pose, PoseProvider, is_upright
 from fractus_services.camera.shutter import Shutter
 from fractus_services.grant_files import ActiveGrant
 
-MAX_EXPOSURES = 8
-"""Pictures of all components that are being taken or wait for the shutter."""
-MAX_FILTERING = 8
-"""Pictures that are being filtered or wait for it; each takes tens of megabytes of memory."""
-FRAME_INTERVAL_S = 0.25
-"""Between the frames that show what moves."""
-_ROUNDED_PX = 2
-"""By so much the whole view may be larger than what was asked for, in its own proportions."""
+_ROUNDING_PX = 2
+"""Maximum difference between the full view and the requested size that is due to rounding, in pixels."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Exposure:
-    """What came out of an exposure, judged.
+    """Authorized frames of an exposure.
 
     Attributes:
-        name: of the picture.
-        grant: by which it was judged.
-        verdict: which filters it needs.
-        known: the verdict before it was taken, which was written down.
-        after: where the camera was at the end, and on which way it got there.
-        frames: what the camera gave.
-        view_width_px: width of the whole view, in pixels that the camera gave.
+        name: Name of the image.
+        grant: Grant by which the exposure was authorized.
+        verdict: Verdict with the required filters.
+        recorded: Verdict before the exposure, which the audit log contains.
+        after: Situation at the end of the exposure, with all situations during the exposure.
+        frames: Frames of the camera.
+        view_width_px: Width of the full view, in pixels that the camera returned.
     """
 
     name: str
     grant: ActiveGrant
     verdict: Verdict
-    known: Verdict
+    recorded: Verdict
     after: Situation
     frames: list[Pixels]
     view_width_px: int
 
 
 class ImageCapture:
-    """CaptureImage of Table 8.2 of the thesis, for callers whose grant is known.
+    """`CaptureImage` of Table 8.2 of the thesis, for callers with a Grant.
 
-    A picture is filtered before it is stored: where a policy requires filters, no picture without them is ever on disk.
+    Images are filtered in memory. If a policy requires filters, the unfiltered image is never written to the disk.
 
     Args:
-        poses: where the camera is.
-        shutter: the camera.
-        camera: its properties.
-        detector: finds faces.
-        filter_queue: who may filter a picture next.
-        album: where pictures are stored.
-        judge: judges and records.
-        clock: Unix time.
+        poses: Poses of the camera.
+        shutter: Camera thread.
+        camera: Properties of the camera.
+        detector: Face detector.
+        filter_queue: Turns for filtering, shared with `StoredImages`.
+        capture_queue: Turns for the camera.
+        store: Image store.
+        authorizer: Policy decisions.
+        clock: Returns Unix time.
+        motion_frame_interval_s: Interval between the frames that motion detection compares, in seconds.
     """
 
     def __init__(
@@ -87,38 +81,45 @@ class ImageCapture:
         shutter: Shutter,
         camera: CameraProperties,
         *,
-        detector: Detector,
+        detector: FaceDetector,
         filter_queue: FairQueue,
-        album: ImageStore,
-        judge: ImageAuthorizer,
+        capture_queue: FairQueue,
+        store: ImageStore,
+        authorizer: ImageAuthorizer,
         clock: Callable[[], float],
+        motion_frame_interval_s: float = 0.25,
     ) -> None:
         self._poses = poses
         self._shutter = shutter
         self._camera = camera
         self._detector = detector
         self._filter_queue = filter_queue
-        self._album = album
-        self._judge = judge
+        self._capture_queue = capture_queue
+        self._store = store
+        self._authorizer = authorizer
         self._clock = clock
-        self._numbers = itertools.count()
-        self._exposures = FairQueue(MAX_PER_OWNER, MAX_EXPOSURES)
+        self._motion_frame_interval_s = motion_frame_interval_s
+        self._sequence = itertools.count()
         self._tasks = Background()
 
     async def capture(
         self, grant: ActiveGrant, args: CaptureArgs, current_grant: Callable[[], ActiveGrant] | None = None
     ) -> tuple[Verdict, ImageRecord]:
-        """Take a picture and store it.
+        """Take an image and store it.
 
-        It is judged when the shutter is free, and again when the picture is taken, together with all that the camera saw
-        on the way: the drone moves meanwhile, and grants change.
+        The call is authorized when the camera is free, and again after the exposure with everything that the camera may have
+        seen, because the drone moves and Grants change in the meantime.
 
         Args:
-            grant: the caller's.
-            args: pixels; 0 means the camera's own.
-            current_grant: the caller's grant at a later moment; raises when there is none any more.
+            grant: Grant of the caller.
+            args: Size in pixels. 0 means the camera's own size.
+            current_grant: Returns the caller's current Grant, or raises if the caller has none any more.
+
+        Raises:
+            Refused: The call is invalid or denied, or no image could be taken.
         """
-        width, height = args.width or self._camera.resolution[0], args.height or self._camera.resolution[1]
+        width = args.width or self._camera.resolution[0]
+        height = args.height or self._camera.resolution[1]
         self._camera.check_size(width, height)
         sized = replace(args, width=width, height=height)
         return await self._tasks.complete(self._capture(owner_of(grant), sized, current_grant or (lambda: grant)))
@@ -130,100 +131,116 @@ class ImageCapture:
         if not expected.filters:
             exposure = await self._expose(owner, args, current_grant)
             if not exposure.verdict.filters:
-                return await self._store(args, exposure)
+                return await self._filter_and_store(args, exposure)
             async with self._filter_queue.turn(owner):
-                return await self._store(args, exposure)
-        # The picture must not wait in memory for its filters, so the turn for these comes first.
+                return await self._filter_and_store(args, exposure)
+        # Wait for the filter turn before the exposure, so that no image waits in memory for its filters.
         async with self._filter_queue.turn(owner):
-            return await self._store(args, await self._expose(owner, args, current_grant))
+            return await self._filter_and_store(args, await self._expose(owner, args, current_grant))
 
     async def _expose(self, owner: str, args: CaptureArgs, current_grant: Callable[[], ActiveGrant]) -> _Exposure:
         call = Call("CaptureImage", args)
-        async with self._exposures.turn(owner):
-            # A camera may deliver a picture that it took before it was asked.
-            begun_s = time.monotonic() - self._shutter.latency_s
-            grant, before = current_grant(), self._poses.situation(self._clock())
-            known = self._judge.judge(call, grant, before)
-            problem = await asyncio.to_thread(self._album.quota_problem, owner)
+        async with self._capture_queue.turn(owner):
+            # The camera may return an image that it took before the request.
+            start_s = time.monotonic() - self._shutter.latency_s
+            grant = current_grant()
+            before = self._poses.situation(self._clock())
+            recorded = self._authorizer.authorize(call, grant, before)
+            problem = await asyncio.to_thread(self._store.quota_problem, owner)
             if problem:
                 raise ImageStoreFull(problem)
             with spans.call().child("camera.capture"):
-                frames = await self._shutter.expose(*self._wanted(args, grant, before, known))
+                frames = await self._take_frames(args, grant, before, recorded)
             if before.lens is not None:
-                # It is judged by a view in these proportions, whatever the camera gave.
-                frames = [cropped(one, *self._camera.resolution) for one in frames]
-            way, grant = self._poses.situations_since(begun_s, self._clock()), current_grant()
-            after = replace(way[-1], exposure=way)
-            verdict = combined([known, *self._judge_again(call, grant, before, after)])
-            # Enlarging a picture does not make its faces easier to find.
+                # Policies judge a view of the described aspect ratio, so crop frames of another one.
+                frames = [crop_to_aspect_ratio(frame, *self._camera.resolution) for frame in frames]
+            situations = self._poses.situations_since(start_s, self._clock())
+            grant = current_grant()
+            after = replace(situations[-1], exposure=situations)
+            verdict = combine_verdicts([recorded, *self._authorize_exposure(call, grant, before, after)])
+            # Enlarging an image does not make its faces easier to detect.
             view_width_px = min(self._camera.source_size(args.width, args.height)[0], frames[len(frames) // 2].shape[1])
-            return _Exposure(self._name(after), grant, verdict, known, after, frames, view_width_px)
+            return _Exposure(self._name(after), grant, verdict, recorded, after, frames, view_width_px)
 
-    def _wanted(
-        self, args: CaptureArgs, grant: ActiveGrant, before: Situation, verdict: Verdict
-    ) -> tuple[CaptureRequest, int, float]:
-        """What to ask the shutter for; what moves is seen only in several frames."""
+    async def _take_frames(
+        self, args: CaptureArgs, grant: ActiveGrant, situation: Situation, verdict: Verdict
+    ) -> list[Pixels]:
+        """Take one frame, or three if a filter needs motion detection."""
         camera = self._camera
-        size = camera.source_size(args.width, args.height)
-        wanted = CaptureRequest(*size, camera.resolution, camera.sensor, before, grant.spec.node)
-        moving = any(one.action == "removeBackground" for one in verdict.filters)
-        return wanted, 3 if moving else 1, FRAME_INTERVAL_S
+        width, height = camera.source_size(args.width, args.height)
+        request = CaptureRequest(width, height, camera.resolution, camera.sensor, situation, grant.spec.node)
+        needs_motion = any(required.action == "removeBackground" for required in verdict.filters)
+        return await self._shutter.expose(request, 3 if needs_motion else 1, self._motion_frame_interval_s)
 
-    def _judge_again(self, call: Call, grant: ActiveGrant, before: Situation, after: Situation) -> list[Verdict]:
-        """The verdicts on all that the camera saw, at every moment the picture may be from.
+    def _authorize_exposure(self, call: Call, grant: ActiveGrant, before: Situation, after: Situation) -> list[Verdict]:
+        """Return the verdicts on everything that the camera may have seen, at each possible time of the exposure.
 
-        Policies have schedules: a zone that was active when the picture was begun counts as well as one that is active
-        now, and so does one that was active when a camera with latency may have taken it.
+        Policies have schedules. A zone counts if it was active at the start of the call, or is active now, or was active when a
+        camera with latency may have taken the image.
         """
         verdicts = [
-            self._judge.judge(call, grant, moment, record=False)
-            for moment in (after, replace(after, time_s=before.time_s))
+            self._authorizer.authorize(call, grant, situation, record=False)
+            for situation in (after, replace(after, time_s=before.time_s))
         ]
-        first_s = UncertainTime(before.time_s, earliest_time(before.time_s) - self._shutter.latency_s)
-        return [*verdicts, self._judge.judge_view(call, grant, replace(after, time_s=first_s))]
+        exposure_s = UncertainTime(before.time_s, earliest_time(before.time_s) - self._shutter.latency_s)
+        return [*verdicts, self._authorizer.authorize_view(call, grant, replace(after, time_s=exposure_s))]
 
     def _name(self, after: Situation) -> str:
-        moment = datetime.fromtimestamp(after.time_s, UTC).strftime("%Y%m%d%H%M%S%f")[:17]
-        return f"{moment}-{next(self._numbers) % 10000:04d}.jpg"
+        time_text = datetime.fromtimestamp(after.time_s, UTC).strftime("%Y%m%d%H%M%S%f")[:17]
+        return f"{time_text}-{next(self._sequence) % 10000:04d}.jpg"
 
-    async def _store(self, args: CaptureArgs, exposure: _Exposure) -> tuple[Verdict, ImageRecord]:
-        grant, after, frames = exposure.grant, exposure.after, exposure.frames
+    async def _filter_and_store(self, args: CaptureArgs, exposure: _Exposure) -> tuple[Verdict, ImageRecord]:
+        grant = exposure.grant
+        after = exposure.after
+        frames = exposure.frames
+        camera = self._camera
         view = exposure_footprint(after.exposure, grant.compiled.frame)
         farthest_m = view.farthest_m if view is not None else math.inf
         face_px = smallest_face_px(after.lens, farthest_m, exposure.view_width_px)
-        call, camera = Call("CaptureImage", args), self._camera
-        plan, verdict = self._judge.plan(call, grant, exposure.verdict, after, face_px=face_px, known=exposure.known)
-        poses, moment_s = tuple(Pose.of(one) for one in after.exposure), float(after.time_s)
-        asked, whole = (args.width, args.height), camera.source_size(args.width, args.height)
+        plan, verdict = self._authorizer.plan_filters(
+            Call("CaptureImage", args), grant, exposure.verdict, after, face_px=face_px, recorded=exposure.recorded
+        )
+        poses = tuple(Pose.from_situation(situation) for situation in after.exposure)
+        time_s = float(after.time_s)
+        requested_size = (args.width, args.height)
+        full_size = camera.source_size(args.width, args.height)
 
-        def work() -> bytes:
-            # Filters see the whole view: callers could ask for parts of it that cut each face in two, which no detector finds.
-            sized = _sized(frames, *(whole if plan.filters else asked))
+        def render() -> bytes:
+            # Filter the full view: callers could request parts of it that cut each face in two, which no detector detects.
+            sized = _resize_frames(frames, *(full_size if plan.filters else requested_size))
             frames.clear()
             upright = is_upright(poses)
             filtered = apply_filters(sized, plan, self._detector, face_px, upright=upright, fixed=camera.fixed)
-            data = encoded(fitted(filtered, *asked))
+            data = encode_jpeg(crop_and_resize(filtered, *requested_size))
             if verdict.filters:
-                # A filtered picture tells nothing of where it was taken.
+                # The metadata of a filtered image would disclose where it was taken.
                 return data
-            # Of another lens the pose has a bound of the view, which is wider.
-            view_px = whole[0] if camera.pinhole else None
-            return with_metadata(data, poses[-1], time_s=moment_s, camera=camera.model, view_width_px=view_px)
+            # For lenses other than a pinhole, the pose contains an upper bound of the field of view.
+            view_px = full_size[0] if camera.pinhole else None
+            return with_metadata(data, poses[-1], time_s=time_s, camera=camera.model, view_width_px=view_px)
 
         with spans.call().child("camera.filters") as span:
-            span.note("fractus.filters", [one.action for one in plan.filters])
-            data = await asyncio.to_thread(work)
-        # In a part of the view faces are cut as well, when they have to be hidden later.
-        uncut = max(whole[0] - asked[0], whole[1] - asked[1]) <= _ROUNDED_PX
-        found_px = face_px if uncut else 0.0
-        shot = ImageRecord(exposure.name, moment_s, *asked, len(data), poses, found_px, plan.filters, whole=uncut)
-        await asyncio.to_thread(self._album.add, owner_of(grant), shot, data)
-        return verdict, shot
+            span.note("fractus.filters", [planned.action for planned in plan.filters])
+            data = await asyncio.to_thread(render)
+        # A part of the view may show cut faces, which are not detected if they have to be hidden later.
+        uncut = max(full_size[0] - requested_size[0], full_size[1] - requested_size[1]) <= _ROUNDING_PX
+        record = ImageRecord(
+            exposure.name,
+            time_s,
+            *requested_size,
+            len(data),
+            poses,
+            face_px if uncut else 0.0,
+            plan.filters,
+            whole=uncut,
+        )
+        await asyncio.to_thread(self._store.add, owner_of(grant), record, data)
+        return verdict, record
 
 
-def _sized(frames: list[Pixels], width: int, height: int) -> list[Pixels]:
-    """The middle frame in a size, the others no larger than motion is detected in."""
-    scale = min(MOTION_PX / width, 1.0)
+def _resize_frames(frames: list[Pixels], width: int, height: int) -> list[Pixels]:
+    """Resize the middle frame to a size, and the others to at most the size in which motion is detected."""
+    scale = min(MAX_MOTION_WIDTH_PX / width, 1.0)
     sizes = [(max(round(width * scale), 1), max(round(height * scale), 1))] * len(frames)
     sizes[len(sizes) // 2] = (width, height)
-    return [fitted(one, *size) for one, size in zip(frames, sizes, strict=True)]
+    return [crop_and_resize(frame, *size) for frame, size in zip(frames, sizes, strict=True)]

@@ -1,4 +1,4 @@
-"""Metadata of a picture: EXIF and XMP with place, height, direction and time."""
+"""EXIF and XMP metadata of an image: position, altitude, direction and time."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ import math
 import struct
 from datetime import UTC, datetime
 
-from fractus_services.camera.pose import Pose, directions
+from PIL import Image
+from PIL.ExifTags import GPS, IFD, Base
+
+from fractus_services.camera.pose import Pose, camera_orientation
 
 _SOI = b"\xff\xd8"
 _APP1 = 0xE1
@@ -15,21 +18,21 @@ _XMP = b"http://ns.adobe.com/xap/1.0/\x00"
 
 
 def with_metadata(jpeg: bytes, pose: Pose, *, time_s: float, camera: str, view_width_px: int | None) -> bytes:
-    """The JPEG of an unfiltered picture with EXIF and XMP segments right after its start, as readers expect them.
+    """Add EXIF and XMP segments to a JPEG, directly after its start marker as readers expect them.
 
     Args:
-        jpeg: the picture, without metadata.
-        pose: where it was taken; what is unknown is left out.
-        time_s: Unix time.
-        camera: make and model; may be empty.
-        view_width_px: pixels of the whole view, before the picture was cropped; None where the pose's field of view does not
-            tell the focal length.
+        jpeg: Unfiltered image without metadata.
+        pose: Pose of the camera. Unknown values are omitted.
+        time_s: Unix time in seconds.
+        camera: Make and model, or an empty string.
+        view_width_px: Width of the full view before cropping, in pixels. None if the field of view of the pose does not give
+            the focal length.
 
     Raises:
-        ValueError: the bytes are no JPEG.
+        ValueError: The data is not a JPEG.
     """
     if not jpeg.startswith(_SOI):
-        raise ValueError("only a JPEG can carry EXIF and XMP")
+        raise ValueError("EXIF and XMP require a JPEG")
     exif = _exif(pose, datetime.fromtimestamp(time_s, UTC), camera)
     return _SOI + _segment(exif) + _segment(_XMP + _xmp(pose, view_width_px).encode()) + jpeg[len(_SOI) :]
 
@@ -38,49 +41,50 @@ def _segment(body: bytes) -> bytes:
     return struct.pack(">BBH", 0xFF, _APP1, len(body) + 2) + body
 
 
-def _exif(pose: Pose, moment: datetime, camera: str) -> bytes:
-    from PIL import Image  # noqa: PLC0415 - 15 MB that a service which takes no picture does without
-    from PIL.ExifTags import GPS, IFD, Base  # noqa: PLC0415
-
+def _exif(pose: Pose, time: datetime, camera: str) -> bytes:
     exif = Image.Exif()
     exif[Base.Software] = "Fractus"
     if camera:
         exif[Base.Model] = camera.encode("ascii", "replace").decode()
-    exif[Base.DateTime] = moment.strftime("%Y:%m:%d %H:%M:%S")
+    exif[Base.DateTime] = time.strftime("%Y:%m:%d %H:%M:%S")
     inner = exif.get_ifd(IFD.Exif)
-    inner[Base.DateTimeOriginal] = moment.strftime("%Y:%m:%d %H:%M:%S")
+    inner[Base.DateTimeOriginal] = time.strftime("%Y:%m:%d %H:%M:%S")
     inner[Base.OffsetTimeOriginal] = "+00:00"
-    inner[Base.SubsecTimeOriginal] = f"{moment.microsecond // 1000:03d}"
+    inner[Base.SubsecTimeOriginal] = f"{time.microsecond // 1000:03d}"
     if pose.lat is not None and pose.lon is not None:
         gps = exif.get_ifd(IFD.GPSInfo)
         gps[GPS.GPSVersionID] = b"\x02\x03\x00\x00"
-        gps[GPS.GPSLatitudeRef], gps[GPS.GPSLatitude] = "N" if pose.lat >= 0 else "S", _sexagesimal(pose.lat)
-        gps[GPS.GPSLongitudeRef], gps[GPS.GPSLongitude] = "E" if pose.lon >= 0 else "W", _sexagesimal(pose.lon)
+        gps[GPS.GPSLatitudeRef] = "N" if pose.lat >= 0 else "S"
+        gps[GPS.GPSLatitude] = _sexagesimal(pose.lat)
+        gps[GPS.GPSLongitudeRef] = "E" if pose.lon >= 0 else "W"
+        gps[GPS.GPSLongitude] = _sexagesimal(pose.lon)
         if pose.home is not None:
             amsl_m = pose.home.amsl_m + pose.altitude_m
-            # EXIF has no sign here: the reference says whether it is below sea level.
+            # The altitude is unsigned. The reference is 1 below sea level.
             gps[GPS.GPSAltitudeRef] = b"\x01" if amsl_m < 0 else b"\x00"
             gps[GPS.GPSAltitude] = round(abs(amsl_m), 3)
-        gps[GPS.GPSTimeStamp] = (moment.hour, moment.minute, moment.second + moment.microsecond // 1000 / 1000)
-        _, _, yaw_deg = directions(pose)
+        gps[GPS.GPSTimeStamp] = (time.hour, time.minute, time.second + time.microsecond // 1000 / 1000)
+        _, _, yaw_deg = camera_orientation(pose)
         if yaw_deg is not None:
-            gps[GPS.GPSImgDirectionRef], gps[GPS.GPSImgDirection] = "T", round(yaw_deg % 360, 3)  # from true north
-        gps[GPS.GPSMapDatum], gps[GPS.GPSDateStamp] = "WGS-84", moment.strftime("%Y:%m:%d")
+            gps[GPS.GPSImgDirectionRef] = "T"  # true north
+            gps[GPS.GPSImgDirection] = round(yaw_deg % 360, 3)
+        gps[GPS.GPSMapDatum] = "WGS-84"
+        gps[GPS.GPSDateStamp] = time.strftime("%Y:%m:%d")
         gps[GPS.GPSHPositioningError] = round(pose.position_error_m, 3)
     data = exif.tobytes()
     return data if data.startswith(_EXIF) else _EXIF + data
 
 
 def _sexagesimal(degrees: float) -> tuple[float, float, float]:
-    """Degrees, minutes and seconds to a millionth of a second's tenth: below a centimetre."""
+    """Convert degrees to degrees, minutes and seconds. Seconds are rounded to 1e-6, which is less than a millimetre."""
     whole, rest = divmod(abs(degrees) * 3600, 3600)
     minutes, seconds = divmod(rest, 60)
     return whole, minutes, round(seconds, 6)
 
 
 def _xmp(pose: Pose, view_width_px: int | None) -> str:
-    """Attitude and height as Pix4D's `Camera` schema has them, which photogrammetry reads."""
-    roll_deg, pitch_deg, yaw_deg = directions(pose)
+    """Return attitude and height in Pix4D's `Camera` schema, which photogrammetry programs read."""
+    roll_deg, pitch_deg, yaw_deg = camera_orientation(pose)
     half = math.radians(pose.lens.horizontal_deg) / 2 if pose.lens is not None else 0.0
     focal_px = view_width_px / 2 / math.tan(half) if half and view_width_px is not None else None
     known = {

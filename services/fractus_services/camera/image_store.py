@@ -1,4 +1,4 @@
-"""Pictures on disk, one folder for each component instance, within quotas."""
+"""Images on disk, one directory for each component instance, with the records by which they are authorized again."""
 
 from __future__ import annotations
 
@@ -6,60 +6,123 @@ import contextlib
 import hashlib
 import json
 import logging
+import math
 import re
 import shutil
 import stat
 import threading
 from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
+from fractus_core.policy.decision_types import Filter, Situation
 from fractus_runtime.files import write_file
 
-from fractus_services.camera.image_record import ImageRecord
+from fractus_services.camera.pose import Pose
 from fractus_services.errors import NotFound, ResourceExhausted
 from fractus_services.grant_files import ActiveGrant
 
 log = logging.getLogger(__name__)
 
-FOLDER_MODE, FILE_MODE = 0o700, 0o600
-"""No other user of the node reads pictures or their records, filtered or not: both tell where someone was."""
+DIRECTORY_MODE = 0o700
+FILE_MODE = 0o600
+"""Modes without access for other users of the node. Images and records, filtered or not, disclose where someone was."""
 
 _NAME = re.compile(r"[0-9]{17}-[0-9]{4}\.jpg")
-_FOLDER = re.compile(r"[0-9a-f]{32}")
+_DIRECTORY = re.compile(r"[0-9a-f]{32}")
 
-
-_REMEDY = "delete each picture once it is fetched (camera.delete of the SDK; the component's methods need DeleteImage)"
+_REMEDY = (
+    "delete each image after fetching it (camera.delete of the SDK; the component's methods must include DeleteImage)"
+)
 
 
 class ImageStoreFull(ResourceExhausted):
-    """A quota is used up."""
+    """A quota is exhausted."""
 
     def __init__(self, reason: str) -> None:
         super().__init__("AlbumFull", reason)
 
 
 class NoSuchImage(NotFound):
-    """An instance has no picture of that name."""
+    """The component instance has no image of this name."""
 
     def __init__(self, reason: str) -> None:
         super().__init__("NoSuchImage", reason)
 
 
+@dataclass(frozen=True, slots=True)
+class ImageRecord:
+    """Record of a stored image, sufficient to authorize it under future policies.
+
+    Attributes:
+        name: Name, unique within its component instance.
+        time_s: Unix time in seconds.
+        width: Width in pixels.
+        height: Height in pixels.
+        size_bytes: Size of the file.
+        poses: Poses of the camera from the start to the end of the exposure.
+        face_px: Width of the smallest face that the image may show, in pixels, or 0 if it is unknown.
+        filters: Filters that were applied.
+        whole: True if the image shows the full view of the camera. A part may show cut faces, so their size is unknown.
+    """
+
+    name: str
+    time_s: float
+    width: int
+    height: int
+    size_bytes: int
+    poses: tuple[Pose, ...]
+    face_px: float = 0.0
+    filters: tuple[Filter, ...] = ()
+    whole: bool = False
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the record as JSON values."""
+        return asdict(self)
+
+    @classmethod
+    def from_json(cls, body: dict[str, Any]) -> ImageRecord:
+        """Parse a record. The position of a record without poses, of an earlier release, is unknown.
+
+        Raises:
+            ValueError: The record is invalid.
+        """
+        try:
+            if "poses" not in body:
+                known = {key: value for key, value in body.items() if key in cls.__slots__}
+                unknown_pose = asdict(Pose.from_situation(Situation(0.0)))
+                body = {**known, "poses": [unknown_pose], "face_px": 0.0}
+            if not body.get("whole"):
+                # Earlier releases stored the face size of cropped images too, but cropped images may show cut faces.
+                body = {**body, "face_px": 0.0}
+            poses = tuple(Pose.from_json(pose) for pose in body["poses"])
+            filters = tuple(Filter(**fields) for fields in body["filters"])
+            record = cls(**{**body, "poses": poses, "filters": filters})
+            finite = math.isfinite(record.face_px + record.time_s)
+            sound = finite and all(pose.apply_to(Situation(0.0)).is_plausible for pose in poses)
+        except (KeyError, TypeError, AttributeError) as error:
+            raise ValueError(f"invalid image record: {error}") from None
+        if not poses or not sound:
+            raise ValueError("invalid image record: it has no valid pose")
+        return record
+
+
 def owner_of(grant: ActiveGrant) -> str:
-    """Whose pictures they are: an instance of this very application, not of a later one of the same name."""
+    """Return the owner of a Grant's images: a component instance of this application, not of a later one of the same name."""
     return f"{grant.spec.application.uid}/{grant.identity}"
 
 
 class ImageStore:
-    """The pictures of all instances on this node; an owner is one instance of one application.
+    """Images of all component instances on this node. An owner is one instance of one application.
 
     Args:
-        directory: where they are kept.
-        keep: pictures that one instance may have.
-        keep_bytes: bytes that the pictures of one instance may take.
-        keep_total_bytes: bytes that all pictures may take; pictures of owners that are gone make room.
-        owners: owners that have a grant at present.
-        added: told when each new picture was taken (Unix seconds), and what it is; from any thread.
+        directory: Directory of the images.
+        keep: Maximum number of images of an owner.
+        keep_bytes: Maximum size of the images of an owner, in bytes.
+        keep_total_bytes: Maximum size of all images, in bytes. Images of owners without a Grant are removed to stay below it.
+        owners: Returns the owners that currently have a Grant.
+        on_added: Callback invoked with the time (Unix seconds) and the data of each new image, from any thread.
     """
 
     def __init__(
@@ -70,164 +133,167 @@ class ImageStore:
         keep_total_bytes: int = 10**13,
         owners: Callable[[], Iterable[str]] = tuple,
         *,
-        added: Callable[[float, bytes], None] = lambda _time_s, _data: None,
+        on_added: Callable[[float, bytes], None] = lambda _time_s, _data: None,
     ) -> None:
-        self._added = added
+        self._on_added = on_added
         self._directory = directory
         self._keep = keep
         self._keep_bytes = keep_bytes
         self._keep_total_bytes = keep_total_bytes
         self._owners = owners
         self._lock = threading.Lock()
-        self._close_to_others()
-        self._tidy()
+        self._restrict_modes()
+        self._remove_incomplete()
 
-    def _folder(self, owner: str) -> Path:
+    def _owner_directory(self, owner: str) -> Path:
         return self._directory / hashlib.sha256(owner.encode()).hexdigest()[:32]
 
     def list(self, owner: str) -> tuple[ImageRecord, ...]:
-        """The pictures of an instance, oldest first."""
-        shots = []
-        for path in sorted(self._folder(owner).glob("*.json")):
+        """Return the records of an owner's images, oldest first."""
+        records = []
+        for path in sorted(self._owner_directory(owner).glob("*.json")):
             try:
-                shots.append(ImageRecord.parse(json.loads(path.read_bytes())))
+                records.append(ImageRecord.from_json(json.loads(path.read_bytes())))
             except FileNotFoundError:
                 continue
             except ValueError as error:
-                log.warning("album: record is damaged, its picture is not returned (file=%s): %s", path, error)
-        return tuple(shots)
+                log.warning("images: damaged record skipped (file=%s error=%s)", path, error)
+        return tuple(records)
 
     def quota_problem(self, owner: str) -> str:
-        """Why an instance may not add a picture; empty when it may."""
-        sizes = _sizes(self._folder(owner).glob("*.jpg"))
+        """Return the reason why an owner may not add an image, or an empty string."""
+        sizes = _file_sizes(self._owner_directory(owner).glob("*.jpg"))
         used = sum(sizes)
         if len(sizes) >= self._keep:
-            return f"{len(sizes)} pictures are kept, as many as allowed; {_REMEDY}"
+            return f"{len(sizes)} images are stored, which is the limit; {_REMEDY}"
         if used >= self._keep_bytes:
-            return f"{used / 1e6:.0f} MB of pictures are kept, as much as allowed; {_REMEDY}"
-        if self._total() >= self._keep_total_bytes and not self._make_room():
+            return f"{used / 1e6:.0f} MB of images are stored, which is the limit; {_REMEDY}"
+        if self._total_bytes() >= self._keep_total_bytes and not self._make_room():
             return (
-                f"the pictures on this node take {self._keep_total_bytes / 1e6:.0f} MB, as much as allowed; {_REMEDY},"
-                " or let the node's operator raise --keep-total-mb"
+                f"the images on this node take {self._keep_total_bytes / 1e6:.0f} MB, which is the limit; {_REMEDY},"
+                " or ask the node's administrator to raise --keep-total-mb"
             )
         return ""
 
-    def add(self, owner: str, shot: ImageRecord, data: bytes) -> None:
-        """Keep a picture.
+    def add(self, owner: str, record: ImageRecord, data: bytes) -> None:
+        """Store an image.
 
         Raises:
-            ImageStoreFull: a quota is used up.
-            OSError: the disk is full.
+            ImageStoreFull: A quota is exhausted.
+            OSError: The disk is full or failed.
         """
         with self._lock:
             problem = self.quota_problem(owner)
             if problem:
                 raise ImageStoreFull(problem)
-            folder = self._folder(owner)
-            folder.mkdir(FOLDER_MODE, parents=True, exist_ok=True)
-            picture = folder / shot.name
+            directory = self._owner_directory(owner)
+            directory.mkdir(DIRECTORY_MODE, parents=True, exist_ok=True)
+            image = directory / record.name
             try:
-                write_file(picture, data, FILE_MODE)
-                write_file(picture.with_suffix(".json"), json.dumps(shot.to_json()).encode(), FILE_MODE)
+                write_file(image, data, FILE_MODE)
+                write_file(image.with_suffix(".json"), json.dumps(record.to_json()).encode(), FILE_MODE)
             except OSError:
-                picture.unlink(missing_ok=True)
+                image.unlink(missing_ok=True)
                 raise
-        self._added(shot.time_s, data)
+        self._on_added(record.time_s, data)
 
     def find(self, owner: str, name: str) -> ImageRecord:
-        """What is known of a picture.
+        """Return the record of an image.
 
         Raises:
-            NoSuchImage: there is none of that name, or its record is damaged: what it shows is then unknown,
-                so no policy can be applied to it.
+            NoSuchImage: The image does not exist, or its record is damaged. It is then unknown what the image shows, so that no
+                policy can be applied.
         """
-        record = self._record(owner, name)
+        path = self._record_path(owner, name)
         try:
-            return ImageRecord.parse(json.loads(record.read_bytes()))
+            return ImageRecord.from_json(json.loads(path.read_bytes()))
         except FileNotFoundError:
-            raise _missing(name) from None
+            raise _not_found(name) from None
         except ValueError as error:
-            log.warning("album: record is damaged, its picture is not returned (picture=%s): %s", name, error)
+            log.warning("images: image with damaged record not returned (image=%s error=%s)", name, error)
             raise NoSuchImage(
-                f"the record of picture {name!r} is damaged, so it is not returned; DeleteImage removes it"
+                f"the record of image {name!r} is damaged, so the image is not returned; DeleteImage removes it"
             ) from None
 
-    def _record(self, owner: str, name: str) -> Path:
+    def _record_path(self, owner: str, name: str) -> Path:
         if not _NAME.fullmatch(name):
-            raise _missing(name)
-        return (self._folder(owner) / name).with_suffix(".json")
+            raise _not_found(name)
+        return (self._owner_directory(owner) / name).with_suffix(".json")
 
     def path(self, owner: str, name: str) -> Path:
-        """The file of a picture that `find` knows."""
-        return self._folder(owner) / name
+        """Return the file of an image for which `find` returned a record."""
+        return self._owner_directory(owner) / name
 
     def delete(self, owner: str, name: str) -> None:
-        """Remove a picture, also one with a damaged record.
+        """Delete an image, even if its record is damaged.
 
         Raises:
-            NoSuchImage: there is none of that name.
+            NoSuchImage: The image does not exist.
         """
-        record = self._record(owner, name)
+        record_path = self._record_path(owner, name)
         try:
-            # The record goes first: a picture without one is never returned, whenever the process ends.
-            record.unlink()
+            # Delete the record first: an image without a record is never returned, even if the process ends in between.
+            record_path.unlink()
         except FileNotFoundError:
-            raise _missing(name) from None
-        record.with_suffix(".jpg").unlink(missing_ok=True)
+            raise _not_found(name) from None
+        record_path.with_suffix(".jpg").unlink(missing_ok=True)
 
-    def _total(self) -> int:
-        return sum(_sizes(self._directory.glob("*/*.jpg")))
+    def _total_bytes(self) -> int:
+        return sum(_file_sizes(self._directory.glob("*/*.jpg")))
 
     def _make_room(self) -> bool:
-        """Remove pictures of owners that are gone, oldest folder first, until there is room."""
-        kept = {self._folder(owner) for owner in self._owners()}
-        gone = [path for path in self._directory.iterdir() if path.is_dir() and path not in kept]
-        for folder in sorted(gone, key=lambda path: path.stat().st_mtime):
-            log.warning("album: removing pictures of a component that is gone, space is needed (folder=%s)", folder)
-            shutil.rmtree(folder, ignore_errors=True)
-            if self._total() < self._keep_total_bytes:
+        """Remove images of owners without a Grant, oldest directory first. Return True once the total is below its limit."""
+        kept = {self._owner_directory(owner) for owner in self._owners()}
+        orphaned = [path for path in self._directory.iterdir() if path.is_dir() and path not in kept]
+        for directory in sorted(orphaned, key=lambda path: path.stat().st_mtime):
+            log.warning(
+                "images: removing images of a component without a Grant to free space (directory=%s)", directory
+            )
+            shutil.rmtree(directory, ignore_errors=True)
+            if self._total_bytes() < self._keep_total_bytes:
                 return True
         return False
 
-    def _close_to_others(self) -> None:
-        """Give folders and pictures of an earlier release, which others could read, the modes of this one."""
-        # The state directory may hold folders of others beside those of owners.
-        folders = [path for path in self._directory.glob("*") if _FOLDER.fullmatch(path.name)]
-        for path in (inner for folder in folders for inner in (folder, *folder.glob("*"))):
+    def _restrict_modes(self) -> None:
+        """Remove access for other users from directories and files of an earlier release."""
+        # The state directory may contain other directories than those of owners.
+        directories = [path for path in self._directory.glob("*") if _DIRECTORY.fullmatch(path.name)]
+        for path in (entry for directory in directories for entry in (directory, *directory.glob("*"))):
             try:
-                found = path.lstat().st_mode
-                wanted = FOLDER_MODE if stat.S_ISDIR(found) else FILE_MODE
-                # A symbolic link is none of the album's: chmod would follow it to a file elsewhere.
-                if not stat.S_ISLNK(found) and stat.S_IMODE(found) != wanted:
+                mode = path.lstat().st_mode
+                wanted = DIRECTORY_MODE if stat.S_ISDIR(mode) else FILE_MODE
+                # Skip symbolic links, because chmod would follow them to other files.
+                if not stat.S_ISLNK(mode) and stat.S_IMODE(mode) != wanted:
                     path.chmod(wanted)
             except OSError as error:
                 log.critical(
-                    "album: other users of the node may read this, chmod it by hand (path=%s): %s", path, error
-                )
+                    "images: cannot restrict access, other users may read this file; run chmod (path=%s error=%s)",
+                    path, error,
+                )  # fmt: skip
 
-    def _tidy(self) -> None:
-        """Remove what can never be returned: unfinished files, and pictures without a readable record.
+    def _remove_incomplete(self) -> None:
+        """Remove temporary files, images without a readable record, and damaged records with their images.
 
-        A crash, a damaged disk or another release may have left them.
+        These can remain after a crash, a disk failure or another release.
         """
-        for record in self._directory.glob("*/*.json"):
-            if not _NAME.fullmatch(record.with_suffix(".jpg").name):
+        for record_path in self._directory.glob("*/*.json"):
+            if not _NAME.fullmatch(record_path.with_suffix(".jpg").name):
                 continue
             try:
-                ImageRecord.parse(json.loads(record.read_bytes()))
+                ImageRecord.from_json(json.loads(record_path.read_bytes()))
             except ValueError as error:
-                log.warning("album: record is damaged, removing it and its picture (file=%s): %s", record, error)
-                record.unlink(missing_ok=True)
+                log.warning("images: removing damaged record and its image (file=%s error=%s)", record_path, error)
+                record_path.unlink(missing_ok=True)
             except OSError as error:
-                log.warning("album: record cannot be read (file=%s): %s", record, error)
+                log.warning("images: cannot read record (file=%s error=%s)", record_path, error)
         for path in self._directory.glob("*/*"):
             orphan = path.suffix == ".jpg" and not path.with_suffix(".json").exists()
             if orphan or path.suffix == ".tmp":
                 path.unlink(missing_ok=True)
 
 
-def _sizes(paths: Iterable[Path]) -> list[int]:
-    """Bytes of those files that are still there."""
+def _file_sizes(paths: Iterable[Path]) -> list[int]:
+    """Return the sizes in bytes of the files that still exist."""
     sizes = []
     for path in paths:
         with contextlib.suppress(FileNotFoundError):
@@ -235,5 +301,5 @@ def _sizes(paths: Iterable[Path]) -> list[int]:
     return sizes
 
 
-def _missing(name: str) -> NoSuchImage:
-    return NoSuchImage(f"there is no picture {name[:64]!r} of this component; ListImages lists those that exist")
+def _not_found(name: str) -> NoSuchImage:
+    return NoSuchImage(f"this component has no image {name[:64]!r}; ListImages returns the existing ones")

@@ -1,7 +1,7 @@
-"""The poses of a drone's camera during the last seconds, with errors that cover every motion between two measurements.
+"""Poses of a drone's camera during the last seconds, with errors that cover all motion between two measurements.
 
-A picture is judged by all that its camera may have seen while it was taken. The error of each pose is a budget: what the
-autopilot's own estimate may be off by, plus what the airframe can move and turn in the time nothing was measured.
+An image is judged by everything that the camera may have seen while the image was taken. The error of each pose is a budget:
+the error of the autopilot's estimate, plus the distance and angle that the airframe can move between measurements.
 """
 
 from __future__ import annotations
@@ -15,33 +15,33 @@ from fractus_core.policy.decision_types import Attitude, Lens, Situation
 from fractus_core.policy.footprint import camera_axes
 
 MAX_AGE_S = 1.0
-"""A measurement that is older says nothing about the present."""
-KEPT_S = 30.0
-"""Longer than any exposure."""
+"""Age from which a measurement is stale."""
+HISTORY_S = 30.0
+"""Time for which measurements are kept. It is longer than any exposure."""
 ALTITUDE_ERROR_M = 1.0
 TILT_ERROR_DEG = 5.0
 YAW_ERROR_DEG = 15.0
 """Bounds of an autopilot's attitude errors: roll and pitch together, and the compass."""
 MAX_TURN_DEG_S = 60.0
 MAX_ACCELERATION_MPS2 = 5.0
-"""How fast a multicopter turns and speeds up at most; between two measurements it may do both."""
+"""Maximum turn rate and acceleration of a multicopter between two measurements."""
 MAX_GIMBAL_TURN_DEG_S = 120.0
-"""How fast a gimbal turns its camera at most, beyond what two measurements tell; the airframe's yaw comes on top."""
+"""Maximum turn rate of a gimbal beyond the rotation between two measurements. The yaw of the airframe is added."""
 
 _LEVEL = Attitude(0.0, 0.0, 0.0)
-_CAMERA = Lens(1.0, 1.0, pitch_deg=0.0)
+_FORWARD_CAMERA = Lens(1.0, 1.0, pitch_deg=0.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """What the mobility service measured; times are monotonic seconds.
+    """A measurement by the mobility service. Times are monotonic seconds.
 
     Attributes:
-        received_at: when it arrived here.
-        position_at: when the position was measured.
-        attitude_at: when the attitude was measured: that of the airframe, or of the gimbal that turns the camera.
-        situation: the state as measured: `position_error_m` is that of the position alone, the attitude has no errors yet,
-            and `lat` is None while the position is unknown.
+        received_at: Time of arrival.
+        position_at: Time at which the position was measured.
+        attitude_at: Time at which the attitude was measured: of the airframe, or of the gimbal that turns the camera.
+        situation: Measured state. `position_error_m` is the error of the position alone, the attitude has no errors yet, and
+            `lat` is None if the position is unknown.
     """
 
     received_at: float
@@ -52,13 +52,13 @@ class Measurement:
 
 @dataclass(frozen=True, slots=True)
 class _Gap:
-    """What may have happened around a pose without being measured.
+    """Bounds of the unmeasured motion around a pose.
 
     Attributes:
-        moved_s: seconds for which the airframe may have moved on.
-        turned_s: seconds for which it may have turned on.
-        tilt_deg: how much further from the pose its roll and pitch are known to have been; of a gimbal, all of its turn.
-        yaw_deg: how much further from the pose its yaw is known to have been.
+        moved_s: Time during which the airframe may have moved, in seconds.
+        turned_s: Time during which the airframe may have turned, in seconds.
+        tilt_deg: Measured change of roll and pitch. For a gimbal, the entire measured rotation.
+        yaw_deg: Measured change of yaw.
     """
 
     moved_s: float = 0.0
@@ -68,29 +68,33 @@ class _Gap:
 
     @classmethod
     def after(cls, last: Measurement, now_s: float) -> _Gap:
-        """From the last measurement until now."""
+        """Return the gap between the last measurement and now."""
         return cls(max(now_s - last.position_at, 0.0), max(now_s - last.attitude_at, 0.0))
 
     @classmethod
-    def between(cls, one: Measurement, other: Measurement, *, gimbal: bool) -> _Gap:
-        """The half of the time to the next or previous measurement that lies nearer to this one."""
-        moved_s, turned_s = abs(other.position_at - one.position_at), abs(other.attitude_at - one.attitude_at)
-        here, there = one.situation.attitude or _LEVEL, other.situation.attitude or _LEVEL
-        # Near straight down, where gimbals point, roll and yaw say little one by one.
-        tilt_deg = (
-            _rotation_deg(here, there)
-            if gimbal
-            else _turn_deg(here.roll_deg, there.roll_deg) + _turn_deg(here.pitch_deg, there.pitch_deg)
-        )
+    def between(cls, measurement: Measurement, neighbour: Measurement, *, gimbal: bool) -> _Gap:
+        """Return the half of the gap between two measurements that is nearer to the first one."""
+        moved_s = abs(neighbour.position_at - measurement.position_at)
+        turned_s = abs(neighbour.attitude_at - measurement.attitude_at)
+        attitude = measurement.situation.attitude or _LEVEL
+        other = neighbour.situation.attitude or _LEVEL
+        if gimbal:
+            # Gimbals point nearly straight down, where roll and yaw are not well-defined separately.
+            tilt_deg = _rotation_deg(attitude, other)
+            yaw_deg = 0.0
+        else:
+            roll_deg = _turn_deg(attitude.roll_deg, other.roll_deg)
+            tilt_deg = roll_deg + _turn_deg(attitude.pitch_deg, other.pitch_deg)
+            yaw_deg = _turn_deg(attitude.yaw_deg, other.yaw_deg)
         return cls(
             moved_s / 2 if moved_s <= MAX_AGE_S else math.inf,
             turned_s / 2 if turned_s <= MAX_AGE_S else math.inf,
             tilt_deg / 2,
-            0.0 if gimbal else _turn_deg(here.yaw_deg, there.yaw_deg) / 2,
+            yaw_deg / 2,
         )
 
-    def joined(self, other: _Gap) -> _Gap:
-        """The larger of each."""
+    def merge(self, other: _Gap) -> _Gap:
+        """Return the maximum of each bound."""
         return _Gap(
             max(self.moved_s, other.moved_s),
             max(self.turned_s, other.turned_s),
@@ -100,13 +104,13 @@ class _Gap:
 
 
 class PoseHistory:
-    """The poses of a drone, as measurements arrive; a `PoseProvider`.
+    """`PoseProvider` of a drone, fed with measurements as they arrive.
 
     Args:
-        now: monotonic seconds.
-        lens: what the camera sees; None when it is unknown.
-        relief_m: how far the ground around may lie below home.
-        gimbal: whether the attitudes are those of a gimbal.
+        now: Returns monotonic seconds.
+        lens: Lens of the camera, or None if it is unknown.
+        relief_m: Maximum depth of the surrounding ground below home, in metres.
+        gimbal: True if the attitudes are those of a gimbal.
     """
 
     def __init__(
@@ -119,88 +123,89 @@ class PoseHistory:
         self._measurements: deque[Measurement] = deque()
 
     def __len__(self) -> int:
-        """Measurements that are kept."""
+        """Return the number of measurements that are kept."""
         return len(self._measurements)
 
     @property
     def age_s(self) -> float:
-        """Age of the newest position; infinite when there is none."""
+        """Age of the latest position in seconds, or infinity if there is no position."""
         return self._now() - self._measurements[-1].position_at if self._measurements else math.inf
 
     def add(self, measurement: Measurement) -> None:
-        """Append the newest measurement, and forget those that are too old for any exposure."""
+        """Append the latest measurement, and drop those that are older than `HISTORY_S`."""
         self._measurements.append(measurement)
-        while self._measurements[0].received_at < measurement.received_at - KEPT_S:
+        while self._measurements[0].received_at < measurement.received_at - HISTORY_S:
             self._measurements.popleft()
 
     def situation(self, time_s: float) -> Situation:
-        """See `PoseProvider`; unknown when the mobility service is silent."""
+        """See `PoseProvider`. The pose is unknown if the latest measurement is stale."""
         if not self._measurements:
             return self._unknown(time_s)
         last = self._measurements[-1]
         return self._situation(last, _Gap.after(last, self._now()), time_s)
 
-    def situations_since(self, begun_s: float, time_s: float) -> tuple[Situation, ...]:
+    def situations_since(self, start_s: float, time_s: float) -> tuple[Situation, ...]:
         """See `PoseProvider`.
 
-        The errors of each pose cover half of the time to its neighbours as well: the drone was there at most that long
-        before or after, and turned away from it by at most half of what the two poses differ by, plus what
-        `MAX_TURN_DEG_S` allows. So no motion between two measurements is left out.
+        The errors of each pose cover half of the time to the neighbouring measurements. The drone had this pose at most that
+        long before or after, and was rotated from it by at most half of the difference between the two poses plus the rotation
+        that `MAX_TURN_DEG_S` allows. The poses together cover all motion between measurements.
         """
-        kept = list(self._measurements)
-        first = next((i for i in reversed(range(len(kept))) if kept[i].received_at <= begun_s), None)
-        # What was seen before the first measurement is unknown, and counts as everything.
+        measurements = list(self._measurements)
+        first = next((i for i in reversed(range(len(measurements))) if measurements[i].received_at <= start_s), None)
+        # The view before the first measurement is unknown, and counts as seeing everything.
         situations = [self._unknown(time_s)] if first is None else []
-        kept = kept[first or 0 :]
-        for i, one in enumerate(kept):
-            gap = _Gap() if i < len(kept) - 1 else _Gap.after(one, self._now())
-            for neighbour in (*kept[max(i - 1, 0) : i], *kept[i + 1 : i + 2]):
-                gap = gap.joined(_Gap.between(one, neighbour, gimbal=self._gimbal))
-            situations.append(self._situation(one, gap, time_s))
+        measurements = measurements[first or 0 :]
+        for i, measurement in enumerate(measurements):
+            gap = _Gap() if i < len(measurements) - 1 else _Gap.after(measurement, self._now())
+            for neighbour in (*measurements[max(i - 1, 0) : i], *measurements[i + 1 : i + 2]):
+                gap = gap.merge(_Gap.between(measurement, neighbour, gimbal=self._gimbal))
+            situations.append(self._situation(measurement, gap, time_s))
         return tuple(situations)
 
     def _unknown(self, time_s: float) -> Situation:
         return Situation(time_s=time_s, lens=self._lens, relief_m=self._relief_m)
 
-    def _situation(self, measured: Measurement, gap: _Gap, time_s: float) -> Situation:
-        known = measured.situation
-        if known.lat is None or gap.moved_s > MAX_AGE_S:
+    def _situation(self, measurement: Measurement, gap: _Gap, time_s: float) -> Situation:
+        measured = measurement.situation
+        if measured.lat is None or gap.moved_s > MAX_AGE_S:
             return self._unknown(time_s)
+        horizontal_mps = math.hypot(measured.north_mps, measured.east_mps)
         return replace(
-            known,
+            measured,
             time_s=time_s,
-            position_error_m=known.position_error_m
-            + _reach_m(math.hypot(known.north_mps, known.east_mps), gap.moved_s),
-            altitude_error_m=ALTITUDE_ERROR_M + _reach_m(abs(known.down_mps), gap.moved_s),
-            attitude=_with_errors(known.attitude, gap, gimbal=self._gimbal),
+            position_error_m=measured.position_error_m + _reach_m(horizontal_mps, gap.moved_s),
+            altitude_error_m=ALTITUDE_ERROR_M + _reach_m(abs(measured.down_mps), gap.moved_s),
+            attitude=_with_errors(measured.attitude, gap, gimbal=self._gimbal),
             lens=self._lens,
             relief_m=self._relief_m,
         )
 
 
 def _reach_m(speed_mps: float, time_s: float) -> float:
-    """How far a drone gets at this speed while it accelerates as fast as it can."""
+    """Return the distance that a drone covers from a speed with maximum acceleration, in metres."""
     return (speed_mps + MAX_ACCELERATION_MPS2 * time_s / 2) * time_s
 
 
-def _turn_deg(one_deg: float, other_deg: float) -> float:
-    """The angle between two directions; they wrap, so from 359 to 1 degree it is 2."""
-    return abs(math.remainder(one_deg - other_deg, 360.0))
+def _turn_deg(first_deg: float, second_deg: float) -> float:
+    """Return the angle between two directions. It is 2 degrees between 359 and 1."""
+    return abs(math.remainder(first_deg - second_deg, 360.0))
 
 
-def _rotation_deg(one: Attitude, other: Attitude) -> float:
-    """The angle of the one turn that leads from an attitude to another: no ray of a camera moves by more."""
-    axes = zip(camera_axes(_CAMERA, one), camera_axes(_CAMERA, other), strict=True)
-    trace = sum(a * b for here, there in axes for a, b in zip(here, there, strict=True))
+def _rotation_deg(first: Attitude, second: Attitude) -> float:
+    """Return the angle of the rotation between two attitudes. No ray of the camera rotates by more."""
+    axes = zip(camera_axes(_FORWARD_CAMERA, first), camera_axes(_FORWARD_CAMERA, second), strict=True)
+    trace = sum(a * b for first_axis, second_axis in axes for a, b in zip(first_axis, second_axis, strict=True))
     return math.degrees(math.acos(max(-1.0, min(1.0, (trace - 1.0) / 2.0))))
 
 
 def _with_errors(attitude: Attitude | None, gap: _Gap, *, gimbal: bool) -> Attitude | None:
+    """Return an attitude with the errors of a gap, or None if the attitude is unknown or stale."""
     if attitude is None or gap.turned_s > MAX_AGE_S:
         return None
-    tilted_deg_s = MAX_GIMBAL_TURN_DEG_S if gimbal else MAX_TURN_DEG_S
+    tilt_rate_deg_s = MAX_GIMBAL_TURN_DEG_S if gimbal else MAX_TURN_DEG_S
     return replace(
         attitude,
-        tilt_error_deg=TILT_ERROR_DEG + tilted_deg_s * gap.turned_s + gap.tilt_deg,
+        tilt_error_deg=TILT_ERROR_DEG + tilt_rate_deg_s * gap.turned_s + gap.tilt_deg,
         yaw_error_deg=YAW_ERROR_DEG + MAX_TURN_DEG_S * gap.turned_s + gap.yaw_deg,
     )

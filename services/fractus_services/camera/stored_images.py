@@ -1,4 +1,4 @@
-"""Returns, lists and deletes stored pictures; each is judged again under the policies of the present."""
+"""Returns, lists and deletes stored images. Each access is authorized under the current policies."""
 
 from __future__ import annotations
 
@@ -12,122 +12,130 @@ from fractus_core.policy.picture_rules import remaining_filters
 from fractus_runtime import spans
 
 from fractus_services.background import Background
-from fractus_services.camera.face_detection import Detector
+from fractus_services.camera.face_detection import FaceDetector
 from fractus_services.camera.fair_queue import FairQueue
 from fractus_services.camera.filter_pipeline import FilterPlan, apply_filters
-from fractus_services.camera.image_authorization import ImageAuthorizer, taken_at
-from fractus_services.camera.image_record import ImageRecord
-from fractus_services.camera.image_store import ImageStore, owner_of
-from fractus_services.camera.pixels import decoded, encoded
-from fractus_services.camera.pose import is_upright
-from fractus_services.camera.pose_provider import PoseProvider
+from fractus_services.camera.image_authorization import ImageAuthorizer, situation_of
+from fractus_services.camera.image_store import ImageRecord, ImageStore, owner_of
+from fractus_services.camera.pixels import decode_image, encode_jpeg
+from fractus_services.camera.pose import PoseProvider, is_upright
 from fractus_services.errors import PolicyDenied
 from fractus_services.grant_files import ActiveGrant
 
 
 class StoredImages:
-    """RetrieveImage, ListImages and DeleteImage of Table 8.2 of the thesis, for callers whose grant is known.
+    """`RetrieveImage`, `ListImages` and `DeleteImage` of Table 8.2 of the thesis, for callers with a Grant.
 
     Args:
-        poses: where the camera is.
-        detector: finds faces.
-        filter_queue: who may filter a picture next.
-        album: where pictures are stored.
-        judge: judges and records.
-        clock: Unix time.
+        poses: Poses of the camera.
+        store: Image store.
+        detector: Face detector.
+        filter_queue: Turns for filtering, shared with `ImageCapture`.
+        authorizer: Policy decisions.
+        clock: Returns Unix time.
     """
 
     def __init__(
         self,
         poses: PoseProvider,
-        album: ImageStore,
+        store: ImageStore,
         *,
-        detector: Detector,
+        detector: FaceDetector,
         filter_queue: FairQueue,
-        judge: ImageAuthorizer,
+        authorizer: ImageAuthorizer,
         clock: Callable[[], float],
     ) -> None:
         self._poses = poses
+        self._store = store
         self._detector = detector
         self._filter_queue = filter_queue
-        self._album = album
-        self._judge = judge
+        self._authorizer = authorizer
         self._clock = clock
         self._tasks = Background()
 
     async def retrieve(
         self, grant: ActiveGrant, name: str, current_grant: Callable[[], ActiveGrant] | None = None
     ) -> tuple[Verdict, ImageRecord, bytes | Path]:
-        """A picture; policies apply to where it was taken and to where the camera is now, and the stricter counts.
+        """Return an image under the policies that apply where it was taken and where the camera is now.
 
-        It is judged again when its filters are applied, as other pictures may come first.
-
-        Args:
-            grant: the caller's.
-            name: of the picture.
-            current_grant: as for `ImageCapture.capture`.
-        """
-        call, now = Call("RetrieveImage"), self._now()
-        known = self._judge.judge(call, grant, now)
-        owner = owner_of(grant)
-        shot = await asyncio.to_thread(self._album.find, owner, name)
-        verdict = self._judge.judge_stored(call, grant, shot.poses, known, now)
-        missing = remaining_filters(verdict.filters, shot.filters)
-        path = self._album.path(owner, name)
-        if not missing:
-            return verdict, shot, path
-        # In a picture that was filtered before it is unknown which faces are still found.
-        face_px = 0.0 if shot.filters else shot.face_px
-        plan, noted = self._judge.plan(
-            call, grant, replace(verdict, filters=missing), taken_at(shot.poses, now), face_px=face_px, known=known
-        )
-        data = await self._tasks.complete(self._filtered(owner, path, plan, replace(shot, face_px=face_px)))
-        shot = replace(shot, size_bytes=len(data), filters=(*shot.filters, *plan.filters))
-        self.judge_again(current_grant() if current_grant else grant, owner, shot)
-        return replace(verdict, reason=noted.reason), shot, data
-
-    def judge_again(self, grant: ActiveGrant, owner: str, shot: ImageRecord) -> None:
-        """Judge a picture whose retrieval was permitted by the policies of this moment: before each part of it is sent.
+        The image is authorized again after filtering, because it may wait for other images.
 
         Args:
-            grant: the caller's by now.
-            owner: whose picture it is.
-            shot: the picture as `retrieve` returned it, with the filters that it got.
+            grant: Grant of the caller.
+            name: Name of the image.
+            current_grant: Returns the caller's current Grant, or raises if the caller has none any more.
+
+        Returns:
+            The verdict, the record, and the image: the file, or the bytes if filters were applied.
 
         Raises:
-            Refused: it may not be returned any more, or needs more filters than it got.
+            Refused: The call is denied, or the image does not exist.
+        """
+        call = Call("RetrieveImage")
+        now = self._now()
+        recorded = self._authorizer.authorize(call, grant, now)
+        owner = owner_of(grant)
+        record = await asyncio.to_thread(self._store.find, owner, name)
+        verdict = self._authorizer.authorize_stored(call, grant, record.poses, recorded, now)
+        missing = remaining_filters(verdict.filters, record.filters)
+        path = self._store.path(owner, name)
+        if not missing:
+            return verdict, record, path
+        # It is unknown which faces are still detectable in an image that was filtered before.
+        face_px = 0.0 if record.filters else record.face_px
+        plan, noted = self._authorizer.plan_filters(
+            call, grant, replace(verdict, filters=missing), situation_of(record.poses, now),
+            face_px=face_px, recorded=recorded,
+        )  # fmt: skip
+        data = await self._tasks.complete(self._filter(owner, path, plan, replace(record, face_px=face_px)))
+        record = replace(record, size_bytes=len(data), filters=(*record.filters, *plan.filters))
+        self.authorize_transfer(current_grant() if current_grant else grant, owner, record)
+        return replace(verdict, reason=noted.reason), record, data
+
+    def authorize_transfer(self, grant: ActiveGrant, owner: str, record: ImageRecord) -> None:
+        """Authorize an image again under the current policies. Call this before each part of the image is sent.
+
+        Args:
+            grant: Current Grant of the caller.
+            owner: Owner of the image.
+            record: Record that `retrieve` returned, with all filters that were applied.
+
+        Raises:
+            Refused: The image may not be returned any more, or requires more filters than were applied.
         """
         if owner_of(grant) != owner:
             raise PolicyDenied(
-                "NoGrant", "the application was replaced by one of the same name; this picture is not its own"
+                "NoGrant", "the application was replaced by another of the same name, which does not own this image"
             )
-        call, now = Call("RetrieveImage"), self._now()
-        verdict = self._judge.judge(call, grant, now, record=False)
-        verdict = self._judge.judge_stored(call, grant, shot.poses, verdict, now)
-        if remaining_filters(verdict.filters, shot.filters):
-            reason = f"{verdict.reason}, which it did not when this picture was asked for; ask again"
+        call = Call("RetrieveImage")
+        now = self._now()
+        verdict = self._authorizer.authorize(call, grant, now, record=False)
+        verdict = self._authorizer.authorize_stored(call, grant, record.poses, verdict, now)
+        if remaining_filters(verdict.filters, record.filters):
+            reason = f"{verdict.reason}, which was not required when this image was requested; request it again"
             refusal = Verdict("deny", None, "PrivacyZone", reason, verdict.policies)
-            self._judge.require(call, grant, refusal, now)
+            self._authorizer.enforce(call, grant, refusal, now)
 
-    async def _filtered(self, owner: str, path: Path, plan: FilterPlan, shot: ImageRecord) -> bytes:
-        def work() -> bytes:
-            picture, upright = decoded(path.read_bytes()), is_upright(shot.poses)
-            return encoded(apply_filters([picture], plan, self._detector, shot.face_px, upright=upright))
+    async def _filter(self, owner: str, path: Path, plan: FilterPlan, record: ImageRecord) -> bytes:
+        def render() -> bytes:
+            picture = decode_image(path.read_bytes())
+            upright = is_upright(record.poses)
+            return encode_jpeg(apply_filters([picture], plan, self._detector, record.face_px, upright=upright))
 
         async with self._filter_queue.turn(owner):
             with spans.call().child("camera.filters") as span:
-                span.note("fractus.filters", [one.action for one in plan.filters])
-                return await asyncio.to_thread(work)
+                span.note("fractus.filters", [planned.action for planned in plan.filters])
+                return await asyncio.to_thread(render)
 
     async def list(self, grant: ActiveGrant) -> tuple[Verdict, tuple[ImageRecord, ...]]:
-        """The pictures of the caller."""
-        verdict = self._judge.judge(Call("ListImages"), grant, self._now())
-        return verdict, await asyncio.to_thread(self._album.list, owner_of(grant))
+        """Return the records of the caller's images."""
+        verdict = self._authorizer.authorize(Call("ListImages"), grant, self._now())
+        return verdict, await asyncio.to_thread(self._store.list, owner_of(grant))
 
     async def delete(self, grant: ActiveGrant, name: str) -> Verdict:
-        """Remove a picture of the caller."""
-        verdict = self._judge.judge(Call("DeleteImage"), grant, self._now())
-        await asyncio.to_thread(self._album.delete, owner_of(grant), name)
+        """Delete an image of the caller."""
+        verdict = self._authorizer.authorize(Call("DeleteImage"), grant, self._now())
+        await asyncio.to_thread(self._store.delete, owner_of(grant), name)
         return verdict
 
     def _now(self) -> Situation:

@@ -1,4 +1,4 @@
-"""Follows the mobility service of the same node, for the poses of a drone's camera."""
+"""Client of the mobility service's telemetry, which provides the poses of a drone's camera."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from fractus_services.camera.pose_history import Measurement
 
 log = logging.getLogger(__name__)
 
-INTERVAL_S = 0.1
-RETRY_S = 1.0
 DEFAULT_ERROR_M = 10.0
-"""Position error where the mobility service reports none."""
+"""Position error if the mobility service reports none, in metres."""
 DEFAULT_AGE_S = 0.5
-"""Age of a measurement where the mobility service reports none."""
-STEP_S = 10.0
-"""A step of the clock counts against the messages that arrive for so long after it: they may have been made before."""
+"""Age of a measurement if the mobility service reports none, in seconds."""
+STEP_WINDOW_S = 10.0
+"""Time after a backward clock step during which messages with timestamps from before the step may still arrive, in seconds."""
 MAX_AHEAD_S = 0.05
-"""A message that is made later than it arrives, by more, has its time from another clock."""
+"""Maximum time by which a message's timestamp may be after its arrival. A larger difference means another clock."""
 
 
 class ArrivalClock:
-    """Unix time as messages arrive, by the latest reading of late: a clock that is stepped back makes no message younger.
+    """Unix time of message arrivals. A backward clock step does not make messages appear younger.
+
+    It uses the largest offset between Unix time and monotonic time during the last `STEP_WINDOW_S` seconds.
 
     Args:
-        clock: Unix time; where that is in doubt, the later reading.
-        now: monotonic seconds.
+        clock: Returns Unix time. If the clock is uncertain, the later reading.
+        now: Returns monotonic seconds.
     """
 
     def __init__(self, clock: Callable[[], float], now: Callable[[], float] = time.monotonic) -> None:
@@ -45,12 +45,12 @@ class ArrivalClock:
         self._offsets: deque[tuple[float, float]] = deque()
 
     def __call__(self) -> float:
-        """Now."""
-        now = self._now()
-        self._offsets.append((now, self._clock() - now))
-        while now - self._offsets[0][0] > STEP_S:
+        """Return the Unix time of a message that arrives now."""
+        now_s = self._now()
+        self._offsets.append((now_s, self._clock() - now_s))
+        while now_s - self._offsets[0][0] > STEP_WINDOW_S:
             self._offsets.popleft()
-        return now + max(offset_s for _, offset_s in self._offsets)
+        return now_s + max(offset_s for _, offset_s in self._offsets)
 
 
 async def follow_telemetry(
@@ -61,16 +61,20 @@ async def follow_telemetry(
     *,
     clock: Callable[[], float],
     gimbal: bool = False,
+    interval_s: float = 0.1,
+    retry_s: float = 1.0,
 ) -> None:
-    """Subscribe to the telemetry, and again after every failure, until cancelled.
+    """Subscribe to telemetry until cancelled, and subscribe again after each failure.
 
     Args:
-        address: host:port of the mobility service.
-        node: name of the node, which its certificate carries.
-        tls: the node's certificate.
-        add: takes each measurement.
-        clock: Unix time as the mobility service has it, also while the clock's steps are in doubt.
-        gimbal: whether the camera's attitude is that of a gimbal.
+        address: HOST:PORT of the mobility service.
+        node: Name of the node, which is in its certificate.
+        tls: Certificate of the node.
+        add: Callback invoked with each measurement.
+        clock: Returns Unix time as the mobility service uses it, also while the clock is uncertain.
+        gimbal: True if a gimbal turns the camera.
+        interval_s: Requested interval between messages, in seconds.
+        retry_s: Delay before a new subscription after a failure, in seconds.
     """
     await tls.wait()
     arrival = ArrivalClock(clock)
@@ -80,39 +84,48 @@ async def follow_telemetry(
             async with grpc.aio.secure_channel(address, tls.client_credentials(), options) as channel:
                 stub = mobility_pb2_grpc.MobilityServiceStub(channel)
                 async for message in stub.SubscribeTelemetry(
-                    mobility_pb2.SubscribeTelemetryRequest(interval_s=INTERVAL_S)
+                    mobility_pb2.SubscribeTelemetryRequest(interval_s=interval_s)
                 ):
-                    add(measurement(message, time.monotonic(), arrival(), gimbal=gimbal))
+                    add(to_measurement(message, time.monotonic(), arrival(), gimbal=gimbal))
         except grpc.aio.AioRpcError as error:
-            log.warning("telemetry: stream ended (mobility=%s): %s", address, error.details())
+            log.warning("telemetry: stream ended (mobility=%s error=%s)", address, error.details())
         except OSError as error:
-            log.warning("telemetry: no certificate to connect with (mobility=%s): %s", address, error)
-        await asyncio.sleep(RETRY_S)
+            log.warning("telemetry: cannot read the client certificate (mobility=%s error=%s)", address, error)
+        await asyncio.sleep(retry_s)
 
 
-def measurement(message: mobility_pb2.Telemetry, now_s: float, time_s: float, *, gimbal: bool = False) -> Measurement:
-    """Translate a message that arrived at a moment; the attitude is the airframe's, or the gimbal's.
+def to_measurement(
+    message: mobility_pb2.Telemetry, now_s: float, time_s: float, *, gimbal: bool = False
+) -> Measurement:
+    """Convert a telemetry message with the attitude of the airframe or of the gimbal.
 
-    Ages count from when the message was made: those that wait while one of the two processes is stalled arrive all at once. Both
-    read the same clock, and where that is stepped meanwhile a message counts as older, never as younger; how old one is that would
-    arrive before it was made is not known.
+    Ages are counted from the message's timestamp, because messages that wait while a process is stalled arrive together. Both
+    processes read the same clock. If the clock is stepped in between, the message counts as older, never as younger. The age of
+    a message whose timestamp is after its arrival is unknown.
 
     Args:
-        message: of the mobility service of this node.
-        now_s: monotonic seconds.
-        time_s: Unix time, see `ArrivalClock`.
-        gimbal: whether the camera's attitude is that of a gimbal.
+        message: Message of the mobility service of this node.
+        now_s: Monotonic time of arrival in seconds.
+        time_s: Unix time of arrival in seconds, from `ArrivalClock`.
+        gimbal: True if a gimbal turns the camera.
     """
     turned = "gimbal" if gimbal else "attitude"
-    late_s = time_s - message.time.ToNanoseconds() / 1e9 if message.HasField("time") else 0.0
-    late_s = max(late_s, 0.0) if late_s >= -MAX_AHEAD_S else math.inf
+    delay_s = 0.0
+    if message.HasField("time"):
+        delay_s = time_s - message.time.ToNanoseconds() / 1e9
+        delay_s = max(delay_s, 0.0) if delay_s >= -MAX_AHEAD_S else math.inf
     position_age_s, attitude_age_s = (
-        late_s + (getattr(message, name) if message.HasField(name) else DEFAULT_AGE_S)
+        delay_s + (getattr(message, name) if message.HasField(name) else DEFAULT_AGE_S)
         for name in ("position_age_s", f"{turned}_age_s")
     )
-    # Without a link to the autopilot the position in the message is an old one.
+    # Without a link to the autopilot, the message contains an old position.
     position = message.position if message.HasField("position") and message.autopilot_connected else None
-    velocity, attitude, home = message.velocity, getattr(message, turned), message.home
+    velocity = message.velocity
+    home = message.home
+    attitude = None
+    if message.HasField(turned):
+        angles = getattr(message, turned)
+        attitude = Attitude(angles.roll_deg, angles.pitch_deg, angles.yaw_deg)
     return Measurement(
         received_at=now_s,
         position_at=now_s - position_age_s,
@@ -129,8 +142,6 @@ def measurement(message: mobility_pb2.Telemetry, now_s: float, time_s: float, *,
             armed=message.armed,
             in_air=message.in_air,
             position_error_m=message.position_error_m or DEFAULT_ERROR_M,
-            attitude=Attitude(attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg)
-            if message.HasField(turned)
-            else None,
+            attitude=attitude,
         ),
     )

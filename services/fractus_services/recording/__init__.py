@@ -1,1 +1,1 @@
-"""Recordings of flights: MCAP files with Foxglove's schemas, and what is in them."""
+"""Flight recordings: MCAP files with Foxglove schemas, and MAVLink logs."""

@@ -1,4 +1,4 @@
-"""The zones and areas of grants, as Zones and as features of a map."""
+"""Zones and areas of Grants as map features (GeoJSON)."""
 
 from __future__ import annotations
 
@@ -17,35 +17,36 @@ _COLOURS = {"zone": "#d62728", "operationArea": "#2ca02c", "corridor": "#9467bd"
 
 
 def zones_of(specs: Iterable[GrantSpec]) -> list[Zone]:
-    """The zones of the policies in some grants, each once, by name."""
-    found: dict[str, ZoneShape] = {
+    """Return the zones of all policies in some Grants, sorted by name, without duplicates."""
+    shapes: dict[str, ZoneShape] = {
         zone.name: zone for spec in specs for policy in spec.policies for zone in policy.zones
     }
-    return [_zone(name, shape) for name, shape in sorted(found.items())]
+    return [_to_zone(name, shape) for name, shape in sorted(shapes.items())]
 
 
 def areas_of(spec: GrantSpec) -> list[Zone]:
-    """Where a grant lets the drone be, in the shape of Zones."""
-    said = (("operationArea", spec.operation_area), ("corridor", spec.corridor))
-    return [_zone(kind, ZoneShape(area=area)) for kind, areas in said for area in areas]
+    """Return the operation areas and corridors of a Grant as Zones."""
+    areas_by_kind = (("operationArea", spec.operation_area), ("corridor", spec.corridor))
+    return [_to_zone(kind, ZoneShape(area=area)) for kind, areas in areas_by_kind for area in areas]
 
 
-def features(specs: Iterable[GrantSpec]) -> list[Feature]:
-    """What some grants say of the map: zones, operation areas and corridors; `kind` and `component` say which."""
+def grant_features(specs: Iterable[GrantSpec]) -> list[Feature]:
+    """Return the zones, operation areas and corridors of some Grants as features with `kind` and `component` properties."""
     specs = tuple(specs)
-    zones = [placed(zone, "zone") for zone in zones_of(specs)]
-    return zones + [placed(area, area.name, component=spec.component) for spec in specs for area in areas_of(spec)]
+    zones = [to_feature(zone, "zone") for zone in zones_of(specs)]
+    areas = [to_feature(area, area.name, component=spec.component) for spec in specs for area in areas_of(spec)]
+    return zones + areas
 
 
-def placed(zone: Zone, kind: str, **more: str) -> Feature:
-    """A zone as a feature of some kind: zone, operationArea or corridor."""
+def to_feature(zone: Zone, kind: str, **properties: str) -> Feature:
+    """Return a zone as a feature of the kind zone, operationArea or corridor."""
     feature = zone_feature(zone, [])
-    # Foxglove's map draws a feature by its `style`.
-    feature["properties"] |= {"kind": kind, "style": {"color": _COLOURS[kind], "fillOpacity": 0.15}} | more
+    # Foxglove's map panel draws a feature by its `style`.
+    feature["properties"] |= {"kind": kind, "style": {"color": _COLOURS[kind], "fillOpacity": 0.15}} | properties
     return feature
 
 
-def _zone(name: str, shape: ZoneShape) -> Zone:
+def _to_zone(name: str, shape: ZoneShape) -> Zone:
     spec = ZoneSpec(area=shape.area, altitude=shape.altitude, schedule=shape.schedule)
-    # What an area is called is no name of an object, and is not checked as one.
+    # Skip validation, because the name of an area need not be a valid object name.
     return Zone.model_construct(metadata=Metadata.model_construct(name=name), spec=spec)

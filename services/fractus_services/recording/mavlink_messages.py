@@ -1,4 +1,4 @@
-"""What the autopilot's messages say in a recording."""
+"""Converts MAVLink messages of the autopilot to records."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ _LEVELS = (FATAL, FATAL, FATAL, ERROR, WARNING, INFO, INFO, DEBUG)
 """Levels of foxglove.Log by MAV_SEVERITY."""
 
 
-def records_of(message: Message, time_ns: int, node: str) -> Iterable[Record]:
-    """The records that a message gives: position, attitude, or text; none for the others, which the tlog has."""
+def to_records(message: Message, time_ns: int, node: str) -> Iterable[Record]:
+    """Yield the position, attitude or text of a message. Other messages are in the tlog only."""
     match message.name:
         case "GLOBAL_POSITION_INT":
-            lat, lon = message.integer("lat") / 1e7, message.integer("lon") / 1e7
+            lat = message.integer("lat") / 1e7
+            lon = message.integer("lon") / 1e7
             if lat or lon:
                 yield location(time_ns, node, lat, lon, message.integer("alt") / 1000)
         case "ATTITUDE":
@@ -30,8 +31,8 @@ def records_of(message: Message, time_ns: int, node: str) -> Iterable[Record]:
             yield text(time_ns, "log", node, level, message.text("text"))
 
 
-def armed(message: Message) -> bool | None:
-    """Whether the motors run, by an autopilot's heartbeat; None for every other message."""
+def is_armed(message: Message) -> bool | None:
+    """Return True if an autopilot's HEARTBEAT reports armed motors, and None for all other messages."""
     if message.name != "HEARTBEAT" or message.integer("autopilot") == mavlink.MAV_AUTOPILOT_INVALID:
         return None
     return bool(message.integer("base_mode") & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)

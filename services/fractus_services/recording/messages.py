@@ -1,4 +1,4 @@
-"""What a recording says: Foxglove's messages where it has them, as JSON, and ours for the rest."""
+"""Messages of a recording: Foxglove schemas as JSON, and schemas of Fractus for state, attitude and decisions."""
 
 from __future__ import annotations
 
@@ -10,19 +10,26 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
-DEBUG, INFO, WARNING, ERROR, FATAL = 1, 2, 3, 4, 5
+DEBUG = 1
+INFO = 2
+WARNING = 3
+ERROR = 4
+FATAL = 5
 """Levels of foxglove.Log."""
 
-DECIDED = frozenset({"correct", "deny", "takeover"})
-"""Actions of a verdict that changed what was asked."""
+RESTRICTING_ACTIONS = frozenset({"correct", "deny", "takeover"})
+"""Actions of verdicts that restricted a call."""
 
-_NUMBER, _TEXT, _FLAG, _INTEGER = {"type": "number"}, {"type": "string"}, {"type": "boolean"}, {"type": "integer"}
+_NUMBER = {"type": "number"}
+_TEXT = {"type": "string"}
+_FLAG = {"type": "boolean"}
+_INTEGER = {"type": "integer"}
 _TEXTS = {"type": "array", "items": _TEXT}
 _TIME = {"type": "object", "title": "time", "properties": {"sec": _INTEGER, "nsec": _INTEGER}}
 
 
 def schema(title: str, /, **properties: Mapping[str, Any]) -> tuple[str, bytes]:
-    """The name and the JSON schema of a kind of messages."""
+    """Return the name and the JSON schema of a message type."""
     return title, json.dumps({"title": title, "type": "object", "properties": properties}).encode()
 
 
@@ -51,7 +58,7 @@ SCHEMAS = dict(
         ),
     )
 )  # fmt: skip
-"""JSON schemas by their names; Foxglove knows its own by these."""
+"""JSON schemas by name. Foxglove recognises its own schemas by name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,10 +66,10 @@ class Record:
     """One message of a recording.
 
     Attributes:
-        topic: below the name of the node.
-        schema: a key of `SCHEMAS`.
+        topic: Topic without the name of the node.
+        schema: Key of `SCHEMAS`.
         time_ns: Unix nanoseconds.
-        content: by that schema.
+        content: Content that matches the schema.
     """
 
     topic: str
@@ -72,48 +79,48 @@ class Record:
 
 
 def location(time_ns: int, node: str, lat: float, lon: float, amsl_m: float) -> Record:
-    """Where the drone was; degrees and metres above sea level."""
+    """Return a position in degrees and metres above sea level."""
     content = {
-        "timestamp": _stamp(time_ns), "frame_id": node, "latitude": lat, "longitude": lon, "altitude": amsl_m,
+        "timestamp": _timestamp(time_ns), "frame_id": node, "latitude": lat, "longitude": lon, "altitude": amsl_m,
         "position_covariance": [0.0] * 9, "position_covariance_type": 0,
     }  # fmt: skip
     return Record("location", "foxglove.LocationFix", time_ns, content)
 
 
 def attitude(time_ns: int, roll_rad: float, pitch_rad: float, yaw_rad: float) -> Record:
-    """How the drone was turned: nose up and right side down are positive, yaw is from north to east."""
+    """Return an attitude. Nose up and right side down are positive, and yaw is measured from north to east."""
     angles = {"roll_rad": roll_rad, "pitch_rad": pitch_rad, "yaw_rad": yaw_rad}
     return Record("attitude", "fractus.Attitude", time_ns, angles)
 
 
 def text(time_ns: int, topic: str, node: str, level: int, message: str) -> Record:
-    """A line of a log."""
+    """Return a log message."""
     content = {
-        "timestamp": _stamp(time_ns), "level": level, "message": message, "name": node, "file": "", "line": 0,
+        "timestamp": _timestamp(time_ns), "level": level, "message": message, "name": node, "file": "", "line": 0,
     }  # fmt: skip
     return Record(topic, "foxglove.Log", time_ns, content)
 
 
 def zones(time_ns: int, features: Sequence[Mapping[str, Any]]) -> Record:
-    """Zones and areas on the map, as GeoJSON features (lon before lat)."""
+    """Return zones and areas as a GeoJSON feature collection (longitude before latitude)."""
     collection = {"type": "FeatureCollection", "features": list(features)}
     return Record("zones", "foxglove.GeoJSON", time_ns, {"geojson": json.dumps(collection, separators=(",", ":"))})
 
 
 def picture(time_ns: int, node: str, jpeg: bytes) -> Record:
-    """A picture."""
+    """Return an image."""
     content = {
-        "timestamp": _stamp(time_ns), "frame_id": node, "data": b64encode(jpeg).decode(), "format": "jpeg",
+        "timestamp": _timestamp(time_ns), "frame_id": node, "data": b64encode(jpeg).decode(), "format": "jpeg",
     }  # fmt: skip
     return Record("picture", "foxglove.CompressedImage", time_ns, content)
 
 
-def of_audit(entry: Mapping[str, Any], node: str) -> Iterable[Record]:
-    """What an entry of an audit log says; nothing if it is damaged.
+def audit_records(entry: Mapping[str, Any], node: str) -> Iterable[Record]:
+    """Yield the records of an audit log entry, or nothing if the entry is damaged.
 
-    The flight recorder's entries give `state`, all others `decisions`, and a line of `log` for people.
+    Entries of the kind `state` yield a `state` record. All others yield a `decisions` record and a readable `log` record.
     """
-    time_ns = moment_ns(entry.get("time"))
+    time_ns = parse_time_ns(entry.get("time"))
     if time_ns is None:
         return
     kind = str(entry.get("kind", ""))
@@ -125,46 +132,48 @@ def of_audit(entry: Mapping[str, Any], node: str) -> Iterable[Record]:
 
 
 def sentence(entry: Mapping[str, Any]) -> str:
-    """An entry that is no state in one line."""
+    """Return a readable line about an entry of any kind but `state`."""
     parts = (component_of(entry), entry.get("method"), entry.get("action") or entry.get("change"), entry.get("name"))
     head = " ".join(str(part) for part in parts if part) or str(entry.get("kind", ""))
-    why = ", ".join(str(entry[key]) for key in ("code", "reason") if entry.get(key))
-    return f"{head}: {why}" if why else head
+    explanation = ", ".join(str(entry[key]) for key in ("code", "reason") if entry.get(key))
+    return f"{head}: {explanation}" if explanation else head
 
 
 def level_of(entry: Mapping[str, Any]) -> int:
-    """How much an entry matters, as a level of foxglove.Log."""
+    """Return the level of an entry for foxglove.Log."""
     if entry.get("kind") == "takeover" or entry.get("action") == "takeover":
         return ERROR
-    return WARNING if entry.get("action") in DECIDED or entry.get("kind") == "monitor" else INFO
+    return WARNING if entry.get("action") in RESTRICTING_ACTIONS or entry.get("kind") == "monitor" else INFO
 
 
 def component_of(entry: Mapping[str, Any]) -> str:
-    """The component that called; empty for what the system did."""
-    _, found, rest = str(entry.get("caller") or "").partition("/component/")
-    return rest.partition("/")[0] if found else ""
+    """Return the component that made the call, or an empty string for an action of the system."""
+    _, separator, rest = str(entry.get("caller") or "").partition("/component/")
+    return rest.partition("/")[0] if separator else ""
 
 
-def moment_ns(given: object) -> int | None:
-    """Unix nanoseconds of an entry's time; None when it is none."""
+def parse_time_ns(value: object) -> int | None:
+    """Return the Unix nanoseconds of an entry's time, or None if it is invalid."""
+    if not isinstance(value, str):
+        return None
     try:
-        moment = datetime.fromisoformat(given) if isinstance(given, str) else None
-        return round(moment.timestamp() * 1e6) * 1000 if moment is not None and moment.tzinfo is not None else None
+        time = datetime.fromisoformat(value)
+        return round(time.timestamp() * 1e6) * 1000 if time.tzinfo is not None else None
     except (ValueError, OverflowError):
         return None
 
 
-def number(given: object) -> float | None:
-    """A finite number; None for anything else."""
-    if isinstance(given, int | float) and not isinstance(given, bool) and math.isfinite(given):
-        return float(given)
+def finite_number(value: object) -> float | None:
+    """Return a finite number, or None for any other value."""
+    if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
+        return float(value)
     return None
 
 
 def _state(entry: Mapping[str, Any]) -> dict[str, Any]:
     return {
-        "altitude_m": number(entry.get("alt")), "amsl_m": number(entry.get("amsl")),
-        "speed_mps": number(entry.get("speed")), "battery": number(entry.get("battery")),
+        "altitude_m": finite_number(entry.get("alt")), "amsl_m": finite_number(entry.get("amsl")),
+        "speed_mps": finite_number(entry.get("speed")), "battery": finite_number(entry.get("battery")),
         "mode": str(entry.get("mode", "")), "controller": str(entry.get("controller", "")),
         "in_air": bool(entry.get("in_air")),
     }  # fmt: skip
@@ -172,14 +181,14 @@ def _state(entry: Mapping[str, Any]) -> dict[str, Any]:
 
 def _decision(kind: str, entry: Mapping[str, Any]) -> dict[str, Any]:
     policies = entry.get("policies")
-    words = ("caller", "method", "action", "code", "reason", "takeover", "controller")
+    text_keys = ("caller", "method", "action", "code", "reason", "takeover", "controller")
     return {
-        "kind": kind, **{key: str(entry.get(key) or "") for key in words},
+        "kind": kind, **{key: str(entry.get(key) or "") for key in text_keys},
         "policies": [str(name) for name in policies] if isinstance(policies, list) else [],
-        "latitude": number(entry.get("lat")), "longitude": number(entry.get("lon")),
-        "altitude_m": number(entry.get("alt")),
+        "latitude": finite_number(entry.get("lat")), "longitude": finite_number(entry.get("lon")),
+        "altitude_m": finite_number(entry.get("alt")),
     }  # fmt: skip
 
 
-def _stamp(time_ns: int) -> dict[str, int]:
+def _timestamp(time_ns: int) -> dict[str, int]:
     return {"sec": time_ns // 1_000_000_000, "nsec": time_ns % 1_000_000_000}

@@ -1,4 +1,4 @@
-"""The files of recordings in one directory, within a bound: the oldest make room for the newest."""
+"""Directory of recording segments within a size limit: the oldest segments are removed for the newest."""
 
 from __future__ import annotations
 
@@ -11,29 +11,31 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO
 
-DIRECTORY_MODE, FILE_MODE = 0o700, 0o600
-"""No other user of the node reads recordings: they tell where the drone was, and what it saw."""
+DIRECTORY_MODE = 0o700
+FILE_MODE = 0o600
+"""Modes without access for other users of the node. Recordings disclose where the drone was, and contain images."""
 
 RESERVE_BYTES = 200_000_000
-"""Free space that recordings leave on their disk: the audit log, without which nothing flies, is often on the same."""
+"""Free space that recordings leave on their disk. The audit log is often on the same disk, and no drone flies without it."""
 
-MIN_SEGMENT_BYTES, MAX_SEGMENT_BYTES = 250_000, 32_000_000
-PARTS = 16
-"""A bound holds this many segments of full size, so that little is lost when the oldest goes."""
+MIN_SEGMENT_BYTES = 250_000
+MAX_SEGMENT_BYTES = 32_000_000
+SEGMENTS_PER_LIMIT = 16
+"""Number of segments of full size within the limit, so that removing the oldest loses little."""
 
 PART_SUFFIX = ".part"
-"""Of a file that is being made."""
+"""Suffix of a file that is being written."""
 
 _NAME = re.compile(r"(?P<number>\d{6,})-\d{8}T\d{6}Z\.(mcap|tlog)")
 
 
 class SegmentDirectory:
-    """SegmentDirectory are numbered, as a clock may be set back; the files of one have one name and several suffixes.
+    """Directory of segments. Segments are numbered, because the clock may be set back. Files of one segment differ in suffix.
 
     Args:
-        directory: where they are kept; nothing else is, and no other process keeps its own there.
-        limit_bytes: what all of them may take.
-        reserve_bytes: what must stay free on the disk.
+        directory: Directory that contains nothing else and is used by no other process.
+        limit_bytes: Maximum size of all segments.
+        reserve_bytes: Minimum free space on the disk.
     """
 
     def __init__(self, directory: Path, limit_bytes: int, reserve_bytes: int = RESERVE_BYTES) -> None:
@@ -41,49 +43,49 @@ class SegmentDirectory:
         self._limit_bytes = limit_bytes
         self._reserve_bytes = reserve_bytes
         self._lock: int | None = None
-        self.segment_bytes = min(max(limit_bytes // PARTS, MIN_SEGMENT_BYTES), MAX_SEGMENT_BYTES)
+        self.segment_bytes = min(max(limit_bytes // SEGMENTS_PER_LIMIT, MIN_SEGMENT_BYTES), MAX_SEGMENT_BYTES)
 
-    def begin(self, time_ns: int) -> Path:
-        """The name of a new segment without a suffix, once there is room for it.
+    def new_segment(self, time_ns: int) -> Path:
+        """Make room for a segment, and return its path without suffix.
 
         Raises:
-            OSError: the directory cannot be written, or the disk is full.
+            OSError: The directory cannot be written, or the disk is full.
         """
         self.prepare()
-        moment = datetime.fromtimestamp(time_ns / 1e9, UTC).strftime("%Y%m%dT%H%M%SZ")
-        return self.directory / f"{max(self.found(), default=0) + 1:06d}-{moment}"
+        time_text = datetime.fromtimestamp(time_ns / 1e9, UTC).strftime("%Y%m%dT%H%M%SZ")
+        return self.directory / f"{max(self.by_number(), default=0) + 1:06d}-{time_text}"
 
     def prepare(self) -> None:
-        """Make the directory, take it for this process, and make room in it.
+        """Create the directory, lock it for this process, and make room in it.
 
         Raises:
-            OSError: it cannot be written, or another process records into it, or the disk is full.
+            OSError: The directory cannot be written, another process records into it, or the disk is full.
         """
         with contextlib.suppress(FileExistsError):
-            # Only what is made here gets its mode: one that was there belongs to who made it.
+            # Set the mode of a new directory only: an existing one may have been created with another mode on purpose.
             self.directory.mkdir(DIRECTORY_MODE, parents=True)
-        self._take()
+        self._acquire_lock()
         self._make_room()
         self.check_space()
 
-    def tidy(self) -> None:
-        """Remove what a crash left half made.
+    def remove_incomplete(self) -> None:
+        """Remove temporary files that a crash left.
 
         Raises:
-            OSError: it cannot be removed.
+            OSError: A file cannot be removed.
         """
         for path in self.directory.glob(f"*{PART_SUFFIX}"):
             if _NAME.fullmatch(path.with_suffix(".mcap").name):
                 path.unlink(missing_ok=True)
 
-    def release(self) -> None:
-        """Leave the directory to others."""
+    def unlock(self) -> None:
+        """Unlock the directory for other processes."""
         if self._lock is not None:
             os.close(self._lock)
             self._lock = None
 
-    def found(self) -> dict[int, list[Path]]:
-        """The files of all segments by the segments' numbers, oldest first."""
+    def by_number(self) -> dict[int, list[Path]]:
+        """Return the files of all segments by segment number, oldest first."""
         segments: dict[int, list[Path]] = {}
         for path in sorted(self.directory.glob("*")):
             match = _NAME.fullmatch(path.name)
@@ -92,17 +94,17 @@ class SegmentDirectory:
         return dict(sorted(segments.items()))
 
     def check_space(self) -> None:
-        """Tell a disk that is nearly full from one that is not.
+        """Check the free space on the disk.
 
         Raises:
-            OSError: it is.
+            OSError: The disk is nearly full.
         """
         disk = os.statvfs(self.directory)
         free = disk.f_bavail * disk.f_frsize
         if free < self._reserve_bytes:
             raise OSError(errno.ENOSPC, f"only {free / 1e6:.0f} MB are free on its disk")
 
-    def _take(self) -> None:
+    def _acquire_lock(self) -> None:
         if self._lock is not None:
             return
         lock = os.open(self.directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
@@ -117,8 +119,8 @@ class SegmentDirectory:
         self._lock = lock
 
     def _make_room(self) -> None:
-        """Remove the oldest segments until a whole one fits in."""
-        segments = self.found()
+        """Remove the oldest segments until a full segment fits within the limit."""
+        segments = self.by_number()
         sizes = {number: sum(path.stat().st_size for path in paths) for number, paths in segments.items()}
         surplus = sum(sizes.values()) + self.segment_bytes - self._limit_bytes
         for number, paths in segments.items():
@@ -129,15 +131,15 @@ class SegmentDirectory:
             surplus -= sizes[number]
 
 
-def create(path: Path) -> IO[bytes]:
-    """A new file that no other user can read.
+def create_file(path: Path) -> IO[bytes]:
+    """Create a file that other users cannot read.
 
     Raises:
-        OSError: it is there already, or cannot be written.
+        OSError: The file exists, or cannot be written.
     """
     return os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, FILE_MODE), "wb")
 
 
 def segments_in(directory: Path | None, megabytes: int) -> SegmentDirectory | None:
-    """What the options of a service ask for; None: nothing is recorded."""
+    """Return the segment directory that the options of a service specify, or None to record nothing."""
     return SegmentDirectory(directory, megabytes * 1_000_000) if directory is not None and megabytes > 0 else None

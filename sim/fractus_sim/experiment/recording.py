@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from fractus_runtime.mavlink_codec import Message
-from fractus_services.recording.mcap_file import McapWriter
 from fractus_services.recording.messages import Record, location, schema, text
+from fractus_services.recording.segment_writer import McapWriter
 
 from fractus_sim.experiment.station import Station
 from fractus_sim.report.track import Place, Sample, Track

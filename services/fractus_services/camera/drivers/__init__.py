@@ -1,1 +1,1 @@
-"""One module for each kind of camera."""
+"""Camera drivers, one module for each kind of camera."""

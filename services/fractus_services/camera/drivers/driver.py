@@ -1,4 +1,4 @@
-"""What every camera driver does, and what is asked of it."""
+"""Interface of camera drivers."""
 
 from __future__ import annotations
 
@@ -12,72 +12,72 @@ from fractus_services.errors import Unavailable
 from fractus_services.options import CannotServe
 
 TIMEOUT_S = 5.0
-"""A camera that takes longer for a picture is broken."""
+"""Time for one image, in seconds, within drivers that wait for a network."""
 
 
 class CameraFailed(Unavailable):
-    """The camera gives no picture; says why, and what to look at."""
+    """The camera returned no image. The message contains the reason and what to check."""
 
     def __init__(self, reason: str) -> None:
         super().__init__("CameraFailed", reason)
 
 
-class BadConnection(CannotServe):
-    """A connection that names no camera."""
+class InvalidCameraConnection(CannotServe):
+    """The connection string names no supported camera."""
 
 
 @dataclass(frozen=True, slots=True)
 class CaptureRequest:
-    """What is asked of a camera.
+    """Request for one image.
 
     Attributes:
-        width: pixels, in the camera's own proportions; it may give others.
-        height: as width.
-        native: the camera's own width and height.
-        sensor: what it sees.
-        now: where the camera is.
-        label: what a drawn picture says.
+        width: Width in pixels, in the camera's own aspect ratio. The camera may return another size.
+        height: Height in pixels, as `width`.
+        native: Width and height of the camera, in pixels.
+        sensor: Spectral band.
+        situation: Current position and attitude of the camera.
+        label: Text that the test pattern shows.
     """
 
     width: int
     height: int
     native: tuple[int, int]
     sensor: Literal["RGB", "IR"]
-    now: Situation
+    situation: Situation
     label: str = ""
 
 
-def as_described(picture: Pixels, wanted: CaptureRequest) -> Pixels:
-    """The picture of a camera that was set to its native size, unless it is not of that size.
+def check_native_size(picture: Pixels, request: CaptureRequest) -> Pixels:
+    """Return the image of a camera that was set to its native size, after checking that it has this size.
 
-    Another size may be another part of the sensor, so the described field of view does not hold for it.
+    An image of another size may show another part of the sensor. The described field of view does not apply to it.
 
     Raises:
-        CameraFailed: it is not, and the picture would be judged by what its description says that it shows.
+        CameraFailed: The image has another size, and policies depend on the described field of view.
     """
     rows, columns = picture.shape[:2]
-    if wanted.now.lens is not None and (columns, rows) != wanted.native:
-        width, height = wanted.native
+    if request.situation.lens is not None and (columns, rows) != request.native:
+        width, height = request.native
         raise CameraFailed(
-            f"the camera gives {columns}x{rows} pixels though it was set to {width}x{height}, so it is unknown what"
-            " they show; set services.camera.resolution of the node to a size that the camera has, and"
-            " horizontalFieldOfView to what it shows at that size"
+            f"the camera returned {columns}x{rows} pixels although it was set to {width}x{height}, so its field of view is"
+            " unknown; set services.camera.resolution of the node to a supported size, and horizontalFieldOfView to the"
+            " field of view at that size"
         )
     return picture
 
 
-class Driver(Protocol):
-    """A camera. Its methods block, and are called from one thread, never two at a time."""
+class CameraDriver(Protocol):
+    """A camera. Its methods block. They are called from one thread, one call at a time."""
 
     @property
     def latency_s(self) -> float:
-        """How many seconds before it is asked for a picture may have been exposed, at most."""
+        """Maximum time between exposure and the call of `capture` that returns the image, in seconds."""
 
-    def capture(self, wanted: CaptureRequest) -> Pixels:
-        """A picture of the present moment, or of one at most `latency_s` ago.
+    def capture(self, request: CaptureRequest) -> Pixels:
+        """Return an image that was exposed at most `latency_s` before the call.
 
         Raises:
-            CameraFailed: the camera gives none.
+            CameraFailed: The camera returned no image.
         """
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Geotagged pictures of a directory instead of a camera: the one that was taken nearest to where the camera is."""
+"""Camera driver that returns geotagged images of a directory: the image taken nearest to the camera's position."""
 
 from __future__ import annotations
 
@@ -9,93 +9,98 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 from fractus_core.geo import LocalFrame
+from PIL import Image
+from PIL.ExifTags import GPS, IFD
 
 from fractus_services.camera.drivers.driver import CameraFailed, CaptureRequest
-from fractus_services.camera.pixels import NotAPicture, Pixels, decoded
+from fractus_services.camera.pixels import InvalidImage, Pixels, decode_image
 
 log = logging.getLogger(__name__)
 
 _SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp"})
 _MAX_FILES = 100_000
-_UNREADABLE = (OSError, KeyError, TypeError, ValueError, ZeroDivisionError, SyntaxError)
-"""What Pillow raises for files that are no pictures, or whose position is none."""
+_EXIF_ERRORS = (OSError, KeyError, TypeError, ValueError, ZeroDivisionError, SyntaxError, Image.DecompressionBombError)
+"""Exceptions that Pillow raises for files that are no images or have no valid position."""
 
 
 class GeotaggedDirectory:
-    """Serves the picture whose EXIF position is nearest to the camera; altitudes count where they are known.
+    """Returns the image whose EXIF position is nearest to the camera, in three dimensions if altitudes are known.
 
     Args:
-        path: the directory; it is read again when it changes.
+        path: Directory of images. It is scanned again when it changes.
     """
 
     latency_s = 0.0
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._stamp: int | None = None
+        self._modified_ns: int | None = None
         self._files: list[Path] = []
-        self._places: npt.NDArray[np.float64] = np.empty((0, 3))
+        self._positions: npt.NDArray[np.float64] = np.empty((0, 3))
 
-    def capture(self, wanted: CaptureRequest) -> Pixels:
-        """See `Driver`."""
-        now = wanted.now
-        if now.lat is None or now.lon is None:
-            raise CameraFailed("the camera's position is unknown, so no picture of the directory is nearest")
-        self._look()
-        frame = LocalFrame(now.lat, now.lon)
-        flat = frame.xy_array(self._places[:, 0], self._places[:, 1])
-        amsl_m = now.home.amsl_m + now.altitude_m if now.home is not None else math.nan
-        up = np.nan_to_num(self._places[:, 2] - amsl_m, nan=0.0)
-        nearest = int(np.argmin(np.square(flat).sum(axis=1) + np.square(up)))
+    def capture(self, request: CaptureRequest) -> Pixels:
+        """See `CameraDriver`."""
+        situation = request.situation
+        if situation.lat is None or situation.lon is None:
+            raise CameraFailed("cannot select an image of the directory because the camera's position is unknown")
+        self._scan()
+        frame = LocalFrame(situation.lat, situation.lon)
+        horizontal_m = frame.xy_array(self._positions[:, 0], self._positions[:, 1])
+        amsl_m = situation.home.amsl_m + situation.altitude_m if situation.home is not None else math.nan
+        vertical_m = np.nan_to_num(self._positions[:, 2] - amsl_m, nan=0.0)
+        nearest = int(np.argmin(np.square(horizontal_m).sum(axis=1) + np.square(vertical_m)))
         try:
-            return decoded(self._files[nearest].read_bytes())
-        except (OSError, NotAPicture) as error:
-            self._stamp = None
-            raise CameraFailed(f"{self._files[nearest]} cannot be read: {error}") from None
+            return decode_image(self._files[nearest].read_bytes())
+        except (OSError, InvalidImage) as error:
+            self._modified_ns = None
+            raise CameraFailed(f"cannot read {self._files[nearest]}: {error}") from None
 
     def close(self) -> None:
-        """Nothing to close."""
+        """See `CameraDriver`."""
 
-    def _look(self) -> None:
+    def _scan(self) -> None:
         try:
-            stamp = self._path.stat().st_mtime_ns
-            if stamp == self._stamp:
+            modified_ns = self._path.stat().st_mtime_ns
+            if modified_ns == self._modified_ns:
                 return
-            named = (p for p in self._path.iterdir() if p.suffix.lower() in _SUFFIXES)
-            # Opening a pipe would wait for someone to write into it.
-            files = sorted(p for p in named if p.is_file())[:_MAX_FILES]
+            images = (path for path in self._path.iterdir() if path.suffix.lower() in _SUFFIXES)
+            # Skip named pipes, because opening one would block.
+            files = sorted(path for path in images if path.is_file())[:_MAX_FILES]
         except OSError as error:
-            raise CameraFailed(f"{self._path} cannot be read: {error.strerror or error}") from None
-        found = [(file, place) for file in files if (place := position_of(file)) is not None]
-        if not found:
-            raise CameraFailed(f"none of the {len(files)} pictures in {self._path} has a GPS position in its EXIF data")
-        self._files = [file for file, _ in found]
-        self._places = np.array([place for _, place in found])
-        self._stamp = stamp
+            raise CameraFailed(f"cannot read {self._path}: {error.strerror or error}") from None
+        positions = {file: position for file in files if (position := read_position(file)) is not None}
+        if not positions:
+            raise CameraFailed(f"none of the {len(files)} images in {self._path} has a GPS position in its EXIF data")
+        self._files = list(positions)
+        self._positions = np.array(list(positions.values()))
+        self._modified_ns = modified_ns
 
 
-def position_of(file: Path) -> tuple[float, float, float] | None:
-    """Latitude, longitude, and metres above mean sea level (NaN where unknown) from a picture's EXIF data."""
-    from PIL import Image  # noqa: PLC0415 - only this camera needs it
-    from PIL.ExifTags import GPS, IFD  # noqa: PLC0415
+def read_position(file: Path) -> tuple[float, float, float] | None:
+    """Read the position of an image from its EXIF data.
 
+    Returns:
+        Latitude and longitude in degrees, and metres above mean sea level (NaN if unknown). None if the file has no valid
+        position.
+    """
     try:
         with Image.open(file) as picture:
             tags = picture.getexif().get_ifd(IFD.GPSInfo)
-        lat, lon = _degrees(tags[GPS.GPSLatitude]), _degrees(tags[GPS.GPSLongitude])
+        lat = _to_degrees(tags[GPS.GPSLatitude])
+        lon = _to_degrees(tags[GPS.GPSLongitude])
         lat = -lat if tags.get(GPS.GPSLatitudeRef) == "S" else lat
         lon = -lon if tags.get(GPS.GPSLongitudeRef) == "W" else lon
         alt = float(tags.get(GPS.GPSAltitude, math.nan))
-        # Cameras write the reference as a number or as a byte; 1 is below sea level.
-        below = tags.get(GPS.GPSAltitudeRef) in {1, b"\x01"}
-    except (*_UNREADABLE, Image.DecompressionBombError) as error:
-        log.debug("camera directory: picture has no position (file=%s): %s", file, error)
+        # Cameras write the reference as a number or as a byte. 1 means below sea level.
+        below_sea_level = tags.get(GPS.GPSAltitudeRef) in {1, b"\x01"}
+    except _EXIF_ERRORS as error:
+        log.debug("camera: image without position skipped (file=%s error=%s)", file, error)
         return None
     if not (-90 <= lat <= 90 and -180 <= lon <= 180):
         return None
-    return lat, lon, -alt if below else alt
+    return lat, lon, -alt if below_sea_level else alt
 
 
-def _degrees(parts: tuple[float, float, float]) -> float:
+def _to_degrees(parts: tuple[float, float, float]) -> float:
     degrees, minutes, seconds = (float(part) for part in parts)
     return degrees + minutes / 60 + seconds / 3600

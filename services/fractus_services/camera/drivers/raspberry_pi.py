@@ -1,4 +1,4 @@
-"""Cameras of the Raspberry Pi, by its library picamera2."""
+"""Camera driver for Raspberry Pi camera modules, based on picamera2."""
 
 from __future__ import annotations
 
@@ -6,61 +6,62 @@ from typing import Any
 
 import numpy as np
 
-from fractus_services.camera.drivers.driver import CameraFailed, CaptureRequest, as_described
+from fractus_services.camera.drivers.driver import CameraFailed, CaptureRequest, check_native_size
 from fractus_services.camera.pixels import Pixels
 
 
 class RaspberryPiCamera:
-    """A camera module, started at the first picture and again after it failed.
+    """A camera module. It is started for the first image, and again after a failure.
 
     Args:
-        number: of the camera, as `rpicam-hello --list-cameras` counts.
+        number: Camera number as `rpicam-hello --list-cameras` lists it.
     """
 
     latency_s = 0.3
-    """In the dark a slow sensor may deliver the frame that it was already exposing."""
+    """In low light the sensor may return the frame that it was already exposing."""
 
     def __init__(self, number: int) -> None:
         self._number = number
         self._camera: Any = None
 
-    def capture(self, wanted: CaptureRequest) -> Pixels:
-        """See `Driver`."""
+    def capture(self, request: CaptureRequest) -> Pixels:
+        """See `CameraDriver`."""
         if self._camera is None:
-            self._camera = self._started(wanted)
+            self._camera = self._start(request)
         try:
-            # What picamera2 calls RGB888 has blue first in memory, as OpenCV expects it.
+            # The format that picamera2 calls RGB888 has blue first in memory, as OpenCV expects it.
             picture = self._camera.capture_array("main")
         except (RuntimeError, OSError) as error:
             self.close()
             raise CameraFailed(
-                f"camera {self._number} gives no picture ({error}); it is started again next time"
+                f"camera {self._number} returned no image ({error}); the next request restarts it"
             ) from error
-        return as_described(np.ascontiguousarray(picture[:, :, :3], np.uint8), wanted)
+        return check_native_size(np.ascontiguousarray(picture[:, :, :3], np.uint8), request)
 
     def close(self) -> None:
-        """See `Driver`."""
-        camera, self._camera = self._camera, None
-        if camera is not None:
+        """See `CameraDriver`."""
+        if self._camera is not None:
+            camera = self._camera
+            self._camera = None
             camera.close()
 
-    def _started(self, wanted: CaptureRequest) -> Any:
+    def _start(self, request: CaptureRequest) -> Any:
         try:
-            from picamera2 import Picamera2  # noqa: PLC0415 - there on a Raspberry Pi only
+            # picamera2 exists on a Raspberry Pi only, and takes seconds to import.
+            from picamera2 import Picamera2  # noqa: PLC0415
         except ImportError:
             raise CameraFailed(
-                "picamera2 is not installed; on a Raspberry Pi: apt-get install python3-picamera2, and a Python that sees it"
+                "picamera2 is not installed; on a Raspberry Pi run apt-get install python3-picamera2, and use a Python that"
+                " finds it"
             ) from None
         try:
             camera = Picamera2(self._number)
         except (IndexError, RuntimeError, OSError) as error:
-            raise CameraFailed(
-                f"there is no camera {self._number} ({error}); check its cable and its connection"
-            ) from None
+            raise CameraFailed(f"camera {self._number} not found ({error}); check its cable and connection") from None
         try:
-            camera.configure(camera.create_still_configuration(main={"size": wanted.native, "format": "RGB888"}))
+            camera.configure(camera.create_still_configuration(main={"size": request.native, "format": "RGB888"}))
             camera.start()
         except (RuntimeError, OSError, ValueError) as error:
             camera.close()
-            raise CameraFailed(f"camera {self._number} does not start: {error}") from None
+            raise CameraFailed(f"cannot start camera {self._number}: {error}") from None
         return camera

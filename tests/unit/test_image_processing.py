@@ -17,21 +17,22 @@ import pytest
 import skimage.data
 from depth import examples
 from fractus_core.policy.decision_types import Attitude, Filter, Home, Lens
-from fractus_services.camera.drivers.connection import driver_for
-from fractus_services.camera.drivers.driver import BadConnection, CameraFailed, CaptureRequest
-from fractus_services.camera.face_detection import BadModel, CascadeDetector, ModelDetector, smallest_face_px
-from fractus_services.camera.filter_pipeline import FacesNotReliable, plan_filters
-from fractus_services.camera.filters import (
-    black,
+from fractus_services.camera.drivers.connection import create_driver
+from fractus_services.camera.drivers.driver import CameraFailed, CaptureRequest, InvalidCameraConnection
+from fractus_services.camera.face_detection import CascadeDetector, InvalidFaceModel, ModelDetector, smallest_face_px
+from fractus_services.camera.filter_pipeline import (
+    FaceDetectionUnreliable,
+    blacken,
     blur_average,
     blur_median,
     hide_faces,
-    moving,
+    plan_filters,
     remove_background,
 )
 from fractus_services.camera.image_metadata import with_metadata
-from fractus_services.camera.image_record import ImageRecord
-from fractus_services.camera.pixels import NotAPicture, Pixels, decoded, encoded, fitted, source_size
+from fractus_services.camera.image_store import ImageRecord
+from fractus_services.camera.motion_detection import detect_motion
+from fractus_services.camera.pixels import InvalidImage, Pixels, crop_and_resize, decode_image, encode_jpeg, source_size
 from fractus_services.camera.pose import Pose, is_upright
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -64,14 +65,14 @@ def test_a_blur_leaves_sixteen_values_across_and_no_face(blur: Any, photo: Pixel
     blurred = blur(photo)
     assert blurred.shape == photo.shape
     assert abs(float(blurred.mean()) - float(photo.mean())) < 12
-    assert not covers(detector.find(blurred, 48, upright=True), FACE)
+    assert not covers(detector.detect(blurred, 48, upright=True), FACE)
     # Structure finer than a cell is gone: what is left follows from 16x16 values.
     few = cv2.resize(blurred[16::32, 16::32], (512, 512), interpolation=cv2.INTER_LINEAR)
     assert float(np.abs(few.astype(float) - blurred).mean()) < 6
 
 
 def test_black_is_black(photo: Pixels) -> None:
-    assert black(photo).max() == 0
+    assert blacken(photo).max() == 0
 
 
 @pytest.mark.parametrize("method", ["pixelate", "gaussian"])
@@ -80,7 +81,7 @@ def test_a_hidden_face_is_found_no_more(method: Any, width_px: int, photo: Pixel
     scale = width_px / 97
     picture = cv2.resize(photo, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     face = tuple(int(v * scale) for v in FACE)
-    boxes = detector.find(picture, 48, upright=True)
+    boxes = detector.detect(picture, 48, upright=True)
     assert covers(boxes, face)  # type: ignore[arg-type]
     hidden = hide_faces(picture, boxes, method)
     x, y, w, h = face
@@ -123,7 +124,7 @@ def test_faces_are_found_in_every_direction(turn: int, light: float, photo: Pixe
     matrix = cv2.getRotationMatrix2D(middle, turn, 60 / 97)
     matrix[:, 2] += (90 - middle[0], 90 - middle[1])
     scene = cv2.convertScaleAbs(cv2.warpAffine(photo, matrix, (180, 180), borderMode=cv2.BORDER_REFLECT), alpha=light)
-    assert covers(detector.find(scene, 56, upright=False), (60, 60, 60, 60))
+    assert covers(detector.detect(scene, 56, upright=False), (60, 60, 60, 60))
 
 
 def test_what_moves_is_kept_and_the_rest_is_black(photo: Pixels) -> None:
@@ -133,13 +134,13 @@ def test_what_moves_is_kept_and_the_rest_is_black(photo: Pixels) -> None:
         return picture
 
     before, now, after = (frame(s, c) for s, c in ((0, 100), (3, 200), (6, 300)))
-    mask = moving(before, now, after, fixed=False)
+    mask = detect_motion(before, now, after, fixed=False)
     assert mask is not None
     kept = remove_background(now, mask)
     assert (kept[352:378, 202:238] == (0, 0, 255)).all()
     assert (kept.max(axis=2) > 0).mean() < 0.08, "the landscape, and where the car was, are gone"
     assert kept[66:163, 177:274].max() == 0
-    standing = moving(frame(0, 100), frame(0, 200), frame(0, 300), fixed=True)
+    standing = detect_motion(frame(0, 100), frame(0, 200), frame(0, 300), fixed=True)
     assert standing is not None
     assert standing[360, 220]
     assert not standing[360, 120]
@@ -154,7 +155,7 @@ def test_a_mast_that_sways_shows_nothing_that_stands(sway_px: int, photo: Pixels
         matrix = cv2.getRotationMatrix2D((256, 256), (i - 1) * sway_px / 20, 1.0)
         matrix[:, 2] += ((i - 1) * sway_px, sway_px * (i == 1) / 2)
         frames.append(np.asarray(cv2.warpAffine(picture, matrix, (512, 512), borderMode=cv2.BORDER_REFLECT), np.uint8))
-    mask = moving(*frames, fixed=True)
+    mask = detect_motion(*frames, fixed=True)
     assert mask is not None
     assert mask[360:370, 205:235].all(), "the car"
     assert mask.mean() < 0.08
@@ -164,7 +165,7 @@ def test_a_fixed_camera_that_sees_little_shows_what_moves(photo: Pixels) -> None
     frames = [np.full_like(photo, 90) for _ in range(3)]
     for i, frame in enumerate(frames):
         frame[350:380, 100 * i + 100 : 100 * i + 140] = (40, 200, 40)
-    mask = moving(*frames, fixed=True)
+    mask = detect_motion(*frames, fixed=True)
     assert mask is not None
     assert mask[352:378, 202:238].all()
     assert mask.mean() < 0.02
@@ -180,7 +181,7 @@ def test_a_camera_that_adapts_to_light_shows_nothing_that_stands(
         picture = np.roll(photo, 0 if fixed else 3 * i, axis=1).copy()
         picture[350:380, car : car + 40] = (40, 200, 40)
         frames.append(cv2.convertScaleAbs(picture, alpha=factor))
-    mask = moving(*frames, fixed=fixed)
+    mask = detect_motion(*frames, fixed=fixed)
     assert mask is not None
     assert mask[352:378, 202:238].all(), "the car"
     assert mask.mean() < 0.08
@@ -188,7 +189,7 @@ def test_a_camera_that_adapts_to_light_shows_nothing_that_stands(
 
 def test_where_light_changes_too_much_nothing_is_shown(photo: Pixels) -> None:
     dark = cv2.convertScaleAbs(photo, alpha=0.3)
-    assert moving(photo, dark, photo, fixed=True) is None
+    assert detect_motion(photo, dark, photo, fixed=True) is None
 
 
 def test_where_motion_is_unknown_nothing_is_shown(photo: Pixels) -> None:
@@ -196,7 +197,7 @@ def test_where_motion_is_unknown_nothing_is_shown(photo: Pixels) -> None:
     noise = np.random.default_rng(3).integers(0, 256, photo.shape).astype(np.uint8)
     plain = np.full_like(photo, 90)
     for before, after in ((noise, other), (plain, plain)):
-        mask = moving(before, photo, after, fixed=False)
+        mask = detect_motion(before, photo, after, fixed=False)
         assert mask is None
         assert remove_background(photo, mask).max() == 0
 
@@ -225,7 +226,7 @@ def test_the_smallest_face_follows_from_lens_distance_and_pixels() -> None:
     ],
 )
 def test_people_stand_upright_only_where_every_pose_says_so(lens: Any, attitudes: list[Any], upright: bool) -> None:
-    assert is_upright([Pose.of(at(lens=lens, attitude=attitude)) for attitude in attitudes]) is upright
+    assert is_upright([Pose.from_situation(at(lens=lens, attitude=attitude)) for attitude in attitudes]) is upright
 
 
 def test_where_faces_are_not_found_reliably_the_fallback_applies(detector: CascadeDetector) -> None:
@@ -236,16 +237,16 @@ def test_where_faces_are_not_found_reliably_the_fallback_applies(detector: Casca
     assert plan_filters((faces("blurAverage"),), 47, detector).filters == (Filter("blurAverage"),)
     assert plan_filters((faces("black"), Filter("removeBackground")), 0, detector).filters == (Filter("black"),)
     assert plan_filters((Filter("blurMedian"),), 0, detector).note == ""
-    with pytest.raises(FacesNotReliable, match="6 pixels"):
+    with pytest.raises(FaceDetectionUnreliable, match="6 pixels"):
         plan_filters((faces("refuse"),), 6, detector)
 
 
 def test_a_model_that_is_none_is_refused_with_a_sentence(tmp_path: Path) -> None:
-    with pytest.raises(BadModel, match="there is no such file"):
+    with pytest.raises(InvalidFaceModel, match="file not found"):
         ModelDetector(tmp_path / "none.onnx")
     corrupt = tmp_path / "corrupt.onnx"
     corrupt.write_bytes(b"\x08\x01 this is no network" * 50)
-    with pytest.raises(BadModel, match="cannot use it as a face detector"):
+    with pytest.raises(InvalidFaceModel, match="cannot use it as a face detector"):
         ModelDetector(corrupt)
 
 
@@ -259,19 +260,19 @@ def test_cropping_keeps_proportions_and_shows_no_more(width: int, height: int, n
     assert source[0] >= width
     assert source[1] >= height
     assert abs(source[0] / source[1] - native[0] / native[1]) < 0.1 * native[0] / native[1]
-    assert fitted(np.zeros((source[1], source[0], 3), np.uint8), width, height).shape == (height, width, 3)
+    assert crop_and_resize(np.zeros((source[1], source[0], 3), np.uint8), width, height).shape == (height, width, 3)
 
 
 def test_the_middle_is_kept() -> None:
     picture = np.zeros((100, 300, 3), np.uint8)
     picture[:, 100:200] = 255
-    assert fitted(picture, 50, 50).min() > 250
+    assert crop_and_resize(picture, 50, 50).min() > 250
 
 
 @pytest.mark.parametrize("data", [b"", b"no picture", b"\xff\xd8\xff\xe0broken"])
 def test_what_is_no_picture_is_said_so(data: bytes) -> None:
-    with pytest.raises(NotAPicture):
-        decoded(data)
+    with pytest.raises(InvalidImage):
+        decode_image(data)
 
 
 @pytest.mark.parametrize("shape", [(40, 60), (40, 60, 3), (40, 60, 4)])
@@ -282,7 +283,7 @@ def test_pictures_are_read_as_opencv_reads_them(shape: tuple[int, ...], suffix: 
     made = np.random.default_rng(3).integers(0, np.iinfo(kind).max, shape, kind)
     data = cv2.imencode(f".{suffix}", made)[1].tobytes()
     expected = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    assert np.abs(decoded(data).astype(int) - expected).max() <= 1
+    assert np.abs(decode_image(data).astype(int) - expected).max() <= 1
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
@@ -291,27 +292,27 @@ def test_pictures_are_turned_upright(photo: Pixels, orientation: int) -> None:
     exif[0x0112] = orientation
     Image.fromarray(photo[:100, :60, ::-1]).save(out, "JPEG", quality=95, exif=exif)
     expected = cv2.imdecode(np.frombuffer(out.getvalue(), np.uint8), cv2.IMREAD_COLOR)
-    assert decoded(out.getvalue()).shape == expected.shape
-    assert np.abs(decoded(out.getvalue()).astype(int) - expected).mean() < 2
+    assert decode_image(out.getvalue()).shape == expected.shape
+    assert np.abs(decode_image(out.getvalue()).astype(int) - expected).mean() < 2
 
 
 def test_half_a_picture_is_none(photo: Pixels) -> None:
-    data = encoded(photo)
-    with pytest.raises(NotAPicture):
-        decoded(data[: len(data) // 2])
+    data = encode_jpeg(photo)
+    with pytest.raises(InvalidImage):
+        decode_image(data[: len(data) // 2])
 
 
 def test_more_pixels_than_a_camera_has_are_not_read() -> None:
     out = io.BytesIO()
     Image.new("1", (10_000, 5_001)).save(out, "PNG")
-    with pytest.raises(NotAPicture, match="too many"):
-        decoded(out.getvalue())
+    with pytest.raises(InvalidImage, match="the limit is 50000000 pixels"):
+        decode_image(out.getvalue())
 
 
 def test_pictures_tell_where_they_were_taken(photo: Pixels) -> None:
     lens = Lens(60.0, 45.0, pitch_deg=-30.0, yaw_deg=10.0, stabilised=True)
-    pose = Pose.of(at(30, 40, alt=12.5, lens=lens, attitude=Attitude(5, 5, 80.0)))
-    data = with_metadata(encoded(photo), pose, time_s=NOW + 0.25, camera="Pi Camera ü", view_width_px=512)
+    pose = Pose.from_situation(at(30, 40, alt=12.5, lens=lens, attitude=Attitude(5, 5, 80.0)))
+    data = with_metadata(encode_jpeg(photo), pose, time_s=NOW + 0.25, camera="Pi Camera ü", view_width_px=512)
     with Image.open(io.BytesIO(data)) as picture:
         assert np.asarray(picture).shape == photo.shape
         exif = picture.getexif()
@@ -341,7 +342,7 @@ def test_pictures_tell_where_they_were_taken(photo: Pixels) -> None:
 
 def test_a_picture_from_nowhere_and_below_the_sea_can_be_with_metadata(photo: Pixels) -> None:
     for now in (at(lens=None, home=None), at(home=Home(-33.9, -70.0, -50.0), alt=1.0)):
-        data = with_metadata(encoded(photo), Pose.of(now), time_s=NOW, camera="", view_width_px=512)
+        data = with_metadata(encode_jpeg(photo), Pose.from_situation(now), time_s=NOW, camera="", view_width_px=512)
         with Image.open(io.BytesIO(data)) as picture:
             gps = picture.getexif().get_ifd(0x8825)
         assert (6 in gps) == (now.home is not None)
@@ -353,20 +354,20 @@ def test_a_picture_from_nowhere_and_below_the_sea_can_be_with_metadata(photo: Pi
 def test_records_of_pictures_survive_json() -> None:
     import json
 
-    pose = Pose.of(at(attitude=Attitude(1, 2, 3)))
-    shot = ImageRecord(
-        "n", NOW, 10, 20, 30, (pose, Pose.of(at(home=None))), 12.0, (Filter("blurFaces", "gaussian"),), True
+    pose = Pose.from_situation(at(attitude=Attitude(1, 2, 3)))
+    record = ImageRecord(
+        "n", NOW, 10, 20, 30, (pose, Pose.from_situation(at(home=None))), 12.0, (Filter("blurFaces", "gaussian"),), True
     )
-    assert ImageRecord.parse(json.loads(json.dumps(shot.to_json()))) == shot
-    for broken in ({}, {"before": 1}, {**shot.to_json(), "colour": "red"}):
-        with pytest.raises(ValueError, match="no shot"):
-            ImageRecord.parse(broken)
+    assert ImageRecord.from_json(json.loads(json.dumps(record.to_json()))) == record
+    for broken in ({}, {"before": 1}, {**record.to_json(), "colour": "red"}):
+        with pytest.raises(ValueError, match="invalid image record"):
+            ImageRecord.from_json(broken)
 
 
 # Drivers
 
 
-def wanted(**more: Any) -> CaptureRequest:
+def capture_request(**more: Any) -> CaptureRequest:
     return CaptureRequest(64, 48, (64, 48), "RGB", at(**more))
 
 
@@ -374,8 +375,8 @@ def wanted(**more: Any) -> CaptureRequest:
     "connection", ["", "ftp://x/", "v4l2:", "picamera2:x", "directory:", "test:x", "http://", "http://h:x/"]
 )
 def test_what_names_no_camera_is_refused(connection: str) -> None:
-    with pytest.raises(BadConnection):
-        driver_for(connection)
+    with pytest.raises(InvalidCameraConnection):
+        create_driver(connection)
 
 
 @pytest.mark.parametrize(
@@ -383,7 +384,7 @@ def test_what_names_no_camera_is_refused(connection: str) -> None:
     [("http://h/", 2.0), ("picamera2:0", 0.3), ("v4l2:/dev/video0", 0.0), ("directory:/", 0.0), ("test:", 0.0)],
 )
 def test_cameras_tell_how_old_their_pictures_may_be(connection: str, latency_s: float) -> None:
-    assert driver_for(connection).latency_s == latency_s
+    assert create_driver(connection).latency_s == latency_s
 
 
 def test_cameras_that_are_not_there_say_so(tmp_path: Path) -> None:
@@ -391,14 +392,14 @@ def test_cameras_that_are_not_there_say_so(tmp_path: Path) -> None:
     no_camera.write_bytes(b"no device")
     for connection, sentence in (
         ("v4l2:/dev/no-such-video", "connect the camera"),
-        (f"v4l2:{no_camera}", "cannot be opened as a camera"),
+        (f"v4l2:{no_camera}", "as a camera; check"),
         ("picamera2:0", "picamera2 is not installed"),
-        (f"directory:{tmp_path}/none", "cannot be read"),
+        (f"directory:{tmp_path}/none", "cannot read"),
         (f"directory:{tmp_path}", "GPS position"),
     ):
-        driver = driver_for(connection)
+        driver = create_driver(connection)
         with pytest.raises(CameraFailed, match=sentence):
-            driver.capture(wanted())
+            driver.capture(capture_request())
         driver.close()
 
 
@@ -430,15 +431,15 @@ def test_a_raspberry_camera_is_configured_started_and_started_again(monkeypatch:
             self.broken = True
 
     monkeypatch.setitem(sys.modules, "picamera2", types.SimpleNamespace(Picamera2=Picamera2))
-    driver = driver_for("picamera2:1")
-    assert driver.capture(wanted()).shape == (48, 64, 3)
+    driver = create_driver("picamera2:1")
+    assert driver.capture(capture_request()).shape == (48, 64, 3)
     begun[0].broken = True
-    with pytest.raises(CameraFailed, match="started again next time"):
-        driver.capture(wanted())
-    assert driver.capture(wanted()).max() == 7
+    with pytest.raises(CameraFailed, match="the next request restarts it"):
+        driver.capture(capture_request())
+    assert driver.capture(capture_request()).max() == 7
     assert len(begun) == 2
-    with pytest.raises(CameraFailed, match="there is no camera 0"):
-        driver_for("picamera2:0").capture(wanted())
+    with pytest.raises(CameraFailed, match="camera 0 not found"):
+        create_driver("picamera2:0").capture(capture_request())
 
 
 def test_a_video_device_that_ignores_the_size_it_was_set_to_gives_no_picture_of_a_known_view(
@@ -451,12 +452,16 @@ def test_a_video_device_that_ignores_the_size_it_was_set_to_gives_no_picture_of_
     )  # fmt: skip
     monkeypatch.setattr(cv2, "VideoCapture", lambda *_: device)
     (tmp_path / "video0").touch()
-    driver = driver_for(f"v4l2:{tmp_path}/video0")
-    with pytest.raises(CameraFailed, match=r"640x480 pixels though it was set to 64x48.*services\.camera\.resolution"):
-        driver.capture(wanted(lens=Lens(60.0, 45.0)))
-    assert driver.capture(wanted(lens=None)).shape == (480, 640, 3), "a camera that is not described sees everything"
+    driver = create_driver(f"v4l2:{tmp_path}/video0")
+    with pytest.raises(
+        CameraFailed, match=r"640x480 pixels although it was set to 64x48.*services\.camera\.resolution"
+    ):
+        driver.capture(capture_request(lens=Lens(60.0, 45.0)))
+    assert driver.capture(capture_request(lens=None)).shape == (480, 640, 3), (
+        "a camera that is not described sees everything"
+    )
     device.read = lambda: (True, np.zeros((48, 64, 3), np.uint8))
-    assert driver.capture(wanted(lens=Lens(60.0, 45.0))).shape == (48, 64, 3)
+    assert driver.capture(capture_request(lens=Lens(60.0, 45.0))).shape == (48, 64, 3)
 
 
 def test_a_directory_gives_the_picture_that_was_taken_nearest_in_space(tmp_path: Path) -> None:
@@ -467,7 +472,7 @@ def test_a_directory_gives_the_picture_that_was_taken_nearest_in_space(tmp_path:
     ):
         picture = np.full((48, 64, 3), level, np.uint8)
         (tmp_path / f"{name}.jpg").write_bytes(
-            with_metadata(encoded(picture), Pose.of(place), time_s=NOW, camera="", view_width_px=64)
+            with_metadata(encode_jpeg(picture), Pose.from_situation(place), time_s=NOW, camera="", view_width_px=64)
         )
     (tmp_path / "untagged.png").write_bytes(bytes(cv2.imencode(".png", np.zeros((4, 4, 3), np.uint8))[1]))
     (tmp_path / "broken.jpg").write_bytes(b"no picture")
@@ -475,15 +480,15 @@ def test_a_directory_gives_the_picture_that_was_taken_nearest_in_space(tmp_path:
     header = struct.pack("<IIIIiiHHIIiiII", 54, 0, 54, 40, 60_000, 60_000, 1, 24, *[0] * 6)
     (tmp_path / "mosaic.tif").write_bytes(b"BM" + header)
     os.mkfifo(tmp_path / "pipe.jpg")
-    driver = driver_for(f"directory:{tmp_path}")
+    driver = create_driver(f"directory:{tmp_path}")
 
     def level(**place: float) -> int:
-        return round(float(driver.capture(wanted(**place)).mean()))
+        return round(float(driver.capture(capture_request(**place)).mean()))
 
     assert (level(x=5, y=3, alt=20), level(x=40, y=0, alt=20), level(x=40, y=0, alt=70)) == (10, 100, 200)
     late = np.full((48, 64, 3), 250, np.uint8)
     (tmp_path / "d.jpg").write_bytes(
-        with_metadata(encoded(late), Pose.of(at(5, 3, alt=20)), time_s=NOW, camera="", view_width_px=64)
+        with_metadata(encode_jpeg(late), Pose.from_situation(at(5, 3, alt=20)), time_s=NOW, camera="", view_width_px=64)
     )
     assert level(x=5, y=3, alt=20) == 250
     with pytest.raises(CameraFailed, match="position is unknown"):

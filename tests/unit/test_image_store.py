@@ -1,4 +1,4 @@
-"""The album: what is kept of pictures, and for how long."""
+"""Image store: records, quotas, permissions and damaged files."""
 
 from __future__ import annotations
 
@@ -26,63 +26,64 @@ def world(tmp_path: Path) -> Iterator[World]:
 
 async def test_the_album_forgets_what_a_crash_left_and_makes_room(tmp_path: Path) -> None:
     world = World(tmp_path)
-    shot = await world.capture(active_grant())
+    record = await world.capture(active_grant())
     folder = next(path for path in world.directory.iterdir() if path.is_dir())
     (folder / "20260101000000000-0001.jpg").write_bytes(b"half")
     (folder / ".20260101000000000-0002.jpg.7.tmp").write_bytes(b"half")
     (folder / "20260101000000000-0003.json").write_text('{"name": "old"}')
-    album = ImageStore(world.directory, 50, 10**9)
-    assert [s.name for s in album.list(owner_of(active_grant()))] == [shot.name]
+    store = ImageStore(world.directory, 50, 10**9)
+    assert [s.name for s in store.list(owner_of(active_grant()))] == [record.name]
     assert len(list(folder.glob("*.jpg*"))) == 1
-    assert album.list(owner_of(active_grant())) == (shot,), "a shot survives its record"
+    assert store.list(owner_of(active_grant())) == (record,), "a shot survives its record"
 
     living = [owner_of(active_grant(instance="other"))]
     small = ImageStore(world.directory, 50, 10**9, 1000, lambda: living)
     assert small.quota_problem(living[0]) == "", "pictures of those who are gone make room"
     assert not folder.exists()
-    small.add(living[0], replace(shot, name="20260101000000000-0009.jpg"), b"x" * 2000)
+    small.add(living[0], replace(record, name="20260101000000000-0009.jpg"), b"x" * 2000)
     assert "--keep-total-mb" in small.quota_problem(living[0])
     world.shutter.close()
 
 
 async def test_a_picture_whose_record_is_damaged_is_removed_and_never_handed_out(tmp_path: Path) -> None:
     world = World(tmp_path)
-    owner, shots = owner_of(active_grant()), [await world.capture(active_grant()) for _ in range(5)]
-    records = [world.album.path(owner, shot.name).with_suffix(".json") for shot in shots]
-    body = json.loads(records[0].read_text())
+    owner = owner_of(active_grant())
+    records = [await world.capture(active_grant()) for _ in range(5)]
+    files = [world.store.path(owner, record.name).with_suffix(".json") for record in records]
+    body = json.loads(files[0].read_text())
     poses = body.pop("poses")
-    records[0].write_text(json.dumps({**body, "poses": poses, "colour": "red"}))
-    records[1].write_text("{")
-    records[2].write_text(json.dumps({**body, "poses": []}))
-    records[3].write_text(json.dumps({**body, "poses": [{**poses[0], "lat": float("nan")}]}))
-    for shot in shots[:4]:
+    files[0].write_text(json.dumps({**body, "poses": poses, "colour": "red"}))
+    files[1].write_text("{")
+    files[2].write_text(json.dumps({**body, "poses": []}))
+    files[3].write_text(json.dumps({**body, "poses": [{**poses[0], "lat": float("nan")}]}))
+    for record in records[:4]:
         with pytest.raises(NoSuchImage, match=r"damaged.*DeleteImage"):
-            await world.library.retrieve(active_grant(), shot.name)
-    assert world.album.list(owner) == (shots[4],)
-    await world.library.delete(active_grant(), shots[0].name)
-    assert not records[0].with_suffix(".jpg").exists()
-    with pytest.raises(NoSuchImage, match="there is no picture"):
-        await world.library.delete(active_grant(), shots[0].name)
-    assert ImageStore(world.directory, 50, 10**9).list(owner) == (shots[4],)
-    assert [path.name for path in world.directory.glob("*/*.jpg")] == [shots[4].name]
+            await world.stored_images.retrieve(active_grant(), record.name)
+    assert world.store.list(owner) == (records[4],)
+    await world.stored_images.delete(active_grant(), records[0].name)
+    assert not files[0].with_suffix(".jpg").exists()
+    with pytest.raises(NoSuchImage, match="has no image"):
+        await world.stored_images.delete(active_grant(), records[0].name)
+    assert ImageStore(world.directory, 50, 10**9).list(owner) == (records[4],)
+    assert [path.name for path in world.directory.glob("*/*.jpg")] == [records[4].name]
     world.shutter.close()
 
 
 async def test_a_picture_of_an_earlier_release_has_an_unknown_place(tmp_path: Path) -> None:
     world = World(tmp_path)
-    shot = await world.capture(active_grant())
-    record = world.album.path(owner_of(active_grant()), shot.name).with_suffix(".json")
-    body = json.loads(record.read_text())
+    record = await world.capture(active_grant())
+    record_path = world.store.path(owner_of(active_grant()), record.name).with_suffix(".json")
+    body = json.loads(record_path.read_text())
     poses = body.pop("poses")
-    record.write_text(json.dumps({**body, "face_px": 900.0, "before": poses[0], "after": poses[-1]}))
+    record_path.write_text(json.dumps({**body, "face_px": 900.0, "before": poses[0], "after": poses[-1]}))
     world.shutter.close()
     world = World(tmp_path)
-    (kept,) = (await world.library.list(active_grant()))[1]
-    assert (kept.name, kept.poses[0].lat, kept.face_px) == (shot.name, None, 0.0)
-    assert await refusal(world.library.retrieve(active_grant(), shot.name)) == "PrivacyZone", (
+    (kept,) = (await world.stored_images.list(active_grant()))[1]
+    assert (kept.name, kept.poses[0].lat, kept.face_px) == (record.name, None, 0.0)
+    assert await refusal(world.stored_images.retrieve(active_grant(), record.name)) == "PrivacyZone", (
         "every policy in force holds"
     )
-    verdict, _, _ = await world.library.retrieve(active_grant(private("black")), shot.name)
+    verdict, _, _ = await world.stored_images.retrieve(active_grant(private("black")), record.name)
     assert verdict.policies == ("p",)
     world.shutter.close()
 
@@ -90,15 +91,15 @@ async def test_a_picture_of_an_earlier_release_has_an_unknown_place(tmp_path: Pa
 async def test_faces_are_not_looked_for_in_a_picture_that_may_be_a_part_of_the_view(tmp_path: Path) -> None:
     """Releases that cropped before they looked for faces did not say so."""
     world = World(tmp_path)
-    shot = await world.capture(active_grant())
-    record = world.album.path(owner_of(active_grant()), shot.name).with_suffix(".json")
-    body = json.loads(record.read_text())
+    record = await world.capture(active_grant())
+    record_path = world.store.path(owner_of(active_grant()), record.name).with_suffix(".json")
+    body = json.loads(record_path.read_text())
     assert body.pop("whole")
-    record.write_text(json.dumps({**body, "face_px": 900.0}))
+    record_path.write_text(json.dumps({**body, "face_px": 900.0}))
     world.shutter.close()
     world = World(tmp_path)
-    (kept,) = (await world.library.list(active_grant()))[1]
-    assert kept == replace(shot, face_px=0.0, whole=False)
+    (kept,) = (await world.stored_images.list(active_grant()))[1]
+    assert kept == replace(record, face_px=0.0, whole=False)
     world.shutter.close()
 
 
@@ -124,7 +125,7 @@ async def test_only_the_service_reads_pictures(world: World) -> None:
 
 
 async def test_pictures_of_an_earlier_release_are_closed_to_others(world: World) -> None:
-    shot = await world.capture(active_grant())
+    record = await world.capture(active_grant())
     for path in world.directory.rglob("*"):
         path.chmod(0o755 if path.is_dir() else 0o644)
     foreign = world.directory.parent / "foreign"
@@ -132,11 +133,11 @@ async def test_pictures_of_an_earlier_release_are_closed_to_others(world: World)
     foreign.chmod(0o644)
     (folder,) = (path for path in world.directory.iterdir() if path.is_dir())
     (folder / "20260101000000000-0001.json").symlink_to(foreign)
-    album = ImageStore(world.directory, 50, 10**9)
+    store = ImageStore(world.directory, 50, 10**9)
     (folder / "20260101000000000-0001.json").unlink(missing_ok=True)
     assert modes(world.directory) == {"folders": {0o700}, "files": {0o600}}
     assert stat.S_IMODE(foreign.stat().st_mode) == 0o644, "a link leads to no other file"
-    assert album.find(owner_of(active_grant()), shot.name) == shot
+    assert store.find(owner_of(active_grant()), record.name) == record
 
 
 async def test_a_full_disk_is_said_and_leaves_nothing_behind(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -149,7 +150,7 @@ async def test_a_full_disk_is_said_and_leaves_nothing_behind(world: World, monke
             await world.capture(active_grant())
     refused = storage_failed(caught.value)
     assert refused.verdict.code == "StorageFailed"
-    assert "make room on the node" in refused.verdict.reason
+    assert "free disk space on the node" in refused.verdict.reason
     assert [path for path in world.directory.rglob("*") if path.is_file()] == []
     await world.capture(active_grant())
 

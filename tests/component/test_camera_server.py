@@ -11,7 +11,7 @@ from exposed import get, values
 from fractus_cluster.ports import free_port
 from fractus_services import node_description
 from fractus_services.camera import server
-from fractus_services.options import CameraOptions
+from fractus_services.camera.settings import CameraSettings
 
 
 class Counted(server.ImageStore):
@@ -37,7 +37,7 @@ async def test_a_node_that_is_described_otherwise_keeps_its_album(
     monkeypatch.setattr(node_description, "POLL_INTERVAL_S", 0.01)
     node = tmp_path / "node.json"
     port = free_port()
-    options = CameraOptions(
+    options = CameraSettings(
         grants=tmp_path / "grants", tls=tmp_path / "tls", state=tmp_path / "state", audit=tmp_path / "audit", node="n",
         node_object=node, description=tmp_path / "none.yaml", listen="127.0.0.1:0", lock_timeout=0.0, mobility="unix:none", recordings=None, metrics=f"127.0.0.1:{port}",
         recordings_mb=0, keep=10, keep_mb=10, keep_total_mb=10, camera=None, face_model=None, face_px=20.0, relief=0.0,
@@ -47,7 +47,7 @@ async def test_a_node_that_is_described_otherwise_keeps_its_album(
     place = '{"apiVersion": "fractus.dev/v1alpha1", "kind": "EdgeNode", "metadata": {"name": "n"}, "spec": {"location": %s}}'
     async with asyncio.timeout(30):
         for lat in (50.0, 51.0):
-            await told(caplog, "what it sees is not described")
+            await told(caplog, "field of view not described")
             caplog.clear()
             node.write_text(place % f'{{"lat": {lat}, "lon": 8.0}}')
         await told(caplog, "described=True")

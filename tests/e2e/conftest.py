@@ -1,8 +1,8 @@
-"""One cluster with Fractus installed, shared by all end-to-end tests that a worker runs.
+"""Fixtures of end-to-end tests: a cluster with Fractus, shared by all tests of a worker.
 
-FRACTUS_E2E_CLUSTER=current runs them on the cluster of KUBECONFIG (k3s, kind), where the images are loaded and the nodes
-carry fractus.dev/class labels, with one worker; otherwise an embedded cluster comes up and goes down again
-(FRACTUS_E2E_KEEP=1 keeps it for the next run).
+By default, each worker starts an embedded cluster and stops it at the end (FRACTUS_E2E_KEEP=1 keeps it for the next run).
+FRACTUS_E2E_CLUSTER=current uses the cluster of KUBECONFIG (k3s, kind), with one worker. The cluster must have the images, and
+its nodes the labels fractus.dev/class.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ SYSTEM = "fractus-system"
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Everything here needs a cluster, and time; of two workers each has a cluster of its own."""
+    """Mark the tests of this folder as end-to-end tests, with a longer timeout."""
     for item in items:
         if pathlib.Path(__file__).parent in item.path.parents:
             item.add_marker(pytest.mark.e2e)
@@ -42,7 +42,7 @@ def _current() -> bool:
 
 
 def _nodes() -> Mapping[str, str]:
-    """The cluster's nodes, by the names that they have in the example."""
+    """Return the names of the cluster's nodes by their names in the example."""
     if not _current():
         return {name: name for name in EXAMPLE_NODES}
     done = subprocess.run(["kubectl", "get", "nodes", "-o", "json"], capture_output=True, timeout=60, check=True)
@@ -54,13 +54,13 @@ DRONE = NODES["drone-1"]
 
 
 def say(line: str) -> None:
-    """Progress of what takes long, past pytest's capture."""
+    """Print progress of a long step, in spite of pytest's capture."""
     os.write(2, f"e2e: {line}\n".encode())
 
 
 @pytest.fixture(scope="session")
 def cluster() -> Iterator[Cluster | None]:
-    """The embedded cluster; None when the tests run on the user's."""
+    """The embedded cluster, or None if the tests run on the user's cluster."""
     if _current():
         yield None
         return
@@ -80,7 +80,7 @@ def cluster() -> Iterator[Cluster | None]:
 
 @pytest.fixture(scope="session")
 def kube(cluster: Cluster | None) -> Kube:
-    """The cluster with CRDs, operator, agents and services, its drone ready to fly."""
+    """The cluster with Fractus installed by its charts, and its drone ready to fly."""
     if cluster is not None:
         programs = ensure_binaries(("kubectl", "helm"), report=say)
         kubectl, helm, kubeconfig = programs["kubectl"], programs["helm"], cluster.kubeconfig
@@ -111,7 +111,7 @@ def kube(cluster: Cluster | None) -> Kube:
 
 @pytest.fixture
 def grounded(kube: Kube) -> Iterator[Kube]:
-    """The cluster with its drone on the ground before the test, and without Applications after it."""
+    """The cluster with its drone on the ground. All Applications are deleted after the test."""
     kube.wait("the drone is on the ground", lambda: flight_state(kube) in {"inactive", "charging"}, timeout_s=120)
     yield kube
     kube.run("delete", "applications.fractus.dev", "--all", "-A", "--wait=true", "--timeout=60s", timeout_s=90)
@@ -119,16 +119,16 @@ def grounded(kube: Kube) -> Iterator[Kube]:
 
 
 def flight_state(kube: Kube) -> str | None:
-    """What the drone's agent last reported."""
+    """Return the flight state that the drone's agent last reported."""
     drone = kube.get("drone", DRONE)
     return ((drone or {}).get("status") or {}).get("flightState")
 
 
 def example(name: str) -> list[Object]:
-    """The objects of one of the example's manifests."""
+    """Return the objects of a manifest of the example."""
     return list(yaml.safe_load_all((EXAMPLE / name).read_text()))
 
 
 def short_flight(name: str, namespace: str = "default") -> Object:
-    """The example's Navigator alone, on a short path that stays near the depot: about a minute in the air."""
+    """Return an Application with only the example's Navigator, on a path of about a minute near the depot."""
     return flight(name, namespace)

@@ -1,4 +1,4 @@
-"""A cluster as the end-to-end tests see it: kubectl, waiting, and power over processes."""
+"""Access of end-to-end tests to a cluster: kubectl, waiting, and signals to processes of pods."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Object = dict[str, Any]
 
 
 class CommandFailed(AssertionError):
-    """A command that had to succeed did not."""
+    """A command failed that must succeed."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Kube:
     kubeconfig: pathlib.Path
 
     def run(self, *args: str, stdin: str | None = None, timeout_s: float = 60) -> subprocess.CompletedProcess[str]:
-        """Run kubectl and return what it said, whatever its exit code."""
+        """Run kubectl and return the completed process, also after an error."""
         return subprocess.run(
             [str(self.kubectl), *args],
             input=stdin,
@@ -58,16 +58,16 @@ class Kube:
         return done.stderr if done.returncode else ""
 
     def get(self, kind: str, name: str, namespace: str = "default") -> Object | None:
-        """The object, None when there is none."""
+        """Return an object, or None if it does not exist."""
         done = self.run("get", kind, name, "-n", namespace, "-o", "json", "--ignore-not-found")
         if done.returncode:
             raise CommandFailed(done.stderr.strip())
         return json.loads(done.stdout) if done.stdout.strip() else None
 
     def all(self, kind: str, namespace: str | None = None, selector: str = "") -> list[Object]:
-        """Objects of a kind, in one namespace or in all."""
-        where = ["-n", namespace] if namespace else ["-A"]
-        text = self.must("get", kind, *where, "-o", "json", *(["-l", selector] if selector else []))
+        """Return the objects of a kind, in one namespace or in all."""
+        scope = ["-n", namespace] if namespace else ["-A"]
+        text = self.must("get", kind, *scope, "-o", "json", *(["-l", selector] if selector else []))
         return list(json.loads(text)["items"])
 
     def wait(self, what: str, condition: Callable[[], Any], timeout_s: float = 60, poll_s: float = 0.3) -> Any:
@@ -82,11 +82,11 @@ class Kube:
             if found:
                 return found
             time.sleep(poll_s)
-        told = f" ({last})" if last else ""
-        raise AssertionError(f"waited {timeout_s:.0f} s for: {what}{told}\n{self.state()}")
+        cause = f" ({last})" if last else ""
+        raise AssertionError(f"waited {timeout_s:.0f} s for: {what}{cause}\n{self.state()}")
 
     def state(self) -> str:
-        """How everything stands, for the report of a test that failed."""
+        """Return the state of the cluster for the report of a failed test."""
         looks = (
             ("get", "applications.fractus.dev,deploymentplans.fractus.dev,grants.fractus.dev,drones.fractus.dev", "-A"),
             ("get", "applications.fractus.dev", "-A", "-o", 'jsonpath={range .items[*]}{.status}{"\\n"}{end}'),
@@ -96,7 +96,7 @@ class Kube:
         return "\n".join(done.stdout + done.stderr for done in (self.run(*look) for look in looks))
 
     def pod(self, selector: str, namespace: str, node: str | None = None) -> Object:
-        """The one running pod that a selector finds."""
+        """Return the only running pod that matches a selector."""
         pods = [
             p
             for p in self.all("pods", namespace, selector)
@@ -115,6 +115,6 @@ class Kube:
 
 
 def condition(obj: Object | None, type_: str) -> Mapping[str, Any]:
-    """A condition of an object, empty when it has none of that type."""
+    """Return a condition of an object, or an empty mapping."""
     conditions = ((obj or {}).get("status") or {}).get("conditions") or []
     return next((c for c in conditions if c["type"] == type_), {})

@@ -1,4 +1,4 @@
-"""Missions go on or end as they should while the API server, the operator and the link fail by a seeded schedule."""
+"""Missions under seeded faults of the API server, the operator and the link break no invariant."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""The embedded cluster: real nodes that can lose power and contact, complete repair, complete removal.
+"""The embedded cluster: nodes, loss of power and of links, repair and removal.
 
-These tests bring up clusters of their own, so they run wherever this is root on Linux, whatever FRACTUS_E2E_CLUSTER says.
+These tests start clusters of their own, also with FRACTUS_E2E_CLUSTER=current. They need root on Linux.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ spec: {{selector: {{app: web}}, ports: [{{port: 80, targetPort: 8080}}]}}
 
 
 def spec_of(name: str, nodes: int = 2) -> ClusterSpec:
-    """A drone with a disk of its own, and edge nodes."""
+    """Return a cluster of a drone with a separate disk, and edge nodes."""
     drone = load_spec(ROOT / "examples" / "clusters" / "demo.yaml").nodes[0].model_dump(by_alias=True)
     drone["hardware"]["disk"] = {"size": "32Mi"}
     edge = load_spec(ROOT / "examples" / "clusters" / "demo.yaml").nodes[1].model_dump(by_alias=True)
@@ -93,10 +93,10 @@ def until(condition: Callable[[], Any], what: str, timeout_s: float = 40.0) -> A
 
 
 def leftovers(name: str) -> list[str]:
-    """All that a cluster of this name has on the machine."""
+    """Return everything that a cluster of this name has on the machine."""
     found = [f"mount {line}" for line in Path("/proc/self/mountinfo").read_text().splitlines() if f"/{name}/" in line]
     found += [f"netns {p}" for p in Path("/run/netns").glob(f"fractus.{name}*")]
-    # os.walk passes over the groups of other clusters that vanish under its hands.
+    # os.walk ignores groups of other clusters that are removed meanwhile.
     groups = ((Path(parent), below) for parent, below, _ in os.walk("/sys/fs/cgroup"))
     found += [f"cgroup {parent / name}" for parent, below in groups if parent.name == "fractus-sim" and name in below]
     found += [f"state {p}" for p in (state_of(name).path, Path(f"/run/fractus-sim/cluster.{name}.lock")) if p.exists()]
@@ -113,18 +113,18 @@ def leftovers(name: str) -> list[str]:
 
 
 def ready(cluster: Cluster) -> dict[str, bool]:
-    """Which nodes the API server calls Ready."""
+    """Return the readiness of each node, as the API server reports it."""
     return {node.name: bool(node.ready) for node in cluster.status()}
 
 
 def pods(cluster: Cluster) -> dict[str, dict[str, Any]]:
-    """The workload's pods by node."""
+    """Return the workload's pods by node."""
     items = json.loads(cluster.kubectl("get", "pods", "-l", "app=web", "-o", "json").stdout)["items"]
     return {item["spec"]["nodeName"]: item for item in items if "nodeName" in item["spec"]}
 
 
 def running(cluster: Cluster, node: str) -> bool:
-    """Whether the workload's pod on a node is ready."""
+    """Return True if the workload's pod on a node is ready."""
     conditions = pods(cluster).get(node, {}).get("status", {}).get("conditions", [])
     return any(entry["type"] == "Ready" and entry["status"] == "True" for entry in conditions)
 
@@ -241,7 +241,7 @@ def test_cut_link_loses_contact_and_nothing_else(healthy: Cluster) -> None:
     assert again["status"]["containerStatuses"][0]["restartCount"] == 0
 
 
-def test_the_commands_of_its_page_do_what_they_say(healthy: Cluster) -> None:
+def test_documented_commands_of_the_embedded_cluster_work(healthy: Cluster) -> None:
     drone, edge = healthy.node("drone-1"), healthy.node("edge-1")
     typed_words = [shlex.split(line, comments=True) for line in shell_lines("docs/embedded-cluster.md")]
     lines = {words[2]: words for words in typed_words if len(words) > 3}

@@ -1,4 +1,4 @@
-"""What a user who may edit a namespace, and no more, gets of a drone: pods on it, but nothing of the node itself."""
+"""A user with the role `edit` in a namespace can run pods on a drone, but gets no access to the node itself."""
 
 from __future__ import annotations
 
@@ -167,7 +167,7 @@ GRASPS: dict[Callable[[Object, Object], None], str] = {
 
 
 @pytest.mark.parametrize("grasp", GRASPS, ids=lambda grasp: grasp.__name__)
-def test_pods_for_drones_get_nothing_of_the_node(alices: Kube, grasp: Callable[[Object, Object], None]) -> None:
+def test_pods_with_access_to_the_node_are_refused(alices: Kube, grasp: Callable[[Object, Object], None]) -> None:
     wanted = pod("grasp")
     grasp(wanted["spec"], wanted["spec"]["containers"][0])
     refusal = create(alices, wanted)
@@ -175,28 +175,28 @@ def test_pods_for_drones_get_nothing_of_the_node(alices: Kube, grasp: Callable[[
     assert GRASPS[grasp] in refusal
 
 
-def test_pods_that_take_nothing_run_there(alices: Kube) -> None:
+def test_pods_without_access_to_the_node_run_on_drones(alices: Kube) -> None:
     assert create(alices, pod("modest")) == ""
     running = alices.wait("the pod runs", lambda: phase(alices, "modest") == "Running" and get(alices, "modest"))
     assert running["spec"]["nodeName"] == DRONE
-    # What was let in can still be labelled and deleted.
+    # The user can still label and delete an admitted pod.
     alices.must("label", "pod", "modest", "-n", NAMESPACE, "--as", ALICE, "seen=yes")
     alices.must("delete", "pod", "modest", "-n", NAMESPACE, "--as", ALICE, "--timeout=30s")
 
 
-def test_debugging_such_a_pod_gives_no_more(alices: Kube) -> None:
+def test_debug_containers_get_no_access_to_the_node(alices: Kube) -> None:
     assert create(alices, pod("debugged")) == ""
     alices.wait("the pod runs", lambda: phase(alices, "debugged") == "Running")
     debug = {"name": "debug", "image": IMAGE, "securityContext": {"privileged": True}}
     patch = yaml.safe_dump({"spec": {"ephemeralContainers": [debug]}})
-    # By the administrator: edit does not reach so far by itself.
+    # As the administrator, because the role edit has no access to ephemeral containers.
     done = alices.run(
         "patch", "pod", "debugged", "-n", NAMESPACE, "--subresource=ephemeralcontainers", "--patch", patch
     )
     assert "allowPrivilegeEscalation to false" in done.stderr
 
 
-def test_a_deployment_makes_no_such_pods(alices: Kube) -> None:
+def test_deployments_create_no_pods_with_access_to_the_node(alices: Kube) -> None:
     template = grasping("unused")["spec"]
     deployment = {
         "apiVersion": "apps/v1",
@@ -213,11 +213,11 @@ def test_a_deployment_makes_no_such_pods(alices: Kube) -> None:
         conditions = (alices.get("deployment", "grasps", NAMESPACE) or {}).get("status", {}).get("conditions", [])
         return next((c["message"] for c in conditions if c["type"] == "ReplicaFailure"), "")
 
-    assert "fractus-pods" in alices.wait("the deployment says that it cannot", failure)
+    assert "fractus-pods" in alices.wait("the deployment reports a ReplicaFailure", failure)
     assert not alices.all("pods", NAMESPACE, "app=grasps")
 
 
-def test_a_waiting_pod_is_not_let_in_afterwards(alices: Kube) -> None:
+def test_pending_pod_gets_no_toleration_of_drones_later(alices: Kube) -> None:
     waiting = grasping("waiting")
     waiting["spec"]["schedulingGates"] = [{"name": "example.com/later"}]
     tolerations = waiting["spec"].pop("tolerations")
@@ -227,7 +227,7 @@ def test_a_waiting_pod_is_not_let_in_afterwards(alices: Kube) -> None:
     assert "remove hostNetwork" in done.stderr
 
 
-def test_naming_the_drone_does_not_get_a_pod_there(alices: Kube) -> None:
+def test_node_name_does_not_place_a_pod_on_a_drone(alices: Kube) -> None:
     named = grasping("named")
     del named["spec"]["tolerations"]
     named["spec"]["nodeName"] = DRONE
@@ -247,10 +247,10 @@ def test_naming_the_drone_does_not_get_a_pod_there(alices: Kube) -> None:
 
 
 def get(kube: Kube, name: str) -> Object | None:
-    """One of Alice's pods."""
+    """Return one of Alice's pods."""
     return kube.get("pod", name, NAMESPACE)
 
 
 def phase(kube: Kube, name: str) -> str:
-    """How far one of Alice's pods is."""
+    """Return the phase of one of Alice's pods."""
     return str(((get(kube, name) or {}).get("status") or {}).get("phase"))

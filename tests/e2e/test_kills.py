@@ -1,4 +1,4 @@
-"""Kill -9, in flight, of each part: the mission goes on or the system brings the drone home; no one flies unsupervised."""
+"""SIGKILL of each part in flight: the mission continues, or the system flies the drone home. No flight is unsupervised."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PARTS: dict[str, tuple[str, str, str | None]] = {
 @pytest.mark.parametrize(
     "part", [part if part == "mobility" else pytest.param(part, marks=pytest.mark.slow) for part in PARTS]
 )
-def test_kill_in_flight(grounded: Kube, part: str) -> None:
+def test_killed_part_does_not_leave_the_drone_unsupervised_in_flight(grounded: Kube, part: str) -> None:
     kube = grounded
     application = f"kill-{part}"
     entries = len(audit_log(kube))
@@ -43,7 +43,7 @@ def test_kill_in_flight(grounded: Kube, part: str) -> None:
 
 
 def in_midleg(kube: Kube, entries: int) -> Callable[[], bool]:
-    """Whether the audit log shows a goto that was let through."""
+    """Return a condition: the audit log shows an allowed Goto."""
 
     def seen() -> bool:
         return any(
@@ -54,7 +54,7 @@ def in_midleg(kube: Kube, entries: int) -> Callable[[], bool]:
 
 
 def landed(kube: Kube, entries: int) -> Callable[[], bool]:
-    """Whether the audit log, which is written a little later, shows that the service saw the drone land."""
+    """Return a condition: the audit log shows that the service detected the landing."""
 
     def seen() -> bool:
         return any(e["kind"] == "control" and e["action"] == "landed" for e in audit_log(kube)[entries:])

@@ -1,4 +1,4 @@
-"""The main job: one manifest flies a drone under policies, and leaves nothing behind."""
+"""Missions on a cluster: one manifest flies a drone under policies and leaves no objects behind."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import time
 
 import pytest
 from conftest import DRONE, NODES, SYSTEM, example, flight_state, short_flight
+from disclosure import readable, secrets
 from fractus_cli import main
 from fractus_runtime.audit_chain import verify
 from kubectl import Kube, Object, condition
 from leaks import leaks
-from told import secrets, told
 
 MOBILITY = "app.kubernetes.io/component=mobility"
 
@@ -59,7 +59,7 @@ def test_traffic_monitoring_flies_under_policies(grounded: Kube, capsys: pytest.
     kube.wait("all pods of the example are Ready", lambda: ready(kube, "traffic-monitoring"), timeout_s=60)
     print(f"apply to all pods Ready: {time.monotonic() - started:.1f} s")
     kept = secrets(kube)
-    said = {f"{what} in flight": text for what, text in told(kube).items()}
+    said = {f"{what} in flight": text for what, text in readable(kube).items()}
 
     plan = kube.get("deploymentplan", "traffic-monitoring")
     placed = {(p["component"], p.get("node")) for p in plan["spec"]["placements"]}
@@ -117,11 +117,11 @@ def test_traffic_monitoring_flies_under_policies(grounded: Kube, capsys: pytest.
 
     assert {f"{SYSTEM}/fractus-ca/tls.key", f"key of {DRONE}"} <= kept.keys()
     assert any(re.fullmatch(r"default/traffic-monitoring-navigator\b.*-tls/tls\.key", name) for name in kept)
-    said |= told(kube) | {"audit log": audit_text(kube)}
+    said |= readable(kube) | {"audit log": audit_text(kube)}
     assert leaks(said, kept) == []
 
 
-def test_deleting_the_application_in_flight_brings_the_drone_home(grounded: Kube) -> None:
+def test_deleted_application_flies_the_drone_home(grounded: Kube) -> None:
     kube = grounded
     kube.apply(short_flight("deleted"))
     kube.wait("the drone flies", lambda: flight_state(kube) == "flying", timeout_s=120)
@@ -133,7 +133,7 @@ def test_deleting_the_application_in_flight_brings_the_drone_home(grounded: Kube
     assert any(e.get("code") == "GrantRevoked" for e in takeovers)
 
 
-def test_a_component_that_fails_is_told_with_its_last_words(grounded: Kube) -> None:
+def test_status_has_the_last_output_of_a_failed_component(grounded: Kube) -> None:
     kube = grounded
     app = short_flight("failing")
     container = app["spec"]["components"][0]["container"]
@@ -151,7 +151,7 @@ def test_a_component_that_fails_is_told_with_its_last_words(grounded: Kube) -> N
     assert any(last_words in message for message in messages)
 
 
-def test_deleting_while_the_operator_is_down_leaves_nothing(grounded: Kube) -> None:
+def test_application_deleted_without_operator_leaves_no_objects(grounded: Kube) -> None:
     kube = grounded
     kube.apply(short_flight("orphan"))
     kube.wait("its grant is there", lambda: kube.all("grants.fractus.dev"), timeout_s=120)
@@ -178,15 +178,15 @@ def test_audit_log_is_an_unbroken_chain(kube: Kube) -> None:
 READ_METRICS = "import os, urllib.request as u; print(u.urlopen(f'http://{os.environ[\"FRACTUS_METRICS\"]}/metrics').read().decode())"
 
 
-def test_every_workload_tells_its_metrics(kube: Kube) -> None:
-    told = set()
+def test_every_workload_serves_metrics(kube: Kube) -> None:
+    checked = set()
     for pod in kube.all("pods", SYSTEM):
         name, (container,) = pod["metadata"]["name"], pod["spec"]["containers"]
         ports = {port["name"]: port["containerPort"] for port in container.get("ports", ())}
         if pod["status"]["phase"] != "Running":
             continue
         if any(variable["name"] == "FRACTUS_METRICS" for variable in container.get("env", ())):
-            # Nodes tell them to their own network alone, unless the chart is told otherwise.
+            # By default, workloads on nodes serve metrics on the loopback interface only.
             metrics = kube.must("exec", "-n", SYSTEM, name, "--", "python3", "-c", READ_METRICS)
         elif "metrics" in ports:
             metrics = kube.must(
@@ -195,5 +195,5 @@ def test_every_workload_tells_its_metrics(kube: Kube) -> None:
         else:
             continue
         assert "\nfractus_" in metrics, name
-        told.add(container["name"])
-    assert told == {"operator", "agent", "mobility", "camera"}
+        checked.add(container["name"])
+    assert checked == {"operator", "agent", "mobility", "camera"}

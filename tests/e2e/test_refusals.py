@@ -110,7 +110,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("make", BAD, ids=lambda make: make.__name__)
-def test_bad_manifest_is_refused_by_name(kube: Kube, make) -> None:
+def test_bad_manifest_is_refused_with_the_name_of_its_field(kube: Kube, make) -> None:
     bad = make()
     kind = {"Application": "application.fractus.dev", "Zone": "zone.fractus.dev", "Policy": "policy.fractus.dev"}[
         bad["kind"]

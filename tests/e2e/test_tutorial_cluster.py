@@ -34,7 +34,7 @@ def files(text: str) -> dict[str, str]:
 def typed(text: str) -> list[tuple[str, list[str]]]:
     """Return the commands of the text, each with the output that it shows."""
     found: list[tuple[str, list[str]]] = []
-    shell: bool | None = None  # None: outside of blocks
+    shell: bool | None = None  # unset outside of blocks
     for line in text.splitlines():
         if line.startswith("```"):
             shell = (line == "```") if shell is None else None

@@ -1,4 +1,4 @@
-"""Fractus is not uninstalled while someone needs it."""
+"""helm uninstall is refused while an Application exists."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.slow
 
 
 def helm(kube: Kube, *args: str) -> subprocess.CompletedProcess[str]:
-    """Run the helm beside kubectl, or else the one on PATH."""
+    """Run helm from the folder of kubectl, or from the PATH if that folder has none."""
     beside = kube.kubectl.with_name("helm")
     return subprocess.run(
         [str(beside) if beside.exists() else shutil.which("helm") or "helm", *args, "-n", SYSTEM],
@@ -27,9 +27,9 @@ def helm(kube: Kube, *args: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_uninstalling_is_refused_while_an_application_must_be_taken_down(kube: Kube) -> None:
+def test_uninstall_is_refused_while_an_application_exists(kube: Kube) -> None:
     application = short_flight("kept")
-    # It is never placed, so nothing flies; what counts is the finalizer.
+    # The Application is never placed, so no drone flies. Its finalizer blocks the uninstall.
     application["spec"]["components"][0]["controlPoints"][0]["point"] = {"depot": "nowhere"}
     application["metadata"]["finalizers"] = ["fractus.dev/teardown"]
     (release,) = json.loads(helm(kube, "list", "--filter", "^fractus$", "--output", "json").stdout)
@@ -37,8 +37,8 @@ def test_uninstalling_is_refused_while_an_application_must_be_taken_down(kube: K
     try:
         done = helm(kube, "uninstall", "fractus", "--timeout", "60s")
         assert done.returncode != 0
-        said = kube.must("logs", "job/fractus-uninstall", "-n", SYSTEM)
-        assert "take down default/kept: delete all Applications first" in said
+        log = kube.must("logs", "job/fractus-uninstall", "-n", SYSTEM)
+        assert "take down default/kept: delete all Applications first" in log
         assert kube.get("deployment", "fractus-operator", SYSTEM)
         assert kube.get("daemonset", "fractus-mobility", SYSTEM)
     finally:

@@ -1,4 +1,4 @@
-"""helm upgrade while a drone is in the air: its services stay, the operator goes on, and both are replaced on the ground."""
+"""helm upgrade during a flight: services and operator continue, and are replaced after the landing."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def refused(kube: Kube, *command: str) -> None:
     assert f"{DRONE} is in the air: wait until it has landed" in done.stderr, done.stderr
 
 
-def test_an_upgrade_in_flight_harms_no_flight(grounded: Kube) -> None:
+def test_upgrade_during_a_flight_does_not_disturb_it(grounded: Kube) -> None:
     kube = grounded
     entries = len(audit_log(kube))
     kube.apply(short_flight("upgraded"))
@@ -44,7 +44,7 @@ def test_an_upgrade_in_flight_harms_no_flight(grounded: Kube) -> None:
     before = services(kube)
     assert len(before) == 3
 
-    # What would take them away is refused, before anything is changed.
+    # Changes that would remove the services are refused.
     done = upgrade(kube, "mobility.enabled=false")
     assert done.returncode
     assert f"mobility.enabled: {DRONE} is in the air and keeps its services" in done.stderr
@@ -53,7 +53,7 @@ def test_an_upgrade_in_flight_harms_no_flight(grounded: Kube) -> None:
     refused(kube, "delete", "daemonset", "fractus-mobility", "-n", SYSTEM)
     mobility = next(name for name in before if "mobility" in name)
     refused(kube, "delete", "pod", mobility, "-n", SYSTEM, "--force", "--grace-period=0")
-    # An upgrade with other values and an image that does not exist goes through, and waits.
+    # An upgrade with other values and a missing image succeeds, but takes no effect during the flight.
     operators = {p["metadata"]["name"] for p in kube.all("pods", SYSTEM, "app.kubernetes.io/component=operator")}
     assert upgrade(kube, "image.tag=missing", "camera.resources.requests.cpu=21m").returncode == 0
     waits = kube.wait(
@@ -75,7 +75,7 @@ def test_an_upgrade_in_flight_harms_no_flight(grounded: Kube) -> None:
     kube.wait("the mission is over", lambda: phase(kube, "upgraded") in {"Completed", "Failed"}, timeout_s=240)
     assert phase(kube, "upgraded") == "Completed"
     assert not [e for e in audit_log(kube)[entries:] if e["kind"] == "takeover"]
-    # On the ground the operator replaces what is outdated, and the drone is ready again.
+    # After the landing the operator replaces outdated services, and the drone becomes ready again.
     camera = next(name for name in before if "camera" in name)
     kube.wait("the camera service is replaced", lambda: camera not in services(kube), timeout_s=120)
     kube.wait(

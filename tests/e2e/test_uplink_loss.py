@@ -1,4 +1,4 @@
-"""Direct links on real nodes when 4G is lost in flight: the drone's calls go on over WiFi, and all comes together afterwards."""
+"""Loss of the mobile uplink in flight: calls continue over a direct link, and the cluster recovers afterwards."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ pytestmark = pytest.mark.slow
 LINKS = EXAMPLE.parent / "links"
 PEER = "edge-1"
 CUT_S = 300.0 if DEEP else 75.0
-"""Longer than a connection gets old (30 s) and than an agent may be silent (45 s); five minutes where FRACTUS_DEEP is set."""
+"""Longer than the maximum connection age (30 s) and the silence limit of agents (45 s). Five minutes if FRACTUS_DEEP is set."""
 QUIET_S = 60.0
-"""So long the pictures, one a second, may stay away on a machine under load."""
+"""Maximum gap between pictures, of which there is one per second, on a machine under load."""
 NEAR_EDGE = ((50.864239, 4.679068), (50.865228, 4.679352))
 
 
 def slow_flight() -> Object:
-    """The example's application, to and fro beside edge-1 for about seven minutes."""
+    """Return the example's application, with a path of about seven minutes near edge-1."""
     (app,) = yaml.safe_load_all((LINKS / "application.yaml").read_text())
     navigator = next(c for c in app["spec"]["components"] if c["name"] == "Navigator")
     turns = [NEAR_EDGE[number % 2] for number in range(5)]
@@ -36,19 +36,23 @@ def slow_flight() -> Object:
 
 
 def received(kube: Kube, pod: str) -> list[float]:
-    """When an ImageChecker received pictures, Unix seconds."""
+    """Return the times at which an ImageChecker received pictures, in Unix seconds."""
     lines = kube.must("logs", pod, "--tail=-1").splitlines()
     return [json.loads(line)["at"] for line in lines if line.startswith("{")]
 
 
 def pods_of(kube: Kube) -> dict[str, tuple[str, int]]:
-    """The pods on the drone and of the application: their identities, and how often they restarted."""
+    """Return uid and restart count of the pods on the drone and of the application, by name."""
     found = {}
     for namespace in ("default", SYSTEM):
         for pod in kube.all("pods", namespace):
             if namespace == "default" or pod["spec"].get("nodeName") == DRONE:
                 found[pod["metadata"]["name"]] = (pod["metadata"]["uid"], restarts(pod))
     return found
+
+
+def drone_ready(kube: Kube) -> bool:
+    return condition(kube.get("drone", DRONE), "Ready").get("status") == "True"
 
 
 def linked(kube: Kube) -> bool:
@@ -58,7 +62,7 @@ def linked(kube: Kube) -> bool:
     )
 
 
-def test_4g_is_lost_in_flight(grounded: Kube, cluster: Cluster | None) -> None:
+def test_calls_continue_over_wifi_when_the_uplink_is_lost(grounded: Kube, cluster: Cluster | None) -> None:
     if cluster is None:
         pytest.skip("cuts the drone's uplink, which only the embedded cluster lets a test do")
     kube = grounded
@@ -70,8 +74,7 @@ def test_4g_is_lost_in_flight(grounded: Kube, cluster: Cluster | None) -> None:
     node.cut_link()
     cut_s = time.time()
     try:
-        ready = lambda: condition(kube.get("drone", DRONE), "Ready")  # noqa: E731 - asked three times
-        kube.wait("the drone's status says that it is silent", lambda: ready().get("status") != "True", timeout_s=CUT_S)
+        kube.wait("the drone is no longer Ready", lambda: not drone_ready(kube), timeout_s=CUT_S)
         assert condition(kube.get("node", DRONE), "Ready")["status"] == "Unknown"
         while (left_s := cut_s + CUT_S - time.time()) > 0:
             last_s = max(received(kube, checker))
@@ -81,7 +84,7 @@ def test_4g_is_lost_in_flight(grounded: Kube, cluster: Cluster | None) -> None:
     finally:
         node.heal_link()
     assert len(arrived) > CUT_S / 3
-    kube.wait("the drone is Ready again", lambda: ready().get("status") == "True", timeout_s=90)
+    kube.wait("the drone is Ready again", lambda: drone_ready(kube), timeout_s=90)
     kube.wait("its node is Ready again", lambda: condition(kube.get("node", DRONE), "Ready")["status"] == "True")
     kube.wait("traffic is direct by the status", lambda: linked(kube), timeout_s=30)
     assert pods_of(kube) == before

@@ -1,4 +1,4 @@
-"""What integration tests share: a bare control plane, the operator as a process on it, and a drone's services."""
+"""Fixtures of integration tests: a control plane without nodes, the operator as a process, and a drone's services."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from control_plane import ControlPlane, programs
 from mobility_rig import Rig
 from operator_world import OperatorProcess, World, fresh_namespace
 
-# A shell's background jobs ignore the one, what nohup starts the other; and so would every program that they start.
+# Background jobs of a shell ignore SIGINT, and nohup ignores SIGHUP. The programs that tests start would inherit that.
 for number in (signal.SIGINT, signal.SIGHUP):
     if signal.getsignal(number) is signal.SIG_IGN:
         signal.signal(number, signal.default_int_handler)
 
 LONG = ("test_scenario_field", "test_sdk_flight", "test_mobility_sdk", "test_mobility_lost")
-"""Modules whose flights take longest: what begins first lets no one wait for it at the end."""
+"""Modules with the longest flights. They run first, so that no worker runs them alone at the end."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the longest."""
+    """Sort the longest tests to the front."""
     items.sort(key=lambda item: item.path.stem not in LONG)
 
 
 @pytest.fixture
 async def rig(tmp_path: Path) -> AsyncIterator[Rig]:
-    """A drone's services and its vehicle, as processes that a test starts."""
+    """A drone's services and vehicle, which the test starts as processes."""
     rig = Rig(tmp_path)
     try:
         yield rig
@@ -40,7 +40,7 @@ async def rig(tmp_path: Path) -> AsyncIterator[Rig]:
 
 @pytest.fixture(scope="session")
 def control_plane(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ControlPlane]:
-    """A real API server with the CRDs installed; about 6 s, once a session."""
+    """A real API server with the CRDs. It starts once per session, in about 6 s."""
     directory: Path = tmp_path_factory.mktemp("control-plane")
     plane = ControlPlane(programs(), directory)
     try:
@@ -52,7 +52,7 @@ def control_plane(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ControlP
 
 @pytest.fixture
 def world(control_plane: ControlPlane) -> Iterator[World]:
-    """One drone, three edge nodes and a cloud node."""
+    """A world with one drone, three edge nodes and a cloud node."""
     world = World(control_plane)
     world.furnish()
     yield world
@@ -61,7 +61,7 @@ def world(control_plane: ControlPlane) -> Iterator[World]:
 
 @pytest.fixture(scope="module")
 def chart(control_plane: ControlPlane) -> Iterator[None]:
-    """What the chart fractus makes, but its workloads: accounts, roles, the admission policies."""
+    """Objects of the chart fractus without its workloads: accounts, roles and admission policies."""
     world = World(control_plane)
     fractus_chart.install(world)
     yield
@@ -70,19 +70,19 @@ def chart(control_plane: ControlPlane) -> Iterator[None]:
 
 @pytest.fixture
 def operator(control_plane: ControlPlane, world: World, tmp_path: Path) -> Iterator[OperatorProcess]:
-    """A running operator; its log is shown when the test fails."""
+    """A running operator. A failed test prints its log."""
     process = OperatorProcess(control_plane.kubeconfig, tmp_path / "operator.log")
     process.start()
     yield process
     code = process.stop() if process.running else None
     print(process.log())
-    # A signal that comes before the handlers are set ends it as well.
-    assert code in (0, -signal.SIGTERM, None), "the operator ended badly"
+    # SIGTERM ends the process before it has set its handlers.
+    assert code in (0, -signal.SIGTERM, None), f"the operator exited with code {code}"
 
 
 @pytest.fixture
 def namespace(world: World, request: pytest.FixtureRequest) -> Iterator[str]:
-    """A namespace of the test's own."""
+    """A separate namespace for the test."""
     name = "t-" + hashlib.sha256(f"{request.node.nodeid}{os.getpid()}".encode()).hexdigest()[:10]
     with fresh_namespace(world, name) as fresh:
         yield fresh

@@ -1,6 +1,6 @@
-"""A bare control plane on loopback ports (etcd, API server, controller manager), and a client for tests.
+"""Control plane without nodes on loopback ports (etcd, API server, controller manager), and a client for tests.
 
-No kubelets: objects are real, nothing runs. Tests say of pods what kubelets would say.
+There are no kubelets, so pods do not run. Tests write the status of pods in place of kubelets.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ _CONTROLLERS = (
 
 
 def programs() -> dict[str, Path]:
-    """The programs of a control plane; `fractus cluster binaries` builds them where the machine has none."""
+    """Return the programs of a control plane. Build those that the machine lacks, as `fractus cluster binaries` does."""
     found = ensure_binaries(PROGRAMS, report=print)
     return {name: found[name] for name in PROGRAMS}
 
 
 def wait_for(question: Callable[[], T | None], what: str | Callable[[], str], timeout_s: float = 60.0) -> T:
-    """Ask until the answer is true; fails with what was waited for."""
+    """Poll until the function returns a true value and return it. Fail with a description after the timeout."""
     end = time.monotonic() + timeout_s
     while True:
         answer = question()
@@ -51,7 +51,6 @@ def wait_for(question: Callable[[], T | None], what: str | Callable[[], str], ti
             raise AssertionError(
                 f"waited {timeout_s:.0f} s without success: {what if isinstance(what, str) else what()}"
             )
-        # Nothing can be awaited on a remote condition: ask again shortly.
         select_pause(0.05)
 
 
@@ -70,7 +69,7 @@ class ControlPlane:
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         self._started: dict[str, tuple[str, ...]] = {}
         self.data = directory / "etcd"
-        """What etcd keeps; to be copied or replaced while the storage is stopped."""
+        """Data directory of etcd. Tests may copy or replace it while the storage is stopped."""
         (directory / "pki").mkdir(parents=True)
         self.authority = Authority(directory / "pki")
         self.server = f"https://127.0.0.1:{free_port()}"
@@ -90,7 +89,7 @@ class ControlPlane:
         return path
 
     def as_user(self, name: str, user: str, groups: tuple[str, ...]) -> BlockingClient:
-        """A client with the certificate of a user in groups."""
+        """Return a client with the certificate of a user who is in groups."""
         credential = self.authority.issue(name, common_name=user, organizations=groups)
         return BlockingClient(
             with_certificate(self.server, self.ca, (credential.certificate, credential.key)), "kubectl"
@@ -100,7 +99,7 @@ class ControlPlane:
         return BlockingClient(with_certificate(self.server, self.ca, token=token), "kubectl")
 
     def start(self, kinds: bool = True) -> None:
-        """Bring it up, with our kinds unless the chart of them is to be installed."""
+        """Start the control plane. Install the CRDs if `kinds` is set."""
         client, peer = free_port(), free_port()
         accounts = self.authority.service_account_key()
         serving = self.authority.issue(
@@ -154,14 +153,14 @@ class ControlPlane:
         )
 
     def stop(self) -> None:
-        """Nothing of it is kept: a graceful end takes an API server that is still watched ten seconds."""
+        """Kill all processes. An API server with open watches would need ten seconds for a graceful exit."""
         self.admin.close()
         for process in reversed(self._processes.values()):
             process.kill()
             process.wait(10)
 
     def stop_storage(self) -> Callable[[], None]:
-        """End etcd and the API server, which keeps copies of it; returns what starts them again, on what is in `data` then."""
+        """Stop etcd and the API server, which caches its data. Return a function that starts both on the content of `data`."""
         ended = [(program, self._started[program]) for program in ("etcd", "kube-apiserver")]
         for program, _ in reversed(ended):
             process = self._processes.pop(program)

@@ -85,7 +85,7 @@ def test_equal_sources_give_equal_layers(tmp_path: Path) -> None:
             shutil.copy2(here, there)
     for name in ("Dockerfile", ".dockerignore"):
         shutil.copy(ROOT / name, checkout)
-    # In no image: without it, the steps of the first build would be taken for those of the second.
+    # This file is in no image. It keeps the second build from using the cached steps of the first.
     (checkout / "examples" / "another.txt").write_text(f"{time.time_ns()}\n")
     [one] = build_images(ROOT, targets=["component"], report=print)
     try:

@@ -1,4 +1,4 @@
-"""What a release publishes fits together: its charts name the images that its workflow pushes."""
+"""Consistency of a release: its charts name the images that its workflow pushes."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ VERSION = yaml.safe_load((CHARTS / "fractus" / "Chart.yaml").read_text())["versi
 EVERYTHING = ("--set=view.enabled=true", "--set=uninstall.wipeNodes=true")
 PARTS = ("operator", "agent", "mobility", "camera", "view")
 BUILT_ON = "component"
-"""The image of a release that no chart names: those of applications are built on it."""
+"""Base image of applications. Charts do not name it."""
 
 
 def script(beginning: str) -> str:
-    """The script of the workflow's step that starts so."""
+    """Return the script of the workflow's step with this beginning."""
     steps = [step for job in WORKFLOW["jobs"].values() for step in job["steps"]]
     (found,) = [step["run"] for step in steps if step.get("run", "").startswith(beginning)]
     return str(found)
@@ -55,12 +55,12 @@ echo "$(cat "${1#oci-archive:}") ${2#docker://}" >> saved-and-pushed
 """,
     "cosign": 'echo "$3" >> signed',
 }
-"""What stands for the programs that would build for half an hour, or reach a registry."""
+"""Replacements for programs that would build images for half an hour, or need a registry."""
 
 
 @pytest.fixture(scope="module")
 def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A directory in which the workflow's own commands have run for a tag, with stubs: `dist`, and lists of images."""
+    """A directory after the workflow's commands ran with stubs for a tag: `dist`, and lists of images."""
     folder = tmp_path_factory.mktemp("release")
     (folder / "programs").mkdir()
     for name, text in STUBS.items():
@@ -79,13 +79,13 @@ def rendered(folder: Path, chart: str, *values: str) -> list[Body]:
 
 
 def images_of(bodies: list[Body]) -> set[str]:
-    """The images that objects name, or manifests that they keep."""
+    """Return the images in objects and in manifests that ConfigMaps contain."""
     kept = [text for body in bodies if body["kind"] == "ConfigMap" for text in body["data"].values()]
     texts = [yaml.safe_dump(bodies), *kept]
     return {name for text in texts for name in re.findall(r"^ *(?:- )?image: (\S+)$", text, re.MULTILINE)}
 
 
-def test_the_charts_of_a_release_run_the_images_that_it_pushes(published: Path) -> None:
+def test_charts_of_a_release_name_its_pushed_images(published: Path) -> None:
     pairs = [line.split() for line in (published / "saved-and-pushed").read_text().splitlines()]
     assert all(saved == to for saved, to in pairs), (
         "an archive that is loaded has the name by which its image is pulled"
@@ -97,18 +97,18 @@ def test_the_charts_of_a_release_run_the_images_that_it_pushes(published: Path) 
     assert set((published / "signed").read_text().split()) == {f"{name.rpartition(':')[0]}@sha256:0" for name in pushed}
 
 
-def test_the_charts_of_a_checkout_run_the_images_that_are_built_from_it() -> None:
+def test_charts_of_a_checkout_name_its_built_images() -> None:
     bodies = [*render(*EVERYTHING), *render("--set=drone=d", chart=CHARTS / "fractus-demo")]
     assert images_of(bodies) == {image_name(target) for target in (*PARTS, "sim", "example-traffic-monitoring")}
 
 
-def test_a_tag_that_is_said_is_taken() -> None:
-    said = "--set=image.tag=1.2.3"
-    bodies = [*render(*EVERYTHING, said), *render("--set=drone=d", said, chart=CHARTS / "fractus-demo")]
+def test_image_tag_of_the_values_is_used() -> None:
+    tag = "--set=image.tag=1.2.3"
+    bodies = [*render(*EVERYTHING, tag), *render("--set=drone=d", tag, chart=CHARTS / "fractus-demo")]
     assert {name.rpartition(":")[2] for name in images_of(bodies)} == {"1.2.3"}
 
 
-def test_a_tag_of_another_version_is_refused() -> None:
+def test_dist_refuses_a_tag_of_another_version() -> None:
     done = subprocess.run(
         ["make", "dist", "TAG=v9.9.9", "PLATFORMS=none"],
         cwd=ROOT,
@@ -123,7 +123,7 @@ def test_a_tag_of_another_version_is_refused() -> None:
     )
 
 
-def test_an_audit_without_advisories_says_so() -> None:
+def test_audit_fails_if_advisories_are_unreachable() -> None:
     nowhere = {"HTTPS_PROXY": "http://127.0.0.1:9", "https_proxy": "http://127.0.0.1:9"}
     done = subprocess.run(
         ["make", "--silent", "audit"], cwd=ROOT, env={**os.environ, **nowhere}, capture_output=True, text=True, timeout=120, check=False
@@ -135,7 +135,7 @@ def test_an_audit_without_advisories_says_so() -> None:
 @pytest.mark.root
 @pytest.mark.timeout(900)
 @pytest.mark.xdist_group("cluster")
-def test_an_image_is_saved_under_the_name_that_the_charts_pull(tmp_path: Path) -> None:
+def test_archive_has_the_image_name_of_the_charts(tmp_path: Path) -> None:
     run(
         ["make", "archives", "RELEASED=component", "REGISTRY=registry.example/f", f"DIST={tmp_path}"],
         cwd=ROOT,
@@ -147,10 +147,12 @@ def test_an_image_is_saved_under_the_name_that_the_charts_pull(tmp_path: Path) -
     assert f"registry.example/f/component:{VERSION}" in image["RepoTags"]
 
 
-@pytest.mark.parametrize(("tag", "said"), [("0.0.1", True), (VERSION, False), ("", False)])
-def test_who_keeps_another_tag_is_told(control_plane: ControlPlane, published: Path, tag: str, *, said: bool) -> None:
+@pytest.mark.parametrize(("tag", "warned"), [("0.0.1", True), (VERSION, False), ("", False)])
+def test_notes_warn_about_another_image_tag(
+    control_plane: ControlPlane, published: Path, tag: str, *, warned: bool
+) -> None:
     argv = [helm(), "install", "fractus", str(published / "dist" / f"fractus-{VERSION}.tgz"), f"--set=image.tag={tag}"]
-    # Other tests have made what is of the chart, without helm.
+    # Other tests created objects of the chart without helm.
     argv += [
         "--namespace",
         SYSTEM,
@@ -163,4 +165,4 @@ def test_who_keeps_another_tag_is_told(control_plane: ControlPlane, published: P
     assert done.returncode == 0, done.stderr
     notes = done.stdout.partition("NOTES:")[2]
     assert f"from the images ghcr.io/some-one/fractus/NAME:{tag or VERSION}." in notes
-    assert (f"images with the tag {VERSION}; --set image.tag= takes them" in notes) is said
+    assert (f"images with the tag {VERSION}; --set image.tag= takes them" in notes) is warned

@@ -1,5 +1,5 @@
-# Of run.sh, for BY=kubeadm: a cluster of six machines as docs/clusters.md tells, of which Fractus knows nothing beforehand. The
-# machines are containers of the nodes' image that machine.sh makes; the program kind has no part in them.
+# Steps of run.sh for BY=kubeadm: a cluster of six machines, set up as docs/clusters.md describes, without kind. The machines
+# are containers of the node image that machine.sh builds.
 control_plane=ground
 declare -A classes=([falcon]=drone [kerb-a]=edge [kerb-b]=edge [kerb-c]=edge [rack]=cloud)
 network=fractus-kubeadm
@@ -13,7 +13,7 @@ delete() {
   docker network rm "$network" > /dev/null
 }
 
-# machine NAME: one whose container runtime answers.
+# machine NAME: start a machine and wait for its container runtime.
 machine() {
   docker run --detach --name "$1" --hostname "$1" --network "$network" --privileged --cgroupns private --tty \
     --security-opt seccomp=unconfined --security-opt apparmor=unconfined \
@@ -34,7 +34,7 @@ cluster() {
     | on "$control_plane" tee /etc/kubernetes/init.yaml > /dev/null
   on "$control_plane" kubeadm init --config /etc/kubernetes/init.yaml --ignore-preflight-errors all --skip-token-print
   on "$control_plane" cat /etc/kubernetes/admin.conf > "$KUBECONFIG"
-  # Its network plugin is in a namespace of its own, as flannel's.
+  # Its network plugin has a separate namespace, like flannel.
   kubectl create namespace kube-flannel
   sed 's/namespace: kube-system/namespace: kube-flannel/' tests/kind/node/default-cni.yaml | kubectl apply --filename -
   join=$(on "$control_plane" kubeadm token create --print-join-command)
@@ -52,12 +52,12 @@ cluster() {
   kubectl get nodes --output wide --label-columns fractus.dev/class
 }
 
-# What docs/clusters.md tells to type, for each image on the nodes that run it.
+# Run the commands of docs/clusters.md for each image on the nodes that need it.
 load() {
   local image class save import
   save=$(sed -n 's/^    \(docker save .*\)/\1/p' docs/clusters.md)
   import=$(sed -n '/^    docker save /{n;s/^    \(ctr .* import NAME.tar\)/\1/p}' docs/clusters.md)
-  [ -n "$save" ] && [ -n "$import" ] || { echo "docs/clusters.md does not say how images are saved and imported" >&2; return 1; }
+  [ -n "$save" ] && [ -n "$import" ] || { echo "docs/clusters.md has no commands to save and import images" >&2; return 1; }
   for image in "${targets[@]}"; do
     case $image in
       operator) class=cloud ;;
@@ -76,7 +76,7 @@ load() {
   done
 }
 
-# What docs/clusters.md tells of such a plugin: without it, what it loses would not come back on drones and edge nodes.
+# Run the command of docs/clusters.md that exempts the plugin's namespace, and check that deleted pods of it come back.
 plugin() {
   bash -e <(sed -n 's/^    \(helm upgrade .*kube-flannel.*\)/\1/p' docs/clusters.md)
   kubectl delete pod --all --namespace kube-flannel

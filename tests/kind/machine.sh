@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
-# machine.sh COMMAND...: run COMMAND with Docker, kind, kubectl and helm on a Debian machine that has no container engine
-# and reaches no registry of images (root). Everything is made here and ended with COMMAND: Docker's engine in namespaces
-# of its own, kind and Kubernetes from Go modules, Debian and the nodes' image by debootstrap.
+# machine.sh COMMAND...: run COMMAND with Docker, kind, kubectl and helm on a Debian machine without a container engine and
+# without access to an image registry (root). The script starts Docker's engine in separate namespaces, builds kind and
+# Kubernetes from Go modules and base and node images with debootstrap, and stops everything after COMMAND.
 #
-#   FRACTUS_KIND=FOLDER      keeps the engine's images there for the next time (some 6 GB)
-#   FRACTUS_KUBERNETES=1.34  Kubernetes of that version
+#   FRACTUS_KIND=FOLDER      keep the engine's images there for the next run (about 6 GB)
+#   FRACTUS_KUBERNETES=1.34  version of Kubernetes
 set -euo pipefail
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 source=$(cd "$here/../.." && pwd)
@@ -14,7 +14,7 @@ node=localhost/kind/node:dev
 network=fractus-kind
 home=${FRACTUS_KIND:-$(mktemp -d /var/tmp/fractus-kind.XXXXXX)}
 host_ca=/etc/ssl/certs/ca-certificates.crt
-# Kubelets set these for the whole machine.
+# Settings that kubelets change for the whole machine. They are restored at the end.
 sysctls=(kernel.panic kernel.panic_on_oops vm.overcommit_memory vm.panic_on_oom kernel.keys.root_maxbytes kernel.keys.root_maxkeys)
 
 say() { echo "machine: $*" >&2; }
@@ -33,11 +33,11 @@ programs() {
   export PATH="$home/bin:$PATH"
 }
 
-# Containers that ask for every capability get those that this machine may give away.
+# Write a wrapper of runc that limits privileged containers to the capabilities of this machine.
 runtime() {
   cat > "$home/bin/runc-bounded" <<'RUNC'
 #!/usr/bin/env bash
-# runc, asked for no capability that the machine lacks: CAP_SYS_RESOURCE.
+# runc without CAP_SYS_RESOURCE, which this machine lacks.
 arguments=("$@")
 for ((i = 0; i < $#; i++)); do
   case ${arguments[i]} in
@@ -70,8 +70,7 @@ engine() {
     runtime
     options+=(--add-runtime "bounded=$home/bin/runc-bounded" --default-runtime bounded)
   fi
-  # This one process is the whole engine: with it go its containers and their mounts. It would take a containerd that it
-  # finds in /run, which is of the machine.
+  # The containers and mounts end with this process. Its own /run/containerd keeps it from using the machine's containerd.
   setsid nsenter --net="/run/netns/$network" unshare --mount --pid --fork --kill-child --mount-proc \
     sh -c 'mkdir -p /run/containerd && mount -t tmpfs tmpfs /run/containerd && exec dockerd "$@"' dockerd "${options[@]}" \
     > "$home/dockerd.log" 2>&1 &
@@ -86,8 +85,8 @@ engine() {
   return 1
 }
 
-# What a registry would have. Builds find the machine's certificates in it, in case package indexes are behind a proxy;
-# no image of Fractus has a layer of it.
+# The base image, which a registry would provide otherwise. It has the machine's CA bundle, because package indexes may be
+# behind a proxy.
 debian() {
   docker image inspect "$base" > /dev/null 2>&1 || {
     say "making $base"

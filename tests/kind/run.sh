@@ -1,13 +1,13 @@
 #!/usr/bin/env bash
-# Everything on a cluster that kind makes: images by Docker, the charts, the end-to-end tests of a mission, the demo.
-# Needs docker, kind, kubectl and helm on the PATH; tests/kind/machine.sh brings them where they are missing.
+# Tests on a cluster of kind: images built by Docker, the charts, end-to-end tests of missions, the demo.
+# Needs docker, kind, kubectl and helm on the PATH. tests/kind/machine.sh provides them on machines without Docker.
 #
-#   BY=kubeadm            the cluster by kubeadm alone (tests/kind/kubeadm.sh)
+#   BY=kubeadm            create the cluster by kubeadm, without kind (tests/kind/kubeadm.sh)
 #   STEPS="cluster"       only these steps, of: images cluster load charts tests demo uninstall one_node
-#   ON_KIND="FILES..."    the tests, as `make test-kind` gives them
-#   KEEP=1                leaves the clusters
-#   KIND_NODE_IMAGE=NAME  the nodes' image; kind's own by default
-#   BUILD_OPTIONS="..."   for `docker build`
+#   ON_KIND="FILES..."    the test files to run
+#   KEEP=1                keep the clusters
+#   KIND_NODE_IMAGE=NAME  image of the nodes; default of kind if unset
+#   BUILD_OPTIONS="..."   options of `docker build`
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/../.."
 
@@ -27,12 +27,12 @@ images() {
 right_version() {
   local runs
   runs=$(kubectl get nodes --output jsonpath='{.items[0].status.nodeInfo.kubeletVersion}')
-  [[ $runs == "v${FRACTUS_KUBERNETES:-1}."* ]] || { echo "nodes run $runs, not $FRACTUS_KUBERNETES: KIND_NODE_IMAGE says which" >&2; return 1; }
+  [[ $runs == "v${FRACTUS_KUBERNETES:-1}."* ]] || { echo "nodes run $runs, not $FRACTUS_KUBERNETES; set KIND_NODE_IMAGE" >&2; return 1; }
 }
 
-# create NAME [OPTION...]: a cluster of that name, whose nodes are ready.
+# create NAME [OPTION...]: create a cluster and wait until its nodes are ready.
 create() {
-  ! kind get clusters 2> /dev/null | grep -qx "$1" || { echo "there is a cluster $1 already: kind delete cluster --name $1" >&2; return 1; }
+  ! kind get clusters 2> /dev/null | grep -qx "$1" || { echo "a cluster $1 exists; remove it: kind delete cluster --name $1" >&2; return 1; }
   made+=("$1")
   kind create cluster --name "$@" --wait 300s ${KIND_NODE_IMAGE:+--image "$KIND_NODE_IMAGE"}
   kubectl wait --for=condition=Ready node --all --timeout=300s
@@ -47,7 +47,6 @@ cluster() {
   kubectl get nodes --output wide --label-columns fractus.dev/class
 }
 
-# The nodes, and the cluster's end.
 nodes() { kind get nodes --name "$name"; }
 delete() { kind delete cluster --name "$1"; }
 
@@ -76,7 +75,7 @@ demo() {
   ls out/demo/recordings/mobility-*.mcap
 }
 
-# What docs/upgrades.md tells to type; nothing of Fractus is left that Kubernetes would run, ask or refuse by, nor on nodes.
+# Run the uninstall commands of docs/upgrades.md. No objects and no files of Fractus remain.
 uninstall() {
   bash -e <(sed -n '/^### What stays, and wiping/,/^## /s/^    \(helm .* upgrade .*\)/\1/p' docs/upgrades.md)
   bash -e <(sed -n '/^## Uninstalling/,/^## /s/^    \(kubectl delete app.*\|helm .* uninstall .*\)/\1/p' docs/upgrades.md)
@@ -85,16 +84,16 @@ uninstall() {
   kinds=$(kubectl api-resources --verbs=list --output=name | grep -v '^events')
   left=$(kubectl get "$(echo $kinds | tr ' ' ',')" --all-namespaces --selector app.kubernetes.io/name=fractus --output name)
   [ -z "$left" ] || { echo "left: $left" >&2; return 1; }
-  [ -n "$(nodes)" ] || { echo "there are no nodes of $name to look at" >&2; return 1; }
+  [ -n "$(nodes)" ] || { echo "the cluster $name has no nodes" >&2; return 1; }
   for node in $(nodes); do
     left=$(docker exec "$node" sh -c 'ls -A /var/lib/fractus 2> /dev/null || true')
     [ -z "$left" ] || { echo "left on $node: $left" >&2; return 1; }
   done
 }
 
-# docs/clusters.md, "One node": the same charts, and a mission that needs no edge nodes.
+# docs/clusters.md, "One node": the same charts and a mission without edge nodes.
 one_node() {
-  # One of them at a time is enough for a small machine; what someone else made, or wants to look at, stays.
+  # A small machine has room for one cluster. Keep clusters of other runs, and with KEEP=1.
   [ -n "${KEEP:-}" ] || [[ " ${made[*]} " != *" $name "* ]] || delete "$name"
   create "$name-one" --config <(sed '/^nodes:/,$d' tests/kind/cluster.yaml)
   kubectl label node --all fractus.dev/class=drone fractus.dev/cloud=true

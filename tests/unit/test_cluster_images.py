@@ -1,4 +1,4 @@
-"""Images: layouts, archives with just the missing layers, and what makes an image stale."""
+"""Images: layouts, archives without known layers, and detection of changed sources."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ def layout(tmp_path: Path) -> Layout:
 
 
 def archive_of(layout: Layout, without: set[str]) -> tarfile.TarFile:
-    """The archive of the layout's image, opened for reading."""
+    """Return the archive of the layout's image, open for reading."""
     out = io.BytesIO()
     layout.write_archive([layout.image(NAME)], without=without, out=out)
     out.seek(0)
     return tarfile.open(fileobj=out)
 
 
-def test_program_is_the_image(layout: Layout) -> None:
+def test_image_of_a_program_has_it_as_its_entry_point(layout: Layout) -> None:
     layer, config, manifest = layout.digests(layout.image(NAME))
     with tarfile.open(layout.blob(layer)) as files:
         assert [(member.name, member.mode) for member in files] == [("tool", 0o755)]
@@ -55,7 +55,7 @@ def test_same_program_is_the_same_image(layout: Layout, tmp_path: Path) -> None:
     assert layout.add_program(NAME, tmp_path / "tool").digest != before.digest
 
 
-def test_archive_holds_what_the_receiver_lacks(layout: Layout) -> None:
+def test_archive_omits_layers_of_the_receiver(layout: Layout) -> None:
     digests = layout.digests(layout.image(NAME))
     with archive_of(layout, set()) as whole:
         blobs = {name for name in whole.getnames() if name.startswith("blobs/")}
@@ -66,7 +66,7 @@ def test_archive_holds_what_the_receiver_lacks(layout: Layout) -> None:
         assert index["manifests"][0]["annotations"]["io.containerd.image.name"] == NAME
 
 
-def test_unused_blobs_go(layout: Layout, tmp_path: Path) -> None:
+def test_unused_blobs_are_removed(layout: Layout, tmp_path: Path) -> None:
     old = layout.digests(layout.image(NAME))
     (tmp_path / "tool").write_bytes(b"\x7fELF other")
     layout.add_program(NAME, tmp_path / "tool")
@@ -75,7 +75,7 @@ def test_unused_blobs_go(layout: Layout, tmp_path: Path) -> None:
     assert all(layout.blob(digest).exists() for digest in layout.digests(layout.image(NAME)))
 
 
-def test_missing_image_is_named(layout: Layout) -> None:
+def test_error_names_the_missing_image(layout: Layout) -> None:
     with pytest.raises(ClusterError, match="no image nothing:1"):
         layout.image("nothing:1")
 
@@ -89,7 +89,7 @@ def test_every_target_is_in_the_dockerfile() -> None:
     assert set(TARGETS) <= stages
 
 
-def test_a_release_builds_on_a_digest_that_its_images_name() -> None:
+def test_release_builds_on_a_base_digest_that_its_images_name() -> None:
     workflow = yaml.safe_load((ROOT / ".github/workflows/release.yaml").read_text())
     scripts = [step["run"] for job in workflow["jobs"].values() for step in job["steps"] if "run" in step]
     (told,) = [n for n, script in enumerate(scripts) if "imagetools inspect" in script]
@@ -106,8 +106,8 @@ def test_a_release_builds_on_a_digest_that_its_images_name() -> None:
     assert f'echo "BASE={base}@$digest" >> "$GITHUB_ENV"' in scripts[told]
 
 
-def test_what_a_release_is_signed_beside_is_named_by_its_commit() -> None:
-    """Who moves a tag of an action would sign, and push, as the release's workflow."""
+def test_actions_of_workflows_with_write_permission_are_pinned_to_commits() -> None:
+    """An attacker who moves the tag of an action could otherwise sign and push as the release workflow."""
     for path in (ROOT / ".github/workflows").iterdir():
         workflow = yaml.safe_load(path.read_text())
         for job in workflow["jobs"].values():
@@ -125,7 +125,7 @@ def test_every_image_of_the_examples_can_be_built() -> None:
 
 @pytest.fixture
 def checkout(tmp_path: Path) -> Path:
-    """A small checkout with the sources of images."""
+    """A small checkout with sources of images."""
     for name in ("Dockerfile", ".dockerignore", "pyproject.toml", "uv.lock", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, tmp_path / name)
     for room in ("core", "runtime", "operator", "agent", "services", "sdk", "proto", "sim"):
@@ -164,5 +164,5 @@ def test_unknown_target_is_refused(checkout: Path) -> None:
         build_images(checkout, targets=["plane"], report=print)
 
 
-def test_names() -> None:
+def test_image_name_has_registry_and_tag() -> None:
     assert image_name("agent") == "localhost/fractus/agent:dev"

@@ -1,4 +1,4 @@
-"""Building the images of Fractus: each target of the Dockerfile, when something that it contains changed."""
+"""Builds of the images of Fractus: the targets of the Dockerfile whose sources changed."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ TARGETS = tuple(_MORE_SOURCES)
 _NOT_IN_SLIM = (
     "usr/share/locale", "usr/share/man", "var/cache/apt/archives", "var/cache/debconf", "var/lib/apt/lists", "var/log",
 )  # fmt: skip
-"""Folders whose contents debian:trixie-slim, of which the base image takes the place, leaves out too."""
+"""Folders that are empty in debian:trixie-slim, too. The base image replaces it without a registry."""
 _BUILD_TIMEOUT_S = 1800.0
 _LOCK_TIMEOUT_S = 1800.0
 _HOST_CA = Path("/etc/ssl/certs/ca-certificates.crt")
@@ -57,10 +57,10 @@ Report = Callable[[str], None]
 
 
 def find_source(start: Path | None = None) -> Path:
-    """Return the checkout that has the Dockerfile: the working directory or one above it.
+    """Return the checkout with the Dockerfile: the working directory or one of its parents.
 
     Raises:
-        ClusterError: There is none.
+        ClusterError: No such directory has a Dockerfile.
     """
     here = (start or Path.cwd()).resolve()
     for folder in (here, *here.parents):
@@ -86,14 +86,14 @@ def build_images(
 
     Args:
         source: The checkout.
-        targets: Which images; a target is left alone when nothing that it contains changed since it was built.
+        targets: The images to build. A target whose sources did not change since its last build is skipped.
         tag: The images' tag.
-        force: Build although nothing changed.
-        report: Told about progress, a line at a time.
+        force: Build targets even if their sources did not change.
+        report: Called with each line of progress.
 
     Raises:
         PrerequisiteError: buildah or debootstrap is missing, or this is not root.
-        ClusterError: A build failed; the message ends with what it said.
+        ClusterError: A build failed. The message ends with the output of buildah.
     """
     unknown = sorted(set(targets) - set(TARGETS))
     if unknown:
@@ -128,7 +128,7 @@ def build_images(
 
 
 def source_digest(source: Path, target: str) -> str:
-    """Return a digest of all files of the checkout that a target's image is made of."""
+    """Return a digest of all source files of a target's image."""
     digest = hashlib.sha256()
     for path in _files(source, (*_SOURCES, *_MORE_SOURCES[target])):
         digest.update(f"{path.relative_to(source)}\0".encode() + path.read_bytes() + b"\0")
@@ -146,7 +146,7 @@ def _files(source: Path, names: Iterable[str]) -> Iterator[Path]:
 
 
 def _build_stale(source: Path, targets: Sequence[str], tag: str, report: Report) -> None:
-    """Build the first target alone, because it fills the cache that the others take most of their steps from."""
+    """Build the first target alone, so that the others find most steps in the cache."""
 
     def one(target: str) -> None:
         started = time.monotonic()
@@ -160,10 +160,7 @@ def _build_stale(source: Path, targets: Sequence[str], tag: str, report: Report)
 
 
 def _remove_replaced(identities: Iterable[str]) -> None:
-    """Remove images that lost their names to newer ones, with the layers that nothing else uses.
-
-    Builds would fill the disk otherwise. An image in use stays, which is no failure.
-    """
+    """Remove images that were replaced by newer ones, because builds would fill the disk. Images in use stay."""
     for identity in identities:
         run(["buildah", "rmi", identity], check=False)
 
@@ -178,7 +175,7 @@ def _build(source: Path, target: str, tag: str) -> None:
 
 
 def ensure_base(*, report: Report) -> None:
-    """Make the Debian base image with debootstrap when buildah's storage has none.
+    """Create the Debian base image with debootstrap if buildah's storage has none.
 
     Raises:
         PrerequisiteError: debootstrap is missing.

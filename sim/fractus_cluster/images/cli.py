@@ -23,14 +23,14 @@ def images() -> None:
     "--source", type=click.Path(path_type=Path, file_okay=False, exists=True), help="Checkout with the Dockerfile."
 )
 @click.option("--tag", default="dev", show_default=True)
-@click.option("--force", is_flag=True, help="Build although nothing changed.")
+@click.option("--force", is_flag=True, help="Build images even if their sources did not change.")
 @click.option(
     "--sbom",
     type=click.Path(path_type=Path, file_okay=False),
-    help="Folder for a bill of materials of each (CycloneDX).",
+    help="Folder for a bill of materials of each image (CycloneDX).",
 )
 def build(targets: tuple[str, ...], source: Path | None, tag: str, force: bool, sbom: Path | None) -> None:
-    """Build the TARGETs, or all; those of which nothing changed are left alone. Prints the images' names."""
+    """Build the TARGETs (all by default) whose sources changed, and print the names of the images."""
     targets = targets or TARGETS
     built = build_images(source or find_source(), targets=targets, tag=tag, force=force, report=print_report)
     if sbom is not None:

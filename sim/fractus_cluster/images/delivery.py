@@ -1,4 +1,4 @@
-"""Delivering images to running nodes: each gets an archive with exactly the layers that it lacks."""
+"""Delivery of images to running nodes, as archives with only the missing layers."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ _IMPORT_TIMEOUT_S = 300.0
 
 
 def deliver(layout: Layout, images: Sequence[Image], nodes: Sequence[Node]) -> dict[str, int]:
-    """Make the images known to every node; a node that has them already is left alone.
+    """Import images on nodes. A node that has all of them is skipped.
 
     Args:
-        layout: Where the images are kept.
-        images: Which to deliver.
-        nodes: Where to; nodes that are off are an error.
+        layout: The layout that has the images.
+        images: The images to deliver.
+        nodes: The nodes, which must be running.
 
     Returns:
-        For each node, how many images it got.
+        The number of images that were new, by the name of the node.
 
     Raises:
-        ClusterError: A node is off or refuses the archive.
+        ClusterError: A node is not running, or its import failed.
     """
     missing = {node.name: _missing(node, images) for node in nodes}
-    # Nodes in the same state get the same archive, so it is written once.
+    # Nodes that lack the same layers share an archive.
     groups: dict[tuple[frozenset[str], frozenset[str]], list[Node]] = {}
     for node in nodes:
         if missing[node.name]:
@@ -61,22 +61,22 @@ def _content(node: Node) -> set[str]:
 
 
 def _import(node: Node, archive: IO[bytes]) -> None:
-    """Import an archive; asked a second time when containerd collected a layer's snapshot while it unpacked."""
-    said = _attempt(node, archive)
-    if said and "snapshot" in said:
-        said = _attempt(node, archive)
-    if said:
-        raise ClusterError(f"node {node.name} refused an image: {said[-1000:]}")
+    """Import an archive. Repeat once if containerd's garbage collector removed a snapshot during the import."""
+    error = _attempt(node, archive)
+    if error and "snapshot" in error:
+        error = _attempt(node, archive)
+    if error:
+        raise ClusterError(f"node {node.name} cannot import an image: {error[-1000:]}")
 
 
 def _attempt(node: Node, archive: IO[bytes]) -> str:
-    """Import an archive; returns what went wrong."""
+    """Import an archive and return the error, empty on success."""
     argv = node.exec_command([*_CTR, "images", "import", "-"])
-    with open(f"/proc/self/fd/{archive.fileno()}", "rb") as own:  # noqa: PTH123  (a read position of its own)
+    with open(f"/proc/self/fd/{archive.fileno()}", "rb") as stream:  # noqa: PTH123  (a separate read position)
         try:
             done = subprocess.run(
-                argv, stdin=own, capture_output=True, text=True, timeout=_IMPORT_TIMEOUT_S, check=False
+                argv, stdin=stream, capture_output=True, text=True, timeout=_IMPORT_TIMEOUT_S, check=False
             )
         except subprocess.TimeoutExpired as error:
-            raise ClusterError(f"node {node.name} did not take an image within {_IMPORT_TIMEOUT_S:.0f} s") from error
+            raise ClusterError(f"node {node.name} did not import an image within {_IMPORT_TIMEOUT_S:.0f} s") from error
     return "" if done.returncode == 0 else done.stderr.strip() or f"exit code {done.returncode}"

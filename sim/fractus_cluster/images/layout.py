@@ -1,4 +1,4 @@
-"""An OCI image layout on disk: which images it holds, and archives with just what a node lacks of them."""
+"""OCI image layout on disk, and archives of images without the layers that a node has."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Image:
 
     Attributes:
         name: Its full name, such as `localhost/fractus/agent:dev`.
-        digest: Digest of its manifest; another digest means another content.
+        digest: Digest of its manifest, which identifies the content.
         size_bytes: Size of its manifest.
         media_type: Media type of its manifest.
     """
@@ -55,7 +55,7 @@ class Layout:
     path: Path
 
     def create(self) -> None:
-        """Make an empty layout where there is none."""
+        """Create an empty layout if the directory has none."""
         (self.path / "blobs" / "sha256").mkdir(parents=True, exist_ok=True)
         if not (self.path / "oci-layout").exists():
             (self.path / "oci-layout").write_text('{"imageLayoutVersion": "1.0.0"}')
@@ -64,18 +64,18 @@ class Layout:
 
     def images(self) -> dict[str, Image]:
         """Return the images by name."""
-        found: dict[str, Image] = {}
+        images: dict[str, Image] = {}
         for entry in self._index():
             name = entry.get("annotations", {}).get(_REF_ANNOTATION)
             if name:
-                found[name] = Image(name, entry["digest"], entry["size"], entry.get("mediaType", MANIFEST_TYPE))
-        return found
+                images[name] = Image(name, entry["digest"], entry["size"], entry.get("mediaType", MANIFEST_TYPE))
+        return images
 
     def image(self, name: str) -> Image:
-        """Return one image.
+        """Return an image by its name.
 
         Raises:
-            ClusterError: The layout does not hold it.
+            ClusterError: The layout has no such image.
         """
         try:
             return self.images()[name]
@@ -88,12 +88,12 @@ class Layout:
         return self.path / "blobs" / algorithm / value
 
     def digests(self, image: Image) -> list[str]:
-        """Return the digests of all that an image consists of, layers first."""
+        """Return the digests of an image's blobs: layers, configuration, manifest."""
         manifest = json.loads(self.blob(image.digest).read_text())
         return [*(layer["digest"] for layer in manifest["layers"]), manifest["config"]["digest"], image.digest]
 
     def image_id(self, image: Image) -> str:
-        """Return the digest of an image's configuration, which is what buildah calls its id."""
+        """Return the digest of an image's configuration, which is buildah's image id."""
         manifest = json.loads(self.blob(image.digest).read_text())
         return str(manifest["config"]["digest"]).removeprefix("sha256:")
 
@@ -105,7 +105,7 @@ class Layout:
                 path.unlink()
 
     def add_program(self, name: str, program: Path) -> Image:
-        """Add an image that consists of one static program, which is also what it runs."""
+        """Add an image that consists of one static program, its entry point."""
         self.create()
         layer = _layer_with(program)
         layer_digest = self._add_blob(layer)
@@ -128,7 +128,7 @@ class Layout:
         return self.image(name)
 
     def add_manifest(self, name: str, manifest: Json) -> None:
-        """Give a name to a manifest whose layers are there already."""
+        """Add a manifest under a name. The layout must have its layers."""
         content = json.dumps(manifest, sort_keys=True).encode()
         entry = _descriptor(MANIFEST_TYPE, self._add_blob(content), len(content))
         entry["annotations"] = {_REF_ANNOTATION: name}
@@ -139,9 +139,9 @@ class Layout:
         """Write an archive that `ctr images import` reads.
 
         Args:
-            images: What it is to contain.
-            without: Digests of layers to leave out because the receiver has them.
-            out: Where the archive goes.
+            images: The images of the archive.
+            without: Digests of layers to omit because the receiver has them.
+            out: Binary stream for the archive.
         """
         wanted = list(images)
         digests = {digest: None for image in wanted for digest in self.digests(image) if digest not in without}

@@ -1,8 +1,8 @@
-"""A registry for the length of one push: takes images from buildah, layer by layer, into an OCI layout.
+"""Temporary registry on the loopback interface that receives images from buildah into an OCI layout.
 
-buildah asks a registry which layers it has and sends only the others, which it does for no other destination.
-It insists on compressing what it sends, and asks by the digest of the uncompressed layer; so layers are kept
-uncompressed, which is also what nodes take fastest, and manifests are rewritten accordingly.
+buildah sends only the missing layers if the destination is a registry. It compresses layers but checks for the digest of
+the uncompressed one. The layout therefore stores layers uncompressed, which nodes also import fastest, and the registry
+rewrites manifests accordingly.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def receiving(layout: Layout) -> Iterator[str]:
     """Run the registry inside the block.
 
     Yields:
-        Its address on the loopback interface, `host:port`.
+        The registry's address, `host:port`.
     """
     server = _Server(layout)
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True)
@@ -56,10 +56,10 @@ class _Server(ThreadingHTTPServer):
     def __init__(self, layout: Layout) -> None:
         super().__init__(("127.0.0.1", 0), _Handler)
         self.layout = layout
-        self.unpacked: dict[str, str] = {}  # digest of a compressed layer as sent -> digest as kept
+        self.unpacked: dict[str, str] = {}  # digest of a compressed layer -> digest of the stored layer
 
     def keep(self, file: Path) -> str:
-        """Take an uploaded file into the layout, uncompressed, and return the digest of what was sent."""
+        """Move an uploaded file into the layout, uncompressed, and return its digest as it was sent."""
         sent = _digest_of(file)
         with file.open("rb") as content:
             packed = content.read(2) == _GZIP_MAGIC
@@ -76,7 +76,7 @@ class _Server(ThreadingHTTPServer):
         return sent
 
     def keep_manifest(self, name: str, content: bytes) -> None:
-        """Take a manifest into the layout, with its layers as they are kept."""
+        """Add a manifest to the layout, with the digests of the uncompressed layers."""
         manifest = json.loads(content)
         for layer in manifest["layers"]:
             layer["digest"] = self.unpacked.get(layer["digest"], layer["digest"])
@@ -97,45 +97,45 @@ class _Handler(BaseHTTPRequestHandler):
         """Write no log."""
 
     def do_GET(self) -> None:
-        """Say that this is a registry; nothing is read back from it."""
-        self._answer(HTTPStatus.OK if self.path == "/v2/" else HTTPStatus.NOT_FOUND)
+        """Confirm the protocol version. The registry serves no content."""
+        self._respond(HTTPStatus.OK if self.path == "/v2/" else HTTPStatus.NOT_FOUND)
 
     def do_HEAD(self) -> None:
-        """Say whether a layer is there."""
+        """Report if the layout has a layer."""
         match = _BLOB.match(self.path)
         path = self.server.layout.blob(match[1]) if match else None
         if match and path is not None and path.is_file():
-            self._answer(
+            self._respond(
                 HTTPStatus.OK,
                 {"Docker-Content-Digest": match[1], "Content-Type": "application/octet-stream"},
                 length=path.stat().st_size,
             )
         else:
-            self._answer(HTTPStatus.NOT_FOUND)
+            self._respond(HTTPStatus.NOT_FOUND)
 
     def do_POST(self) -> None:
-        """Begin an upload."""
+        """Start an upload."""
         self._drain()
         name = os.urandom(8).hex()
         self._upload_file(name).touch()
-        self._answer(
+        self._respond(
             HTTPStatus.ACCEPTED, {"Location": f"{urlsplit(self.path).path.rstrip('/')}/{name}", "Range": "0-0"}
         )
 
     def do_PATCH(self) -> None:
-        """Take a piece of an upload."""
+        """Receive a part of an upload."""
         match = _UPLOAD.match(urlsplit(self.path).path)
         if match is None:
-            self._answer(HTTPStatus.NOT_FOUND)
+            self._respond(HTTPStatus.NOT_FOUND)
             return
         file = self._upload_file(match[1])
         with file.open("ab") as out:
             for piece in self._body():
                 out.write(piece)
-        self._answer(HTTPStatus.ACCEPTED, {"Location": self.path, "Range": f"0-{file.stat().st_size - 1}"})
+        self._respond(HTTPStatus.ACCEPTED, {"Location": self.path, "Range": f"0-{file.stat().st_size - 1}"})
 
     def do_PUT(self) -> None:
-        """Complete an upload, or take a manifest."""
+        """Complete an upload, or receive a manifest."""
         address = urlsplit(self.path)
         upload, manifest = _UPLOAD.match(address.path), _MANIFEST.match(address.path)
         if upload is not None:
@@ -145,14 +145,14 @@ class _Handler(BaseHTTPRequestHandler):
                     out.write(piece)
             digest = self.server.keep(file)
             if parse_qs(address.query).get("digest") != [digest]:
-                self._answer(HTTPStatus.BAD_REQUEST)
+                self._respond(HTTPStatus.BAD_REQUEST)
                 return
-            self._answer(HTTPStatus.CREATED, {"Docker-Content-Digest": digest})
+            self._respond(HTTPStatus.CREATED, {"Docker-Content-Digest": digest})
         elif manifest is not None:
             self.server.keep_manifest(f"{manifest[1]}:{manifest[2]}", b"".join(self._body()))
-            self._answer(HTTPStatus.CREATED)
+            self._respond(HTTPStatus.CREATED)
         else:
-            self._answer(HTTPStatus.NOT_FOUND)
+            self._respond(HTTPStatus.NOT_FOUND)
 
     def _upload_file(self, name: str) -> Path:
         return self.server.layout.path / f".upload-{name}"
@@ -174,11 +174,11 @@ class _Handler(BaseHTTPRequestHandler):
         while size > 0:
             piece = self.rfile.read(min(size, _PIECE_BYTES))
             if not piece:
-                raise ConnectionError("the sender of an image went away")
+                raise ConnectionError("the connection was closed during an upload")
             size -= len(piece)
             yield piece
 
-    def _answer(self, status: HTTPStatus, headers: dict[str, str] | None = None, *, length: int = 0) -> None:
+    def _respond(self, status: HTTPStatus, headers: dict[str, str] | None = None, *, length: int = 0) -> None:
         self.send_response(status)
         for name, value in (headers or {}).items():
             self.send_header(name, value)

@@ -1,4 +1,4 @@
-"""The machine's store of images for embedded clusters: filled from buildah or archives, emptied into nodes."""
+"""The machine's image store for embedded clusters, between buildah or archives and the nodes."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ Report = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True)
 class ImageStore:
-    """A directory with an OCI layout of all images, and templates of nodes that have them unpacked.
+    """A directory with an OCI layout of images, and node templates with images unpacked.
 
     Attributes:
-        path: The directory; on the file system of the clusters' state, so that files can be shared by hard links.
-        report: Told about progress, a line at a time.
+        path: The directory. It is on the file system of the clusters' state, because nodes share files by hard links.
+        report: Called with each line of progress.
     """
 
     path: Path
@@ -43,7 +43,7 @@ class ImageStore:
 
     @classmethod
     def default(cls, *, report: Report) -> ImageStore:
-        """Return the store beside the clusters' state."""
+        """Return the store in the folder of the clusters' state."""
         return cls(state_root() / ".images", report)
 
     @property
@@ -52,13 +52,13 @@ class ImageStore:
         return Layout(self.path / "layout")
 
     def fetch(self, names: Sequence[str]) -> list[Image]:
-        """Take images into the store; one that is there already and has not changed costs nothing.
+        """Copy images into the store, if they are new or changed, and return them.
 
         Args:
             names: Names in buildah's storage, or paths of OCI or Docker archives.
 
         Raises:
-            ClusterError: One does not exist.
+            ClusterError: An image does not exist.
         """
         if not names:
             return []
@@ -83,7 +83,7 @@ class ImageStore:
                 run([*argv, f"docker://{address}/{name}"], timeout_s=_COPY_TIMEOUT_S)
 
     def template(self, images: Sequence[Image], pause: Path) -> Template:
-        """Return a node's container storage with these images unpacked, made when there is none yet."""
+        """Return a template of a node's container storage with these images unpacked. Create it if it is missing."""
         with self._locked():
             sandbox = self._sandbox(pause)
             wanted = [sandbox, *images]
@@ -109,7 +109,7 @@ class ImageStore:
 def image_ids() -> dict[str, str]:
     """Return the ids of all images in buildah's storage, by name.
 
-    The listing fails when another process removes an image meanwhile, so it is asked for again a few times.
+    The listing is repeated because it fails if another process removes an image at the same time.
     """
     argv = ["buildah", "images", "--no-trunc", "--format", "{{.Name}}:{{.Tag}} {{.ID}}"]
     for _ in range(_LISTINGS):
@@ -124,7 +124,7 @@ def image_ids() -> dict[str, str]:
 
 
 def _names_behind(entry: str) -> list[str]:
-    """Return the names of what is to be delivered: the entry itself, or what an archive contains."""
+    """Return the names of the images of an entry: the name itself, or the content of an archive."""
     if not Path(entry).is_file():
         return [entry]
     with tarfile.open(entry) as archive:

@@ -1,4 +1,4 @@
-"""Templates: the container storage of a node with images unpacked, made once and hard-linked into every node."""
+"""Templates of a node's container storage with images unpacked. Nodes get hard links to their files."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ disabled_plugins = ["io.containerd.grpc.v1.cri", "io.containerd.internal.v1.opt"
   "io.containerd.snapshotter.v1.devmapper", "io.containerd.snapshotter.v1.zfs"]
 [grpc]
   address = "{socket}"
-# ctr unpacks without a lease: a collection that begins meanwhile takes the layers from under those that build on them.
+# ctr unpacks without a lease. A garbage collection in between would remove layers that others build on.
 [plugins."io.containerd.gc.v1.scheduler"]
   deletion_threshold = 0
   mutation_threshold = 0
@@ -47,18 +47,18 @@ disabled_plugins = ["io.containerd.grpc.v1.cri", "io.containerd.internal.v1.opt"
 
 @dataclass(frozen=True, slots=True)
 class Template:
-    """A directory that holds what /var/lib/containerd of a node is to be.
+    """Initial content of a node's /var/lib/containerd.
 
     Attributes:
-        path: The directory; complete when it exists.
+        path: The directory, which exists only if it is complete.
     """
 
     path: Path
 
     def make(self, layout: Layout, images: Sequence[Image], *, report: Report) -> None:
-        """Unpack the images with a container daemon of its own; a no-op when that was done before.
+        """Unpack the images with a separate container daemon, unless the template exists.
 
-        It starts from the newest template beside it, so that only layers which that one lacks are unpacked.
+        The daemon starts from a copy of the newest template, so that only new layers are unpacked.
         """
         if self.path.exists():
             os.utime(self.path)
@@ -81,7 +81,7 @@ class Template:
         report(f"unpacked {len(images)} images in {time.monotonic() - started:.1f} s")
 
     def furnish(self, node: Node) -> None:
-        """Give a node that never ran this template as its container storage; other nodes are left alone."""
+        """Copy the template into a node that has no container storage yet."""
         target = _storage(node)
         if target.exists():
             return
@@ -94,7 +94,7 @@ class Template:
 
 
 def has_storage(node: Node) -> bool:
-    """Whether a node has container storage already."""
+    """Return True if a node has container storage."""
     return _storage(node).exists()
 
 
@@ -103,7 +103,7 @@ def _storage(node: Node) -> Path:
 
 
 def _copy_storage(source: Path, target: Path) -> None:
-    """Copy a daemon's storage: hard links where nothing is ever written, real copies of its databases."""
+    """Copy a daemon's storage by hard links, except its databases, because the daemon writes to them."""
     linked = run(["cp", "-al", source, target], check=False, timeout_s=_IMPORT_TIMEOUT_S)
     if linked.returncode != 0:  # another file system
         shutil.rmtree(target, ignore_errors=True)
@@ -116,7 +116,7 @@ def _copy_storage(source: Path, target: Path) -> None:
 
 @contextmanager
 def _daemon(scratch: Path) -> Iterator[list[str]]:
-    """Run a container daemon on `scratch/root` inside the block; yields the start of its client's command."""
+    """Run a container daemon on `scratch/root`, and yield the beginning of its client's command line."""
     socket, config, log = scratch / "s", scratch / "config.toml", scratch / "log"
     config.write_text(_CONFIG.format(root=scratch / "root", state=scratch / "state", socket=socket))
     with log.open("wb") as output:
@@ -125,7 +125,7 @@ def _daemon(scratch: Path) -> Iterator[list[str]]:
             stdin=subprocess.DEVNULL,
             stdout=output,
             stderr=subprocess.STDOUT,
-            preexec_fn=_die_with_parent,  # noqa: PLW1509  (it only makes a system call)
+            preexec_fn=_die_with_parent,  # noqa: PLW1509  (only a system call)
         )
     try:
         deadline = time.monotonic() + _START_TIMEOUT_S

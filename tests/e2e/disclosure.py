@@ -1,4 +1,4 @@
-"""What a cluster with Fractus keeps secret, and all that it tells of itself."""
+"""Secrets of a cluster with Fractus, and everything that users can read: objects, logs and Events."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ NODE_KEY = "/var/lib/fractus/tls/tls.key"
 
 
 def secrets(kube: Kube) -> dict[str, bytes]:
-    """What is in Secrets, the keys of nodes, and the tokens that are mounted in pods of Fractus."""
+    """Return the values of Secrets, the keys of nodes, and the tokens of Fractus' pods."""
     found: dict[str, bytes] = {}
     for body in kube.all("secrets"):
-        # What a release was made of, and kubeadm's tokens with what they are for, are not of Fractus.
+        # Releases of helm and tokens of kubeadm do not belong to Fractus.
         if body["type"] not in {"helm.sh/release.v1", "bootstrap.kubernetes.io/token"}:
             for name, value in (body.get("data") or {}).items():
                 found[f"{body['metadata']['namespace']}/{body['metadata']['name']}/{name}"] = base64.b64decode(value)
@@ -31,8 +31,8 @@ def secrets(kube: Kube) -> dict[str, bytes]:
     return found
 
 
-def told(kube: Kube) -> dict[str, str]:
-    """Logs of all pods of Fractus and its applications, Events, and every object that is no Secret."""
+def readable(kube: Kube) -> dict[str, str]:
+    """Return the logs of all pods of Fractus and its applications, Events, and all objects except Secrets."""
     found: dict[str, str] = {}
     for pod in (*kube.all("pods", SYSTEM), *kube.all("pods", None, "fractus.dev/application")):
         namespace, name = pod["metadata"]["namespace"], pod["metadata"]["name"]

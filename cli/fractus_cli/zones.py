@@ -62,7 +62,7 @@ def import_(file: pathlib.Path, source: str, prefix: str, without: tuple[str, ..
         for zone in named:
             check_zone(zone)
     except UnicodeDecodeError:
-        raise click.ClickException(f"{file}: this is no text file in UTF-8") from None
+        raise click.ClickException(f"{file}: not a UTF-8 text file") from None
     except formats.InexactFeatures as error:
         *most, last = (f"{_where(file, content, one)}: {one}" for one in error.every)
         _tell(most)

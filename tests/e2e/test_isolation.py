@@ -160,7 +160,7 @@ GRASPS: dict[Callable[[Object, Object], None], str] = {
     host_port: "remove hostPort",
     probe_of_the_autopilot: "remove host from httpGet",
     hook_to_the_autopilot: "remove host from httpGet",
-    root: "do not run as root",
+    root: "must not run as root",
     unconfined: "RuntimeDefault",
     displacing: "PriorityClass below",
 }

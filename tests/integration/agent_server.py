@@ -17,7 +17,7 @@ from agent_pki import TestAuthority
 from control_plane import ControlPlane, programs, wait_for
 from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric import ec
-from fractus_core.api.node_grants import NODE_GRANTS_NAMESPACE, pack
+from fractus_core.api.grants import NODE_GRANTS_NAMESPACE, pack
 from fractus_runtime.kubernetes import KubeError
 
 FRACTUS = "/apis/fractus.dev/v1alpha1"

@@ -23,7 +23,7 @@ from agent_server import FRACTUS, NODE_GRANTS, REQUESTS, ApiServer, running
 from control_plane import wait_for
 from exposed import scraped
 from fractus_cluster.ports import free_port
-from fractus_core.api.plans import Grant
+from fractus_core.api.grants import Grant
 from fractus_core.policy.grant_signatures import sign
 from fractus_proto.v1 import mobility_pb2_grpc
 from fractus_proto.v1.mobility_pb2 import MissionOutcome, SubscribeTelemetryRequest, Telemetry

@@ -26,7 +26,7 @@ from fractus_agent.cluster.store import (
     WatchTimes,
     connect,
 )
-from fractus_core.api.node_grants import ReportedGrant
+from fractus_core.api.grants import ReportedGrant
 
 pytestmark = [pytest.mark.timeout(300), pytest.mark.xdist_group("agent-watch")]  # they share an API server
 WAIT_TIMEOUT_S = 30.0

@@ -166,7 +166,7 @@ RESERVED = (
 def test_no_label_by_which_policies_and_selectors_go_is_replaced(name: str) -> None:
     for part in ("operator", "mobility"):
         said = refusal(f"--set-json={part}.podLabels={json.dumps({name: 'x'})}", "--skip-schema-validation")
-        assert f"{part}.podLabels: policies, selectors or the operator go by {name}" in said
+        assert f"{part}.podLabels: the label {name} is reserved" in said
     assert name in refusal(DRONE, f"--set-json=vehicle.podLabels={json.dumps({name: 'x'})}", chart="fractus-demo")
 
 
@@ -182,7 +182,7 @@ def test_what_can_be_no_tag_is_refused(chart: str, more: tuple[str, ...]) -> Non
 @pytest.mark.parametrize("part", WORKLOADS)
 def test_no_variable_of_ours_is_replaced(part: str) -> None:
     said = refusal(f"--set={part}.extraEnv[0].name=FRACTUS_NODE", "--set=view.enabled=true")
-    assert f"{part}.extraEnv: FRACTUS_NODE is the chart's own" in said
+    assert f"{part}.extraEnv: FRACTUS_NODE is reserved" in said
 
 
 def test_the_vehicle_of_the_demo_takes_them_too() -> None:

@@ -9,7 +9,7 @@ import pytest
 import yaml
 from chart import operator_token
 from control_plane import ControlPlane, wait_for
-from fractus_core.api.node_grants import unpack
+from fractus_core.api.grants import unpack
 from operator_world import FRACTUS, NODE_OBJECTS, NODES, Body, OperatorProcess, World
 from test_operator import running
 

@@ -216,7 +216,7 @@ def test_the_operator_writes_nothing_that_it_has_not_made(
     world.api.apply(theirs, body)
     ours_too = {"metadata": {"labels": {"app.kubernetes.io/managed-by": "fractus"}}}
     client = control_plane.with_token(operator_token(world))
-    made = "writes only the secrets that it has made itself"
+    made = "may write only secrets that it has created"
     try:
         wait_for(lambda: _probe_refused(client), "the admission policy to be in force")
         secrets = theirs.rpartition("/")[0]
@@ -239,7 +239,7 @@ def test_the_operator_writes_nothing_that_it_has_not_made(
             lambda: client.call("PATCH", f"{pods}/ours", other, content_type=change), "does not change what they run"
         )
         client.merge(f"{pods}/ours", {"spec": {"activeDeadlineSeconds": 1}})
-        node, labels = "/api/v1/nodes/edge-1", "writes only the location labels of nodes"
+        node, labels = "/api/v1/nodes/edge-1", "may write only the location labels of nodes"
         denied(lambda: client.merge(node, {"spec": {"unschedulable": True}}), labels)
         denied(lambda: client.merge(node, {"metadata": {"labels": {"fractus.dev/class": "cloud"}}}), labels)
         denied(lambda: client.merge(node, {"metadata": {"labels": {"kubernetes.io/os": "x"}}}), labels)
@@ -251,7 +251,7 @@ def test_the_operator_writes_nothing_that_it_has_not_made(
             denied(lambda field=field, value=value: client.merge(node, {"metadata": {field: value}}), labels)
         client.merge(node, {"metadata": {"labels": {"fractus.dev/geohash": "sx1"}}})
         guarded = {"metadata": {"labels": {"fractus.dev/guarded": "true"}}}
-        denied(lambda: client.merge(node, guarded), "calls no node guarded")
+        denied(lambda: client.merge(node, guarded), "mark only nodes as guarded")
         world.api.merge(node, {"spec": {"taints": [{"key": "fractus.dev/class", "effect": "NoExecute"}]}})
         client.merge(node, guarded)
         world.api.merge(node, {"spec": {"taints": []}})
@@ -260,7 +260,7 @@ def test_the_operator_writes_nothing_that_it_has_not_made(
         world.put(traffic(namespace))
         path = world.path(traffic(namespace))
         denied(
-            lambda: client.merge(path, {"spec": {"components": [component("A", "cloud")]}}), "does not write the spec"
+            lambda: client.merge(path, {"spec": {"components": [component("A", "cloud")]}}), "may not write the spec"
         )
         client.merge(path, {"metadata": {"finalizers": []}})
     finally:
@@ -319,12 +319,12 @@ def test_who_has_the_operator_s_token_gets_no_further(
         deployment()()
         secret("traffic-navigator-tls")()
         for place in ("kube-system", SYSTEM, NODES):
-            denied(deployment(place), "runs nothing in the namespace")
+            denied(deployment(place), "may not run pods in the namespace")
         for pod in (
             {"automountServiceAccountToken": True},
             {"serviceAccountName": "privileged"},
         ):
-            denied(deployment(**pod), "without an account")
+            denied(deployment(**pod), "without a service account")
         for pod in (
             {"hostNetwork": True},
             {"hostPID": True},
@@ -333,30 +333,30 @@ def test_who_has_the_operator_s_token_gets_no_further(
             {"volumes": [host]},
             {"volumes": [token]},
         ):
-            denied(deployment(**pod), "share nothing with their node")
+            denied(deployment(**pod), "do not share resources of the node")
         for pod in ({"securityContext": root}, {"initContainers": [{"name": "first", "image": "x"}]}):
-            denied(deployment(**pod), "one container without privileges")
+            denied(deployment(**pod), "one unprivileged container")
         for given in (
             {"privileged": True},
             {"allowPrivilegeEscalation": False},
             {"allowPrivilegeEscalation": False, "readOnlyRootFilesystem": True, "capabilities": {"drop": ["ALL"], "add": ["NET_RAW"]}},
             {"allowPrivilegeEscalation": False, "readOnlyRootFilesystem": True, "capabilities": {"drop": ["ALL"]}, "runAsUser": 0},
         ):  # fmt: skip
-            denied(deployment(container={"securityContext": given}), "one container without privileges")
+            denied(deployment(container={"securityContext": given}), "one unprivileged container")
         confined = {"runAsNonRoot": True, "runAsUser": 10001, "seccompProfile": {"type": "RuntimeDefault"}}
         for more in ({"seLinuxOptions": {"type": "spc_t"}}, {"appArmorProfile": {"type": "Unconfined"}}):
-            denied(deployment(securityContext=confined | more), "pods that are confined")
-            denied(deployment(container={"securityContext": restricted | more}), "pods that are confined")
+            denied(deployment(securityContext=confined | more), "only confined pods")
+            denied(deployment(container={"securityContext": restricted | more}), "only confined pods")
         denied(
             deployment(securityContext=confined | {"sysctls": [{"name": "a.b", "value": "1"}]}),
-            "pods that are confined",
+            "only confined pods",
         )
         unmasked = {"securityContext": restricted | {"procMount": "Unmasked"}}
-        denied(deployment(container=unmasked, hostUsers=False), "pods that are confined")
+        denied(deployment(container=unmasked, hostUsers=False), "only confined pods")
         beyond = {"httpGet": {"host": "169.254.169.254", "port": 80}}
         for called in ({"livenessProbe": beyond}, {"lifecycle": {"postStart": beyond}}):
-            denied(deployment(container=called), "has no kubelet call others")
-        certificates = "certificates of instances only"
+            denied(deployment(container=called), "without probes and hooks")
+        certificates = "only Secrets with certificates of instances"
         denied(
             secret("theirs-tls", type="kubernetes.io/service-account-token", data={}, metadata=account), certificates
         )
@@ -418,7 +418,7 @@ def test_who_has_the_operator_s_token_moves_no_traffic(
             {"ports": ports, "selector": own, "externalIPs": ["192.0.2.1"]},
             {"type": "ExternalName", "externalName": "bank.test"},
         ):
-            denied(made("Service", spec), "inside the cluster, for pods of applications")
+            denied(made("Service", spec), "cluster-internal Services for pods of applications")
         endpoints()()
         names = {
             "kubernetes.io/service-name": "theirs",
@@ -432,7 +432,7 @@ def test_who_has_the_operator_s_token_moves_no_traffic(
             {"target": {"kind": "Node"}},
             {"target": {"namespace": "elsewhere"}},
         ):
-            denied(endpoints(**changed), "EndpointSlices of pods of applications")
+            denied(endpoints(**changed), "EndpointSlices for pods of applications")
         _leads_no_other_s_traffic(world, client, namespace)
         made("NetworkPolicy", {"podSelector": {"matchLabels": own}, "policyTypes": ["Ingress"]})()
         for spec in (
@@ -444,7 +444,7 @@ def test_who_has_the_operator_s_token_moves_no_traffic(
         made("PodDisruptionBudget", {"maxUnavailable": 0, "selector": {"matchLabels": own}})()
         every = {"maxUnavailable": 0, "selector": {"matchLabels": {"app": "bank"}}}
         denied(made("PodDisruptionBudget", every), "PodDisruptionBudgets for pods of applications")
-        denied(made("Service", {"ports": ports, "selector": own}, "kube-system"), "runs nothing in the namespace")
+        denied(made("Service", {"ports": ports, "selector": own}, "kube-system"), "may not run pods in the namespace")
     finally:
         client.close()
 
@@ -472,7 +472,7 @@ def _leads_no_other_s_traffic(world: World, client: BlockingClient, namespace: s
         try:
             lead(name, "?dryRun=All")
         except KubeError as error:
-            return f"has not made the Service {name}, and leads its traffic nowhere" in str(error)
+            return f"did not create the Service {name} and may not direct its traffic" in str(error)
         return False
 
     for name, labels in (("bank", {}), ("ours", {"app.kubernetes.io/managed-by": "fractus"})):
@@ -485,7 +485,7 @@ def _leads_no_other_s_traffic(world: World, client: BlockingClient, namespace: s
     world.api.merge(f"{services}/ours", {"metadata": {"labels": {"app.kubernetes.io/managed-by": "helm"}}})
     wait_for(lambda: refused("ours"), "the Service to be another's")
     elsewhere = {"endpoints": ends("10.1.2.4")}
-    denied(lambda: client.merge(f"{slices}/ours", elsewhere), "has not made the Service ours")
+    denied(lambda: client.merge(f"{slices}/ours", elsewhere), "did not create the Service ours")
 
 
 def _probe_refused(client: BlockingClient) -> bool:

@@ -202,7 +202,7 @@ def test_only_its_kubelet_says_that_a_service_has_ended(
     path = f"{PODS}/fractus-mobility-{drone}/status?dryRun=All"
     failed, ended = {"status": {"phase": "Failed"}}, {"status": {"containerStatuses": []}}
     for change in (failed, ended):
-        assert "only its node's kubelet" in refusal(lambda change=change: guarded.api.merge(path, change))
+        assert "only the kubelet of the node" in refusal(lambda change=change: guarded.api.merge(path, change))
     hidden = {"metadata": {"labels": {"app.kubernetes.io/component": "x"}}}
     assert "labels of services" in refusal(lambda: guarded.api.merge(path, hidden))
     guarded.api.merge(path, {"status": {"conditions": [{"type": "Ready", "status": "False"}]}})
@@ -213,7 +213,7 @@ def test_only_its_kubelet_says_that_a_service_has_ended(
     collector = "system:serviceaccount:kube-system:pod-garbage-collector"
     with control_plane.as_user("collector", collector, ()) as client:
         client.merge(path, failed)
-        assert "only its node's kubelet" in refusal(lambda: client.merge(path, ended))
+        assert "only the kubelet of the node" in refusal(lambda: client.merge(path, ended))
 
 
 def test_the_kinds_stay_while_the_chart_needs_them(guarded: World) -> None:
@@ -332,13 +332,13 @@ def test_the_operator_does_not_say_that_a_drone_has_landed(control_plane: Contro
         for lie in ({"flightState": "inactive"}, {"flightState": "unknown", "lastFlightState": "inactive"}):
             body = guarded.api.get(path) or {}
             body["status"] |= lie
-            assert "does not say what a drone does" in refusal(
+            assert "may not change the flight state" in refusal(
                 lambda body=body: client.call("PUT", f"{path}/status", body)
             )
         # What it may say of one that is silent is no step to another lie.
         client.merge(f"{path}/status", {"status": {"flightState": "unknown", "lastFlightState": "flying"}})
         for last in ("unknown", "inactive", None):
-            assert "does not say what a drone does" in refusal(
+            assert "may not change the flight state" in refusal(
                 lambda last=last: client.merge(f"{path}/status", {"status": {"lastFlightState": last}})
             )
         assert "fractus-flight-pods" in refusal(lambda: client.delete(f"{PODS}/fractus-mobility-drone-1"))

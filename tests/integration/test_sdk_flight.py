@@ -22,7 +22,7 @@ from fractus_core.api import Application, Depot, Drone, Grant, Policy, Zone
 from fractus_core.api.model import Metadata
 from fractus_core.api.plans import DeploymentPlanSpec, PlannedInstance
 from fractus_core.planning import Inventory
-from fractus_core.planning.grants import compile_grants
+from fractus_core.planning.grant_compiler import compile_grants
 from fractus_core.policy.grant_signatures import sign
 from fractus_runtime.audit_chain import verify
 from mobility_rig import issue_signer

@@ -113,7 +113,7 @@ def test_an_installation_cannot_be_told_to_wipe(world: World) -> None:
     """`helm install --atomic` that fails uninstalls, on nodes that may have been there before."""
     with pytest.raises(subprocess.CalledProcessError) as refused:
         render(*on(world, WIPES))
-    assert "set it by an upgrade just before uninstalling" in refused.value.stderr
+    assert "set it with an upgrade just before uninstalling" in refused.value.stderr
 
 
 def on(world: World, *arguments: str) -> tuple[str, ...]:

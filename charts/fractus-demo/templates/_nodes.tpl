@@ -1,4 +1,4 @@
-{{/* Names of the cluster's nodes of a class, in order, as a JSON list; take a class. Empty where no cluster is asked (helm template). */}}
+{{/* Names of the nodes of a class, sorted, as a JSON list. Argument: the class. Empty without a cluster (helm template). */}}
 {{- define "fractus-demo.nodes" -}}
 {{- $names := list }}
 {{- range (lookup "v1" "Node" "" "").items }}
@@ -9,19 +9,19 @@
 {{- toJson (sortAlpha $names) }}
 {{- end }}
 
-{{/* An image; take (dict "root" $ "part" "sim"). */}}
+{{/* Image of a part. Argument: (dict "root" $ "part" "sim"). */}}
 {{- define "fractus-demo.image" -}}
 {{- with .root }}{{ .Values.image.registry }}/{{ $.part }}:{{ .Values.image.tag | default .Chart.AppVersion }}{{ end }}
 {{- end }}
 
-{{/* Name of the node that this release made the drone, also while other nodes come and go: hardware does not move. */}}
+{{/* Name of the node that this release chose as the drone. The choice persists when other nodes come and go. */}}
 {{- define "fractus-demo.earlier" -}}
 {{- if .Release.IsUpgrade }}
 {{- dig "metadata" "annotations" "fractus.dev/node" "" (lookup "apps/v1" "DaemonSet" .Release.Namespace (printf "%s-vehicle" .Release.Name)) }}
 {{- end }}
 {{- end }}
 
-{{/* Name of the node that is the drone. */}}
+{{/* Name of the drone node. */}}
 {{- define "fractus-demo.drone" -}}
 {{- $earlier := include "fractus-demo.earlier" . }}
 {{- if and $earlier .Values.drone (ne $earlier .Values.drone) }}

@@ -1,6 +1,6 @@
 {{/*
-Gives values that are missing their defaults. `helm upgrade --reuse-values` keeps the values of the release before, which does
-not have those that a newer chart has added. Each template starts with it, for they are rendered in no order.
+Sets missing values to their defaults. `helm upgrade --reuse-values` keeps the values of the previous release, which lack
+the values that a newer chart adds. Each template includes it, because the rendering order is undefined.
 */}}
 {{- define "fractus.defaults" }}
 {{- include "fractus.fill" (dict "values" .Values "defaults" (.Files.Get "files/values.yaml" | fromYaml)) }}
@@ -9,14 +9,14 @@ not have those that a newer chart has added. Each template starts with it, for t
 {{- range $key, $default := .defaults }}
 {{- if not (hasKey $.values $key) }}
 {{- $_ := set $.values $key $default }}
-{{- /* Who leaves a limit or a label out means it. */}}
+{{- /* Removed limits and labels stay removed. */}}
 {{- else if and (kindIs "map" $default) (not (has $key (list "resources" "labels"))) }}
 {{- include "fractus.fill" (dict "values" (index $.values $key) "defaults" $default) }}
 {{- end }}
 {{- end }}
 {{- end }}
 
-{{/* Labels of every object of this release; take (dict "root" $ "part" "agent"). */}}
+{{/* Labels of every object of this release. Argument: (dict "root" $ "part" "agent"). */}}
 {{- define "fractus.labels" -}}
 app.kubernetes.io/name: fractus
 app.kubernetes.io/instance: {{ .root.Release.Name }}
@@ -26,29 +26,29 @@ app.kubernetes.io/managed-by: {{ .root.Release.Service }}
 helm.sh/chart: {{ printf "%s-%s" .root.Chart.Name .root.Chart.Version }}
 {{- end }}
 
-{{/* Labels that select the pods of one part. */}}
+{{/* Labels that select the pods of a part. */}}
 {{- define "fractus.selector" -}}
 app.kubernetes.io/name: fractus
 app.kubernetes.io/instance: {{ .root.Release.Name }}
 app.kubernetes.io/component: {{ .part }}
 {{- end }}
 
-{{/* CEL: whether an agent asks, also one of an earlier release that has yet to be replaced. */}}
+{{/* CEL: true if the request comes from an agent, including agents of an earlier release that are not yet replaced. */}}
 {{- define "fractus.byAnAgent" -}}
 request.userInfo.username in ["system:serviceaccount:{{ .Release.Namespace }}:fractus-node", "system:serviceaccount:{{ .Release.Namespace }}:fractus-agent"]
 {{- end }}
 
-{{/* CEL: the node that the token of who asks is bound to; empty where it is bound to none. */}}
+{{/* CEL: the node that the token of the requester is bound to, or an empty string. */}}
 {{- define "fractus.callersNode" -}}
 has(request.userInfo.extra) && "authentication.kubernetes.io/node-name" in request.userInfo.extra
 && size(request.userInfo.extra["authentication.kubernetes.io/node-name"]) == 1
 ? request.userInfo.extra["authentication.kubernetes.io/node-name"][0] : ""
 {{- end }}
 
-{{/* Where each node has an account of its own, and its Grants; fractus_core.api.node_grants knows it by this name. */}}
+{{/* Namespace of the accounts and Grants of nodes. fractus_core.api.grants uses the same name. */}}
 {{- define "fractus.nodesNamespace" -}}fractus-nodes{{- end }}
 
-{{/* The image of a part; take (dict "root" $ "part" "agent"). */}}
+{{/* Image of a part. Argument: (dict "root" $ "part" "agent"). */}}
 {{- define "fractus.image" -}}
 {{- with .root }}{{ printf "%s/%s:%s" .Values.image.registry $.part (.Values.image.tag | default .Chart.AppVersion) | quote }}{{ end }}
 {{- end }}
@@ -67,14 +67,14 @@ imagePullSecrets:
 - {name: FRACTUS_LOG_FORMAT, value: {{ .Values.logFormat | quote }}}
 {{- end }}
 
-{{/* Where nodes tell their metrics: localhost, node (their own address, out of reach over direct links), or nothing. */}}
+{{/* Listen address for metrics of nodes: localhost, node (address of the node, not reachable over direct links), or empty. */}}
 {{- define "fractus.nodeMetrics" -}}
 {{- with .Values.metrics }}
 {{- if .nodes.enabled }}{{ ternary (ternary "node" "localhost" .podMonitor.enabled) .nodes.address (eq .nodes.address "auto") }}{{ end }}
 {{- end }}
 {{- end }}
 
-{{/* The same for a workload; takes (dict "root" $ "port" 46812). */}}
+{{/* Listen address for metrics of a workload. Argument: (dict "root" $ "port" 46812). */}}
 {{- define "fractus.nodeMetricsEnv" -}}
 {{- $where := include "fractus.nodeMetrics" .root }}
 {{- if eq $where "node" }}
@@ -90,7 +90,7 @@ imagePullSecrets:
 {{- end }}
 {{- end }}
 
-{{/* Root, to write the node's directories, and nothing beyond but what is added; take (dict "privileged" false). */}}
+{{/* Security context that runs as root to write the node's directories, without other privileges. Argument: (dict "privileged" false). */}}
 {{- define "fractus.nodeSecurity" -}}
 {{- if .privileged }}
 privileged: true
@@ -104,7 +104,7 @@ seccompProfile: {type: RuntimeDefault}
 {{- end }}
 {{- end }}
 
-{{/* CEL: whether a pod may run on drones and edge nodes; takes the name of the variable that holds the pod. */}}
+{{/* CEL: true if a pod may run on drones and edge nodes. Argument: name of the variable that holds the pod. */}}
 {{- define "fractus.tolerates" -}}
 {{ . }}.spec.?tolerations.orValue([]).exists(t, t.?key.orValue("") in ["", "fractus.dev/class"])
 {{- end }}

@@ -1,13 +1,13 @@
 {{/*
-Labels and annotations of a workload's pods; take (dict "root" $ "part" "agent" "workload" "agent"): the part that the pods are, and
-the workload whose values they take. A label by which policies, selectors and the operator go can be no one else's: who could say
-that a service is another one would take it from what guards it in flight.
+Labels and annotations of the pods of a workload. Argument: (dict "root" $ "part" "agent" "workload" "agent"), that is, the part that
+the pods belong to and the workload whose values apply. Labels that policies, selectors and the operator use cannot be set by values,
+because a service under another label would lose its protection in flight.
 */}}
 {{- define "fractus.podMetadata" -}}
 {{- $values := index .root.Values .workload }}
 {{- range $name, $_ := $values.podLabels }}
 {{- if regexMatch "^(([a-z0-9.-]+[.])?fractus[.]dev|app[.]kubernetes[.]io|helm[.]sh)/|^(controller-revision-hash|pod-template-(hash|generation))$" $name }}
-{{- fail (printf "%s.podLabels: policies, selectors or the operator go by %s: use a label of another name" $.workload $name) }}
+{{- fail (printf "%s.podLabels: the label %s is reserved; use a label with another name" $.workload $name) }}
 {{- end }}
 {{- end -}}
 labels:
@@ -18,19 +18,19 @@ annotations: {{- toYaml . | nindent 2 }}
 {{- end }}
 {{- end }}
 
-{{/* Further variables of a workload's container; take (dict "root" $ "workload" "agent"). */}}
+{{/* Additional environment variables of the container of a workload. Argument: (dict "root" $ "workload" "agent"). */}}
 {{- define "fractus.extraEnv" -}}
 {{- range (index .root.Values .workload).extraEnv }}
 {{- if hasPrefix "FRACTUS_" .name }}
-{{- fail (printf "%s.extraEnv: %s is the chart's own: set it by its values" $.workload .name) }}
+{{- fail (printf "%s.extraEnv: %s is reserved; use the values of the chart instead" $.workload .name) }}
 {{- end }}
 - {{- toYaml . | nindent 2 }}
 {{- end }}
 {{- end }}
 
 {{/*
-Affinities that must hold along with those that are asked for; takes (dict "ours" DICT "theirs" DICT), as pods have them. Terms that
-select nodes are alternatives: each of ours is joined with each of theirs.
+Combines required affinities with those of the values. Argument: (dict "ours" DICT "theirs" DICT), in Kubernetes format. Terms that
+select nodes are alternatives, so each required term is combined with each term of the values.
 */}}
 {{- define "fractus.affinity" -}}
 {{- $required := "requiredDuringSchedulingIgnoredDuringExecution" }}
@@ -60,8 +60,8 @@ nodeAffinity:
 {{- end }}
 
 {{/*
-What pods on drones and edge nodes share; take (dict "root" $ "part" "camera" "classes" (list "drone")). All have one PriorityClass,
-which the policy fractus-pods keeps others below, and tolerate everything.
+Common pod fields on drones and edge nodes. Argument: (dict "root" $ "part" "camera" "classes" (list "drone")). All pods tolerate
+every taint and have one PriorityClass, and the policy fractus-pods keeps other pods below it.
 */}}
 {{- define "fractus.nodePod" -}}
 {{- $values := index .root.Values .part -}}
@@ -78,13 +78,13 @@ affinity:
 {{- with $values.nodeSelector }}
 nodeSelector: {{- toYaml . | nindent 2 }}
 {{- end }}
-# A drone out of reach keeps what flies it.
+# The pods stay on an unreachable drone.
 tolerations:
   - operator: Exists
 {{ include "fractus.pullSecrets" .root }}
 {{- end }}
 
-{{/* On nodes that are neither drones nor at the edge, or are of the cloud as well; operators apart from each other where they can. */}}
+{{/* Affinity to nodes that are cloud nodes, or neither drones nor edge nodes. Operators are spread over nodes if possible. */}}
 {{- define "fractus.cloudAffinity" -}}
 nodeAffinity:
   requiredDuringSchedulingIgnoredDuringExecution:
@@ -104,7 +104,7 @@ podAntiAffinity:
     {{- end }}
 {{- end }}
 
-{{/* Where the pods of the operator and of the view run; take (dict "root" $ "workload" "view"). */}}
+{{/* Scheduling of the pods of the operator and the view. Argument: (dict "root" $ "workload" "view"). */}}
 {{- define "fractus.cloudPod" -}}
 {{- $values := index .root.Values .workload }}
 {{- $operator := .root.Values.operator -}}

@@ -60,26 +60,28 @@ class CameraServiceServicer(object):
     """Missing associated documentation comment in .proto file."""
 
     def CaptureImage(self, request, context):
-        """Missing associated documentation comment in .proto file."""
+        """Captures an image, applies the privacy filters, and stores the result on the node.
+        """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def RetrieveImage(self, request, context):
-        """Streams the image in chunks of at most 256 KiB; the decision comes with the first one.
+        """Streams a stored image in chunks of at most 256 KiB. The first chunk contains the decision and the image info.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def ListImages(self, request, context):
-        """Missing associated documentation comment in .proto file."""
+        """Lists the stored images of the caller.
+        """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def DeleteImage(self, request, context):
-        """Where the node records pictures, the copy in the recording stays until its segment makes room for newer ones.
+        """Deletes a stored image. A copy in a recording remains until its segment is removed.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

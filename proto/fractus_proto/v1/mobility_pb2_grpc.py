@@ -125,22 +125,22 @@ class MobilityServiceServicer(object):
     """Missing associated documentation comment in .proto file."""
 
     def GetControl(self, request, context):
-        """Blocks until the drone is at the caller's next control point, then yields GRANTED and stays open for as long as the
-        caller holds control. The stream is the driver's sign of life: when it breaks, the system hovers, then flies home.
+        """Blocks until the drone is at the caller's next control point, then sends GRANTED. The stream is the control lease: it stays
+        open while the caller has control. If it breaks, the system hovers and then flies the drone home.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def ReturnControl(self, request, context):
-        """Gives control back at the end of a control point's task; at the last one the system brings the drone home.
+        """Returns control at the end of the task of a control point. After the last control point the system flies the drone home.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def ReportProgress(self, request, context):
-        """Tells how far the caller is with the task of its control point; it is told again with GRANTED after a restart. Needs control.
+        """Reports the progress of the caller's current task. GRANTED returns it after a restart of the caller. Requires control.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -159,7 +159,7 @@ class MobilityServiceServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def Takeoff(self, request, context):
-        """Motion calls stream their progress until the motion is complete. Cancelling the call stops the motion: the drone hovers.
+        """Motion calls stream their progress until the motion is complete. Cancelling a call stops the motion, and the drone hovers.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -202,14 +202,14 @@ class MobilityServiceServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def SetVelocity(self, request, context):
-        """Flies with a velocity until the next one comes; a watchdog hovers when none comes within hold_s.
+        """Sets a velocity. The drone hovers if no further setpoint arrives within hold_s.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def PointGimbal(self, request, context):
-        """Turns the camera by the gimbal, and returns once the autopilot has taken the command; telemetry tells where it points.
+        """Points the camera with the gimbal. Returns when the autopilot has accepted the command. Telemetry reports the measured attitude.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -222,14 +222,14 @@ class MobilityServiceServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def SubscribeTelemetry(self, request, context):
-        """Fast telemetry, at the asked interval (0.05 s at least). Needs the method GetPosition, or the node's own identity.
+        """Streams telemetry at the requested interval. Requires the method GetPosition, or the identity of the node.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def CheckCall(self, request, context):
-        """What would become of a call at this moment: nothing is done and nothing is taken over. Needs a grant, not control.
+        """Returns the verdict on a call without executing it or taking the drone over. Requires a Grant, but not control.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

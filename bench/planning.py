@@ -31,7 +31,7 @@ from fractus_core.geo import LocalFrame, distance_m
 from fractus_core.planning import Host, Inventory, NodeLocations, Settings, operation_area
 from fractus_core.planning.candidates import direct_reach_m, requests
 from fractus_core.planning.coverage import Samples
-from fractus_core.planning.plan import plan_in_steps
+from fractus_core.planning.planner import plan_in_steps
 
 FRAME = LocalFrame(39.3606, 22.9307)
 BLOCK_M = (600.0, 540.0)

@@ -27,7 +27,7 @@ from typing import Any
 
 import shapely
 from fractus_cluster.ports import free_port
-from fractus_core.api.plans import GrantSpec
+from fractus_core.api.grants import GrantSpec
 from fractus_core.geo import LocalFrame
 from fractus_core.policy.compiled_grant import CompiledGrant, compile_grant
 from fractus_core.policy.decision_types import Airframe, Call, GotoArgs, Home, Situation, VelocityArgs

@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import Any
 
-from fractus_core.api.plans import GrantSpec
+from fractus_core.api.grants import GrantSpec
 from fractus_core.geo import LocalFrame
 from fractus_core.policy.compiled_grant import CompiledGrant, compile_grant
 from fractus_core.policy.decision_types import Call, GotoArgs, Home, Lens, Situation, Verdict

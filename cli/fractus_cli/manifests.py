@@ -29,7 +29,7 @@ from fractus_core.api.names import CLASS_LABEL
 from fractus_core.api.nodes import DroneStatus
 from fractus_core.documents import MAX_BYTES, BadDocument, Documents, parse_documents
 from fractus_core.planning import Host, Inventory
-from fractus_core.planning.quantities import amount_of
+from fractus_core.planning.inventory import amount_of
 from fractus_core.validation import check_policy, check_zone
 
 from fractus_cli.output import printable

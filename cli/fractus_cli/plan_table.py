@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from fractus_core.api import Application
 from fractus_core.api.plans import DeploymentPlanSpec, DroneChoice, PlannedInstance, Rejection
 from fractus_core.planning import Infeasible
-from fractus_core.planning.links import PlannedLink
+from fractus_core.planning.link_planning import PlannedLink
 
 _LISTED = 20
 

@@ -10,8 +10,8 @@ from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.planning import Flight, Host, Infeasible, Inventory, Settings, flight_of
 from fractus_core.planning import plan as decide
 from fractus_core.planning.candidates import requests
-from fractus_core.planning.grants import compile_grants
-from fractus_core.planning.links import PlannedLink, plan_links
+from fractus_core.planning.grant_compiler import compile_grants
+from fractus_core.planning.link_planning import PlannedLink, plan_links
 from fractus_core.validation import check_application
 
 from fractus_cli.manifests import BadManifest, Manifests

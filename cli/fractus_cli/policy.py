@@ -12,11 +12,11 @@ from typing import Any, TypeVar
 
 import click
 from fractus_core.api import Application, Drone, Policy, Resource
+from fractus_core.api.grants import ApplicationReference, GrantedLimits, GrantSpec
 from fractus_core.api.methods import METHODS_OF
 from fractus_core.api.model import InvalidObject
-from fractus_core.api.plans import ApplicationReference, GrantedLimits, GrantSpec
 from fractus_core.planning import Settings
-from fractus_core.planning.grants import compile_grants, refresh
+from fractus_core.planning.grant_compiler import compile_grants, refresh
 from fractus_core.policy.compiled_grant import compile_grant
 from fractus_core.policy.decision_types import Airframe, Attitude, Call, Home, Situation, Verdict
 from fractus_core.policy.engine import judge

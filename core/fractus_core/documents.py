@@ -1,8 +1,8 @@
-"""YAML and JSON as the API server reads them, within limits, and the line that each value is on.
+"""YAML and JSON parsing as in the API server, with resource limits and the line of each value.
 
-What programs of others made of a file must not be another thing than what Fractus makes of it. So plain scalars are typed
-as kubectl types them (a time stays a text, `on` is true, 1e3 a number), a key that is there twice is an error, and aliases
-are counted as what they stand for.
+Files must mean the same to Fractus as to other programs. So plain scalars have the types that kubectl gives them (a
+timestamp is a string, `on` is true, 1e3 is a number), duplicate keys are errors, and an alias counts as the values that
+it repeats. Values are built from parser events, so the limits apply before memory is spent (docs/decisions/0020-yaml-from-parser-events.md).
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ import yaml
 
 MAX_BYTES = 64 * 2**20
 MAX_NODES = 5_000_000
-"""Scalars, lists and objects of one file at most: a hundred thousand nodes with their interfaces."""
+"""Maximum number of scalars, lists and objects of a file, enough for 100,000 nodes with their interfaces."""
 MAX_ALIASED = 100_000
-"""Those of them at most that aliases repeat: manifests repeat an image or a path, alias bombs repeat each other."""
+"""Maximum number of values that aliases repeat. Manifests repeat an image or a path; alias bombs repeat each other."""
 MAX_DEPTH = 100
 _MAX_DIGITS = 300
 
@@ -31,9 +31,9 @@ _CONSTANTS: dict[str, bool | None] = {
 }
 _INTEGER = re.compile(r"[-+]?(?:0[xX][0-9a-fA-F]+|0[bB][01]+|0[oO]?[0-7]+|0|[1-9][0-9]*)")
 _FLOAT = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?")
-_NO_NUMBER = re.compile(r"[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)")
+_NOT_FINITE = re.compile(r"[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)")
 _NOT_YAML = re.compile("[\x7f-\x9f\u2028\u2029\ufeff\ufffe\uffff]")
-"""What JSON has in its texts as it is, and YAML has not, or takes for the end of a line."""
+"""Characters that JSON strings may contain but YAML rejects or reads as line breaks."""
 _SURROGATES = re.compile(r"\\(?:u([dD][89abAB][0-9a-fA-F]{2})\\u([dD][c-fC-F][0-9a-fA-F]{2})|.)", re.DOTALL)
 _PART = re.compile(r"\.?([^.\[\]]+)|\[([0-9]+)\]")
 _TEXT_TAGS = frozenset({"!", "tag:yaml.org,2002:str"})
@@ -43,10 +43,10 @@ _Lines = dict[Hashable, int]
 
 
 class _Dumper(yaml.CSafeDumper):
-    """Quotes what a program of another language would take for a number or a truth value; writes no aliases."""
+    """Quotes strings that other YAML parsers would read as numbers or booleans, and writes no aliases."""
 
     def ignore_aliases(self, data: object) -> bool:
-        """Say that nothing is shared."""
+        """Return True for every value."""
         return True
 
 
@@ -57,20 +57,21 @@ _Dumper.add_implicit_resolver(
 
 
 def dump_documents(values: Iterable[Any]) -> str:
-    """A YAML stream that `parse_documents`, kubectl and all else read as these values."""
+    """Return a YAML stream that every YAML parser, including kubectl's, reads as these values."""
     return yaml.dump_all(values, Dumper=_Dumper, sort_keys=False, width=120, allow_unicode=True)
 
 
 class BadDocument(ValueError):
-    """A file that cannot be read; one sentence that names the file and the line.
+    """A file cannot be parsed. The message contains the file name and the line.
 
     Attributes:
-        line: where, counted from 1; 0 where it is the file as a whole.
-        problem: what is wrong, and the remedy.
+        line: Line number, from 1, or 0 if the problem concerns the whole file.
+        problem: Description of the problem, with the remedy.
     """
 
     def __init__(self, name: str, line: int, problem: str) -> None:
-        self.line, self.problem = line, problem
+        self.line = line
+        self.problem = problem
         super().__init__(f"{_place(name, line)}: {problem}")
 
 
@@ -87,11 +88,14 @@ class Documents:
     _lines: dict[int, tuple[int, _Lines]] = field(repr=False)
 
     def where(self, value: object, path: str = "") -> str:
-        """FILE:LINE of a list or object of these documents, or of a field below it, as far as the path leads."""
+        """Return FILE:LINE of a list or object of these documents, or of the field at `path` below it."""
         return _place(self.name, self.line(value, path))
 
     def line(self, value: object, path: str = "") -> int:
-        """The line of a list or object of these documents, or of a field below it; 0 where it is not known."""
+        """Return the line of a list or object of these documents, or of the field at `path` below it.
+
+        If the path does not exist completely, the line of its last existing part is returned, or 0 if no part is known.
+        """
         line, fields = self._lines.get(id(value), (0, {}))
         for part in _PART.finditer(path):
             key: Hashable = part[1] or part[2]
@@ -99,27 +103,28 @@ class Documents:
                 key = int(str(key)) if str(key).isdigit() else key
             if key not in fields:
                 break
-            line, value = fields[key], value[key]  # type: ignore[index]  # it has fields: it is a list or an object
+            line = fields[key]
+            value = value[key]  # type: ignore[index]  # a value with fields is a list or a dict
             fields = self._lines.get(id(value), (0, {}))[1]
         return line
 
 
 def parse_documents(content: bytes, name: str, *, is_json: bool = False) -> Documents:
-    """The documents of a YAML stream, or the one of a JSON file.
+    """Parse a YAML stream, or a JSON file with `is_json`.
 
     Raises:
-        BadDocument: it cannot be parsed, has a key twice, or goes beyond a limit.
+        BadDocument: The content cannot be parsed, has a duplicate key, or exceeds a limit.
     """
     if len(content) > MAX_BYTES:
-        raise BadDocument(name, 0, f"it has more than {MAX_BYTES // 2**20} MiB; split it")
+        raise BadDocument(name, 0, f"the file is larger than {MAX_BYTES // 2**20} MiB; split it")
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = content[: error.start].count(b"\n") + 1
-        raise BadDocument(name, line, "this is no text file in UTF-8") from None
+        raise BadDocument(name, line, "not a UTF-8 text file") from None
     if is_json:
         _check_json(text, name)
-        text = _NOT_YAML.sub(lambda found: f"\\u{ord(found[0]):04x}", _SURROGATES.sub(_joined, text))
+        text = _NOT_YAML.sub(lambda match: f"\\u{ord(match[0]):04x}", _SURROGATES.sub(_joined, text))
     reader = _Reader(name)
     try:
         for event in yaml.parse(text, Loader=yaml.CSafeLoader):
@@ -127,39 +132,45 @@ def parse_documents(content: bytes, name: str, *, is_json: bool = False) -> Docu
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = mark.line + 1 if mark is not None else 0
-        raise BadDocument(name, line, f"this is not YAML: {error.problem or error.context}") from None
+        raise BadDocument(name, line, f"invalid YAML: {error.problem or error.context}") from None
     except yaml.YAMLError as error:
         line = text[: getattr(error, "position", 0)].count("\n") + 1
-        raise BadDocument(name, line, f"this is not YAML: {getattr(error, 'reason', None) or error}") from None
+        raise BadDocument(name, line, f"invalid YAML: {getattr(error, 'reason', None) or error}") from None
     return Documents(name, tuple(reader.values), reader.lines)
 
 
 def parse_document(content: bytes, name: str) -> tuple[Any, Documents]:
-    """The one document of a YAML file (None if it is empty), and where its parts are.
+    """Parse a YAML file with at most one document.
+
+    Returns:
+        The document (None if the file is empty), and the lines of its values.
 
     Raises:
-        BadDocument: it cannot be parsed, or has several documents.
+        BadDocument: The content cannot be parsed, or has several documents.
     """
-    found = parse_documents(content, name)
-    if len(found.values) > 1:
-        raise BadDocument(name, found.line(found.values[1]), "there is a second document; give one")
-    return (found.values[0] if found.values else None), found
+    documents = parse_documents(content, name)
+    if len(documents.values) > 1:
+        line = documents.line(documents.values[1])
+        raise BadDocument(name, line, "the file has a second document; remove it")
+    return (documents.values[0] if documents.values else None), documents
 
 
 def _check_json(text: str, name: str) -> None:
-    def no_number(word: str) -> None:
-        raise BadDocument(name, 0, f"{word} is not a number that JSON has; give a finite one")
+    def refuse_constant(word: str) -> None:
+        raise BadDocument(name, 0, f"{word} is not a JSON number; use a finite number")
 
     try:
-        json.loads(text, parse_int=len, parse_constant=no_number)
+        json.loads(text, parse_int=len, parse_constant=refuse_constant)
     except json.JSONDecodeError as error:
-        raise BadDocument(name, error.lineno, f"this is not JSON: {error.msg.lower()}") from None
+        raise BadDocument(name, error.lineno, f"invalid JSON: {error.msg.lower()}") from None
     except RecursionError:
-        raise BadDocument(name, 0, f"its lists or objects are nested deeper than {MAX_DEPTH}; flatten them") from None
+        raise BadDocument(
+            name, 0, f"lists or objects are nested deeper than {MAX_DEPTH} levels; flatten them"
+        ) from None
 
 
 def _joined(escape: re.Match[str]) -> str:
-    """Of two escaped surrogates (JSON) one escaped character (YAML)."""
+    """Convert an escaped surrogate pair (JSON) to one escaped character (YAML)."""
     if escape[1] is None:
         return escape[0]
     return f"\\U{0x10000 + ((int(escape[1], 16) - 0xD800) << 10) + int(escape[2], 16) - 0xDC00:08x}"
@@ -168,31 +179,35 @@ def _joined(escape: re.Match[str]) -> str:
 _NO_KEY: Any = object()
 
 
-class _Open:
-    """A list or object that is being read."""
+class _OpenCollection:
+    """A list or object whose end has not been read yet."""
 
     __slots__ = ("anchor", "before", "key", "line", "lines", "merged", "value")
 
     def __init__(self, value: Any, line: int, anchor: str | None, before: int) -> None:
-        self.value, self.line, self.anchor, self.before = value, line, anchor, before
+        self.value = value
+        self.line = line
+        self.anchor = anchor
+        self.before = before
         self.lines: _Lines = {}
         self.key: Any = _NO_KEY
         self.merged: list[dict[str, Any]] = []
 
 
 class _Reader:
-    """Makes values of the events of a parser."""
+    """Builds values from parser events."""
 
     def __init__(self, name: str) -> None:
         self.values: list[Any] = []
         self.lines: dict[int, tuple[int, _Lines]] = {}
         self._name = name
-        self._stack: list[_Open] = []
+        self._stack: list[_OpenCollection] = []
         self._anchors: dict[str, tuple[Any, int] | None] = {}
-        self._nodes = self._aliased = 0
+        self._nodes = 0
+        self._aliased = 0
 
     def take(self, event: Any) -> None:
-        """Go on with the next event."""
+        """Process the next event."""
         kind = type(event)
         if kind is yaml.ScalarEvent:
             self._scalar(event)
@@ -208,23 +223,24 @@ class _Reader:
     def _open(self, event: Any, value: Any) -> None:
         line = event.start_mark.line + 1
         if event.tag not in _PLAIN_TAGS:
-            raise self._bad(line, f"the tag {event.tag} means nothing here; remove it")
+            raise self._bad(line, f"the tag {event.tag} is not supported; remove it")
         if len(self._stack) >= MAX_DEPTH:
-            raise self._bad(line, f"its lists or objects are nested deeper than {MAX_DEPTH}; flatten them")
+            raise self._bad(line, f"lists or objects are nested deeper than {MAX_DEPTH} levels; flatten them")
         if self._stack and self._expects_key():
-            raise self._bad(line, "a list or object cannot be a key; give a name")
+            raise self._bad(line, "a list or object cannot be a key; use a string")
         self._count(line)
         if event.anchor is not None:
             self._anchors[event.anchor] = None
-        self._stack.append(_Open(value, line, event.anchor, self._nodes))
+        self._stack.append(_OpenCollection(value, line, event.anchor, self._nodes))
 
     def _close(self) -> None:
         done = self._stack.pop()
         for other in done.merged:
             for key, value in other.items():
                 if key in done.value:
-                    raise self._bad(done.line, f"{key} is given here and by <<; remove one of them")
-                done.value[key], done.lines[key] = value, done.line
+                    raise self._bad(done.line, f"{key} is defined here and by <<; remove one of them")
+                done.value[key] = value
+                done.lines[key] = done.line
         self.lines[id(done.value)] = done.line, done.lines
         if done.anchor is not None:
             self._anchors[done.anchor] = done.value, self._nodes - done.before + 1
@@ -235,7 +251,7 @@ class _Reader:
         self._count(line)
         plain = event.implicit[0]
         if not plain and event.tag is not None and event.tag not in _TEXT_TAGS:
-            raise self._bad(line, f"the tag {event.tag} means nothing here; remove it")
+            raise self._bad(line, f"the tag {event.tag} is not supported; remove it")
         if self._stack and self._expects_key():
             value: Any = event.value
             if plain and value == "<<":
@@ -249,20 +265,18 @@ class _Reader:
     def _alias(self, event: Any) -> None:
         line = event.start_mark.line + 1
         if event.anchor not in self._anchors:
-            raise self._bad(line, f"there is no anchor &{event.anchor} above; define it, or correct the name")
-        found = self._anchors[event.anchor]
-        if found is None:
-            raise self._bad(
-                line, f"*{event.anchor} stands for a part of the file that it is in; write out what is meant"
-            )
-        value, weight = found
+            raise self._bad(line, f"the anchor &{event.anchor} is not defined above; define it or correct the name")
+        anchored = self._anchors[event.anchor]
+        if anchored is None:
+            raise self._bad(line, f"*{event.anchor} refers to a value that contains it; write out the value")
+        value, weight = anchored
         self._aliased += weight
         self._nodes += weight - 1
         if self._aliased > MAX_ALIASED:
-            raise self._bad(line, f"aliases repeat more than {MAX_ALIASED} values; write fewer of them")
+            raise self._bad(line, f"aliases repeat more than {MAX_ALIASED} values; use fewer aliases")
         self._count(line)
         if self._stack and self._expects_key() and not isinstance(value, str):
-            raise self._bad(line, "only a text can be a key; give a name")
+            raise self._bad(line, "only a string can be a key; correct it")
         self._add(value, line)
 
     def _expects_key(self) -> bool:
@@ -281,7 +295,7 @@ class _Reader:
         elif top.key is _NO_KEY:
             top.key = value
             if value in top.lines:
-                raise self._bad(line, f"{value} is given twice, on line {top.lines[value]} as well; remove one of them")
+                raise self._bad(line, f"{value} is also defined on line {top.lines[value]}; remove one of them")
             if isinstance(value, str):
                 top.lines[value] = line
         elif top.key is yaml.MappingStartEvent:
@@ -291,10 +305,10 @@ class _Reader:
             top.value[top.key] = value
             top.key = _NO_KEY
 
-    def _merge(self, top: _Open, value: Any, line: int) -> None:
+    def _merge(self, top: _OpenCollection, value: Any, line: int) -> None:
         parts = value if isinstance(value, list) else [value]
         if not all(isinstance(part, dict) for part in parts):
-            raise self._bad(line, "<< takes an alias of an object, or a list of them")
+            raise self._bad(line, "<< requires an alias of an object, or a list of such aliases")
         top.merged += parts
 
     def _typed(self, text: str, line: int) -> Any:
@@ -310,18 +324,18 @@ class _Reader:
             whole = int(number, 0)
             return whole if -(2**63) <= whole < 2**63 else float(whole)
         if _FLOAT.fullmatch(number):
-            found = float(number)
-            if not math.isfinite(found):
-                raise self._bad(line, f"{text[:40]} is larger than any number; correct it")
-            return found
-        if _NO_NUMBER.fullmatch(text):
-            raise self._bad(line, f"{text} is not a number that JSON has; give a finite one")
+            parsed = float(number)
+            if not math.isfinite(parsed):
+                raise self._bad(line, f"{text[:40]} exceeds the range of numbers; correct it")
+            return parsed
+        if _NOT_FINITE.fullmatch(text):
+            raise self._bad(line, f"{text} is not a JSON number; use a finite number")
         return text
 
     def _count(self, line: int) -> None:
         self._nodes += 1
         if self._nodes > MAX_NODES:
-            raise self._bad(line, f"it has more than {MAX_NODES} values; split it")
+            raise self._bad(line, f"the file has more than {MAX_NODES} values; split it")
 
     def _bad(self, line: int, problem: str) -> BadDocument:
         return BadDocument(self._name, line, problem)

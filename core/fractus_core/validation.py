@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping
 from fractus_core.api import Application, Depot, InvalidObject, Policy, Zone
 from fractus_core.api.geometry import Area
 from fractus_core.geo import LocalFrame, area_center, area_polygon, check_extent
-from fractus_core.planning.area import check_crossings, route_of
+from fractus_core.planning.operation_area import check_crossings, route_of
 from fractus_core.policy.selectors import is_attribute
 
 MAX_WAYPOINTS = 2000

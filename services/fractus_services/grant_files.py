@@ -10,8 +10,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from fractus_core.api.grants import Grant, GrantSpec
 from fractus_core.api.model import InvalidObject
-from fractus_core.api.plans import Grant, GrantSpec
 from fractus_core.policy.compiled_grant import CompiledGrant, compile_grant
 from fractus_core.policy.grant_signatures import BadSignature
 

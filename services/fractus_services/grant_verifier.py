@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from cryptography import x509
-from fractus_core.api.plans import Grant
+from fractus_core.api.grants import Grant
 from fractus_core.policy.grant_signatures import (
     SIGNATURE_ANNOTATION,
     SIGNER_ANNOTATION,

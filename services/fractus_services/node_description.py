@@ -6,8 +6,7 @@ import asyncio
 import logging
 from pathlib import Path
 
-from fractus_core.api.descriptions import InvalidDescription, parse_description
-from fractus_core.api.nodes import Drone, EdgeNode
+from fractus_core.api.nodes import Drone, EdgeNode, InvalidDescription, parse_description
 
 from fractus_services.options import CannotServe
 

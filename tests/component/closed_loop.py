@@ -19,7 +19,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import shapely
-from fractus_core.api.plans import GrantSpec
+from fractus_core.api.grants import GrantSpec
 from fractus_core.control import ControlEvent, ControlState, StreamState
 from fractus_core.policy.decision_types import SetSpeedArgs, TakeoffArgs, VelocityArgs
 from fractus_runtime.mavlink_codec import Parser

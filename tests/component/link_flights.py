@@ -17,7 +17,7 @@ from typing import Any
 
 import shapely
 from closed_loop import HALF_M, Account, Drone, Oracle, Sky, Weather
-from fractus_core.api.plans import GrantSpec
+from fractus_core.api.grants import GrantSpec
 from fractus_core.control import StreamState
 from fractus_core.policy.decision_types import TakeoffArgs, VelocityArgs
 from fractus_services.errors import AutopilotError, Refused, Unavailable

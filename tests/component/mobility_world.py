@@ -10,7 +10,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import shapely
-from fractus_core.api.plans import GrantSpec
+from fractus_core.api.grants import GrantSpec
 from fractus_core.control import ControlEvent, ControlState, StreamState
 from fractus_core.control.state import FlightMode
 from fractus_core.geo import LocalFrame

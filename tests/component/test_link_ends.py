@@ -27,7 +27,7 @@ from fractus_agent.redirector.netlink import NetlinkError
 from fractus_agent.redirector.nft import Endpoint
 from fractus_agent.redirector.redirector import Namespaces, Redirector
 from fractus_agent.settings import MAX_DRAIN_S, BadSetting, Settings
-from fractus_core.api.links import DirectLink, LinkedService
+from fractus_core.api.direct_links import DirectLink, LinkedService
 from fractus_core.linking import PathMetrics, UnknownHeuristic
 
 PATH = PathMetrics(8.0, 8.0, 60.0, 60.0)

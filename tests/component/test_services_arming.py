@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fractus_core.api.plans import GrantSpec
+from fractus_core.api.grants import GrantSpec
 from fractus_core.control.events import Airborne, ArmingRequested
 from fractus_core.policy.decision_types import Airframe, TakeoffArgs
 from fractus_services.errors import AutopilotError

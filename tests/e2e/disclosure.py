@@ -6,7 +6,7 @@ import base64
 import json
 
 from conftest import SYSTEM
-from fractus_core.api.node_grants import unpack
+from fractus_core.api.grants import unpack
 from kubectl import Kube
 
 TOKEN = "/var/run/secrets/kubernetes.io/serviceaccount/token"

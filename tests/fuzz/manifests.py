@@ -22,12 +22,11 @@ import atheris
 with atheris.instrument_imports(include=["fractus_core", "fractus_cli.manifests", "fractus_cli.planning", "yaml"]):
     from fractus_cli.manifests import BadManifest, read_manifests
     from fractus_cli.planning import plan_all
-    from fractus_core.api.descriptions import InvalidDescription, parse_description
-    from fractus_core.api.nodes import Drone, EdgeNode
-    from fractus_core.api.plans import GrantSpec
+    from fractus_core.api.grants import GrantSpec
+    from fractus_core.api.nodes import Drone, EdgeNode, InvalidDescription, parse_description
     from fractus_core.documents import dump_documents, parse_documents
     from fractus_core.planning import Settings
-    from fractus_core.planning.grants import compile_grants
+    from fractus_core.planning.grant_compiler import compile_grants
     from fractus_core.policy.compiled_grant import compile_grant
 
 FOLDER = Path(tempfile.mkdtemp())

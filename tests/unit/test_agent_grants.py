@@ -17,8 +17,7 @@ from fractus_agent.grants.keeper import (
     stored_form,
     unless_ended,
 )
-from fractus_core.api.node_grants import ReportedGrant, pack
-from fractus_core.api.plans import Grant
+from fractus_core.api.grants import Grant, ReportedGrant, pack
 from fractus_core.control import Outcome, OutcomeKind
 from fractus_core.policy.grant_signatures import BadSignature, UnknownAuthority
 

@@ -14,8 +14,7 @@ from fractus_agent.registration.registration import (
     description_hash,
     own_description,
 )
-from fractus_core.api.descriptions import InvalidDescription, parse_description
-from fractus_core.api.nodes import CameraMount, Drone
+from fractus_core.api.nodes import CameraMount, Drone, InvalidDescription, parse_description
 
 MANIFEST: dict[str, Any] = {
     "apiVersion": "fractus.dev/v1alpha1",

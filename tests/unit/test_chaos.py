@@ -12,8 +12,7 @@ from typing import Any, cast
 import pytest
 from fractus_cluster.spec import load_spec
 from fractus_core.api import Grant
-from fractus_core.api.node_grants import pack
-from fractus_core.api.plans import GrantSpec
+from fractus_core.api.grants import GrantSpec, pack
 from fractus_core.policy.decision_types import Home
 from fractus_sim.chaos.__main__ import with_disk
 from fractus_sim.chaos.faults import FAULTS, broken

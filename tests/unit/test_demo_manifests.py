@@ -16,7 +16,7 @@ from fractus_cluster.spec import load_spec
 from fractus_core.api import KINDS, Application, Depot, Drone, EdgeNode, Policy, Resource, Zone
 from fractus_core.geo import geodesic_m
 from fractus_core.planning import Host, Inventory, plan
-from fractus_core.planning.grants import compile_grants
+from fractus_core.planning.grant_compiler import compile_grants
 from fractus_core.policy.compiled_grant import compile_grant
 from fractus_core.policy.decision_types import Call, GotoArgs, Home, SetSpeedArgs, Situation
 from fractus_core.policy.engine import judge

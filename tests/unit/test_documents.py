@@ -55,23 +55,23 @@ def test_json_has_characters_that_yaml_has_not(number):
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("a: 1\nb: 2\na: 3", "f.yaml:3: a is given twice, on line 1 as well; remove one of them"),
-        ("a:\n  b: {c: 1, d: 2, c: 1}", "f.yaml:2: c is given twice, on line 2 as well"),
-        ("a: &a {p: 1}\nb: {<<: *a, p: 2}", "f.yaml:2: p is given here and by <<; remove one of them"),
-        ("a: &a [1, *a]", "f.yaml:1: *a stands for a part of the file that it is in"),
-        ("a: *b", "f.yaml:1: there is no anchor &b above"),
-        ("a: &x 1\n---\nb: *x", "f.yaml:3: there is no anchor &x above"),
+        ("a: 1\nb: 2\na: 3", "f.yaml:3: a is also defined on line 1; remove one of them"),
+        ("a:\n  b: {c: 1, d: 2, c: 1}", "f.yaml:2: c is also defined on line 2"),
+        ("a: &a {p: 1}\nb: {<<: *a, p: 2}", "f.yaml:2: p is defined here and by <<; remove one of them"),
+        ("a: &a [1, *a]", "f.yaml:1: *a refers to a value that contains it"),
+        ("a: *b", "f.yaml:1: the anchor &b is not defined above"),
+        ("a: &x 1\n---\nb: *x", "f.yaml:3: the anchor &x is not defined above"),
         ("a: 1\nb: !!python/object/apply:os.system [ls]", "f.yaml:2: the tag tag:yaml.org,2002:python/object/apply"),
         ("? [1]\n: 2", "f.yaml:1: a list or object cannot be a key"),
-        ("a: &a {b: 1}\n*a : 2", "f.yaml:2: only a text can be a key"),
-        ("<<: 3", "f.yaml:1: << takes an alias of an object"),
-        ("a: 1e999", "f.yaml:1: 1e999 is larger than any number"),
-        ("a: .nan", "f.yaml:1: .nan is not a number that JSON has"),
+        ("a: &a {b: 1}\n*a : 2", "f.yaml:2: only a string can be a key"),
+        ("<<: 3", "f.yaml:1: << requires an alias of an object"),
+        ("a: 1e999", "f.yaml:1: 1e999 exceeds the range of numbers"),
+        ("a: .nan", "f.yaml:1: .nan is not a JSON number"),
         ("a: " + "9" * 5000, "f.yaml:1: a number has more than 300 digits"),
-        ("a: [1,\nb\n", "f.yaml:3: this is not YAML"),
-        ("a: 1\nb: '\x01'", "f.yaml:2: this is not YAML: control characters are not allowed"),
-        ("[" * 100_000, "f.yaml:1: its lists or objects are nested deeper than 100"),
-        ("- " * 100_000, "f.yaml:1: its lists or objects are nested deeper than 100"),
+        ("a: [1,\nb\n", "f.yaml:3: invalid YAML"),
+        ("a: 1\nb: '\x01'", "f.yaml:2: invalid YAML: control characters are not allowed"),
+        ("[" * 100_000, "f.yaml:1: lists or objects are nested deeper than 100 levels"),
+        ("- " * 100_000, "f.yaml:1: lists or objects are nested deeper than 100 levels"),
         (BOMB, "f.yaml:6: aliases repeat more than 100000 values"),
     ],
 )  # fmt: skip
@@ -86,12 +86,12 @@ def test_what_no_one_can_mean_has_its_line(text, sentence):
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ('{\n"kind": }', "f.yaml:2: this is not JSON: expecting value"),
-        ('{\n"a": 1,\n"a": 1}', "f.yaml:3: a is given twice"),
-        ('{"a": 1} # no', "f.yaml:1: this is not JSON: extra data"),
-        ('{"a": NaN}', "f.yaml: NaN is not a number that JSON has"),
-        ('{"a":' * 100_000, "f.yaml: its lists or objects are nested deeper"),
-        ('{"a":' * 200 + "1" + "}" * 200, "f.yaml:1: its lists or objects are nested deeper"),
+        ('{\n"kind": }', "f.yaml:2: invalid JSON: expecting value"),
+        ('{\n"a": 1,\n"a": 1}', "f.yaml:3: a is also defined on line 2"),
+        ('{"a": 1} # no', "f.yaml:1: invalid JSON: extra data"),
+        ('{"a": NaN}', "f.yaml: NaN is not a JSON number"),
+        ('{"a":' * 100_000, "f.yaml: lists or objects are nested deeper"),
+        ('{"a":' * 200 + "1" + "}" * 200, "f.yaml:1: lists or objects are nested deeper"),
     ],
 )
 def test_what_is_no_json_has_its_line(text, sentence):
@@ -101,13 +101,13 @@ def test_what_is_no_json_has_its_line(text, sentence):
 
 
 def test_limits(monkeypatch):
-    for name, value, sentence in (("MAX_NODES", 10, "more than 10 values"), ("MAX_BYTES", 0, "more than 0 MiB")):
+    for name, value, sentence in (("MAX_NODES", 10, "more than 10 values"), ("MAX_BYTES", 0, "larger than 0 MiB")):
         with monkeypatch.context() as patched, pytest.raises(BadDocument, match=sentence):
             patched.setattr(documents, name, value)
             parsed("[1, 2, 3, 4, 5, 6, 7, 8, 9, 10]")
-    with pytest.raises(BadDocument, match="f:2: this is no text file in UTF-8"):
+    with pytest.raises(BadDocument, match="f:2: not a UTF-8 text file"):
         parse_documents(b"a: 1\nb: \xff", "f")
-    with pytest.raises(BadDocument, match="f:3: there is a second document; give one"):
+    with pytest.raises(BadDocument, match="f:3: the file has a second document; remove it"):
         parse_document(b"a: 1\n---\nb: 1", "f")
     assert parse_document(b"", "f")[0] is None
 

@@ -7,8 +7,8 @@ import pytest
 from depth import examples
 from fractus_core.api.geometry import Position
 from fractus_core.planning import Flight, Settings, flight_of, operation_area
-from fractus_core.planning.flight import MissionEstimator, first_missed, transit_legs
-from fractus_core.planning.tour import short_tour
+from fractus_core.planning.mission import MissionEstimator, first_missed, transit_legs
+from fractus_core.planning.operation_area import short_tour
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from test_planning import FRAME, PATH, VIEWER, application, at, drone, inventory, navigator

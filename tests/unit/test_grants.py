@@ -8,10 +8,9 @@ import shapely
 from fractus_core.api import InvalidObject, Policy, Zone
 from fractus_core.api.policies import NodeExpression
 from fractus_core.geo import area_polygon
-from fractus_core.planning import flight_of, grants, plan
-from fractus_core.planning.area import operation_area
-from fractus_core.planning.grants import compile_grants, refresh
-from fractus_core.planning.zones import _SOUND, sound, zone_crossings
+from fractus_core.planning import flight_of, grant_compiler, plan
+from fractus_core.planning.grant_compiler import _SOUND, MAX_ROUNDING_M, compile_grants, refresh, sound, zone_crossings
+from fractus_core.planning.operation_area import operation_area
 from fractus_core.policy.compiled_grant import compile_grant
 from fractus_core.policy.decision_types import Call, CaptureArgs, GotoArgs, Home, Situation
 from fractus_core.policy.engine import judge
@@ -118,15 +117,15 @@ def test_a_path_with_many_turns_is_granted_within_a_centimetre():
 
 
 def test_an_outline_with_more_points_than_a_ring_takes_is_rounded_further(monkeypatch):
-    monkeypatch.setattr(grants, "MAX_RING_POINTS", 150)
+    monkeypatch.setattr(grant_compiler, "MAX_RING_POINTS", 150)
     (grant,) = compiled(components=[navigator(furrows(12))])
     (area,) = grant.operation_area
     assert len(area.polygon.exterior) <= 150
-    assert 0.011 < _off_the_plan_m(grant, furrows(12)) < grants.MAX_ROUNDING_M
+    assert 0.011 < _off_the_plan_m(grant, furrows(12)) < MAX_ROUNDING_M
 
 
 def test_a_path_with_too_many_meshes_is_refused_with_a_sentence(monkeypatch):
-    monkeypatch.setattr(grants, "MAX_HOLES", 0)
+    monkeypatch.setattr(grant_compiler, "MAX_HOLES", 0)
     meshes = [at(0, 0, 10), at(60, 0, 10), at(60, 60, 10), at(0, 60, 10), at(0, 0, 10)]
     with pytest.raises(
         InvalidObject, match=r"^spec\.components: .* 1 holes, more than .*; give fewer waypoints, or a region"

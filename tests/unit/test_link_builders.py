@@ -11,7 +11,7 @@ import pytest
 import yaml
 from fractus_core.api import Application, Depot, DirectLink, Drone, EdgeNode
 from fractus_core.api.plans import DeploymentPlanSpec
-from fractus_core.planning.links import flown_path, plan_links
+from fractus_core.planning.link_planning import flown_path, plan_links
 from fractus_operator.cluster.pods import PodView
 from fractus_operator.reconcile.links import direct_links, link_name, retargeted
 

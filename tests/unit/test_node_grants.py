@@ -10,8 +10,8 @@ import tracemalloc
 from typing import Any
 
 import pytest
-from fractus_core.api import InvalidObject, node_grants
-from fractus_core.api.node_grants import MAX_UNPACKED_BYTES, pack, pack_oldest, unpack
+from fractus_core.api import InvalidObject, grants
+from fractus_core.api.grants import MAX_UNPACKED_BYTES, pack, pack_oldest, unpack
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -108,7 +108,7 @@ def test_of_too_many_the_oldest_are_packed(monkeypatch: pytest.MonkeyPatch, boun
     ]
     text = pack(bodies[:fits])
     size = len(text) if bound == "MAX_PACKED_BYTES" else len(lzma.decompress(base64.b64decode(text)))
-    monkeypatch.setattr(node_grants, bound, size)
+    monkeypatch.setattr(grants, bound, size)
     chance.shuffle(bodies)
     packed, count = pack_oldest(bodies)
     assert (packed, count) == (text, fits)

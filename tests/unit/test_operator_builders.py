@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 import yaml
 from fractus_core.api import Application, Drone
-from fractus_core.api.plans import ApplicationReference, DeploymentPlanSpec, GrantSpec
+from fractus_core.api.grants import ApplicationReference, GrantSpec
+from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_operator.cluster.pods import PodView
 from fractus_operator.reconcile import builders
 

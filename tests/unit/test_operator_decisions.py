@@ -10,8 +10,7 @@ import pytest
 from fractus_core.api import Application, Drone, EdgeNode, Grant
 from fractus_core.api.plans import DeploymentPlanSpec, PlannedInstance
 from fractus_core.control import Outcome, OutcomeKind
-from fractus_core.planning.inventory import Host, Inventory
-from fractus_core.planning.quantities import amount_of
+from fractus_core.planning.inventory import Host, Inventory, amount_of
 from fractus_operator.cluster.pods import PodView, read_host, read_pod, refusals
 from fractus_operator.cluster.store import Store
 from fractus_operator.inventory.live import LiveInventory

@@ -9,8 +9,8 @@ from collections.abc import AsyncIterator
 from typing import Any
 
 import pytest
-from fractus_core.api import node_grants
-from fractus_core.api.node_grants import NODE_GRANTS_NAMESPACE, ReportedGrant, unpack
+from fractus_core.api import grants
+from fractus_core.api.grants import NODE_GRANTS_NAMESPACE, ReportedGrant, unpack
 from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Body, Kind
 from fractus_operator.cluster.node_accounts import ACCOUNT_KINDS, account_object, is_as_made
@@ -293,7 +293,7 @@ async def test_what_one_object_does_not_take_is_the_newest(
     cluster: Cluster, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     one = cluster.grant("z-oldest", "drone-1", creationTimestamp="2026-01-01T00:00:00Z")
-    monkeypatch.setattr(node_grants, "MAX_UNPACKED_BYTES", 3 * len(json.dumps(one)))
+    monkeypatch.setattr(grants, "MAX_UNPACKED_BYTES", 3 * len(json.dumps(one)))
     for hour in range(9):
         cluster.grant(f"g{hour}", "drone-1", creationTimestamp=f"2026-01-02T0{hour}:00:00Z")
     await cluster.settled()

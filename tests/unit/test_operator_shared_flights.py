@@ -11,7 +11,7 @@ from fractus_core.api import Drone, Grant
 from fractus_core.api.plans import DeploymentPlanSpec, DroneChoice
 from fractus_core.control import OutcomeKind
 from fractus_core.planning import flight_of, plan
-from fractus_core.planning.flight import Flight
+from fractus_core.planning.mission import Flight
 from fractus_operator.cluster.pods import PlannedRequest, PodView
 from fractus_operator.cluster.reading import OwnedPlan, PartPool, read_submitted
 from fractus_operator.inventory.bookings import Bookings

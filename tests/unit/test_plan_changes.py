@@ -3,8 +3,8 @@
 import pytest
 from fractus_core.api.geometry import Position
 from fractus_core.planning import Infeasible, Settings, flight_of, plan
-from fractus_core.planning.flight import ahead, misses
-from fractus_core.planning.growth import room_to_grow, without_room
+from fractus_core.planning.mission import ahead, misses
+from fractus_core.planning.scale_up import room_to_grow, without_room
 from test_plan_drones import flown_by_other, passenger, shared
 from test_plan_properties import where
 from test_planning import PATH, application, at, component, drone, edge, host, inventory, navigator

@@ -10,9 +10,8 @@ from fractus_core.api import Zone
 from fractus_core.api.geometry import Point
 from fractus_core.api.plans import DroneChoice
 from fractus_core.planning import Infeasible, Settings, operation_area, plan
-from fractus_core.planning.grants import AROUND_WAY_M, compile_grants, flight_grant
+from fractus_core.planning.grant_compiler import AROUND_WAY_M, compile_grants, flight_grant, sound
 from fractus_core.planning.legality import MAX_LISTED, MAX_SEARCHES, with_legality
-from fractus_core.planning.zones import sound
 from fractus_core.policy.compiled_grant import compile_grant
 from fractus_core.policy.decision_types import Airframe, Call, GotoArgs, Home, Situation
 from fractus_core.policy.engine import judge

@@ -9,7 +9,7 @@ import pytest
 import yaml
 from fractus_core.api import Application, Drone, EdgeNode
 from fractus_core.api.components import Heuristic
-from fractus_core.planning.links import DEFAULT_HEURISTIC, flown_path, plan_links
+from fractus_core.planning.link_planning import DEFAULT_HEURISTIC, flown_path, plan_links
 from test_link_builders import APPLICATION, DEPOTS, DRONE, EDGES, INPUT, PATH, PLAN, PLANNED
 
 Body = dict[str, Any]

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 from fractus_core.api import InvalidObject
-from fractus_core.api.plans import GrantSpec
+from fractus_core.api.grants import GrantSpec
 from fractus_core.geo import LocalFrame
 from fractus_core.policy.compiled_grant import compile_grant
 from fractus_core.policy.decision_types import Airframe, Call, GotoArgs, Home, Situation, UncertainTime, VelocityArgs

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import shapely
 from depth import examples
-from fractus_core.api.plans import GrantSpec
+from fractus_core.api.grants import GrantSpec
 from fractus_core.geo import LocalFrame
 from fractus_runtime.mavlink_codec import Message
 from fractus_services.errors import AutopilotError

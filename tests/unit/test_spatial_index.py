@@ -1,4 +1,4 @@
-"""The spatial index against geodesics to every point."""
+"""SpatialIndex compared with brute force over geodesic distances, including the antimeridian and the poles."""
 
 import math
 import time
@@ -18,13 +18,13 @@ longitudes = st.one_of(st.floats(-180, 180), st.sampled_from([180.0, -180.0, 179
 places = st.builds(lambda lat, lon: Point(lat=lat, lon=lon), latitudes, longitudes)
 
 
-def away(place, bearing_deg, distance):
+def destination(place, bearing_deg, distance):
     there = Geodesic.WGS84.Direct(place.lat, place.lon, bearing_deg, distance)
     return Point(lat=there["lat2"], lon=there["lon2"])
 
 
-def brute(points, centre, radius):
-    """Every name with its geodesic distance, in the order that the index promises."""
+def brute_force(points, centre, radius):
+    """Return the names within a radius with their distances, in the documented order."""
     near = [(name, geodesic_m(centre, p)) for name, p in points.items()]
     return sorted(((n, d) for n, d in near if d <= radius), key=lambda x: (round(x[1] * 1000), x[0]))
 
@@ -35,25 +35,25 @@ def index_of(points):
 
 @given(places, st.floats(1, 300_000), st.lists(st.tuples(st.floats(0, 360), st.floats(0, 2.5)), max_size=25))
 @settings(deadline=None)
-def test_within_is_exact_anywhere_on_earth(centre, radius, spread):
-    points = {f"n{i:02d}": away(centre, b, share * radius) for i, (b, share) in enumerate(spread)}
-    points |= {f"edge{i}": away(centre, 77.0 * i, radius + d) for i, d in enumerate((-1e-3, 1e-3, -1.0, 1.0))}
-    found = index_of(points).within(centre, radius)
-    wanted = brute(points, centre, radius)
-    assert {n for n, _ in found} == {n for n, _ in wanted}
-    assert [round(d, 3) for _, d in found] == pytest.approx([round(d, 3) for _, d in wanted], abs=2e-3)
+def test_within_equals_brute_force_anywhere_on_earth(centre, radius, spread):
+    points = {f"n{i:02d}": destination(centre, b, share * radius) for i, (b, share) in enumerate(spread)}
+    points |= {f"edge{i}": destination(centre, 77.0 * i, radius + d) for i, d in enumerate((-1e-3, 1e-3, -1.0, 1.0))}
+    result = index_of(points).within(centre, radius)
+    expected = brute_force(points, centre, radius)
+    assert {n for n, _ in result} == {n for n, _ in expected}
+    assert [round(d, 3) for _, d in result] == pytest.approx([round(d, 3) for _, d in expected], abs=2e-3)
 
 
 @given(places, st.lists(places, max_size=12), st.floats(300_000, 2e7))
 @settings(max_examples=examples(60), deadline=None)
-def test_within_is_exact_for_huge_radii(centre, others, radius):
+def test_within_equals_brute_force_for_huge_radii(centre, others, radius):
     points = {f"n{i}": p for i, p in enumerate(others)}
-    found, wanted = index_of(points).within(centre, radius), brute(points, centre, radius)
-    assert [n for n, _ in found] == [n for n, _ in wanted]
-    assert [d for _, d in found] == pytest.approx([d for _, d in wanted], abs=1e-4)
+    result, expected = index_of(points).within(centre, radius), brute_force(points, centre, radius)
+    assert [n for n, _ in result] == [n for n, _ in expected]
+    assert [d for _, d in result] == pytest.approx([d for _, d in expected], abs=1e-4)
 
 
-def test_neighbours_across_the_antimeridian_and_over_the_pole():
+def test_within_returns_points_across_the_antimeridian_and_the_pole():
     points = {"east": Point(lat=10, lon=-179.9995), "west": Point(lat=10, lon=179.9995)}
     points |= {f"polar{i}": Point(lat=89.9999, lon=-180 + 60 * i) for i in range(6)}
     index = index_of(points)
@@ -61,9 +61,9 @@ def test_neighbours_across_the_antimeridian_and_over_the_pole():
     assert [n for n, _ in index.within(Point(lat=90, lon=12), 12)] == [f"polar{i}" for i in range(6)]
 
 
-def test_equally_far_goes_by_name():
+def test_within_orders_equal_distances_by_name():
     centre = Point(lat=39, lon=23)
-    points = {name: away(centre, bearing, 100) for name, bearing in (("c", 0), ("a", 90), ("b", 270))}
+    points = {name: destination(centre, bearing, 100) for name, bearing in (("c", 0), ("a", 90), ("b", 270))}
     assert [n for n, _ in index_of(points).within(centre, 200)] == ["a", "b", "c"]
 
 
@@ -75,14 +75,14 @@ operations = st.lists(
 
 @given(places, operations)
 @settings(deadline=None)
-def test_an_index_that_followed_every_change_equals_one_made_again(centre, changes):
+def test_index_after_updates_equals_a_new_index(centre, changes):
     index, points = SpatialIndex(), {}
     for name, target in changes:
         if target is None:
             index.remove(name)
             points.pop(name, None)
         else:
-            points[name] = away(centre, *target)
+            points[name] = destination(centre, *target)
             index.upsert(name, points[name].lat, points[name].lon)
         assert len(index) == len(points)
     for radius in (100, 1500, 5000, 1e6):
@@ -96,11 +96,11 @@ def test_an_index_that_followed_every_change_equals_one_made_again(centre, chang
     st.lists(st.tuples(st.floats(0, 360), st.floats(1, 50_000)), max_size=20),
 )
 @settings(deadline=None)
-def test_nearest_beyond_a_radius(centre, count, beyond, spread):
-    points = {f"n{i:02d}": away(centre, b, d) for i, (b, d) in enumerate(spread)}
+def test_nearest_equals_brute_force_beyond_a_radius(centre, count, beyond, spread):
+    points = {f"n{i:02d}": destination(centre, b, d) for i, (b, d) in enumerate(spread)}
     assume(all(abs(geodesic_m(centre, p) - beyond) > 1e-3 for p in points.values()))
-    wanted = [n for n, d in brute(points, centre, 1e5) if d > beyond][:count]
-    assert [n for n, _ in index_of(points).nearest(centre, count, beyond)] == wanted
+    expected = [n for n, d in brute_force(points, centre, 1e5) if d > beyond][:count]
+    assert [n for n, _ in index_of(points).nearest(centre, count, beyond)] == expected
 
 
 @given(
@@ -111,7 +111,7 @@ def test_nearest_beyond_a_radius(centre, count, beyond, spread):
     st.floats(0.5, 500),
 )
 @settings(deadline=None)
-def test_points_near_an_area(lat, lon, path, spots, margin):
+def test_near_area_returns_exactly_the_points_within_the_margin(lat, lon, path, spots, margin):
     frame = LocalFrame(lat, lon)
     shape = shapely.LineString(path).buffer(10)
     points = {f"n{i:02d}": frame.latlon(x, y) for i, (x, y) in enumerate(spots)}
@@ -129,18 +129,18 @@ def test_points_near_an_area(lat, lon, path, spots, margin):
 
 @given(places, st.floats(0, 360), st.floats(0, 60_000))
 @settings(deadline=None)
-def test_fast_distance_is_the_geodesic(a, bearing, length):
-    b = away(a, bearing, length)
+def test_distance_equals_the_geodesic_up_to_60_km(a, bearing, length):
+    b = destination(a, bearing, length)
     assert distance_m(a, b) == pytest.approx(geodesic_m(a, b), abs=1e-6)
 
 
 @given(places, places)
 @settings(max_examples=examples(50), deadline=None)
-def test_fast_distance_is_the_geodesic_around_the_globe(a, b):
+def test_distance_equals_the_geodesic_around_the_globe(a, b):
     assert distance_m(a, b) == pytest.approx(geodesic_m(a, b), abs=1e-4)
 
 
-def test_a_move_takes_less_than_a_millisecond_among_many():
+def test_upsert_takes_less_than_a_millisecond_among_40000_points():
     frame = LocalFrame(39, 23)
     side = 200
     index = SpatialIndex.of((f"n{i}", *frame.latlon(90 * (i % side), 90 * (i // side))) for i in range(side * side))
@@ -154,31 +154,31 @@ def test_a_move_takes_less_than_a_millisecond_among_many():
     assert math.isclose(index.position(name).lat, lat)
 
 
-def test_equally_near_points_go_by_name_also_where_a_look_ends():
+def test_nearest_orders_equal_distances_by_name_at_its_limit():
     centre = Point(lat=50, lon=4)
-    points = {"b": away(centre, 10, 127.9998), "a": away(centre, 200, 128.0002)}
+    points = {"b": destination(centre, 10, 127.9998), "a": destination(centre, 200, 128.0002)}
     assert [n for n, _ in index_of(points).nearest(centre, 1)] == ["a"]
     assert index_of(points).nearest(centre, 2) == index_of(points).within(centre, 200)
 
 
-def test_what_is_too_near_is_measured_once_and_not_again_for_every_wider_look(monkeypatch):
-    centre = Point(lat=50, lon=4)
-    points = {f"near{i}": away(centre, 9 * i, 50 + i) for i in range(40)}
-    points |= {f"far{i}": away(centre, 30 * i, 20_000 + i) for i in range(5)}
-    spatial = index_of(points)
-    looks = []
-    exactly = SpatialIndex._exactly
+@given(places, st.integers(1, 8), st.floats(0, 2e7), st.floats(1e5, 2e7), st.lists(places, max_size=12))
+@settings(max_examples=examples(60), deadline=None)
+def test_nearest_equals_brute_force_at_any_distance(centre, count, beyond, limit, others):
+    points = {f"n{i:02d}": p for i, p in enumerate(others)}
+    distances = {n: geodesic_m(centre, p) for n, p in points.items()}
+    assume(all(abs(d - beyond) > 1e-3 and abs(d - limit) > 1e-3 for d in distances.values()))
+    expected = [n for n, d in brute_force(points, centre, limit) if d > beyond][:count]
+    assert [n for n, _ in index_of(points).nearest(centre, count, beyond, limit)] == expected
 
-    def counted(self, *args):
-        looks.append(args)
-        return exactly(self, *args)
 
-    monkeypatch.setattr(SpatialIndex, "_exactly", counted)
-    assert [n for n, _ in spatial.nearest(centre, 5, 150)] == [f"far{i}" for i in range(5)]
-    assert len(looks) == 2
+def test_removed_points_are_never_returned():
+    index = index_of({"a": Point(lat=1, lon=2), "b": Point(lat=1, lon=3)})
+    index.remove("a")
+    assert [n for n, _ in index.within(Point(lat=0, lon=0), math.inf)] == ["b"]
+    assert [n for n, _ in index.nearest(Point(lat=0, lon=0), 5, 0, math.inf)] == ["b"]
 
 
 @pytest.mark.parametrize("lat", [0.0, 45.0, -80.0])
-def test_one_place_on_both_sides_of_the_antimeridian(lat):
+def test_within_finds_longitude_minus_180_from_180(lat):
     index = SpatialIndex.of([("west", lat, -180.0)])
     assert index.within(Point(lat=lat, lon=180.0), 0.0) == [("west", 0.0)]

@@ -329,7 +329,7 @@ def test_a_file_with_a_key_twice_is_refused():
 @pytest.mark.parametrize(
     ("read", "text", "sentence"),
     [
-        (formats.read_geojson, "{", "line 1: this is not JSON"),
+        (formats.read_geojson, "{", "line 1: invalid JSON"),
         (formats.read_geojson, '{"type": "Topology"}', "type: 'Topology' is not GeoJSON"),
         (
             formats.read_geojson,
@@ -354,7 +354,7 @@ def test_a_file_with_a_key_twice_is_refused():
             "features[0].geometry[0].horizontalProjection.type: must be Polygon or Circle",
         ),
         pytest.param(
-            formats.read_geojson, '{"type":' * 100_000, "its lists or objects are nested deeper than 100", id="deep"
+            formats.read_geojson, '{"type":' * 100_000, "lists or objects are nested deeper than 100 levels", id="deep"
         ),
         pytest.param(formats.read_geojson, "1" * 5000, "line 1: a number has more than 300 digits", id="digits"),
         (

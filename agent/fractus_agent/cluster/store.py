@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Literal
 
 from fractus_core.api import DirectLink, Drone, EdgeNode, InvalidObject, NodeGrants
+from fractus_core.api.grants import NODE_GRANTS_NAMESPACE, NodeGrantsStatus, ReportedGrant, unpack
 from fractus_core.api.model import API_VERSION, GROUP
 from fractus_core.api.names import NODE_SIGNER
-from fractus_core.api.node_grants import NODE_GRANTS_NAMESPACE, NodeGrantsStatus, ReportedGrant, unpack
 from fractus_runtime.kubernetes import (
     Backoff,
     Body,

@@ -11,9 +11,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from fractus_core.api.grants import ENDED, MAX_MESSAGE, Grant, GrantPhase, GrantSpec, ReportedGrant
 from fractus_core.api.model import InvalidObject
-from fractus_core.api.node_grants import MAX_MESSAGE, ReportedGrant
-from fractus_core.api.plans import ENDED, Grant, GrantPhase, GrantSpec
 from fractus_core.control import Outcome, OutcomeKind
 from fractus_core.policy.grant_signatures import BadSignature, UnknownAuthority
 from fractus_runtime.files import remove_file, write_file

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from fractus_core.api.plans import Grant
+from fractus_core.api.grants import Grant
 from fractus_core.policy.grant_signatures import UnknownAuthority
 
 

@@ -12,7 +12,7 @@ from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Any
 
-from fractus_core.api.links import DirectLink
+from fractus_core.api.direct_links import DirectLink
 from fractus_core.linking import (
     NO_LINK,
     Course,

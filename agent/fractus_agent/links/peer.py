@@ -7,7 +7,7 @@ import logging
 from collections.abc import Callable
 from pathlib import Path
 
-from fractus_core.api.links import DirectLink
+from fractus_core.api.direct_links import DirectLink
 
 from fractus_agent.links.acceptor import Acceptor
 from fractus_agent.links.addressing import link_address

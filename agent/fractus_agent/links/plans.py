@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator
 from ipaddress import AddressValueError, IPv4Address
 from pathlib import Path
 
-from fractus_core.api.links import DirectLink, LinkedService
+from fractus_core.api.direct_links import DirectLink, LinkedService
 from fractus_core.api.model import InvalidObject
 from fractus_runtime.files import remove_file, write_file
 

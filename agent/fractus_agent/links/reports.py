@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any
 
-from fractus_core.api.links import LINKED, PEER_READY, TRAFFIC_DIRECT, DirectLink
+from fractus_core.api.direct_links import LINKED, PEER_READY, TRAFFIC_DIRECT, DirectLink
 from fractus_core.linking import Link, PathMetrics, Peer, Phase, Reach
 
 from fractus_agent.cluster.store import End, Object, Store

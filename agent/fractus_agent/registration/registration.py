@@ -9,10 +9,9 @@ import logging
 from collections.abc import Callable
 from pathlib import Path
 
-from fractus_core.api.descriptions import InvalidDescription, parse_description
 from fractus_core.api.model import GROUP, InvalidObject
 from fractus_core.api.names import CLASS_LABEL
-from fractus_core.api.nodes import Drone, EdgeNode
+from fractus_core.api.nodes import Drone, EdgeNode, InvalidDescription, parse_description
 
 from fractus_agent.cluster.store import Invalid, KubeError, Object, Store
 from fractus_agent.conditions import Condition

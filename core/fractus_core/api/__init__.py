@@ -2,7 +2,9 @@
 
 from fractus_core.api.applications import Application as Application
 from fractus_core.api.components import Component as Component
-from fractus_core.api.links import DirectLink as DirectLink
+from fractus_core.api.direct_links import DirectLink as DirectLink
+from fractus_core.api.grants import Grant as Grant
+from fractus_core.api.grants import NodeGrants as NodeGrants
 from fractus_core.api.model import API_VERSION as API_VERSION
 from fractus_core.api.model import GROUP as GROUP
 from fractus_core.api.model import VERSION as VERSION
@@ -13,12 +15,10 @@ from fractus_core.api.model import Resource as Resource
 from fractus_core.api.names import component_identity as component_identity
 from fractus_core.api.names import node_identity as node_identity
 from fractus_core.api.names import node_server_name as node_server_name
-from fractus_core.api.node_grants import NodeGrants as NodeGrants
 from fractus_core.api.nodes import Depot as Depot
 from fractus_core.api.nodes import Drone as Drone
 from fractus_core.api.nodes import EdgeNode as EdgeNode
 from fractus_core.api.plans import DeploymentPlan as DeploymentPlan
-from fractus_core.api.plans import Grant as Grant
 from fractus_core.api.policies import Policy as Policy
 from fractus_core.api.policies import Zone as Zone
 

@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from fractus_core.api.geometry import Position
-from fractus_core.api.model import InvalidObject
+from fractus_core.api.model import InvalidObject, quantity
 from fractus_core.api.names import CLASS_LABEL, CLOUD_LABEL
 from fractus_core.api.nodes import Depot, Drone, EdgeNode
 from fractus_core.api.policies import Policy, Zone
 from fractus_core.planning.coverage import CoverStrategy
-from fractus_core.planning.locations import NodeLocations
+from fractus_core.planning.spatial_index import NodeLocations
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,3 +177,22 @@ class Settings:
             value = getattr(self, name)
             if not minimum <= value <= maximum:
                 raise InvalidObject(spelled, f"must be {minimum:g} to {maximum:g}, not {value:g}")
+
+
+_RARE_SCALE = {"n": 1e-9, "u": 1e-6, "E": 1e18, "Ei": 2.0**60}
+
+
+def amount_of(text: str | float) -> float:
+    """Value of any quantity that the API server may hold, also those that manifests of ours may not use.
+
+    Raises:
+        ValueError: it is not a quantity.
+    """
+    try:
+        return quantity(text)
+    except ValueError:
+        digits = str(text)
+        for suffix, scale in _RARE_SCALE.items():
+            if digits.endswith(suffix):
+                return float(digits.removesuffix(suffix)) * scale
+        return float(digits)

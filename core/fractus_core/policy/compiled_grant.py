@@ -15,8 +15,8 @@ from shapely.geometry.base import BaseGeometry
 
 from fractus_core.api.components import ServiceRequest
 from fractus_core.api.geometry import AltitudeBand, Area, Point
+from fractus_core.api.grants import GrantedPolicy, GrantSpec
 from fractus_core.api.methods import METHODS_OF, MOBILITY_METHODS
-from fractus_core.api.plans import GrantedPolicy, GrantSpec
 from fractus_core.api.policies import PolicySpec
 from fractus_core.api.schedules import ActiveTime, active_at
 from fractus_core.geo import LocalFrame, area_center, area_polygon, check_extent

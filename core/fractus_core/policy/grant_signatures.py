@@ -19,9 +19,9 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ObjectIdentifier
 
+from fractus_core.api.grants import Grant
 from fractus_core.api.model import GROUP, InvalidObject
 from fractus_core.api.names import OPERATOR_IDENTITY
-from fractus_core.api.plans import Grant
 
 SIGNATURE_ANNOTATION = f"{GROUP}/signature"
 SIGNER_ANNOTATION = f"{GROUP}/signed-by"

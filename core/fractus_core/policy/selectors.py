@@ -10,8 +10,8 @@ from pydantic import BaseModel
 from pydantic.alias_generators import to_camel
 
 from fractus_core.api import Application, Component, Drone, EdgeNode
+from fractus_core.api.grants import ApplicationReference
 from fractus_core.api.nodes import DroneSpec, EdgeNodeSpec
-from fractus_core.api.plans import ApplicationReference
 from fractus_core.api.policies import NodeExpression, PolicySpec
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from fractus_core.api.grants import NODE_GRANTS_NAMESPACE
 from fractus_core.api.model import GROUP
-from fractus_core.api.node_grants import NODE_GRANTS_NAMESPACE
 
 from fractus_operator.cluster.kinds import NODE_GRANTS, ROLE, ROLE_BINDING, SERVICE_ACCOUNT, Body, Kind
 from fractus_operator.cluster.labels import MANAGED_BY, MANAGED_LABEL

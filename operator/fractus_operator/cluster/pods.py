@@ -11,8 +11,7 @@ from datetime import UTC, datetime
 from typing import NamedTuple
 
 from fractus_core.api.names import CLASS_LABEL
-from fractus_core.planning.inventory import Host
-from fractus_core.planning.quantities import amount_of
+from fractus_core.planning.inventory import Host, amount_of
 
 from fractus_operator.cluster.kinds import Body
 from fractus_operator.cluster.labels import (

@@ -9,7 +9,7 @@ from fractus_core.api import DeploymentPlan, Depot, DirectLink, Drone, EdgeNode,
 from fractus_core.api.names import NODE_SIGNER
 from fractus_core.planning.candidates import readiness
 from fractus_core.planning.inventory import Flight, Host, Inventory
-from fractus_core.planning.locations import NodeLocations
+from fractus_core.planning.spatial_index import NodeLocations
 
 from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Body, Key, Kind

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from fractus_core.api.node_grants import NODE_GRANTS_NAMESPACE, PACKED_METADATA, NodeGrantsStatus, ReportedGrant
+from fractus_core.api.grants import NODE_GRANTS_NAMESPACE, PACKED_METADATA, NodeGrantsStatus, ReportedGrant
 from pydantic import ValidationError
 
 from fractus_operator.cluster.kinds import NODE_GRANTS, Body, Key, Kind

@@ -13,7 +13,7 @@ from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.identity.authority import Authority
 from fractus_core.identity.grant_signer import GrantSigner
 from fractus_core.planning.inventory import Inventory, Settings
-from fractus_core.planning.plan import Infeasible
+from fractus_core.planning.planner import Infeasible
 from fractus_core.validation import check_application
 
 from fractus_operator.cluster import kinds

@@ -8,9 +8,10 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any, assert_never
 
 from fractus_core.api import API_VERSION, Application, Component, Drone
-from fractus_core.api.containers import TLS_DIR, TMP_DIR
+from fractus_core.api.components import TLS_DIR, TMP_DIR
+from fractus_core.api.grants import GrantSpec
 from fractus_core.api.names import CLASS_LABEL, CLOUD_LABEL, address_variable
-from fractus_core.api.plans import DeploymentPlanSpec, GrantSpec, PlannedInstance
+from fractus_core.api.plans import DeploymentPlanSpec, PlannedInstance
 
 from fractus_operator.cluster import kinds, labels
 from fractus_operator.cluster.kinds import Body, Kind

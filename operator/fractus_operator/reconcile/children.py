@@ -8,7 +8,7 @@ import logging
 from collections.abc import Awaitable, Iterable, Mapping, Sequence
 
 from fractus_core.api import Application, Grant, InvalidObject
-from fractus_core.api.plans import GrantSpec
+from fractus_core.api.grants import GrantSpec
 from fractus_core.identity.grant_signer import GrantSigner
 
 from fractus_operator.cluster import kinds

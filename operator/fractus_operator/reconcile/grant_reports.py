@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from fractus_core.api.node_grants import ReportedGrant
-from fractus_core.api.plans import ENDED
+from fractus_core.api.grants import ENDED, ReportedGrant
 
 from fractus_operator.cluster.kinds import Body
 

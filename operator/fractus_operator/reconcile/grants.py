@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from fractus_core.api import Application, Grant
-from fractus_core.api.plans import DeploymentPlanSpec, GrantSpec
+from fractus_core.api.grants import GrantSpec
+from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.identity.grant_signer import GrantSigner
-from fractus_core.planning.grants import compile_grants, refresh
+from fractus_core.planning.grant_compiler import compile_grants, refresh
 from fractus_core.planning.inventory import Inventory, Settings
 
 from fractus_operator.cluster.kinds import Key

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import datetime
 
+from fractus_core.api.grants import ApplicationReference
 from fractus_core.api.names import shortened
-from fractus_core.api.plans import ApplicationReference
 
 from fractus_operator.cluster.kinds import APPLICATION, DIRECT_LINK, Body, Key
 from fractus_operator.cluster.store import Reflector, Store

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 
 from fractus_core.api import Application
+from fractus_core.api.direct_links import Caller, DirectLinkSpec, LinkedService, TargetAddress, VirtualAddress
 from fractus_core.api.geometry import Position
-from fractus_core.api.links import Caller, DirectLinkSpec, LinkedService, TargetAddress, VirtualAddress
+from fractus_core.api.grants import ApplicationReference
 from fractus_core.api.names import object_name
-from fractus_core.api.plans import ApplicationReference, DeploymentPlanSpec, PlannedInstance
-from fractus_core.planning.links import PlannedLink
+from fractus_core.api.plans import DeploymentPlanSpec, PlannedInstance
+from fractus_core.planning.link_planning import PlannedLink
 
 from fractus_operator.cluster import kinds, labels
 from fractus_operator.cluster.kinds import Body

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 
-from fractus_core.api.node_grants import NODE_GRANTS_NAMESPACE, pack_oldest
+from fractus_core.api.grants import NODE_GRANTS_NAMESPACE, pack_oldest
 
 from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Body, Key, Kind

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 
-from fractus_core.api.plans import ApplicationReference
+from fractus_core.api.grants import ApplicationReference
 from pydantic import ValidationError
 
 from fractus_operator.cluster.kinds import APPLICATION, DEPLOYMENT, POD, REPLICA_SET, Body, Key, Kind, key_of

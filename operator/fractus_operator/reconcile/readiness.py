@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from datetime import datetime
 
 from fractus_core.api import Condition, InvalidObject, Policy, Zone
-from fractus_core.planning.zones import check_united, sound
+from fractus_core.planning.grant_compiler import check_united, sound
 from fractus_core.validation import check_policy, check_zone
 
 from fractus_operator.cluster.kinds import POLICY, ZONE, Key, Kind

@@ -8,9 +8,9 @@ from datetime import datetime, timedelta
 
 from fractus_core.api import Application
 from fractus_core.api.plans import DeploymentPlanSpec
-from fractus_core.planning.growth import room_to_grow, without_room
 from fractus_core.planning.inventory import Inventory, Settings
-from fractus_core.planning.plan import Infeasible, plan
+from fractus_core.planning.planner import Infeasible, plan
+from fractus_core.planning.scale_up import room_to_grow, without_room
 
 from fractus_operator.cluster.pods import PodView
 

@@ -10,9 +10,10 @@ from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 
 from fractus_core.api import Application, InvalidObject
-from fractus_core.api.plans import DeploymentPlanSpec, GrantSpec
+from fractus_core.api.grants import GrantSpec
+from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.identity.authority import Authority
-from fractus_core.planning.links import flown_path, plan_links
+from fractus_core.planning.link_planning import flown_path, plan_links
 
 from fractus_operator.cluster import kinds
 from fractus_operator.cluster.kinds import Body, Key, Kind, key_of

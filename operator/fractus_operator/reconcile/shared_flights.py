@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping
 from fractus_core.api import Application, Depot, InvalidObject
 from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.control import Outcome, OutcomeKind
-from fractus_core.planning.flight import ahead, flight_of, misses
 from fractus_core.planning.inventory import Flight
+from fractus_core.planning.mission import ahead, flight_of, misses
 
 from fractus_operator.cluster.reading import Submitted
 from fractus_operator.inventory.claims import Flown

@@ -12,7 +12,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from fractus_core.api.plans import GrantSpec
+from fractus_core.api.grants import GrantSpec
 from fractus_core.control.state import FlightMode, ModeKind, TaskKind
 from fractus_core.geo import LocalFrame
 from fractus_core.policy.decision_types import STATIONARY_MPS, Airframe, Attitude, Home

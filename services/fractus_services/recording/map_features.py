@@ -6,8 +6,8 @@ from collections.abc import Iterable
 from typing import Any
 
 from fractus_core.api import Zone
+from fractus_core.api.grants import GrantSpec
 from fractus_core.api.model import Metadata
-from fractus_core.api.plans import GrantSpec
 from fractus_core.api.policies import ZoneShape, ZoneSpec
 from fractus_core.geo.formats.geojson import zone_feature
 

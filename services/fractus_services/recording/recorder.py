@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fractus_core.api.plans import GrantSpec
+from fractus_core.api.grants import GrantSpec
 from fractus_runtime.files import write_file
 from fractus_runtime.mavlink_codec import Parser
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
-from fractus_core.api.plans import GrantSpec
+from fractus_core.api.grants import GrantSpec
 from fractus_core.policy.compiled_grant import CompiledGrant, compile_grant
 from fractus_core.policy.decision_types import Call, GotoArgs, Home, Situation
 from fractus_core.policy.engine import judge

@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 
 import yaml
-from fractus_core.api.node_grants import unpack
+from fractus_core.api.grants import unpack
 
 from fractus_sim.chaos.stage import Stage
 from fractus_sim.demo.clusters import EXAMPLE, documents

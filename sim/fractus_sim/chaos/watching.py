@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 
 from fractus_core.api import Grant
-from fractus_core.api.plans import GrantSpec
+from fractus_core.api.grants import GrantSpec
 from fractus_core.policy.decision_types import Home
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 

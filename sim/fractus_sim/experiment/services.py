@@ -11,9 +11,9 @@ from typing import Any
 from fractus_cli.manifests import BadManifest, Manifests, read_manifests
 from fractus_cli.planning import plan_all
 from fractus_core.api import API_VERSION, Drone
-from fractus_core.api.plans import GrantSpec
+from fractus_core.api.grants import GrantSpec
 from fractus_core.planning import Settings
-from fractus_core.planning.grants import compile_grants
+from fractus_core.planning.grant_compiler import compile_grants
 
 from fractus_sim.experiment.audits import read_audit
 from fractus_sim.experiment.detections import FILE, VARIABLE, TruthWatch, read_detections

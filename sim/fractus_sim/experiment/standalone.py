@@ -81,7 +81,7 @@ class Standalone:
         """Sign a Grant and put it where the services of its node find it; replaces the one of the same name.
 
         Args:
-            manifest: of kind Grant; `fractus_core.planning.grants.compile_grants` makes the spec.
+            manifest: of kind Grant; `fractus_core.planning.grant_compiler.compile_grants` makes the spec.
 
         Returns:
             The identity of the component instance that it is for.

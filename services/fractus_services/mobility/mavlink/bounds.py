@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import shapely
-from fractus_core.api.plans import GrantSpec
+from fractus_core.api.grants import GrantSpec
 from fractus_core.geo import LocalFrame, area_center, area_polygon
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 

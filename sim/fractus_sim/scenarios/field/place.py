@@ -13,7 +13,7 @@ from typing import Any
 
 import shapely
 from fractus_core.api import Application, Drone, Policy, Zone
-from fractus_core.api.plans import GrantSpec
+from fractus_core.api.grants import GrantSpec
 from fractus_core.documents import BadDocument, dump_documents, parse_documents
 from fractus_core.geo import LocalFrame, area_polygon
 

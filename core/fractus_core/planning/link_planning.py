@@ -10,8 +10,8 @@ from fractus_core.api.components import Component, Heuristic
 from fractus_core.api.geometry import Position
 from fractus_core.api.nodes import Depot, Drone, EdgeNode, Pairing, Technology, direct_interface
 from fractus_core.api.plans import DeploymentPlanSpec, PlannedInstance
-from fractus_core.planning.area import route_of
 from fractus_core.planning.candidates import direct_reach_m
+from fractus_core.planning.operation_area import route_of
 
 MAX_WAYPOINTS = 1000
 """A longer path is not told: it would be repeated in every link, and agents judge by the velocity instead."""

@@ -1,4 +1,4 @@
-"""The area where an application uses the drone (thesis Algorithm 5)."""
+"""Operation area and route of an application (thesis Algorithm 5)."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import assert_never
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
 from fractus_core.api.applications import ApplicationSpec
@@ -27,7 +28,6 @@ from fractus_core.geo import (
     ground_point,
     points_xy,
 )
-from fractus_core.planning.tour import short_tour
 
 MAX_CROSSINGS = 50_000
 """How often ways and the edges of regions may cross: uniting what they enclose takes a second or so then, and minutes for a hundred
@@ -213,3 +213,70 @@ def length_m(frame: LocalFrame, points: Sequence[Point]) -> float:
     """Length of a polyline over ground in metres."""
     xy = [frame.xy(p.lat, p.lon) for p in points]
     return sum(math.dist(a, b) for a, b in itertools.pairwise(xy))
+
+
+_MAX_EXACT = 9
+_MAX_PASSES = 50
+
+
+def short_tour(xy: Sequence[tuple[float, float]]) -> list[int]:
+    """The order in which to visit points, starting with the first and ending anywhere.
+
+    The shortest for up to nine points (dynamic programming, M. Held and R. Karp 1962); for more the nearest neighbour's
+    tour, untangled by 2-opt, O(n^2) a pass. The same points always give the same order.
+    """
+    places = np.array(xy, dtype=np.float64).reshape(-1, 2)
+    distance = np.hypot(*(places[:, None, :] - places[None, :, :]).transpose(2, 0, 1))
+    if len(places) <= 2:
+        return list(range(len(places)))
+    if len(places) <= _MAX_EXACT:
+        return _shortest(distance)
+    return _untangled(_greedy(distance), distance)
+
+
+def _shortest(distance: NDArray[np.float64]) -> list[int]:
+    count = len(distance)
+    best: dict[tuple[int, int], tuple[float, tuple[int, ...]]] = {(1, 0): (0.0, (0,))}
+    for size in range(1, count):
+        for chosen in itertools.combinations(range(1, count), size):
+            visited = 1 | sum(1 << i for i in chosen)
+            for last in chosen:
+                before = visited & ~(1 << last)
+                best[visited, last] = min(
+                    (length + float(distance[i, last]), (*tour, last))
+                    for i in range(count)
+                    if (before, i) in best
+                    for length, tour in (best[before, i],)
+                )
+    full = (1 << count) - 1
+    return list(min(best[full, last] for last in range(1, count))[1])
+
+
+def _greedy(distance: NDArray[np.float64]) -> list[int]:
+    tour = [0]
+    left = np.ones(len(distance), dtype=bool)
+    left[0] = False
+    while left.any():
+        nearest = int(np.argmin(np.where(left, distance[tour[-1]], np.inf)))
+        tour.append(nearest)
+        left[nearest] = False
+    return tour
+
+
+def _untangled(tour: list[int], distance: NDArray[np.float64]) -> list[int]:
+    order = np.array(tour)
+    for _ in range(_MAX_PASSES):
+        improved = False
+        for i in range(len(order) - 2):
+            # Reverse order[i+1..j]: the edges (i, i+1) and (j, j+1) become (i, j) and (i+1, j+1); the end is open.
+            a, b = order[i], order[i + 1]
+            ends, after = order[i + 2 :], order[i + 3 :]
+            change = distance[a, ends] - distance[a, b]
+            change[:-1] += distance[b, after] - distance[ends[:-1], after]
+            j = int(np.argmin(change))
+            if change[j] < -1e-9:
+                order[i + 1 : i + 3 + j] = order[i + 1 : i + 3 + j][::-1]
+                improved = True
+        if not improved:
+            break
+    return [int(i) for i in order]

@@ -17,8 +17,8 @@ from fractus_core.api.nodes import Depot, Drone
 from fractus_core.api.plans import TransitLeg
 from fractus_core.exhaustive import exhaustive
 from fractus_core.geo import LocalFrame, center_of, distance_m
-from fractus_core.planning.area import OperationArea, control_routes
 from fractus_core.planning.inventory import Flight, Settings
+from fractus_core.planning.operation_area import OperationArea, control_routes
 
 
 @dataclass(frozen=True, slots=True)

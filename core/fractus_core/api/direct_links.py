@@ -9,9 +9,9 @@ from pydantic import Field
 
 from fractus_core.api.components import Heuristic
 from fractus_core.api.geometry import Position
+from fractus_core.api.grants import ApplicationReference
 from fractus_core.api.model import AGE, Conditions, ObservedGeneration, OpenModel, Resource
 from fractus_core.api.nodes import CONDITIONS_BY_TYPE, Pairing, Technology
-from fractus_core.api.plans import ApplicationReference
 
 LINKED = "Linked"
 """Condition set by the drone's agent: True if the link is up."""

@@ -9,8 +9,8 @@ from fractus_core.api.applications import Application
 from fractus_core.api.components import Component, EdgeLocation
 from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.planning.candidates import INSUFFICIENT, Check
-from fractus_core.planning.draft import Draft
 from fractus_core.planning.inventory import Inventory, Settings
+from fractus_core.planning.plan_builder import Draft
 
 
 def with_too_few(application: Application, present: DeploymentPlanSpec) -> Iterator[tuple[Component, EdgeLocation]]:

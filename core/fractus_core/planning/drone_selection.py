@@ -10,10 +10,10 @@ from fractus_core.api.geometry import Point
 from fractus_core.api.nodes import Drone
 from fractus_core.api.plans import Alternative, DroneChoice, Mission
 from fractus_core.geo import ground_point
-from fractus_core.planning.area import OperationArea, start_of
 from fractus_core.planning.candidates import SUITABLE, Check, check_host, check_resources, check_services, readiness
-from fractus_core.planning.draft import Draft
-from fractus_core.planning.flight import (
+from fractus_core.planning.inventory import DroneFacts
+from fractus_core.planning.legality import Way, WayJudge
+from fractus_core.planning.mission import (
     Estimate,
     MissionEstimator,
     first_missed,
@@ -21,9 +21,9 @@ from fractus_core.planning.flight import (
     remaining_minutes,
     transit_legs,
 )
-from fractus_core.planning.index import Near
-from fractus_core.planning.inventory import DroneFacts
-from fractus_core.planning.legality import Way, WayJudge
+from fractus_core.planning.operation_area import OperationArea, start_of
+from fractus_core.planning.plan_builder import Draft
+from fractus_core.planning.spatial_index import Near
 
 _DAY_MIN = 1440.0
 _ALTERNATIVES = 10

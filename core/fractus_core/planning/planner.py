@@ -10,13 +10,19 @@ from fractus_core.api.components import Component, Placement
 from fractus_core.api.plans import DeploymentPlanSpec, DroneChoice
 from fractus_core.exhaustive import exhaustive
 from fractus_core.geo import multipolygon_geojson
-from fractus_core.planning.area import OperationArea, operation_area
 from fractus_core.planning.candidates import check_host, check_resources
-from fractus_core.planning.draft import Draft, Infeasible, instance_name
-from fractus_core.planning.drones import choose_drone, find_drones
-from fractus_core.planning.edges import HybridHosts, find_along, place_along, place_beside
+from fractus_core.planning.drone_selection import choose_drone, find_drones
+from fractus_core.planning.edge_placement import (
+    HybridHosts,
+    find_along,
+    find_static,
+    place_along,
+    place_beside,
+    place_static,
+)
 from fractus_core.planning.inventory import Inventory, Settings
-from fractus_core.planning.statics import find_static, place_static
+from fractus_core.planning.operation_area import OperationArea, operation_area
+from fractus_core.planning.plan_builder import Draft, Infeasible, instance_name
 
 __all__ = ["Infeasible", "instance_name", "plan", "plan_in_steps"]
 

@@ -1,13 +1,14 @@
-"""The policy engine against an independent oracle: random policies, vehicles, states and requests, every permitted one flown.
+"""The policy engine against an independent oracle that flies every permitted random request.
 
-The oracle (tests/component/policy_flights.py) integrates jerk-limited motion in steps of 50 ms, with wind, latency and position
-errors inside the bounds that the engine is told, and looks for drones where a policy forbids them and for corrections that are
-not allowed as they are, or lie inside a margin. Vehicles have accelerations and return altitudes of their own, which other
-stations change in flight. Afterwards the system flies some drones home, as the service decides it, and the autopilots of others
-return alone (tests/component/homeward_flights.py). The motion monitor looks at one flight in twelve, which it must let pass.
+Policies, vehicles, states and requests are random. The oracle (tests/component/policy_flights.py) integrates
+jerk-limited motion in steps of 50 ms, with wind, latency and position errors inside the bounds given to the engine. It
+reports drones where a policy forbids them, and corrections that are not allowed unchanged or lie inside a margin.
+Vehicles differ in acceleration and return altitude, and other stations change these in flight. Afterwards the system
+flies some drones home, as the service decides it, and the autopilots of others return without the system
+(tests/component/homeward_flights.py). The motion monitor checks one flight in twelve, which it must not stop.
 
-A case is one request of one drone to one set of policies; each drone has three, the later ones in flight. Beside them,
-vehicles with lost, absent and odd parameters are asked to arm (tests/component/parameter_faults.py).
+A case is one request of one drone under one set of policies. Each drone makes three requests, the later ones in flight.
+In addition, vehicles with lost, absent and odd parameters are armed (tests/component/parameter_faults.py).
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ def main() -> int:
         figures = (
             f"{whole.asked:,} cases, {whole.permitted:,} permitted ({whole.corrected:,} corrected, {whole.braked:,} after a"
             f" stop), {whole.taken:,} takeovers, {whole.homeward:,} ways home ({whole.straight:,} alone), {vehicles:,}"
-            f" vehicles asked to arm, {len(whole.wrong)} wrong, {len(whole.stopped)} stopped"
+            f" arming requests, {len(whole.wrong)} wrong, {len(whole.stopped)} stopped"
         )
         print(f"\rseed {seed}: {figures}; {left_s / 60:.0f} min left ", end="", flush=True)
         seed += 1
@@ -65,9 +66,9 @@ def main() -> int:
 
 
 def claims(tally: Tally, vehicles: int) -> dict[str, object]:
-    """What was found, as other benchmarks write it."""
+    """Return the results in the format of the other benchmarks."""
     claim = {
-        "name": f"breaches and corrections that do not hold, in {tally.asked} random cases",
+        "name": f"violations and invalid corrections in {tally.asked} random cases",
         "ours": len(tally.wrong), "theirs": None, "unit": "cases", "ratio": None, "target": 0,
         "holds": not tally.wrong, "permitted": tally.permitted, "corrected": tally.corrected, "braked": tally.braked,
         "takeovers": tally.taken, "changed": tally.changed, "homeward": tally.homeward, "alone": tally.straight,

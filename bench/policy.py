@@ -1,12 +1,12 @@
-"""The policy engine against the method of the thesis (ch. 8.9.1, Fig. 8.9): how long one check takes.
+"""The policy engine against the method of the thesis (ch. 8.9.1, Fig. 8.9): duration of one check.
 
-The stand-in does what the thesis describes: for each call it asks the autopilot for its position over MAVLink, and tests
-the position against every policy's area in turn. The autopilot is a simulated ArduCopter in a process of its own, spoken to
-over loopback TCP with pymavlink. Both methods are timed in one run of this program, call by call.
+The stand-in does what the thesis describes: for each call it requests the position from the autopilot over MAVLink, and
+tests the position against the area of each policy in turn. The autopilot is a simulated ArduCopter in a separate
+process, connected over loopback TCP with pymavlink. Both methods are timed in one run of this program, call by call.
 
-Our own figures are processor time of this thread: a check waits for nothing, and other programs on the machine do not
-count. The wall clock's are printed beside them. The stand-in waits, so it has the wall clock; its areas alone, without the
-wait, are printed too.
+The engine's durations are processor time of this thread, because a check never waits, and other programs on the machine
+do not count. Wall-clock durations are printed as well. The stand-in waits, so its durations are wall-clock time. Its
+area tests alone, without the wait, are printed too.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ HOME = Home(39.36, 22.95, 100.0)
 FRAME = LocalFrame(HOME.lat, HOME.lon)
 METHODS = ["Goto", "SetVelocity", "Hover", "GetPosition"]
 POSITION = 33
-"""GLOBAL_POSITION_INT."""
+"""MAVLink id of GLOBAL_POSITION_INT."""
 
 
 def square(x: float, y: float, half: float) -> dict[str, Any]:
@@ -61,7 +61,7 @@ def grant(policies: list[dict[str, Any]]) -> GrantSpec:
 
 
 def access_policies(count: int, rng: random.Random) -> list[dict[str, Any]]:
-    """Denials in scattered areas; none holds at home."""
+    """Return denials in scattered areas, none of which contains home."""
     found = []
     for i in range(count):
         angle, away = rng.uniform(0, 2 * math.pi), rng.uniform(200, 4000)
@@ -82,7 +82,7 @@ def fence_and_limit() -> list[dict[str, Any]]:
 
 
 def fences(count: int, rng: random.Random) -> list[dict[str, Any]]:
-    """One policy with many exclusion zones in thousands of metres around."""
+    """Return one policy with many exclusion zones within thousands of metres."""
     zones = []
     side = math.ceil(math.sqrt(count))
     for i in range(count):
@@ -95,7 +95,7 @@ def fences(count: int, rng: random.Random) -> list[dict[str, Any]]:
 
 
 class Autopilot:
-    """A simulated ArduCopter in another process, asked for its position over MAVLink."""
+    """Simulated ArduCopter in another process that reports its position over MAVLink."""
 
     def __init__(self) -> None:
         port = free_port()
@@ -113,25 +113,25 @@ class Autopilot:
                 raise SystemExit("the simulated vehicle finds no position")
 
     def fetch(self) -> tuple[float, float, float]:
-        """Ask for the position and wait for it."""
+        """Request the position and wait for it."""
         mav = mavutil.mavlink
         while self._link.recv_msg() is not None:
             pass
         self._link.mav.command_long_send(1, 1, mav.MAV_CMD_REQUEST_MESSAGE, 0, POSITION, 0, 0, 0, 0, 0, 0)
         found = self._link.recv_match(type="GLOBAL_POSITION_INT", blocking=True, timeout=5)
         if found is None:
-            raise SystemExit("the simulated vehicle does not tell its position")
+            raise SystemExit("the simulated vehicle reports no position")
         return found.lat / 1e7, found.lon / 1e7, found.relative_alt / 1e3
 
     def close(self) -> None:
-        """End it."""
+        """End the process."""
         self._link.close()
         self._child.terminate()
         self._child.wait(timeout=10)
 
 
 class Thesis:
-    """Position fetched for each check, areas tested one after the other."""
+    """Method of the thesis: fetch the position for each check and test the areas one after the other."""
 
     def __init__(self, spec: GrantSpec, fetch: Callable[[], tuple[float, float, float]]) -> None:
         self._policies = [
@@ -159,7 +159,7 @@ class Thesis:
 def timed(
     work: Callable[[], object], runs: int, clock: Callable[[], int] = time.perf_counter_ns
 ) -> tuple[float, float]:
-    """Median and 99th percentile of one call, in microseconds."""
+    """Return median and 99th percentile of the duration of one call, in microseconds."""
     for _ in range(max(runs // 10, 5)):
         work()
     taken = []
@@ -173,7 +173,7 @@ def timed(
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """Policies, a call, and what its check may take."""
+    """Policies, a call, and the time limit of its check."""
 
     name: str
     policies: list[dict[str, Any]]
@@ -183,7 +183,7 @@ class Case:
 
 
 def cases() -> list[Case]:
-    """What is measured."""
+    """Return the cases to measure."""
     rng = random.Random(8)
     goto, velocity = Call("Goto", GotoArgs(*FRAME.latlon(60, 80), 20)), Call("SetVelocity", VelocityArgs(3.0, 4.0))
     return [
@@ -211,7 +211,7 @@ def main() -> int:
 
 
 def measure(runs: int, autopilot: Autopilot) -> list[dict[str, Any]]:
-    """Time each case both ways, and print."""
+    """Time each case with both methods, and print the results."""
     now = Situation(time_s=0, lat=HOME.lat, lon=HOME.lon, altitude_m=10, home=HOME, armed=True, in_air=True)
     fetch_us, _ = timed(autopilot.fetch, max(runs // 20, 50))
     print(f"one position over MAVLink: {fetch_us:.0f} us\n")
@@ -233,7 +233,7 @@ def measure(runs: int, autopilot: Autopilot) -> list[dict[str, Any]]:
         few = max(runs // (100 if len(spec.policies) > 1000 else 20), 20)
         theirs, _ = timed(functools.partial(thesis.check, case.call), few)
         alone, _ = timed(functools.partial(areas.check, case.call), few)
-        # Neither clock is ever too fast; on a busy machine the lesser one is the less disturbed.
+        # Neither clock measures too little. On a busy machine the smaller duration is the less disturbed one.
         holds = min(p50, wall50) < case.target_us and (case.tail_us is None or min(p99, wall99) < case.tail_us)
         print(
             f"{case.name:40} {p50:7.1f}us {p99:6.1f}us {wall50:7.1f}us {wall99:6.1f}us {theirs:9.0f}us {alone:7.0f}us"
@@ -253,7 +253,7 @@ def measure(runs: int, autopilot: Autopilot) -> list[dict[str, Any]]:
 
 
 def route_claim(runs: int) -> dict[str, Any]:
-    """A way through a thousand zones."""
+    """Time the search of a route through a thousand zones."""
     compiled = compile_grant(grant(fences(1000, random.Random(8))))
     now = Situation(time_s=0, lat=HOME.lat, lon=HOME.lon, altitude_m=10, home=HOME, airframe=Airframe(retraces=True))
     way = find_route((0.0, 0.0), (800.0, 700.0), now, compiled, 20.0)

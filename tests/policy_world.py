@@ -1,4 +1,4 @@
-"""Grants and situations in metres around a home, for tests of the policy engine."""
+"""Builders of grants and situations in metres around a home, for tests of the policy engine."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ METHODS = [
 ]
 CAMERA = ["CaptureImage", "RetrieveImage"]
 DOWN = Lens(90.0, 90.0, stabilised=True, error_deg=0.0)
-"""Straight down; while the yaw is unknown it sees a disc of altitude times the root of two."""
+"""Lens that looks straight down. While the yaw is unknown it sees a disc of altitude times the square root of two."""
 
 Corners = list[tuple[float, float]]
 

@@ -1,8 +1,8 @@
-"""An oracle for the policy engine: thousands of drones at once, flown in small steps through random policies.
+"""Oracle for the policy engine: thousands of drones flown in small steps through random policies.
 
-It shares nothing with the engine but the calls and verdicts: it projects on a flat Earth, casts rays to tell inside from
+It shares only calls and verdicts with the engine. It projects on a flat Earth, casts rays to distinguish inside from
 outside, and integrates ArduPilot's jerk-limited position controller under wind, latency and position errors inside the
-bounds that the engine is told. Everything is numpy over drones; only the questions to the engine are asked one by one.
+bounds given to the engine. The computation is vectorised over drones. Only the calls of the engine are made one by one.
 """
 
 from __future__ import annotations
@@ -29,26 +29,26 @@ STEP_S = 0.05
 STANDING_MPS = 0.02
 ZONES, CORNERS = 7, 8
 ACCELS, CLIMB_ACCELS, JERKS, GAIN = (1.0, 2.5, 2.5, 3.5), (1.0, 1.0, 2.0), (3.0, 5.0, 5.0, 8.0), 1.0
-"""What vehicles have for WPNAV_ACCEL, WPNAV_ACCEL_Z and PSC_JERK_XY, in metres."""
+"""Values of WPNAV_ACCEL, WPNAV_ACCEL_Z and PSC_JERK_XY, in metres."""
 CHANGED = 0.04
-"""Share of vehicles whose parameters change between two requests."""
+"""Fraction of vehicles whose parameters change between two requests."""
 RETURNS_M = (3.0, 15.0, 15.0, 40.0)
-"""What their owners have for RTL_ALT."""
+"""Values of RTL_ALT in metres."""
 UP_MPS, DOWN_MPS = 2.5, 1.5
 RATIO = 4.0
 """ArduPilot's CONTROL_TIME_CONSTANT_RATIO: it plans to brake with three quarters of its acceleration."""
 POSITION_ERROR_M, HEIGHT_ERROR_M, TRACKING_M = 1.5, 1.0, 1.0
 LATENCY_S = (0.05, 0.8)
-"""A link that delays by up to half a second there and back, and what the autopilot takes."""
+"""Round-trip delay of the link of up to half a second, plus the reaction time of the autopilot."""
 COURSE_S = 0.3
-"""Accelerations that are told are those of this long ago, so that what was commanded since then is told as well."""
+"""Age of reported accelerations. Setpoints sent since then are reported as pending."""
 RESEND_S = 0.2
-"""The service sends a velocity this often while it holds, and then one of zero."""
+"""Interval at which the service sends a velocity during its hold time. Afterwards it sends a zero velocity."""
 STILL = (0.0, 0.0, 0.0)
 HOURS = 12
-"""The hour of the day at which all of it happens."""
+"""Hour of the day of all flights."""
 NORTH_M, EAST_M = 110_998.6, math.cos(math.radians(HOME.lat)) * 111_457.6
-"""Metres per degree at home (WGS 84), good to centimetres over this scene."""
+"""Metres per degree at home (WGS 84), accurate to centimetres over this scene."""
 EXCLUSION, INCLUSION, LIMIT = 1, 2, 3
 SERVICES = [{"service": "mobility", "methods": [*METHODS, "SetVelocity"]}]
 METHOD_OF: dict[type, Method] = {GotoArgs: "Goto", VelocityArgs: "SetVelocity", SetSpeedArgs: "SetSpeed"}
@@ -57,13 +57,13 @@ _CIRCLE = np.array([(math.cos(a), math.sin(a)) for a in np.arange(16) * math.pi 
 
 @dataclass
 class Scene:
-    """Policies as the oracle reads them: what each zone is, where, and between which heights.
+    """Policies as the oracle reads them: kind, position and altitude range of each zone.
 
     Attributes:
-        rings: corners in metres, shape (ZONES, CORNERS, 2); short rings repeat their last corner.
+        rings: Corners in metres, shape (ZONES, CORNERS, 2). Short rings repeat their last corner.
         kinds: 0 for an empty or inactive slot, shape (ZONES,).
-        bands: lower and upper metres above home, shape (ZONES, 2); of a limit the heights that are allowed.
-        heights: limits that hold everywhere.
+        bands: Lower and upper metres above home, shape (ZONES, 2). For a limit, the permitted altitudes.
+        heights: Limits that hold everywhere.
     """
 
     grant: CompiledGrant
@@ -74,7 +74,7 @@ class Scene:
     top_mps: float
 
     def airframe(self, rng: np.random.Generator) -> Airframe:
-        """A vehicle whose return altitude is lowered to the limits, as before arming."""
+        """Return a vehicle whose return altitude is lowered to the limits, as before arming."""
         return Airframe(
             accel_mps2=float(rng.choice(ACCELS)), climb_accel_mps2=float(rng.choice(CLIMB_ACCELS)),
             jerk_mps3=float(rng.choice(JERKS)), return_altitude_m=min(float(rng.choice(RETURNS_M)), self.heights[1]),
@@ -83,7 +83,7 @@ class Scene:
 
 
 def scene(rng: np.random.Generator) -> Scene:
-    """A random set of policies."""
+    """Return a random set of policies."""
     rings = np.full((ZONES, CORNERS, 2), 1e6)
     kinds = np.zeros(ZONES, dtype=np.int64)
     bands = np.tile(np.array([-np.inf, np.inf]), (ZONES, 1))
@@ -100,7 +100,7 @@ def scene(rng: np.random.Generator) -> Scene:
         for _ in range(int(rng.integers(1, 3))):
             zone, active = _zone(rng, slot, rings, bands, rng.uniform(60, 110), rng.uniform(-20, 20, 2))
             zones.append(zone)
-            # A slot that is not active allows nothing: a band that no height is in.
+            # An inactive slot permits nothing: its band contains no altitude.
             kinds[slot] = INCLUSION
             if not active:
                 bands[slot] = (np.inf, -np.inf)
@@ -135,7 +135,7 @@ def _zone(
     *,
     banded: bool = True,
 ) -> tuple[dict[str, Any], bool]:
-    """A star-shaped zone, convex or not, in a slot of the scene; and whether it is active."""
+    """Add a star-shaped zone, convex or not, to a slot of the scene, and return whether it is active."""
     count = int(rng.integers(3, CORNERS + 1))
     turn = rng.uniform(0, 2 * math.pi) + 2 * math.pi * np.arange(count) / count
     radii = size * rng.uniform(0.45, 1.0, count)
@@ -158,7 +158,7 @@ def _zone(
 
 @dataclass(frozen=True)
 class Walls:
-    """Edges of rings, ready for rays: lower and upper end north, east at north 0, and east per north."""
+    """Edges of rings for ray casting: lower and upper end north, east at north 0, and east per north."""
 
     y0: Floats
     y1: Floats
@@ -167,18 +167,18 @@ class Walls:
 
     @classmethod
     def of(cls, rings: Floats) -> Walls:
-        """The edges of rings, shape (n, z, c, 2)."""
+        """Return the edges of rings, shape (n, z, c, 2)."""
         x, y = rings[..., 0], rings[..., 1]
         rise = np.roll(y, -1, axis=2) - y
         slope = (np.roll(x, -1, axis=2) - x) / np.where(rise == 0, 1.0, rise)
         return cls(y, np.roll(y, -1, axis=2), x - slope * y, slope)
 
     def of_some(self, who: NDArray[np.int64]) -> Walls:
-        """Those of some drones."""
+        """Return the edges of some drones."""
         return Walls(self.y0[who], self.y1[who], self.x0[who], self.slope[who])
 
     def around(self, points: Floats) -> Flags:
-        """Which rings points, shape (n, 2), lie in, by rays to the east: shape (n, z)."""
+        """Return which rings contain points of shape (n, 2), by rays to the east: shape (n, z)."""
         x, y = points[:, None, None, 0], points[:, None, None, 1]
         hits = ((self.y0 > y) != (self.y1 > y)) & (x < self.x0 + self.slope * y)
         odd: Flags = np.logical_xor.reduce(hits, axis=2)
@@ -193,18 +193,18 @@ _ROWS = (
 
 @dataclass
 class Fleet:
-    """Drones in flight, one a row: where the controller has each, and how the world treats it."""
+    """Drones in flight, one per row: position of each in its controller, and the disturbances that act on it."""
 
     rng: np.random.Generator
     scenes: list[Scene]
     place: Floats = field(init=False)
-    """East, north, up as the controller has it."""
+    """East, north, up in the controller."""
     speed: Floats = field(init=False)
     accel: Floats = field(init=False)
     airframes: list[Airframe] = field(init=False)
 
     def __post_init__(self) -> None:
-        """Put each somewhere, with some velocity, wind and errors."""
+        """Place each drone somewhere, with some velocity, wind and errors."""
         rng, count = self.rng, len(self.scenes)
         (other,) = rng.spawn(1)
         self.airframes = [s.airframe(other) for s in self.scenes]
@@ -222,40 +222,40 @@ class Fleet:
         )
         self.gust = np.column_stack((_disc(rng, count, TRACKING_M), rng.uniform(-TRACKING_M, TRACKING_M, count)))
         self.settled = np.zeros((count, 3))
-        """The sway that each had when its present course began: from there on it strays."""
+        """Sway of each drone at the beginning of its present course."""
         self.beat = rng.uniform(0.05, 0.4, count)
         self.phase = rng.uniform(0, 2 * math.pi, count)
         self.latency = rng.uniform(*LATENCY_S, count)
         self.sent: list[list[tuple[float, float, tuple[float, float, float]]]] = [[] for _ in range(count)]
-        """Velocities that each is told, with when first and when last, in the order in which it hears of them."""
+        """Velocity setpoints of each drone with first and last time, in the order of arrival."""
         self.mail: list[tuple[float, int, Verdict]] = []
         self.asked: list[Call | None] = [None] * count
         self.legs: list[GotoArgs | None] = [None] * count
-        """What each was told to fly to last, unless something else came after it."""
+        """Last target of each drone, unless another command followed."""
         self.time_s = 0.0
         self._seen: Floats | None = None
-        # Commands: fly to a point with a speed, or hold a velocity until a time; all from a time on.
+        # Commands: fly to a point with a speed, or hold a velocity until a time. All start at a time.
         self.goal = self.place.copy()
         self.cruise = np.full(count, 5.0)
         self.setpoint = np.full(count, 5.0)
         self.wanted = np.zeros((count, 3))
         self.held = np.zeros(count, dtype=bool)
         self.arrives, self.surely_returns = (np.zeros(count, dtype=bool) for _ in range(2))
-        """Who flies a leg whose end has a legal way home."""
+        """Drones that fly a leg whose end has a legal return."""
         self.until = np.zeros(count)
         self.learn()
-        # Who is told nothing stops.
+        # A drone without a command stops.
         self.stop(np.arange(count))
 
     def learn(self) -> None:
-        """Take over what `airframes` say."""
+        """Adopt the parameters in `airframes`."""
         self.accels, self.climbs, self.jerks = (
             np.array([getattr(a, name) for a in self.airframes])
             for name in ("accel_mps2", "climb_accel_mps2", "jerk_mps3")
         )
 
     def part(self, who: NDArray[np.int64]) -> Fleet:
-        """Some of the drones as they are at this moment, on flights of their own."""
+        """Return some of the drones in their present state, on independent flights."""
         found = Fleet(np.random.default_rng(0), [self.scenes[i] for i in who])
         found.rng, found.time_s = self.rng, self.time_s
         found.airframes = [self.airframes[i] for i in who]
@@ -265,7 +265,10 @@ class Fleet:
         return found
 
     def sway(self) -> Floats:
-        """How far wind has each off its course: no further than the bound from a course that began where it was seen."""
+        """Return the displacement of each drone by wind.
+
+        It is bounded along a course that began at the observed position.
+        """
         return (self._wind() - self.settled) / 2
 
     def _wind(self) -> Floats:
@@ -273,18 +276,18 @@ class Fleet:
 
     @property
     def seen(self) -> Floats:
-        """Where each believes it is."""
+        """Return the position that each drone estimates."""
         if self._seen is None:
             self._seen = self.place + self.sway()
         return self._seen
 
     @property
     def true(self) -> Floats:
-        """Where each is."""
+        """Return the true position of each drone."""
         return self.seen + self.error
 
     def stop(self, who: NDArray[np.int64]) -> None:
-        """Send them to where their controllers can stop."""
+        """Send drones to the positions where their controllers can stop."""
         for axes, accels in ((slice(0, 2), self.accels), (slice(2, 3), self.climbs)):
             accel = accels[who]
             moving = self.speed[who, axes]
@@ -297,7 +300,7 @@ class Fleet:
         self.wanted[who] = 0.0
 
     def step(self) -> None:
-        """Move on by a little, and hear what has come."""
+        """Advance by one step and receive the messages that have arrived."""
         for due, i, verdict in [letter for letter in self.mail if letter[0] <= self.time_s]:
             self.mail.remove((due, i, verdict))
             self.obey(i, verdict)
@@ -311,7 +314,7 @@ class Fleet:
         self.time_s += STEP_S
 
     def _axes(self, axes: slice, accel: Floats, most: Floats, least: Floats) -> None:
-        """ArduPilot's shape_pos_vel_accel (AP_Math/control.cpp) for some axes together."""
+        """Integrate ArduPilot's shape_pos_vel_accel (AP_Math/control.cpp) for some axes together."""
         off = self.goal[:, axes] - self.place[:, axes]
         away = np.linalg.norm(off, axis=1)
         most = np.where(off[:, -1] < 0, least, most) if off.shape[1] == 1 else most
@@ -324,7 +327,7 @@ class Fleet:
         change = wanted - self.speed[:, axes]
         size = np.linalg.norm(change, axis=1)
         push = np.minimum(_root(size, self.jerks / accel, self.jerks), accel)
-        # A jerk-limited controller aims to be done a step ahead; without it, it rings by a step.
+        # A jerk-limited controller plans to finish a step ahead. Without this it oscillates by a step.
         target = change / np.maximum(size, 1e-9)[:, None] * np.minimum(push, size / STEP_S)[:, None]
         step = target - self.accel[:, axes]
         jerk = np.linalg.norm(step, axis=1)
@@ -332,7 +335,7 @@ class Fleet:
         self.speed[:, axes] += self.accel[:, axes] * STEP_S
 
     def situation(self, i: int, *, told: bool) -> Situation:
-        """What the engine is told of one drone; of its acceleration only some services know."""
+        """Return the situation that the engine gets for one drone. Only some services know its acceleration."""
         x, y, z = self.seen[i]
         drift = self.gust[i] * self.beat[i] * math.cos(self.beat[i] * self.time_s + self.phase[i])
         east, north, up = (float(v) for v in self.speed[i] + drift)
@@ -346,7 +349,7 @@ class Fleet:
         )  # fmt: skip
 
     def _pending(self, i: int) -> tuple[tuple[float, float, float], ...]:
-        """What one was told that its state may not show yet."""
+        """Return the setpoints that the state of a drone may not show yet."""
         now, since = self.time_s, self.time_s - float(self.latency[i]) - COURSE_S
         late = [told for told in self.sent[i] if told[1] >= since]
         before = [told for told in self.sent[i] if told[1] < since][-1:]
@@ -355,9 +358,10 @@ class Fleet:
         return tuple(dict.fromkeys(velocity for at, _, velocity in reversed(self.sent[i]) if at <= now))[::-1]
 
     def send(self, i: int, verdict: Verdict, *, returns: bool = False) -> None:
-        """Put what the engine made of a request on its way: it comes within the latency, and after those before it.
+        """Send the outcome of a request to a drone. It arrives within the latency, after all earlier ones.
 
-        `returns`: whether the engine has made sure of the way home from the end of a leg.
+        Args:
+            returns: True if the engine has verified the return from the end of a leg.
         """
         self.surely_returns[i] = returns or (self.surely_returns[i] and isinstance(verdict.args, SetSpeedArgs))
         args, velocity, hold_s = verdict.args, STILL, 0.0
@@ -382,7 +386,7 @@ class Fleet:
         self.mail.append((max(before, self.time_s + self.rng.uniform(0, float(self.latency[i]))), i, verdict))
 
     def obey(self, i: int, verdict: Verdict) -> None:
-        """Carry out what the engine made of a request."""
+        """Carry out the outcome of a request."""
         args = verdict.args
         if isinstance(args, SetSpeedArgs):
             self.setpoint[i] = args.speed_mps
@@ -405,12 +409,14 @@ class Fleet:
             self.until[i] = self.time_s + args.hold_s + self.rng.uniform(0, float(self.latency[i]))
 
     def trespassing(self) -> Flags:
-        """Which zones each breaks: exclusion zones and limits one by one, inclusion zones all together in slot 0 of a second
-        block; shape (n, ZONES + 1)."""
+        """Return the zones that each drone breaks, shape (n, ZONES + 1).
+
+        Exclusion zones and limits count one by one, inclusion zones together in slot 0 of a second block.
+        """
         true, fast = self.true, np.abs(self.speed).max(axis=1) > STANDING_MPS
         if fast.mean() > 0.5:
             return trespasses(true[:, :2], true[:, 2], self.walls, self.kinds, self.bands)
-        # Who stands sways slowly, and is looked at twice a second.
+        # A stationary drone sways slowly and is observed twice a second.
         fast |= round(self.time_s / STEP_S) % 10 == 0
         found = np.zeros((len(true), ZONES + 1), dtype=bool)
         who = np.flatnonzero(fast)
@@ -419,7 +425,7 @@ class Fleet:
 
 
 def trespasses(points: Floats, heights: Floats, walls: Walls, kinds: NDArray[np.int64], bands: Floats) -> Flags:
-    """Which zones are broken by being at some points; the last column: being outside all inclusion zones."""
+    """Return the zones broken at some points. The last column is True outside all inclusion zones."""
     here = walls.around(points)
     up = heights[:, None]
     within = (bands[..., 0] <= up) & (up <= bands[..., 1])
@@ -432,7 +438,7 @@ def trespasses(points: Floats, heights: Floats, walls: Walls, kinds: NDArray[np.
 
 
 JUST_M = 0.3
-"""How much a limit of altitude may be overshot beyond the declared errors: the controller's own overshoot."""
+"""Permitted excess over an altitude limit beyond the declared errors: the controller's overshoot."""
 
 
 def _root(error: Floats, gain: Floats, limit: Floats) -> Floats:
@@ -443,19 +449,19 @@ def _root(error: Floats, gain: Floats, limit: Floats) -> Floats:
 
 
 def _disc(rng: np.random.Generator, count: int, radius: float) -> Floats:
-    """Points of a disc, half of them on its rim."""
+    """Return points of a disc, half of them on its rim."""
     angle, far = rng.uniform(0, 2 * math.pi, count), np.sqrt(np.minimum(rng.uniform(0, 2, count), 1.0)) * radius
     return np.column_stack((far * np.cos(angle), far * np.sin(angle)))
 
 
 @dataclass
 class Tally:
-    """What came of the requests, and every one that went wrong.
+    """Results of the requests, and every violation.
 
     Attributes:
-        changed: vehicles whose parameters another station changed in flight.
-        homeward: ways home that the system flew.
-        straight: those that the autopilot flew by itself.
+        changed: Vehicles whose parameters another station changed in flight.
+        homeward: Return flights by the system.
+        straight: Return flights by the autopilot.
     """
 
     asked: int = 0
@@ -469,10 +475,10 @@ class Tally:
     straight: int = 0
     wrong: list[str] = field(default_factory=list)
     stopped: list[str] = field(default_factory=list)
-    """Flights that were permitted, and stopped by the monitor."""
+    """Permitted flights that the monitor stopped."""
 
     def add(self, other: Tally) -> None:
-        """Count another tally in."""
+        """Add another tally."""
         for name in vars(self):
             setattr(self, name, getattr(self, name) + getattr(other, name))
 
@@ -486,16 +492,16 @@ def flights(
     watched: int = 1,
     returns: Returns | None = None,
 ) -> Tally:
-    """Fly a fleet through random scenes, each drone with several requests, and look for trespasses.
+    """Fly a fleet through random scenes, each drone with several requests, and report violations.
 
     Args:
-        seed: of everything.
-        count: drones.
-        shared: drones to a scene: compiling policies takes longer than judging.
-        requests: to each drone; the later ones interrupt the flight of the earlier.
-        watch_every: steps after which the monitor looks at each drone again, as the service has it look; 0 for never.
-        watched: the monitor looks at one drone of this number.
-        returns: ways home; None for none.
+        seed: Seed of all random numbers.
+        count: Number of drones.
+        shared: Drones per scene, because compiling policies takes longer than judging.
+        requests: Requests per drone. The later ones interrupt the flight of the earlier.
+        watch_every: Steps between two checks of a drone by the monitor. 0 disables the monitor.
+        watched: The monitor checks one drone out of this number.
+        returns: Return flights, or None.
     """
     rng = np.random.default_rng(seed)
     scenes = [s for s in (scene(rng) for _ in range(math.ceil(count / shared))) for _ in range(shared)][:count]
@@ -508,7 +514,7 @@ def flights(
             _change(fleet, tally, told, pardoned, other)
         flown = _ask_all(fleet, tally, told, rng, watched if watch_every else 0)
         called_s = fleet.time_s + other.uniform(1.5, 8.0) if returns is not None and turn == requests - 1 else math.inf
-        # Every third request comes before the one before it can have had its effect.
+        # Every third request arrives before the previous one can have taken effect.
         span_s = 30.0 if turn == requests - 1 else rng.choice([rng.uniform(0.05, 0.6), *rng.uniform(0.4, 7.0, 2)])
         for n in range(int(span_s / STEP_S)):
             fleet.step()
@@ -526,7 +532,7 @@ def flights(
                 _watch(fleet, tally, flown, pardoned)
             found = fleet.trespassing() & ~pardoned
             for i in np.flatnonzero(found.any(axis=1)):
-                # Where wind takes a drone that nothing was permitted to is no one's doing.
+                # A drone without a permitted command may drift in the wind.
                 if not told[i]:
                     continue
                 tally.wrong.append(f"seed {seed}, drone {i}, turn {turn}, {fleet.time_s:.2f} s: {told[i]}")
@@ -537,19 +543,19 @@ def flights(
 
 
 class Returns(Protocol):
-    """What becomes of drones after their requests, each in a world of its own."""
+    """Return flights after the requests of drones, each in a separate world."""
 
     def called(self, fleet: Fleet, pardoned: Flags, tally: Tally) -> None:
-        """Let the system fly some home that are in flight."""
+        """Let the system fly home some drones that are in flight."""
 
     def alone(self, fleet: Fleet, pardoned: Flags, tally: Tally) -> None:
-        """Let the autopilots of some that rest fly home."""
+        """Let the autopilots of some drones at rest fly home."""
 
 
 def _change(fleet: Fleet, tally: Tally, told: list[str], pardoned: Flags, rng: np.random.Generator) -> None:
-    """Another station changes parameters of some vehicles, and their services hear of it.
+    """Change parameters of some vehicles as another station does, and inform their services.
 
-    What was permitted before, and what a vehicle does whatever it is told now, is not judged any more.
+    Earlier permissions, and motion that no command can prevent, are not judged any longer.
     """
     expected = {i for _, i, _ in fleet.mail}
     who = np.array([i for i in np.flatnonzero(rng.random(len(told)) < CHANGED) if i not in expected], dtype=np.int64)
@@ -564,11 +570,11 @@ def _change(fleet: Fleet, tally: Tally, told: list[str], pardoned: Flags, rng: n
 
 
 Flown = dict[int, tuple[str, GotoArgs | None, bool]]
-"""By drone: what was permitted, its leg, and whether its acceleration is told."""
+"""Per drone: the permitted request, its leg, and whether its acceleration is reported."""
 
 
 def _watch(fleet: Fleet, tally: Tally, flown: Flown, pardoned: Flags) -> None:
-    """Look for drones that the monitor would stop; each is counted once."""
+    """Report drones that the monitor would stop, each once."""
     for i, (what, end, told) in list(flown.items()):
         if np.abs(fleet.speed[i]).max() < STANDING_MPS:
             continue
@@ -583,7 +589,7 @@ def _watch(fleet: Fleet, tally: Tally, flown: Flown, pardoned: Flags) -> None:
 
 
 def _ask_all(fleet: Fleet, tally: Tally, told: list[str], rng: np.random.Generator, watched: int) -> Flown:
-    """One request of each drone. Returns those of the watched that the monitor has nothing against."""
+    """Make one request per drone. Return the watched drones that the monitor does not object to."""
     flown: Flown = {}
     legs: list[tuple[int, GotoArgs]] = []
     near = vicinity(fleet).any(axis=1)
@@ -600,14 +606,14 @@ def _ask_all(fleet: Fleet, tally: Tally, told: list[str], rng: np.random.Generat
         if verdict.permits and not _flies_faster(fleet, i, verdict, now):
             what = f"{call} in {now} -> {verdict}"
             tally.wrong += [f"{odd}: {what}" for odd in _odd(verdict, now, place)]
-            # A speed alone moves nothing.
+            # SetSpeed moves nothing.
             moves = not isinstance(verdict.args, SetSpeedArgs)
             told[i] = what if moves else told[i] and f"{told[i]}, then {what}"
             tally.shortened += "the last legal point" in verdict.reason
             if isinstance(verdict.args, GotoArgs):
                 legs.append((i, verdict.args))
             fleet.send(i, verdict, returns=not near[i])
-            # Who begins beyond a limit of altitude is at its edge on the way back.
+            # A drone that starts beyond an altitude limit is at the limit's edge on its way back.
             low, high = place.heights
             level = low - HEIGHT_ERROR_M <= now.altitude_m <= high + HEIGHT_ERROR_M
             if moves and level and watched and i % watched == 0 and monitor(now, place.grant) is None:
@@ -618,7 +624,10 @@ def _ask_all(fleet: Fleet, tally: Tally, told: list[str], rng: np.random.Generat
 
 
 def _flies_faster(fleet: Fleet, i: int, verdict: Verdict, now: Situation) -> bool:
-    """Whether a drone would fly its leg faster than it was judged, and the rest of it is not legal so: the service keeps its speed."""
+    """Return True if a drone would fly its leg illegally faster than it was judged.
+
+    The service keeps its speed then.
+    """
     leg, args = fleet.legs[i], verdict.args
     if leg is None or not isinstance(args, SetSpeedArgs) or args.speed_mps <= float(fleet.setpoint[i]):
         return False
@@ -628,7 +637,7 @@ def _flies_faster(fleet: Fleet, i: int, verdict: Verdict, now: Situation) -> boo
 
 
 def _too_near(fleet: Fleet, legs: list[tuple[int, GotoArgs]]) -> Iterator[int]:
-    """Drones whose legs end inside the margin of a fence."""
+    """Return drones whose legs end inside the margin of a fence."""
     who = np.array([i for i, _ in legs for _ in _CIRCLE], dtype=np.int64)
     heights = np.array([leg.alt for _, leg in legs for _ in _CIRCLE])
     ends = [[(leg.lon - HOME.lon) * EAST_M, (leg.lat - HOME.lat) * NORTH_M] for _, leg in legs]
@@ -638,7 +647,7 @@ def _too_near(fleet: Fleet, legs: list[tuple[int, GotoArgs]]) -> Iterator[int]:
 
 
 def _again(rng: np.random.Generator, last: Call | None) -> Call | None:
-    """Half of the drivers that steer ask for the same once more, or a little faster."""
+    """Repeat the request of half of the drivers that use velocities, with the same or a slightly higher speed."""
     if last is None or not isinstance(last.args, VelocityArgs) or rng.random() < 0.5:
         return None
     args, faster = last.args, float(rng.choice([1.0, 1.3]))
@@ -659,12 +668,12 @@ def _request(rng: np.random.Generator) -> Call:
 
 
 def _odd(verdict: Verdict, now: Situation, place: Scene) -> Iterator[str]:
-    """What is wrong with the arguments that come back, flown or not."""
+    """Return the defects of corrected arguments."""
     args = verdict.args
     if verdict.action == "correct":
         again = judge(Call(METHOD_OF[type(args)], args), now, place.grant)
         if (again.action, again.args) != ("allow", args):
-            yield "corrected to what is not allowed as it is"
+            yield "corrected to arguments that are not allowed unchanged"
     if isinstance(args, VelocityArgs) and math.hypot(args.north_mps, args.east_mps) > place.top_mps + 1e-6:
         yield "too fast"
     if isinstance(args, SetSpeedArgs) and args.speed_mps > place.top_mps + 1e-6:
@@ -679,14 +688,14 @@ def _odd(verdict: Verdict, now: Situation, place: Scene) -> Iterator[str]:
 
 
 SLOWEST_STOP_S = 20.0
-"""From 15 m/s with 1 m/s2, the latency and the controller's approach included."""
+"""Time to stop from 15 m/s with 1 m/s2, including latency and the controller's approach."""
 
 
 def excused(fleet: Fleet) -> Flags:
-    """Fences that a drone breaks, or comes too close to, whatever it is told at the beginning; shape (n, ZONES + 1).
+    """Return the fences that a drone breaks or approaches before any command can take effect, shape (n, ZONES + 1).
 
-    What it does before a request can have any effect is not the request's doing, nor are the ways back that the engine
-    allows from there. `fleet` is left as it is.
+    Motion before a request can take effect is not caused by the request, nor are the ways back that the engine permits
+    from there. `fleet` is not changed.
     """
     trial = fleet.part(np.arange(len(fleet.scenes)))
     trial.held[:], trial.wanted, trial.until = True, trial.speed.copy(), fleet.time_s + fleet.latency
@@ -701,7 +710,7 @@ def excused(fleet: Fleet) -> Flags:
 
 
 def vicinity(fleet: Fleet) -> Flags:
-    """Fences that each breaks, or is closer to than its margin; shape (n, ZONES + 1)."""
+    """Return the fences that each drone breaks or is closer to than its margin, shape (n, ZONES + 1)."""
     tall = HEIGHT_ERROR_M + TRACKING_M + 0.1
     around = np.where((fleet.kinds == EXCLUSION)[..., None], [-tall, tall], [tall, -tall])
     found = np.zeros((len(fleet.scenes), ZONES + 1), dtype=bool)

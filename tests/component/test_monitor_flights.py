@@ -1,4 +1,4 @@
-"""The continuous check beside a drone that the oracle of the policies flies: silent on a permitted leg, in time before a zone."""
+"""The motion monitor on flights of the policy oracle: silent on permitted legs, in time before a zone."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ WALL = box(-50, 50, 50, 90)
 
 
 @pytest.mark.parametrize("speed_mps", [2.0, 5.0, 8.0, 12.0])
-def test_what_is_permitted_never_alarms(speed_mps: float) -> None:
-    """A drone that flies a permitted leg to the edge of a zone's margin, as ArduPilot brakes for it."""
+def test_monitor_never_stops_permitted_flights(speed_mps: float) -> None:
+    """A drone flies a permitted leg to the edge of a zone's margin, braking as ArduPilot does."""
     grant = compiled(exclusion(WALL, "revoke"), operationArea=[])
     assert ask(grant, goto(0, 47.4, speed_mps=speed_mps)).permits
     rng = np.random.default_rng(1)
@@ -39,7 +39,7 @@ def test_what_is_permitted_never_alarms(speed_mps: float) -> None:
 
 
 @pytest.mark.parametrize("appears_s", [0.5, 1.0, 1.5, 2.0, 2.5, 3.0])
-def test_a_zone_that_appears_while_a_drone_speeds_up_stops_it_in_time(appears_s: float) -> None:
+def test_monitor_stops_accelerating_drone_before_new_zone(appears_s: float) -> None:
     rng = np.random.default_rng(1)
     fleet = Fleet(rng, [scene(rng)])
     fleet.airframes = [Airframe()]
@@ -67,7 +67,7 @@ def test_a_zone_that_appears_while_a_drone_speeds_up_stops_it_in_time(appears_s:
     assert monitor(now, grant) is None, "on a way that was judged by these fences it has room"
     for _ in range(int(now.latency_s / STEP_S)):
         fleet.step()
-    # Told, as it is by the service, to fly with no velocity.
+    # The service commands a zero velocity.
     fleet.held[:], fleet.wanted[:], fleet.until[:] = True, 0.0, math.inf
     for _ in range(int(20 / STEP_S)):
         fleet.step()

@@ -1,6 +1,6 @@
 """Random fences, states and requests, against an oracle that flies the drone in small steps.
 
-The oracle shares nothing with the engine: it projects on a sphere, casts rays to tell inside from outside, and
+The oracle shares nothing with the engine: it projects on a sphere, casts rays to distinguish inside from outside, and
 integrates a drone with bounded acceleration, wind drift, latency and position error.
 """
 
@@ -51,7 +51,7 @@ def inside(point: tuple[float, float], corners: Corners) -> bool:
 def fly(
     start: tuple[float, float], velocity: tuple[float, float], to: tuple[float, float], cruise: float, latency: float
 ) -> list[tuple[float, float]]:
-    """Positions of a drone that learns of its target after a latency and then turns to it, braking in time."""
+    """Return positions of a drone that receives its target after a latency and then turns to it, braking in time."""
     (x, y), (vx, vy) = start, velocity
     track, t = [start], 0.0
     while t < 120:
@@ -77,7 +77,7 @@ def fly(
 
 
 def brake(start: tuple[float, float], velocity: tuple[float, float], latency: float) -> list[tuple[float, float]]:
-    """Where a drone flies that is told to stop, with the slack of ArduPilot's formula."""
+    """Return the positions of a drone that is commanded to stop, with the tolerance of ArduPilot's formula."""
     speed = math.hypot(*velocity)
     run = speed * latency + 1.25 + speed * speed / (2 * ACCEL_MPS2) if speed > 0 else 0.0
     return [
@@ -89,7 +89,7 @@ def brake(start: tuple[float, float], velocity: tuple[float, float], latency: fl
 
 @st.composite
 def polygons(draw: st.DrawFn) -> Corners:
-    """A star-shaped polygon, convex or not."""
+    """Draw a star-shaped polygon, convex or not."""
     cx, cy = draw(st.floats(-120, 120)), draw(st.floats(-120, 120))
     count = draw(st.integers(3, 8))
     radii = draw(st.lists(st.floats(5, 45), min_size=count, max_size=count))
@@ -113,7 +113,7 @@ speeds = st.tuples(st.floats(-8, 8), st.floats(-8, 8)).filter(lambda v: math.hyp
     action=st.sampled_from(["ignore", "adjust"]),
     seed=st.integers(0, 10**6),
 )
-def test_no_accepted_goto_leads_into_a_zone(
+def test_oracle_no_permitted_goto_enters_a_zone(
     zones: list[Corners],
     start: tuple[float, float],
     to: tuple[float, float],
@@ -136,7 +136,7 @@ def test_no_accepted_goto_leads_into_a_zone(
     track = fly(
         (start[0] + off[0], start[1] + off[1]), velocity, (end[0] + off[0], end[1] + off[1]), 10.0, now.latency_s
     )
-    # What the drone does whatever it is told is not the request's doing.
+    # Motion that no command can prevent is not caused by the request.
     braking = [(x + off[0] * k, y + off[1] * k) for x, y in brake(start, velocity, now.latency_s) for k in (-1, 0, 1)]
     unavoidable = any(inside(point, zone) for zone in zones for point in braking)
     if begun_outside and not unavoidable:
@@ -149,7 +149,7 @@ def test_no_accepted_goto_leads_into_a_zone(
 
 @_cases
 @given(area=polygons(), start=spots, to=spots, action=st.sampled_from(["ignore", "adjust"]))
-def test_no_accepted_goto_leaves_an_inclusion_zone(
+def test_oracle_no_permitted_goto_leaves_an_inclusion_zone(
     area: Corners, start: tuple[float, float], to: tuple[float, float], action: str
 ) -> None:
     big = [(x * 3, y * 3) for x, y in area]
@@ -176,7 +176,7 @@ def test_no_accepted_goto_leaves_an_inclusion_zone(
     upper=st.one_of(st.none(), st.floats(0, 60)),
     refuse=st.booleans(),
 )
-def test_altitudes_against_a_plain_reading_of_the_rules(
+def test_oracle_altitude_verdicts_match_the_rules(
     asked: float, lower: float | None, upper: float | None, refuse: bool
 ) -> None:
     if lower is None and upper is None:
@@ -207,7 +207,7 @@ def test_altitudes_against_a_plain_reading_of_the_rules(
 
 @_cases
 @given(lat=st.floats(), lon=st.floats(), alt=st.floats(), vn=st.floats(-100, 100), ve=st.floats(-100, 100))
-def test_no_request_is_too_odd_to_answer(lat: float, lon: float, alt: float, vn: float, ve: float) -> None:
+def test_oracle_every_goto_gets_a_verdict(lat: float, lon: float, alt: float, vn: float, ve: float) -> None:
     zone = [(20.0, 20.0), (40.0, 20.0), (40.0, 40.0)]
     grant = compiled(exclusion(ring(zone), "adjust"), altitude(upperLimit=30))
     verdict = ask(grant, Call("Goto", GotoArgs(lat, lon, alt)), at(north_mps=vn, east_mps=ve))
@@ -219,8 +219,8 @@ def test_no_request_is_too_odd_to_answer(lat: float, lon: float, alt: float, vn:
         assert verdict.code
 
 
-def test_no_permitted_request_ends_in_a_breach() -> None:
-    """Velocities, legs in flight, bands, schedules, limits, wind: the million of `bench/oracle.py` in small."""
+def test_oracle_no_permitted_request_breaks_a_policy() -> None:
+    """A small version of `bench/oracle.py`: velocities, legs in flight, bands, schedules, limits, wind."""
     tally = flights(seed=7, count=500)
     assert tally.wrong == []
     assert tally.permitted > tally.asked / 3
@@ -229,13 +229,13 @@ def test_no_permitted_request_ends_in_a_breach() -> None:
     assert tally.braked > 0
 
 
-def test_the_oracle_would_notice(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_oracle_detects_too_small_margins(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (goto_rules, velocity_rules):
         monkeypatch.setattr(module, "margin_m", lambda _now: 0.5)
     assert flights(seed=3, count=200).wrong
 
 
-def test_ways_home_break_nothing() -> None:
+def test_oracle_return_flights_break_no_policy() -> None:
     tally = flights(seed=11, count=160, requests=2, returns=WaysHome(11, 4))
     assert tally.wrong == []
     assert tally.homeward > 30
@@ -243,7 +243,7 @@ def test_ways_home_break_nothing() -> None:
     assert tally.changed > 0
 
 
-def test_the_oracle_would_notice_a_way_home_through_a_zone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_oracle_detects_return_flights_through_zones(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(return_route, "check_straight_return", lambda *_, **__: None)
     monkeypatch.setattr(goto_rules, "check_return", lambda *_: None)
     monkeypatch.setattr(free_space.FreeSpace, "blockers", lambda *_: [])
@@ -252,16 +252,16 @@ def test_the_oracle_would_notice_a_way_home_through_a_zone(monkeypatch: pytest.M
     assert any("alone on its way home" in line for line in wrong)
 
 
-def test_only_vehicles_whose_parameters_are_known_may_arm() -> None:
+def test_oracle_arms_only_vehicles_with_known_parameters() -> None:
     assert parameter_faults(seed=1, count=300) == []
 
 
-def test_the_oracle_would_notice_a_parameter_that_is_made_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_oracle_detects_assumed_parameters(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(failsafes.Reader, "read", lambda self, names, otherwise, *, needed=True: otherwise)
     assert parameter_faults(seed=1, count=50)
 
 
-def test_who_begins_beyond_a_limit_of_altitude_breaks_it_by_no_request() -> None:
+def test_oracle_excuses_drones_that_start_beyond_an_altitude_limit() -> None:
     rings = np.full((ZONES, CORNERS, 2), 1e6)
     rings[0] = [(-20, -20)] * 5 + [(20, -20), (20, 20), (-20, 20)]
     limits = np.tile([-np.inf, np.inf], (ZONES, 1))
@@ -275,7 +275,7 @@ def test_who_begins_beyond_a_limit_of_altitude_breaks_it_by_no_request() -> None
 
 @pytest.fixture
 def shortening(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Legs only, and every fence shortens those that would break it, so that they end at its margin."""
+    """Use legs only, with fences that shorten them, so that they end at the margins of fences."""
     made = policy_flights.policy
 
     def shortens(name: str, *args: Any, **more: Any) -> dict[str, Any]:
@@ -294,7 +294,7 @@ def shortening(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("shortening")
 @pytest.mark.parametrize("seed", cells([3, 4], quick=[3]))
-def test_the_monitor_lets_pass_what_is_permitted(seed: int) -> None:
+def test_oracle_monitor_never_stops_permitted_flights(seed: int) -> None:
     tally = flights(seed=seed, count=examples(400, 100), requests=2, watch_every=3)
     assert tally.wrong == []
     assert tally.stopped == []
@@ -303,6 +303,6 @@ def test_the_monitor_lets_pass_what_is_permitted(seed: int) -> None:
 
 
 @pytest.mark.usefixtures("shortening")
-def test_the_oracle_would_notice_a_monitor_that_stops_what_is_permitted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_oracle_detects_monitor_that_stops_permitted_flights(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(policy_flights, "monitor", lambda now, grant, **_: monitor(now, grant))
     assert flights(seed=7, count=64, requests=2, watch_every=3).stopped

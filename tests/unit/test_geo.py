@@ -1,4 +1,4 @@
-"""The local frame and areas against geodesics and closed forms."""
+"""Local frame and areas against geodesics and closed forms."""
 
 import itertools
 import math
@@ -26,7 +26,7 @@ longitudes = st.floats(-180, 180)
 
 
 @given(latitudes, longitudes, st.floats(0, 2 * math.pi), st.floats(1, 50_000))
-def test_planar_distance_is_geodesic_within_a_tenth_of_a_percent(lat, lon, bearing, distance):
+def test_local_frame_distances_match_geodesic_distances(lat, lon, bearing, distance):
     frame = LocalFrame(lat, lon)
     x, y = distance * math.sin(bearing), distance * math.cos(bearing)
     there_lat, there_lon = frame.latlon(x, y)
@@ -35,12 +35,12 @@ def test_planar_distance_is_geodesic_within_a_tenth_of_a_percent(lat, lon, beari
 
 
 @given(latitudes, longitudes, st.floats(-50_000, 50_000), st.floats(-50_000, 50_000))
-def test_frame_round_trips(lat, lon, x, y):
+def test_local_frame_conversion_round_trips(lat, lon, x, y):
     frame = LocalFrame(lat, lon)
     assert frame.xy(*frame.latlon(x, y)) == pytest.approx((x, y), abs=1e-3)
 
 
-def test_frame_says_when_a_point_is_beyond_the_horizon():
+def test_local_frame_rejects_points_beyond_the_horizon():
     with pytest.raises(ValueError, match="beyond the horizon"):
         LocalFrame(10, 20).latlon(9_000_000, 0)
     with pytest.raises(ValueError, match="beyond the horizon"):
@@ -48,7 +48,7 @@ def test_frame_says_when_a_point_is_beyond_the_horizon():
 
 
 @pytest.mark.parametrize("origin", [(0.0, 0.0), (39.36, 22.95), (-80.0, 179.99), (90.0, 0.0)])
-def test_many_points_are_converted_as_one_is(origin):
+def test_local_frame_array_conversion_matches_single_conversion(origin):
     frame = LocalFrame(*origin)
     xy = np.array([(x, y) for x in (-5e4, -3.0, 0.0, 120.5) for y in (-40.0, 0.0, 3e4)])
     lats, lons = frame.latlon_array(xy)
@@ -59,7 +59,7 @@ def test_many_points_are_converted_as_one_is(origin):
 
 @pytest.mark.parametrize("lat", [0, 45, 80, -80])
 @pytest.mark.parametrize("lon", [0, 179.9999, -180])
-def test_circle_area_anywhere(lat, lon):
+def test_circle_has_the_right_area_anywhere(lat, lon):
     area = Area(circle=Circle(center=Point(lat=lat, lon=lon), radius=500))
     shape = area_polygon(LocalFrame(lat, lon), area)
     assert shape.area == pytest.approx(math.pi * 500**2, rel=5e-3)
@@ -67,7 +67,7 @@ def test_circle_area_anywhere(lat, lon):
 
 
 @pytest.mark.parametrize(("radius", "pieces"), [(1e-6, 32), (0.5, 32), (7, 60), (33, 128), (500, 128), (40_000, 128)])
-def test_rounds_are_never_cut_short_and_hardly_larger(radius, pieces):
+def test_circles_and_corridors_are_circumscribed_tightly(radius, pieces):
     frame = LocalFrame(50, 4)
     here = Point(lat=50, lon=4)
     exact = shapely.Point(0, 0).buffer(radius, quad_segs=2000)
@@ -84,8 +84,8 @@ def test_rounds_are_never_cut_short_and_hardly_larger(radius, pieces):
 
 
 @given(latitudes, longitudes, st.floats(1, 200_000), st.floats(0, 300_000), st.floats(0, math.tau))
-def test_what_stands_for_a_circle_to_stay_in_is_never_larger(lat, lon, radius, away, bearing):
-    """However far its middle is from the origin of the frame, which shows distances there too small."""
+def test_inscribed_circle_is_never_larger_than_the_circle(lat, lon, radius, away, bearing):
+    """Applies at any distance from the origin of the frame, which shortens distances there."""
     frame = LocalFrame(lat, lon)
     centre_lat, centre_lon = frame.latlon(away * math.sin(bearing), away * math.cos(bearing))
     centre = Point(lat=centre_lat, lon=centre_lon)
@@ -97,7 +97,7 @@ def test_what_stands_for_a_circle_to_stay_in_is_never_larger(lat, lon, radius, a
 
 
 @given(st.floats(1, 200), st.floats(-9, 3), st.floats(0, math.tau))
-def test_a_corridor_covers_its_legs_however_short(radius, magnitude, direction):
+def test_corridor_covers_short_legs(radius, magnitude, direction):
     frame = LocalFrame(50, 4)
     length = 10**magnitude
     legs = [(0.0, 0.0), (length * math.sin(direction), length * math.cos(direction))]
@@ -130,8 +130,8 @@ def test_polygon_across_the_antimeridian_is_small():
     st.floats(5, 3000),
     st.lists(st.tuples(st.floats(0, 2 * math.pi), st.sampled_from([0.0, 0.5, 0.9, 1.1, 2.0])), min_size=5, max_size=20),
 )
-def test_circles_at_the_poles_hold_on_a_map_of_degrees_what_they_hold_on_the_ground(pole, off, lon, radius, places):
-    # A way past the pole that is shorter than a segment is bent on such a map.
+def test_geojson_of_circles_at_the_poles_covers_the_same_area(pole, off, lon, radius, places):
+    # On such a map, an edge past the pole that is shorter than a segment is bent.
     assume(abs(off - radius) > 0.2 * radius)
     lat = pole - math.copysign(off / 111_694, pole)
     frame = LocalFrame(lat, lon)
@@ -146,24 +146,24 @@ def test_circles_at_the_poles_hold_on_a_map_of_degrees_what_they_hold_on_the_gro
         assert any(part.covers(shapely.Point(there_lon, there_lat)) for part in drawn) == (share < 1)
 
 
-def test_bow_tie_names_the_ring_and_the_place():
+def test_self_crossing_ring_error_names_ring_and_place():
     a, b, c, d = square(0, 0, 0.01)
     with pytest.raises(InvalidObject, match=r"polygon\.exterior: the ring crosses itself near lat -?0\.0"):
         area_polygon(LocalFrame(0, 0), Area(polygon=Polygon(exterior=(a, c, b, d))))
 
 
-def test_ring_without_area_is_refused():
+def test_ring_without_area_is_rejected():
     line = tuple(Point(lat=0, lon=v) for v in (0, 0.1, 0.2))
     with pytest.raises(InvalidObject, match=r"polygon\.exterior"):
         area_polygon(LocalFrame(0, 0), Area(polygon=Polygon(exterior=line)))
 
 
-def test_hole_outside_is_refused():
+def test_hole_outside_exterior_is_rejected():
     with pytest.raises(InvalidObject, match=r"holes\[0\]"):
         area_polygon(LocalFrame(0, 0), Area(polygon=Polygon(exterior=square(0, 0, 0.01), holes=(square(1, 1, 0.01),))))
 
 
-def test_corridor_covers_what_is_within_its_radius():
+def test_corridor_covers_points_within_its_radius():
     frame = LocalFrame(47, 8)
     points = [Point(lat=47, lon=8), Point(lat=47.002, lon=8), Point(lat=47.002, lon=8.002)]
     shape = corridor(frame, points, 7)
@@ -173,19 +173,19 @@ def test_corridor_covers_what_is_within_its_radius():
 
 
 @given(latitudes, longitudes)
-def test_areas_survive_the_round_trip(lat, lon):
+def test_areas_of_shape_round_trip(lat, lon):
     frame = LocalFrame(lat, lon)
     shape = shapely.Polygon([(0, 0), (100, 0), (100, 80), (0, 80)], [[(10, 10), (20, 10), (20, 20)]])
     (area,) = areas_of_shape(frame, shape)
     assert area_polygon(frame, area).symmetric_difference(shape).area < 0.5
 
 
-def test_middle_is_right_across_the_antimeridian():
+def test_center_is_correct_across_the_antimeridian():
     middle = center_of([Point(lat=0, lon=179), Point(lat=0, lon=-179)])
     assert abs(middle.lon) == pytest.approx(180)
 
 
-def test_corridor_of_a_path_that_crosses_itself_a_thousand_times_is_the_dilated_path():
+def test_corridor_of_self_crossing_path_equals_dilated_path():
     frame = LocalFrame(50, 4)
     turns = [
         frame.latlon(300 * math.sin(math.tau * i * 0.497), 300 * math.cos(math.tau * i * 0.497)) for i in range(60)
@@ -197,7 +197,7 @@ def test_corridor_of_a_path_that_crosses_itself_a_thousand_times_is_the_dilated_
     assert shape.area == pytest.approx(whole.area, rel=2e-3)
 
 
-def test_crossings_are_those_of_each_piece_with_each_other():
+def test_crossings_count_matches_pairwise_comparison():
     rng = np.random.default_rng(7)
     for corners in (2, 3, 30, 200):
         lines = [rng.uniform(-100, 100, (corners, 2)) for _ in range(3)]
@@ -209,18 +209,18 @@ def test_crossings_are_those_of_each_piece_with_each_other():
     assert count_crossings([], 5) == 0
 
 
-def test_lines_that_only_touch_or_lie_on_each_other_do_not_cross():
+def test_crossings_exclude_touching_and_overlapping_lines():
     square = np.array([[0, 0], [10, 0], [10, 10], [0, 10], [0, 0]], dtype=float)
     assert count_crossings([square, square, np.add(square, (10, 0))], 100) == 0
 
 
-def test_more_pieces_beside_each_other_than_can_be_compared_count_as_too_many():
+def test_crossings_of_too_many_parallel_pieces_exceed_the_limit():
     teeth = np.array([[i + (i % 2) * 1e4, -i + (i % 2) * 1e4] for i in range(10_000)], dtype=float)
     assert count_crossings([teeth], 5000) == 5001
     assert count_crossings([teeth[:2000]], 5000) == 0
 
 
-def test_rings_across_the_antimeridian_stay_closed_and_repeat_no_corner():
+def test_geojson_rings_across_the_antimeridian_are_closed_without_repeated_corners():
     for lon in (179.9999, -179.9998):
         for radius in (20.0, 137.3, 900.0):
             frame = LocalFrame(-41.0, lon)

@@ -1,4 +1,4 @@
-"""`fractus policy check`: the engine's answer from manifests, and one sentence for what it cannot read."""
+"""`fractus policy check`: verdicts from manifests, and errors for invalid input."""
 
 from __future__ import annotations
 

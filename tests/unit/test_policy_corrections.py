@@ -1,4 +1,4 @@
-"""Corrections that hold: what comes back is allowed as it is, and keeps every limit, band and fence by a plain reading."""
+"""Corrections are allowed unchanged, and comply with every limit, band and fence by a plain reading of the policies."""
 
 from __future__ import annotations
 
@@ -46,15 +46,15 @@ SERVICES = [{"service": "mobility", "methods": [*METHODS, "SetVelocity"]}, {"ser
 
 
 def holds(grant: CompiledGrant, call: Call, verdict: Verdict, now: Situation) -> bool:
-    """Whether what a call was corrected to is allowed as it is."""
+    """Return True if a corrected call is allowed unchanged."""
     again = ask(grant, Call(call.method, verdict.args), now)
     return again.action == "allow" and again.args == verdict.args
 
 
-# What is corrected is judged again
+# Corrections are judged again
 
 
-def test_an_altitude_corrected_into_a_slower_zone_takes_its_speed() -> None:
+def test_altitude_correction_into_slower_zone_also_corrects_speed() -> None:
     low = zone("low", EVERYWHERE, lower=20, upper=60)
     grant = compiled(altitude(lowerLimit=30), speed("slow", [low], upperLimit=3))
     verdict = ask(grant, goto(50, 0, 5, speed_mps=8), at(alt=10))
@@ -66,7 +66,7 @@ def test_an_altitude_corrected_into_a_slower_zone_takes_its_speed() -> None:
     assert "speed 8.0 m/s" in verdict.reason
 
 
-def test_a_takeoff_corrected_upward_meets_the_limits_of_the_zone_it_comes_into() -> None:
+def test_takeoff_correction_complies_with_limits_of_entered_zone() -> None:
     high = zone("high", EVERYWHERE, lower=20, upper=60)
     climb, ground = Call("Takeoff", TakeoffArgs(5)), at(alt=0.0, in_air=False)
     taller = ask(compiled(altitude(lowerLimit=30), altitude("tall", [high], lowerLimit=40)), climb, ground)
@@ -78,7 +78,7 @@ def test_a_takeoff_corrected_upward_meets_the_limits_of_the_zone_it_comes_into()
     assert "flat" in lower.reason
 
 
-def test_a_chain_of_stacked_zones_is_climbed_and_an_endless_one_is_denied() -> None:
+def test_corrections_through_stacked_zones_settle_or_are_denied() -> None:
     floors = [altitude(f"f{n}", [zone(f"z{n}", EVERYWHERE, lower=n * 10, upper=n * 10 + 5)], lowerLimit=n * 10 + 10) for n in range(1, 11)]  # fmt: skip
     climb, ground = Call("Takeoff", TakeoffArgs(5)), at(alt=0.0, in_air=False)
     short = ask(compiled(altitude(lowerLimit=10), *floors[:4]), climb, ground)
@@ -87,7 +87,7 @@ def test_a_chain_of_stacked_zones_is_climbed_and_an_endless_one_is_denied() -> N
     assert (endless.action, endless.code) == ("deny", "ConflictingLimits")
 
 
-def test_a_drone_is_never_taken_over_for_what_its_call_was_corrected_to() -> None:
+def test_correction_never_causes_takeover() -> None:
     below = exclusion(box(40, -50, 90, 50), "revoke", upper=60)
     grant = compiled(altitude(upperLimit=50), below)
     over = ask(grant, goto(150, 0, 90), at(alt=90))
@@ -100,7 +100,7 @@ def test_a_drone_is_never_taken_over_for_what_its_call_was_corrected_to() -> Non
     assert (climb.code, climb.policies) == ("ConflictingLimits", ("altitudes", "no-fly"))
 
 
-def test_a_velocity_led_back_into_a_fence_is_denied() -> None:
+def test_velocity_corrected_into_fence_is_denied() -> None:
     below = exclusion(box(40, -50, 90, 50), "land", upper=55)
     grant = compiled(altitude(upperLimit=50), below, services=SERVICES)
     back = ask(grant, Call("SetVelocity", VelocityArgs(0, 0, 0, hold_s=2.0)), at(65, alt=59.0))
@@ -108,10 +108,10 @@ def test_a_velocity_led_back_into_a_fence_is_denied() -> None:
 
 
 @pytest.mark.parametrize("limit", [0.05, 0.0, -5.0, math.nan, -math.inf])
-def test_a_speed_is_never_corrected_to_one_that_cannot_be_flown(limit: float) -> None:
+def test_speed_is_not_corrected_to_unachievable_speed(limit: float) -> None:
     grant = compiled(speed(upperLimit=5), services=SERVICES)
     for rule in grant.speed_limits.everywhere:
-        # Past the schema: the engine does not rely on it.
+        # This passes the schema, on which the engine does not rely.
         rule.spec.__dict__["upper_limit"] = limit
     for call in (Call("SetSpeed", SetSpeedArgs(3)), goto(50, 0), goto(50, 0, speed_mps=4)):
         verdict = ask(grant, call)
@@ -121,7 +121,7 @@ def test_a_speed_is_never_corrected_to_one_that_cannot_be_flown(limit: float) ->
 
 
 @pytest.mark.parametrize("limit", [math.inf, math.nan])
-def test_a_speed_is_never_corrected_to_infinity(limit: float) -> None:
+def test_speed_is_not_corrected_to_infinity(limit: float) -> None:
     grant = compiled(speed(lowerLimit=5))
     for rule in grant.speed_limits.everywhere:
         rule.spec.__dict__["lower_limit"] = limit
@@ -133,7 +133,7 @@ def test_a_speed_is_never_corrected_to_infinity(limit: float) -> None:
 
 @dataclass
 class Plain:
-    """A zoned rule as the oracle reads it; without corners it holds everywhere."""
+    """A zoned rule as the oracle reads it. Without corners it holds everywhere."""
 
     kind: str
     corners: Corners
@@ -156,14 +156,14 @@ class Plain:
 
 @dataclass
 class World:
-    """Random policies, twice: compiled for the engine, and plain."""
+    """Random policies in two forms: compiled for the engine, and plain."""
 
     seed: int
     rules: list[Plain] = field(default_factory=list)
     bodies: list[dict[str, Any]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        """Draw them."""
+        """Draw the policies."""
         self.draw = random.Random(self.seed)
         for n in range(self.draw.randint(1, 5)):
             self.draw.choice((self._altitude, self._altitude, self._speed, self._exclusion, self._inclusion))(f"p{n}")
@@ -227,7 +227,7 @@ class World:
         self.rules.append(Plain("inclusion", corners, band))
 
     def call(self) -> tuple[Call, Situation]:
-        """A request, in some situation."""
+        """Return a request in some situation."""
         draw = self.draw
         method = draw.choice(("Goto", "Goto", "Goto", "Takeoff", "SetSpeed", "SetVelocity"))
         x, y, alt = draw.uniform(-80, 80), draw.uniform(-80, 80), draw.uniform(3, 90)
@@ -256,7 +256,7 @@ class World:
 
 @dataclass(frozen=True)
 class Motion:
-    """What arguments do, plainly: points on the ground, the slab of air, where it ends, how fast."""
+    """Effect of arguments in plain form: points on the ground, altitude range, end, and speed."""
 
     way: list[tuple[float, float]]
     heights: tuple[float, float]
@@ -279,7 +279,7 @@ def motion(args: Args, now: Situation) -> Motion:
         case SetSpeedArgs(speed_mps):
             return Motion([(x, y)], (here, here), speed_mps, "SetSpeed")
         case VelocityArgs(north, east, _, _, hold_s):
-            # A drone in motion drifts off this line: where it goes, tests/component/policy_flights.py flies.
+            # A moving drone drifts off this line. tests/component/policy_flights.py flies such cases.
             resting = math.hypot(now.north_mps, now.east_mps) == 0
             way = [(x + east * hold_s * n / 10, y + north * hold_s * n / 10) for n in range(11 if resting else 1)]
             return Motion(way, (here, here), math.hypot(north, east), "SetVelocity")
@@ -287,7 +287,7 @@ def motion(args: Args, now: Situation) -> Motion:
 
 
 def broken(rules: list[Plain], args: Args, now: Situation) -> Iterator[str]:
-    """What arguments break by a plain reading: points on the way, the slab of air, and comparisons."""
+    """Return the policies that arguments break by a plain reading."""
     done = motion(args, now)
     if done.fast is not None and not (0 <= done.fast < math.inf and (done.fast > 0 or done.method == "SetVelocity")):
         yield f"flies at {done.fast}"
@@ -302,13 +302,13 @@ def _breaks(rule: Plain, done: Motion, along: list[bool]) -> bool:
     met = any(along) and rule.meets(min(done.heights), max(done.heights))
     match rule.kind:
         case "speed" if fast is not None:
-            # To hover is always allowed: the lower limits of speed do not hold for velocities.
+            # Hovering is always permitted, so lower speed limits do not apply to velocities.
             slow = fast < rule.lower - 1e-3 and done.method != "SetVelocity"
             return met and (slow or fast > rule.upper + 1e-3)
         case "altitude" if done.method in {"Goto", "Takeoff"}:
             return met and not rule.lower - 1e-3 <= end <= rule.upper + 1e-3
         case "exclusion" if done.method != "SetSpeed":
-            # Out of a zone that it is in a drone may fly.
+            # A drone may leave a zone that contains it.
             return (met and not along[0]) or (along[-1] and rule.meets(end, end) and done.method == "Goto")
         case "inclusion" if done.method in {"Goto", "Takeoff"}:
             return not along[-1] or not rule.band[0] <= end <= rule.band[1]
@@ -316,7 +316,7 @@ def _breaks(rule: Plain, done: Motion, along: list[bool]) -> bool:
 
 
 def corrections(seeds: range) -> Iterator[tuple[World, Call, Situation, Verdict]]:
-    """Random calls that are corrected, or cannot be."""
+    """Yield random calls that are corrected, or cannot be corrected."""
     for seed in seeds:
         world = World(seed)
         for _ in range(4):
@@ -326,7 +326,7 @@ def corrections(seeds: range) -> Iterator[tuple[World, Call, Situation, Verdict]
                 yield world, call, now, verdict
 
 
-def test_what_is_corrected_is_allowed_as_it_is_and_breaks_nothing() -> None:
+def test_corrected_calls_are_allowed_unchanged_and_break_no_policy() -> None:
     corrected = dict.fromkeys(("Goto", "Takeoff", "SetSpeed", "SetVelocity"), 0)
     again = conflicts = 0
     for world, call, now, verdict in corrections(range(examples(20_000, 400))):
@@ -339,14 +339,14 @@ def test_what_is_corrected_is_allowed_as_it_is_and_breaks_nothing() -> None:
         corrected[call.method] += 1
         again += verdict.reason.count("corrected") > 1
         assert holds(world.grant, call, verdict, now), told
-        # One that begins with a stop is judged again from there.
+        # A call that begins with a stop is judged again after it.
         assert verdict.brake_first or not list(broken(world.rules, verdict.args, now)), told
     assert min(corrected.values()) > 10, corrected
     assert again > 5
     assert conflicts > 5
 
 
-def test_the_plain_reading_would_notice(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_correction_oracle_detects_unsettled_corrections(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(engine, "settle_correction", lambda _call, first, _judge: first)
     assert any(
         verdict.permits and not verdict.brake_first and any(broken(world.rules, verdict.args, now))

@@ -1,4 +1,4 @@
-"""The engine's rules, one by one."""
+"""Rules of the engine, one by one."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from policy_world import (
 NAN, INF = math.nan, math.inf
 
 
-def test_a_plain_request_is_allowed_as_asked() -> None:
+def test_plain_request_is_allowed_unchanged() -> None:
     verdict = ask(compiled(), goto(50, 60, 20))
     assert (verdict.action, verdict.code, verdict.policies) == ("allow", "", ())
     assert target(verdict) == pytest.approx((50, 60), abs=1e-3)
@@ -46,7 +46,7 @@ def test_a_plain_request_is_allowed_as_asked() -> None:
 # Method access
 
 
-def test_a_method_that_is_not_granted_is_denied() -> None:
+def test_method_that_is_not_granted_is_denied() -> None:
     grant = compiled(services=[{"service": "mobility", "methods": ["GetPosition"]}])
     assert ask(grant, Call("Hover")).code == "MethodNotGranted"
     assert ask(grant, Call("GetPosition")).action == "allow"
@@ -56,7 +56,7 @@ def test_a_method_that_is_not_granted_is_denied() -> None:
     assert ask(grant, Call("Explode")).code == "MethodNotGranted"
 
 
-def test_denial_holds_in_its_zone_and_window_only() -> None:
+def test_denial_holds_only_in_its_zone_and_validity_window() -> None:
     denial = policy("quiet", "AccessControl", "denial", [zone("q", box(10, 10, 30, 30))], methods=["Hover"])
     grant = compiled(denial)
     assert ask(grant, Call("Hover"), at(20, 20)).code == "MethodDenied"
@@ -77,7 +77,7 @@ def _lost() -> Any:
     return replace(at(), lat=None, lon=None)
 
 
-def test_denial_respects_its_altitude_band() -> None:
+def test_denial_holds_only_in_its_altitude_band() -> None:
     banded = policy(
         "quiet", "AccessControl", "denial", [zone("q", box(-9, -9, 9, 9), lower=30, upper=50)], methods=["Hover"]
     )
@@ -87,7 +87,7 @@ def test_denial_respects_its_altitude_band() -> None:
     assert ask(grant, Call("Hover"), at(alt=29.5)).code == "MethodDenied", "inside the altitude error"
 
 
-def test_a_grant_policy_says_where_a_method_is_granted() -> None:
+def test_grant_policy_limits_method_to_its_zone() -> None:
     grant = compiled(policy("here", "AccessControl", "grant", [zone("h", box(10, 10, 30, 30))], methods=["Hover"]))
     assert ask(grant, Call("Hover"), at(20, 20)).action == "allow"
     assert ask(grant, Call("Hover"), at(0, 0)).code == "MethodNotGrantedHere"
@@ -95,7 +95,7 @@ def test_a_grant_policy_says_where_a_method_is_granted() -> None:
     assert ask(grant, Call("GetSpeed"), at(0, 0)).action == "allow"
 
 
-def test_denial_beats_grant_whatever_the_priority() -> None:
+def test_denial_overrides_grant_regardless_of_priority() -> None:
     both = (
         policy("yes", "AccessControl", "grant", methods=["Hover"], priority=1000),
         policy("no", "AccessControl", "denial", methods=["Hover"], priority=-1000),
@@ -103,7 +103,7 @@ def test_denial_beats_grant_whatever_the_priority() -> None:
     assert ask(compiled(*both), Call("Hover")).code == "MethodDenied"
 
 
-def test_higher_priority_is_named_first_among_equals() -> None:
+def test_verdict_names_higher_priority_policy_first() -> None:
     two = (
         policy("b-second", "AccessControl", "denial", methods=["Hover"], priority=1),
         policy("a-third", "AccessControl", "denial", methods=["Hover"]),
@@ -123,7 +123,7 @@ def test_higher_priority_is_named_first_among_equals() -> None:
         GotoArgs(39.36, 22.95, 10, speed_mps=-1), GotoArgs(-39.36, -157.05, 10), GotoArgs(41.36, 22.95, 10), None,
     ],
 )  # fmt: skip
-def test_goto_with_impossible_arguments(args: GotoArgs | None) -> None:
+def test_goto_with_invalid_arguments_is_denied(args: GotoArgs | None) -> None:
     for operation in ([box(-200, -200, 200, 200)], []):
         verdict = ask(compiled(operationArea=operation), Call("Goto", args))
         assert (verdict.action, verdict.code) == ("deny", "InvalidArgument")
@@ -138,11 +138,11 @@ def test_goto_with_impossible_arguments(args: GotoArgs | None) -> None:
         Call("PointGimbal", PointGimbalArgs(0, 181)), Call("SetSpeed"), Call("CaptureImage", CaptureArgs(-1, 0)), Call("CaptureImage", CaptureArgs(0, 10**9)),
     ],
 )  # fmt: skip
-def test_other_impossible_arguments(call: Call) -> None:
+def test_calls_with_invalid_arguments_are_denied(call: Call) -> None:
     assert ask(compiled(), call).code == "InvalidArgument"
 
 
-def test_without_position_nothing_moves() -> None:
+def test_motion_is_denied_when_position_is_unknown() -> None:
     for call in (
         goto(5, 5),
         Call("Takeoff", TakeoffArgs(10)),
@@ -161,7 +161,7 @@ def test_without_position_nothing_moves() -> None:
 # Limits
 
 
-def test_altitudes_are_clamped_to_the_limit() -> None:
+def test_altitude_is_corrected_to_enforced_limit() -> None:
     grant = compiled(altitude(upperLimit=15, lowerLimit=5, action="enforce"))
     high, low = ask(grant, goto(10, 10, 20)), ask(grant, goto(10, 10, 4))
     assert (high.action, high.code, high.args.alt, high.policies) == (
@@ -177,33 +177,33 @@ def test_altitudes_are_clamped_to_the_limit() -> None:
     assert ask(grant, goto(10, 10, 15)).action == "allow"
 
 
-def test_a_limit_may_refuse() -> None:
+def test_altitude_beyond_refusing_limit_is_denied() -> None:
     grant = compiled(altitude(upperLimit=15, action="refuse"), altitude("lax", upperLimit=10, action="enforce"))
     assert ask(grant, goto(10, 10, 20)).action == "deny"
     assert ask(grant, goto(10, 10, 20)).policies == ("altitudes",)
     assert ask(grant, goto(10, 10, 12)).args.alt == 10
 
 
-def test_the_most_restrictive_limit_wins() -> None:
+def test_altitude_is_corrected_to_most_restrictive_limit() -> None:
     grant = compiled(altitude("a", upperLimit=30), altitude("b", upperLimit=12), altitude("c", upperLimit=20))
     verdict = ask(grant, goto(10, 10, 50))
     assert verdict.args.alt == 12
     assert verdict.policies == ("b", "c", "a")
 
 
-def test_the_drone_has_its_own_limits() -> None:
+def test_limits_of_the_drone_are_enforced() -> None:
     assert ask(compiled(), goto(10, 10, 500)).args.alt == 120
     assert ask(compiled(), Call("SetSpeed", SetSpeedArgs(99))).args == SetSpeedArgs(15)
 
 
-def test_limits_that_contradict_each_other_deny() -> None:
+def test_contradicting_limits_deny() -> None:
     grant = compiled(altitude("low", upperLimit=10), altitude("high", lowerLimit=20))
     verdict = ask(grant, goto(10, 10, 15))
     assert verdict.action == "deny"
     assert set(verdict.policies) <= {"low", "high"}
 
 
-def test_a_limit_in_a_zone_holds_for_every_leg_that_touches_it() -> None:
+def test_zone_limit_applies_to_every_leg_that_touches_the_zone() -> None:
     grant = compiled(altitude(zones=[zone("low", box(40, -20, 60, 20))], upperLimit=15))
     assert ask(grant, goto(0, 100, 50)).action == "allow"
     assert ask(grant, goto(100, 0, 50)).args.alt == 15
@@ -212,7 +212,7 @@ def test_a_limit_in_a_zone_holds_for_every_leg_that_touches_it() -> None:
     assert ask(grant, goto(45, 0, 10), at(50, 0, alt=30)).action == "allow", "already inside: leading back"
 
 
-def test_limits_above_sea_level() -> None:
+def test_altitude_limit_above_sea_level_is_converted() -> None:
     grant = compiled(altitude(upperLimit=130, altitudeReference="amsl"))
     assert ask(grant, goto(10, 10, 50)).args.alt == pytest.approx(30)
     amsl = ask(grant, goto(10, 10, 120, reference="amsl"))
@@ -220,7 +220,7 @@ def test_limits_above_sea_level() -> None:
     assert (amsl.args.alt, amsl.args.reference) == (pytest.approx(20), "home")
 
 
-def test_terrain_is_unknown_unless_it_is_taken_for_flat() -> None:
+def test_terrain_altitude_is_unknown_without_flat_terrain() -> None:
     limit = altitude(upperLimit=15, altitudeReference="terrain")
     assert ask(compiled(limit), goto(10, 10, 10)).code == "TerrainUnknown"
     assert ask(compiled(limit, flat_terrain=True), goto(10, 10, 20)).args.alt == 15
@@ -230,7 +230,7 @@ def test_terrain_is_unknown_unless_it_is_taken_for_flat() -> None:
     assert "level with home" in flat.reason
 
 
-def test_speeds() -> None:
+def test_speed_is_corrected_or_denied_by_limits() -> None:
     grant = compiled(speed(upperLimit=8, lowerLimit=2), speed("slow", [zone("s", box(40, -20, 60, 20))], upperLimit=3))
     assert ask(grant, Call("SetSpeed", SetSpeedArgs(10))).args == SetSpeedArgs(8)
     assert ask(grant, Call("SetSpeed", SetSpeedArgs(1))).args == SetSpeedArgs(2)
@@ -244,13 +244,13 @@ def test_speeds() -> None:
 # Pictures
 
 
-def test_pictures_are_taken_in_the_operation_area() -> None:
+def test_capture_is_denied_outside_the_operation_area() -> None:
     assert ask(compiled(), Call("CaptureImage", CaptureArgs())).action == "allow"
     assert ask(compiled(), Call("CaptureImage", CaptureArgs()), at(0, 250)).code == "OutsideOperationArea"
     assert ask(compiled(), Call("CaptureImage", CaptureArgs()), _lost()).code == "PositionUnknown"
 
 
-def test_privacy_refuses_or_names_its_filters() -> None:
+def test_privacy_policy_denies_or_returns_filters() -> None:
     def private(name: str, action: str, *area: float) -> dict[str, Any]:
         return policy(name, "PrivacyControl", "camera", [zone(name, box(*area))], action=action)
 
@@ -264,7 +264,7 @@ def test_privacy_refuses_or_names_its_filters() -> None:
 # Schedules
 
 
-def test_a_zone_counts_while_it_is_active() -> None:
+def test_zone_applies_only_while_its_schedule_is_active() -> None:
     def at_night(kind: str, *area: float) -> dict[str, Any]:
         scheduled = {**zone("z", box(*area)), "schedule": [{"start": "22:00", "end": "06:00"}]}
         return policy("night", "GeofenceControl", kind, [scheduled])
@@ -278,7 +278,7 @@ def test_a_zone_counts_while_it_is_active() -> None:
     assert ask(kept, goto(60, 0), noon).action == "deny", "a zone that is not active allows nothing"
 
 
-def test_verdicts_are_the_same_every_time() -> None:
+def test_verdicts_are_deterministic() -> None:
     grant = compiled(exclusion(box(50, -20, 80, 20), "adjust"), altitude(upperLimit=15))
     assert len({repr(ask(grant, goto(150, 0, 30))) for _ in range(5)}) == 1
     assert FRAME.lat == HOME.lat

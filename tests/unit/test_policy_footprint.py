@@ -1,4 +1,4 @@
-"""What a camera sees, against a brute-force camera that is turned, moved and raised within the bounds of the errors."""
+"""Camera footprint against a brute-force camera that is turned, moved and raised within the error bounds."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def rotation(axis: int, degrees: float) -> np.ndarray:
 
 
 def ray(lens: Lens, attitude: Attitude, u: float, v: float) -> np.ndarray:
-    """North, east, down of the ray through a point of the picture; u and v go from -1 to 1, right and down."""
+    """Return the ray through a point of the picture as north, east, down. u and v range from -1 to 1, right and down."""
     half = [math.tan(math.radians(d / 2)) for d in (lens.horizontal_deg, lens.vertical_deg)]
     camera = np.array([1.0, u * half[0], v * half[1]])
     tilt = np.eye(3)
@@ -59,12 +59,12 @@ attitudes = st.builds(
 @_cases
 @given(lens=lenses, attitude=attitudes, alt=st.floats(0, 120), errors=st.tuples(*[st.floats(0, 5)] * 3),
        u=part, v=part, turn=st.tuples(*[part] * 6))  # fmt: skip
-def test_whatever_may_be_in_the_picture_is_in_the_footprint(
+def test_footprint_contains_everything_a_picture_may_show(
     lens: Lens, attitude: Attitude, alt: float, errors: tuple[float, ...], u: float, v: float, turn: tuple[float, ...]
 ) -> None:
     now = at(0, 0, alt=alt, lens=lens, attitude=attitude, position_error_m=errors[0], altitude_error_m=errors[1],
              relief_m=errors[2])  # fmt: skip
-    # Roll and pitch share their bound; the mount's error is a turn about any axis, here the camera's own.
+    # Roll and pitch share their bound. The mount's error is a turn about any axis, here the camera's.
     share = (1 + turn[5]) / 2
     actual = replace(
         attitude,
@@ -86,7 +86,7 @@ def test_whatever_may_be_in_the_picture_is_in_the_footprint(
         assert shown.sight.dwithin(point, shown.margin_m + 1e-6)
         assert shown.shows(point.buffer(1e-3), -math.inf, ground_m + 1e-3)
         assert math.dist((0, 0, 0), direction * reach) <= shown.farthest_m + errors[0] + 1e-6
-        # The same holds for what the ray passes on its way down.
+        # The same holds for the air that the ray passes on its way down.
         for share_of_way in (0.3, 0.8):
             height = above_m - share_of_way * (above_m - ground_m)
             on_way = shapely.Point(x + east * share_of_way, y + north * share_of_way).buffer(1e-3)
@@ -104,7 +104,7 @@ def test_whatever_may_be_in_the_picture_is_in_the_footprint(
         {"lens": Lens(60, 45, -10, stabilised=True)},
     ],
 )
-def test_whatever_is_unknown_makes_the_camera_see_everything_around(unknown: dict[str, object]) -> None:
+def test_footprint_covers_everything_when_attitude_or_lens_is_unknown(unknown: dict[str, object]) -> None:
     shown = view(at(0, 0, **unknown))  # type: ignore[arg-type]
     for bearing in range(0, 360, 7):
         far = shapely.Point(9990 * math.sin(bearing), 9990 * math.cos(bearing))
@@ -112,19 +112,19 @@ def test_whatever_is_unknown_makes_the_camera_see_everything_around(unknown: dic
     assert shown.farthest_m == math.inf
 
 
-def test_a_lens_straight_down_sees_a_rectangle_that_turns_with_the_drone() -> None:
+def test_footprint_of_downward_lens_is_rectangle_rotated_by_yaw() -> None:
     lens = Lens(2 * math.degrees(math.atan(1.0)), 2 * math.degrees(math.atan(0.5)), error_deg=0.0)
     sharp = {"position_error_m": 0.0, "altitude_error_m": 0.0, "lens": lens}
     north = view(at(0, 0, alt=20, attitude=Attitude(0, 0, 0, 0, 0), **sharp))
     assert north.sight.bounds == pytest.approx((-20, -10, 20, 10))
     east = view(at(0, 0, alt=20, attitude=Attitude(0, 0, 90, 0, 0), **sharp))
     assert east.sight.bounds == pytest.approx((-10, -20, 10, 20))
-    # Nose up by 30 degrees: the camera under it looks ahead.
+    # With the nose up by 30 degrees, the camera under it looks ahead.
     ahead = view(at(0, 0, alt=20, attitude=Attitude(0, 30, 0, 0, 0), **sharp))
     assert ahead.sight.bounds[3] == pytest.approx(20 * math.tan(math.radians(30) + math.atan(0.5)))
 
 
-def test_a_camera_that_shows_the_horizon_sees_what_is_ahead_only() -> None:
+def test_footprint_of_camera_showing_horizon_is_sector_ahead() -> None:
     lens = Lens(60, 40, pitch_deg=0, stabilised=True, error_deg=0)
     shown = view(at(0, 0, lens=lens, attitude=Attitude(0, 0, 90, 0, 0)))
     assert shown.sight.covers(shapely.Point(9000, 0))
@@ -132,8 +132,8 @@ def test_a_camera_that_shows_the_horizon_sees_what_is_ahead_only() -> None:
     assert shown.upper_m == math.inf
 
 
-def test_bands_of_zones_are_seen_where_the_view_passes_them() -> None:
-    # 45 degrees down to the east, narrow: the ground is seen about 20 m ahead.
+def test_footprint_shows_zones_with_altitude_bands() -> None:
+    # 45 degrees down to the east, with a narrow view: the ground shown is about 20 m ahead.
     lens = Lens(10, 10, pitch_deg=-45, stabilised=True, error_deg=0)
     now = at(0, 0, alt=20, lens=lens, attitude=Attitude(0, 0, 90, 0, 0), position_error_m=0.1, altitude_error_m=0.1)
 
@@ -142,7 +142,7 @@ def test_bands_of_zones_are_seen_where_the_view_passes_them() -> None:
         return ask(compiled(private), _CAPTURE, now).code
 
     assert verdict(15, 25) == "PrivacyZone"
-    assert verdict(5, 10) == "PrivacyZone", "a house there may stand in the picture"
+    assert verdict(5, 10) == "PrivacyZone", "the picture may show a house there"
     assert verdict(5, 10, upper=3) == "", "a pool there does not"
     assert verdict(5, 10, lower=8, upper=14) == "PrivacyZone"
     assert verdict(-30, -5) == "", "behind"
@@ -151,14 +151,14 @@ def test_bands_of_zones_are_seen_where_the_view_passes_them() -> None:
     assert verdict(-5, 5) == "PrivacyZone", "the drone is there"
 
 
-def test_an_exposure_shows_what_lies_between_its_begin_and_its_end() -> None:
+def test_footprint_of_exposure_covers_the_motion_between_its_ends() -> None:
     private = policy("p", "PrivacyControl", "camera", [zone("z", box(40, -5, 45, 5))], action="refuse")
     grant = compiled(private)
     now, later = at(0, 0, alt=10), at(100, 0, alt=10)
     assert judge_privacy(now, grant).action == judge_privacy(later, grant).action == "allow"
     assert judge_privacy(replace(later, exposure=(now, later)), grant).code == "PrivacyZone"
     assert judge_privacy(replace(later, exposure=(now, Situation(time_s=NOW))), grant).code == "PrivacyZone", (
-        "where it went is unknown"
+        "the motion is unknown"
     )
 
 
@@ -173,7 +173,7 @@ _FILTERS = st.builds(
 
 @_cases
 @given(st.lists(_FILTERS, max_size=6), st.lists(_FILTERS, max_size=4))
-def test_filters_compose_to_what_satisfies_each_of_them(asked: list[Filter], more: list[Filter]) -> None:
+def test_combined_filters_satisfy_each_filter(asked: list[Filter], more: list[Filter]) -> None:
     composed = combine_filters(asked)
     assert composed == combine_filters(reversed(asked)) == combine_filters(composed)
     done = {one.action for one in composed}
@@ -181,16 +181,16 @@ def test_filters_compose_to_what_satisfies_each_of_them(asked: list[Filter], mor
     for one in asked:
         assert one.action in done or "black" in done or (one.action == "blurFaces" and done & hidden)
     assert remaining_filters(asked, composed) == ()
-    # What is done later makes up for what was not asked for before, or asked for in a milder way.
+    # Filters applied later replace missing or milder earlier filters.
     both = (*composed, *remaining_filters(more, composed))
     assert remaining_filters(combine_filters([*asked, *more]), both) == ()
 
 
-def test_the_stricter_way_to_hide_faces_stands() -> None:
+def test_combined_filters_use_stricter_face_method() -> None:
     soft, hard = Filter("blurFaces", "gaussian", "refuse"), Filter("blurFaces", "pixelate", "black")
     assert combine_filters([soft, hard]) == (Filter("blurFaces", "pixelate", "refuse"),)
     assert combine_filters([soft]) == (soft,)
-    assert remaining_filters([hard], [soft]) == (hard,), "a soft blur is not what is asked for"
+    assert remaining_filters([hard], [soft]) == (hard,), "a soft blur does not satisfy pixelation"
     assert (
         remaining_filters([soft], [hard])
         == remaining_filters([soft], [soft])
@@ -199,7 +199,7 @@ def test_the_stricter_way_to_hide_faces_stands() -> None:
     )
 
 
-def test_policies_name_their_filters() -> None:
+def test_privacy_rule_returns_its_filter() -> None:
     def private(name: str, **fields: str) -> dict[str, object]:
         return policy(name, "PrivacyControl", "camera", [zone(name, box(-5, -5, 5, 5))], **fields)
 
@@ -214,7 +214,7 @@ def test_policies_name_their_filters() -> None:
     )
 
 
-def test_descriptions_tell_the_lens() -> None:
+def test_lens_is_read_from_camera_description() -> None:
     fields = {
         "methods": ["CaptureImage"],
         "resolution": "1600x900",
@@ -222,7 +222,7 @@ def test_descriptions_tell_the_lens() -> None:
         "lens": {"model": "pinhole"},
     }
     assert bounding_lens(None) is None
-    assert bounding_lens(CameraFeatures.model_validate(fields)) is None, "no one knows where it looks"
+    assert bounding_lens(CameraFeatures.model_validate(fields)) is None, "its direction is unknown"
     lens = bounding_lens(CameraFeatures.model_validate({**fields, "mount": {"pitch": -60, "stabilised": True}}))
     assert lens is not None
     assert (lens.pitch_deg, lens.stabilised) == (-60, True)

@@ -1,4 +1,4 @@
-"""Lenses of all kinds against OpenCV's own projections: whatever is in a picture is in its footprint."""
+"""Lens models against OpenCV's projections: the footprint contains everything in a picture."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def rotation(axis: int, degrees: float) -> np.ndarray:
 
 
 def projected(model: str, rays: np.ndarray, focal: float, centre: tuple[float, float], k: tuple[float, ...]) -> Any:
-    """Pixels of rays (right, down, ahead) that lie ahead of the camera."""
+    """Return pixels of rays (right, down, ahead) that lie ahead of the camera."""
     matrix = np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]])
     still = np.zeros(3)
     if model == "equidistant":
@@ -56,7 +56,7 @@ def described(model: str, half: float, height: int, k: tuple[float, ...], *, tol
 
 
 def folds_at(k: tuple[float, ...], reach: float) -> float:
-    """The tangent from which on the model of a lens turns back, which no lens does."""
+    """Return the tangent at which the model of a lens turns back, which no real lens does."""
     r = np.linspace(0, reach, 20_000)
     shown = r * (1 + k[0] * r**2 + k[1] * r**4 + k[4] * r**6)
     back = np.flatnonzero(np.diff(shown) <= 0)
@@ -74,7 +74,7 @@ def folds_at(k: tuple[float, ...], reach: float) -> float:
     alt=st.floats(2, 100),
     seed=st.integers(0, 2**32 - 1),
 )
-def test_no_zone_that_a_picture_shows_is_missed(
+def test_bounding_lens_covers_every_zone_a_picture_shows(
     model: str,
     told: bool,
     half_deg: float,
@@ -91,9 +91,9 @@ def test_no_zone_that_a_picture_shows_is_missed(
     else:
         fold = folds_at(k, 200.0)
         assume(fold > math.tan(half) * 1.3)
-        # What the description does not tell, it must not be asked to bound: a lens that is not told of is decentred little.
+        # The bound does not cover what the description omits: a lens without description has little decentring.
         k = k if told else (*k[:2], 0.0, 0.0, k[4])
-    # The focal length with which the sides of the picture are at that angle.
+    # Focal length at which the sides of the picture are at that angle.
     side = projected(model, np.array([[math.tan(half), 0.0, 1.0]]), 1.0, (0.0, 0.0), k)[0][0]
     assume(side > 0.01)
     focal, centre = _WIDTH / 2 / side, (_WIDTH / 2, height / 2)
@@ -103,7 +103,7 @@ def test_no_zone_that_a_picture_shows_is_missed(
     now = at(0, 0, alt=alt, lens=exact, attitude=Attitude(*turn, 0, 0), position_error_m=0.0, altitude_error_m=0.0)
     shown = footprint(now, FRAME)
     assert shown is not None
-    # Points of the ground, nearer ones more often, and where they are in the picture.
+    # Points of the ground, nearer ones more often, and their positions in the picture.
     rng = np.random.default_rng(seed)
     reach, bearing = alt * 10 ** rng.uniform(-2, 1.7, _POINTS), rng.uniform(0, 2 * math.pi, _POINTS)
     north, east = reach * np.cos(bearing), reach * np.sin(bearing)
@@ -117,7 +117,7 @@ def test_no_zone_that_a_picture_shows_is_missed(
     u, v = projected(model, np.where(seen[:, None], rays, [0.0, 0.0, 1.0]), focal, centre, k).T
     seen &= (u >= 0) & (u <= _WIDTH) & (v >= 0) & (v <= height)
     if not told and model == "brownConrady":
-        # At its corners a lens that is not described shows no more than an orthographic fisheye.
+        # At its corners, a lens without description shows no more than an orthographic fisheye.
         angle = np.arctan2(np.hypot(right, down), ahead)
         across = np.hypot(u - centre[0], v - centre[1]) / (_WIDTH / 2)
         seen &= np.sin(np.minimum(angle, math.pi / 2)) <= np.maximum(across, 1.0) * math.sin(half) + 1e-9
@@ -134,7 +134,7 @@ def half_views(model: str | None, field_deg: float, **more: float) -> tuple[floa
     return lens.horizontal_deg / 2, lens.vertical_deg / 2
 
 
-def test_what_a_lens_does_not_show_does_not_count() -> None:
+def test_bounding_lens_excludes_ground_outside_the_picture() -> None:
     assert half_views("pinhole", 62.2) == pytest.approx((31.1, 24.34), abs=0.01)
     assert half_views("brownConrady", 62.2) == pytest.approx((31.1, 24.34), abs=0.1)
     assert half_views("equidistant", 62.2) == pytest.approx((32.82, 25.81), abs=0.05)
@@ -151,11 +151,11 @@ def test_what_a_lens_does_not_show_does_not_count() -> None:
         ("brownConrady", 100, {"k1": 100.0, "k2": -100.0}), ("brownConrady", 179.9, {"k3": 100.0}),
     ],
 )  # fmt: skip
-def test_what_no_model_bounds_sees_everything(model: str | None, field_deg: float, more: dict[str, float]) -> None:
+def test_lens_without_bound_sees_everything(model: str | None, field_deg: float, more: dict[str, float]) -> None:
     assert max(half_views(model, field_deg, **more)) >= MAX_HALF_VIEW_DEG
 
 
-def test_coefficients_belong_to_the_model_that_has_them() -> None:
+def test_distortion_coefficients_are_rejected_for_other_lens_models() -> None:
     with pytest.raises(ValueError, match="k2: distortion coefficients belong to model brownConrady"):
         CameraLens.model_validate({"model": "equidistant", "k2": 0.1})
     CameraLens.model_validate({"model": "brownConrady", "k2": 0.1})

@@ -1,4 +1,4 @@
-"""Zones with a schedule: as if they were not there outside it."""
+"""Zones with a schedule have no effect outside it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def scheduled(name: str, area: dict[str, Any], schedule: list[dict[str, Any]]) -
     return {**zone(name, area), "schedule": schedule}
 
 
-def test_an_exclusion_zone_counts_only_while_it_is_active() -> None:
+def test_exclusion_zone_applies_only_while_active() -> None:
     def verdict(schedule: list[dict[str, Any]]) -> str:
         found = policy("no-fly", "GeofenceControl", "exclusion", [scheduled("z", box(20, -9, 40, 9), schedule)])
         return ask(compiled(found), goto(30, 0)).action
@@ -28,7 +28,7 @@ def test_an_exclusion_zone_counts_only_while_it_is_active() -> None:
     assert verdict([*OFF, *ON]) != "allow"
 
 
-def test_an_inclusion_zone_that_is_not_active_holds_nothing() -> None:
+def test_inactive_inclusion_zone_permits_nothing() -> None:
     def verdict(schedule: list[dict[str, Any]]) -> str:
         found = policy("keep-in", "GeofenceControl", "inclusion", [scheduled("z", box(-90, -90, 90, 90), schedule)])
         return ask(compiled(found), goto(10, 0)).action
@@ -37,7 +37,7 @@ def test_an_inclusion_zone_that_is_not_active_holds_nothing() -> None:
     assert verdict(OFF) != "allow"
 
 
-def test_a_method_is_granted_in_a_zone_only_while_it_is_active() -> None:
+def test_method_is_granted_in_zone_only_while_active() -> None:
     def code(schedule: list[dict[str, Any]]) -> str | None:
         here = policy("h", "AccessControl", "grant", [scheduled("z", box(-9, -9, 9, 9), schedule)], methods=["Hover"])
         return ask(compiled(here), Call("Hover"), at(0, 0)).code

@@ -1,4 +1,4 @@
-"""A zone is never crossed because a drone may come to rest behind it: only because it certainly does not before it."""
+"""A zone is crossed only if the drone certainly cannot stop before it, never because it may come to rest behind it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ RETRACES = Airframe(retraces=True)
     beyond=st.floats(0.0, 30.0),
     velocity=st.booleans(),
 )
-def test_only_who_cannot_stop_before_a_zone_may_fly_on_through_it(
+def test_leg_through_thin_zone_is_allowed_only_when_the_drone_cannot_stop_before_it(
     thick: float, speed: float, away: float, latency: float, forward: float | None, beyond: float, velocity: bool
 ) -> None:
     grant = compiled(exclusion(box(-60, away, 60, away + thick)), operationArea=[])
@@ -39,19 +39,19 @@ def test_only_who_cannot_stop_before_a_zone_may_fly_on_through_it(
     if verdict.permits and not verdict.brake_first:
         flown = verdict.args
         if isinstance(flown, VelocityArgs) and math.hypot(flown.north_mps, flown.east_mps) < speed - 0.1:
-            return  # scaled: it stays before the zone
+            return  # scaled: the drone stays before the zone
         reach = speed * speed / (2 * now.airframe.accel_mps2)
         assert reach >= away or (velocity and away > reach + 2.0 * speed), "it could stop before it"
 
 
 @pytest.mark.parametrize("thick", [0.5, 2.0, 4.0])
-def test_a_drone_that_certainly_enters_may_leave_at_the_far_side(thick: float) -> None:
+def test_drone_that_certainly_enters_thin_zone_may_leave_on_the_far_side(thick: float) -> None:
     grant = compiled(exclusion(box(-60, 5, 60, 5 + thick)), operationArea=[])
     now = at(0, 0, north_mps=9.0, forward_mps2=0.0, airframe=RETRACES)
     assert judge(goto(0, 60), now, grant).permits
 
 
-def test_a_drone_inside_a_thin_zone_may_leave_it() -> None:
+def test_drone_inside_thin_zone_may_leave_it() -> None:
     grant = compiled(exclusion(box(-60, -1, 60, 1)), operationArea=[])
     for end in (30, -30):
         assert judge(goto(0, end), at(0, math.copysign(0.2, end), airframe=RETRACES), grant).permits
@@ -65,7 +65,7 @@ def test_a_drone_inside_a_thin_zone_may_leave_it() -> None:
     latency=st.sampled_from([0.05, 0.3, 1.0, 1.8]),
     forward=st.sampled_from([None, -2.5, 0.0, 2.5]),
 )
-def test_only_who_cannot_stop_before_a_gap_may_fly_on_across_it(
+def test_leg_across_gap_is_allowed_only_when_the_drone_cannot_stop_before_it(
     gap: float, speed: float, away: float, latency: float, forward: float | None
 ) -> None:
     here, there = box(-60, -60, 60, away), box(-60, away + gap, 60, 200)

@@ -1,4 +1,4 @@
-"""Velocity setpoints: judged by all that they sweep until the drone stops by itself."""
+"""Velocity setpoints are judged by everything the drone sweeps until it stops."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def flown(verdict: Verdict) -> VelocityArgs:
     return verdict.args
 
 
-def test_a_velocity_in_free_air_is_allowed_as_asked() -> None:
+def test_velocity_in_free_air_is_allowed_unchanged() -> None:
     verdict = ask(compiled(), fly(5, 3, -1))
     assert (verdict.action, verdict.code, verdict.args) == ("allow", "", VelocityArgs(5, 3, -1))
     assert ask(granted(), fly(1)).code == "MethodNotGranted"
@@ -41,20 +41,20 @@ def test_a_velocity_in_free_air_is_allowed_as_asked() -> None:
         VelocityArgs(1, 0, hold_s=0), VelocityArgs(1, 0, hold_s=-1), VelocityArgs(1, 0, hold_s=2.5), None,
     ],
 )  # fmt: skip
-def test_impossible_velocities(args: VelocityArgs | None) -> None:
+def test_velocity_with_invalid_arguments_is_denied(args: VelocityArgs | None) -> None:
     assert ask(compiled(), Call("SetVelocity", args)).code == "InvalidArgument"
 
 
-def test_no_one_flies_blind() -> None:
+def test_velocity_is_denied_when_position_is_unknown() -> None:
     from fractus_core.policy.decision_types import Situation
 
     assert ask(compiled(operationArea=[]), fly(1), Situation(time_s=0)).code == "PositionUnknown"
     assert ask(compiled(), fly(1), at(home=None)).code == "HomeUnknown"
 
 
-def test_the_sweep_counts_latency_hold_and_stop() -> None:
+def test_velocity_leg_includes_latency_hold_and_stop() -> None:
     grant = compiled(exclusion(box(-50, 30, 50, 60)), operationArea=[])
-    # 5 m/s from standstill: 0.8 s of latency and hold, most of it spent on speeding up, and the stop, with 2.5 m of margin.
+    # 5 m/s from standstill: 0.8 s of latency and hold, mostly acceleration, and the stop, with a margin of 2.5 m.
     near = [y for y in range(31) if ask(grant, fly(5), at(0, float(y))).permits]
     assert 19 <= max(near) <= 26
     longer = [y for y in range(31) if ask(grant, fly(5, hold=2.0), at(0, float(y))).permits]
@@ -66,7 +66,7 @@ def test_the_sweep_counts_latency_hold_and_stop() -> None:
 
 
 @pytest.mark.parametrize("action", ["ignore", "hover", "land", "returnToLaunch", "revoke"])
-def test_a_velocity_into_a_zone(action: str) -> None:
+def test_velocity_into_zone_is_denied_or_taken_over(action: str) -> None:
     grant = compiled(exclusion(box(-50, 10, 50, 60), action), operationArea=[])
     verdict = ask(grant, fly(8, hold=2.0))
     assert verdict.action == ("deny" if action == "ignore" else "takeover")
@@ -74,7 +74,7 @@ def test_a_velocity_into_a_zone(action: str) -> None:
     assert ask(grant, fly(-8, hold=2.0)).permits
 
 
-def test_an_adjusting_fence_scales_the_velocity() -> None:
+def test_velocity_is_scaled_by_adjusting_fence() -> None:
     grant = compiled(exclusion(box(-50, 14, 50, 60), "adjust"), operationArea=[])
     asked = fly(8, 1, hold=2.0)
     verdict = ask(grant, asked)
@@ -82,11 +82,11 @@ def test_an_adjusting_fence_scales_the_velocity() -> None:
     assert (verdict.action, verdict.code, verdict.policies) == ("correct", "VelocityScaled", ("no-fly",))
     assert 1 < new.north_mps < 7
     assert new.east_mps == pytest.approx(new.north_mps / 8)
-    assert ask(grant, Call("SetVelocity", new)).action == "allow", "what is corrected is legal by itself"
+    assert ask(grant, Call("SetVelocity", new)).action == "allow", "the corrected velocity is legal"
     assert ask(grant, fly(8, hold=2.0), at(0, 11.4)).action == "deny", "nothing worth flying is left"
 
 
-def test_from_inside_a_zone_only_out() -> None:
+def test_velocity_from_inside_zone_may_only_lead_out() -> None:
     grant = compiled(exclusion(box(-50, -50, 50, 50), "land"), operationArea=[])
     inside = at(0, 45)
     assert ask(grant, fly(9, hold=2.0), inside).permits
@@ -94,14 +94,14 @@ def test_from_inside_a_zone_only_out() -> None:
     assert not ask(grant, fly(0, 3), inside).permits
 
 
-def test_a_stop_that_need_not_lie_behind_a_zone_opens_no_way_through_it() -> None:
+def test_velocity_through_zone_is_denied_when_the_drone_may_stop_before_it() -> None:
     grant = compiled(exclusion(ring([(33.2, 9.5), (25.4, 12.8), (29.3, 5.4)])))
     hot = {"north_mps": 4.9, "east_mps": 3.2, "speed_setpoint_mps": 8.8, "airframe": Airframe(retraces=True)}
     assert ask(grant, fly(7.7, 5.9), at(20.2, -4.8, **hot)).code == "LegThroughExclusionZone"
     assert ask(grant, fly(7.7, 5.9), at(33.2, 14.5, **hot)).action == "allow", "past it"
 
 
-def test_the_operation_area_and_the_way_to_it() -> None:
+def test_velocity_is_limited_to_operation_area_and_corridor() -> None:
     grant = compiled()
     assert ask(grant, fly(5), at(0, 195)).code == "OutsideOperationArea"
     assert ask(grant, fly(-5), at(0, 195)).permits
@@ -112,13 +112,13 @@ def test_the_operation_area_and_the_way_to_it() -> None:
     assert ask(apart, fly(5, 0), at(40, 22)).code == "OutsideOperationArea", "out of the corridor"
 
 
-def test_inclusion_zones() -> None:
+def test_velocity_out_of_inclusion_zone_is_denied() -> None:
     grant = compiled(inclusion(box(-30, -30, 30, 30)), operationArea=[])
     assert ask(grant, fly(5), at(0, 0)).permits
     assert ask(grant, fly(5), at(0, 25)).code in {"OutsideInclusionZone", "TooCloseToInclusionBorder"}
 
 
-def test_speed_limits_scale_the_horizontal_part() -> None:
+def test_velocity_horizontal_part_is_scaled_to_speed_limit() -> None:
     grant = compiled(speed(upperLimit=4, lowerLimit=2))
     verdict = ask(grant, fly(6, 8, -1))
     new = flown(verdict)
@@ -129,7 +129,7 @@ def test_speed_limits_scale_the_horizontal_part() -> None:
     assert ask(compiled(), fly(99)).action == "correct", "the drone's own limit"
 
 
-def test_altitude_limits_scale_the_vertical_part() -> None:
+def test_velocity_vertical_part_is_scaled_to_altitude_limit() -> None:
     grant = compiled(altitude(upperLimit=15, lowerLimit=5))
     climbing = ask(grant, fly(2, 0, -3, hold=2.0), at(alt=12))
     assert (climbing.action, climbing.code, climbing.policies) == ("correct", "AltitudeAboveLimit", ("altitudes",))
@@ -142,7 +142,7 @@ def test_altitude_limits_scale_the_vertical_part() -> None:
     assert ask(compiled(altitude(upperLimit=15, action="refuse")), fly(0, 0, -3, hold=2.0), at(alt=12)).action == "deny"
 
 
-def test_a_drone_beyond_its_limits_is_led_back() -> None:
+def test_velocity_leads_drone_back_to_altitude_limits() -> None:
     grant = compiled(altitude(upperLimit=15, lowerLimit=5))
     high = ask(grant, fly(2, 0, -2), at(alt=20))
     assert (high.code, flown(high).down_mps) == ("AltitudeAboveLimit", 1.0)
@@ -152,7 +152,7 @@ def test_a_drone_beyond_its_limits_is_led_back() -> None:
     assert (low.code, flown(low).down_mps) == ("AltitudeBelowLimit", -1.0)
 
 
-def test_no_one_flies_into_the_ground() -> None:
+def test_velocity_into_the_ground_is_corrected() -> None:
     verdict = ask(compiled(), fly(0, 0, 3, hold=2.0), at(alt=5))
     assert verdict.code == "AltitudeBelowLimit"
     assert 0 < flown(verdict).down_mps < 1.5
@@ -160,7 +160,7 @@ def test_no_one_flies_into_the_ground() -> None:
     assert ask(compiled(), fly(0, 0, -1), at(alt=1.0)).action == "allow"
 
 
-def test_a_velocity_does_not_carry_a_drone_into_a_zone_of_other_altitudes() -> None:
+def test_velocity_into_zone_with_other_altitude_limits_is_denied() -> None:
     from policy_world import zone
 
     grant = compiled(altitude(zones=[zone("low", box(-20, 10, 20, 60))], upperLimit=15))
@@ -169,7 +169,7 @@ def test_a_velocity_does_not_carry_a_drone_into_a_zone_of_other_altitudes() -> N
     assert ask(grant, fly(-8, hold=2.0), at(alt=30)).action == "allow"
 
 
-def test_the_way_home_stays_legal() -> None:
+def test_velocity_is_denied_when_straight_return_is_blocked() -> None:
     wall = exclusion(box(-100, 40, 60, 50), name="wall")
     behind = at(110, 60)
     free = compiled(wall, operationArea=[])
@@ -179,7 +179,7 @@ def test_the_way_home_stays_legal() -> None:
     assert ask(free, toward, at(110, 60, airframe=Airframe(retraces=True))).permits, "back as it came"
 
 
-def test_a_band_too_narrow_to_stop_in_turns_no_velocity_from_one_limit_beyond_the_other() -> None:
+def test_velocity_is_denied_when_altitude_limits_are_too_close_to_stop() -> None:
     rising = at(alt=30.7, down_mps=-1.5, altitude_error_m=1.0)
     low = ask(compiled(altitude(lowerLimit=31.0)), fly(3, 0, 1.0, hold=1.7), rising)
     assert flown(low).down_mps < 0, "sinking, it would come below the limit"

@@ -1,4 +1,4 @@
-"""Zones from and to ED-269: times, volumes, and what a zone cannot keep."""
+"""Import and export of ED-269: times, volumes, and features that a Zone cannot represent."""
 
 import json
 
@@ -27,7 +27,7 @@ def ed269(applicability, **volume):
     return found.zones[0].spec, found.notes
 
 
-def test_ed269_of_others():
+def test_ed269_reads_foreign_file():
     spec, notes = ed269([{"permanent": "YES"}])
     assert (spec.altitude.lower, spec.altitude.upper, spec.altitude.reference) == (None, 120, "terrain")
     assert spec.description == "Hospital: PROHIBITED: keep out"
@@ -60,7 +60,7 @@ WEEK = ("Mon", "Tue", "Wed", "Thu", "Fri", "Sat", "Sun")
         (daily(list(map(str.upper, WEEK)), "12:00Z", "13:00Z"), (), "12:00", "13:00"),
     ],
 )
-def test_ed269_times_of_day_are_kept_in_utc(day, days, start, end):
+def test_ed269_converts_times_of_day_to_utc(day, days, start, end):
     spec, _ = ed269([{"permanent": "NO", "startDateTime": "2026-03-01T00:00:00+01:00", "schedule": [day]}])
     (time,) = spec.schedule
     assert (time.days, time.start, time.end) == (days, start, end)
@@ -78,12 +78,12 @@ def test_ed269_times_of_day_are_kept_in_utc(day, days, start, end):
         [{"permanent": "NO", "schedule": [daily(["MON"], "08:00Z", "09:00Z"), {"day": ["ANY"]}]}],
     ],
 )
-def test_ed269_zones_that_are_always_active(applicability):
+def test_ed269_reads_permanent_zones(applicability):
     assert ed269(applicability)[0].schedule == ()
 
 
 @pytest.mark.parametrize("offset_h", range(-12, 15))
-def test_ed269_offsets_mean_the_same_moments(offset_h):
+def test_ed269_time_zone_offsets_mean_the_same_times(offset_h):
     zone_text = f"{'-' if offset_h < 0 else '+'}{abs(offset_h):02d}:30"
     offset_s = (abs(offset_h) * 3600 + 1800) * (-1 if offset_h < 0 else 1)
     spec, _ = ed269([{"schedule": [daily(["MON"], f"06:00{zone_text}", f"03:00{zone_text}")]}])
@@ -133,14 +133,14 @@ NO = {"permanent": "NO"}
         ([NO | {"season": "winter"}], {}, "applicability[0].season: a Zone cannot represent this field"),
     ],
 )  # fmt: skip
-def test_ed269_refuses_what_a_zone_cannot_keep(applicability, volume, sentence):
+def test_ed269_rejects_features_a_zone_cannot_represent(applicability, volume, sentence):
     with pytest.raises(InvalidObject) as refused:
         ed269(applicability, **volume)
     assert str(refused.value).startswith(f"features[0].{sentence}")
     assert str(refused.value).endswith(" (in BEL0001)")
 
 
-def test_ed269_refuses_features_without_geometry_and_says_what_it_cuts():
+def test_ed269_rejects_features_without_geometry_and_notes_cut_descriptions():
     with pytest.raises(InvalidObject, match=r"features\[0\].geometry: is missing; give at least one volume \(in A\)"):
         formats.read_ed269('{"features": [{"identifier": "A"}]}')
     written = json.loads(formats.write_ed269([ROUND]).text)
@@ -148,7 +148,7 @@ def test_ed269_refuses_features_without_geometry_and_says_what_it_cuts():
     assert "A: its description is cut after 1024 characters" in formats.read_ed269(json.dumps(written)).notes
 
 
-def test_ed269_has_no_altitude_above_home():
+def test_ed269_export_rejects_altitudes_above_home():
     low = zone("low", {"circle": {"center": {"lat": 50.0, "lon": 4.0}, "radius": 3}}, altitude={"upper": 50})
     with pytest.raises(InvalidObject, match=r"low: spec\.altitude\.reference: ED-269 has no altitudes above home"):
         formats.write_ed269([low])

@@ -1,4 +1,4 @@
-"""Zones from and to GeoJSON, KML, QGroundControl plans and ED-269; nothing is dropped in silence."""
+"""Import and export of zones as GeoJSON, KML, QGroundControl plans and ED-269. Nothing is dropped without a note."""
 
 import json
 import re
@@ -54,7 +54,7 @@ def kml(inside, around=""):
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_areas_survive_the_round_trip(name):
+def test_zone_areas_survive_export_and_import(name):
     write, read = WRITERS[name]
     back = read(write([BLOCK, ROUND]).text).zones
     assert len(back) == 2
@@ -78,7 +78,7 @@ def test_areas_survive_the_round_trip(name):
         ("ed269", ["every zone: zoneAuthority is unknown"]),
     ],
 )
-def test_what_a_format_cannot_say_is_told(name, sentences):
+def test_export_notes_parts_that_the_format_cannot_represent(name, sentences):
     notes = WRITERS[name][0]([BLOCK, ROUND]).notes
     assert len(notes) == len(sentences)
     assert all(note.startswith(sentence) for note, sentence in zip(notes, sentences, strict=True))
@@ -101,7 +101,7 @@ def feature(geometry, **more):
     return {"type": "Feature", "geometry": geometry, **more}
 
 
-def test_geojson_of_others():
+def test_geojson_reads_foreign_file():
     features = [
         feature(
             {"type": "MultiPolygon", "coordinates": [[SQUARE], [[[lon + 1, lat] for lon, lat in SQUARE]]]},
@@ -144,7 +144,7 @@ def test_polygons_across_the_antimeridian_survive_the_round_trip_in_parts(name):
     assert shapely.union_all(parts).symmetric_difference(whole).area < 1e-4 * whole.area
 
 
-def test_geojson_tells_of_zones_around_a_pole():
+def test_geojson_export_notes_zones_around_a_pole():
     polar = zone("n", {"circle": {"center": {"lat": 90.0, "lon": 0.0}, "radius": 500}})
     assert any("contains a pole" in note for note in formats.write_geojson([polar]).notes)
 
@@ -153,7 +153,7 @@ HIGH = {"type": "Polygon", "coordinates": [[[lon, lat, 30] for lon, lat in SQUAR
 FLAT = {"type": "Polygon", "coordinates": [SQUARE]}
 
 
-def test_geojson_takes_the_reference_system_that_it_has_anyway_and_heights_beside_an_altitude():
+def test_geojson_accepts_wgs84_and_ignores_heights_with_an_altitude_property():
     named = {"type": "name", "properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}}
     whole = feature(HIGH, id="a", properties={"altitude": {"upper": 30, "reference": "terrain"}}) | {"crs": named}
     found = formats.read_geojson("\ufeff" + json.dumps(whole))
@@ -161,7 +161,7 @@ def test_geojson_takes_the_reference_system_that_it_has_anyway_and_heights_besid
     assert found.notes == ("a: heights of its points are ignored; properties.altitude is used",)
 
 
-def test_geojson_keeps_every_polygon_of_a_collection():
+def test_geojson_imports_every_polygon_of_a_collection():
     parts = [
         FLAT,
         {"type": "GeometryCollection", "geometries": [{"type": "MultiPolygon", "coordinates": [[SQUARE]] * 2}]},
@@ -173,8 +173,11 @@ def test_geojson_keeps_every_polygon_of_a_collection():
         assert len(found.notes) == 1
 
 
-def test_geojson_follows_parallels():
-    """A side of 140 km leaves its parallel by 470 m in the middle; the zone follows it to half a metre."""
+def test_geojson_adds_points_along_parallels():
+    """A side of 140 km leaves its parallel by 470 m in the middle.
+
+    The imported zone follows the parallel to half a metre.
+    """
     wide = [[4, 50], [6, 50], [6, 50.5], [4, 50.5], [4, 50]]
     (found,) = formats.read_geojson(json.dumps(feature({"type": "Polygon", "coordinates": [wide]}))).zones
     frame = LocalFrame.at(area_center(found.spec.area))
@@ -228,13 +231,13 @@ LAMBERT = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::31370"}
         ),
     ],
 )
-def test_geojson_refuses_what_a_zone_cannot_keep(whole, sentence):
+def test_geojson_rejects_features_a_zone_cannot_represent(whole, sentence):
     with pytest.raises(InvalidObject) as refused:
         formats.read_geojson(json.dumps(whole))
     assert str(refused.value).startswith(sentence)
 
 
-def test_every_refused_feature_is_told_with_its_line_and_can_be_left_out(tmp_path):
+def test_import_reports_every_rejected_feature_and_can_leave_it_out(tmp_path):
     features = [feature(HIGH, id="a"), feature(FLAT, id="b"), feature(FLAT | {"layer": 1}, id="c")]
     source = tmp_path / "town.geojson"
     source.write_text(json.dumps({"type": "FeatureCollection", "features": features}, indent=1))
@@ -270,7 +273,7 @@ def test_every_refused_feature_is_told_with_its_line_and_can_be_left_out(tmp_pat
         "Altitude",
     ],
 )
-def test_properties_that_say_how_high_or_when_in_other_words_are_refused(name, tmp_path):
+def test_import_rejects_properties_that_suggest_altitude_or_time(name, tmp_path):
     sentence = "seems to state the altitude or time of the zone; write it as altitude or schedule"
     text = json.dumps(feature(FLAT, properties={"name": "a", "owner": "x", name: 120}))
     with pytest.raises(InvalidObject, match=sentence) as refused:
@@ -291,12 +294,12 @@ def test_properties_that_say_how_high_or_when_in_other_words_are_refused(name, t
 
 
 @pytest.mark.parametrize("name", ["owner", "kind", "fromage", "timer", "status", "id", "restriction"])
-def test_other_properties_are_told(name):
+def test_import_notes_other_properties(name):
     found = formats.read_geojson(json.dumps(feature(FLAT, properties={"name": "a", name: "x"})))
     assert found.notes == (f"a: properties {name} cannot be imported; left out",)
 
 
-def test_what_is_to_be_dropped_has_to_be_there(tmp_path):
+def test_import_rejects_unknown_properties_to_drop(tmp_path):
     with pytest.raises(InvalidObject, match="there is no property ceiling to drop; correct its name"):
         formats.read_geojson(json.dumps(feature(FLAT)), drop=["ceiling"])
     source = tmp_path / "a.json"
@@ -305,7 +308,7 @@ def test_what_is_to_be_dropped_has_to_be_there(tmp_path):
     assert "--drop is for --from geojson and kml" in refused.stderr
 
 
-def test_the_points_of_a_whole_file_have_a_limit(monkeypatch):
+def test_import_limits_the_points_of_a_file(monkeypatch):
     long = [[-179, 60], [179, 60], [179, 70], [-179, 70]]
     around = [[[x / 2 - 80, y] for x, y in long]]
     one = feature({"type": "Polygon", "coordinates": around})
@@ -321,7 +324,7 @@ def test_the_points_of_a_whole_file_have_a_limit(monkeypatch):
         assert not isinstance(refused.value, formats.InexactFeatures), "it is not read on"
 
 
-def test_a_file_with_a_key_twice_is_refused():
+def test_import_rejects_duplicate_keys():
     with pytest.raises(InvalidObject, match="line 1: type is given twice"):
         formats.read_geojson('{"type": "Feature", "type": "FeatureCollection"}')
 
@@ -407,13 +410,13 @@ def test_a_file_with_a_key_twice_is_refused():
         ),
     ],
 )
-def test_bad_files_have_their_sentence(read, text, sentence):
+def test_import_of_bad_file_raises_readable_error(read, text, sentence):
     with pytest.raises(InvalidObject) as caught:
         read(text)
     assert str(caught.value).startswith(sentence)
 
 
-def test_the_command_imports_and_exports(tmp_path):
+def test_zones_command_imports_and_exports(tmp_path):
     source = tmp_path / "town.geojson"
     source.write_text(formats.write_geojson([BLOCK, ROUND]).text)
     found = CliRunner().invoke(command, ["import", str(source), "--from", "geojson", "--prefix", "town-"])
@@ -434,7 +437,7 @@ def test_the_command_imports_and_exports(tmp_path):
     assert f"{source}: this is not XML" in wrong.stderr
 
 
-def test_notes_have_no_characters_that_a_terminal_acts_on(tmp_path):
+def test_import_notes_contain_no_control_characters(tmp_path):
     source = tmp_path / "town.geojson"
     square = {"type": "Polygon", "coordinates": [[[4.0, 50.0], [4.01, 50.0], [4.01, 50.01], [4.0, 50.0]]]}
     features = [

@@ -1,4 +1,4 @@
-"""Zones from KML and QGroundControl plans of others: what is kept, and what a zone cannot keep."""
+"""Import of foreign KML files and QGroundControl plans, and features that a Zone cannot represent."""
 
 import json
 
@@ -8,7 +8,7 @@ from fractus_core.geo import area_center, formats
 from test_zone_formats import HOLE, ROUND, SQUARE, kml
 
 
-def test_kml_of_others():
+def test_kml_reads_foreign_file():
     ring = " ".join(f"{lon},{lat},30" for lon, lat in SQUARE)
     text = f"""<?xml version="1.0" encoding="UTF-8"?><kml xmlns="http://www.opengis.net/kml/2.2"><Document><Folder>
     <Placemark><name>School &amp; yard</name><description>no pictures</description><ExtendedData><Data name="owner"><value>x</value></Data></ExtendedData><styleUrl/><Polygon>
@@ -23,7 +23,7 @@ def test_kml_of_others():
     )
 
 
-def test_qgc_plan_of_others():
+def test_qgc_plan_reads_foreign_file():
     fence = {
         "version": 2,
         "polygons": [{"inclusion": True, "version": 1, "polygon": [[lat, lon] for lon, lat in SQUARE[:-1]]}],
@@ -39,7 +39,7 @@ def test_qgc_plan_of_others():
     )
 
 
-def test_kml_keeps_all_holes_and_every_polygon_of_a_multigeometry():
+def test_kml_imports_all_holes_and_polygons_of_a_multigeometry():
     rings = [[[lon + shift, lat] for lon, lat in HOLE] for shift in (0, -0.003)]
     texts = [
         f"<LinearRing><coordinates>{' '.join(f'{x},{y},99' for x, y in r)}</coordinates></LinearRing>" for r in rings
@@ -72,7 +72,7 @@ def test_kml_keeps_all_holes_and_every_polygon_of_a_multigeometry():
         (kml("<Polygon/>"), "Polygon[0].outerBoundaryIs: a polygon has exactly one"),
     ],
 )
-def test_kml_refuses_what_a_zone_cannot_keep(text, sentence):
+def test_kml_rejects_placemarks_a_zone_cannot_represent(text, sentence):
     with pytest.raises(InvalidObject) as refused:
         formats.read_kml(text)
     assert str(refused.value).startswith(sentence)
@@ -94,7 +94,7 @@ def test_kml_refuses_what_a_zone_cannot_keep(text, sentence):
         ({"corridors": [1]}, "geoFence.corridors: a Zone cannot represent this field"),
     ],
 )
-def test_qgc_plan_refuses_what_a_zone_cannot_keep(fence, sentence):
+def test_qgc_plan_rejects_shapes_a_zone_cannot_represent(fence, sentence):
     with pytest.raises(InvalidObject) as refused:
         formats.read_qgc_plan(json.dumps({"fileType": "Plan", "geoFence": {"version": 2, **fence}}))
     assert str(refused.value).startswith(sentence)

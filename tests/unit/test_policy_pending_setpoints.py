@@ -1,4 +1,4 @@
-"""Setpoints in quick succession: what is on its way counts, whenever each of them is heard."""
+"""Setpoints in quick succession: pending setpoints count whenever each of them is received."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ BRAKES = -2.5
 
 
 def flown(rng: random.Random, now: Situation, pending: list[Velocity], asked: VelocityArgs) -> list[Velocity]:
-    """Where a drone may come that hears each of these some time within the latency, in their order, and stops in the end."""
+    """Return possible positions of a drone that receives setpoints in order, within the latency, and then stops."""
     moments = sorted(rng.choice([0.0, rng.uniform(0, now.latency_s), now.latency_s]) for _ in (*pending, asked))
     wanted = [
         (0.0, 0.0) if now.forward_mps2 == BRAKES else (now.east_mps, now.north_mps),
@@ -45,7 +45,7 @@ def direction(rng: random.Random, fast: float) -> Velocity:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_what_a_setpoint_sweeps_holds_what_is_flown(seed: int) -> None:
+def test_velocity_leg_contains_the_flown_path_with_pending_setpoints(seed: int) -> None:
     rng = random.Random(seed)
     furthest_m, missed_m = 0.0, 0.0
     for _ in range(150):
@@ -63,10 +63,10 @@ def test_what_a_setpoint_sweeps_holds_what_is_flown(seed: int) -> None:
         blind = Situation(**{f: getattr(now, f) for f in Situation.__slots__ if f != "pending"})
         missed_m = max(missed_m, float(shapely.distance(velocity_leg(blind, (0.0, 0.0), asked).ground, places).max()))
     assert furthest_m < now.airframe.tracking_m, "legs keep that much more"
-    assert missed_m > 2.0, "it is what is pending that makes the difference"
+    assert missed_m > 2.0, "the pending setpoint makes the difference"
 
 
-def test_a_drone_that_was_told_to_fly_on_does_not_go_on_braking() -> None:
+def test_pending_setpoint_may_end_braking() -> None:
     braking = at(0, 0, east_mps=8, forward_mps2=-2.5, latency_s=0.5)
     told = at(0, 0, east_mps=8, forward_mps2=-2.5, latency_s=0.5, pending=((0.0, 8.0, 0.0),))
     stopped = at(0, 0, east_mps=8, forward_mps2=-2.5, latency_s=0.5, pending=((0.0, 0.0, 0.0),))
@@ -75,13 +75,13 @@ def test_a_drone_that_was_told_to_fly_on_does_not_go_on_braking() -> None:
     assert stop_point(told, (0.0, 0.0))[0] > stop_point(braking, (0.0, 0.0))[0] + 3.0
 
 
-def test_a_drone_that_was_told_to_fly_does_not_stand() -> None:
+def test_drone_with_pending_setpoint_counts_as_moving() -> None:
     assert not is_moving(at(0, 0))
     assert is_moving(at(0, 0, pending=((5.0, 0.0, 0.0),)))
     assert not is_moving(at(0, 0, pending=((0.0, 0.0, 0.0),)))
 
 
-def test_a_leg_is_judged_for_a_drone_that_may_have_begun_another() -> None:
+def test_goto_is_judged_with_pending_setpoints() -> None:
     grant = compiled(exclusion(box(-30, 3.5, 30, 30)))
     aside = goto(30, 0, speed_mps=5.0)
     assert judge(aside, at(0, 0), grant).permits
@@ -89,7 +89,7 @@ def test_a_leg_is_judged_for_a_drone_that_may_have_begun_another() -> None:
     assert not verdict.permits or verdict.brake_first
 
 
-def test_a_setpoint_that_was_refused_is_not_let_through_by_the_next() -> None:
+def test_denied_setpoint_stays_denied_after_the_next_one() -> None:
     grant = compiled(exclusion(box(-30, 30, 30, 60)))
     call = Call("SetVelocity", VelocityArgs(9.0, 0.0, hold_s=1.0))
     hot = at(0, 4, north_mps=8.9, forward_mps2=-2.0, latency_s=0.5, speed_setpoint_mps=9.0, pending=((9.0, 0.0, 0.0),))

@@ -1,4 +1,4 @@
-"""The engine under attack: odd places, odd zones, odd numbers, odd clocks."""
+"""The engine with unusual and hostile input: places, zones, numbers and clocks."""
 
 from __future__ import annotations
 
@@ -39,8 +39,11 @@ SERVICES = [{"service": "mobility", "methods": [*METHODS, "SetVelocity"]}]
 RETRACING = Airframe(retraces=True)
 
 
-def test_no_judgement_takes_long_beside_an_outline_of_many_corners() -> None:
-    """Of a region with ten thousand corners, which any application may have: the motion monitor and the heartbeats wait meanwhile."""
+def test_judge_is_fast_near_outline_with_many_corners() -> None:
+    """Any application may have a region with ten thousand corners.
+
+    Motion monitor and heartbeats wait during a judgement.
+    """
     corners = [
         ((300.0 if i % 2 else 150.0) * math.sin(math.tau * i / 10_000), (300.0 if i % 2 else 150.0) * math.cos(math.tau * i / 10_000))
         for i in range(10_000)
@@ -59,7 +62,7 @@ def test_no_judgement_takes_long_beside_an_outline_of_many_corners() -> None:
 @pytest.mark.parametrize(
     ("lat", "lon"), [(-17.0, 179.9999), (-17.0, -180.0), (89.9995, 40.0), (-89.9995, -120.0), (0, 0)]
 )
-def test_anywhere_on_the_globe(lat: float, lon: float) -> None:
+def test_engine_works_anywhere_on_the_globe(lat: float, lon: float) -> None:
     frame = LocalFrame(lat, lon)
 
     def area(x0: float, y0: float, x1: float, y1: float) -> dict[str, Any]:
@@ -82,12 +85,12 @@ def test_anywhere_on_the_globe(lat: float, lon: float) -> None:
 
 
 @pytest.mark.parametrize("place", [(90.0, 0.0), (-90.0, 180.0), (39.36, -157.05), (0.0, 202.95)])
-def test_targets_at_the_ends_of_the_earth(place: tuple[float, float]) -> None:
+def test_goto_to_target_on_far_side_of_globe_is_denied(place: tuple[float, float]) -> None:
     for area in ([], [box(-200, -200, 200, 200)]):
         assert ask(compiled(operationArea=area), Call("Goto", GotoArgs(*place, 10))).code == "InvalidArgument"
 
 
-def test_a_zone_as_big_as_a_country() -> None:
+def test_zone_of_country_size_is_respected() -> None:
     huge = {"circle": {"center": {"lat": 39.0, "lon": 22.0}, "radius": 200_000}}
     assert ask(compiled(exclusion(huge)), goto(50, 0)).action == "deny"
     assert ask(compiled(inclusion(huge)), goto(50, 0)).action == "allow"
@@ -96,7 +99,7 @@ def test_a_zone_as_big_as_a_country() -> None:
     assert ask(compiled(inclusion(beside)), goto(50, 0)).action == "deny"
 
 
-def test_a_zone_that_reaches_around_the_globe_grants_nothing() -> None:
+def test_grant_with_zone_around_the_globe_is_rejected() -> None:
     corners = [(0, -62), (0, 23), (0, 108), (70, 108), (80, 23), (70, -62)]
     world = {"polygon": {"exterior": [{"lat": lat, "lon": lon} for lat, lon in corners]}}
     with pytest.raises(InvalidObject, match="more than 1000 km from the middle"):
@@ -105,7 +108,7 @@ def test_a_zone_that_reaches_around_the_globe_grants_nothing() -> None:
     assert ask(compiled(exclusion(far)), goto(50, 0)).action == "allow"
 
 
-def test_one_altitude_that_is_both_limits_forbids_what_is_above_and_below() -> None:
+def test_equal_lower_and_upper_limit_forbids_other_altitudes() -> None:
     height = 20.0
     (level,) = compiled(
         altitude(zones=[zone("level", box(0, 0, 9, 9))], lowerLimit=height, upperLimit=height)
@@ -119,7 +122,7 @@ def _court() -> dict[str, Any]:
     return area
 
 
-def test_a_zone_with_a_hole() -> None:
+def test_goto_into_hole_of_zone_is_judged_by_the_ring() -> None:
     grant = compiled(exclusion(_court()), operationArea=[])
     assert ask(grant, goto(30, 0)).action == "allow"
     assert ask(grant, goto(38, 0)).code == "TooCloseToExclusionZone"
@@ -131,17 +134,17 @@ def test_a_zone_with_a_hole() -> None:
     assert ask(kept, goto(30, 0), at(50, 0)).action == "deny"
 
 
-def test_zones_that_touch_leave_no_gap() -> None:
+def test_touching_zones_leave_no_gap() -> None:
     two = (exclusion(box(-100, 20, 0, 40), name="a"), exclusion(box(0, 20, 100, 40), name="b"))
     for way in ((0, 60), (0.001, 60), (-0.001, 60)):
         assert ask(compiled(*two), goto(*way)).action == "deny"
     union = policy(
         "in", "GeofenceControl", "inclusion", [zone("a", box(-50, -50, 0, 50)), zone("b", box(0, -50, 50, 50))]
     )
-    assert ask(compiled(union), goto(30, 0), at(-30, 0)).action == "allow", "their common border is none"
+    assert ask(compiled(union), goto(30, 0), at(-30, 0)).action == "allow", "their common border is no gap"
 
 
-def test_a_leg_to_where_the_drone_is() -> None:
+def test_goto_to_present_position_is_allowed() -> None:
     grant = compiled(exclusion(box(10, -20, 30, 20)), services=SERVICES)
     assert ask(grant, goto(0, 0)).action == "allow"
     assert ask(grant, goto(0, 0, 30)).action == "allow"
@@ -150,13 +153,13 @@ def test_a_leg_to_where_the_drone_is() -> None:
     assert ask(grant, goto(20, 0), at(20, 0)).action == "deny"
 
 
-def test_home_inside_a_zone() -> None:
+def test_engine_handles_home_inside_a_zone() -> None:
     grant = compiled(exclusion(box(-20, -20, 20, 20), "land"), operationArea=[])
     assert ask(grant, Call("Arm"), at(alt=0, in_air=False)).code == "InsideExclusionZone"
     assert ask(grant, Call("Takeoff"), at(alt=0)).action == "deny"
     assert ask(grant, goto(100, 0), at(60, 0)).code == "WayHomeBlocked"
     assert ask(grant, goto(100, 0), at(60, 0, airframe=RETRACING)).code == "WayHomeBlocked"
-    assert ask(grant, goto(40, 0), at(15, 0)).action == "allow", "out of it, whatever lies at home"
+    assert ask(grant, goto(40, 0), at(15, 0)).action == "allow", "it may leave the zone regardless of home"
     assert ask(grant, Call("ReturnToLaunch"), at(60, 0)).action == "allow"
 
 
@@ -164,7 +167,7 @@ NANS = [math.nan, math.inf, -math.inf, 1e300, -1e300]
 
 
 @pytest.mark.parametrize("odd", NANS)
-def test_figures_that_are_none(odd: float) -> None:
+def test_non_finite_arguments_are_denied(odd: float) -> None:
     grant = compiled(exclusion(box(-20, 20, 20, 60)), altitude(upperLimit=30), services=SERVICES)
     calls = [
         Call("SetVelocity", VelocityArgs(odd, 0)), Call("SetVelocity", VelocityArgs(0, 0, odd)),
@@ -178,7 +181,7 @@ def test_figures_that_are_none(odd: float) -> None:
         assert ask(grant, goto(0, 10), replace(at(), **{field: odd})).code == "PositionUnknown", field
 
 
-def test_a_clock_set_back_in_flight() -> None:
+def test_clock_set_back_in_flight_keeps_restrictions() -> None:
     shut = {"validFrom": "2026-06-01T11:00:00Z", "validUntil": "2026-06-01T13:00:00Z"}
     fence = exclusion(box(-20, 20, 20, 60), "land")
     fence["spec"] |= shut
@@ -189,18 +192,18 @@ def test_a_clock_set_back_in_flight() -> None:
     assert not ask(grant, goto(0, 40), replace(back, time_s=UncertainTime(NOW + 7200, NOW))).permits
 
 
-def test_a_grant_without_anything_grants_nothing() -> None:
+def test_empty_grant_denies_everything() -> None:
     empty = compile_grant(GrantSpec.model_validate(spec(services=[]).to_dict()))
     for method in (*METHODS, "CaptureImage", "SetVelocity", "Explode"):
         assert judge(Call(method), at(), empty).action == "deny"
 
 
-def test_a_granted_method_without_a_rule_is_refused() -> None:
+def test_granted_method_without_rule_is_denied() -> None:
     grant = replace(compiled(), methods=frozenset({"Barrel"}))
     assert ask(grant, Call("Barrel")).code == "MethodUnknown"
 
 
-def test_thousands_of_policies_at_one_place() -> None:
+def test_judge_handles_thousands_of_policies_at_one_place() -> None:
     many = [exclusion(box(50, -20, 80, 20), "ignore" if i else "land", f"p{i:04}", priority=i % 7) for i in range(500)]
     verdict = ask(compiled(*many), goto(60, 0))
     assert (verdict.action, verdict.takeover, verdict.policies[0]) == ("takeover", "land", "p0000")
@@ -209,7 +212,7 @@ def test_thousands_of_policies_at_one_place() -> None:
     assert list(verdict.policies[1 : len(sixth) + 1]) == sixth, "then by priority, then by name"
 
 
-def test_datums_of_bands() -> None:
+def test_altitude_bands_of_every_datum_are_respected() -> None:
     amsl = compiled(exclusion(box(50, -20, 80, 20), lower=90, upper=115, reference="amsl"), services=SERVICES)
     low, high = at(40, 0, alt=10), at(40, 0, alt=30)
     push = Call("SetVelocity", VelocityArgs(0, 9, hold_s=2))
@@ -218,11 +221,11 @@ def test_datums_of_bands() -> None:
     sunk = replace(high, home=Home(39.36, 22.95, 80.0))
     assert ask(amsl, push, sunk).action == "deny", "home lies lower, and so does the drone"
     terrain = exclusion(box(50, -20, 80, 20), lower=0, upper=15, reference="terrain")
-    assert ask(compiled(terrain, services=SERVICES), push, high).action == "deny", "no one knows the terrain"
+    assert ask(compiled(terrain, services=SERVICES), push, high).action == "deny", "the terrain is unknown"
     assert ask(compiled(terrain, services=SERVICES, flat_terrain=True), push, high).action == "allow"
 
 
-def test_out_of_a_zone_but_not_up_into_it() -> None:
+def test_leg_out_of_zone_may_not_climb_into_it() -> None:
     above = compiled(exclusion(box(-30, -30, 30, 30), lower=14), operationArea=[])
     under = at(25, 0, alt=12.5, airframe=RETRACING)
     assert ask(above, goto(60, 0, 11), under).action == "allow", "out from under it"
@@ -241,7 +244,7 @@ def test_out_of_a_zone_but_not_up_into_it() -> None:
     assert ask(above, goto(60, 0, 30), replace(inside, airframe=RETRACING)).action == "allow"
 
 
-def test_not_out_of_an_inclusion_zone_by_sinking() -> None:
+def test_leg_may_not_sink_out_of_inclusion_zone() -> None:
     two = policy(
         "in", "GeofenceControl", "inclusion",
         [zone("ground", box(-50, -50, 10, 50)), zone("high", box(0, -50, 60, 50), lower=16)],

@@ -1,4 +1,4 @@
-"""The engine's fences: operation areas, exclusion and inclusion zones, near and on the other side of the globe."""
+"""Fences of the engine: operation areas, exclusion and inclusion zones, near and on the far side of the globe."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from policy_world import (
 # Fences
 
 
-def test_targets_outside_the_operation_area_are_refused() -> None:
+def test_goto_outside_operation_area_is_denied() -> None:
     verdict = ask(compiled(), goto(0, 230))
     assert (verdict.action, verdict.code, verdict.takeover) == ("deny", "OutsideOperationArea", None)
     assert "30.0 m outside" in verdict.reason
@@ -41,14 +41,14 @@ def test_targets_outside_the_operation_area_are_refused() -> None:
     assert ask(compiled(operationArea=[]), goto(0, 230)).action == "allow"
 
 
-def test_a_leg_that_cuts_a_corner_of_the_operation_area_is_refused() -> None:
+def test_goto_cutting_corner_of_operation_area_is_denied() -> None:
     corner = [ring([(-20, -20), (100, -20), (100, 20), (20, 20), (20, 100), (-20, 100)])]
     grant = compiled(operationArea=corner)
     assert ask(grant, goto(0, 90), at(0, 0)).action == "allow"
     assert ask(grant, goto(90, 0), at(0, 90)).code == "OutsideOperationArea"
 
 
-def test_the_way_to_the_operation_area_and_home() -> None:
+def test_goto_along_corridor_and_home_is_allowed() -> None:
     grant = compiled(operationArea=[box(50, -20, 150, 20)], corridor=[box(-30, -30, 150, 30)])
     assert ask(grant, goto(100, 0), at(0, 0)).action == "allow"
     assert ask(grant, goto(20, 0), at(0, 0)).code == "OutsideOperationArea", "the way is not a place to work"
@@ -59,7 +59,7 @@ def test_the_way_to_the_operation_area_and_home() -> None:
     assert ask(partial, Call("Arm"), at(0, 0, 0)).code == "OutsideOperationArea"
 
 
-def test_the_way_from_home_is_not_bound_to_an_operation_area_that_home_happens_to_lie_in() -> None:
+def test_goto_from_home_may_leave_operation_area_into_corridor() -> None:
     bend = ring([(-10, -5), (60, -5), (60, 60), (50, 60), (50, 5), (-10, 5)])
     grant = compiled(operationArea=[bend], corridor=[box(-30, -30, 100, 100)])
     assert ask(grant, goto(55, 50), at(0, 0)).action == "allow"
@@ -68,7 +68,7 @@ def test_the_way_from_home_is_not_bound_to_an_operation_area_that_home_happens_t
     assert ask(partial, goto(55, 50), at(0, 0)).code == "OutsideOperationArea", "the system flies there"
 
 
-def test_a_driver_with_partial_control_works_where_the_system_can_fly_home_around_a_zone() -> None:
+def test_partial_control_driver_may_fly_where_system_can_return_around_zone() -> None:
     fields = {"operationArea": [box(50, -20, 150, 20)], "corridor": [box(-30, -60, 150, 60)], "control": "partial"}
     retracing = at(60, 0, airframe=Airframe(retraces=True))
     beside, across = exclusion(box(20, -10, 40, 10)), exclusion(box(20, -70, 40, 70))
@@ -77,7 +77,7 @@ def test_a_driver_with_partial_control_works_where_the_system_can_fly_home_aroun
     assert ask(compiled(beside, **fields), goto(100, 0), at(60, 0)).code == "WayHomeBlocked", "it flies home straight"
 
 
-def test_exclusion_zones() -> None:
+def test_goto_into_through_or_near_exclusion_zone_is_denied() -> None:
     grant = compiled(exclusion(box(50, -20, 80, 20)))
     inside, through, near = ask(grant, goto(60, 0)), ask(grant, goto(150, 0)), ask(grant, goto(48, 0))
     assert (inside.action, inside.code) == ("deny", "InsideExclusionZone")
@@ -89,7 +89,7 @@ def test_exclusion_zones() -> None:
     assert ask(grant, goto(47, 0), at(position_error_m=3)).code == "TooCloseToExclusionZone"
 
 
-def test_distances_that_round_to_nothing_are_told_as_such() -> None:
+def test_reason_shows_distances_below_a_tenth_of_a_metre() -> None:
     zone_at = exclusion(box(50, -20, 80, 20))
     told = [
         ask(compiled(exclusion(ring([(50, 0.01), (40, -20), (60, -20)]))), goto(100, 0)),
@@ -109,13 +109,13 @@ def test_distances_that_round_to_nothing_are_told_as_such() -> None:
     assert "comes within 0.1 m of zone no-fly-zone" in told[2].reason
 
 
-def test_a_turn_that_sweeps_a_zone_beside_the_leg_is_told_apart() -> None:
+def test_reason_distinguishes_turn_from_leg_through_zone() -> None:
     verdict = ask(compiled(exclusion(box(1, 5, 3, 9))), goto(0, 60), at(east_mps=5.0, north_mps=0.0))
     assert verdict.code == "LegThroughExclusionZone"
     assert "turn onto the leg touches zone no-fly-zone" in verdict.reason
 
 
-def test_a_zone_in_a_band_of_altitudes_may_be_overflown() -> None:
+def test_zone_with_altitude_band_may_be_overflown() -> None:
     grant = compiled(exclusion(box(50, -20, 80, 20), upper=20))
     assert ask(grant, goto(150, 0, 30), at(alt=30)).action == "allow"
     assert ask(grant, goto(150, 0, 30), at(alt=10)).code == "LegThroughExclusionZone", "it may climb too late"
@@ -128,7 +128,7 @@ def test_a_zone_in_a_band_of_altitudes_may_be_overflown() -> None:
 
 
 @pytest.mark.parametrize("action", ["hover", "land", "returnToLaunch", "revoke"])
-def test_takeovers(action: str) -> None:
+def test_geofence_action_determines_takeover(action: str) -> None:
     grant = compiled(exclusion(box(50, -20, 80, 20), action))
     verdict = ask(grant, goto(60, 0))
     assert (verdict.action, verdict.takeover, verdict.policies) == ("takeover", action, ("no-fly",))
@@ -136,7 +136,7 @@ def test_takeovers(action: str) -> None:
     assert ask(grant, goto(48, 0)).action == "deny", "coming close costs no more than the request"
 
 
-def test_the_strictest_fence_decides() -> None:
+def test_most_restrictive_fence_decides() -> None:
     actions = ("adjust", "hover", "ignore", "land", "returnToLaunch")
     zones = [exclusion(box(50, -20, 80, 20), a, f"p-{a.lower()}") for a in actions]
     verdict = ask(compiled(*zones), goto(60, 0))
@@ -144,20 +144,20 @@ def test_the_strictest_fence_decides() -> None:
     assert verdict.policies == ("p-land", "p-returntolaunch", "p-hover", "p-ignore", "p-adjust")
 
 
-def test_adjusting_shortens_the_leg() -> None:
+def test_adjust_action_shortens_leg_before_exclusion_zone() -> None:
     grant = compiled(exclusion(box(50, -20, 80, 20), "adjust"))
     verdict = ask(grant, goto(150, 0))
     assert (verdict.action, verdict.code) == ("correct", "LegShortened")
     x, y = target(verdict)
     assert y == pytest.approx(0, abs=1e-3)
     assert 46.5 < x < 47.5
-    assert ask(grant, Call("Goto", verdict.args)).action == "allow", "what is corrected is legal by itself"
+    assert ask(grant, Call("Goto", verdict.args)).action == "allow", "the corrected target is legal"
     assert ask(grant, goto(150, 0), at(47, 0)).action == "deny", "nothing is left of the leg"
     both = compiled(exclusion(box(50, -20, 80, 20), "adjust"), exclusion(box(20, -20, 30, 20), "ignore", "other"))
     assert ask(both, goto(150, 0)).action == "deny"
 
 
-def test_adjusting_inside_an_inclusion_zone() -> None:
+def test_adjust_action_shortens_leg_inside_inclusion_zone() -> None:
     grant = compiled(inclusion(box(-30, -30, 60, 60), "adjust"))
     verdict = ask(grant, goto(0, 100))
     assert verdict.action == "correct"
@@ -168,10 +168,10 @@ def test_adjusting_inside_an_inclusion_zone() -> None:
 
 
 @pytest.mark.parametrize("radius_m", [20_000.0, 100_000.0])
-def test_a_wide_circle_to_stay_in_is_not_left(radius_m: float) -> None:
-    """Its border is 100 m north of home, and its middle far to the south."""
+def test_inclusion_circle_of_large_radius_is_not_left(radius_m: float) -> None:
+    """The border is 100 m north of home, and the center far to the south."""
     lat, lon = FRAME.latlon(0.0, -(radius_m - 100.0))
-    # True to scale, unlike the frame.
+    # Unlike the frame, this is true to scale.
     south_m = distance_m(Point(lat=lat, lon=lon), Point(lat=HOME.lat, lon=HOME.lon))
     circle = {"circle": {"center": {"lat": lat, "lon": lon}, "radius": south_m + 100.0}}
     grant = compiled(inclusion(circle))
@@ -182,7 +182,7 @@ def test_a_wide_circle_to_stay_in_is_not_left(radius_m: float) -> None:
     assert ask(grant, goto(0, -180), at(0, -170)).action == "allow"
 
 
-def test_inclusion_is_the_union_of_a_policys_zones() -> None:
+def test_inclusion_area_is_union_of_the_zones_of_a_policy() -> None:
     two = policy(
         "keep-in", "GeofenceControl", "inclusion",
         [zone("a", box(-30, -30, 50, 30)), zone("b", box(49, -30, 120, 30))],
@@ -192,7 +192,7 @@ def test_inclusion_is_the_union_of_a_policys_zones() -> None:
     assert ask(compiled(*apart), goto(100, 0)).action == "deny", "two policies hold both"
 
 
-def test_a_moving_drone_needs_room_to_turn() -> None:
+def test_goto_of_moving_drone_needs_room_to_turn() -> None:
     grant = compiled(exclusion(box(10, 15, 30, 30)))
     assert ask(grant, goto(0, 60), at(0, 0)).action == "allow"
     assert ask(grant, goto(0, 60), at(0, 0, east_mps=9)).code == "LegThroughExclusionZone"
@@ -203,7 +203,7 @@ def test_a_moving_drone_needs_room_to_turn() -> None:
     assert stopping_distance_m(2, 2.5, 1.0) == pytest.approx(2.0)
 
 
-def test_from_inside_a_zone_only_out() -> None:
+def test_goto_from_inside_zone_may_only_lead_out() -> None:
     grant = compiled(exclusion(box(50, -50, 90, 50), "land"))
     inside = at(60, 0)
     assert ask(grant, goto(40, 0), inside).action == "allow"
@@ -213,7 +213,7 @@ def test_from_inside_a_zone_only_out() -> None:
     assert ask(grant, goto(80, 0), inside).action == "deny", "no second takeover for what the monitor handles"
 
 
-def test_from_outside_only_in() -> None:
+def test_drone_outside_inclusion_zone_may_only_fly_in() -> None:
     grant = compiled(operationArea=[box(50, -50, 150, 50)])
     outside = at(20, 0)
     assert ask(grant, goto(100, 0), outside).action == "allow"
@@ -223,7 +223,7 @@ def test_from_outside_only_in() -> None:
     assert ask(keep, goto(-10, 0), at(-20, 0)).action == "deny"
 
 
-def test_the_way_home_must_stay_legal() -> None:
+def test_goto_is_denied_when_straight_return_is_blocked() -> None:
     wall = exclusion(box(-100, 40, 60, 50), name="wall")
     grant = compiled(wall)
     behind = at(100, 60)
@@ -234,8 +234,8 @@ def test_the_way_home_must_stay_legal() -> None:
     assert ask(compiled(inclusion(box(20, -50, 150, 150))), goto(100, 50), at(80, 50)).code == "WayHomeBlocked"
 
 
-def test_near_home_an_autopilot_returns_lower() -> None:
-    """It climbs to three times its distance from home, and not to its return altitude."""
+def test_straight_return_near_home_is_checked_at_lower_altitude() -> None:
+    """The autopilot climbs to three times its distance from home instead of its return altitude."""
     grant = compiled(exclusion(box(-20, 15, 20, 17), name="mast", upper=70))
     high = at(60, 60, airframe=Airframe(return_altitude_m=100.0))
     assert ask(grant, goto(0, 60), high).action == "allow", "from there it returns at 100 m"
@@ -244,7 +244,7 @@ def test_near_home_an_autopilot_returns_lower() -> None:
     assert "69.0 to 100.0 m" in near.reason
 
 
-def test_vertical_motions_respect_fences() -> None:
+def test_takeoff_and_landing_respect_fences() -> None:
     grant = compiled(exclusion(box(-10, -10, 10, 10), "land", lower=20))
     assert ask(grant, Call("Takeoff", TakeoffArgs(10)), at(alt=0)).action == "allow"
     assert ask(grant, Call("Takeoff", TakeoffArgs(30)), at(alt=0)).action == "deny"
@@ -256,7 +256,7 @@ def test_vertical_motions_respect_fences() -> None:
 
 
 @pytest.mark.parametrize(("lower", "upper", "away", "closer"), [(12.0, 60.0, 9.0, 10.5), (-5.0, 8.0, 11.0, 9.5)])
-def test_from_too_close_below_or_above_a_zone_a_leg_may_sink_or_climb_away(
+def test_drone_too_close_below_or_above_zone_may_sink_or_climb_away(
     lower: float, upper: float, away: float, closer: float
 ) -> None:
     grant = compiled(exclusion(box(-40, -40, 40, 40), lower=lower, upper=upper))
@@ -270,7 +270,7 @@ def test_from_too_close_below_or_above_a_zone_a_leg_may_sink_or_climb_away(
     assert ask(grant, goto(40.5, 0, away), moving).action == "deny"
 
 
-def test_motors_do_not_stop_in_the_air() -> None:
+def test_disarm_is_denied_in_the_air() -> None:
     assert ask(compiled(), Call("Disarm"), at()).code == "InAir"
     assert ask(compiled(), Call("Disarm"), at(in_air=False)).action == "allow"
 
@@ -278,13 +278,13 @@ def test_motors_do_not_stop_in_the_air() -> None:
 # Geometry far away
 
 
-def test_zones_on_the_other_side_of_the_globe_do_not_matter() -> None:
+def test_zones_on_the_far_side_of_the_globe_are_ignored() -> None:
     far = [{"lat": lat, "lon": lon} for lat, lon in ((-39.3, -157.1), (-39.4, -157.1), (-39.4, -157.0))]
     grant = compiled(exclusion({"polygon": {"exterior": far}}))
     assert ask(grant, goto(50, 0)).action == "allow"
 
 
-def test_the_antimeridian_is_nothing_special() -> None:
+def test_fences_work_across_the_antimeridian() -> None:
     from fractus_core.geo import LocalFrame
     from fractus_core.policy.decision_types import Situation
     from fractus_core.policy.engine import judge

@@ -1,4 +1,4 @@
-"""What is not known counts against the request: figures that are no numbers, doubtful clocks, what a picture shows."""
+"""Unknown state counts against a request: numbers that are not finite, uncertain clocks, and camera footprints."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ODD: tuple[dict[str, Any], ...] = (
 
 
 @pytest.mark.parametrize("odd", ODD)
-def test_a_state_that_is_no_number_refuses_motion_and_stops_the_drone(odd: dict[str, Any]) -> None:
+def test_implausible_state_denies_motion_and_stops_drone(odd: dict[str, Any]) -> None:
     grant = compiled(exclusion(box(-20, 20, 20, 60)))
     now = replace(at(north_mps=5.0), **odd)
     assert ask(grant, goto(0, -50), now).code == "PositionUnknown"
@@ -40,7 +40,7 @@ def test_a_state_that_is_no_number_refuses_motion_and_stops_the_drone(odd: dict[
     assert (found.action, found.takeover) == ("takeover", "hover")
 
 
-def test_a_time_that_is_no_number_is_an_error() -> None:
+def test_judge_raises_when_time_is_not_a_number() -> None:
     now = replace(at(), time_s=math.nan)
     with pytest.raises(ValueError, match="time"):
         judge(goto(0, 50), now, compiled())
@@ -48,7 +48,7 @@ def test_a_time_that_is_no_number_is_an_error() -> None:
         monitor(now, compiled())
 
 
-def test_a_leg_keeps_off_the_ground_unless_a_limit_speaks_of_lower() -> None:
+def test_goto_keeps_minimum_altitude_unless_a_limit_permits_less() -> None:
     for low in (-40.0, 0.0, 1.9):
         assert ask(compiled(), goto(0, 50, low)).code == "AltitudeTooLow"
     assert ask(compiled(), goto(0, 50, 2.0)).action == "allow"
@@ -65,7 +65,7 @@ def _with(body: dict[str, Any], **spec: Any) -> dict[str, Any]:
     return {**body, "spec": {**body["spec"], **spec}}
 
 
-def test_restrictions_hold_at_either_reading_of_the_clock_and_permissions_at_both() -> None:
+def test_uncertain_time_applies_restrictions_at_either_and_permissions_at_both_readings() -> None:
     day = 86_400.0
     doubtful = replace(at(), time_s=UncertainTime(NOW + 3 * day, NOW))
     fence = compiled(_with(exclusion(box(-20, 20, 20, 60)), **_until(NOW + day)))
@@ -79,7 +79,7 @@ def test_restrictions_hold_at_either_reading_of_the_clock_and_permissions_at_bot
     assert ask(compiled(allowance), Call("Hover"), doubtful).code == "MethodNotGrantedHere"
 
 
-def test_a_zone_to_stay_in_must_be_active_at_both_readings() -> None:
+def test_inclusion_zone_must_be_active_at_both_readings_of_uncertain_time() -> None:
     body = inclusion(box(-80, -80, 80, 80))
     body["zones"][0]["schedule"] = [{"start": "11:00", "end": "13:00"}]
     grant = compiled(body)
@@ -92,18 +92,18 @@ def test_a_zone_to_stay_in_must_be_active_at_both_readings() -> None:
     ("x", "height_m", "seen"),
     [(0, 20, True), (0, 35, True), (23, 20, True), (45, 20, True), (53, 20, False), (80, 70, True)],
 )
-def test_privacy_is_judged_by_what_a_picture_shows(x: float, height_m: float, seen: bool) -> None:
+def test_privacy_is_judged_by_camera_footprint(x: float, height_m: float, seen: bool) -> None:
     private = policy("p", "PrivacyControl", "camera", [zone("z", box(-20, -20, 20, 20), upper=30)], action="refuse")
     verdict = ask(compiled(private), CAPTURE, at(x, 0, alt=height_m))
     assert verdict.code == ("PrivacyZone" if seen else "")
 
 
-def test_a_denial_of_the_camera_counts_for_what_it_would_see() -> None:
+def test_camera_denial_is_judged_by_camera_footprint() -> None:
     denial = policy("d", "AccessControl", "denial", [zone("z", box(-20, -20, 20, 20))], methods=["CaptureImage"])
     assert ask(compiled(denial), CAPTURE, at(35, 0, alt=20)).code == "MethodDenied"
     narrow = replace(at(35, 0, alt=20), lens=Lens(30.0, 20.0, stabilised=True))
     assert ask(compiled(denial), CAPTURE, narrow).action == "allow"
 
 
-def test_a_picture_from_nowhere_is_not_taken() -> None:
+def test_capture_is_denied_when_position_is_unknown() -> None:
     assert ask(compiled(operationArea=[]), CAPTURE, Situation(time_s=NOW)).code == "PositionUnknown"

@@ -1,4 +1,4 @@
-"""Legal ways around zones: legal by the engine's own word, and no longer than they must be."""
+"""Routes around zones: the engine permits every leg, and routes are no longer than necessary."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def length(start: tuple[float, float], way: Way) -> float:
 
 
 def legal(grant: CompiledGrant, start: tuple[float, float], way: Way, now: Situation) -> None:
-    """Every leg is permitted to a drone that stands within a metre of where the last one ended."""
+    """Return True if every leg is permitted for a stationary drone within a metre of the end of the previous leg."""
     for a, b in itertools.pairwise((start, *way)):
         for dx, dy in ((0.0, 0.0), (0.7, 0.7), (-0.7, 0.7), (0.7, -0.7), (-0.7, -0.7)):
             x, y = (a[0] + dx, a[1] + dy) if a != start else a
@@ -44,12 +44,12 @@ def legal(grant: CompiledGrant, start: tuple[float, float], way: Way, now: Situa
             assert verdict.action == "allow", (a, b, verdict)
 
 
-def test_nothing_in_the_way() -> None:
+def test_route_is_straight_without_obstacles() -> None:
     assert find(free(), (0, 0), (100, 50)) == ((100, 50),)
     assert find(free(), (5, 5), (5, 5)) == ((5, 5),)
 
 
-def test_around_a_wall_by_the_shorter_side() -> None:
+def test_route_passes_wall_on_the_shorter_side() -> None:
     grant = free(exclusion(box(-100, 40, 30, 50)))
     way = find(grant, (0, 0), (0, 100))
     assert way is not None
@@ -60,7 +60,7 @@ def test_around_a_wall_by_the_shorter_side() -> None:
     assert find(grant, (0, 0), (0, 100)) == way, "the same again"
 
 
-def test_there_may_be_no_way() -> None:
+def test_route_is_none_when_target_is_enclosed() -> None:
     hole = [(-10, 30), (10, 30), (10, 50), (-10, 50)]
     area = ring([(-20, 20), (20, 20), (20, 60), (-20, 60)])
     area["polygon"]["holes"] = [ring(hole)["polygon"]["exterior"]]  # type: ignore[list-item]
@@ -73,7 +73,7 @@ def test_there_may_be_no_way() -> None:
     assert find(grant, (0, 0), (0, -40), home=None) is None
 
 
-def test_bands_and_limits_of_altitude() -> None:
+def test_route_respects_altitude_bands_and_limits() -> None:
     low = free(exclusion(box(-100, 40, 30, 50), upper=20))
     assert find(low, (0, 0), (0, 100), alt=30) == ((0, 100),)
     assert len(find(low, (0, 0), (0, 100), alt=21) or ()) == 3, "too close above it"
@@ -85,10 +85,10 @@ def test_bands_and_limits_of_altitude() -> None:
     above_terrain = free(
         altitude(zones=[zone("low", box(-100, 40, 30, 50))], upperLimit=15, altitudeReference="terrain")
     )
-    assert len(find(above_terrain, (0, 0), (0, 100)) or ()) == 3, "no one knows how high that is"
+    assert len(find(above_terrain, (0, 0), (0, 100)) or ()) == 3, "the altitude is unknown"
 
 
-def test_inside_an_inclusion_zone() -> None:
+def test_route_stays_inside_inclusion_zone() -> None:
     corner: Corners = [(-20, -20), (100, -20), (100, 20), (20, 20), (20, 100), (-20, 100)]
     grant = free(inclusion(ring(corner)))
     way = find(grant, (0, 90), (90, 0))
@@ -101,7 +101,7 @@ def test_inside_an_inclusion_zone() -> None:
     assert find(banded, (0, 90), (90, 0), alt=20) is None
 
 
-def test_the_system_flies_the_corridor() -> None:
+def test_route_of_the_system_may_use_the_corridor() -> None:
     body = spec(
         exclusion(box(10, -60, 30, 5)),
         operationArea=[box(50, -20, 150, 20)], corridor=[box(-30, -30, 150, 30)], control="partial",
@@ -116,16 +116,16 @@ def test_the_system_flies_the_corridor() -> None:
     assert find_route((0, 0), (100, 40), now, grant, 10.0) is None, "outside"
 
 
-def test_a_straight_way_home_binds_every_waypoint() -> None:
+def test_route_requires_legal_straight_return_from_every_waypoint() -> None:
     wall = free(exclusion(box(-100, 40, 30, 50)))
-    assert find(wall, (60, 45), (0, 100), airframe=Airframe()) is None, "no way home from there"
+    assert find(wall, (60, 45), (0, 100), airframe=Airframe()) is None, "the return from there is blocked"
     assert find(wall, (60, 45), (0, 100)) is not None
     island = free(exclusion(box(30, -10, 50, 10)))
     way = find(island, (80, -60), (80, 60), airframe=Airframe())
     assert way == ((80, 60),)
 
 
-def test_from_a_start_too_close_to_a_zone_the_first_leg_leads_away() -> None:
+def test_route_leads_away_from_zone_when_start_is_too_close() -> None:
     grant = free(exclusion(box(-30, 1, 30, 40)))
     way = find(grant, (0, 0), (0, 60))
     assert way is not None
@@ -134,7 +134,7 @@ def test_from_a_start_too_close_to_a_zone_the_first_leg_leads_away() -> None:
     assert inside == ((0, -60),)
 
 
-def test_a_narrow_gap_is_used_when_there_is_no_wider_one() -> None:
+def test_route_uses_narrow_gap_when_no_wider_one_exists() -> None:
     gap = 2 * (2.5 + CLEARANCES_M[1]) + 0.6
     grant = free(exclusion(box(-500, 40, 0, 50), name="west"), exclusion(box(gap, 40, 500, 50), name="east"))
     way = find(grant, (-30, 0), (-30, 100))
@@ -145,7 +145,7 @@ def test_a_narrow_gap_is_used_when_there_is_no_wider_one() -> None:
 
 
 def _shortest(zones: list[Corners], start: tuple[float, float], to: tuple[float, float]) -> float:
-    """Dijkstra over all pairs of corners of finely buffered zones: slow, simple, and apart from the engine's search."""
+    """Dijkstra over all pairs of corners of finely buffered zones, independent of the engine's search."""
     walls = shapely.union_all([shapely.Polygon(z).buffer(2.5 + CLEARANCES_M[0], quad_segs=4) for z in zones])
     nodes = [start, to, *map(tuple, shapely.get_coordinates(walls.buffer(0.01)))]
     inner = walls.buffer(-1e-3)
@@ -164,7 +164,7 @@ def _shortest(zones: list[Corners], start: tuple[float, float], to: tuple[float,
 
 
 @pytest.mark.parametrize("seed", cells(range(4), quick=[1]))
-def test_no_way_is_much_longer_than_the_shortest(seed: int) -> None:
+def test_route_is_not_much_longer_than_the_shortest(seed: int) -> None:
     draw = random.Random(seed)
     zones: list[Corners] = []
     for x, y in itertools.product(range(20, 90, 34), repeat=2):
@@ -179,7 +179,7 @@ def test_no_way_is_much_longer_than_the_shortest(seed: int) -> None:
     assert best * 0.999 <= length((0, 0), way) <= best * 1.02
 
 
-def test_a_thousand_zones() -> None:
+def test_route_search_handles_a_thousand_zones() -> None:
     draw = random.Random(3)
     zones = []
     for i, (x, y) in enumerate(itertools.product(range(-960, 961, 60), repeat=2)):
@@ -194,7 +194,7 @@ def test_a_thousand_zones() -> None:
     legal(grant, (0, 0), way, at(airframe=RETRACING))
 
 
-def test_a_target_behind_a_wall_is_legal_for_a_drone_that_retraces_its_path() -> None:
+def test_goto_behind_wall_is_legal_when_the_autopilot_retraces_its_path() -> None:
     wall = free(exclusion(box(-100, 40, 30, 50)))
     behind = at(60, 100)
     assert judge(goto(0, 100), behind, wall).code == "WayHomeBlocked"
@@ -208,7 +208,7 @@ def test_a_target_behind_a_wall_is_legal_for_a_drone_that_retraces_its_path() ->
     assert "no legal route around it was found" in shut.reason
 
 
-def test_from_below_a_zone_too_close_overhead_the_first_leg_sinks() -> None:
+def test_route_first_leg_sinks_when_a_zone_is_too_close_overhead() -> None:
     grant = free(exclusion(box(-200, -200, 200, 200), lower=16), exclusion(box(50, 2, 70, 30), name="wall"))
     low = replace(RETRACING, return_altitude_m=10.0)
     now = at(60, 0, alt=14.5, airframe=low)
@@ -216,10 +216,10 @@ def test_from_below_a_zone_too_close_overhead_the_first_leg_sinks() -> None:
     assert way is not None
     assert judge(goto(*way[0], 13.0), now, grant).action == "allow"
     legal(grant, way[0], way[1:], at(alt=13.0, airframe=low))
-    assert find_route((60, 0), (60, 100), now, grant, 14.5) is None, "all of it too close below the zone"
+    assert find_route((60, 0), (60, 100), now, grant, 14.5) is None, "the whole route is too close below the zone"
 
 
-def test_only_the_first_leg_is_flown_at_both_altitudes() -> None:
+def test_route_checks_both_altitudes_on_the_first_leg_only() -> None:
     grant = free(exclusion(box(30, -60, 40, 10), name="wall"), exclusion(box(80, -60, 90, 60), upper=20))
     climbing = find_route((0, 0), (150, 0), at(alt=5, airframe=RETRACING), grant, 30.0, from_m=5.0)
     level = find_route((0, 0), (150, 0), at(alt=5, airframe=RETRACING), grant, 5.0)

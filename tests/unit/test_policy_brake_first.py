@@ -1,4 +1,4 @@
-"""Legs that a moving drone cannot begin: it stops first, where stop and leg are both legal."""
+"""Legs that a moving drone cannot begin: it stops first if stop and leg are both legal."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def lane(radius_m: float, *points: tuple[float, float], **changes: Any) -> Compi
     return compiled(operationArea=areas, **changes)
 
 
-def test_a_turn_back_inside_a_narrow_corridor() -> None:
+def test_goto_turning_back_in_narrow_corridor_brakes_first() -> None:
     grant = lane(7.0, (0, 0), (0, 80), (60, 80))
     assert judge(goto(50, 80), at(0.5, 79), grant).brake_first is False
     hot = judge(goto(50, 80), at(0.5, 74, north_mps=5), grant)
@@ -38,7 +38,7 @@ def test_a_turn_back_inside_a_narrow_corridor() -> None:
     assert isinstance(turning.args, GotoArgs)
 
 
-def test_what_it_says_after_the_stop_is_what_it_would_say_then() -> None:
+def test_goto_after_stop_gets_the_verdict_of_a_goto_from_standstill() -> None:
     grant = compiled(exclusion(box(10, 15, 30, 30)), altitude(upperLimit=15))
     moving = at(0, 0, east_mps=5)
     verdict = ask(grant, goto(0, 60, 40), moving)
@@ -48,7 +48,7 @@ def test_what_it_says_after_the_stop_is_what_it_would_say_then() -> None:
     assert (again.action, again.args, again.brake_first) == (verdict.action, verdict.args, False)
 
 
-def test_a_wide_turn_is_no_reason_to_take_the_drone_over() -> None:
+def test_goto_with_wide_turn_is_no_takeover() -> None:
     grant = compiled(exclusion(box(10, 15, 30, 30), "land"))
     assert ask(grant, goto(0, 60), at(0, 0, east_mps=5)).brake_first
     through = ask(grant, goto(20, 60), at(0, 0, east_mps=5))
@@ -56,14 +56,14 @@ def test_a_wide_turn_is_no_reason_to_take_the_drone_over() -> None:
     assert ask(grant, goto(20, 20), at(0, 0)).brake_first is False
 
 
-def test_no_stop_that_breaks_a_fence_itself() -> None:
+def test_goto_is_denied_when_the_stop_breaks_a_fence() -> None:
     ahead = compiled(exclusion(box(12, -20, 30, 20)))
     verdict = ask(ahead, goto(60, 60), at(0, 0, east_mps=9))
     assert not verdict.permits
     assert not verdict.brake_first
 
 
-def test_a_whole_leg_after_a_stop_beats_a_shortened_one() -> None:
+def test_goto_prefers_whole_leg_after_stop_to_shortened_leg() -> None:
     grant = compiled(exclusion(box(10, 15, 30, 30), "adjust"))
     verdict = ask(grant, goto(0, 60), at(0, 0, east_mps=5))
     assert verdict.brake_first
@@ -73,7 +73,7 @@ def test_a_whole_leg_after_a_stop_beats_a_shortened_one() -> None:
 
 
 @pytest.mark.parametrize("speed", [0.6, 2.0, 5.0, 8.0])
-def test_every_stop_it_offers_ends_where_it_is_legal(speed: float) -> None:
+def test_brake_first_stops_end_at_legal_positions(speed: float) -> None:
     grant = compiled(exclusion(box(10, 15, 30, 30)), inclusion(box(-40, -40, 60, 80)), operationArea=[])
     offered = 0
     for degrees in range(0, 360, 15):
@@ -88,7 +88,7 @@ def test_every_stop_it_offers_ends_where_it_is_legal(speed: float) -> None:
 
 
 RETRACES = Airframe(retraces=True)
-"""So that what is asked here is not denied for the way home."""
+"""Airframe that returns along its path, so that no request here is denied because of its return."""
 
 
 @pytest.mark.parametrize(
@@ -98,7 +98,7 @@ RETRACES = Airframe(retraces=True)
         ([(-6.1, 69.1), (-35.6, 79.5), (-48.8, 50.1), (-20.3, 45.2)], (-7.2, 79.3), (-0.3, -3.7), (-29.4, -12), 5.6),
     ],
 )
-def test_a_stop_that_need_not_lie_inside_a_zone_opens_no_way_through_it(
+def test_goto_through_zone_is_denied_when_the_drone_may_stop_before_it(
     corners: list[tuple[float, float]],
     start: tuple[float, float],
     velocity: tuple[float, float],
@@ -114,15 +114,15 @@ def test_a_stop_that_need_not_lie_inside_a_zone_opens_no_way_through_it(
     assert ask(grant, away, at(*start, airframe=RETRACES)).action == "allow", "at rest"
 
 
-def test_a_stop_that_need_not_lie_outside_an_area_opens_no_turn_beyond_its_border() -> None:
+def test_goto_outside_area_is_denied_when_the_drone_may_stop_inside() -> None:
     area = box(-50, -50, 20, 50)
     for grant in (compiled(operationArea=[area]), compiled(inclusion(area), operationArea=[])):
         leg = goto(10, 40, speed_mps=9.0)
-        assert not ask(grant, leg, at(6, 0, east_mps=5)).permits, "it may speed up already, or be told to stop in time"
+        assert not ask(grant, leg, at(6, 0, east_mps=5)).permits, "it may already accelerate, or be stopped in time"
         assert ask(grant, leg, at(14, 0, east_mps=5)).permits, "it comes too close whatever it does, and leads back"
 
 
-def test_a_faster_leg_needs_a_wider_turn() -> None:
+def test_goto_at_higher_speed_needs_wider_turn() -> None:
     grant = compiled(exclusion(box(6, 10, 30, 30)))
     slow = ask(grant, goto(0, 60), at(0, -2, east_mps=1.5, speed_setpoint_mps=1.0))
     assert (slow.action, slow.brake_first) == ("allow", False)
@@ -130,7 +130,7 @@ def test_a_faster_leg_needs_a_wider_turn() -> None:
     assert fast.brake_first or not fast.permits
 
 
-def test_a_drone_that_speeds_up_needs_more_room() -> None:
+def test_goto_of_accelerating_drone_needs_more_room() -> None:
     steady = stop_point(at(east_mps=4, speed_setpoint_mps=4), (0.0, 0.0))[0]
     known = stop_point(at(east_mps=4, speed_setpoint_mps=9, forward_mps2=0.0), (0.0, 0.0))[0]
     unknown = stop_point(at(east_mps=4, speed_setpoint_mps=9), (0.0, 0.0))[0]
@@ -139,7 +139,7 @@ def test_a_drone_that_speeds_up_needs_more_room() -> None:
     assert steady == known
     assert slowing < known - 2
     assert unknown == measured > steady + 3
-    # By hand, in steps: latency, easing off with the jerk limit, then ArduPilot's stopping distance.
+    # Computed in steps: latency, end of the acceleration by the jerk limit, then ArduPilot's stopping distance.
     x, v, a, t = 0.0, 4.0, 2.5, 0.0
     while t < 0.3 or a > 0:
         a = a if t < 0.3 else max(a - 5.0 * 1e-4, 0.0)
@@ -148,7 +148,7 @@ def test_a_drone_that_speeds_up_needs_more_room() -> None:
     assert unknown == pytest.approx(x, abs=0.05)
 
 
-def test_room_for_a_stop_while_it_turns() -> None:
+def test_goto_leaves_room_for_a_stop_during_the_turn() -> None:
     grant = compiled(exclusion(box(14, 7.5, 40, 30)))
     now = at(0, 0, east_mps=6, speed_setpoint_mps=6)
     leg = ask(grant, goto(-6, 60), now)
@@ -156,7 +156,7 @@ def test_room_for_a_stop_while_it_turns() -> None:
 
 
 @pytest.mark.parametrize("target", [(0, -50), (40, 0)])
-def test_a_stop_before_a_leg_enters_no_zone_at_a_height_that_is_not_allowed(target: tuple[float, float]) -> None:
+def test_stop_before_leg_enters_no_zone_at_forbidden_altitude(target: tuple[float, float]) -> None:
     low = compiled(altitude("low", [zone("ahead", box(-20, 12, 20, 60))], upperLimit=10))
     flying = at(alt=20, north_mps=8, speed_setpoint_mps=8)
     assert ask(low, goto(*target, 20), flying).code == "AltitudeAboveLimit"

@@ -1,4 +1,4 @@
-"""The continuous check: what it sees coming, and what it leaves alone."""
+"""Motion monitor: violations that it prevents, and motion that it permits."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from policy_world import NOW, altitude, at, box, compiled, exclusion, goto, incl
 WALL = box(-50, 50, 50, 90)
 
 
-def test_all_is_well() -> None:
+def test_monitor_returns_none_when_nothing_is_wrong() -> None:
     grant = compiled(exclusion(WALL), altitude(upperLimit=30), speed(upperLimit=10))
     assert monitor(at(), grant) is None
     assert monitor(at(0, 20, north_mps=5), grant) is None
     assert monitor(at(0, 60, in_air=False), grant) is None, "on the ground nothing moves"
 
 
-def test_a_drone_brakes_while_it_still_can() -> None:
+def test_monitor_stops_drone_while_it_can_still_brake() -> None:
     grant = compiled(exclusion(WALL))
     for y in range(10, 60):
         verdict = monitor(at(0, float(y), north_mps=8), grant)
@@ -35,7 +35,7 @@ def test_a_drone_brakes_while_it_still_can() -> None:
 
 
 @pytest.mark.parametrize("action", ["hover", "land", "returnToLaunch", "revoke"])
-def test_a_policy_that_takes_the_drone_takes_it(action: str) -> None:
+def test_monitor_takes_over_by_action_of_policy(action: str) -> None:
     grant = compiled(exclusion(WALL, action))
     for state in (at(0, 70), at(0, 40, north_mps=8)):
         verdict = monitor(state, grant)
@@ -43,14 +43,14 @@ def test_a_policy_that_takes_the_drone_takes_it(action: str) -> None:
         assert (verdict.action, verdict.takeover, verdict.policies) == ("takeover", action, ("no-fly",))
 
 
-def test_the_strictest_of_several_takes_it() -> None:
+def test_monitor_takes_over_by_most_restrictive_policy() -> None:
     grant = compiled(exclusion(WALL, "hover", "a"), exclusion(WALL, "revoke", "b"), exclusion(WALL, "ignore", "c"))
     verdict = monitor(at(0, 70), grant)
     assert verdict is not None
     assert verdict.policies == ("b",)
 
 
-def test_inside_a_zone_it_may_hover_or_leave_but_not_go_deeper() -> None:
+def test_monitor_lets_drone_inside_zone_hover_or_leave_but_not_go_deeper() -> None:
     grant = compiled(exclusion(WALL))
     assert monitor(at(0, 55), grant) is None
     assert monitor(at(0, 55, north_mps=-4), grant) is None
@@ -59,7 +59,7 @@ def test_inside_a_zone_it_may_hover_or_leave_but_not_go_deeper() -> None:
     assert deeper.code == "InsideExclusionZone"
 
 
-def test_bands_and_validity() -> None:
+def test_monitor_respects_altitude_bands_and_validity_windows() -> None:
     assert monitor(at(0, 70, 40), compiled(exclusion(WALL, "land", upper=20))) is None
     falling = at(0, 70, 26, down_mps=4)
     verdict = monitor(falling, compiled(exclusion(WALL, "land", upper=20)))
@@ -69,7 +69,7 @@ def test_bands_and_validity() -> None:
     assert monitor(replace(at(0, 70), time_s=NOW + 11), future) is not None
 
 
-def test_leaving_the_operation_area_or_an_inclusion_zone() -> None:
+def test_monitor_stops_drone_leaving_operation_area_or_inclusion_zone() -> None:
     leaving = monitor(at(0, 190, north_mps=6), compiled())
     assert leaving is not None
     assert (leaving.action, leaving.code) == ("deny", "OperationAreaBorderAhead")
@@ -80,7 +80,7 @@ def test_leaving_the_operation_area_or_an_inclusion_zone() -> None:
     assert (verdict.code, verdict.takeover) == ("InclusionBorderAhead", "returnToLaunch")
 
 
-def test_what_the_system_flies_is_stopped_only_where_it_makes_things_worse() -> None:
+def test_monitor_stops_system_flight_only_when_it_makes_things_worse() -> None:
     kept, out = compiled(inclusion(box(-50, -50, 50, 50), "land")), compiled(exclusion(WALL, "revoke"))
     for state, grant, code in (
         (at(0, 45, north_mps=6), kept, "InclusionBorderAhead"),
@@ -97,7 +97,7 @@ def test_what_the_system_flies_is_stopped_only_where_it_makes_things_worse() -> 
         assert monitor(state, grant) is not None
 
 
-def test_a_zone_that_is_left_hides_no_zone_ahead() -> None:
+def test_monitor_detects_zone_ahead_while_leaving_another() -> None:
     around, ahead = exclusion(box(-50, -50, 50, 10), "revoke", "around"), exclusion(WALL, "ignore", "ahead")
     verdict = monitor(at(0, 8, north_mps=12), compiled(around, ahead), system_flies=True)
     assert verdict is None
@@ -107,7 +107,7 @@ def test_a_zone_that_is_left_hides_no_zone_ahead() -> None:
 
 
 @pytest.mark.parametrize("forward_mps2", [None, 0.0, -2.5])
-def test_a_drone_on_its_way_into_a_zone_rests_before_it_begins_anything(forward_mps2: float | None) -> None:
+def test_drone_flying_into_zone_brakes_before_a_new_command(forward_mps2: float | None) -> None:
     grant, back = compiled(exclusion(WALL)), goto(0, 0)
     heading = replace(at(0, 29, north_mps=7.5), forward_mps2=forward_mps2)
     verdict = judge(back, heading, grant)
@@ -117,7 +117,7 @@ def test_a_drone_on_its_way_into_a_zone_rests_before_it_begins_anything(forward_
     assert judge(back, at(0, 10, north_mps=7.5), grant).brake_first is False
 
 
-def test_altitude_and_speed_are_corrected() -> None:
+def test_monitor_corrects_altitude_and_speed() -> None:
     grant = compiled(altitude(upperLimit=15), speed(upperLimit=5))
     high = monitor(at(alt=18), grant)
     assert high is not None
@@ -130,7 +130,7 @@ def test_altitude_and_speed_are_corrected() -> None:
     assert monitor(at(north_mps=5.5), grant) is None
 
 
-def test_an_altitude_limit_that_is_known_holds_beside_one_of_unknown_datum() -> None:
+def test_known_altitude_limit_holds_beside_limit_of_unknown_datum() -> None:
     grant = compiled(altitude(upperLimit=15), altitude("terrain", lowerLimit=5, altitudeReference="terrain"))
     high = monitor(at(alt=18), grant)
     assert high is not None
@@ -141,14 +141,14 @@ def test_an_altitude_limit_that_is_known_holds_beside_one_of_unknown_datum() -> 
     assert (climbing.action, climbing.code, climbing.takeover) == ("deny", "TerrainUnknown", "hover")
 
 
-def test_an_unknown_position_is_no_position() -> None:
+def test_monitor_takes_over_when_position_is_unknown() -> None:
     for state in (replace(at(), lat=None), at(north_mps=math.nan)):
         verdict = monitor(state, compiled())
         assert verdict is not None
         assert (verdict.action, verdict.takeover) == ("takeover", "hover")
 
 
-def test_a_takeover_of_a_fast_drone_begins_with_a_stop() -> None:
+def test_monitor_takeover_of_fast_drone_brakes_first() -> None:
     grant = compiled(exclusion(WALL, "returnToLaunch"))
     fast, slow = monitor(at(0, 40, north_mps=8), grant), monitor(at(0, 70), grant)
     assert fast is not None
@@ -156,7 +156,7 @@ def test_a_takeover_of_a_fast_drone_begins_with_a_stop() -> None:
     assert (fast.brake_first, slow.brake_first) == (True, False)
 
 
-def test_a_drone_that_creeps_over_a_border_is_stopped() -> None:
+def test_monitor_stops_drone_creeping_over_border() -> None:
     creeping = monitor(at(0, 49.9, north_mps=0.3), compiled(exclusion(WALL)))
     assert creeping is not None
     assert (creeping.action, creeping.takeover) == ("deny", "hover")
@@ -164,7 +164,7 @@ def test_a_drone_that_creeps_over_a_border_is_stopped() -> None:
     assert out is not None
 
 
-def test_lower_limits_hold_in_flight_but_not_for_a_landing() -> None:
+def test_monitor_ignores_lower_limits_while_landing() -> None:
     grant = compiled(altitude(lowerLimit=8, upperLimit=30))
     low = monitor(at(alt=4), grant)
     assert low is not None
@@ -174,23 +174,23 @@ def test_lower_limits_hold_in_flight_but_not_for_a_landing() -> None:
     assert monitor(at(alt=7), grant) is None, "within what the autopilot strays"
 
 
-def test_no_correction_leads_into_a_zone() -> None:
+def test_monitor_correction_never_leads_into_zone() -> None:
     under = exclusion(box(-50, -50, 50, 50), upper=20, name="under")
     stuck = monitor(at(alt=30), compiled(under, altitude(upperLimit=15)))
     assert stuck is not None
     assert (stuck.action, stuck.takeover, stuck.args) == ("deny", "hover", None)
 
 
-def test_a_zone_that_appears_around_a_flying_drone() -> None:
+def test_monitor_handles_zone_appearing_around_drone() -> None:
     for action, want in (("ignore", None), ("hover", "hover"), ("land", "land"), ("revoke", "revoke")):
         verdict = monitor(at(0, 70, north_mps=-4), compiled(exclusion(WALL, action)))
-        assert (verdict.takeover if verdict else None) == want, "it leaves by itself, where the policy lets it"
+        assert (verdict.takeover if verdict else None) == want, "it leaves without a command if the policy permits"
     deeper = monitor(at(0, 60, north_mps=6), compiled(exclusion(WALL, "adjust")))
     assert deeper is not None
     assert (deeper.action, deeper.takeover) == ("deny", "hover")
 
 
-def test_a_climb_to_an_altitude_that_is_allowed_is_let_pass_though_the_link_is_slow() -> None:
+def test_monitor_permits_climb_to_allowed_altitude_despite_link_latency() -> None:
     grant = compiled(altitude(upperLimit=16))
     leg = goto(100, 0, 16.0).args
     assert isinstance(leg, GotoArgs)
@@ -207,8 +207,8 @@ def test_a_climb_to_an_altitude_that_is_allowed_is_let_pass_though_the_link_is_s
     assert correction(monitor(fast, grant, current_leg=higher)) == "AltitudeAboveLimit"
 
 
-def test_a_leg_that_a_new_zone_crosses_is_stopped_at_once() -> None:
-    """Not where it has to be: by then the link may be cut."""
+def test_monitor_stops_leg_crossing_new_zone_at_once() -> None:
+    """The stop is not delayed to the last possible moment, because the link may be cut by then."""
     leg, climbing, short = goto(180, 0, 12.0).args, goto(180, 0, 30.0).args, goto(60, 0, 12.0).args
     assert isinstance(leg, GotoArgs)
     assert isinstance(climbing, GotoArgs)
@@ -227,7 +227,7 @@ def test_a_leg_that_a_new_zone_crosses_is_stopped_at_once() -> None:
     assert monitor(flying, around, current_leg=leg, fences_changed=True, system_flies=True) is None, "it leads out"
 
 
-def test_a_climb_that_ends_by_a_velocity_is_let_pass_though_the_link_is_slow() -> None:
+def test_monitor_permits_climb_ended_by_velocity_despite_link_latency() -> None:
     grant, up, level = compiled(altitude(upperLimit=16)), (0.0, 0.0, -2.6), (1.0, 0.0, 0.0)
     climbing = at(0, 0, 12.5, down_mps=-2.6, latency_s=0.77)
     assert monitor(replace(climbing, pending=(up, level)), grant) is None
@@ -250,7 +250,7 @@ AROUND = box(-50, -50, 50, 50)
         (False, -2.0, lambda action: compiled(inclusion(AROUND, action, lower=15))),
     ],
 )
-def test_a_drone_is_stopped_below_and_above_what_is_closed_to_it(
+def test_monitor_stops_drone_below_and_above_altitude_band(
     action: str, above: bool, climb_mps: float, grant: Any
 ) -> None:
     grant, up = grant(action), 1 if above else -1
@@ -263,20 +263,20 @@ def test_a_drone_is_stopped_below_and_above_what_is_closed_to_it(
             stopped.append(height)
     stop_m = 2 * (0.3 + 0.1) + 0.5 + 2.0
     assert stop_m < (15 - stopped[0]) * up < stop_m + 1.5, "neither too early nor too late"
-    assert len(stopped) > 100, "also once it is there"
+    assert len(stopped) > 100, "also after it has entered"
     away = at(0, 0, 15 + up, down_mps=climb_mps)
     assert (monitor(away, grant) is None) is (action == "ignore"), "it may turn back"
     assert monitor(at(0, 0, 15 - 3 * up), grant) is None
     assert monitor(at(60 * up, 0, 12, down_mps=-climb_mps), compiled(exclusion(AROUND, lower=15))) is None
 
 
-def test_a_drone_that_creeps_up_into_a_zone_is_stopped() -> None:
+def test_monitor_stops_drone_creeping_up_into_zone() -> None:
     verdict = monitor(at(0, 0, 14.9, down_mps=-0.2), compiled(exclusion(AROUND, lower=15)))
     assert verdict is not None
     assert verdict.takeover == "hover"
 
 
-def test_a_climb_to_below_a_zone_is_let_pass_and_so_is_a_landing() -> None:
+def test_monitor_permits_climb_to_below_zone_and_landing() -> None:
     grant = compiled(exclusion(AROUND, "returnToLaunch", lower=18))
     leg = goto(0, 0, 16.0).args
     assert isinstance(leg, GotoArgs)
@@ -293,11 +293,11 @@ def test_a_climb_to_below_a_zone_is_let_pass_and_so_is_a_landing() -> None:
 
 
 def correction(verdict: Verdict | None) -> str:
-    """The code of a correction."""
+    """Return the code of a correction."""
     return verdict.code if verdict is not None and verdict.action == "correct" else ""
 
 
-def test_a_climb_that_was_never_judged_is_ended_with_half_the_slack_left() -> None:
+def test_monitor_ends_unjudged_climb_at_half_the_tolerance() -> None:
     grant = compiled(altitude(upperLimit=10))
     climbing = at(0, 0, 10.8, down_mps=-0.7)
     assert correction(monitor(climbing, grant, system_flies=True)) == "AltitudeAboveLimit"

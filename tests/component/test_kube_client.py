@@ -15,6 +15,8 @@ from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
 from fractus_cluster.pki import Authority
 from fractus_runtime.kubernetes import (
     BlockingClient,
@@ -339,6 +341,41 @@ async def test_a_credential_plugin_is_asked_again_when_its_token_is_refused(tmp_
         server.token = "two"
         (tmp_path / "token").write_text("two")
         assert await client.get(ZONE, "a") == OBJECT
+
+
+async def test_server_certificate_without_authority_key_identifier_is_accepted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    credential = Authority(tmp_path).issue("server", common_name="s", alternative_names=("localhost",))
+    key = serialization.load_pem_private_key(credential.key.read_bytes(), None)
+    ca_key = serialization.load_pem_private_key((tmp_path / "ca.key").read_bytes(), None)
+    original = x509.load_pem_x509_certificate(credential.certificate.read_bytes())
+    builder = x509.CertificateBuilder(
+        original.issuer, original.subject, key.public_key(), x509.random_serial_number(),
+        original.not_valid_before_utc, original.not_valid_after_utc,
+    )  # fmt: skip
+    for extension in original.extensions:
+        if not isinstance(extension.value, x509.AuthorityKeyIdentifier):
+            builder = builder.add_extension(extension.value, extension.critical)
+    credential.certificate.write_bytes(
+        builder.sign(ca_key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)  # type: ignore[arg-type]
+    )
+    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+    context.load_cert_chain(credential.certificate, credential.key)
+    default_context = ssl.create_default_context
+
+    def strict_context(*args: Any, **kwargs: Any) -> ssl.SSLContext:
+        """Create a context with the defaults of Python 3.13."""
+        strict = default_context(*args, **kwargs)
+        strict.verify_flags |= ssl.VERIFY_X509_STRICT
+        return strict
+
+    monkeypatch.setattr(ssl, "create_default_context", strict_context)
+    server = Server(answer(OBJECT))
+    async with listening(server, context):
+        access = with_certificate(server.url.replace("127.0.0.1", "localhost"), tmp_path / "ca.crt")
+        async with contextlib.aclosing(Client(access, "tests")) as client:
+            assert await client.get(ZONE, "a") == OBJECT
 
 
 async def test_a_certificate_of_an_unknown_authority_is_one_sentence(tmp_path: Path) -> None:

@@ -1,10 +1,13 @@
-"""What a component of a Fractus application imports."""
+"""SDK for components of Fractus applications: drone, camera, and requests between components."""
 
 from fractus import sync as sync
 from fractus.control import Control as Control
+from fractus.control_point import Circle as Circle
+from fractus.control_point import ControlPoint as ControlPoint
+from fractus.control_point import Polygon as Polygon
 from fractus.drone import Mobility as Mobility
 from fractus.drone import mobility as mobility
-from fractus.dry_runs import CanI as CanI
+from fractus.dry_run import CanI as CanI
 from fractus.environment import Endpoint as Endpoint
 from fractus.environment import control_points as control_points
 from fractus.environment import egress as egress
@@ -34,18 +37,15 @@ from fractus.exchange import Request as Request
 from fractus.exchange import Requester as Requester
 from fractus.exchange import Responder as Responder
 from fractus.exchange import requester as requester
-from fractus.missions import Mission as Mission
-from fractus.missions import MissionProgress as MissionProgress
-from fractus.missions import Waypoint as Waypoint
-from fractus.missions import orbit as orbit
-from fractus.missions import read_plan as read_plan
-from fractus.motions import Motion as Motion
+from fractus.mission import Mission as Mission
+from fractus.mission import MissionProgress as MissionProgress
+from fractus.mission import Waypoint as Waypoint
+from fractus.mission import orbit as orbit
+from fractus.mission import read_plan as read_plan
+from fractus.motion import Motion as Motion
 from fractus.pictures import Camera as Camera
 from fractus.pictures import camera as camera
-from fractus.running import run as run
-from fractus.tasks import Circle as Circle
-from fractus.tasks import ControlPoint as ControlPoint
-from fractus.tasks import Polygon as Polygon
+from fractus.runner import run as run
 from fractus.telemetry import Battery as Battery
 from fractus.telemetry import Fix as Fix
 from fractus.telemetry import Gps as Gps
@@ -66,7 +66,7 @@ from fractus.values import Position as Position
 from fractus.values import PositionResult as PositionResult
 from fractus.values import Progress as Progress
 from fractus.values import Result as Result
-from fractus.values import Ride as Ride
 from fractus.values import SpeedResult as SpeedResult
+from fractus.values import TourProgress as TourProgress
 from fractus.values import Velocity as Velocity
 from fractus.values import VelocityResult as VelocityResult

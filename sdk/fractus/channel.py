@@ -1,4 +1,4 @@
-"""A mutually authenticated connection to a node service that outlives its restarts and our certificates."""
+"""Mutually authenticated gRPC channel to a node service that survives service restarts and certificate renewal."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from fractus.tracing import traced
 
 CALL_TIMEOUT_S = 10.0
 RECONNECT_TIMEOUT_S = 30.0
-"""How long a call waits for a service that is restarting: once it runs it gives a drone's driver 15 s to come back."""
+"""Time for which a call retries while the service restarts. After its start, the service gives a driver 15 s to reconnect."""
 
 MAX_RETRY_DELAY_S = 2.0
-"""The longest pause between two attempts."""
+"""Longest delay between two attempts."""
 
 NOT_RETRIED = frozenset({"Arm", "SetVelocity"})
-"""Methods that are for this moment: repeated late, they would do what is no longer wanted."""
+"""Methods that are not retried, because a late repetition would have an effect that the caller no longer expects."""
 
 _OPTIONS = (
     ("grpc.keepalive_time_ms", 10_000),
@@ -33,7 +33,7 @@ _OPTIONS = (
     ("grpc.keepalive_permit_without_calls", 0),
     ("grpc.http2.max_pings_without_data", 0),
     ("grpc.initial_reconnect_backoff_ms", 100),
-    ("grpc.min_reconnect_backoff_ms", 5_000),  # as long may a handshake take on a busy node
+    ("grpc.min_reconnect_backoff_ms", 5_000),  # a handshake may take this long on a busy node
     ("grpc.max_reconnect_backoff_ms", 1_000),
     ("grpc.enable_retries", 0),
     ("grpc.enable_http_proxy", 0),
@@ -48,7 +48,7 @@ _Stamp = tuple[tuple[int, int, int], ...]
 def backoff(
     first_s: float = 0.1, cap_s: float = MAX_RETRY_DELAY_S, rng: random.Random | None = None
 ) -> Iterator[float]:
-    """Delays that double from `first_s` to `cap_s`, each jittered down by up to half."""
+    """Yield delays in seconds that double from `first_s` to `cap_s`, each reduced by a random jitter of up to 50 %."""
     draw = (rng or random).uniform
     delay = first_s
     while True:
@@ -66,10 +66,10 @@ class _Connection:
 
 
 class ServiceChannel:
-    """Calls on one service of one node.
+    """gRPC channel to one service of one node.
 
-    Certificates are read again when their files change: calls that begin then use a new connection, and the old one
-    closes after its last call, so that renewal never interrupts a flight.
+    When the certificate files change, new calls use a new connection. The old connection is closed after its last
+    call, so certificate renewal never interrupts a flight.
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class ServiceChannel:
         self._outdated: weakref.WeakSet[grpc.aio.AioRpcError] = weakref.WeakSet()
 
     async def close(self) -> None:
-        """Close every connection; calls in flight are cancelled."""
+        """Close all connections and cancel their calls."""
         connections = [*self._retired, *([self._connection] if self._connection else [])]
         self._retired.clear()
         self._connection = None
@@ -99,15 +99,15 @@ class ServiceChannel:
 
     @asynccontextmanager
     async def stub(self) -> AsyncIterator[Any]:
-        """The service's stub on a connection that stays open until the block ends."""
+        """Return the service's stub on a connection that stays open until the block ends."""
         connection = self._current()
         connection.calls += 1
         try:
             yield connection.stub
         except grpc.aio.AioRpcError as error:
-            # A stream may outlive the certificate that it was opened with.
+            # The service ends a stream when the certificate that opened the connection expires.
             if error.code() is grpc.StatusCode.UNAUTHENTICATED and connection.stamp != self._stamp():
-                # All that were opened with it end together.
+                # All calls of this connection end together and may be retried with the new certificate.
                 self._outdated.add(error)
             raise
         finally:
@@ -115,14 +115,16 @@ class ServiceChannel:
             await self._close_unused()
 
     def transient(self, error: grpc.aio.AioRpcError) -> bool:
-        """Whether another attempt may succeed: the service is away, or the certificate was renewed since the call began."""
+        """Return True if a retry may succeed: the service is unreachable, or the certificate was renewed during the call."""
         return error in self._outdated or error.code() is grpc.StatusCode.UNAVAILABLE
 
     async def unary(self, method: str, request: Any, *, timeout_s: float | None = None) -> Any:
-        """One call with a deadline; while the service restarts it is tried again, for `reconnect_timeout_s` at most, unless in `NOT_RETRIED`.
+        """Call a method with a deadline.
+
+        The call is retried for at most `reconnect_timeout_s` while the service restarts, unless it is in `NOT_RETRIED`.
 
         Raises:
-            FractusError: one of the typed errors; `Unavailable` when the service did not come back.
+            FractusError: One of the typed errors; `Unavailable` if the service did not return in time.
         """
         retries = Retries(self, method, retried=method not in NOT_RETRIED)
         while True:
@@ -133,10 +135,10 @@ class ServiceChannel:
                 await retries.pause(error)
 
     async def stream(self, method: str, request: Any) -> AsyncGenerator[Any, None]:
-        """The messages of a stream that is opened again after the service restarts.
+        """Yield the messages of a stream, and reopen it after the service restarts.
 
         Raises:
-            FractusError: one of the typed errors; `Unavailable` when the service did not come back.
+            FractusError: One of the typed errors; `Unavailable` if the service did not return in time.
         """
         retries = Retries(self, method)
         while True:
@@ -173,10 +175,10 @@ class ServiceChannel:
 
     def _stamp(self) -> _Stamp:
         try:
-            found = [(self._endpoint.tls_dir / name).stat() for name in _FILES]
+            files = [(self._endpoint.tls_dir / name).stat() for name in _FILES]
         except OSError as error:
             raise self._unreadable(error) from None
-        return tuple((s.st_mtime_ns, s.st_size, s.st_ino) for s in found)
+        return tuple((s.st_mtime_ns, s.st_size, s.st_ino) for s in files)
 
     @staticmethod
     def _unreadable(error: OSError) -> NotConfigured:
@@ -184,18 +186,19 @@ class ServiceChannel:
 
     def _connect(self) -> _Connection:
         stamp = self._stamp()
-        for _ in range(3):  # until no file changed while we read: key and certificate must belong together
+        for _ in range(3):  # Retry if a file changed during reading, because key and certificate must belong together.
             try:
                 ca, key, chain = ((self._endpoint.tls_dir / name).read_bytes() for name in _FILES)
             except OSError as error:
                 raise self._unreadable(error) from None
-            before, stamp = stamp, self._stamp()
-            if before == stamp:
+            previous_stamp = stamp
+            stamp = self._stamp()
+            if previous_stamp == stamp:
                 break
         for name, content in zip(_FILES, (ca, key, chain), strict=True):
-            # gRPC itself would only fail to connect, indefinitely and without a word of this.
+            # With an invalid PEM file, gRPC would retry the connection indefinitely without reporting the cause.
             if b"-----BEGIN " not in content:
-                raise NotConfigured(f"{self._endpoint.tls_dir / name} is no PEM file; {_REMEDY}")
+                raise NotConfigured(f"{self._endpoint.tls_dir / name} is not a PEM file; {_REMEDY}")
         credentials = grpc.ssl_channel_credentials(ca, key, chain)
         options = (*_OPTIONS, ("grpc.ssl_target_name_override", self._endpoint.server_name))
         channel = grpc.aio.secure_channel(self.address, credentials, options=options)
@@ -203,13 +206,13 @@ class ServiceChannel:
 
 
 class Retries:
-    """The pauses between attempts at one call while its service restarts, and when to give up.
+    """Retry policy of one call while its service restarts: delays, and when to give up.
 
     Args:
-        channel: where the call goes.
-        method: what is called.
-        max_delay_s: the longest pause.
-        retried: whether the call may be tried again at all.
+        channel: Channel of the call.
+        method: Name of the method, for error messages.
+        max_delay_s: Longest delay between two attempts, in seconds.
+        retried: False if the call must not be retried.
     """
 
     def __init__(
@@ -222,17 +225,21 @@ class Retries:
         self.reset()
 
     def reset(self) -> None:
-        """The service has answered: the next failure is a first one."""
+        """Reset delays and deadline after a response of the service."""
         self._delays = backoff(cap_s=self._max_delay_s)
         self._give_up: float | None = None
 
     async def pause(self, error: grpc.aio.AioRpcError | None = None) -> None:
-        """Wait before the next attempt, after a failure or the end of a stream (None).
+        """Wait before the next attempt.
+
+        Args:
+            error: Failure of the last attempt; None if the service ended the stream.
 
         Raises:
-            FractusError: there is no other attempt; this is why.
+            FractusError: The reason why there is no further attempt.
         """
-        now, delay = asyncio.get_running_loop().time(), next(self._delays)
+        now = asyncio.get_running_loop().time()
+        delay = next(self._delays)
         self._give_up = self._give_up or now + self._channel.reconnect_timeout_s
         transient = error is None or self._channel.transient(error)
         if not (transient and self._retried) or now + delay > self._give_up:
@@ -243,7 +250,7 @@ class Retries:
 
 
 class ServiceClient:
-    """A client of one service of one node; `async with` closes it."""
+    """Client of one service of one node, as an asynchronous context manager that closes the connection."""
 
     _channel: ServiceChannel
 

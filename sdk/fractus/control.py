@@ -1,4 +1,4 @@
-"""Control of the drone: taken, kept alive in the background, lost, returned."""
+"""Control lease of a driver: acquire, keep alive, detect loss, return."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ import grpc.aio
 from fractus_proto.v1 import mobility_pb2
 
 from fractus.channel import Retries, ServiceChannel
+from fractus.control_point import ControlPoint
 from fractus.errors import ControlLost, FractusError, MissionComplete, NotConfigured, Unavailable
-from fractus.tasks import ControlPoint
 from fractus.values import Position
 
 _log = logging.getLogger("fractus")
 _Event = mobility_pb2.ControlEvent
 
 MAX_RETRY_DELAY_S = 0.5
-"""The longest pause between requests for control while the service restarts: the drone hovers meanwhile, and not for long."""
+"""Longest delay between requests for control while the service restarts. The drone hovers only for the grace period."""
 
 
 OnWait = Callable[[str], None]
-"""Told what is waited for: "the autopilot is not ready to arm: ..."."""
+"""Callback for the reason why control is not granted yet, for example "the autopilot is not ready to arm: ..."."""
 
 
 class Control:
-    """The right to move the drone, for one control point.
+    """Control lease for one control point: the right to move the drone.
 
-    The stream behind it is this component's sign of life: while it is open the drone is ours, and when the process dies
-    the system hovers and then flies home. If the service restarts, the stream is opened again and motions go on.
+    The lease lasts while its stream is open. If the process ends, the drone hovers, and after the grace period the
+    system flies it home. If the service restarts, the stream is reopened and motions continue.
 
-    Use it as `async with drone.control() as control:`. Leaving the block normally returns control; leaving it by an
-    exception does not, so that the system, or this component after a restart, decides what comes next.
+    Use it as `async with drone.control() as control:`. Leaving the block normally returns control. Leaving it by an
+    exception does not return control, so that this component can continue after a restart.
     """
 
     def __init__(
@@ -54,29 +54,29 @@ class Control:
         self._interrupted = False
         self._cancellations = 0
         self.control_point = 0
-        """Index of the control point that this is for."""
+        """Index of the control point, from 0."""
         self.task = ControlPoint("")
-        """What is to be done there: path or region, as the application declares them; known once control is ours."""
+        """Path or region of the control point, as declared by the application. Valid after control was granted."""
         self.waypoints_reached = 0
-        """How many of its waypoints are done with, in this life of the component and in earlier ones."""
+        """Number of completed waypoints, including those of earlier runs of this component."""
         self.begun: Sequence[object] | None = None
-        """The waypoints of its mission, once that was begun; `waypoints_reached` counts them."""
+        """Waypoints of the mission that was started at this control point, which `waypoints_reached` counts; None if there is none."""
         self.mission_complete = False
-        """After control was returned: whether that was the last control point."""
+        """True after control of the last control point was returned."""
 
     @property
     def lost(self) -> FractusError | None:
-        """Why control was lost; None while it is ours."""
+        """Reason why control was lost; None while it is held."""
         return self._lost
 
     async def acquire(self) -> Self:
-        """Wait until the drone is at the control point and is ours.
+        """Wait until the drone is at the control point and control is granted.
 
         Raises:
-            MissionComplete: this component has nothing left to fly.
-            ControlLost: the system or a pilot keeps the drone.
-            PolicyDenied: this component may not drive.
-            Unavailable: the service did not answer, or the wait was longer than the timeout.
+            MissionComplete: All control points of this component are complete.
+            ControlLost: The system or a pilot keeps the drone.
+            PolicyDenied: This component may not drive.
+            Unavailable: The service did not respond, or the timeout expired.
         """
         self._watcher = asyncio.create_task(self._watch(), name="fractus-control")
         try:
@@ -91,10 +91,10 @@ class Control:
         return self
 
     async def ready(self) -> None:
-        """Wait while the service restarts.
+        """Wait until control is granted again after a restart of the service.
 
         Raises:
-            FractusError: why control is lost.
+            FractusError: The reason why control was lost.
         """
         if self._watcher is None:
             raise ControlLost("control was not taken; use `async with drone.control():`")
@@ -109,10 +109,10 @@ class Control:
             raise ControlLost("control was returned")
 
     async def release(self) -> bool:
-        """Return control at the end of this control point's task.
+        """Return control at the end of the control point's task.
 
         Returns:
-            Whether that was the last one; the system then flies the drone home.
+            True if this was the last control point. The system then flies the drone home.
         """
         self._returning = True
         try:
@@ -123,19 +123,19 @@ class Control:
         return self.mission_complete
 
     async def report(self, waypoints: int) -> None:
-        """Remember, on the drone, how many waypoints of the task are done with: a restart goes on after them.
+        """Store the number of completed waypoints on the drone. After a restart, the component continues there.
 
         Args:
-            waypoints: reached or passed over; a number below the one before changes nothing.
+            waypoints: Number of reached or skipped waypoints. A lower number than before has no effect.
         """
         await self._channel.unary("ReportProgress", mobility_pb2.ReportProgressRequest(waypoints=waypoints))
         self.waypoints_reached = max(self.waypoints_reached, waypoints)
 
     async def remaining(self, waypoints: Sequence[Position] | None = None) -> AsyncGenerator[Position, None]:
-        """The waypoints that no life of this component is done with; each is reported when the next one is asked for.
+        """Yield the waypoints that are not completed yet, and report each one when the next one is requested.
 
         Args:
-            waypoints: the same ones in each life; by default the task's path.
+            waypoints: Waypoints, the same in every run of this component; by default the path of the control point.
         """
         todo = self.task.path if waypoints is None else waypoints
         for number in range(self.waypoints_reached, len(todo)):
@@ -143,7 +143,7 @@ class Control:
             await self.report(number + 1)
 
     async def abandon(self) -> None:
-        """Let the stream break without returning control: the system hovers, then flies home."""
+        """Close the stream without returning control: the drone hovers, then the system flies it home."""
         self._returning = True
         self._granted.clear()
         if self._watcher is not None:
@@ -151,11 +151,11 @@ class Control:
             await asyncio.gather(self._watcher, return_exceptions=True)
 
     def begin(self, call: Any) -> None:
-        """Register a motion's call, to be stopped when control is lost."""
+        """Register the call of a motion, which is cancelled when control is lost."""
         self._calls[call] = asyncio.current_task()
 
     def end(self, call: Any) -> None:
-        """Forget a motion's call."""
+        """Unregister the call of a motion."""
         self._calls.pop(call, None)
 
     async def __aenter__(self) -> Self:
@@ -166,7 +166,8 @@ class Control:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        owner, self._owner = self._owner, None
+        owner = self._owner
+        self._owner = None
         if kind is None and self._lost is None:
             await self.release()
             return
@@ -175,13 +176,13 @@ class Control:
         except asyncio.CancelledError:
             if not self._interrupted:
                 raise
-        # As in asyncio.timeout: only a cancellation that was ours becomes an error of ours.
-        ours = self._interrupted and owner is not None and owner.uncancel() <= self._cancellations
-        if self._lost is not None and (kind is None or (ours and kind is asyncio.CancelledError)):
+        # As in asyncio.timeout: only a cancellation by this object is converted to an error.
+        cancelled_here = self._interrupted and owner is not None and owner.uncancel() <= self._cancellations
+        if self._lost is not None and (kind is None or (cancelled_here and kind is asyncio.CancelledError)):
             raise self._lost from error
 
     async def _watch(self) -> None:
-        """Keep the stream open; ends when control is lost or was returned."""
+        """Keep the stream open until control is lost or returned."""
         retries = Retries(self._channel, "GetControl", max_delay_s=MAX_RETRY_DELAY_S)
         while True:
             error: grpc.aio.AioRpcError | None = None
@@ -190,7 +191,7 @@ class Control:
             except grpc.aio.AioRpcError as failed:
                 error = failed
             except NotConfigured as failed:
-                # A certificate that is not there, or not one: no other attempt would find it.
+                # The certificate is missing or invalid, so a retry cannot succeed.
                 self._lose(failed)
                 return
             if self._returning or self._lost is not None:
@@ -229,7 +230,7 @@ class Control:
                     return
 
     def _lose(self, reason: FractusError) -> None:
-        """Remember why, and stop what the component is doing with the drone."""
+        """Store the reason, and cancel the motions of this component."""
         if self._held and not isinstance(reason, (ControlLost, MissionComplete)):
             reason = ControlLost(str(reason))
         self._lost = reason

@@ -1,4 +1,4 @@
-"""The drone that this component rides on: motion, state, and control of it."""
+"""Client of the mobility service: motion, state and control of the drone."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc
 
 from fractus.channel import CALL_TIMEOUT_S, RECONNECT_TIMEOUT_S, ServiceChannel, ServiceClient
 from fractus.control import Control, OnWait
-from fractus.dry_runs import CanI
+from fractus.dry_run import CanI
 from fractus.environment import Endpoint, endpoint
 from fractus.errors import ControlLost, Corrected
-from fractus.missions import Mission, Waypoint
-from fractus.motions import Motion, OnProgress
-from fractus.requests import gimbal_request, goto_request, speed_request, takeoff_request, velocity_request
+from fractus.mission import Mission, Waypoint
+from fractus.motion import Motion, OnProgress
+from fractus.proto_requests import gimbal_request, goto_request, speed_request, takeoff_request, velocity_request
 from fractus.telemetry import Telemetry, Watch
 from fractus.values import (
     AltitudeReference,
@@ -25,29 +25,29 @@ from fractus.values import (
     PositionResult,
     Progress,
     Result,
-    Ride,
     SpeedResult,
+    TourProgress,
     Velocity,
     VelocityResult,
 )
 
 ARM_TIMEOUT_S = 60.0
-"""An autopilot is ready some 40 s after it was switched on."""
+"""An autopilot is ready about 40 s after power-on."""
 
 R = TypeVar("R", bound=Result)
 
 
 class Mobility(ServiceClient):
-    """The mobility service of the node that this component runs on.
+    """Client of the mobility service of this component's node.
 
-    Passengers may ask where the drone is; a driver takes control and then moves it. Every answer tells what policies
-    made of the call (`result.decision`, `result.corrected`).
+    Passengers may read the drone's state. A driver acquires control and then moves the drone. Every result contains the
+    decision of the policy engine (`result.decision`, `result.corrected`).
 
     Args:
-        endpoint: where the service is; by default, what the pod's environment says.
-        strict: raise `Corrected` instead of accepting what a policy corrected.
-        timeout_s: deadline of each call that is not a motion.
-        reconnect_timeout_s: how long to wait for a service that is restarting.
+        endpoint: Address and certificates of the service.
+        strict: Raise `Corrected` instead of accepting a correction by a policy.
+        timeout_s: Deadline of each call that is not a motion, in seconds.
+        reconnect_timeout_s: Time for which calls wait for a restarting service, in seconds.
     """
 
     def __init__(
@@ -65,20 +65,20 @@ class Mobility(ServiceClient):
         self.can_i = CanI(self._check)
         """Dry runs: `await drone.can_i.goto(lat, lon, 20)`."""
         self.watch = Watch(self.telemetry)
-        """One thing of the drone's state, each time it changes: `async for gps in drone.watch.gps()`."""
+        """Changes of one part of the drone's state: `async for gps in drone.watch.gps()`."""
 
     async def close(self) -> None:
-        """Close the connection; control that is still held breaks off."""
+        """Close the connection. Control that is still held is abandoned."""
         if self._control is not None:
             await self._control.abandon()
         await super().close()
 
     def control(self, *, timeout_s: float | None = None, progress: OnWait | None = None) -> Control:
-        """Control of the drone for the next control point, as a context manager.
+        """Return the control lease for the next control point, as a context manager.
 
         Args:
-            timeout_s: how long to wait for it; by default as long as the drone takes to get there.
-            progress: called with what is waited for, each time that changes.
+            timeout_s: Longest wait for control, in seconds; by default unlimited.
+            progress: Callback for the reason of the wait, called on every change.
         """
         self._control = Control(self._channel, timeout_s=timeout_s, progress=progress)
         return self._control
@@ -87,23 +87,23 @@ class Mobility(ServiceClient):
         """Start the motors.
 
         Args:
-            timeout_s: how long the service asks an autopilot again that is not ready yet.
+            timeout_s: Time for which the service repeats the command while the autopilot is not ready, in seconds.
         """
         return await self._unary("Arm", mobility_pb2.ArmRequest(), timeout_s=timeout_s)
 
     async def disarm(self) -> Result:
-        """Stop the motors; refused in the air."""
+        """Stop the motors. The call is refused in the air."""
         return await self._unary("Disarm", mobility_pb2.DisarmRequest())
 
     async def hover(self) -> Result:
-        """Stop and stay."""
+        """Stop and hold the position."""
         return await self._unary("Hover", mobility_pb2.HoverRequest())
 
     async def set_speed(self, speed_mps: float) -> SpeedResult:
-        """Fly at this speed over ground from now on.
+        """Set the ground speed of further motions, in metres per second.
 
         Returns:
-            The speed in force, after correction.
+            The speed after correction.
         """
         reply = await self._call("SetSpeed", speed_request(speed_mps))
         return self._judged(SpeedResult(decision=Decision.from_proto(reply.decision), speed_mps=reply.speed_mps))
@@ -117,19 +117,19 @@ class Mobility(ServiceClient):
         yaw_deg: float | None = None,
         hold_s: float = 0.0,
     ) -> VelocityResult:
-        """Fly with this velocity over ground until the next one is set.
+        """Fly with this velocity over ground until the next setpoint.
 
-        When no other follows in time, the drone hovers: call this again and again, ten times a second say.
+        If no setpoint follows within `hold_s`, the drone hovers. Repeat the call, for example ten times per second.
 
         Args:
-            north_mps: metres per second.
-            east_mps: metres per second.
-            down_mps: metres per second, positive down.
-            yaw_deg: heading in degrees clockwise from true north; unset leaves it to the autopilot.
-            hold_s: seconds until the drone hovers, 2 at most; 0 leaves it to the service (0.5 s).
+            north_mps: Metres per second.
+            east_mps: Metres per second.
+            down_mps: Metres per second, positive down.
+            yaw_deg: Heading in degrees clockwise from true north; by default chosen by the autopilot.
+            hold_s: Seconds until the drone hovers, at most 2; 0 selects the service's default (0.5 s).
 
         Returns:
-            The velocity in force, after correction.
+            The velocity after correction.
         """
         request = velocity_request(Velocity(north_mps, east_mps, down_mps), yaw_deg, hold_s)
         reply = await self._call("SetVelocity", request)
@@ -137,25 +137,27 @@ class Mobility(ServiceClient):
         return self._judged(VelocityResult(decision=decision, velocity=velocity))
 
     async def point_gimbal(self, pitch_deg: float, yaw_deg: float = 0.0) -> Result:
-        """Turn the camera, and return once the autopilot has taken the command; `watch.gimbal()` tells where it points.
+        """Turn the camera. The call returns when the autopilot has accepted the command.
+
+        `watch.gimbal()` reports the measured attitude.
 
         Args:
-            pitch_deg: over the horizon: 0 looks ahead, -90 straight down.
-            yaw_deg: clockwise from the nose, which the camera then follows; -180 to 180.
+            pitch_deg: Degrees above the horizon: 0 looks ahead, -90 straight down.
+            yaw_deg: Degrees clockwise from the nose, which the camera then follows; -180 to 180.
 
         Raises:
-            AutopilotRefused: there is no gimbal, or it does not turn that far.
-            CameraFixed: the node's description says that its camera does not move.
+            AutopilotRefused: There is no gimbal, or it cannot turn that far.
+            CameraFixed: The node's description declares a fixed camera.
         """
         return await self._unary("PointGimbal", gimbal_request(pitch_deg, yaw_deg))
 
     async def speed(self) -> SpeedResult:
-        """The speed over ground, as measured."""
+        """Return the measured ground speed."""
         reply = await self._call("GetSpeed", mobility_pb2.GetSpeedRequest())
         return SpeedResult(decision=Decision.from_proto(reply.decision), speed_mps=reply.speed_mps)
 
     async def position(self) -> PositionResult:
-        """Where the drone is, above home, and how it moves."""
+        """Return the drone's position (altitude above home) and velocity."""
         reply = await self._call("GetPosition", mobility_pb2.GetPositionRequest())
         return PositionResult(
             decision=Decision.from_proto(reply.decision),
@@ -166,15 +168,18 @@ class Mobility(ServiceClient):
     def takeoff(
         self, altitude_m: float, *, progress: OnProgress | None = None, timeout_s: float | None = None
     ) -> Motion:
-        """Climb from the ground to an altitude above home; in the air climb on to it, or pass where the drone is high enough."""
+        """Climb to an altitude above home, in metres.
+
+        In the air, the drone climbs further, or the motion completes at once if the drone is high enough.
+        """
         return self._motion("Takeoff", takeoff_request(altitude_m), progress, timeout_s)
 
     def land(self, *, progress: OnProgress | None = None, timeout_s: float | None = None) -> Motion:
-        """Land here, and disarm."""
+        """Land at the current position, and disarm."""
         return self._motion("Land", mobility_pb2.LandRequest(), progress, timeout_s)
 
     def return_to_launch(self, *, progress: OnProgress | None = None, timeout_s: float | None = None) -> Motion:
-        """Fly home and land there."""
+        """Fly home, land and disarm."""
         return self._motion("ReturnToLaunch", mobility_pb2.ReturnToLaunchRequest(), progress, timeout_s)
 
     def goto(
@@ -193,38 +198,37 @@ class Mobility(ServiceClient):
         """Fly straight to a position.
 
         Args:
-            lat: degrees north.
-            lon: degrees east.
-            alt: metres above `reference`.
-            reference: what `alt` is measured from; by default the drone's home.
-            yaw_deg: heading in degrees clockwise from true north; unset leaves it to the autopilot.
-            speed_mps: horizontal speed of this leg; unset keeps the speed in force.
-            acceptance_radius_m: how near counts as reached; 0 leaves it to the service (1 m).
-            progress: called with each step of the way.
-            timeout_s: gives up, and hovers, after this long.
+            lat: Degrees north.
+            lon: Degrees east.
+            alt: Metres above `reference`.
+            reference: Datum of `alt`; by default the drone's home.
+            yaw_deg: Heading in degrees clockwise from true north; by default chosen by the autopilot.
+            speed_mps: Horizontal speed of this leg; by default the current speed setting.
+            acceptance_radius_m: Distance at which the target counts as reached; 0 selects the service's default (1 m).
+            progress: Callback for each progress report.
+            timeout_s: Seconds after which the motion is cancelled and the drone hovers; by default unlimited.
         """
         request = goto_request(Position(lat, lon, alt, reference), yaw_deg, speed_mps, acceptance_radius_m)
         return self._motion("Goto", request, progress, timeout_s)
 
     async def turn(self, yaw_deg: float) -> Progress:
-        """Point the nose on the spot; needs the method GetPosition, too.
+        """Turn the nose at the current position. The component also needs the method GetPosition.
 
         Args:
-            yaw_deg: degrees clockwise from true north.
+            yaw_deg: Degrees clockwise from true north.
         """
-        here = (await self.position()).position
-        return await self.goto(here.lat, here.lon, here.alt, yaw_deg=yaw_deg)
+        position = (await self.position()).position
+        return await self.goto(position.lat, position.lon, position.alt, yaw_deg=yaw_deg)
 
     def mission(self, waypoints: Sequence[Waypoint | Position] | None = None, *, skip_refused: bool = False) -> Mission:
-        """Waypoints to fly one after the other: `await drone.mission(fractus.read_plan("survey.plan"))`.
+        """Return a mission that flies waypoints in order: `await drone.mission(fractus.read_plan("survey.plan"))`.
 
         Args:
-            waypoints: the same ones in each life of this component; by default the path of the control point.
-            skip_refused: go on with the next one where policies forbid a leg.
+            waypoints: Waypoints, the same in every run of this component; by default the path of the control point.
+            skip_refused: Continue with the next waypoint if policies forbid a leg.
 
         Raises:
-            ControlLost: control was not taken.
-            InvalidRequest: when it is flown: the control point has a mission of other waypoints.
+            ControlLost: Control was not acquired.
         """
         if self._control is None:
             raise ControlLost("a mission is for a control point; use `async with drone.control():`")
@@ -235,25 +239,25 @@ class Mobility(ServiceClient):
         return self._motion("Goto", request, progress, None)
 
     async def telemetry(self, interval_s: float = 0.2) -> AsyncGenerator[Telemetry, None]:
-        """The drone's state, every `interval_s` seconds, until the iteration is left; goes on after a restart.
+        """Yield the drone's state every `interval_s` seconds. The iteration continues after a restart of the service.
 
         Raises:
-            Unavailable: the service is away, and did not come back.
+            Unavailable: The service is unreachable and did not return in time.
         """
         request = mobility_pb2.SubscribeTelemetryRequest(interval_s=interval_s)
         async with aclosing(self._channel.stream("SubscribeTelemetry", request)) as samples:
             async for message in samples:
                 yield Telemetry.from_proto(message)
 
-    async def ride(self) -> AsyncGenerator[Ride, None]:
-        """For a passenger of an application without a driver: how far the system is with its points of interest.
+    async def passenger(self) -> AsyncGenerator[TourProgress, None]:
+        """Yield the progress of the system's tour through this passenger's points of interest.
 
-        The iteration ends when all were visited; the drone then flies home.
+        For applications without a driver. The iteration ends when all points were visited; the drone then flies home.
 
         Raises:
-            ControlLost: the mission ended before.
-            MissionComplete: it was complete before this began.
-            Unavailable: the service is away, and did not come back.
+            ControlLost: The mission ended before all points were visited.
+            MissionComplete: The mission was complete before the call.
+            Unavailable: The service is unreachable and did not return in time.
         """
         states = mobility_pb2.ControlEvent
         async with aclosing(self._channel.stream("GetControl", mobility_pb2.GetControlRequest())) as events:
@@ -261,7 +265,9 @@ class Mobility(ServiceClient):
                 if event.state == states.STATE_LOST:
                     raise ControlLost(event.reason)
                 complete = event.state == states.STATE_COMPLETE
-                yield Ride(event.state == states.STATE_RIDING, event.waypoints_reached, complete, event.reason)
+                yield TourProgress(
+                    event.state == states.STATE_PASSENGER, event.waypoints_reached, complete, event.reason
+                )
                 if complete:
                     return
 
@@ -292,14 +298,14 @@ class Mobility(ServiceClient):
 def mobility(
     target: Endpoint | None = None, *, strict: bool = False, reconnect_timeout_s: float = RECONNECT_TIMEOUT_S
 ) -> Mobility:
-    """The mobility service of this node: `async with fractus.mobility() as drone`.
+    """Return a client of this node's mobility service: `async with fractus.mobility() as drone`.
 
     Args:
-        target: where it is; by default what the pod's environment says.
-        strict: raise `Corrected` when a policy changes what was asked.
-        reconnect_timeout_s: how long calls wait for a service that is restarting.
+        target: Endpoint of the service; by default from the pod's environment.
+        strict: Raise `Corrected` if a policy changes the request.
+        reconnect_timeout_s: Time for which calls wait for a restarting service, in seconds.
 
     Raises:
-        NotConfigured: not in a pod of a Fractus application, and no target given.
+        NotConfigured: The process is not in a pod of a Fractus application, and no target is given.
     """
     return Mobility(target or endpoint("mobility"), strict=strict, reconnect_timeout_s=reconnect_timeout_s)

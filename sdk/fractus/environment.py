@@ -1,4 +1,4 @@
-"""What Fractus puts into the environment of a component's pod: identity, addresses, control points."""
+"""Environment variables that Fractus sets in a component's pod: identity, addresses, control points."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from fractus.control_point import ControlPoint
 from fractus.errors import NotConfigured
-from fractus.tasks import ControlPoint
 
 MOBILITY_PORT = 50051
 CAMERA_PORT = 50052
@@ -19,12 +19,12 @@ DEFAULT_TLS_DIR = "/var/run/fractus/tls"
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """Where a node service listens, and how both sides prove who they are.
+    """Address of a node service, and the certificates for mutual TLS.
 
     Attributes:
-        address: host:port.
-        server_name: the name that the service's certificate must carry.
-        tls_dir: folder with tls.crt, tls.key and ca.crt of this component.
+        address: `host:port`.
+        server_name: Name that the service's certificate must contain.
+        tls_dir: Directory with `tls.crt`, `tls.key` and `ca.crt` of this component.
     """
 
     address: str
@@ -33,34 +33,34 @@ class Endpoint:
 
     @classmethod
     def on_node(cls, node: str, address: str, tls_dir: Path) -> Endpoint:
-        """A service of a node, whose certificate carries the node's name whatever address is dialled."""
+        """Return the endpoint of a service on a node. Its certificate contains the node's name, whatever the address."""
         return cls(address, f"{node}.node.fractus.dev", tls_dir)
 
 
 def endpoint(service: str, env: Mapping[str, str] | None = None) -> Endpoint:
-    """The endpoint of `mobility` or `camera` on the node that this pod runs on.
+    """Return the endpoint of `mobility` or `camera` on this pod's node.
 
     Raises:
-        NotConfigured: a variable is missing; the message names it.
+        NotConfigured: A variable is missing; the message names it.
     """
     values = os.environ if env is None else env
-    node = _needed(values, "FRACTUS_NODE")
+    node = _required(values, "FRACTUS_NODE")
     address = values.get(f"FRACTUS_{service.upper()}_ADDRESS")
     if not address:
         port = {"mobility": MOBILITY_PORT, "camera": CAMERA_PORT}[service]
-        address = f"{_needed(values, 'FRACTUS_HOST_IP')}:{port}"
+        address = f"{_required(values, 'FRACTUS_HOST_IP')}:{port}"
     return Endpoint.on_node(node, address, Path(values.get("FRACTUS_TLS_DIR", DEFAULT_TLS_DIR)))
 
 
 def egress(component: str, env: Mapping[str, str] | None = None) -> str:
-    """Address (`host:port`) of a component that this one may call.
+    """Return the address (`host:port`) of a component that this component may call.
 
     Args:
-        component: its name in the application, such as `ImageChecker`.
-        env: variables to read instead of the process' own.
+        component: Name of the component in the application, for example `ImageChecker`.
+        env: Environment variables; by default those of the process.
 
     Raises:
-        NotConfigured: the application does not list it in this component's egress.
+        NotConfigured: The application does not list the component in this component's `egress`.
     """
     values = os.environ if env is None else env
     kebab = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", component)
@@ -72,15 +72,15 @@ def egress(component: str, env: Mapping[str, str] | None = None) -> str:
 
 
 def control_points(env: Mapping[str, str] | None = None) -> tuple[ControlPoint, ...]:
-    """The driver's control points, in the order flown: from FRACTUS_CONTROL_POINTS, or from the Grant of FRACTUS_GRANT.
+    """Return the driver's control points in flight order, from FRACTUS_CONTROL_POINTS or the Grant file in FRACTUS_GRANT.
 
-    A driver that has control finds its own in `control.task`, without any of these.
+    A driver with control finds its current control point in `control.task`, without these variables.
 
     Raises:
-        NotConfigured: both variables are missing, or what they give is not what Fractus writes.
+        NotConfigured: Both variables are missing, or their content is invalid.
     """
     values = os.environ if env is None else env
-    source, points = "FRACTUS_CONTROL_POINTS", None
+    source = "FRACTUS_CONTROL_POINTS"
     try:
         if not values.get(source) and values.get("FRACTUS_GRANT"):
             source = f"FRACTUS_GRANT ({values['FRACTUS_GRANT']})"
@@ -88,17 +88,19 @@ def control_points(env: Mapping[str, str] | None = None) -> tuple[ControlPoint, 
         else:
             if not values.get(source):
                 raise NotConfigured(
-                    f"{source} is not set; set FRACTUS_GRANT to a signed Grant's file, or see `control.task`"
+                    f"{source} is not set; set FRACTUS_GRANT to the file of a signed Grant, or use `control.task`"
                 )
             points = json.loads(values[source])
         return tuple(ControlPoint.from_manifest(point) for point in points)
     except OSError as error:
-        raise NotConfigured(f"{source} cannot be read: {error.strerror}; name a signed Grant's file") from None
+        raise NotConfigured(
+            f"{source} cannot be read: {error.strerror}; set it to the file of a signed Grant"
+        ) from None
     except (ValueError, AttributeError, TypeError, KeyError) as error:
-        raise NotConfigured(f"{source} does not hold control points as Fractus writes them: {error}") from None
+        raise NotConfigured(f"{source} does not contain valid control points: {error}") from None
 
 
-def _needed(values: Mapping[str, str], name: str) -> str:
+def _required(values: Mapping[str, str], name: str) -> str:
     value = values.get(name)
     if not value:
         raise NotConfigured(f"{name} is not set; run this as a component of a Fractus application, or pass an Endpoint")

@@ -1,4 +1,4 @@
-"""What can go wrong in a call, as types that programs can tell apart."""
+"""Exceptions of the SDK, and the translation of gRPC errors."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from fractus.values import Action, Decision, Result
 
 
 class FractusError(Exception):
-    """Root of everything that the SDK raises; its text is one sentence for people.
+    """Base class of all exceptions of the SDK. The text is one sentence for people.
 
     Attributes:
-        remedy: what a program, or its author, does about it; empty where the text says so.
+        remedy: What the program or its author should do; empty if the text already contains it.
     """
 
     remedy = ""
 
 
 class InvalidRequest(FractusError):
-    """The service cannot make sense of an argument: a NaN, a latitude of 95, an unknown picture."""
+    """An argument is invalid, for example NaN, a latitude of 95, or an unknown picture."""
 
     remedy = "correct the argument"
 
 
 class StateError(FractusError):
-    """The state of the drone, its autopilot or its node does not permit the call now; nothing of it was carried out.
+    """The state of the drone, the autopilot or the node does not permit the call now. Nothing was carried out.
 
     Attributes:
-        code: CamelCase reason for programs.
+        code: Reason in CamelCase, for programs.
     """
 
     def __init__(self, code: str, message: str) -> None:
@@ -41,13 +41,13 @@ class StateError(FractusError):
 
 
 class NotReady(StateError):
-    """The motors cannot be started yet: a check of the autopilot, its failsafes, its fence, the link, or a log."""
+    """The motors cannot start yet because of an autopilot check, its failsafes, its fence, the link, or a log."""
 
-    remedy = "wait and try again; `control(progress=print)` tells what is waited for"
+    remedy = "wait and retry; `control(progress=print)` prints the reason"
 
 
 class NotAtHome(StateError):
-    """The drone stands too far from the home of its Grant to begin there."""
+    """The drone is too far from the home position of its Grant to take off."""
 
     remedy = "carry the drone to its home, or correct the home"
 
@@ -65,40 +65,40 @@ class NotFlying(StateError):
 
 
 class NoLegalWay(StateError):
-    """The system finds no way there that policies permit."""
+    """The system found no route to the target that policies permit."""
 
-    remedy = "ask for another place"
+    remedy = "choose another target"
 
 
 class ControlHeld(StateError):
-    """Another application has the drone."""
+    """Another application controls the drone."""
 
-    remedy = "try again when it is back; `fractus.run` does"
+    remedy = "retry when the drone is back; `fractus.run` does this"
 
 
 class AutopilotRefused(StateError):
-    """The autopilot heard the command and refused it."""
+    """The autopilot refused the command."""
 
-    remedy = "see the reason; `drone.telemetry()` has its texts"
+    remedy = "read the reason; `drone.telemetry()` contains the autopilot's texts"
 
 
 class CameraFixed(StateError):
-    """The node's description says that its camera does not move."""
+    """The node's description declares a fixed camera."""
 
-    remedy = "set services.camera.mount.gimbal of the Drone, if a gimbal turns its camera"
+    remedy = "set services.camera.mount.gimbal of the Drone if a gimbal turns its camera"
 
 
 class PolicyDenied(FractusError):
-    """Policies forbid the call and nothing of it was carried out: the drone hovers, and is still yours.
+    """Policies forbid the call. Nothing was carried out: the drone hovers, and this component keeps control.
 
     Attributes:
-        decision: what the policy checker answered.
-        code: CamelCase reason for programs, such as `InsideExclusionZone`.
-        reason: one sentence for people.
-        policies: names of the policies that decided, most restrictive first.
+        decision: Decision of the policy engine.
+        code: Reason in CamelCase, for programs, for example `InsideExclusionZone`.
+        reason: Reason in one sentence, for people.
+        policies: Names of the policies that decided, most restrictive first.
     """
 
-    remedy = "ask for something else, or go on without it; `drone.can_i` asks beforehand"
+    remedy = "request something else, or continue without it; `drone.can_i` checks a call in advance"
 
     def __init__(self, decision: Decision) -> None:
         self.decision = decision
@@ -110,10 +110,10 @@ class PolicyDenied(FractusError):
 
 
 class Corrected(FractusError):
-    """A policy changed the call's arguments and the client is strict.
+    """A policy changed the call's arguments, and the client is strict.
 
     Attributes:
-        result: what was carried out instead; a corrected motion is stopped.
+        result: The corrected call that was carried out. A corrected motion is stopped.
     """
 
     def __init__(self, result: Result) -> None:
@@ -123,25 +123,25 @@ class Corrected(FractusError):
 
 
 class ControlLost(FractusError):
-    """The system or a human pilot took the drone, or this component never had it."""
+    """The system or a human pilot took the drone, or this component never had control."""
 
-    remedy = "ask for control again: it comes when the drone is free; `fractus.run` does"
+    remedy = "request control again: it is granted when the drone is free; `fractus.run` does this"
 
 
 class MissionEnded(ControlLost):
-    """The mission is over before its end: a policy took the drone for good, its driver was lost, or its Grant was removed."""
+    """The mission ended early: a policy took the drone permanently, the driver was lost, or the Grant was removed."""
 
-    remedy = "apply the application again, or give the Grant another uid, for another flight"
+    remedy = "for another flight, apply the application again, or give the Grant another uid"
 
 
 class Interrupted(FractusError):
-    """A motion was begun and then stopped before it was complete; the drone hovers, and is still yours.
+    """A motion was stopped before it was complete. The drone hovers, and this component keeps control.
 
     Attributes:
-        decision: why, and by which policies, if any.
+        decision: Reason, and the policies that decided, if any.
     """
 
-    remedy = "ask for the motion again; `fractus.run` begins the program again"
+    remedy = "request the motion again; `fractus.run` restarts the program"
 
     def __init__(self, message: str, decision: Decision | None) -> None:
         self.decision = decision or Decision(Action.UNSPECIFIED, reason=message)
@@ -149,22 +149,23 @@ class Interrupted(FractusError):
 
 
 class MissionComplete(FractusError):
-    """Every control point of this component is done; the drone is home or on its way there."""
+    """All control points of this component are complete. The drone is at home or on its return flight."""
 
-    remedy = "nothing is left to do"
+    remedy = "nothing remains to be done"
 
 
 class Unavailable(FractusError):
-    """The service cannot be reached, or did not answer in time."""
+    """The service is unreachable or did not respond in time."""
 
-    remedy = "see that the service runs, and begin again: the drone goes on where it was"
+    remedy = "check that the service runs, and start again: the mission continues where it was"
 
 
 class Busy(FractusError):
-    """The service takes no more of this component now: too many calls, or no room for another picture.
+    """The service accepts no more calls or pictures of this component now.
 
     Attributes:
-        retry_after_s: in how many seconds to try again; None where waiting alone does not help: the message says what does.
+        retry_after_s: Seconds after which a retry may succeed; None if waiting alone does not help. The message then
+            contains the remedy.
     """
 
     remedy = "wait for `retry_after_s`, and call less often"
@@ -177,17 +178,17 @@ class Busy(FractusError):
 
 
 class NotConfigured(FractusError):
-    """The environment lacks what Fractus gives the pods of a component; the message says what to set."""
+    """Environment variables of a component's pod are missing or invalid. The message names what to set."""
 
 
 def decision_of(error: Any) -> Decision | None:
-    """The policy checker's decision in the status details of a failed call, if it carries one."""
+    """Return the policy engine's decision from the status details of a failed call, or None."""
     message = types_pb2.Decision()
     return Decision.from_proto(message) if _detail(error, message) else None
 
 
 def _retry_after_s(error: Any) -> float | None:
-    """In how many seconds a failed call may be tried again, if it says so."""
+    """Return the delay in seconds after which a failed call may be retried, or None if the status contains no delay."""
     message = error_details_pb2.RetryInfo()
     if not _detail(error, message):
         return None
@@ -195,24 +196,24 @@ def _retry_after_s(error: Any) -> float | None:
 
 
 def _detail(error: Any, message: Any) -> bool:
-    """Fill in the detail of the message's kind that a failed call carries; False if it carries none."""
+    """Unpack the status detail of the message's type into `message`. Return False if there is no such detail."""
     if error.trailing_metadata() is None:
         return False
     try:
         status = rpc_status.from_call(error)
-    except ValueError:  # the details contradict the status: not ours
+    except ValueError:  # the details contradict the status, so a Fractus service did not send them
         return False
-    found = status.details if status is not None else ()
-    return any(detail.Is(message.DESCRIPTOR) and detail.Unpack(message) for detail in found)
+    details = status.details if status is not None else ()
+    return any(detail.Is(message.DESCRIPTOR) and detail.Unpack(message) for detail in details)
 
 
 def translate(error: Any, what: str, address: str) -> FractusError:
-    """Turn a failed gRPC call into one of our types.
+    """Convert a failed gRPC call to an exception of the SDK.
 
     Args:
-        error: the `grpc.aio.AioRpcError`.
-        what: the method, as the user knows it.
-        address: where the call went.
+        error: The `grpc.aio.AioRpcError`.
+        what: Name of the method.
+        address: Address of the service.
     """
     code, text = error.code(), error.details() or ""
     decision = decision_of(error)
@@ -223,7 +224,7 @@ def translate(error: Any, what: str, address: str) -> FractusError:
     if code in {grpc.StatusCode.INVALID_ARGUMENT, grpc.StatusCode.NOT_FOUND, grpc.StatusCode.OUT_OF_RANGE}:
         return InvalidRequest(f"{what}: {text}")
     if code in {grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.DEADLINE_EXCEEDED}:
-        return Unavailable(f"{what}: no answer from {address} ({text or code.name}){_remedy(text)}")
+        return Unavailable(f"{what}: no response from {address} ({text or code.name}){_remedy(text)}")
     if code is grpc.StatusCode.RESOURCE_EXHAUSTED:
         return Busy(f"{what}: {text or code.name}", _retry_after_s(error))
     return FractusError(f"{what}: {text or code.name}{_remedy(text)}")
@@ -248,19 +249,19 @@ def _refusal(code: grpc.StatusCode, text: str, what: str, decision: Decision | N
 
 _FOREIGN = "another authority signed its certificate: correct FRACTUS_TLS_DIR, or the address"
 _REMEDIES = {
-    "hostname verification": "it is another node's: correct FRACTUS_NODE, or the address",
-    "not in peer certificate": "it is another node's: correct FRACTUS_NODE, or the address",
+    "hostname verification": "the certificate is that of another node: correct FRACTUS_NODE or the address",
+    "not in peer certificate": "the certificate is that of another node: correct FRACTUS_NODE or the address",
     "certificate_verify_failed": _FOREIGN,
     "certificate signature failure": _FOREIGN,
-    "create security handshaker": "tls.crt and tls.key are no pair: correct FRACTUS_TLS_DIR",
-    "socket closed": "it may not know the authority of our certificate: see its log, and correct FRACTUS_TLS_DIR",
-    "wrong_version_number": "it speaks no TLS: correct the address",
-    "method not found": "another service listens there, or another version: correct the address",
+    "create security handshaker": "tls.crt and tls.key do not match: correct FRACTUS_TLS_DIR",
+    "socket closed": "the service may not trust the authority of this component's certificate: see its log, and correct FRACTUS_TLS_DIR",
+    "wrong_version_number": "the server does not use TLS: correct the address",
+    "method not found": "another service or another version listens there: correct the address",
 }
-"""What to correct, by what gRPC says of a connection that failed."""
+"""Remedies for failed connections, by a part of gRPC's error text."""
 
 _CONTROL_CODES = frozenset({"NotInControl", "ControlLost", "NoControl"})
-"""Codes of refusals that say who flies, not what is forbidden."""
+"""Codes of refusals because of the control authority, not because of a policy."""
 
 _STATE_ERRORS: dict[str, type[StateError]] = {
     **dict.fromkeys(
@@ -278,4 +279,4 @@ _STATE_ERRORS: dict[str, type[StateError]] = {
     "CameraFixed": CameraFixed,
     "AutopilotRefused": AutopilotRefused,
 }  # fmt: skip
-"""Refusals by the state of the drone, by their code."""
+"""Exceptions for refusals because of the drone's state, by code."""

@@ -1,11 +1,11 @@
-"""Requests between an application's components, over whatever path there is: repeated until answered, carried out once.
+"""Requests between components of an application that are retried until a response arrives and are processed once.
 
-Where traffic moves from one network path to another, connections break, and a request may arrive twice or its answer not at
-all. So each request has an id that it keeps when it is repeated; who answers keeps the answers for a while and gives them
-again instead of doing the work twice. A repetition can reach another instance than the first attempt did: what collects
-results has to drop those whose `Request.id` it has had (`Answers` does).
+When traffic moves to another network path, connections break: a request may arrive twice, or its response may be lost.
+Each request therefore has an id that stays the same when it is repeated. The responder stores its responses for some
+time and returns a stored response instead of repeating the work. A repetition may reach another instance than the first
+attempt, so a component that collects results must drop those whose `Request.id` it already received (`Answers` does).
 
-The connections are not encrypted by themselves.
+The connections are not encrypted.
 """
 
 from __future__ import annotations
@@ -30,14 +30,18 @@ from fractus.errors import InvalidRequest, Unavailable
 log = logging.getLogger(__name__)
 
 SERVICE = "fractus.exchange"
-ID, ATTEMPT = "fractus-request-id", "fractus-attempt"
+ID_HEADER = "fractus-request-id"
+ATTEMPT_HEADER = "fractus-attempt"
 MAX_BODY_BYTES = 16 * 2**20
-TIMEOUT_S, ATTEMPT_TIMEOUT_S = 30.0, 5.0
+TIMEOUT_S = 30.0
+ATTEMPT_TIMEOUT_S = 5.0
 MAX_DELAY_S = 0.5
-CONNECTION_AGE_S, CONNECTION_GRACE_S = 30.0, 10.0
-KEPT_ANSWERS, KEPT_BYTES = 4096, 16 * 2**20
-_MAX_ID, _MAX_ATTEMPT = 200, 9
-"""Characters of what a request says of itself."""
+CONNECTION_AGE_S = 30.0
+CONNECTION_GRACE_S = 10.0
+KEPT_ANSWERS = 4096
+KEPT_BYTES = 16 * 2**20
+_MAX_ID_LENGTH = 200
+_MAX_ATTEMPT_LENGTH = 9
 
 _REPEATED = frozenset(
     {
@@ -54,7 +58,7 @@ _LENGTHS = (
 _CLIENT = (
     *_LENGTHS,
     ("grpc.enable_http_proxy", 0),
-    # A path that is gone without a word is given up within 4 s, and a new one found quickly.
+    # Detect a silent path within 4 s, and reconnect quickly.
     ("grpc.keepalive_time_ms", 2000),
     ("grpc.keepalive_timeout_ms", 2000),
     ("grpc.initial_reconnect_backoff_ms", 100),
@@ -65,13 +69,13 @@ _CLIENT = (
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What a component is asked.
+    """A request to a component.
 
     Attributes:
-        id: the same in every repetition, and in those only: an id that comes with another body is refused.
-        method: what is asked for.
-        body: of whatever form the components agree on.
-        attempt: 1 for the first; only in repetitions more.
+        id: Unique id, the same in every repetition. An id with another body is refused.
+        method: Name of the requested method.
+        body: Content in a format that the components agree on.
+        attempt: Number of the attempt, from 1.
     """
 
     id: str
@@ -89,11 +93,11 @@ class _Kept(NamedTuple):
 
 
 class Answers:
-    """Answers by method and request id, so that no request is carried out twice; the oldest are forgotten first.
+    """Stored responses by method and request id, so that no request is processed twice. The oldest are removed first.
 
     Args:
-        count: how many are kept.
-        size: how many bytes of them.
+        count: Maximum number of stored responses.
+        size: Maximum size of all stored responses, in bytes.
     """
 
     def __init__(self, count: int = KEPT_ANSWERS, size: int = KEPT_BYTES) -> None:
@@ -103,21 +107,22 @@ class Answers:
         self.repeated = 0
 
     async def once(self, request: Request, handler: Handler) -> bytes:
-        """The answer of a handler, which is called for the first request of a method and an id only.
+        """Return the response of `handler`, which is called only for the first request with this method and id.
 
-        A handler that raises has carried nothing out: a repetition calls it again. One that has begun goes on when the
-        connection breaks.
+        If the handler raises, the request counts as not processed, and a repetition calls the handler again. A running
+        handler continues when the connection breaks.
 
         Raises:
-            ValueError: the request of that id had another body.
+            ValueError: An earlier request with this id had another body.
         """
-        key, digest = (request.method, request.id), hashlib.sha256(request.body).digest()
+        key = (request.method, request.id)
+        digest = hashlib.sha256(request.body).digest()
         kept = self._kept.get(key)
         if kept is None:
             kept = self._kept[key] = _Kept(digest, asyncio.ensure_future(_run(handler, request)))
             kept.answer.add_done_callback(lambda done: self._ended(key, done))
         elif kept.digest != digest:
-            raise ValueError(f"request {request.id} had another body before: give each request an id of its own")
+            raise ValueError(f"request {request.id} had another body before; use a new id for each request")
         else:
             self.repeated += 1
         return await asyncio.shield(kept.answer)
@@ -139,14 +144,15 @@ async def _run(handler: Handler, request: Request) -> bytes:
 
 
 class Requester:
-    """Asks another component; `async with` closes it.
+    """Client for requests to another component, as an asynchronous context manager.
 
-    From the first request on it keeps a connection: one that breaks, or is closed because traffic has to move to another
-    path, is opened again at once, so that the next request need not wait for it.
+    After the first request it keeps a connection open. A connection that breaks, or that is closed because traffic moves
+    to another path, is reopened immediately, so that the next request does not wait.
 
     Args:
         address: `host:port`.
-        attempt_timeout_s: how long one attempt may take; more than the other end needs over the slowest path.
+        attempt_timeout_s: Longest duration of one attempt, in seconds. It must exceed the response time on the slowest
+            path.
     """
 
     def __init__(self, address: str, *, attempt_timeout_s: float = ATTEMPT_TIMEOUT_S) -> None:
@@ -159,42 +165,43 @@ class Requester:
     async def ask(
         self, method: str, body: bytes = b"", *, timeout_s: float = TIMEOUT_S, request_id: str | None = None
     ) -> bytes:
-        """The answer to a request, which is repeated with the same id until there is one.
+        """Send a request, repeat it with the same id until a response arrives, and return the response.
 
         Args:
-            method: what is asked for.
-            body: at most 16 MiB.
-            timeout_s: when to give up.
-            request_id: of a request on whose behalf this one is made, which then has the same body each time; by default a
-                new one.
+            method: Name of the requested method.
+            body: Content, at most 16 MiB.
+            timeout_s: Seconds after which the request fails.
+            request_id: Id of the request on whose behalf this one is sent, whose body must be the same each time; by
+                default a new id.
 
         Raises:
-            InvalidRequest: the other component refuses it.
-            Unavailable: no answer in time.
+            InvalidRequest: The other component refused the request.
+            Unavailable: No response arrived in time.
         """
         if len(body) > MAX_BODY_BYTES:
-            raise InvalidRequest(f"{method}: a body has at most {MAX_BODY_BYTES >> 20} MiB; send it in parts")
+            raise InvalidRequest(f"{method}: the body exceeds {MAX_BODY_BYTES >> 20} MiB; send it in parts")
         loop = asyncio.get_running_loop()
-        end, wanted = loop.time() + timeout_s, request_id or uuid.uuid4().hex
+        deadline = loop.time() + timeout_s
+        request_id = request_id or uuid.uuid4().hex
         for attempt, delay in enumerate(backoff(cap_s=MAX_DELAY_S), 1):
             self.repeated += attempt > 1
             try:
-                return await self._attempt(method, body, wanted, attempt, end - loop.time())
+                return await self._attempt(method, body, request_id, attempt, deadline - loop.time())
             except grpc.aio.AioRpcError as error:
-                said = f"{method} on {self.address}: {error.details() or error.code().name}"
+                message = f"{method} on {self.address}: {error.details() or error.code().name}"
                 if error.code() not in _REPEATED:
-                    raise InvalidRequest(said) from None
-            if loop.time() + delay >= end:
-                raise Unavailable(f"{said} (after {attempt} attempts)")
+                    raise InvalidRequest(message) from None
+            if loop.time() + delay >= deadline:
+                raise Unavailable(f"{message} (after {attempt} attempts)")
             await asyncio.sleep(delay)
-        raise AssertionError("delays never end")
+        raise AssertionError("the back-off is infinite")
 
     async def _attempt(self, method: str, body: bytes, request_id: str, attempt: int, left_s: float) -> bytes:
         if self._channel is None:
             self._channel = grpc.aio.insecure_channel(self.address, options=_CLIENT)
             self._connecting = asyncio.create_task(_keep_connected(self._channel))
         call = self._channel.unary_unary(f"/{SERVICE}/{method}")
-        metadata = ((ID, request_id), (ATTEMPT, str(attempt)))
+        metadata = ((ID_HEADER, request_id), (ATTEMPT_HEADER, str(attempt)))
         answer: bytes = await call(body, timeout=min(left_s, self._attempt_timeout_s), metadata=metadata)
         return answer
 
@@ -216,29 +223,29 @@ class Requester:
 
 
 async def _keep_connected(channel: Any) -> None:
-    """Connect whenever there is no connection; left alone, gRPC would wait for the next call."""
+    """Reconnect immediately after a disconnect. By default, gRPC would wait for the next call."""
     while True:
         await channel.wait_for_state_change(channel.get_state(try_to_connect=True))
 
 
 def requester(component: str, *, attempt_timeout_s: float = ATTEMPT_TIMEOUT_S) -> Requester:
-    """What asks a component that the application lists in this one's egress.
+    """Return a client for requests to a component in this component's `egress`.
 
     Raises:
-        NotConfigured: it lists no such component.
+        NotConfigured: The application does not list the component in this component's `egress`.
     """
     return Requester(egress(component), attempt_timeout_s=attempt_timeout_s)
 
 
 class Responder:
-    """Answers other components.
+    """Server for requests of other components.
 
     Args:
-        handlers: by method. One that raises ValueError refuses the request for good; with OSError or one of the SDK's
-            errors, the other end repeats it.
-        port: to listen on; 0 for any.
-        connection_age_s: a connection is closed in peace when it is about so old, so that none stays on a path that
-            traffic has left.
+        handlers: Handlers by method name. A handler that raises ValueError refuses the request permanently. If it raises
+            OSError or `Unavailable`, the client repeats the request.
+        port: Port to listen on; 0 selects a free port.
+        connection_age_s: Age in seconds after which a connection is closed gracefully, so that no connection stays on a
+            path that traffic has left.
     """
 
     def __init__(
@@ -251,10 +258,10 @@ class Responder:
         self._server: Any = None
 
     async def start(self) -> None:
-        """Begin to listen.
+        """Start the server.
 
         Raises:
-            Unavailable: the port is taken.
+            Unavailable: The port is in use.
         """
         age_ms = math.ceil(self._connection_age_s * 1e3)
         options = (
@@ -275,32 +282,33 @@ class Responder:
         self._server = server
 
     async def stop(self, grace_s: float = 1.0) -> None:
-        """Let requests that are being answered end, and stop."""
+        """Stop the server after the current requests have completed, at the latest after `grace_s` seconds."""
         if self._server is not None:
             await self._server.stop(grace_s)
 
     async def serve(self) -> None:
-        """Answer until SIGTERM.
+        """Serve requests until SIGTERM.
 
         Raises:
-            Unavailable: the port is taken.
+            Unavailable: The port is in use.
         """
-        over = asyncio.Event()
-        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, over.set)
+        terminated = asyncio.Event()
+        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, terminated.set)
         await self.start()
-        await over.wait()
+        await terminated.wait()
         await self.stop()
 
     def _method(self, name: str, handler: Handler) -> Any:
-        """A method as gRPC knows it."""
+        """Return the gRPC method handler for a handler function."""
 
         async def answer(body: bytes, context: Any) -> bytes:
-            told = dict(context.invocation_metadata())
-            request_id, attempt = str(told.get(ID, "")), str(told.get(ATTEMPT, ""))
-            if not 0 < len(request_id) <= _MAX_ID:
-                await context.abort(grpc.StatusCode.INVALID_ARGUMENT, f"{ID} is missing, or too long")
-            counted = attempt.isdecimal() and len(attempt) <= _MAX_ATTEMPT
-            request = Request(request_id, name, body, int(attempt) if counted else 1)
+            metadata = dict(context.invocation_metadata())
+            request_id = str(metadata.get(ID_HEADER, ""))
+            attempt = str(metadata.get(ATTEMPT_HEADER, ""))
+            if not 0 < len(request_id) <= _MAX_ID_LENGTH:
+                await context.abort(grpc.StatusCode.INVALID_ARGUMENT, f"{ID_HEADER} is missing or too long")
+            valid_attempt = attempt.isdecimal() and len(attempt) <= _MAX_ATTEMPT_LENGTH
+            request = Request(request_id, name, body, int(attempt) if valid_attempt else 1)
             try:
                 return await self.answers.once(request, handler)
             except ValueError as error:

@@ -1,4 +1,4 @@
-"""The camera of the node that this component runs on."""
+"""Client of the camera service."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from fractus_proto.v1 import camera_pb2, camera_pb2_grpc, types_pb2
 from fractus.channel import CALL_TIMEOUT_S, RECONNECT_TIMEOUT_S, ServiceChannel, ServiceClient
 from fractus.environment import Endpoint, endpoint
 from fractus.errors import FractusError, Unavailable, translate
-from fractus.requests import capture_request
+from fractus.proto_requests import capture_request
 from fractus.values import Decision, ImageInfo, Picture, Result
 
 log = logging.getLogger(__name__)
 
 RETRIEVE_TIMEOUT_S = 60.0
 CAPTURE_TIMEOUT_S = 120.0
-"""Looking for faces in megapixels takes its time."""
+"""Face detection in pictures of several megapixels is slow."""
 
 
 class Camera(ServiceClient):
-    """The camera service of this node: pictures are taken, kept on the node, and fetched from there."""
+    """Client of this node's camera service, which takes pictures and stores them until they are retrieved or deleted."""
 
     def __init__(
         self, endpoint: Endpoint, *, timeout_s: float = CALL_TIMEOUT_S, reconnect_timeout_s: float = RECONNECT_TIMEOUT_S
@@ -34,58 +34,65 @@ class Camera(ServiceClient):
         )
 
     async def capture(self, width: int = 0, height: int = 0, *, timeout_s: float = CAPTURE_TIMEOUT_S) -> ImageInfo:
-        """Take a picture; 0 leaves width and height to the camera.
+        """Take a picture and store it on the node.
 
-        Where privacy policies ask for filters, the picture is kept filtered: `corrected` says so, and why. It is blurred as
-        a whole where faces are to be hidden but may be too small to be found; come closer, or ask for more pixels.
+        If privacy policies require filters, the stored picture is filtered, and `decision` of the result contains the
+        reason. If faces must be hidden but may be too small to be detected, the whole picture is blurred: fly closer, or
+        request more pixels.
 
-        The node keeps 200 of a component, and then takes no more: `delete` those that are fetched, or use `take`.
+        The node stores 200 pictures per component and then takes no more: `delete` retrieved pictures, or use `take`.
+
+        Args:
+            width: Width in pixels; 0 selects the camera's default.
+            height: Height in pixels; 0 selects the camera's default.
+            timeout_s: Longest duration of the call, in seconds.
 
         Raises:
-            PolicyDenied: no pictures from here, or not of this.
-            Unavailable: the camera gives no picture.
+            PolicyDenied: Policies forbid pictures at this position, or of this area.
+            Unavailable: The camera returned no picture.
         """
         request = capture_request(width, height)
         reply = await self._channel.unary("CaptureImage", request, timeout_s=timeout_s)
         return ImageInfo.from_proto(reply.image, reply.decision)
 
     async def take(self, width: int = 0, height: int = 0, *, timeout_s: float = CAPTURE_TIMEOUT_S) -> Picture:
-        """Take a picture, fetch it, and delete it from the node, which keeps 200 of a component and then takes no more.
+        """Take a picture, retrieve it, and delete it from the node.
 
-        Judged twice, when it is taken and when it is fetched. The component needs CaptureImage, RetrieveImage and DeleteImage.
+        The picture is judged twice: when it is taken and when it is retrieved. The component needs the methods
+        CaptureImage, RetrieveImage and DeleteImage.
 
         Args:
-            width: pixels; 0 leaves it to the camera.
-            height: pixels; 0 leaves it to the camera.
-            timeout_s: how long the camera may take.
+            width: Width in pixels; 0 selects the camera's default.
+            height: Height in pixels; 0 selects the camera's default.
+            timeout_s: Longest duration of the capture, in seconds.
 
         Raises:
-            PolicyDenied: no pictures from here, or not of this.
-            Unavailable: the camera gives no picture, or the transfer broke off.
+            PolicyDenied: Policies forbid pictures at this position, or of this area.
+            Unavailable: The camera returned no picture, or the transfer was interrupted.
         """
         info = await self.capture(width, height, timeout_s=timeout_s)
         try:
             return Picture(info, await self.retrieve(info.name))
         finally:
-            # A failure here neither loses a picture that was fetched nor hides why one was not.
+            # A failed deletion must neither lose a retrieved picture nor hide the error of a failed retrieval.
             try:
                 await self.delete(info.name)
             except FractusError as error:
-                log.warning("camera: picture stays on the node (name=%s error=%s)", info.name, error)
+                log.warning("camera: picture not deleted from the node (name=%s error=%s)", info.name, error)
 
     async def every(self, interval_s: float, width: int = 0, height: int = 0) -> AsyncGenerator[Picture, None]:
-        """Take a picture each `interval_s` seconds, until the iteration is left; a camera that takes longer is waited for.
+        """Take a picture every `interval_s` seconds until the iteration is left. A slower camera extends the interval.
 
-        Each is fetched and deleted from the node, as `take` does, so it may go on for as long as the flight.
+        Each picture is retrieved and deleted from the node as by `take`, so the iteration may last for the whole flight.
 
         Args:
-            interval_s: seconds from the beginning of one picture to that of the next.
-            width: pixels; 0 leaves it to the camera.
-            height: pixels; 0 leaves it to the camera.
+            interval_s: Seconds between the starts of two captures.
+            width: Width in pixels; 0 selects the camera's default.
+            height: Height in pixels; 0 selects the camera's default.
 
         Raises:
-            PolicyDenied: no pictures from here, or not of this; call it again further on.
-            Unavailable: the camera gives no picture.
+            PolicyDenied: Policies forbid pictures at this position, or of this area. Call the method again elsewhere.
+            Unavailable: The camera returned no picture.
         """
         loop = asyncio.get_running_loop()
         while True:
@@ -94,12 +101,12 @@ class Camera(ServiceClient):
             await asyncio.sleep(max(due - loop.time(), 0.0))
 
     async def retrieve(self, name: str, *, timeout_s: float = RETRIEVE_TIMEOUT_S) -> bytes:
-        """Fetch a picture, with what privacy policies demand already done to it.
+        """Retrieve a stored picture, filtered as privacy policies require.
 
         Raises:
-            PolicyDenied: not this one.
-            InvalidRequest: there is no such picture.
-            Unavailable: the transfer broke off.
+            PolicyDenied: Policies forbid this picture.
+            InvalidRequest: There is no picture with this name.
+            Unavailable: The transfer was interrupted.
         """
         parts: list[bytes] = []
         size: int | None = None
@@ -113,19 +120,19 @@ class Camera(ServiceClient):
                 raise translate(error, "RetrieveImage", self._channel.address) from None
         picture = b"".join(parts)
         if size is not None and len(picture) != size:
-            raise Unavailable(f"RetrieveImage: {name} ended after {len(picture)} of {size} bytes; fetch it again")
+            raise Unavailable(f"RetrieveImage: {name} ended after {len(picture)} of {size} bytes; retrieve it again")
         return picture
 
     async def list(self) -> tuple[ImageInfo, ...]:
-        """The pictures of this component on the node, oldest first."""
+        """Return the stored pictures of this component, oldest first."""
         reply = await self._channel.unary("ListImages", camera_pb2.ListImagesRequest())
         return tuple(ImageInfo.from_proto(image, reply.decision) for image in reply.images)
 
     async def delete(self, name: str) -> Result:
         """Delete a picture from the node.
 
-        Where the node records pictures (`fractus camera serve --recordings`), the copy in the recording stays until its segment
-        makes room for newer ones.
+        If the node records pictures (`fractus camera serve --recordings`), the copy in the recording stays until its
+        segment is removed.
         """
         reply: types_pb2.Decision = (
             await self._channel.unary("DeleteImage", camera_pb2.DeleteImageRequest(name=name))
@@ -134,13 +141,13 @@ class Camera(ServiceClient):
 
 
 def camera(target: Endpoint | None = None, *, reconnect_timeout_s: float = RECONNECT_TIMEOUT_S) -> Camera:
-    """The camera service of this node: `async with fractus.camera() as camera`.
+    """Return a client of this node's camera service: `async with fractus.camera() as camera`.
 
     Args:
-        target: where it is; by default what the pod's environment says.
-        reconnect_timeout_s: how long calls wait for a service that is restarting.
+        target: Endpoint of the service; by default from the pod's environment.
+        reconnect_timeout_s: Time for which calls wait for a restarting service, in seconds.
 
     Raises:
-        NotConfigured: not in a pod of a Fractus application, and no target given.
+        NotConfigured: The process is not in a pod of a Fractus application, and no target is given.
     """
     return Camera(target or endpoint("camera"), reconnect_timeout_s=reconnect_timeout_s)

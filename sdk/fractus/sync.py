@@ -1,7 +1,7 @@
-"""The same clients for programs without asyncio: `with fractus.sync.mobility() as drone: drone.arm()`.
+"""Synchronous clients for programs without asyncio: `with fractus.sync.mobility() as drone: drone.arm()`.
 
-Each method here waits for the method of the same name of the asynchronous client, which runs on an event loop in a
-thread of its own: same arguments, same answers, same errors, same documentation.
+Each method waits for the method of the same name of the asynchronous client, which runs in an event loop on another
+thread. Arguments, results, exceptions and documentation are the same.
 """
 
 from __future__ import annotations
@@ -15,32 +15,32 @@ from typing import Any, Concatenate, Generic, ParamSpec, Protocol, Self, TypeVar
 
 from fractus import control as _control
 from fractus import drone as _drone
-from fractus import dry_runs as _dry_runs
-from fractus import missions as _missions
+from fractus import dry_run as _dry_runs
+from fractus import mission as _missions
 from fractus import pictures as _pictures
 from fractus import telemetry as _telemetry
+from fractus.control_point import ControlPoint
 from fractus.environment import Endpoint
 from fractus.errors import FractusError, PolicyDenied
-from fractus.missions import Waypoint
-from fractus.tasks import ControlPoint
+from fractus.mission import Waypoint
 from fractus.values import Position
 
 JOIN_TIMEOUT_S = 10.0
-"""How long `close` waits for the thread of the event loop to end."""
+"""Time for which `close` waits for the event loop's thread, in seconds."""
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
 
 class _End:
-    """Nothing follows."""
+    """Marker for the end of an iteration."""
 
 
 _END = _End()
 
 
 class _Loop:
-    """An event loop on a thread of its own."""
+    """An event loop on a separate thread."""
 
     def __init__(self) -> None:
         self._loop = asyncio.new_event_loop()
@@ -48,7 +48,7 @@ class _Loop:
         self._thread.start()
 
     def run(self, work: Callable[[], Awaitable[T]]) -> T:
-        """Wait for some work on the loop; an interrupt here (Ctrl-C, say) cancels it there."""
+        """Run a coroutine on the loop and wait for its result. An interrupt, for example Ctrl-C, cancels the coroutine."""
 
         async def working() -> T:
             return await work()
@@ -61,16 +61,16 @@ class _Loop:
             raise
 
     def iterate(self, items: AsyncGenerator[T, None]) -> Iterator[T]:
-        """The items, one by one; leaving the iteration ends it there, too."""
+        """Yield the items. Leaving the iteration closes the generator."""
         try:
             while not isinstance(item := self.run(lambda: anext(items, _END)), _End):
                 yield item
         finally:
             self.run(items.aclose)
 
-    def call(self, what: Callable[[], None]) -> None:
-        """Do something on the loop, soon."""
-        self._loop.call_soon_threadsafe(what)
+    def call(self, function: Callable[[], None]) -> None:
+        """Schedule a function on the loop."""
+        self._loop.call_soon_threadsafe(function)
 
     def close(self) -> None:
         """Stop the loop and its thread."""
@@ -89,7 +89,7 @@ C = TypeVar("C", bound=_Closable)
 
 
 class _Wrapper(Generic[A]):
-    """An asynchronous object and the loop that it lives on."""
+    """Wrapper of an asynchronous object and its event loop."""
 
     def __init__(self, loop: _Loop, wrapped: A) -> None:
         self._loop = loop
@@ -97,7 +97,7 @@ class _Wrapper(Generic[A]):
 
 
 class _Client(_Wrapper[C]):
-    """A client with a loop of its own."""
+    """Client with its own event loop."""
 
     def __init__(self, wrapped: C) -> None:
         super().__init__(_Loop(), wrapped)
@@ -109,13 +109,13 @@ class _Client(_Wrapper[C]):
         self.close()
 
     def close(self) -> None:
-        """Close the connection; control that is still held breaks off."""
+        """Close the connection. Control that is still held is abandoned."""
         self._loop.run(self._async.close)
         self._loop.close()
 
 
 def _waiting(method: Callable[Concatenate[A, P], Awaitable[T]]) -> Callable[Concatenate[Any, P], T]:
-    """The method that waits for an asynchronous one."""
+    """Return a method that waits for an asynchronous method."""
 
     def waiting(self: _Wrapper[A], /, *args: P.args, **kwargs: P.kwargs) -> T:
         return self._loop.run(lambda: method(self._async, *args, **kwargs))
@@ -127,7 +127,7 @@ def _waiting(method: Callable[Concatenate[A, P], Awaitable[T]]) -> Callable[Conc
 def _iterating(
     method: Callable[Concatenate[A, P], AsyncGenerator[T, None]],
 ) -> Callable[Concatenate[Any, P], Iterator[T]]:
-    """The method that iterates over what an asynchronous one gives."""
+    """Return a method that iterates over an asynchronous generator."""
 
     def iterating(self: _Wrapper[A], /, *args: P.args, **kwargs: P.kwargs) -> Iterator[T]:
         return self._loop.iterate(method(self._async, *args, **kwargs))
@@ -137,24 +137,24 @@ def _iterating(
 
 
 class Control(_Wrapper[_control.Control]):
-    """Control of the drone for one control point; see `fractus.Control`.
+    """Control lease for one control point; see `fractus.Control`.
 
-    When it is lost, the motion in progress, or else the next call, raises `ControlLost`.
+    If control is lost, the current motion or the next call raises `ControlLost`.
     """
 
     @property
     def control_point(self) -> int:
-        """Index of the control point that this is for."""
+        """Index of the control point, from 0."""
         return self._async.control_point
 
     @property
     def waypoints_reached(self) -> int:
-        """How many of its waypoints are done with, in this life of the component and in earlier ones."""
+        """Number of completed waypoints, including those of earlier runs of this component."""
         return self._async.waypoints_reached
 
     @property
     def task(self) -> ControlPoint:
-        """What is to be done there: path or region, as the application declares them."""
+        """Path or region of the control point, as declared by the application."""
         return self._async.task
 
     report = _waiting(_control.Control.report)
@@ -162,12 +162,12 @@ class Control(_Wrapper[_control.Control]):
 
     @property
     def mission_complete(self) -> bool:
-        """After control was returned: whether that was the last control point."""
+        """True after control of the last control point was returned."""
         return self._async.mission_complete
 
     @property
     def lost(self) -> FractusError | None:
-        """Why control was lost; None while it is ours."""
+        """Reason why control was lost; None while it is held."""
         return self._async.lost
 
     def __enter__(self) -> Self:
@@ -203,7 +203,7 @@ class CanI(_Wrapper[_dry_runs.CanI]):
 
 
 class Watch(_Wrapper[_telemetry.Watch]):
-    """One thing of the drone's state, each time it changes; see `fractus.Watch`."""
+    """Changes of one part of the drone's state; see `fractus.Watch`."""
 
     gps = _iterating(_telemetry.Watch.gps)
     battery = _iterating(_telemetry.Watch.battery)
@@ -215,43 +215,43 @@ class Watch(_Wrapper[_telemetry.Watch]):
 
 
 class Mission(_Wrapper[_missions.Mission]):
-    """Waypoints that `fly` flies; see `fractus.Mission`."""
+    """Mission that `fly` starts; see `fractus.Mission`."""
 
     fly = _waiting(_missions.Mission.fly)
 
     @property
     def refused(self) -> dict[int, PolicyDenied]:
-        """Legs that were passed over, by the number of their waypoint, from 1."""
+        """Skipped legs by the number of their waypoint, from 1."""
         return self._async.refused
 
     def pause(self) -> None:
-        """Stop the leg under way, from another thread: the drone hovers until `resume`."""
+        """Stop the current leg from another thread. The drone hovers until `resume`."""
         self._loop.call(self._async.pause)
 
     def resume(self) -> None:
-        """Go on with the leg that was stopped."""
+        """Continue the stopped leg."""
         self._loop.call(self._async.resume)
 
 
 class Mobility(_Client[_drone.Mobility]):
-    """The mobility service of this node; see `fractus.Mobility`."""
+    """Client of this node's mobility service; see `fractus.Mobility`."""
 
     def __init__(self, endpoint: Endpoint | None = None, *, strict: bool = False) -> None:
         super().__init__(_drone.mobility(endpoint, strict=strict))
         self.can_i = CanI(self._loop, self._async.can_i)
         """Dry runs: `drone.can_i.goto(lat, lon, 20)`."""
         self.watch = Watch(self._loop, self._async.watch)
-        """One thing of the drone's state, each time it changes: `for gps in drone.watch.gps()`."""
+        """Changes of one part of the drone's state: `for gps in drone.watch.gps()`."""
 
     def control(self, *, timeout_s: float | None = None, progress: _control.OnWait | None = None) -> Control:
-        """Control of the drone for the next control point: `with drone.control() as control`."""
+        """Return the control lease for the next control point: `with drone.control() as control`."""
         return Control(self._loop, self._async.control(timeout_s=timeout_s, progress=progress))
 
     arm = _waiting(_drone.Mobility.arm)
     disarm = _waiting(_drone.Mobility.disarm)
 
     def mission(self, waypoints: Sequence[Waypoint | Position] | None = None, *, skip_refused: bool = False) -> Mission:
-        """Waypoints to fly one after the other: `drone.mission(fractus.read_plan("survey.plan")).fly()`."""
+        """Return a mission that flies waypoints in order: `drone.mission(fractus.read_plan("survey.plan")).fly()`."""
         return Mission(self._loop, self._async.mission(waypoints, skip_refused=skip_refused))
 
     takeoff = _waiting(_drone.Mobility.takeoff)
@@ -266,11 +266,11 @@ class Mobility(_Client[_drone.Mobility]):
     position = _waiting(_drone.Mobility.position)
     speed = _waiting(_drone.Mobility.speed)
     telemetry = _iterating(_drone.Mobility.telemetry)
-    ride = _iterating(_drone.Mobility.ride)
+    passenger = _iterating(_drone.Mobility.passenger)
 
 
 class Camera(_Client[_pictures.Camera]):
-    """The camera service of this node; see `fractus.Camera`."""
+    """Client of this node's camera service; see `fractus.Camera`."""
 
     def __init__(self, endpoint: Endpoint | None = None) -> None:
         super().__init__(_pictures.camera(endpoint))
@@ -284,10 +284,10 @@ class Camera(_Client[_pictures.Camera]):
 
 
 def mobility(endpoint: Endpoint | None = None, *, strict: bool = False) -> Mobility:
-    """The mobility service of this node, without asyncio."""
+    """Return a synchronous client of this node's mobility service."""
     return Mobility(endpoint, strict=strict)
 
 
 def camera(endpoint: Endpoint | None = None) -> Camera:
-    """The camera service of this node, without asyncio."""
+    """Return a synchronous client of this node's camera service."""
     return Camera(endpoint)

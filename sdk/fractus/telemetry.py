@@ -1,4 +1,4 @@
-"""The drone's state as its mobility service tells it: all of it, or one thing each time that changes."""
+"""The drone's state: complete samples, or changes of one part of it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ T = TypeVar("T")
 
 
 class Fix(enum.IntEnum):
-    """How well the satellite receiver knows where it is; `GPS_FIX_TYPE` of MAVLink."""
+    """Fix type of the satellite receiver; `GPS_FIX_TYPE` of MAVLink."""
 
     NO_GPS = 0
     NO_FIX = 1
@@ -31,7 +31,7 @@ class Fix(enum.IntEnum):
 
 
 class Severity(enum.IntEnum):
-    """How serious a text of the autopilot is; `MAV_SEVERITY` of MAVLink, the most serious first."""
+    """Severity of an autopilot text, most severe first; `MAV_SEVERITY` of MAVLink."""
 
     EMERGENCY = 0
     ALERT = 1
@@ -45,12 +45,12 @@ class Severity(enum.IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Gps:
-    """What the satellite receiver says of itself.
+    """State of the satellite receiver.
 
     Attributes:
-        fix: how well it knows where it is.
-        satellites: how many it sees.
-        position_error_m: bound of the horizontal error of the position in metres; None while that is unknown.
+        fix: Fix type.
+        satellites: Number of visible satellites.
+        position_error_m: Bound of the horizontal position error in metres; None if the position is unknown.
     """
 
     fix: Fix
@@ -63,9 +63,9 @@ class Battery:
     """The flight battery.
 
     Attributes:
-        remaining: 0 to 1; 0 while the autopilot does not measure it.
-        voltage_v: volts; 0 while it is not measured.
-        current_a: amperes, positive while it discharges; 0 while it is not measured.
+        remaining: Remaining charge, 0 to 1; 0 if it is not measured.
+        voltage_v: Voltage in volts; 0 if it is not measured.
+        current_a: Current in amperes, positive during discharge; 0 if it is not measured.
     """
 
     remaining: float
@@ -75,12 +75,12 @@ class Battery:
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """Whether the drone could take off.
+    """Readiness for takeoff.
 
     Attributes:
-        ready: whether the motors could be started now.
-        problem: why not, in a sentence: the autopilot's checks, its failsafes, the link; empty when they could.
-        autopilot_connected: whether the autopilot is heard.
+        ready: True if the motors can be started now.
+        problem: Reason why the motors cannot be started, in one sentence; empty if `ready`.
+        autopilot_connected: True if messages of the autopilot are received.
     """
 
     ready: bool
@@ -90,11 +90,11 @@ class Health:
 
 @dataclass(frozen=True, slots=True)
 class Wind:
-    """The wind as the autopilot estimates it.
+    """Wind estimate of the autopilot.
 
     Attributes:
-        from_deg: where it comes from, degrees clockwise from true north.
-        speed_mps: metres per second.
+        from_deg: Direction from which the wind blows, in degrees clockwise from true north.
+        speed_mps: Speed in metres per second.
     """
 
     from_deg: float
@@ -103,7 +103,7 @@ class Wind:
 
 @dataclass(frozen=True, slots=True)
 class StatusText:
-    """Something that the autopilot said."""
+    """A text message of the autopilot (STATUSTEXT)."""
 
     severity: Severity
     text: str
@@ -114,28 +114,28 @@ class Telemetry:
     """One sample of the drone's state.
 
     Attributes:
-        time: when the service sent it, UTC.
-        position: degrees, and metres above home; None while it is unknown, or older than a second.
-        altitude_amsl_m: metres above mean sea level.
-        velocity: over ground; None while the position is.
-        yaw_deg: where the nose points, degrees clockwise from true north.
-        battery_remaining: 0 to 1; `battery` has more.
-        armed: whether the motors run.
-        in_air: whether it flies; in doubt it does.
-        mode: the autopilot's name of its flight mode: GUIDED, RTL.
-        ready: whether the motors could be started now; `health` says why not.
-        home: degrees, and metres above mean sea level; None until the autopilot has one.
+        time: Time at which the service sent the sample, UTC.
+        position: Position with the altitude above home; None if it is unknown or older than one second.
+        altitude_amsl_m: Altitude in metres above mean sea level.
+        velocity: Velocity over ground; None if the position is unknown.
+        yaw_deg: Heading in degrees clockwise from true north.
+        battery_remaining: Remaining charge, 0 to 1.
+        armed: True while the motors run.
+        in_air: True if airborne, or if the landed state is unknown.
+        mode: Name of the autopilot's flight mode, for example GUIDED or RTL.
+        ready: True if the motors can be started now; `health` contains the reason if not.
+        home: Home position with the altitude above mean sea level; None until the autopilot has a home.
         flight_state: inactive, charging, takingOff, flying or landing.
-        controller: who flies: `system`, `pilot`, or the SPIFFE id of the driver instance.
-        attitude: None while it is unknown.
-        gimbal: how the gimbal turns the camera, as measured: its yaw from true north; None while it is unknown.
-        position_error_m: bound of the horizontal error in metres; None while the position is.
-        autopilot_connected: whether the autopilot is heard.
-        gps: None until the receiver has told.
-        battery: charge, voltage and current.
-        health: whether the drone could take off, and why not.
-        wind: None while the autopilot does not estimate it.
-        texts: what the autopilot has said since the last sample; in the first one, what it said of late.
+        controller: Control authority: `system`, `pilot`, or the SPIFFE id of the driver instance.
+        attitude: Attitude of the airframe; None if it is unknown.
+        gimbal: Measured attitude of the gimbal's camera, with the yaw from true north; None if it is unknown.
+        position_error_m: Bound of the horizontal position error in metres; None if the position is unknown.
+        autopilot_connected: True if messages of the autopilot are received.
+        gps: State of the satellite receiver; None until the first report.
+        battery: Charge, voltage and current.
+        health: Readiness for takeoff.
+        wind: Wind estimate; None if the autopilot does not estimate it.
+        texts: Texts of the autopilot since the last sample; the first sample contains recent texts.
     """
 
     time: datetime
@@ -163,7 +163,7 @@ class Telemetry:
 
     @classmethod
     def from_proto(cls, message: mobility_pb2.Telemetry) -> Telemetry:
-        """Read the wire form."""
+        """Create the value from its protobuf message."""
         located = message.HasField("position")
         error_m = message.position_error_m if located else None
         return cls(
@@ -195,47 +195,47 @@ class Telemetry:
 def _gps(message: mobility_pb2.Telemetry, error_m: float | None) -> Gps | None:
     if not message.HasField("gps"):
         return None
-    # A kind of fix that this release does not know is a three-dimensional one at least.
+    # Fix types that MAVLink adds later are at least three-dimensional.
     fix = Fix(message.gps.fix_type) if message.gps.fix_type in Fix._value2member_map_ else Fix.FIX_3D
     return Gps(fix, message.gps.satellites, error_m)
 
 
 class Watch:
-    """One thing of the drone's state, each time it changes: `async for gps in drone.watch.gps()`.
+    """Changes of one part of the drone's state: `async for gps in drone.watch.gps()`.
 
-    Each iteration begins with the value of the moment, goes on after a restart of the service, and ends when it is left.
-    Like `Mobility.telemetry` it needs the method GetPosition.
+    Each iteration starts with the current value and continues after a restart of the service. The component needs the
+    method GetPosition.
     """
 
     def __init__(self, telemetry: Callable[[float], AsyncGenerator[Telemetry, None]]) -> None:
         self._telemetry = telemetry
 
     def gps(self, interval_s: float = 0.5) -> AsyncGenerator[Gps, None]:
-        """Fix, satellites and error of the satellite receiver."""
+        """Yield the state of the satellite receiver."""
         return self._changes(interval_s, lambda sample: sample.gps)
 
     def battery(self, interval_s: float = 1.0) -> AsyncGenerator[Battery, None]:
-        """Charge, voltage and current."""
+        """Yield charge, voltage and current."""
         return self._changes(interval_s, lambda sample: sample.battery)
 
     def health(self, interval_s: float = 0.5) -> AsyncGenerator[Health, None]:
-        """Whether the drone could take off, and why not."""
+        """Yield the readiness for takeoff."""
         return self._changes(interval_s, lambda sample: sample.health)
 
     def attitude(self, interval_s: float = 0.1) -> AsyncGenerator[Attitude, None]:
-        """Roll, pitch and yaw."""
+        """Yield the attitude of the airframe."""
         return self._changes(interval_s, lambda sample: sample.attitude)
 
     def gimbal(self, interval_s: float = 0.1) -> AsyncGenerator[Attitude, None]:
-        """Roll, pitch and yaw of the camera on the gimbal, as measured."""
+        """Yield the measured attitude of the gimbal's camera."""
         return self._changes(interval_s, lambda sample: sample.gimbal)
 
     def wind(self, interval_s: float = 1.0) -> AsyncGenerator[Wind, None]:
-        """The wind, as the autopilot estimates it."""
+        """Yield the wind estimate."""
         return self._changes(interval_s, lambda sample: sample.wind)
 
     async def status_texts(self, interval_s: float = 0.5) -> AsyncGenerator[StatusText, None]:
-        """What the autopilot says; at first what it said of late."""
+        """Yield texts of the autopilot, starting with recent ones."""
         async with aclosing(self._telemetry(interval_s)) as samples:
             async for sample in samples:
                 for text in sample.texts:

@@ -1,4 +1,4 @@
-"""What the services answer with, as plain frozen values: positions, decisions, progress, pictures."""
+"""Frozen values of requests and responses: positions, decisions, progress, pictures."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from fractus_proto.v1 import camera_pb2, mobility_pb2, types_pb2
 
 
 class AltitudeReference(enum.Enum):
-    """What an altitude is measured from."""
+    """Datum of an altitude."""
 
     HOME = types_pb2.ALTITUDE_REFERENCE_HOME
     AMSL = types_pb2.ALTITUDE_REFERENCE_AMSL
@@ -19,7 +19,7 @@ class AltitudeReference(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """A point in the air: degrees of WGS 84, and metres above `reference`, NaN where a path names no altitude."""
+    """Position: WGS 84 degrees, and metres above `reference`. The altitude is NaN if a path contains none."""
 
     lat: float
     lon: float
@@ -28,7 +28,7 @@ class Position:
 
     @classmethod
     def from_proto(cls, message: types_pb2.Position) -> Position:
-        """Read the wire form."""
+        """Create the value from its protobuf message."""
         return cls(
             message.latitude_deg,
             message.longitude_deg,
@@ -37,7 +37,7 @@ class Position:
         )
 
     def to_proto(self) -> types_pb2.Position:
-        """Write the wire form."""
+        """Return the protobuf message."""
         return types_pb2.Position(
             latitude_deg=self.lat,
             longitude_deg=self.lon,
@@ -51,7 +51,7 @@ class Position:
 
 @dataclass(frozen=True, slots=True)
 class Velocity:
-    """Metres per second north, east and down."""
+    """Velocity in metres per second: north, east, down."""
 
     north: float = 0.0
     east: float = 0.0
@@ -59,17 +59,20 @@ class Velocity:
 
     @classmethod
     def from_proto(cls, message: types_pb2.Velocity) -> Velocity:
-        """Read the wire form."""
+        """Create the value from its protobuf message."""
         return cls(message.north_mps, message.east_mps, message.down_mps)
 
     def to_proto(self) -> types_pb2.Velocity:
-        """Write the wire form."""
+        """Return the protobuf message."""
         return types_pb2.Velocity(north_mps=self.north, east_mps=self.east, down_mps=self.down)
 
 
 @dataclass(frozen=True, slots=True)
 class Attitude:
-    """Orientation of the airframe, or of the camera on a gimbal, in degrees: right side down, nose up, clockwise from true north."""
+    """Attitude of the airframe or of a gimbal's camera, in degrees.
+
+    Roll is positive right side down, pitch nose up, yaw clockwise from true north.
+    """
 
     roll_deg: float
     pitch_deg: float
@@ -77,12 +80,12 @@ class Attitude:
 
     @classmethod
     def from_proto(cls, message: types_pb2.Attitude) -> Attitude:
-        """Read the wire form."""
+        """Create the value from its protobuf message."""
         return cls(message.roll_deg, message.pitch_deg, message.yaw_deg)
 
 
 class Action(enum.Enum):
-    """What the policy checker did with a call."""
+    """Action of the policy engine on a call."""
 
     UNSPECIFIED = types_pb2.Decision.ACTION_UNSPECIFIED
     ALLOW = types_pb2.Decision.ACTION_ALLOW
@@ -93,13 +96,13 @@ class Action(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """What the policy checker decided on a call, and why.
+    """Decision of the policy engine on a call.
 
     Attributes:
-        action: allowed, corrected, denied, or taken over.
-        reason: one sentence for people; empty when the call was allowed as asked.
-        code: CamelCase and stable, for programs: AltitudeAboveLimit, InsideExclusionZone.
-        policies: names of the policies that decided, most restrictive first.
+        action: Action on the call.
+        reason: Reason in one sentence, for people; empty if the call was allowed unchanged.
+        code: Stable reason in CamelCase, for programs, for example AltitudeAboveLimit or InsideExclusionZone.
+        policies: Names of the policies that decided, most restrictive first.
     """
 
     action: Action = Action.ALLOW
@@ -109,25 +112,25 @@ class Decision:
 
     @classmethod
     def from_proto(cls, message: types_pb2.Decision) -> Decision:
-        """Read the wire form."""
+        """Create the value from its protobuf message."""
         return cls(Action(message.action), message.reason, message.code, tuple(message.policies))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Result:
-    """The outcome of a call that was carried out."""
+    """Result of a call that was carried out."""
 
     decision: Decision = field(default_factory=Decision)
 
     @property
     def corrected(self) -> bool:
-        """Whether a policy changed what was asked before it was carried out."""
+        """True if a policy changed the request before it was carried out."""
         return self.decision.action is Action.CORRECT
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Progress(Result):
-    """A motion on its way: where it leads, where the drone is, how far it still has to go."""
+    """Progress of a motion: target, current position, and remaining distance in metres."""
 
     target: Position
     position: Position
@@ -136,11 +139,16 @@ class Progress(Result):
 
     @classmethod
     def from_proto(cls, message: mobility_pb2.MotionProgress, first: Progress | None) -> Progress:
-        """Read the wire form; decision and target come in the first message and hold for all."""
-        given = {field.name for field, _ in message.ListFields()}
+        """Create the value from its protobuf message.
+
+        Only the first message contains decision and target. They apply to all messages.
+        """
+        present = {field.name for field, _ in message.ListFields()}
         return cls(
-            decision=Decision.from_proto(message.decision) if first is None or "decision" in given else first.decision,
-            target=Position.from_proto(message.target) if first is None or "target" in given else first.target,
+            decision=Decision.from_proto(message.decision)
+            if first is None or "decision" in present
+            else first.decision,
+            target=Position.from_proto(message.target) if first is None or "target" in present else first.target,
             position=Position.from_proto(message.position),
             distance_m=message.distance_m,
             complete=message.complete,
@@ -149,14 +157,14 @@ class Progress(Result):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SpeedResult(Result):
-    """A speed over ground, in force or measured."""
+    """A ground speed, set or measured."""
 
     speed_mps: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PositionResult(Result):
-    """Where the drone is and how it moves."""
+    """Position and velocity of the drone."""
 
     position: Position
     velocity: Velocity
@@ -164,22 +172,22 @@ class PositionResult(Result):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VelocityResult(Result):
-    """The velocity in force, after correction."""
+    """The velocity after correction."""
 
     velocity: Velocity
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Check(Result):
-    """What would become of a call now. Nothing was done; a moment later the answer may be another.
+    """Result of a dry run: the current verdict on a call that was not carried out. A later verdict may differ.
 
     Attributes:
-        position: where a goto would lead, after correction.
-        altitude_m: how high a takeoff would climb, after correction.
-        speed_mps: the speed that would be in force, after correction.
-        velocity: the velocity that would be in force, after correction.
-        takeover: what the system would do with the drone: hover, land, returnToLaunch or revoke; empty: it would not take it.
-        brake_first: whether the drone would be stopped first, to turn on the spot.
+        position: Target of a goto, after correction.
+        altitude_m: Altitude of a takeoff, after correction.
+        speed_mps: Speed, after correction.
+        velocity: Velocity, after correction.
+        takeover: Action of the system if it took the drone over: hover, land, returnToLaunch or revoke; empty if it would not.
+        brake_first: True if the drone would stop before the leg.
     """
 
     position: Position | None = None
@@ -191,7 +199,7 @@ class Check(Result):
 
     @property
     def allowed(self) -> bool:
-        """Whether the call would be carried out, as asked or corrected."""
+        """True if the call would be carried out, unchanged or corrected."""
         return self.decision.action in {Action.ALLOW, Action.CORRECT}
 
     def __bool__(self) -> bool:
@@ -199,7 +207,7 @@ class Check(Result):
 
     @classmethod
     def from_proto(cls, message: mobility_pb2.CheckCallResponse) -> Check:
-        """Read the wire form."""
+        """Create the value from its protobuf message."""
         which = message.WhichOneof("result")
         goto = message.goto if which == "goto" else None
         speed = message.set_speed if which == "set_speed" else goto
@@ -215,13 +223,14 @@ class Check(Result):
 
 
 @dataclass(frozen=True, slots=True)
-class Ride:
-    """How far the system is with the points of interest of a passenger.
+class TourProgress:
+    """Progress of the system's tour through a passenger's points of interest.
 
     Attributes:
-        flying: whether it is on the tour; until then `reason` says what it waits for.
-        visited: how many points the drone was at.
-        complete: whether that was all of them.
+        flying: True during the tour. Before the tour, `reason` contains what the system waits for.
+        visited: Number of visited points.
+        complete: True if all points were visited.
+        reason: Current activity, or the reason of the wait, in one sentence.
     """
 
     flying: bool
@@ -232,11 +241,11 @@ class Ride:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A picture with what is known of it.
+    """A picture and its metadata.
 
     Attributes:
-        info: when, where and how large it was taken, and what policies did to it.
-        data: the file, of `info.media_type`, after privacy filters.
+        info: Time, position, size, and the decision of the policy engine.
+        data: Content of the file, of type `info.media_type`, after privacy filters.
     """
 
     info: ImageInfo
@@ -245,7 +254,7 @@ class Picture:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImageInfo(Result):
-    """A picture in the camera's store."""
+    """Metadata of a stored picture."""
 
     name: str
     time: datetime
@@ -257,7 +266,7 @@ class ImageInfo(Result):
 
     @classmethod
     def from_proto(cls, message: camera_pb2.ImageInfo, decision: types_pb2.Decision) -> ImageInfo:
-        """Read the wire form."""
+        """Create the value from its protobuf message."""
         return cls(
             decision=Decision.from_proto(decision),
             name=message.name,

@@ -1,4 +1,4 @@
-"""Requests between components: repeated with the same id, carried out once, refused for good or for now."""
+"""Requests between components: retries with the same id, single processing, refusals."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ async def until(condition: Callable[[], int]) -> None:
             await asyncio.sleep(0.02)
 
 
-async def test_a_request_is_answered() -> None:
+async def test_request_returns_response() -> None:
     worker = Worker()
     async with worker.serving() as responder, Requester(f"127.0.0.1:{responder.port}") as asking:
         assert await asking.ask("work", b"this") == b"did this"
@@ -53,7 +53,7 @@ async def test_a_request_is_answered() -> None:
     assert asking.repeated == 0
 
 
-async def test_a_connection_that_is_closed_is_opened_again_before_the_next_request() -> None:
+async def test_requester_reconnects_before_the_next_request() -> None:
     worker, opened = Worker(), list[asyncio.StreamWriter]()
 
     async with worker.serving() as responder:
@@ -81,7 +81,7 @@ async def test_a_connection_that_is_closed_is_opened_again_before_the_next_reque
             assert len(opened) == 3
 
 
-async def test_a_repetition_gets_the_first_answer() -> None:
+async def test_repeated_request_returns_first_response() -> None:
     worker = Worker()
     async with worker.serving() as responder, Requester(f"127.0.0.1:{responder.port}") as asking:
         assert await asking.ask("work", b"this", request_id="r1") == b"did this"
@@ -92,14 +92,14 @@ async def test_a_repetition_gets_the_first_answer() -> None:
     assert worker.done == ["r1"]
 
 
-async def test_an_id_counts_within_its_method() -> None:
+async def test_request_id_is_scoped_to_its_method() -> None:
     answers, worker = Answers(), Worker()
     for method in ("work", "play"):
         await answers.once(Request("r1", method, b"this"), worker.work)
     assert worker.done == ["r1", "r1"]
 
 
-async def test_work_that_has_begun_is_waited_for_and_not_begun_again() -> None:
+async def test_repeated_request_waits_for_running_handler() -> None:
     worker = Worker()
     worker.slow.clear()
     async with worker.serving() as responder, Requester(f"127.0.0.1:{responder.port}", attempt_timeout_s=0.3) as asking:
@@ -112,7 +112,7 @@ async def test_work_that_has_begun_is_waited_for_and_not_begun_again() -> None:
 
 
 @pytest.mark.parametrize("failure", [OSError("the store is away"), Unavailable("not yet")])
-async def test_what_fails_for_now_is_tried_again(failure: Exception) -> None:
+async def test_temporary_handler_error_is_retried(failure: Exception) -> None:
     worker = Worker()
     worker.failures = [failure, failure]
     async with worker.serving() as responder, Requester(f"127.0.0.1:{responder.port}") as asking:
@@ -120,7 +120,7 @@ async def test_what_fails_for_now_is_tried_again(failure: Exception) -> None:
     assert asking.repeated == 2
 
 
-async def test_what_is_refused_is_not_tried_again() -> None:
+async def test_refused_request_is_not_retried() -> None:
     worker = Worker()
     worker.failures = [ValueError("this is no picture")]
     async with worker.serving() as responder, Requester(f"127.0.0.1:{responder.port}") as asking:
@@ -133,7 +133,7 @@ async def test_what_is_refused_is_not_tried_again() -> None:
     assert asking.repeated == 0
 
 
-async def test_a_server_that_comes_back_is_found() -> None:
+async def test_requester_finds_restarted_server() -> None:
     worker = Worker()
     async with worker.serving() as responder:
         port = responder.port
@@ -146,7 +146,7 @@ async def test_a_server_that_comes_back_is_found() -> None:
         await again.stop(0.0)
 
 
-async def test_a_request_that_is_not_answered_ends_in_time() -> None:
+async def test_request_without_response_fails_at_its_timeout() -> None:
     worker = Worker()
     async with worker.serving() as responder:
         port = responder.port
@@ -155,7 +155,7 @@ async def test_a_request_that_is_not_answered_ends_in_time() -> None:
             await asking.ask("work", b"x", timeout_s=0.5)
 
 
-async def test_requests_without_an_id_are_refused() -> None:
+async def test_request_without_id_is_refused() -> None:
     worker = Worker()
     async with worker.serving() as responder, grpc.aio.insecure_channel(f"127.0.0.1:{responder.port}") as channel:
         for metadata in ((), ((ID, "x" * 300),)):
@@ -165,7 +165,7 @@ async def test_requests_without_an_id_are_refused() -> None:
     assert not worker.done
 
 
-async def test_answers_are_forgotten_oldest_first() -> None:
+async def test_oldest_stored_responses_are_removed_first() -> None:
     async def echo(request: Request) -> bytes:
         calls.append(request.id)
         return request.body
@@ -179,7 +179,7 @@ async def test_answers_are_forgotten_oldest_first() -> None:
         assert calls == ["a", "b", "c", "a"]
 
 
-async def test_an_attempt_that_is_no_number_counts_as_the_first() -> None:
+async def test_non_numeric_attempt_counts_as_first() -> None:
     worker = Worker()
     async with worker.serving() as responder, grpc.aio.insecure_channel(f"127.0.0.1:{responder.port}") as channel:
         for number, attempt in enumerate(("9" * 5000, "x", "-1", "")):

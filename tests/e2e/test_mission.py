@@ -100,7 +100,7 @@ def test_traffic_monitoring_flies_under_policies(grounded: Kube, capsys: pytest.
     config = ("--kubeconfig", str(kube.kubeconfig))
     assert main.run(["logs", "traffic-monitoring", "--system", *config]) == 0
     log = capsys.readouterr().out.splitlines()
-    assert any(line.startswith(f"Navigator@{DRONE} | ") and "nothing is left to fly" in line for line in log)
+    assert any(line.startswith(f"Navigator@{DRONE} | ") and "run: mission complete" in line for line in log)
     assert {line.split(" | ")[0] for line in log} >= {
         f"AerialViewer@{DRONE}",
         f"GroundViewer@{NODES['edge-1']}",

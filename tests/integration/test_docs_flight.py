@@ -107,7 +107,7 @@ def test_component_reports_corrected_and_denied_calls(flown: Flown) -> None:
     assert re.search(r"^climbed to 15 m: .*policy low", flown.output, re.MULTILINE), flown.output
     assert re.search(r"^going on without it: .*zone pool of policy pool", flown.output, re.MULTILINE), flown.output
     assert re.search(r"^a picture of \d{4,} bytes$", flown.output, re.MULTILINE), flown.output
-    assert "the mission is over; nothing is left to fly" in flown.output
+    assert "run: mission complete" in flown.output
 
 
 def test_audit_log_has_the_verdicts_and_verification_finds_removed_entries(

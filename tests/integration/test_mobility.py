@@ -224,7 +224,7 @@ async def test_an_autopilot_that_is_described_later_is_used(rig: Rig) -> None:
     await rig.until(lambda t: t.ready and t.HasField("position"), 20)
 
 
-async def test_cancelling_a_motion_stops_the_drone(rig: Rig) -> None:
+async def test_cancelled_motion_stops_the_drone(rig: Rig) -> None:
     rig.write_grant(grant())
     rig.start_service()
     rig.start_vehicle(1.0)

@@ -121,7 +121,7 @@ async def test_passengers_without_a_driver_are_flown_through_their_points(rig: R
     events = await riding
     assert events[-1].state == pb.ControlEvent.STATE_COMPLETE
     assert events[-1].waypoints_reached == 2
-    assert pb.ControlEvent.STATE_RIDING in {e.state for e in events}
+    assert pb.ControlEvent.STATE_PASSENGER in {e.state for e in events}
     landed = await rig.until(lambda t: not t.armed, 90, "landing")
     assert math.dist(xy(landed.position), (0, 0)) < 2.0
     assert outcomes(landed) == {VIEWER_MISSION: "complete"}

@@ -1,4 +1,4 @@
-"""The SDK against the real service: what components will live with."""
+"""The SDK with the real mobility service."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ async def restart(rig: Rig) -> None:
     rig.tell("vehicle", signal.SIGCONT)
 
 
-async def test_a_mission_through_the_sdk(rig: Rig) -> None:
+async def test_sdk_mission_with_real_service(rig: Rig) -> None:
     rig.write_grant(
         grant(
             altitude_limit(5, 7),
@@ -91,7 +91,7 @@ async def test_a_mission_through_the_sdk(rig: Rig) -> None:
     assert outcomes(state)[NAVIGATOR_MISSION].startswith("revoked:")
 
 
-async def test_control_returned_through_the_sdk(rig: Rig) -> None:
+async def test_sdk_returns_control_to_real_service(rig: Rig) -> None:
     rig.write_grant(grant())
     rig.start_service()
     rig.start_vehicle()
@@ -108,7 +108,7 @@ async def test_control_returned_through_the_sdk(rig: Rig) -> None:
                 raise AssertionError("control after the mission")
 
 
-async def test_what_a_component_watches(rig: Rig) -> None:
+async def test_sdk_watch_with_real_service(rig: Rig) -> None:
     rig.write_grant(grant())
     rig.start_service()
     rig.start_vehicle()
@@ -134,7 +134,7 @@ async def _until(items: AsyncIterator[T], over: Callable[[T], bool]) -> AsyncIte
             return
 
 
-async def test_asking_first_and_riding_along(rig: Rig) -> None:
+async def test_sdk_dry_runs_and_passenger_tour(rig: Rig) -> None:
     rig.write_grant(grant(altitude_limit(5, 15), fence("no-fly", "exclusion", "revoke", -60, -10, -40, 10)))
     rig.start_service()
     rig.start_vehicle()
@@ -177,10 +177,10 @@ async def test_asking_first_and_riding_along(rig: Rig) -> None:
     await rig.until(lambda t: t.ready and len(rig.entries("grant")) == 2, 20, "the passenger's grant")
     async with Mobility(endpoint(rig, PASSENGER)) as viewer:
         assert not await viewer.can_i.goto(*FRAME.latlon(0, 10), 10)
-        async with contextlib.aclosing(viewer.ride()) as rides:
-            async for ride in rides:
-                assert (ride.visited, ride.complete) == (0, False)
-                if ride.flying:
+        async with contextlib.aclosing(viewer.passenger()) as tour:
+            async for progress in tour:
+                assert (progress.visited, progress.complete) == (0, False)
+                if progress.flying:
                     break
 
 
@@ -188,7 +188,7 @@ CALL_EVERY_S = 0.05
 LIFE_S = 8.0
 
 
-async def test_no_call_is_lost_while_certificates_are_renewed_before_they_expire(rig: Rig) -> None:
+async def test_no_call_is_lost_during_certificate_renewal(rig: Rig) -> None:
     """Of server and client, of mobility and camera, with control of the drone held all the while."""
     rig.write_grant(
         grant(services=[{"service": "mobility", "methods": ALL}, {"service": "camera", "methods": ["ListImages"]}])

@@ -12,7 +12,7 @@ import fractus
 import grpc
 import pytest
 from cryptography import x509
-from fractus import running
+from fractus import runner
 from fractus.drone import Mobility
 from fractus.pictures import Camera
 from fractus_proto.v1 import mobility_pb2
@@ -54,7 +54,7 @@ async def stage(tmp_path: Path) -> AsyncIterator[Stage]:
     await server.stop()
 
 
-async def test_a_driver_flies_and_returns_control(stage: Stage) -> None:
+async def test_driver_flies_and_returns_control(stage: Stage) -> None:
     steps: list[float] = []
     async with stage.client() as drone:
         async with drone.control() as control:
@@ -81,7 +81,7 @@ async def test_every_unary_call_has_a_deadline(stage: Stage) -> None:
     ]  # fmt: skip
 
 
-async def test_a_correction_shows_in_the_result(stage: Stage) -> None:
+async def test_correction_is_in_the_result(stage: Stage) -> None:
     async with stage.client() as drone, drone.control():
         result = await drone.goto(40.0, 22.0, 120.0)
         speed = await drone.set_speed(30.0)
@@ -92,7 +92,7 @@ async def test_a_correction_shows_in_the_result(stage: Stage) -> None:
     assert speed.speed_mps == 10.0
 
 
-async def test_a_strict_client_raises_instead_of_taking_a_correction(stage: Stage) -> None:
+async def test_strict_client_raises_on_correction(stage: Stage) -> None:
     stage.drone.release = asyncio.Event()
     async with stage.client(strict=True) as drone, drone.control():
         with pytest.raises(fractus.Corrected) as motion:
@@ -103,7 +103,7 @@ async def test_a_strict_client_raises_instead_of_taking_a_correction(stage: Stag
     assert motion.value.decision.code == "AboveLimit"
 
 
-async def test_a_refusal_names_code_reason_and_policies(stage: Stage) -> None:
+async def test_refusal_contains_code_reason_and_policies(stage: Stage) -> None:
     async with stage.client() as drone, drone.control():
         with pytest.raises(fractus.PolicyDenied) as refusal:
             await drone.goto(40.02, 22.0, 20.0)
@@ -113,7 +113,7 @@ async def test_a_refusal_names_code_reason_and_policies(stage: Stage) -> None:
     assert "exclusion zone hospital (by no-fly-hospital)" in str(refusal.value)
 
 
-async def test_cancelling_a_motion_stops_the_drone(stage: Stage) -> None:
+async def test_cancelled_motion_stops_the_drone(stage: Stage) -> None:
     stage.drone.release = asyncio.Event()
     async with stage.client() as drone, drone.control():
         with pytest.raises(TimeoutError):
@@ -123,7 +123,7 @@ async def test_cancelling_a_motion_stops_the_drone(stage: Stage) -> None:
     assert stage.drone.calls[-1] == "ReturnControl"
 
 
-async def test_leaving_an_iteration_stops_the_drone(stage: Stage) -> None:
+async def test_leaving_motion_iteration_stops_the_drone(stage: Stage) -> None:
     stage.drone.release = asyncio.Event()
     async with stage.client() as drone, drone.control():
         async with contextlib.aclosing(aiter(drone.goto(40.0, 22.0, 20.0))) as steps:
@@ -133,7 +133,7 @@ async def test_leaving_an_iteration_stops_the_drone(stage: Stage) -> None:
         await asyncio.wait_for(stage.drone.hovering.wait(), WAIT_S)
 
 
-async def test_losing_control_ends_the_motion_with_the_reason(stage: Stage) -> None:
+async def test_control_loss_ends_motion_with_reason(stage: Stage) -> None:
     stage.drone.release = asyncio.Event()
     async with stage.client() as drone:
         with pytest.raises(fractus.ControlLost, match="the pilot took over"):
@@ -150,7 +150,7 @@ async def test_losing_control_ends_the_motion_with_the_reason(stage: Stage) -> N
     assert "ReturnControl" not in stage.drone.calls
 
 
-async def test_losing_control_interrupts_other_work_of_the_body(stage: Stage) -> None:
+async def test_control_loss_interrupts_other_work_in_the_block(stage: Stage) -> None:
     async with stage.client() as drone:
         with pytest.raises(fractus.ControlLost, match="revoked"):
             async with drone.control():
@@ -161,7 +161,7 @@ async def test_losing_control_interrupts_other_work_of_the_body(stage: Stage) ->
     assert not task.cancelling()
 
 
-async def test_a_body_may_catch_the_loss_itself(stage: Stage) -> None:
+async def test_control_loss_can_be_caught_in_the_block(stage: Stage) -> None:
     stage.drone.release = asyncio.Event()
     seen: list[str] = []
     async with stage.client() as drone:
@@ -178,7 +178,7 @@ async def test_a_body_may_catch_the_loss_itself(stage: Stage) -> None:
     assert seen == ["revoked"]
 
 
-async def test_what_is_waited_for_is_told(stage: Stage) -> None:
+async def test_control_progress_reports_reason_of_wait(stage: Stage) -> None:
     told: list[str] = []
     async with stage.client() as drone, drone.control(progress=told.append):
         assert told == ["the autopilot is not ready to arm: it has no home yet"]
@@ -189,36 +189,36 @@ async def visit(drone: Mobility, control: fractus.Control) -> None:
         await drone.goto(waypoint.lat, waypoint.lon, waypoint.alt)
 
 
-async def test_another_life_goes_on_where_the_one_before_was(stage: Stage) -> None:
+async def test_restarted_driver_continues_at_next_waypoint(stage: Stage) -> None:
     stage.drone.waypoints_reached = 1
     async with stage.client() as drone:
-        await running.fly(visit, drone)
+        await runner.fly(visit, drone)
     assert [round(target.longitude_deg, 3) for target in stage.drone.targets] == [22.001, 22.002]
     assert stage.drone.waypoints_reached == 3
     assert stage.drone.calls[-1] == "ReturnControl"
 
 
-async def test_an_interrupted_program_begins_again_and_not_for_ever(
+async def test_interrupted_program_restarts_a_limited_number_of_times(
     stage: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(running, "RETRY_S", 0.0)
+    monkeypatch.setattr(runner, "RETRY_S", 0.0)
     stage.drone.interruptions = 2
     async with stage.client() as drone:
-        await running.fly(visit, drone)
+        await runner.fly(visit, drone)
     assert len(stage.drone.targets) == 3
     assert stage.drone.calls.count("GetControl") == 1
 
     stage.drone.interruptions, stage.drone.waypoints_reached = 1000, 0
     async with stage.client() as drone:
         with pytest.raises(fractus.Interrupted, match="a zone appeared ahead"):
-            await running.fly(visit, drone)
+            await runner.fly(visit, drone)
 
 
-async def test_control_that_was_lost_is_asked_for_again(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(running, "RETRY_S", 0.0)
+async def test_run_requests_lost_control_again(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runner, "RETRY_S", 0.0)
     stage.drone.release = asyncio.Event()
     async with stage.client() as drone:
-        flight = asyncio.create_task(running.fly(visit, drone))
+        flight = asyncio.create_task(runner.fly(visit, drone))
         await asyncio.wait_for(stage.drone.moving.wait(), WAIT_S)
         stage.drone.control.put_nowait(Event(state=Event.STATE_LOST, reason="a human pilot changed the mode to LOITER"))
         await asyncio.wait_for(stage.drone.hovering.wait(), WAIT_S)
@@ -228,7 +228,7 @@ async def test_control_that_was_lost_is_asked_for_again(stage: Stage, monkeypatc
     assert stage.drone.waypoints_reached == 3
 
 
-async def test_a_mission_goes_on_with_the_waypoint_that_was_under_way(stage: Stage) -> None:
+async def test_mission_continues_with_interrupted_waypoint(stage: Stage) -> None:
     stage.drone.waypoints_reached = 1
     seen: list[tuple[int, int]] = []
     async with stage.client() as drone, drone.control():
@@ -238,7 +238,7 @@ async def test_a_mission_goes_on_with_the_waypoint_that_was_under_way(stage: Sta
     assert stage.drone.waypoints_reached == 3
 
 
-async def test_a_mission_passes_over_what_is_refused_if_it_is_to(stage: Stage) -> None:
+async def test_mission_skips_refused_legs_if_requested(stage: Stage) -> None:
     waypoints = [fractus.Position(lat, 22.0, 20.0) for lat in (40.0, 40.5, 40.001)]
     async with stage.client() as drone, drone.control():
         with pytest.raises(fractus.PolicyDenied):
@@ -250,7 +250,7 @@ async def test_a_mission_passes_over_what_is_refused_if_it_is_to(stage: Stage) -
     assert [target.latitude_deg for target in stage.drone.targets] == [40.0, 40.001]
 
 
-async def test_a_mission_is_paused_and_goes_on(stage: Stage) -> None:
+async def test_mission_pauses_and_resumes(stage: Stage) -> None:
     stage.drone.release = asyncio.Event()
     async with stage.client() as drone, drone.control(), asyncio.timeout(WAIT_S):
         mission = drone.mission()
@@ -266,27 +266,27 @@ async def test_a_mission_is_paused_and_goes_on(stage: Stage) -> None:
     assert len(stage.drone.targets) == 4, "the leg that was stopped is begun again"
 
 
-async def test_a_mission_needs_control(stage: Stage) -> None:
+async def test_mission_without_control_is_refused(stage: Stage) -> None:
     async with stage.client() as drone:
         with pytest.raises(fractus.ControlLost, match=r"use `async with drone.control"):
             drone.mission()
 
 
-async def test_a_nose_is_turned_on_the_spot(stage: Stage) -> None:
+async def test_turn_changes_heading_at_current_position(stage: Stage) -> None:
     async with stage.client() as drone, drone.control():
         await drone.turn(90)
     (target,) = stage.drone.targets
     assert (target.latitude_deg, target.longitude_deg, target.altitude_m) == (40.0, 22.0, 5.0)
 
 
-async def test_pictures_are_taken_again_and_again(stage: Stage) -> None:
+async def test_camera_every_takes_pictures_repeatedly(stage: Stage) -> None:
     async with Camera(stage.endpoint) as camera, contextlib.aclosing(camera.every(0.0)) as pictures:
         first, second = await anext(pictures), await anext(pictures)
         assert not stage.pictures.kept
     assert [(p.info.name, p.data) for p in (first, second)] == [("1.jpg", stage.pictures.picture)] * 2
 
 
-async def test_a_picture_that_cannot_be_fetched_is_deleted(stage: Stage) -> None:
+async def test_picture_that_cannot_be_retrieved_is_deleted(stage: Stage) -> None:
     stage.pictures.cut = True
     async with Camera(stage.endpoint) as camera:
         with pytest.raises(fractus.Unavailable, match="ended after"):
@@ -294,7 +294,7 @@ async def test_a_picture_that_cannot_be_fetched_is_deleted(stage: Stage) -> None
     assert not stage.pictures.kept
 
 
-async def test_an_error_in_the_body_does_not_return_control(stage: Stage) -> None:
+async def test_exception_in_block_does_not_return_control(stage: Stage) -> None:
     async with stage.client() as drone:
         with pytest.raises(ZeroDivisionError):
             async with drone.control():
@@ -303,7 +303,7 @@ async def test_an_error_in_the_body_does_not_return_control(stage: Stage) -> Non
     assert "ReturnControl" not in stage.drone.calls
 
 
-async def test_outside_cancellation_stays_a_cancellation(stage: Stage) -> None:
+async def test_outer_cancellation_stays_a_cancellation(stage: Stage) -> None:
     async def fly() -> None:
         async with stage.client() as drone, drone.control():
             await asyncio.sleep(WAIT_S)
@@ -315,7 +315,7 @@ async def test_outside_cancellation_stays_a_cancellation(stage: Stage) -> None:
         await task
 
 
-async def test_a_finished_mission_says_so(stage: Stage) -> None:
+async def test_completed_mission_raises_mission_complete(stage: Stage) -> None:
     stage.drone.refuse_control = (grpc.StatusCode.FAILED_PRECONDITION, "the mission is complete")
     async with stage.client() as drone:
         with pytest.raises(fractus.MissionComplete):
@@ -323,7 +323,7 @@ async def test_a_finished_mission_says_so(stage: Stage) -> None:
                 pytest.fail("no one drives after the mission")
 
 
-async def test_a_flight_survives_a_restart_of_the_service(stage: Stage) -> None:
+async def test_flight_survives_service_restart(stage: Stage) -> None:
     stage.drone.release = asyncio.Event()
     async with stage.client() as drone, drone.control() as control:
         flight = asyncio.create_task(_fly(drone))
@@ -342,7 +342,7 @@ async def _fly(drone: Mobility) -> fractus.Progress:
     return await drone.goto(40.0, 22.0, 20.0)
 
 
-async def test_control_is_lost_when_the_service_stays_away(stage: Stage) -> None:
+async def test_control_is_lost_if_service_does_not_return(stage: Stage) -> None:
     stage.drone.release = asyncio.Event()
     async with stage.client(reconnect_timeout_s=0.5) as drone:
         with pytest.raises(fractus.ControlLost, match="no answer"):
@@ -357,7 +357,7 @@ async def _stop(when: asyncio.Future[bool], server: Server) -> None:
     await server.stop()
 
 
-async def test_a_call_waits_for_a_restarting_service_and_no_longer(stage: Stage) -> None:
+async def test_call_waits_for_restarting_service_up_to_its_limit(stage: Stage) -> None:
     await stage.server.stop()
     async with stage.client(reconnect_timeout_s=0.5) as drone:
         with pytest.raises(fractus.Unavailable, match=stage.endpoint.address):
@@ -370,7 +370,7 @@ async def test_a_call_waits_for_a_restarting_service_and_no_longer(stage: Stage)
         assert (await asyncio.wait_for(call, WAIT_S)).velocity.north == 1.0
 
 
-async def test_a_slow_handshake_is_waited_for(stage: Stage) -> None:
+async def test_slow_tls_handshake_succeeds(stage: Stage) -> None:
     """A node with a busy processor takes longer over a handshake than a call waits between two attempts."""
 
     async def pass_on(source: asyncio.StreamReader, sink: asyncio.StreamWriter) -> None:
@@ -393,7 +393,7 @@ async def test_a_slow_handshake_is_waited_for(stage: Stage) -> None:
     slow.close()
 
 
-async def test_a_renewed_certificate_is_used_without_ending_the_flight(stage: Stage) -> None:
+async def test_renewed_certificate_is_used_without_interrupting_flight(stage: Stage) -> None:
     stage.drone.release = asyncio.Event()
     async with stage.client() as drone, drone.control() as control:
         flight = asyncio.create_task(_fly(drone))
@@ -407,7 +407,7 @@ async def test_a_renewed_certificate_is_used_without_ending_the_flight(stage: St
         assert (await asyncio.wait_for(flight, WAIT_S)).complete
 
 
-async def test_all_streams_go_on_with_a_renewed_certificate(stage: Stage) -> None:
+async def test_streams_continue_after_certificate_renewal(stage: Stage) -> None:
     async with stage.client() as drone, drone.control() as control:
         samples = drone.telemetry()
         await anext(samples)
@@ -423,7 +423,7 @@ async def test_all_streams_go_on_with_a_renewed_certificate(stage: Stage) -> Non
     assert len(stage.drone.certificates) == 2
 
 
-async def test_each_call_that_ends_with_an_old_certificate_is_tried_again(stage: Stage) -> None:
+async def test_calls_ended_by_expired_certificate_are_retried(stage: Stage) -> None:
     async with stage.client() as drone:
         channel = drone._channel
         errors = [grpc.aio.AioRpcError(grpc.StatusCode.UNAUTHENTICATED, Metadata(), Metadata()) for _ in range(2)]
@@ -436,7 +436,7 @@ async def test_each_call_that_ends_with_an_old_certificate_is_tried_again(stage:
         assert all(channel.transient(error) for error in errors)
 
 
-async def test_a_stream_ends_with_a_certificate_that_is_not_renewed(stage: Stage) -> None:
+async def test_stream_ends_if_certificate_is_not_renewed(stage: Stage) -> None:
     async with stage.client() as drone:
         samples = drone.telemetry()
         await anext(samples)
@@ -446,7 +446,7 @@ async def test_a_stream_ends_with_a_certificate_that_is_not_renewed(stage: Stage
     assert stage.drone.calls == ["SubscribeTelemetry"]
 
 
-async def test_the_server_must_be_the_node_that_was_meant(stage: Stage) -> None:
+async def test_server_certificate_must_match_the_node(stage: Stage) -> None:
     other = replace(stage.endpoint, server_name="drone-2.node.fractus.dev")
     async with Mobility(other, reconnect_timeout_s=0.3) as drone:
         with pytest.raises(fractus.Unavailable):
@@ -462,7 +462,7 @@ async def test_the_server_must_be_the_node_that_was_meant(stage: Stage) -> None:
         (("ca.crt", "tls.crt"), "tls.crt and tls.key are no pair: correct FRACTUS_TLS_DIR"),
     ],
 )
-async def test_a_stranger_gets_no_answer_and_is_told_why(
+async def test_client_with_foreign_certificate_fails_with_reason(
     stage: Stage, tmp_path: Path, ours: tuple[str, ...], remedy: str
 ) -> None:
     tls = Authority().issue(tmp_path / "stranger", [x509.UniformResourceIdentifier(NAVIGATOR)])
@@ -477,13 +477,13 @@ async def test_a_stranger_gets_no_answer_and_is_told_why(
     assert stage.drone.calls == []
 
 
-async def test_missing_certificates_are_named(stage: Stage, tmp_path: Path) -> None:
+async def test_missing_certificate_file_is_named(stage: Stage, tmp_path: Path) -> None:
     async with Mobility(replace(stage.endpoint, tls_dir=tmp_path / "nowhere")) as drone:
         with pytest.raises(fractus.NotConfigured, match=r"nowhere/ca\.crt"):
             await drone.position()
 
 
-async def test_pictures_come_whole_or_not_at_all(stage: Stage) -> None:
+async def test_incomplete_picture_transfer_is_an_error(stage: Stage) -> None:
     async with Camera(stage.endpoint, reconnect_timeout_s=0.5) as camera:
         info = await camera.capture(width=800)
         assert info.width == 800
@@ -495,7 +495,7 @@ async def test_pictures_come_whole_or_not_at_all(stage: Stage) -> None:
             await camera.retrieve(info.name)
 
 
-async def test_the_same_without_asyncio(stage: Stage) -> None:
+async def test_sync_client_flies_a_mission(stage: Stage) -> None:
     def fly() -> tuple[fractus.Progress, bool]:
         with fractus.sync.mobility(stage.endpoint) as drone:
             with drone.control() as control:
@@ -510,7 +510,7 @@ async def test_the_same_without_asyncio(stage: Stage) -> None:
     assert complete
 
 
-async def test_losing_control_without_asyncio(stage: Stage) -> None:
+async def test_sync_client_raises_control_lost(stage: Stage) -> None:
     stage.drone.release = asyncio.Event()
 
     def fly() -> None:

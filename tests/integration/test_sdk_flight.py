@@ -194,7 +194,7 @@ def calls(stage: Stage) -> list[tuple[str, str, str]]:
     return [(last["method"], last["action"], last["code"]) for *_, last in each]
 
 
-def test_the_navigator_flies_its_path_is_corrected_and_refused_and_comes_home(stage: Stage) -> None:
+def test_navigator_flies_path_with_corrections_and_refusals(stage: Stage) -> None:
     stage.start_navigator()
     stage.wait("landing", lambda: stage.noted("landed"))
 
@@ -215,30 +215,30 @@ def test_the_navigator_flies_its_path_is_corrected_and_refused_and_comes_home(st
     assert "flying at 10.0 m/s: speed 12.0 m/s is above the limit of policy town-speed" in log
     assert "detour refused, going on: the target is" in log
     assert "waypoint 3/5 reached: 50.865633, 4.680631, 50.0 m (corrected: altitude 70.0 m" in log
-    stage.wait("farewell", lambda: "control returned: the system flies the drone home" in stage.log("navigator"), 10)
+    stage.wait("farewell", lambda: "control returned (mission_complete=True)" in stage.log("navigator"), 10)
     with stage.audit.open("rb") as lines:
         assert not verify(lines).problem
 
 
-def test_a_navigator_that_is_killed_goes_on_where_it_was_and_rests_after_its_mission(short: Stage) -> None:
+def test_killed_navigator_continues_and_stays_after_mission(short: Stage) -> None:
     short.start_navigator()
     short.wait("first waypoint", lambda: "waypoint 1/2 reached" in short.log("navigator"))
     short.kill("navigator")
     short.start_navigator()
     short.wait("return", lambda: "control returned" in short.log("navigator"))
     log = short.log("navigator")
-    assert "in control at control point 1 (waypoints reached=1)" in log
+    assert "control granted (control_point=1 waypoints_reached=1)" in log
     assert log.count("waypoint 1/2 reached") == 1
     assert "waypoint 2/2 reached" in log
     assert short.noted("driver lost")
 
     short.kill("navigator")
     short.start_navigator()
-    short.wait("word of it", lambda: "the mission is over; nothing is left to fly" in short.log("navigator"), 20)
+    short.wait("word of it", lambda: "run: mission complete" in short.log("navigator"), 20)
     assert short.processes["navigator"].poll() is None
 
 
-def test_a_navigator_that_is_killed_at_each_stage_of_its_flight_completes_it(short: Stage) -> None:
+def test_navigator_killed_at_each_stage_completes_mission(short: Stage) -> None:
     def begun(method: str, times: int) -> bool:
         return [entry["method"] for entry in short.entries() if entry["kind"] == "call"].count(method) >= times
 
@@ -258,11 +258,11 @@ def test_a_navigator_that_is_killed_at_each_stage_of_its_flight_completes_it(sho
     log = short.log("navigator")
     assert log.count("waypoint 1/2 reached") == 1
     assert log.count("waypoint 2/2 reached") == 1
-    assert "in control at control point 1 (waypoints reached=1)" in log
+    assert "control granted (control_point=1 waypoints_reached=1)" in log
     short.wait("landing", lambda: short.noted("landed"))
 
 
-def test_a_service_that_is_killed_is_found_again_by_the_navigator(slow: Stage) -> None:
+def test_navigator_reconnects_to_killed_service(slow: Stage) -> None:
     slow.start_navigator()
     slow.wait("first waypoint", lambda: "waypoint 1/2 reached" in slow.log("navigator"))
     slow.kill("service")
@@ -274,16 +274,16 @@ def test_a_service_that_is_killed_is_found_again_by_the_navigator(slow: Stage) -
     assert "waypoint 2/2 reached" in log
 
 
-def test_sigterm_stops_the_navigator_and_the_system_brings_the_drone_home(short: Stage) -> None:
+def test_sigterm_stops_navigator_and_system_flies_home(short: Stage) -> None:
     short.start_navigator()
     short.wait("takeoff", lambda: "takeoff reached" in short.log("navigator"))
     short.processes["navigator"].terminate()
     assert short.processes["navigator"].wait(10) == 0
-    assert "told to stop" in short.log("navigator")
+    assert "run: stopping" in short.log("navigator")
     short.wait("landing", lambda: short.noted("landed"))
 
 
-def test_telemetry_reads_as_json_lines_with_the_node_s_certificate(short: Stage) -> None:
+def test_telemetry_command_prints_json_lines(short: Stage) -> None:
     def read() -> list[dict[str, Any]]:
         done = subprocess.run(
             [

@@ -1,4 +1,4 @@
-"""A plan of a ground station and an orbit, flown by the SDK in the real service: paused, gone on with, by two lives of a program."""
+"""A QGroundControl plan and an orbit, flown by the SDK with the real service, with a pause and a restart."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Killed(Exception):
     """What ends the first life of the program in flight."""
 
 
-async def test_a_plan_and_an_orbit_are_flown_paused_and_gone_on_with(rig: Rig) -> None:
+async def test_plan_and_orbit_mission_survives_pause_and_restart(rig: Rig) -> None:
     rig.write_grant(grant())
     rig.start_service("--driver-grace", "30")
     rig.start_vehicle(2.0)

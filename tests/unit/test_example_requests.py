@@ -1,4 +1,4 @@
-"""The traffic monitoring example: a picture that comes again after a change of path counts once."""
+"""Traffic monitoring example: a picture that is repeated after a path change counts once."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def programs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict[str, Any]:
     return found
 
 
-async def test_two_instances_and_one_picture(programs: dict[str, Any]) -> None:
+async def test_repeated_picture_counts_once_across_instances(programs: dict[str, Any]) -> None:
     check, pictures = programs["image_checker"].check, programs["pictures"]
     body = pictures.pack("picture-1", "viewer-1", pictures.render(160, 120, 1))
     for _ in range(2):  # instances, each of which knows nothing of the other
@@ -52,7 +52,7 @@ async def test_two_instances_and_one_picture(programs: dict[str, Any]) -> None:
     assert kept["request"] == "r1"
 
 
-async def test_what_is_no_picture_is_refused(programs: dict[str, Any]) -> None:
+async def test_example_refuses_invalid_picture(programs: dict[str, Any]) -> None:
     for body in (b"", b"not json\nx", programs["pictures"].pack("p", "s", b"no picture")):
         with pytest.raises(ValueError, match=" "):
             await programs["image_checker"].check(Request("r", "check", body))
@@ -83,7 +83,7 @@ class FullCamera:
         self.kept.remove(name)
 
 
-async def test_examples_leave_no_pictures_on_the_node(programs: dict[str, Any]) -> None:
+async def test_traffic_example_leaves_no_pictures_on_the_node(programs: dict[str, Any]) -> None:
     camera = FullCamera()
     for number in range(4):
         try:
@@ -93,7 +93,7 @@ async def test_examples_leave_no_pictures_on_the_node(programs: dict[str, Any]) 
     assert (camera.kept, camera.taken) == ([], 4)
 
 
-async def test_the_links_example_leaves_no_pictures_on_the_node(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_links_example_leaves_no_pictures_on_the_node(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "path", [str(EXAMPLES / "links"), *sys.path])
     monkeypatch.delitem(sys.modules, "aerial_viewer", raising=False)
     monkeypatch.delitem(os.environ, "PICTURE_BYTES", raising=False)
@@ -104,7 +104,7 @@ async def test_the_links_example_leaves_no_pictures_on_the_node(monkeypatch: pyt
     assert not camera.kept
 
 
-def test_components_that_take_pictures_may_delete_them() -> None:
+def test_components_that_take_pictures_have_delete_method() -> None:
     taking = 0
     for path in sorted(EXAMPLES.rglob("*.yaml")):
         for body in filter(None, yaml.safe_load_all(path.read_text())):

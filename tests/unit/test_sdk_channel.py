@@ -1,4 +1,4 @@
-"""What is tried again while a service is away, and what is not."""
+"""Retries of SDK calls while a service is unreachable."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ class Restarting(ServiceChannel):
 
 
 @pytest.mark.parametrize("method", ["Hover", "GetPosition"])
-async def test_a_call_waits_for_a_service_that_restarts(method: str) -> None:
+async def test_call_retries_while_service_restarts(method: str) -> None:
     channel = Restarting()
     assert await channel.unary(method, "request") == "done"
     assert len(channel.calls) == 2
 
 
 @pytest.mark.parametrize("method", ["Arm", "SetVelocity"])
-async def test_what_is_for_this_moment_is_not_asked_for_later(method: str) -> None:
+async def test_arm_and_set_velocity_are_not_retried(method: str) -> None:
     channel = Restarting()
     with pytest.raises(Unavailable):
         await channel.unary(method, "request")
@@ -55,10 +55,10 @@ async def test_what_is_for_this_moment_is_not_asked_for_later(method: str) -> No
     ("content", "said"),
     [
         (None, "the certificate {0}/ca.crt cannot be read: No such file or directory"),
-        (b"", "{0}/ca.crt is no PEM file"),
+        (b"", "{0}/ca.crt is not a PEM file"),
     ],
 )
-def test_a_driver_without_a_certificate_ends_with_one_sentence(
+def test_missing_or_invalid_certificate_exits_with_one_sentence(
     tmp_path: Path, content: bytes | None, said: str
 ) -> None:
     if content is not None:
@@ -74,7 +74,7 @@ def test_a_driver_without_a_certificate_ends_with_one_sentence(
     assert ended.value.code == f"{said.format(tmp_path)}; {remedy}"
 
 
-async def test_control_without_a_certificate_is_no_loss_of_control(tmp_path: Path) -> None:
+async def test_control_without_certificate_raises_not_configured(tmp_path: Path) -> None:
     async with fractus.mobility(Endpoint("127.0.0.1:1", "drone-1", tmp_path)) as drone:
         with pytest.raises(NotConfigured, match="set FRACTUS_TLS_DIR"):
             async with drone.control():

@@ -1,4 +1,4 @@
-"""What the SDK reads from a pod's environment."""
+"""Environment variables read by the SDK."""
 
 from __future__ import annotations
 
@@ -20,36 +20,36 @@ POD = {
 }
 
 
-def test_the_mobility_service_is_the_node_s_own() -> None:
+def test_mobility_endpoint_is_that_of_the_node() -> None:
     found = endpoint("mobility", POD)
     assert found.address == "10.200.0.11:50051"
     assert found.server_name == "drone-1.node.fractus.dev"
     assert str(found.tls_dir) == "/tls"
 
 
-def test_the_camera_is_found_by_the_host_unless_it_has_an_address() -> None:
+def test_camera_endpoint_uses_host_ip_unless_address_is_set() -> None:
     assert endpoint("camera", POD).address == "10.200.0.11:50052"
     assert endpoint("camera", POD | {"FRACTUS_CAMERA_ADDRESS": "10.0.0.1:1"}).address == "10.0.0.1:1"
 
 
 @pytest.mark.parametrize("missing", ["FRACTUS_NODE", "FRACTUS_HOST_IP"])
-def test_a_missing_variable_is_named(missing: str) -> None:
+def test_missing_environment_variable_is_named(missing: str) -> None:
     env = {k: v for k, v in POD.items() if k not in {missing, "FRACTUS_MOBILITY_ADDRESS"}}
     with pytest.raises(fractus.NotConfigured, match=missing):
         endpoint("mobility", env)
 
 
 @pytest.mark.parametrize("component", ["ImageChecker", "image-checker"])
-def test_egress_gives_the_address_of_a_component(component: str) -> None:
+def test_egress_returns_component_address(component: str) -> None:
     assert egress(component, POD) == "traffic-image-checker.default.svc:8080"
 
 
-def test_egress_that_the_application_does_not_list_is_refused() -> None:
+def test_egress_to_unlisted_component_is_refused() -> None:
     with pytest.raises(fractus.NotConfigured, match="list DataStore in the egress"):
         egress("DataStore", POD)
 
 
-def test_control_points_are_read_as_the_manifest_spells_them() -> None:
+def test_control_points_are_read_from_environment() -> None:
     text = json.dumps(
         [
             {
@@ -71,7 +71,7 @@ def test_control_points_are_read_as_the_manifest_spells_them() -> None:
     assert region.region == fractus.Circle(fractus.Position(1.0, 2.0), 50.0)
 
 
-def test_control_points_of_a_grant_are_those_of_its_driver(tmp_path: Path) -> None:
+def test_control_points_are_read_from_grant_file(tmp_path: Path) -> None:
     corners = [{"lat": 0, "lon": 0}, {"lat": 0, "lon": 1}, {"lat": 1, "lon": 1}]
     points = [{"navigation": "regionBased", "region": {"polygon": {"exterior": corners, "holes": [corners]}}}]
     path = tmp_path / "grant.json"
@@ -82,18 +82,18 @@ def test_control_points_of_a_grant_are_those_of_its_driver(tmp_path: Path) -> No
     assert point.region.exterior[1] == fractus.Position(0.0, 1.0)
     with pytest.raises(fractus.NotConfigured, match=r"FRACTUS_GRANT .* cannot be read"):
         control_points({"FRACTUS_GRANT": str(tmp_path / "none.json")})
-    with pytest.raises(fractus.NotConfigured, match="set FRACTUS_GRANT to a signed Grant's file"):
+    with pytest.raises(fractus.NotConfigured, match="set FRACTUS_GRANT to the file of a signed Grant"):
         control_points({})
 
 
 @pytest.mark.parametrize("text", ["{", "3", '[{"path": []}]', '[{"navigation": "pathBased", "path": [{"lat": 1}]}]'])
-def test_control_points_that_are_not_ours_are_refused(text: str) -> None:
+def test_invalid_control_points_are_refused(text: str) -> None:
     with pytest.raises(fractus.NotConfigured, match="FRACTUS_CONTROL_POINTS"):
         control_points({"FRACTUS_CONTROL_POINTS": text})
 
 
 @pytest.mark.parametrize("component", ["ImageChecker", "Viewer2D", "data-store", "A"])
-def test_names_are_those_of_the_operator(component: str) -> None:
+def test_egress_variable_names_match_the_operator(component: str) -> None:
     assert egress(component, {address_variable(component): "a:1"}) == "a:1"
     found = endpoint("mobility", {"FRACTUS_NODE": "drone-1", "FRACTUS_HOST_IP": "10.0.0.1"})
     assert found.server_name == node_server_name("drone-1")

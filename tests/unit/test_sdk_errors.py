@@ -1,4 +1,4 @@
-"""Failed calls as typed errors."""
+"""Translation of failed gRPC calls to exceptions of the SDK."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ async def failed(refusal: Refused) -> grpc.aio.AioRpcError:
 
 
 @pytest.mark.parametrize("again_s", [0.25, 0.0])
-async def test_who_asks_too_much_learns_when_to_ask_again(again_s: float) -> None:
+async def test_busy_error_contains_retry_delay(again_s: float) -> None:
     reason = "more than 50 calls a second; slow down"
     error = await failed(ResourceExhausted("TooManyCalls", reason, retry_after_s=again_s))
     found = translate(error, "GetSpeed", "there")
@@ -42,7 +42,7 @@ async def test_who_asks_too_much_learns_when_to_ask_again(again_s: float) -> Non
     assert bool(found.remedy) == bool(again_s), "where waiting does not help, the message says what does"
 
 
-async def test_a_refusal_carries_who_decided() -> None:
+async def test_policy_denied_contains_decision() -> None:
     verdict = Verdict("deny", None, "InsideExclusionZone", "the target is inside", ("no-fly",))
     found = translate(await failed(denied(verdict)), "Goto", "there")
     assert isinstance(found, PolicyDenied)
@@ -59,23 +59,23 @@ async def test_a_refusal_carries_who_decided() -> None:
         (
             "UNAVAILABLE",
             "failed to connect: Hostname Verification Check failed.",
-            "another node's: correct FRACTUS_NODE",
+            "another node: correct FRACTUS_NODE",
         ),
         (
             "UNAVAILABLE",
             "Peer name d2.node.fractus.dev is not in peer certificate",
-            "another node's: correct FRACTUS_NODE",
+            "another node: correct FRACTUS_NODE",
         ),
         ("UNAVAILABLE", "SSL_ERROR_SSL: CERTIFICATE_VERIFY_FAILED: unable to get", "correct FRACTUS_TLS_DIR"),
-        ("UNAVAILABLE", "SSL routines:OPENSSL_internal:WRONG_VERSION_NUMBER", "it speaks no TLS: correct the address"),
+        ("UNAVAILABLE", "SSL routines:OPENSSL_internal:WRONG_VERSION_NUMBER", "does not use TLS: correct the address"),
         (
             "UNIMPLEMENTED",
             "Method not found!",
-            "another service listens there, or another version: correct the address",
+            "another service or another version listens there: correct the address",
         ),
     ],
 )
-def test_what_grpc_says_comes_with_a_remedy(code: str, text: str, remedy: str) -> None:
+def test_grpc_error_text_gets_a_remedy(code: str, text: str, remedy: str) -> None:
     error = grpc.aio.AioRpcError(grpc.StatusCode[code], grpc.aio.Metadata(), grpc.aio.Metadata(), details=text)
     assert remedy in str(translate(error, "Goto", "there"))
 
@@ -84,7 +84,7 @@ ROOT = Path(__file__).parents[2]
 RAISED = re.compile(r'PreconditionFailed\(\s*(?:\*ended_refusal|"([A-Z]\w+)")')
 
 
-async def test_every_state_that_refuses_a_call_has_a_type_of_its_own() -> None:
+async def test_every_state_refusal_code_has_an_exception_type() -> None:
     sources = [path.read_text() for path in (ROOT / "services").rglob("*.py")]
     codes = {code for source in sources for code in RAISED.findall(source) if code} | {"AutopilotRefused"}
     assert {"NotArmed", "NotFlying", "NoLegalWay", "ControlHeld", "NotAtHome"} <= codes
@@ -94,7 +94,7 @@ async def test_every_state_that_refuses_a_call_has_a_type_of_its_own() -> None:
         assert found.remedy, code
 
 
-async def test_a_mission_that_is_over_says_what_another_flight_needs() -> None:
+async def test_mission_ended_names_remedy_for_another_flight() -> None:
     refusal = ended_refusal(Outcome(OutcomeKind.FAILED, "driver lost"))
     found = translate(await failed(errors.PreconditionFailed(*refusal)), "GetControl", "there")
     assert isinstance(found, MissionEnded)

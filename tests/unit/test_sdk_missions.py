@@ -1,4 +1,4 @@
-"""Missions of the SDK: orbits, and plans of QGroundControl."""
+"""Missions of the SDK: orbits and QGroundControl plans."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from fractus_core.geo import LocalFrame
 
 
 @pytest.mark.parametrize("turns", [1.0, -0.5, 2.0])
-def test_an_orbit_keeps_its_distance_and_looks_at_its_middle(turns: float) -> None:
+def test_orbit_keeps_radius_and_faces_centre(turns: float) -> None:
     frame = LocalFrame(39.36, 22.95)
     waypoints = fractus.orbit(fractus.Position(39.36, 22.95, 25.0), 80.0, turns=turns, points=12)
     assert len(waypoints) == abs(turns) * 12 + 1
@@ -30,7 +30,7 @@ def test_an_orbit_keeps_its_distance_and_looks_at_its_middle(turns: float) -> No
 
 
 @pytest.mark.parametrize(("radius_m", "points"), [(0.0, 16), (math.nan, 16), (30.0, 2)])
-def test_an_orbit_that_is_none_is_refused(radius_m: float, points: int) -> None:
+def test_orbit_with_invalid_radius_or_points_is_refused(radius_m: float, points: int) -> None:
     with pytest.raises(fractus.InvalidRequest, match="radius above 0"):
         fractus.orbit(fractus.Position(0.0, 0.0), radius_m, points=points)
 
@@ -45,7 +45,7 @@ def plan(tmp_path: Path, *items: dict[str, Any]) -> Path:
     return path
 
 
-def test_a_plan_gives_its_waypoints(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_plan_waypoints_are_read(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     survey = {
         "type": "ComplexItem",
         "complexItemType": "survey",
@@ -68,19 +68,19 @@ def test_a_plan_gives_its_waypoints(tmp_path: Path, caplog: pytest.LogCaptureFix
     amsl = fractus.Position(39.2, 22.2, 230.0, fractus.AltitudeReference.AMSL)
     assert second == fractus.Waypoint(amsl, yaw_deg=90, speed_mps=7.5, acceptance_radius_m=2.0, stay_s=4.0)
     assert (third.position.alt, third.speed_mps) == (40.0, 7.5)
-    assert "MAV_CMD 206" in caplog.text
+    assert "MAV_CMD=206" in caplog.text
 
 
 @pytest.mark.parametrize(
     ("items", "why"),
     [
-        ([item(18, 1, 0, 5, 0, 39.1, 22.1, 30)], "item 1 is MAV_CMD 18, which is not flown"),
-        ([item(16, 0, 0, 0, None, 39.1, 22.1, 30, frame=1)], "item 1 has frame 1"),
-        ([item(16, 0, 0, 0)], "not a plan of QGroundControl"),
-        ([{"type": "SimpleItem"}], "not a plan of QGroundControl"),
+        ([item(18, 1, 0, 5, 0, 39.1, 22.1, 30)], "item 1 .MAV_CMD 18. cannot be flown"),
+        ([item(16, 0, 0, 0, None, 39.1, 22.1, 30, frame=1)], "item 1 has the unsupported frame 1"),
+        ([item(16, 0, 0, 0)], "not a QGroundControl plan"),
+        ([{"type": "SimpleItem"}], "not a QGroundControl plan"),
     ],
 )  # fmt: skip
-def test_a_plan_that_cannot_be_flown_says_why(tmp_path: Path, items: list[dict[str, Any]], why: str) -> None:
+def test_unsupported_plan_is_refused_with_reason(tmp_path: Path, items: list[dict[str, Any]], why: str) -> None:
     with pytest.raises(fractus.InvalidRequest, match=why):
         fractus.read_plan(plan(tmp_path, *items))
     with pytest.raises(fractus.InvalidRequest, match="No such file"):
@@ -97,7 +97,7 @@ class Remembered:
         self.waypoints_reached = waypoints
 
 
-async def test_a_control_point_has_one_mission() -> None:
+async def test_second_mission_at_control_point_is_refused() -> None:
     control, flown = cast(fractus.Control, Remembered()), list[fractus.Position]()
     first, second, third = (fractus.Position(lat, 22.0) for lat in (39.0, 39.1, 39.2))
 
@@ -111,6 +111,6 @@ async def test_a_control_point_has_one_mission() -> None:
     await whole
     await whole
     for other in (mission(third), mission(first, second, third), mission(first, second)):
-        with pytest.raises(fractus.InvalidRequest, match="one mission, and another one was begun"):
+        with pytest.raises(fractus.InvalidRequest, match="one mission, and another one has started"):
             await other
     assert flown == [first, second]

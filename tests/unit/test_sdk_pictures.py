@@ -1,4 +1,4 @@
-"""Pictures that are taken in one call: what happens where they cannot be deleted from the node."""
+"""`Camera.take` if the picture cannot be deleted from the node."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ class Node(Camera):
         raise Unavailable(f"deleting {name} broke off")
 
 
-async def test_a_fetched_picture_is_kept_though_it_cannot_be_deleted(caplog: pytest.LogCaptureFixture) -> None:
+async def test_take_returns_picture_if_deletion_fails(caplog: pytest.LogCaptureFixture) -> None:
     picture = await Node(b"jpeg").take()
     assert picture.data == b"jpeg"
-    assert "stays on the node" in caplog.text
+    assert "not deleted from the node" in caplog.text
 
 
-async def test_it_says_why_a_picture_was_not_fetched() -> None:
+async def test_take_reports_retrieval_error_if_deletion_fails_too() -> None:
     with pytest.raises(Unavailable, match="fetching broke off"):
         await Node(None).take()

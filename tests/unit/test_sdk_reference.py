@@ -1,4 +1,4 @@
-"""The reference of the SDK is the one that its docstrings give."""
+"""The SDK reference page matches the docstrings."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ _CODE = re.compile(r"```python\n.*?\n```", re.DOTALL)
 PAGE = Path(__file__).parents[2] / "docs" / "reference" / "sdk.md"
 
 
-def test_the_reference_is_the_one_of_the_docstrings() -> None:
+def test_sdk_reference_page_matches_docstrings() -> None:
     assert PAGE.read_text() == reference(), "run `make generate`"
 
 
-def test_every_method_and_field_is_described() -> None:
+def test_every_public_method_and_field_has_a_docstring() -> None:
     blocks = [block.strip() for block in _CODE.sub("", reference()).split("\n\n") if block.strip()]
     for head, after in itertools.pairwise(blocks):
         if head.startswith(("### ", "#### ")):

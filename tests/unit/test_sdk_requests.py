@@ -1,4 +1,4 @@
-"""Arguments that are no numbers: refused before the wire takes them for zero."""
+"""Validation of numeric arguments before they are converted to protobuf."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from fractus import InvalidRequest, Position, Velocity
-from fractus.requests import capture_request, goto_request, speed_request, takeoff_request, velocity_request
+from fractus.proto_requests import capture_request, goto_request, speed_request, takeoff_request, velocity_request
 
 NUMBERS: dict[str, Callable[[Any], object]] = {
     "lat": lambda bad: goto_request(Position(bad, 1.0, 1.0), None, None),
@@ -26,13 +26,13 @@ NUMBERS: dict[str, Callable[[Any], object]] = {
 
 @pytest.mark.parametrize("field", NUMBERS)
 @pytest.mark.parametrize("bad", [None, "39.36", True, [], 10**400, object()])
-def test_what_is_no_number_is_refused_by_name(field: str, bad: object) -> None:
+def test_non_numeric_argument_is_refused_by_name(field: str, bad: object) -> None:
     with pytest.raises(InvalidRequest, match=f"^{field} must be a number"):
         NUMBERS[field](bad)
 
 
 @pytest.mark.parametrize("bad", ["90", True, []])
-def test_yaw_and_speed_may_be_left_out_only(bad: Any) -> None:
+def test_yaw_and_speed_are_numbers_or_none(bad: Any) -> None:
     with pytest.raises(InvalidRequest, match="yaw_deg"):
         goto_request(Position(1.0, 1.0), bad, None)
     with pytest.raises(InvalidRequest, match="speed_mps"):
@@ -41,14 +41,14 @@ def test_yaw_and_speed_may_be_left_out_only(bad: Any) -> None:
 
 
 @pytest.mark.parametrize("bad", [-1, 2**31, 10**30, 1.5, math.nan, "640", None])
-def test_pixels_are_whole_numbers(bad: Any) -> None:
+def test_picture_size_must_be_whole_numbers(bad: Any) -> None:
     with pytest.raises(InvalidRequest, match="width must be a whole number"):
         capture_request(bad, 480)
     with pytest.raises(InvalidRequest, match="height must be a whole number"):
         capture_request(640, bad)
 
 
-def test_numbers_arrive_as_they_were() -> None:
+def test_numeric_arguments_are_sent_unchanged() -> None:
     assert goto_request(Position(1, 2, 3), 90, 4).speed_mps == 4.0
     assert math.isnan(takeoff_request(math.nan).altitude_m)
     assert capture_request(640, 480).height == 480

@@ -1,4 +1,4 @@
-"""The clients without asyncio have every method of the asynchronous ones, with its arguments and documentation."""
+"""Synchronous clients have every method of the asynchronous clients, with the same arguments and documentation."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PAIRS = [
 
 
 @pytest.mark.parametrize(("theirs", "ours"), PAIRS, ids=lambda kind: kind.__name__)
-def test_every_method_is_there(theirs: type, ours: type) -> None:
+def test_sync_clients_have_every_asynchronous_method(theirs: type, ours: type) -> None:
     for name, method in inspect.getmembers(theirs, inspect.isfunction):
         if not name.startswith("_"):
             waiting = getattr(ours, name)

@@ -1,4 +1,4 @@
-"""What the wire says, as values."""
+"""Conversion of protobuf messages to values."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from fractus_cli.telemetry import _line
 from fractus_proto.v1 import mobility_pb2, types_pb2
 
 
-def test_telemetry_tells_an_unknown_position_from_the_gulf_of_guinea() -> None:
+def test_telemetry_position_is_none_if_unknown() -> None:
     lost = Telemetry.from_proto(mobility_pb2.Telemetry(position_error_m=1.5))
     assert (lost.position_error_m, lost.autopilot_connected, lost.attitude) == (None, False, None)
     assert (lost.position, lost.velocity, lost.home) == (None, None, None)
@@ -19,7 +19,7 @@ def test_telemetry_tells_an_unknown_position_from_the_gulf_of_guinea() -> None:
     assert (known.position_error_m, known.autopilot_connected) == (1.5, True)
 
 
-async def test_what_changes_is_told_once_and_texts_all() -> None:
+async def test_watch_yields_changes_once_and_all_texts() -> None:
     def sample(satellites: int, *texts: str) -> Telemetry:
         message = mobility_pb2.Telemetry(not_ready_reason="it has no home yet")
         message.gps.fix_type, message.gps.satellites = 3, satellites
@@ -38,7 +38,7 @@ async def test_what_changes_is_told_once_and_texts_all() -> None:
     assert [wind async for wind in watch.wind()] == []
 
 
-def test_a_fix_of_a_kind_that_is_not_known_yet_is_a_fix() -> None:
+def test_unknown_gps_fix_type_counts_as_3d_fix() -> None:
     message = mobility_pb2.Telemetry()
     message.gps.fix_type = 42
     gps = Telemetry.from_proto(message).gps

@@ -135,7 +135,7 @@ class StreamState(Enum):
 
     WAITING = "waiting"
     GRANTED = "granted"
-    RIDING = "riding"
+    PASSENGER = "passenger"
     LOST = "lost"
     COMPLETE = "complete"
 

@@ -24,13 +24,13 @@ class ControlEvent(_message.Message):
         STATE_GRANTED: _ClassVar[ControlEvent.State]
         STATE_LOST: _ClassVar[ControlEvent.State]
         STATE_COMPLETE: _ClassVar[ControlEvent.State]
-        STATE_RIDING: _ClassVar[ControlEvent.State]
+        STATE_PASSENGER: _ClassVar[ControlEvent.State]
     STATE_UNSPECIFIED: ControlEvent.State
     STATE_WAITING: ControlEvent.State
     STATE_GRANTED: ControlEvent.State
     STATE_LOST: ControlEvent.State
     STATE_COMPLETE: ControlEvent.State
-    STATE_RIDING: ControlEvent.State
+    STATE_PASSENGER: ControlEvent.State
     STATE_FIELD_NUMBER: _ClassVar[int]
     CONTROL_POINT_FIELD_NUMBER: _ClassVar[int]
     REASON_FIELD_NUMBER: _ClassVar[int]

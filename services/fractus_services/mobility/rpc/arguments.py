@@ -220,7 +220,7 @@ def _invalid(reason: str) -> Refused:
 
 _STATES = {
     StreamState.WAITING: mobility_pb2.ControlEvent.STATE_WAITING,
-    StreamState.RIDING: mobility_pb2.ControlEvent.STATE_RIDING,
+    StreamState.PASSENGER: mobility_pb2.ControlEvent.STATE_PASSENGER,
     StreamState.GRANTED: mobility_pb2.ControlEvent.STATE_GRANTED,
     StreamState.LOST: mobility_pb2.ControlEvent.STATE_LOST,
     StreamState.COMPLETE: mobility_pb2.ControlEvent.STATE_COMPLETE,

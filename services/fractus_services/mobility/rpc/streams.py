@@ -114,6 +114,6 @@ class Streams:
         if outcome is not None:
             return ControlEvent(StreamState.LOST, done, str(outcome), done)
         if self._control.state.touring == grant.key:
-            return ControlEvent(StreamState.RIDING, done, "the system flies through the points of interest", done)
+            return ControlEvent(StreamState.PASSENGER, done, "the system flies through the points of interest", done)
         reason = self._control.not_ready_reason(grant.key) or "the system is about to take off"
         return ControlEvent(StreamState.WAITING, done, reason, done)

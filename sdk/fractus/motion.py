@@ -1,4 +1,4 @@
-"""Motions under way: awaited, or iterated step by step."""
+"""Motions that are awaited, or iterated for progress reports."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ OnProgress = Callable[[Progress], Awaitable[None] | None]
 class Motion:
     """A motion that starts when it is awaited or iterated.
 
-    Awaiting it flies until the motion is complete and gives the last `Progress`; iterating gives every step of it.
-    Cancelling the task, or leaving the iteration early, stops the motion: the drone hovers. When the service restarts
-    while this component holds control, the motion is asked for again.
+    Awaiting it flies until the motion is complete, and returns the last `Progress`. Iterating it yields every progress
+    report. Cancelling the task, or leaving the iteration early, stops the motion: the drone hovers. If the service
+    restarts while this component holds control, the motion is requested again.
 
     Raises:
-        PolicyDenied: policies forbid it; the drone goes on hovering.
-        Corrected: the client is strict and a policy changed the target; the motion is stopped.
-        ControlLost: the system or a pilot took the drone.
-        Unavailable: the service is away, and did not come back.
+        PolicyDenied: Policies forbid the motion. The drone continues to hover.
+        Corrected: The client is strict, and a policy changed the target. The motion is stopped.
+        ControlLost: The system or a pilot took the drone.
+        Unavailable: The service is unreachable and did not return in time.
     """
 
     def __init__(

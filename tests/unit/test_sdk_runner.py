@@ -1,4 +1,4 @@
-"""`fractus.run` after the mission: in a pod it stays, and ends quietly when it is told to."""
+"""`fractus.run` after the mission: in a pod it waits for SIGTERM."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from typing import Any
 
 import fractus
 import pytest
-from fractus import running
+from fractus import runner
 
 
 @pytest.mark.parametrize("over", [True, False])
-def test_a_mission_that_is_over_leaves_nothing_to_stop(
+def test_run_waits_for_sigterm_after_mission_in_a_pod(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, *, over: bool
 ) -> None:
-    async def fly(_program: running.Program, _drone: fractus.Mobility) -> None:
+    async def fly(_program: runner.Program, _drone: fractus.Mobility) -> None:
         asyncio.get_running_loop().call_soon(signal.raise_signal, signal.SIGTERM)
         if not over:
             await asyncio.Event().wait()
@@ -26,11 +26,11 @@ def test_a_mission_that_is_over_leaves_nothing_to_stop(
         return contextlib.nullcontext()
 
     async def program(_drone: fractus.Mobility, _control: fractus.Control) -> None:
-        raise AssertionError("it is not begun")
+        raise AssertionError("the program must not start")
 
-    monkeypatch.setattr(running, "fly", fly)
-    monkeypatch.setattr(running, "mobility", nothing)
+    monkeypatch.setattr(runner, "fly", fly)
+    monkeypatch.setattr(runner, "mobility", nothing)
     with caplog.at_level(logging.INFO):
-        running.run(program, stay=True)
-    assert ("told to stop" in caplog.text) != over
-    assert ("the mission is over" in caplog.text) == over
+        runner.run(program, stay=True)
+    assert ("run: stopping" in caplog.text) != over
+    assert ("run: mission complete" in caplog.text) == over

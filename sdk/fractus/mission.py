@@ -1,4 +1,4 @@
-"""Missions: waypoints flown one after the other, each leg judged by the service when its turn comes."""
+"""Missions: waypoints flown in order. The service judges each leg when it begins."""
 
 from __future__ import annotations
 
@@ -13,33 +13,39 @@ from typing import Any
 
 from fractus.control import Control
 from fractus.errors import InvalidRequest, PolicyDenied
-from fractus.motions import Motion, OnProgress
+from fractus.motion import Motion, OnProgress
 from fractus.values import AltitudeReference, Position, Progress
 
 EARTH_M = 6_371_008.8
-"""Mean radius: over an orbit of a kilometre it is wrong by a few metres at most."""
+"""Mean radius in metres. The error on an orbit of one kilometre is a few metres at most."""
 
-_NAV_WAYPOINT, _NAV_RETURN, _NAV_LAND, _NAV_TAKEOFF, _NAV_LAST, _DO_CHANGE_SPEED = 16, 20, 21, 22, 95, 178
+# Values of MAV_CMD.
+_NAV_WAYPOINT = 16
+_NAV_RETURN = 20
+_NAV_LAND = 21
+_NAV_TAKEOFF = 22
+_NAV_LAST = 95
+_DO_CHANGE_SPEED = 178
 _REFERENCES = {
     **dict.fromkeys((0, 5), AltitudeReference.AMSL),
     **dict.fromkeys((3, 6), AltitudeReference.HOME),
     **dict.fromkeys((10, 11), AltitudeReference.TERRAIN),
 }
-"""What altitudes are measured from, by MAV_FRAME."""
+"""Altitude references by MAV_FRAME."""
 
 _log = logging.getLogger("fractus")
 
 
 @dataclass(frozen=True, slots=True)
 class Waypoint:
-    """A place to fly to, and how.
+    """A waypoint of a mission.
 
     Attributes:
-        position: degrees, and metres above its reference.
-        yaw_deg: heading in degrees clockwise from true north; None leaves it to the autopilot.
-        speed_mps: horizontal speed of the leg to it; None keeps the speed in force.
-        acceptance_radius_m: how near counts as reached; 0 leaves it to the service (1 m).
-        stay_s: how long the drone hovers there.
+        position: Target position.
+        yaw_deg: Heading in degrees clockwise from true north; None if the autopilot chooses it.
+        speed_mps: Horizontal speed of the leg to this waypoint; None for the current speed setting.
+        acceptance_radius_m: Distance at which the waypoint counts as reached; 0 for the service's default (1 m).
+        stay_s: Seconds for which the drone hovers at the waypoint.
     """
 
     position: Position
@@ -51,12 +57,12 @@ class Waypoint:
 
 @dataclass(frozen=True, slots=True)
 class MissionProgress:
-    """How far a mission is.
+    """Progress of a mission.
 
     Attributes:
-        number: of the waypoint that is flown to, from 1.
-        count: how many there are.
-        step: how far the leg is.
+        number: Number of the current target waypoint, from 1.
+        count: Number of waypoints.
+        step: Progress of the current leg.
     """
 
     number: int
@@ -65,18 +71,19 @@ class MissionProgress:
 
 
 class Mission:
-    """Waypoints that are flown when this is awaited; the result is the legs that policies refused, by number.
+    """Mission that flies its waypoints when awaited. The result contains the refused legs by waypoint number.
 
-    Progress is kept on the drone (`Control.report`): the mission of a restarted component goes on with the waypoint that
-    was under way. Each leg is a `goto` that is judged when its turn comes; nothing is uploaded to the autopilot.
+    Progress is stored on the drone (`Control.report`), so the mission of a restarted component continues with the current
+    waypoint. Each leg is a `goto`, judged when it begins; nothing is uploaded to the autopilot.
 
-    A control point has one mission, for there is one count of waypoints; one of the same waypoints goes on with it.
+    A control point has one mission, because it has one waypoint counter. A second mission with the same waypoints
+    continues the first one.
 
     Args:
-        fly: begins one leg.
-        control: of the control point.
-        waypoints: by default the path of the control point.
-        skip_refused: go on with the next waypoint where policies forbid a leg.
+        fly: Function that returns the motion of one leg.
+        control: Control lease of the control point.
+        waypoints: Waypoints; by default the path of the control point.
+        skip_refused: Continue with the next waypoint if policies forbid a leg.
     """
 
     def __init__(
@@ -88,9 +95,9 @@ class Mission:
         skip_refused: bool = False,
     ) -> None:
         given = control.task.path if waypoints is None else waypoints
-        self.waypoints = tuple(Waypoint(one) if isinstance(one, Position) else one for one in given)
+        self.waypoints = tuple(Waypoint(item) if isinstance(item, Position) else item for item in given)
         self.refused: dict[int, PolicyDenied] = {}
-        """Legs that were passed over, by the number of their waypoint, from 1."""
+        """Skipped legs by the number of their waypoint, from 1."""
         self._fly = fly
         self._control = control
         self._skip_refused = skip_refused
@@ -100,33 +107,33 @@ class Mission:
 
     @property
     def paused(self) -> bool:
-        """Whether it is paused."""
+        """True while the mission is paused."""
         return self._paused.is_set()
 
     def pause(self) -> None:
-        """Stop the leg under way: the drone hovers until `resume`, while the one that awaits the mission waits."""
+        """Stop the current leg. The drone hovers until `resume`; the task that awaits the mission waits."""
         self._paused.set()
         self._resumed.clear()
 
     def resume(self) -> None:
-        """Go on with the leg that was stopped."""
+        """Continue the stopped leg."""
         self._paused.clear()
         self._resumed.set()
 
     async def fly(self, progress: Callable[[MissionProgress], None] | None = None) -> dict[int, PolicyDenied]:
-        """Fly what is left of it.
+        """Fly the remaining waypoints.
 
         Args:
-            progress: called with each step of each leg.
+            progress: Callback for each progress report of each leg.
 
         Returns:
-            The legs that policies refused, by number; empty unless refused legs are to be skipped.
+            Refused legs by waypoint number; empty unless `skip_refused` is set.
 
         Raises:
-            PolicyDenied: policies forbid a leg; the drone hovers before it.
-            Interrupted: a leg was stopped; awaiting the mission again goes on with it.
-            ControlLost: the system or a pilot took the drone.
-            InvalidRequest: the control point's mission is another one, or one of the same waypoints is over.
+            PolicyDenied: Policies forbid a leg. The drone hovers before it.
+            Interrupted: A leg was stopped. Awaiting the mission again continues it.
+            ControlLost: The system or a pilot took the drone.
+            InvalidRequest: The control point has another mission, or this mission is already complete.
         """
         self._begin()
         for number in range(self._control.waypoints_reached + 1, len(self.waypoints) + 1):
@@ -135,7 +142,7 @@ class Mission:
             except PolicyDenied as refusal:
                 if not self._skip_refused:
                     raise
-                _log.warning("waypoint %d is passed over: %s", number, refusal)
+                _log.warning("mission: waypoint skipped (number=%d reason=%s)", number, refusal)
                 self.refused[number] = refusal
             await self._control.report(number)
         return self.refused
@@ -144,28 +151,30 @@ class Mission:
         return self.fly().__await__()
 
     def _begin(self) -> None:
-        begun, over = self._control.begun, self._control.waypoints_reached >= len(self.waypoints)
-        if begun is not None and begun is not self.waypoints and (over or begun != self.waypoints):
+        begun = self._control.begun
+        complete = self._control.waypoints_reached >= len(self.waypoints)
+        if begun is not None and begun is not self.waypoints and (complete or begun != self.waypoints):
             raise InvalidRequest(
-                "a control point has one mission, and another one was begun: fly all waypoints in one, "
-                "`drone.mission([*survey, *orbit])`, or those that are not to be remembered with `drone.goto`"
+                "a control point has one mission, and another one has started: fly all waypoints in one mission, "
+                "`drone.mission([*survey, *orbit])`, or use `drone.goto` for waypoints that need not be remembered"
             )
         self._control.begun = self.waypoints
 
     async def _leg(self, number: int, progress: Callable[[MissionProgress], None] | None) -> None:
-        """One leg, begun again after each pause."""
+        """Fly one leg, and restart it after each pause."""
 
-        def tell(step: Progress) -> None:
+        def report(step: Progress) -> None:
             if progress is not None:
                 progress(MissionProgress(number, len(self.waypoints), step))
 
         async def flown() -> None:
-            await self._fly(self.waypoints[number - 1], tell)
+            await self._fly(self.waypoints[number - 1], report)
             await asyncio.sleep(self.waypoints[number - 1].stay_s)
 
         while True:
             await self._resumed.wait()
-            leg, pause = asyncio.ensure_future(flown()), asyncio.ensure_future(self._paused.wait())
+            leg = asyncio.ensure_future(flown())
+            pause = asyncio.ensure_future(self._paused.wait())
             try:
                 await asyncio.wait([leg, pause], return_when=asyncio.FIRST_COMPLETED)
                 if leg.done():
@@ -180,39 +189,43 @@ class Mission:
 def orbit(
     center: Position, radius_m: float, *, turns: float = 1.0, points: int = 16, speed_mps: float | None = None
 ) -> tuple[Waypoint, ...]:
-    """A circle around a place, nose to its middle, as waypoints: `await drone.mission(fractus.orbit(tower, 30))`.
+    """Return waypoints on a circle with the nose to its centre: `await drone.mission(fractus.orbit(tower, 30))`.
 
     Args:
-        center: its middle; its altitude is that of the circle.
-        radius_m: metres, to a kilometre or so.
-        turns: how many times around, clockwise; negative: the other way.
-        points: waypoints a turn.
-        speed_mps: of its legs; unset keeps the speed in force.
+        center: Centre; its altitude is the altitude of the circle.
+        radius_m: Radius in metres, up to about a kilometre.
+        turns: Number of turns, clockwise; negative for counter-clockwise.
+        points: Waypoints per turn.
+        speed_mps: Speed of the legs; by default the current speed setting.
 
     Returns:
-        Waypoints from the northernmost point of the circle on.
+        Waypoints, starting at the northernmost point of the circle.
+
+    Raises:
+        InvalidRequest: The radius is not positive, or there are fewer than 3 points.
     """
     if not radius_m > 0 or points < 3:
-        raise InvalidRequest(f"an orbit needs a radius above 0 m and 3 points or more, not {radius_m} m and {points}")
-    found = []
+        raise InvalidRequest(f"an orbit needs a radius above 0 m and at least 3 points, not {radius_m} m and {points}")
+    waypoints = []
     for index in range(round(abs(turns) * points) + 1):
         angle = math.copysign(index * 2 * math.pi / points, turns)
-        north, east = radius_m * math.cos(angle), radius_m * math.sin(angle)
+        north = radius_m * math.cos(angle)
+        east = radius_m * math.sin(angle)
         lat = center.lat + math.degrees(north / EARTH_M)
         lon = center.lon + math.degrees(east / EARTH_M / math.cos(math.radians(center.lat)))
         position = Position(lat, lon, center.alt, center.reference)
-        found.append(Waypoint(position, (math.degrees(angle) + 180.0) % 360.0, speed_mps))
-    return tuple(found)
+        waypoints.append(Waypoint(position, (math.degrees(angle) + 180.0) % 360.0, speed_mps))
+    return tuple(waypoints)
 
 
 def read_plan(path: str | Path) -> tuple[Waypoint, ...]:
-    """The waypoints of a QGroundControl plan (.plan), with their speeds, headings and stays; those of surveys, too.
+    """Return the waypoints of a QGroundControl plan (.plan) with speeds, headings and stays, including surveys.
 
-    Takeoff, landing and return are left out: the program takes off, and the system flies home. So are commands for cameras
-    and gimbals, with a warning: pictures are taken through the camera service.
+    Takeoff, landing and return are omitted, because the program takes off and the system flies home. Commands for cameras
+    and gimbals are omitted with a warning, because pictures are taken through the camera service.
 
     Raises:
-        InvalidRequest: it is no plan, or has a command that cannot be flown.
+        InvalidRequest: The file is not a plan, or contains a command that cannot be flown.
     """
     try:
         plan = json.loads(Path(path).read_bytes())
@@ -220,13 +233,11 @@ def read_plan(path: str | Path) -> tuple[Waypoint, ...]:
     except OSError as error:
         raise InvalidRequest(f"{path}: {error.strerror}") from None
     except (ValueError, KeyError, TypeError, IndexError) as error:
-        raise InvalidRequest(
-            f"{path}: this is not a plan of QGroundControl ({type(error).__name__}: {error})"
-        ) from None
+        raise InvalidRequest(f"{path}: not a QGroundControl plan ({type(error).__name__}: {error})") from None
 
 
 def _simple(items: Sequence[Any]) -> Iterator[Any]:
-    """The items of a plan, with those inside of surveys and corridor scans."""
+    """Yield the items of a plan, including those inside surveys and corridor scans."""
     for item in items:
         if item["type"] == "ComplexItem":
             yield from _simple(item.get("TransectStyleComplexItem", item)["Items"])
@@ -241,7 +252,7 @@ def _waypoints(items: Iterator[Any], path: str) -> Iterator[Waypoint]:
         if command == _NAV_WAYPOINT:
             if item["frame"] not in _REFERENCES:
                 raise InvalidRequest(
-                    f"{path}: item {number} has frame {item['frame']}; use altitudes above home or AMSL"
+                    f"{path}: item {number} has the unsupported frame {item['frame']}; use altitudes above home or AMSL"
                 )
             stay_s, radius_m, _, yaw_deg, lat, lon, alt = params
             position = Position(float(lat), float(lon), float(alt), _REFERENCES[item["frame"]])
@@ -249,8 +260,6 @@ def _waypoints(items: Iterator[Any], path: str) -> Iterator[Waypoint]:
         elif command == _DO_CHANGE_SPEED:
             speed_mps = float(params[1]) if params[1] and params[1] > 0 else speed_mps
         elif command > _NAV_LAST:
-            _log.warning("%s: item %d (MAV_CMD %d) is left out", path, number, command)
+            _log.warning("mission: plan item omitted (file=%s item=%d MAV_CMD=%d)", path, number, command)
         elif command not in {_NAV_TAKEOFF, _NAV_RETURN, _NAV_LAND}:
-            raise InvalidRequest(
-                f"{path}: item {number} is MAV_CMD {command}, which is not flown; remove it from the plan"
-            )
+            raise InvalidRequest(f"{path}: item {number} (MAV_CMD {command}) cannot be flown; remove it from the plan")

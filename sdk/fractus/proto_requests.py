@@ -1,4 +1,4 @@
-"""Calls as the wire has them; an argument that is not a number ends here, for the wire would take it for zero."""
+"""Protobuf requests of calls. Arguments that are not numbers are refused here, because protobuf would send zero."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ MAX_PIXELS = 2**31 - 1
 
 
 def takeoff_request(altitude_m: float) -> mobility_pb2.TakeoffRequest:
-    """A climb to an altitude above home."""
+    """Return the request of a takeoff."""
     return mobility_pb2.TakeoffRequest(altitude_m=_number("altitude_m", altitude_m))
 
 
 def speed_request(speed_mps: float) -> mobility_pb2.SetSpeedRequest:
-    """A speed over ground."""
+    """Return the request of a ground speed."""
     return mobility_pb2.SetSpeedRequest(speed_mps=_number("speed_mps", speed_mps))
 
 
 def goto_request(
     target: Position, yaw_deg: float | None, speed_mps: float | None, acceptance_radius_m: float = 0.0
 ) -> mobility_pb2.GotoRequest:
-    """A leg to a position."""
+    """Return the request of a leg to a position."""
     for name, value in (("lat", target.lat), ("lon", target.lon), ("alt", target.alt)):
         _number(name, value)
     return mobility_pb2.GotoRequest(
@@ -38,7 +38,7 @@ def goto_request(
 
 
 def velocity_request(velocity: Velocity, yaw_deg: float | None, hold_s: float) -> mobility_pb2.SetVelocityRequest:
-    """A velocity setpoint."""
+    """Return the request of a velocity setpoint."""
     for name, value in (("north_mps", velocity.north), ("east_mps", velocity.east), ("down_mps", velocity.down)):
         _number(name, value)
     return mobility_pb2.SetVelocityRequest(
@@ -47,18 +47,18 @@ def velocity_request(velocity: Velocity, yaw_deg: float | None, hold_s: float) -
 
 
 def gimbal_request(pitch_deg: float, yaw_deg: float) -> mobility_pb2.PointGimbalRequest:
-    """A direction of the camera."""
+    """Return the request of a camera direction."""
     return mobility_pb2.PointGimbalRequest(
         pitch_deg=_number("pitch_deg", pitch_deg), yaw_deg=_number("yaw_deg", yaw_deg)
     )
 
 
 def capture_request(width: int, height: int) -> camera_pb2.CaptureImageRequest:
-    """A picture of a size in pixels."""
+    """Return the request of a picture with a size in pixels."""
     for name, value in (("width", width), ("height", height)):
         if not isinstance(value, SupportsIndex) or not 0 <= operator.index(value) <= MAX_PIXELS:
             raise InvalidRequest(
-                f"CaptureImage: {name} must be a whole number of pixels, not {value!r:.40}; 0 leaves it to the camera"
+                f"CaptureImage: {name} must be a whole number of pixels, not {value!r:.40}; 0 selects the camera's default"
             )
     return camera_pb2.CaptureImageRequest(width=width, height=height)
 
@@ -68,10 +68,10 @@ def _optional(name: str, value: Any) -> float | None:
 
 
 def _number(name: str, value: Any) -> float:
-    """The value as the wire's floating-point number.
+    """Return the value as a float.
 
     Raises:
-        InvalidRequest: it is none.
+        InvalidRequest: The value is not a number.
     """
     if not isinstance(value, str | bytes | bool | None):
         try:

@@ -1,4 +1,4 @@
-"""What a driver is to do at a control point, as its application declares it: a path, or a region."""
+"""Control points of a driver, as declared by its application: a path or a region."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from fractus.values import AltitudeReference, Position
 
 @dataclass(frozen=True, slots=True)
 class Circle:
-    """A disc on the ground: its middle, and its radius in metres."""
+    """Circular area: centre and radius in metres."""
 
     center: Position
     radius_m: float
@@ -22,7 +22,7 @@ class Circle:
 
 @dataclass(frozen=True, slots=True)
 class Polygon:
-    """Ground inside a ring of corners, without the holes; rings are not closed."""
+    """Polygonal area with holes. The first corner of a ring is not repeated at its end."""
 
     exterior: tuple[Position, ...]
     holes: tuple[tuple[Position, ...], ...] = ()
@@ -33,12 +33,12 @@ Region = Circle | Polygon
 
 @dataclass(frozen=True, slots=True)
 class ControlPoint:
-    """One of the driver's control points, as its application declares it.
+    """A control point of the driver.
 
     Attributes:
         navigation: `pathBased` (in a corridor around the path) or `regionBased` (anywhere in the region).
-        path: waypoints in the order to fly; empty for a region.
-        region: the ground to stay above; None for a path.
+        path: Waypoints in flight order; empty for a region.
+        region: Permitted ground area; None for a path.
     """
 
     navigation: str
@@ -47,21 +47,21 @@ class ControlPoint:
 
     @classmethod
     def from_manifest(cls, value: Mapping[str, Any]) -> ControlPoint:
-        """Read a control point as manifests spell it.
+        """Create a control point from a manifest.
 
         Raises:
-            ValueError: something is missing, the message says what.
+            ValueError: A field is missing; the message names it.
         """
         try:
             path = tuple(_waypoint(point) for point in value.get("path") or ())
             region = value.get("region")
             return cls(str(value["navigation"]), path, None if region is None else _region(region))
         except KeyError as error:
-            raise ValueError(f"a control point lacks {error.args[0]}") from None
+            raise ValueError(f"the control point has no {error.args[0]}") from None
 
     @classmethod
     def from_proto(cls, message: types_pb2.ControlPoint) -> ControlPoint:
-        """Read the wire form."""
+        """Create the value from its protobuf message."""
         path = tuple(map(Position.from_proto, message.path))
         return cls(message.navigation, path, _area(message.region) if message.HasField("region") else None)
 
@@ -72,7 +72,7 @@ def _waypoint(point: Mapping[str, Any]) -> Position:
 
 
 def _altitude(value: Any) -> float:
-    # Not zero, which would be a descent to the ground: a call with NaN is refused.
+    # NaN instead of zero: zero would mean a descent to the ground, while a call with NaN is refused.
     return math.nan if value is None else float(value)
 
 

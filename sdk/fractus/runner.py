@@ -1,0 +1,136 @@
+"""Runner for driver programs that may be killed at any time and continue where they were."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+import signal
+import sys
+from collections.abc import Awaitable, Callable
+
+from fractus.control import Control
+from fractus.drone import Mobility, mobility
+from fractus.environment import Endpoint
+from fractus.errors import ControlHeld, ControlLost, FractusError, Interrupted, MissionComplete, MissionEnded
+
+MAX_INTERRUPTIONS = 5
+"""Maximum number of consecutive restarts after an interrupted motion without a further waypoint."""
+
+RETRY_S = 2.0
+"""Delay in seconds before control is requested again, or a program is restarted."""
+
+Program = Callable[[Mobility, Control], Awaitable[None]]
+"""Program that performs the task of one control point. It is called again after an interruption or a restart."""
+
+_log = logging.getLogger("fractus")
+
+
+def run(program: Program, *, endpoint: Endpoint | None = None, strict: bool = False, stay: bool | None = None) -> None:
+    """Fly a mission: acquire control at each control point, run the program there, return control.
+
+    The program may be restarted at any point of its flight, in this process or in the next one: `arm` and `takeoff` complete
+    at once in the air, and `control.remaining()` yields the remaining waypoints. The mission therefore continues after a
+    restart, an update or an interrupted motion.
+
+    | Event | Reaction |
+    |---|---|
+    | A motion is stopped (`Interrupted`) | The program is restarted with the same control |
+    | The system or a pilot takes the drone (`ControlLost`) | Control is requested again |
+    | The mission ends early (`MissionEnded`) | The process exits with 1 (in a pod it stays, because a restart would have no effect) |
+    | The program raises another error, for example `PolicyDenied` | The drone hovers, and the process exits with 1 |
+    | SIGTERM or SIGINT | The program is cancelled, the drone hovers, and the process exits with 0 |
+
+    A hovering drone waits for the next start of the program for the grace period (15 s). Then the system flies it home, and
+    the mission has failed.
+
+    Args:
+        program: Function that is called with the drone and its control.
+        endpoint: Endpoint of the service; by default from the environment.
+        strict: Raise `Corrected` if a policy changes a request.
+        stay: Wait for SIGTERM after the mission; by default in a Kubernetes pod, which would be restarted otherwise.
+
+    Raises:
+        SystemExit: The mission could not be completed. The message contains the reason and the remedy.
+    """
+    if not logging.getLogger().handlers:
+        logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S", stream=sys.stderr)
+    stays = "KUBERNETES_SERVICE_HOST" in os.environ if stay is None else stay
+    try:
+        asyncio.run(_run(program, endpoint, strict, stays))
+    except (asyncio.CancelledError, KeyboardInterrupt):
+        _log.info("run: stopping; the drone hovers, and the system flies it home unless the program restarts soon")
+    except FractusError as error:
+        raise SystemExit(_describe(error)) from None
+
+
+async def _run(program: Program, endpoint: Endpoint | None, strict: bool, stays: bool) -> None:
+    flight = asyncio.current_task()
+    assert flight is not None
+    for signum in (signal.SIGTERM, signal.SIGINT):
+        asyncio.get_running_loop().add_signal_handler(signum, flight.cancel)
+    try:
+        async with mobility(endpoint, strict=strict) as drone:
+            await fly(program, drone)
+        _log.info("run: mission complete")
+    except MissionEnded as error:
+        if not stays:
+            raise
+        _log.error("%s", _describe(error))
+    if stays:
+        with contextlib.suppress(asyncio.CancelledError):  # SIGTERM after the mission
+            await asyncio.Event().wait()
+
+
+async def fly(program: Program, drone: Mobility) -> None:
+    """Fly a mission like `run`, inside a running event loop.
+
+    Raises:
+        MissionEnded: The mission ended early.
+        FractusError: An error of the program that a retry cannot resolve.
+    """
+    complete = False
+    while not complete:
+        try:
+            async with drone.control(
+                progress=lambda reason: _log.info("run: waiting for the drone (reason=%s)", reason)
+            ) as control:
+                reached = control.waypoints_reached
+                _log.info(
+                    "run: control granted (control_point=%d waypoints_reached=%d)", control.control_point + 1, reached
+                )
+                await _carry_out(program, drone, control)
+            complete = control.mission_complete
+            _log.info("run: control returned (mission_complete=%s)", complete)
+        except MissionComplete:
+            complete = True
+        except MissionEnded:
+            raise
+        except (ControlLost, ControlHeld) as error:
+            _log.warning("run: requesting control again (reason=%s)", error)
+            await asyncio.sleep(RETRY_S)
+
+
+async def _carry_out(program: Program, drone: Mobility, control: Control) -> None:
+    """Run the program, and restart it after each interruption while it makes progress."""
+    reached = control.waypoints_reached
+    interruptions = 0
+    while True:
+        try:
+            await program(drone, control)
+        except Interrupted as stopped:
+            interruptions = interruptions + 1 if control.waypoints_reached == reached else 1
+            reached = control.waypoints_reached
+            if interruptions > MAX_INTERRUPTIONS:
+                raise
+            _log.warning(
+                "run: motion interrupted, restarting the program (interruptions=%d reason=%s)", interruptions, stopped
+            )
+            await asyncio.sleep(RETRY_S)
+        else:
+            return
+
+
+def _describe(error: FractusError) -> str:
+    return f"{error}; {error.remedy}" if error.remedy else str(error)

@@ -1,4 +1,4 @@
-"""What every handler does: authenticate the caller, limit its rate, and turn errors into a status with details."""
+"""Admission of calls: authentication, rate limits, and conversion of errors to a gRPC status with details."""
 
 from __future__ import annotations
 
@@ -31,51 +31,51 @@ log = logging.getLogger(__name__)
 
 CALLS_PER_S = 50.0
 BURST = 100.0
-"""What one identity may ask of a service; a driver that streams setpoints stays far below it."""
+"""Rate and burst of calls of one identity. A driver that streams setpoints stays far below it."""
 
 URGENT_PER_S = 20.0
 URGENT_BURST = 40.0
-"""The same for calls that only make things safer; these are counted apart, so that no other call uses them up."""
+"""Rate and burst of urgent calls, which only make the flight safer. They are counted separately from other calls."""
 
 MAX_OPEN_CALLS = 32
-"""How many calls of one identity may be under way at a time, streams included."""
+"""Maximum number of concurrent calls of one identity, including streams."""
 
 REQUEST_TIMEOUT_S = 10.0
-"""Within which the request of a call has to come. Clients send both at once, but a bad link may lose the second part."""
+"""Time between the start of a call and its request message. Clients send both together, but a bad link may delay the second."""
 
 _MAX_COUNTED = 1_000
 
 
-class Allowance:
-    """A token bucket for each caller: a flood costs its sender, not the drone."""
+class RateLimiter:
+    """A token bucket for each caller, so that a flood affects its sender only."""
 
     def __init__(self, rate: float = CALLS_PER_S, burst: float = BURST) -> None:
         self.rate = rate
         self._burst = burst
-        self._left: dict[str, tuple[float, float]] = {}
+        self._buckets: dict[str, tuple[float, float]] = {}
 
     def take(self, identity: str, time_s: float) -> float:
-        """Use up one call; 0, or in how many seconds to try again when there is none left. Times are monotonic."""
-        left, at = self._left.get(identity, (self._burst, time_s))
-        left = min(self._burst, left + max(time_s - at, 0.0) * self.rate)
-        if left < 1.0:
-            self._left[identity] = (left, time_s)
-            return (1.0 - left) / self.rate
-        self._left[identity] = (left - 1.0, time_s)
-        if len(self._left) > _MAX_COUNTED:
+        """Take one token. Return 0, or the seconds until the next token if there is none. Times are monotonic."""
+        tokens, updated_s = self._buckets.get(identity, (self._burst, time_s))
+        tokens = min(self._burst, tokens + max(time_s - updated_s, 0.0) * self.rate)
+        if tokens < 1.0:
+            self._buckets[identity] = (tokens, time_s)
+            return (1.0 - tokens) / self.rate
+        self._buckets[identity] = (tokens - 1.0, time_s)
+        if len(self._buckets) > _MAX_COUNTED:
             full_s = self._burst / self.rate
-            self._left = {name: entry for name, entry in self._left.items() if time_s - entry[1] < full_s}
+            self._buckets = {name: bucket for name, bucket in self._buckets.items() if time_s - bucket[1] < full_s}
         return 0.0
 
 
 class CallAdmission:
-    """Lets calls of one service in, and ends them with a status.
+    """Admits the calls of one service, and ends failed calls with a status.
 
     Args:
-        grants: grants of this node.
-        clock: Unix time.
-        translate: a failure of the service's own kind as a refusal; None for what it does not know.
-        failed: called with the verdict on an error that no one foresaw.
+        grants: Grants of this node.
+        clock: Returns Unix time.
+        translate: Converts an exception of the service to a refusal, or returns None for an unknown exception.
+        failed: Callback invoked with the verdict on an unexpected exception.
     """
 
     def __init__(
@@ -89,25 +89,25 @@ class CallAdmission:
         self._callers = Callers(clock)
         self._translate = translate
         self._failed = failed
-        self._allowance = Allowance()
-        self._urgent = Allowance(URGENT_PER_S, URGENT_BURST)
+        self._limiter = RateLimiter()
+        self._urgent_limiter = RateLimiter(URGENT_PER_S, URGENT_BURST)
         self._open: Counter[str] = Counter()
 
     @asynccontextmanager
     async def call(self, context: Any, urgent: bool = False, lasting: bool = False) -> AsyncIterator[Caller]:
-        """The caller of a call; exceptions inside end it with a status.
+        """Admit a call, and yield its caller. Exceptions within the block end the call with a status.
 
         Args:
-            context: gRPC's context of the call.
-            urgent: the call only makes things safer: it needs no deadline and no certificate of this moment, and no flood of
-                other calls holds it up.
-            lasting: a stream that is the caller's sign of life, and needs no deadline either.
+            context: gRPC context of the call.
+            urgent: True if the call only makes the flight safer. It needs no deadline, may use a certificate that has expired
+                since the handshake, and has its own rate limit.
+            lasting: True for a stream that keeps the caller's control lease alive. It needs no deadline.
         """
         admitted = ""
         try:
             caller = self._callers.of(context.auth_context(), urgent)
             spans.call().note("fractus.caller", caller.identity)
-            self._admit(caller.identity, self._urgent if urgent else self._allowance, urgent)
+            self._admit(caller.identity, self._urgent_limiter if urgent else self._limiter, urgent)
             admitted = caller.identity
             self._open[admitted] += 1
             if not (urgent or lasting) and context.time_remaining() is None:
@@ -122,7 +122,7 @@ class CallAdmission:
             known = self._translate(error)
             if known is not None:
                 await abort(context, known)
-            log.exception("rpc: a call failed inside the service, refused")
+            log.exception("rpc: unexpected error, call refused")
             reason = "the service failed; nothing was done"
             self._failed(Verdict("deny", None, "InternalError", reason, (), "hover"))
             await abort(context, InternalError("InternalError", reason))
@@ -133,12 +133,13 @@ class CallAdmission:
                     del self._open[admitted]
 
     def decoded(self, handler: grpc.RpcMethodHandler) -> grpc.RpcMethodHandler:
-        """A handler whose requests are decoded once their caller is let in and counted: a flood of nonsense is one too.
+        """Wrap a handler so that requests are decoded after the caller is counted. Malformed requests then count as well.
 
-        gRPC begins the call of a method with one request when that has arrived, and keeps those whose request never does. So
-        to gRPC it is a method with a stream of requests, of which the first one is read.
+        gRPC starts the handler of a method with a single request only after the request has arrived, and keeps calls whose
+        request never arrives. The wrapped handler therefore has a request stream, and reads one message from it.
         """
-        decode, handle = handler.request_deserializer, handler.unary_unary or handler.unary_stream
+        decode = handler.request_deserializer
+        handle = handler.unary_unary or handler.unary_stream
         unsent: Counter[str] = Counter()
 
         async def behaviour(_requests: Any, context: Any) -> Any:
@@ -150,62 +151,65 @@ class CallAdmission:
             if request is not None:
                 return await handle(request, context)
             async with self.call(context, lasting=True):
-                raise InvalidRequest("InvalidArgument", "the request cannot be decoded; send this method's message")
+                raise InvalidRequest(
+                    "InvalidArgument", "cannot decode the request; send the request message of this method"
+                )
 
         build = grpc.stream_unary_rpc_method_handler if handler.unary_unary else grpc.stream_stream_rpc_method_handler
         return build(behaviour, None, handler.response_serializer)
 
     async def _received(self, unsent: Counter[str], context: Any) -> Any:
-        """The bytes of a call's request, or EOF; ends a call that does not send it, and the one too many that has not yet.
+        """Return the request of a call as bytes, or EOF. End the call if the request is late, or if too many calls wait.
 
         Args:
-            unsent: calls of each identity whose request is not there yet.
-            context: gRPC's context of the call.
+            unsent: Number of calls of each identity whose request has not arrived.
+            context: gRPC context of the call.
         """
         try:
             identity = self._callers.of(context.auth_context(), True).identity
         except NotAuthenticated:
             identity = ""
         if unsent[identity] >= MAX_OPEN_CALLS:
-            reason = f"{MAX_OPEN_CALLS} calls of this method wait for their request; send it with the call"
+            reason = f"{MAX_OPEN_CALLS} calls of this method wait for their request; send the request with the call"
             await abort(context, ResourceExhausted("TooManyCalls", reason, retry_after_s=1.0))
         unsent[identity] += 1
         try:
             async with asyncio.timeout(REQUEST_TIMEOUT_S):
                 return await context.read()
         except TimeoutError:
-            reason = f"no request came within {REQUEST_TIMEOUT_S:.0f} s of the call; send it with the call"
+            reason = f"no request arrived within {REQUEST_TIMEOUT_S:.0f} s of the call; send the request with the call"
             await abort(context, InvalidRequest("InvalidArgument", reason))
         finally:
             unsent[identity] -= 1
             if not unsent[identity]:
                 del unsent[identity]
 
-    def _admit(self, identity: str, allowance: Allowance, urgent: bool) -> None:
+    def _admit(self, identity: str, limiter: RateLimiter, urgent: bool) -> None:
         """Count a call.
 
         Raises:
-            Refused: the caller asks too much.
+            ResourceExhausted: The caller exceeds its rate or its number of concurrent calls.
         """
-        again_s = allowance.take(identity, time.monotonic())
-        reason = f"more than {allowance.rate:.0f} calls a second; slow down"
-        if not again_s and not urgent and self._open[identity] >= MAX_OPEN_CALLS:
-            again_s, reason = 1.0, f"{MAX_OPEN_CALLS} calls are under way; end one before the next"
-        if again_s:
-            raise ResourceExhausted("TooManyCalls", reason, retry_after_s=again_s)
+        retry_after_s = limiter.take(identity, time.monotonic())
+        if retry_after_s:
+            reason = f"more than {limiter.rate:.0f} calls per second; slow down"
+            raise ResourceExhausted("TooManyCalls", reason, retry_after_s=retry_after_s)
+        if not urgent and self._open[identity] >= MAX_OPEN_CALLS:
+            reason = f"{MAX_OPEN_CALLS} calls are in progress; end one before the next"
+            raise ResourceExhausted("TooManyCalls", reason, retry_after_s=1.0)
 
     def grant_of(self, caller: Caller) -> ActiveGrant:
-        """The grant of a caller.
+        """Return the Grant of a caller.
 
         Raises:
-            Refused: it has none here.
+            PolicyDenied: The caller has no Grant on this node.
         """
         grant = self._grants.of(caller.identity)
         if grant is None:
             log.warning(
-                "policy: no grant on this node, call refused (caller=%s)",
+                "policy: call refused because the caller has no Grant on this node (caller=%s)",
                 caller.identity,
                 extra={"limit_by": caller.identity},
             )
-            raise PolicyDenied("NoGrant", f"{caller.identity} has no grant on this node")
+            raise PolicyDenied("NoGrant", f"{caller.identity} has no Grant on this node")
         return grant

@@ -1,4 +1,4 @@
-"""Identities of callers from client certificates, and TLS whose files may change while the service runs."""
+"""Authentication of callers by client certificates, and TLS files that may change while the service runs."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ log = logging.getLogger(__name__)
 
 FILES = ("tls.key", "tls.crt", "ca.crt")
 MAX_SEEN = 256
-"""Certificates whose first sight is remembered; the one that called longest ago is forgotten."""
+"""Maximum number of remembered certificates. The least recently used one is forgotten."""
 MAX_SKEW_S = 60.0
-"""How far a caller's certificate may begin in the future."""
+"""Maximum time by which the validity of a client certificate may start in the future, in seconds."""
 
 
 @dataclass(frozen=True, slots=True)
 class Caller:
-    """A peer as its certificate names it.
+    """An authenticated caller.
 
     Attributes:
-        identity: SPIFFE id.
-        until_s: steady time at which its certificate expires.
+        identity: SPIFFE ID.
+        until_s: Steady time at which the certificate expires, in seconds.
     """
 
     identity: str
@@ -41,28 +41,28 @@ class Caller:
 
     @property
     def left_s(self) -> float:
-        """Seconds until its certificate expires."""
+        """Time until the certificate expires, in seconds."""
         return max(self.until_s - steady_s(), 0.0)
 
     def check(self) -> None:
-        """Handshakes check validity once; long connections must be checked again.
+        """Check that the certificate is still valid. The TLS handshake checks a long connection only once.
 
         Raises:
-            NotAuthenticated: the certificate has expired.
+            NotAuthenticated: The certificate has expired.
         """
         if not self.left_s:
-            raise NotAuthenticated("the client certificate has expired; connect again with the renewed one")
+            raise NotAuthenticated("the client certificate has expired; reconnect with the renewed one")
 
 
 class Callers:
-    """Who calls, by client certificates.
+    """Authenticates callers by their client certificates.
 
-    A certificate is judged by the clock when it is first seen. From then on it has the rest of its life by steady time,
-    whatever the clock says: a step cuts off no driver in flight, and revives no certificate that has expired here. Each new
-    connection is also judged by the TLS handshake, which knows nothing but the clock.
+    A certificate is checked against the system clock when it is first seen. From then on, its remaining lifetime is counted in
+    steady time, so that a clock step neither disconnects a driver in flight nor revives an expired certificate. The TLS
+    handshake of each new connection also checks the certificate, against the system clock alone.
 
     Args:
-        clock: Unix time.
+        clock: Returns Unix time.
     """
 
     def __init__(self, clock: Callable[[], float]) -> None:
@@ -70,14 +70,14 @@ class Callers:
         self._seen: OrderedDict[bytes, Caller] = OrderedDict()
 
     def of(self, auth_context: Mapping[str, Any], urgent: bool = False) -> Caller:
-        """The peer of a call.
+        """Return the caller of a call.
 
         Args:
             auth_context: gRPC's authentication context of the call.
-            urgent: the call only makes things safer, so that the handshake of its connection is proof enough.
+            urgent: True if the call only makes the flight safer. The TLS handshake is then sufficient.
 
         Raises:
-            NotAuthenticated: there is no certificate, or it names no one, or it is not valid now.
+            NotAuthenticated: The certificate is missing, contains no identity, or is not valid now.
         """
         chain = auth_context.get("x509_pem_cert") or ()
         if not chain:
@@ -96,14 +96,14 @@ class Callers:
         try:
             identity, begin_s, end_s = _read(pem)
         except ValueError:
-            raise NotAuthenticated("the client certificate cannot be read") from None
+            raise NotAuthenticated("cannot parse the client certificate") from None
         now_s = self._clock()
         caller = Caller(identity, steady_s() + end_s - now_s)
-        begun = now_s >= begin_s - MAX_SKEW_S
-        if not (begun or urgent):
+        started = now_s >= begin_s - MAX_SKEW_S
+        if not (started or urgent):
             raise NotAuthenticated("the client certificate is not valid yet; check the clocks")
-        if begun and caller.left_s and not isinstance(now_s, UncertainTime):
-            # While the clock is in doubt, or wrong about this certificate, nothing is remembered: it may be right later.
+        if started and caller.left_s and not isinstance(now_s, UncertainTime):
+            # Do not remember a certificate while the clock is uncertain or contradicts it: the clock may be corrected later.
             self._seen[pem] = caller
             if len(self._seen) > MAX_SEEN:
                 self._seen.popitem(last=False)
@@ -111,20 +111,20 @@ class Callers:
 
 
 def _read(pem: bytes) -> tuple[str, float, float]:
-    """Identity, begin and end of a certificate."""
+    """Return the identity, start and end of validity of a certificate."""
     certificate = x509.load_pem_x509_certificate(pem)
     try:
         names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     except x509.ExtensionNotFound:
-        raise NotAuthenticated("the client certificate names no identity") from None
+        raise NotAuthenticated("the client certificate contains no identity") from None
     uris = [uri for uri in names.get_values_for_type(x509.UniformResourceIdentifier) if uri.startswith(SPIFFE_SCHEME)]
     if len(uris) != 1:
-        raise NotAuthenticated(f"the client certificate must name one SPIFFE id, not {len(uris)}")
+        raise NotAuthenticated(f"the client certificate must contain one SPIFFE ID, not {len(uris)}")
     return uris[0], certificate.not_valid_before_utc.timestamp(), certificate.not_valid_after_utc.timestamp()
 
 
 class TlsFiles:
-    """Key, certificate and CA of a service, read again whenever they change."""
+    """Key, certificate and CA of a service. They are read again when they change."""
 
     def __init__(self, directory: Path) -> None:
         self._directory = directory
@@ -132,7 +132,7 @@ class TlsFiles:
         self._waiting = False
 
     async def wait(self, poll_s: float = 0.5) -> None:
-        """Wait until all files are there; logs that once."""
+        """Wait until all files exist. The first wait is logged."""
         while True:
             missing = [name for name in FILES if not self._present(name)]
             if not missing:
@@ -149,8 +149,8 @@ class TlsFiles:
             return False
 
     def _stamps(self) -> tuple[tuple[int, int, int], ...]:
-        found = [(self._directory / name).stat() for name in FILES]
-        return tuple((s.st_mtime_ns, s.st_size, s.st_ino) for s in found)
+        stats = [(self._directory / name).stat() for name in FILES]
+        return tuple((stat.st_mtime_ns, stat.st_size, stat.st_ino) for stat in stats)
 
     def _load(self) -> tuple[bytes, bytes, bytes]:
         key, certificate, ca = ((self._directory / name).read_bytes() for name in FILES)
@@ -164,7 +164,7 @@ class TlsFiles:
         return configuration
 
     def expires_s(self) -> float | None:
-        """Unix time at which the certificate expires; None while there is none that can be read."""
+        """Return the Unix time at which the certificate expires, or None if it is missing or unreadable."""
         try:
             pem = (self._directory / "tls.crt").read_bytes()
             return x509.load_pem_x509_certificate(pem).not_valid_after_utc.timestamp()
@@ -172,24 +172,24 @@ class TlsFiles:
             return None
 
     def _changed(self) -> Any:
-        """Asked by gRPC at every handshake: a new configuration, or None to keep the present one."""
+        """Return a new configuration, or None to keep the current one. gRPC calls this at each handshake."""
         try:
             return self._configuration() if self._stamps() != self._stamp else None
         except OSError as error:
-            log.critical("tls: cannot read the renewed certificate, keeping the old one: %s", error)
+            log.critical("tls: cannot read the renewed certificate, keeping the current one (error=%s)", error)
             return None
 
     def server_credentials(self) -> Any:
-        """Credentials of a server that demands client certificates."""
+        """Return the credentials of a server that requires client certificates."""
         return grpc.dynamic_ssl_server_credentials(self._configuration(), self._changed, True)
 
     def client_credentials(self) -> Any:
-        """Credentials of a client, as the files are now."""
+        """Return the credentials of a client from the current files."""
         key, certificate, ca = self._load()
         return grpc.ssl_channel_credentials(ca, key, certificate)
 
 
-KEEPALIVE = (
+SERVER_OPTIONS = (
     ("grpc.keepalive_time_ms", 2_000),
     ("grpc.keepalive_timeout_ms", 2_000),
     ("grpc.http2.ping_timeout_ms", 2_000),
@@ -205,4 +205,4 @@ KEEPALIVE = (
     ("grpc.server_handshake_timeout_ms", 5_000),
     ("grpc.max_allowed_incoming_connections", 512),
 )
-"""Server options: a peer that does not answer pings is gone within four seconds, one that begins no TLS within five."""
+"""Options of gRPC servers. A peer without ping replies is disconnected within 4 s, and one without TLS handshake within 5 s."""

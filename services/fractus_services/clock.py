@@ -1,4 +1,4 @@
-"""Wall-clock time of a machine whose clock may be stepped, and the steady time that no step moves."""
+"""Unix time of a machine whose clock may be stepped, and steady time that no step affects."""
 
 from __future__ import annotations
 
@@ -11,54 +11,57 @@ from fractus_core.policy.decision_types import UncertainTime
 log = logging.getLogger(__name__)
 
 TRUST_AFTER_S = 120.0
-"""A clock that has run on for this long after a step is right: what it showed before was wrong."""
+"""Time after a step from which the new reading is trusted."""
 
 MAX_SLEW_S = 1.0
-"""How far NTP sets a clock in normal operation."""
+"""Maximum correction by NTP in normal operation."""
 
 
 def steady_s() -> float:
-    """Seconds that no step of the clock moves; unlike the event loop's, they go on while the machine sleeps."""
+    """Return steady seconds. Clock steps do not affect them, and they continue while the machine is suspended."""
     return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
 class Clock:
     """Unix time in seconds.
 
-    A clock that is stepped, back or ahead, must neither bring what has expired back to life nor end at once what restricts.
-    Until it is clear which reading is right, the time is a `UncertainTime`: what it is as a number is the later reading, and the
-    policy engine counts both against the caller. Who was let in before the step stays in by steady time (`auth.Callers`).
+    A clock step must neither revive an expired permission nor end a restriction early. Until the step is confirmed, the time is
+    an `UncertainTime`: its value is the later reading, and the policy engine applies the more restrictive of both readings.
+    Callers that were authenticated before the step stay authenticated by steady time (`auth.Callers`).
 
     Args:
-        stepped: told of each step, in seconds, and whether the new reading counts from now on; 0: it was taken back. This may
-            be from any thread.
+        stepped: Callback invoked for each step with its size in seconds, and True if the new reading is now trusted. A size of 0
+            means that the step was reversed. It may be invoked from any thread.
     """
 
     def __init__(self, stepped: Callable[[float, bool], None] = lambda _step_s, _trusted: None) -> None:
         self._stepped = stepped
-        self._offset_s = self._stepped_to_s = time.time() - steady_s()
-        self._doubted_since_s: float | None = None
+        self._offset_s = time.time() - steady_s()
+        self._new_offset_s = self._offset_s
+        self._uncertain_since_s: float | None = None
 
     def __call__(self) -> float:
-        """Now."""
+        """Return the current time."""
         now_s = steady_s()
         offset_s = time.time() - now_s
         step_s = offset_s - self._offset_s
         if abs(step_s) <= MAX_SLEW_S:
-            if self._doubted_since_s is not None:
-                self._doubted_since_s = None
-                log.warning("clock: the step was taken back")
+            if self._uncertain_since_s is not None:
+                self._uncertain_since_s = None
+                log.warning("clock: step reversed")
                 self._stepped(0.0, True)
             self._offset_s = offset_s
             return now_s + offset_s
-        if self._doubted_since_s is None or abs(offset_s - self._stepped_to_s) > MAX_SLEW_S:
-            self._doubted_since_s, self._stepped_to_s = now_s, offset_s
-            log.warning("clock: stepped, both readings count for now (seconds=%.0f for_s=%.0f)", step_s, TRUST_AFTER_S)
+        if self._uncertain_since_s is None or abs(offset_s - self._new_offset_s) > MAX_SLEW_S:
+            self._uncertain_since_s = now_s
+            self._new_offset_s = offset_s
+            log.warning("clock: stepped, both readings apply for now (seconds=%.0f for_s=%.0f)", step_s, TRUST_AFTER_S)
             self._stepped(step_s, False)
-        if now_s - self._doubted_since_s < TRUST_AFTER_S:
+        if now_s - self._uncertain_since_s < TRUST_AFTER_S:
             readings = now_s + self._offset_s, now_s + offset_s
             return UncertainTime(max(readings), min(readings))
-        self._offset_s, self._doubted_since_s = offset_s, None
-        log.warning("clock: the step lasted, the new reading counts (seconds=%.0f)", step_s)
+        self._offset_s = offset_s
+        self._uncertain_since_s = None
+        log.warning("clock: step confirmed, the new reading applies (seconds=%.0f)", step_s)
         self._stepped(step_s, True)
         return now_s + offset_s

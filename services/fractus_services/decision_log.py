@@ -1,4 +1,4 @@
-"""Tells the log of every decision that is no plain permission, in one line, from what the audit log records."""
+"""Log lines for audit log entries about restricted calls and changes of control."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ log = logging.getLogger(__name__)
 
 
 def log_decision(entry: Mapping[str, Any]) -> None:
-    """Write the line of an entry of the audit log, if it is of a call that was corrected or refused, or of a change of control.
+    """Log an audit log entry if it is about a corrected or refused call, or about a change of control.
 
-    Positions and arguments stay in the audit log.
+    Positions and arguments are in the audit log only.
     """
     match entry:
         case {"kind": "call", "action": "correct" | "deny" | "takeover"}:
@@ -21,19 +21,21 @@ def log_decision(entry: Mapping[str, Any]) -> None:
             log.log(
                 logging.WARNING if kind == "takeover" else logging.INFO,
                 "control: %s (kind=%s controller=%s code=%s policies=%s reason=%s)",
-                entry["action"], kind, entry["controller"], entry["code"] or "-", _listed(entry["policies"]),
+                entry["action"], kind, entry["controller"], entry["code"] or "-", _join(entry["policies"]),
                 entry["reason"] or "-",
             )  # fmt: skip
 
 
 def _log_verdict(entry: Mapping[str, Any]) -> None:
-    # One component that is refused all the time must not keep the others' lines from being written.
-    caller, limit = entry["caller"], {"limit_by": entry["caller"]}
-    policies, reason = _listed(entry["policies"]), entry["reason"] or "-"
+    caller = entry["caller"]
+    # Limit log lines for each caller, so that refusals of one component do not suppress the lines of others.
+    limit = {"limit_by": caller}
+    policies = _join(entry["policies"])
+    reason = entry["reason"] or "-"
     if filters := entry.get("filters"):
         log.info(
             "policy: filters required (action=%s caller=%s method=%s filters=%s policies=%s reason=%s)",
-            entry["action"], caller, entry["method"], _listed(filters), policies, reason, extra=limit,
+            entry["action"], caller, entry["method"], _join(filters), policies, reason, extra=limit,
         )  # fmt: skip
         return
     log.log(
@@ -43,5 +45,5 @@ def _log_verdict(entry: Mapping[str, Any]) -> None:
     )  # fmt: skip
 
 
-def _listed(names: Iterable[str]) -> str:
+def _join(names: Iterable[str]) -> str:
     return ",".join(names) or "-"

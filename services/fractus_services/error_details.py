@@ -1,4 +1,4 @@
-"""Verdicts and errors as gRPC replies: the one place where domain errors become status codes."""
+"""Converts verdicts and refusals to gRPC messages, status codes and error details."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ STATUS: dict[type[Refused], grpc.StatusCode] = {
 
 
 def decision(verdict: Verdict) -> types_pb2.Decision:
-    """The verdict as replies carry it."""
+    """Convert a verdict to its message."""
     spans.call().verdict(verdict.action, verdict.code, verdict.policies)
     return types_pb2.Decision(
         action=_ACTIONS[verdict.action], reason=verdict.reason, code=verdict.code, policies=verdict.policies
@@ -62,12 +62,12 @@ def decision(verdict: Verdict) -> types_pb2.Decision:
 
 
 async def abort(context: Any, refusal: Refused) -> NoReturn:
-    """End a call with the structured details of a refusal."""
+    """End a call with the status and the error details of a refusal."""
     details = [decision(refusal.verdict), _error_info(refusal.verdict)]
     if refusal.retry_after_s:
-        again = error_details_pb2.RetryInfo()
-        again.retry_delay.FromNanoseconds(int(refusal.retry_after_s * 1e9))
-        details.append(again)
+        retry = error_details_pb2.RetryInfo()
+        retry.retry_delay.FromNanoseconds(int(refusal.retry_after_s * 1e9))
+        details.append(retry)
     status = next(STATUS[kind] for kind in type(refusal).__mro__ if kind in STATUS)
     number = code_pb2.Code.Value(status.name)
     spans.call().note(spans.STATUS, number)

@@ -1,4 +1,4 @@
-"""Why a call is not carried out: one hierarchy for both services, which only their gRPC side translates."""
+"""Reasons to refuse a call: one exception hierarchy for both services. `error_details` converts it to gRPC."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ from fractus_core.policy.decision_types import Verdict
 
 
 class Refused(Exception):
-    """A call that ends without being carried out, or not to its end.
+    """A call is refused, or aborted before its end.
 
     Args:
-        code: a CamelCase word for programs.
-        reason: a sentence for people.
-        policies: names of those that decided.
-        retry_after_s: when the caller may try again; 0: trying again as such does not help.
-        verdict: of the engine, where that refuses.
+        code: CamelCase code for programs.
+        reason: Sentence for people.
+        policies: Names of the policies that decided.
+        retry_after_s: Time after which the caller may retry, in seconds. 0 means that a retry does not help.
+        verdict: Verdict of the policy engine, if the engine refused.
 
     Attributes:
-        verdict: the same as clients find it in the status details.
+        verdict: The refusal as a verdict, which clients receive in the status details.
     """
 
     def __init__(
@@ -34,56 +34,56 @@ class Refused(Exception):
 
 
 class PolicyDenied(Refused):
-    """Policies forbid it."""
+    """Policies forbid the call."""
 
 
 class InvalidRequest(Refused):
-    """The request itself is wrong, whatever the state of the node."""
+    """The request is invalid in any state of the node."""
 
 
 class NotAuthenticated(Refused):
-    """The caller's certificate proves nothing (any more)."""
+    """The caller's certificate is missing, invalid or expired."""
 
     def __init__(self, reason: str) -> None:
         super().__init__("NotAuthenticated", reason)
 
 
 class PreconditionFailed(Refused):
-    """The present state of the drone or the node forbids it."""
+    """The current state of the drone or the node forbids the call."""
 
 
 class Aborted(Refused):
-    """It was carried out in part and then stopped."""
+    """The call was stopped before its end."""
 
 
 class Unavailable(Refused):
-    """It cannot be served now and may be tried again."""
+    """The call cannot be served now. The caller may retry."""
 
 
 class ResourceExhausted(Refused):
-    """The caller asks for more than its share, or the node is full."""
+    """The caller exceeds a limit, or the node is full."""
 
 
 class NotFound(Refused):
-    """It names something that does not exist."""
+    """The requested object does not exist."""
 
 
 class InternalError(Refused):
-    """The service itself failed."""
+    """The service failed."""
 
 
 def denied(verdict: Verdict) -> Refused:
-    """The refusal that a verdict of the engine stands for, which clients get as it is."""
+    """Return the refusal for a verdict of the policy engine. Clients receive the verdict unchanged."""
     kind = InvalidRequest if verdict.code == "InvalidArgument" else PolicyDenied
     return kind(verdict.code, verdict.reason, verdict=verdict)
 
 
 class AutopilotError(Exception):
-    """The autopilot did not do what was asked; the text says what and why.
+    """An autopilot command failed. The message contains the command and the reason.
 
     Attributes:
-        link: whether it was not heard, so that trying again may help.
-        refused: whether it answered that it does not do this.
+        link: True if the autopilot sent no reply, so that a retry may help.
+        refused: True if the autopilot rejected the command.
     """
 
     def __init__(self, reason: str, *, link: bool = False, refused: bool = False) -> None:

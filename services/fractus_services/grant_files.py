@@ -1,8 +1,9 @@
-"""The grants of this node, as files: watched, compiled, matched to callers."""
+"""Grant files of this node: rescanned, verified, compiled, and looked up by caller identity."""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import logging
 import threading
@@ -15,23 +16,25 @@ from fractus_core.api.model import InvalidObject
 from fractus_core.policy.compiled_grant import CompiledGrant, compile_grant
 from fractus_core.policy.grant_signatures import BadSignature
 
-from fractus_services.directory_watch import DirectoryWatch
 from fractus_services.grant_verifier import GrantVerifier
 
 log = logging.getLogger(__name__)
 
-RESCAN_INTERVAL_S = 2.0
-"""Files are also read this often: inotify misses changes on some file systems."""
+RESCAN_INTERVAL_S = 0.25
+"""Interval at which the directory is scanned. It bounds the time until a removed Grant is revoked, on any file system."""
 _Stamp = tuple[int, int, int]
 
 
 @dataclass(frozen=True, slots=True)
 class ActiveGrant:
-    """A grant that is in force on this node.
+    """A Grant in force on this node.
 
     Attributes:
-        key: tells the mission from all others; made of what is signed.
-        digest: of the grant with its signature.
+        key: Key of the mission, derived from signed content.
+        name: Name of the Grant.
+        spec: Spec of the Grant.
+        compiled: Compiled policies.
+        digest: Digest of the Grant with its signature.
     """
 
     key: str
@@ -42,29 +45,29 @@ class ActiveGrant:
 
     @property
     def identity(self) -> str:
-        """SPIFFE id of the instance."""
+        """SPIFFE ID of the component instance."""
         return self.compiled.identity
 
 
 Listener = Callable[[ActiveGrant | None, ActiveGrant | None], None]
-"""Called with the grant before and after a change; None: there is none."""
+"""Callback invoked with the Grant before and after a change, or None for no Grant."""
 
-Refusal = Callable[[str, str], None]
-"""Called with the name of a file that grants nothing, and why."""
+RejectionCallback = Callable[[str, str], None]
+"""Callback invoked with the name of a rejected file and the reason."""
 
 
 class GrantFiles:
-    """Watches a directory of Grant manifests.
+    """Grants in a directory of Grant manifests.
 
-    A file that cannot be read or parsed, or is not signed by the operator, is no grant: when a file turns bad, its grant is
-    revoked, as nothing tells any more what it forbids.
+    A file that cannot be read or parsed, or that the operator did not sign, grants nothing. If a file becomes invalid, its Grant
+    is revoked, because its restrictions are then unknown.
 
     Args:
-        directory: where the agent stores the grants; it may not exist yet.
-        node: the node that grants must be for.
-        verifier: verifies their signatures.
-        flat_terrain: see `compile_grant`.
-        refused: called for files that grant nothing.
+        directory: Directory in which the agent stores the Grants. It may not exist yet.
+        node: Node for which the Grants must be issued.
+        verifier: Verifies signatures.
+        flat_terrain: See `compile_grant`.
+        refused: Callback invoked for rejected files.
     """
 
     def __init__(
@@ -73,7 +76,7 @@ class GrantFiles:
         node: str,
         verifier: GrantVerifier,
         flat_terrain: bool = False,
-        refused: Refusal = lambda _name, _why: None,
+        refused: RejectionCallback = lambda _name, _reason: None,
     ) -> None:
         self._directory = directory
         self._node = node
@@ -89,83 +92,74 @@ class GrantFiles:
 
     @property
     def active(self) -> Mapping[str, ActiveGrant]:
-        """Grants in force by identity."""
+        """Grants in force, by identity."""
         return self._active
 
     def of(self, identity: str) -> ActiveGrant | None:
-        """The grant of a caller."""
+        """Return the Grant of a caller, or None."""
         return self._active.get(identity)
 
     def listen(self, listener: Listener) -> None:
-        """Call a listener at every change."""
+        """Add a listener that is called at each change."""
         self._listeners.append(listener)
 
     async def run(self) -> None:
-        """Watch until cancelled: changes are read at once, and all files every 2 s."""
-        told = ""
+        """Scan the directory every `RESCAN_INTERVAL_S` seconds until cancelled."""
+        # Create the directory only once: if it disappears later, its disk may be gone, and no Grant must count as removed.
+        with contextlib.suppress(OSError):
+            self._directory.mkdir(parents=True, exist_ok=True)
         while True:
-            try:
-                self._directory.mkdir(parents=True, exist_ok=True)
-                with DirectoryWatch(self._directory) as watch:
-                    while True:
-                        await watch.changed(RESCAN_INTERVAL_S)
-                        await self._scan_aside()
-                        self._remember()
-            except OSError as error:
-                if str(error) != told:
-                    told = str(error)
-                    log.warning("grants: cannot watch, scanning instead (directory=%s): %s", self._directory, error)
+            await self._scan_in_thread()
+            self._store_memory()
             await asyncio.sleep(RESCAN_INTERVAL_S)
-            await self._scan_aside()
-            self._remember()
 
-    def _remember(self) -> None:
-        """Store what was seen, in a thread: a disk that hangs must not delay a change of grants."""
+    def _store_memory(self) -> None:
+        """Store the latest Grants in a thread, because a hanging disk must not delay a change of Grants."""
         if self._saving is None or self._saving.done():
             content = self._verifier.unsaved()
             if content is not None:
                 self._saving = asyncio.create_task(asyncio.to_thread(self._verifier.store, content))
 
     def scan(self) -> None:
-        """Read what changed."""
+        """Read changed files and update the Grants in force."""
         if self._read_changes():
             self._replace()
 
-    async def _scan_aside(self) -> None:
-        """Read what changed, in a thread: grants of large areas take seconds, in which a flight is watched all the same."""
+    async def _scan_in_thread(self) -> None:
+        """Scan in a thread, because Grants of large areas take seconds to compile while a flight has to be monitored."""
         if await asyncio.to_thread(self._read_changes):
             self._replace()
 
     def _read_changes(self) -> bool:
-        """Read the files that changed; whether there are any."""
-        # The thread of a watch that was cancelled may still read.
+        """Read the files that changed. Return True if there are any."""
+        # The thread of a cancelled scan may still be reading.
         with self._reading:
-            return self._read_changed()
+            return self._read_changes_locked()
 
-    def _read_changed(self) -> bool:
-        found, whole = self._list()
-        trusted = self._verifier.reload_authorities()
-        if found == self._stamps and not trusted:
+    def _read_changes_locked(self) -> bool:
+        stamps, complete = self._list()
+        authorities_changed = self._verifier.reload_authorities()
+        if stamps == self._stamps and not authorities_changed:
             return False
         before = dict(self._loaded)
-        for path in self._stamps.keys() - found.keys():
+        for path in self._stamps.keys() - stamps.keys():
             self._loaded.pop(path, None)
-        for path, stamp in found.items():
-            if self._stamps.get(path) != stamp or (trusted and self._loaded.get(path) is None):
+        for path, stamp in stamps.items():
+            if self._stamps.get(path) != stamp or (authorities_changed and self._loaded.get(path) is None):
                 self._loaded[path] = self._load(path)
-        self._stamps = found
-        if whole:
+        self._stamps = stamps
+        if complete:
             renamed = {grant.digest for grant in self._loaded.values() if grant is not None}
             for path in before.keys() - self._loaded.keys():
-                gone = before[path]
-                if gone is not None and gone.digest not in renamed:
-                    self._revoke(gone)
+                removed = before[path]
+                if removed is not None and removed.digest not in renamed:
+                    self._revoke(removed)
         return True
 
     def _list(self) -> tuple[dict[Path, _Stamp], bool]:
-        """The files, and whether those that are missing were certainly removed, and are not just unreadable."""
-        found: dict[Path, _Stamp] = {}
-        whole = True
+        """Return the stamps of the files. The second value is False if missing files may be unreadable rather than removed."""
+        stamps: dict[Path, _Stamp] = {}
+        complete = True
         try:
             for path in sorted(self._directory.glob("*.json")):
                 try:
@@ -173,30 +167,30 @@ class GrantFiles:
                 except FileNotFoundError:
                     continue
                 except OSError as error:
-                    whole = False
-                    log.critical("grants: file cannot be read, grants nothing (file=%s): %s", path, error)
+                    complete = False
+                    log.critical("grants: cannot read file, it grants nothing (file=%s error=%s)", path, error)
                     continue
-                found[path] = (stat.st_mtime_ns, stat.st_size, stat.st_ino)
+                stamps[path] = (stat.st_mtime_ns, stat.st_size, stat.st_ino)
         except OSError as error:
-            whole = False
+            complete = False
             log.critical(
-                "grants: directory cannot be read, nothing is granted (directory=%s): %s", self._directory, error
+                "grants: cannot read directory, nothing is granted (directory=%s error=%s)", self._directory, error
             )
-        return found, whole and self._directory.is_dir()
+        return stamps, complete and self._directory.is_dir()
 
     def _load(self, path: Path) -> ActiveGrant | None:
-        """The grant of a file; the one that was there before and no longer is gets revoked."""
+        """Return the Grant of a file. Revoke the previous Grant of the file if it is no longer valid."""
         before = self._loaded.get(path)
         try:
             grant = self._read(path)
         except (OSError, ValueError, InvalidObject, BadSignature) as error:
-            log.critical("grants: file is no valid grant, grants nothing (file=%s): %s", path, error)
+            log.critical("grants: invalid file, it grants nothing (file=%s error=%s)", path, error)
             self._refused(path.name, str(error))
             if not isinstance(error, OSError):
                 self._revoke(before)
             return None
         except Exception as error:
-            log.exception("grants: reading failed, grants nothing (file=%s)", path)
+            log.exception("grants: reading failed, the file grants nothing (file=%s)", path)
             self._refused(path.name, f"{type(error).__name__}: {error}")
             return None
         if grant is None or (before is not None and before.identity != grant.identity):
@@ -206,7 +200,7 @@ class GrantFiles:
     def _read(self, path: Path) -> ActiveGrant | None:
         grant = Grant.from_body(json.loads(path.read_bytes()))
         if grant.spec.node != self._node:
-            log.error("grants: for another node, ignored (file=%s node=%s)", path, grant.spec.node)
+            log.error("grants: Grant of another node ignored (file=%s node=%s)", path, grant.spec.node)
             return None
         digest = self._verifier.verify(grant)
         compiled = compile_grant(grant.spec, flat_terrain=self._flat_terrain)
@@ -222,17 +216,25 @@ class GrantFiles:
             if grant is None:
                 continue
             if not self._verifier.is_latest(grant.identity, grant.digest):
-                log.error("grants: replaced by a later one, ignored (file=%s identity=%s)", path, grant.identity)
+                log.error(
+                    "grants: Grant ignored because a later one was seen (file=%s identity=%s)", path, grant.identity
+                )
                 continue
             if grant.identity in fresh:
-                log.error("grants: second grant of an identity, ignored (file=%s identity=%s)", path, grant.identity)
+                log.error("grants: second Grant of an identity ignored (file=%s identity=%s)", path, grant.identity)
                 continue
             fresh[grant.identity] = grant
-        before, self._active = self._active, fresh
+        before = self._active
+        self._active = fresh
         for identity in sorted(before.keys() | fresh.keys()):
-            old, new = before.get(identity), fresh.get(identity)
+            old = before.get(identity)
+            new = fresh.get(identity)
             if old is not new:
-                change = "added" if old is None else "removed" if new is None else "changed"
+                change = "changed"
+                if old is None:
+                    change = "added"
+                elif new is None:
+                    change = "removed"
                 log.info("grants: %s (identity=%s)", change, identity)
                 self._notify(old, new)
 
@@ -241,4 +243,4 @@ class GrantFiles:
             try:
                 listener(old, new)
             except Exception:
-                log.exception("grants: a listener failed, the others are still called")
+                log.exception("grants: listener failed, the others are still called")

@@ -1,11 +1,11 @@
-"""What both services do once they run: bind, serve, stop."""
+"""gRPC server of both services: binding, a server interceptor, and the lifetime of the process."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
 import os
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Awaitable, Callable, Coroutine
 from typing import Any
 
 import grpc
@@ -13,7 +13,7 @@ from fractus_runtime import tracing
 from fractus_runtime.spans import Tracer
 
 from fractus_services.admission import CallAdmission
-from fractus_services.auth import KEEPALIVE, TlsFiles
+from fractus_services.auth import SERVER_OPTIONS, TlsFiles
 from fractus_services.options import CannotServe
 
 log = logging.getLogger(__name__)
@@ -21,33 +21,39 @@ log = logging.getLogger(__name__)
 STOP_TIMEOUT_S = 2.0
 
 
-class _Registry:
-    """What generated code adds the handlers of a service to.
+class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[misc]
+    """Traces calls, and decodes requests after their callers are authenticated and counted.
 
     Args:
-        server: where they go.
-        admission: lets their callers in.
-        tracer: of their calls; None where they are not traced.
+        admission: Authenticates and limits callers.
+        tracer: Tracer of calls, or None if tracing is off.
     """
 
-    def __init__(self, server: grpc.aio.Server, admission: CallAdmission, tracer: Tracer | None) -> None:
-        self._server = server
+    def __init__(self, admission: CallAdmission, tracer: Tracer | None) -> None:
         self._admission = admission
         self._tracer = tracer
+        self._handlers: dict[str, grpc.RpcMethodHandler] = {}
 
-    def add_generic_rpc_handlers(self, _handlers: object) -> None:
-        """The same handlers once more, by name; they are registered already."""
-
-    def add_registered_method_handlers(self, service: str, handlers: Mapping[str, grpc.RpcMethodHandler]) -> None:
-        """Add the handlers of a service."""
-        decoded = {name: self._admission.decoded(handler) for name, handler in handlers.items()}
-        if self._tracer is not None:
-            decoded = {name: _traced(f"{service}/{name}", handler, self._tracer) for name, handler in decoded.items()}
-        self._server.add_registered_method_handlers(service, decoded)
+    async def intercept_service(
+        self,
+        continuation: Callable[[grpc.HandlerCallDetails], Awaitable[grpc.RpcMethodHandler | None]],
+        details: grpc.HandlerCallDetails,
+    ) -> grpc.RpcMethodHandler | None:
+        """Return the wrapped handler of a method, or None if the method does not exist."""
+        wrapped = self._handlers.get(details.method)
+        if wrapped is None:
+            handler = await continuation(details)
+            if handler is None:
+                return None
+            wrapped = self._admission.decoded(handler)
+            if self._tracer is not None:
+                wrapped = _traced(details.method.lstrip("/"), wrapped, self._tracer)
+            self._handlers[details.method] = wrapped
+        return wrapped
 
 
 def _traced(method: str, handler: grpc.RpcMethodHandler, tracer: Tracer) -> grpc.RpcMethodHandler:
-    """A handler whose calls are traced, from before their callers are let in."""
+    """Wrap a handler of a request stream in a span that begins before its caller is authenticated."""
     handle = handler.stream_unary or handler.stream_stream
 
     async def behaviour(requests: Any, context: Any) -> Any:
@@ -64,31 +70,32 @@ async def serve_grpc(
     """Wait for certificates, then serve calls until cancelled.
 
     Args:
-        name: of the service, for the log and for traces.
+        name: Name of the service, for logs and traces.
         listen: HOST:PORT.
-        tls: certificates of the server.
-        register: adds the handlers to the server.
-        admission: lets callers in.
-        node: that it runs on, for traces.
+        tls: Certificates of the server.
+        register: Adds the servicer to the server.
+        admission: Authenticates and limits callers.
+        node: Name of the node, for traces.
 
     Raises:
-        CannotServe: the address cannot be bound.
+        CannotServe: The address cannot be bound, or the key does not match the certificate.
     """
-    server = grpc.aio.server(options=KEEPALIVE)
     await tls.wait()
-    try:
-        server.add_secure_port(listen, tls.server_credentials())
-    except RuntimeError:
-        raise CannotServe(
-            f"--listen {listen}: cannot listen there; give HOST:PORT with an address of this machine and a free port,"
-            " and in --tls a tls.key that belongs to tls.crt"
-        ) from None
-    # What it imports takes a small computer seconds, in which a drone in flight must not be left alone.
+    # Importing the tracing libraries takes seconds on a small computer. A thread keeps the service responsive for a drone in
+    # flight.
     tracer = await asyncio.to_thread(tracing.tracer, name, node, os.environ)
-    register(_Registry(server, admission, tracer))
-    await server.start()
-    log.info("%s: serving (address=%s)", name, listen)
+    server = grpc.aio.server(interceptors=[CallInterceptor(admission, tracer)], options=SERVER_OPTIONS)
     try:
+        try:
+            server.add_secure_port(listen, tls.server_credentials())
+        except RuntimeError:
+            raise CannotServe(
+                f"--listen {listen}: cannot listen there; specify HOST:PORT with an address of this machine and a free"
+                " port, and check that tls.key in --tls belongs to tls.crt"
+            ) from None
+        register(server)
+        await server.start()
+        log.info("%s: serving (address=%s)", name, listen)
         await asyncio.Event().wait()
     finally:
         await asyncio.shield(server.stop(STOP_TIMEOUT_S))
@@ -97,10 +104,10 @@ async def serve_grpc(
 
 
 async def run_until(stop: asyncio.Event, *parts: Coroutine[Any, Any, None]) -> None:
-    """Run the parts of a service until `stop` is set; the failure of any one ends all.
+    """Run the parts of a service until `stop` is set. The failure of one part ends all.
 
     Raises:
-        ExceptionGroup: a part failed.
+        ExceptionGroup: A part failed.
     """
     async with asyncio.TaskGroup() as tasks:
         running = [tasks.create_task(part) for part in parts]

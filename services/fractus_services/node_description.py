@@ -1,4 +1,4 @@
-"""What this node is, as its agent hands it over or as its owner's file says; read again when that changes."""
+"""Description of this node from its agent or from a local file. It is read again when it changes."""
 
 from __future__ import annotations
 
@@ -18,43 +18,44 @@ POLL_INTERVAL_S = 1.0
 class NodeDescription:
     """The manifest that describes this node.
 
-    What the agent hands over is the node's object as the API server has it, with its owner's edits; it counts before the
-    file. What cannot be read, or is another node's, describes nothing: the camera then counts as seeing everything.
+    The agent stores the node's object from the API server, with its owner's edits. It takes precedence over the local file. An
+    object that is unreadable or belongs to another node counts as no description. The camera then counts as seeing everything.
 
     Args:
-        node: this node's name; None where only the description tells it.
-        handed: where the agent stores the object.
-        file: the owner's.
-        kinds: which kinds of node there may be.
+        node: Name of this node, or None to take it from the description.
+        agent_file: File in which the agent stores the object.
+        local_file: File of the node's owner.
+        kinds: Permitted kinds of nodes.
 
     Attributes:
-        value: the manifest; None where there is none.
+        value: The manifest, or None if there is no description.
 
     Raises:
-        CannotServe: the owner's file is not a valid manifest of one of these kinds.
+        CannotServe: The local file is not a valid manifest of one of the kinds.
     """
 
-    def __init__(self, node: str | None, handed: Path, file: Path, *kinds: type[Drone | EdgeNode]) -> None:
+    def __init__(self, node: str | None, agent_file: Path, local_file: Path, *kinds: type[Drone | EdgeNode]) -> None:
         self._node = node
-        self._paths = (handed, file)
+        self._paths = (agent_file, local_file)
         self._kinds = kinds
         self._stamps = self._stamps_now()
         self.value = self._read()
         if self.value is None:
-            log.warning("description: this node has none, using defaults (files=%s,%s)", *self._paths)
+            log.warning("description: missing, using defaults (files=%s,%s)", *self._paths)
 
     async def changed(self) -> None:
-        """Wait until the manifest says something else."""
+        """Wait until the manifest changes."""
         while True:
             await asyncio.sleep(POLL_INTERVAL_S)
             stamps = self._stamps_now()
             if stamps == self._stamps:
                 continue
-            self._stamps, before = stamps, self.value
+            self._stamps = stamps
+            before = self.value
             try:
                 self.value = self._read()
             except CannotServe as error:
-                log.critical("description: cannot be used, the node counts as not described: %s", error)
+                log.critical("description: invalid, the node counts as not described (error=%s)", error)
                 self.value = None
             if self.value != before:
                 log.warning("description: changed (described=%s)", self.value is not None)
@@ -64,29 +65,29 @@ class NodeDescription:
         return tuple(_stamp(path) for path in self._paths)
 
     def _read(self) -> Drone | EdgeNode | None:
-        handed, file = self._paths
+        agent_file, local_file = self._paths
         try:
-            found = _parsed(handed, self._kinds)
-            if found is None and handed.is_file():
-                raise CannotServe(f"{handed}: is empty")
-            if found is not None and self._node not in (None, found.name):
-                raise CannotServe(f"{handed}: is of {found.name}, and this node is {self._node}")
+            manifest = _parse(agent_file, self._kinds)
+            if manifest is None and agent_file.is_file():
+                raise CannotServe(f"{agent_file}: is empty")
+            if manifest is not None and self._node not in (None, manifest.name):
+                raise CannotServe(f"{agent_file}: describes {manifest.name}, but this node is {self._node}")
         except CannotServe as error:
-            # Not the file instead: it may be older, and describe a camera that sees less.
-            log.critical("description: the agent's cannot be used, the node counts as not described: %s", error)
+            # Do not fall back to the local file: it may be older, and describe a camera with a smaller view.
+            log.critical("description: agent's file invalid, the node counts as not described (error=%s)", error)
             return None
-        return found or _parsed(file, self._kinds, "--description ")
+        return manifest or _parse(local_file, self._kinds, "--description ")
 
 
 def _stamp(path: Path) -> object:
     try:
-        found = path.stat()
+        stat = path.stat()
     except OSError:
         return None
-    return found.st_ino, found.st_mtime_ns, found.st_size
+    return stat.st_ino, stat.st_mtime_ns, stat.st_size
 
 
-def _parsed(path: Path, kinds: tuple[type[Drone | EdgeNode], ...], option: str = "") -> Drone | EdgeNode | None:
+def _parse(path: Path, kinds: tuple[type[Drone | EdgeNode], ...], option: str = "") -> Drone | EdgeNode | None:
     try:
         return parse_description(path.read_text(encoding="utf-8"), *kinds)
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError):

@@ -1,4 +1,4 @@
-"""What the command lines of the services say; node, autopilot and camera default to the node's description."""
+"""Command-line options of the services. Node, autopilot and camera default to the node description."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 class CannotServe(Exception):
-    """A service cannot run as it is told to; the message names what is wrong and the remedy."""
+    """A service cannot run with its options. The message contains the problem and the remedy."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,12 +29,12 @@ class ServiceOptions:
 
     @property
     def grant_memory(self) -> Path:
-        """File that remembers which grants were seen."""
+        """File with the latest Grant of each component instance."""
         return self.state / "grants-seen.json"
 
     @property
     def recording_problem(self) -> Path:
-        """File that says why nothing is recorded, while that is so; the node's agent reads it."""
+        """File with the reason why nothing is recorded, if there is one. The agent reads it."""
         return self.state / "recording.problem"
 
 

@@ -71,7 +71,7 @@ def test_an_address_that_is_none(tmp_path: Path, service: click.Group, listen: s
 def test_an_address_of_another_machine(tmp_path: Path, service: click.Group, tls: Path) -> None:
     result = serve(service, tmp_path, "--tls", str(tls), "--listen", "192.0.2.1:50051", *quiet(service))
     assert result.exit_code == 1
-    assert "Error: --listen 192.0.2.1:50051: cannot listen there; give HOST:PORT" in result.output
+    assert "Error: --listen 192.0.2.1:50051: cannot listen there; specify HOST:PORT" in result.output
 
 
 @SERVICES

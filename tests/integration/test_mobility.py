@@ -208,7 +208,7 @@ async def test_an_autopilot_that_is_described_later_is_used(rig: Rig) -> None:
     handed = rig.directory / "node.json"
     rig.write_grant(grant())
     rig.start_service("--autopilot", "", "--node-object", str(handed))
-    await rig.until_logged("service", "description: this node has none")
+    await rig.until_logged("service", "description: missing, using defaults")
     services = {
         "mobility": {"connection": rig.link, "maxAltitude": 80, "maxFlightTime": 15, "maxSpeed": 15, "methods": ALL}
     }

@@ -33,11 +33,11 @@ async def failed(refusal: Refused) -> grpc.aio.AioRpcError:
 
 @pytest.mark.parametrize("again_s", [0.25, 0.0])
 async def test_busy_error_contains_retry_delay(again_s: float) -> None:
-    reason = "more than 50 calls a second; slow down"
+    reason = "more than 50 calls per second; slow down"
     error = await failed(ResourceExhausted("TooManyCalls", reason, retry_after_s=again_s))
     found = translate(error, "GetSpeed", "there")
     assert isinstance(found, Busy)
-    assert str(found) == "GetSpeed: more than 50 calls a second; slow down"
+    assert str(found) == "GetSpeed: more than 50 calls per second; slow down"
     assert found.retry_after_s == (again_s or None)
     assert bool(found.remedy) == bool(again_s), "where waiting does not help, the message says what does"
 

@@ -67,7 +67,7 @@ async def test_an_urgent_call_is_let_through_a_flood_and_no_flood_of_its_own(cal
     for _ in range(int(BURST)):
         async with calls.call(Context()):
             pass
-    with pytest.raises(Aborted, match="RESOURCE_EXHAUSTED: more than 50 calls a second") as refusal:
+    with pytest.raises(Aborted, match="RESOURCE_EXHAUSTED: more than 50 calls per second") as refusal:
         async with calls.call(Context()):
             pass
     assert refusal.value.find(error_details_pb2.RetryInfo).retry_delay.nanos == 20_000_000
@@ -76,7 +76,7 @@ async def test_an_urgent_call_is_let_through_a_flood_and_no_flood_of_its_own(cal
     for _ in range(int(URGENT_BURST)):
         async with calls.call(Context(), urgent=True) as caller:
             assert caller.identity == "spiffe://fractus.dev/a"
-    with pytest.raises(Aborted, match="RESOURCE_EXHAUSTED: more than 20 calls a second"):
+    with pytest.raises(Aborted, match="RESOURCE_EXHAUSTED: more than 20 calls per second"):
         async with calls.call(Context(), urgent=True):
             pass
 
@@ -85,7 +85,7 @@ async def test_only_so_many_calls_at_a_time(calls: CallAdmission) -> None:
     async with AsyncExitStack() as stack:
         for _ in range(MAX_OPEN_CALLS):
             await stack.enter_async_context(calls.call(Context(), lasting=True))
-        with pytest.raises(Aborted, match=f"RESOURCE_EXHAUSTED: {MAX_OPEN_CALLS} calls are under way"):
+        with pytest.raises(Aborted, match=f"RESOURCE_EXHAUSTED: {MAX_OPEN_CALLS} calls are in progress"):
             async with calls.call(Context()):
                 pass
         async with calls.call(Context(), urgent=True):
@@ -147,5 +147,8 @@ def test_a_caller_without_a_grant_is_logged(caplog: pytest.LogCaptureFixture) ->
     with pytest.raises(PolicyDenied):
         calls.grant_of(Caller("spiffe://fractus.dev/a", math.inf))
     (record,) = caplog.records
-    assert record.getMessage() == "policy: no grant on this node, call refused (caller=spiffe://fractus.dev/a)"
+    assert (
+        record.getMessage()
+        == "policy: call refused because the caller has no Grant on this node (caller=spiffe://fractus.dev/a)"
+    )
     assert record.limit_by == "spiffe://fractus.dev/a"  # type: ignore[attr-defined]

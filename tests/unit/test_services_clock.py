@@ -152,10 +152,10 @@ def test_callers_without_an_identity(machine: Machine) -> None:
                 machine.callers.of(context, urgent)
 
     refused({}, "mutual TLS")
-    refused({"x509_pem_cert": [b"nonsense"]}, "cannot be read")
-    refused({"x509_pem_cert": [certificate(uris=())]}, "names no identity")
-    refused({"x509_pem_cert": [certificate(uris=("https://fractus.dev/a",))]}, "one SPIFFE id, not 0")
-    refused({"x509_pem_cert": [certificate(uris=(IDENTITY, IDENTITY + "2"))]}, "one SPIFFE id, not 2")
+    refused({"x509_pem_cert": [b"nonsense"]}, "cannot parse")
+    refused({"x509_pem_cert": [certificate(uris=())]}, "contains no identity")
+    refused({"x509_pem_cert": [certificate(uris=("https://fractus.dev/a",))]}, "one SPIFFE ID, not 0")
+    refused({"x509_pem_cert": [certificate(uris=(IDENTITY, IDENTITY + "2"))]}, "one SPIFFE ID, not 2")
     with pytest.raises(NotAuthenticated, match="expired"):
         machine.caller(certificate(-DAY_S, -1.0))
     with pytest.raises(NotAuthenticated, match="not valid yet"):

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from fractus_core.policy.compiled_grant import CompiledGrant, compile_grant
 from fractus_services import grant_files as module
-from fractus_services.admission import Allowance
+from fractus_services.admission import RateLimiter
 from fractus_services.grant_files import ActiveGrant, GrantFiles
 from fractus_services.grant_verifier import GrantVerifier
 from grant_signing import CA_PEM, signed
@@ -59,6 +59,47 @@ def test_files_come_change_and_go(tmp_path: Path) -> None:
     path.unlink()
     files.scan()
     assert seen == [(None, "u1"), ("u1", "u2"), ("u2", None), (None, "u3"), ("u3", None)]
+
+
+async def active_within_1_s(files: GrantFiles, count: int) -> None:
+    async with asyncio.timeout(1.0):
+        while len(files.active) != count:  # noqa: ASYNC110
+            await asyncio.sleep(0.01)
+
+
+async def test_grant_files_revoke_a_removed_grant_within_one_second(tmp_path: Path) -> None:
+    directory = tmp_path / "grants"
+    files = grant_files(directory)
+    watching = asyncio.ensure_future(files.run())
+    try:
+        path = directory / "g.json"
+        while not directory.is_dir():  # noqa: ASYNC110
+            await asyncio.sleep(0.01)
+        path.write_text(body())
+        await active_within_1_s(files, 1)
+        path.unlink()
+        await active_within_1_s(files, 0)
+    finally:
+        watching.cancel()
+        await asyncio.gather(watching, return_exceptions=True)
+
+
+async def test_grant_files_grant_nothing_while_their_directory_is_missing(tmp_path: Path) -> None:
+    """A directory that is back, for example after its disk was mounted again, grants the same as before."""
+    directory = tmp_path / "grants"
+    directory.mkdir()
+    (directory / "g.json").write_text(body())
+    files = grant_files(directory)
+    watching = asyncio.ensure_future(files.run())
+    try:
+        await active_within_1_s(files, 1)
+        directory.rename(tmp_path / "unmounted")
+        await active_within_1_s(files, 0)
+        (tmp_path / "unmounted").rename(directory)
+        await active_within_1_s(files, 1)
+    finally:
+        watching.cancel()
+        await asyncio.gather(watching, return_exceptions=True)
 
 
 async def test_a_flight_is_watched_while_large_grants_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -163,15 +204,15 @@ def test_a_listener_that_fails_does_not_stop_the_others(tmp_path: Path) -> None:
 
 
 def test_a_flood_runs_dry_and_fills_again() -> None:
-    allowance = Allowance(rate=10, burst=5)
-    assert [allowance.take("a", 0.0) for _ in range(7)] == [0.0] * 5 + [0.1] * 2
-    assert allowance.take("b", 0.0) == 0.0, "others are not concerned"
-    assert [allowance.take("a", 0.25) for _ in range(3)] == [0.0, 0.0, pytest.approx(0.05)]
-    assert [allowance.take("a", 100.0) for _ in range(6)] == [0.0] * 5 + [0.1]
+    limiter = RateLimiter(rate=10, burst=5)
+    assert [limiter.take("a", 0.0) for _ in range(7)] == [0.0] * 5 + [0.1] * 2
+    assert limiter.take("b", 0.0) == 0.0, "others are not concerned"
+    assert [limiter.take("a", 0.25) for _ in range(3)] == [0.0, 0.0, pytest.approx(0.05)]
+    assert [limiter.take("a", 100.0) for _ in range(6)] == [0.0] * 5 + [0.1]
 
 
 def test_those_who_ask_no_more_are_not_counted_for_ever() -> None:
-    allowance = Allowance(rate=10, burst=5)
+    limiter = RateLimiter(rate=10, burst=5)
     for n in range(2500):
-        allowance.take(f"caller-{n}", n * 0.01)
-    assert len(allowance._left) < 1100
+        limiter.take(f"caller-{n}", n * 0.01)
+    assert len(limiter._buckets) < 1100

@@ -32,7 +32,7 @@ from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes
 from fractus_services.mobility.mavlink.fence import MissionFence
 from fractus_services.mobility.mavlink.neighbours import Memory
 from fractus_services.mobility.mavlink.returning import MavlinkReturn
-from fractus_services.mobility.rpc.wiring import Parts
+from fractus_services.mobility.rpc.components import MobilityComponents
 from fractus_vehicle.earth import Place
 from fractus_vehicle.simulation import Simulation
 from fractus_vehicle.state import CONTROL_STEP_S, VehicleConfig, VehicleState
@@ -399,14 +399,14 @@ class Drone:
         )
         self.journal = Journal(directory)
         self.journal._write = lambda _data: None  # type: ignore[method-assign]
-        self.parts = Parts(
+        self.parts = MobilityComponents(
             self.autopilot, MavlinkFailsafes(self.autopilot), MissionFence(self.autopilot, directory), MavlinkReturn(self.autopilot, directory),
             journal=self.journal, grants=self.grants, audit=self.audit,  # type: ignore[arg-type]
             clock=lambda: 1_790_000_000.0 + self.autopilot.now, grace_s=grace_s, boarding_s=0.0, state=ControlState(),
         )  # fmt: skip
         parts = self.parts
         self.control, self.service, self.streams = parts.control, parts.service, parts.streams
-        work = (self.autopilot.run(), parts.monitor.run(), parts.tours.run())
+        work = (self.autopilot.run(), parts.monitor.run(), parts.poi_missions.run())
         self.tasks = [asyncio.ensure_future(part) for part in work]
         self.state = StreamState.WAITING
         self._last = ""

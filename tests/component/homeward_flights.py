@@ -15,8 +15,8 @@ import numpy as np
 from fractus_core.policy.decision_types import GotoArgs, Situation, Verdict
 from fractus_core.policy.return_route import return_bounds
 from fractus_services.errors import Refused
-from fractus_services.mobility.flight.homing import Homing
 from fractus_services.mobility.flight.motions import HEIGHT_REACHED_M, REACHED_M
+from fractus_services.mobility.flight.return_to_launch import ReturnFlight
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from policy_flights import (
     EAST_M,
@@ -210,6 +210,6 @@ async def _search(fleet: Fleet, i: int) -> Any:
     vehicle = SimpleNamespace(home=HOME, distance_m=lambda _lat, _lon: math.hypot(place[0], place[1]))
     state = SimpleNamespace(mission=None)
     control: Any = SimpleNamespace(autopilot=SimpleNamespace(vehicle=vehicle), cruise_mps=CRUISE_MPS, state=state)
-    guard: Any = SimpleNamespace(situation=lambda: now)
-    trip: Any = SimpleNamespace(constraints=SimpleNamespace(compiled=fleet.scenes[i].grant))
-    return await Homing(control, guard, SimpleNamespace())._search(trip)  # type: ignore[arg-type]
+    gate: Any = SimpleNamespace(situation=lambda: now)
+    flight: Any = SimpleNamespace(constraints=SimpleNamespace(compiled=fleet.scenes[i].grant))
+    return await ReturnFlight(control, gate, SimpleNamespace())._next_leg(flight)  # type: ignore[arg-type]

@@ -27,7 +27,7 @@ from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
 from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes
 from fractus_services.mobility.mavlink.returning import MavlinkReturn
 from fractus_services.mobility.mavlink.timing import PROBE_S
-from fractus_services.mobility.rpc.wiring import Parts
+from fractus_services.mobility.rpc.components import MobilityComponents
 from parameter_vehicle import FAILSAFES, MOVEMENT, told
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -324,14 +324,14 @@ class World:
         self.journal._write = lambda _data: None  # type: ignore[method-assign]
         self.fence = Fence()
         facts = self.plane.vehicle
-        parts = Parts(
+        parts = MobilityComponents(
             self.plane, MavlinkFailsafes(self.plane), self.fence, MavlinkReturn(self.plane, directory), journal=self.journal, grants=self.grants,  # type: ignore[arg-type]
             audit=self.audit, clock=lambda: 1_790_000_000.0 + self.plane.now, grace_s=grace_s, boarding_s=boarding_s,  # type: ignore[arg-type]
             state=ControlState(decided=known, armed_seen=facts.armed if known else None, expected_mode=GUIDED),
         )  # fmt: skip
-        self.control, self.guard, self.service, self.streams = parts.control, parts.guard, parts.service, parts.streams
+        self.control, self.gate, self.service, self.streams = parts.control, parts.gate, parts.service, parts.streams
         self.tours, self.monitor, self.supervisor, self.observer = (
-            parts.tours, parts.monitor, parts.supervisor, parts.observer,
+            parts.poi_missions, parts.monitor, parts.supervisor, parts.observer,
         )  # fmt: skip
         self.control.set_checked(Checked("", (), Airframe(retraces=retraces), 8.0, retraces))
         self.plane.on_parameter = self.observer.parameter

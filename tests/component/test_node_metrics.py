@@ -22,7 +22,7 @@ from fractus_runtime.audit import AuditLog
 from fractus_runtime.figures import text_of
 from fractus_services.grant_files import GrantFiles
 from fractus_services.metrics import MAX_POLICIES, DecisionMetrics, ServiceMetrics, common_figures
-from fractus_services.mobility.rpc.figures import flight_figures
+from fractus_services.mobility.rpc.flight_metrics import flight_figures
 from mobility_world import World, spec
 from virtual_time import fly
 

@@ -133,11 +133,11 @@ def test_a_link_that_comes_back_in_flight_leaves_the_way_home_as_chosen(tmp_path
             assert plane.parameters["FS_GCS_ENABLE"] == 1.0
             world.observer.found()
             assert control.checked.problem
-            assert world.guard.situation().airframe.accel_mps2 == 1.0, "it brakes as it did a moment ago"
+            assert world.gate.situation().airframe.accel_mps2 == 1.0, "it brakes as it did a moment ago"
             await world.until(lambda: control.checked is not None and not control.checked.problem, 10)
             assert plane.parameters["FS_GCS_ENABLE"] == 1.0
             assert not control.retraces
-            assert world.guard.situation().airframe.accel_mps2 == 1.0
+            assert world.gate.situation().airframe.accel_mps2 == 1.0
 
     fly(flight)
 

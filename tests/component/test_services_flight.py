@@ -182,9 +182,9 @@ def test_without_any_legal_way_home_the_drone_comes_home_all_the_same(
 def test_a_path_that_the_vehicle_forgot_is_not_relied_on(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=True) as world:
-            assert world.guard.situation().airframe.retraces
+            assert world.gate.situation().airframe.retraces
             world.plane.vehicle.path_lost = True
-            assert not world.guard.situation().airframe.retraces
+            assert not world.gate.situation().airframe.retraces
 
     fly(flight)
 
@@ -257,7 +257,7 @@ def test_a_tour_visits_its_points_and_comes_home(tmp_path: Path) -> None:
             grant = world.grants.put(touring(zone("wall", "ignore", *WALL), tour=((0, 70), (60, 70))))
             await asyncio.sleep(5)
             assert not world.plane.vehicle.armed
-            world.tours.heard(grant)
+            world.tours.passenger_called(grant)
             await world.until(lambda: world.outcome() == "complete")
             assert world.control.state.missions["m1"].waypoints == 2
             await world.until(lambda: not world.plane.vehicle.armed)
@@ -373,7 +373,7 @@ def test_a_drone_that_does_not_stop_begins_no_leg(tmp_path: Path) -> None:
             await world.up(grant)
             flying = asyncio.ensure_future(refusal(world.service.goto(grant, goto(0, 180), 0)))
             await world.until(lambda: world.plane.velocity[1] > 5)
-            world.guard.judge = lambda *_args, **_more: replace(Verdict("allow", goto(-60, 50)), brake_first=True)  # type: ignore[method-assign]
+            world.gate.judge = lambda *_args, **_more: replace(Verdict("allow", goto(-60, 50)), brake_first=True)  # type: ignore[method-assign]
             world.plane._command = lambda: (0.0, 1.0, 0.0)  # type: ignore[method-assign]
             why = await refusal(world.service.goto(grant, goto(-60, 50), 0))
             assert why.verdict.code == "NotStopping"
@@ -552,7 +552,7 @@ def test_a_planner_that_fails_brings_the_drone_home_straight(tmp_path: Path, mon
             grant = world.grants.put(spec(zone("far", "ignore", 150, 150, 160, 160)))
             await world.up(grant)
             await end(world.service.goto(grant, goto(0, 30), 0))
-            monkeypatch.setattr("fractus_services.mobility.flight.homing.check_straight_return", broken)
+            monkeypatch.setattr("fractus_services.mobility.flight.return_to_launch.check_straight_return", broken)
             await world.control.return_control(grant)
             await world.until(lambda: not world.plane.vehicle.armed)
             assert math.dist(world.plane.xy, (0, 0)) < 1.5

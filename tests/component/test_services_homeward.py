@@ -186,7 +186,7 @@ def test_the_way_home_is_judged_below_the_fence_of_the_mission(tmp_path: Path) -
             await world.drive(grant)
             world.plane.parameters |= {"RTL_ALT": 9000.0, "FENCE_ENABLE": 1.0, "FENCE_TYPE": 5.0, "FENCE_ALT_MAX": 55.0}
             await world.service.arm(grant)
-            assert world.guard.situation().airframe.return_altitude_m == 53.0
+            assert world.gate.situation().airframe.return_altitude_m == 53.0
 
     fly(flight)
 
@@ -237,13 +237,13 @@ def test_a_fault_of_ours_ends_the_mission_once(tmp_path: Path, monkeypatch: pyte
 
     async def flight() -> None:
         async with World(tmp_path) as world:
-            monkeypatch.setattr("fractus_services.mobility.flight.courses.route_steps", broken)
+            monkeypatch.setattr("fractus_services.mobility.flight.route_following.route_steps", broken)
             grant = world.grants.put(touring(tour=((0.0, 60.0),)) if who == "tour" else partial())
             if who == "driver":
                 why = await refusal(world.drive(grant))
-                assert "has a fault" in str(why)
+                assert "has an internal error" in str(why)
             await world.until(world.outcome)
-            assert world.outcome().startswith("failed: the mobility service has a fault")
+            assert world.outcome().startswith("failed: the mobility service has an internal error")
             await world.until(lambda: not world.plane.vehicle.armed)
             assert world.plane.commands.count(mavlink.MAV_CMD_COMPONENT_ARM_DISARM) == 1, "not armed again"
             await asyncio.sleep(20)
@@ -445,7 +445,7 @@ def test_a_driver_that_flies_on_is_kept_from_zones_by_the_same_grant(tmp_path: P
             await world.up(grant)
             for x, y in ((60, 30), (60, 70), (0, 70)):
                 await end(world.service.goto(grant, GotoArgs(*at(x, y), 10.0), 0))
-            world.monitor._way_home.given_up = grant  # as a way home left it that its driver has stopped
+            world.monitor._return_flight.given_up = grant  # as a way home left it that its driver has stopped
             await asyncio.sleep(2)
             plane.vehicle.failsafe = True
             plane.set_to(RTL)
@@ -520,12 +520,12 @@ def test_how_the_vehicle_moves_is_heard_at_once(tmp_path: Path) -> None:
             grant = world.grants.put(spec())
             await world.until(lambda: world.control.checked is not None, 10)
             await world.up(grant)
-            assert world.guard.situation().airframe.accel_mps2 == 2.5
+            assert world.gate.situation().airframe.accel_mps2 == 2.5
             changes(world, "WPNAV_ACCEL", 100.0)
-            assert world.guard.situation().airframe.accel_mps2 == 1.0
+            assert world.gate.situation().airframe.accel_mps2 == 1.0
             changes(world, "WPNAV_ACCEL", 50.0, told=False)
-            await world.until(lambda: world.guard.situation().airframe.accel_mps2 == 0.5, 12)
-            await world.until(lambda: any("moves otherwise" in str(e) for _, e in world.entries), 2)
+            await world.until(lambda: world.gate.situation().airframe.accel_mps2 == 0.5, 12)
+            await world.until(lambda: any("flight parameters changed" in str(e) for _, e in world.entries), 2)
 
     fly(flight)
 
@@ -558,7 +558,7 @@ def test_what_is_changed_on_the_ground_is_verified_before_anything_arms(tmp_path
             assert why.verdict.code == "FailsafesNotVerified"
             await world.until(lambda: world.control.checked is not None and not world.control.checked.problem, 5)
             await world.service.arm(grant)
-            assert world.guard.situation().airframe.accel_mps2 == 1.0
+            assert world.gate.situation().airframe.accel_mps2 == 1.0
 
     fly(flight)
 
@@ -605,7 +605,7 @@ def test_it_flies_home_below_a_zone_that_appears_close_overhead(tmp_path: Path) 
 def test_a_leg_into_a_zone_that_begins_is_stopped_at_once(tmp_path: Path, how: str) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            began = datetime.fromtimestamp(world.guard.situation().time_s + 25.0, UTC)
+            began = datetime.fromtimestamp(world.gate.situation().time_s + 25.0, UTC)
             later = zone("later", "ignore", -30.0, 150.0, 30.0, 170.0)
             if how == "validity":
                 later["spec"]["validFrom"] = began.isoformat()
@@ -613,7 +613,7 @@ def test_a_leg_into_a_zone_that_begins_is_stopped_at_once(tmp_path: Path, how: s
                 later["zones"][0]["schedule"] = [{"validFrom": began.isoformat()}]
             grant = world.grants.put(spec(later))
             await world.up(grant)
-            await world.until(lambda: world.guard.situation().time_s > began.timestamp() - 5.0, 30)
+            await world.until(lambda: world.gate.situation().time_s > began.timestamp() - 5.0, 30)
             stopped = await refusal(end(world.service.goto(grant, GotoArgs(*at(0, 190), 10.0), 0)))
             assert stopped.verdict.policies == ("later",)
             assert 10.0 < world.plane.xy[1] < 80.0, "70 m before it has to"

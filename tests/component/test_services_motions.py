@@ -16,7 +16,7 @@ from fractus_core.policy.monitoring import monitor
 from fractus_services.errors import AutopilotError, PreconditionFailed, Refused, Unavailable
 from fractus_services.mobility.authority.leases import FlightConstraints
 from fractus_services.mobility.flight import monitor as monitoring
-from fractus_services.mobility.flight.courses import Courses, Trip
+from fractus_services.mobility.flight.route_following import RouteFollower, SystemFlight
 from mobility_world import GUIDED, LOITER, World, area, clear_m, end, goto, partial, refusal, spec, zone
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from virtual_time import fly
@@ -168,7 +168,7 @@ def test_the_next_driver_does_not_inherit_a_speed(tmp_path: Path) -> None:
             grant = world.grants.put(spec())
             await world.up(grant)
             await world.service.set_speed(grant, SetSpeedArgs(2.0))
-            assert world.guard.situation().speed_setpoint_mps == 2.0
+            assert world.gate.situation().speed_setpoint_mps == 2.0
             await world.control.return_control(grant)
             await world.until(lambda: not world.plane.vehicle.armed)
             grant = world.grants.put(spec(), "m2")
@@ -195,7 +195,7 @@ def test_the_system_flies_home_at_the_speed_of_the_vehicle_within_limits(
             await world.control.return_control(grant)
             await world.until(lambda: world.control.motion is not None and world.control.motion.speed_mps is not None)
             told = 3.0 if limited else 8.0
-            assert world.guard.situation().speed_setpoint_mps == 8.0
+            assert world.gate.situation().speed_setpoint_mps == 8.0
             top = 0.0
             while world.plane.vehicle.mode == GUIDED:
                 await world.plane.update(0.1)
@@ -214,9 +214,9 @@ def test_a_driver_that_comes_back_has_its_speed_again(tmp_path: Path) -> None:
             await world.service.set_speed(grant, SetSpeedArgs(2.0))
             stream.cancel()
             await world.until(lambda: world.control.authority is Authority.SYSTEM, 10)
-            assert world.guard.situation().speed_setpoint_mps == 8.0
+            assert world.gate.situation().speed_setpoint_mps == 8.0
             await world.drive(grant)
-            assert world.guard.situation().speed_setpoint_mps == 2.0
+            assert world.gate.situation().speed_setpoint_mps == 2.0
 
     fly(flight)
 
@@ -231,9 +231,9 @@ def test_the_monitor_leads_a_slow_driver_back_at_the_speed_of_the_vehicle(tmp_pa
             await world.until(lambda: world.plane.speed_mps == 8.0, 5)
             assert world.control.motion is not None
             assert world.control.motion.kind == "Correction"
-            assert world.guard.situation().speed_setpoint_mps == 8.0
+            assert world.gate.situation().speed_setpoint_mps == 8.0
             await world.until(lambda: world.control.motion is None, 20)
-            assert world.guard.situation().speed_setpoint_mps == 0.2
+            assert world.gate.situation().speed_setpoint_mps == 0.2
 
     fly(flight)
 
@@ -246,7 +246,7 @@ def test_a_correction_that_came_too_late_for_its_motion_is_made_for_the_next(tmp
             flying = asyncio.ensure_future(refusal(world.service.goto(grant, goto(0, 150), 0)))
             await world.until(lambda: world.plane.velocity[1] > 7)
             world.grants.put(spec(limit("speed", 3.0)))
-            world.monitor.look()
+            world.monitor.check()
             world.control.begin_motion("Goto").speed_mps = 8.0  # before the correction has begun
             begun = world.plane.now
             await world.until(lambda: world.plane.speed_mps == 3.0, 5)
@@ -281,7 +281,7 @@ def test_a_correction_that_a_pilot_came_before_is_not_made(tmp_path: Path) -> No
             grant = world.grants.put(spec())
             await world.up(grant, 25.0)
             world.grants.put(spec(limit("altitude", 15.0)))
-            world.monitor.look()
+            world.monitor.check()
             world.plane.set_to(LOITER)
             world.observer.heartbeat()
             commands = len(world.plane.commands)
@@ -306,11 +306,11 @@ def test_what_the_system_may_not_fly_ends_no_motion(tmp_path: Path, what: str) -
             grant = world.grants.put(spec())
             await world.up(grant)
             flown = world.control.begin_motion("Goto")
-            trip = Trip(FlightConstraints(grant, grant.compiled), "Transit", forbidden)
+            trip = SystemFlight(FlightConstraints(grant, grant.compiled), "Transit", forbidden)
             away = goto(0, 50)
             with pytest.raises(PreconditionFailed, match="is gone"):
                 async for _ in (
-                    Courses(world.control, world.guard).fly(trip, away)
+                    RouteFollower(world.control, world.gate).fly(trip, away)
                     if what == "course"
                     else world.tours._launch(trip, Position(lat=away.lat, lon=away.lon))
                 ):
@@ -403,7 +403,7 @@ def test_what_is_permitted_while_the_drone_brakes_before_a_new_zone_is_flown(
             grant = world.grants.put(spec(zone("new", "ignore", -30, 50, 30, 70)))
             assert (await flying).verdict.code == "ExclusionZoneAhead"
             back = goto(*target)
-            await world.until(lambda: judge(Call("Goto", back), world.guard.situation(), grant.compiled).permits, 5)
+            await world.until(lambda: judge(Call("Goto", back), world.gate.situation(), grant.compiled).permits, 5)
             assert world.plane.velocity[1] > 5, "it still flies toward the zone"
             await end(world.service.goto(grant, back, 0))
             assert clear_m(world, -30, 50, 30, 70) > 0.0

@@ -94,7 +94,7 @@ def test_it_is_limited_while_a_mission_lasts(tmp_path: Path, restarted: bool) ->
             grant = world.grants.put(spec(limits=LIMITS))
             await world.up(grant, 8.0)
             assert held(world) == LOW
-            assert world.guard.situation().airframe.return_altitude_m == 12.0
+            assert world.gate.situation().airframe.return_altitude_m == 12.0
             await end(world.service.goto(grant, goto(0, 30, 8.0), 0))
             if not restarted:
                 await world.control.return_control(grant)
@@ -204,7 +204,7 @@ def test_it_follows_the_limits_in_flight_and_legs_keep_their_speed(tmp_path: Pat
             await world.up(grant, 8.0)
             world.grants.put(spec(limited("altitude", 12.0, 50, 50, 60, 60), limited("speed", 3.5, 50, 50, 60, 60)))
             await world.until(lambda: held(world) == LOW, 5)
-            assert world.guard.situation().airframe.return_altitude_m == 12.0
+            assert world.gate.situation().airframe.return_altitude_m == 12.0
             assert world.control.cruise_mps == 10.0, "the zone of the limits is far from where the leg leads"
             world.plane.parameters["RTL_ALT"] = 3000.0  # by a station whose message was lost
             await world.until(lambda: held(world) == LOW, 15)

@@ -74,7 +74,7 @@ def test_a_gust_stops_no_drone_that_keeps_its_place_beside_a_fence(
             plane.vehicle.courses.clear()
             plane.vehicle.courses.extend([(0.0, -speed_mps, 0.0), (COURSE_S, speed_mps, 0.0)])
             assert plane.vehicle.keeps_place(plane.now) is not stopped
-            world.monitor.look()
+            world.monitor.check()
             assert bool(plane.commands) is stopped
 
     virtual_time.fly(flight)

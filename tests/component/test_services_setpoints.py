@@ -190,13 +190,13 @@ def test_a_drone_that_slows_down_to_a_setpoint_is_not_taken_to_brake_on(tmp_path
             for north in (8.0, 8.0, 8.0, 4.0):
                 await world.service.set_velocity(grant, VelocityArgs(north, 0.0, hold_s=2.0))
                 await asyncio.sleep(1.4)
-            now = world.guard.situation()
+            now = world.gate.situation()
             assert now.forward_mps2 is not None
             assert now.forward_mps2 < -2.0
             assert now.pending == ((4.0, 0.0, 0.0),)
             assert motion_before_reaction(now).speed_mps == pytest.approx(now.north_mps)
             await world.service.hover(grant)
             await asyncio.sleep(1.0)
-            assert world.guard.situation().pending == ((0.0, 0.0, 0.0),)
+            assert world.gate.situation().pending == ((0.0, 0.0, 0.0),)
 
     fly(flight)

@@ -17,7 +17,7 @@ from fractus_services import admission, background
 from fractus_services.auth import Caller
 from fractus_services.background import in_slices
 from fractus_services.grant_files import ActiveGrant
-from fractus_services.mobility.flight import calls, courses
+from fractus_services.mobility.flight import authorization, route_following
 from fractus_services.mobility.rpc.handlers import MobilityHandlers
 from google.rpc import error_details_pb2, status_pb2
 from mobility_world import World, at, partial, refusal, spec, zone
@@ -75,8 +75,8 @@ def handlers_of(world: World) -> MobilityHandlers:
 
 def costly(world: World, method: str, monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """Let each judgement of a method take a tenth of a second of computing; gives when they are made."""
-    judge, clock, at_s = world.guard.judge, Clock(), list[float]()
-    monkeypatch.setattr(calls, "time", clock)
+    judge, clock, at_s = world.gate.judge, Clock(), list[float]()
+    monkeypatch.setattr(authorization, "time", clock)
 
     def slow(call: Call, *args: Any, **options: Any) -> Verdict:
         if call.method == method:
@@ -84,7 +84,7 @@ def costly(world: World, method: str, monkeypatch: pytest.MonkeyPatch) -> list[f
             at_s.append(world.plane.now)
         return judge(call, *args, **options)
 
-    monkeypatch.setattr(world.guard, "judge", slow)
+    monkeypatch.setattr(world.gate, "judge", slow)
     return at_s
 
 
@@ -122,7 +122,7 @@ def test_fences_that_change_during_a_search_count(tmp_path: Path, monkeypatch: p
                     world.grants.put(partial(zone("wall", "ignore", *WALL)))
                 return await in_slices(search)
 
-            monkeypatch.setattr(courses, "in_slices", slowly)
+            monkeypatch.setattr(route_following, "in_slices", slowly)
             await world.drive(grant)
             assert searches > 2
             assert max(abs(x) for x, _, _ in world.plane.trace) > 41, "around the wall from the first leg on"
@@ -137,11 +137,11 @@ def test_who_asks_much_waits_and_who_drives_waits_less(tmp_path: Path, monkeypat
             grant = world.grants.put(spec())
             other = world.grants.put(spec(instance="app-viewer", **{"class": "passenger", "control": None}), "m2")
             await world.drive(grant)
-            monkeypatch.setattr(calls, "time", Clock())
+            monkeypatch.setattr(authorization, "time", Clock())
 
             async def ask(who: Any, times: int) -> float:
                 async def once() -> None:
-                    await world.service.calls.turn(who)
+                    await world.service.calls.throttle(who)
                     world.service.calls.check(Call("GetPosition"), who)
 
                 begun = world.plane.now
@@ -201,11 +201,11 @@ def test_a_cheap_call_shortens_no_rest(world: Callable[[], World], monkeypatch: 
             await w.up(grant)
             costly(w, "Goto", monkeypatch)
             for who, rest_s in ((grant, 0.1), (other, 0.4)):
-                await w.service.calls.turn(who)
+                await w.service.calls.throttle(who)
                 begun = w.plane.now
                 w.service.calls.check(Call("Goto"), who)
                 w.service.calls.check(Call("Hover"), who)
-                await w.service.calls.turn(who)
+                await w.service.calls.throttle(who)
                 assert w.plane.now - begun == pytest.approx(rest_s, abs=0.02)
 
     fly(flight)

@@ -10,7 +10,7 @@ with atheris.instrument_imports(include=["fractus_services.mobility.rpc", "fract
     from fractus_core.policy.decision_types import Call
     from fractus_core.policy.engine import judge
     from fractus_services.errors import Refused
-    from fractus_services.mobility.rpc import arguments
+    from fractus_services.mobility.rpc import proto_conversion
 from fractus_proto.v1 import mobility_pb2
 from google.protobuf.message import DecodeError
 from policy_world import HOME, altitude, at, box, compiled, exclusion, speed
@@ -23,7 +23,7 @@ REPLIES = {"allow", "correct", "deny"}
 
 def wire(message: bytes) -> Call:
     """What a message asks for."""
-    return arguments.call_of(mobility_pb2.CheckCallRequest.FromString(message))
+    return proto_conversion.call_of(mobility_pb2.CheckCallRequest.FromString(message))
 
 
 def numbers(given: atheris.FuzzedDataProvider) -> Call:
@@ -37,17 +37,17 @@ def numbers(given: atheris.FuzzedDataProvider) -> Call:
         request.target.altitude_m = number(given, 100)
         if given.ConsumeBool():
             request.yaw_deg = number(given, 360)
-        arguments.acceptance_radius_m(request)
-        return Call("Goto", arguments.goto_args(request))
+        proto_conversion.acceptance_radius_m(request)
+        return Call("Goto", proto_conversion.goto_args(request))
     if which == 1:
         velocity = mobility_pb2.SetVelocityRequest(hold_s=number(given, 2))
         velocity.velocity.north_mps = number(given, 20)
         velocity.velocity.east_mps = number(given, 20)
         velocity.velocity.down_mps = number(given, 5)
-        return Call("SetVelocity", arguments.velocity_args(velocity))
+        return Call("SetVelocity", proto_conversion.velocity_args(velocity))
     check = mobility_pb2.CheckCallRequest()
     check.takeoff.altitude_m = number(given, 100)
-    return arguments.call_of(check)
+    return proto_conversion.call_of(check)
 
 
 def one(data: bytes) -> None:
@@ -60,7 +60,7 @@ def one(data: bytes) -> None:
         verdict = judge(call, situation, GRANT)
         assert verdict.action in REPLIES
         assert verdict.code != "InternalError", verdict
-        arguments.checked(verdict).SerializeToString()
+        proto_conversion.check_call_response(verdict).SerializeToString()
 
 
 if __name__ == "__main__":

@@ -87,7 +87,7 @@ class Flight:
             chains += [*STRANGE, (of(active.identity, 1),), node]
             handlers = MobilityHandlers(
                 world.service, world.control, world.streams, grants=world.grants, node=NODE, clock=time.time,  # type: ignore[arg-type]
-                heard=world.tours.heard,
+                on_call=world.tours.passenger_called,
             )  # fmt: skip
             registry = Registry(handlers.admission)
             mobility_pb2_grpc.add_MobilityServiceServicer_to_server(handlers, registry)

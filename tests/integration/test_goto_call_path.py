@@ -23,8 +23,8 @@ from fractus_services.mobility.rpc.server import run
 from fractus_services.options import MobilityOptions
 from mobility_rig import DRIVER, FRAME, NODE, Rig, altitude_limit, fence, grant
 
-MAX_FILES = 59
-MAX_FUNCTIONS = 196
+MAX_FILES = 52
+MAX_FUNCTIONS = 188
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 FOLDERS = ("agent", "core", "proto", "runtime", "sdk", "services")

@@ -218,7 +218,7 @@ async def test_an_autopilot_that_is_described_later_is_used(rig: Rig) -> None:
         )
     )
     assert await rig.ended("service") == 1
-    assert f"tells another autopilot ({rig.link}); starting again" in rig.log("service")
+    assert f"names a different autopilot link ({rig.link}); restarting" in rig.log("service")
     rig.start_service("--autopilot", "", "--node-object", str(handed))
     rig.start_vehicle()
     await rig.until(lambda t: t.ready and t.HasField("position"), 20)

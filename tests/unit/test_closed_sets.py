@@ -14,7 +14,7 @@ from fractus_core.policy.compiled_grant import Rule
 from fractus_core.policy.decision_types import Filter
 from fractus_core.policy.picture_rules import combine_filters, rule_filter
 from fractus_proto.v1 import mobility_pb2
-from fractus_services.mobility.rpc.arguments import call_of
+from fractus_services.mobility.rpc.proto_conversion import call_of
 
 Shape = Literal["round", "square"]
 

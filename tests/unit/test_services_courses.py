@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.leases import FlightConstraints
-from fractus_services.mobility.flight import courses
+from fractus_services.mobility.flight import route_following
 from policy_world import at, compiled, spec
 
 
@@ -26,10 +26,10 @@ def way(*_: Any, **__: Any) -> Iterator[None]:
 async def test_a_first_waypoint_beside_the_drone_is_left_out_only_at_its_altitude(
     monkeypatch: pytest.MonkeyPatch, altitude_m: float, waypoint: tuple[float, float]
 ) -> None:
-    monkeypatch.setattr(courses, "route_steps", way)
+    monkeypatch.setattr(route_following, "route_steps", way)
     grant = compiled(operationArea=[])
-    trip = courses.Trip(FlightConstraints(ActiveGrant("", "", spec(), grant), grant), "Transit", unused)
-    found = await courses.first_leg(grant.frame.latlon(100.0, 50.0), (30.0,), at(0, 0, alt=altitude_m), trip)
+    trip = route_following.SystemFlight(FlightConstraints(ActiveGrant("", "", spec(), grant), grant), "Transit", unused)
+    found = await route_following.first_leg(grant.frame.latlon(100.0, 50.0), (30.0,), at(0, 0, alt=altitude_m), trip)
     assert found is not None
     leg, last, _ = found
     assert grant.frame.xy(leg.lat, leg.lon) == pytest.approx(waypoint, abs=0.01)

@@ -60,9 +60,9 @@ def told(vehicle: Vehicle, now: float, missions: bool = False, heard: int = 0, w
     ended = Mission("uid", "identity", outcome=Outcome(OutcomeKind.REVOKED, "why"))
     state = ControlState(missions={"uid": ended, "other": Mission("other", "identity")})
     control: Any = SimpleNamespace(
-        autopilot=autopilot, checked=None, state=state, taken_because=lambda: "a pilot took it"
+        autopilot=autopilot, checked=None, state=state, effects=SimpleNamespace(takeover_reason="a pilot took it")
     )
-    return telemetry_of(control, 0.0, missions=missions, not_ready_reason="", heard=heard)
+    return telemetry_of(control, 0.0, missions=missions, not_ready_reason="", last_text=heard)
 
 
 def test_telemetry_carries_no_stale_position() -> None:

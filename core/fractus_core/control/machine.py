@@ -60,6 +60,7 @@ from fractus_core.control.events import (
 from fractus_core.control.state import (
     COMPLETE,
     NOTHING_FLOWN,
+    ActiveFlight,
     ActiveMotion,
     Authority,
     ControlEvent,
@@ -67,7 +68,6 @@ from fractus_core.control.state import (
     ControlState,
     OutcomeKind,
     StreamState,
-    SystemFlight,
     SystemTask,
     TaskKind,
     ended_refusal,
@@ -393,9 +393,9 @@ def _on_system(update: StateUpdate, event: SystemEvent) -> None:
             kept = grace if grace is not None and grace.key == key else None
             update.set(grace=kept, authority=Authority.SYSTEM)
             update.adopt(update.mission(key, identity))
-            update.set(flight=SystemFlight(flight_id, key))
+            update.set(flight=ActiveFlight(flight_id, key))
         case SystemFlightBegan(flight_id, key):
-            update.set(flight=SystemFlight(flight_id, key))
+            update.set(flight=ActiveFlight(flight_id, key))
         case SystemFlightEnded(flight_id):
             if update.state.flight is not None and update.state.flight.flight_id == flight_id:
                 update.set(flight=None)

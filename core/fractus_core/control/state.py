@@ -201,7 +201,7 @@ class SystemTask:
 
 
 @dataclass(frozen=True, slots=True)
-class SystemFlight:
+class ActiveFlight:
     """Flight for an application under the flight constraints of its grant."""
 
     flight_id: int
@@ -278,7 +278,7 @@ class ControlState:
     vehicle: VehicleFacts = VehicleFacts()
     authority: Authority = Authority.SYSTEM
     lease: ControlLease | None = None
-    flight: SystemFlight | None = None
+    flight: ActiveFlight | None = None
     task: SystemTask | None = None
     returning: bool = False
     motion: ActiveMotion | None = None

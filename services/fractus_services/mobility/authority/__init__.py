@@ -1,1 +1,1 @@
-"""Who may command the vehicle: control, leases, permits, arming, and the journal of missions."""
+"""Control authority: control state, leases, arming, failsafes, and the journal of missions."""

@@ -1,1 +1,1 @@
-"""Flying: motions, transit, tours, the way home, and the monitor of what is flown."""
+"""Flights: motions, transit, return, missions over points of interest, and the monitor."""

@@ -1,4 +1,4 @@
-"""The continuous monitor and the flight recorder: what runs while the drone is armed."""
+"""Continuous monitor of the flying drone, and flight recorder."""
 
 from __future__ import annotations
 
@@ -22,45 +22,62 @@ from fractus_services.errors import Aborted, AutopilotError, Refused
 from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.control_store import CORRECTION, ControlStore
 from fractus_services.mobility.authority.leases import Motion
-from fractus_services.mobility.authority.situation import fences_of
 from fractus_services.mobility.authority.supervisor import Supervisor
 from fractus_services.mobility.autopilot import Permit
-from fractus_services.mobility.flight.courses import STOPPED, WayHome, limited_mps
-from fractus_services.mobility.flight.guard import Guard
 from fractus_services.mobility.flight.motions import REACHED_M, fly_to
+from fractus_services.mobility.flight.policy_gate import PolicyGate
+from fractus_services.mobility.flight.return_to_launch import ReturnFlight
+from fractus_services.mobility.flight.route_following import REPLAN_CODES, limited_mps
 
 log = logging.getLogger(__name__)
 
 TICK_S = 0.1
-"""In the air the monitor runs on every position (20 Hz), and this often when none come."""
+"""Longest time between two checks in flight, in seconds of the vehicle's clock. Each position also starts one (20 Hz)."""
 
 IDLE_S = 0.5
-RECORD_S = 0.5
-CORRECT_AGAIN_S = 3.0
-"""How long a correction may take effect before the same alarm asks for it again."""
+"""Longest time between two iterations on the ground."""
 
-CHANGED_S = 30.0
-"""How long after its grant, or what is in force of it, changed a drone may still speed up on a leg that was judged by the grant before."""
+RECORD_S = 0.5
+"""Seconds between two entries of the flight recorder."""
+
+CORRECTION_TIMEOUT_S = 3.0
+"""Seconds within which a correction must take effect before the same alarm is raised again."""
+
+GRANT_CHANGE_S = 30.0
+"""Seconds after a change of the constraints for which a drone may still accelerate on a leg judged before the change."""
 
 START_S = 2.0
-"""How long a drone may take to move after it was told to fly; one that keeps its place longer flies nothing."""
+"""Seconds within which a drone starts to move after a command. A drone that keeps its position longer flies nothing."""
 
 
 Permits = Callable[[Motion | None], Permit]
-"""For a motion, the check that its commands must pass."""
+"""Returns the permit for the commands of a motion."""
 
 
 class MotionMonitor:
-    """Judges the flying drone's present state, and acts on what it finds."""
+    """Judges the present state of the flying drone and reacts to violations.
+
+    Args:
+        control: Control state.
+        gate: Policy engine.
+        audit: Audit log for alarms and for the flight recorder.
+        supervisor: Supervision that runs in the same loop.
+        return_flight: Return flights, whose last resort must not be interrupted.
+    """
 
     def __init__(
-        self, control: ControlStore, guard: Guard, audit: AuditLog, supervisor: Supervisor, way_home: WayHome
+        self,
+        control: ControlStore,
+        gate: PolicyGate,
+        audit: AuditLog,
+        supervisor: Supervisor,
+        return_flight: ReturnFlight,
     ) -> None:
         self._control = control
-        self._guard = guard
+        self._gate = gate
         self._audit = audit
         self._supervisor = supervisor
-        self._way_home = way_home
+        self._return_flight = return_flight
         self._alarm = ""
         self._alarm_at = 0.0
         self._grant: ActiveGrant | None = None
@@ -68,86 +85,105 @@ class MotionMonitor:
         self._changed_at = -math.inf
 
     async def run(self) -> None:
-        """Watch until cancelled."""
+        """Monitor until cancelled."""
         autopilot = self._control.autopilot
         while True:
             await autopilot.update(TICK_S / autopilot.pace if autopilot.vehicle.in_air else IDLE_S)
-            self._renew_way_home()
+            self._reset_return()
             if autopilot.vehicle.in_air:
                 self._control.dispatch(Airborne())
                 try:
-                    self.look()
+                    self.check()
                 except Exception:
-                    log.exception("monitor: failed, the drone holds its position")
+                    log.exception("monitor: check failed, drone brakes")
                     reason = "the motion monitor failed"
                     self._control.brake(Verdict("deny", None, "InternalError", reason, (), "hover"))
             try:
                 self._supervisor.tick()
             except Exception:
-                # No heartbeat follows a supervisor that fails: within seconds the autopilot takes the drone home.
+                # A failing supervisor stops the heartbeats: within seconds the autopilot brings the drone home.
                 log.exception("monitor: supervisor failed, the autopilot's failsafe brings the drone home")
 
-    def _renew_way_home(self) -> None:
-        """What was the last line holds only for the flight home that it ended: not for a drone that stands or flies on."""
-        control, vehicle = self._control, self._control.autopilot.vehicle
-        homeward = control.state.returning or (control.motion is not None and control.motion.kind == "ReturnToLaunch")
-        if not vehicle.in_air or (vehicle.mode.commanded and not homeward):
-            self._way_home.given_up = None
+    def _reset_return(self) -> None:
+        """Forget that no legal return was found, once the drone is on the ground or flies something else."""
+        control = self._control
+        vehicle = control.autopilot.vehicle
+        returns = control.state.returning or (control.motion is not None and control.motion.kind == "ReturnToLaunch")
+        if not vehicle.in_air or (vehicle.mode.commanded and not returns):
+            self._return_flight.given_up = None
 
-    def look(self) -> None:
-        """One check."""
-        control, mode = self._control, self._control.autopilot.vehicle.mode
+    def check(self) -> None:
+        """Judge the present state once."""
+        control = self._control
+        mode = control.autopilot.vehicle.mode
         piloted = control.authority is Authority.PILOT
-        compiled = fences_of(control) if mode.comes_down or (mode.commanded and not piloted) else None
-        verdict, ours = self._judge(compiled) if compiled is not None else (None, False)
+        compiled = self._constraints() if mode.comes_down or (mode.commanded and not piloted) else None
+        verdict, by_system = self._judge(compiled) if compiled is not None else (None, False)
         if verdict is None or verdict.code != POSITION_UNKNOWN:
             control.dispatch(PositionFound())
         if compiled is None or verdict is None:
             self._alarm = ""
             return
-        watched = not mode.commanded or (control.state.returning and control.motion is None)
-        acts = not watched or self._may_take_back(verdict)
-        lasting = control.autopilot.now - self._alarm_at > CORRECT_AGAIN_S
+        uncommanded = not mode.commanded or (control.state.returning and control.motion is None)
+        acts = not uncommanded or self._may_take_back(verdict)
+        lasting = control.autopilot.now - self._alarm_at > CORRECTION_TIMEOUT_S
         fresh = verdict.code != self._alarm or (lasting and acts)
         if fresh:
             self._alarm, self._alarm_at = verdict.code, control.autopilot.now
             policies = ",".join(verdict.policies) or "-"
             log.warning(
-                "monitor: alarm (code=%s mode=%s policies=%s reason=%s)",
+                "monitor: alarm raised (code=%s mode=%s policies=%s reason=%s)",
                 verdict.code, mode.name, policies, verdict.reason,
             )  # fmt: skip
-        if watched:
+        if uncommanded:
             if fresh:
                 self._note("takeBack" if acts else "alarm", verdict)
             if fresh and acts:
                 self._take_back(verdict)
         elif verdict.code == POSITION_UNKNOWN:
             self._hover(verdict, fresh)
-        elif verdict.action == "takeover" and not ours:
+        elif verdict.action == "takeover" and not by_system:
             control.take_over(verdict)
         elif verdict.action in {"takeover", "deny"}:
             self._stop(verdict, fresh)
         elif fresh:
             self._correct(verdict, compiled)
 
+    def _constraints(self) -> CompiledGrant | None:
+        """Return the constraints of the present flight; None if no grant applies.
+
+        A flight of the system or of the autopilot may be anywhere between home and operation area.
+        """
+        control = self._control
+        if control.constraints is not None:
+            return control.constraints.compiled
+        autonomous = control.state.returning or control.autopilot.vehicle.mode.comes_down
+        if control.authority is Authority.DRIVER or not autonomous:
+            return control.mission_grant.compiled if control.mission_grant is not None else None
+        return control.for_transit(control.last_grant) if control.last_grant is not None else None
+
     def _judge(self, compiled: CompiledGrant) -> tuple[Verdict | None, bool]:
-        """What is wrong, and whether the system flies the drone already, so that there is no driver to take it from."""
-        control, now = self._control, self._guard.situation()
-        changed, motion = self._has_changed(compiled.fences_in_force(now.time_s)), control.motion
-        # What moves a drone without a motion was judged by no one: another station commands it, or a motion has just ended. One that
-        # keeps its place is pushed by gusts alone, which its margin counts.
+        """Return the violation, if any, and whether the system already flies the drone, so that no takeover is needed."""
+        control = self._control
+        now = self._gate.situation()
+        changed = self._has_changed(compiled.fences_in_force(now.time_s))
+        motion = control.motion
+        # The movement of a drone without a motion was never judged: another station commands it, or a motion has just ended.
+        # A drone that keeps its position only moves by gusts, which its margin covers.
         vehicle = control.autopilot.vehicle
         changed = changed or (motion is None and not vehicle.keeps_place(control.autopilot.now))
-        bound_for = motion.leg if motion is not None and motion.under_way and not motion.braking else None
+        current_leg = motion.leg if motion is not None and motion.under_way and not motion.braking else None
         if control.state.returning or not control.autopilot.vehicle.mode.commanded:
-            # The autopilot's own ways were judged by no one, whatever the grant was.
+            # The autopilot's own flights were never judged, whatever the grant.
             changed = changed or not control.autopilot.vehicle.mode.commanded
-            return monitor(now, compiled, system_flies=True, fences_changed=changed, current_leg=bound_for), True
-        verdict = monitor(now, compiled, fences_changed=changed, current_leg=bound_for)
-        alone = control.constraints is not None and verdict is not None and verdict.action == "correct"
-        if verdict is None or (not alone and (verdict.takeover != "hover" or control.authority is Authority.DRIVER)):
+            return monitor(now, compiled, system_flies=True, fences_changed=changed, current_leg=current_leg), True
+        verdict = monitor(now, compiled, fences_changed=changed, current_leg=current_leg)
+        system_correction = control.constraints is not None and verdict is not None and verdict.action == "correct"
+        if verdict is None or (
+            not system_correction and (verdict.takeover != "hover" or control.authority is Authority.DRIVER)
+        ):
             return verdict, False
-        return monitor(now, compiled, system_flies=True, fences_changed=changed, current_leg=bound_for), True
+        return monitor(now, compiled, system_flies=True, fences_changed=changed, current_leg=current_leg), True
 
     @property
     def _flown_grant(self) -> ActiveGrant | None:
@@ -155,120 +191,127 @@ class MotionMonitor:
         return constraints.grant if constraints is not None else self._control.last_grant
 
     def _may_take_back(self, verdict: Verdict) -> bool:
-        """Whether the system may end what the autopilot flies by itself.
+        """Return True if the system may interrupt a flight of the autopilot.
 
-        Not what a pilot chose or may have chosen before the service began, not a landing of the system or a failsafe, and not the last line behind the system's own ways.
+        It does not interrupt a mode that a pilot chose, or may have chosen before the service started, a landing by the system
+        or a failsafe, or the last resort of a return flight.
         """
-        control, mode = self._control, self._control.autopilot.vehicle.mode
-        if mode.commanded or verdict.code == POSITION_UNKNOWN or self._way_home.given_up is self._flown_grant:
+        control = self._control
+        mode = control.autopilot.vehicle.mode
+        if mode.commanded or verdict.code == POSITION_UNKNOWN or self._return_flight.given_up is self._flown_grant:
             return False
         if control.authority is Authority.DRIVER:
             return True
         task = control.state.task
-        ours = task is not None and task.kind is TaskKind.RETURN and not task.found
-        returns = ours and mode.kind is ModeKind.RETURNING
+        by_system = task is not None and task.kind is TaskKind.RETURN and not task.found
+        returns = by_system and mode.kind is ModeKind.RETURNING
         return returns and control.authority is Authority.SYSTEM
 
     def _take_back(self, verdict: Verdict) -> None:
-        """Stop the drone in GUIDED: its driver is told why, the system looks for a legal way home."""
-        control, state = self._control, self._control.state
+        """Stop the drone in GUIDED. The driver receives the reason, and the system searches a legal return."""
+        control = self._control
+        state = control.state
         control.stop_motion(verdict)
 
         def permit() -> None:
             now = control.state
             if now.authority is not state.authority or now.task != state.task or now.motion is not None:
-                raise AutopilotError("something else flies by now")
+                raise AutopilotError("another motion has begun")
 
         control.tasks.spawn(control.tasks.attempt(control.modes.hold, permit))
 
     def _has_changed(self, in_force: tuple[bool, ...]) -> bool:
-        """Whether the drone's way may have been judged by another grant than now, or before a schedule opened or closed a zone."""
-        control, grant = self._control, self._flown_grant
-        autopilot, motion = control.autopilot, control.motion
+        """Return True if the present leg may have been judged under other constraints: a different grant or schedule."""
+        control = self._control
+        grant = self._flown_grant
+        autopilot = control.autopilot
+        motion = control.motion
         if grant is not self._grant or in_force != self._in_force:
-            self._grant, self._in_force, self._changed_at = grant, in_force, autopilot.now
+            self._grant = grant
+            self._in_force = in_force
+            self._changed_at = autopilot.now
         begins = autopilot.now - control.state.motion_began_at < START_S
         if (motion is None or motion.kind == "Takeoff") and not begins and autopilot.vehicle.keeps_place(autopilot.now):
-            # Whatever moves it from here is judged by what holds now, or later.
+            # Any later movement is judged under the present constraints, or later ones.
             self._changed_at = -math.inf
-        return autopilot.now - self._changed_at < CHANGED_S
+        return autopilot.now - self._changed_at < GRANT_CHANGE_S
 
     def _stop(self, verdict: Verdict, fresh: bool) -> None:
-        """End the motion that makes things worse; the system then looks for another way.
+        """End the motion that causes the violation. A system flight then searches a different route.
 
-        A motion that comes to rest before it begins does what is wanted.
+        A motion that is still braking before its leg already does what is needed.
         """
         control = self._control
         motion = control.motion
-        waits = motion is not None and motion.braking
-        if not waits and (fresh or motion is not None):
+        braking = motion is not None and motion.braking
+        if not braking and (fresh or motion is not None):
             control.brake(verdict)
         else:
             control.autopilot.stop()
 
     def _hover(self, verdict: Verdict, fresh: bool) -> None:
-        """Nothing flies on while the position is not known; who has the drone keeps it for the grace time."""
+        """Hover while the position is unknown. The driver keeps control for the grace time."""
         if fresh or self._control.motion is not None:
             self._control.dispatch(PositionLost(verdict.reason))
         else:
             self._control.autopilot.stop()
 
     def _note(self, action: str, verdict: Verdict) -> None:
-        """Write down what was found."""
+        """Write an alarm to the audit log."""
         content = {"action": action, "code": verdict.code, "reason": verdict.reason, "policies": list(verdict.policies)}
         self._audit.append("monitor", content | {"mode": self._control.autopilot.vehicle.mode.name})
 
     def _correct(self, verdict: Verdict, compiled: CompiledGrant) -> None:
-        if self._control.constraints is not None and verdict.code in STOPPED:
-            self._stop(verdict, fresh=True)  # The system's flights look for another way by themselves.
+        if self._control.constraints is not None and verdict.code in REPLAN_CODES:
+            self._stop(verdict, fresh=True)  # System flights search a different route by themselves.
             return
         self._note(verdict.action, verdict)
         self._control.tasks.spawn(self._carry_out(verdict, self._control.motion, self._permits(), compiled))
 
     def _permits(self) -> Permits:
-        """What corrects a motion is sent only while no one else flies than at this moment."""
+        """Return permits for a correction that hold while lease, authority and motion do not change."""
         control = self._control
         lease, authority = control.lease, control.authority
 
         def permit(motion: Motion | None) -> Permit:
             def check() -> None:
                 if control.lease is not lease or control.authority is not authority or control.motion is not motion:
-                    raise Aborted("Replaced", "something else flies by now")
+                    raise Aborted("Replaced", "another motion has begun")
 
             return check
 
         return permit
 
     async def _carry_out(
-        self, verdict: Verdict, seen: Motion | None, permits: Permits, compiled: CompiledGrant
+        self, verdict: Verdict, current: Motion | None, permits: Permits, compiled: CompiledGrant
     ) -> None:
         try:
-            permits(seen)()
+            permits(current)()
         except Aborted:
             self._alarm = ""
-            return  # Another motion has begun: the next look judges that one.
+            return  # Another motion has begun. The next check judges it.
         try:
             if isinstance(verdict.args, SetSpeedArgs):
-                await self._slow_down(verdict.args.speed_mps, permits(seen))
+                await self._slow_down(verdict.args.speed_mps, permits(current))
             elif isinstance(verdict.args, GotoArgs):
                 await self._lead_back(verdict, verdict.args, permits, compiled)
         except (AutopilotError, Refused) as error:
             log.warning("monitor: correction failed (error=%s)", error)
 
     async def _slow_down(self, speed_mps: float, permit: Permit) -> None:
-        """Fly the present leg slower; the next one is judged by itself."""
+        """Reduce the speed of the present leg. The next leg is judged on its own."""
         motion = self._control.motion
         if motion is not None and motion.speed_mps is not None:
             speed_mps = motion.speed_mps = min(speed_mps, motion.speed_mps)
         await self._control.autopilot.set_speed(speed_mps, permit)
 
-    async def _lead_back(self, verdict: Verdict, place: GotoArgs, permits: Permits, compiled: CompiledGrant) -> None:
-        """Fly to where the limits hold, as a motion that follows the one that left them."""
+    async def _lead_back(self, verdict: Verdict, target: GotoArgs, permits: Permits, compiled: CompiledGrant) -> None:
+        """Fly back into the limits, as a motion that replaces the one that violated them."""
         control = self._control
         control.stop_motion(verdict)
         motion = control.begin_motion(CORRECTION)
-        speed = limited_mps(control.cruise_mps, place, self._guard.situation(), compiled)
-        leg = replace(place, speed_mps=speed)
+        speed = limited_mps(control.cruise_mps, target, self._gate.situation(), compiled)
+        leg = replace(target, speed_mps=speed)
         try:
             async for _ in fly_to(control.autopilot, motion, leg, REACHED_M, permits(motion)):
                 pass
@@ -278,15 +321,15 @@ class MotionMonitor:
         control.finish_motion(motion)
 
     async def record(self) -> None:
-        """The flight recorder, until cancelled."""
+        """Record the flight in the audit log until cancelled."""
         while True:
             await asyncio.sleep(RECORD_S)
             if self._control.autopilot.vehicle.armed:
-                self._audit.append("state", recorded(self._control), now=False)
+                self._audit.append("state", flight_record(self._control), now=False)
 
 
-def recorded(control: ControlStore) -> dict[str, Any]:
-    """One entry of the flight recorder."""
+def flight_record(control: ControlStore) -> dict[str, Any]:
+    """Return one entry of the flight recorder."""
     vehicle = control.autopilot.vehicle
     return {
         "lat": vehicle.lat,

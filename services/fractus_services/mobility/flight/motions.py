@@ -1,64 +1,110 @@
-"""Motions under way: each commands the autopilot, then follows the streamed state until it is complete."""
+"""Execution of motions: each sends its command, then follows the telemetry until the motion is complete."""
 
 from __future__ import annotations
 
 import asyncio
+import logging
 import math
 from collections.abc import AsyncGenerator
 from contextlib import aclosing
 from dataclasses import dataclass
 
-from fractus_core.policy.decision_types import GotoArgs
+from fractus_core.policy.decision_types import GotoArgs, VelocityArgs
 
-from fractus_services.errors import Aborted, AutopilotError, Unavailable
+from fractus_services.errors import Aborted, AutopilotError, Refused, Unavailable
+from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.authority.leases import Motion
 from fractus_services.mobility.autopilot import Autopilot, Permit, VehicleState
 
+log = logging.getLogger(__name__)
+
 REACHED_M = 1.0
-HEIGHT_REACHED_M, HEIGHT_REACHED_MPS = 0.8, 0.6
-"""A climb is complete this near to its altitude and this slow: ArduCopter approaches the last metre ever more slowly."""
+"""Default distance to the target within which a leg is complete."""
+
+HEIGHT_REACHED_M = 0.8
+"""Difference of altitude within which a climb or leg is complete. ArduCopter approaches the last metre ever more slowly."""
+
+HEIGHT_REACHED_MPS = 0.6
+"""Vertical speed below which a climb is complete."""
 
 REPORT_S = 0.2
-CLIMB_TIMEOUT_S, CLIMB_PROGRESS_M = 20.0, 0.2
-STUCK_TIMEOUT_S, LEG_PROGRESS_M = 6.0, 0.3
-MAX_RESENDS = 3
-"""A leg on which the drone gets no nearer for that long is sent again: a stop of ours may have overtaken the command, or the
-autopilot may have restarted its controller."""
+"""Seconds between progress reports of a motion."""
 
-TURNED_DEG, TURN_TIMEOUT_S = 8.0, 8.0
-"""A leg with a heading is complete when the nose points there, or had this long to turn."""
+CLIMB_TIMEOUT_S = 20.0
+"""Seconds without progress after which a climb has failed."""
+
+CLIMB_PROGRESS_M = 0.2
+"""Gain of altitude that counts as progress of a climb."""
+
+STUCK_TIMEOUT_S = 6.0
+"""Seconds without progress after which the command of a leg is sent again.
+
+A stop setpoint may have overtaken the command, or the autopilot may have restarted its controller.
+"""
+
+LEG_PROGRESS_M = 0.3
+"""Approach to the target that counts as progress of a leg."""
+
+MAX_RESENDS = 3
+"""Number of times that the command of a leg is sent again."""
+
+HEADING_REACHED_DEG = 8.0
+"""Difference of heading within which a leg with a heading is complete."""
+
+HEADING_TIMEOUT_S = 8.0
+"""Seconds at the target after which a leg with a heading is complete in any case."""
 
 SPEED_TIMEOUT_S = 1.3
-"""A leg whose speed is not acknowledged in this time, in which it is sent twice, is stopped and begun once more."""
+"""Seconds within which the speed of a leg must be acknowledged. It is sent twice in this time.
 
-REST_TIMEOUT_S, STOP_RESEND_S = 12.0, 0.1
+Without an acknowledgement the drone is stopped and the leg is started once more.
+"""
+
+REST_TIMEOUT_S = 12.0
+"""Seconds within which the drone must come to rest."""
+
+STOP_RESEND_S = 0.1
+"""Seconds of the vehicle's clock between stop setpoints."""
+
+SETPOINT_RESEND_S = 0.2
+"""Seconds of the vehicle's clock between repetitions of a velocity setpoint.
+
+A lost message must not leave the previous setpoint in force, and ArduCopter itself stops after GUID_TIMEOUT without one
+(1 s, set with the failsafes).
+"""
+
+MIN_HOLD_S = 1e-3
+"""Remaining hold time below which a velocity setpoint has expired. The event loop does not sleep for less."""
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """Where a motion is."""
+    """Progress of a motion: remaining distance in metres, and whether the motion is complete."""
 
     distance_m: float
     complete: bool
 
 
 async def climb(autopilot: Autopilot, motion: Motion, altitude_m: float, permit: Permit) -> AsyncGenerator[Step, None]:
-    """Take off to an altitude above home."""
+    """Take off to an altitude above home in metres."""
     vehicle = autopilot.vehicle
     await autopilot.take_off(altitude_m, permit)
     if vehicle.lat is not None and vehicle.lon is not None:
-        # The monitor lets it climb to there: the autopilot ends its climb by itself.
-        motion.leg, motion.under_way = GotoArgs(vehicle.lat, vehicle.lon, altitude_m), True
-    begun, best = autopilot.now, -math.inf
+        # The monitor permits the climb to this leg's altitude, where the autopilot ends it by itself.
+        motion.leg = GotoArgs(vehicle.lat, vehicle.lon, altitude_m)
+        motion.under_way = True
+    progress_at = autopilot.now
+    best_m = -math.inf
     while True:
-        left = altitude_m - vehicle.altitude_m
-        done = left < HEIGHT_REACHED_M and abs(vehicle.down_mps) < HEIGHT_REACHED_MPS
-        yield Step(max(left, 0.0), done)
-        if done:
+        remaining_m = altitude_m - vehicle.altitude_m
+        complete = remaining_m < HEIGHT_REACHED_M and abs(vehicle.down_mps) < HEIGHT_REACHED_MPS
+        yield Step(max(remaining_m, 0.0), complete)
+        if complete:
             return
-        if vehicle.altitude_m > best + CLIMB_PROGRESS_M:
-            best, begun = vehicle.altitude_m, autopilot.now
-        if autopilot.now - begun > CLIMB_TIMEOUT_S:
+        if vehicle.altitude_m > best_m + CLIMB_PROGRESS_M:
+            best_m = vehicle.altitude_m
+            progress_at = autopilot.now
+        if autopilot.now - progress_at > CLIMB_TIMEOUT_S:
             raise Aborted("NotFollowing", f"the drone does not climb above {vehicle.altitude_m:.1f} m")
         if not vehicle.armed:
             raise Aborted("Disarmed", "the autopilot disarmed before the drone took off")
@@ -74,62 +120,69 @@ async def fly_to(
     *,
     judged: Permit | None = None,
 ) -> AsyncGenerator[Step, None]:
-    """Fly straight to a point; altitude above home.
+    """Fly straight to a point.
 
     Args:
-        autopilot: flies.
-        motion: what it belongs to.
-        args: the leg; with a speed, since the autopilot may not remember the last one.
-        reached_m: how near to the point the leg is complete.
-        permit: the check that each command must pass before it is sent.
-        judged: the check instead of `permit` each time before the leg is begun: the drone moves on while commands are lost,
-            and a leg that was legal from there may not be legal from here.
+        autopilot: Autopilot interface.
+        motion: Motion that the leg belongs to.
+        args: Target of the leg; altitude above home. It has a speed, because the autopilot may not keep the previous one.
+        reached_m: Distance to the target within which the leg is complete.
+        permit: Check before each command.
+        judged: Check before each start of the leg, instead of `permit`. The drone moves on while commands are lost, so a leg
+            that was legal from its previous position may no longer be legal.
     """
     altitude = args.alt if args.alt is not None else autopilot.vehicle.altitude_m
-    motion.leg, motion.speed_mps = args, args.speed_mps
+    motion.leg = args
+    motion.speed_mps = args.speed_mps
 
     async def begin() -> None:
         motion.under_way = False
         await autopilot.go_to(args.lat, args.lon, altitude, args.yaw_deg, judged or permit)
         motion.under_way = True
-        if not await _hears_speed(autopilot, motion, permit):
-            # It flies at an unknown speed, maybe its own default: above a limit that was judged. Stop, and try once more.
+        if not await _speed_acknowledged(autopilot, motion, permit):
+            # The drone flies at an unknown speed, perhaps its default, which may exceed a limit. Stop and retry once.
             motion.under_way = False
             await come_to_rest(autopilot, motion, permit)
             await autopilot.go_to(args.lat, args.lon, altitude, args.yaw_deg, judged or permit)
             motion.under_way = True
-            if not await _hears_speed(autopilot, motion, permit):
+            if not await _speed_acknowledged(autopilot, motion, permit):
                 raise AutopilotError("the autopilot does not acknowledge the speed of the leg", link=True)
         if args.yaw_deg is not None:
             await autopilot.turn(args.yaw_deg, permit)
 
     await begin()
-    sent, resends, best = autopilot.now, 0, math.inf
-    there: float | None = None
+    progress_at = autopilot.now
+    resends = 0
+    best_m = math.inf
+    reached_at: float | None = None
     while True:
         vehicle = autopilot.vehicle
-        away = vehicle.distance_m(args.lat, args.lon)
-        rise = abs(altitude - vehicle.altitude_m)
-        done = away <= reached_m and rise <= HEIGHT_REACHED_M
-        if done and args.yaw_deg is not None:
-            there = autopilot.now if there is None else there
-            sent = autopilot.now  # turning on the spot is progress
-            done = _turned(vehicle, args.yaw_deg) or autopilot.now - there > TURN_TIMEOUT_S
-        yield Step(math.hypot(away, rise), done)
-        if done:
+        distance_m = vehicle.distance_m(args.lat, args.lon)
+        height_m = abs(altitude - vehicle.altitude_m)
+        remaining_m = math.hypot(distance_m, height_m)
+        complete = distance_m <= reached_m and height_m <= HEIGHT_REACHED_M
+        if complete and args.yaw_deg is not None:
+            reached_at = autopilot.now if reached_at is None else reached_at
+            progress_at = autopilot.now  # turning on the spot is progress
+            timed_out = autopilot.now - reached_at > HEADING_TIMEOUT_S
+            complete = _heading_reached(vehicle, args.yaw_deg) or timed_out
+        yield Step(remaining_m, complete)
+        if complete:
             return
-        if math.hypot(away, rise) < best - LEG_PROGRESS_M:
-            best, sent = math.hypot(away, rise), autopilot.now
-        if autopilot.now - sent > STUCK_TIMEOUT_S:
+        if remaining_m < best_m - LEG_PROGRESS_M:
+            best_m = remaining_m
+            progress_at = autopilot.now
+        if autopilot.now - progress_at > STUCK_TIMEOUT_S:
             if resends == MAX_RESENDS:
-                raise Aborted("NotFollowing", f"the drone stays {math.hypot(away, rise):.1f} m away from the target")
-            resends, sent = resends + 1, autopilot.now
+                raise Aborted("NotFollowing", f"the drone stays {remaining_m:.1f} m away from the target")
+            resends += 1
+            progress_at = autopilot.now
             await begin()
         await _tick(autopilot, motion)
 
 
-async def _hears_speed(autopilot: Autopilot, motion: Motion, permit: Permit) -> bool:
-    """Tell the autopilot how fast the leg that it has begun is flown; whether it answers soon enough."""
+async def _speed_acknowledged(autopilot: Autopilot, motion: Motion, permit: Permit) -> bool:
+    """Set the speed of the leg that the autopilot has begun. Return False if it is not acknowledged in time."""
     if motion.speed_mps is None:
         return True
     try:
@@ -141,7 +194,7 @@ async def _hears_speed(autopilot: Autopilot, motion: Motion, permit: Permit) -> 
 
 
 async def come_down(autopilot: Autopilot, motion: Motion) -> AsyncGenerator[Step, None]:
-    """Follow a landing or a return to launch until the motors stop."""
+    """Follow a landing or the autopilot's return until the motors stop."""
     vehicle = autopilot.vehicle
     while vehicle.armed:
         yield Step(max(vehicle.altitude_m, 0.0), complete=False)
@@ -152,7 +205,7 @@ async def come_down(autopilot: Autopilot, motion: Motion) -> AsyncGenerator[Step
 async def rise(
     speed_mps: float, autopilot: Autopilot, motion: Motion, altitude_m: float, permit: Permit, *, judged: Permit
 ) -> AsyncGenerator[Step, None]:
-    """Climb to an altitude above home over the place where the drone rests, unless it is high enough; see `fly_to`."""
+    """Climb to an altitude above home over the present position at rest, unless the drone is high enough; see `fly_to`."""
     vehicle = autopilot.vehicle
     if vehicle.lat is None or vehicle.lon is None or vehicle.altitude_m > altitude_m - HEIGHT_REACHED_M:
         yield Step(0.0, True)
@@ -164,22 +217,23 @@ async def rise(
 
 
 async def come_to_rest(autopilot: Autopilot, motion: Motion, permit: Permit) -> None:
-    """Brake until the drone stands, so that its next leg begins on the spot.
+    """Brake until the drone is at rest, so that its next leg begins at a known position.
 
     Raises:
-        Refused: the motion was stopped, or the drone does not come to rest.
+        Refused: The motion was stopped, or the drone did not come to rest.
     """
-    deadline, sent = autopilot.now + REST_TIMEOUT_S, -math.inf
+    deadline = autopilot.now + REST_TIMEOUT_S
+    sent_at = -math.inf
     motion.braking = True
     try:
         while not autopilot.at_rest:
             if autopilot.now > deadline:
                 speed = autopilot.vehicle.speed_mps
                 raise Aborted("NotStopping", f"the drone does not stop; it still flies {speed:.1f} m/s")
-            if autopilot.now - sent >= STOP_RESEND_S / autopilot.pace:
+            if autopilot.now - sent_at >= STOP_RESEND_S / autopilot.pace:
                 permit()
                 autopilot.stop()
-                sent = autopilot.now
+                sent_at = autopilot.now
             motion.check()
             await _next_message(autopilot)
     finally:
@@ -187,8 +241,8 @@ async def come_to_rest(autopilot: Autopilot, motion: Motion, permit: Permit) -> 
     motion.check()
 
 
-def _turned(vehicle: VehicleState, yaw_deg: float) -> bool:
-    return abs((vehicle.yaw_deg - yaw_deg + 180.0) % 360.0 - 180.0) <= TURNED_DEG
+def _heading_reached(vehicle: VehicleState, yaw_deg: float) -> bool:
+    return abs((vehicle.yaw_deg - yaw_deg + 180.0) % 360.0 - 180.0) <= HEADING_REACHED_DEG
 
 
 async def _tick(autopilot: Autopilot, motion: Motion) -> None:
@@ -201,4 +255,52 @@ async def _tick(autopilot: Autopilot, motion: Motion) -> None:
 
 async def _next_message(autopilot: Autopilot) -> None:
     if not await autopilot.update(REPORT_S) and not autopilot.connected:
-        raise Unavailable("AutopilotUnavailable", "the autopilot is no longer heard; it flies home by its own failsafe")
+        raise Unavailable(
+            "AutopilotUnavailable", "the autopilot is no longer connected; its own failsafe brings the drone home"
+        )
+
+
+class VelocityHold:
+    """Keeps one velocity setpoint in force until the next one, until its hold time ends, or until another motion begins.
+
+    When the hold time ends without a new setpoint, the drone hovers.
+
+    Args:
+        control: Control state.
+    """
+
+    def __init__(self, control: ControlStore) -> None:
+        self._control = control
+        self._watchdog: asyncio.Task[None] | None = None
+
+    def start(self, setpoint: VelocityArgs, motion: Motion, permit: Permit) -> None:
+        """Send a setpoint and keep it in force, as a motion of its own.
+
+        Raises:
+            Refused: The caller may no longer move the drone.
+        """
+        permit()
+        self._send(setpoint)
+        self._control.tasks.drop(self._watchdog)
+        self._watchdog = self._control.tasks.spawn(self._watch(setpoint, motion, permit))
+
+    def _send(self, setpoint: VelocityArgs) -> None:
+        self._control.autopilot.fly(setpoint.north_mps, setpoint.east_mps, setpoint.down_mps, setpoint.yaw_deg)
+
+    async def _watch(self, setpoint: VelocityArgs, motion: Motion, permit: Permit) -> None:
+        """Repeat the setpoint until its hold time ends, then hover, unless another motion has begun."""
+        control = self._control
+        pace = control.autopilot.pace
+        until = control.autopilot.now + setpoint.hold_s / pace
+        while control.motion is motion and (remaining_s := until - control.autopilot.now) > MIN_HOLD_S:
+            await asyncio.sleep(min(remaining_s, SETPOINT_RESEND_S / pace))
+            try:
+                permit()
+            except Refused as refusal:
+                log.info("velocity: setpoint ended early (reason=%s)", refusal)
+                break
+            if control.motion is motion and control.autopilot.now < until:
+                self._send(setpoint)
+        if control.motion is motion:
+            control.finish_motion(motion)
+            await control.tasks.attempt(control.effects.hover, control.effects.require_undisturbed)

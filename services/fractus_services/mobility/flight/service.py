@@ -1,4 +1,4 @@
-"""The mobility service: each call is judged, then carried out if its caller has the drone."""
+"""Methods of the mobility service: each call is authorized, then carried out if its caller has control."""
 
 from __future__ import annotations
 
@@ -8,7 +8,15 @@ from contextlib import aclosing
 from dataclasses import dataclass, replace
 from functools import partial
 
-from fractus_core.policy.decision_types import Call, GotoArgs, SetSpeedArgs, TakeoffArgs, VelocityArgs, Verdict
+from fractus_core.policy.decision_types import (
+    Call,
+    GotoArgs,
+    PointGimbalArgs,
+    SetSpeedArgs,
+    TakeoffArgs,
+    VelocityArgs,
+    Verdict,
+)
 
 from fractus_services.errors import Aborted, PreconditionFailed, Refused
 from fractus_services.grant_files import ActiveGrant
@@ -16,131 +24,165 @@ from fractus_services.mobility.authority.arming import Arming
 from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.authority.leases import Motion
 from fractus_services.mobility.autopilot import Autopilot, Permit
-from fractus_services.mobility.flight.calls import CallJudge
-from fractus_services.mobility.flight.courses import Replans, Trip, WayHome
+from fractus_services.mobility.flight.authorization import CallAuthorizer
 from fractus_services.mobility.flight.motions import (
     REACHED_M,
     Step,
+    VelocityHold,
     climb,
     come_down,
     come_to_rest,
     fly_to,
     rise,
 )
-from fractus_services.mobility.flight.steering import Steering
+from fractus_services.mobility.flight.return_to_launch import ReturnFlight
+from fractus_services.mobility.flight.route_following import ReplanBudget, SystemFlight
+
+MIN_REACHED_M = 0.3
+"""Smallest acceptance radius of a goto."""
 
 MAX_REACHED_M = 50.0
-JUDGE_AGAIN_S = 0.05
-"""A leg whose command waited for longer is judged again, from where the drone is by then: at 15 m/s that is 0.75 m."""
+"""Largest acceptance radius of a goto."""
+
+REJUDGE_AFTER_S = 0.05
+"""Seconds of the vehicle's clock after which a waiting command is judged again from the present position.
+
+At 15 m/s the drone moves 0.75 m in this time.
+"""
 
 MAX_JUDGEMENTS = 6
-"""How many times a call is judged before it is given up: a drone that does not come to rest cannot begin its leg."""
+"""Number of judgements after which a call is given up, because a drone that does not come to rest cannot begin its leg."""
 
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """A motion under way: the verdict on it, and how far it is."""
+    """Progress of a motion, with the verdict on it."""
 
     verdict: Verdict
     step: Step
 
 
 class _Outdated(Aborted):
-    """The leg that was judged is not legal any more, or another one is; carries the verdict that holds now."""
+    """The verdict on a leg changed before its command was acknowledged. Carries the present verdict."""
 
     def __init__(self, verdict: Verdict) -> None:
-        super().__init__(
-            "NotFollowing", "what is permitted has changed since the autopilot was first told where to fly"
-        )
+        super().__init__("NotFollowing", "the verdict on the leg changed before the autopilot acknowledged the command")
         self.verdict = verdict
 
 
 class MobilityService:
-    """Table 8.2 of the thesis, for callers whose grant is known.
+    """Carries out the methods of the mobility API for callers whose grant is known.
 
     Args:
-        control: who has the drone.
-        arming: starts the motors.
-        calls: gives calls their turn, before they come here, and judges them.
-        way_home: flies home.
+        control: Control state.
+        arming: Starts the motors.
+        calls: Authorizes calls. The gRPC handlers throttle calls with it before they reach this class.
+        return_flight: Flies home.
     """
 
     def __init__(
         self,
         control: ControlStore,
         arming: Arming,
-        calls: CallJudge,
-        way_home: WayHome,
+        calls: CallAuthorizer,
+        return_flight: ReturnFlight,
     ) -> None:
         self.calls = calls
         self._control = control
         self._arming = arming
-        self._way_home = way_home
-        self._steering = Steering(control)
+        self._return_flight = return_flight
+        self._velocity_hold = VelocityHold(control)
         self._autopilot: Autopilot = control.autopilot
 
     async def arm(self, grant: ActiveGrant, patience_s: float = 0.0) -> Verdict:
-        """Start the motors; what may pass, as that the autopilot is not ready yet, is tried again for so long."""
-        permit, call = self._control.driver_permit(grant), Call("Arm")
+        """Arm. Retry transient failures, such as an autopilot that is not ready yet, for `patience_s` seconds."""
+        permit = self._control.driver_permit(grant)
+        call = Call("Arm")
         async for _ in self._arming.arm(grant, permit, lambda: self.calls.allow_motion(call, grant), patience_s):
             pass
         return Verdict("allow")
 
     async def disarm(self, grant: ActiveGrant) -> Verdict:
-        """Stop the motors on the ground."""
-        self.calls.supersede(grant)
+        """Disarm on the ground."""
+        self.calls.cancel_pending(grant)
         verdict = self.calls.allow_motion(Call("Disarm"), grant)
         await self._autopilot.disarm(self._control.driver_permit(grant))
         return verdict
 
     async def hover(self, grant: ActiveGrant) -> Verdict:
-        """Stop and stay."""
-        self.calls.supersede(grant)
+        """Stop and hover."""
+        self.calls.cancel_pending(grant)
         verdict = self.calls.allow_motion(Call("Hover"), grant)
-        _require_air(self._autopilot, "Hover")
+        _require_in_air(self._autopilot, "Hover")
         self._control.finish_motion(self._control.begin_motion("Hover"))
         await self._control.effects.hover(self._control.driver_permit(grant))
         return verdict
 
     async def set_speed(self, grant: ActiveGrant, args: SetSpeedArgs) -> tuple[Verdict, float]:
-        """Change the speed of legs."""
+        """Set the speed of legs. Return the verdict and the speed of the current leg."""
         verdict = self.calls.allow_motion(Call("SetSpeed", args), grant)
-        wanted = verdict.args.speed_mps if isinstance(verdict.args, SetSpeedArgs) else args.speed_mps
-        verdict, speed = self._on_leg(grant, verdict, wanted)
-        self._control.set_cruise_speed(wanted, speed)
+        requested_mps = verdict.args.speed_mps if isinstance(verdict.args, SetSpeedArgs) else args.speed_mps
+        verdict, speed = self._limit_to_leg(grant, verdict, requested_mps)
+        self._control.set_cruise_speed(requested_mps, speed)
         await self._autopilot.set_speed(speed, self._control.driver_permit(grant))
         return verdict, speed
 
-    def _on_leg(self, grant: ActiveGrant, verdict: Verdict, wanted: float) -> tuple[Verdict, float]:
-        """A change of speed as the rest of the leg under way allows it; a leg that is not legal faster gets no faster."""
+    def _limit_to_leg(self, grant: ActiveGrant, verdict: Verdict, requested_mps: float) -> tuple[Verdict, float]:
+        """Limit a new speed to what the rest of the current leg allows. A leg that is not legal faster keeps its speed."""
         motion = self._control.motion
-        if motion is None or motion.leg is None or motion.speed_mps is None or wanted <= motion.speed_mps:
-            return verdict, wanted
-        # The leg was judged with its speed: a faster drone needs a wider margin to every border along the rest of it.
-        leg, speed = replace(motion.leg, speed_mps=wanted), motion.speed_mps
+        if motion is None or motion.leg is None or motion.speed_mps is None or requested_mps <= motion.speed_mps:
+            return verdict, requested_mps
+        # The leg was judged with its speed. A faster drone needs a wider margin to every border along the rest of it.
+        leg = replace(motion.leg, speed_mps=requested_mps)
+        speed = motion.speed_mps
         rest = self.calls.check(Call("Goto", leg), grant)
         if rest.permits and not rest.brake_first and isinstance(rest.args, GotoArgs):
-            legal_mps = rest.args.speed_mps or wanted
-            speed = min(legal_mps, wanted) if replace(rest.args, speed_mps=wanted) == leg else speed
-        if speed >= wanted:
-            return verdict, wanted
-        reason = f"the leg under way is flown with {speed:.1f} m/s: {rest.reason or 'it is not legal faster'}"
+            legal_mps = rest.args.speed_mps or requested_mps
+            speed = min(legal_mps, requested_mps) if replace(rest.args, speed_mps=requested_mps) == leg else speed
+        if speed >= requested_mps:
+            return verdict, requested_mps
+        reason = f"the current leg is flown with {speed:.1f} m/s: {rest.reason or 'it is not legal faster'}"
         return Verdict("correct", SetSpeedArgs(speed), rest.code or "SpeedAboveLimit", reason, rest.policies), speed
 
+    async def point_gimbal(self, grant: ActiveGrant, args: PointGimbalArgs, *, fixed_camera: bool) -> Verdict:
+        """Turn the camera, on the ground or in the air. The current motion continues.
+
+        Args:
+            grant: Grant of the caller.
+            args: Pitch and yaw of the camera.
+            fixed_camera: True if pictures are judged by a mount that does not move.
+
+        Raises:
+            Refused: A policy forbids it, the caller does not have control, or the camera cannot turn.
+            AutopilotError: The autopilot did not answer.
+        """
+        verdict = self.calls.allow_motion(Call("PointGimbal", args), grant)
+        if fixed_camera:
+            raise PreconditionFailed(
+                "CameraFixed",
+                "the node's description declares a fixed camera; set services.camera.mount.gimbal of the Drone",
+            )
+        await self._autopilot.point_gimbal(args.pitch_deg, args.yaw_deg, self._control.driver_permit(grant))
+        return verdict
+
     def take_off(self, grant: ActiveGrant, args: TakeoffArgs) -> AsyncGenerator[Progress, None]:
-        """Climb from the ground; in the air, climb to that altitude, or be done above it: a takeoff may be sent again."""
+        """Take off. In the air, climb to the altitude, or do nothing above it, because a takeoff may be sent again."""
         call = Call("Takeoff", args)
-        self._standing_by(call, grant)
+        self._require_armed(call, grant)
         verdict = self.calls.allow_motion(call, grant)
 
         async def steps(motion: Motion) -> AsyncGenerator[Progress, None]:
-            permit, final, vehicle = self._control.driver_permit(grant, motion), verdict, self._autopilot.vehicle
+            permit = self._control.driver_permit(grant, motion)
+            final = verdict
+            vehicle = self._autopilot.vehicle
             await self._control.modes.enter_guided(permit)
             climbs: Callable[[Autopilot, Motion, float, Permit], AsyncGenerator[Step, None]] = climb
             if vehicle.in_air and not vehicle.standing:
                 await come_to_rest(self._autopilot, motion, permit)
                 final = self.calls.allow_motion(call, self._control.require_control(grant).grant, verdict)
-                climbs = partial(rise, self._control.cruise_mps, judged=self._judged(call, grant, final, permit))
+                climbs = partial(
+                    rise, self._control.cruise_mps, judged=self._rejudging_permit(call, grant, final, permit)
+                )
             altitude_m = final.args.altitude_m if isinstance(final.args, TakeoffArgs) else args.altitude_m
             async with aclosing(climbs(self._autopilot, motion, altitude_m, permit)) as climbing:
                 async for step in climbing:
@@ -149,17 +191,25 @@ class MobilityService:
         return self._run("Takeoff", grant, steps)
 
     def goto(self, grant: ActiveGrant, args: GotoArgs, reached_m: float) -> AsyncGenerator[Progress, None]:
-        """Fly straight to a point."""
+        """Fly straight to a point.
+
+        Args:
+            grant: Grant of the caller.
+            args: Target.
+            reached_m: Distance to the target within which the motion is complete; 0 for the default.
+        """
         verdict = self.calls.allow_motion(Call("Goto", args), grant)
-        _require_air(self._autopilot, "Goto")
-        radius = min(max(reached_m, 0.3), MAX_REACHED_M) if reached_m > 0 else REACHED_M
+        _require_in_air(self._autopilot, "Goto")
+        radius = min(max(reached_m, MIN_REACHED_M), MAX_REACHED_M) if reached_m > 0 else REACHED_M
 
         async def steps(motion: Motion) -> AsyncGenerator[Progress, None]:
             permit = self._control.driver_permit(grant, motion)
-            call, final = Call("Goto", args), verdict
+            call = Call("Goto", args)
+            final = verdict
             for _ in range(MAX_JUDGEMENTS):
-                final = await self._settled(call, grant, final, motion, permit)
-                leg, judged = _leg(final, args, self._control.cruise_mps), self._judged(call, grant, final, permit)
+                final = await self._settle(call, grant, final, motion, permit)
+                leg = _leg(final, args, self._control.cruise_mps)
+                judged = self._rejudging_permit(call, grant, final, permit)
                 try:
                     async with aclosing(fly_to(self._autopilot, motion, leg, radius, permit, judged=judged)) as flying:
                         async for step in flying:
@@ -170,68 +220,68 @@ class MobilityService:
                     final = outdated.verdict
                 else:
                     return
-            raise Aborted("NotFollowing", f"the autopilot was told {MAX_JUDGEMENTS} times where to fly, and does not")
+            raise Aborted("NotFollowing", f"the autopilot did not begin the leg after {MAX_JUDGEMENTS} commands")
 
         return self._run("Goto", grant, steps)
 
-    def _judged(self, call: Call, grant: ActiveGrant, verdict: Verdict, permit: Permit) -> Permit:
-        """A permit that judges the leg again when its command is sent late, from where the drone is by then."""
+    def _rejudging_permit(self, call: Call, grant: ActiveGrant, verdict: Verdict, permit: Permit) -> Permit:
+        """Return a permit that judges the leg again, from the present position, if its command is sent late."""
         judged_at = self._autopilot.now
 
         def check() -> None:
             nonlocal judged_at
             permit()
-            if self._autopilot.now - judged_at <= JUDGE_AGAIN_S / self._autopilot.pace:
+            if self._autopilot.now - judged_at <= REJUDGE_AFTER_S / self._autopilot.pace:
                 return
             judged_at = self._autopilot.now
-            again = self.calls.allow_motion(call, self._control.require_control(grant).grant, verdict)
-            if again.brake_first or again.args != verdict.args:
-                raise _Outdated(again)
+            current = self.calls.allow_motion(call, self._control.require_control(grant).grant, verdict)
+            if current.brake_first or current.args != verdict.args:
+                raise _Outdated(current)
 
         return check
 
-    async def _settled(
+    async def _settle(
         self, call: Call, grant: ActiveGrant, verdict: Verdict, motion: Motion, permit: Permit
     ) -> Verdict:
-        """The verdict to carry out, once the drone is ready for it: in GUIDED, and at rest where the verdict asks for that.
+        """Bring the drone into GUIDED, and to rest if the verdict requires it. Return the verdict to carry out.
 
-        Changing the mode and braking take time in which the drone moves, so the call is judged again after them.
+        The drone moves during the mode change and while it brakes, so the call is judged again after them.
 
         Raises:
-            Refused: the call is not legal from there, or the drone does not come to rest.
+            Refused: The call is not legal from the new position, or the drone does not come to rest.
         """
         for _ in range(MAX_JUDGEMENTS):
             begun = self._autopilot.now
             await self._control.modes.enter_guided(permit)
             if verdict.brake_first:
                 await come_to_rest(self._autopilot, motion, permit)
-            elif self._autopilot.now - begun <= JUDGE_AGAIN_S / self._autopilot.pace:
+            elif self._autopilot.now - begun <= REJUDGE_AFTER_S / self._autopilot.pace:
                 return verdict
             permit()
             verdict = self.calls.allow_motion(call, self._control.require_control(grant).grant, verdict)
-        raise Aborted("NotStopping", "the drone does not come to rest, and could not begin its leg otherwise")
+        raise Aborted("NotStopping", "the drone does not come to rest, which it must before it can begin its leg")
 
     async def set_velocity(self, grant: ActiveGrant, args: VelocityArgs) -> tuple[Verdict, VelocityArgs]:
-        """Fly with a velocity until the next one, or until its hold is over."""
+        """Fly with a velocity until the next setpoint, or until its hold time ends."""
         verdict = self.calls.allow_motion(Call("SetVelocity", args), grant)
-        _require_air(self._autopilot, "SetVelocity")
+        _require_in_air(self._autopilot, "SetVelocity")
         motion = self._control.begin_motion("SetVelocity")
         permit = self._control.driver_permit(grant, motion)
         try:
-            final = await self._settled(Call("SetVelocity", args), grant, verdict, motion, permit)
+            final = await self._settle(Call("SetVelocity", args), grant, verdict, motion, permit)
             setpoint = final.args if isinstance(final.args, VelocityArgs) else args
-            self._steering.steer(setpoint, motion, permit)
+            self._velocity_hold.start(setpoint, motion, permit)
             self._control.count_velocity_flight(grant)
-        except BaseException:  # a caller that hangs up while the drone brakes leaves it hovering, too
+        except BaseException:  # also if the caller cancels while the drone brakes
             self._control.fail_motion(motion)
             raise
         return final, setpoint
 
     def land(self, grant: ActiveGrant) -> AsyncGenerator[Progress, None]:
-        """Come down here."""
-        self.calls.supersede(grant)
+        """Land at the present position."""
+        self.calls.cancel_pending(grant)
         verdict = self.calls.allow_motion(Call("Land"), grant)
-        _require_air(self._autopilot, "Land")
+        _require_in_air(self._autopilot, "Land")
 
         async def steps(motion: Motion) -> AsyncGenerator[Progress, None]:
             await self._control.modes.change_mode(
@@ -243,52 +293,56 @@ class MobilityService:
         return self._run("Land", grant, steps)
 
     def return_to_launch(self, grant: ActiveGrant) -> AsyncGenerator[Progress, None]:
-        """Fly home on a legal way, and land; a way that becomes illegal under the flying drone is replaced by another."""
-        self.calls.supersede(grant)
+        """Fly home on a legal route and land. A route that becomes illegal in flight is replaced."""
+        self.calls.cancel_pending(grant)
         verdict = self.calls.allow_motion(Call("ReturnToLaunch"), grant)
-        _require_air(self._autopilot, "ReturnToLaunch")
+        _require_in_air(self._autopilot, "ReturnToLaunch")
         return self._return(grant, verdict)
 
     async def _return(self, grant: ActiveGrant, verdict: Verdict) -> AsyncGenerator[Progress, None]:
         control = self._control
         constraints = control.begin_system_flight(control.require_control(grant).grant)
-        trip = Trip(constraints, "ReturnToLaunch", lambda motion: control.driver_permit(grant, motion))
-        replans, goes_on = Replans(constraints), True
+        flight = SystemFlight(constraints, "ReturnToLaunch", lambda motion: control.driver_permit(grant, motion))
+        replans = ReplanBudget(constraints)
+        continues = True
         try:
-            while goes_on:
-                goes_on = False
-                attempt = self._run(trip.kind, grant, lambda motion: self._homeward(trip, motion, verdict))
+            while continues:
+                continues = False
+                attempt = self._run(flight.kind, grant, lambda motion: self._attempt_return(flight, motion, verdict))
                 try:
                     async with aclosing(attempt) as running:
                         async for progress in running:
                             yield progress
                 except Refused as refusal:
-                    if not (goes_on := replans.allow(refusal)):
+                    if not (continues := replans.allow(refusal)):
                         raise
         finally:
             control.end_system_flight(constraints)
 
-    async def _homeward(self, trip: Trip, motion: Motion, verdict: Verdict) -> AsyncGenerator[Progress, None]:
-        """One attempt to come home."""
-        permit, modes = trip.permit(motion), self._control.modes
+    async def _attempt_return(
+        self, flight: SystemFlight, motion: Motion, verdict: Verdict
+    ) -> AsyncGenerator[Progress, None]:
+        """Try once to fly home and land."""
+        permit = flight.permit(motion)
+        modes = self._control.modes
         await modes.enter_guided(permit)
-        async with aclosing(self._way_home.attempt(trip, motion)) as steps:
+        async with aclosing(self._return_flight.attempt(flight, motion)) as steps:
             async for step in steps:
                 yield Progress(verdict, step)
-        await modes.change_mode(self._way_home.descent(trip.constraints.grant), permit)
+        await modes.change_mode(self._return_flight.descent(flight.constraints.grant), permit)
         async for step in come_down(self._autopilot, motion):
             yield Progress(verdict, step)
 
-    def _standing_by(self, call: Call, grant: ActiveGrant) -> None:
-        """Refuse a takeoff that cannot be carried out before its costly judgement.
+    def _require_armed(self, call: Call, grant: ActiveGrant) -> None:
+        """Refuse a takeoff that cannot be carried out, before its expensive judgement.
 
-        Methods that are not granted are left to the judgement: it writes their refusal to the audit log.
+        A method that is not granted is left to the judgement, which writes the refusal to the audit log.
         """
         if grant.spec.class_ != "driver" or call.method not in grant.compiled.methods:
             return
         self._control.require_control(grant)
         if not self._autopilot.vehicle.armed:
-            raise PreconditionFailed("NotArmed", "the motors are off; arm first")
+            raise PreconditionFailed("NotArmed", "the drone is disarmed; arm first")
 
     async def _run(
         self, kind: str, grant: ActiveGrant, steps: Callable[[Motion], AsyncGenerator[Progress, None]]
@@ -308,11 +362,11 @@ class MobilityService:
 
 
 def _leg(verdict: Verdict, args: GotoArgs, cruise_mps: float) -> GotoArgs:
-    """What is flown of a goto, with its speed."""
-    goal = verdict.args if isinstance(verdict.args, GotoArgs) else args
-    return replace(goal, speed_mps=goal.speed_mps or cruise_mps)
+    """Return the leg of a goto as the verdict permits it, with its speed."""
+    target = verdict.args if isinstance(verdict.args, GotoArgs) else args
+    return replace(target, speed_mps=target.speed_mps or cruise_mps)
 
 
-def _require_air(autopilot: Autopilot, method: str) -> None:
+def _require_in_air(autopilot: Autopilot, method: str) -> None:
     if not autopilot.vehicle.in_air:
-        raise PreconditionFailed("NotFlying", f"{method} needs a drone in the air; take off first")
+        raise PreconditionFailed("NotFlying", f"{method} requires a drone in the air; take off first")

@@ -1,4 +1,4 @@
-"""Transit: the system flies drivers with partial control to the start of each control point."""
+"""Transit flights: the system flies drivers with partial control to the start of each control point."""
 
 from __future__ import annotations
 
@@ -16,116 +16,124 @@ from fractus_services.errors import AutopilotError, PreconditionFailed, Refused
 from fractus_services.mobility.authority.arming import Arming
 from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.authority.leases import Lease
-from fractus_services.mobility.flight.courses import FAULT, Courses, Trip, above_home_m, target_of
-from fractus_services.mobility.flight.guard import Guard
 from fractus_services.mobility.flight.motions import climb
+from fractus_services.mobility.flight.policy_gate import PolicyGate
+from fractus_services.mobility.flight.route_following import (
+    INTERNAL_ERROR,
+    RouteFollower,
+    SystemFlight,
+    above_home_m,
+    target_of,
+)
 
 ARMING_TIMEOUT_S = 120.0
-"""How long the system tries to arm a drone whose autopilot refuses."""
+"""Seconds for which the system tries to arm a drone whose autopilot refuses."""
 
 DEFAULT_ALTITUDE_M = 10.0
-"""How high the system takes off, above home, when the place it flies to gives no altitude."""
+"""Altitude above home to which the system takes off if the target has no altitude."""
 
 log = logging.getLogger(__name__)
 
 
 def start_of(point: ControlPoint) -> Position:
-    """Where a control point begins; its altitude may be unset."""
+    """Return the start of a control point. Its altitude may be unset."""
     if point.point is not None and point.point.position is not None:
         return point.point.position
     if point.path:
         return point.path[0]
     if point.region is not None:
-        centre = area_center(point.region)
-        return Position(lat=centre.lat, lon=centre.lon)
-    raise PreconditionFailed("NoStart", "the control point has neither position, path nor region")
+        center = area_center(point.region)
+        return Position(lat=center.lat, lon=center.lon)
+    raise PreconditionFailed("NoStart", "the control point has no position, path or region")
 
 
 class TransitFlight:
-    """Arms, takes off and flies to where the driver takes over; judged by the same policies as a driver."""
+    """Arms, takes off and flies to the start of a control point, judged by the same policies as a driver."""
 
-    def __init__(self, control: ControlStore, arming: Arming, guard: Guard, courses: Courses) -> None:
+    def __init__(self, control: ControlStore, arming: Arming, gate: PolicyGate, routes: RouteFollower) -> None:
         self._control = control
         self._arming = arming
-        self._guard = guard
-        self._courses = courses
+        self._gate = gate
+        self._routes = routes
 
     async def bring(self, lease: Lease) -> AsyncGenerator[str, None]:
         """Fly to the start of the driver's next control point.
 
         Yields:
-            What is being done, for the waiting driver.
+            The current step, for the waiting driver.
 
         Raises:
-            Refused: the way there is not legal.
-            AutopilotError: the autopilot refuses.
+            Refused: There is no legal route.
+            AutopilotError: The autopilot refused.
         """
         control = self._control
         start = start_of(lease.grant.spec.control_points[control.mission(lease.grant).points_done])
         constraints = control.begin_transit(lease.grant)
-        trip = Trip(constraints, "Transit", lambda motion: control.transit_permit(lease, motion))
+        flight = SystemFlight(constraints, "Transit", lambda motion: control.transit_permit(lease, motion))
         try:
-            async for doing in self.launch(trip, start):
-                yield doing
+            async for step in self.launch(flight, start):
+                yield step
             yield "the system flies to the control point"
-            async for _ in self._courses.fly(trip, target_of(start)):
+            async for _ in self._routes.fly(flight, target_of(start)):
                 pass
         except (Refused, AutopilotError):
             raise
         except Exception as error:
             log.exception("transit: flight failed (identity=%s)", lease.grant.identity)
-            # After a fault of ours a retry would fail in the same way: the mission ends, and the drone comes home.
-            control.dispatch(TransitFailed(lease.lease_id, FAULT))
-            raise PreconditionFailed("ControlLost", FAULT) from error
+            # A retry would fail in the same way after an internal error: the mission ends and the drone returns.
+            control.dispatch(TransitFailed(lease.lease_id, INTERNAL_ERROR))
+            raise PreconditionFailed("ControlLost", INTERNAL_ERROR) from error
         finally:
             control.end_system_flight(constraints)
 
-    async def launch(self, trip: Trip, place: Position) -> AsyncGenerator[str, None]:
-        """Arm and take off, unless the drone is in the air, to the altitude of a place.
+    async def launch(self, flight: SystemFlight, target: Position) -> AsyncGenerator[str, None]:
+        """Arm and take off to the altitude of a position, unless the drone is in the air.
 
         Yields:
-            What is being done.
+            The current step.
 
         Raises:
-            Refused: policies or the drone's state forbid it.
-            AutopilotError: the autopilot refuses.
+            Refused: Policies or the state of the drone forbid it.
+            AutopilotError: The autopilot refused.
         """
-        control, autopilot = self._control, self._control.autopilot
+        control = self._control
+        autopilot = control.autopilot
         vehicle = autopilot.vehicle
-        motion = control.begin_motion("Takeoff", trip.permit)
-        permit = trip.permit(motion)
+        motion = control.begin_motion("Takeoff", flight.permit)
+        permit = flight.permit(motion)
         try:
-            # `standing` is the autopilot's own word, `in_air` counts doubt as flying: an armed drone on a raised pad is both.
+            # `standing` is reported by the autopilot, `in_air` is also True if uncertain: for an armed drone on a raised pad
+            # both are True.
             if vehicle.standing or not vehicle.in_air:
                 yield "the system arms the drone"
                 if vehicle.armed:
-                    self._allow(Call("Arm"), trip)
+                    self._allow(Call("Arm"), flight)
                 else:
-                    grant = trip.constraints.grant
-                    arming = self._arming.arm(grant, permit, lambda: self._allow(Call("Arm"), trip), ARMING_TIMEOUT_S)
+                    grant = flight.constraints.grant
+                    arming = self._arming.arm(grant, permit, lambda: self._allow(Call("Arm"), flight), ARMING_TIMEOUT_S)
                     async with aclosing(arming) as waiting:
-                        async for why in waiting:
-                            yield f"the system arms the drone: {why}"
-                climbed = self._allow(Call("Takeoff", TakeoffArgs(self._height_m(place, trip))), trip)
+                        async for reason in waiting:
+                            yield f"the system arms the drone: {reason}"
+                allowed = self._allow(Call("Takeoff", TakeoffArgs(self._altitude_m(target, flight))), flight)
                 yield "the system takes off"
                 await control.modes.enter_guided(permit)
-                height = climbed.altitude_m if isinstance(climbed, TakeoffArgs) else DEFAULT_ALTITUDE_M
-                async for _ in climb(autopilot, motion, height, permit):
+                altitude_m = allowed.altitude_m if isinstance(allowed, TakeoffArgs) else DEFAULT_ALTITUDE_M
+                async for _ in climb(autopilot, motion, altitude_m, permit):
                     pass
             await control.modes.enter_guided(permit)
         finally:
             control.finish_motion(motion)
 
-    def _height_m(self, place: Position, trip: Trip) -> float:
-        if place.alt is None:
+    def _altitude_m(self, target: Position, flight: SystemFlight) -> float:
+        if target.alt is None:
             return DEFAULT_ALTITUDE_M
         home = self._control.autopilot.vehicle.home
-        return above_home_m(place.alt, place.altitude_reference, home, trip.constraints.compiled)
+        return above_home_m(target.alt, target.altitude_reference, home, flight.constraints.compiled)
 
-    def _allow(self, call: Call, trip: Trip) -> object:
-        verdict = self._guard.judge(call, trip.constraints.grant, trip.constraints.compiled)
+    def _allow(self, call: Call, flight: SystemFlight) -> object:
+        verdict = self._gate.judge(call, flight.constraints.grant, flight.constraints.compiled)
         if not verdict.permits:
             raise PreconditionFailed(
-                "ControlPointUnreachable", f"the system cannot bring the drone there: {verdict.reason}"
+                "ControlPointUnreachable", f"the system cannot fly to the control point: {verdict.reason}"
             )
         return verdict.args

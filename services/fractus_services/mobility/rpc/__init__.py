@@ -1,1 +1,1 @@
-"""The gRPC side of the mobility service: handlers, streams, arguments, and the wiring of the server."""
+"""gRPC layer of the mobility service: handlers, control streams, message conversion, and construction of the server."""

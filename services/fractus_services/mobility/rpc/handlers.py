@@ -1,4 +1,4 @@
-"""gRPC handlers of the mobility service: parse the request, make one call, translate the outcome."""
+"""gRPC handlers of the mobility service: parse the request, make one call, convert the result."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import asyncio
 import math
 from collections.abc import AsyncGenerator, Callable
 from contextlib import aclosing
-from typing import Any
+from typing import Protocol
 
 from fractus_core.api.names import node_identity
 from fractus_core.control import Authority
@@ -20,85 +20,101 @@ from fractus_services.error_details import decision
 from fractus_services.errors import AutopilotError, PreconditionFailed, Refused, Unavailable
 from fractus_services.grant_files import ActiveGrant, GrantFiles
 from fractus_services.mobility.authority.control_store import ControlStore
-from fractus_services.mobility.flight.pointing import point_gimbal
 from fractus_services.mobility.flight.service import MobilityService, Progress
-from fractus_services.mobility.rpc.arguments import (
+from fractus_services.mobility.rpc.control_streams import ControlStreams
+from fractus_services.mobility.rpc.proto_conversion import (
     acceptance_radius_m,
     call_of,
-    checked,
+    check_call_response,
     control_event,
     goto_args,
     motion_progress,
     velocity_args,
 )
-from fractus_services.mobility.rpc.streams import Streams
 from fractus_services.mobility.rpc.telemetry import located, position_of, telemetry_of, velocity_of
 
-MIN_INTERVAL_S, DEFAULT_INTERVAL_S = 0.05, 0.2
-ANSWER_S = 1.0
-"""How long before its deadline a call is answered that waits for the autopilot."""
+MIN_INTERVAL_S = 0.05
+"""Shortest interval of a telemetry stream."""
+
+DEFAULT_INTERVAL_S = 0.2
+"""Interval of a telemetry stream if the request has none."""
+
+RESPONSE_RESERVE_S = 1.0
+"""Seconds before the deadline of an Arm call at which it is answered, so that the caller receives the refusal."""
 
 JUDGE_INTERVAL_S = 0.5
-"""How often a stream of telemetry is judged again: a grant that is revoked ends it within a second."""
+"""Seconds between judgements of a telemetry stream, so that a revoked grant ends the stream within a second."""
+
+
+class CallContext(Protocol):
+    """The part of `grpc.aio.ServicerContext` that the handlers use themselves."""
+
+    def time_remaining(self) -> float | None:
+        """Return the seconds until the deadline of the call; None if it has none."""
+
+    async def write(
+        self, message: mobility_pb2.ControlEvent | mobility_pb2.MotionProgress | mobility_pb2.Telemetry
+    ) -> None:
+        """Send one message of a stream."""
 
 
 class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
-    """The service on the wire. A grant is looked up again after each wait: it may have been revoked meanwhile.
+    """The gRPC service. The grant is looked up again after each wait, because it may have been revoked meanwhile.
 
     Args:
-        service: carries out.
-        control: who has the drone.
-        streams: of drivers and passengers.
-        grants: grants of this node.
-        node: its name.
+        service: Methods of the mobility service.
+        control: Control state.
+        streams: Control streams of drivers and passengers.
+        grants: Grants of this node.
+        node: Name of the node.
         clock: Unix time.
-        heard: told whose grant each call is made under.
-        fixed_camera: whether the node's description says that its camera does not move.
-        recording_problem: why flights are not recorded though they should be; empty when nothing is wrong.
+        on_call: Called with the grant of the caller for every call.
+        fixed_camera: Returns True if the node description declares a camera that does not move.
+        recording_problem: Returns why flights are not recorded; an empty string if there is no problem.
     """
 
     def __init__(
         self,
         service: MobilityService,
         control: ControlStore,
-        streams: Streams,
+        streams: ControlStreams,
         *,
         grants: GrantFiles,
         node: str,
         clock: Clock,
-        heard: Callable[[ActiveGrant], None] = lambda _grant: None,
+        on_call: Callable[[ActiveGrant], None] = lambda _grant: None,
         fixed_camera: Callable[[], bool] = bool,
         recording_problem: Callable[[], str] = str,
     ) -> None:
-        self._fixed_camera, self._recording_problem = fixed_camera, recording_problem
+        self._fixed_camera = fixed_camera
+        self._recording_problem = recording_problem
         self._service = service
         self._control = control
         self._streams = streams
-        self._heard = heard
+        self._on_call = on_call
         self._node = node_identity(node)
         self._clock = clock
-        self.admission = CallAdmission(grants, clock, _known, self._failed)
+        self.admission = CallAdmission(grants, clock, _refusal_of, self._handle_internal_error)
 
     def _grant_of(self, caller: Caller) -> ActiveGrant:
-        """The grant of a caller; a call also tells tours that a component of its application is there."""
         grant = self.admission.grant_of(caller)
-        self._heard(grant)
+        self._on_call(grant)
         return grant
 
-    def _failed(self, verdict: Verdict) -> None:
-        """An error of ours: hold the drone of a driver where it is."""
+    def _handle_internal_error(self, verdict: Verdict) -> None:
+        """Brake if a driver is flying."""
         if self._control.authority is Authority.DRIVER and self._control.autopilot.vehicle.in_air:
             self._control.brake(verdict)
 
     # Control
 
-    async def GetControl(self, _request: Any, context: Any) -> None:  # noqa: N802 - the protocol's name
+    async def GetControl(self, _request: mobility_pb2.GetControlRequest, context: CallContext) -> None:  # noqa: N802
         """See mobility.proto."""
         async with self.admission.call(context, lasting=True) as caller:
             grant = self._grant_of(caller)
             self._service.calls.allow(Call("GetControl"), grant)
             try:
-                # A stream lives no longer than the certificate that its connection was authenticated with.
+                # The stream ends at the latest when the certificate that authenticated the connection expires.
                 async with (
                     asyncio.timeout(caller.left_s),
                     aclosing(self._streams.follow(grant)) as events,
@@ -108,84 +124,105 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
             except TimeoutError:
                 caller.check()
 
-    async def ReturnControl(self, _request: Any, context: Any) -> Any:  # noqa: N802
+    async def ReturnControl(  # noqa: N802
+        self, _request: mobility_pb2.ReturnControlRequest, context: CallContext
+    ) -> mobility_pb2.ReturnControlResponse:
         """See mobility.proto."""
         async with self.admission.call(context, urgent=True) as caller:
             grant = self._grant_of(caller)
-            self._service.calls.supersede(grant)
+            self._service.calls.cancel_pending(grant)
             self._service.calls.allow(Call("ReturnControl"), grant)
             last = await self._control.return_control(grant)
             return mobility_pb2.ReturnControlResponse(mission_complete=last)
 
-    async def ReportProgress(self, request: Any, context: Any) -> Any:  # noqa: N802
+    async def ReportProgress(  # noqa: N802
+        self, request: mobility_pb2.ReportProgressRequest, context: CallContext
+    ) -> mobility_pb2.ReportProgressResponse:
         """See mobility.proto."""
         async with self.admission.call(context) as caller:
             await self._control.report_waypoints(self._grant_of(caller), request.waypoints)
             return mobility_pb2.ReportProgressResponse()
 
-    # Calls that answer at once
+    # Calls without a motion
 
-    async def Arm(self, _request: Any, context: Any) -> Any:  # noqa: N802
+    async def Arm(self, _request: mobility_pb2.ArmRequest, context: CallContext) -> mobility_pb2.ArmResponse:  # noqa: N802
         """See mobility.proto."""
         async with self.admission.call(context) as caller:
-            # The refusal must be there before the caller stops waiting for it.
-            patience_s = (context.time_remaining() or 0.0) - ANSWER_S
-            return mobility_pb2.ArmResponse(
-                decision=decision(await self._service.arm(self._grant_of(caller), patience_s))
-            )
+            patience_s = (context.time_remaining() or 0.0) - RESPONSE_RESERVE_S
+            verdict = await self._service.arm(self._grant_of(caller), patience_s)
+            return mobility_pb2.ArmResponse(decision=decision(verdict))
 
-    async def Disarm(self, _request: Any, context: Any) -> Any:  # noqa: N802
+    async def Disarm(  # noqa: N802
+        self, _request: mobility_pb2.DisarmRequest, context: CallContext
+    ) -> mobility_pb2.DisarmResponse:
         """See mobility.proto."""
         async with self.admission.call(context) as caller:
-            return mobility_pb2.DisarmResponse(decision=decision(await self._service.disarm(self._grant_of(caller))))
+            verdict = await self._service.disarm(self._grant_of(caller))
+            return mobility_pb2.DisarmResponse(decision=decision(verdict))
 
-    async def Hover(self, _request: Any, context: Any) -> Any:  # noqa: N802
+    async def Hover(  # noqa: N802
+        self, _request: mobility_pb2.HoverRequest, context: CallContext
+    ) -> mobility_pb2.HoverResponse:
         """See mobility.proto."""
         async with self.admission.call(context, urgent=True) as caller:
-            return mobility_pb2.HoverResponse(decision=decision(await self._service.hover(self._grant_of(caller))))
+            verdict = await self._service.hover(self._grant_of(caller))
+            return mobility_pb2.HoverResponse(decision=decision(verdict))
 
-    async def SetSpeed(self, request: Any, context: Any) -> Any:  # noqa: N802
+    async def SetSpeed(  # noqa: N802
+        self, request: mobility_pb2.SetSpeedRequest, context: CallContext
+    ) -> mobility_pb2.SetSpeedResponse:
         """See mobility.proto."""
         async with self.admission.call(context) as caller:
-            await self._service.calls.turn(self._grant_of(caller))
+            await self._service.calls.throttle(self._grant_of(caller))
             verdict, speed = await self._service.set_speed(self._grant_of(caller), SetSpeedArgs(request.speed_mps))
             return mobility_pb2.SetSpeedResponse(decision=decision(verdict), speed_mps=speed)
 
-    async def PointGimbal(self, request: Any, context: Any) -> Any:  # noqa: N802
+    async def PointGimbal(  # noqa: N802
+        self, request: mobility_pb2.PointGimbalRequest, context: CallContext
+    ) -> mobility_pb2.PointGimbalResponse:
         """See mobility.proto."""
         async with self.admission.call(context) as caller:
-            calls, args = self._service.calls, PointGimbalArgs(request.pitch_deg, request.yaw_deg)
-            await calls.turn(self._grant_of(caller))
-            fixed, grant = self._fixed_camera(), self._grant_of(caller)
-            verdict = await point_gimbal(self._control, calls, grant, args, fixed_camera=fixed)
+            args = PointGimbalArgs(request.pitch_deg, request.yaw_deg)
+            await self._service.calls.throttle(self._grant_of(caller))
+            fixed = self._fixed_camera()
+            verdict = await self._service.point_gimbal(self._grant_of(caller), args, fixed_camera=fixed)
             return mobility_pb2.PointGimbalResponse(decision=decision(verdict))
 
-    async def GetSpeed(self, _request: Any, context: Any) -> Any:  # noqa: N802
+    async def GetSpeed(  # noqa: N802
+        self, _request: mobility_pb2.GetSpeedRequest, context: CallContext
+    ) -> mobility_pb2.GetSpeedResponse:
         """See mobility.proto."""
         async with self.admission.call(context) as caller:
             verdict = self._service.calls.allow(Call("GetSpeed"), self._grant_of(caller))
             speed = self._control.autopilot.vehicle.speed_mps
             return mobility_pb2.GetSpeedResponse(decision=decision(verdict), speed_mps=speed)
 
-    async def SetVelocity(self, request: Any, context: Any) -> Any:  # noqa: N802
+    async def SetVelocity(  # noqa: N802
+        self, request: mobility_pb2.SetVelocityRequest, context: CallContext
+    ) -> mobility_pb2.SetVelocityResponse:
         """See mobility.proto."""
         async with self.admission.call(context) as caller:
             args = velocity_args(request)
-            await self._service.calls.turn_to_move(self._grant_of(caller))
-            verdict, flown = await self._service.set_velocity(self._grant_of(caller), args)
-            reply = mobility_pb2.SetVelocityResponse(decision=decision(verdict))
-            reply.velocity.north_mps, reply.velocity.east_mps = flown.north_mps, flown.east_mps
-            reply.velocity.down_mps = flown.down_mps
-            return reply
+            await self._service.calls.throttle_motion(self._grant_of(caller))
+            verdict, setpoint = await self._service.set_velocity(self._grant_of(caller), args)
+            response = mobility_pb2.SetVelocityResponse(decision=decision(verdict))
+            response.velocity.north_mps = setpoint.north_mps
+            response.velocity.east_mps = setpoint.east_mps
+            response.velocity.down_mps = setpoint.down_mps
+            return response
 
-    async def CheckCall(self, request: Any, context: Any) -> Any:  # noqa: N802
+    async def CheckCall(  # noqa: N802
+        self, request: mobility_pb2.CheckCallRequest, context: CallContext
+    ) -> mobility_pb2.CheckCallResponse:
         """See mobility.proto."""
         async with self.admission.call(context) as caller:
             call = call_of(request)
-            await self._service.calls.turn(self._grant_of(caller))
-            return checked(self._service.calls.check(call, self._grant_of(caller)))
+            await self._service.calls.throttle(self._grant_of(caller))
+            return check_call_response(self._service.calls.check(call, self._grant_of(caller)))
 
-    async def GetPosition(self, _request: Any, context: Any) -> Any:  # noqa: N802
+    async def GetPosition(  # noqa: N802
+        self, _request: mobility_pb2.GetPositionRequest, context: CallContext
+    ) -> mobility_pb2.GetPositionResponse:
         """See mobility.proto."""
         async with self.admission.call(context) as caller:
             verdict = self._service.calls.allow(Call("GetPosition"), self._grant_of(caller))
@@ -198,75 +235,86 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
 
     # Motions
 
-    async def Takeoff(self, request: Any, context: Any) -> None:  # noqa: N802
+    async def Takeoff(self, request: mobility_pb2.TakeoffRequest, context: CallContext) -> None:  # noqa: N802
         """See mobility.proto."""
         async with self.admission.call(context, lasting=True) as caller:
-            await self._service.calls.turn_to_move(self._grant_of(caller))
+            await self._service.calls.throttle_motion(self._grant_of(caller))
             progress = self._service.take_off(self._grant_of(caller), TakeoffArgs(request.altitude_m))
-            await self._report(progress, context)
+            await self._send_progress(progress, context)
 
-    async def Goto(self, request: Any, context: Any) -> None:  # noqa: N802
+    async def Goto(self, request: mobility_pb2.GotoRequest, context: CallContext) -> None:  # noqa: N802
         """See mobility.proto."""
         async with self.admission.call(context, lasting=True) as caller:
-            args, reached_m = goto_args(request), acceptance_radius_m(request)
-            await self._service.calls.turn_to_move(self._grant_of(caller))
+            args = goto_args(request)
+            reached_m = acceptance_radius_m(request)
+            await self._service.calls.throttle_motion(self._grant_of(caller))
             progress = self._service.goto(self._grant_of(caller), args, reached_m)
-            await self._report(progress, context)
+            await self._send_progress(progress, context)
 
-    async def Land(self, _request: Any, context: Any) -> None:  # noqa: N802
+    async def Land(self, _request: mobility_pb2.LandRequest, context: CallContext) -> None:  # noqa: N802
         """See mobility.proto."""
         async with self.admission.call(context, urgent=True) as caller:
-            await self._report(self._service.land(self._grant_of(caller)), context)
+            await self._send_progress(self._service.land(self._grant_of(caller)), context)
 
-    async def ReturnToLaunch(self, _request: Any, context: Any) -> None:  # noqa: N802
+    async def ReturnToLaunch(  # noqa: N802
+        self, _request: mobility_pb2.ReturnToLaunchRequest, context: CallContext
+    ) -> None:
         """See mobility.proto."""
         async with self.admission.call(context, urgent=True) as caller:
-            await self._report(self._service.return_to_launch(self._grant_of(caller)), context)
+            await self._send_progress(self._service.return_to_launch(self._grant_of(caller)), context)
 
-    async def _report(self, progress: AsyncGenerator[Progress, None], context: Any) -> None:
+    async def _send_progress(self, progress: AsyncGenerator[Progress, None], context: CallContext) -> None:
+        """Send every step of a motion. Only the first message contains the decision and the target."""
         first = True
         vehicle = self._control.autopilot.vehicle
         async with aclosing(progress) as steps:
-            async for at in steps:
-                # Clients remember the decision and the target of the first message.
-                await context.write(motion_progress(at.step, vehicle, at.verdict if first else None))
+            async for current in steps:
+                await context.write(motion_progress(current.step, vehicle, current.verdict if first else None))
                 first = False
 
     # Telemetry
 
-    async def SubscribeTelemetry(self, request: Any, context: Any) -> None:  # noqa: N802
+    async def SubscribeTelemetry(  # noqa: N802
+        self, request: mobility_pb2.SubscribeTelemetryRequest, context: CallContext
+    ) -> None:
         """See mobility.proto."""
         async with self.admission.call(context, lasting=True) as caller:
-            node = caller.identity == self._node
+            is_node = caller.identity == self._node
             wanted = request.interval_s
             interval = max(wanted, MIN_INTERVAL_S) if math.isfinite(wanted) and wanted > 0 else DEFAULT_INTERVAL_S
             loop = asyncio.get_running_loop()
-            judged = due = -math.inf
-            heard = 0
+            judged_at = -math.inf
+            due = -math.inf
+            last_text = 0
             while True:
-                if loop.time() - judged >= JUDGE_INTERVAL_S:
-                    judged = loop.time()
+                if loop.time() - judged_at >= JUDGE_INTERVAL_S:
+                    judged_at = loop.time()
                     caller.check()
-                    if not node:
+                    if not is_node:
                         self._service.calls.allow(Call("GetPosition"), self._grant_of(caller))
                 if loop.time() >= due:
                     due = loop.time() + interval
-                    sample = self._sample(missions=node, heard=heard)
-                    heard = sample.texts[-1].number if sample.texts else heard
+                    sample = self._sample(missions=is_node, last_text=last_text)
+                    last_text = sample.texts[-1].number if sample.texts else last_text
                     await context.write(sample)
                 await asyncio.sleep(max(min(due - loop.time(), JUDGE_INTERVAL_S), 0.0))
 
-    def _sample(self, *, missions: bool, heard: int) -> mobility_pb2.Telemetry:
-        control = self._control
+    def _sample(self, *, missions: bool, last_text: int) -> mobility_pb2.Telemetry:
         message = telemetry_of(
-            control, self._clock(), missions=missions, not_ready_reason=control.arming_problem, heard=heard
+            self._control,
+            self._clock(),
+            missions=missions,
+            not_ready_reason=self._control.arming_problem,
+            last_text=last_text,
         )
         message.recording_problem = self._recording_problem()
         return message
 
 
-def _known(error: Exception) -> Refused | None:
+def _refusal_of(error: Exception) -> Refused | None:
+    """Return the refusal for an error of the autopilot; None for any other error."""
     if not isinstance(error, AutopilotError):
         return None
-    code = "AutopilotUnavailable" if error.link else "AutopilotRefused"
-    return (Unavailable if error.link else PreconditionFailed)(code, str(error))
+    if error.link:
+        return Unavailable("AutopilotUnavailable", str(error))
+    return PreconditionFailed("AutopilotRefused", str(error))

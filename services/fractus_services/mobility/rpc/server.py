@@ -1,4 +1,4 @@
-"""Wires the mobility service together and runs it."""
+"""Process of the mobility service: construction, servers and shutdown."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ from fractus_services.mobility.mavlink.neighbours import Memory
 from fractus_services.mobility.mavlink.returning import MavlinkReturn
 from fractus_services.mobility.mavlink.startup import VEHICLE_FILE, came_to_serve
 from fractus_services.mobility.mavlink.traced import TracedAutopilot
-from fractus_services.mobility.rpc.figures import flight_figures
+from fractus_services.mobility.rpc.components import MobilityComponents
+from fractus_services.mobility.rpc.flight_metrics import flight_figures
 from fractus_services.mobility.rpc.handlers import MobilityHandlers
-from fractus_services.mobility.rpc.wiring import Parts
 from fractus_services.node_description import NodeDescription
 from fractus_services.options import CannotServe, MobilityOptions
 from fractus_services.recording.recorder import Recorder
@@ -40,65 +40,77 @@ from fractus_services.recording.segment_directory import segments_in
 log = logging.getLogger(__name__)
 
 DEFAULT_LINK = "tcp:127.0.0.1:5760"
+"""Autopilot link if neither the command line nor the node description specifies one."""
 
 
 def _link(description: NodeDescription) -> str:
-    """The autopilot's link."""
+    """Return the autopilot link of a node description."""
     features = description.value.spec.services.mobility if isinstance(description.value, Drone) else None
     return features.connection if features is not None else DEFAULT_LINK
 
 
 def _fixed_camera(description: NodeDescription) -> bool:
-    """Whether pictures are judged by a mount that does not move; one that is not described counts as seeing everything."""
+    """Return True if the description declares a mount without a gimbal. An undescribed mount may point anywhere."""
     camera = description.value.spec.services.camera if description.value is not None else None
     return camera is not None and camera.mount is not None and not camera.mount.gimbal
 
 
-async def _follow(description: NodeDescription, url: str, heard: asyncio.Event, *, told: bool) -> None:
-    """Follow the description, and watch for one with another link, where the command line does not tell it.
+async def _watch_description(description: NodeDescription, url: str, found: asyncio.Event, *, fixed_link: bool) -> None:
+    """Reload the node description when it changes.
+
+    Args:
+        description: The node description.
+        url: Autopilot link in use.
+        found: Set once the autopilot was found on this link.
+        fixed_link: True if the command line specifies the link.
 
     Raises:
-        CannotServe: there is one, and no vehicle was ever heard on the present link.
+        CannotServe: The description names a different link, and no autopilot was found on the present one.
     """
     while True:
         await description.changed()
-        if told or _link(description) == url:
+        if fixed_link or _link(description) == url:
             continue
-        if not heard.is_set():
-            raise CannotServe(f"the node's description tells another autopilot ({_link(description)}); starting again")
-        log.warning("mobility: another autopilot is described, used after a restart (url=%s)", _link(description))
+        if not found.is_set():
+            raise CannotServe(
+                f"the node description now names a different autopilot link ({_link(description)}); restarting"
+            )
+        log.warning(
+            "mobility: node description names a different autopilot link, used after a restart (url=%s)",
+            _link(description),
+        )
 
 
-def _linked(
+def _connect(
     options: MobilityOptions,
     url: str,
-    heard: asyncio.Event,
+    found: asyncio.Event,
     *,
     recorder: Recorder,
     grants: GrantFiles,
     audit: AuditLog,
     clock: Clock,
-) -> tuple[MavlinkAutopilot, Parts]:
-    """The autopilot's link, and the parts that command it; `heard` is set once there is a vehicle on the link."""
+) -> tuple[MavlinkAutopilot, MobilityComponents]:
+    """Create the autopilot and the components that command it. `found` is set once the autopilot is on the link."""
 
-    def found() -> None:
-        heard.set()
-        parts.observer.found()
-        parts.control.tasks.spawn(came_to_serve(options.state))
+    def on_found() -> None:
+        found.set()
+        components.observer.found()
+        components.control.tasks.spawn(came_to_serve(options.state))
 
     autopilot = TracedAutopilot(
         url,
         ARDUCOPTER,
-        # The parts need the autopilot first: they are looked up when it calls.
-        alive=lambda: parts.supervisor.alive(),  # noqa: PLW0108
-        on_found=found,
-        on_heartbeat=lambda: parts.observer.heartbeat(),  # noqa: PLW0108
-        on_parameter=lambda name: parts.observer.parameter(name),  # noqa: PLW0108
+        # The components need the autopilot, so its callbacks look them up when they are called.
+        alive=lambda: components.supervisor.alive(),  # noqa: PLW0108
+        on_found=on_found,
+        on_heartbeat=lambda: components.observer.heartbeat(),  # noqa: PLW0108
+        on_parameter=lambda name: components.observer.parameter(name),  # noqa: PLW0108
         memory=Memory(options.state / VEHICLE_FILE, url),
         received=recorder.take_received,
         sent=recorder.take_sent,
     )
-    parts = Parts(
+    components = MobilityComponents(
         autopilot,
         MavlinkFailsafes(autopilot),
         MissionFence(autopilot, options.state),
@@ -110,20 +122,21 @@ def _linked(
         grace_s=options.driver_grace,
         boarding_s=options.boarding,
     )
-    return autopilot, parts
+    return autopilot, components
 
 
 async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
-    """Serve until `stop` is set, or a part of the service fails.
+    """Serve until `stop` is set, or a task of the service fails.
 
     Raises:
-        CannotServe: an option is wrong; also within an ExceptionGroup.
+        CannotServe: An option is wrong. The error may be inside an ExceptionGroup.
     """
-    # The log has its times from the clock, and is looked up when that is stepped.
+    # The audit log needs the clock, which reports its steps to the audit log.
     clock = Clock(lambda step_s, trusted: audit.clock_stepped(step_s, trusted))  # noqa: PLW0108
     description = NodeDescription(options.node, options.node_object, options.description, Drone)
     name = description.value.name if description.value is not None else socket.gethostname()
-    node, url = options.node or name, options.autopilot or _link(description)
+    node = options.node or name
+    url = options.autopilot or _link(description)
     tls = TlsFiles(options.tls)
     recorder = Recorder(segments_in(options.recordings, options.recordings_mb), node)
     metrics = ServiceMetrics()
@@ -136,42 +149,48 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
     audit = AuditLog(options.audit, clock, tls=options.tls, copied=recorded)
     verifier = GrantVerifier(options.tls, options.grant_memory)
     grants = GrantFiles(options.grants, node, verifier, options.flat_terrain, audit.refused_grant)
-    heard = asyncio.Event()
-    autopilot, parts = _linked(options, url, heard, recorder=recorder, grants=grants, audit=audit, clock=clock)
-    control, monitor, tours = parts.control, parts.monitor, parts.tours
+    found = asyncio.Event()
+    autopilot, components = _connect(options, url, found, recorder=recorder, grants=grants, audit=audit, clock=clock)
+    control = components.control
+    monitor = components.monitor
+    poi_missions = components.poi_missions
     audit.append("started", {"node": node, "autopilot": url})
     grants.listen(lambda old, new: _record_grant(audit, old, new))
     grants.listen(lambda _old, _new: recorder.take_grants([grant.spec for grant in grants.active.values()]))
     grants.scan()
     handlers = MobilityHandlers(
-        parts.service,
+        components.service,
         control,
-        parts.streams,
+        components.streams,
         grants=grants,
         node=node,
         clock=clock,
-        heard=tours.heard,
+        on_call=poi_missions.passenger_called,
         fixed_camera=partial(_fixed_camera, description),
         recording_problem=lambda: recorder.problem,
     )
 
     register = partial(mobility_pb2_grpc.add_MobilityServiceServicer_to_server, handlers)
     calls = serve_grpc("mobility", options.listen, tls, register, handlers.admission, node=node)
-    running = [autopilot.run(), grants.run(), monitor.run(), monitor.record(), tours.run(), calls]
-    running.append(_follow(description, url, heard, told=bool(options.autopilot)))
+    running = [autopilot.run(), grants.run(), monitor.run(), monitor.record(), poi_missions.run(), calls]
+    running.append(_watch_description(description, url, found, fixed_link=bool(options.autopilot)))
     metrics.observe(partial(common_figures, LastRead(tls.expires_s), grants, audit, lambda: recorder.problem))
-    metrics.observe(partial(flight_figures, control, parts.supervisor))
+    metrics.observe(partial(flight_figures, control, components.supervisor))
     try:
         async with serving(options.metrics, metrics.text):
             await run_until(stop, *running)
     finally:
         control.close()
-    log.info("mobility: stopped, a drone in flight goes home by its autopilot's failsafe")
+    log.info("mobility: stopped, the autopilot's failsafe brings a flying drone home")
     await audit.close()
     await recorder.close()
 
 
 def _record_grant(audit: AuditLog, old: Any, new: Any) -> None:
     grant = new or old
-    change = "added" if old is None else "removed" if new is None else "changed"
+    change = "changed"
+    if old is None:
+        change = "added"
+    elif new is None:
+        change = "removed"
     audit.append("grant", {"change": change, "identity": grant.identity, "name": grant.name, "key": grant.key})

@@ -1,4 +1,4 @@
-"""What Prometheus is told of the drone: how old what is known of it is, who commands it, and whether its failsafes hold."""
+"""Prometheus metrics of the mobility service: telemetry age, control authority, failsafe state."""
 
 from __future__ import annotations
 
@@ -13,31 +13,34 @@ from fractus_services.mobility.authority.supervisor import Supervisor
 
 
 def flight_figures(control: ControlStore, supervisor: Supervisor) -> Iterator[Figure]:
-    """What holds of the drone now."""
-    autopilot, vehicle = control.autopilot, control.autopilot.vehicle
+    """Yield the present metrics of the drone."""
+    autopilot = control.autopilot
+    vehicle = autopilot.vehicle
     yield telemetry_age(max(autopilot.now - vehicle.position_at, 0.0))
     yield gauge(
         "fractus_autopilot_heartbeat_age_seconds",
-        "Since the autopilot was heard.",
+        "Seconds since the last heartbeat of the autopilot.",
         max(autopilot.now - vehicle.heartbeat_at, 0.0),
     )
-    yield gauge("fractus_in_air", "1 while the drone is in the air, or may be.", vehicle.in_air)
+    yield gauge("fractus_in_air", "1 while the drone is in the air, or if that is uncertain.", vehicle.in_air)
     yield gauge(
         "fractus_control_authority",
-        "1 for who has control authority: driver, system or pilot.",
+        "1 for the party that has control authority: driver, system or pilot.",
         {authority.value: float(authority is control.authority) for authority in Authority},
         "authority",
     )
     yield gauge(
         "fractus_companion_alive",
-        "1 while the autopilot gets heartbeats: a driver, the system or a pilot is responsible for the drone.",
+        "1 while the service sends heartbeats, because a driver, the system or a pilot is responsible for the drone.",
         supervisor.alive(),
     )
     yield gauge(
         "fractus_failsafes_verified",
-        "1 while the autopilot's failsafes are known to be set.",
+        "1 while the autopilot's failsafes are verified.",
         control.checked is not None,
     )
     yield gauge(
-        "fractus_battery_ratio", "Charge that is left, 0 to 1; NaN while it is not known.", vehicle.battery_remaining
+        "fractus_battery_ratio",
+        "Remaining charge of the battery, 0 to 1; NaN while unknown.",
+        vehicle.battery_remaining,
     )

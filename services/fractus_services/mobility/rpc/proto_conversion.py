@@ -1,10 +1,10 @@
-"""Requests as calls of the policy engine; verdicts, motions and events as replies."""
+"""Conversion between protobuf messages and the values of the policy engine and of flights."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, assert_never, cast
+from typing import Any, assert_never
 
 from fractus_core.api.components import ControlPoint
 from fractus_core.api.geometry import Area, Point, Reference
@@ -32,9 +32,9 @@ from fractus_services.mobility.flight.motions import Step
 from fractus_services.mobility.rpc.telemetry import position_of
 
 DEFAULT_HOLD_S = 0.5
-"""How long a velocity holds when the caller does not say; proto3 cannot tell an absent number from 0."""
+"""Hold time of a velocity if the request has none. In proto3 an absent number equals 0."""
 
-_WIRE: dict[Reference, int] = exhaustive(
+_PROTO_REFERENCES: dict[Reference, types_pb2.AltitudeReference] = exhaustive(
     Reference,
     {
         "home": types_pb2.ALTITUDE_REFERENCE_HOME,
@@ -42,14 +42,14 @@ _WIRE: dict[Reference, int] = exhaustive(
         "terrain": types_pb2.ALTITUDE_REFERENCE_TERRAIN,
     },
 )
-_REFERENCES = {wire: reference for reference, wire in _WIRE.items()}
+_REFERENCES = {message: reference for reference, message in _PROTO_REFERENCES.items()}
 
 
 def goto_args(request: mobility_pb2.GotoRequest) -> GotoArgs:
-    """Read a goto.
+    """Return the arguments of a Goto request.
 
     Raises:
-        Refused: it has no target, or an unknown altitude reference.
+        Refused: The target is missing or has an unknown altitude reference.
     """
     if not request.HasField("target"):
         raise _invalid("target is missing; give the position to fly to")
@@ -67,10 +67,10 @@ def goto_args(request: mobility_pb2.GotoRequest) -> GotoArgs:
 
 
 def velocity_args(request: mobility_pb2.SetVelocityRequest) -> VelocityArgs:
-    """Read a velocity setpoint.
+    """Return the arguments of a SetVelocity request.
 
     Raises:
-        Refused: it has no velocity.
+        Refused: The velocity is missing.
     """
     if not request.HasField("velocity"):
         raise _invalid("velocity is missing; give north, east and down in m/s")
@@ -84,10 +84,10 @@ def velocity_args(request: mobility_pb2.SetVelocityRequest) -> VelocityArgs:
 
 
 def acceptance_radius_m(request: mobility_pb2.GotoRequest) -> float:
-    """How near to its target a goto is complete; 0 when the caller leaves it to the service.
+    """Return the acceptance radius of a Goto request; 0 for the default of the service.
 
     Raises:
-        Refused: it is not a distance.
+        Refused: The radius is negative or not finite.
     """
     value = request.acceptance_radius_m
     if not math.isfinite(value) or value < 0:
@@ -96,10 +96,10 @@ def acceptance_radius_m(request: mobility_pb2.GotoRequest) -> float:
 
 
 def call_of(request: mobility_pb2.CheckCallRequest) -> Call:
-    """The call that a client wants to have judged.
+    """Return the call of a CheckCall request.
 
     Raises:
-        Refused: it names no method, or lacks an argument.
+        Refused: The method or an argument is missing.
     """
     which = request.WhichOneof("call")
     if which is None:
@@ -108,8 +108,8 @@ def call_of(request: mobility_pb2.CheckCallRequest) -> Call:
     return Call(_METHODS[which], None if read is None else read(getattr(request, which)))
 
 
-def checked(verdict: Verdict) -> mobility_pb2.CheckCallResponse:
-    """The reply to a dry run."""
+def check_call_response(verdict: Verdict) -> mobility_pb2.CheckCallResponse:
+    """Return the reply to a dry run."""
     reply = mobility_pb2.CheckCallResponse(
         decision=decision(verdict), takeover=verdict.takeover or "", brake_first=verdict.brake_first
     )
@@ -130,11 +130,11 @@ def checked(verdict: Verdict) -> mobility_pb2.CheckCallResponse:
 
 
 def control_event(event: ControlEvent, points: Sequence[ControlPoint]) -> mobility_pb2.ControlEvent:
-    """An event of a control stream; a driver that is granted control reads what its task is.
+    """Return an event of a control stream. The event that grants control contains the task of the control point.
 
     Args:
-        event: what happened.
-        points: the caller's control points.
+        event: Event of the control state machine.
+        points: Control points of the caller.
     """
     message = mobility_pb2.ControlEvent(
         state=_STATES[event.state],
@@ -154,7 +154,7 @@ def _task(point: ControlPoint) -> types_pb2.ControlPoint:
             latitude_deg=waypoint.lat,
             longitude_deg=waypoint.lon,
             altitude_m=math.nan if waypoint.alt is None else waypoint.alt,
-            altitude_reference=cast("Any", _WIRE[waypoint.altitude_reference]),
+            altitude_reference=_PROTO_REFERENCES[waypoint.altitude_reference],
         )
     if point.region is not None:
         _write_area(message.region, point.region)
@@ -163,20 +163,20 @@ def _task(point: ControlPoint) -> types_pb2.ControlPoint:
 
 def _write_area(message: types_pb2.Area, area: Area) -> None:
     if area.circle is not None:
-        message.circle.center.CopyFrom(_place(area.circle.center))
+        message.circle.center.CopyFrom(_position(area.circle.center))
         message.circle.radius_m = area.circle.radius
     elif area.polygon is not None:
-        message.polygon.exterior.corners.extend(map(_place, area.polygon.exterior))
+        message.polygon.exterior.corners.extend(map(_position, area.polygon.exterior))
         for hole in area.polygon.holes:
-            message.polygon.holes.add().corners.extend(map(_place, hole))
+            message.polygon.holes.add().corners.extend(map(_position, hole))
 
 
-def _place(point: Point) -> types_pb2.Position:
+def _position(point: Point) -> types_pb2.Position:
     return types_pb2.Position(latitude_deg=point.lat, longitude_deg=point.lon)
 
 
 def motion_progress(step: Step, vehicle: VehicleState, verdict: Verdict | None) -> mobility_pb2.MotionProgress:
-    """How far a motion is; with a verdict, what was decided on it and where it goes."""
+    """Return the progress of a motion. With a verdict, the message contains the decision and the target."""
     message = mobility_pb2.MotionProgress(
         position=position_of(vehicle), distance_m=step.distance_m, complete=step.complete
     )
@@ -187,20 +187,23 @@ def motion_progress(step: Step, vehicle: VehicleState, verdict: Verdict | None) 
 
 
 def _write_target(message: mobility_pb2.MotionProgress, verdict: Verdict, vehicle: VehicleState) -> None:
-    """Where the motion goes, after correction."""
+    """Set the target of the motion after correction."""
     args = verdict.args
     if isinstance(args, GotoArgs):
-        message.target.latitude_deg, message.target.longitude_deg = args.lat, args.lon
+        message.target.latitude_deg = args.lat
+        message.target.longitude_deg = args.lon
         message.target.altitude_m = args.alt if args.alt is not None else vehicle.altitude_m
     elif isinstance(args, TakeoffArgs):
         message.target.CopyFrom(position_of(vehicle))
         message.target.altitude_m = args.altitude_m
     elif vehicle.home is not None:
-        message.target.latitude_deg, message.target.longitude_deg = vehicle.home.lat, vehicle.home.lon
+        message.target.latitude_deg = vehicle.home.lat
+        message.target.longitude_deg = vehicle.home.lon
 
 
 def _write_goto(message: mobility_pb2.GotoRequest, args: GotoArgs) -> None:
-    message.target.latitude_deg, message.target.longitude_deg = args.lat, args.lon
+    message.target.latitude_deg = args.lat
+    message.target.longitude_deg = args.lon
     message.target.altitude_m = args.alt or 0.0
     message.speed_mps = args.speed_mps or 0.0
     if args.yaw_deg is not None:
@@ -208,8 +211,10 @@ def _write_goto(message: mobility_pb2.GotoRequest, args: GotoArgs) -> None:
 
 
 def _write_velocity(message: mobility_pb2.SetVelocityRequest, args: VelocityArgs) -> None:
-    message.velocity.north_mps, message.velocity.east_mps = args.north_mps, args.east_mps
-    message.velocity.down_mps, message.hold_s = args.down_mps, args.hold_s
+    message.velocity.north_mps = args.north_mps
+    message.velocity.east_mps = args.east_mps
+    message.velocity.down_mps = args.down_mps
+    message.hold_s = args.hold_s
     if args.yaw_deg is not None:
         message.yaw_deg = args.yaw_deg
 
@@ -233,4 +238,4 @@ _ARGUMENTS: dict[str, Callable[[Any], Args]] = {
     "point_gimbal": lambda request: PointGimbalArgs(request.pitch_deg, request.yaw_deg),
 }
 _METHODS: dict[str, Method] = {to_snake(method): method for method in (*MOBILITY_METHODS, *CONTROL_METHODS)}
-"""Methods by the field of a CheckCallRequest that holds their request."""
+"""Methods by the field of CheckCallRequest that contains their request."""

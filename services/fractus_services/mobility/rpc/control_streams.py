@@ -1,4 +1,4 @@
-"""The streams of GetControl: drivers wait for the drone, command it and leave; passengers ride along."""
+"""GetControl streams: drivers wait for control, command the drone and return it; passengers follow their mission."""
 
 from __future__ import annotations
 
@@ -15,17 +15,18 @@ from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.authority.leases import Lease
 
 CHECK_S = 0.5
-"""How often a waiting caller looks whether it can go on when nothing wakes it: the autopilot's readiness wakes no one."""
+"""Longest time between two checks for a waiting caller, because a change of the autopilot's readiness wakes no task."""
 
 EVENT_TIMEOUT_S = 5.0
+"""Seconds to wait for one event of a lease."""
 
 
-class Streams:
-    """Who asks for control, and what it is told.
+class ControlStreams:
+    """Produces the events of control streams.
 
     Args:
-        control: who has the drone.
-        bring: flies the drone to where a driver with partial control takes over, and says what it does meanwhile.
+        control: Control state.
+        bring: Flies the drone to the control point of a driver with partial control. Yields the current step.
     """
 
     def __init__(self, control: ControlStore, bring: Callable[[Lease], AsyncGenerator[str, None]]) -> None:
@@ -33,20 +34,20 @@ class Streams:
         self._bring = bring
 
     def follow(self, grant: ActiveGrant) -> AsyncGenerator[ControlEvent, None]:
-        """The events of a caller's stream.
+        """Yield the events of a caller's stream.
 
         Raises:
-            Refused: this caller gets neither the drone nor a ride.
+            Refused: The caller may neither control the drone nor follow a mission.
         """
-        return self._ride(grant) if grant.spec.tour else self._drive(grant)
+        return self._follow_mission(grant) if grant.spec.tour else self._drive(grant)
 
     # Drivers
 
     async def _drive(self, grant: ActiveGrant) -> AsyncGenerator[ControlEvent, None]:
-        """A driver has the drone from GRANTED until this is closed."""
+        """Yield the events of a driver. The driver has control from GRANTED until this generator is closed."""
         control = self._control
         if grant.spec.class_ != "driver":
-            raise PolicyDenied("NotADriver", "only a driver gets control; passengers ride along")
+            raise PolicyDenied("NotADriver", "a passenger cannot get control; only a driver can")
         lease = control.open_lease(grant)
         try:
             while control.lease is lease and not control.state.granted:
@@ -69,7 +70,9 @@ class Streams:
             control.close_lease(lease)
 
     async def _until_ready(self, lease: Lease) -> AsyncGenerator[str, None]:
-        control, said = self._control, ""
+        """Yield each new reason to wait until the driver can get control."""
+        control = self._control
+        reported = ""
         while control.lease is lease:
             reason = control.not_ready_reason(lease.key)
             if control.state.taken(lease.key):
@@ -79,41 +82,43 @@ class Streams:
                     return
                 control.dispatch(TransitRequested(lease.lease_id))
                 async with aclosing(self._bring(lease)) as flying:
-                    async for event in flying:
-                        yield event
+                    async for step in flying:
+                        yield step
                 return
-            if reason != said:
-                said = reason
+            if reason != reported:
+                reported = reason
                 yield reason
             await control.changes.wait(CHECK_S)
 
     # Passengers
 
-    async def _ride(self, grant: ActiveGrant) -> AsyncGenerator[ControlEvent, None]:
-        """A passenger whose points of interest the system visits is told how far it is; leaving changes nothing."""
+    async def _follow_mission(self, grant: ActiveGrant) -> AsyncGenerator[ControlEvent, None]:
+        """Yield the progress of a mission over points of interest. Closing the stream does not change the mission."""
         control = self._control
         control.dispatch(PassengerBoarded(grant.key, grant.identity))
         outcome = control.mission(grant).outcome
         if outcome is not None:
             raise PreconditionFailed(*ended_refusal(outcome))
-        said: ControlEvent | None = None
+        reported: ControlEvent | None = None
         while True:
-            event = self._ridden(grant)
-            if event != said:
-                said = event
+            event = self._mission_event(grant)
+            if event != reported:
+                reported = event
                 yield event
             if event.final:
                 return
             await control.changes.wait(CHECK_S)
 
-    def _ridden(self, grant: ActiveGrant) -> ControlEvent:
+    def _mission_event(self, grant: ActiveGrant) -> ControlEvent:
         mission = self._control.mission(grant)
-        done, outcome = mission.waypoints, mission.outcome
+        visited = mission.waypoints
+        outcome = mission.outcome
         if outcome is not None and outcome.kind is OutcomeKind.COMPLETE:
-            return ControlEvent(StreamState.COMPLETE, done, "every point of interest was visited", done)
+            return ControlEvent(StreamState.COMPLETE, visited, "every point of interest was visited", visited)
         if outcome is not None:
-            return ControlEvent(StreamState.LOST, done, str(outcome), done)
+            return ControlEvent(StreamState.LOST, visited, str(outcome), visited)
         if self._control.state.touring == grant.key:
-            return ControlEvent(StreamState.PASSENGER, done, "the system flies through the points of interest", done)
+            reason = "the system flies through the points of interest"
+            return ControlEvent(StreamState.PASSENGER, visited, reason, visited)
         reason = self._control.not_ready_reason(grant.key) or "the system is about to take off"
-        return ControlEvent(StreamState.WAITING, done, reason, done)
+        return ControlEvent(StreamState.WAITING, visited, reason, visited)

@@ -1,0 +1,269 @@
+"""Return flights: the system flies home on legal legs. The autopilot's own return is the last resort."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import AsyncGenerator, Callable
+from contextlib import aclosing
+from dataclasses import replace
+
+from fractus_core.control.state import FlightMode, ModeKind, TaskKind
+from fractus_core.policy.compiled_grant import CompiledGrant
+from fractus_core.policy.kinematics import height_margin_m, margin_m
+from fractus_core.policy.return_route import (
+    RTL_CONE_SLOPE,
+    check_straight_return,
+    descent_enters_fence,
+    may_change_altitude,
+    return_altitudes_m,
+)
+
+from fractus_services.errors import AutopilotError, PreconditionFailed, Refused, Unavailable
+from fractus_services.grant_files import ActiveGrant
+from fractus_services.mobility.authority.control_store import ControlStore
+from fractus_services.mobility.authority.home import home_moved, restore_home
+from fractus_services.mobility.authority.leases import Motion
+from fractus_services.mobility.flight.motions import REACHED_M, Step
+from fractus_services.mobility.flight.policy_gate import PolicyGate
+from fractus_services.mobility.flight.route_following import (
+    REPLAN_CODES,
+    NextLeg,
+    RouteFollower,
+    SystemFlight,
+    first_leg,
+    limited_mps,
+)
+
+log = logging.getLogger(__name__)
+
+LEVEL_M = 1.0
+"""Change of altitude above which a return climbs or descends before it flies towards home."""
+
+LAST_LEG_M = 0.5
+"""Distance from home within which the last leg ends and the drone lands."""
+
+MAX_ATTEMPTS = 3
+"""Number of attempts to fly around zones if the autopilot refuses.
+
+After that the drone returns on the path it flew (SmartRTL), and if that is refused too, straight (RTL).
+"""
+
+
+class ReturnFlight:
+    """Brings the drone home.
+
+    Args:
+        control: Control state.
+        gate: Policy engine.
+        routes: Follows the legs of a route.
+
+    Attributes:
+        given_up: Grant under which no legal return was found last, so that the autopilot's own return is flown.
+    """
+
+    def __init__(self, control: ControlStore, gate: PolicyGate, routes: RouteFollower) -> None:
+        self._control = control
+        self._gate = gate
+        self._routes = routes
+        self.given_up: ActiveGrant | None = None
+
+    async def approach(self, kind: TaskKind, wanted: Callable[[], bool], attempts: int) -> FlightMode:
+        """Fly home for the system until only the descent is left. A drone that is to land does so, unless into a zone.
+
+        Args:
+            kind: Task of the system: land or return.
+            wanted: Returns True while the task is current.
+            attempts: Number of attempts that failed.
+
+        Returns:
+            The mode for the rest of the return. If no legal route is known, that is SMART_RTL if the autopilot recorded the
+            path flown, else RTL. A return through a zone is the lesser evil, because a drone that stays in the air comes down
+            anywhere when its battery is empty.
+
+        Raises:
+            AutopilotError: The autopilot refused, or the link broke.
+        """
+        control = self._control
+        grant = control.last_grant
+        vehicle = control.autopilot.vehicle
+        stack = control.autopilot.stack
+        self.given_up = None
+        if kind is TaskKind.RETURN and attempts < MAX_ATTEMPTS:
+            await self._restore_home()
+        # A landing in progress was chosen by a failsafe or a pilot. The battery may be too low for any other flight.
+        landing = vehicle.mode.kind is ModeKind.LANDING or self._blind()
+        if kind is TaskKind.LAND and (grant is None or landing or not self._lands_in_zone(grant)):
+            return stack.land
+        if vehicle.in_air and not vehicle.mode.comes_down and attempts <= MAX_ATTEMPTS and self._path_is_home():
+            control.note("returnToLaunch", "home was moved; the drone returns on the path it flew", "HomeMoved")
+            return stack.return_retracing
+        if grant is None or not vehicle.in_air or vehicle.mode.comes_down or self._blind():
+            return stack.return_straight
+        try:
+            problem = await self._fly_home(grant, wanted) if attempts < MAX_ATTEMPTS else self._give_up(grant, attempts)
+        except AutopilotError:
+            raise
+        except Exception:
+            log.exception("return: route planner failed")
+            problem = "the route planner failed"
+        if not problem:
+            return self.descent(grant)
+        retraces = control.retraces and attempts <= MAX_ATTEMPTS
+        path = "on the path it flew" if retraces else "straight"
+        control.note(
+            "returnToLaunch", f"no legal route home is known ({problem}); the drone returns {path}", "NoLegalWay"
+        )
+        log.error("return: no legal route home is known, the drone returns %s (reason=%s)", path, problem)
+        self.given_up = grant
+        return stack.return_retracing if retraces else stack.return_straight
+
+    async def _restore_home(self) -> None:
+        """Restore home if it was moved, because the autopilot's own return leads there.
+
+        Raises:
+            AutopilotError: Home was not restored. While the autopilot is connected this counts as an attempt, so that a station
+                that moves home repeatedly does not keep the drone in the air.
+        """
+        control = self._control
+        try:
+            await restore_home(control.autopilot, control)
+        except AutopilotError as error:
+            raise AutopilotError(str(error), link=not control.autopilot.connected) from error
+
+    def _path_is_home(self) -> bool:
+        """Return True if home was moved, so that only the path flown leads to where the mission armed."""
+        return self._control.retraces and home_moved(self._control.state, self._control.autopilot.vehicle)
+
+    def _give_up(self, grant: ActiveGrant, attempts: int) -> str:
+        """Return why the system no longer flies home; an empty string if the straight return is legal."""
+        return (
+            ""
+            if self._straight_return_legal(self._control.for_transit(grant))
+            else f"the autopilot refused {attempts} times"
+        )
+
+    async def _fly_home(self, grant: ActiveGrant, wanted: Callable[[], bool]) -> str:
+        """Fly home and return why that is impossible, or an empty string.
+
+        Raises:
+            AutopilotError: The drone did not follow its commands.
+        """
+        control = self._control
+        constraints = control.begin_system_flight(grant)
+
+        def permit() -> None:
+            if not wanted() or control.constraints is not constraints:
+                raise AutopilotError("the system has lost control of the drone")
+
+        flight = SystemFlight(constraints, "Homeward", lambda motion: _both(permit, motion))
+        try:
+            await control.modes.enter_guided(permit)
+            async for _ in self._routes.follow(flight, lambda: self._next_leg(flight)):
+                pass
+        except Refused as refusal:
+            if self._cannot_rest(refusal, flight):
+                return ""
+            if refusal.verdict.code == "NoLegalWay" or refusal.verdict.code in REPLAN_CODES:
+                return str(refusal)
+            moved = home_moved(control.state, control.autopilot.vehicle)
+            raise AutopilotError(str(refusal), link=isinstance(refusal, Unavailable) and not moved) from refusal
+        finally:
+            control.end_system_flight(constraints)
+        return ""
+
+    async def attempt(self, flight: SystemFlight, motion: Motion) -> AsyncGenerator[Step, None]:
+        """Fly home for a driver, as one motion. The drone is in GUIDED.
+
+        Raises:
+            Refused: There is no legal route and the autopilot has recorded no path, or the motion was stopped.
+            AutopilotError: The autopilot refused.
+        """
+        self.given_up = None
+        await restore_home(self._control.autopilot, self._control)
+        if self._blind():
+            return
+        try:
+            async with aclosing(self._routes.legs(flight, motion, lambda: self._next_leg(flight))) as steps:
+                async for step in steps:
+                    yield step
+        except Refused as refusal:
+            if refusal.verdict.code == "NoLegalWay" and self._control.retraces:
+                self.given_up = flight.constraints.grant
+            elif not self._cannot_rest(refusal, flight):
+                raise
+
+    def descent(self, grant: ActiveGrant) -> FlightMode:
+        """Return the mode for the rest of the return: land at home, else return on the path flown or straight."""
+        autopilot = self._control.autopilot
+        stack = autopilot.stack
+        if grant is self.given_up:
+            return stack.return_retracing
+        at_home = autopilot.vehicle.position_fresh(autopilot.now) and self._home_distance_m() <= 2 * REACHED_M
+        return stack.land if at_home else stack.return_straight
+
+    def _cannot_rest(self, refusal: Refused, flight: SystemFlight) -> bool:
+        """Return True if wind prevents the drone from resting at a place from which the straight return is legal."""
+        return refusal.verdict.code == "NotStopping" and self._straight_return_legal(flight.constraints.compiled)
+
+    def _lands_in_zone(self, grant: ActiveGrant) -> bool:
+        """Return True if the drone would descend into a fence that it is above."""
+        return descent_enters_fence(self._gate.situation(), self._control.for_transit(grant))
+
+    def _blind(self) -> bool:
+        """Return True if position or home is unknown, so that only the autopilot can navigate."""
+        now = self._gate.situation()
+        return now.lat is None or now.home is None
+
+    def _straight_return_legal(self, grant: CompiledGrant) -> bool:
+        """Return True if the autopilot's own straight return is legal from the present position."""
+        now = self._gate.situation()
+        if now.lat is None or now.lon is None or now.home is None:
+            return True
+        room = {"margin": margin_m(now), "slack": height_margin_m(now)}
+        return check_straight_return(grant.frame.xy(now.lat, now.lon), now.altitude_m, now, grant, **room) is None
+
+    def _home_distance_m(self) -> float:
+        """Return the horizontal distance to home in metres; infinite if home is unknown."""
+        vehicle = self._control.autopilot.vehicle
+        return vehicle.distance_m(vehicle.home.lat, vehicle.home.lon) if vehicle.home is not None else math.inf
+
+    async def _next_leg(self, flight: SystemFlight) -> NextLeg | None:
+        """Return the next leg home; None at home, or if no route can be planned.
+
+        Raises:
+            Refused: There is no legal route.
+        """
+        if home_moved(self._control.state, self._control.autopilot.vehicle):
+            raise Unavailable("AutopilotUnavailable", "another station moved home; it must be set back first")
+        now = self._gate.situation()
+        distance_m = self._home_distance_m()
+        if now.lat is None or now.lon is None or now.home is None or distance_m <= REACHED_M:
+            return None
+        for height in return_altitudes_m(now, flight.constraints.compiled, RTL_CONE_SLOPE * distance_m):
+            vertical_first = may_change_altitude(now, flight.constraints.compiled, height)
+            # The system flies the whole route, so the autopilot's straight return need not be legal from its waypoints.
+            # `retraces` removes that condition from the search.
+            planned = replace(
+                now,
+                airframe=replace(now.airframe, retraces=True),
+                altitude_m=height if vertical_first else now.altitude_m,
+            )
+            first = await first_leg((now.home.lat, now.home.lon), (height,), planned, flight)
+            if first is None:
+                continue
+            leg, last, _ = first
+            if vertical_first and abs(height - now.altitude_m) > LEVEL_M:
+                leg = replace(leg, lat=now.lat, lon=now.lon)
+                last = False
+            speed_mps = limited_mps(self._control.cruise_mps, leg, now, flight.constraints.compiled)
+            return NextLeg(replace(leg, speed_mps=speed_mps), last=False, reached_m=LAST_LEG_M if last else REACHED_M)
+        raise PreconditionFailed("NoLegalWay", "zones surround the drone or its home")
+
+
+def _both(permit: Callable[[], None], motion: Motion) -> Callable[[], None]:
+    def check() -> None:
+        motion.check()
+        permit()
+
+    return check

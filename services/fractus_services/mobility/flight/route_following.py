@@ -1,0 +1,296 @@
+"""System flights: the shortest legal route to a target, leg by leg, planned again around zones that appear on it."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import AsyncGenerator, Awaitable, Callable, Iterable
+from contextlib import aclosing
+from dataclasses import dataclass, replace
+
+import shapely
+from fractus_core.api.geometry import Position, Reference
+from fractus_core.policy.altitude import altitude_above_home_m
+from fractus_core.policy.compiled_grant import AirVolume, CompiledGrant
+from fractus_core.policy.decision_types import Call, GotoArgs, Home, Situation
+from fractus_core.policy.kinematics import margin_m
+from fractus_core.policy.limits import speed_bounds
+from fractus_core.policy.route_search import route_steps
+
+from fractus_services.background import in_slices
+from fractus_services.errors import Aborted, PreconditionFailed, Refused, Unavailable
+from fractus_services.mobility.authority.control_store import ControlStore
+from fractus_services.mobility.authority.leases import FlightConstraints, Motion
+from fractus_services.mobility.autopilot import Permit
+from fractus_services.mobility.flight.motions import HEIGHT_REACHED_M, REACHED_M, Step, come_to_rest, fly_to
+from fractus_services.mobility.flight.policy_gate import PolicyGate
+
+log = logging.getLogger(__name__)
+
+MAX_REPLANS = 5
+"""Number of new routes that are searched after the monitor stopped the drone, under the same flight constraints."""
+
+MAX_LEGS = 60
+"""Number of legs after which a flight makes no progress, because every leg is planned again from the present position."""
+
+NEAR_M = 0.3
+"""Distance within which the drone is at a waypoint. Waypoints keep more than this beyond the margin of legs."""
+
+INTERNAL_ERROR = "the mobility service has an internal error; see its log"
+"""Reason that clients receive when an internal error ends a mission. The log has the details."""
+
+REPLAN_CODES = frozenset(
+    {
+        "ExclusionZoneAhead", "InsideExclusionZone", "InclusionBorderAhead", "OutsideInclusionZone",
+        "OperationAreaBorderAhead", "OutsideOperationArea", "AltitudeAboveLimit", "AltitudeBelowLimit",
+    }
+)  # fmt: skip
+"""Codes of legs that became illegal, so that a different route may be legal. Other codes end the flight."""
+
+
+Search = Callable[[], Awaitable["NextLeg | None"]]
+
+
+@dataclass(frozen=True, slots=True)
+class SystemFlight:
+    """A flight by the system.
+
+    Attributes:
+        constraints: Flight constraints. They follow changes of the grant.
+        kind: Kind of its motions.
+        permit: Returns the permit for the commands of a motion.
+    """
+
+    constraints: FlightConstraints
+    kind: str
+    permit: Callable[[Motion], Permit]
+
+
+def target_of(position: Position) -> GotoArgs:
+    """Return a position as the target of a goto."""
+    return GotoArgs(position.lat, position.lon, position.alt, position.altitude_reference)
+
+
+def above_home_m(altitude_m: float, reference: Reference, home: Home | None, grant: CompiledGrant) -> float:
+    """Return an altitude in metres above home.
+
+    Raises:
+        Refused: The altitude is above terrain, and the terrain is unknown.
+    """
+    height = altitude_above_home_m(altitude_m, reference, home, grant.flat_terrain)
+    if height is None:
+        raise PreconditionFailed(
+            "TerrainUnknown", "the altitude is relative to terrain, and no terrain model is loaded; use home or amsl"
+        )
+    return height
+
+
+class ReplanBudget:
+    """Number of route searches that remain since the flight constraints changed last.
+
+    Args:
+        constraints: Constraints of the flight.
+    """
+
+    def __init__(self, constraints: FlightConstraints) -> None:
+        self._constraints = constraints
+        self._compiled = constraints.compiled
+        self._count = 0
+
+    def allow(self, refusal: Refused) -> bool:
+        """Count a refusal. Return True if the flight continues on a different route."""
+        if self._constraints.compiled is not self._compiled:
+            self._compiled = self._constraints.compiled
+            self._count = 0
+        self._count += 1
+        if self._count > MAX_REPLANS or not (isinstance(refusal, Aborted) and refusal.verdict.code in REPLAN_CODES):
+            return False
+        log.info("route: leg stopped, searching a different route (attempt=%d reason=%s)", self._count, refusal)
+        return True
+
+
+@dataclass(frozen=True, slots=True)
+class NextLeg:
+    """The next leg of a route.
+
+    Attributes:
+        args: Target, altitude and speed of the leg.
+        last: True if the route ends with this leg.
+        reached_m: Distance to the target within which the leg is complete.
+    """
+
+    args: GotoArgs
+    last: bool
+    reached_m: float = REACHED_M
+
+
+async def first_leg(
+    goal: tuple[float, float], heights_m: Iterable[float], now: Situation, flight: SystemFlight
+) -> tuple[GotoArgs, bool, float] | None:
+    """Return the first leg of the shortest legal route from the present position.
+
+    The search runs in slices between other tasks of the event loop. It restarts if the constraints change.
+
+    Args:
+        goal: Latitude and longitude.
+        heights_m: Altitudes above home to fly at, in order of preference.
+        now: Present situation, with a known position.
+        flight: System flight whose constraints apply.
+
+    Returns:
+        The leg, whether it is the last one, and the altitude of the route; None if there is no route.
+
+    Raises:
+        Refused: The constraints change faster than a route is found.
+    """
+    heights = tuple(dict.fromkeys(heights_m))
+    for _ in range(MAX_REPLANS + 1):
+        grant = flight.constraints.compiled
+        leg = await _first_leg(goal, heights, now, grant)
+        if flight.constraints.compiled is grant:
+            return leg
+    raise Aborted("FencesChanged", "the flight constraints change faster than a route is found")
+
+
+async def _first_leg(
+    goal: tuple[float, float], heights_m: Iterable[float], now: Situation, grant: CompiledGrant
+) -> tuple[GotoArgs, bool, float] | None:
+    frame = grant.frame
+    begin = frame.xy(now.lat or 0.0, now.lon or 0.0)
+    end = frame.xy(*goal)
+    for height in heights_m:
+        route = await in_slices(route_steps(begin, end, now, grant, height, from_m=now.altitude_m))
+        if route is not None:
+            # If the drone is at the first waypoint already, the next leg is legal from here, and this leg would only change
+            # the altitude.
+            reached = math.dist(begin, route[0]) <= NEAR_M and abs(now.altitude_m - height) <= HEIGHT_REACHED_M
+            first = min(reached, len(route) - 1)
+            return GotoArgs(*frame.latlon(*route[first]), height), len(route) == first + 1, height
+    return None
+
+
+def limited_mps(speed_mps: float, leg: GotoArgs, now: Situation, grant: CompiledGrant) -> float:
+    """Return the highest speed that the limits along a leg allow, at most the requested one.
+
+    Lower limits are ignored and no limit refuses the leg, because the system returns even where a driver may not fly.
+
+    Args:
+        speed_mps: Requested speed.
+        leg: Leg with its altitude above home.
+        now: Present situation.
+        grant: Compiled constraints with the limits.
+    """
+    at = grant.locate(now)
+    if at is None:
+        return speed_mps
+    target = grant.frame.xy(leg.lat, leg.lon)
+    heights = (now.altitude_m, now.altitude_m if leg.alt is None else leg.alt)
+    ground = shapely.points(at) if at == target else shapely.linestrings((at, target))
+    air = AirVolume(ground, margin_m(now), min(heights), max(heights))
+    return min([speed_mps, *(bound.upper for bound in speed_bounds(grant, now, air) if bound.upper is not None)])
+
+
+class RouteFollower:
+    """Flies system flights along legal routes.
+
+    Args:
+        control: Control state.
+        gate: Policy engine.
+    """
+
+    def __init__(self, control: ControlStore, gate: PolicyGate) -> None:
+        self._control = control
+        self._gate = gate
+
+    async def fly(self, flight: SystemFlight, target: GotoArgs) -> AsyncGenerator[Step, None]:
+        """Fly to a target. A route that becomes illegal in flight is replaced.
+
+        Raises:
+            Refused: There is no legal route, or the flight lost its permit.
+            AutopilotError: The autopilot refused.
+        """
+        async with aclosing(self.follow(flight, lambda: self._next(flight, target))) as steps:
+            async for step in steps:
+                yield step
+
+    async def follow(self, flight: SystemFlight, search: Search) -> AsyncGenerator[Step, None]:
+        """Fly leg by leg, as `fly` does.
+
+        Args:
+            flight: System flight.
+            search: Returns the next leg from the present position at rest; None at the target.
+        """
+        replans = ReplanBudget(flight.constraints)
+        while True:
+            motion = self._control.begin_motion(flight.kind, flight.permit)
+            try:
+                async with aclosing(self.legs(flight, motion, search)) as steps:
+                    async for step in steps:
+                        yield step
+            except Refused as refusal:
+                if not replans.allow(refusal):
+                    raise
+            else:
+                return
+            finally:
+                self._control.finish_motion(motion)
+
+    async def legs(self, flight: SystemFlight, motion: Motion, search: Search) -> AsyncGenerator[Step, None]:
+        """Fly one attempt of `follow`, as one motion."""
+        autopilot = self._control.autopilot
+        permit = flight.permit(motion)
+        for _ in range(MAX_LEGS):
+            # A leg is judged from the present position. A moving drone would begin it elsewhere.
+            if not autopilot.at_rest:
+                await come_to_rest(autopilot, motion, permit)
+            leg = await search()
+            if leg is None:
+                return
+            distance_m = autopilot.vehicle.distance_m(leg.args.lat, leg.args.lon)
+            # A leg that is shorter than the usual radius, for example out of a zone's margin, is flown nevertheless.
+            short = NEAR_M < distance_m < 2 * leg.reached_m and not leg.last
+            reached_m = min(leg.reached_m, max(distance_m / 3, NEAR_M)) if short else leg.reached_m
+            async with aclosing(fly_to(autopilot, motion, leg.args, reached_m, permit)) as steps:
+                async for step in steps:
+                    yield Step(step.distance_m, step.complete and leg.last)
+            if leg.last:
+                return
+        raise Aborted("NotFollowing", f"the drone did not reach its target within {MAX_LEGS} legs")
+
+    async def _next(self, flight: SystemFlight, target: GotoArgs) -> NextLeg:
+        now = self._gate.situation()
+        grant = flight.constraints.compiled
+        if now.lat is None or now.lon is None:
+            raise Unavailable("AutopilotUnavailable", "the drone's position is not known")
+        wanted = now.altitude_m if target.alt is None else above_home_m(target.alt, target.reference, now.home, grant)
+        first = await first_leg((target.lat, target.lon), (wanted, now.altitude_m), now, flight)
+        if first is None:
+            raise self._unreachable(flight, target)
+        leg, last, height = first
+        # If the only legal route is at the present altitude, its end is an intermediate stop, where the drone climbs or
+        # descends.
+        if last and height != wanted:
+            if self._arrived(leg):
+                raise self._unreachable(flight, target)
+            last = False
+        leg = self._allowed(flight, leg)
+        return NextLeg(replace(leg, yaw_deg=target.yaw_deg) if last else leg, last)
+
+    def _arrived(self, leg: GotoArgs) -> bool:
+        """Return True if the drone is at the end of a leg already."""
+        return self._control.autopilot.vehicle.distance_m(leg.lat, leg.lon) <= 2 * REACHED_M
+
+    def _unreachable(self, flight: SystemFlight, target: GotoArgs) -> Refused:
+        """Return the refusal for a missing route. The verdict on the straight leg names the zone in the way."""
+        verdict = self._gate.judge(Call("Goto", target), flight.constraints.grant, flight.constraints.compiled)
+        reason = verdict.reason or "no route around the zones was found"
+        return PreconditionFailed(
+            "NoLegalWay", f"the system cannot fly to {target.lat:.6f}, {target.lon:.6f}: {reason}"
+        )
+
+    def _allowed(self, flight: SystemFlight, leg: GotoArgs) -> GotoArgs:
+        """Return the leg as the policies allow it."""
+        verdict = self._gate.judge(Call("Goto", leg), flight.constraints.grant, flight.constraints.compiled)
+        if not verdict.permits or not isinstance(verdict.args, GotoArgs):
+            raise PreconditionFailed("NoLegalWay", f"the system cannot fly there: {verdict.reason}")
+        return replace(verdict.args, speed_mps=verdict.args.speed_mps or self._control.cruise_mps)

@@ -4,7 +4,7 @@ import pytest
 from fractus_core.api.geometry import Position
 from fractus_core.planning import Infeasible, Settings, flight_of, plan
 from fractus_core.planning.mission import ahead, misses
-from fractus_core.planning.scale_up import room_to_grow, without_room
+from fractus_core.planning.scale_up import full_nodes, next_free_node
 from test_plan_drones import flown_by_other, passenger, shared
 from test_plan_properties import where
 from test_planning import PATH, application, at, component, drone, edge, host, inventory, navigator
@@ -28,12 +28,12 @@ def test_a_location_with_too_few_instances_grows_onto_a_new_node(instances):
     app = everywhere(instances)
     stock = inventory([drone("d")], [edge("e1", (0, 0)), edge("e2", (50, 0))])
     before = plan(app, stock)
-    assert room_to_grow(app, stock, Settings(), before) is None
+    assert next_free_node(app, stock, Settings(), before) is None
     more = inventory([drone("d")], [edge("e1", (0, 0)), edge("e2", (50, 0)), edge("e3", (10, 0)), edge("x", (900, 0))])
-    assert room_to_grow(app, more, Settings(), before) == "e3"
+    assert next_free_node(app, more, Settings(), before) == "e3"
     after = plan(app, more, previous=before)
     assert set(map(where, before.placements)) < set(map(where, after.placements))
-    assert room_to_grow(app, more, Settings(), after) is None
+    assert next_free_node(app, more, Settings(), after) is None
 
 
 def test_a_node_that_does_not_suit_is_no_room():
@@ -41,12 +41,12 @@ def test_a_node_that_does_not_suit_is_no_room():
     before = plan(app, inventory([drone("d")], [edge("e1", (0, 0))]))
     full = host("e2", "edge", cpu=0.01)
     stock = inventory([drone("d")], [edge("e1", (0, 0)), edge("e2", (50, 0))], [full])
-    assert room_to_grow(app, stock, Settings(), before) is None
-    assert without_room(app, stock, Settings(), before) == {"e2"}
+    assert next_free_node(app, stock, Settings(), before) is None
+    assert full_nodes(app, stock, Settings(), before) == {"e2"}
     stock = inventory([drone("d")], [edge("e1", (0, 0)), edge("e2", (50, 0))])
-    assert not without_room(app, stock, Settings(excluded={"e2": "refused"}), before)
-    assert room_to_grow(app, stock, Settings(excluded={"e2": "refused"}), before) is None
-    assert room_to_grow(app, stock, Settings(), before) == "e2"
+    assert not full_nodes(app, stock, Settings(excluded={"e2": "refused"}), before)
+    assert next_free_node(app, stock, Settings(excluded={"e2": "refused"}), before) is None
+    assert next_free_node(app, stock, Settings(), before) == "e2"
 
 
 def test_what_comes_first_in_the_manifest_does_not_drive_out_what_runs():

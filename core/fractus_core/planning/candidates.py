@@ -1,4 +1,4 @@
-"""Which nodes can host a component, and why the others cannot (thesis Algorithms 6 to 8)."""
+"""Requirements of components on nodes: host state, services, resources, direct links (thesis Algorithms 6 to 8)."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from fractus_core.api.plans import Rejection
 from fractus_core.planning.inventory import Host, Settings
 
 INSUFFICIENT = "InsufficientResources"
-"""Why a node is rejected that would do, once others leave enough room on it."""
+"""Reason for a node that would be suitable with more free resources."""
 
 
 class Ledger:
-    """What hosts have left while a plan is made: allocatable minus requested minus what the plan already placed.
+    """Free resources of hosts during planning: allocatable minus requested minus placed by the plan.
 
-    What a component had on a node in the plan before is kept for it until it is placed again, so that nothing that comes
-    first in the manifest drives out what runs there.
+    The resources of a component on its node in the previous plan stay reserved until the component is placed again.
+    Otherwise, a component that comes earlier in the manifest could displace a running one.
     """
 
     def __init__(self, hosts: Mapping[str, Host], kept: Iterable[tuple[Component, str]] = ()) -> None:
@@ -29,18 +29,20 @@ class Ledger:
         for component, node in kept:
             self._kept.setdefault(node, {})[component.name] = requests(component)
 
-    def shortage(self, node: str, wanted: Mapping[str, float], asking: Collection[str]) -> str | None:
-        """The first resource of which there is too little, with figures; None when all of it is there.
+    def shortage(self, node: str, wanted: Mapping[str, float], requesters: Collection[str]) -> str | None:
+        """Return the first insufficient resource with its amounts, or None if all are available.
 
         Args:
             node: Name of the host.
-            wanted: What is asked for in all, resource name to quantity.
-            asking: Names of the components that ask: what is kept for them is theirs.
+            wanted: Total requests by resource name.
+            requesters: Names of the requesting components, whose own reservations are available to them.
         """
         host = self._hosts[node]
         placed = self._placed.get(node, {})
         kept = [
-            amounts for name, amounts in self._kept.get(node, {}).items() if name not in asking and name not in placed
+            amounts
+            for name, amounts in self._kept.get(node, {}).items()
+            if name not in requesters and name not in placed
         ]
         for resource, amount in wanted.items():
             free = host.allocatable.get(resource, 0.0) - host.requested.get(resource, 0.0)
@@ -50,33 +52,33 @@ class Ledger:
         return None
 
     def take(self, node: str, component: Component) -> None:
-        """Book the component's requests on the node."""
+        """Book the resource requests of a component on a node."""
         self._placed.setdefault(node, {})[component.name] = requests(component)
 
     def release(self, node: str, component: Component) -> None:
-        """Undo the booking of a component; what was kept for it is kept again."""
+        """Cancel the booking of a component. Its reservation from the previous plan applies again."""
         self._placed[node].pop(component.name)
 
 
 def requests(component: Component) -> dict[str, float]:
-    """What a pod of the component asks for: requests, with limits where requests say nothing, as Kubernetes does."""
+    """Return the resource requests of a component's pod. Missing requests default to the limits, as in Kubernetes."""
     resources = component.container.resources
     return {name: quantity(q) for name, q in {**resources.limits, **resources.requests}.items()}
 
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """The outcome of looking at one node: suitable, or the first rule it fails."""
+    """Result of checking a node: suitable, or the first failed requirement."""
 
     reason: str = ""
     message: str = ""
 
     def __bool__(self) -> bool:
-        """Whether the node is suitable."""
+        """True if the node is suitable."""
         return not self.reason
 
     def rejection(self, component: Component | str, node: str) -> Rejection:
-        """The failed check as the plan reports it."""
+        """Return the failed check as an entry of the plan."""
         name = component if isinstance(component, str) else component.name
         return Rejection(component=name, node=node, reason=self.reason, message=self.message)
 
@@ -85,9 +87,9 @@ SUITABLE = Check()
 
 
 def check_host(hosts: Mapping[str, Host], node: str, settings: Settings, *, kept: bool = False) -> Check:
-    """Whether the Kubernetes Node behind a drone or edge node takes pods.
+    """Check that the Kubernetes Node of a drone or edge node accepts pods.
 
-    A node that already hosts the instance (kept) may be out of reach: its pods run on, and it comes back.
+    A node that already hosts the instance (`kept`) may be unreachable: its pods keep running.
     """
     host = hosts.get(node)
     if host is None:
@@ -102,12 +104,12 @@ def check_host(hosts: Mapping[str, Host], node: str, settings: Settings, *, kept
 
 
 def readiness(status: DroneStatus | EdgeNodeStatus | None) -> Condition | None:
-    """The Ready condition that a node's agent reports; None while it has reported none."""
+    """Return the Ready condition that the agent of a node reported, or None."""
     return next((c for c in status.conditions if c.type == "Ready"), None) if status is not None else None
 
 
 def check_services(offered: NodeServices, components: Iterable[Component]) -> Check:
-    """Whether a node offers every service and method that the components ask for."""
+    """Check that a node offers all services and methods that the components request."""
     for component in components:
         for request in component.services:
             service = getattr(offered, request.service)
@@ -123,26 +125,26 @@ def check_services(offered: NodeServices, components: Iterable[Component]) -> Ch
 
 
 def check_resources(ledger: Ledger, node: str, components: Iterable[Component]) -> Check:
-    """Whether the components fit, all of them together, into what the node has left."""
+    """Check that all components together fit into the free resources of a node."""
     wanted: dict[str, float] = {}
-    asking: list[str] = []
+    names: list[str] = []
     for component in components:
-        asking.append(component.name)
+        names.append(component.name)
         for resource, amount in requests(component).items():
             wanted[resource] = wanted.get(resource, 0.0) + amount
-        shortage = ledger.shortage(node, wanted, asking)
+        shortage = ledger.shortage(node, wanted, names)
         if shortage is not None:
-            fit = "does not fit" if len(asking) == 1 else "do not fit together"
-            return Check(INSUFFICIENT, f"{', '.join(asking)} {fit} ({shortage})")
+            fit = "does not fit" if len(names) == 1 else "do not fit together"
+            return Check(INSUFFICIENT, f"{', '.join(names)} {fit} ({shortage})")
     return SUITABLE
 
 
-def direct_reach_m(ours: Iterable[Interface], theirs: Iterable[Interface]) -> float | None:
-    """How far two nodes can be apart and still talk directly, in metres; None when no interfaces match.
+def direct_reach_m(interfaces: Iterable[Interface], peer_interfaces: Iterable[Interface]) -> float | None:
+    """Return the maximum distance of a direct link between two nodes in metres, or None if no interfaces match.
 
-    The interfaces that their agents make links over match in technology and pairing mode; the lesser range counts.
+    The interfaces for direct links must have the same technology and pairing mode. The smaller range applies.
     """
-    a, b = direct_interface(ours), direct_interface(theirs)
+    a, b = direct_interface(interfaces), direct_interface(peer_interfaces)
     if a is None or b is None or a.technology != b.technology:
         return None
     if a.range is None or b.range is None or a.pairing is None or b.pairing is None or a.pairing.mode != b.pairing.mode:
@@ -151,6 +153,6 @@ def direct_reach_m(ours: Iterable[Interface], theirs: Iterable[Interface]) -> fl
 
 
 def direct_range_m(interfaces: Iterable[Interface]) -> float | None:
-    """The range of the interface that a node makes direct links over; None when it has none: no direct link is longer."""
-    found = direct_interface(interfaces)
-    return found.range if found is not None else None
+    """Return the range of the interface for direct links in metres, or None if the node has none."""
+    interface = direct_interface(interfaces)
+    return interface.range if interface is not None else None

@@ -22,7 +22,7 @@ from fractus_core.planning.mission import (
     transit_legs,
 )
 from fractus_core.planning.operation_area import OperationArea, start_of
-from fractus_core.planning.plan_builder import Draft
+from fractus_core.planning.plan_builder import PlanBuilder
 from fractus_core.planning.spatial_index import Near
 
 _DAY_MIN = 1440.0
@@ -60,49 +60,51 @@ def default_score(facts: DroneFacts) -> float:
     return ready + min(facts.remaining_min / _DAY_MIN, 0.999)
 
 
-def find_drones(draft: Draft, area: OperationArea) -> DroneCandidates:
+def find_drones(builder: PlanBuilder, area: OperationArea) -> DroneCandidates:
     """The candidates by place: from depots at or near the start, and for passengers alone also those that fly by."""
-    leader = draft.spec.driver or next(draft.spec.on("drone"))
-    flying = _flying_by(draft, leader) if draft.spec.driver is None else []
-    names = set(_standing(draft, area, leader, flying))
-    draft.consider(leader, [*names, *flying], len(draft.located.stands) + len(draft.located.homeless))
-    idle = [draft.inventory.drones[name] for name in sorted(names - set(flying)) if name in draft.inventory.drones]
-    return DroneCandidates(tuple(idle), tuple(draft.inventory.drones[name] for name in flying))
+    leader = builder.spec.driver or next(builder.spec.on("drone"))
+    flying = _flying_by(builder, leader) if builder.spec.driver is None else []
+    names = set(_standing(builder, area, leader, flying))
+    builder.set_candidates(leader, [*names, *flying], len(builder.located.stands) + len(builder.located.homeless))
+    idle = [builder.inventory.drones[name] for name in sorted(names - set(flying)) if name in builder.inventory.drones]
+    return DroneCandidates(tuple(idle), tuple(builder.inventory.drones[name] for name in flying))
 
 
-def choose_drone(draft: Draft, area: OperationArea, candidates: DroneCandidates) -> DroneChoice:
+def choose_drone(builder: PlanBuilder, area: OperationArea, candidates: DroneCandidates) -> DroneChoice:
     """Place all drone components on the best candidate; the one that has the application already stays.
 
     Raises:
         Infeasible: no candidate is suitable. The reason is DroneBusy if one would be, were it not for another
             application that has it.
     """
-    components = list(draft.spec.on("drone"))
-    leader = draft.spec.driver or components[0]
-    mission = MissionEstimator(draft.spec, area, draft.settings)
+    components = list(builder.spec.on("drone"))
+    leader = builder.spec.driver or components[0]
+    mission = MissionEstimator(builder.spec, area, builder.settings)
     ranked = [
         found
         for drones, used in ((candidates.flying, True), (candidates.idle, False))
         for drone in drones
-        if (found := _judge(draft, mission, drone, components, used=used)) is not None
+        if (found := _judge(builder, mission, drone, components, used=used)) is not None
     ]
     if not ranked:
-        busy = any(r.reason == "Claimed" for r in draft.rejections(leader))
+        busy = any(r.reason == "Claimed" for r in builder.rejections(leader))
         reason = "DroneBusy" if busy else "NoDrone"
-        known = len(draft.inventory.drones)
+        known = len(builder.inventory.drones)
         nothing = f"of {known} known drones none is anywhere near the start" if known else "there is no drone"
-        raise draft.infeasible(leader, reason, f"no drone can fly {leader.name}", nothing)
-    ranked.sort(key=lambda r: (not draft.flew(r.drone.name, shared=r.used), -r.score, r.drone.name))
-    best, way, conflict = _legal_first(draft, area, ranked, leader)
+        raise builder.infeasible(leader, reason, f"no drone can fly {leader.name}", nothing)
+    ranked.sort(key=lambda r: (not builder.was_selected(r.drone.name, shared=r.used), -r.score, r.drone.name))
+    best, way, conflict = _legal_first(builder, area, ranked, leader)
     for component in components:
-        draft.place(component, "drone", best.drone.name)
-    home = home_of(best.drone, draft.inventory.depots)
-    legs = transit_legs(draft.spec, area, home, draft.inventory.depots) if home is not None and not best.used else []
-    others = [r for r in ranked if r is not best and not draft.rejected(leader, r.drone.name)]
+        builder.place(component, "drone", best.drone.name)
+    home = home_of(best.drone, builder.inventory.depots)
+    legs = (
+        transit_legs(builder.spec, area, home, builder.inventory.depots) if home is not None and not best.used else []
+    )
+    others = [r for r in ranked if r is not best and not builder.is_rejected(leader, r.drone.name)]
     choice = DroneChoice(
         node=best.drone.name,
         score=round(best.score, 6),
-        shared_with="/".join(draft.inventory.flights[best.drone.name].holder) if best.used else None,
+        shared_with="/".join(builder.inventory.flights[best.drone.name].holder) if best.used else None,
         mission=_mission(best.mission, way) if best.mission is not None else None,
         transit=tuple(legs),
         alternatives=tuple(Alternative(node=r.drone.name, score=round(r.score, 6)) for r in others[:_ALTERNATIVES]),
@@ -111,7 +113,7 @@ def choose_drone(draft: Draft, area: OperationArea, candidates: DroneCandidates)
 
 
 def _legal_first(
-    draft: Draft, area: OperationArea, ranked: Sequence[_Ranked], leader: Component
+    builder: PlanBuilder, area: OperationArea, ranked: Sequence[_Ranked], leader: Component
 ) -> tuple[_Ranked, Way | None, str | None]:
     """The first drone that the policies let fly its way, with that way; those before it are rejected.
 
@@ -121,13 +123,13 @@ def _legal_first(
     Raises:
         Infeasible: there is none, and conflicts are forbidden.
     """
-    judge = WayJudge(draft.application, area, draft.inventory, draft.settings)
-    forbids = draft.settings.policy_conflicts == "forbid"
+    judge = WayJudge(builder.application, area, builder.inventory, builder.settings)
+    forbids = builder.settings.policy_conflicts == "forbid"
     tried: list[tuple[_Ranked, Way | None, str | None]] = []
     for candidate in ranked:
         if judge.exhausted:
             break
-        kept = draft.flew(candidate.drone.name, shared=candidate.used)
+        kept = builder.was_selected(candidate.drone.name, shared=candidate.used)
         way = judge.way(candidate.drone, candidate.mission)
         available = candidate.mission.available_min if candidate.mission is not None and not kept else None
         conflict = way.conflict(available) if way is not None else None
@@ -139,72 +141,72 @@ def _legal_first(
         return tried[0]
     for candidate, _, conflict in tried:
         if conflict is not None:
-            draft.reject(leader, candidate.drone.name, Check("PolicyConflict", f"{candidate.drone.name}: {conflict}"))
+            builder.reject(leader, candidate.drone.name, Check("PolicyConflict", f"{candidate.drone.name}: {conflict}"))
     if legal:
         return tried[-1]
     for candidate in ranked[len(tried) :]:
         message = (
             f"{candidate.drone.name} was not looked at, after {len(tried)} whose ways policies do not let be flown"
         )
-        draft.reject(leader, candidate.drone.name, Check("NotJudged", message))
-    raise draft.infeasible(leader, "PolicyConflict", f"no drone may fly {leader.name}", "")
+        builder.reject(leader, candidate.drone.name, Check("NotJudged", message))
+    raise builder.infeasible(leader, "PolicyConflict", f"no drone may fly {leader.name}", "")
 
 
 # -- by place --
 
 
-def _standing(draft: Draft, area: OperationArea, leader: Component, flying: Sequence[str]) -> list[str]:
+def _standing(builder: PlanBuilder, area: OperationArea, leader: Component, flying: Sequence[str]) -> list[str]:
     """Drones that stand where the application wants them; notes the nearest that do not."""
-    located, settings = draft.located, draft.settings
+    located, settings = builder.located, builder.settings
     first = leader.control_points[0] if leader.control_points else None
-    start = start_of(first, draft.inventory.depots) if first is not None else None
+    start = start_of(first, builder.inventory.depots) if first is not None else None
     named = first.point.depot if first is not None and first.point is not None else None
     centre = ground_point(start) if start is not None else area.start
-    inside = draft.inventory.depots[named].spec.radius if named is not None else settings.safety_radius_m
+    inside = builder.inventory.depots[named].spec.radius if named is not None else settings.safety_radius_m
     kept = located.kept_in(named) if named is not None else frozenset()
     if start is None or leader.control == "partial":
         limit, reason = max(settings.depot_radius_m, inside), "TooFar"
     else:
         limit, reason = inside, "TooFar" if named is None else "OtherDepot"
         if named is None:
-            kept = frozenset().union(*(located.kept_in(name) for name in _depots_around(draft, centre)))
+            kept = frozenset().union(*(located.kept_in(name) for name in _depots_around(builder, centre)))
     wanted = f"not in {named}" if reason == "OtherDepot" else f"more than {limit:.0f} m"
     here = {name for name, _ in located.stands.within(centre, limit)} | kept
     for name, distance in located.stands.nearest(centre, settings.near_misses, limit, settings.near_miss_m):
-        if name not in here and name in draft.inventory.drones:
+        if name not in here and name in builder.inventory.drones:
             place = "is"
             if reason == "OtherDepot":
-                place = f"is kept in {draft.inventory.drones[name].spec.depot or 'no depot'},"
+                place = f"is kept in {builder.inventory.drones[name].spec.depot or 'no depot'},"
             message = f"{name} {place} {distance:.0f} m from the start, {wanted}"
-            draft.reject(leader, name, Check(reason, message), far=True)
+            builder.reject(leader, name, Check(reason, message), far=True)
     for name in sorted(located.homeless - kept - set(flying))[: settings.near_misses]:
         message = f"{name} has neither a depot that exists nor a home; set spec.depot or spec.home"
-        draft.reject(leader, name, Check("NoHome", message))
+        builder.reject(leader, name, Check("NoHome", message))
     return sorted(here)
 
 
-def _depots_around(draft: Draft, place: Point) -> Iterable[str]:
-    near: list[Near] = draft.located.depots.within(place, draft.located.widest_depot_m)
-    return [n for n, m in near if n in draft.inventory.depots and m <= draft.inventory.depots[n].spec.radius]
+def _depots_around(builder: PlanBuilder, place: Point) -> Iterable[str]:
+    near: list[Near] = builder.located.depots.within(place, builder.located.widest_depot_m)
+    return [n for n, m in near if n in builder.inventory.depots and m <= builder.inventory.depots[n].spec.radius]
 
 
-def _flying_by(draft: Draft, leader: Component) -> list[str]:
+def _flying_by(builder: PlanBuilder, leader: Component) -> list[str]:
     """Drones that fly for other applications and visit all points of interest, by name; notes some that do not."""
-    poi = draft.spec.points_of_interest
+    poi = builder.spec.points_of_interest
     found = []
     noted = 0
-    for name, flight in sorted(draft.inventory.flights.items()):
-        if poi is None or name not in draft.inventory.drones or flight.holder == draft.application.key:
+    for name, flight in sorted(builder.inventory.flights.items()):
+        if poi is None or name not in builder.inventory.drones or flight.holder == builder.application.key:
             continue
-        missed = first_missed(poi.points, flight, draft.settings.safety_radius_m, ordered=poi.ordered)
+        missed = first_missed(poi.points, flight, builder.settings.safety_radius_m, ordered=poi.ordered)
         if missed is None:
             found.append(name)
-        elif noted < draft.settings.near_misses:
+        elif noted < builder.settings.near_misses:
             noted += 1
             holder = "/".join(flight.holder)
             order = " in this order" if poi.ordered else ""
             message = f"{name} flies for {holder}, which does not visit pointsOfInterest.points[{missed}]{order}"
-            draft.reject(leader, name, Check("PathMissesPoint", message), far=True)
+            builder.reject(leader, name, Check("PathMissesPoint", message), far=True)
     return found
 
 
@@ -212,18 +214,18 @@ def _flying_by(draft: Draft, leader: Component) -> list[str]:
 
 
 def _judge(
-    draft: Draft, asked: MissionEstimator, drone: Drone, components: list[Component], *, used: bool
+    builder: PlanBuilder, asked: MissionEstimator, drone: Drone, components: list[Component], *, used: bool
 ) -> _Ranked | None:
     """The drone with its score, or None with the first rule it fails noted."""
-    leader = draft.spec.driver or components[0]
-    kept = draft.flew(drone.name, shared=used)
-    home = home_of(drone, draft.inventory.depots)
+    leader = builder.spec.driver or components[0]
+    kept = builder.was_selected(drone.name, shared=used)
+    home = home_of(drone, builder.inventory.depots)
     mission = asked.estimate(home, drone) if home is not None and not used else None
-    check = _lasting(draft, drone, components, mission, kept=kept) and (
-        _passing(draft, drone, components, mission, kept=kept, used=used)
+    check = _lasting(builder, drone, components, mission, kept=kept) and (
+        _passing(builder, drone, components, mission, kept=kept, used=used)
     )
     if not check:
-        draft.reject(leader, drone.name, check)
+        builder.reject(leader, drone.name, check)
         return None
     facts = DroneFacts(
         drone=drone,
@@ -233,11 +235,13 @@ def _judge(
         needed_min=mission.needed_min if mission is not None else 0.0,
         distance_m=mission.approach_m if mission is not None else 0.0,
     )
-    score = (draft.settings.score_drone or default_score)(facts)
+    score = (builder.settings.score_drone or default_score)(facts)
     return _Ranked(drone, score, used, mission)
 
 
-def _lasting(draft: Draft, drone: Drone, components: list[Component], mission: Estimate | None, *, kept: bool) -> Check:
+def _lasting(
+    builder: PlanBuilder, drone: Drone, components: list[Component], mission: Estimate | None, *, kept: bool
+) -> Check:
     """The rules that waiting does not change: services, altitude, a flight too long for a full battery."""
     check = check_services(drone.spec.services, components)
     mobility = drone.spec.services.mobility
@@ -249,26 +253,26 @@ def _lasting(draft: Draft, drone: Drone, components: list[Component], mission: E
     if mission.top_m > mobility.max_altitude:
         message = f"{drone.name} climbs to {mobility.max_altitude:g} m; the path goes up to {mission.top_m:g} m"
         return Check("TooHigh", message)
-    full = (1 - draft.settings.battery_reserve) * mobility.max_flight_time
+    full = (1 - builder.settings.battery_reserve) * mobility.max_flight_time
     if not kept and mission.needed_min > full:
         return _too_long(drone, mission, full, "even with a full battery")
     return SUITABLE
 
 
 def _passing(
-    draft: Draft, drone: Drone, components: list[Component], mission: Estimate | None, *, kept: bool, used: bool
+    builder: PlanBuilder, drone: Drone, components: list[Component], mission: Estimate | None, *, kept: bool, used: bool
 ) -> Check:
     """The rules of the moment: who has the drone, its node, its state, its battery, what runs on it.
 
     A drone that already has the application (kept) is not given up for what passes or comes with the mission: a lost
     link, a restarted service, a battery that the flight has drained.
     """
-    owner = draft.inventory.claimed.get(drone.name)
-    if owner is not None and owner != draft.application.key and not used:
-        leader = draft.spec.driver or components[0]
-        note = draft.far_note(leader, drone.name)
+    owner = builder.inventory.claimed.get(drone.name)
+    if owner is not None and owner != builder.application.key and not used:
+        leader = builder.spec.driver or components[0]
+        note = builder.range_message(leader, drone.name)
         return Check("Claimed", f"{owner[0]}/{owner[1]} has {drone.name}" + (f", and {note}" if note else ""))
-    host = check_host(draft.inventory.hosts, drone.name, draft.settings, kept=kept)
+    host = check_host(builder.inventory.hosts, drone.name, builder.settings, kept=kept)
     if kept:
         return host
     energy = SUITABLE
@@ -276,7 +280,7 @@ def _passing(
         battery = drone.status.battery if drone.status is not None else None
         share = battery.remaining if battery is not None else 1.0
         energy = _too_long(drone, mission, mission.available_min, f"with its battery at {share:.0%}")
-    return host and _check_state(drone) and energy and check_resources(draft.ledger, drone.name, components)
+    return host and _check_state(drone) and energy and check_resources(builder.ledger, drone.name, components)
 
 
 def _too_long(drone: Drone, mission: Estimate, available_min: float, when: str) -> Check:

@@ -1,4 +1,4 @@
-"""A plan in the making: the inputs, what is booked and placed so far, and what was rejected."""
+"""State of a planning run: inputs, reserved resources, placements and rejected nodes."""
 
 from __future__ import annotations
 
@@ -22,15 +22,18 @@ from fractus_core.planning.candidates import (
 from fractus_core.planning.inventory import Inventory, Settings
 
 _MAX_INSTANCE_NAME = 57
-"""Leaves room for a suffix, such as -tls of its Secret, within the 63 characters of a DNS label."""
+"""Maximum length of instance names. A suffix such as -tls of a Secret still fits into a DNS label of 63 characters."""
 
 
 class Infeasible(Exception):
-    """No plan exists for the application; says which component has no host and why each node was dropped.
+    """No plan exists for the application.
 
     Attributes:
-        omitted: how many nodes that were too far away are not among those rejected.
-        full: nodes that would do, were there room on them.
+        component: Component without a suitable node.
+        reason: Machine-readable CamelCase reason.
+        rejected: Rejected nodes with the failed requirements.
+        omitted: Number of out-of-range nodes that are not listed in `rejected`.
+        full: Nodes that would be suitable with more free resources.
     """
 
     def __init__(
@@ -46,12 +49,12 @@ class Infeasible(Exception):
 
 
 def instance_name(application: str, component: Component, node: str | None = None) -> str:
-    """Name of an instance, unique in the namespace: a DNS label with room for a suffix."""
+    """Return the name of an instance: a DNS label, unique in the namespace, with room for a suffix."""
     return object_name(application, component.slug, node, limit=_MAX_INSTANCE_NAME)
 
 
-class Draft:
-    """One run of the planner: its inputs, and what it has decided so far."""
+class PlanBuilder:
+    """Builds a plan step by step. Checks nodes, and stores placements, bookings and rejections."""
 
     def __init__(
         self,
@@ -68,33 +71,33 @@ class Draft:
         self.settings = settings
         self.located = inventory.located()
         self.placements: list[PlannedInstance] = []
-        self.ledger = Ledger(inventory.hosts, _running(application, previous) if reserving else ())
-        self.drone_before = previous.drone.node if previous is not None and previous.drone is not None else None
-        self.shared_before = self.drone_before is not None and previous is not None and _shares(previous)
-        self.before = previous.placements if previous is not None else ()
-        self._used_before = {(p.component, p.node) for p in self.before}
+        self.ledger = Ledger(inventory.hosts, _previously_placed(application, previous) if reserving else ())
+        self.previous_drone = previous.drone.node if previous is not None and previous.drone is not None else None
+        self.previous_shared = previous is not None and _is_shared(previous)
+        self.previous_placements = previous.placements if previous is not None else ()
+        self._previously_used = {(p.component, p.node) for p in self.previous_placements}
         self._placed: set[tuple[str, str | None]] = set()
         self._rejected: dict[tuple[str, str], Rejection] = {}
         self._far: dict[tuple[str, str], Rejection] = {}
         self._candidates: dict[str, tuple[set[str], int]] = {}
 
-    def had(self, component: Component, node: str) -> bool:
-        """Whether the plan before had the component on the node."""
-        return (component.name, node) in self._used_before
+    def was_placed(self, component: Component, node: str) -> bool:
+        """Return True if the previous plan has the component on the node."""
+        return (component.name, node) in self._previously_used
 
-    def placed(self, component: Component, node: str) -> bool:
-        """Whether this plan has the component on the node."""
+    def is_placed(self, component: Component, node: str) -> bool:
+        """Return True if this plan has the component on the node."""
         return (component.name, node) in self._placed
 
-    def flew(self, drone: str, *, shared: bool) -> bool:
-        """Whether the plan before had the drone, and in the same way: for itself alone, or coming along."""
-        return drone == self.drone_before and shared == self.shared_before
+    def was_selected(self, drone: str, *, shared: bool) -> bool:
+        """Return True if the previous plan has the drone, with the same kind of flight (own or shared)."""
+        return drone == self.previous_drone and shared == self.previous_shared
 
-    # -- judging --
+    # -- checks --
 
     def check_edge(self, node: EdgeNode, component: Component) -> Check:
-        """Whether an edge node can host the component, or the first rule it fails."""
-        kept = self.had(component, node.name)
+        """Check whether an edge node can host the component. Return the first failed requirement otherwise."""
+        kept = self.was_placed(component, node.name)
         return (
             check_host(self.inventory.hosts, node.name, self.settings, kept=kept)
             and (SUITABLE if kept else _check_state(node))
@@ -103,39 +106,46 @@ class Draft:
         )
 
     def reject(self, component: Component, node: str, check: Check, *, far: bool = False) -> None:
-        """Note that a node is not a host for a component; `far` says that it was not a candidate by place."""
-        notes = self._far if far else self._rejected
-        notes.setdefault((component.name, node), check.rejection(component, node))
+        """Store why a node cannot host a component. `far` means that it is out of range."""
+        rejections = self._far if far else self._rejected
+        rejections.setdefault((component.name, node), check.rejection(component, node))
 
-    def consider(self, component: Component, names: Iterable[str], known: int) -> None:
-        """Note which nodes are candidates for a component by place, of how many that are known: the others are too far."""
+    def set_candidates(self, component: Component, names: Iterable[str], known: int) -> None:
+        """Store the nodes in range for a component, and the number of known nodes. The remaining nodes are out of range."""
         self._candidates[component.name] = (set(names), known)
 
-    def rejected(self, component: Component, node: str) -> bool:
-        """Whether a node that was a candidate by place is rejected for a component."""
+    def is_rejected(self, component: Component, node: str) -> bool:
+        """Return True if a node in range is rejected for a component."""
         return (component.name, node) in self._rejected
 
-    def far_note(self, component: Component, node: str) -> str:
-        """Why a node was not a candidate by place; empty if that was not noted."""
-        found = self._far.get((component.name, node))
-        return found.message if found is not None else ""
+    def range_message(self, component: Component, node: str) -> str:
+        """Return why a node is out of range for a component, or an empty string."""
+        rejection = self._far.get((component.name, node))
+        return rejection.message if rejection is not None else ""
 
     def rejections(self, component: Component) -> list[Rejection]:
-        """What was rejected for one component: first what was there, then what was too far; each by name."""
-        here = sorted((r for r in self._rejected.values() if r.component == component.name), key=lambda r: r.node)
-        nodes = {r.node for r in here}
+        """Return the rejected nodes of a component: nodes in range first, then nodes out of range, each sorted by name."""
+        near = sorted((r for r in self._rejected.values() if r.component == component.name), key=lambda r: r.node)
+        nodes = {r.node for r in near}
         far = (r for r in self._far.values() if r.component == component.name and r.node not in nodes)
-        return here + sorted(far, key=lambda r: r.node)
+        return near + sorted(far, key=lambda r: r.node)
 
-    def infeasible(self, component: Component, reason: str, problem: str, nothing: str) -> Infeasible:
-        """The refusal of a component: the problem, the first few reasons, and all rejected nodes."""
+    def infeasible(self, component: Component, reason: str, problem: str, fallback: str) -> Infeasible:
+        """Return the error for a component without a host.
+
+        Args:
+            component: Component that cannot be placed.
+            reason: Machine-readable CamelCase reason.
+            problem: First part of the message.
+            fallback: Explanation if no node was rejected.
+        """
         rejected = self.rejections(component)
-        why = "; ".join(r.message for r in rejected[:5]) or nothing
+        explanation = "; ".join(r.message for r in rejected[:5]) or fallback
         more = f"; and {len(rejected) - 5} more" if len(rejected) > 5 else ""
         omitted = self._unlisted(component.name, {r.node for r in rejected})
-        return Infeasible(component.name, reason, f"{problem}: {why}{more}", rejected, omitted)
+        return Infeasible(component.name, reason, f"{problem}: {explanation}{more}", rejected, omitted)
 
-    # -- deciding --
+    # -- placement --
 
     def place(
         self,
@@ -148,7 +158,7 @@ class Draft:
         coverage: float | None = None,
         location: int | None = None,
     ) -> None:
-        """Put an instance of a component on a node (None: any cloud node), and book what it asks for."""
+        """Place an instance of a component on a node (None: any cloud node), and book its resource requests."""
         if node is not None:
             self.ledger.take(node, component)
         self._placed.add((component.name, node))
@@ -166,46 +176,48 @@ class Draft:
             )
         )
 
-    def listed(self) -> tuple[tuple[Rejection, ...], int]:
-        """The rejected nodes that the plan lists, in the order of components and nodes, and how many it leaves out.
+    def listed_rejections(self) -> tuple[tuple[Rejection, ...], int]:
+        """Return the rejections for the plan, and the number of rejected nodes that are omitted.
 
-        A node that hosts the component after all is not rejected. What was a candidate by place goes before what was
-        too far away.
+        The list is sorted by component and node. A node that finally hosts the component is not listed. If the list is too
+        long, nodes out of range are omitted first.
         """
-        notes = {**self._rejected}
+        rejections = {**self._rejected}
         for key, rejection in self._far.items():
-            notes.setdefault(key, rejection)
-        wanted = [r for key, r in notes.items() if key not in self._placed]
-        kept = wanted[: self.settings.rejections_listed]
-        order = {c.name: i for i, c in enumerate(self.spec.components)}
-        kept.sort(key=lambda r: (order[r.component], r.node))
+            rejections.setdefault(key, rejection)
+            listable = [r for key, r in rejections.items() if key not in self._placed]
+            listed = listable[: self.settings.rejections_listed]
+            order = {c.name: i for i, c in enumerate(self.spec.components)}
+        listed.sort(key=lambda r: (order[r.component], r.node))
         mentioned: dict[str, set[str]] = {}
-        for name, node in (*notes, *self._placed):
+        for name, node in (*rejections, *self._placed):
             if node is not None:
                 mentioned.setdefault(name, set()).add(node)
         far = sum(self._unlisted(name, mentioned.get(name, set())) for name in self._candidates)
-        return tuple(kept), len(wanted) - len(kept) + far
+        return tuple(listed), len(listable) - len(listed) + far
 
     def _unlisted(self, component: str, mentioned: set[str]) -> int:
-        """How many nodes were too far away for a component, and are not mentioned."""
+        """Return the number of nodes out of range for a component that are not mentioned."""
         candidates, known = self._candidates.get(component, (set(), 0))
         return max(known - len(candidates | mentioned), 0)
 
 
 def _check_state(node: EdgeNode) -> Check:
-    """Whether an edge node is Ready, as far as its agent says: one without an agent that reports takes pods all the same."""
+    """Check that an edge node is Ready. A node whose agent has not reported is accepted."""
     ready = readiness(node.status)
     if ready is not None and ready.status != "True":
         return Check("EdgeNodeNotReady", ready.message or f"{node.name} is not Ready ({ready.reason})")
     return SUITABLE
 
 
-def _shares(plan: DeploymentPlanSpec) -> bool:
+def _is_shared(plan: DeploymentPlanSpec) -> bool:
     return plan.drone is not None and plan.drone.shared_with is not None
 
 
-def _running(application: Application, previous: DeploymentPlanSpec | None) -> Iterator[tuple[Component, str]]:
-    """What of the application the plan before has on which node."""
+def _previously_placed(
+    application: Application, previous: DeploymentPlanSpec | None
+) -> Iterator[tuple[Component, str]]:
+    """Return the components of the application that the previous plan placed, with their nodes."""
     components: dict[str, Component] = {c.name: c for c in application.spec.components}
     for placed in previous.placements if previous is not None else ():
         if placed.node is not None and placed.component in components:

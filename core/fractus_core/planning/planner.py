@@ -22,14 +22,14 @@ from fractus_core.planning.edge_placement import (
 )
 from fractus_core.planning.inventory import Inventory, Settings
 from fractus_core.planning.operation_area import OperationArea, operation_area
-from fractus_core.planning.plan_builder import Draft, Infeasible, instance_name
+from fractus_core.planning.plan_builder import Infeasible, PlanBuilder, instance_name
 
 __all__ = ["Infeasible", "instance_name", "plan", "plan_in_steps"]
 
 
 _IN_ORDER: tuple[Placement, ...] = exhaustive(Placement, ("drone", "edge", "hybrid", "cloud"))
 _ROUNDING_M = 0.01
-"""How far from the area its outline in a plan may be: it is written to the centimetre anyway."""
+"""Tolerance of the operation area's outline in a plan; coordinates are written with centimetres."""
 
 
 def plan(
@@ -40,17 +40,16 @@ def plan(
 ) -> DeploymentPlanSpec:
     """Choose a host for every instance of every component.
 
-    Ties go by name, so that the same inventory always gives the same plan; hosts of the previous plan come first as
-    long as they are suitable, so that a new plan moves as little as it can.
+    Ties are resolved by name, so the same inventory always gives the same plan. Suitable hosts of the previous plan are
+    preferred, so a new plan moves as few instances as possible.
 
-    Rejected nodes: every node that was a candidate by its place and was looked at is listed with the first rule it
-    fails. Of the nodes that are too far away, only the nearest are (Settings.near_misses for each place asked for), and
-    Settings.rejections_listed of all; the plan tells how many it leaves out. Nodes behind the best ones, which did not have to
-    be looked at, are not rejected.
+    The plan lists each node in range that was checked and rejected, with its first failed requirement. Of the nodes out of
+    range it lists only the nearest ones (`Settings.near_misses` per place), up to `Settings.rejections_listed` in total, and
+    contains the number of omitted nodes. Nodes that did not have to be checked are not rejected.
 
     Raises:
-        Infeasible: some component has no suitable node.
-        InvalidObject: the application names an unknown depot or its geometry is broken.
+        Infeasible: A component has no suitable node.
+        InvalidObject: The application names an unknown depot, or its geometry is invalid.
     """
     steps = plan_in_steps(application, inventory, settings, previous)
     while True:
@@ -67,57 +66,59 @@ def plan_in_steps(
     settings: Settings | None = None,
     previous: DeploymentPlanSpec | None = None,
 ) -> Generator[str, None, DeploymentPlanSpec]:
-    """Plan as `plan` does, naming each phase when it is done, for benchmarks.
+    """Plan like `plan`, and yield the name of each completed phase, for benchmarks.
 
-    The phases are the thesis' own: area, then for each kind of component (drone, static, hybrid, cloud) the search of
-    candidates by place (`drone.candidates`) and the choice among them (`drone.host`).
+    The phases are those of the thesis: area, then for each kind of component (drone, static, hybrid, cloud) the search for
+    nodes in range (`drone.candidates`) and the choice among them (`drone.host`).
     """
     try:
-        return (yield from _drafted(Draft(application, inventory, settings or Settings(), previous)))
+        return (yield from _plan_once(PlanBuilder(application, inventory, settings or Settings(), previous)))
     except Infeasible:
         if previous is None:
             raise
     # What runs takes no room from what must run: without keeping it in place there may be a plan.
-    return (yield from _drafted(Draft(application, inventory, settings or Settings(), previous, reserving=False)))
+    return (
+        yield from _plan_once(PlanBuilder(application, inventory, settings or Settings(), previous, reserving=False))
+    )
 
 
-def _drafted(draft: Draft) -> Generator[str, None, DeploymentPlanSpec]:
-    application, inventory = draft.application, draft.inventory
-    area = operation_area(draft.spec, inventory.depots, draft.settings.safety_radius_m)
+def _plan_once(builder: PlanBuilder) -> Generator[str, None, DeploymentPlanSpec]:
+    application, inventory = builder.application, builder.inventory
+    area = operation_area(builder.spec, inventory.depots, builder.settings.safety_radius_m)
     yield "area"
     choice: DroneChoice | None = None
     if area is not None:
-        drones = find_drones(draft, area)
+        drones = find_drones(builder, area)
         yield "drone.candidates"
-        choice = choose_drone(draft, area, drones)
+        choice = choose_drone(builder, area, drones)
         yield "drone.host"
-    locations = [location for component in draft.spec.on("edge") for location in find_static(draft, component)]
+    locations = [location for component in builder.spec.on("edge") for location in find_static(builder, component)]
     yield "static.candidates"
-    place_static(draft, locations)
+    place_static(builder, locations)
     yield "static.host"
     # Hybrid components go beside those that have their places already, so these come first.
     for placement in _IN_ORDER:
-        for component in draft.spec.on(placement):
+        for component in builder.spec.on(placement):
             match placement:
                 case "drone" | "edge":
                     pass  # They are placed: all on one drone, and the static ones.
                 case "hybrid":
-                    _place_cloud(draft, component, 1)
+                    _place_cloud(builder, component, 1)
                     yield "cloud.host"
-                    yield from _place_hybrid(draft, component, area, choice)
+                    yield from _place_hybrid(builder, component, area, choice)
                 case "cloud":
-                    _place_cloud(draft, component, component.replicas or 1)
+                    _place_cloud(builder, component, component.replicas or 1)
                     yield "cloud.host"
                 case _:
                     assert_never(placement)
-    rejected, omitted = draft.listed()
+    rejected, omitted = builder.listed_rejections()
     decided = DeploymentPlanSpec(
         application=application.name,
         application_generation=application.metadata.generation,
         application_digest=application.spec.mission_digest,
         operation_area=multipolygon_geojson(area.frame, area.shape.simplify(_ROUNDING_M)) if area is not None else None,
         drone=choice,
-        placements=tuple(draft.placements),
+        placements=tuple(builder.placements),
         rejected=rejected,
         rejected_omitted=omitted or None,
     )
@@ -126,39 +127,39 @@ def _drafted(draft: Draft) -> Generator[str, None, DeploymentPlanSpec]:
 
 
 def _place_hybrid(
-    draft: Draft, component: Component, area: OperationArea | None, choice: DroneChoice | None
+    builder: PlanBuilder, component: Component, area: OperationArea | None, choice: DroneChoice | None
 ) -> Generator[str, None, None]:
-    """Instances of a hybrid component near each of its partners; the one in the cloud is there already."""
+    """Place instances of a hybrid component near each of its partners. Its cloud instance is already placed."""
     hosts = HybridHosts()
     for name in component.hybrid_to:
-        other = draft.spec.component(name)
+        other = builder.spec.component(name)
         if other.placement == "edge":
-            for static in [p for p in draft.placements if p.component == name]:
-                place_beside(draft, component, static, hosts)
+            for static in [p for p in builder.placements if p.component == name]:
+                place_beside(builder, component, static, hosts)
             yield "hybrid-edge"
         elif area is not None and choice is not None:
-            drone = draft.inventory.drones[choice.node]
-            along = find_along(draft, component, drone, area)
+            drone = builder.inventory.drones[choice.node]
+            along = find_along(builder, component, drone, area)
             yield "hybrid-drone.candidates"
-            place_along(draft, component, other, along, hosts)
+            place_along(builder, component, other, along, hosts)
             yield "hybrid-drone.host"
 
 
-def _place_cloud(draft: Draft, component: Component, replicas: int) -> None:
-    """Leave a component to the cloud, if there is a node that could run it; Kubernetes chooses which.
+def _place_cloud(builder: PlanBuilder, component: Component, replicas: int) -> None:
+    """Place a component in the cloud if a node can run it. Kubernetes selects the node.
 
     Raises:
-        Infeasible: there is none.
+        Infeasible: No cloud node can run the component.
     """
-    for name in sorted(draft.located.cloud & draft.inventory.hosts.keys()):
-        check = check_host(draft.inventory.hosts, name, draft.settings) and check_resources(
-            draft.ledger, name, [component]
+    for name in sorted(builder.located.cloud & builder.inventory.hosts.keys()):
+        check = check_host(builder.inventory.hosts, name, builder.settings) and check_resources(
+            builder.ledger, name, [component]
         )
         if check:
-            draft.place(component, "cloud", None, replicas=replicas)
+            builder.place(component, "cloud", None, replicas=replicas)
             return
-        draft.reject(component, name, check)
-    raise draft.infeasible(
+        builder.reject(component, name, check)
+    raise builder.infeasible(
         component,
         "NoCloudNode",
         f"no cloud node can host {component.name}",

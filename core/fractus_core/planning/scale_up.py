@@ -1,4 +1,4 @@
-"""Where a plan that stands could have more instances, because nodes came or got room."""
+"""Detection of nodes on which an existing plan could have more instances."""
 
 from __future__ import annotations
 
@@ -10,47 +10,49 @@ from fractus_core.api.components import Component, EdgeLocation
 from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.planning.candidates import INSUFFICIENT, Check
 from fractus_core.planning.inventory import Inventory, Settings
-from fractus_core.planning.plan_builder import Draft
+from fractus_core.planning.plan_builder import PlanBuilder
 
 
-def with_too_few(application: Application, present: DeploymentPlanSpec) -> Iterator[tuple[Component, EdgeLocation]]:
-    """The locations that could have more instances than a plan has there, if there were nodes: each with its component.
+def underfilled_locations(
+    application: Application, current: DeploymentPlanSpec
+) -> Iterator[tuple[Component, EdgeLocation]]:
+    """Return the locations that could have more instances than the plan has, each with its component.
 
-    Those are one that takes every suitable node (`instances: "*"`), and one that found fewer than it asks for.
+    These are locations for every suitable node (`instances: "*"`) and locations with fewer instances than requested.
     """
-    counts = Counter((placed.component, placed.location) for placed in present.placements)
+    counts = Counter((placed.component, placed.location) for placed in current.placements)
     for component in application.spec.on("edge"):
         for i, spot in enumerate(component.locations):
             if spot.instances == "*" or counts[component.name, i] < spot.instances:
                 yield component, spot
 
 
-def room_to_grow(
-    application: Application, inventory: Inventory, settings: Settings, present: DeploymentPlanSpec
+def next_free_node(
+    application: Application, inventory: Inventory, settings: Settings, current: DeploymentPlanSpec
 ) -> str | None:
-    """The first node that a location with too few instances could have beside what the plan has; None: there is none.
+    """Return a node that could host another instance of an underfilled location, or None.
 
-    Costs a look at the nodes in such locations only.
+    Only the nodes in these locations are checked.
     """
-    return next((name for name, check in _looked_at(application, inventory, settings, present) if check), None)
+    return next((name for name, check in _check_candidates(application, inventory, settings, current) if check), None)
 
 
-def without_room(
-    application: Application, inventory: Inventory, settings: Settings, present: DeploymentPlanSpec
+def full_nodes(
+    application: Application, inventory: Inventory, settings: Settings, current: DeploymentPlanSpec
 ) -> frozenset[str]:
-    """The nodes that a location with too few instances could have, were there room on them."""
-    checks = _looked_at(application, inventory, settings, present)
+    """Return the nodes in underfilled locations that lack only free resources."""
+    checks = _check_candidates(application, inventory, settings, current)
     return frozenset(name for name, check in checks if check.reason == INSUFFICIENT)
 
 
-def _looked_at(
-    application: Application, inventory: Inventory, settings: Settings, present: DeploymentPlanSpec
+def _check_candidates(
+    application: Application, inventory: Inventory, settings: Settings, current: DeploymentPlanSpec
 ) -> Iterator[tuple[str, Check]]:
-    """Each node in a location with too few instances that has none of them, and whether it does."""
-    draft: Draft | None = None
-    for component, spot in with_too_few(application, present):
-        draft = draft or Draft(application, inventory, settings, present)
-        for name, _ in draft.located.edge_nodes.within(spot.center, spot.radius):
+    """Check each node in an underfilled location that does not host the component yet."""
+    builder: PlanBuilder | None = None
+    for component, spot in underfilled_locations(application, current):
+        builder = builder or PlanBuilder(application, inventory, settings, current)
+        for name, _ in builder.located.edge_nodes.within(spot.center, spot.radius):
             node = inventory.edge_nodes.get(name)
-            if node is not None and not draft.had(component, name):
-                yield name, draft.check_edge(node, component)
+            if node is not None and not builder.was_placed(component, name):
+                yield name, builder.check_edge(node, component)

@@ -10,7 +10,7 @@ from fractus_core.api import Application
 from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.planning.inventory import Inventory, Settings
 from fractus_core.planning.planner import Infeasible, plan
-from fractus_core.planning.scale_up import room_to_grow, without_room
+from fractus_core.planning.scale_up import full_nodes, next_free_node
 
 from fractus_operator.cluster.pods import PodView
 
@@ -67,7 +67,7 @@ def choose_plan(
         InvalidObject: the application contradicts itself.
     """
     choice = _choose(application, previous, inventory, settings, stuck=stuck, in_flight=in_flight)
-    return replace(choice, full=without_room(application, inventory, settings, choice.plan))
+    return replace(choice, full=full_nodes(application, inventory, settings, choice.plan))
 
 
 def _choose(
@@ -86,7 +86,7 @@ def _choose(
     if reason is None and settings.policy_conflicts == "forbid" and _conflict(previous) is not None:
         reason = "PolicyConflict"
     if previous is not None and reason is None:
-        if room_to_grow(application, inventory, settings, previous) is None:
+        if next_free_node(application, inventory, settings, previous) is None:
             return Choice(previous, fits=True)
         reason = "NodesAppeared"
     try:

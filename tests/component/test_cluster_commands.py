@@ -107,7 +107,7 @@ PLAN: Body = {
             {
                 "end": {"lat": 39.5, "lon": 22.5},
                 "outcome": "Detour",
-                "message": "the system flies around, 80 m",
+                "message": "the system flies a detour of 80 m",
                 "policies": ["school"],
             }
         ],
@@ -148,7 +148,7 @@ def test_explain_says_why_here_why_not_there_and_which_policy_did_what(run: Run,
         "default/traffic: Flying: drone-1 flies",
         "Drone: drone-1 (score 12.5); next best: drone-2 (3.25)",
         "420 m in 6.2 min; it can fly 18.0 min",
-        "leg to 39.500000, 22.500000: Detour by school: the system flies around, 80 m",
+        "leg to 39.500000, 22.500000: Detour by school: the system flies a detour of 80 m",
         "Viewer: edge-1 (for location 1)",
         "Store: cloud (any cloud node)",
         "Not for Navigator:",

@@ -136,7 +136,9 @@ def test_regions_that_cross_too_often_are_refused_before_they_are_united():
     check_application(flown(star(0, 600), star(1000, 600), star(5, 600)), {})
     check_application(flown(star(0, 3000), star(0, 3000)), {})
     app = flown(star(0, 1500), star(1000, 4), star(5, 1500))
-    with pytest.raises(InvalidObject, match=r"components\[0\]\.controlPoints: ways and edges .* more than 50000 times"):
+    with pytest.raises(
+        InvalidObject, match=r"components\[0\]\.controlPoints: paths and edges .* more than 50000 times"
+    ):
         check_application(app, {})
     with pytest.raises(InvalidObject, match="more than 50000 times"):
         operation_area(app.spec, {}, 7.0)
@@ -150,10 +152,10 @@ def test_a_way_that_crosses_itself_too_often_is_refused():
 
     driver = navigator(grid(200), point={"position": at(0, 0, 10)})
     check_application(application(driver), {})
-    with pytest.raises(InvalidObject, match=r"components\[0\]\.controlPoints: ways and edges"):
+    with pytest.raises(InvalidObject, match=r"components\[0\]\.controlPoints: paths and edges"):
         check_application(application(navigator(grid(240), point={"position": at(0, 0, 10)})), {})
     guide = VIEWER | {"egress": [], "pointsOfInterest": {"points": grid(240)}}
-    with pytest.raises(InvalidObject, match=r"spec\.components: ways and edges"):
+    with pytest.raises(InvalidObject, match=r"spec\.components: paths and edges"):
         check_application(application(guide), {})
 
 

@@ -3,7 +3,7 @@
 import pytest
 from fractus_core.api.geometry import Position
 from fractus_core.planning import Infeasible, Settings, flight_of, plan
-from fractus_core.planning.mission import ahead, misses
+from fractus_core.planning.mission import misses, remaining_flight
 from fractus_core.planning.scale_up import full_nodes, next_free_node
 from test_plan_drones import flown_by_other, passenger, shared
 from test_plan_properties import where
@@ -84,16 +84,16 @@ def test_a_drone_that_took_someone_along_is_judged_again_when_it_is_to_fly_for_h
 
 def test_of_a_flight_only_what_lies_ahead_is_offered():
     whole = flown_by_other()
-    rest = ahead(whole, Position(**at(150, 3)), 7.0)
+    rest = remaining_flight(whole, Position(**at(150, 3)), 7.0)
     assert misses(passenger([at(200, 0), at(290, 0)]), rest, 7.0) is None
     assert misses(passenger([at(120, 0), at(290, 0)]), rest, 7.0) == 0
     assert misses(passenger([at(120, 0), at(290, 0)]), whole, 7.0) is None
-    assert ahead(whole, Position(**at(150, 60)), 7.0) is None
+    assert remaining_flight(whole, Position(**at(150, 60)), 7.0) is None
 
 
 def test_of_two_passages_the_last_counts():
     there_and_back = application(navigator([at(0, 0), at(200, 0), at(0, 0)]))
     whole = flight_of(there_and_back, inventory().depots)
-    rest = ahead(whole, Position(**at(100, 0)), 7.0)
+    rest = remaining_flight(whole, Position(**at(100, 0)), 7.0)
     assert misses(passenger([at(50, 0)]), rest, 7.0) is None
     assert misses(passenger([at(150, 0)]), rest, 7.0) == 0

@@ -291,7 +291,7 @@ def test_broken_yaml_and_json_name_the_line(tmp_path):
 def test_unknown_plug_in_is_named(run):
     result = run([*SCENE, TRAFFIC], "--ranking", "best")
     assert result.exit_code == 1
-    assert "--ranking: there is no plug-in best" in result.stderr
+    assert "--ranking: plug-in best is not installed" in result.stderr
 
 
 def test_plug_ins_are_entry_points(run, monkeypatch):
@@ -318,7 +318,7 @@ def test_a_conflict_with_policies_is_told_or_forbidden(run):
     told = run([TRAFFIC, *SCENE, FENCE, SQUARE])
     assert told.exit_code == 0
     end = at(300, 0)
-    assert f"policy conflict: policies do not let the leg to {end['lat']:.6f}, {end['lon']:.6f} be flown" in told.stdout
+    assert f"policy conflict: policies do not allow the leg to {end['lat']:.6f}, {end['lon']:.6f}" in told.stdout
     assert re.search(r"driver +Denied +LegThroughExclusionZone +the leg crosses zone square for 40.0 m", told.stdout)
     written = yaml.safe_load(run([TRAFFIC, *SCENE, FENCE, SQUARE], "-o", "yaml").stdout)
     assert written["spec"]["drone"]["legality"][0]["policies"] == ["keep-out"]

@@ -55,7 +55,7 @@ def test_policies_are_not_asked_without_a_time():
 def test_a_leg_through_a_zone_is_known_before_takeoff():
     choice = plan(APP, fenced(200, 0), WARN).drone
     assert outcomes(choice)[0] == ("driver", "Denied", ("keep-out",))
-    assert choice.policy_conflict.startswith("policies do not let the leg to 39.3606")
+    assert choice.policy_conflict.startswith("policies do not allow the leg to 39.3606")
     assert "crosses zone z for 40.0 m of policy keep-out" in choice.policy_conflict
     with pytest.raises(Infeasible) as caught:
         plan(APP, fenced(200, 0), FORBID)
@@ -106,9 +106,9 @@ def test_a_limit_of_speed_makes_a_mission_too_long():
     assert choice.policy_conflict is None
     short = stock(slow, drones=[drone("d", minutes=20)])
     choice = plan(APP, short, WARN).drone
-    assert "with what slow ask for the mission takes 20.2 min" in choice.policy_conflict
-    assert "can fly 16.0 min with its reserve kept" in choice.policy_conflict
-    with pytest.raises(Infeasible, match=r"no drone may fly Navigator: d: with what slow"):
+    assert "under slow the mission takes 20.2 min" in choice.policy_conflict
+    assert "can fly only 16.0 min without its battery reserve" in choice.policy_conflict
+    with pytest.raises(Infeasible, match=r"no drone may fly Navigator: d: under slow"):
         plan(APP, short, FORBID)
 
 
@@ -242,7 +242,7 @@ def test_a_plan_looks_for_a_limited_number_of_ways_around():
     inventory_ = stock(policy("keep-out", zones=[z.name for z in walls], **FENCE), zones=walls, drones=fleet)
     choice = plan(tour, inventory_, WARN).drone
     assert sum(leg.outcome == "Detour" for leg in choice.legality) == MAX_SEARCHES
-    assert choice.legality[-1].message.startswith("no more ways around are looked for: ")
+    assert choice.legality[-1].message.startswith("no further detour is searched: ")
     with pytest.raises(Infeasible) as caught:
         plan(tour, inventory_, FORBID)
     assert sorted(r.reason for r in caught.value.rejected) == ["NotJudged", "NotJudged", "PolicyConflict"]
@@ -251,8 +251,8 @@ def test_a_plan_looks_for_a_limited_number_of_ways_around():
 def test_a_denied_waypoint_that_strands_its_driver_is_told():
     corner = application(navigator([at(100, 0, 10), at(200, 0, 10), at(200, 100, 10), at(200, 200, 10)]))
     choice = plan(corner, fenced(200, 0), WARN).drone
-    assert "a driver that passes over it reaches none of the 2 waypoints after it" in choice.legality[0].message
-    assert "none of the 2 waypoints after it" in choice.policy_conflict
+    assert "a driver that skips it cannot reach any of the 2 waypoints after it" in choice.legality[0].message
+    assert "any of the 2 waypoints after it" in choice.policy_conflict
     with pytest.raises(Infeasible, match="use regionBased navigation"):
         plan(corner, fenced(200, 0), FORBID)
     high = Zone.from_body(
@@ -262,4 +262,4 @@ def test_a_denied_waypoint_that_strands_its_driver_is_told():
     up = application(navigator([at(100, 0, 10), at(200, 0, 50), at(300, 0, 10)]))
     legs = [leg for leg in plan(up, above, WARN).drone.legality if leg.outcome == "Denied"]
     assert legs
-    assert "passes over it" not in legs[0].message, "the driver passes below"
+    assert "skips it" not in legs[0].message, "the driver passes below"

@@ -1,4 +1,4 @@
-"""Which nodes together reach most of an area: greedy coverage by communication discs (thesis Algorithm 10)."""
+"""Selection of nodes that cover an area: greedy coverage by communication discs (thesis Algorithm 10)."""
 
 from __future__ import annotations
 
@@ -15,31 +15,30 @@ _Floats = NDArray[np.float64]
 _Integers = NDArray[np.int64]
 
 SAMPLES = 8192
-"""About how many samples an area gets; more if it is long and narrow."""
+"""Approximate number of samples of an area. Long and narrow areas have more."""
 
 _MAX_SAMPLES = 200_000
 _MAX_CROSSINGS = 1_000_000
-"""How often the outline may cross the lattice's rows: a region may be a millimetre wide and many kilometres long."""
+"""Maximum number of crossings of outline and lattice rows, because a region may be a millimetre wide and kilometres long."""
 _ACROSS = 4
-"""Samples across the width of a narrow area, so that a corridor is not missed between two rows."""
+"""Samples across a narrow area, so that no corridor lies between two rows."""
 _TILT_RAD = math.atan((math.sqrt(5) - 1) / 2)
-"""The lattice's rows follow no direction that roads and manifests like, so that straight legs are sampled evenly."""
+"""Tilt of the lattice rows. No usual direction of roads or paths is parallel to them, so straight legs are sampled evenly."""
 
 _BATCH = 256
-"""Stale bounds looked at again at once: numpy's overhead for one call is that of hundreds of numbers."""
+"""Number of stale bounds that are updated at once, because the overhead of a numpy call equals hundreds of operations."""
 _CHUNK = 2048
-"""Candidates whose runs are found at once; bounds the memory of one step."""
+"""Number of candidates whose runs are computed at once; limits the memory of a step."""
 _TABLE = 2_000_000
-"""Places of a lattice up to which ranks come from a table; beyond, from a binary search."""
+"""Maximum lattice size for a table of ranks. Larger lattices use binary search."""
 _REMEMBERED = 4_000_000
-"""Runs up to which all of them are kept, some 64 MB; beyond, they are found again when needed."""
+"""Maximum number of runs that are cached (about 64 MB). Beyond it, runs are computed again when needed."""
 
 
 class Samples:
-    """A square lattice of points inside an area: how much of the area something covers becomes a count.
+    """A square lattice of points inside an area, with which coverage is counted.
 
-    Counting makes gains whole numbers, so that ties are ties and a plan does not depend on rounding. Shares are within
-    1 % of the exact areas.
+    Counts are integers, so ties are exact and a plan does not depend on rounding. Shares are within 1 % of exact areas.
     """
 
     __slots__ = ("_columns", "_first", "_keys", "_ranks", "_rows", "spacing_m")
@@ -61,20 +60,20 @@ class Samples:
             self._ranks = np.cumsum(taken)
 
     def __len__(self) -> int:
-        """How many samples there are."""
+        """Number of samples."""
         return len(self._keys)
 
     def xy(self) -> _Floats:
-        """The samples in metres east and north, shape (n, 2)."""
+        """Return the samples in metres east and north, shape (n, 2)."""
         rows = self._keys // self._columns + self._first[0]
         columns = self._keys % self._columns + self._first[1]
         return _turned(np.column_stack((columns + 0.5, rows + 0.5)) * self.spacing_m, _TILT_RAD)
 
     def runs(self, xy: _Floats, reach_m: _Floats) -> tuple[_Integers, _Integers, _Integers]:
-        """The samples within reach of each node, as runs of consecutive ones: one run a node and row of the lattice.
+        """Return the samples in range of each node as runs of consecutive samples, one per node and lattice row.
 
         Returns:
-            For each run the node (its row in xy), the first sample, and the one after the last.
+            For each run, the node (its row in xy), the first sample, and the sample after the last one.
         """
         turned = _turned(xy, -_TILT_RAD) / self.spacing_m - 0.5
         reach = reach_m / self.spacing_m
@@ -91,23 +90,23 @@ class Samples:
         return node, self._rank(base + left), self._rank(base + right)
 
     def _rank(self, keys: _Integers) -> _Integers:
-        """How many samples come before each place of the lattice."""
+        """Return the number of samples before each lattice position."""
         return np.searchsorted(self._keys, keys) if self._ranks is None else self._ranks[keys]
 
 
 @dataclass(frozen=True, slots=True)
 class CoverScene:
-    """What a coverage strategy decides on.
+    """Input of a coverage strategy.
 
     Attributes:
-        samples: the area.
-        names: the candidates; among equals the earlier one is to be preferred.
-        xy: where they are, metres east and north, shape (n, 2).
-        reach_m: how far each can talk directly to what moves in the area, shape (n,).
-        share: the share of the area to reach.
-        kept: candidates that have an instance already and should keep it while it is of use.
-        covered_by: discs that are covered anyway: x, y, reach, shape (m, 3).
-        newly_covered_by: discs that new instances cover; what is kept need not yield to them.
+        samples: Samples of the area.
+        names: Candidates; the earlier one of equal candidates is preferred.
+        xy: Positions in metres east and north, shape (n, 2).
+        reach_m: Range of direct links to the drone in metres, shape (n,).
+        share: Share of the area to cover, 0 to 1.
+        kept: Candidates with an instance, which they keep if it adds coverage.
+        covered_by: Discs that are already covered: x, y, range, shape (m, 3).
+        newly_covered_by: Discs that new instances cover. Kept candidates do not yield to them.
     """
 
     samples: Samples
@@ -122,22 +121,22 @@ class CoverScene:
 
 @dataclass(frozen=True, slots=True)
 class Pick:
-    """A chosen candidate and the share of the area that it adds to those chosen before."""
+    """A selected candidate and the share of the area that it adds to the coverage."""
 
     name: str
     share: float
 
 
 CoverStrategy = Callable[[CoverScene, Callable[[str], bool]], Sequence[Pick]]
-"""Chooses candidates of a scene in order; the function says whether a candidate fits, and is asked once for each."""
+"""Selects candidates of a scene in order. The function argument checks whether a candidate fits; it is called once for each."""
 
 
 def greedy_cover(scene: CoverScene, fits: Callable[[str], bool]) -> list[Pick]:
-    """Pick the candidate that adds most, again and again, until the share is reached or nothing is added.
+    """Select the candidate that adds most coverage, repeatedly, until the share is reached or no candidate adds coverage.
 
-    Candidates that are kept come first, so that a new plan moves as little as it can. Gains only shrink as picks
-    are made, so that a gain known from before is an upper bound, and only the candidates with the highest bounds are
-    looked at again (lazy evaluation: M. Minoux 1978; CELF: J. Leskovec et al., KDD 2007).
+    Kept candidates come first, so a new plan moves as few instances as possible. Gains never grow, so an earlier gain is an
+    upper bound, and only the candidates with the highest bounds are evaluated again (lazy evaluation: M. Minoux 1978;
+    CELF: J. Leskovec et al., KDD 2007).
     """
     state = _State(scene)
     picks: list[Pick] = []
@@ -160,7 +159,7 @@ def greedy_cover(scene: CoverScene, fits: Callable[[str], bool]) -> list[Pick]:
 
 
 class _State:
-    """What is covered so far, and for each candidate a bound on what it would add."""
+    """Covered samples, and an upper bound of the gain of each candidate."""
 
     def __init__(self, scene: CoverScene) -> None:
         self._scene = scene
@@ -173,23 +172,23 @@ class _State:
         self._count()
 
     def cover(self, discs: _Floats | None) -> None:
-        """Cover what some discs reach."""
+        """Mark the samples in discs as covered."""
         if discs is not None and len(discs):
             self._cover(*self._scene.samples.runs(discs[:, :2], discs[:, 2])[1:])
 
     def consider(self, candidates: _Integers) -> None:
-        """Let these candidates take part, unless they were taken or dropped."""
+        """Add candidates, unless they were selected or dropped before."""
         candidates = candidates[~self._gone[candidates] & ~self._fresh[candidates]]
         for start in range(0, len(candidates), _CHUNK):
             self._refresh(candidates[start : start + _CHUNK])
 
     def enough(self) -> bool:
-        """Whether the wanted share is covered."""
+        """Return True if the requested share is covered."""
         total = len(self._open)
         return total - int(self._before[-1]) >= self._scene.share * total
 
     def best(self) -> int | None:
-        """The candidate that adds most, the first among equals; None when none adds anything."""
+        """Return the candidate that adds most coverage, the first of equal ones, or None if none adds coverage."""
         while True:
             best = int(np.argmax(self._bounds)) if len(self._bounds) else -1
             if best < 0 or self._bounds[best] <= 0:
@@ -203,14 +202,14 @@ class _State:
             self._refresh(stale)
 
     def take(self, candidate: int) -> float:
-        """Cover what the candidate reaches; the share of the area that this adds."""
+        """Cover the disc of a candidate, and return the share of the area that it adds."""
         gain = int(self._bounds[candidate])
         self._cover(*self._runs.of(np.array([candidate]))[1:])
         self.drop(candidate)
         return gain / len(self._open)
 
     def drop(self, candidate: int) -> None:
-        """Let a candidate take part no longer."""
+        """Exclude a candidate."""
         self._gone[candidate] = True
         self._bounds[candidate] = -1
 
@@ -231,7 +230,7 @@ class _State:
 
 
 class _Runs:
-    """The runs of samples that each candidate reaches: found once, and remembered unless there are too many."""
+    """Runs of samples in range of each candidate, cached unless there are too many."""
 
     def __init__(self, scene: CoverScene) -> None:
         self._scene = scene
@@ -248,7 +247,7 @@ class _Runs:
             self._end = np.concatenate([part[2] for part in parts])
 
     def of(self, candidates: _Integers) -> tuple[_Integers, _Integers, _Integers]:
-        """As Samples.runs, of these candidates."""
+        """Return the result of `Samples.runs` for some candidates."""
         if self._starts is None:
             return self._scene.samples.runs(self._scene.xy[candidates], self._scene.reach_m[candidates])
         node, run = _ranges(self._starts[candidates], self._starts[candidates + 1])
@@ -256,7 +255,7 @@ class _Runs:
 
 
 def _lattice(shape: BaseGeometry, spacing_m: float) -> tuple[_Integers, _Integers]:
-    """Rows and columns of the tilted lattice's points in the shape, in order; found by scan lines, O(points + edges)."""
+    """Return rows and columns of the tilted lattice's points in a shape, in order, by scan lines in O(points + edges)."""
     coordinates, ring = shapely.get_coordinates(
         shapely.get_rings(shapely.get_parts(shapely.get_parts(shape))), return_index=True
     )
@@ -279,7 +278,7 @@ def _lattice(shape: BaseGeometry, spacing_m: float) -> tuple[_Integers, _Integer
 
 
 def _ranges(starts: _Integers, ends: _Integers) -> tuple[_Integers, _Integers]:
-    """The whole numbers of many half-open ranges in a row, each with the range it is of."""
+    """Concatenate the integers of half-open ranges. Return the range index of each integer, and the integers."""
     counts = np.maximum(ends - starts, 0)
     owner = np.repeat(np.arange(len(counts)), counts)
     offset = np.arange(int(counts.sum())) - np.repeat(np.cumsum(counts) - counts, counts)

@@ -1,4 +1,4 @@
-"""Which drone flies an application (thesis Algorithms 6 and 9)."""
+"""Selection of the drone of an application (thesis Algorithms 6 and 9)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from fractus_core.api.plans import Alternative, DroneChoice, Mission
 from fractus_core.geo import ground_point
 from fractus_core.planning.candidates import SUITABLE, Check, check_host, check_resources, check_services, readiness
 from fractus_core.planning.inventory import DroneFacts
-from fractus_core.planning.legality import Way, WayJudge
+from fractus_core.planning.legality import MissionRoute, RouteJudge
 from fractus_core.planning.mission import (
     Estimate,
     MissionEstimator,
@@ -31,11 +31,11 @@ _ALTERNATIVES = 10
 
 @dataclass(frozen=True, slots=True)
 class DroneCandidates:
-    """The drones that stand, or fly, where the application needs one; ordered by name.
+    """Drones in range of the start of an application, sorted by name.
 
     Attributes:
-        idle: drones whose depot or home suits.
-        flying: drones of other applications that pass all points of interest in order.
+        idle: Drones whose depot or home is in range.
+        flying: Drones of other applications whose flights visit all points of interest.
     """
 
     idle: tuple[Drone, ...]
@@ -51,17 +51,19 @@ class _Ranked:
 
 
 def default_score(facts: DroneFacts) -> float:
-    """Readiness before energy.
+    """Score a drone by readiness, then by energy.
 
-    2 for a drone that flies anyway, 1 for one that is not at its charger, and the share of a day it can still fly.
-    To come along saves a take-off, a landing and a drone in the air (thesis 8.5).
+    The score is 2 for a shared flight, 1 for a drone that is not charging, and 0 otherwise, plus the remaining flight time
+    as a share of a day. A shared flight saves a takeoff, a landing and a drone in the air (thesis 8.5).
     """
-    ready = 2.0 if facts.used else 0.0 if facts.charging else 1.0
+    ready = 0.0 if facts.charging else 1.0
+    if facts.used:
+        ready = 2.0
     return ready + min(facts.remaining_min / _DAY_MIN, 0.999)
 
 
 def find_drones(builder: PlanBuilder, area: OperationArea) -> DroneCandidates:
-    """The candidates by place: from depots at or near the start, and for passengers alone also those that fly by."""
+    """Return the drones in range of the start. Without a driver, include airborne drones that visit all points of interest."""
     leader = builder.spec.driver or next(builder.spec.on("drone"))
     flying = _flying_by(builder, leader) if builder.spec.driver is None else []
     names = set(_standing(builder, area, leader, flying))
@@ -71,27 +73,26 @@ def find_drones(builder: PlanBuilder, area: OperationArea) -> DroneCandidates:
 
 
 def choose_drone(builder: PlanBuilder, area: OperationArea, candidates: DroneCandidates) -> DroneChoice:
-    """Place all drone components on the best candidate; the one that has the application already stays.
+    """Place all drone components on the best candidate. A suitable drone of the previous plan is kept.
 
     Raises:
-        Infeasible: no candidate is suitable. The reason is DroneBusy if one would be, were it not for another
-            application that has it.
+        Infeasible: No candidate is suitable. The reason is DroneBusy if another application uses a suitable drone.
     """
     components = list(builder.spec.on("drone"))
     leader = builder.spec.driver or components[0]
     mission = MissionEstimator(builder.spec, area, builder.settings)
     ranked = [
-        found
+        candidate
         for drones, used in ((candidates.flying, True), (candidates.idle, False))
         for drone in drones
-        if (found := _judge(builder, mission, drone, components, used=used)) is not None
+        if (candidate := _rank(builder, mission, drone, components, used=used)) is not None
     ]
     if not ranked:
         busy = any(r.reason == "Claimed" for r in builder.rejections(leader))
         reason = "DroneBusy" if busy else "NoDrone"
         known = len(builder.inventory.drones)
-        nothing = f"of {known} known drones none is anywhere near the start" if known else "there is no drone"
-        raise builder.infeasible(leader, reason, f"no drone can fly {leader.name}", nothing)
+        fallback = f"none of the {known} known drones is near the start" if known else "no Drone exists"
+        raise builder.infeasible(leader, reason, f"no drone can fly {leader.name}", fallback)
     ranked.sort(key=lambda r: (not builder.was_selected(r.drone.name, shared=r.used), -r.score, r.drone.name))
     best, way, conflict = _legal_first(builder, area, ranked, leader)
     for component in components:
@@ -109,23 +110,26 @@ def choose_drone(builder: PlanBuilder, area: OperationArea, candidates: DroneCan
         transit=tuple(legs),
         alternatives=tuple(Alternative(node=r.drone.name, score=round(r.score, 6)) for r in others[:_ALTERNATIVES]),
     )
-    return way.noted(choice, conflict) if way is not None else choice
+    return way.add_to(choice, conflict) if way is not None else choice
 
 
 def _legal_first(
     builder: PlanBuilder, area: OperationArea, ranked: Sequence[_Ranked], leader: Component
-) -> tuple[_Ranked, Way | None, str | None]:
-    """The first drone that the policies let fly its way, with that way; those before it are rejected.
+) -> tuple[_Ranked, MissionRoute | None, str | None]:
+    """Select the first drone whose route the policies allow, and reject the drones before it.
 
-    Where there is none, the first of all, with the conflict. A drone that has the application already stays, unless
-    conflicts are forbidden.
+    If there is none, select the first drone of all, with the conflict. A drone of the previous plan is kept in spite of a
+    conflict, unless conflicts are forbidden.
+
+    Returns:
+        The drone, its route, and the policy conflict if there is one.
 
     Raises:
-        Infeasible: there is none, and conflicts are forbidden.
+        Infeasible: There is no such drone, and conflicts are forbidden.
     """
-    judge = WayJudge(builder.application, area, builder.inventory, builder.settings)
+    judge = RouteJudge(builder.application, area, builder.inventory, builder.settings)
     forbids = builder.settings.policy_conflicts == "forbid"
-    tried: list[tuple[_Ranked, Way | None, str | None]] = []
+    tried: list[tuple[_Ranked, MissionRoute | None, str | None]] = []
     for candidate in ranked:
         if judge.exhausted:
             break
@@ -145,18 +149,16 @@ def _legal_first(
     if legal:
         return tried[-1]
     for candidate in ranked[len(tried) :]:
-        message = (
-            f"{candidate.drone.name} was not looked at, after {len(tried)} whose ways policies do not let be flown"
-        )
+        message = f"{candidate.drone.name} was not checked because policies do not allow the routes of {len(tried)} other drones"
         builder.reject(leader, candidate.drone.name, Check("NotJudged", message))
     raise builder.infeasible(leader, "PolicyConflict", f"no drone may fly {leader.name}", "")
 
 
-# -- by place --
+# -- drones in range --
 
 
 def _standing(builder: PlanBuilder, area: OperationArea, leader: Component, flying: Sequence[str]) -> list[str]:
-    """Drones that stand where the application wants them; notes the nearest that do not."""
+    """Return the drones parked in range of the start, and reject the nearest ones out of range."""
     located, settings = builder.located, builder.settings
     first = leader.control_points[0] if leader.control_points else None
     start = start_of(first, builder.inventory.depots) if first is not None else None
@@ -171,18 +173,18 @@ def _standing(builder: PlanBuilder, area: OperationArea, leader: Component, flyi
         if named is None:
             kept = frozenset().union(*(located.kept_in(name) for name in _depots_around(builder, centre)))
     wanted = f"not in {named}" if reason == "OtherDepot" else f"more than {limit:.0f} m"
-    here = {name for name, _ in located.stands.within(centre, limit)} | kept
+    in_range = {name for name, _ in located.stands.within(centre, limit)} | kept
     for name, distance in located.stands.nearest(centre, settings.near_misses, limit, settings.near_miss_m):
-        if name not in here and name in builder.inventory.drones:
-            place = "is"
+        if name not in in_range and name in builder.inventory.drones:
+            relation = "is"
             if reason == "OtherDepot":
-                place = f"is kept in {builder.inventory.drones[name].spec.depot or 'no depot'},"
-            message = f"{name} {place} {distance:.0f} m from the start, {wanted}"
+                relation = f"is kept in {builder.inventory.drones[name].spec.depot or 'no depot'},"
+            message = f"{name} {relation} {distance:.0f} m from the start, {wanted}"
             builder.reject(leader, name, Check(reason, message), far=True)
     for name in sorted(located.homeless - kept - set(flying))[: settings.near_misses]:
         message = f"{name} has neither a depot that exists nor a home; set spec.depot or spec.home"
         builder.reject(leader, name, Check("NoHome", message))
-    return sorted(here)
+    return sorted(in_range)
 
 
 def _depots_around(builder: PlanBuilder, place: Point) -> Iterable[str]:
@@ -191,7 +193,7 @@ def _depots_around(builder: PlanBuilder, place: Point) -> Iterable[str]:
 
 
 def _flying_by(builder: PlanBuilder, leader: Component) -> list[str]:
-    """Drones that fly for other applications and visit all points of interest, by name; notes some that do not."""
+    """Return the drones of other applications whose flights visit all points of interest, and reject some of the others."""
     poi = builder.spec.points_of_interest
     found = []
     noted = 0
@@ -210,17 +212,17 @@ def _flying_by(builder: PlanBuilder, leader: Component) -> list[str]:
     return found
 
 
-# -- by what it is and has --
+# -- requirements on a drone --
 
 
-def _judge(
-    builder: PlanBuilder, asked: MissionEstimator, drone: Drone, components: list[Component], *, used: bool
+def _rank(
+    builder: PlanBuilder, estimator: MissionEstimator, drone: Drone, components: list[Component], *, used: bool
 ) -> _Ranked | None:
-    """The drone with its score, or None with the first rule it fails noted."""
+    """Return the drone with its score. If it fails a requirement, store the rejection and return None."""
     leader = builder.spec.driver or components[0]
     kept = builder.was_selected(drone.name, shared=used)
     home = home_of(drone, builder.inventory.depots)
-    mission = asked.estimate(home, drone) if home is not None and not used else None
+    mission = estimator.estimate(home, drone) if home is not None and not used else None
     check = _lasting(builder, drone, components, mission, kept=kept) and (
         _passing(builder, drone, components, mission, kept=kept, used=used)
     )
@@ -242,14 +244,14 @@ def _judge(
 def _lasting(
     builder: PlanBuilder, drone: Drone, components: list[Component], mission: Estimate | None, *, kept: bool
 ) -> Check:
-    """The rules that waiting does not change: services, altitude, a flight too long for a full battery."""
+    """Check permanent requirements: services, altitude, flight time with a full battery."""
     check = check_services(drone.spec.services, components)
     mobility = drone.spec.services.mobility
     if not check or mission is None:
         return check
     if mobility is None:
-        # No component need ask for it: passengers alone have the system fly the drone.
-        return SUITABLE if kept else Check("ServiceMissing", "it has no mobility service, which every flight needs")
+        # Components may not request the service: without a driver, the system flies the drone.
+        return SUITABLE if kept else Check("ServiceMissing", "it has no mobility service, which every flight requires")
     if mission.top_m > mobility.max_altitude:
         message = f"{drone.name} climbs to {mobility.max_altitude:g} m; the path goes up to {mission.top_m:g} m"
         return Check("TooHigh", message)
@@ -262,16 +264,16 @@ def _lasting(
 def _passing(
     builder: PlanBuilder, drone: Drone, components: list[Component], mission: Estimate | None, *, kept: bool, used: bool
 ) -> Check:
-    """The rules of the moment: who has the drone, its node, its state, its battery, what runs on it.
+    """Check temporary requirements: other applications, host, state, battery, free resources.
 
-    A drone that already has the application (kept) is not given up for what passes or comes with the mission: a lost
-    link, a restarted service, a battery that the flight has drained.
+    A drone of the previous plan (`kept`) is not replaced because of temporary problems or of effects of the mission, such
+    as a lost link, a restarted service or a battery that the flight has drained.
     """
     owner = builder.inventory.claimed.get(drone.name)
     if owner is not None and owner != builder.application.key and not used:
         leader = builder.spec.driver or components[0]
         note = builder.range_message(leader, drone.name)
-        return Check("Claimed", f"{owner[0]}/{owner[1]} has {drone.name}" + (f", and {note}" if note else ""))
+        return Check("Claimed", f"{owner[0]}/{owner[1]} uses {drone.name}" + (f", and {note}" if note else ""))
     host = check_host(builder.inventory.hosts, drone.name, builder.settings, kept=kept)
     if kept:
         return host
@@ -291,12 +293,12 @@ def _too_long(drone: Drone, mission: Estimate, available_min: float, when: str) 
     )
 
 
-def _mission(found: Estimate, way: Way | None) -> Mission:
-    flown = way if way is not None and way.legs and way.denied is None else found
+def _mission(estimate: Estimate, way: MissionRoute | None) -> Mission:
+    flown = way if way is not None and way.legs and way.denied is None else estimate
     return Mission(
         distance=round(flown.distance_m, 1),
         duration=round(flown.needed_min, 3),
-        available=round(found.available_min, 3),
+        available=round(estimate.available_min, 3),
     )
 
 

@@ -1,4 +1,4 @@
-"""What planning looks at: hosts, drones, edge nodes, depots, who has which drone, and what may be tuned."""
+"""Input of planning: hosts, drones, edge nodes, depots, claimed drones, and settings."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ class Host:
     """A Kubernetes Node.
 
     Attributes:
-        allocatable: what it offers to pods, resource name to quantity in base units (cores, bytes, pieces).
-        requested: what the pods on it have asked for, the same way; those of the application that is planned do not count.
-        guarded: whether its kubelet turns away pods that do not tolerate the taint of drones and edge nodes, also those that name it.
+        allocatable: Resources for pods, by resource name, in base units (cores, bytes, items).
+        requested: Resource requests of its pods in the same units, without those of the planned application.
+        guarded: True if its kubelet rejects pods that do not tolerate the taint of drones and edge nodes, even with nodeName.
     """
 
     name: str
@@ -36,18 +36,18 @@ class Host:
 
     @property
     def is_cloud(self) -> bool:
-        """Whether it takes the cloud's pods, as a node of that class or beside another one."""
+        """True if the node accepts cloud pods, by its class or in addition to it."""
         return self.labels.get(CLASS_LABEL) == "cloud" or self.labels.get(CLOUD_LABEL) == "true"
 
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """Where a drone flies, or will fly, for the application that has it; others may come along.
+    """Flight of a drone for the application that uses it. Other applications may share it.
 
     Attributes:
-        holder: (namespace, name) of the application that has the drone.
-        legs: polylines flown in order; between them nothing is known of the way (a driver's region).
-        reached: how many points of the legs, counted in order, lie behind the drone already.
+        holder: (namespace, name) of the application that uses the drone.
+        legs: Polylines flown in order. The route between them is unknown (regions of a driver).
+        reached: Number of points of the legs, counted in order, that the drone has passed.
     """
 
     holder: tuple[str, str]
@@ -57,14 +57,14 @@ class Flight:
 
 @dataclass(frozen=True, slots=True)
 class Inventory:
-    """All that a plan and its grants are made from; every mapping is by object name.
+    """All objects that a plan and its Grants depend on; every mapping is by object name.
 
     Attributes:
-        unreadable_policies: policies that exist but cannot be read, with what is wrong: they may hold for every component.
-        unreadable_zones: zones that exist but cannot be read, with what is wrong.
-        claimed: drones that an application has, by drone: (namespace, name) of the application.
-        flights: what claimed drones fly, by drone, as far as it is known; without it no application can come along.
-        locations: indexes of these very mappings, kept current by the caller; None: built when first needed.
+        unreadable_policies: Invalid policies with their problems. They may apply to every component.
+        unreadable_zones: Invalid zones with their problems.
+        claimed: (namespace, name) of the application that uses a drone, by drone.
+        flights: Known flights of claimed drones, by drone. Only known flights can be shared.
+        locations: Indexes of these mappings that the caller keeps current, or None to build them when needed.
     """
 
     hosts: Mapping[str, Host] = field(default_factory=dict)
@@ -81,7 +81,7 @@ class Inventory:
     _built: list[NodeLocations] = field(default_factory=list, init=False, compare=False, repr=False)
 
     def located(self) -> NodeLocations:
-        """The indexes: those given, or built once from the mappings."""
+        """Return the given indexes, or build them once from the mappings."""
         if self.locations is not None:
             return self.locations
         if not self._built:
@@ -94,14 +94,14 @@ class Inventory:
 
 @dataclass(frozen=True, slots=True)
 class DroneFacts:
-    """What ranks a drone that can fly an application.
+    """Properties that rank a suitable drone.
 
     Attributes:
-        used: it flies for another application already, and this one would come along.
-        charging: it stands at its charger.
-        remaining_min: minutes it can fly with what its battery holds.
-        needed_min: minutes that the application takes of them; 0 when it comes along.
-        distance_m: from where it stands to where the work starts.
+        used: True if the application would share the flight of another one.
+        charging: True if the drone is charging.
+        remaining_min: Flight time in minutes with the present charge.
+        needed_min: Flight time of the mission in minutes; 0 for a shared flight.
+        distance_m: Distance from the parking position to the start of the mission.
     """
 
     drone: Drone
@@ -113,7 +113,7 @@ class DroneFacts:
 
 
 DroneScore = Callable[[DroneFacts], float]
-"""Scores a drone, higher is better; equals go by name."""
+"""Scores a drone; higher is better. Ties are resolved by name."""
 
 
 PolicyConflicts = Literal["warn", "forbid"]
@@ -130,25 +130,25 @@ _BOUNDS = {
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What an installation may tune.
+    """Planning settings of an installation.
 
     Attributes:
-        safety_radius_m: how far paths are dilated (thesis 8.9.2: 7 m).
-        depot_radius_m: how far a depot may be from an open or partial start.
-        coverage_share: share of the operation area that hybrid instances should cover with direct links.
-        cruise_speed_mps: ground speed assumed for flight times, unless the drone is slower.
-        climb_speed_mps: vertical speed assumed for flight times.
-        battery_reserve: share of a full charge that must be left after landing.
-        excluded: hosts not to use, with the reason, such as one the scheduler refused.
-        near_misses: how many nodes a plan lists that were too far away to be candidates, for each place asked for.
-        near_miss_m: how far from there they may be to be listed.
-        rejections_listed: how many rejected nodes a plan lists at most, so that it fits into an object of Kubernetes.
-        time_s: when the flight begins, in seconds since 1970; None: what policies say of its way is not asked.
-        policy_conflicts: what becomes of a mission whose way policies do not let be flown, where no drone has another one:
-            the plan warns, or there is none.
-        flat_terrain: whether the ground counts as level with home everywhere, as for the mobility service.
-        score_drone: replaces the ranking of drones.
-        cover: replaces the choice of nodes that cover the operation area.
+        safety_radius_m: Distance by which paths are dilated (thesis 8.9.2: 7 m).
+        depot_radius_m: Maximum distance between a depot and an open or partial start.
+        coverage_share: Share of the operation area that hybrid instances should cover with direct links, 0 to 1.
+        cruise_speed_mps: Assumed ground speed, unless the drone is slower.
+        climb_speed_mps: Assumed vertical speed.
+        battery_reserve: Share of the full charge that must remain after landing, 0 to 1.
+        excluded: Hosts that must not be used, with the reason (such as a refusal of the scheduler).
+        near_misses: Number of nodes out of range that a plan lists for each requested place.
+        near_miss_m: Maximum distance of these nodes from the place.
+        rejections_listed: Maximum number of rejected nodes in a plan, so that it fits into a Kubernetes object.
+        time_s: Start of the flight in seconds since 1970, or None to skip the legality check of the route.
+        policy_conflicts: Handling of a mission whose route policies do not allow with any drone: plan it with a warning, or
+            do not plan it.
+        flat_terrain: True to assume terrain level with home everywhere, as in the mobility service.
+        score_drone: Replacement for the ranking of drones.
+        cover: Replacement for the selection of nodes that cover the operation area.
     """
 
     safety_radius_m: float = 7.0
@@ -168,25 +168,25 @@ class Settings:
     cover: CoverStrategy | None = None
 
     def __post_init__(self) -> None:
-        """Refuse numbers that no plan can be made with.
+        """Validate the settings.
 
         Raises:
-            InvalidObject: naming the setting.
+            InvalidObject: A setting is out of range.
         """
-        for name, (spelled, minimum, maximum) in _BOUNDS.items():
+        for name, (label, minimum, maximum) in _BOUNDS.items():
             value = getattr(self, name)
             if not minimum <= value <= maximum:
-                raise InvalidObject(spelled, f"must be {minimum:g} to {maximum:g}, not {value:g}")
+                raise InvalidObject(label, f"must be {minimum:g} to {maximum:g}, not {value:g}")
 
 
 _RARE_SCALE = {"n": 1e-9, "u": 1e-6, "E": 1e18, "Ei": 2.0**60}
 
 
 def amount_of(text: str | float) -> float:
-    """Value of any quantity that the API server may hold, also those that manifests of ours may not use.
+    """Convert any Kubernetes quantity to its base unit, including the suffixes that Fractus manifests may not use.
 
     Raises:
-        ValueError: it is not a quantity.
+        ValueError: The text is not a quantity.
     """
     try:
         return quantity(text)

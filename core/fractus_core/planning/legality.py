@@ -1,4 +1,4 @@
-"""What the policies say of a mission's way before takeoff: by the engine that judges it in flight."""
+"""Legality of a mission's route before takeoff, judged by the policy engine that also judges it in flight."""
 
 from __future__ import annotations
 
@@ -32,31 +32,33 @@ from fractus_core.policy.route_search import quick_route
 from fractus_core.policy.selectors import application_reference, node_attributes, policy_applies
 
 MAX_LISTED = 50
-"""Legs that a plan lists at most."""
+"""Maximum number of legs that a plan lists."""
 
 TAKEOFF_ALTITUDE_M = 10.0
-"""How high a mission is taken to begin where its first place gives no altitude; the mobility service does so."""
+"""Assumed takeoff altitude if the first position has none, as in the mobility service, in metres above home."""
 
-MAX_WAYS, MAX_SEARCHES = 10, 20
-"""Ways that are judged for one plan, and ways around zones that are looked for: each of these takes up to 80 ms, while the
-operator does nothing else."""
+MAX_ROUTES = 10
+"""Maximum number of routes that are judged for one plan."""
+
+MAX_SEARCHES = 20
+"""Maximum number of searches for detours around zones for one plan. Each of them blocks the operator for up to 80 ms."""
 
 MAX_LEFT = 100
-"""Waypoints after a denied one that are judged from before it."""
+"""Maximum number of waypoints after a denied one that are judged from the point before it."""
 
 _MAX_DENIED = 5
-"""Denied legs after which a way is not judged any further."""
+"""Number of denied legs after which the rest of a route is not judged."""
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
-    """A mission's way as the policies let it be flown.
+class MissionRoute:
+    """The route of a mission as the policies allow it.
 
     Attributes:
-        legs: those not flown as asked for, in order.
-        distance_m: over ground, with the ways around zones.
-        needed_min: minutes of flight, with these and the limits of speed and altitude. Like the distance it may be too low
-            where legs are denied: what comes after some is not judged.
+        legs: Legs that are not flown as requested, in order.
+        distance_m: Ground distance including detours.
+        needed_min: Flight time in minutes with detours and limits of speed and altitude. Time and distance may be too low if
+            legs are denied, because the legs after them may not be judged.
     """
 
     legs: tuple[LegLegality, ...]
@@ -65,29 +67,29 @@ class Way:
 
     @property
     def denied(self) -> LegLegality | None:
-        """The first leg that is not flown."""
+        """The first denied leg."""
         return next((leg for leg in self.legs if leg.outcome == "Denied"), None)
 
     def conflict(self, available_min: float | None) -> str | None:
-        """Why it is not flown as planned, as a sentence; None if it is.
+        """Return why the route cannot be flown as planned, or None if it can.
 
         Args:
-            available_min: minutes that the drone can fly with its reserve kept; None: they do not matter.
+            available_min: Available flight time of the drone in minutes, or None to ignore it.
         """
         denied = self.denied
         if denied is not None:
             where = f"the leg to {denied.end.lat:.6f}, {denied.end.lon:.6f}"
-            return f"policies do not let {where} be flown: {denied.message}"
+            return f"policies do not allow {where}: {denied.message}"
         if available_min is None or not self.legs or self.needed_min <= available_min:
             return None
         names = ", ".join(distinct(name for leg in self.legs for name in leg.policies)) or "the drone's limits"
         return (
-            f"with what {names} ask for the mission takes {self.needed_min:.1f} min for {self.distance_m:.0f} m; the drone"
-            f" can fly {max(available_min, 0):.1f} min with its reserve kept"
+            f"under {names} the mission takes {self.needed_min:.1f} min for {self.distance_m:.0f} m, but the drone can fly only"
+            f" {max(available_min, 0):.1f} min without its battery reserve"
         )
 
-    def noted(self, choice: DroneChoice, conflict: str | None) -> DroneChoice:
-        """The choice of a drone with what is known of its way."""
+    def add_to(self, choice: DroneChoice, conflict: str | None) -> DroneChoice:
+        """Return the choice of a drone with the legality of its route."""
         return choice.model_copy(
             update={
                 "legality": self.legs[:MAX_LISTED],
@@ -97,28 +99,28 @@ class Way:
         )
 
 
-class WayJudge:
-    """Judges an application's way for one drone after another; drones that stand together share the answer."""
+class RouteJudge:
+    """Judges the route of an application for several drones. Drones with the same home and limits share the result."""
 
     def __init__(self, application: Application, area: OperationArea, inventory: Inventory, settings: Settings) -> None:
         self._application = application
         self._area = area
         self._inventory = inventory
         self._settings = settings
-        self._known: dict[tuple[object, ...], Way] = {}
+        self._known: dict[tuple[object, ...], MissionRoute] = {}
         self._searches = MAX_SEARCHES
 
     @property
     def exhausted(self) -> bool:
-        """Whether no further way should be judged."""
-        return len(self._known) >= MAX_WAYS or self._searches <= 0
+        """True if no further route should be judged."""
+        return len(self._known) >= MAX_ROUTES or self._searches <= 0
 
-    def way(self, drone: Drone, mission: Estimate | None) -> Way | None:
-        """The way that a drone would fly; None where it is not asked for, or the drone is not flown for it.
+    def way(self, drone: Drone, mission: Estimate | None) -> MissionRoute | None:
+        """Return the route that a drone would fly, or None if it is not judged (no start time, or no flight of its own).
 
         Args:
-            drone: Whose way.
-            mission: What the mission takes of it; None when the application comes along.
+            drone: Drone that flies.
+            mission: Estimated flight, or None if the application shares the flight of another one.
         """
         home, leader = home_of(drone, self._inventory.depots), self._application.spec.leader
         mobility, time_s = drone.spec.services.mobility, self._settings.time_s
@@ -131,9 +133,9 @@ class WayJudge:
         base = drone.spec.home.alt if drone.spec.home is not None else None
         key = (home, base, drone.spec.depot, mobility.max_altitude, mobility.max_speed, held)
         if key not in self._known and not held:
-            self._known[key] = Way((), mission.distance_m, mission.needed_min)
+            self._known[key] = MissionRoute((), mission.distance_m, mission.needed_min)
         elif key not in self._known:
-            # What holds when it begins or when it ends may hold when the drone is there.
+            # A policy that applies at the start or the end of the mission may apply at any time between.
             during = UncertainTime(time_s + mission.needed_min * 60, time_s)
             cruise_mps = min(self._settings.cruise_speed_mps, mobility.max_speed)
             now = Situation(
@@ -147,7 +149,7 @@ class WayJudge:
             )
             granted = flight_grant(self._application, drone, self._inventory, self._area)
             own = compile_grant(granted, home, self._settings.flat_terrain)
-            # The system flies wherever the application's drone may be; a driver with partial control stays where it works.
+            # The system may use the whole corridor. A driver with partial control must stay in the operation area.
             system = replace(own, operation_area=own.flight_area, operation_area_border=own.flight_area_border)
             stays = replace(own, flight_area=own.operation_area, flight_area_border=own.operation_area_border)
             flight = _Flight(now, system, stays if leader.control == "partial" else own, self._searches)
@@ -160,10 +162,10 @@ class WayJudge:
 def with_legality(
     application: Application, plan: DeploymentPlanSpec, inventory: Inventory, settings: Settings
 ) -> DeploymentPlanSpec:
-    """A plan with what the policies of now say of its drone's way; the same object if that is no news.
+    """Return a plan with the legality of its route under the current policies. Return the same object if nothing changed.
 
     Raises:
-        InvalidObject: the application names an unknown depot or its geometry is broken.
+        InvalidObject: The application names an unknown depot, or its geometry is invalid.
     """
     choice = plan.drone
     drone = inventory.drones.get(choice.node) if choice is not None and choice.shared_with is None else None
@@ -172,16 +174,16 @@ def with_legality(
     if choice is None or drone is None or area is None or home is None:
         return plan
     mission = MissionEstimator(application.spec, area, settings).estimate(home, drone)
-    way = WayJudge(application, area, inventory, settings).way(drone, mission)
+    way = RouteJudge(application, area, inventory, settings).way(drone, mission)
     if way is None:
         return plan
-    noted = way.noted(choice, way.conflict(choice.mission.available if choice.mission is not None else None))
+    noted = way.add_to(choice, way.conflict(choice.mission.available if choice.mission is not None else None))
     return plan if noted == choice else plan.model_copy(update={"drone": noted})
 
 
 @dataclass(slots=True)
 class _Flight:
-    """A mission that is flown leg by leg as the engine permits it."""
+    """Simulated flight of a mission, leg by leg, as the policy engine permits it."""
 
     now: Situation
     grant: CompiledGrant
@@ -193,20 +195,20 @@ class _Flight:
     climbed_m: float = 0.0
 
     def fly(self, legs: list[MissionLeg]) -> None:
-        """Take off and fly the legs, until too many are denied."""
+        """Simulate the takeoff and the legs until too many are denied."""
         self._take_off(legs)
         for index, leg in enumerate(legs):
-            # An answer that costs a search need not be found twice: the way is not legal.
+            # The route is not legal, so further expensive searches are useless.
             if [n.outcome for n in self.noted].count("Denied") >= _MAX_DENIED:
                 return
             if (leg.start.lat, leg.start.lon) != (leg.end.lat, leg.end.lon) or leg.end.alt is not None:
                 self._fly(leg, legs[index + 1 :])
 
-    def way(self, climb_speed_mps: float, stay_min: float) -> Way:
-        """What was flown, with the landing."""
+    def way(self, climb_speed_mps: float, stay_min: float) -> MissionRoute:
+        """Return the flown route, including the landing."""
         climbed_m = self.climbed_m + self.now.altitude_m
         needed_min = (self.flown_s + climbed_m / climb_speed_mps) / 60 + stay_min
-        return Way(tuple(self.noted), self.distance_m, needed_min)
+        return MissionRoute(tuple(self.noted), self.distance_m, needed_min)
 
     def _take_off(self, legs: list[MissionLeg]) -> None:
         first = legs[0].end
@@ -226,48 +228,48 @@ class _Flight:
         self.now = replace(self.now, altitude_m=height, in_air=True)
 
     def _fly(self, leg: MissionLeg, following: list[MissionLeg]) -> None:
-        asked = GotoArgs(leg.end.lat, leg.end.lon, leg.end.alt, leg.end.altitude_reference)
-        verdict = judge(Call("Goto", asked), self.now, self.driver if leg.flown_by == "driver" else self.grant)
-        if isinstance(verdict.args, GotoArgs) and _same_place(verdict.args, asked):
+        request = GotoArgs(leg.end.lat, leg.end.lon, leg.end.alt, leg.end.altitude_reference)
+        verdict = judge(Call("Goto", request), self.now, self.driver if leg.flown_by == "driver" else self.grant)
+        if isinstance(verdict.args, GotoArgs) and _same_place(verdict.args, request):
             if verdict.action != "allow":
                 self._note(leg, "Corrected", verdict)
             self._arrive(verdict.args)
             return
         if leg.free:
-            self._arrive(asked)
+            self._arrive(request)
             return
-        around = self._around(asked) if leg.flown_by == "system" else None
-        if around is not None:
+        detour = self._detour(request) if leg.flown_by == "system" else None
+        if detour is not None:
             before_m = self.distance_m
-            for part in around:
+            for part in detour:
                 self._arrive(part)
-            self._note(leg, "Detour", verdict, f"the system flies around, {self.distance_m - before_m:.0f} m: ")
+            self._note(leg, "Detour", verdict, f"the system flies a detour of {self.distance_m - before_m:.0f} m: ")
             return
         given_up = leg.flown_by == "system" and self.searches <= 0
         after = self._stranded(following) if leg.flown_by == "driver" else ""
-        self._note(leg, "Denied", verdict, "no more ways around are looked for: " if given_up else "", after)
-        self._arrive(asked)
+        self._note(leg, "Denied", verdict, "no further detour is searched: " if given_up else "", after)
+        self._arrive(request)
 
     def _stranded(self, following: list[MissionLeg]) -> str:
-        """What a driver should know that passes over a denied waypoint: from before it no other one may be legal."""
+        """Return a note if a driver that skips a denied waypoint cannot reach any of the following ones either."""
         left = list(takewhile(lambda leg: leg.flown_by == "driver", following))[:MAX_LEFT]
         ends = [GotoArgs(leg.end.lat, leg.end.lon, leg.end.alt, leg.end.altitude_reference) for leg in left]
         if not ends or any(judge(Call("Goto", end), self.now, self.driver).permits for end in ends):
             return ""
-        count = f"none of the {len(ends)} waypoints after it" if len(ends) > 1 else "the waypoint after it neither"
-        return f"; a driver that passes over it reaches {count}: move the path, or use regionBased navigation"
+        targets = f"any of the {len(ends)} waypoints after it" if len(ends) > 1 else "the waypoint after it"
+        return f"; a driver that skips it cannot reach {targets}: move the path, or use regionBased navigation"
 
-    def _around(self, asked: GotoArgs) -> list[GotoArgs] | None:
-        """The legs of a legal way to a place, as they are permitted; None if no short search finds one."""
+    def _detour(self, request: GotoArgs) -> list[GotoArgs] | None:
+        """Return the permitted legs of a detour to a position, or None if a short search finds none."""
         grant = self.grant
         begin = grant.locate(self.now)
         present_m = self.now.altitude_m
         wanted = (
             present_m
-            if asked.alt is None
-            else altitude_above_home_m(asked.alt, asked.reference, self.now.home, grant.flat_terrain)
+            if request.alt is None
+            else altitude_above_home_m(request.alt, request.reference, self.now.home, grant.flat_terrain)
         )
-        goal = grant.frame.xy(asked.lat, asked.lon)
+        goal = grant.frame.xy(request.lat, request.lon)
         for height in dict.fromkeys((present_m if wanted is None else wanted, present_m)):
             if begin is None or self.searches <= 0:
                 return None
@@ -279,16 +281,17 @@ class _Flight:
         return None
 
     def _permitted(self, parts: list[GotoArgs]) -> list[GotoArgs]:
-        """The parts of a way as the engine permits them, one after the other; empty if it denies one."""
-        now, found = self.now, []
+        """Return the legs of a route as the engine permits them, or an empty list if it denies one."""
+        now = self.now
+        permitted = []
         for part in parts:
             verdict = judge(Call("Goto", part), now, self.grant)
             if not isinstance(verdict.args, GotoArgs) or not _same_place(verdict.args, part):
                 return []
-            found.append(verdict.args)
+            permitted.append(verdict.args)
             height = now.altitude_m if verdict.args.alt is None else verdict.args.alt
             now = replace(now, lat=part.lat, lon=part.lon, altitude_m=height)
-        return found
+        return permitted
 
     def _arrive(self, flown: GotoArgs) -> None:
         now, frame = self.now, self.grant.frame

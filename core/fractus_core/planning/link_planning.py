@@ -1,4 +1,4 @@
-"""Which direct links a plan makes possible: between its drone and the edge nodes with instances the drone can use."""
+"""Direct links of a plan, between its drone and the edge nodes with instances that the drone's components use."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from fractus_core.planning.candidates import direct_reach_m
 from fractus_core.planning.operation_area import route_of
 
 MAX_WAYPOINTS = 1000
-"""A longer path is not told: it would be repeated in every link, and agents judge by the velocity instead."""
+"""Maximum path length. Longer paths are omitted, because each link repeats them. Agents then predict from the velocity."""
 
 DEFAULT_HEURISTIC = Heuristic(kind="preferDirect")
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedLink:
-    """A direct link that a drone may have.
+    """A possible direct link of a drone.
 
     Attributes:
-        drone: the node that asks.
-        node: the node that is asked.
-        technology: of the two interfaces.
-        pairing: of the interface of the node that is asked: the drone joins its network.
-        range_m: the lesser reach of the two interfaces.
-        bandwidth_mbps: the lesser bandwidth of the two interfaces.
-        position: of the node that is asked.
-        heuristic: of the first of the components in the manifest.
-        instances: what the drone's components can use on that node, in the order of the manifest.
+        drone: Name of the drone, which sets up the link.
+        node: Name of the edge node, which accepts the link.
+        technology: Network technology of both interfaces.
+        pairing: Network settings of the edge node, which the drone joins.
+        range_m: Smaller range of the two interfaces.
+        bandwidth_mbps: Smaller bandwidth of the two interfaces.
+        position: Position of the edge node.
+        heuristic: Heuristic of the first component in the manifest.
+        instances: Instances on the edge node that the drone's components use, in the order of the manifest.
     """
 
     drone: str
@@ -49,13 +49,13 @@ class PlannedLink:
 def plan_links(
     application: Application, plan: DeploymentPlanSpec, drone: Drone | None, edge_nodes: Mapping[str, EdgeNode]
 ) -> tuple[PlannedLink, ...]:
-    """The direct links of a plan by node: one to each edge node that hosts a hybrid component which the drone's use.
+    """Return the direct links of a plan: one to each edge node with a hybrid component that the drone's components use.
 
     Args:
-        application: Whose plan it is.
-        plan: Where its instances run.
-        drone: The drone of the plan; None where there is none, or none any more.
-        edge_nodes: By name. One that is gone, or has no interface that pairs with the drone's, gets no link.
+        application: Application of the plan.
+        plan: Placements of its instances.
+        drone: Drone of the plan, or None if it has none or the drone does not exist any more.
+        edge_nodes: Edge nodes by name. Missing nodes and nodes without a matching interface get no link.
     """
     if drone is None:
         return ()
@@ -70,17 +70,20 @@ def plan_links(
 
 
 def _link(drone: Drone, node: EdgeNode, hosted: Sequence[tuple[Component, PlannedInstance]]) -> PlannedLink | None:
-    ours, theirs = direct_interface(drone.spec.interfaces), direct_interface(node.spec.interfaces)
-    reach_m = direct_reach_m([ours], [theirs]) if ours is not None and theirs is not None else None
-    if ours is None or theirs is None or theirs.pairing is None or reach_m is None:
+    interface = direct_interface(drone.spec.interfaces)
+    peer_interface = direct_interface(node.spec.interfaces)
+    if interface is None or peer_interface is None or peer_interface.pairing is None:
+        return None
+    reach_m = direct_reach_m([interface], [peer_interface])
+    if reach_m is None:
         return None
     return PlannedLink(
         drone=drone.name,
         node=node.name,
-        technology=theirs.technology,
-        pairing=theirs.pairing,
+        technology=peer_interface.technology,
+        pairing=peer_interface.pairing,
         range_m=reach_m,
-        bandwidth_mbps=min(ours.bandwidth_mbps, theirs.bandwidth_mbps),
+        bandwidth_mbps=min(interface.bandwidth_mbps, peer_interface.bandwidth_mbps),
         position=node.spec.location,
         heuristic=hosted[0][0].heuristic or DEFAULT_HEURISTIC,
         instances=tuple(placed for _, placed in hosted),
@@ -88,10 +91,10 @@ def _link(drone: Drone, node: EdgeNode, hosted: Sequence[tuple[Component, Planne
 
 
 def flown_path(spec: ApplicationSpec, depots: Mapping[str, Depot]) -> tuple[Position, ...]:
-    """The waypoints that a drone flies for an application, in order; empty where part of its way is not known before.
+    """Return the waypoints of an application's flight in order, or an empty path if part of the route is unknown.
 
     Raises:
-        InvalidObject: a control point names an unknown depot.
+        InvalidObject: A control point names an unknown depot.
     """
     points = spec.driver.control_points if spec.driver is not None else ()
     path = () if any(point.region is not None for point in points) else tuple(route_of(spec, depots))
@@ -99,7 +102,7 @@ def flown_path(spec: ApplicationSpec, depots: Mapping[str, Depot]) -> tuple[Posi
 
 
 def _is_used_aboard(spec: ApplicationSpec, component: Component) -> bool:
-    """Whether a component is hybrid, can be called, and a component on the drone calls it or draws it near."""
+    """Return True for a hybrid component with ports that a drone component calls or is a partner of."""
     if component.placement != "hybrid" or not component.container.ports:
         return False
     named = {*component.hybrid_to, *component.ingress}

@@ -1,4 +1,4 @@
-"""What a mission asks of a drone: how long it takes, which legs the system flies, whom it can take along."""
+"""Missions: flight time estimates, legs, transit flights, and shared flights."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from fractus_core.planning.operation_area import OperationArea, control_routes
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """What a mission takes of a drone, from its stand and back to it.
+    """Estimated flight of a mission, from the parking position of the drone and back.
 
     Attributes:
-        distance_m: over ground.
-        approach_m: of it from the stand to the first point.
-        top_m: the highest point, above home.
-        needed_min: minutes of flight.
-        available_min: minutes that the drone can fly with its reserve kept.
+        distance_m: Ground distance.
+        approach_m: Ground distance from the parking position to the first point.
+        top_m: Maximum altitude above home.
+        needed_min: Flight time in minutes.
+        available_min: Available flight time in minutes, without the battery reserve.
     """
 
     distance_m: float
@@ -41,22 +41,22 @@ class Estimate:
 
 
 class MissionEstimator:
-    """What an application asks of a drone; what does not depend on the drone is found once."""
+    """Estimates the mission of an application for several drones. Results for the same home are computed once."""
 
     def __init__(self, spec: ApplicationSpec, area: OperationArea, settings: Settings) -> None:
         self._area = area
         self._settings = settings
         self._stay_min = stay_minutes(spec)
-        self._ways: dict[tuple[float, float], tuple[float, float]] = {}
+        self._distances_by_home: dict[tuple[float, float], tuple[float, float]] = {}
         self._climbs: dict[float | None, tuple[float, float]] = {}
 
     def estimate(self, home: Point, drone: Drone) -> Estimate:
-        """Length, climb and time of the whole mission, with the way to the first point and home from the last.
+        """Estimate distance, altitude and time of the mission, including approach and return.
 
-        Legs are straight; altitudes are gained and lost at the climb speed on top of the time over ground; a region
-        counts with the way to its middle and the stay its control point declares.
+        Legs are straight. Altitude changes at the climb speed take additional time. A region counts with the distance to
+        its centre and the duration that its control point declares.
         """
-        approach, distance = self._way(home)
+        approach, distance = self._distances(home)
         top, climb = self._climb(drone)
         mobility = drone.spec.services.mobility
         speed, available = self._settings.cruise_speed_mps, 0.0
@@ -66,12 +66,15 @@ class MissionEstimator:
         needed = (distance / speed + climb / self._settings.climb_speed_mps) / 60 + self._stay_min
         return Estimate(distance, approach, top, needed, available)
 
-    def _way(self, home: Point) -> tuple[float, float]:
+    def _distances(self, home: Point) -> tuple[float, float]:
         key = (home.lat, home.lon)
-        if key not in self._ways:
+        if key not in self._distances_by_home:
             approach = distance_m(home, self._area.route[0])
-            self._ways[key] = (approach, approach + self._area.length_m + distance_m(self._area.route[-1], home))
-        return self._ways[key]
+            self._distances_by_home[key] = (
+                approach,
+                approach + self._area.length_m + distance_m(self._area.route[-1], home),
+            )
+        return self._distances_by_home[key]
 
     def _climb(self, drone: Drone) -> tuple[float, float]:
         base = drone.spec.home.alt if drone.spec.home is not None else None
@@ -82,7 +85,10 @@ class MissionEstimator:
 
 
 def heights_m(route: Sequence[Position], home_amsl_m: float | None) -> list[float]:
-    """Metres above home along a route; unset keeps the altitude, and one above sea level counts if home's is known."""
+    """Return altitudes in metres above home along a route.
+
+    A position without altitude keeps the previous one, and so does an AMSL altitude if the elevation of home is unknown.
+    """
     base = home_amsl_m
     heights = [0.0]
     for place in route:
@@ -96,7 +102,7 @@ def heights_m(route: Sequence[Position], home_amsl_m: float | None) -> list[floa
 
 
 def remaining_minutes(drone: Drone) -> float:
-    """Minutes the drone can fly with what its battery holds."""
+    """Return the flight time in minutes with the present charge of the battery."""
     mobility = drone.spec.services.mobility
     if mobility is None:
         return 0.0
@@ -105,12 +111,12 @@ def remaining_minutes(drone: Drone) -> float:
 
 
 def stay_minutes(spec: ApplicationSpec) -> float:
-    """Minutes that a driver will move in the regions of its control points."""
+    """Return the total declared duration of a driver's flights in regions, in minutes."""
     return sum(p.duration or 0.0 for p in spec.driver.control_points) if spec.driver is not None else 0.0
 
 
 def home_of(drone: Drone, depots: Mapping[str, Depot]) -> Position | None:
-    """Where a drone stands, on the ground; None where that is not known."""
+    """Return the parking position of a drone on the ground, or None if it is unknown."""
     depot = depots.get(drone.spec.depot or "")
     place = drone.spec.home or (depot.spec.location if depot is not None else None)
     return Position(lat=place.lat, lon=place.lon) if place is not None else None
@@ -118,11 +124,11 @@ def home_of(drone: Drone, depots: Mapping[str, Depot]) -> Position | None:
 
 @dataclass(frozen=True, slots=True)
 class MissionLeg:
-    """A straight piece of a mission.
+    """A straight leg of a mission.
 
     Attributes:
-        flown_by: the way home counts as the system's, for any application may leave it to the system.
-        free: the driver finds its own way there, in a region.
+        flown_by: Control authority. The return flight counts as the system's, because every driver may leave it to the system.
+        free: True if the driver chooses its own route, in a region.
     """
 
     start: Position
@@ -134,7 +140,7 @@ class MissionLeg:
 def mission_legs(
     spec: ApplicationSpec, area: OperationArea, home: Position, depots: Mapping[str, Depot]
 ) -> Iterator[MissionLeg]:
-    """The legs from the drone's stand and back to it, in order."""
+    """Return the legs of a mission from the parking position of the drone and back, in order."""
     driver, at = spec.driver, home
     if driver is None:
         for place in area.route:
@@ -156,10 +162,10 @@ def mission_legs(
 def transit_legs(
     spec: ApplicationSpec, area: OperationArea, home: Position, depots: Mapping[str, Depot]
 ) -> list[TransitLeg]:
-    """The legs that the system flies itself.
+    """Return the legs that the system flies.
 
-    To and between the control points of a driver with partial control, through all points of interest of an
-    application without a driver, and home from there. A driver with full control flies all of it.
+    These are the legs to and between the control points of a driver with partial control, or through all points of interest
+    of an application without a driver, and the return flight. A driver with full control flies the whole mission.
     """
     if spec.driver is not None and spec.driver.control != "partial":
         return []
@@ -171,10 +177,10 @@ def transit_legs(
 
 
 def flight_of(application: Application, depots: Mapping[str, Depot]) -> Flight:
-    """What a drone flies for an application: its driver's paths, or its points of interest.
+    """Return the planned flight of an application: the paths of its driver, or its points of interest.
 
     Raises:
-        InvalidObject: a control point names an unknown depot.
+        InvalidObject: A control point names an unknown depot.
     """
     spec = application.spec
     legs: list[tuple[Position, ...]] = []
@@ -184,7 +190,7 @@ def flight_of(application: Application, depots: Mapping[str, Depot]) -> Flight:
             spec.driver.control_points, control_routes(spec.driver.control_points, depots), strict=True
         ):
             if point.region is not None:
-                # The way to a region is known only if it has a start; the way out of it never is.
+                # The route to a region is known only if it has a start. The route out of it is never known.
                 start = route[:1] if point.point is not None else []
                 legs.append((*open_leg, *start))
                 open_leg = []
@@ -196,13 +202,13 @@ def flight_of(application: Application, depots: Mapping[str, Depot]) -> Flight:
     return Flight(application.key, tuple(leg for leg in legs if leg))
 
 
-def ahead(flight: Flight, place: Position, radius_m: float) -> Flight | None:
-    """What is left of a flight whose drone is at a place: from there on, along the path.
+def remaining_flight(flight: Flight, place: Position, radius_m: float) -> Flight | None:
+    """Return the rest of a flight from the position of its drone on.
 
-    Where the path passes the place more than once, the last passage counts, so that no application is promised what may lie behind.
+    If the path passes the position more than once, the last passage counts, so that no visited point is promised again.
 
     Returns:
-        The rest of the flight; None where the drone is nowhere near its path, so that nothing is known of its way.
+        The rest of the flight, or None if the drone is not near its path and its route is therefore unknown.
     """
     if not flight.legs:
         return None
@@ -222,7 +228,7 @@ def ahead(flight: Flight, place: Position, radius_m: float) -> Flight | None:
 
 
 def misses(application: Application, flight: Flight, radius_m: float) -> int | None:
-    """The first point of interest of an application that a flight does not visit; None if it can come along."""
+    """Return the index of the first point of interest that a flight does not visit, or None if the flight can be shared."""
     poi = application.spec.points_of_interest
     if poi is None:
         return 0
@@ -230,10 +236,10 @@ def misses(application: Application, flight: Flight, radius_m: float) -> int | N
 
 
 def first_missed(points: Sequence[Position], flight: Flight, radius_m: float, *, ordered: bool) -> int | None:
-    """The first of some points that a flight does not visit, None if it visits all.
+    """Return the index of the first point that a flight does not visit, or None if it visits all points.
 
-    A point is visited where the path passes within the radius over ground, and within the radius of its altitude if
-    both the point and the path there have one of the same datum. Ordered points must be passed in their order.
+    A point is visited if the path passes within the radius over ground. If both the point and the path have an altitude in
+    the same datum, the altitudes must also differ by at most the radius. Ordered points must be passed in their order.
     """
     path = [p for leg in flight.legs for p in leg]
     if len(path) <= flight.reached:
@@ -263,7 +269,7 @@ def _spot(frame: LocalFrame, place: Position, alt: float | None) -> list[float]:
 
 
 def _segments(frame: LocalFrame, flight: Flight) -> tuple[_Spots, _Spots]:
-    """Starts and ends of the pieces of path that lie ahead: x, y, altitude (nan if unknown), datum; shape (n, 4)."""
+    """Return starts and ends of the remaining segments: x, y, altitude (NaN if unknown), datum; shape (n, 4)."""
     starts, ends = [], []
     passed = flight.reached
     for leg in flight.legs:
@@ -272,16 +278,16 @@ def _segments(frame: LocalFrame, flight: Flight) -> tuple[_Spots, _Spots]:
         for place in leg:
             alt = place.alt if place.alt is not None else alt
             spots.append(_spot(frame, place, alt))
-        # The drone is between the last point reached and the next, so the piece between them counts.
-        ahead = spots[max(passed - 1, 0) :] if passed < len(spots) else []
+        # The drone is between the last reached point and the next one, so the segment between them counts.
+        left = spots[max(passed - 1, 0) :] if passed < len(spots) else []
         passed = max(passed - len(spots), 0)
-        starts += ahead[:-1] or ahead
-        ends += ahead[1:] or ahead
+        starts += left[:-1] or left
+        ends += left[1:] or left
     return np.array(starts), np.array(ends)
 
 
 def _passages(starts: _Spots, ends: _Spots, spot: Sequence[float], radius_m: float) -> _Spots:
-    """From where to where (0 to 1) each piece of path is near a spot; inf where it never is. Shape (n, 2)."""
+    """Return the interval (0 to 1) in which each segment is within a radius of a spot, or inf; shape (n, 2)."""
     along = ends[:, :2] - starts[:, :2]
     offset = starts[:, :2] - np.array(spot[:2])
     a, b = (along**2).sum(axis=1), (along * offset).sum(axis=1)

@@ -30,19 +30,19 @@ from fractus_core.geo import (
 )
 
 MAX_CROSSINGS = 50_000
-"""How often ways and the edges of regions may cross: uniting what they enclose takes a second or so then, and minutes for a hundred
-times as many. A survey of 220 lines each way has as many, and takes a tenth of that."""
+"""Maximum number of crossings of paths and region edges. Their union then takes about a second, but minutes for a hundred
+times as many. A survey of 220 lines in each direction has as many crossings and takes 0.1 s."""
 
 
 @dataclass(frozen=True, slots=True)
 class OperationArea:
-    """Where the drone works, in metres east and north of the frame's origin.
+    """The area in which an application uses its drone, in metres east and north of the frame's origin.
 
     Attributes:
-        shape: the ground the application may use the drone's services above.
-        route: the points visited in order, without the way to the first and home from the last.
-        parts: the areas that shape unites: one a control point, or one for the points of interest.
-        length_m: length of the route over ground.
+        shape: Area above which the application may use the services of the drone.
+        route: Visited positions in order, without approach and return.
+        parts: Areas whose union is `shape`: one for each control point, or one for the points of interest.
+        length_m: Ground distance of the route.
     """
 
     frame: LocalFrame
@@ -53,18 +53,19 @@ class OperationArea:
 
     @property
     def start(self) -> Point:
-        """Where the work begins."""
+        """First position of the route."""
         return ground_point(self.route[0])
 
 
 def operation_area(spec: ApplicationSpec, depots: Mapping[str, Depot], safety_radius_m: float) -> OperationArea | None:
-    """The union of the areas of all control points, or of the points of interest; None without drone components.
+    """Return the union of the areas of all control points or of the points of interest, or None without drone components.
 
-    Points of interest in any order are joined in the order of a short tour that starts with the first. Paths are dilated by the safety radius; a leg that starts at a depot opens to the whole depot, since a drone may
-    stand anywhere in it. Regions count as given.
+    Unordered points of interest are visited on a short tour that starts with the first. Paths are dilated by the safety
+    radius. A leg that starts at a depot widens to the whole depot, because the drone may be parked anywhere in it.
 
     Raises:
-        InvalidObject: a depot is unknown, a ring crosses itself, or ways and edges cross too often; the field is relative to spec.
+        InvalidObject: A depot is unknown, a ring crosses itself, or paths and edges cross too often. The field is relative
+            to spec.
     """
     route = route_of(spec, depots)
     if not route:
@@ -95,14 +96,14 @@ def operation_area(spec: ApplicationSpec, depots: Mapping[str, Depot], safety_ra
 
 
 def check_crossings(spec: ApplicationSpec, route: Sequence[Position]) -> None:
-    """Refuse an application whose area would take so long to work out that others wait for it.
+    """Refuse an application whose operation area would take too long to compute.
 
     Args:
-        spec: of the application.
-        route: as `route_of` tells it.
+        spec: Specification of the application.
+        route: Result of `route_of`.
 
     Raises:
-        InvalidObject: its ways and the edges of its regions cross too often; the field is relative to spec.
+        InvalidObject: Paths and region edges cross too often. The field is relative to spec.
     """
     if not route:
         return
@@ -113,7 +114,7 @@ def check_crossings(spec: ApplicationSpec, route: Sequence[Position]) -> None:
         ways: list[Sequence[Point]] = [point.path for point in driver.control_points if point.path is not None]
         areas = {point.region.polygon for point in driver.control_points if point.region is not None} - {None}
         if not ways and len(areas) < 2:
-            return  # the rings of one region do not cross
+            return  # The rings of one region do not cross.
         rings = [ring for area in areas if area is not None for ring in (area.exterior, *area.holes)]
         field = f"components[{spec.components.index(driver)}].controlPoints"
     elif poi is not None and poi.service_access == "path":
@@ -124,15 +125,15 @@ def check_crossings(spec: ApplicationSpec, route: Sequence[Position]) -> None:
     if count_crossings(lines, MAX_CROSSINGS) > MAX_CROSSINGS:
         raise InvalidObject(
             field,
-            f"ways and edges of regions cross more than {MAX_CROSSINGS} times; give fewer waypoints, or regions with fewer corners",
+            f"paths and edges of regions cross more than {MAX_CROSSINGS} times; use fewer waypoints, or regions with fewer corners",
         )
 
 
 def start_of(point: ControlPoint, depots: Mapping[str, Depot]) -> Position | None:
-    """Where a control point begins, None when it is left open.
+    """Return the start of a control point, or None if it is open.
 
     Raises:
-        InvalidObject: the depot is unknown.
+        InvalidObject: The depot is unknown.
     """
     if point.point is None:
         return None
@@ -147,10 +148,10 @@ def start_of(point: ControlPoint, depots: Mapping[str, Depot]) -> Position | Non
 
 
 def control_routes(points: Sequence[ControlPoint], depots: Mapping[str, Depot]) -> list[list[Position]]:
-    """For each control point the places visited: its start if it has one, then its path or its region's middle.
+    """Return the positions visited at each control point: its start, if any, then its path or the centre of its region.
 
     Raises:
-        InvalidObject: a depot is unknown; the field is relative to the list.
+        InvalidObject: A depot is unknown. The field is relative to the list.
     """
     routes = []
     for i, point in enumerate(points):
@@ -168,10 +169,10 @@ def control_routes(points: Sequence[ControlPoint], depots: Mapping[str, Depot]) 
 
 
 def route_of(spec: ApplicationSpec, depots: Mapping[str, Depot]) -> list[Position]:
-    """The places that a drone visits for an application, in order.
+    """Return the positions that a drone visits for an application, in order.
 
     Raises:
-        InvalidObject: a control point names an unknown depot.
+        InvalidObject: A control point names an unknown depot.
     """
     poi = spec.points_of_interest
     if spec.driver is not None:
@@ -210,7 +211,7 @@ def _control_area(
 
 
 def length_m(frame: LocalFrame, points: Sequence[Point]) -> float:
-    """Length of a polyline over ground in metres."""
+    """Return the ground distance of a polyline in metres."""
     xy = [frame.xy(p.lat, p.lon) for p in points]
     return sum(math.dist(a, b) for a, b in itertools.pairwise(xy))
 
@@ -220,10 +221,10 @@ _MAX_PASSES = 50
 
 
 def short_tour(xy: Sequence[tuple[float, float]]) -> list[int]:
-    """The order in which to visit points, starting with the first and ending anywhere.
+    """Return an order in which to visit points, starting with the first and ending anywhere.
 
-    The shortest for up to nine points (dynamic programming, M. Held and R. Karp 1962); for more the nearest neighbour's
-    tour, untangled by 2-opt, O(n^2) a pass. The same points always give the same order.
+    The order is optimal for up to nine points (dynamic programming, M. Held and R. Karp 1962). For more points it is a
+    nearest-neighbour tour improved by 2-opt, O(n^2) per pass. The same points always give the same order.
     """
     places = np.array(xy, dtype=np.float64).reshape(-1, 2)
     distance = np.hypot(*(places[:, None, :] - places[None, :, :]).transpose(2, 0, 1))

@@ -185,9 +185,9 @@ class PlanBuilder:
         rejections = {**self._rejected}
         for key, rejection in self._far.items():
             rejections.setdefault(key, rejection)
-            listable = [r for key, r in rejections.items() if key not in self._placed]
-            listed = listable[: self.settings.rejections_listed]
-            order = {c.name: i for i, c in enumerate(self.spec.components)}
+        listable = [r for key, r in rejections.items() if key not in self._placed]
+        listed = listable[: self.settings.rejections_listed]
+        order = {c.name: i for i, c in enumerate(self.spec.components)}
         listed.sort(key=lambda r: (order[r.component], r.node))
         mentioned: dict[str, set[str]] = {}
         for name, node in (*rejections, *self._placed):

@@ -1,4 +1,4 @@
-"""Plug-ins that replace how drones are ranked and how areas are covered: entry points of installed packages."""
+"""Plug-ins for the ranking of drones and the coverage of areas: entry points of installed packages."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ GROUP = "fractus.planning"
 
 
 class UnknownPlugin(Exception):
-    """There is no plug-in of a name, or it is not a function."""
+    """A plug-in does not exist, or is not a function."""
 
 
 def load_plugin(name: str | None) -> Any:
-    """The plug-in of a name; None when none is asked for.
+    """Load a plug-in by name. Return None for an empty name.
 
     Raises:
-        UnknownPlugin: there is none, or it is not a function.
+        UnknownPlugin: The plug-in does not exist, or is not a function.
     """
     if not name:
         return None
-    known = {entry.name: entry for entry in importlib.metadata.entry_points(group=GROUP)}
-    if name not in known:
-        names = ", ".join(sorted(known)) or "none is installed"
-        raise UnknownPlugin(f"there is no plug-in {name} ({names})")
-    found = known[name].load()
-    if not callable(found):
-        raise UnknownPlugin(f"{known[name].value} is not a function")
-    return found
+    entries = {entry.name: entry for entry in importlib.metadata.entry_points(group=GROUP)}
+    if name not in entries:
+        names = ", ".join(sorted(entries)) or "none"
+        raise UnknownPlugin(f"plug-in {name} is not installed (installed: {names})")
+    plugin = entries[name].load()
+    if not callable(plugin):
+        raise UnknownPlugin(f"{entries[name].value} is not a function")
+    return plugin

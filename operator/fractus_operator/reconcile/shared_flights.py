@@ -8,7 +8,7 @@ from fractus_core.api import Application, Depot, InvalidObject
 from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.control import Outcome, OutcomeKind
 from fractus_core.planning.inventory import Flight
-from fractus_core.planning.mission import ahead, flight_of, misses
+from fractus_core.planning.mission import flight_of, misses, remaining_flight
 
 from fractus_operator.cluster.reading import Submitted
 from fractus_operator.inventory.claims import Flown
@@ -48,7 +48,7 @@ def offered_flights(
             continue
         if flight is not None and host.in_flight and host.drone.name != shared:
             place = host.drone.status.position if host.drone.status is not None else None
-            flight = ahead(flight, place, radius_m) if place is not None else None
+            flight = remaining_flight(flight, place, radius_m) if place is not None else None
         if flight is not None:
             found[host.drone.name] = flight
     return found

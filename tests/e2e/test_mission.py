@@ -6,10 +6,8 @@ import json
 import re
 import time
 
-import pytest
 from conftest import DRONE, NODES, SYSTEM, example, flight_state, short_flight
 from disclosure import readable, secrets
-from fractus_cli import main
 from fractus_runtime.audit_chain import verify
 from kubectl import Kube, Object, condition
 from leaks import leaks
@@ -51,7 +49,7 @@ def children(kube: Kube, namespace: str = "default", pods: str = "") -> list[str
     return [f"{o['kind']}/{o['metadata']['name']}" for o in (*found, *grants)]
 
 
-def test_traffic_monitoring_flies_under_policies(grounded: Kube, capsys: pytest.CaptureFixture[str]) -> None:
+def test_traffic_monitoring_flies_under_policies(grounded: Kube) -> None:
     kube = grounded
     app = example("application.yaml")[0]
     started = time.monotonic()
@@ -97,21 +95,8 @@ def test_traffic_monitoring_flies_under_policies(grounded: Kube, capsys: pytest.
     application = "fractus.dev/application=traffic-monitoring"
     stopped = kube.wait("all pods stopped", lambda: all_stopped(kube.all("pods", "default", application)), timeout_s=60)
     assert len(stopped) >= 7
-    config = ("--kubeconfig", str(kube.kubeconfig))
-    assert main.run(["logs", "traffic-monitoring", "--system", *config]) == 0
-    log = capsys.readouterr().out.splitlines()
-    assert any(line.startswith(f"Navigator@{DRONE} | ") and "run: mission complete" in line for line in log)
-    assert {line.split(" | ")[0] for line in log} >= {
-        f"AerialViewer@{DRONE}",
-        f"GroundViewer@{NODES['edge-1']}",
-        f"fractus-agent@{DRONE}",
-        f"fractus-mobility@{DRONE}",
-    }
-    assert (
-        main.run(["logs", "traffic-monitoring", "--component", "Navigator", "--tail", "1", "-o", "json", *config]) == 0
-    )
-    (last,) = map(json.loads, capsys.readouterr().out.splitlines())
-    assert (last["node"], bool(last["time"])) == (DRONE, True)
+    logs = kube.must("logs", "-l", application, "--all-containers", "--prefix", "--tail=-1", "--max-log-requests=20")
+    assert "run: mission complete" in logs
     events = {e["reason"] for e in kube.all("events", "default")}
     assert {"Planned", "MissionComplete"} <= events
 

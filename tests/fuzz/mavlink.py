@@ -1,43 +1,36 @@
 """Fuzz the MAVLink parser: the same messages however the bytes are cut, and no exception on any of them.
 
-Also checks that recorded frames are found in a tlog while it grows, and that no changed frame is accepted on a signed link.
+Also checks that no changed frame is accepted on a signed link.
 """
 
 from __future__ import annotations
 
-import struct
 import sys
 
 import atheris
 
-with atheris.instrument_imports(include=["fractus_runtime.mavlink_codec", "pymavlink", "fractus_cli.tlog_tail"]):
-    from fractus_cli.tlog_tail import Tail, split
+with atheris.instrument_imports(include=["fractus_runtime.mavlink_codec", "pymavlink"]):
     from fractus_runtime.mavlink_codec import MAX_FRAME_LENGTH, Endpoint, Message, Parser
     from mavlink_frames import MESSAGE_CLASSES, MessageClass, frame_v1, frame_v2
     from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 MARKERS = bytes((mavlink.PROTOCOL_MARKER_V1, mavlink.PROTOCOL_MARKER_V2))
 KEY = bytes(range(32))
-STAMP = struct.pack(">Q", 1_790_000_000_000_000)
-NAME = "000001-20260601T120000Z.tlog"
 
 
 def one(data: bytes) -> None:
-    """Check one input as a stream, as a tlog, and as the payload of intact frames."""
+    """Check one input as a stream and as the payload of intact frames."""
     parsed(data)
-    check_tlog(data)
     if len(data) > 3:
         kind = MESSAGE_CLASSES[int.from_bytes(data[:2], "little") % len(MESSAGE_CLASSES)]
         # Any length: empty, cut by the sender, or extended by a newer dialect.
         payload = data[3 : 3 + data[2]]
         frame = frame_v2(kind, payload)
         check_encoded_again(accepted(frame, data))
-        check_growing_tlog(frame, data)
         check_signed(kind, payload, data)
         if kind.id <= 0xFF:
             old = frame_v1(kind, payload)
             assert repr(accepted(old, data).values) == repr(accepted(frame, data).values)
-            check_growing_tlog(old, data)
             check_unsigned(old, kind)
         check_unsigned(frame, kind)
 
@@ -86,39 +79,6 @@ def check_encoded_again(message: Message) -> None:
     """Check that a received message can be sent and is received as the same."""
     (again,) = Parser().feed(Endpoint(1, 1).encode(message.name, message.values))
     assert repr(again.values) == repr(message.values)
-
-
-def check_tlog(data: bytes) -> None:
-    """Check that any bytes are split into parts of themselves, and that at most one frame is kept for later."""
-    frames, rest = split(data)
-    assert all(frame.data in data for frame in frames)
-    assert sum(len(STAMP) + len(frame.data) for frame in frames) + len(rest) <= len(data)
-    assert len(rest) < len(STAMP) + MAX_FRAME_LENGTH, len(rest)
-
-
-class Growing:
-    """A tlog that is being written."""
-
-    def __init__(self) -> None:
-        self.data: bytes | None = None
-
-    def sizes(self) -> dict[str, int]:
-        return {} if self.data is None else {NAME: len(self.data)}
-
-    def read(self, _name: str, offset: int) -> bytes:
-        return (self.data or b"")[offset:]
-
-
-def check_growing_tlog(frame: bytes, cuts: bytes) -> None:
-    """Check that each record is found once, wherever the file ended when it was read."""
-    whole, directory = (STAMP + frame) * 3, Growing()
-    tail = Tail(directory)
-    tail.read()
-    found = []
-    for end in sorted({*(cut * len(whole) // 255 for cut in cuts[:8]), len(whole)}):
-        directory.data = whole[:end]
-        found += tail.read()
-    assert [record.data for record in found] == [frame] * 3, found
 
 
 def check_signed(kind: MessageClass, payload: bytes, data: bytes) -> None:

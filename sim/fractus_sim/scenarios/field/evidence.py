@@ -9,12 +9,12 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from fractus_cli.tlog_tail import split
 from fractus_runtime.audit_chain import entries
 from fractus_runtime.mavlink_codec import Message, Parser, enum_names
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_sim.experiment.station import FLYING_STATES
+from fractus_sim.experiment.tlog import read_tlog
 from fractus_sim.report.track import Place, Sample, Track
 
 _SAMPLE_S = 0.2
@@ -122,11 +122,11 @@ class _Clock:
 
 
 def _frames(path: Path) -> Iterator[tuple[float, Message]]:
-    """The messages of a tlog with their Unix times."""
+    """Yield the messages of a tlog with their Unix times in seconds."""
     parser = Parser()
-    for frame in split(path.read_bytes())[0]:
-        for message in parser.feed(frame.data):
-            yield frame.time_s, message
+    for time_s, frame in read_tlog(path.read_bytes()):
+        for message in parser.feed(frame):
+            yield time_s, message
 
 
 def _flight(path: Path) -> tuple[tuple[Sample, ...], _Clock, list[str]]:

@@ -19,8 +19,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "integration"))
 
-from fractus_agent.redirector.conntrack import Conntrack
-from fractus_agent.redirector.redirector import Namespaces, Redirector
+from fractus_agent.redirector.connections import Conntrack, PodNamespaces
+from fractus_agent.redirector.redirector import Redirector
 from redirect_rig import DIRECT, VIP, Rig, rig
 
 RATES = (20, 50, 100, 200, 400)
@@ -50,9 +50,9 @@ async def measure(switches: int) -> list[dict[str, object]]:
     claims: list[dict[str, object]] = []
     with tempfile.TemporaryDirectory() as folder, rig() as world:
         (Path(folder) / "pod").symlink_to(world.path("dpod"))
-        namespaces = Namespaces(Path(folder), own=world.path("drone"))
+        namespaces = PodNamespaces(Path(folder), own=world.path("drone"))
         redirector = Redirector(world.maps("drone"), Conntrack(world.netlink("drone")), namespaces)
-        redirector.serve([VIP])
+        redirector.set_services([VIP])
         world.servers(work_s=0.001)
         keeping = asyncio.create_task(redirector.run())
         for rate in RATES:

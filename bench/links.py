@@ -20,7 +20,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "integration"))
 
-from connected_world import connected_world, until
+from linked_world import linked_world, until
 
 TICKS = os.sysconf("SC_CLK_TCK")
 MEMORY_LIMIT_MB, PROCESSOR_LIMIT = 60.0, 1.0
@@ -60,7 +60,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write the claims to this file")
     options = parser.parse_args()
     seconds = 8.0 if options.quick else 30.0
-    with tempfile.TemporaryDirectory() as folder, connected_world(Path(folder)) as world:
+    with tempfile.TemporaryDirectory() as folder, linked_world(Path(folder)) as world:
         edge, drone = world.edge("e1", 20.0), world.drone()
         link = world.link(drone, edge)
         world.serve()

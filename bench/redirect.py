@@ -19,8 +19,8 @@ from ipaddress import IPv4Address
 from pathlib import Path
 
 from fractus_agent.redirector.netlink import NETLINK_NETFILTER, Netlink, in_namespace
-from fractus_agent.redirector.nft import Endpoint, Maps, Redirect
-from fractus_agent.redirector.tables import Ports, create
+from fractus_agent.redirector.nft_maps import Endpoint, NftMaps, Redirect
+from fractus_agent.redirector.ruleset import Ports, create
 
 SIZES = (1, 4, 16, 64)
 FOREIGN = 2000
@@ -37,7 +37,7 @@ class Side:
         subprocess.run(["ip", "netns", "add", name], check=True)
         create("fxl*", PORTS, self.inside, clients=True)
         self.netlink = in_namespace(Path("/run/netns", name), lambda: Netlink(NETLINK_NETFILTER))
-        self.maps = Maps(self.netlink, lambda _: create("fxl*", PORTS, self.inside, clients=True))
+        self.maps = NftMaps(self.netlink, lambda _: create("fxl*", PORTS, self.inside, clients=True))
 
     def run(self, *words: str) -> None:
         subprocess.run([*self.inside, *words], check=True, capture_output=True)

@@ -1,1 +1,1 @@
-"""The daemon of a node: registration, telemetry, grants."""
+"""Fractus agent: daemon of a drone or edge node (registration, Grants, certificate, telemetry, direct links)."""

@@ -1,4 +1,4 @@
-"""`python -m fractus_agent`: runs the agent of a node until it is told to stop."""
+"""Entry point of the agent: `python -m fractus_agent`."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from collections.abc import Mapping
 
 from fractus_runtime import logs
 
-from fractus_agent.cluster.store import Store, Unconfigured, connect
-from fractus_agent.daemon import Agent
+from fractus_agent.agent import Agent
 from fractus_agent.settings import BadSetting, MissingSetting, Settings
+from fractus_agent.store import Store, Unconfigured, connect
 
 LOG = logging.getLogger("fractus_agent")
 
@@ -23,7 +23,7 @@ async def serve(settings: Settings) -> None:
     """Run the agent until SIGTERM or SIGINT.
 
     Raises:
-        Unconfigured: there is no service account and no KUBECONFIG.
+        Unconfigured: There is no service account and no KUBECONFIG.
     """
     store = Store(await connect(), settings.node)
     task = asyncio.create_task(Agent(settings, store).run())
@@ -38,7 +38,7 @@ async def serve(settings: Settings) -> None:
 
 
 def main(environment: Mapping[str, str] = os.environ) -> int:
-    """Run the agent of this node; the exit code."""
+    """Run the agent of this node, and return the exit code."""
     try:
         settings = Settings.from_environment(environment)
     except (MissingSetting, BadSetting) as error:

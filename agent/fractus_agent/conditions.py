@@ -1,4 +1,4 @@
-"""Conditions of the node, as the agent observes them and as Kubernetes writes them."""
+"""Conditions of the node and of its DirectLinks."""
 
 from __future__ import annotations
 
@@ -10,7 +10,14 @@ from typing import Any, Literal
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """One condition, before it gets its time stamps."""
+    """Condition without timestamps.
+
+    Attributes:
+        type: Condition type.
+        status: Condition status.
+        reason: Reason in CamelCase.
+        message: Details for people.
+    """
 
     type: str
     status: Literal["True", "False", "Unknown"]
@@ -19,19 +26,19 @@ class Condition:
 
     @property
     def is_true(self) -> bool:
-        """Whether the status is True."""
+        """True if the status is "True"."""
         return self.status == "True"
 
 
 def timestamp(moment: datetime) -> str:
-    """A moment as Kubernetes writes it, in whole seconds UTC."""
+    """Format a time as Kubernetes does, in whole seconds UTC."""
     return moment.strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
 def to_kubernetes(
     conditions: Iterable[Condition], previous: Sequence[dict[str, Any]], generation: int | None, now: datetime
 ) -> list[dict[str, Any]]:
-    """Conditions as Kubernetes has them; lastTransitionTime is kept while the status stays the same."""
+    """Convert conditions to Kubernetes objects. lastTransitionTime stays while the status stays the same."""
     before = {condition.get("type"): condition for condition in previous}
     result = []
     for condition in conditions:

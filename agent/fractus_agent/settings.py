@@ -1,4 +1,4 @@
-"""Where the agent finds things: its node, its files, the services beside it."""
+"""Settings of the agent, from environment variables."""
 
 from __future__ import annotations
 
@@ -7,24 +7,34 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+DEFAULT_DRAIN_S = 1.5
 MAX_DRAIN_S = 600.0
-"""A drone stays on a link for as long as something drains on it."""
+"""Limit of the drain, because a drone stays on a link while connections drain on it."""
 
 
 class MissingSetting(Exception):
-    """A setting that has no default is not set."""
+    """A required setting is missing."""
 
 
 class BadSetting(Exception):
-    """A setting has a value that it cannot have."""
+    """A setting has an invalid value."""
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What differs between nodes; everything else is a constant of the module that uses it.
+    """Settings of the agent.
 
     Attributes:
-        drain_s: how long connections may finish what they do on a path that their service leaves while it works.
+        node: Name of the Kubernetes node (FRACTUS_NODE, required).
+        description: Manifest of the node's Drone or EdgeNode (FRACTUS_DESCRIPTION).
+        state: State directory (FRACTUS_STATE_DIR).
+        mobility_address: Host and port of the mobility service (FRACTUS_MOBILITY).
+        log_level: Log level (FRACTUS_LOG_LEVEL).
+        log_format: Log format, text or json (FRACTUS_LOG_FORMAT).
+        direct_links: True to use direct links (FRACTUS_DIRECT_LINKS).
+        metrics: Host and port of the Prometheus endpoint, empty for none (FRACTUS_METRICS).
+        drain_s: Time for which connections may stay on a working path that their service has left, in seconds
+            (FRACTUS_DRAIN_S).
     """
 
     node: str
@@ -35,21 +45,21 @@ class Settings:
     log_format: str = "text"
     direct_links: bool = True
     metrics: str = ""
-    drain_s: float = 30.0
+    drain_s: float = DEFAULT_DRAIN_S
 
     @property
     def grants(self) -> Path:
-        """Directory of the stored grants, which the node's services watch."""
+        """Directory of the stored Grants, which the node's services watch."""
         return self.state / "grants"
 
     @property
     def node_object(self) -> Path:
-        """The node's Drone or EdgeNode, which the node's services watch."""
+        """File of the node's Drone or EdgeNode, which the node's services watch."""
         return self.state / "node.json"
 
     @property
     def audit(self) -> Path:
-        """Directory of the audit logs, the services' and this one's."""
+        """Directory of the audit logs of the services and the agent."""
         return self.state / "audit"
 
     @property
@@ -64,18 +74,16 @@ class Settings:
 
     @classmethod
     def from_environment(cls, environment: Mapping[str, str]) -> Settings:
-        """Read FRACTUS_NODE, which is needed, and others.
-
-        These are FRACTUS_DESCRIPTION, _STATE_DIR, _MOBILITY, _LOG_LEVEL, _LOG_FORMAT, _DIRECT_LINKS, _DRAIN_S and _METRICS.
+        """Read the settings from the environment variables of the attributes.
 
         Raises:
             MissingSetting: FRACTUS_NODE is not set.
-            BadSetting: FRACTUS_DRAIN_S is no number of seconds, or too many.
+            BadSetting: FRACTUS_DRAIN_S is not a number of seconds in the allowed range.
         """
         node = environment.get("FRACTUS_NODE", "")
         if not node:
-            raise MissingSetting("FRACTUS_NODE is not set: give it the node's name (fieldRef spec.nodeName)")
-        drain_s = _seconds("FRACTUS_DRAIN_S", environment.get("FRACTUS_DRAIN_S", "30"), MAX_DRAIN_S)
+            raise MissingSetting("FRACTUS_NODE is not set: set it to the node's name (fieldRef spec.nodeName)")
+        drain_s = _seconds("FRACTUS_DRAIN_S", environment.get("FRACTUS_DRAIN_S", str(DEFAULT_DRAIN_S)), MAX_DRAIN_S)
         return cls(
             node=node,
             description=Path(environment.get("FRACTUS_DESCRIPTION", "/etc/fractus/node.yaml")),
@@ -89,16 +97,16 @@ class Settings:
         )
 
 
-def _seconds(name: str, text: str, most: float) -> float:
-    """A time.
+def _seconds(name: str, text: str, maximum: float) -> float:
+    """Parse a number of seconds.
 
     Raises:
-        BadSetting: the text is no number, or one out of bounds.
+        BadSetting: The text is not a number, or out of range.
     """
     try:
         seconds = float(text)
     except ValueError:
         seconds = math.nan
-    if not 0 <= seconds <= most:
-        raise BadSetting(f"{name} is {text[:80]!r}: give it a number of seconds from 0 to {most:g}")
+    if not 0 <= seconds <= maximum:
+        raise BadSetting(f"{name} is {text[:80]!r}: set it to a number of seconds from 0 to {maximum:g}")
     return seconds

@@ -1,22 +1,25 @@
-"""Runs the loops of the agent, and repeats steps that depend on the API server."""
+"""Loops of the agent: supervision, retries while the API server is unavailable, and a watchdog of the event loop."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import faulthandler
 import logging
 from collections.abc import Awaitable, Callable, Coroutine
 from typing import Any
 
-from fractus_agent.cluster.store import Backoff, KubeError
+from fractus_agent.store import Backoff, KubeError
 
 LOG = logging.getLogger(__name__)
 
 FIRST_RETRY_S, MAX_RETRY_S = 0.5, 15.0
+WATCHDOG_INTERVAL_S = 10.0
+WATCHDOG_TIMEOUT_S = 60.0
 
 
 class Supervisor:
-    """The loops of the agent. One that fails ends them all, and kubelet starts the agent again: nothing runs half."""
+    """Runs the loops of the agent. If one fails, all end, and kubelet restarts the agent."""
 
     def __init__(self) -> None:
         self._loops: dict[str, Callable[[], Coroutine[Any, Any, None]]] = {}
@@ -29,7 +32,7 @@ class Supervisor:
         """Run all loops.
 
         Raises:
-            ExceptionGroup: one of them failed.
+            ExceptionGroup: A loop failed.
         """
         async with asyncio.TaskGroup() as tasks:
             for name, loop in self._loops.items():
@@ -37,26 +40,40 @@ class Supervisor:
 
 
 async def repeat(name: str, step: Callable[[], Awaitable[float]], changed: asyncio.Event) -> None:
-    """Repeat a step until cancelled: after the delay that it returns, or as soon as something changed.
+    """Repeat a step until cancelled: after the delay that it returns, or when something changed.
 
-    While the API server fails, the delay grows instead, and changes wait: a fleet must not storm a server that comes back.
+    While the API server fails, the delay grows and changes wait, so that a fleet does not overload a recovering server.
 
     Args:
-        name: of the step, for the log.
-        step: does what is due; returns seconds until it is due again.
-        changed: set when something changed.
+        name: Name of the step, for the log.
+        step: Does what is due, and returns the seconds until it is due again.
+        changed: Event that is set when something changed.
     """
     backoff = Backoff(FIRST_RETRY_S, MAX_RETRY_S)
     while True:
-        # Cleared before the step reads anything, so that a change during it is not lost.
+        # Clear the event before the step reads anything, so that no change is missed.
         changed.clear()
         try:
             delay_s = await step()
             backoff.succeeded()
         except KubeError as error:
             level = logging.DEBUG if backoff.attempts else logging.WARNING
-            LOG.log(level, "%s: the API server failed, trying again: %s", name, error)
+            LOG.log(level, "%s: API server failed, retrying (error=%s)", name, error)
             await asyncio.sleep(backoff.delay_s())
             continue
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(changed.wait(), delay_s)
+
+
+async def run_watchdog(interval_s: float = WATCHDOG_INTERVAL_S, timeout_s: float = WATCHDOG_TIMEOUT_S) -> None:
+    """Reset a watchdog timer until cancelled, so that kubelet restarts an agent whose event loop hangs.
+
+    If the event loop does not reset the timer for `timeout_s`, the process prints all stacks to stderr and exits with
+    status 1.
+    """
+    try:
+        while True:
+            faulthandler.dump_traceback_later(timeout_s, exit=True)
+            await asyncio.sleep(interval_s)
+    finally:
+        faulthandler.cancel_dump_traceback_later()

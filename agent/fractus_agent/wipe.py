@@ -1,4 +1,4 @@
-"""`python -m fractus_agent.wipe DIRECTORY`: removes what Fractus keeps on a node, before Fractus leaves it."""
+"""Remove the state of Fractus from a node before uninstallation: `python -m fractus_agent.wipe DIRECTORY`."""
 
 from __future__ import annotations
 
@@ -11,45 +11,49 @@ from pathlib import Path
 
 
 def wipe(directory: Path) -> list[Path]:
-    """Remove all that is in a directory, not the directory itself. What links lead to stays, and the links go.
+    """Remove the content of a directory. Symbolic links are removed, their targets stay.
+
+    Errors are printed to stderr.
 
     Returns:
-        What is left, for it could not be removed, or not even be read; why is said on standard error. Empty directories where
-        disks are mounted stay, and are not among it.
+        Paths that could not be removed or read. Empty mount points stay, and are not included.
     """
     left: set[Path] = set()
 
-    def refused(path: str, error: BaseException) -> None:
-        print(f"wipe: {path} is not removed: {error}", file=sys.stderr)
-        # Of a directory that is not empty, what is in it counts.
+    def on_error(path: str, error: BaseException) -> None:
+        print(f"wipe: cannot remove {path}: {error}", file=sys.stderr)
+        # For a directory that is not empty, its content is reported instead.
         if not (isinstance(error, OSError) and error.errno in {errno.EBUSY, errno.ENOTEMPTY}):
             left.add(Path(path))
 
     try:
         entries = list(os.scandir(directory))
     except OSError as error:
-        refused(str(directory), error)
+        on_error(str(directory), error)
         return sorted(left)
     for entry in entries:
         if entry.is_dir(follow_symlinks=False):
-            shutil.rmtree(entry.path, onerror=lambda _, path, raised: refused(path, raised[1]))
+            shutil.rmtree(entry.path, onerror=lambda _, path, raised: on_error(path, raised[1]))
         else:
             try:
                 Path(entry.path).unlink()
             except OSError as error:
-                refused(entry.path, error)
+                on_error(entry.path, error)
     for folder, _, names in os.walk(directory, onerror=lambda error: left.add(Path(error.filename))):
         left.update(Path(folder, name) for name in names)
     return sorted(left)
 
 
 def main(arguments: Sequence[str] = sys.argv[1:]) -> int:
-    """Wipe the directory that is named; returns the exit code."""
+    """Wipe the given directory, and return the exit code."""
     if len(arguments) != 1 or not Path(arguments[0]).is_dir():
         print("usage: python -m fractus_agent.wipe DIRECTORY", file=sys.stderr)
         return 2
     left = wipe(Path(arguments[0]))
-    print(f"wipe: {arguments[0]}: {len(left)} files or folders are left" if left else f"wipe: {arguments[0]} is empty")
+    if left:
+        print(f"wipe: {len(left)} files or directories left in {arguments[0]}")
+    else:
+        print(f"wipe: {arguments[0]} is empty")
     return 1 if left else 0
 
 

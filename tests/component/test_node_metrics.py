@@ -11,12 +11,12 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 from exposed import assert_documented, values
-from fractus_agent.links.decisions import Actions
-from fractus_agent.links.flows import Flow
-from fractus_agent.links.metrics import LinkMetrics
-from fractus_agent.links.reports import DroneReport
-from fractus_agent.metrics import AgentFigures
-from fractus_agent.redirector.nft import Endpoint
+from fractus_agent.agent_metrics import AgentMetrics
+from fractus_agent.links.decisions import LinkActions
+from fractus_agent.links.link_metrics import LinkMetrics
+from fractus_agent.links.link_status import DroneLinkReport
+from fractus_agent.links.traffic_rates import ServiceRate
+from fractus_agent.redirector.nft_maps import Endpoint
 from fractus_core.linking import NO_LINK, PathMetrics, Peer
 from fractus_runtime.audit import AuditLog
 from fractus_runtime.figures import text_of
@@ -105,11 +105,11 @@ def test_the_mobility_service_tells_what_is_documented(tmp_path: Path) -> None:
 
 
 def test_the_agent_tells_what_is_documented() -> None:
-    figures = AgentFigures(
+    figures = AgentMetrics(
         expires_s=2e9,
-        heard_s={"grants": 3.0},
-        reported_s=math.inf,
-        telemetry_s=0.5,
+        watch_ages_s={"grants": 3.0},
+        report_age_s=math.inf,
+        telemetry_age_s=0.5,
         grants={"stored": 2, "unverified": 0},
         checkpoints={"mobility": (7, "fedcba9876543210" * 4)},
     )
@@ -126,12 +126,12 @@ def test_the_drones_links_tell_what_is_documented() -> None:
     offers = PathMetrics(8.0, 8.0, 5.0, 5.0, direct=True)
     peer = Peer("e1", (0.0, 0.0, 0.0), 50.0, offers)
     service = Endpoint(IPv4Address("10.96.0.5"), 8080)
-    report = DroneReport(
-        links=(), link=NO_LINK, actions=cast(Actions, None), direct=frozenset({service}), measured=None, reaches={}, unknown={},
-        cloud=None, offers={peer: offers}, flows={service: Flow(1.5, 0.5)},
+    report = DroneLinkReport(
+        links=(), link=NO_LINK, actions=cast(LinkActions, None), direct=frozenset({service}), measured=None, ranges={}, unknown={},
+        cloud=None, expected={peer: offers}, rates={service: ServiceRate(1.5, 0.5)},
     )  # fmt: skip
     metrics = LinkMetrics()
-    metrics.take(report)
+    metrics.update(report)
     told = text(metrics.collect)
     assert_documented(told, "Direct links of a drone")
     seen = values(told)

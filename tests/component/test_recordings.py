@@ -21,9 +21,9 @@ from typing import Any
 import pytest
 from demo_flight import GRANT
 from fractus_agent.conditions import Condition
-from fractus_agent.registration.evidence import recording_problems
-from fractus_agent.registration.status import Observed, node_status
-from fractus_agent.telemetry.feed import snapshot
+from fractus_agent.registration.diagnostics import read_recording_problems
+from fractus_agent.registration.node_status import NodeObservation, node_status
+from fractus_agent.telemetry import parse_telemetry
 from fractus_core.api import Grant
 from fractus_proto.v1.mobility_pb2 import Telemetry
 from fractus_runtime.audit import AuditLog
@@ -546,11 +546,11 @@ def test_the_agent_is_told_what_is_not_recorded(tmp_path: Path, monkeypatch: pyt
 
     monkeypatch.setattr(SegmentDirectory, "check_space", check)
     Recorder(None, "drone-1", problem_file=state / "recording.problem")
-    assert recording_problems(tmp_path) == []
+    assert read_recording_problems(tmp_path) == []
     taken = Recorder(SegmentDirectory(tmp_path / "r", 4_000_000), "drone-1", problem_file=state / "recording.problem")
-    until(lambda: recording_problems(tmp_path) == ["camera: recording stopped: no room"])
+    until(lambda: read_recording_problems(tmp_path) == ["camera: recording stopped: no room"])
     full.clear()
-    until(lambda: recording_problems(tmp_path) == [])
+    until(lambda: read_recording_problems(tmp_path) == [])
     asyncio.run(taken.close())
 
 
@@ -568,9 +568,14 @@ def test_the_status_of_the_node_tells_that_nothing_is_recorded() -> None:
     certified = Condition("Certified", "True", "Issued", "")
     cases = (("", (), ""), ("flights stopped", (), "flights stopped"), ("", ("camera: full",), "camera: full"))
     for flights, others, problem in cases:
-        seen = snapshot(Telemetry(recording_problem=flights))
-        observed = Observed(
-            "Drone", has_mobility=True, needs_certificate=True, certified=certified, snapshot=seen, unrecorded=others
+        seen = parse_telemetry(Telemetry(recording_problem=flights))
+        observed = NodeObservation(
+            "Drone",
+            has_mobility=True,
+            needs_certificate=True,
+            certified=certified,
+            snapshot=seen,
+            recording_problems=others,
         )
         status = node_status(observed, {}, 1, datetime(2026, 6, 1, tzinfo=UTC))
         told = [c["message"] for c in status["conditions"] if c["type"] == "Recording" and c["status"] == "False"]

@@ -1,6 +1,6 @@
-"""A node of the link tests: an acceptor, a connector and beacons in the network namespace that it is started in.
+"""Program of the pairing tests: acceptor, connector and beacons of one node, in the network namespace of the process.
 
-It takes commands on its standard input (`want PEER`, `permit PEER`, `refuse REASON`) and tells events on its output.
+It reads commands from its standard input (`want PEER`, `refuse REASON`), and prints events.
 """
 
 from __future__ import annotations
@@ -10,62 +10,62 @@ import sys
 from pathlib import Path
 
 from fractus_agent.links.acceptor import Acceptor
-from fractus_agent.links.addressing import link_address
 from fractus_agent.links.beacons import Beacons
 from fractus_agent.links.connector import Connector
+from fractus_agent.links.device_addresses import link_address
 from fractus_agent.links.pairing import Session
 
 
-def tell(*words: object) -> None:
+def emit(*words: object) -> None:
     print(*words, flush=True)
 
 
 async def main(node: str, files: Path, max_peers: int) -> None:
     refusal = ""
-    heard: set[str] = set()
+    peers: set[str] = set()
 
-    def hear(peer: str) -> None:
-        if peer not in heard:
-            heard.add(peer)
-            tell("heard", peer)
+    def on_beacon(peer: str) -> None:
+        if peer not in peers:
+            peers.add(peer)
+            emit("heard", peer)
 
-    async def serves(session: Session) -> None:
-        tell("accepted", session.peer)
+    async def on_accepted(session: Session) -> None:
+        emit("accepted", session.peer)
         try:
             await asyncio.Event().wait()
         finally:
-            tell("ended", session.peer)
+            emit("ended", session.peer)
 
-    async def uses(session: Session) -> None:
+    async def on_paired(session: Session) -> None:
         while session.latency_ms is None:  # noqa: ASYNC110 - the session has no event for it
             await asyncio.sleep(0.01)
-        tell("latency", f"{session.latency_ms:.1f}")
+        emit("latency", f"{session.latency_ms:.1f}")
         await asyncio.Event().wait()
 
-    def changed(link: object, reason: str) -> None:
-        tell("link", connector.link.phase.value, connector.link.peer or "-", reason.replace(" ", "_"))
+    def on_change(link: object, reason: str) -> None:
+        emit("link", connector.link.phase.value, connector.link.peer or "-", reason.replace(" ", "_"))
 
-    connector = Connector(node, files, uses, changed)
-    acceptor = Acceptor(files, lambda _peer: refusal, serves, max_peers=max_peers)
+    connector = Connector(node, files, on_paired, on_change)
+    acceptor = Acceptor(files, lambda _peer: refusal, on_accepted, max_peers=max_peers)
     tasks = [
         asyncio.create_task(acceptor.run(link_address(node))),
-        asyncio.create_task(Beacons(node, hear).run("wlan0")),
+        asyncio.create_task(Beacons(node, on_beacon).run("wlan0")),
     ]
     loop = asyncio.get_running_loop()
     commands = asyncio.StreamReader()
     await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(commands), sys.stdin)
-    tell("ready")
+    emit("ready")
     while line := (await commands.readline()).decode().strip():
         verb, _, rest = line.partition(" ")
         if verb == "want":
-            await connector.want(rest)
+            await connector.set_peer(rest)
         elif verb == "refuse":
             refusal = rest
     await connector.close()
     for task in tasks:
         task.cancel()
     await asyncio.gather(*tasks, return_exceptions=True)
-    tell("over")
+    emit("over")
 
 
 if __name__ == "__main__":

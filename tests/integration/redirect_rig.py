@@ -1,4 +1,4 @@
-"""Two nodes with a pod each, a cloud and a direct link, as network namespaces; and servers and clients in them."""
+"""Network namespaces of two nodes with a pod each, a cloud and a direct link, with servers and clients."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from ipaddress import IPv4Address
 from pathlib import Path
 
 from fractus_agent.redirector.netlink import NETLINK_NETFILTER, Netlink, in_namespace
-from fractus_agent.redirector.nft import Callers, Endpoint, Maps, Redirect
-from fractus_agent.redirector.tables import Ports, create
+from fractus_agent.redirector.nft_maps import Callers, Endpoint, NftMaps, Redirect
+from fractus_agent.redirector.ruleset import Ports, create
 
 VIP = Endpoint(IPv4Address("10.96.0.5"), 8080)
 DIRECT = Endpoint(IPv4Address("10.77.0.2"), 9000)
@@ -28,7 +28,7 @@ name, address, work_s = sys.argv[1], sys.argv[2], float(sys.argv[3])
 def answer(request, context):
     time.sleep(work_s)
     return name.encode() + b" " + request[:32]
-def send(request, context):  # as many bytes as are asked for, in messages of 200 kB
+def send(request, context):  # the requested number of bytes, in messages of 200 kB
     left = int(request)
     while left:
         size = min(left, 200_000)
@@ -71,12 +71,12 @@ for number in range(calls):
 
 
 def run(*words: str) -> None:
-    """Run a command; its error is the test's."""
+    """Run a command. An error fails the test."""
     subprocess.run(words, check=True, capture_output=True, timeout=30)
 
 
 class Rig:
-    """The namespaces: drone (with a pod), edge (with a pod) and cloud, and what runs in them."""
+    """Namespaces of a drone with a pod, an edge node with a pod and a cloud, with their processes."""
 
     def __init__(self) -> None:
         self.tag = f"fx{os.getpid() % 100000}"
@@ -85,19 +85,19 @@ class Rig:
         self.pods: list[str] = []
 
     def name(self, node: str) -> str:
-        """The namespace of a node or pod."""
+        """Return the name of the namespace of a node or pod."""
         return f"{self.tag}{node}"
 
     def path(self, node: str) -> Path:
-        """Its file."""
+        """Return the file of the namespace."""
         return Path("/run/netns", self.name(node))
 
     def inside(self, node: str) -> list[str]:
-        """Words that run a command in it."""
+        """Return the command prefix that runs a command in the namespace."""
         return ["nsenter", f"--net={self.path(node)}"]
 
     def build(self) -> None:
-        """Make everything; the direct link is `fxl0` on both ends."""
+        """Create all namespaces and devices. The direct link is `fxl0` on both ends."""
         for node in ("drone", "dpod", "edge", "epod", "cloud"):
             run("ip", "netns", "add", self.name(node))
             run(*self.inside(node), "ip", "link", "set", "lo", "up")
@@ -125,7 +125,7 @@ class Rig:
             run(*self.inside(node), "ip", "link", "set", link, "up")
 
     def pod(self, name: str, net: str, at: str = "drone") -> str:
-        """Another pod on a node, in a network such as `10.86.0`."""
+        """Add a pod on a node, in a network such as `10.86.0`."""
         run("ip", "netns", "add", self.name(name))
         self.pods.append(name)
         self._link(at, name, f"{net}.1/24", name, "eth0", f"{net}.2/24")
@@ -133,28 +133,28 @@ class Rig:
         return name
 
     def reaches(self, node: str, address: str, port: int) -> bool:
-        """Whether a connection can be made from a node or pod."""
+        """Return True if a TCP connection can be opened from a node or pod."""
         program = f"import socket; socket.create_connection(({address!r}, {port}), 1).close()"
         done = subprocess.run(
             [*self.inside(node), sys.executable, "-c", program], capture_output=True, timeout=30, check=False
         )
         return done.returncode == 0
 
-    def maps(self, node: str) -> Maps:
-        """The maps of a node, whose table is made again when it is gone."""
+    def maps(self, node: str) -> NftMaps:
+        """Return the maps of a node, whose table is created again if it is missing."""
 
         def make_table(callers: Callers) -> None:
             create("fxl*", PORTS, self.inside(node), clients=node == "drone", callers=callers)
 
-        return Maps(self.netlink(node), make_table)
+        return NftMaps(self.netlink(node), make_table)
 
     def netlink(self, node: str, protocol: int = NETLINK_NETFILTER) -> Netlink:
-        """A netlink socket in a namespace."""
+        """Open a netlink socket in a namespace."""
         self.sockets.append(in_namespace(self.path(node), lambda: Netlink(protocol)))
         return self.sockets[-1]
 
     def python(self, node: str, program: str, *arguments: object) -> subprocess.Popen[str]:
-        """Start a program in a namespace, and wait until it is ready."""
+        """Start a Python program in a namespace, and wait until it is ready."""
         process = subprocess.Popen(
             [*self.inside(node), sys.executable, "-c", program, *map(str, arguments)], stdout=subprocess.PIPE, text=True
         )
@@ -187,10 +187,10 @@ class Rig:
 
 @contextmanager
 def rig() -> Iterator[Rig]:
-    """A rig that is removed at the end."""
-    found = Rig()
+    """Create a rig, and remove it at the end."""
+    created = Rig()
     try:
-        found.build()
-        yield found
+        created.build()
+        yield created
     finally:
-        found.clear()
+        created.clear()

@@ -111,20 +111,20 @@ def test_a_set_is_all_old_or_all_new(tmp_path: Path, before: str) -> None:
 WRITER = """
 import sys
 from pathlib import Path
-from fractus_agent.grants.keeper import GrantDirectory, GrantKeeper
-from fractus_agent.cluster.store import Granted
+from fractus_agent.grants import GrantDirectory, GrantSynchronizer
+from fractus_agent.store import GrantList
 def grant(name, size):
     return {"apiVersion": "fractus.dev/v1alpha1", "kind": "Grant", "metadata": {"name": name, "uid": name},
         "spec": {"node": "n", "application": {"namespace": "d", "name": "a", "uid": "u"}, "component": "C",
                  "instance": "i" * size}}
 directory = GrantDirectory(Path(sys.argv[1]))
 directory.open()
-keeper = GrantKeeper(None, directory, "n", lambda grant: None)
+synchronizer = GrantSynchronizer(None, directory, "n", lambda grant: None)
 print("ready", flush=True)
 turn = 0
 while True:
     turn += 1
-    keeper.take(Granted(turn, tuple(grant(f"g{i}", turn % 700 + 1) for i in range(turn % 5)), {}, 0))
+    synchronizer.apply(GrantList(turn, tuple(grant(f"g{i}", turn % 700 + 1) for i in range(turn % 5)), {}, 0))
 """
 
 

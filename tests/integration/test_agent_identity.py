@@ -1,4 +1,4 @@
-"""The node's certificate: real keys and files, a signer of the test's own, a clock of the test's own."""
+"""Certificate of the node, with real keys and files, a fake signer and a fake clock."""
 
 import asyncio
 import contextlib
@@ -9,10 +9,9 @@ import pytest
 from agent_pki import FakeSigner, TestAuthority
 from cryptography import x509
 from cryptography.hazmat.primitives import serialization
-from fractus_agent.cluster.store import KubeError
-from fractus_agent.identity.certificates import Unusable, inspect
-from fractus_agent.identity.csr import make_request
-from fractus_agent.identity.identity import FILES, Identity, SigningRefused, make_request_in_process
+from fractus_agent.certificates import CERTIFICATE_FILES, InvalidCertificate, create_request, inspect_certificate
+from fractus_agent.identity import NodeIdentity, SigningRefused
+from fractus_agent.store import KubeError
 from fractus_runtime.files import read_set, write_set
 
 NODE = "drone-1"
@@ -26,32 +25,28 @@ class Clock:
         return self.now
 
 
-async def made_here(node: str) -> tuple[bytes, bytes]:
-    return make_request(node)
-
-
-class Bench:
+class IdentityBench:
     def __init__(self, directory: Path) -> None:
         self.directory = directory
         self.clock = Clock()
         self.signer = FakeSigner(TestAuthority())
         self.identity = self.agent()
 
-    def agent(self) -> Identity:
-        return Identity(self.signer, self.directory, NODE, self.clock, make_request=made_here)
+    def agent(self) -> NodeIdentity:
+        return NodeIdentity(self.signer, self.directory, NODE, self.clock)
 
     def files(self) -> dict[str, bytes]:
-        files = read_set(self.directory, FILES)
+        files = read_set(self.directory, CERTIFICATE_FILES)
         assert files is not None
         return files
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Bench:
-    return Bench(tmp_path / "tls")
+def bench(tmp_path: Path) -> IdentityBench:
+    return IdentityBench(tmp_path / "tls")
 
 
-async def test_round_trip(bench: Bench) -> None:
+async def test_certificate_is_requested_signed_and_stored(bench: IdentityBench) -> None:
     await bench.identity.step()
     assert bench.identity.ready.is_set()
     assert bench.identity.condition.is_true
@@ -66,15 +61,15 @@ async def test_round_trip(bench: Bench) -> None:
     assert bench.signer.requests == {}
 
 
-async def test_the_key_process_makes_a_usable_pair(bench: Bench) -> None:
-    key, request = await make_request_in_process(NODE)
+async def test_created_key_and_request_give_a_valid_certificate(bench: IdentityBench) -> None:
+    key, request = create_request(NODE)
     write_set(
         bench.directory, {"tls.key": key, "tls.crt": bench.signer.ca.sign(request), "ca.crt": bench.signer.ca.pem}
     )
-    assert inspect(bench.directory, NODE).begun(datetime.now(UTC))
+    assert inspect_certificate(bench.directory, NODE).has_begun(datetime.now(UTC))
 
 
-async def test_a_restarted_agent_asks_for_nothing(bench: Bench) -> None:
+async def test_restarted_agent_requests_no_certificate(bench: IdentityBench) -> None:
     await bench.identity.step()
     before = bench.files()
     again = bench.agent()
@@ -84,7 +79,7 @@ async def test_a_restarted_agent_asks_for_nothing(bench: Bench) -> None:
     assert again.ready.is_set()
 
 
-async def test_renewal_at_two_thirds_with_a_new_key(bench: Bench) -> None:
+async def test_certificate_is_renewed_at_two_thirds_with_a_new_key(bench: IdentityBench) -> None:
     await bench.identity.step()
     before = bench.files()
     bench.clock.now += timedelta(days=19.5)
@@ -98,7 +93,7 @@ async def test_renewal_at_two_thirds_with_a_new_key(bench: Bench) -> None:
     assert bench.identity.serial == 2
 
 
-async def test_a_renewal_that_fails_leaves_the_certificate_in_use(bench: Bench) -> None:
+async def test_failed_renewal_keeps_the_certificate_in_use(bench: IdentityBench) -> None:
     await bench.identity.step()
     before = bench.files()
     bench.clock.now += timedelta(days=22)
@@ -109,7 +104,7 @@ async def test_a_renewal_that_fails_leaves_the_certificate_in_use(bench: Bench) 
     assert bench.identity.condition.is_true
 
 
-async def test_an_expired_certificate_is_replaced(bench: Bench) -> None:
+async def test_expired_certificate_is_replaced(bench: IdentityBench) -> None:
     await bench.identity.step()
     bench.clock.now += timedelta(days=40)
     bench.signer.sign_with = {"begin": bench.clock.now}
@@ -118,7 +113,7 @@ async def test_an_expired_certificate_is_replaced(bench: Bench) -> None:
     assert bench.identity.condition.is_true
 
 
-async def test_rotation_to_a_bundle_keeps_the_certificate(bench: Bench) -> None:
+async def test_rotation_to_a_bundle_keeps_the_certificate(bench: IdentityBench) -> None:
     await bench.identity.step()
     before = bench.files()
     bench.signer.published = TestAuthority("next").pem + bench.signer.ca.pem
@@ -127,20 +122,20 @@ async def test_rotation_to_a_bundle_keeps_the_certificate(bench: Bench) -> None:
     assert bench.files() == before | {"ca.crt": bench.signer.published}
 
 
-async def test_rotation_to_another_authority_requests_again(bench: Bench) -> None:
+async def test_rotation_to_another_authority_requests_a_certificate(bench: IdentityBench) -> None:
     await bench.identity.step()
     bench.signer.ca = TestAuthority("next")
     bench.signer.published = bench.signer.ca.pem
     await bench.identity.step()
     assert bench.signer.made == 2
     assert bench.files()["ca.crt"] == bench.signer.ca.pem
-    assert inspect(bench.directory, NODE)
+    assert inspect_certificate(bench.directory, NODE)
 
 
 @pytest.mark.parametrize(
     "harm", ["no key", "cut certificate", "other key", "empty authority", "dangling", "other node"]
 )
-async def test_a_damaged_directory_is_repaired(bench: Bench, harm: str) -> None:
+async def test_damaged_certificate_files_are_replaced(bench: IdentityBench, harm: str) -> None:
     await bench.identity.step()
     files = bench.files()
     if harm == "dangling":
@@ -148,7 +143,7 @@ async def test_a_damaged_directory_is_repaired(bench: Bench, harm: str) -> None:
     elif harm == "no key":
         (bench.directory / "tls.key").unlink()
     elif harm == "other node":
-        key, request = make_request("drone-2")
+        key, request = create_request("drone-2")
         write_set(bench.directory, files | {"tls.key": key, "tls.crt": bench.signer.ca.sign(request)})
     else:
         write_set(
@@ -156,20 +151,20 @@ async def test_a_damaged_directory_is_repaired(bench: Bench, harm: str) -> None:
             files
             | {
                 "cut certificate": {"tls.crt": files["tls.crt"][:200]},
-                "other key": {"tls.key": make_request(NODE)[0]},
+                "other key": {"tls.key": create_request(NODE)[0]},
                 "empty authority": {"ca.crt": b""},
             }[harm],
         )
-    with pytest.raises(Unusable):
-        inspect(bench.directory, NODE)
+    with pytest.raises(InvalidCertificate):
+        inspect_certificate(bench.directory, NODE)
     again = bench.agent()
     await again.step()
-    assert inspect(bench.directory, NODE)
+    assert inspect_certificate(bench.directory, NODE)
     assert again.ready.is_set()
 
 
 @pytest.mark.parametrize("kind", ["Denied", "Failed"])
-async def test_a_refusal_is_said(bench: Bench, kind: str) -> None:
+async def test_refused_signing_request_is_raised(bench: IdentityBench, kind: str) -> None:
     bench.signer.conditions = [{"type": kind, "message": "node drone-1 is not in the fleet"}]
     with pytest.raises(SigningRefused, match="not in the fleet") as refusal:
         await bench.identity.step()
@@ -178,15 +173,15 @@ async def test_a_refusal_is_said(bench: Bench, kind: str) -> None:
     assert not (bench.directory / "tls.crt").exists()
 
 
-async def test_a_refusal_reaches_the_condition(bench: Bench) -> None:
+async def test_refused_signing_request_sets_the_condition(bench: IdentityBench) -> None:
     bench.signer.conditions = [{"type": "Denied", "message": "node drone-1 is not in the fleet"}]
-    said = asyncio.Event()
-    identity = Identity(bench.signer, bench.directory, NODE, bench.clock, changed=said.set, make_request=made_here)
+    changed = asyncio.Event()
+    identity = NodeIdentity(bench.signer, bench.directory, NODE, bench.clock, on_change=changed.set)
     task = asyncio.create_task(identity.run())
     try:
         while identity.condition.reason != "Denied":
-            await asyncio.wait_for(said.wait(), 10.0)
-            said.clear()
+            await asyncio.wait_for(changed.wait(), 10.0)
+            changed.clear()
     finally:
         task.cancel()
         with contextlib.suppress(asyncio.CancelledError):
@@ -195,17 +190,17 @@ async def test_a_refusal_reaches_the_condition(bench: Bench) -> None:
     assert "not in the fleet" in identity.condition.message
 
 
-async def test_a_denied_renewal_leaves_the_node_certified(bench: Bench) -> None:
+async def test_denied_renewal_keeps_the_node_certified(bench: IdentityBench) -> None:
     await bench.identity.step()
     bench.clock.now += timedelta(days=22)
     bench.signer.conditions = [{"type": "Denied", "message": "fleet frozen"}]
-    said = asyncio.Event()
-    identity = Identity(bench.signer, bench.directory, NODE, bench.clock, changed=said.set, make_request=made_here)
+    changed = asyncio.Event()
+    identity = NodeIdentity(bench.signer, bench.directory, NODE, bench.clock, on_change=changed.set)
     task = asyncio.create_task(identity.run())
     try:
         while "fleet frozen" not in identity.condition.message:
-            await asyncio.wait_for(said.wait(), 10.0)
-            said.clear()
+            await asyncio.wait_for(changed.wait(), 10.0)
+            changed.clear()
     finally:
         task.cancel()
         with contextlib.suppress(asyncio.CancelledError):
@@ -214,21 +209,21 @@ async def test_a_denied_renewal_leaves_the_node_certified(bench: Bench) -> None:
     assert bench.signer.made == 2
 
 
-async def test_a_certificate_of_a_strange_authority_is_not_installed(bench: Bench) -> None:
+async def test_certificate_of_another_authority_is_not_installed(bench: IdentityBench) -> None:
     bench.signer.published = TestAuthority("other").pem
-    with pytest.raises(SigningRefused, match="of no use"):
+    with pytest.raises(SigningRefused, match="is invalid"):
         await bench.identity.step()
     assert not (bench.directory / "tls.crt").exists()
 
 
-async def test_no_authority_is_said(bench: Bench) -> None:
+async def test_missing_authority_is_raised(bench: IdentityBench) -> None:
     bench.signer.published = None
     with pytest.raises(SigningRefused) as refusal:
         await bench.identity.step()
     assert refusal.value.reason == "NoAuthority"
 
 
-async def test_a_clock_behind_asks_for_nothing_and_recovers(bench: Bench) -> None:
+async def test_clock_before_the_validity_requests_nothing_and_recovers(bench: IdentityBench) -> None:
     await bench.identity.step()
     now = bench.clock.now
     bench.clock.now = datetime(1970, 1, 1, tzinfo=UTC)
@@ -240,7 +235,7 @@ async def test_a_clock_behind_asks_for_nothing_and_recovers(bench: Bench) -> Non
     assert bench.identity.condition.is_true
 
 
-async def test_a_clock_ahead_is_said_and_recovers(bench: Bench) -> None:
+async def test_clock_after_the_validity_is_reported_and_recovers(bench: IdentityBench) -> None:
     now = bench.clock.now
     bench.clock.now = now + timedelta(days=900)
     with pytest.raises(SigningRefused) as refusal:

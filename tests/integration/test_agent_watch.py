@@ -1,4 +1,4 @@
-"""Following grants against an API server that restarts, forgets, freezes and compacts."""
+"""Watches of Grants and DirectLinks while the API server restarts, loses data, freezes and compacts."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from typing import Any, TypeVar
 import pytest
 from agent_pki import TestAuthority
 from agent_server import ACCOUNTS, FRACTUS, NODE_GRANTS, RBAC, ApiServer, running
-from fractus_agent.cluster import store as store_module
-from fractus_agent.cluster.store import (
+from fractus_agent import store as store_module
+from fractus_agent.store import (
     Changed,
     Conflict,
     Deleted,
     Event,
     Expired,
-    Granted,
+    GrantList,
     Invalid,
     KubeError,
     Listed,
@@ -30,7 +30,7 @@ from fractus_core.api.grants import ReportedGrant
 
 pytestmark = [pytest.mark.timeout(300), pytest.mark.xdist_group("agent-watch")]  # they share an API server
 WAIT_TIMEOUT_S = 30.0
-Told = TypeVar("Told", Event, Granted)
+WatchItem = TypeVar("WatchItem", Event, GrantList)
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +82,7 @@ async def store(**times: Any) -> AsyncIterator[Store]:
         await made.close()
 
 
-async def following(events: AsyncIterator[Told]) -> Told:
+async def following(events: AsyncIterator[WatchItem]) -> WatchItem:
     return await asyncio.wait_for(anext(events), WAIT_TIMEOUT_S)
 
 
@@ -108,7 +108,7 @@ def names(event: Event) -> set[str]:
     return {g["metadata"]["name"] for g in event.objects}
 
 
-async def test_a_list_then_changes_of_this_node_only(server: ApiServer) -> None:
+async def test_watch_yields_a_list_and_then_changes_of_this_node_only(server: ApiServer) -> None:
     server.post(f"{FRACTUS}/directlinks", link("a"))
     server.post(f"{FRACTUS}/directlinks", link("other", "drone-2"))
     async with store() as watched:
@@ -123,17 +123,17 @@ async def test_a_list_then_changes_of_this_node_only(server: ApiServer) -> None:
         assert await following(events) == Deleted("a")
 
 
-async def test_an_expired_version_leads_to_a_list(server: ApiServer) -> None:
+async def test_expired_resource_version_leads_to_a_new_list(server: ApiServer) -> None:
     async with store() as watched:
         own = {"fieldSelector": "spec.drone=drone-1"}
-        links = store_module._Feed(watched._client, store_module._KINDS["DirectLink"], own)
+        links = store_module._WatchTarget(watched._client, store_module._KINDS["DirectLink"], own)
         _, old = await watched._list(links)
         for number in range(3):
             server.post(f"{FRACTUS}/directlinks", link(f"g{number}"))
         server.stop_apiserver()
         server.start_apiserver()
         server.compact()
-        # Storage of the kinds comes up a moment after the server says it is ready.
+        # The storage of custom resources is available a moment after the server reports that it is ready.
         await served(watched)
         with pytest.raises(Expired):
             await until(watched._watch(links, old), Deleted)
@@ -154,7 +154,7 @@ async def test_an_expired_version_leads_to_a_list(server: ApiServer) -> None:
         assert len(used) == 2
 
 
-async def test_an_outage_yields_nothing_and_then_a_list(server: ApiServer) -> None:
+async def test_outage_yields_no_event_and_then_a_list(server: ApiServer) -> None:
     server.post(f"{FRACTUS}/directlinks", link("a"))
     server.post(f"{FRACTUS}/directlinks", link("b"))
     async with store() as watched:
@@ -172,7 +172,7 @@ async def test_an_outage_yields_nothing_and_then_a_list(server: ApiServer) -> No
                 event = await anext(events)
 
 
-async def test_a_frozen_server_is_noticed_by_its_silence(server: ApiServer) -> None:
+async def test_frozen_api_server_is_detected_by_its_silence(server: ApiServer) -> None:
     async with store(silence_s=1.0) as watched:
         events = watched.direct_links("drone")
         assert names(await following(events)) == set()
@@ -187,31 +187,31 @@ async def test_a_frozen_server_is_noticed_by_its_silence(server: ApiServer) -> N
                 event = await anext(events)
 
 
-async def test_a_watch_that_the_server_ends_goes_on_where_it_was(server: ApiServer) -> None:
+async def test_watch_ended_by_the_server_continues_without_a_list(server: ApiServer) -> None:
     async with store(server_s=2) as watched:
         events = watched.direct_links("drone")
         assert names(await following(events)) == set()
         waiting = asyncio.ensure_future(anext(events))
         done, _ = await asyncio.wait([waiting], timeout=3.5)
-        assert not done, "a clean end is no reason to list again"
+        assert not done, "no list after a clean end"
         server.post(f"{FRACTUS}/directlinks", link("after"))
         event = await asyncio.wait_for(waiting, WAIT_TIMEOUT_S)
         assert isinstance(event, Changed)
 
 
-async def nothing_from(granted: AsyncIterator[Granted], for_s: float = 2.0) -> asyncio.Future[Granted]:
-    """What comes next, which is nothing for a while."""
+async def nothing_from(granted: AsyncIterator[GrantList], for_s: float = 2.0) -> asyncio.Future[GrantList]:
+    """Return the next event as a future, after checking that there is none for a while."""
     waiting = asyncio.ensure_future(anext(granted))
     done, _ = await asyncio.wait([waiting], timeout=for_s)
     assert not done
     return waiting
 
 
-def named(granted: Granted) -> set[str] | None:
+def named(granted: GrantList) -> set[str] | None:
     return None if granted.grants is None else {body["metadata"]["name"] for body in granted.grants}
 
 
-async def test_the_grants_of_the_node_are_those_of_its_object(server: ApiServer) -> None:
+async def test_grants_of_the_node_come_from_its_node_grants_object(server: ApiServer) -> None:
     uid = add_grant(server, "a")
     add_grant(server, "other", "drone-2")
     for node in ("drone-1", "drone-2"):
@@ -230,12 +230,12 @@ async def test_the_grants_of_the_node_are_those_of_its_object(server: ApiServer)
         assert await watched.report_grants(second.generation, [report])
         assert server.reported("drone-1", "a")["phase"] == "Active"
         third = await following(granted)
-        assert (named(third), third.reported) == (None, {uid: report}), "what is the same is not unpacked again"
+        assert (named(third), third.reported) == (None, {uid: report}), "unchanged Grants are not unpacked again"
         assert await watched.report_grants(second.generation, [])
         assert server.reported("drone-1", "a") == {}
 
 
-async def test_an_object_that_is_not_there_takes_no_grant_away(server: ApiServer) -> None:
+async def test_missing_or_damaged_node_grants_object_removes_no_grant(server: ApiServer) -> None:
     async with store() as watched:
         granted = watched.grants()
         waiting = await nothing_from(granted)
@@ -262,7 +262,7 @@ async def _reports(watched: Store) -> bool:
         return False
 
 
-async def test_an_account_that_is_made_again_or_may_not_takes_no_grant_away(server: ApiServer) -> None:
+async def test_recreated_or_unauthorized_account_removes_no_grant(server: ApiServer) -> None:
     add_grant(server, "a")
     server.publish("drone-1")
     async with store(server_s=1) as watched:
@@ -288,9 +288,7 @@ async def test_an_account_that_is_made_again_or_may_not_takes_no_grant_away(serv
         assert named(await asyncio.wait_for(waiting, WAIT_TIMEOUT_S)) == {"a"}
 
 
-async def test_a_rotated_token_is_read_again(
-    server: ApiServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_rotated_token_is_read_again(server: ApiServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     account = server.post("/api/v1/namespaces/fractus-system/serviceaccounts", {"metadata": {"name": "agent"}})
     server.post(
         "/apis/rbac.authorization.k8s.io/v1/clusterrolebindings",
@@ -310,14 +308,14 @@ async def test_a_rotated_token_is_read_again(
     used = Store(await connect(tmp_path), "drone-1")
     try:
         with pytest.raises(KubeError, match="Unauthorized"):
-            await used.described("Drone")
+            await used.node_object("Drone")
         (tmp_path / "token").write_text(token)
-        assert await used.described("Drone") is None
+        assert await used.node_object("Drone") is None
     finally:
         await used.close()
 
 
-async def test_errors_come_by_what_to_do_about_them(server: ApiServer) -> None:
+async def test_store_errors_have_distinct_types(server: ApiServer) -> None:
     drone: dict[str, Any] = {
         "apiVersion": "fractus.dev/v1alpha1",
         "kind": "Drone",
@@ -325,7 +323,7 @@ async def test_errors_come_by_what_to_do_about_them(server: ApiServer) -> None:
         "spec": {},
     }
     async with store() as used:
-        assert await used.described("Drone") is None
+        assert await used.node_object("Drone") is None
         assert await used.apply_status("Drone", "drone-1", {"flightState": "inactive"}) is None
         made = await used.create(drone)
         with pytest.raises(Conflict):
@@ -342,7 +340,7 @@ async def test_errors_come_by_what_to_do_about_them(server: ApiServer) -> None:
         server.stop_apiserver()
         try:
             with pytest.raises(KubeError):
-                await used.described("Drone")
+                await used.node_object("Drone")
         finally:
             server.start_apiserver()
-        assert await used.described("Drone") is not None
+        assert await used.node_object("Drone") is not None

@@ -17,7 +17,7 @@ import grpc
 import numpy as np
 import pytest
 import yaml
-from fractus_agent.registration.handover import Handover
+from fractus_agent.registration.node_object_file import NodeObjectFile
 from fractus_cluster.ports import free_port
 from fractus_core.api.nodes import EdgeNode
 from fractus_proto.v1 import camera_pb2, camera_pb2_grpc, types_pb2
@@ -128,7 +128,7 @@ async def test_the_description_that_the_agent_hands_over_is_judged_by_at_once(ri
         passenger_grant(privacy("refuse", 40, -20, 60, 20), services=CAMERA, operationArea=[], **{"class": None})
     )
     handed = rig.directory / "node.json"
-    handover = Handover(handed)
+    handover = NodeObjectFile(handed)
     camera = stub(rig, rig.start_camera("--node-object", str(handed)))
     assert (await denied(capture(camera)))[1].code == "PositionUnknown", "not even the kind of node is known"
     await rig.until_logged("camera", "it counts as seeing everything (missing=services.camera)")
@@ -147,7 +147,7 @@ async def test_the_description_that_the_agent_hands_over_is_judged_by_at_once(ri
     def hand_over(**mount: float) -> None:
         described = yaml.safe_load(EDGE)
         described["spec"]["services"]["camera"]["mount"] = mount
-        handover.put(EdgeNode.from_body(described))
+        handover.write(EdgeNode.from_body(described))
 
     hand_over(pitch=-90, height=4)
     await becomes("")

@@ -10,7 +10,7 @@ from typing import Any
 
 import chart
 import pytest
-from fractus_agent.registration.evidence import recording_problems
+from fractus_agent.registration.diagnostics import read_recording_problems
 from fractus_core.api.names import component_identity
 from fractus_proto.v1 import camera_pb2, camera_pb2_grpc
 from fractus_proto.v1 import mobility_pb2 as pb
@@ -132,7 +132,7 @@ async def test_the_second_service_of_a_directory_says_so_where_the_agent_looks(r
     said = f"pictures: recording stopped: another service records into {shared}; give each its own directory with --recordings"
     async with asyncio.timeout(60):
         while True:
-            if recording_problems(rig.directory) == [said]:
+            if read_recording_problems(rig.directory) == [said]:
                 break
             await asyncio.sleep(0.1)
     assert not (await rig.telemetry()).recording_problem

@@ -11,7 +11,7 @@ from pathlib import Path
 import grpc
 import pytest
 from exposed import scraped
-from fractus_agent.registration.handover import Handover
+from fractus_agent.registration.node_object_file import NodeObjectFile
 from fractus_cluster.ports import free_port
 from fractus_core.api.model import API_VERSION
 from fractus_core.api.names import node_identity
@@ -212,7 +212,7 @@ async def test_an_autopilot_that_is_described_later_is_used(rig: Rig) -> None:
     services = {
         "mobility": {"connection": rig.link, "maxAltitude": 80, "maxFlightTime": 15, "maxSpeed": 15, "methods": ALL}
     }
-    Handover(handed).put(
+    NodeObjectFile(handed).write(
         Drone.from_body(
             {"apiVersion": API_VERSION, "kind": "Drone", "metadata": {"name": NODE}, "spec": {"services": services}}
         )

@@ -1,4 +1,4 @@
-"""Joining a WiFi network through a real wpa_supplicant, on a cable: its wired driver needs no radio."""
+"""WiFi interface with a real wpa_supplicant on a veth device: its wired driver needs no radio."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from connected_world import link_address
-from fractus_agent.links.interfaces import wifi as module
-from fractus_agent.links.interfaces.controller import InterfaceProblem
-from fractus_agent.links.interfaces.wifi import Supplicant, Wifi
+from fractus_agent.links import wifi as module
+from fractus_agent.links.wifi import WifiInterface, WpaSupplicant
+from fractus_agent.links.wired import InterfaceProblem
 from fractus_core.api.nodes import Pairing
+from linked_world import link_address
 from redirect_rig import run
 
 pytestmark = [
@@ -36,7 +36,7 @@ def device() -> Iterator[str]:
 
 @pytest.fixture
 def sockets(device: str, tmp_path: Path) -> Iterator[Path]:
-    """wpa_supplicant's control sockets, with a network of the owner's in its configuration."""
+    """Start wpa_supplicant with a network of the owner, and return the directory of its control sockets."""
     directory, configuration = tmp_path / "wpa", tmp_path / "wpa.conf"
     configuration.write_text(
         f'ctrl_interface={directory}\nap_scan=0\nnetwork={{\n ssid="owner"\n key_mgmt=NONE\n disabled=1\n}}\n'
@@ -51,8 +51,8 @@ def sockets(device: str, tmp_path: Path) -> Iterator[Path]:
     process.wait(TIMEOUT_S)
 
 
-def controller(device: str, sockets: Path, network: str, mode: str = "infrastructure") -> Wifi:
-    return Wifi(device, link_address("d1"), Pairing(mode=mode, network_id=network), sockets)
+def controller(device: str, sockets: Path, network: str, mode: str = "infrastructure") -> WifiInterface:
+    return WifiInterface(device, link_address("d1"), Pairing(mode=mode, network_id=network), sockets)
 
 
 def addresses(device: str) -> str:
@@ -60,58 +60,58 @@ def addresses(device: str) -> str:
 
 
 async def networks(sockets: Path, device: str) -> list[str]:
-    listed = await Supplicant(sockets / device).ask("LIST_NETWORKS")
+    listed = await WpaSupplicant(sockets / device).request("LIST_NETWORKS")
     return [line.split("\t")[1] for line in listed.splitlines()[1:]]
 
 
-async def test_a_network_is_made_joined_and_left(device: str, sockets: Path) -> None:
+async def test_wifi_network_is_created_joined_and_removed(device: str, sockets: Path) -> None:
     wifi = controller(device, sockets, "fleet")
     await wifi.up()
     assert await networks(sockets, device) == ["owner", "fleet"]
-    supplicant = Supplicant(sockets / device)
-    assert await supplicant.state() == ("COMPLETED", await supplicant.network("fleet"))
+    supplicant = WpaSupplicant(sockets / device)
+    assert await supplicant.state() == ("COMPLETED", await supplicant.find_network("fleet"))
     assert str(link_address("d1")) in addresses(device)
-    await wifi.up()  # again and again, while it is wanted
+    await wifi.up()  # called repeatedly while links are planned
     assert await networks(sockets, device) == ["owner", "fleet"]
     await wifi.down()
     assert await networks(sockets, device) == ["owner"]
     assert str(link_address("d1")) not in addresses(device)
 
 
-async def test_a_network_of_the_owners_is_used_as_it_is(device: str, sockets: Path) -> None:
+async def test_wifi_network_of_the_owner_is_used_unchanged(device: str, sockets: Path) -> None:
     wifi = controller(device, sockets, "owner")
     await wifi.up()
-    assert (await Supplicant(sockets / device).state())[0] == "COMPLETED"
+    assert (await WpaSupplicant(sockets / device).state())[0] == "COMPLETED"
     await wifi.down()
     assert await networks(sockets, device) == ["owner"]
 
 
-async def test_an_ad_hoc_network_is_described_as_one(
+async def test_wifi_ad_hoc_network_has_ad_hoc_settings(
     device: str, sockets: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "JOIN_TIMEOUT_S", 0.5)
     wifi = controller(device, sockets, "fleet", "adhoc")
     try:
-        await wifi.up()  # whether a cable takes the mode is its driver's business
+        await wifi.up()  # the wired driver may not support the mode
     except InterfaceProblem as problem:
         assert problem.reason == "NotJoined"
-    supplicant = Supplicant(sockets / device)
-    number = await supplicant.network("fleet")
+    supplicant = WpaSupplicant(sockets / device)
+    number = await supplicant.find_network("fleet")
     assert number is not None
-    assert await supplicant.ask("GET_NETWORK", number, "mode") == "1"
-    assert await supplicant.ask("GET_NETWORK", number, "frequency") == "2412"
+    assert await supplicant.request("GET_NETWORK", number, "mode") == "1"
+    assert await supplicant.request("GET_NETWORK", number, "frequency") == "2412"
 
 
-async def test_a_supplicant_that_is_silent_is_a_problem(device: str, tmp_path: Path) -> None:
+async def test_unresponsive_wpa_supplicant_is_an_interface_problem(device: str, tmp_path: Path) -> None:
     import socket
 
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as silent:
         silent.bind(str(tmp_path / device))
-        with pytest.raises(InterfaceProblem, match="does not answer") as found:
+        with pytest.raises(InterfaceProblem, match="does not respond") as found:
             await asyncio.wait_for(controller(device, tmp_path, "fleet").up(), TIMEOUT_S)
     assert found.value.reason == "NoSupplicant"
 
 
-async def test_without_a_supplicant_the_nodes_own_software_joins(device: str, tmp_path: Path) -> None:
+async def test_wifi_interface_gets_its_address_without_wpa_supplicant(device: str, tmp_path: Path) -> None:
     await controller(device, tmp_path, "fleet").up()
     assert str(link_address("d1")) in addresses(device)

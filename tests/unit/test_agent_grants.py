@@ -1,4 +1,4 @@
-"""What becomes of grants: phases, and which news changes the disk."""
+"""Grant synchronization: stored files and reported phases."""
 
 import json
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
@@ -7,16 +7,16 @@ from types import SimpleNamespace
 from typing import Any, Self, cast
 
 import pytest
-from fractus_agent.cluster.store import Backoff, Granted, KubeError, Store
-from fractus_agent.grants.keeper import (
+from fractus_agent.grants import (
     UNVERIFIED_TIMEOUT_S,
     GrantDirectory,
-    GrantKeeper,
-    outcome_of,
-    report_of,
-    stored_form,
-    unless_ended,
+    GrantSynchronizer,
+    grant_report,
+    keep_final_phase,
+    mission_outcome,
+    serialize,
 )
+from fractus_agent.store import Backoff, GrantList, KubeError, Store
 from fractus_core.api.grants import Grant, ReportedGrant, pack
 from fractus_core.control import Outcome, OutcomeKind
 from fractus_core.policy.grant_signatures import BadSignature, UnknownAuthority
@@ -43,10 +43,13 @@ def manifest(name: str = "g1", uid: str = "u1", version: str = "1", **more: Any)
     }
 
 
-def granted(
-    *manifests: dict[str, Any], generation: int = 1, reported: Sequence[ReportedGrant] = (), reported_of: int = 1
-) -> Granted:
-    return Granted(generation, manifests, {report.uid: report for report in reported}, reported_of)
+def grant_list(
+    *manifests: dict[str, Any],
+    generation: int = 1,
+    reported: Sequence[ReportedGrant] = (),
+    reported_generation: int = 1,
+) -> GrantList:
+    return GrantList(generation, manifests, {report.uid: report for report in reported}, reported_generation)
 
 
 def report(phase: str, message: str = "", name: str = "g1", uid: str = "u1") -> ReportedGrant:
@@ -56,7 +59,7 @@ def report(phase: str, message: str = "", name: str = "g1", uid: str = "u1") -> 
 
 
 class FakeStore:
-    """What was reported, each time of all Grants."""
+    """Fake store that records the reports of all Grants."""
 
     def __init__(self) -> None:
         self.reports: list[dict[str, ReportedGrant]] = []
@@ -75,13 +78,13 @@ class FakeStore:
     def phases(self, name: str = "g1") -> list[str]:
         return [reports[name].phase for reports in self.reports]
 
-    async def grants(self) -> AsyncIterator[Granted]:
+    async def grants(self) -> AsyncIterator[GrantList]:
         raise NotImplementedError
         yield
 
 
-def believe(_grant: Grant) -> None:
-    """Every grant is as good as signed."""
+def accept(_grant: Grant) -> None:
+    """Accept every signature."""
 
 
 @pytest.fixture
@@ -90,141 +93,141 @@ def store() -> FakeStore:
 
 
 @pytest.fixture
-def keeper(store: FakeStore, tmp_path: Path) -> GrantKeeper:
+def synchronizer(store: FakeStore, tmp_path: Path) -> GrantSynchronizer:
     directory = GrantDirectory(tmp_path)
     directory.open()
-    return GrantKeeper(store, directory, "drone-1", believe)
+    return GrantSynchronizer(store, directory, "drone-1", accept)
 
 
 def on_disk(path: Path) -> set[str]:
     return {p.name for p in path.iterdir()}
 
 
-def test_what_the_operator_does_not_name_any_more_is_removed(keeper: GrantKeeper, tmp_path: Path) -> None:
-    keeper.take(granted(manifest("g1"), manifest("g2")))
+def test_grants_missing_from_the_list_are_removed(synchronizer: GrantSynchronizer, tmp_path: Path) -> None:
+    synchronizer.apply(grant_list(manifest("g1"), manifest("g2")))
     assert on_disk(tmp_path) == {"g1.json", "g2.json"}
-    keeper.take(Granted(1, None, {}, 0))
-    assert on_disk(tmp_path) == {"g1.json", "g2.json"}, "only what was reported has changed"
-    keeper.take(granted(manifest("g2"), manifest("g3")))
+    synchronizer.apply(GrantList(1, None, {}, 0))
+    assert on_disk(tmp_path) == {"g1.json", "g2.json"}, "only the reports have changed"
+    synchronizer.apply(grant_list(manifest("g2"), manifest("g3")))
     assert on_disk(tmp_path) == {"g2.json", "g3.json"}
 
 
-def test_a_new_agent_removes_what_a_full_list_lacks(store: FakeStore, tmp_path: Path) -> None:
+def test_new_agent_removes_stored_grants_missing_from_the_list(store: FakeStore, tmp_path: Path) -> None:
     (tmp_path / "old.json").write_text("{}")
     (tmp_path / ".half.json.tmp").write_text("{")
     directory = GrantDirectory(tmp_path)
     directory.open()
     assert on_disk(tmp_path) == {"old.json"}
-    GrantKeeper(store, directory, "drone-1", believe).take(granted())
+    GrantSynchronizer(store, directory, "drone-1", accept).apply(grant_list())
     assert on_disk(tmp_path) == set()
 
 
-def test_a_file_is_the_grant_and_only_its_content_rewrites_it(keeper: GrantKeeper, tmp_path: Path) -> None:
-    keeper.take(granted(manifest()))
+def test_grant_file_is_rewritten_only_if_its_content_changes(synchronizer: GrantSynchronizer, tmp_path: Path) -> None:
+    synchronizer.apply(grant_list(manifest()))
     file = tmp_path / "g1.json"
     assert Grant.from_body(json.loads(file.read_text())).spec.identity.endswith("/instance/app-navigator")
     assert file.stat().st_mode & 0o777 == 0o600
     first = file.stat().st_ino
-    keeper.take(granted(manifest(version="2", status={"phase": "Active"})))
+    synchronizer.apply(grant_list(manifest(version="2", status={"phase": "Active"})))
     assert file.stat().st_ino == first
-    keeper.take(granted(manifest(version="3", spec={"control": "full"})))
+    synchronizer.apply(grant_list(manifest(version="3", spec={"control": "full"})))
     assert file.stat().st_ino != first
     assert json.loads(file.read_text())["spec"]["control"] == "full"
 
 
-def test_a_grant_of_another_node_is_not_stored(keeper: GrantKeeper, tmp_path: Path) -> None:
-    keeper.take(granted(manifest("g1"), manifest("g2")))
-    keeper.take(granted(manifest("g1"), manifest("g2", spec={"node": "drone-2"})))
+def test_grant_of_another_node_is_not_stored(synchronizer: GrantSynchronizer, tmp_path: Path) -> None:
+    synchronizer.apply(grant_list(manifest("g1"), manifest("g2")))
+    synchronizer.apply(grant_list(manifest("g1"), manifest("g2", spec={"node": "drone-2"})))
     assert on_disk(tmp_path) == {"g1.json"}
 
 
-async def test_an_unreadable_grant_grants_nothing_and_says_so(
-    keeper: GrantKeeper, store: FakeStore, tmp_path: Path
+async def test_invalid_grant_is_removed_and_reported_as_failed(
+    synchronizer: GrantSynchronizer, store: FakeStore, tmp_path: Path
 ) -> None:
-    keeper.take(granted(manifest()))
-    keeper.take(granted(manifest(spec={"newRestriction": True})))
+    synchronizer.apply(grant_list(manifest()))
+    synchronizer.apply(grant_list(manifest(spec={"newRestriction": True})))
     assert on_disk(tmp_path) == set()
-    await keeper.report_once()
+    await synchronizer.report_once()
     (found,) = store.reports[-1].values()
     assert (found.name, found.uid, found.phase) == ("g1", "u1", "Failed")
     assert "spec.newRestriction" in found.message
 
 
-async def test_phases_are_reported_once_and_survive_outages(keeper: GrantKeeper, store: FakeStore) -> None:
-    keeper.take(granted(manifest()))
+async def test_phases_are_reported_once_and_after_outages(synchronizer: GrantSynchronizer, store: FakeStore) -> None:
+    synchronizer.apply(grant_list(manifest()))
     store.down = True
     with pytest.raises(KubeError):
-        await keeper.report_once()
+        await synchronizer.report_once()
     store.down = False
-    await keeper.report_once()
-    await keeper.report_once()
+    await synchronizer.report_once()
+    await synchronizer.report_once()
     assert store.phases() == ["Active"]
-    keeper.missions_changed({KEY: FAILED})
-    await keeper.report_once()
+    synchronizer.set_missions({KEY: FAILED})
+    await synchronizer.report_once()
     assert store.reports[-1] == {"g1": report("Failed", "driver lost")}
 
 
-async def test_a_new_agent_does_not_repeat_what_is_reported(keeper: GrantKeeper, store: FakeStore) -> None:
-    keeper.take(granted(manifest(), reported=[report("Active")]))
-    await keeper.report_once()
+async def test_new_agent_does_not_repeat_reports(synchronizer: GrantSynchronizer, store: FakeStore) -> None:
+    synchronizer.apply(grant_list(manifest(), reported=[report("Active")]))
+    await synchronizer.report_once()
     assert store.reports == []
 
 
-async def test_what_the_api_server_lost_is_reported_again(keeper: GrantKeeper, store: FakeStore) -> None:
-    keeper.take(granted(manifest(), generation=4))
-    await keeper.report_once()
-    keeper.take(Granted(5, None, {}, 0))
-    await keeper.report_once()
+async def test_reports_lost_by_the_api_server_are_repeated(synchronizer: GrantSynchronizer, store: FakeStore) -> None:
+    synchronizer.apply(grant_list(manifest(), generation=4))
+    await synchronizer.report_once()
+    synchronizer.apply(GrantList(5, None, {}, 0))
+    await synchronizer.report_once()
     assert store.phases() == ["Active", "Active"]
     assert store.generation == 5
 
 
-async def test_what_is_reported_names_all_grants_and_no_other(keeper: GrantKeeper, store: FakeStore) -> None:
-    keeper.take(granted(manifest(), manifest("g2", "u2"), reported=[report("Active")]))
-    await keeper.report_once()
+async def test_report_contains_all_grants_of_the_list(synchronizer: GrantSynchronizer, store: FakeStore) -> None:
+    synchronizer.apply(grant_list(manifest(), manifest("g2", "u2"), reported=[report("Active")]))
+    await synchronizer.report_once()
     assert store.reports == [{"g1": report("Active"), "g2": report("Active", name="g2", uid="u2")}]
-    keeper.take(granted(manifest("g2", "u2"), reported=list(store.reports[-1].values())))
-    await keeper.report_once()
+    synchronizer.apply(grant_list(manifest("g2", "u2"), reported=list(store.reports[-1].values())))
+    await synchronizer.report_once()
     assert store.reports[-1] == {"g2": report("Active", name="g2", uid="u2")}
 
 
-async def test_reports_wait_for_an_object_that_takes_them(keeper: GrantKeeper, store: FakeStore) -> None:
+async def test_reports_wait_for_the_node_grants_object(synchronizer: GrantSynchronizer, store: FakeStore) -> None:
     store.absent = True
-    keeper.take(granted(manifest()))
-    await keeper.report_once()
+    synchronizer.apply(grant_list(manifest()))
+    await synchronizer.report_once()
     store.absent = False
-    await keeper.report_once()
+    await synchronizer.report_once()
     assert store.phases() == ["Active"]
 
 
-async def test_a_grant_made_again_under_its_name_is_reported_again(keeper: GrantKeeper, store: FakeStore) -> None:
-    keeper.missions_changed({KEY: COMPLETE})
+async def test_recreated_grant_is_reported_again(synchronizer: GrantSynchronizer, store: FakeStore) -> None:
+    synchronizer.set_missions({KEY: COMPLETE})
     for uid in ("u1", "u2"):
-        keeper.take(granted(manifest(uid=uid)))
-        await keeper.report_once()
-    keeper.take(granted(manifest(uid="u3")))
-    await keeper.report_once()
+        synchronizer.apply(grant_list(manifest(uid=uid)))
+        await synchronizer.report_once()
+    synchronizer.apply(grant_list(manifest(uid="u3")))
+    await synchronizer.report_once()
     assert store.phases() == ["Complete", "Active", "Active"]
 
 
-async def test_a_grant_that_cannot_be_stored_is_pending_until_it_can(
-    keeper: GrantKeeper, store: FakeStore, monkeypatch: pytest.MonkeyPatch
+async def test_grant_is_pending_until_it_can_be_stored(
+    synchronizer: GrantSynchronizer, store: FakeStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
         patch.setattr("os.fsync", full)
-        keeper.take(granted(manifest()))
-    await keeper.report_once()
+        synchronizer.apply(grant_list(manifest()))
+    await synchronizer.report_once()
     assert store.phases()[-1] == "Pending"
     assert "No space left" in store.reports[-1]["g1"].message
-    keeper.retry_disk()
-    await keeper.report_once()
+    synchronizer.retry_disk()
+    await synchronizer.report_once()
     assert store.phases()[-1] == "Active"
 
 
-async def test_what_the_disk_did_not_take_is_tried_again_within_seconds(
+async def test_failed_disk_write_is_retried_within_seconds(
     store: FakeStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def full(*_: object) -> None:
@@ -239,265 +242,274 @@ async def test_what_the_disk_did_not_take_is_tried_again_within_seconds(
             now_s[0] += waits_s[-1]
 
     directory = GrantDirectory(tmp_path)
-    keeper = GrantKeeper(store, directory, "drone-1", believe, monotonic=lambda: now_s[0])
-    monkeypatch.setattr("fractus_agent.grants.keeper.repeat", repeated)
+    synchronizer = GrantSynchronizer(store, directory, "drone-1", accept, monotonic=lambda: now_s[0])
+    monkeypatch.setattr("fractus_agent.grants.repeat", repeated)
     with monkeypatch.context() as patch:
-        patch.setattr("fractus_agent.grants.keeper.write_file", full)
-        keeper.take(granted(manifest()))
-        await keeper.report()
+        patch.setattr("fractus_agent.grants.write_file", full)
+        synchronizer.apply(grant_list(manifest()))
+        await synchronizer.report()
     assert max(waits_s) <= 5
-    assert caplog.text.count("cannot be written to disk") == 1, "it is told once"
+    assert caplog.text.count("cannot write to disk") == 1, "logged once"
     waits_s.clear()
-    await keeper.report()
+    await synchronizer.report()
     assert on_disk(tmp_path) == {"g1.json"}
     assert waits_s == [60.0] * 4
 
 
-def test_services_do_not_go_on_by_a_grant_whose_change_cannot_be_stored(
-    keeper: GrantKeeper, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_outdated_grant_is_removed_if_its_change_cannot_be_stored(
+    synchronizer: GrantSynchronizer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
-    keeper.take(granted(manifest()))
+    synchronizer.apply(grant_list(manifest()))
     stored = (tmp_path / "g1.json").read_bytes()
     narrower = manifest()
     narrower["spec"]["limits"] = {"maxAltitude": 10, "maxSpeed": 5}
     annotated = manifest()
     annotated["metadata"]["annotations"] = {"note": "new"}
     with monkeypatch.context() as patch:
-        patch.setattr("fractus_agent.grants.keeper.write_file", full)
-        keeper.take(granted(annotated))
-        assert (tmp_path / "g1.json").read_bytes() == stored, "it grants the same"
-        keeper.take(granted(narrower))
+        patch.setattr("fractus_agent.grants.write_file", full)
+        synchronizer.apply(grant_list(annotated))
+        assert (tmp_path / "g1.json").read_bytes() == stored, "its spec has not changed"
+        synchronizer.apply(grant_list(narrower))
         assert on_disk(tmp_path) == set()
-        assert keeper.counts()["unstored"] == 1
-    keeper.retry_disk()
+        assert synchronizer.counts()["unstored"] == 1
+    synchronizer.retry_disk()
     assert json.loads((tmp_path / "g1.json").read_bytes())["spec"]["limits"]["maxAltitude"] == 10
 
 
-def test_a_grant_that_cannot_be_read_for_a_while_is_kept_if_it_is_the_same(
-    keeper: GrantKeeper, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_unreadable_grant_file_is_kept_if_the_grant_is_unchanged(
+    synchronizer: GrantSynchronizer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An agent without a free descriptor may still remove files, and must not take what a drone flies by."""
+    """Run out of file descriptors. The agent could still remove files, but must not remove a valid Grant."""
 
     def unreadable(_path: Path) -> bytes:
         raise OSError(24, "Too many open files")
 
-    keeper.take(granted(manifest()))
+    synchronizer.apply(grant_list(manifest()))
     narrower = manifest()
     narrower["spec"]["limits"] = {"maxAltitude": 10, "maxSpeed": 5}
     with monkeypatch.context() as patch:
         patch.setattr(Path, "read_bytes", unreadable)
-        keeper.take(granted(manifest(), generation=2))
+        synchronizer.apply(grant_list(manifest(), generation=2))
         assert on_disk(tmp_path) == {"g1.json"}
-        keeper.take(granted(narrower, generation=3))
+        synchronizer.apply(grant_list(narrower, generation=3))
         assert on_disk(tmp_path) == set()
-    keeper.retry_disk()
+    synchronizer.retry_disk()
     assert json.loads((tmp_path / "g1.json").read_bytes())["spec"]["limits"]["maxAltitude"] == 10
 
 
-def test_the_older_grant_makes_room_for_the_newer(
-    keeper: GrantKeeper, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_outdated_grant_is_removed_to_free_disk_space(
+    synchronizer: GrantSynchronizer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def tight(path: Path, content: bytes) -> None:
         if path.exists():
             raise OSError(28, "No space left on device")
         path.write_bytes(content)
 
-    keeper.take(granted(manifest()))
-    monkeypatch.setattr("fractus_agent.grants.keeper.write_file", tight)
+    synchronizer.apply(grant_list(manifest()))
+    monkeypatch.setattr("fractus_agent.grants.write_file", tight)
     narrower = manifest()
     narrower["spec"]["limits"] = {"maxAltitude": 10, "maxSpeed": 5}
-    keeper.take(granted(narrower))
+    synchronizer.apply(grant_list(narrower))
     assert json.loads((tmp_path / "g1.json").read_bytes())["spec"]["limits"]["maxAltitude"] == 10
-    assert keeper.counts()["unstored"] == 0
+    assert synchronizer.counts()["unstored"] == 0
 
 
-class Doubter:
-    """The operator's word on grants, which a test changes."""
+class FakeVerifier:
+    """Fake signature check whose result a test sets."""
 
     def __init__(self) -> None:
         self.error: Exception | None = None
-        self.asked = 0
+        self.refreshes = 0
         self.now_s = 0.0
 
     def check(self, _grant: Grant) -> None:
         if self.error is not None:
             raise self.error
 
-    def ask(self) -> None:
-        self.asked += 1
+    def refresh(self) -> None:
+        self.refreshes += 1
 
 
 @pytest.fixture
-def doubter() -> Doubter:
-    return Doubter()
+def verifier() -> FakeVerifier:
+    return FakeVerifier()
 
 
 @pytest.fixture
-def doubting(store: FakeStore, doubter: Doubter, tmp_path: Path) -> GrantKeeper:
+def verifying(store: FakeStore, verifier: FakeVerifier, tmp_path: Path) -> GrantSynchronizer:
     directory = GrantDirectory(tmp_path)
     directory.open()
-    return GrantKeeper(
-        store, directory, "drone-1", doubter.check, refresh_authority=doubter.ask, monotonic=lambda: doubter.now_s
+    return GrantSynchronizer(
+        store,
+        directory,
+        "drone-1",
+        verifier.check,
+        refresh_authority=verifier.refresh,
+        monotonic=lambda: verifier.now_s,
     )
 
 
-async def test_a_grant_that_is_not_signed_is_not_stored_and_takes_away_the_one_before(
-    doubting: GrantKeeper, doubter: Doubter, store: FakeStore, tmp_path: Path
+async def test_grant_with_bad_signature_is_not_stored_and_removes_the_previous_one(
+    verifying: GrantSynchronizer, verifier: FakeVerifier, store: FakeStore, tmp_path: Path
 ) -> None:
-    doubting.take(granted(manifest()))
-    doubter.error = BadSignature("the Grant was changed after signing")
-    doubting.take(granted(manifest(spec={"control": "full"})))
+    verifying.apply(grant_list(manifest()))
+    verifier.error = BadSignature("the Grant was changed after signing")
+    verifying.apply(grant_list(manifest(spec={"control": "full"})))
     assert on_disk(tmp_path) == set()
-    await doubting.report_once()
+    await verifying.report_once()
     found = store.reports[-1]["g1"]
-    assert found.phase == "Pending", "the operator signs it again; nothing has failed"
+    assert found.phase == "Pending", "the operator will sign it again"
     assert "changed after" in found.message
-    doubter.error = None
-    doubting.take(granted(manifest()))
-    await doubting.report_once()
+    verifier.error = None
+    verifying.apply(grant_list(manifest()))
+    await verifying.report_once()
     assert on_disk(tmp_path) == {"g1.json"}
     assert store.phases()[-1] == "Active"
 
 
-async def test_a_change_of_authorities_takes_no_grant_away(
-    doubting: GrantKeeper, doubter: Doubter, store: FakeStore, tmp_path: Path
+async def test_change_of_authorities_keeps_stored_grants(
+    verifying: GrantSynchronizer, verifier: FakeVerifier, store: FakeStore, tmp_path: Path
 ) -> None:
-    doubting.take(granted(manifest()))
-    await doubting.report_once()
-    doubter.error = UnknownAuthority("it is of an authority that is not in ca.crt")
-    doubting.take(granted(manifest(spec={"control": "full"}), reported=[report("Active")]))
-    await doubting.report_once()
+    verifying.apply(grant_list(manifest()))
+    await verifying.report_once()
+    verifier.error = UnknownAuthority("it is of an authority that is not in ca.crt")
+    verifying.apply(grant_list(manifest(spec={"control": "full"}), reported=[report("Active")]))
+    await verifying.report_once()
     assert "control" not in json.loads((tmp_path / "g1.json").read_text())["spec"]
-    assert doubter.asked == 1
+    assert verifier.refreshes == 1
     assert store.phases() == ["Active"]
-    doubter.error = None
-    doubting.authority_changed()
+    verifier.error = None
+    verifying.on_authority_changed()
     assert json.loads((tmp_path / "g1.json").read_text())["spec"]["control"] == "full"
 
 
-def test_an_authority_that_stays_unknown_ends_the_grant(
-    doubting: GrantKeeper, doubter: Doubter, tmp_path: Path
+def test_stored_grant_is_removed_if_the_authority_of_its_replacement_stays_unknown(
+    verifying: GrantSynchronizer, verifier: FakeVerifier, tmp_path: Path
 ) -> None:
-    doubting.take(granted(manifest()))
-    doubter.error = UnknownAuthority("it is of an authority that is not in ca.crt")
-    doubting.take(granted(manifest(spec={"control": "full"})))
-    doubter.now_s = UNVERIFIED_TIMEOUT_S
-    doubting.give_up_unverified()
+    verifying.apply(grant_list(manifest()))
+    verifier.error = UnknownAuthority("it is of an authority that is not in ca.crt")
+    verifying.apply(grant_list(manifest(spec={"control": "full"})))
+    verifier.now_s = UNVERIFIED_TIMEOUT_S
+    verifying.expire_unverified()
     assert on_disk(tmp_path) == {"g1.json"}
-    doubter.now_s = UNVERIFIED_TIMEOUT_S + 1
-    doubting.give_up_unverified()
+    verifier.now_s = UNVERIFIED_TIMEOUT_S + 1
+    verifying.expire_unverified()
     assert on_disk(tmp_path) == set()
-    doubting.take(granted())
-    doubter.error = None
-    doubting.authority_changed()
-    assert on_disk(tmp_path) == set(), "what the API server has no more does not come back"
+    verifying.apply(grant_list())
+    verifier.error = None
+    verifying.on_authority_changed()
+    assert on_disk(tmp_path) == set(), "a removed Grant does not come back"
 
 
-async def test_a_stored_grant_outlives_its_authority_and_the_agent(
-    doubting: GrantKeeper, doubter: Doubter, store: FakeStore, tmp_path: Path
+async def test_stored_grant_survives_unknown_authority_and_agent_restart(
+    verifying: GrantSynchronizer, verifier: FakeVerifier, store: FakeStore, tmp_path: Path
 ) -> None:
-    doubting.take(granted(manifest()))
-    doubter.error = UnknownAuthority("it is of an authority that is not in ca.crt")
-    again = GrantKeeper(store, GrantDirectory(tmp_path), "drone-1", doubter.check, monotonic=lambda: doubter.now_s)
-    again.take(granted(manifest()))
-    doubter.now_s = UNVERIFIED_TIMEOUT_S * 2
-    again.give_up_unverified()
+    verifying.apply(grant_list(manifest()))
+    verifier.error = UnknownAuthority("it is of an authority that is not in ca.crt")
+    again = GrantSynchronizer(
+        store, GrantDirectory(tmp_path), "drone-1", verifier.check, monotonic=lambda: verifier.now_s
+    )
+    again.apply(grant_list(manifest()))
+    verifier.now_s = UNVERIFIED_TIMEOUT_S * 2
+    again.expire_unverified()
     await again.report_once()
     assert on_disk(tmp_path) == {"g1.json"}
     assert store.phases()[-1] == "Active"
 
 
-async def test_an_api_server_that_is_gone_for_a_month_takes_no_grant_away(
-    doubting: GrantKeeper, doubter: Doubter, store: FakeStore, tmp_path: Path
+async def test_grants_stay_stored_while_the_api_server_is_unreachable_for_a_month(
+    verifying: GrantSynchronizer, verifier: FakeVerifier, store: FakeStore, tmp_path: Path
 ) -> None:
-    doubting.take(granted(manifest("g1"), manifest("g2")))
+    verifying.apply(grant_list(manifest("g1"), manifest("g2")))
     store.down = True
-    doubter.error = UnknownAuthority("there is no ca.crt any more")
+    verifier.error = UnknownAuthority("there is no ca.crt any more")
     for _ in range(30):
-        doubter.now_s += 86_400
-        doubting.missions_changed({KEY: Outcome(OutcomeKind.FAILED, f"{doubter.now_s}")})
-        doubting.give_up_unverified()
-        doubting.retry_disk()
-        doubting.authority_changed()
+        verifier.now_s += 86_400
+        verifying.set_missions({KEY: Outcome(OutcomeKind.FAILED, f"{verifier.now_s}")})
+        verifying.expire_unverified()
+        verifying.retry_disk()
+        verifying.on_authority_changed()
         with pytest.raises(KubeError):
-            await doubting.report_once()
+            await verifying.report_once()
     assert on_disk(tmp_path) == {"g1.json", "g2.json"}
 
 
-def test_outcomes() -> None:
+def test_mission_outcome_gives_phase_and_reason() -> None:
     grant = Grant.from_body(manifest())
-    assert outcome_of(grant, {}) is None
-    assert outcome_of(grant, {KEY: COMPLETE}) == ("Complete", "")
-    assert outcome_of(grant, {KEY: Outcome(OutcomeKind.REVOKED, "zone closed: now")}) == (
+    assert mission_outcome(grant, {}) is None
+    assert mission_outcome(grant, {KEY: COMPLETE}) == ("Complete", "")
+    assert mission_outcome(grant, {KEY: Outcome(OutcomeKind.REVOKED, "zone closed: now")}) == (
         "Revoked",
         "zone closed: now",
     )
-    assert outcome_of(grant, {KEY: FAILED}) == ("Failed", "driver lost")
-    assert outcome_of(grant, {KEY.replace("#u1", "#u2"): COMPLETE, "u1": COMPLETE}) is None
+    assert mission_outcome(grant, {KEY: FAILED}) == ("Failed", "driver lost")
+    assert mission_outcome(grant, {KEY.replace("#u1", "#u2"): COMPLETE, "u1": COMPLETE}) is None
 
 
-def test_a_reported_end_is_final() -> None:
+def test_reported_final_phase_is_kept() -> None:
     grant, ended = Grant.from_body(manifest(metadata={"generation": 2})), report("Complete", "done")
-    now = report_of(grant, {KEY: FAILED}, None)
-    assert unless_ended(now, ended) == ended.model_copy(update={"observed_generation": 2})
-    assert unless_ended(report_of(grant, {}, "disk full"), ended).phase == "Complete"
-    assert unless_ended(now, report("Active")) == unless_ended(now, None) == now
+    now = grant_report(grant, {KEY: FAILED}, None)
+    assert keep_final_phase(now, ended) == ended.model_copy(update={"observed_generation": 2})
+    assert keep_final_phase(grant_report(grant, {}, "disk full"), ended).phase == "Complete"
+    assert keep_final_phase(now, report("Active")) == keep_final_phase(now, None) == now
 
 
 @pytest.mark.parametrize("problem", [BadSignature("changed"), UnknownAuthority("unknown"), None])
-async def test_nor_is_an_end_taken_back_by_a_grant_that_is_unusable(
-    doubting: GrantKeeper, doubter: Doubter, store: FakeStore, problem: Exception | None
+async def test_reported_final_phase_is_kept_for_unusable_grant(
+    verifying: GrantSynchronizer, verifier: FakeVerifier, store: FakeStore, problem: Exception | None
 ) -> None:
-    doubter.error = problem
+    verifier.error = problem
     spec = {} if problem is not None else {"newRestriction": True}
-    doubting.take(granted(manifest(spec=spec), reported=[report("Complete", "done")]))
-    await doubting.report_once()
+    verifying.apply(grant_list(manifest(spec=spec), reported=[report("Complete", "done")]))
+    await verifying.report_once()
     assert store.reports == []
 
 
-async def test_what_is_reported_is_of_the_present_generation(keeper: GrantKeeper, store: FakeStore) -> None:
-    """Signed again, a Grant has other annotations and the same generation."""
-    keeper.take(granted(manifest(), reported=[report("Active")]))
+async def test_report_has_the_current_generation(synchronizer: GrantSynchronizer, store: FakeStore) -> None:
+    """Sign a Grant again, which changes its annotations but not its generation."""
+    synchronizer.apply(grant_list(manifest(), reported=[report("Active")]))
     again = manifest(metadata={"annotations": {"fractus.dev/signature": "again"}})
-    keeper.take(granted(again, generation=2, reported=[report("Active")]))
-    await keeper.report_once()
+    synchronizer.apply(grant_list(again, generation=2, reported=[report("Active")]))
+    await synchronizer.report_once()
     assert (store.generation, store.phases()) == (2, ["Active"])
 
 
-def test_what_is_unchanged_is_not_verified_again(doubting: GrantKeeper, doubter: Doubter, tmp_path: Path) -> None:
-    doubting.take(granted(manifest("g1"), manifest("g2")))
-    doubter.error = BadSignature("it is asked again")
-    doubting.take(granted(manifest("g1"), manifest("g2", spec={"control": "full"})))
+def test_unchanged_grants_are_not_verified_again(
+    verifying: GrantSynchronizer, verifier: FakeVerifier, tmp_path: Path
+) -> None:
+    verifying.apply(grant_list(manifest("g1"), manifest("g2")))
+    verifier.error = BadSignature("it is verified again")
+    verifying.apply(grant_list(manifest("g1"), manifest("g2", spec={"control": "full"})))
     assert on_disk(tmp_path) == {"g1.json"}
-    doubter.error = None
-    doubting.take(granted(manifest("g1"), manifest("g2")))
+    verifier.error = None
+    verifying.apply(grant_list(manifest("g1"), manifest("g2")))
     stored = {name: (tmp_path / name).read_bytes() for name in ("g1.json", "g2.json")}
     (tmp_path / "g1.json").unlink()
     (tmp_path / "g2.json").write_bytes(stored["g2.json"][:20])
-    doubting.take(granted(manifest("g1"), manifest("g2")))
-    assert {name: (tmp_path / name).read_bytes() for name in on_disk(tmp_path)} == stored, "as it was written"
+    verifying.apply(grant_list(manifest("g1"), manifest("g2")))
+    assert {name: (tmp_path / name).read_bytes() for name in on_disk(tmp_path)} == stored, "restored"
 
 
-async def test_a_new_agent_takes_no_reported_end_back(keeper: GrantKeeper, store: FakeStore) -> None:
-    keeper.take(granted(manifest(), reported=[report("Complete", "done")]))
-    await keeper.report_once()
+async def test_new_agent_keeps_reported_final_phase(synchronizer: GrantSynchronizer, store: FakeStore) -> None:
+    synchronizer.apply(grant_list(manifest(), reported=[report("Complete", "done")]))
+    await synchronizer.report_once()
     assert store.reports == []
 
 
-def test_the_stored_form_is_stable() -> None:
+def test_serialized_grant_does_not_depend_on_status() -> None:
     one = Grant.from_body(manifest(version="1"))
     two = Grant.from_body(manifest(version="2", status={"phase": "Active"}))
-    assert stored_form(one) == stored_form(two)
-    stored = json.loads(stored_form(one))
+    assert serialize(one) == serialize(two)
+    stored = json.loads(serialize(one))
     assert stored["metadata"]["uid"] == "u1"
     assert Grant.from_body(stored).spec == one.spec
-    assert "policies" not in stored["spec"], "services of an earlier release meet no field that is not used"
+    assert "policies" not in stored["spec"], "unused fields are left out for services of an earlier release"
 
 
-def test_backoff_doubles_to_its_cap_and_starts_again() -> None:
+def test_backoff_doubles_to_its_cap_and_restarts_after_success() -> None:
     backoff = Backoff(0.5, 15.0)
     delays = [backoff.delay_s() for _ in range(50)]
     for attempt, delay in enumerate(delays):
@@ -507,8 +519,8 @@ def test_backoff_doubles_to_its_cap_and_starts_again() -> None:
     assert backoff.delay_s() <= 0.5
 
 
-class OneObject:
-    """A client that finds the object of the node, and then hears nothing."""
+class FakeClient:
+    """Fake client that lists one object."""
 
     def __init__(self, body: dict[str, Any]) -> None:
         self._body = body
@@ -520,8 +532,8 @@ class OneObject:
         return SimpleNamespace(items=[self._body], resource_version="1")
 
 
-async def test_what_was_reported_keeps_no_grant_from_the_node() -> None:
-    """By a release that knew of other phases."""
+async def test_invalid_status_of_node_grants_does_not_block_grants() -> None:
+    """Use a status of a release with other phases."""
     reports = [{"uid": "u1", "name": "g1", "phase": "Paused", "observedGeneration": 1}]
     body = {
         "apiVersion": "fractus.dev/v1alpha1",
@@ -530,7 +542,7 @@ async def test_what_was_reported_keeps_no_grant_from_the_node() -> None:
         "spec": {"count": 1, "packed": pack([manifest()])},
         "status": {"observedGeneration": 2, "grants": reports},
     }
-    found = await anext(Store(cast(Any, OneObject(body)), "drone-1").grants())
+    found = await anext(Store(cast(Any, FakeClient(body)), "drone-1").grants())
     assert found.grants is not None
     assert [grant["metadata"]["name"] for grant in found.grants] == ["g1"]
-    assert (found.generation, found.reported, found.reported_of) == (3, {}, 0), "and it is reported again"
+    assert (found.generation, found.reported, found.reported_generation) == (3, {}, 0), "everything is reported again"

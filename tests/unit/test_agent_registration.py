@@ -1,4 +1,4 @@
-"""Registration: created once, the owner's edits stay, a changed description is taken over."""
+"""Registration: the object is created once, the owner's edits stay, a changed description is applied."""
 
 import copy
 from pathlib import Path
@@ -6,14 +6,14 @@ from typing import Any
 
 import pytest
 import yaml
-from fractus_agent.cluster.store import Invalid
-from fractus_agent.registration.handover import Handover
+from fractus_agent.registration.node_object_file import NodeObjectFile
 from fractus_agent.registration.registration import (
     HASH_ANNOTATION,
     Registration,
     description_hash,
-    own_description,
+    parse_node_description,
 )
+from fractus_agent.store import Invalid
 from fractus_core.api.nodes import CameraMount, Drone, InvalidDescription, parse_description
 
 MANIFEST: dict[str, Any] = {
@@ -31,7 +31,7 @@ MANIFEST: dict[str, Any] = {
 
 
 class FakeStore:
-    """One node's object and labels, with the API server's bookkeeping."""
+    """Fake store with the object and labels of one node, and the metadata that an API server sets."""
 
     def __init__(self) -> None:
         self.object: dict[str, Any] | None = None
@@ -42,7 +42,7 @@ class FakeStore:
     async def node_labels(self) -> dict[str, str] | None:
         return None if self.labels is None else dict(self.labels)
 
-    async def described(self, kind: str) -> dict[str, Any] | None:
+    async def node_object(self, kind: str) -> dict[str, Any] | None:
         return copy.deepcopy(self.object) if self.object and self.object["kind"] == kind else None
 
     async def create(self, body: dict[str, Any]) -> dict[str, Any]:
@@ -80,10 +80,10 @@ def edited(**spec: Any) -> str:
 
 
 def registration_of(store: FakeStore, path: Path) -> Registration:
-    return Registration(store, path, "drone-1", Handover(path.with_name("node.json")))  # type: ignore[arg-type]
+    return Registration(store, path, "drone-1", NodeObjectFile(path.with_name("node.json")))  # type: ignore[arg-type]
 
 
-async def test_registers_once(path: Path) -> None:
+async def test_registration_creates_the_object_once(path: Path) -> None:
     store = FakeStore()
     for _ in range(3):
         await registration_of(store, path).step()
@@ -93,7 +93,7 @@ async def test_registers_once(path: Path) -> None:
     assert store.object["spec"]["depot"] == "campus"
 
 
-async def test_the_owners_edits_stay(path: Path) -> None:
+async def test_registration_keeps_the_owners_edits(path: Path) -> None:
     store = FakeStore()
     registration = registration_of(store, path)
     await registration.step()
@@ -107,7 +107,7 @@ async def test_the_owners_edits_stay(path: Path) -> None:
     assert store.object["spec"]["depot"] == "harbour"
 
 
-async def test_a_changed_description_is_taken_over_once(path: Path) -> None:
+async def test_changed_description_is_applied_once(path: Path) -> None:
     store = FakeStore()
     registration = registration_of(store, path)
     await registration.step()
@@ -120,7 +120,7 @@ async def test_a_changed_description_is_taken_over_once(path: Path) -> None:
     assert store.object["metadata"]["labels"] == {"fleet": "north"}
 
 
-async def test_an_owners_object_is_adopted_unchanged(path: Path) -> None:
+async def test_existing_object_of_the_owner_is_adopted_unchanged(path: Path) -> None:
     store = FakeStore()
     store.object = {
         "apiVersion": "fractus.dev/v1alpha1",
@@ -133,7 +133,7 @@ async def test_an_owners_object_is_adopted_unchanged(path: Path) -> None:
     assert HASH_ANNOTATION in store.object["metadata"]["annotations"]
 
 
-async def test_without_a_description_the_owners_object_is_awaited(tmp_path: Path) -> None:
+async def test_registration_without_description_waits_for_the_owners_object(tmp_path: Path) -> None:
     store = FakeStore()
     registration = registration_of(store, tmp_path / "node.yaml")
     await registration.step()
@@ -147,21 +147,21 @@ async def test_without_a_description_the_owners_object_is_awaited(tmp_path: Path
     }
     await registration.step()
     assert registration.body is not None
-    assert registration.described is None
+    assert registration.description_problem is None
 
 
-async def test_a_deleted_object_is_registered_again(path: Path) -> None:
+async def test_deleted_object_is_registered_again(path: Path) -> None:
     store = FakeStore()
     registration = registration_of(store, path)
     await registration.step()
     store.object = None
-    registration.seen(None)
+    registration.on_status_written(None)
     assert registration.body is None
     await registration.step()
     assert store.object is not None
 
 
-async def test_a_bad_description_is_reported_and_the_object_kept(path: Path) -> None:
+async def test_invalid_description_is_reported_and_the_object_kept(path: Path) -> None:
     store = FakeStore()
     registration = registration_of(store, path)
     await registration.step()
@@ -169,36 +169,36 @@ async def test_a_bad_description_is_reported_and_the_object_kept(path: Path) -> 
     write(path, edited(depot="No Such Name!"))
     await registration.step()
     assert store.object == before
-    assert registration.described is not None
-    assert "spec.depot" in registration.described.message
+    assert registration.description_problem is not None
+    assert "spec.depot" in registration.description_problem.message
     write(path, edited())
     await registration.step()
-    assert registration.described is None
+    assert registration.description_problem is None
 
 
-async def test_a_refused_object_is_said(path: Path) -> None:
+async def test_object_refused_by_the_api_server_is_reported(path: Path) -> None:
     store = FakeStore()
     store.refuse = True
     registration = registration_of(store, path)
     with pytest.raises(Invalid):
         await registration.step()
-    assert registration.described is not None
-    assert "spec.depot: no" in registration.described.message
+    assert registration.description_problem is not None
+    assert "spec.depot: no" in registration.description_problem.message
     assert registration.body is None
 
 
-async def test_a_description_of_the_other_class_is_refused(path: Path) -> None:
+async def test_description_of_another_node_class_is_refused(path: Path) -> None:
     store = FakeStore()
     store.labels = {"fractus.dev/class": "edge"}
     registration = registration_of(store, path)
     await registration.step()
     assert store.object is None
-    assert registration.described is not None
-    assert "EdgeNode" in registration.described.message
+    assert registration.description_problem is not None
+    assert "EdgeNode" in registration.description_problem.message
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "message"),
     [
         ("a: [", "is not YAML"),
         ("- 1", "kind"),
@@ -207,15 +207,17 @@ async def test_a_description_of_the_other_class_is_refused(path: Path) -> None:
         (yaml.safe_dump(MANIFEST).replace("maxSpeed: 15", "maxSpeed: -1"), "maxSpeed"),
     ],
 )
-def test_bad_descriptions(text: str, says: str) -> None:
-    with pytest.raises(InvalidDescription, match=says):
-        own_description(text, "drone-1")
+def test_invalid_description_is_rejected(text: str, message: str) -> None:
+    with pytest.raises(InvalidDescription, match=message):
+        parse_node_description(text, "drone-1")
 
 
-def test_hash_is_of_what_is_said() -> None:
-    first = own_description(yaml.safe_dump(MANIFEST), "drone-1")
-    again = own_description("# x\n" + yaml.safe_dump(MANIFEST, sort_keys=False, default_flow_style=True), "drone-1")
-    other = own_description(edited(depot="x"), "drone-1")
+def test_description_hash_ignores_comments_and_layout() -> None:
+    first = parse_node_description(yaml.safe_dump(MANIFEST), "drone-1")
+    again = parse_node_description(
+        "# x\n" + yaml.safe_dump(MANIFEST, sort_keys=False, default_flow_style=True), "drone-1"
+    )
+    other = parse_node_description(edited(depot="x"), "drone-1")
     assert description_hash(first) == description_hash(again) != description_hash(other)
 
 
@@ -226,27 +228,28 @@ def described_camera(camera: dict[str, Any]) -> str:
     return edited(services={**MANIFEST["spec"]["services"], "camera": camera})
 
 
-async def test_hands_the_object_over_as_its_owner_has_it_now(path: Path) -> None:
-    store, handed = FakeStore(), path.with_name("node.json")
+async def test_node_object_file_follows_the_owners_edits(path: Path) -> None:
+    store = FakeStore()
+    file = path.with_name("node.json")
     write(path, described_camera(CAMERA))
     registration = registration_of(store, path)
     await registration.step()
-    first = parse_description(handed.read_text(), Drone)
+    first = parse_description(file.read_text(), Drone)
     assert first is not None
     assert first.spec.services.camera is not None
     assert (first.spec.services.camera.mount, first.status) == (CameraMount(pitch=-60), None)
     assert store.object is not None
     store.object["spec"]["services"]["camera"]["mount"]["pitch"] = -30
     store.object["metadata"]["generation"] += 1
-    registration.seen(copy.deepcopy(store.object) | {"status": {"flightState": "flying"}})
-    second = parse_description(handed.read_text(), Drone)
+    registration.on_status_written(copy.deepcopy(store.object) | {"status": {"flightState": "flying"}})
+    second = parse_description(file.read_text(), Drone)
     assert registration.resource is not None
     assert second is not None
     assert second.spec == registration.resource.spec
-    assert "depot" in handed.read_text()
-    written = handed.stat()
+    assert "depot" in file.read_text()
+    written = file.stat()
     await registration.step()
-    assert handed.stat().st_ino == written.st_ino, "nothing changed"
+    assert file.stat().st_ino == written.st_ino, "nothing changed"
 
 
 @pytest.mark.parametrize(
@@ -257,47 +260,48 @@ async def test_hands_the_object_over_as_its_owner_has_it_now(path: Path) -> None
         ({**CAMERA, "mount": None}, "has no mount: "),
     ],
 )
-async def test_a_camera_whose_view_is_unknown_is_told_of(path: Path, camera: dict[str, Any], missing: str) -> None:
+async def test_incomplete_camera_description_is_reported(path: Path, camera: dict[str, Any], missing: str) -> None:
     write(path, described_camera({key: value for key, value in camera.items() if value is not None}))
-    handover = Handover(path.with_name("node.json"))
-    registration = Registration(FakeStore(), path, "drone-1", handover)  # type: ignore[arg-type]
+    object_file = NodeObjectFile(path.with_name("node.json"))
+    registration = Registration(FakeStore(), path, "drone-1", object_file)  # type: ignore[arg-type]
     await registration.step()
-    assert handover.condition is not None
-    assert (handover.condition.type, handover.condition.status) == ("CameraDescribed", "False")
-    assert missing in handover.condition.message
+    assert object_file.condition is not None
+    assert (object_file.condition.type, object_file.condition.status) == ("CameraDescribed", "False")
+    assert missing in object_file.condition.message
     write(path, described_camera(CAMERA))
     await registration.step()
-    assert handover.condition is None
+    assert object_file.condition is None
 
 
-async def test_what_cannot_be_read_or_stored_is_not_handed_over(
+async def test_node_object_file_is_emptied_if_the_object_cannot_be_parsed_or_stored(
     path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    handed = tmp_path / "handed" / "node.json"
-    handover, store = Handover(handed), FakeStore()
-    registration = Registration(store, path, "drone-1", handover)  # type: ignore[arg-type]
+    file = tmp_path / "state" / "node.json"
+    object_file = NodeObjectFile(file)
+    store = FakeStore()
+    registration = Registration(store, path, "drone-1", object_file)  # type: ignore[arg-type]
     await registration.step()
-    assert handed.exists()
+    assert file.exists()
 
-    def seen(generation: int, **changes: Any) -> None:
+    def write_status(generation: int, **changes: Any) -> None:
         assert store.object is not None
         body = copy.deepcopy(store.object)
         body["metadata"]["generation"] = generation
         body["spec"] |= changes
-        registration.seen(body)
+        registration.on_status_written(body)
 
-    seen(2, services={"camera": {"mount": "above"}})
-    assert handed.read_bytes() == b"", "services would go on with what held before, and without a file by the owner's"
-    assert handover.condition is not None
-    assert "cannot read the object" in handover.condition.message
-    seen(3)
-    assert (handed.read_bytes() != b"", handover.condition) == (True, None)
+    write_status(2, services={"camera": {"mount": "above"}})
+    assert file.read_bytes() == b"", "an outdated or missing file would be used by the services"
+    assert object_file.condition is not None
+    assert "cannot parse the object" in object_file.condition.message
+    write_status(3)
+    assert (file.read_bytes() != b"", object_file.condition) == (True, None)
 
     def full(*_args: object, **_named: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("fractus_agent.registration.handover.write_file", full)
-    seen(4, depot="other")
-    assert handed.read_bytes() == b""
-    assert handover.condition is not None
-    assert "cannot store its description" in handover.condition.message
+    monkeypatch.setattr("fractus_agent.registration.node_object_file.write_file", full)
+    write_status(4, depot="other")
+    assert file.read_bytes() == b""
+    assert object_file.condition is not None
+    assert "cannot store its description" in object_file.condition.message

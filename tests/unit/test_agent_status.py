@@ -1,24 +1,23 @@
-"""What the agent writes into status, and when."""
+"""Status that the agent writes for its node, and the intervals of the writes."""
 
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import pytest
-from fractus_agent.cluster.store import KubeError
 from fractus_agent.conditions import Condition
-from fractus_agent.registration.status import (
-    DRONE_PACE,
-    EDGE_PACE,
-    FLIGHT_PACE,
-    Observed,
+from fractus_agent.registration.node_status import (
+    DRONE_INTERVALS,
+    EDGE_INTERVALS,
+    FLIGHT_INTERVALS,
+    NodeObservation,
     StatusReporter,
     due_s,
     node_status,
-    pace_of,
     readiness,
+    report_intervals,
 )
-from fractus_agent.telemetry.feed import snapshot
-from fractus_agent.telemetry.snapshot import Snapshot
+from fractus_agent.store import KubeError
+from fractus_agent.telemetry import TelemetrySnapshot, parse_telemetry
 from fractus_core.api.names import CONTROL_TAKEN
 from fractus_core.api.nodes import DroneStatus, EdgeNodeStatus
 from fractus_core.control import Outcome, OutcomeKind
@@ -29,7 +28,7 @@ NOW = datetime(2026, 5, 1, 12, 0, 0, tzinfo=UTC)
 ISSUED = Condition("Certified", "True", "Issued", "Valid.")
 
 
-def seen(**changes: Any) -> Snapshot:
+def telemetry(**changes: Any) -> TelemetrySnapshot:
     facts: dict[str, Any] = {
         "flight_state": "flying",
         "controller": "system",
@@ -42,21 +41,21 @@ def seen(**changes: Any) -> Snapshot:
         "battery_voltage_v": 15.9,
         "battery_current_a": 12.1,
     }
-    return Snapshot(**(facts | changes))
+    return TelemetrySnapshot(**(facts | changes))
 
 
-def observed(**changes: Any) -> Observed:
+def observed(**changes: Any) -> NodeObservation:
     facts: dict[str, Any] = {
         "kind": "Drone",
         "has_mobility": True,
         "needs_certificate": True,
         "certified": ISSUED,
-        "snapshot": seen(),
+        "snapshot": telemetry(),
     }
-    return Observed(**(facts | changes))
+    return NodeObservation(**(facts | changes))
 
 
-def test_telemetry_becomes_a_valid_drone_status() -> None:
+def test_telemetry_is_converted_to_a_valid_drone_status() -> None:
     message = Telemetry(
         position=Position(
             latitude_deg=39.36, longitude_deg=22.94, altitude_m=20.0,
@@ -66,8 +65,10 @@ def test_telemetry_becomes_a_valid_drone_status() -> None:
         flight_state="flying", controller="spiffe://fractus.dev/ns/a/app/b/component/c/instance/d",
         autopilot_connected=True, ready=True, missions={"x": MissionOutcome(kind=99, reason="new")},
     )  # fmt: skip
-    status = node_status(observed(snapshot=snapshot(message)), {}, 3, NOW)
-    assert snapshot(message).missions == {"x": Outcome(OutcomeKind.FAILED, "new")}, "of a kind that is not known"
+    status = node_status(observed(snapshot=parse_telemetry(message)), {}, 3, NOW)
+    assert parse_telemetry(message).missions == {"x": Outcome(OutcomeKind.FAILED, "new")}, (
+        "an unknown kind counts as failed"
+    )
     parsed = DroneStatus.model_validate(status)
     assert parsed.flight_state == "flying"
     assert parsed.controller == "spiffe://fractus.dev/ns/a/app/b/component/c/instance/d"
@@ -87,12 +88,12 @@ def test_telemetry_becomes_a_valid_drone_status() -> None:
     ({"controller_reason": ""}, None), ({"controller": "spiffe://fractus.dev/a"}, None), ({"in_air": False}, None),
     ({"connected": False}, None),
 ])  # fmt: skip
-def test_a_drone_in_the_air_tells_why_no_driver_has_control(
+def test_airborne_drone_reports_why_no_driver_has_control(
     changes: dict[str, Any], expected: tuple[str, str] | None
 ) -> None:
-    assert snapshot(Telemetry(controller_reason="x")).controller_reason == "x"
+    assert parse_telemetry(Telemetry(controller_reason="x")).controller_reason == "x"
     status = node_status(
-        observed(snapshot=seen(**{"controller_reason": "policy campus forbids it", **changes})), {}, 1, NOW
+        observed(snapshot=telemetry(**{"controller_reason": "policy campus forbids it", **changes})), {}, 1, NOW
     )
     taken = [(c["reason"], c["message"]) for c in status["conditions"] if c["type"] == CONTROL_TAKEN]
     assert taken == ([expected] if expected else [])
@@ -102,20 +103,20 @@ def test_a_drone_in_the_air_tells_why_no_driver_has_control(
     ("facts", "reason"),
     [
         ({"certified": Condition("Certified", "False", "Denied", "no")}, "NoCertificate"),
-        ({"problem": "The mobility service is out of reach: x."}, "MobilityUnreachable"),
+        ({"telemetry_problem": "The mobility service is unreachable: x."}, "MobilityUnreachable"),
         ({"snapshot": None}, "MobilityUnreachable"),
-        ({"snapshot": seen(connected=False)}, "AutopilotDisconnected"),
-        ({"snapshot": seen(ready=False, in_air=False)}, "AutopilotNotReady"),
+        ({"snapshot": telemetry(connected=False)}, "AutopilotDisconnected"),
+        ({"snapshot": telemetry(ready=False, in_air=False)}, "AutopilotNotReady"),
     ],
 )
-def test_a_drone_is_not_ready_when(facts: dict[str, Any], reason: str) -> None:
+def test_drone_is_not_ready_if_a_requirement_is_missing(facts: dict[str, Any], reason: str) -> None:
     ready = readiness(observed(**facts))
     assert (ready.status, ready.reason) == ("False", reason)
     assert ready.message
 
 
-def test_a_flying_drone_is_ready_though_it_would_not_arm() -> None:
-    assert readiness(observed(snapshot=seen(ready=False, in_air=True))).is_true
+def test_flying_drone_is_ready_even_if_it_would_not_arm() -> None:
+    assert readiness(observed(snapshot=telemetry(ready=False, in_air=True))).is_true
 
 
 def test_edge_node_without_services_is_ready_without_certificate() -> None:
@@ -129,57 +130,63 @@ def test_edge_node_without_services_is_ready_without_certificate() -> None:
     assert readiness(bare).is_true
 
 
-@pytest.mark.parametrize("blind", [{"snapshot": None, "problem": "gone"}, {"snapshot": seen(connected=False)}])
-def test_what_cannot_be_seen_is_unknown_and_where_it_was_is_kept(blind: dict[str, Any]) -> None:
+@pytest.mark.parametrize(
+    "blind", [{"snapshot": None, "telemetry_problem": "gone"}, {"snapshot": telemetry(connected=False)}]
+)
+def test_flight_state_is_unknown_without_telemetry_and_position_is_kept(blind: dict[str, Any]) -> None:
     status = node_status(observed(), {}, 1, NOW)
     assert (status["flightState"], status["lastFlightState"]) == ("flying", "flying")
-    place = status["position"]
+    position = status["position"]
     for second in (9, 18):
         status = node_status(observed(**blind), status, 1, NOW + timedelta(seconds=second))
         assert (status["flightState"], status["lastFlightState"]) == ("unknown", "flying")
-        assert status["position"] == place
+        assert status["position"] == position
         assert DroneStatus.model_validate(status).in_air
-        assert pace_of("Drone", status) is FLIGHT_PACE
+        assert report_intervals("Drone", status) is FLIGHT_INTERVALS
         assert status["conditions"][0]["status"] == "False"
-    assert "controller" not in node_status(observed(snapshot=None), status, 1, NOW), "who flies is not known either"
+    assert "controller" not in node_status(observed(snapshot=None), status, 1, NOW), (
+        "the control authority is unknown, too"
+    )
 
 
-def test_a_drone_that_was_never_seen_is_not_said_to_stand() -> None:
+def test_drone_without_any_telemetry_has_no_last_flight_state() -> None:
     status = node_status(observed(snapshot=None), {}, 1, NOW)
     assert status["flightState"] == "unknown"
     assert "lastFlightState" not in status
-    assert pace_of("Drone", status) is DRONE_PACE
+    assert report_intervals("Drone", status) is DRONE_INTERVALS
 
 
 def test_transition_time_moves_only_with_the_status() -> None:
     first = node_status(observed(), {}, 1, NOW)
     later = node_status(observed(), first, 2, NOW + timedelta(minutes=1))
     assert later["conditions"][0]["lastTransitionTime"] == "2026-05-01T12:00:00Z"
-    worse = node_status(observed(problem="gone"), later, 2, NOW + timedelta(minutes=2))
+    worse = node_status(observed(telemetry_problem="gone"), later, 2, NOW + timedelta(minutes=2))
     assert worse["conditions"][0]["lastTransitionTime"] == "2026-05-01T12:02:00Z"
 
 
 def moved(north_m: float) -> dict[str, Any]:
-    return node_status(observed(snapshot=seen(position=(39.36 + north_m / 111_320, 22.94, 20.0, "home"))), {}, 1, NOW)
+    return node_status(
+        observed(snapshot=telemetry(position=(39.36 + north_m / 111_320, 22.94, 20.0, "home"))), {}, 1, NOW
+    )
 
 
-def test_changes_are_due_by_their_weight() -> None:
+def test_write_interval_depends_on_the_kind_of_change() -> None:
     base = moved(0)
-    assert due_s(None, base, 0.0, DRONE_PACE) == 0.0
-    assert due_s(base, base, 4.0, DRONE_PACE) == DRONE_PACE.idle_s - 4.0
-    assert due_s(base, base, 4.0, EDGE_PACE) == EDGE_PACE.idle_s - 4.0
-    assert due_s(base, moved(50.0), 4.0, DRONE_PACE) == 6.0
-    assert due_s(base, moved(50.0), 10.0, DRONE_PACE) == 0.0
-    assert due_s(base, moved(1.0), 10.0, DRONE_PACE) == 20.0
-    landing = node_status(observed(snapshot=seen(flight_state="landing")), {}, 1, NOW)
-    assert due_s(base, landing, 1.0, DRONE_PACE) == 0.0
-    assert due_s(base, landing, 0.2, DRONE_PACE) == pytest.approx(0.8)
-    drained = node_status(observed(snapshot=seen(battery_remaining=0.82)), {}, 1, NOW)
-    assert due_s(base, drained, 5.0, DRONE_PACE) == 5.0
+    assert due_s(None, base, 0.0, DRONE_INTERVALS) == 0.0
+    assert due_s(base, base, 4.0, DRONE_INTERVALS) == DRONE_INTERVALS.idle_s - 4.0
+    assert due_s(base, base, 4.0, EDGE_INTERVALS) == EDGE_INTERVALS.idle_s - 4.0
+    assert due_s(base, moved(50.0), 4.0, DRONE_INTERVALS) == 6.0
+    assert due_s(base, moved(50.0), 10.0, DRONE_INTERVALS) == 0.0
+    assert due_s(base, moved(1.0), 10.0, DRONE_INTERVALS) == 20.0
+    landing = node_status(observed(snapshot=telemetry(flight_state="landing")), {}, 1, NOW)
+    assert due_s(base, landing, 1.0, DRONE_INTERVALS) == 0.0
+    assert due_s(base, landing, 0.2, DRONE_INTERVALS) == pytest.approx(0.8)
+    drained = node_status(observed(snapshot=telemetry(battery_remaining=0.82)), {}, 1, NOW)
+    assert due_s(base, drained, 5.0, DRONE_INTERVALS) == 5.0
 
 
 class FakeStore:
-    """Counts writes; can be out of reach or without the object."""
+    """Fake store that records writes. It can be unreachable, or have no object."""
 
     def __init__(self) -> None:
         self.writes: list[dict[str, Any]] = []
@@ -195,8 +202,8 @@ class FakeStore:
         return {"kind": kind, "metadata": {"name": name, "uid": "1", "generation": 1}, "status": status}
 
 
-class Bench:
-    """A reporter with a clock of its own and telemetry at 1 Hz."""
+class ReporterBench:
+    """Status reporter with a simulated clock and telemetry at 1 Hz."""
 
     def __init__(self) -> None:
         self.store = FakeStore()
@@ -208,91 +215,94 @@ class Bench:
             self.store,
             body=lambda: self.body,
             observe=lambda _: self.observed,
-            written=self.returned.append,
+            on_written=self.returned.append,
             wall=lambda: NOW + timedelta(seconds=self.seconds),
             monotonic=lambda: self.seconds,
         )
 
-    async def second(self, snap: Snapshot) -> None:
+    async def second(self, snapshot: TelemetrySnapshot) -> None:
         self.seconds += 1.0
-        self.observed = observed(snapshot=snap)
+        self.observed = observed(snapshot=snapshot)
         await self.reporter.step()
 
 
-async def test_an_agent_that_has_just_started_waits_for_the_first_telemetry() -> None:
-    bench = Bench()
+async def test_reporter_waits_for_the_first_telemetry_after_start() -> None:
+    bench = ReporterBench()
     for _ in range(4):
         bench.seconds += 1.0
         bench.observed = observed(snapshot=None)
         await bench.reporter.step()
-    assert not bench.store.writes, "a flight is not called unknown for an agent that is replaced"
-    await bench.second(seen())
+    assert not bench.store.writes, "no unknown flight state while an agent is replaced"
+    await bench.second(telemetry())
     assert bench.store.writes[0]["flightState"] == "flying"
-    deaf = Bench()
-    deaf.seconds, deaf.observed = 5.0, observed(snapshot=None)
-    await deaf.reporter.step()
-    assert deaf.store.writes[0]["flightState"] == "unknown"
+    silent = ReporterBench()
+    silent.seconds = 5.0
+    silent.observed = observed(snapshot=None)
+    await silent.reporter.step()
+    assert silent.store.writes[0]["flightState"] == "unknown"
 
 
-async def test_flying_straight_writes_every_five_seconds() -> None:
-    bench = Bench()
+async def test_status_of_flying_drone_is_written_every_five_seconds() -> None:
+    bench = ReporterBench()
     for second in range(60):
-        await bench.second(seen(position=(39.36 + second * 1e-4, 22.94, 20.0, "home")))
+        await bench.second(telemetry(position=(39.36 + second * 1e-4, 22.94, 20.0, "home")))
     assert len(bench.store.writes) == 12
 
 
-async def test_a_change_of_flight_state_is_written_at_once() -> None:
-    bench = Bench()
-    await bench.second(seen(flight_state="takingOff"))
-    await bench.second(seen(flight_state="flying"))
+async def test_change_of_flight_state_is_written_at_once() -> None:
+    bench = ReporterBench()
+    await bench.second(telemetry(flight_state="takingOff"))
+    await bench.second(telemetry(flight_state="flying"))
     assert [w["flightState"] for w in bench.store.writes] == ["takingOff", "flying"]
 
 
-async def test_a_standing_drone_writes_every_thirty_seconds() -> None:
-    bench = Bench()
+async def test_status_of_standing_drone_is_written_every_thirty_seconds() -> None:
+    bench = ReporterBench()
     for second in range(120):
         jitter = (second % 3) * 3e-6
-        await bench.second(seen(flight_state="inactive", in_air=False, position=(39.36 + jitter, 22.94, 0.0, "home")))
+        await bench.second(
+            telemetry(flight_state="inactive", in_air=False, position=(39.36 + jitter, 22.94, 0.0, "home"))
+        )
     assert len(bench.store.writes) == 4
 
 
-async def test_no_change_is_lost_over_an_outage() -> None:
-    bench = Bench()
-    await bench.second(seen(flight_state="flying"))
+async def test_change_during_an_outage_is_written_afterwards() -> None:
+    bench = ReporterBench()
+    await bench.second(telemetry(flight_state="flying"))
     bench.store.down = True
     with pytest.raises(KubeError):
-        await bench.second(seen(flight_state="landing"))
+        await bench.second(telemetry(flight_state="landing"))
     bench.store.down = False
-    await bench.second(seen(flight_state="landing"))
+    await bench.second(telemetry(flight_state="landing"))
     assert bench.store.writes[-1]["flightState"] == "landing"
 
 
-async def test_a_vanished_object_is_reported_and_its_successor_written() -> None:
-    bench = Bench()
-    await bench.second(seen())
+async def test_deleted_object_is_reported_and_its_successor_written() -> None:
+    bench = ReporterBench()
+    await bench.second(telemetry())
     bench.store.absent = True
     bench.seconds += 60
-    await bench.second(seen())
+    await bench.second(telemetry())
     assert bench.returned[-1] is None
     bench.store.absent = False
     bench.body = {"kind": "Drone", "metadata": {"name": "d", "uid": "2", "generation": 1}}
-    await bench.second(seen())
+    await bench.second(telemetry())
     assert len(bench.store.writes) == 2
 
 
-async def test_an_object_made_again_gets_its_status_at_once() -> None:
-    bench = Bench()
-    await bench.second(seen())
+async def test_recreated_object_gets_its_status_at_once() -> None:
+    bench = ReporterBench()
+    await bench.second(telemetry())
     bench.body = {"kind": "Drone", "metadata": {"name": "d", "uid": "2", "generation": 1}}
-    await bench.second(seen())
+    await bench.second(telemetry())
     assert len(bench.store.writes) == 2
 
 
 @pytest.mark.parametrize(("kind", "model"), [("Drone", DroneStatus), ("EdgeNode", EdgeNodeStatus)])
-def test_how_far_the_audit_logs_have_come_is_reported_and_kept(kind: str, model: Any) -> None:
+def test_audit_heads_are_reported_and_kept(kind: str, model: Any) -> None:
     heads = ["mobility:7:" + "a" * 64]
-    first = node_status(observed(kind=kind, audit=heads), {}, 1, NOW)
+    first = node_status(observed(kind=kind, audit_heads=heads), {}, 1, NOW)
     assert model.model_validate(first).audit == tuple(heads)
-    assert node_status(observed(kind=kind), first, 1, NOW)["audit"] == heads, "logs that are gone are missed"
+    assert node_status(observed(kind=kind), first, 1, NOW)["audit"] == heads, "the heads of missing logs stay"
     assert "audit" not in node_status(observed(kind=kind), {}, 1, NOW)
-    assert due_s(first, first | {"audit": ["mobility:8:" + "b" * 64]}, 0.0, EDGE_PACE) == EDGE_PACE.idle_s
+    assert due_s(first, first | {"audit": ["mobility:8:" + "b" * 64]}, 0.0, EDGE_INTERVALS) == EDGE_INTERVALS.idle_s

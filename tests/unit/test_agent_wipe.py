@@ -1,4 +1,4 @@
-"""What uninstalling removes on a node, and what not."""
+"""Removal of the node's state at uninstallation."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from fractus_agent.wipe import main, wipe
 
 @pytest.fixture
 def state(tmp_path: Path) -> Path:
-    """A node's directory, beside what is not Fractus's and that it has links to."""
+    """Create a state directory with symbolic links to files of another program."""
     state, other = tmp_path / "fractus", tmp_path / "other"
     for folder in (state / "tls", state / "camera" / "albums", other):
         folder.mkdir(parents=True)
@@ -27,14 +27,14 @@ def state(tmp_path: Path) -> Path:
     return state
 
 
-def test_all_goes_but_the_directory_and_what_links_lead_to(state: Path) -> None:
+def test_wipe_removes_all_except_the_directory_and_link_targets(state: Path) -> None:
     assert main([str(state)]) == 0
     assert list(state.iterdir()) == []
     assert (state.parent / "other" / "kept").read_text() == "x"
-    assert main([str(state)]) == 0, "again, after a container that was restarted"
+    assert main([str(state)]) == 0, "a repeated run after a container restart"
 
 
-def test_what_cannot_be_removed_is_told(
+def test_wipe_reports_files_that_cannot_be_removed(
     state: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def unlink(path: str, *_: object, **__: object) -> None:
@@ -43,15 +43,15 @@ def test_what_cannot_be_removed_is_told(
     monkeypatch.setattr(module.os, "unlink", unlink)
     assert state / "tls" / "tls.key" in wipe(state)
     assert main([str(state)]) == 1
-    said = capsys.readouterr()
-    assert "tls.key is not removed" in said.err
-    assert ".hidden is not removed" in said.err
-    assert "are left" in said.out
+    output = capsys.readouterr()
+    assert f"wipe: cannot remove {state}/tls/tls.key: " in output.err
+    assert f"wipe: cannot remove {state}/.hidden: " in output.err
+    assert "directories left in" in output.out
 
 
 @pytest.fixture
 def unprivileged(state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """As the pod runs: no right to read what is others'."""
+    """Run without root privileges, as the pod does."""
     monkeypatch.chdir(tmp_path)  # no other user reaches it from the root
     (state / "tls").chmod(0o700)
     if os.geteuid() != 0:
@@ -67,25 +67,26 @@ def unprivileged(state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.parametrize("folder", ["tls", "camera/albums", "."])
-def test_a_folder_that_cannot_be_read_is_not_empty(
+def test_wipe_reports_directories_that_cannot_be_read(
     state: Path, folder: str, unprivileged: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A folder of another user, mode 0700."""
+    """Use a directory of another user with mode 0700."""
     (state.relative_to(Path.cwd()) / folder).chmod(0)
     try:
         assert main(["fractus"]) == 1
-        said = capsys.readouterr()
-        assert f"fractus/{folder}".removesuffix("/.") + " is not removed" in said.err
-        assert "is empty" not in said.out
+        output = capsys.readouterr()
+        directory = f"fractus/{folder}".removesuffix("/.")
+        assert f"wipe: cannot remove {directory}: " in output.err
+        assert "is empty" not in output.out
     finally:
         (Path("fractus") / folder).chmod(0o700)
 
 
 @pytest.mark.parametrize(("number", "code"), [(errno.EBUSY, 0), (errno.EPERM, 1)])
-def test_a_folder_that_stays_counts_unless_a_disk_is_mounted_there(
+def test_wipe_reports_remaining_directories_except_mount_points(
     state: Path, monkeypatch: pytest.MonkeyPatch, number: int, code: int
 ) -> None:
-    """A disk's data goes, and the empty folder where it is mounted cannot."""
+    """Remove the data of a mounted disk. Its mount point cannot be removed."""
     rmdir = os.rmdir
 
     def refused(path: str, *, dir_fd: int | None = None) -> None:
@@ -98,6 +99,6 @@ def test_a_folder_that_stays_counts_unless_a_disk_is_mounted_there(
     assert [path for path in state.rglob("*") if not path.is_dir()] == []
 
 
-def test_it_takes_a_directory(tmp_path: Path) -> None:
+def test_wipe_requires_an_existing_directory(tmp_path: Path) -> None:
     assert main([]) == 2
     assert main([str(tmp_path / "missing")]) == 2

@@ -1,4 +1,4 @@
-"""The example of a heuristic of a user's own: its tests pass, and agents find it once it is installed."""
+"""Example of a user-defined heuristic: its tests pass, and agents find it after installation."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 from fractus_core.api.components import Heuristic
-from fractus_core.linking import UnknownHeuristic, heuristic
+from fractus_core.linking import UnknownHeuristic, find_heuristic
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "heuristic-plugin"
 PROJECT = tomllib.loads((EXAMPLE / "pyproject.toml").read_text())["project"]
@@ -17,7 +17,7 @@ PROJECT = tomllib.loads((EXAMPLE / "pyproject.toml").read_text())["project"]
 
 @pytest.fixture
 def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """The package as an installer leaves it; the name of its heuristic."""
+    """Install the example package, and return the name of its heuristic."""
     (entries,) = PROJECT["entry-points"].items()
     (name,) = entries[1]
     metadata = tmp_path / "acme_heuristics-1.0.dist-info"
@@ -32,7 +32,7 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     return str(name)
 
 
-def test_its_tests_pass(installed: str) -> None:
+def test_example_tests_of_heuristic_plugin_pass(installed: str) -> None:
     tests = vars(importlib.import_module("test_acme_heuristics"))
     found = [test for name, test in tests.items() if name.startswith("test_")]
     assert found
@@ -40,14 +40,14 @@ def test_its_tests_pass(installed: str) -> None:
         test()
 
 
-def test_it_is_found_by_the_name_that_the_manifest_gives(installed: str) -> None:
+def test_installed_heuristic_is_found_by_the_name_in_the_manifest(installed: str) -> None:
     manifest = (EXAMPLE / "README.md").read_text()
     (line,) = [line for line in manifest.splitlines() if "heuristic:" in line]
     named = Heuristic.model_validate(yaml.safe_load(line.strip())["heuristic"])
     assert named.kind == installed
-    assert heuristic(named.kind, named.metric).__name__ == "least_cost"
+    assert find_heuristic(named.kind, named.metric).__name__ == "least_cost"
 
 
-def test_without_the_package_it_is_unknown() -> None:
+def test_heuristic_of_missing_package_is_unknown() -> None:
     with pytest.raises(UnknownHeuristic, match="acme-least-cost"):
-        heuristic("acme-least-cost")
+        find_heuristic("acme-least-cost")

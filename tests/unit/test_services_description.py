@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fractus_agent.registration.handover import Handover
+from fractus_agent.registration.node_object_file import NodeObjectFile
 from fractus_core.api.model import API_VERSION
 from fractus_core.api.nodes import Drone, EdgeNode
 from fractus_services import node_description as module
@@ -28,7 +28,7 @@ class Node:
         self.handed, self.file = directory / "node.json", directory / "node.yaml"
 
     def hand_over(self, pitch: float, name: str = "drone-1") -> None:
-        Handover(self.handed).put(Drone.from_body(drone(pitch, name)))
+        NodeObjectFile(self.handed).write(Drone.from_body(drone(pitch, name)))
 
     def write(self, text: str) -> None:
         self.file.write_text(text)
@@ -72,14 +72,14 @@ def test_what_cannot_be_read_describes_nothing_though_there_is_a_file(node: Node
 def test_what_the_agent_takes_back_describes_nothing_though_there_is_a_file(node: Node) -> None:
     node.write(str(drone(-10)))
     node.hand_over(-20)
-    Handover(node.handed).drop("The agent cannot read the object.")
+    NodeObjectFile(node.handed).clear("The agent cannot read the object.")
     assert pitch(node.describe()) is None
 
 
 def test_any_text_can_be_handed_over(node: Node) -> None:
     body = drone(-20)
     body["spec"]["services"]["camera"]["model"] = 'Kamera \U0001f681 é\x7f\u2028"\\'
-    Handover(node.handed).put(Drone.from_body(body))
+    NodeObjectFile(node.handed).write(Drone.from_body(body))
     found = node.describe().value
     assert found is not None
     assert found.spec == Drone.from_body(body).spec

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner
-from fractus_agent.registration.evidence import audit_heads
+from fractus_agent.registration.diagnostics import read_audit_heads
 from fractus_cli.audit import audit
 from fractus_core.identity.authority import Authority
 from fractus_runtime.audit import AuditLog
@@ -153,13 +153,13 @@ async def test_a_checkpoint_finds_what_the_chain_alone_does_not(tmp_path: Path, 
 
 async def test_what_the_status_of_the_node_tells_is_a_checkpoint_too(tmp_path: Path, tls: Path) -> None:
     path = tmp_path / "audit" / "audit.jsonl"
-    assert audit_heads(path.parent) == []
+    assert read_audit_heads(path.parent) == []
     await filled(path, 4, tls=tls)
-    (head,) = audit_heads(path.parent)
+    (head,) = read_audit_heads(path.parent)
     assert head == f"audit:4:{json.loads(read(path)[-1])['hash']}"
     (path.parent / "odd.checkpoint").write_bytes(b"{")
     (path.parent / "other.checkpoint").write_text(json.dumps({"log": "a b", "seq": 1, "hash": "0" * 64}))
-    assert audit_heads(path.parent) == [head]
+    assert read_audit_heads(path.parent) == [head]
     code, said = verified(path, "--since", head)
     assert (code, "all since number 4 are there" in said, "signed" in said) == (0, True, False)
     path.write_bytes(b"".join(read(path)[:3]))

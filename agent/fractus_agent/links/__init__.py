@@ -1,1 +1,1 @@
-"""Direct links of a node: hearing peers, pairing with one by node certificates, supervising the link, ending it."""
+"""Direct links of a node: discovery, pairing by node certificates, link and path decisions, and status."""

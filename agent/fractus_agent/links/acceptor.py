@@ -1,4 +1,4 @@
-"""The end that is asked: takes sessions of the nodes that a DirectLink names, and no more than it has room for."""
+"""Accepting end of pairing: takes sessions of the nodes that a DirectLink names, up to a limit."""
 
 from __future__ import annotations
 
@@ -19,82 +19,83 @@ from fractus_agent.links.pairing import (
     LinkLost,
     PairingFailed,
     Session,
-    proven_node,
+    authenticated_node,
     server_context,
 )
 
 log = logging.getLogger(__name__)
 
 MAX_PENDING = 8
-"""Handshakes at one time: each costs a signature, and anyone in reach can ask for one."""
+"""Limit of concurrent handshakes: each costs a signature, and anyone in range can start one."""
 
 ACCEPT_RETRY_S = 0.2
 
 
 class Acceptor:
-    """Takes sessions on a direct interface.
+    """Accepts pairing sessions on a direct interface.
 
     Args:
-        directory: certificate, key and authority of this node; read for each session, since they are renewed.
-        permits: whether a node may link to this one now; what it returns is the reason why not, empty for a yes.
-        linked: runs while a session lasts: moves traffic, and moves it back.
-        max_peers: sessions at one time.
+        directory: Directory of this node's certificate, key and authority. Read for each session, because they are
+            renewed.
+        refusal: Returns the reason why a node may not link to this one now, empty if it may.
+        on_session: Runs while a session lasts. It moves traffic to the link, and back at the end.
+        max_peers: Limit of concurrent sessions.
     """
 
     def __init__(
         self,
         directory: Path,
-        permits: Callable[[str], str],
-        linked: Callable[[Session], Awaitable[None]],
+        refusal: Callable[[str], str],
+        on_session: Callable[[Session], Awaitable[None]],
         *,
         max_peers: int = 4,
     ) -> None:
         self._directory = directory
-        self._permits = permits
-        self._linked = linked
+        self._refusal_of = refusal
+        self._on_session = on_session
         self._max_peers = max_peers
         self._pending = 0
         self._sessions: dict[str, asyncio.Task[None]] = {}
-        self._turns: defaultdict[str, asyncio.Lock] = defaultdict(asyncio.Lock)
+        self._locks: defaultdict[str, asyncio.Lock] = defaultdict(asyncio.Lock)
         self._tasks: set[asyncio.Task[None]] = set()
 
     @property
     def peers(self) -> frozenset[str]:
-        """The nodes that are linked to this one."""
+        """Names of the nodes that are linked to this one."""
         return frozenset(self._sessions)
 
     async def run(self, address: IPv4Address) -> None:
-        """Take sessions until cancelled.
+        """Accept sessions until cancelled.
 
         Raises:
-            OSError: the port cannot be bound, or a file is missing.
-            ssl.SSLError: the node's certificate cannot be used.
+            OSError: The port cannot be bound, or a file is missing.
+            ssl.SSLError: The node's certificate is not usable.
         """
         server_context(self._directory)
         loop = asyncio.get_running_loop()
-        with socket.create_server((str(address), PORT), backlog=MAX_PENDING) as listening:
-            listening.setblocking(False)
+        with socket.create_server((str(address), PORT), backlog=MAX_PENDING) as listener:
+            listener.setblocking(False)
             try:
                 while True:
                     try:
-                        connection, _ = await loop.sock_accept(listening)
-                    except OSError as error:  # too many open files, or the peer was gone again
+                        connection, _ = await loop.sock_accept(listener)
+                    except OSError as error:  # too many open files, or the peer has closed the connection
                         log.warning("links: connection not accepted (error=%s)", error)
                         await asyncio.sleep(ACCEPT_RETRY_S)
                         continue
-                    self._take(connection)
+                    self._start(connection)
             finally:
                 for task in self._tasks:
                     task.cancel()
                 await asyncio.gather(*self._tasks, return_exceptions=True)
 
-    def _take(self, connection: socket.socket) -> None:
-        """Begin a handshake, if there is room for one."""
+    def _start(self, connection: socket.socket) -> None:
+        """Start a session, unless too many handshakes are pending."""
         if self._pending >= MAX_PENDING:
             connection.close()
             return
         self._pending += 1
-        task = asyncio.create_task(self._asked(connection))
+        task = asyncio.create_task(self._run_session(connection))
         self._tasks.add(task)
         task.add_done_callback(self._ended)
 
@@ -103,12 +104,12 @@ class Acceptor:
         if not task.cancelled() and (error := task.exception()) is not None:
             log.error("links: session failed", exc_info=error)
 
-    async def _asked(self, connection: socket.socket) -> None:
-        """One session, from its handshake to its end."""
+    async def _run_session(self, connection: socket.socket) -> None:
+        """Run one session from its handshake to its end."""
         session: Session | None = None
         try:
             try:
-                session = await self._met(connection)
+                session = await self._handshake(connection)
             finally:
                 self._pending -= 1
             if session is not None:
@@ -119,24 +120,23 @@ class Acceptor:
                     del self._sessions[session.peer]
                 await session.close()
 
-    async def _met(self, connection: socket.socket) -> Session | None:
-        """The session of a node that has proven its name and is accepted; None for any other, which is told why."""
+    async def _handshake(self, connection: socket.socket) -> Session | None:
+        """Return the session of an authenticated and accepted node. Refuse any other node with a reason."""
         session: Session | None = None
         try:
-            reader, writer = await _encrypted(connection, self._directory)
-            session = Session(reader, writer, proven_node(writer))
+            reader, writer = await _open_tls(connection, self._directory)
+            session = Session(reader, writer, authenticated_node(writer))
             await session.receive(HANDSHAKE_TIMEOUT_S)
             reason = self._refusal(session.peer)
             if not reason:
-                # From here on the place is taken; a node that asks again has lost its old session, whether this end has
-                # noticed or not.
+                # The node counts as linked from here on. If it has an old session, it has lost that one.
                 if (old := self._sessions.get(session.peer)) is not None:
                     old.cancel()
                 self._sessions[session.peer] = _this_task()
             await session.send({"accepted": not reason, "reason": reason})
         except (LinkLost, PairingFailed, OSError, TimeoutError) as error:
             log.warning("links: pairing failed (error=%s)", error)
-            reason = str(error) or "time-out"
+            reason = str(error) or "timeout"
         except BaseException:
             if session is not None:
                 session.abort()
@@ -150,31 +150,30 @@ class Acceptor:
 
     def _refusal(self, peer: str) -> str:
         if len(self._sessions) >= self._max_peers and peer not in self._sessions:
-            return f"{len(self._sessions)} nodes are linked already"
+            return f"{len(self._sessions)} other nodes are linked already"
         try:
-            return self._permits(peer)
+            return self._refusal_of(peer)
         except Exception:
-            log.exception("links: whether a node may link is unknown, so it may not (peer=%s)", peer)
-            return "it is not known whether the link is permitted"
+            log.exception("links: permission check failed, pairing refused (peer=%s)", peer)
+            return "internal error in the permission check"
 
     async def _hold(self, session: Session) -> None:
-        # Traffic of the peer's old session is moved back before that of this one is moved.
-        async with self._turns[session.peer]:
+        # Traffic of the peer's old session is moved back before traffic of this session moves.
+        async with self._locks[session.peer]:
             log.info("links: up (peer=%s)", session.peer)
             try:
-                async with asyncio.TaskGroup() as both:
-                    both.create_task(session.keep())
-                    both.create_task(_run(self._linked, session))
+                async with asyncio.TaskGroup() as tasks:
+                    tasks.create_task(session.run())
+                    tasks.create_task(_run(self._on_session, session))
             except* LinkLost as lost:
                 log.info("links: lost (peer=%s reason=%s)", session.peer, lost.exceptions[0])
 
 
-async def _encrypted(connection: socket.socket, directory: Path) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
-    """Streams over TLS on an accepted connection.
+async def _open_tls(connection: socket.socket, directory: Path) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    """Return TLS streams on an accepted connection.
 
     Raises:
-        OSError: the handshake failed, or took too long.
-        PairingFailed: this node's certificate cannot be read at this moment.
+        PairingFailed: The handshake failed or timed out, or this node's certificate cannot be read.
     """
     loop = asyncio.get_running_loop()
     reader = asyncio.StreamReader(limit=MAX_LINE_BYTES)
@@ -187,7 +186,7 @@ async def _encrypted(connection: socket.socket, directory: Path) -> tuple[asynci
     except (OSError, ssl.SSLError) as error:
         with contextlib.suppress(OSError):
             connection.close()
-        raise PairingFailed(f"no TLS session: {error}") from error
+        raise PairingFailed(f"TLS handshake failed: {error}") from error
     except BaseException:
         connection.close()
         raise
@@ -200,5 +199,5 @@ def _this_task() -> asyncio.Task[None]:
     return task
 
 
-async def _run(linked: Callable[[Session], Awaitable[None]], session: Session) -> None:
-    await linked(session)
+async def _run(on_session: Callable[[Session], Awaitable[None]], session: Session) -> None:
+    await on_session(session)

@@ -1,6 +1,6 @@
-"""Beacons: each node tells its name on its direct interface, so that others learn who is in reach.
+"""Beacons: each node broadcasts its name on its direct interface, so that others learn which nodes are in range.
 
-A beacon proves nothing; it only says where pairing is worth an attempt.
+A beacon proves nothing. It only shows that an attempt to pair is worthwhile.
 """
 
 from __future__ import annotations
@@ -22,30 +22,30 @@ SO_BINDTODEVICE = 25
 
 
 def beacon_socket(device: str) -> socket.socket:
-    """A socket that sends and hears beacons on one device only.
+    """Open a socket that sends and receives beacons on one device only.
 
     Raises:
-        OSError: there is no such device, or no right to bind to it.
+        OSError: The device does not exist, or the process may not bind to it.
     """
-    found = socket.socket(socket.AF_INET, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+    beacons = socket.socket(socket.AF_INET, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
     try:
-        found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        found.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
-        found.setsockopt(socket.SOL_SOCKET, SO_BINDTODEVICE, device.encode() + b"\0")
-        found.bind(("", PORT))
+        beacons.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        beacons.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        beacons.setsockopt(socket.SOL_SOCKET, SO_BINDTODEVICE, device.encode() + b"\0")
+        beacons.bind(("", PORT))
     except OSError:
-        found.close()
+        beacons.close()
         raise
-    return found
+    return beacons
 
 
 def encode(node: str) -> bytes:
-    """A beacon of a node."""
+    """Encode a beacon of a node."""
     return json.dumps({"fractus": 1, "node": node}).encode()
 
 
 def decode(data: bytes) -> str | None:
-    """Whose beacon this is; None for anything else."""
+    """Return the node name in a beacon, None for any other datagram."""
     try:
         content = json.loads(data)
     except (ValueError, RecursionError):
@@ -55,37 +55,37 @@ def decode(data: bytes) -> str | None:
 
 
 class Beacons(asyncio.DatagramProtocol):
-    """Sends the beacons of this node, and tells of those of others.
+    """Sends the beacons of this node, and receives those of other nodes.
 
     Args:
-        node: this node.
-        heard: called with the name of each node that is heard.
+        node: Name of this node.
+        on_beacon: Called with the node name of each received beacon.
     """
 
-    def __init__(self, node: str, heard: Callable[[str], None]) -> None:
+    def __init__(self, node: str, on_beacon: Callable[[str], None]) -> None:
         self._node = node
-        self._heard = heard
+        self._on_beacon = on_beacon
         self._broken = asyncio.Event()
 
     def datagram_received(self, data: bytes, _addr: object) -> None:
-        """Tell of a beacon."""
+        """Handle a received beacon."""
         node = decode(data[:MAX_BYTES])
         if node is not None and node != self._node:
-            self._heard(node)
+            self._on_beacon(node)
 
     def error_received(self, exc: Exception) -> None:
-        """A beacon was not sent: the device may be down for a moment, or have been replaced by one of its name."""
+        """Handle a beacon that was not sent: the device may be down, or may have been replaced by one with its name."""
         log.debug("links: beacon not sent (error=%s)", exc)
         self._broken.set()
 
     async def run(self, device: str) -> None:
-        """Send and hear beacons on a device until cancelled; also on one that comes later, or comes back."""
+        """Send and receive beacons on a device until cancelled. The device may appear and disappear."""
         loop = asyncio.get_running_loop()
         while True:
             try:
                 transport, _ = await loop.create_datagram_endpoint(lambda: self, sock=beacon_socket(device))
             except OSError as error:
-                log.debug("links: no beacons (device=%s error=%s)", device, error)
+                log.debug("links: beacons not started (device=%s error=%s)", device, error)
                 await asyncio.sleep(INTERVAL_S)
                 continue
             self._broken.clear()

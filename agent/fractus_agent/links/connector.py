@@ -1,4 +1,4 @@
-"""The end that asks: keeps the one direct link of a drone where it is wanted, and says how far it is."""
+"""Requesting end of pairing: keeps the one direct link of a drone with the wanted peer."""
 
 from __future__ import annotations
 
@@ -10,117 +10,127 @@ from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Any
 
-from fractus_core.linking import NO_LINK, Link, Phase
+from fractus_core.linking import NO_LINK, LinkPhase, LinkState
+from pyroute2 import NetlinkError
 
-from fractus_agent.links.addressing import link_address
-from fractus_agent.links.interfaces import neighbours
-from fractus_agent.links.pairing import LinkLost, PairingFailed, Session, ask
-from fractus_agent.redirector.netlink import NetlinkError
+from fractus_agent.links import arp
+from fractus_agent.links.device_addresses import link_address
+from fractus_agent.links.pairing import LinkLost, PairingFailed, Session, pair
 
 log = logging.getLogger(__name__)
 
-SILENT_S = 0.8
-"""Who does not answer for so long may be asked at hardware that had its address before; TCP asks again after a second."""
+ARP_FLUSH_S = 0.8
+"""Time without a response after which the ARP entry of the peer is flushed, because its address may have belonged to other
+hardware. TCP repeats its SYN after one second."""
 
 
 class Connector:
-    """Pairs with the wanted peer, and holds the session until another one is wanted or the link is lost.
+    """Pairs with the wanted peer, and keeps the session until another peer is wanted or the link is lost.
 
-    It does not try again by itself: after a failure the link is down, and the next decision on the wanted peer counts what the
-    failure taught.
+    The connector does not retry by itself. After a failure the link is down, and the next decision on the wanted peer
+    takes the failure into account.
 
     Args:
-        node: this node.
-        directory: certificate, key and authority of this node.
-        linked: runs while a session lasts: moves traffic, and moves it back.
-        changed: called after each change of `link`, with the reason.
-        address_of: the address of a peer on the link.
+        node: Name of this node.
+        directory: Directory of this node's certificate, key and authority.
+        on_session: Runs while a session lasts. It moves traffic to the link, and back at the end.
+        on_change: Called after each change of `link`, with the reason.
+        address_of: Returns the address of a peer on the link.
+
+    Attributes:
+        link: Current state of the link.
     """
 
     def __init__(
         self,
         node: str,
         directory: Path,
-        linked: Callable[[Session], Awaitable[None]],
-        changed: Callable[[Link, str], None],
+        on_session: Callable[[Session], Awaitable[None]],
+        on_change: Callable[[LinkState, str], None],
         *,
         address_of: Callable[[str], IPv4Address] = link_address,
     ) -> None:
         self._node = node
         self._directory = directory
-        self._linked = linked
-        self._changed = changed
+        self._on_session = on_session
+        self._on_change = on_change
         self._address_of = address_of
         self._task: asyncio.Task[None] | None = None
-        self.link: Link = NO_LINK
+        self._flushes: set[asyncio.Task[None]] = set()
+        self.link: LinkState = NO_LINK
 
-    async def want(self, peer: str, about: Mapping[str, Any] | None = None) -> None:
-        """Link to a peer; a link to another one ends first, for a drone has one at a time.
+    async def set_peer(self, peer: str, description: Mapping[str, Any] | None = None) -> None:
+        """Link to a peer. A link to another peer ends first, because a drone has one link at a time.
 
         Args:
-            peer: empty for none.
-            about: what the peer is told of the link.
+            peer: Name of the peer, empty for no link.
+            description: Description of the link, sent to the peer.
         """
-        if peer == self.link.peer and self.link.phase is not Phase.NONE:
+        if peer == self.link.peer and self.link.phase is not LinkPhase.NONE:
             return
         await self.close("another peer is wanted" if peer else "no link is wanted")
         if peer:
-            self._set(Link(Phase.CONNECTING, peer, time.monotonic()), "pairing")
-            self._task = asyncio.create_task(self._connect(peer, about or {}))
+            self._set(LinkState(LinkPhase.CONNECTING, peer, time.monotonic()), "pairing")
+            self._task = asyncio.create_task(self._connect(peer, description or {}))
 
     async def close(self, reason: str = "the agent ends") -> None:
-        """End the link, if there is one."""
+        """End the current link, if any."""
         task, self._task = self._task, None
         if task is not None:
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
-        if self.link.phase is not Phase.NONE:
+        if self.link.phase is not LinkPhase.NONE:
             self._set(NO_LINK, reason)
 
-    def _set(self, link: Link, reason: str) -> None:
+    def _set(self, link: LinkState, reason: str) -> None:
         log.info("links: %s (peer=%s reason=%s)", link.phase.value, link.peer or self.link.peer, reason)
         self.link = link
-        self._changed(link, reason)
+        self._on_change(link, reason)
 
-    async def _connect(self, peer: str, about: Mapping[str, Any]) -> None:
+    async def _connect(self, peer: str, description: Mapping[str, Any]) -> None:
         address = self._address_of(peer)
-        silent = asyncio.get_running_loop().call_later(SILENT_S, _ask_again, address)
+        flush = asyncio.get_running_loop().call_later(ARP_FLUSH_S, self._flush_arp, address)
         try:
-            session = await ask(self._node, peer, address, self._directory, about)
+            session = await pair(self._node, peer, address, self._directory, description)
         except (PairingFailed, OSError) as error:
             self._set(NO_LINK, str(error))
             return
         finally:
-            silent.cancel()
+            flush.cancel()
         try:
-            self._set(Link(Phase.UP, peer, time.monotonic()), "paired")
-            # Told before the farewell: over a link that is lost it takes a while, and traffic must not wait for it.
+            self._set(LinkState(LinkPhase.UP, peer, time.monotonic()), "paired")
+            # Report the loss before closing the session: on a lost link closing takes a while, and traffic must not wait.
             self._set(NO_LINK, await self._hold(session))
         finally:
             await session.close()
 
     async def _hold(self, session: Session) -> str:
-        """Hold a session; why it is over."""
-        work = asyncio.ensure_future(self._linked(session))
-        keep = asyncio.create_task(session.keep())
+        """Keep a session until it ends, and return the reason of its end."""
+        traffic = asyncio.ensure_future(self._on_session(session))
+        heartbeats = asyncio.create_task(session.run())
         try:
-            done, _ = await asyncio.wait({work, keep}, return_when=asyncio.FIRST_COMPLETED)
+            done, _ = await asyncio.wait({traffic, heartbeats}, return_when=asyncio.FIRST_COMPLETED)
             for task in done:
                 task.result()
         except LinkLost as lost:
             return str(lost)
         except Exception:
-            log.exception("links: the link's traffic failed (peer=%s)", session.peer)
-            return "the link's traffic failed"
+            log.exception("links: traffic handling failed (peer=%s)", session.peer)
+            return "traffic handling failed"
         finally:
-            for task in (work, keep):
+            for task in (traffic, heartbeats):
                 task.cancel()
-            await asyncio.gather(work, keep, return_exceptions=True)
-        return "the link's traffic is over"
+            await asyncio.gather(traffic, heartbeats, return_exceptions=True)
+        return "the link's traffic has ended"
+
+    def _flush_arp(self, address: IPv4Address) -> None:
+        task = asyncio.create_task(_flush_arp(address))
+        self._flushes.add(task)
+        task.add_done_callback(self._flushes.discard)
 
 
-def _ask_again(address: IPv4Address) -> None:
+async def _flush_arp(address: IPv4Address) -> None:
     try:
-        neighbours.forget(address)
-    except NetlinkError as error:
-        log.warning("links: the kernel does not ask again who has an address (address=%s error=%s)", address, error)
+        await arp.flush(address)
+    except (NetlinkError, OSError) as error:
+        log.warning("links: cannot flush ARP entry (address=%s error=%s)", address, error)

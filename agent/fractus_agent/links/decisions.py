@@ -1,4 +1,4 @@
-"""What the drone's end does next, from all that it knows: pure, so that it is tried without radios."""
+"""Decisions of the drone's direct links: next peer, and path of each application's traffic. Pure functions."""
 
 from __future__ import annotations
 
@@ -7,66 +7,67 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from fractus_core.linking import (
-    Link,
+    LearnedRange,
     LinkDecision,
+    LinkPhase,
+    LinkSettings,
+    LinkState,
+    PathDecision,
+    PathHeuristic,
     PathMetrics,
     Peer,
-    Phase,
-    Reach,
-    Settings,
-    TargetDecision,
-    TargetHeuristic,
     Track,
-    choose_target,
-    leaves_reach,
+    choose_path,
+    leaves_range,
     plan_link,
 )
-from fractus_core.linking.learning import expected
+from fractus_core.linking.range_model import expected_range
 
-from fractus_agent.redirector.nft import Endpoint
+from fractus_agent.redirector.nft_maps import Endpoint
 
-HEARD_S = 2.0
-"""A peer that should be in reach, and of which no beacon came for so long, is not there, or does not reach as far as it says."""
+BEACON_TIMEOUT_S = 2.0
+"""A peer that should be in range counts as absent after this time without a beacon, in seconds."""
 
 
 @dataclass(frozen=True, slots=True)
-class Traffic:
-    """The traffic of one application that may take a direct link.
+class ApplicationTraffic:
+    """Traffic of one application that may take a direct link.
 
     Attributes:
-        application: namespace and name.
-        heuristic: what makes a path good for it.
-        peers: nodes that serve it over a link.
-        services: where its components call.
+        application: Namespace and name of the application.
+        heuristic: Scores a path for the application.
+        peers: Nodes that serve the application over a link.
+        services: Virtual endpoints that its components call.
     """
 
     application: str
-    heuristic: TargetHeuristic
+    heuristic: PathHeuristic
     peers: tuple[Peer, ...]
     services: frozenset[Endpoint]
 
 
 @dataclass(frozen=True, slots=True)
 class Situation:
-    """All that a decision depends on.
+    """All inputs of a decision.
 
     Attributes:
-        now_s: monotonic.
-        track: of the drone; None while its position is not known.
-        traffic: by application.
-        link: the direct link as it is.
-        reaches: what was learned of peers' links, by name.
-        cloud: what the cloud path offers; None while it does not answer.
-        direct: what was measured of the link that is up; None before that.
-        routes: where on the link its peer takes the calls to services; empty until it says so, and once the link is lost.
-        redirects: where calls to services are led now.
+        now_s: Current time on a monotonic clock, in seconds.
+        track: Position and expected motion of the drone, None if its position is unknown.
+        traffic: Traffic by application.
+        link: Current state of the direct link.
+        ranges: Learned ranges by peer.
+        cloud: Performance of the cloud path, None while it does not respond.
+        direct: Measured performance of the link that is up, None before the first measurement.
+        routes: Endpoint on the link at which the peer accepts calls, by service. Empty until the peer has sent its
+            routes, and after the loss of the link.
+        redirects: Current target by service.
     """
 
     now_s: float
     track: Track | None
-    traffic: tuple[Traffic, ...]
-    link: Link
-    reaches: Mapping[str, Reach]
+    traffic: tuple[ApplicationTraffic, ...]
+    link: LinkState
+    ranges: Mapping[str, LearnedRange]
     cloud: PathMetrics | None
     direct: PathMetrics | None = None
     routes: Mapping[Endpoint, Endpoint] = field(default_factory=dict)
@@ -74,94 +75,116 @@ class Situation:
 
 
 @dataclass(frozen=True, slots=True)
-class Actions:
-    """What is to be done, in this order.
+class LinkActions:
+    """Actions of a decision, in this order.
 
     Attributes:
-        abrupt: services whose path is gone, and where their calls go from now on; None for the cloud path.
-        planned: services whose old path still lives, and where their calls go from now on.
-        peer: which node the link should go to afterwards; empty for none.
-        link: why.
-        targets: why each application's traffic takes its path.
+        abrupt: New targets of services whose old path is lost, None for the cloud path.
+        planned: New targets of services whose old path still works, None for the cloud path.
+        peer: Peer that the link should go to afterwards, empty for none.
+        link: Decision on the peer.
+        targets: Decision on the path by application.
     """
 
     abrupt: Mapping[Endpoint, Endpoint | None]
     planned: Mapping[Endpoint, Endpoint | None]
     peer: str
     link: LinkDecision
-    targets: Mapping[str, TargetDecision]
+    targets: Mapping[str, PathDecision]
 
 
-def decide(now: Situation, settings: Settings) -> Actions:
-    """Decide on the link and on the paths of all traffic; the same situation gives the same actions.
+def decide(situation: Situation, settings: LinkSettings) -> LinkActions:
+    """Decide on the peer of the link and on the paths of all traffic. The same situation gives the same actions.
 
-    The drone has one link, so the traffic of one application decides which: that of the first by name. All others take it
-    where it is better for them. A link that carries traffic is left only after that was led back (make before break).
+    The drone has one link, so the traffic of the first application by name decides on its peer. Other applications
+    take the link if it is better for them. A link that carries traffic is left only after its traffic has been moved
+    back (make before break).
     """
-    link = _wanted(now, settings)
-    leaving = link.changes or _leaves(now, settings)
+    link = _decide_peer(situation, settings)
+    leaving = link.changes or _leaves_range(situation, settings)
     abrupt: dict[Endpoint, Endpoint | None] = {}
     planned: dict[Endpoint, Endpoint | None] = {}
-    targets: dict[str, TargetDecision] = {}
-    for traffic in now.traffic:
-        found = targets[traffic.application] = _target(traffic, now, leaving, settings)
+    targets: dict[str, PathDecision] = {}
+
+    def move(service: Endpoint, target: Endpoint | None) -> None:
+        moves = planned if _current_path_works(service, situation) else abrupt
+        moves[service] = target
+
+    for traffic in situation.traffic:
+        decision = _decide_path(traffic, situation, leaving, settings)
+        targets[traffic.application] = decision
         for service in sorted(traffic.services):
-            to = now.routes.get(service) if found.direct else None
-            if now.redirects.get(service) != to:
-                (planned if _lives(service, now) else abrupt)[service] = to
-    for service in now.redirects.keys() - {s for traffic in now.traffic for s in traffic.services}:
-        (planned if _lives(service, now) else abrupt)[service] = None
-    return Actions(abrupt, planned, link.peer, link, targets)
+            target = situation.routes.get(service) if decision.direct else None
+            if situation.redirects.get(service) != target:
+                move(service, target)
+    planned_services = {service for traffic in situation.traffic for service in traffic.services}
+    for service in situation.redirects.keys() - planned_services:
+        move(service, None)
+    return LinkActions(abrupt, planned, link.peer, link, targets)
 
 
-def _wanted(now: Situation, settings: Settings) -> LinkDecision:
-    """Which peer the link should go to."""
-    present = now.link.peer if now.link.phase is not Phase.NONE else ""
-    deciding = next((traffic for traffic in now.traffic if traffic.peers), None)
+def _decide_peer(situation: Situation, settings: LinkSettings) -> LinkDecision:
+    link = situation.link
+    present = link.peer if link.phase is not LinkPhase.NONE else ""
+    deciding = next((traffic for traffic in situation.traffic if traffic.peers), None)
     if deciding is None:
-        return LinkDecision("", bool(present), "NotPlanned", "no application's traffic may take a direct link")
-    if now.track is None:
-        return LinkDecision(present, False, "PositionUnknown", "where the drone is is not known, so nothing is changed")
-    found = plan_link(
-        now.track, [peer for peer in deciding.peers if _expected(peer, now.track, now)], now.cloud, now.link, now.now_s,
-        heuristic=deciding.heuristic, settings=settings, reaches=now.reaches,
-    )  # fmt: skip
-    if now.cloud is None and now.link.phase is Phase.UP and not found.peer:
-        return LinkDecision(present, False, "CloudSilent", "the cloud path does not answer, so the link is kept")
-    return found
+        return LinkDecision("", bool(present), "NotPlanned", "no application may use a direct link")
+    track = situation.track
+    if track is None:
+        return LinkDecision(present, False, "PositionUnknown", "the position of the drone is unknown, nothing changes")
+    decision = plan_link(
+        track,
+        [peer for peer in deciding.peers if _is_candidate(peer, track, situation)],
+        situation.cloud,
+        link,
+        situation.now_s,
+        heuristic=deciding.heuristic,
+        settings=settings,
+        ranges=situation.ranges,
+    )
+    if situation.cloud is None and link.phase is LinkPhase.UP and not decision.peer:
+        return LinkDecision(present, False, "CloudSilent", "the cloud path does not respond, the link is kept")
+    return decision
 
 
-def _expected(peer: Peer, track: Track, now: Situation) -> bool:
-    """Whether a link to a peer can be hoped for: it is there, or it is heard, or nothing of it can be heard from here yet."""
-    if peer.name == now.link.peer and now.link.phase is not Phase.NONE:
+def _is_candidate(peer: Peer, track: Track, situation: Situation) -> bool:
+    """Return True if a peer is linked, has sent a recent beacon, or is too far away for beacons."""
+    if peer.name == situation.link.peer and situation.link.phase is not LinkPhase.NONE:
         return True
-    reach = expected(now.reaches, peer.name)
-    silent = now.now_s - reach.heard_s > HEARD_S
-    return not silent or math.dist(track.position, peer.position) > peer.range_m * reach.range_factor
+    learned = expected_range(situation.ranges, peer.name)
+    silent = situation.now_s - learned.last_beacon_s > BEACON_TIMEOUT_S
+    return not silent or math.dist(track.position, peer.position) > peer.range_m * learned.range_factor
 
 
-def _lives(service: Endpoint, now: Situation) -> bool:
-    """Whether the path that a service takes now works."""
-    before = now.redirects.get(service)
-    return now.cloud is not None if before is None else before in now.routes.values()
+def _current_path_works(service: Endpoint, situation: Situation) -> bool:
+    target = situation.redirects.get(service)
+    if target is None:
+        return situation.cloud is not None
+    return target in situation.routes.values()
 
 
-def _leaves(now: Situation, settings: Settings) -> bool:
-    if now.track is None:
+def _leaves_range(situation: Situation, settings: LinkSettings) -> bool:
+    peers = {peer.name: peer for traffic in situation.traffic for peer in traffic.peers}
+    peer = peers.get(situation.link.peer)
+    if situation.track is None or peer is None:
         return False
-    peers = {peer.name: peer for traffic in now.traffic for peer in traffic.peers}
-    peer = peers.get(now.link.peer)
-    return peer is not None and leaves_reach(now.track, peer, expected(now.reaches, peer.name), now.link, settings)
+    learned = expected_range(situation.ranges, peer.name)
+    return leaves_range(situation.track, peer, learned, situation.link, settings)
 
 
-def _target(traffic: Traffic, now: Situation, leaving: bool, settings: Settings) -> TargetDecision:
-    """Which path the traffic of one application takes."""
-    is_direct = any(service in now.redirects for service in traffic.services)
-    served = not traffic.services.isdisjoint(now.routes)
-    if now.direct is not None and not served:
-        reason = f"{now.link.peer} has no ready instance"
-        return TargetDecision(False, is_direct, False, "NotServed", reason)
-    return choose_target(
-        traffic.heuristic, now.cloud, now.direct if served else None,
-        is_direct=is_direct, leaving=leaving, settings=settings,
-    )  # fmt: skip
+def _decide_path(
+    traffic: ApplicationTraffic, situation: Situation, leaving: bool, settings: LinkSettings
+) -> PathDecision:
+    is_direct = any(service in situation.redirects for service in traffic.services)
+    served = not traffic.services.isdisjoint(situation.routes)
+    if situation.direct is not None and not served:
+        reason = f"{situation.link.peer} has no ready instance"
+        return PathDecision(False, is_direct, False, "NotServed", reason)
+    return choose_path(
+        traffic.heuristic,
+        situation.cloud,
+        situation.direct if served else None,
+        is_direct=is_direct,
+        leaving=leaving,
+        settings=settings,
+    )

@@ -1,1 +1,1 @@
-"""Moves application traffic between the cloud path and a direct link: one nftables table of ours on each node."""
+"""Redirects application traffic between the cloud path and a direct link, with one nftables table per node."""

@@ -1,6 +1,7 @@
-"""Netlink as far as the agent needs it: raw messages, so that a switch takes a millisecond and no library.
+"""Raw netlink messages for the redirector, because its map swap must take less than a millisecond.
 
-A netlink socket belongs to the network namespace in which it was opened, for as long as it lives.
+Addresses, neighbours and link state use pyroute2 instead (docs/decisions/0022). A netlink socket stays in the network
+namespace in which it was opened.
 """
 
 from __future__ import annotations
@@ -15,13 +16,13 @@ from pathlib import Path
 from threading import Thread
 from typing import TypeVar
 
-NETLINK_ROUTE, NETLINK_SOCK_DIAG, NETLINK_NETFILTER = 0, 4, 12
-NLM_F_REQUEST, NLM_F_ACK, NLM_F_REPLACE, NLM_F_DUMP, NLM_F_CREATE = 0x1, 0x4, 0x100, 0x300, 0x400
+NETLINK_SOCK_DIAG, NETLINK_NETFILTER = 4, 12
+NLM_F_REQUEST, NLM_F_ACK, NLM_F_DUMP, NLM_F_CREATE = 0x1, 0x4, 0x300, 0x400
 NLMSG_ERROR, NLMSG_DONE = 2, 3
 NLA_F_NESTED = 0x8000
 
 TIMEOUT_S = 2.0
-"""The kernel answers in microseconds; a socket that stays silent is broken."""
+"""Time to wait for a response, in seconds. The kernel responds in microseconds, so a silent socket is broken."""
 
 RECEIVE_BYTES = 1 << 16
 CLONE_NEWNET = 0x40000000
@@ -33,21 +34,21 @@ Result = TypeVar("Result")
 
 
 class NetlinkError(OSError):
-    """The kernel refused a message, or did not answer."""
+    """The kernel refused a message, or did not respond."""
 
 
 def attribute(kind: int, value: bytes) -> bytes:
-    """One attribute, padded to four bytes."""
+    """Encode an attribute, padded to four bytes."""
     return _ATTRIBUTE.pack(_ATTRIBUTE.size + len(value), kind) + value + b"\0" * (-len(value) % 4)
 
 
 def nested(kind: int, *attributes: bytes) -> bytes:
-    """An attribute that holds attributes."""
+    """Encode an attribute that contains other attributes."""
     return attribute(kind | NLA_F_NESTED, b"".join(attributes))
 
 
 def attributes(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """The attributes in a message: kind without its flags, and value."""
+    """Decode the attributes of a message to kind (without flags) and value."""
     while len(data) >= _ATTRIBUTE.size:
         length, kind = _ATTRIBUTE.unpack_from(data)
         if not _ATTRIBUTE.size <= length <= len(data):
@@ -57,7 +58,7 @@ def attributes(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def message(kind: int, flags: int, sequence: int, payload: bytes) -> bytes:
-    """One message with its header."""
+    """Encode a message with its header."""
     return _HEADER.pack(_HEADER.size + len(payload), kind, flags | NLM_F_REQUEST, sequence, 0) + payload
 
 
@@ -65,10 +66,10 @@ class Netlink:
     """A netlink socket.
 
     Args:
-        protocol: NETLINK_NETFILTER, NETLINK_SOCK_DIAG or NETLINK_ROUTE.
+        protocol: NETLINK_NETFILTER or NETLINK_SOCK_DIAG.
 
     Raises:
-        NetlinkError: the kernel has no such protocol.
+        NetlinkError: The kernel does not support the protocol.
     """
 
     def __init__(self, protocol: int) -> None:
@@ -85,15 +86,15 @@ class Netlink:
         self._socket.close()
 
     def sequence(self) -> int:
-        """A number for the next message."""
+        """Return the sequence number of the next message."""
         self._sequence = self._sequence % 0x7FFFFFFF + 1
         return self._sequence
 
     def send(self, data: bytes) -> None:
-        """Send messages in one datagram, which the kernel handles before this returns.
+        """Send messages in one datagram. The kernel handles them before this method returns.
 
         Raises:
-            NetlinkError: the socket does not take them.
+            NetlinkError: The messages cannot be sent.
         """
         try:
             self._socket.send(data)
@@ -101,15 +102,15 @@ class Netlink:
             raise NetlinkError(error.errno, f"netlink: {error.strerror or error}") from error
 
     def receive(self) -> Iterator[tuple[int, int, bytes]]:
-        """Kind, sequence and payload of the messages of one datagram.
+        """Receive one datagram, and yield kind, sequence number and payload of its messages.
 
         Raises:
-            NetlinkError: none came in time.
+            NetlinkError: No datagram arrived in time.
         """
         try:
             data = self._socket.recv(RECEIVE_BYTES)
         except OSError as error:
-            raise NetlinkError(error.errno, f"netlink: no answer ({error})") from error
+            raise NetlinkError(error.errno, f"netlink: no response ({error})") from error
         while len(data) >= _HEADER.size:
             length, kind, _flags, sequence, _port = _HEADER.unpack_from(data)
             if not _HEADER.size <= length <= len(data):
@@ -120,15 +121,15 @@ class Netlink:
     def acknowledged(
         self, sequences: set[int], *, refusals: frozenset[int] = frozenset(), ignore: frozenset[int] = frozenset()
     ) -> None:
-        """Wait until messages that asked for it are acknowledged.
+        """Wait until messages are acknowledged.
 
         Args:
-            sequences: of these messages.
-            refusals: of messages that are answered only when the kernel refuses them, and all that follow.
+            sequences: Sequence numbers of messages with NLM_F_ACK.
+            refusals: Sequence numbers of messages to which the kernel responds only if it refuses the whole batch.
             ignore: errno values that are no errors here, such as ENOENT of a deletion.
 
         Raises:
-            NetlinkError: the kernel refused one, or did not answer in time.
+            NetlinkError: The kernel refused a message, or did not respond in time.
         """
         waiting = set(sequences)
         refused: int | None = None
@@ -146,34 +147,34 @@ class Netlink:
             raise NetlinkError(refused, f"netlink: the kernel refused a message: {os.strerror(refused)}")
 
     def dump(self, kind: int, payload: bytes) -> Iterator[bytes]:
-        """The payloads of all answers to one request.
+        """Send a dump request, and yield the payloads of all responses.
 
         Raises:
-            NetlinkError: the kernel refused it, or stopped answering.
+            NetlinkError: The kernel refused the request, or stopped responding.
         """
         sequence = self.sequence()
         self.send(message(kind, NLM_F_DUMP, sequence, payload))
         while True:
-            for found, number, body in self.receive():
+            for response_kind, number, body in self.receive():
                 if number != sequence:
                     continue
-                if found == NLMSG_DONE:
+                if response_kind == NLMSG_DONE:
                     return
-                if found == NLMSG_ERROR:
-                    failed = -struct.unpack_from("=i", body)[0]
-                    raise NetlinkError(failed, f"netlink: the kernel refused a list: {os.strerror(failed)}")
+                if response_kind == NLMSG_ERROR:
+                    code = -struct.unpack_from("=i", body)[0]
+                    raise NetlinkError(code, f"netlink: the kernel refused a dump: {os.strerror(code)}")
                 yield body
 
 
-def in_namespace(path: Path, make: Callable[[], Result]) -> Result:
-    """Call a function in another network namespace, such as a pod's, on a thread of its own.
+def in_namespace(path: Path, function: Callable[[], Result]) -> Result:
+    """Call a function in another network namespace, such as a pod's, on a separate thread.
 
     Args:
-        path: the namespace, /proc/PID/ns/net or /run/netns/NAME.
-        make: opens sockets, which stay in that namespace.
+        path: Namespace file: /proc/PID/ns/net or /run/netns/NAME.
+        function: Function to call. Sockets that it opens stay in that namespace.
 
     Raises:
-        OSError: there is no such namespace, or it may not be entered.
+        OSError: The namespace does not exist, or the process may not enter it.
     """
     done: Future[Result] = Future()
 
@@ -184,11 +185,11 @@ def in_namespace(path: Path, make: Callable[[], Result]) -> Result:
                 if libc.setns(namespace.fileno(), CLONE_NEWNET) != 0:
                     number = ctypes.get_errno()
                     raise OSError(number, f"cannot enter the network namespace: {os.strerror(number)}", str(path))
-            done.set_result(make())
-        except BaseException as error:  # handed to the caller, whatever it is
+            done.set_result(function())
+        except BaseException as error:  # re-raised in the caller
             done.set_exception(error)
 
-    # The thread ends here, and the namespace that it entered with it: no thread of a pool is left in a wrong one.
+    # A thread of a pool would stay in the namespace. This thread ends here.
     thread = Thread(target=enter, name="in_namespace", daemon=True)
     thread.start()
     thread.join()

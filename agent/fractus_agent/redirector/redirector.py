@@ -1,8 +1,8 @@
-"""Moves the traffic of services between the cloud path and the direct link, and keeps it there while the agent lives.
+"""Redirector: moves traffic of services between the cloud path and the direct link, and keeps the redirects alive.
 
-A planned switch moves new connections at once and lets each old one finish what it does: it is closed when it is idle, so
-that no call is lost, and at the latest after a time that a long reply should take. An abrupt switch, after a link was lost,
-closes and forgets all old connections at once: they would never recover by themselves.
+A planned switch redirects new connections at once. Existing connections stay on the old path for `drain_s`, in which
+their calls can finish. After that they are closed between two calls if possible, and otherwise cut. An abrupt switch,
+after the loss of a link, closes all old connections at once, because they would hang until a timeout.
 """
 
 from __future__ import annotations
@@ -10,117 +10,56 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from ipaddress import IPv4Address
-from pathlib import Path
 
-from fractus_agent.redirector.conntrack import Conntrack
-from fractus_agent.redirector.habits import Exchange, Habits
-from fractus_agent.redirector.netlink import NETLINK_SOCK_DIAG, Netlink, NetlinkError, in_namespace
-from fractus_agent.redirector.nft import MAX_NUMBER, NO_GUARDS, Callers, Endpoint, Maps, Redirect, RedirectFailed
-from fractus_agent.redirector.sockets import Connection, DestroyUnsupported, Sockets
+from fractus_agent.redirector.connections import Conntrack, PodNamespaces, destroy_connection
+from fractus_agent.redirector.netlink import NetlinkError
+from fractus_agent.redirector.nft_maps import (
+    MAX_NUMBER,
+    NO_GUARDS,
+    Callers,
+    Endpoint,
+    NftMaps,
+    Redirect,
+    RedirectFailed,
+)
+from fractus_agent.settings import DEFAULT_DRAIN_S
 
 log = logging.getLogger(__name__)
 
 LEASE_S = 5.0
-"""Redirects live so long without an agent: then the kernel drops them, and new connections take the cloud path."""
+"""Lifetime of redirects without an agent, in seconds. After that the kernel drops them."""
 REFRESH_S = 1.5
 
-DRAIN_S = 30.0
-"""Connections that are in the middle of something stay on the path that their service has left for so long."""
-BUSY_TIMEOUT_S = 1.5
-"""A client that calls all the time never rests for long: over this time ever less is asked for of its rests between calls."""
-DRAIN_POLL_S, SLOW_POLL_S = 0.002, 0.02
-LEARN_S = 0.1
+QUIET_TIMEOUT_S = 0.5
+"""Time to wait for a quiet moment of a connection at the end of the drain, in seconds."""
+DRAIN_POLL_S, QUIET_POLL_S = 0.02, 0.002
 
 
 @dataclass(frozen=True, slots=True)
-class Switched:
-    """What a switch did.
+class SwitchResult:
+    """Number of connections that a switch closed.
 
     Attributes:
-        drained: connections that were closed when they were idle.
-        cut: connections that were closed in the middle of something.
+        drained: Connections closed while quiet.
+        cut: Connections closed in the middle of a call.
     """
 
     drained: int = 0
     cut: int = 0
 
 
-class Namespaces:
-    """Sockets of the pods on this node, through the network namespaces that the container runtime made.
-
-    Args:
-        directory: where the runtime keeps them, /run/netns; None where no client is on this node.
-        own: the node's own namespace as well, for clients in the host's network.
-    """
-
-    def __init__(self, directory: Path | None, *, own: Path = Path("/proc/self/ns/net")) -> None:
-        self._directory = directory
-        self._own = own
-        self._open: dict[Path, Sockets] = {}
-
-    def refresh(self) -> Collection[Sockets]:
-        """Open what is new, close what is gone; all that are there."""
-        if self._directory is None:
-            return ()
-        there = {self._own}
-        try:
-            there.update(self._directory.iterdir())
-        except OSError as error:  # the runtime has made none yet
-            log.debug("redirector: no network namespaces of pods (error=%s)", error)
-        for path in set(self._open) - there:
-            self._open.pop(path).close()
-        for path in there - set(self._open):
-            try:
-                self._open[path] = Sockets(in_namespace(path, lambda: Netlink(NETLINK_SOCK_DIAG)))
-            except (OSError, RuntimeError) as error:  # a pod that ends at this moment
-                log.debug("redirector: network namespace left out (path=%s error=%s)", path, error)
-        return self._open.values()
-
-    def to(self, services: Collection[Endpoint]) -> Iterator[tuple[Sockets, Connection]]:
-        """The connections to some services; without those of namespaces that cannot be looked at, such as a pod's that ends."""
-        for sockets in self.refresh():
-            try:
-                found = sockets.to(services)
-            except NetlinkError as error:
-                log.warning("redirector: connections not looked at (error=%s)", error)
-                continue
-            for connection in found:
-                yield sockets, connection
-
-    def cut(self, services: Collection[Endpoint], only: Collection[bytes]) -> int:
-        """Close these of the connections to some services, whatever they do; how many there were.
-
-        Raises:
-            NetlinkError: the kernel does not tell.
-        """
-        cut = 0
-        for sockets in self.refresh():
-            for connection in sockets.to(services):
-                if connection.identity in only:
-                    if not _destroy(sockets, connection):
-                        return cut
-                    cut += 1
-        return cut
-
-    def close(self) -> None:
-        """Close all sockets."""
-        for sockets in self._open.values():
-            sockets.close()
-        self._open.clear()
-
-
 @dataclass(frozen=True, slots=True)
-class _Left:
-    """A path that a service has left.
+class _LeftPath:
+    """Path that a service has left.
 
     Attributes:
-        service: where clients connect to.
-        number: carried by the connections that were opened on it, and by no others.
-        connections: those that were on it when it was left, and on no path that was left before.
+        service: Endpoint that clients connect to.
+        number: Service number of the connections opened on this path, and of no others.
+        connections: Identities of connections on the path when it was left, except those on paths left before.
     """
 
     service: Endpoint
@@ -129,19 +68,21 @@ class _Left:
 
 
 class Redirector:
-    """Holds the redirects of this node, and switches them.
+    """Holds and switches the redirects of this node.
 
-    Each switch gives the services that it moves new numbers: so connections that clients open while the old ones are drained
-    are not forgotten with these, and what a switch could not clean up can be cleaned up later.
+    Each switch assigns new numbers to the services that it moves. So connections that clients open during a drain are
+    not deleted with the old ones, and a failed cleanup can be repeated later.
 
     Args:
-        maps: our table.
-        conntrack: the kernel's connections.
-        namespaces: sockets of the pods.
-        drain_s: how long connections may finish what they do on a path that their service has left while it lives.
+        maps: Elements of the nftables table.
+        conntrack: Connection tracking entries of the kernel.
+        namespaces: TCP sockets of the pods.
+        drain_s: Time for which connections may stay on a working path that their service has left, in seconds.
     """
 
-    def __init__(self, maps: Maps, conntrack: Conntrack, namespaces: Namespaces, *, drain_s: float = DRAIN_S) -> None:
+    def __init__(
+        self, maps: NftMaps, conntrack: Conntrack, namespaces: PodNamespaces, *, drain_s: float = DEFAULT_DRAIN_S
+    ) -> None:
         self._drain_s = drain_s
         self._maps = maps
         self._conntrack = conntrack
@@ -150,137 +91,137 @@ class Redirector:
         self._numbers: dict[Endpoint, int] = {}
         self._peers: frozenset[IPv4Address] = frozenset()
         self._callers = NO_GUARDS
-        self._left: list[_Left] = []
+        self._left: list[_LeftPath] = []
         self._draining: set[int] = set()
         self._last_number = 0
-        self._habits = Habits()
-        self._exchanges: dict[bytes, Exchange] = {}
 
     @property
     def redirects(self) -> Mapping[Endpoint, Endpoint]:
-        """Where connections to virtual endpoints go now; those that are not named take the cloud path."""
+        """Current target by virtual endpoint. Endpoints without a target take the cloud path."""
         return dict(self._redirects)
 
-    def counted(self) -> dict[Endpoint, tuple[int, int]]:
-        """Bytes that services have sent and received over the link since they took it; those of which nothing is known are not named.
+    def byte_counts(self) -> dict[Endpoint, tuple[int, int]]:
+        """Return the bytes sent and received over the link since each service moved to it. Idle services are missing.
 
         Raises:
-            NetlinkError: the kernel does not tell.
+            NetlinkError: The counters cannot be read.
         """
-        found = self._maps.counted()
-        return {service: found[number] for service, number in self._numbers.items() if number in found}
+        counts = self._maps.byte_counts()
+        return {service: counts[number] for service, number in self._numbers.items() if number in counts}
 
-    def admit(self, peers: Iterable[IPv4Address]) -> None:
-        """Lead on the connections of these nodes, and of no others, that come over direct interfaces.
+    def set_peers(self, peers: Iterable[IPv4Address]) -> None:
+        """Set the nodes whose connections over direct interfaces are redirected.
 
         Raises:
-            NetlinkError: the kernel refused; nothing was changed.
-            RedirectFailed: our table cannot be made.
+            NetlinkError: The kernel refused the transaction. Nothing has changed.
+            RedirectFailed: The table cannot be created.
         """
-        before, self._peers = self._peers, frozenset(peers)
+        before = self._peers
+        self._peers = frozenset(peers)
         try:
             self._write(self._redirects, self._numbers)
         except (NetlinkError, RedirectFailed):
             self._peers = before
             raise
 
-    def serve(self, services: Iterable[Endpoint], callers: Callers = NO_GUARDS) -> None:
-        """Number the services that clients on this node connect to; redirects of others end, and what was led by them.
+    def set_services(self, services: Iterable[Endpoint], callers: Callers = NO_GUARDS) -> None:
+        """Set the services that clients on this node connect to. Redirects of other services end.
 
         Args:
-            services: where clients connect to.
-            callers: who may, by guarded endpoint: on a node with clients of services, on others of pods that take nothing but
-                what comes over a link.
+            services: Endpoints that clients connect to.
+            callers: Allowed clients by guarded endpoint: of services on a node with clients, and of pods that accept
+                only traffic of a direct link on other nodes.
 
         Raises:
-            NetlinkError: the kernel refused; nothing was changed.
-            RedirectFailed: our table cannot be made.
+            NetlinkError: The kernel refused the transaction. Nothing has changed.
+            RedirectFailed: The table cannot be created.
         """
         wanted = set(services)
         if wanted == self._numbers.keys() and callers == self._callers:
             return
         numbers: dict[Endpoint, int] = {}
         for service in sorted(wanted):
-            # A number stays with its service, for connections that are there carry it.
-            numbers[service] = self._numbers.get(service) or self._fresh(numbers)
-        # On the cloud path, connections to services that are served no more go on.
-        ended = self._paths({service: self._numbers[service] for service in self._redirects.keys() - wanted})
-        self._write({virtual: to for virtual, to in self._redirects.items() if virtual in numbers}, numbers, callers)
+            # A service keeps its number, because its connections carry it as their mark.
+            numbers[service] = self._numbers.get(service) or self._new_number(numbers)
+        # Connections of removed services on the cloud path go on.
+        removed = self._redirects.keys() - wanted
+        ended = self._left_paths({service: self._numbers[service] for service in removed})
+        redirects = {virtual: target for virtual, target in self._redirects.items() if virtual in numbers}
+        self._write(redirects, numbers, callers)
         self._callers = dict(callers)
         self._left += ended
-        self._leave(ended)
+        self._close_left(ended)
 
-    def lead(self, targets: Mapping[Endpoint, Endpoint]) -> None:
-        """Lead what comes from elsewhere to pods of this node; connections to pods that are no targets any more are forgotten.
+    def set_targets(self, targets: Mapping[Endpoint, Endpoint]) -> None:
+        """Redirect incoming connections to pods of this node at once. Connections to previous targets are closed.
 
         Raises:
-            NetlinkError: the kernel refused; nothing was changed.
-            RedirectFailed: our table cannot be made.
+            NetlinkError: The kernel refused the transaction. Nothing has changed.
+            RedirectFailed: The table cannot be created.
         """
-        self._leave(self._turn(targets)[1])
+        _, left = self._redirect(targets)
+        self._close_left(left)
 
     async def run(self) -> None:
-        """Keep the redirects alive until cancelled; then new connections take the cloud path at once."""
+        """Keep the redirects alive until cancelled. After that new connections take the cloud path at once."""
         try:
             while True:
-                for _ in range(round(REFRESH_S / LEARN_S)):
-                    await asyncio.sleep(LEARN_S)
-                    self.learn()
+                await asyncio.sleep(REFRESH_S)
                 try:
-                    # Marks as well: someone may have removed the table, and with it what the kernel knew of them.
+                    # Write the marks as well, because someone may have removed the table with its elements.
                     self._write(self._redirects, self._numbers)
-                    self._leave([left for left in self._left if left.number not in self._draining])
+                    self._close_left([left for left in self._left if left.number not in self._draining])
                 except (NetlinkError, RedirectFailed) as error:
                     log.warning("redirector: redirects not refreshed (error=%s)", error)
         finally:
             with suppress(NetlinkError, RedirectFailed):
                 self._write({}, None)
 
-    async def switch(self, targets: Mapping[Endpoint, Endpoint | None], *, planned: bool) -> Switched:
-        """Lead services elsewhere. A switch may begin while an older one drains: it waits for nothing.
+    async def switch(self, targets: Mapping[Endpoint, Endpoint | None], *, planned: bool) -> SwitchResult:
+        """Redirect services. A switch may begin while an older one drains. It does not wait for the older one.
 
         Args:
-            targets: virtual endpoints that are served and where their connections go; None for the cloud path.
-            planned: whether the old path still works, so that calls under way may finish on it.
+            targets: Target by virtual endpoint of a service, None for the cloud path.
+            planned: True if the old path still works, so that current calls may finish on it.
 
         Raises:
-            NetlinkError: the kernel refused; nothing was changed.
-            RedirectFailed: our table is gone and cannot be made again.
+            NetlinkError: The kernel refused the transaction. Nothing has changed.
+            RedirectFailed: The table was removed, and cannot be created again.
         """
-        moved, left = self._turn(targets)
+        moved, left = self._redirect(targets)
         if not moved:
-            return Switched()
-        old = {each.number for each in left}
+            return SwitchResult()
+        old = {path.number for path in left}
         drained = 0
         try:
             if planned:
                 self._draining |= old
-                drained = await self._drain({c for each in left for c in each.connections}, moved)
+                drained = await self._drain({identity for path in left for identity in path.connections}, moved)
         finally:
             self._draining -= old
-            cut = self._leave(left)
+            cut = self._close_left(left)
         log.info("redirector: switched (services=%d planned=%s drained=%d cut=%d)", len(moved), planned, drained, cut)
-        return Switched(drained, cut)
+        return SwitchResult(drained, cut)
 
-    def _turn(self, targets: Mapping[Endpoint, Endpoint | None]) -> tuple[list[Endpoint], list[_Left]]:
-        """Lead new connections elsewhere; which services were moved, and the paths that they left."""
+    def _redirect(self, targets: Mapping[Endpoint, Endpoint | None]) -> tuple[list[Endpoint], list[_LeftPath]]:
+        """Redirect new connections. Return the services that moved, and the paths that they left."""
         before = self._redirects
         after = {v: t for v, t in (before | dict(targets)).items() if t is not None and v in self._numbers}
-        moved = sorted(v for v in targets if before.get(v) != after.get(v))
+        moved = sorted(virtual for virtual in targets if before.get(virtual) != after.get(virtual))
         if not moved:
             return [], []
         old = {virtual: self._numbers[virtual] for virtual in moved if virtual in self._numbers}
         numbers = dict(self._numbers)
         for virtual in old:
-            numbers[virtual] = self._fresh(numbers)
+            numbers[virtual] = self._new_number(numbers)
         self._write(after, numbers)
-        # Connections that clients open from here on take the new path, and have the new number.
-        left = self._paths(old)
+        # From here on new connections take the new path and carry the new number.
+        left = self._left_paths(old)
         self._left += left
         return moved, left
 
-    def _fresh(self, taken: Mapping[Endpoint, int]) -> int:
-        """A number that no service has, and none that was left."""
+    def _new_number(self, taken: Mapping[Endpoint, int]) -> int:
+        """Return a number that no service and no left path has."""
         used = {*taken.values(), *self._numbers.values(), *(left.number for left in self._left)}
         while True:
             self._last_number = self._last_number % MAX_NUMBER + 1
@@ -294,90 +235,78 @@ class Redirector:
         callers: Callers | None = None,
     ) -> None:
         self._maps.write(
-            (Redirect(virtual, to) for virtual, to in redirects.items()),
+            (Redirect(virtual, target) for virtual, target in redirects.items()),
             numbers.items() if numbers is not None else None,
             LEASE_S,
             self._peers,
             callers,
         )
         self._redirects = dict(redirects)
-        self._numbers = dict(numbers) if numbers is not None else self._numbers
+        if numbers is not None:
+            self._numbers = dict(numbers)
 
-    def _paths(self, numbers: Mapping[Endpoint, int]) -> list[_Left]:
-        """What is left of services with these numbers, as it is now; without connections where the kernel does not tell."""
-        found: dict[Endpoint, set[bytes]] = {service: set() for service in numbers}
-        # Those of a path that was left before are on that one still, which may be well.
+    def _left_paths(self, numbers: Mapping[Endpoint, int]) -> list[_LeftPath]:
+        """Return the paths of services with these numbers, with their current connections."""
+        connections: dict[Endpoint, set[bytes]] = {service: set() for service in numbers}
+        # Connections of a path that was left before are still on that path, which may work.
         older = frozenset[bytes]().union(*(left.connections for left in self._left))
-        for _, connection in self._namespaces.to(found):
+        for _, connection in self._namespaces.list_connections(connections):
             if connection.identity not in older:
-                found[connection.peer].add(connection.identity)
-        return [_Left(service, number, frozenset(found[service])) for service, number in numbers.items()]
+                connections[connection.peer].add(connection.identity)
+        return [_LeftPath(service, number, frozenset(connections[service])) for service, number in numbers.items()]
 
-    def _leave(self, paths: Iterable[_Left]) -> int:
-        """Close the connections that are left on paths, and forget them; what fails is tried again. How many were closed."""
+    def _close_left(self, paths: Iterable[_LeftPath]) -> int:
+        """Close the remaining connections of left paths, and return how many were closed. Failures are retried later."""
         paths = [left for left in paths if left in self._left]
         try:
             cut = self._namespaces.cut({p.service for p in paths}, {c for p in paths for c in p.connections})
             for left in paths:
-                self._conntrack.forget(left.number)
+                self._conntrack.delete(left.number)
                 self._left.remove(left)
         except NetlinkError as error:
-            log.warning("redirector: old paths are not cleaned up yet (paths=%d error=%s)", len(paths), error)
+            log.warning("redirector: old paths not cleaned up, retrying (paths=%d error=%s)", len(paths), error)
             return 0
         return cut
 
-    def learn(self) -> None:
-        """Look at the connections to the services: what they are doing, and how long the services work for a request."""
-        before, self._exchanges = self._exchanges, {}
-        for _, connection in self._namespaces.to(self._numbers):
-            self._habits.learn(connection)
-            known = before.get(connection.identity)
-            self._exchanges[connection.identity] = known.then(connection) if known else Exchange.first(connection)
+    async def _drain(self, old: Collection[bytes], services: Collection[Endpoint]) -> int:
+        """Wait for `drain_s` or until the old connections have ended. Then close each one at a quiet moment.
 
-    async def _drain(self, old: Collection[bytes], moved: Collection[Endpoint]) -> int:
-        """Close old connections as they become idle, until the time is over; how many."""
-        begun, drained = time.monotonic(), 0
-        watched = [
-            (sockets, self._exchanges.get(connection.identity) or Exchange.first(connection))
-            for sockets, connection in self._namespaces.to(moved)
-            if connection.identity in old
-        ]
-        while watched and (spent := time.monotonic() - begun) < self._drain_s:
-            there = []
-            for sockets, exchange in watched:
+        A connection that is not quiet within QUIET_TIMEOUT_S stays open. The caller cuts it.
+
+        Args:
+            old: Identities of the connections on the old path.
+            services: Services that left the path.
+
+        Returns:
+            Number of connections closed at a quiet moment.
+        """
+        drained = 0
+        closing_s = time.monotonic() + self._drain_s
+        watched = [pair for pair in self._namespaces.list_connections(services) if pair[1].identity in old]
+        while watched:
+            now_s = time.monotonic()
+            if now_s >= closing_s + QUIET_TIMEOUT_S:
+                break
+            remaining = []
+            for sockets, connection in watched:
                 try:
-                    connection = sockets.now(exchange.connection)
-                except NetlinkError as error:  # it is closed with those that were not idle in time
-                    log.warning("redirector: a connection is not drained (error=%s)", error)
+                    current = sockets.refresh(connection)
+                except NetlinkError as error:  # the caller cuts it
+                    log.warning("redirector: connection not drained (error=%s)", error)
                     continue
-                if connection is None:
+                if current is None:
                     continue
-                seen = exchange.then(connection)
-                within_s = self._drain_s if seen.long else min(BUSY_TIMEOUT_S, self._drain_s)
-                if not self._habits.closable(seen, max(1 - spent / within_s, 0.0)):
-                    there.append((sockets, seen))
-                # At once: the next request comes at some time, and none is to come in between.
-                elif not _destroy(sockets, connection):
-                    return drained
-                else:
+                if now_s < closing_s or not current.is_quiet:
+                    remaining.append((sockets, current))
+                elif destroy_connection(sockets, current):
                     drained += 1
-            watched = there
+                else:
+                    return drained
+            watched = remaining
             if watched:
-                await asyncio.sleep(DRAIN_POLL_S if spent < BUSY_TIMEOUT_S else SLOW_POLL_S)
+                await asyncio.sleep(DRAIN_POLL_S if now_s < closing_s else QUIET_POLL_S)
         return drained
 
     def close(self) -> None:
         """Close the sockets of the pods' namespaces."""
         self._namespaces.close()
-
-
-def _destroy(sockets: Sockets, connection: Connection) -> bool:
-    """Close a connection; False where the kernel cannot: then it ends when its packets find no entry any more."""
-    try:
-        sockets.destroy(connection)
-    except DestroyUnsupported as error:
-        log.warning("redirector: connections are not closed (error=%s)", error)
-        return False
-    except NetlinkError as error:
-        log.warning("redirector: a connection is not closed (error=%s)", error)
-    return True

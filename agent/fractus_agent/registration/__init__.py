@@ -1,1 +1,1 @@
-"""The node's Drone or EdgeNode, and its status."""
+"""Registration of the node: its Drone or EdgeNode, and the status of that object."""

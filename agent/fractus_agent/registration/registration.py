@@ -1,4 +1,7 @@
-"""The node's Drone or EdgeNode: made from the description on the node, then left to its owner."""
+"""Registration of the node: creates its Drone or EdgeNode from the description on the node.
+
+After that the object belongs to its owner.
+"""
 
 from __future__ import annotations
 
@@ -13,9 +16,9 @@ from fractus_core.api.model import GROUP, InvalidObject
 from fractus_core.api.names import CLASS_LABEL
 from fractus_core.api.nodes import Drone, EdgeNode, InvalidDescription, parse_description
 
-from fractus_agent.cluster.store import Invalid, KubeError, Object, Store
 from fractus_agent.conditions import Condition
-from fractus_agent.registration.handover import Handover
+from fractus_agent.registration.node_object_file import NodeObjectFile
+from fractus_agent.store import Invalid, KubeError, Object, Store
 from fractus_agent.supervisor import repeat
 
 LOG = logging.getLogger(__name__)
@@ -24,52 +27,74 @@ HASH_ANNOTATION = f"{GROUP}/description-hash"
 CHECK_INTERVAL_S = 10.0
 """Seconds between checks of the description on the node."""
 RESYNC_INTERVAL_S = 300.0
-"""Seconds between reads of the object; every status write returns it too."""
+"""Seconds between reads of the object. Each status write returns the object as well."""
 _KINDS: dict[str, type[Drone] | type[EdgeNode]] = {"Drone": Drone, "EdgeNode": EdgeNode}
 _KIND_OF_CLASS = {"drone": "Drone", "edge": "EdgeNode"}
 
 
-def own_description(text: str, node: str) -> Drone | EdgeNode:
-    """The Drone or EdgeNode that a manifest describes.
+def parse_node_description(text: str, node: str) -> Drone | EdgeNode:
+    """Parse the manifest of a node's Drone or EdgeNode.
 
     Raises:
-        InvalidDescription: it is not one, or another node's.
+        InvalidDescription: The manifest is invalid, or describes another node.
     """
     described = parse_description(text, Drone, EdgeNode)
     if described is None:
-        raise InvalidDescription("is empty; put this node's Drone or EdgeNode manifest there")
+        raise InvalidDescription("is empty; write this node's Drone or EdgeNode manifest to it")
     if described.name != node:
         raise InvalidDescription(f"metadata.name: is {described.name}, but this node is {node}")
     return described
 
 
 def description_hash(described: Drone | EdgeNode) -> str:
-    """Digest of what the description says; comments and layout do not count."""
-    said = {"kind": described.kind, "labels": described.metadata.labels, "spec": described.spec.model_dump(mode="json")}
-    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:16]
+    """Return the digest of a description. Comments and layout do not matter."""
+    content = {
+        "kind": described.kind,
+        "labels": described.metadata.labels,
+        "spec": described.spec.model_dump(mode="json"),
+    }
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
 class Registration:
     """Keeps the node registered.
 
-    The object is written in two cases only: it is absent, or the description on the node changed since it was last
-    taken over (annotation fractus.dev/description-hash). The owner's edits of an object stay.
+    The object is written only if it is missing, or if the description on the node has changed since it was last applied
+    (annotation fractus.dev/description-hash). Otherwise the owner's edits stay.
+
+    Args:
+        store: The node's objects at the API server.
+        path: File of the description.
+        node: Name of the node.
+        object_file: File of the node's object, for the services of the node.
+        on_change: Called when the object or the condition has changed.
+
+    Attributes:
+        body: The object at the API server, None if missing.
+        resource: The last valid object, None before the first.
+        description_problem: Condition Described if the description is invalid, otherwise None.
     """
 
     def __init__(
-        self, store: Store, path: Path, node: str, handover: Handover, *, changed: Callable[[], None] = lambda: None
+        self,
+        store: Store,
+        path: Path,
+        node: str,
+        object_file: NodeObjectFile,
+        *,
+        on_change: Callable[[], None] = lambda: None,
     ) -> None:
         self._store = store
         self._path = path
         self._node = node
-        self._handover = handover
-        self._changed = changed
+        self._object_file = object_file
+        self._on_change = on_change
         self._stamp: object = None
         self._gone = asyncio.Event()
         self._resync_s = 0.0
         self.body: Object | None = None
         self.resource: Drone | EdgeNode | None = None
-        self.described: Condition | None = None
+        self.description_problem: Condition | None = None
 
     async def run(self) -> None:
         """Keep the node registered until cancelled."""
@@ -81,92 +106,93 @@ class Registration:
             try:
                 await self.step()
             except KubeError:
-                self._stamp = None  # so that the next check registers, whatever the file says
+                self._stamp = None  # the next check repeats the registration even if the file stays the same
                 raise
             self._resync_s = now_s + RESYNC_INTERVAL_S
         return CHECK_INTERVAL_S
 
-    def seen(self, body: Object | None) -> None:
-        """Take the object as a write of its status returned it; None when it is gone."""
+    def on_status_written(self, body: Object | None) -> None:
+        """Handle the object that a status write returned, None if it does not exist."""
         if body is None:
-            LOG.warning("registration: the node's object was deleted")
+            LOG.warning("registration: node object deleted")
             self.body = None
             self._gone.set()
             return
-        old, self.body = self.body, body
+        old = self.body
+        self.body = body
         if old is None or old["metadata"].get("generation") != body["metadata"].get("generation"):
-            self._read(body)
+            self._parse(body)
 
     async def step(self) -> None:
-        """Bring the object in step with the description once.
+        """Synchronize the object with the description once.
 
         Raises:
-            Conflict: the object was written in between.
-            Invalid: the API server refuses the object.
-            KubeError: the API server is out of reach.
+            Conflict: The object was changed in between.
+            Invalid: The API server refused the object.
+            KubeError: The API server is unreachable.
         """
-        described = self._description()
+        described = self._read_description()
         labels = await self._store.node_labels()
         kind = _KIND_OF_CLASS.get((labels or {}).get(CLASS_LABEL, ""))
         if described is not None and kind not in (None, described.kind):
-            self._set_invalid(f"kind: is {described.kind}, but the node's label {CLASS_LABEL} calls for {kind}")
+            self._set_invalid(f"kind: is {described.kind}, but the node's label {CLASS_LABEL} requires {kind}")
             described = None
         kind = described.kind if described is not None else kind
         if kind is None:
-            LOG.debug("registration: the node's kind is unknown (description=%s label=%s)", self._path, CLASS_LABEL)
+            LOG.debug("registration: node kind unknown (description=%s label=%s)", self._path, CLASS_LABEL)
             return
-        body = await self._store.described(kind)
+        body = await self._store.node_object(kind)
         if described is not None:
             body = await self._register(described, body)
-        self._take(body)
+        self._set_body(body)
 
     async def _register(self, described: Drone | EdgeNode, body: Object | None) -> Object:
         digest = description_hash(described)
         try:
             if body is None:
-                made: Object = {
+                metadata: Object = {
                     "name": self._node,
                     "labels": described.metadata.labels,
                     "annotations": described.metadata.annotations | {HASH_ANNOTATION: digest},
                 }
-                said = {key: value for key, value in described.to_dict().items() if key != "status"}
-                created = await self._store.create(said | {"metadata": made})
+                manifest = {key: value for key, value in described.to_dict().items() if key != "status"}
+                created = await self._store.create(manifest | {"metadata": metadata})
                 LOG.info("registration: created (kind=%s node=%s)", described.kind, self._node)
                 return created
-            known = body["metadata"].get("annotations", {}).get(HASH_ANNOTATION)
-            if known == digest:
+            applied = body["metadata"].get("annotations", {}).get(HASH_ANNOTATION)
+            if applied == digest:
                 return body
             metadata = dict(body["metadata"])
             metadata["annotations"] = metadata.get("annotations", {}) | {HASH_ANNOTATION: digest}
             changed = body | {"metadata": metadata}
-            if known is not None:
-                # Who changes the description on the node has the hardware in front of them: it overrides the owner's edits.
+            if applied is not None:
+                # A changed description overrides the owner's edits, because its author has access to the hardware.
                 metadata["labels"] = metadata.get("labels", {}) | described.metadata.labels
                 changed["spec"] = described.to_dict()["spec"]
                 LOG.info("registration: description changed (kind=%s node=%s)", described.kind, self._node)
             return await self._store.replace(changed)
         except Invalid as error:
-            self._set_invalid(f"the API server refuses it: {error}")
-            self._take(body)
+            self._set_invalid(f"the API server refused it: {error}")
+            self._set_body(body)
             raise
 
-    def _take(self, body: Object | None) -> None:
+    def _set_body(self, body: Object | None) -> None:
         self.body = body
         if body is None:
-            if self.described is None:
-                LOG.debug("registration: waiting for the owner's object (node=%s)", self._node)
+            if self.description_problem is None:
+                LOG.debug("registration: waiting for the owner to create the object (node=%s)", self._node)
             return
-        self._read(body)
+        self._parse(body)
 
-    def _read(self, body: Object) -> None:
+    def _parse(self, body: Object) -> None:
         try:
             self.resource = _KINDS[body["kind"]].from_body({k: v for k, v in body.items() if k != "status"})
         except InvalidObject as error:
-            LOG.warning("registration: the node's object cannot be read: %s", error)
-            self._handover.drop(f"The agent cannot read the object: {error}.")
+            LOG.warning("registration: invalid node object (error=%s)", error)
+            self._object_file.clear(f"The agent cannot parse the object: {error}.")
         else:
-            self._handover.put(self.resource)
-        self._changed()
+            self._object_file.write(self.resource)
+        self._on_change()
 
     def _file_changed(self) -> bool:
         try:
@@ -174,24 +200,25 @@ class Registration:
             stamp: object = (status.st_ino, status.st_mtime_ns, status.st_size)
         except OSError:
             stamp = "absent"
-        changed, self._stamp = stamp != self._stamp, stamp
+        changed = stamp != self._stamp
+        self._stamp = stamp
         return changed
 
-    def _description(self) -> Drone | EdgeNode | None:
+    def _read_description(self) -> Drone | EdgeNode | None:
         try:
-            described = own_description(self._path.read_text(encoding="utf-8"), self._node)
+            described = parse_node_description(self._path.read_text(encoding="utf-8"), self._node)
         except FileNotFoundError:
-            self.described = None
+            self.description_problem = None
             return None
         except (OSError, UnicodeDecodeError, InvalidDescription) as error:
             self._set_invalid(str(error))
             return None
-        self.described = None
+        self.description_problem = None
         return described
 
     def _set_invalid(self, problem: str) -> None:
-        found = Condition("Described", "False", "InvalidDescription", f"{self._path}: {problem}.")
-        if found != self.described:
-            LOG.error("registration: the description cannot be used (file=%s): %s", self._path, problem)
-            self.described = found
-            self._changed()
+        condition = Condition("Described", "False", "InvalidDescription", f"{self._path}: {problem}.")
+        if condition != self.description_problem:
+            LOG.error("registration: invalid description (file=%s error=%s)", self._path, problem)
+            self.description_problem = condition
+            self._on_change()

@@ -1,63 +1,80 @@
-"""Where the drone will be, and what a direct link will offer there."""
+"""Predicted positions of the drone, and the expected performance of a direct link at a position."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
 
-from fractus_core.linking.values import PathMetrics, Peer, Position, Reach, Settings, Track
+from fractus_core.linking.values import LearnedRange, LinkSettings, LocalPosition, PathMetrics, Peer, Track
 
 
-def predict(track: Track, settings: Settings) -> list[Position]:
-    """Positions at each step of the horizon, the present one first.
+def predict(track: Track, settings: LinkSettings) -> list[LocalPosition]:
+    """Return the positions at each step of the horizon, starting with the current one.
 
-    With waypoints the drone flies from one to the next with its speed and stays at the last (path navigation, thesis
-    8.6). Without, it keeps its velocity for as long as that is believed, and then stays (region navigation).
+    With waypoints, the drone flies from one to the next with its speed and stays at the last one (path navigation,
+    thesis 8.6). Without waypoints, it keeps its velocity for `region_trust_s` and then stays (region navigation).
     """
     steps = round(settings.horizon_s / settings.step_s)
     if track.waypoints and track.speed_mps > 0:
-        return _along(track, steps, settings.step_s)
-    found = []
+        return _predict_along_waypoints(track, steps, settings.step_s)
+    positions = []
     for step in range(steps + 1):
-        elapsed = min(step * settings.step_s, settings.region_trust_s)
-        x, y, z = (p + v * elapsed for p, v in zip(track.position, track.velocity_mps, strict=True))
-        found.append((x, y, z))
-    return found
+        elapsed_s = min(step * settings.step_s, settings.region_trust_s)
+        x, y, z = (p + v * elapsed_s for p, v in zip(track.position, track.velocity_mps, strict=True))
+        positions.append((x, y, z))
+    return positions
 
 
-def _along(track: Track, steps: int, step_s: float) -> list[Position]:
-    at, coming = track.position, list(reversed(track.waypoints))
-    found = [at]
+def _predict_along_waypoints(track: Track, steps: int, step_s: float) -> list[LocalPosition]:
+    position = track.position
+    remaining = list(reversed(track.waypoints))
+    positions = [position]
     for _ in range(steps):
-        left = track.speed_mps * step_s
-        while coming and left > 0:
-            goal = coming[-1]
-            away = math.dist(at, goal)
-            if away <= left:
-                at, left = goal, left - away
-                coming.pop()
+        left_m = track.speed_mps * step_s
+        while remaining and left_m > 0:
+            waypoint = remaining[-1]
+            distance_m = math.dist(position, waypoint)
+            if distance_m <= left_m:
+                position = waypoint
+                left_m -= distance_m
+                remaining.pop()
             else:
-                share = left / away
-                x, y, z = (a + (b - a) * share for a, b in zip(at, goal, strict=True))
-                at, left = (x, y, z), 0.0
-        found.append(at)
-    return found
+                share = left_m / distance_m
+                x, y, z = (a + (b - a) * share for a, b in zip(position, waypoint, strict=True))
+                position = (x, y, z)
+                left_m = 0.0
+        positions.append(position)
+    return positions
 
 
-def offered(peer: Peer, reach: Reach, position: Position, settings: Settings) -> PathMetrics | None:
-    """What the direct link to a peer is expected to offer from a position; None out of its reach."""
-    reach_m = peer.range_m * reach.range_factor
-    share = strength(math.dist(position, peer.position) / reach_m, settings.edge) if reach_m > 0 else 0.0
+def expected_metrics(
+    peer: Peer, learned: LearnedRange, position: LocalPosition, settings: LinkSettings
+) -> PathMetrics | None:
+    """Return the expected performance of the direct link to a peer, None outside its range.
+
+    Args:
+        peer: The peer.
+        learned: Experience with the peer's link.
+        position: Position of the drone.
+        settings: Link settings, of which `edge` is used.
+    """
+    range_m = peer.range_m * learned.range_factor
+    share = bandwidth_share(math.dist(position, peer.position) / range_m, settings.edge) if range_m > 0 else 0.0
     if share <= 0:
         return None
-    factor = share * reach.rate_factor
+    factor = share * learned.rate_factor
     return replace(
         peer.offers, ingress_mbps=peer.offers.ingress_mbps * factor, egress_mbps=peer.offers.egress_mbps * factor
     )
 
 
-def strength(distance: float, edge: float) -> float:
-    """Share of its bandwidth that a link offers at a distance, in units of its reach: all inside the edge, none beyond 1."""
+def bandwidth_share(distance: float, edge: float) -> float:
+    """Return the share of its bandwidth that a link offers: 1 inside the edge, 0 beyond its range.
+
+    Args:
+        distance: Distance in units of the link's range.
+        edge: Distance at which the bandwidth begins to fade, in the same unit.
+    """
     if distance <= edge:
         return 1.0
     return max((1.0 - distance) / (1.0 - edge), 0.0) if edge < 1 else 0.0

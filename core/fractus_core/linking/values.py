@@ -1,24 +1,24 @@
-"""What decisions on direct links are made of: paths, peers, the drone's track, the state of the link, settings."""
+"""Values of direct link decisions: paths, peers, the drone's track, the link state, settings and decisions."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import Enum
 
-Position = tuple[float, float, float]
+LocalPosition = tuple[float, float, float]
 """East, north and up in metres in one local frame."""
 
 
 @dataclass(frozen=True, slots=True)
 class PathMetrics:
-    """What a network path offers the drone's services; measured where known, else expected.
+    """Performance of a network path for the drone's services, measured if possible, otherwise expected.
 
     Attributes:
-        ingress_mbps: towards the component that provides the service.
-        egress_mbps: from it.
-        ingress_latency_ms: one way, towards the component that provides the service.
-        egress_latency_ms: one way, from it.
-        direct: whether the path is a direct link.
+        ingress_mbps: Bandwidth towards the component that provides the service, in Mbit/s.
+        egress_mbps: Bandwidth from that component, in Mbit/s.
+        ingress_latency_ms: One-way latency towards that component, in milliseconds.
+        egress_latency_ms: One-way latency from that component, in milliseconds.
+        direct: True if the path is a direct link.
     """
 
     ingress_mbps: float
@@ -33,37 +33,37 @@ class Peer:
     """A node that the drone may link to.
 
     Attributes:
-        name: of the node.
-        position: where it stands.
-        range_m: declared reach of the direct link, the lesser of both ends.
-        offers: what the link offers well inside its reach.
+        name: Name of the node.
+        position: Position of the node in the local frame.
+        range_m: Declared range of the direct link: the smaller one of both ends, in metres.
+        offers: Performance of the link well inside its range.
     """
 
     name: str
-    position: Position
+    position: LocalPosition
     range_m: float
     offers: PathMetrics
 
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """Where the drone is, and what is known of where it will be.
+    """Position of the drone and its expected motion.
 
     Attributes:
-        position: now.
-        speed_mps: along the waypoints; for path navigation.
-        waypoints: coming waypoints in the order flown; for path navigation.
-        velocity_mps: east, north and up; for region navigation, where nothing else is known.
+        position: Current position.
+        speed_mps: Speed along the waypoints, in m/s (path navigation).
+        waypoints: Next waypoints in the order flown (path navigation).
+        velocity_mps: East, north and up velocity in m/s (region navigation, where no waypoints are known).
     """
 
-    position: Position
+    position: LocalPosition
     speed_mps: float = 0.0
-    waypoints: tuple[Position, ...] = ()
-    velocity_mps: Position = (0.0, 0.0, 0.0)
+    waypoints: tuple[LocalPosition, ...] = ()
+    velocity_mps: LocalPosition = (0.0, 0.0, 0.0)
 
 
-class Phase(Enum):
-    """How far the one direct link of a drone is."""
+class LinkPhase(Enum):
+    """Phase of the drone's direct link."""
 
     NONE = "none"
     CONNECTING = "connecting"
@@ -71,57 +71,58 @@ class Phase(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Link:
-    """The direct link of the drone.
+class LinkState:
+    """State of the drone's direct link.
 
     Attributes:
-        phase: how far it is.
-        peer: the other end; empty when there is none.
-        since_s: when this phase began, on the clock of `now_s`.
+        phase: Current phase.
+        peer: Node at the other end, empty without a link.
+        since_s: Start of this phase, on the clock of `now_s`.
     """
 
-    phase: Phase = Phase.NONE
+    phase: LinkPhase = LinkPhase.NONE
     peer: str = ""
     since_s: float = 0.0
 
 
-NO_LINK = Link()
+NO_LINK = LinkState()
 
 
 @dataclass(frozen=True, slots=True)
-class Reach:
-    """What was learned of a peer's link beside its declaration.
+class LearnedRange:
+    """Experience with the link to one peer, relative to its declaration.
 
     Attributes:
-        range_factor: real reach by declared reach.
-        rate_factor: measured by offered bandwidth, well inside the reach.
-        heard_s: when the peer was last heard, on the clock of `now_s`; negative infinity before.
-        failures: attempts to connect that failed since the link last worked.
-        failed_s: when the last of them did, on the same clock.
+        range_factor: Real range divided by the declared range.
+        rate_factor: Measured bandwidth divided by the declared one, well inside the range.
+        last_beacon_s: Time of the last beacon on the clock of `now_s`, negative infinity before the first.
+        failures: Failed attempts to connect since the link last worked.
+        last_failure_s: Time of the last failed attempt, on the same clock.
     """
 
     range_factor: float = 1.0
     rate_factor: float = 1.0
-    heard_s: float = float("-inf")
+    last_beacon_s: float = float("-inf")
     failures: int = 0
-    failed_s: float = float("-inf")
+    last_failure_s: float = float("-inf")
 
 
 @dataclass(frozen=True, slots=True)
-class Settings:
-    """Times and costs of switching.
+class LinkSettings:
+    """Times and costs of link and path switches.
 
     Attributes:
-        horizon_s: how far ahead is planned.
-        step_s: resolution of the plan.
-        link_up_s: from the command to connect until the link carries traffic (thesis 8.9.1: 0.62 s).
-        probe_s: for how long a new link is measured before traffic moves to it.
-        drain_s: for how long connections on the old path may finish in a planned switch.
-        dwell_s: a working link is kept at least for so long, unless it is about to be lost.
-        switch_cost_s: what one change of link costs, in seconds of the advantage of the best direct link.
-        hysteresis: by which share another target must be better than the present one.
-        region_trust_s: for how long a velocity is believed in region navigation.
-        edge: share of the reach inside which a link offers all; from there to the reach it fades.
+        horizon_s: Planning horizon, in seconds.
+        step_s: Resolution of the plan, in seconds.
+        link_up_s: Time from the command to connect until the link carries traffic (thesis 8.9.1: 0.62 s).
+        probe_s: Time for which a new link is measured before traffic moves to it.
+        drain_s: Time before the end of the range at which traffic leaves the link, so that connections can finish.
+        dwell_s: Minimum time for which a working link is kept, unless it is about to be lost.
+        switch_cost_s: Cost of one change of link, in seconds of the advantage of the best direct link.
+        hysteresis: Share by which another path must be better than the current one.
+        region_trust_s: Time for which a velocity is extrapolated in region navigation.
+        edge: Share of the range inside which a link offers its full bandwidth. The bandwidth fades from there to
+            the range.
     """
 
     horizon_s: float = 45.0
@@ -137,8 +138,8 @@ class Settings:
 
 
 @dataclass(frozen=True, slots=True)
-class Segment:
-    """A piece of the plan: from when on which peer is linked to; empty for the cloud path alone."""
+class PlanSegment:
+    """Segment of a link plan: start in seconds from now, and the linked peer (empty for the cloud path alone)."""
 
     begin_s: float
     peer: str
@@ -146,33 +147,33 @@ class Segment:
 
 @dataclass(frozen=True, slots=True)
 class LinkDecision:
-    """Which peer the drone's direct link should go to now, and why.
+    """Decision on the peer of the drone's direct link.
 
     Attributes:
-        peer: empty for none.
-        changes: whether that differs from the link as it is.
-        code: CamelCase, for programs.
-        reason: one sentence for people.
-        plan: what is expected over the horizon, from now on, in seconds from now.
+        peer: Name of the peer, empty for no link.
+        changes: True if the peer differs from that of the current link.
+        code: Reason in CamelCase, for programs.
+        reason: Reason in one sentence, for people.
+        plan: Expected links over the horizon.
     """
 
     peer: str
     changes: bool
     code: str
     reason: str
-    plan: tuple[Segment, ...] = field(default=())
+    plan: tuple[PlanSegment, ...] = field(default=())
 
 
 @dataclass(frozen=True, slots=True)
-class TargetDecision:
-    """Which path the traffic of a hybrid component should take now, and why.
+class PathDecision:
+    """Decision on the path of a hybrid component's traffic.
 
     Attributes:
-        direct: the direct link, or else the cloud path.
-        changes: whether that differs from the path as it is.
-        planned: whether the old path still lives, so that connections may finish on it.
-        code: CamelCase, for programs.
-        reason: one sentence for people.
+        direct: True for the direct link, False for the cloud path.
+        changes: True if the path differs from the current one.
+        planned: True if the old path still works, so that connections may finish on it.
+        code: Reason in CamelCase, for programs.
+        reason: Reason in one sentence, for people.
     """
 
     direct: bool

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from fractus_core.linking.values import Position
+from fractus_core.linking import LocalPosition
 
 from fractus_sim.scenarios.links.podlogs import Line
 
@@ -118,7 +118,7 @@ class Evidence:
 
     pictures: tuple[Picture, ...]
     switches: tuple[Switch, ...]
-    track: tuple[tuple[float, Position], ...]
+    track: tuple[tuple[float, LocalPosition], ...]
 
     @property
     def longest_gap_s(self) -> float:
@@ -150,7 +150,7 @@ class Evidence:
         return dict(sorted(Counter(first).items()))
 
 
-def read(lines: Sequence[Line], track: Iterable[tuple[float, Position]], drone: str) -> Evidence:
+def read(lines: Sequence[Line], track: Iterable[tuple[float, LocalPosition]], drone: str) -> Evidence:
     """Read a run from its logs."""
     pictures = _pictures(lines)
     switches = _switches(line for line in lines if line.container == AGENT and line.node == drone)

@@ -13,7 +13,7 @@ from fractus_cluster.cluster import Cluster
 from fractus_cluster.errors import ClusterError
 from fractus_cluster.hardware import RADIO_LINK
 from fractus_cluster.images.build import build_images
-from fractus_core.linking.values import Position
+from fractus_core.linking import LocalPosition
 from fractus_radio.follower import Follower, parse_address
 
 from fractus_sim.demo.clusters import ROOT, documents, install_fractus, kube_of
@@ -59,7 +59,7 @@ def _mission(site: Site, cluster: Cluster, kube: Kube, out: Path, tell: Tell) ->
     install_fractus(kube)
     kube.apply(documents(EXAMPLE / "depot.yaml"))
     wait_ready(kube, READY_S, lambda _line: None)
-    track: list[tuple[float, Position]] = []
+    track: list[tuple[float, LocalPosition]] = []
 
     def at(lat: float, lon: float, alt: float) -> None:
         track.append((time.time(), site.position(lat, lon, alt)))

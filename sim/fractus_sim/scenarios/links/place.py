@@ -8,8 +8,7 @@ from typing import Any
 
 from fractus_cluster.spec import ClusterSpec, NodeSpec, WifiHardware, load_spec
 from fractus_core.geo import LocalFrame
-from fractus_core.linking import PathMetrics, Peer
-from fractus_core.linking.values import Position
+from fractus_core.linking import LocalPosition, PathMetrics, Peer
 
 from fractus_sim.demo.clusters import ROOT, documents
 
@@ -34,13 +33,13 @@ class Site:
 
     cluster: ClusterSpec
     peers: tuple[Peer, ...]
-    edges: dict[str, Position]
-    path: tuple[Position, ...]
+    edges: dict[str, LocalPosition]
+    path: tuple[LocalPosition, ...]
     factor: float
     frame: LocalFrame
     ground_m: float
 
-    def position(self, lat: float, lon: float, alt: float) -> Position:
+    def position(self, lat: float, lon: float, alt: float) -> LocalPosition:
         """Of degrees, and metres above mean sea level."""
         east, north = self.frame.xy(lat, lon)
         return east, north, alt - self.ground_m

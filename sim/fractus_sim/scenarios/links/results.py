@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from fractus_core.linking.values import Position
+from fractus_core.linking import LocalPosition
 
 from fractus_sim.scenarios.links.evidence import Evidence, Switch
 from fractus_sim.scenarios.links.place import Site
@@ -46,7 +46,7 @@ def scene_of(site: Site, run: Evidence) -> tuple[Scene, float]:
     grid = np.arange(times[0], times[-1], STEP_S)
     places = np.array([position for _, position in flown])
     columns = [np.interp(grid, times, places[:, axis]) for axis in range(3)]
-    positions: list[Position] = [(float(x), float(y), float(z)) for x, y, z in zip(*columns, strict=True)]
+    positions: list[LocalPosition] = [(float(x), float(y), float(z)) for x, y, z in zip(*columns, strict=True)]
     coming, waypoints = list(site.path[1:]), []
     for position in positions:
         if len(coming) > 1 and math.dist(position, coming[0]) <= ARRIVED_M:

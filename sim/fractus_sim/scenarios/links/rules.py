@@ -6,17 +6,28 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from fractus_core.linking import NO_LINK, Link, PathMetrics, Peer, Phase, Reach, Settings, Track, heuristic, plan_link
-from fractus_core.linking.learning import failed, heard, lost
-from fractus_core.linking.values import Position
+from fractus_core.linking import (
+    NO_LINK,
+    LearnedRange,
+    LinkPhase,
+    LinkSettings,
+    LinkState,
+    LocalPosition,
+    PathMetrics,
+    Peer,
+    Track,
+    find_heuristic,
+    plan_link,
+)
+from fractus_core.linking.range_model import with_contact, with_failure, with_loss
 
 STEP_S = 0.1
 LINK_UP_STEPS = 9
 """0.92 s: until a link is up and measured."""
 DECIDE_STEPS, BEACON_STEPS = 5, 10
 AHEAD_M = 20.0
-INGRESS = heuristic("max", "ingress-bandwidth")
-SETTINGS = Settings()
+INGRESS = find_heuristic("max", "ingress-bandwidth")
+SETTINGS = LinkSettings()
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,8 +44,8 @@ class Scene:
         direct_mbps: what a direct link really carries inside its reach.
     """
 
-    positions: Sequence[Position]
-    waypoints: Sequence[tuple[Position, ...]]
+    positions: Sequence[LocalPosition]
+    waypoints: Sequence[tuple[LocalPosition, ...]]
     speed: float
     peers: Sequence[Peer]
     cloud: PathMetrics
@@ -52,7 +63,7 @@ class Scene:
         return self.direct_mbps - self.cloud.ingress_mbps
 
 
-def along(path: Sequence[Position], speed: float) -> tuple[list[Position], list[tuple[Position, ...]]]:
+def along(path: Sequence[LocalPosition], speed: float) -> tuple[list[LocalPosition], list[tuple[LocalPosition, ...]]]:
     """Positions and coming waypoints, one every `STEP_S`, of a flight of constant speed along a path."""
     at, coming = path[0], list(path[1:])
     positions, waypoints = [], []
@@ -85,18 +96,18 @@ def oracle(scene: Scene) -> float:
     return value[""][0]
 
 
-Rule = Callable[[Scene, int, Link, dict[str, Reach]], str]
+Rule = Callable[[Scene, int, LinkState, dict[str, LearnedRange]], str]
 
 
-def ours(scene: Scene, step: int, link: Link, reaches: dict[str, Reach]) -> str:
+def ours(scene: Scene, step: int, link: LinkState, ranges: dict[str, LearnedRange]) -> str:
     """The receding-horizon plan."""
     track = Track(scene.positions[step], scene.speed, scene.waypoints[step])
     return plan_link(
-        track, scene.peers, scene.cloud, link, step * STEP_S, heuristic=INGRESS, settings=SETTINGS, reaches=reaches
+        track, scene.peers, scene.cloud, link, step * STEP_S, heuristic=INGRESS, settings=SETTINGS, ranges=ranges
     ).peer
 
 
-def thesis(scene: Scene, step: int, _link: Link, _reaches: dict[str, Reach]) -> str:
+def thesis(scene: Scene, step: int, _link: LinkState, _reaches: dict[str, LearnedRange]) -> str:
     """The nearest peer in declared range, where the drone flies towards its next waypoint (thesis 8.6)."""
     at, goal = scene.positions[step], scene.waypoints[step][0]
     share = min(AHEAD_M / max(math.dist(at, goal), 1e-9), 1.0)
@@ -108,41 +119,41 @@ def thesis(scene: Scene, step: int, _link: Link, _reaches: dict[str, Reach]) -> 
 def carried(scene: Scene, rule: Rule) -> tuple[float, int]:
     """Mbit that a rule carries beyond the cloud path when it decides twice a second, and how many links it makes."""
     link, gain, links, coming = NO_LINK, 0.0, 0, 0
-    reaches: dict[str, Reach] = {}
+    ranges: dict[str, LearnedRange] = {}
     nodes = {node.name: node for node in scene.peers}
     for step in range(len(scene.positions)):
         now_s = step * STEP_S
         node = nodes.get(link.peer)
         if node is not None and not scene.rate(step, node):
-            _learn_loss(scene, step, node, link, reaches)
+            _learn_loss(scene, step, node, link, ranges)
             link = NO_LINK
-        elif link.phase is Phase.CONNECTING:
+        elif link.phase is LinkPhase.CONNECTING:
             coming -= 1
             if coming <= 0:
-                link = Link(Phase.UP, link.peer, now_s)
+                link = LinkState(LinkPhase.UP, link.peer, now_s)
         elif node is not None:
             gain += scene.gain_mbps * STEP_S
         if step % BEACON_STEPS == 0:
-            _hear(scene, step, reaches)
+            _hear(scene, step, ranges)
         if step % DECIDE_STEPS == 0:
-            wanted = rule(scene, step, link, reaches)
+            wanted = rule(scene, step, link, ranges)
             if wanted != link.peer:
-                link = Link(Phase.CONNECTING, wanted, now_s) if wanted else NO_LINK
+                link = LinkState(LinkPhase.CONNECTING, wanted, now_s) if wanted else NO_LINK
                 coming, links = LINK_UP_STEPS, links + bool(wanted)
     return gain, links
 
 
-def _learn_loss(scene: Scene, step: int, node: Peer, link: Link, reaches: dict[str, Reach]) -> None:
-    known = reaches.get(node.name, Reach())
-    if link.phase is Phase.UP:
-        reaches[node.name] = lost(known, math.dist(scene.positions[step], node.position) / node.range_m)
+def _learn_loss(scene: Scene, step: int, node: Peer, link: LinkState, ranges: dict[str, LearnedRange]) -> None:
+    known = ranges.get(node.name, LearnedRange())
+    if link.phase is LinkPhase.UP:
+        ranges[node.name] = with_loss(known, math.dist(scene.positions[step], node.position) / node.range_m)
     else:
-        reaches[node.name] = failed(known, step * STEP_S)
+        ranges[node.name] = with_failure(known, step * STEP_S)
 
 
-def _hear(scene: Scene, step: int, reaches: dict[str, Reach]) -> None:
+def _hear(scene: Scene, step: int, ranges: dict[str, LearnedRange]) -> None:
     """A radio hears the beacons of the peers around it about once a second."""
     for other in scene.peers:
         if scene.rate(step, other):
             distance = math.dist(scene.positions[step], other.position) / other.range_m
-            reaches[other.name] = heard(reaches.get(other.name, Reach()), distance, step * STEP_S)
+            ranges[other.name] = with_contact(ranges.get(other.name, LearnedRange()), distance, step * STEP_S)

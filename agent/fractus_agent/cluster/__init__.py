@@ -1,1 +1,0 @@
-"""All Kubernetes I/O of the agent."""

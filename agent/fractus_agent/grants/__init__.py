@@ -1,1 +1,0 @@
-"""The node's Grants: verified, on disk, and reported."""

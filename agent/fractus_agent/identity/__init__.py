@@ -1,1 +1,0 @@
-"""The node's certificate: requested, verified, renewed."""

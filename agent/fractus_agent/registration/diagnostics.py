@@ -1,0 +1,38 @@
+"""Diagnostics that the node's services leave in files: heads of audit logs, and recording problems."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+_HEAD = re.compile(r"[a-z0-9-]{1,63}:\d{1,15}:[0-9a-f]{64}")
+
+MAX_PROBLEM_BYTES = 500
+
+
+def read_audit_heads(directory: Path) -> list[str]:
+    """Return LOG:NUMBER:HASH of each log's latest checkpoint, for `fractus audit verify --since`. Skip invalid files."""
+    heads = []
+    for path in sorted(directory.glob("*.checkpoint")):
+        try:
+            checkpoint = json.loads(path.read_bytes())
+            head = f"{checkpoint['log']}:{checkpoint['seq']}:{checkpoint['hash']}"
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
+            continue
+        if _HEAD.fullmatch(head):
+            heads.append(head)
+    return heads
+
+
+def read_recording_problems(state: Path) -> list[str]:
+    """Return SERVICE: PROBLEM of each service that cannot record, from files below the node's state directory."""
+    problems = []
+    for path in sorted(state.glob("*/recording.problem")):
+        try:
+            problem = path.read_bytes()[:MAX_PROBLEM_BYTES].decode(errors="replace").strip()
+        except OSError:
+            continue
+        if problem:
+            problems.append(f"{path.parent.name}: {problem}")
+    return problems

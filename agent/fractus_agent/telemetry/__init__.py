@@ -1,1 +1,0 @@
-"""The state of the drone, from the mobility service of the node."""

@@ -1,0 +1,577 @@
+"""A drone with a pod, edge nodes with a pod each, a cloud, and a radio: network namespaces in which agents run direct links."""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import queue
+import re
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
+from ipaddress import IPv4Address
+from pathlib import Path
+from typing import Any
+
+from fractus_agent.links.device_addresses import link_address
+from fractus_agent.redirector.netlink import NETLINK_NETFILTER, NLM_F_ACK, Netlink, in_namespace, message
+from fractus_agent.redirector.nft_maps import Endpoint
+from fractus_core.identity.authority import Authority
+from fractus_core.linking.trajectory_estimator import FlatFrame
+from fractus_radio.medium import Medium, Station
+from fractus_radio.propagation import Propagation
+from fractus_radio.radio import Radio
+from fractus_radio.taps import Tap
+from fractus_runtime.audit_chain import verify
+from fractus_runtime.audit_checkpoints import read_checkpoint
+from redirect_rig import CLIENT, SERVER, run
+
+VIP = Endpoint(IPv4Address("10.96.0.5"), 8080)
+RANGE_M = 80.0
+TIMEOUT_S = 40.0
+PROGRAM = Path(__file__).with_name("linked_agent.py")
+ORIGIN = (39.36, 22.94)
+_FRAME = FlatFrame(*ORIGIN)
+_PER_EAST, _PER_NORTH = (
+    _FRAME.from_degrees(ORIGIN[0], ORIGIN[1] + 1, 0)[0],
+    _FRAME.from_degrees(ORIGIN[0] + 1, ORIGIN[1], 0)[1],
+)
+
+
+def place(east: float, north: float, up: float = 0.0) -> dict[str, Any]:
+    """A position of a manifest."""
+    lat, lon = ORIGIN[0] + north / _PER_NORTH, ORIGIN[1] + east / _PER_EAST
+    return {"lat": lat, "lon": lon, "alt": up, "altitudeReference": "home"}
+
+
+STREAM = """
+import itertools, queue, sys, threading, time
+import grpc
+channel = grpc.insecure_channel(sys.argv[1])
+call = channel.stream_stream("/test/Stream")
+print("ready", flush=True)
+number = 0
+while True:
+    asked = queue.Queue()
+    replies = call(iter(asked.get, None))
+    try:
+        while True:  # one at a time: what was not answered is sent again on the next stream
+            asked.put(f"{number:08d}".encode())
+            print(number, next(replies).decode().split()[0], f"{time.monotonic():.3f}", flush=True)
+            number += 1
+            time.sleep(0.02)
+    except grpc.RpcError as error:
+        print(number, "REOPENED", error.code().name, flush=True)
+"""
+"""A client whose one stream never ends, and is never idle for long."""
+
+FOREIGN = """table ip kube-proxy {
+    chain pre { type nat hook prerouting priority -100; ip daddr 10.97.0.9 tcp dport 80 dnat to 10.88.0.2:8080; }
+}"""
+"""Another program's rules."""
+
+
+class Agent:
+    """A node in a network namespace, with a radio, an uplink to the cloud, a pod, and an agent's direct links."""
+
+    def __init__(self, world: World, name: str, kind: str, at: tuple[float, float]) -> None:
+        self.world, self.name, self.kind, self.at = world, name, kind, at
+        self.number = len(world.agents) + 1
+        self.pod = f"10.88.{self.number}.2"
+        self.folder = world.directory / name
+        self.pods = self.folder / "pods"
+        self.pods.mkdir(parents=True)
+        world.namespace(name)
+        self.add_pod()
+        world.cable(name, "lte0", f"10.90.{self.number}.1/24", "cloud", f"to{self.number}", f"10.90.{self.number}.2/24")
+        run(*world.inside(name), "ip", "route", "add", "default", "via", f"10.90.{self.number}.2")
+        run(*world.inside("cloud"), "ip", "route", "add", f"10.88.{self.number}.0/24", "via", f"10.90.{self.number}.1")
+        self.add_radio()
+        self.run("nft", "-f", "-", text=FOREIGN)
+        self.certify(name)
+        # So slow that a link is better also where a busy machine hardly gets to carry its frames.
+        self.describe(uplink_mbps=1)
+        self._process: subprocess.Popen[str] | None = None
+        self._reading: threading.Thread | None = None
+        self._said: queue.Queue[str] = queue.Queue()
+        self.statuses: dict[str, dict[str, Any]] = {}
+
+    def add_pod(self) -> None:
+        """The namespace of its pod, as the container runtime makes it."""
+        name, net = f"{self.name}p", f"10.88.{self.number}"
+        self.world.namespace(name)
+        (self.pods / "pod").unlink(missing_ok=True)
+        (self.pods / "pod").symlink_to(self.world.path(name))
+        self.world.cable(self.name, "pod0", f"{net}.1/24", name, "eth0", f"{self.pod}/24")
+        run(*self.world.inside(name), "ip", "route", "add", "default", "via", f"{net}.1")
+
+    def lose_power(self) -> None:
+        """Agent and pod end; what is not on disk is gone: pods' namespaces, packet filter, connections, addresses of the device."""
+        self.kill()
+        self.world.end(f"{self.name}p")
+        self.run("ip", "link", "del", "pod0")
+        run("ip", "netns", "del", self.world.name(f"{self.name}p"))
+        run(*self.world.inside(self.name), "nft", "flush", "ruleset")
+        for words in (["addr", "flush", "dev", "wlan0"], ["link", "set", "wlan0", "down", "alias", ""]):
+            run(*self.world.inside(self.name), "ip", *words)
+        in_namespace(self.world.path(self.name), _forget_connections)
+        self.add_pod()
+
+    def describe(self, uplink_mbps: float) -> None:
+        """What the node's description says."""
+        interfaces = [
+            {"technology": "4G", "bandwidth": uplink_mbps},
+            {
+                "technology": "WiFi",
+                "device": "wlan0",
+                "range": RANGE_M,
+                "pairing": {"mode": "adhoc", "networkId": "net"},
+            },
+        ]
+        spec: dict[str, Any] = {"interfaces": interfaces}
+        if self.kind == "EdgeNode":
+            spec["location"] = {"lat": place(*self.at)["lat"], "lon": place(*self.at)["lon"]}
+        self._write(
+            "node.json",
+            {"apiVersion": "fractus.dev/v1alpha1", "kind": self.kind, "metadata": {"name": self.name}, "spec": spec},
+        )
+
+    def add_radio(self) -> None:
+        self.hardware = bytes([2, 0, 0, 0, 0, self.number])
+        tap = Tap(self.world.path(self.name), "wlan0", self.hardware)
+        with self.world.turn:
+            self.world.radio.add_station(self.name, tap, Station((*self.at, 0.0), self.hardware, "net"))
+
+    def uplink(self, *, up: bool) -> None:
+        """The way to the cloud goes, or comes back."""
+        run(*self.world.inside(self.name), "ip", "link", "set", "lte0", "up" if up else "down")
+        if up:
+            way = f"10.90.{self.number}.2"
+            run(*self.world.inside(self.name), "ip", "route", "replace", "default", "via", way)
+
+    def api(self, *, up: bool) -> None:
+        """The API server is in reach of the agent, or not."""
+        self._write("api.json", up)
+
+    def lose_radio(self) -> None:
+        """The device goes, as one on USB does."""
+        self._rename("wlan0", "gone0")
+
+    def regain_radio(self) -> None:
+        """It comes back, without its address."""
+        self._rename("gone0", "wlan0")
+
+    def _rename(self, before: str, after: str) -> None:
+        for words in (["down"], ["name", after]):
+            run(*self.world.inside(self.name), "ip", "link", "set", before, *words)
+
+    def join(self, address: str) -> None:
+        """Be in the network of the direct links without an agent."""
+        for words in (["addr", "add", f"{address}/16", "dev", "wlan0"], ["link", "set", "wlan0", "up"]):
+            run(*self.world.inside(self.name), "ip", *words)
+
+    def reaches(self, address: str, port: int) -> bool:
+        """Whether a connection can be made from the node."""
+        program = f"import socket; socket.create_connection(({address!r}, {port}), 2).close()"
+        done = subprocess.run(
+            [*self.world.inside(self.name), sys.executable, "-c", program], capture_output=True, timeout=30, check=False
+        )
+        return done.returncode == 0
+
+    def metrics(self) -> dict[str, float]:
+        """What Prometheus is told on the node's loopback."""
+        program = (
+            "import urllib.request as r; print(r.urlopen('http://127.0.0.1:46812/metrics', timeout=10).read().decode())"
+        )
+        lines = self._show("env", "-u", "http_proxy", "-u", "HTTP_PROXY", sys.executable, "-c", program).splitlines()
+        samples = (line.rsplit(" ", 1) for line in lines if line and not line.startswith("#"))
+        return {name: float(value) for name, value in samples}
+
+    def certify(self, name: str, authority: Authority | None = None) -> None:
+        """Give it a node's certificate."""
+        tls = self.folder / "tls"
+        tls.mkdir(exist_ok=True)
+        for file, content in (authority or self.world.authority).issue_node(name, datetime.now(UTC)).items():
+            (tls / file).write_bytes(base64.b64decode(content))
+
+    def _write(self, name: str, content: Any) -> None:
+        fresh = self.folder / f".{name}.new"
+        fresh.write_text(json.dumps(content))
+        fresh.replace(self.folder / name)
+
+    def plan(self, *links: dict[str, Any]) -> None:
+        """What the operator wrote."""
+        self._write("links.json", list(links))
+
+    def fly(self, east: float, north: float = 0.0, velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
+        """Where the drone is and what telemetry says of it."""
+        self.see(east, north, velocity)
+        self.world.command(station=self.name, position=[east, north, 0.0])
+
+    def see(self, east: float, north: float = 0.0, velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
+        """What telemetry says alone."""
+        where = place(east, north)
+        self._write("telemetry.json", {"lat": where["lat"], "lon": where["lon"], "up": 0.0, "velocity": velocity})
+
+    def start(self) -> None:
+        log = (self.folder / "agent.log").open("a")
+        self._process = subprocess.Popen(
+            [*self.world.inside(self.name), sys.executable, str(PROGRAM), str(self.folder)],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True,
+        )  # fmt: skip
+        log.close()
+        assert self._process.stdout is not None
+        assert self._process.stdout.readline() == "ready\n"
+        self._reading = threading.Thread(target=self._read, args=(self._process.stdout,))
+        self._reading.start()
+
+    def _read(self, output: Any) -> None:
+        for line in output:
+            said = json.loads(line)
+            self.statuses[said["link"]] = said["status"]
+        output.close()
+
+    @property
+    def pid(self) -> int:
+        assert self._process is not None
+        return self._process.pid
+
+    def kill(self) -> None:
+        """As kubelet, the kernel or a loss of power would."""
+        assert self._process is not None
+        self._process.kill()
+        self._end()
+
+    def stop(self) -> None:
+        """As an upgrade would."""
+        assert self._process is not None
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        self._end()
+
+    def _end(self) -> None:
+        assert self._process is not None
+        self._process.wait(TIMEOUT_S)
+        if self._process.stdin is not None and not self._process.stdin.closed:
+            self._process.stdin.close()
+        if self._reading is not None:
+            self._reading.join()
+        self._process = None
+
+    def clear(self) -> None:
+        if self._process is not None:
+            self.stop()
+
+    def log(self) -> str:
+        path = self.folder / "agent.log"
+        return path.read_text() if path.exists() else ""
+
+    def audit(self, kind: str) -> list[dict[str, Any]]:
+        """Entries of its audit log, whose chain is sound and signed."""
+        path = self.folder / "audit" / "links.jsonl"
+        lines = path.read_bytes().splitlines(keepends=True)
+        signed = read_checkpoint(path.with_suffix(".checkpoint").read_bytes())
+        assert (signed.log, signed.node.rpartition("/")[2]) == ("links", self.name)
+        assert not verify(lines, since=signed.link).problem
+        return [entry for entry in map(json.loads, lines) if entry["kind"] == kind]
+
+    def status(self, link: str) -> dict[str, Any]:
+        return self.statuses.get(link, {})
+
+    def condition(self, link: str, kind: str) -> dict[str, Any]:
+        return next((c for c in self.status(link).get("conditions", ()) if c["type"] == kind), {})
+
+    def _show(self, *words: str) -> str:
+        return subprocess.run(
+            [*self.world.inside(self.name), *words], capture_output=True, text=True, timeout=30, check=False
+        ).stdout
+
+    def cut_at(self) -> list[float]:
+        """When it switched at once, as after the loss of a link, by its own clock: Unix time in seconds."""
+        lines = (line.split(" ", 1) for line in self.log().splitlines() if "redirector: switched" in line)
+        return [float(at) for at, text in lines if "planned=False" in text]
+
+    def redirects(self) -> set[str]:
+        """Elements of the map, such as `10.96.0.5 . tcp . 8080`."""
+        return set(
+            re.findall(r"([\d.]+ \. \w+ \. \d+) timeout", self._show("nft", "list", "map", "ip", "fractus", "targets"))
+        )
+
+    def tables(self) -> set[str]:
+        """Ours, and not those of another program."""
+        return set(self._show("nft", "list", "tables").split("\n")) - {"", "table ip kube-proxy"}
+
+    def addresses(self) -> list[str]:
+        return re.findall(r"169\.254\.[\d.]+/\d+", self._show("ip", "addr", "show", "dev", "wlan0"))
+
+    def routes(self) -> list[str]:
+        return sorted(self._show("ip", "route").splitlines())
+
+    def run(self, *words: str, text: str = "") -> str:
+        """Run a command in its namespace, with this as its input; its output."""
+        inside = [*self.world.inside(self.name), *words]
+        return subprocess.run(inside, input=text, capture_output=True, text=True, timeout=30, check=True).stdout
+
+    def state(self) -> dict[str, Any]:
+        """All that links may change of a node: packet filter, routes, addresses, its device, and connections of ours."""
+        addresses = re.sub(r"(?m)^\d+: | valid_lft.*", "", self._show("ip", "-o", "-4", "address"))
+        return {
+            "ruleset": self._show("nft", "list", "ruleset"),
+            "rules": self._show("ip", "rule"),
+            # A cable's carrier comes up a moment after its ends.
+            "routes": sorted(
+                self._show("ip", "-4", "route", "show", "table", "all").replace("linkdown ", "").splitlines()
+            ),
+            "addresses": sorted(addresses.splitlines()),
+            # A device gets a queue when it is up for the first time, and keeps it.
+            "device": re.sub(r" qdisc \w+", "", self._show("ip", "address", "show", "dev", "wlan0")),
+            "connections": self.world.conntrack(self),
+        }
+
+
+class World:
+    """The namespaces, the radio on a thread, and an authority."""
+
+    def __init__(self, directory: Path) -> None:
+        self.directory = directory
+        self.tag = f"fxw{os.getpid() % 100000}"
+        self.turn = threading.Lock()
+        self.radio = Radio(Medium(Propagation.reaching(RANGE_M), 1), directory / "radio.sock")
+        self.authority = Authority.generate(datetime.now(UTC))
+        self.agents: dict[str, Agent] = {}
+        self._namespaces: list[str] = []
+        self._processes: list[tuple[str, subprocess.Popen[str]]] = []
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._carry)
+        self._thread.start()
+        self.namespace("cloud")
+        run(*self.inside("cloud"), "ip", "addr", "add", f"{VIP.address}/32", "dev", "lo")
+
+    def _carry(self) -> None:
+        while not self._over.is_set():
+            with self.turn:
+                self.radio.turn(0.01)
+            time.sleep(0)
+
+    def command(self, **command: object) -> None:
+        with self.turn:
+            self.radio.command(command)
+
+    def name(self, node: str) -> str:
+        return f"{self.tag}{node}"
+
+    def path(self, node: str) -> Path:
+        return Path("/run/netns", self.name(node))
+
+    def inside(self, node: str) -> list[str]:
+        return ["nsenter", f"--net={self.path(node)}"]
+
+    def namespace(self, node: str) -> None:
+        run("ip", "netns", "add", self.name(node))
+        self._namespaces.append(self.name(node))
+        run(*self.inside(node), "ip", "link", "set", "lo", "up")
+        run(*self.inside(node), "sysctl", "-qw", "net.ipv4.ip_forward=1")
+
+    def cable(self, left: str, device: str, address: str, right: str, other: str, peer: str) -> None:
+        run(
+            *self.inside(left), "ip", "link", "add", device, "type", "veth",
+            "peer", "name", other, "netns", self.name(right),
+        )  # fmt: skip
+        for node, link, ip in ((left, device, address), (right, other, peer)):
+            run(*self.inside(node), "ip", "addr", "add", ip, "dev", link)
+            run(*self.inside(node), "ip", "link", "set", link, "up")
+
+    def drone(self, name: str = "d1") -> Agent:
+        self.agents[name] = found = Agent(self, name, "Drone", (0.0, 0.0))
+        found.fly(0.0)
+        return found
+
+    def edge(self, name: str, east: float, north: float = 0.0) -> Agent:
+        self.agents[name] = Agent(self, name, "EdgeNode", (east, north))
+        return self.agents[name]
+
+    def link(self, drone: Agent, edge: Agent, **spec: Any) -> dict[str, Any]:
+        """A DirectLink, as the operator writes it."""
+        service = {
+            "component": "Server", "instance": f"server-{edge.name}",
+            "virtual": {"address": str(VIP.address), "port": VIP.port},
+            "target": {"address": edge.pod, "port": VIP.port},
+        }  # fmt: skip
+        base = {
+            "drone": drone.name, "node": edge.name, "technology": "WiFi",
+            "application": {"namespace": "default", "name": "app", "uid": "u"},
+            "pairing": {"mode": "adhoc", "networkId": "net"}, "range": RANGE_M, "bandwidth": 12.0,
+            "position": place(*edge.at), "heuristic": {"kind": "max", "metric": "ingress-bandwidth"},
+            "services": [service],
+        }  # fmt: skip
+        return {
+            "apiVersion": "fractus.dev/v1alpha1", "kind": "DirectLink",
+            "metadata": {"name": f"app-{drone.name}-{edge.name}", "uid": "u", "generation": 1}, "spec": base | spec,
+        }  # fmt: skip
+
+    def states(self) -> dict[str, dict[str, Any]]:
+        """All that links may change, by node."""
+        return {name: agent.state() for name, agent in self.agents.items()}
+
+    def python(self, node: str, program: str, *arguments: object) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            [*self.inside(node), sys.executable, "-c", program, *map(str, arguments)], stdout=subprocess.PIPE, text=True
+        )
+        self._processes.append((node, process))
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        return process
+
+    def end(self, node: str) -> None:
+        """End the programs that run in a namespace."""
+        for _, process in (each for each in self._processes if each[0] == node):
+            process.kill()
+            process.wait()
+
+    def serve(self, work_s: float = 0.005) -> None:
+        """Start the base instance in the cloud, and one on each edge node."""
+        self.python("cloud", SERVER, "cloud", f"{VIP.address}:{VIP.port}", work_s)
+        for agent in self.agents.values():
+            if agent.kind == "EdgeNode":
+                self.serve_at(agent, work_s)
+
+    def serve_at(self, edge: Agent, work_s: float = 0.005) -> None:
+        """Start the instance on an edge node."""
+        self.python(f"{edge.name}p", SERVER, edge.name, f"{edge.pod}:{VIP.port}", work_s)
+
+    def client(self, drone: Agent, calls: int, pause_s: float = 0.02, size: int = 10) -> Client:
+        return Client(self.python(f"{drone.name}p", CLIENT, f"{VIP.address}:{VIP.port}", calls, pause_s, size))
+
+    def conntrack(self, agent: Agent) -> int:
+        """Connections of a node that carry a mark of ours."""
+        listed = in_namespace(self.path(agent.name), lambda: Path("/proc/thread-self/net/nf_conntrack"))
+        text = in_namespace(self.path(agent.name), lambda: listed.read_text() if listed.exists() else "")
+        marks = [int(found) for found in re.findall(r"mark=(\d+)", text)]
+        return len([mark for mark in marks if mark & 0xFFF00000 == 0xF6A00000])
+
+    def close(self) -> None:
+        for _, process in self._processes:
+            process.kill()
+            process.wait()
+            if process.stdout is not None:
+                process.stdout.close()
+        for agent in self.agents.values():
+            agent.clear()
+        self._over.set()
+        self._thread.join()
+        self.radio.close()
+        for name in self._namespaces:
+            subprocess.run(["ip", "netns", "del", name], capture_output=True, check=False)
+
+
+def _forget_connections() -> None:
+    """Empty the connection tracking of the namespace that this runs in."""
+    netlink = Netlink(NETLINK_NETFILTER)
+    try:
+        sequence = netlink.sequence()
+        netlink.send(message(1 << 8 | 2, NLM_F_ACK, sequence, b"\x02\0\0\0"))
+        netlink.acknowledged({sequence})
+    finally:
+        netlink.close()
+
+
+class Client:
+    """A client that calls the virtual address, and what it was answered."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self.answers: list[list[str]] = []
+        self._process = process
+        self._thread = threading.Thread(target=self._read)
+        self._thread.start()
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            self.answers.append(line.split())
+
+    def all(self) -> list[list[str]]:
+        self._thread.join(120)
+        return self.answers
+
+    @property
+    def by(self) -> str:
+        """Who answered last."""
+        return self.answers[-1][1] if self.answers else ""
+
+    @property
+    def failed(self) -> list[list[str]]:
+        return [answer for answer in self.answers if answer[1] == "FAILED"]
+
+
+def until(holds: Callable[[], object], what: str, world: World | None = None, timeout_s: float = TIMEOUT_S) -> float:
+    """Wait for something; how long it took."""
+    begun = time.monotonic()
+    while time.monotonic() - begun < timeout_s:
+        if holds():
+            return time.monotonic() - begun
+        time.sleep(0.02)
+    logs = "".join(f"\n--- {a.name}\n{a.log()[-3000:]}\n{a.statuses}" for a in world.agents.values()) if world else ""
+    raise AssertionError(f"not in {timeout_s:g} s: {what}{logs}")
+
+
+def flying(world: World, *edges: Agent) -> Agent:
+    """A drone that has a link to each edge node, with everything running."""
+    drone = world.agents.get("d1") or world.drone()
+    links = [world.link(drone, edge) for edge in edges]
+    world.serve()
+    for edge, link in zip(edges, links, strict=True):
+        edge.plan(link)
+        edge.start()
+    drone.plan(*links)
+    drone.start()
+    return drone
+
+
+def unchanged(world: World, before: Mapping[str, Mapping[str, Any]]) -> None:
+    """Have no link planned any more; then every node is as it was before."""
+
+    def changes() -> list[tuple[str, str, Any, Any]]:
+        now = world.states()
+        return [
+            (name, what, was, now[name][what])
+            for name, all_ in before.items()
+            for what, was in all_.items()
+            if now[name][what] != was
+        ]
+
+    for agent in world.agents.values():
+        agent.plan()
+    with suppress(AssertionError):
+        until(lambda: not changes(), "nodes as they were")
+    left = changes()
+    assert not left, left
+
+
+@contextmanager
+def linked_world(directory: Path) -> Iterator[World]:
+    """A world that is removed at the end."""
+    found = World(directory)
+    try:
+        yield found
+    finally:
+        found.close()
+
+
+__all__ = [
+    "FOREIGN",
+    "STREAM",
+    "Agent",
+    "Client",
+    "World",
+    "flying",
+    "link_address",
+    "linked_world",
+    "place",
+    "unchanged",
+    "until",
+]

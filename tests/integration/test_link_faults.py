@@ -1,0 +1,170 @@
+"""Direct links after a loss of power, and with peers and strangers that do not play by the rules."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from linked_world import FOREIGN, STREAM, VIP, Client, World, flying, link_address, linked_world, unchanged, until
+from redirect_rig import SERVER
+
+pytestmark = [pytest.mark.root, pytest.mark.timeout(300)]
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    with linked_world(tmp_path) as found:
+        yield found
+
+
+@pytest.mark.parametrize("left", ["nothing", "half"])
+def test_nodes_that_lose_power_with_a_link_in_use(world: World, left: str) -> None:
+    edge, drone = world.edge("e1", 20.0), world.drone()
+    before = world.states()
+    flying(world, edge)
+    client = world.client(drone, 100_000, 0.1)
+    until(lambda: client.by == "e1", "an answer over the link", world)
+    for agent in (drone, edge):
+        rules = agent.run("nft", "list", "ruleset")
+        agent.lose_power()
+        # The API server may be out of reach: only what is on disk is known.
+        (agent.folder / "links.json").unlink()
+        if left == "nothing":
+            agent.run("nft", "-f", "-", text=FOREIGN)
+            continue
+        # What an operating system may bring back: rules as they were saved, and a device that is up with some address.
+        agent.run("nft", "-f", "-", text=rules)
+        agent.run("ip", "address", "add", "169.254.9.9/16", "dev", "wlan0")
+        agent.run("ip", "link", "set", "wlan0", "up")
+        (agent.pods / "ended").symlink_to("/run/netns/no-such-pod")
+    world.serve_at(edge)
+    client = world.client(drone, 100_000, 0.1)
+    for agent in (edge, drone):
+        agent.start()
+    until(lambda: client.by == "e1", "an answer over the link again", world)
+    if left == "nothing":
+        assert not client.failed
+    assert "restored from disk" in drone.log()
+    assert len(drone.redirects()) == len(edge.redirects()) == 1
+    for agent in (drone, edge):
+        assert agent.addresses() == [f"{link_address(agent.name)}/16"]
+    if left == "half":  # a device that was up stays up, without addresses
+        for agent in (drone, edge):
+            agent.plan()
+            until(lambda agent=agent: not agent.tables(), "no table of ours", world)
+            agent.run("ip", "link", "set", "wlan0", "down")
+    unchanged(world, before)
+
+
+BAD_PEER = """
+import asyncio, sys
+from ipaddress import IPv4Address
+from pathlib import Path
+from fractus_agent.links import pairing
+from fractus_agent.links.acceptor import Acceptor
+from fractus_agent.links.beacons import Beacons
+node, address, files, fault = sys.argv[1:]
+async def nothing(*_):
+    await asyncio.Event().wait()
+if fault == "silent":
+    pairing.Session.run = nothing
+async def linked(session):
+    print("paired", flush=True)
+    if fault == "no probes":
+        session.send = lambda message, send=session.send: nothing() if "arrived" in message else send(message)
+        await session.send({"routes": {"10.96.0.5:8080/TCP": 30000}})
+    await nothing()
+async def main():
+    print("ready", flush=True)
+    acceptor = Acceptor(Path(files), lambda _: "", linked)
+    await asyncio.gather(acceptor.run(IPv4Address(address)), Beacons(node, lambda _: None).run("wlan0"))
+asyncio.run(main())
+"""
+
+
+@pytest.mark.parametrize("fault", ["silent", "no routes", "no probes"])
+def test_a_peer_that_pairs_and_then_leaves_it_at_that(world: World, fault: str) -> None:
+    bad, other, drone = world.edge("e1", 5.0), world.edge("e2", 30.0), world.drone()
+    before = {name: state for name, state in world.states().items() if name != "e1"}
+    # The bad one promises more, and so it is asked first.
+    links = [world.link(drone, bad, bandwidth=13.0), world.link(drone, other)]
+    world.serve()
+    client = world.client(drone, 100_000, 0.1)
+    bad.join(str(link_address("e1")))
+    bad.run("ip", "route", "add", "255.255.255.255", "dev", "wlan0")
+    peer = Client(world.python("e1", BAD_PEER, "e1", link_address("e1"), bad.folder / "tls", fault))
+    drone.plan(*links)
+    drone.start()
+    until(lambda: ["paired"] in peer.answers, "that the bad one paired", world)
+    other.plan(links[1])
+    other.start()
+    until(lambda: client.by == "e2", "an answer over the link to the honest node", world)
+    assert "e1" not in {answer[1] for answer in client.answers}
+    assert not client.failed
+    unchanged(world, before)
+
+
+STRANGER = """
+import socket, struct, sys, time
+device, address, hardware = sys.argv[1:]
+raw = socket.socket(socket.AF_PACKET, socket.SOCK_RAW)
+raw.bind((device, 0))
+own, ip = bytes.fromhex(hardware), socket.inet_aton(address)
+frame = b"\\xff" * 6 + own + struct.pack(">HHHBBH", 0x0806, 1, 0x0800, 6, 4, 2) + own + ip + b"\\xff" * 6 + ip
+print("ready", flush=True)
+while True:  # "that address is here"
+    raw.send(frame)
+    time.sleep(0.05)
+"""
+
+
+def test_a_stranger_with_the_address_of_the_paired_node(world: World) -> None:
+    edge, drone, stranger = world.edge("e1", 20.0), world.drone(), world.edge("e9", 5.0)
+    before = {name: state for name, state in world.states().items() if name != "e9"}
+    flying(world, edge)
+    client = world.client(drone, 100_000, 0.05)
+    until(lambda: client.by == "e1", "an answer over the link", world)
+    address, port = str(link_address("e1")), int(next(iter(edge.redirects())).split(" . ")[2])
+    # It takes calls where the edge node does, and pairs with the certificate that it has.
+    stranger.join(address)
+    stranger.plan(world.link(drone, edge))
+    world.python("e9", SERVER, "stranger", f"{address}:{port}", 0.005)
+    paired = Client(world.python("e9", BAD_PEER, "e1", address, stranger.folder / "tls", "no routes"))
+    world.python("e9", STRANGER, "wlan0", address, stranger.hardware.hex())
+    until(lambda: drone.log().count("does not have its certificate") > 3, "refusals", world)
+    until(lambda: client.by == "cloud", "an answer of the cloud", world)
+    led = len(client.answers)
+    until(lambda: len(client.answers) > led + 60, "more answers", world)
+    assert "stranger" not in {answer[1] for answer in client.answers[led:]}
+    assert not paired.answers
+    # Gone, it is not asked any more, though the drone was told that the address is there.
+    world.end("e9")
+    stranger.run("ip", "link", "set", "wlan0", "down")
+    took_s = until(lambda: client.by == "e1", "an answer over the link", world, timeout_s=20.0)
+    print("from the stranger's end to the first answer:", took_s)
+    unchanged(world, before)
+
+
+@pytest.mark.parametrize("loss", ["planned", "abrupt"])
+def test_a_long_stream_is_reopened_and_answers_each_once(world: World, loss: str) -> None:
+    edge, drone = world.edge("e1", 20.0), world.drone()
+    before = world.states()
+    flying(world, edge)
+    stream = Client(world.python("d1p", STREAM, f"{VIP.address}:{VIP.port}"))
+    until(lambda: stream.by == "e1", "an answer over the link", world)
+    for _ in range(2):
+        if loss == "planned":
+            drone.fly(-57.0, velocity=(-3.0, 0.0, 0.0))
+        else:
+            world.command(station="d1", off=True)
+        until(lambda: stream.by == "cloud", "an answer of the cloud", world)
+        drone.fly(0.0)
+        world.command(station="d1", off=False)
+        until(lambda: stream.by == "e1", "an answer over the link again", world)
+    answered = [int(answer[0]) for answer in stream.answers if answer[1] in {"cloud", "e1"}]
+    assert answered == list(range(len(answered)))
+    ends = [answer[2] for answer in stream.answers if answer[1] == "REOPENED"]
+    assert ends
+    assert set(ends) <= {"UNAVAILABLE"}, "a status after which gRPC's clients try again"
+    unchanged(world, before)

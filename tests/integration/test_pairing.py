@@ -1,0 +1,269 @@
+"""Direct links over the simulated radio: TLS with node certificates on real devices; imposters, silence, competition, loss."""
+
+from __future__ import annotations
+
+import base64
+import os
+import queue
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from fractus_agent.links.beacons import decode, encode
+from fractus_agent.links.device_addresses import link_address
+from fractus_core.identity.authority import Authority
+from fractus_radio.medium import Medium, Station
+from fractus_radio.propagation import Propagation
+from fractus_radio.radio import Radio
+from fractus_radio.taps import Tap
+
+pytestmark = pytest.mark.root
+
+TIMEOUT_S = 30.0
+PROGRAM = Path(__file__).with_name("link_node.py")
+
+
+class Node:
+    """A node in a network namespace with a radio."""
+
+    def __init__(
+        self, air: Air, name: str, *, certified_as: str = "", max_peers: int = 4, files: Path | None = None
+    ) -> None:
+        self.name = name
+        self.namespace = f"{air.tag}{name}"
+        subprocess.run(["ip", "netns", "add", self.namespace], check=True)
+        path = Path("/run/netns", self.namespace)
+        address = bytes([2, 0, 0, 0, 0, len(air.nodes) + 1])
+        tap = Tap(path, "wlan0", address)
+        air.radio.add_station(name, tap, Station((0.0, 0.0, 0.0), address, "net"))
+        inside = ["nsenter", f"--net={path}"]
+        for words in (
+            ["addr", "add", f"{link_address(name)}/16", "dev", "wlan0"],
+            ["link", "set", "wlan0", "up"],
+            ["route", "add", "255.255.255.255", "dev", "wlan0"],
+        ):
+            subprocess.run([*inside, "ip", *words], check=True)
+        files = files or air.files(certified_as or name)
+        self._process = subprocess.Popen(
+            [*inside, sys.executable, str(PROGRAM), name, str(files), str(max_peers)],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        self._events: queue.Queue[str] = queue.Queue()
+        self._reading = threading.Thread(target=self._read)
+        self._reading.start()
+        self.expect("ready")
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            self._events.put(line.strip())
+
+    def expect(self, begins: str) -> str:
+        """The next event that begins like this."""
+        deadline = time.monotonic() + TIMEOUT_S
+        seen = []
+        while (left := deadline - time.monotonic()) > 0:
+            try:
+                seen.append(self._events.get(timeout=left))
+            except queue.Empty:
+                break
+            if seen[-1].startswith(begins):
+                return seen[-1]
+        raise AssertionError(f"{self.name}: no {begins!r} in {seen}")
+
+    def tell(self, command: str) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.write(command + "\n")
+        self._process.stdin.flush()
+
+    def kill(self) -> None:
+        self._process.kill()
+        self._process.wait()
+
+    def clear(self) -> None:
+        if self._process.poll() is None:
+            self._process.communicate(timeout=TIMEOUT_S) if not self._reading.is_alive() else self._end()
+        self._reading.join()
+        subprocess.run(["ip", "netns", "del", self.namespace], check=True)
+
+    def _end(self) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        self._process.wait(TIMEOUT_S)
+
+
+class Air:
+    """The radio on a thread, and an authority that certifies nodes."""
+
+    def __init__(self, directory: Path) -> None:
+        self.directory = directory
+        self.tag = f"fxl{os.getpid() % 100000}"
+        self.authority = Authority.generate(datetime.now(UTC))
+        self.radio = Radio(Medium(Propagation.reaching(80.0), 1), directory / "radio.sock")
+        self.nodes: list[Node] = []
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._carry)
+        self._thread.start()
+
+    def _carry(self) -> None:
+        while not self._over.is_set():
+            self.radio.turn(0.02)
+
+    def files(self, node: str, authority: Authority | None = None, now: datetime | None = None) -> Path:
+        """Certificate, key and authority of a node, as its agent keeps them."""
+        folder = self.directory / f"{node}-{len(list(self.directory.iterdir()))}"
+        folder.mkdir()
+        for name, content in (authority or self.authority).issue_node(node, now or datetime.now(UTC)).items():
+            (folder / name).write_bytes(base64.b64decode(content))
+        return folder
+
+    def node(self, name: str, **options: object) -> Node:
+        self.nodes.append(Node(self, name, **options))
+        return self.nodes[-1]
+
+    def command(self, **command: object) -> None:
+        self.radio.command(command)
+
+    def close(self) -> None:
+        for node in self.nodes:
+            node.clear()
+        self._over.set()
+        self._thread.join()
+        self.radio.close()
+
+
+@pytest.fixture
+def air(tmp_path: Path) -> Iterator[Air]:
+    found = Air(tmp_path)
+    yield found
+    found.close()
+
+
+def test_two_nodes_hear_each_other_pair_and_part(air: Air) -> None:
+    edge, drone = air.node("e1"), air.node("d1")
+    edge.expect("heard d1")
+    drone.expect("heard e1")
+    drone.tell("want e1")
+    drone.expect("link connecting e1")
+    drone.expect("link up e1")
+    edge.expect("accepted d1")
+    drone.expect("latency")
+    drone.tell("want ")
+    drone.expect("link none -")
+    edge.expect("ended d1")
+
+
+def test_a_drone_changes_peers_and_has_one_at_a_time(air: Air) -> None:
+    first, second, drone = air.node("e1"), air.node("e2"), air.node("d1")
+    drone.tell("want e1")
+    drone.expect("link up e1")
+    drone.tell("want e2")
+    drone.expect("link none -")
+    drone.expect("link up e2")
+    first.expect("ended d1")
+    second.expect("accepted d1")
+
+
+def test_both_ends_notice_the_loss_of_the_link(air: Air) -> None:
+    edge, drone = air.node("e1"), air.node("d1")
+    drone.tell("want e1")
+    drone.expect("link up e1")
+    edge.expect("accepted d1")
+    lost_at = time.monotonic()
+    air.command(station="d1", position=[200.0, 0.0, 0.0])
+    assert "silent" in drone.expect("link none -")
+    edge.expect("ended d1")
+    assert time.monotonic() - lost_at < 5.0
+    air.command(station="d1", position=[0.0, 0.0, 0.0])
+    drone.tell("want e1")
+    drone.expect("link up e1")
+
+
+def test_a_peer_that_hears_and_never_answers(air: Air) -> None:
+    air.node("e1")
+    drone = air.node("d1")
+    air.command(station="e1", silent=True)
+    drone.tell("want e1")
+    assert "e1_does_not_answer:_time-out" in drone.expect("link none -")
+
+
+@pytest.mark.parametrize("fault", ["other name", "other authority", "component", "expired"])
+def test_an_imposter_is_not_linked_to(air: Air, fault: str) -> None:
+    if fault == "other name":
+        files = air.files("e2")
+    elif fault == "expired":
+        files = air.files("e1", now=datetime.now(UTC) - timedelta(days=90))
+    elif fault == "other authority":
+        files = air.files("e1", Authority.generate(datetime.now(UTC)))
+    else:
+        files = air.files("e1")
+        own = air.authority.issue_component(
+            "spiffe://fractus.dev/ns/a/app/b/component/c/instance/e1", datetime.now(UTC)
+        )
+        for name, content in own.items():
+            (files / name).write_bytes(base64.b64decode(content))
+    air.node("e1", files=files)
+    drone = air.node("d1")
+    drone.tell("want e1")
+    assert drone.expect("link none -")
+    # The honest node, when it comes, is linked to: nothing is left of the imposter.
+    drone.tell("want e1")
+    drone.expect("link none -")
+
+
+def test_an_edge_node_takes_no_drone_that_it_was_not_told_of(air: Air) -> None:
+    edge, drone = air.node("e1"), air.node("d1")
+    edge.tell("refuse no DirectLink names d1")
+    drone.tell("want e1")
+    assert "no_DirectLink_names_d1" in drone.expect("link none -")
+
+
+def test_two_drones_compete_for_one_place(air: Air) -> None:
+    edge = air.node("e1", max_peers=1)
+    first, second = air.node("d1"), air.node("d2")
+    first.tell("want e1")
+    first.expect("link up e1")
+    edge.expect("accepted d1")
+    second.tell("want e1")
+    assert "linked_already" in second.expect("link none -")
+    first.tell("want ")
+    edge.expect("ended d1")
+    second.tell("want e1")
+    second.expect("link up e1")
+
+
+def test_a_peer_that_dies_and_comes_back(air: Air) -> None:
+    edge, drone = air.node("e1"), air.node("d1")
+    drone.tell("want e1")
+    drone.expect("link up e1")
+    drone.kill()
+    edge.expect("ended d1")
+
+
+def test_beacons_are_no_more_than_names() -> None:
+    assert decode(encode("e1")) == "e1"
+    for data in (
+        b"",
+        b"{",
+        b"[]",
+        b'{"fractus": 2, "node": "e1"}',
+        b'{"fractus": 1, "node": 3}',
+        b'{"fractus": 1, "node": ""}',
+        b'{"fractus": 1, "node": "e1\\nlinks: up"}',
+        b'{"fractus": 1, "node": "\\ud800"}',
+        b"[" * 512,
+    ):
+        assert decode(data) is None
+    assert decode(encode("x" * 254)) is None
+
+
+def test_addresses_follow_from_names_and_avoid_what_is_reserved() -> None:
+    found = {link_address(f"node-{n}") for n in range(2000)}
+    assert len(found) > 1900
+    assert all(str(address).startswith("169.254.") for address in found)
+    assert not [a for a in found if a.packed[2] in {0, 255}]

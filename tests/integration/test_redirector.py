@@ -152,9 +152,9 @@ async def test_call_is_cut_only_if_it_takes_longer_than_the_drain(
     redirector._drain_s = drain_s
     world.servers(work_s=4.0)
     keeping = asyncio.create_task(redirector.run())
-    client = world.client(before + 2, pause_s=8.0)
+    client = world.client(before + 2, pause_s=7.0)
     shown = await asyncio.to_thread(answers, client, before)
-    await asyncio.sleep(1.0)  # the next call is under way, the first of its connection or another one
+    await asyncio.sleep(4.0 if before else 1.0)  # the next call is in progress, for about one second
     done = await redirector.switch(TO_EDGE, planned=True)
     shown += await asyncio.to_thread(answers, client)
     keeping.cancel()

@@ -200,7 +200,7 @@ async def test_description_of_another_node_class_is_refused(path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("a: [", "is not YAML"),
+        ("a: [", "invalid YAML"),
         ("- 1", "kind"),
         ("kind: Depot", "kind"),
         (yaml.safe_dump(MANIFEST).replace("drone-1", "drone-2"), "metadata.name: is drone-2"),

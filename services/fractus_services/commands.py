@@ -1,18 +1,108 @@
-"""`fractus mobility` and `fractus camera`: the services of a node, with or without Kubernetes around them."""
+"""Commands `fractus mobility` and `fractus camera`: options, logging, signals and the process lock of the services."""
 
 from __future__ import annotations
 
 import asyncio
+import os
+import signal
 from collections.abc import Callable, Coroutine
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import click
+from fractus_runtime import logs
 
 from fractus_services.camera.settings import CameraSettings
-from fractus_services.launch import DIRECTORY, FILE, address, metrics_address, until_signalled
-from fractus_services.options import MobilityOptions
-from fractus_services.service_lock import DEFAULT_LOCK_TIMEOUT_S
+from fractus_services.options import CannotServe, MobilityOptions, ServiceOptions
+from fractus_services.service_lock import DEFAULT_LOCK_TIMEOUT_S, ServiceLock
+
+# gRPC reads this variable when it is imported later. At lower levels it logs each failed handshake, without a limit.
+os.environ.setdefault("GRPC_VERBOSITY", "ERROR")
+
+_Options = TypeVar("_Options", bound=ServiceOptions)
+
+_MAX_PORT = 65535
+_UNIX_SOCKETS = ("unix:", "unix-abstract:")
+
+DIRECTORY = click.Path(file_okay=False, path_type=Path)
+FILE = click.Path(dir_okay=False, path_type=Path)
+
+
+def address(_context: click.Context, _parameter: click.Parameter, value: str) -> str:
+    """Validate a HOST:PORT option. gRPC itself accepts 99999 and uses port 34463.
+
+    Raises:
+        click.BadParameter: The value is not HOST:PORT.
+    """
+    host, _, port = value.rpartition(":")
+    if not value.startswith(_UNIX_SOCKETS) and not (host and port.isdecimal() and int(port) <= _MAX_PORT):
+        raise click.BadParameter(f"{value!r} is not HOST:PORT with a port of at most {_MAX_PORT}")
+    return value
+
+
+def metrics_address(context: click.Context, parameter: click.Parameter, value: str) -> str:
+    """Validate a HOST:PORT option that may be empty.
+
+    Raises:
+        click.BadParameter: The value is not HOST:PORT.
+    """
+    return address(context, parameter, value) if value else ""
+
+
+def until_signalled(
+    service: str,
+    run: Callable[[_Options, asyncio.Event], Coroutine[Any, Any, None]],
+    options: _Options,
+    verbose: bool = False,
+) -> None:
+    """Run a service until SIGTERM or SIGINT, after acquiring the lock of its state directory.
+
+    Args:
+        service: Name of the service.
+        run: Serves until the event is set. It opens everything that only one process may open.
+        options: Options of the command line.
+        verbose: True to log at DEBUG instead of FRACTUS_LOG_LEVEL, which is INFO by default.
+
+    Raises:
+        click.ClickException: The service cannot run with its options.
+    """
+    level = "DEBUG" if verbose else os.environ.get("FRACTUS_LOG_LEVEL") or "INFO"
+    try:
+        logs.configure(level.upper(), os.environ.get("FRACTUS_LOG_FORMAT") or "text")
+    except ValueError as error:
+        raise click.ClickException(f"FRACTUS_LOG_LEVEL, FRACTUS_LOG_FORMAT: {error}") from None
+
+    async def main() -> None:
+        stop = asyncio.Event()
+        for number in (signal.SIGTERM, signal.SIGINT):
+            asyncio.get_running_loop().add_signal_handler(number, stop.set)
+        lock = ServiceLock(service, options.state, options.audit)
+        if await lock.acquire(options.lock_timeout, stop):
+            with lock.watched():
+                await run(options, stop)
+
+    try:
+        asyncio.run(main())
+    except CannotServe as error:
+        raise click.ClickException(str(error)) from None
+    except ExceptionGroup as failures:
+        raise _one_sentence(failures) from None
+
+
+def _one_sentence(failures: ExceptionGroup[Exception]) -> click.ClickException:
+    """Return the error of a service whose parts failed, as one sentence.
+
+    Raises:
+        ExceptionGroup: The group contains other exceptions than `CannotServe`.
+    """
+    expected, others = failures.split(CannotServe)
+    if expected is None or others is not None:
+        raise failures
+    error: BaseException = expected
+    while isinstance(error, BaseExceptionGroup):
+        error = error.exceptions[0]
+    return click.ClickException(str(error))
+
 
 _DESCRIPTION = click.Path(path_type=Path)
 _COUNT = click.IntRange(min=1)
@@ -28,7 +118,7 @@ def _option(
 
 
 def _service_options(service: str, port: int, kinds: str, state: str, recorded: str) -> Callable[[Any], Any]:
-    """The options that both services take."""
+    """Return a decorator that adds the options of both services."""
     options = (
         _option("--grants", "/var/lib/fractus/grants", "Directory of Grant manifests (JSON).", DIRECTORY),
         _option("--tls", "/var/lib/fractus/tls", "Directory of tls.crt, tls.key and ca.crt.", DIRECTORY),
@@ -37,7 +127,7 @@ def _service_options(service: str, port: int, kinds: str, state: str, recorded: 
         _option(
             "--node-object",
             "/var/lib/fractus/node.json",
-            f"{kinds} of this node as its agent stores it; counts before --description.",
+            f"{kinds} of this node as its agent stores it; takes precedence over --description.",
             _DESCRIPTION,
         ),
         _option("--description", "/etc/fractus/node.yaml", f"{kinds} manifest of this node.", _DESCRIPTION),
@@ -51,12 +141,12 @@ def _service_options(service: str, port: int, kinds: str, state: str, recorded: 
         click.option(
             "--recordings",
             type=DIRECTORY,
-            help=f"Directory to record {recorded} into (docs/recordings.md); nothing is recorded without it.",
+            help=f"Directory to record {recorded} into (docs/recordings.md). Without it nothing is recorded.",
         ),
         _option(
             "--recordings-mb",
             DEFAULT_RECORDINGS_MB,
-            "Megabytes that recordings may take; the oldest are removed first. 0: none are made.",
+            "Maximum size of the recordings in megabytes; the oldest are removed first. 0 disables recording.",
             click.IntRange(min=0),
         ),
         click.option(
@@ -64,7 +154,7 @@ def _service_options(service: str, port: int, kinds: str, state: str, recorded: 
             envvar="FRACTUS_METRICS",
             default="",
             callback=metrics_address,
-            help="HOST:PORT to answer GET /metrics of Prometheus on (docs/metrics.md); nothing is told without it.",
+            help="HOST:PORT that serves /metrics for Prometheus (docs/metrics.md). Without it there are no metrics.",
         ),
         click.option(
             "--node", envvar="FRACTUS_NODE", help="Name of this node; by default the description's, else the host's."
@@ -81,30 +171,35 @@ def _service_options(service: str, port: int, kinds: str, state: str, recorded: 
 
 @click.group()
 def mobility() -> None:
-    """The mobility service of a drone."""
+    """Run the mobility service of a drone."""
 
 
 @mobility.command("serve")
-@_service_options("mobility", 50051, "Optional: Drone", "what survives a restart", "flights")
+@_service_options("mobility", 50051, "Optional: Drone", "state that survives a restart", "flights")
 @click.option(
     "--autopilot",
     help="Link to the autopilot: tcp:HOST:PORT, udpin:HOST:PORT, udpout:HOST:PORT or serial:DEVICE:BAUD; by default the"
     " description's, else tcp:127.0.0.1:5760.",
 )
-@_option("--driver-grace", 15.0, "Seconds that a lost driver may take to come back.", _SECONDS)
-@_option("--boarding", 60.0, "Seconds a drone without a driver waits for the first call of its passengers.", _SECONDS)
+@_option("--driver-grace", 15.0, "Seconds in which a lost driver may reconnect.", _SECONDS)
+@_option(
+    "--boarding",
+    60.0,
+    "Seconds for which a drone without a driver waits for the first call of its passengers.",
+    _SECONDS,
+)
 @click.option(
     "--flat-terrain",
     is_flag=True,
-    help="Assume that the ground is level with home everywhere; otherwise limits above terrain refuse.",
+    help="Assume that the ground is level with home everywhere; otherwise limits above terrain deny calls.",
 )
 @click.option("--verbose", "-v", is_flag=True, help="Log more.")
 def serve_mobility(verbose: bool, **given: Any) -> None:
-    """Serve until stopped; waits for certificates and for the autopilot."""
-    from fractus_services.mobility.mavlink.startup import with_heartbeats  # noqa: PLC0415 - the command line stays quick
+    """Serve until stopped. Waits for certificates and for the autopilot."""
+    from fractus_services.mobility.mavlink.startup import with_heartbeats  # noqa: PLC0415 - keeps the command line fast
 
     async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
-        # Most of the start is importing, on a small computer for longer than a drone in flight is left alone.
+        # Imports take most of the start, on a small computer longer than the heartbeat time-out of a drone in flight.
         serve = await with_heartbeats(asyncio.to_thread(_mobility_server), options.state, options.autopilot)
         await serve(options, stop)
 
@@ -112,47 +207,47 @@ def serve_mobility(verbose: bool, **given: Any) -> None:
 
 
 def _mobility_server() -> Callable[[MobilityOptions, asyncio.Event], Coroutine[Any, Any, None]]:
-    from fractus_services.mobility.rpc.server import run  # noqa: PLC0415 - takes long
+    from fractus_services.mobility.rpc.server import run  # noqa: PLC0415 - imported while heartbeats are sent
 
     return run
 
 
 @click.group()
 def camera() -> None:
-    """The camera service of a node."""
+    """Run the camera service of a node."""
 
 
 @camera.command("serve")
 @_service_options("camera", 50052, "Drone or EdgeNode", "the pictures", "pictures and decisions")
 @_option("--mobility", "127.0.0.1:50051", "Mobility service that reports a drone's position.")
-@_option("--keep", 200, "Pictures kept for each component instance.", _COUNT)
-@_option("--keep-mb", 200, "Megabytes of pictures kept for each component instance.", _COUNT)
+@_option("--keep", 200, "Maximum number of images for each component instance.", _COUNT)
+@_option("--keep-mb", 200, "Maximum size of the images of each component instance, in megabytes.", _COUNT)
 @_option(
     "--keep-total-mb",
     2000,
-    "Megabytes of pictures kept altogether; those of components that are gone are removed first.",
+    "Maximum size of all images in megabytes; those of components without a Grant are removed first.",
     _COUNT,
 )
 @click.option(
     "--camera",
-    help="Where pictures come from: http://HOST/snapshot.jpg, v4l2:/dev/video0, picamera2:0, directory:/PATH or test:;"
+    help="Camera: http://HOST/snapshot.jpg, v4l2:/dev/video0, picamera2:0, directory:/PATH or test:;"
     " by default the description's.",
 )
 @click.option("--face-model", type=FILE, help="Face detector (YuNet, ONNX) to use instead of OpenCV's cascades.")
 @_option(
     "--face-px",
     48,
-    "Width in pixels from which on faces are found reliably; where they may be smaller, a policy's fallback applies.",
+    "Face width in pixels from which detection is reliable; if faces may be smaller, a policy's fallback applies.",
     click.FloatRange(min=12, max=1000),
 )
 @_option(
     "--relief",
     0.0,
-    "How many metres the ground around may lie below home; pictures are judged by what they may show of it.",
+    "Maximum depth of the surrounding ground below home in metres, for the area that an image may show.",
     click.FloatRange(min=0, max=5000),
 )
 def serve_camera(**given: Any) -> None:
-    """Serve until stopped; waits for certificates."""
-    from fractus_services.camera.server import run  # noqa: PLC0415 - the command line stays quick
+    """Serve until stopped. Waits for certificates."""
+    from fractus_services.camera.server import run  # noqa: PLC0415 - needs libraries that the CLI does without
 
     until_signalled("camera", run, CameraSettings(**given))

@@ -1,4 +1,4 @@
-"""Whether a Grant is the operator's, and the latest one: its signature, and a memory against replays."""
+"""Verification of Grants: the operator's signature, and a memory of the latest Grants against replays."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ from fractus_runtime.files import remove_temporary, write_file
 log = logging.getLogger(__name__)
 
 MAX_REMEMBERED = 5_000
-"""Instances that are remembered one by one; older ones share one date, and no grant issued before it counts."""
+"""Maximum number of remembered instances. For all others, Grants issued before the oldest forgotten one are rejected."""
 
 _EPOCH = datetime.fromtimestamp(0, UTC)
 
 
 @dataclass(frozen=True, slots=True)
 class _Seen:
-    """The latest grant of an instance.
+    """The latest Grant of a component instance.
 
     Attributes:
-        issued_at: when it was signed, ISO 8601 in UTC.
-        digest: of the grant with its signature.
-        revoked: it was removed on this node and no longer counts.
+        issued_at: Time of the signature, ISO 8601 in UTC.
+        digest: Digest of the Grant with its signature.
+        revoked: True if the Grant was removed on this node.
     """
 
     issued_at: str
@@ -46,15 +46,15 @@ class _Seen:
 
 
 class GrantVerifier:
-    """Verifies grants and remembers the latest one of each instance.
+    """Verifies Grants, and remembers the latest one of each component instance.
 
-    A grant is verified once. It stays in force, also over a restart, when certificates expire or the authority changes
-    meanwhile: a drone in flight must not lose its grant to a date. It ends when its file goes, or when a later one takes
-    its place. The memory is what stops a replay: an old grant has a valid signature too.
+    A Grant is verified once. It stays in force, also after a restart, if certificates expire or the authority changes, because
+    a drone in flight must not lose its Grant to a date. It ends when its file is removed or a later Grant replaces it. The
+    memory prevents replays: an old Grant has a valid signature too.
 
     Args:
-        directory: where ca.crt is.
-        memory: file that remembers the grants seen on this node.
+        directory: Directory that contains ca.crt.
+        memory: File that stores the latest Grants.
     """
 
     def __init__(self, directory: Path, memory: Path) -> None:
@@ -64,12 +64,13 @@ class GrantVerifier:
         self._authorities: tuple[x509.Certificate, ...] = ()
         self._seen: dict[str, _Seen] = {}
         self._oldest = _iso(_EPOCH)
-        self._unsaved = self._failing = False
+        self._unsaved = False
+        self._failing = False
         remove_temporary(memory)
         self._restore()
 
     def reload_authorities(self) -> bool:
-        """Read ca.crt if it changed; True if it did."""
+        """Read ca.crt if it changed. Return True if it did."""
         try:
             stat = self._path.stat()
             stamp = (stat.st_mtime_ns, stat.st_size, stat.st_ino)
@@ -80,27 +81,30 @@ class GrantVerifier:
         except FileNotFoundError:
             return False
         except (OSError, ValueError) as error:
-            log.critical("grants: cannot read the authority, keeping the previous one (file=%s): %s", self._path, error)
+            log.critical(
+                "grants: cannot read the authority, keeping the previous one (file=%s error=%s)", self._path, error
+            )
             return False
         return True
 
     def verify(self, grant: Grant) -> str:
-        """Accept a grant as the latest of its instance; returns the digest of it with its signature.
+        """Accept a Grant as the latest of its instance, and return its digest with its signature.
 
         Raises:
-            BadSignature: the operator did not sign it, a later one was seen here, or it was revoked here.
+            BadSignature: The operator did not sign the Grant, or this node has seen a later one, or has revoked it.
         """
-        identity, digest = grant.spec.identity, _digest(grant)
+        identity = grant.spec.identity
+        digest = _digest(grant)
         seen = self._seen.get(identity)
         if seen is not None and seen.digest == digest and not seen.revoked:
             return digest
         if not self._authorities:
-            raise UnknownAuthority(f"there is no {self._path} to check its signature by")
+            raise UnknownAuthority(f"cannot check the signature because {self._path} is missing")
         issued_at = _iso(verify(grant, self._authorities))
         latest = seen.issued_at if seen is not None else self._oldest
         if issued_at <= latest:
             raise BadSignature(
-                f"it was issued at {issued_at}, and not after the one of {latest} that was "
+                f"it was issued at {issued_at}, not after the Grant of {latest} that was "
                 f"{'revoked' if seen is not None and seen.revoked else 'granted'} here; sign it again"
             )
         self._seen[identity] = _Seen(issued_at, digest)
@@ -108,19 +112,19 @@ class GrantVerifier:
         return digest
 
     def is_latest(self, identity: str, digest: str) -> bool:
-        """Whether a grant is still the latest one of its instance."""
+        """Return True if a Grant is still the latest of its instance."""
         seen = self._seen.get(identity)
         return seen is not None and seen.digest == digest and not seen.revoked
 
     def revoke(self, identity: str, digest: str) -> None:
-        """A grant was removed: from now on only a later one of its instance counts."""
+        """Revoke a removed Grant. From now on only a later Grant of its instance is accepted."""
         seen = self._seen.get(identity)
         if seen is not None and seen.digest == digest and not seen.revoked:
             self._seen[identity] = replace(seen, revoked=True)
             self._unsaved = True
 
     def unsaved(self) -> bytes | None:
-        """Content for `store`; None when it is stored already."""
+        """Return the content for `store`, or None if it is stored already."""
         if not self._unsaved:
             return None
         self._limit()
@@ -129,23 +133,24 @@ class GrantVerifier:
         return json.dumps(body).encode()
 
     def store(self, content: bytes) -> None:
-        """Write the memory; may be called from another thread. What cannot be written is unsaved again."""
+        """Write the memory file. It may be called from another thread. After a failure, the content counts as unsaved."""
         try:
             self._memory.parent.mkdir(parents=True, exist_ok=True)
             write_file(self._memory, content, 0o644)
         except OSError as error:
             if not self._failing:
                 log.critical(
-                    "grants: cannot write the memory, a restart would forget replaced grants (file=%s): %s",
+                    "grants: cannot write the memory, a restart would forget replaced Grants (file=%s error=%s)",
                     self._memory,
                     error,
                 )
-            self._failing = self._unsaved = True
+            self._failing = True
+            self._unsaved = True
         else:
             self._failing = False
 
     def _limit(self) -> None:
-        """Keep the instances that were granted last."""
+        """Forget the instances with the oldest Grants."""
         surplus = len(self._seen) - MAX_REMEMBERED
         if surplus > 0:
             for identity in sorted(self._seen, key=lambda name: self._seen[name].issued_at)[:surplus]:
@@ -159,16 +164,17 @@ class GrantVerifier:
         except FileNotFoundError:
             return
         except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
-            # Refusing every grant from now on would strand the drone; signatures are still verified.
-            self._seen, self._oldest = {}, _iso(_EPOCH)
+            # Rejecting all Grants would strand the drone. Signatures are still verified.
+            self._seen = {}
+            self._oldest = _iso(_EPOCH)
             log.critical(
-                "grants: the memory cannot be read, replaced grants are forgotten (file=%s): %s", self._memory, error
+                "grants: cannot read the memory, replaced Grants are forgotten (file=%s error=%s)", self._memory, error
             )
 
 
-def _iso(moment: datetime) -> str:
-    """A moment as text that sorts like it."""
-    return moment.astimezone(UTC).isoformat(timespec="microseconds")
+def _iso(time: datetime) -> str:
+    """Return a time as text that sorts chronologically."""
+    return time.astimezone(UTC).isoformat(timespec="microseconds")
 
 
 def _digest(grant: Grant) -> str:

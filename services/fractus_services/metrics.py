@@ -1,4 +1,4 @@
-"""What both services tell Prometheus: decisions as the audit log records them, and the state of that log, of certificate and grants."""
+"""Prometheus metrics of both services: decisions, audit log, certificate, Grants and recording."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from fractus_runtime.figures import Counter, Figure, gauge, hash_number, text_of
 from fractus_services.grant_files import GrantFiles
 
 MAX_POLICIES = 200
-"""Policies that are counted by name; verdicts of others count as those of `other`."""
+"""Maximum number of policies with their own label. Verdicts of further policies have the label `other`."""
 
 
 class DecisionMetrics:
-    """Counts the decisions of a service from the entries of its audit log."""
+    """Counters of decisions, fed with the entries of the audit log."""
 
     def __init__(self) -> None:
         self._verdicts = Counter(
@@ -43,7 +43,7 @@ class DecisionMetrics:
         self._named: set[str] = set()
 
     def take_entry(self, entry: dict[str, Any]) -> None:
-        """Count an entry, if it is of a decision."""
+        """Count an entry if it contains a decision."""
         match entry:
             case {"kind": "call", "action": str(action), "code": str(code), "policies": policies}:
                 self._verdicts.count(action, code)
@@ -55,7 +55,7 @@ class DecisionMetrics:
                 self._interventions.count(action, code)
 
     def figures(self) -> Iterator[Figure]:
-        """The counts as they are now."""
+        """Yield the current counts."""
         for counter in (self._verdicts, self._by_policy, self._takeovers, self._interventions):
             yield counter.figure()
 
@@ -68,41 +68,42 @@ class DecisionMetrics:
 class ServiceMetrics:
     """All metrics of a service.
 
-    Attributes:
-        figures: what the service adds of its own; read when it is asked for.
-        take_entry: takes the entries of the audit log.
+    Metrics of the components are collected when Prometheus scrapes them.
     """
 
     def __init__(self) -> None:
-        decisions = DecisionMetrics()
-        self.take_entry = decisions.take_entry
-        self._figures: list[Callable[[], Iterator[Figure]]] = [decisions.figures]
+        self._decisions = DecisionMetrics()
+        self._figures: list[Callable[[], Iterator[Figure]]] = [self._decisions.figures]
+
+    def take_entry(self, entry: dict[str, Any]) -> None:
+        """Count an entry of the audit log if it contains a decision."""
+        self._decisions.take_entry(entry)
 
     def observe(self, figures: Callable[[], Iterator[Figure]]) -> None:
-        """Add figures that are read when they are asked for."""
+        """Add a callback that returns metrics at each scrape."""
         self._figures.append(figures)
 
     def text(self) -> bytes:
-        """All metrics in Prometheus' text format."""
+        """Return all metrics in Prometheus' text format."""
         return text_of(figure for figures in self._figures for figure in figures())
 
 
 def telemetry_age(age_s: float) -> Figure:
-    """How old what a service knows of the drone is."""
-    what = "Age of the drone's position, as this service knows it; not of a camera that stands."
-    return gauge("fractus_telemetry_age_seconds", what, age_s)
+    """Return the age of the latest telemetry."""
+    description = "Age of the drone's position, as this service knows it; not of a camera that stands."
+    return gauge("fractus_telemetry_age_seconds", description, age_s)
 
 
 def common_figures(
     expiry: Callable[[], float | None], grants: GrantFiles, audit: AuditLog, recording_problem: Callable[[], str]
 ) -> Iterator[Figure]:
-    """What holds of any service now.
+    """Yield the metrics that all services have.
 
     Args:
-        expiry: Unix time at which its certificate expires; None while that is not known.
-        grants: of its node.
-        audit: its audit log.
-        recording_problem: why nothing is recorded that should be; empty while it is.
+        expiry: Returns the Unix time at which the certificate expires, or None if it is unknown.
+        grants: Grants of the node.
+        audit: Audit log of the service.
+        recording_problem: Returns the reason why nothing is recorded, or an empty string.
     """
     expires_s = expiry()
     if expires_s is not None:

@@ -1,4 +1,4 @@
-"""One process at a time for each service of a node: a lock that the kernel frees when its holder dies, however it dies."""
+"""Exclusive lock of a service: the kernel releases it when its process ends for any reason."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from fractus_services.options import CannotServe
 log = logging.getLogger(__name__)
 
 DEFAULT_LOCK_TIMEOUT_S = 60.0
-"""Longer than the 30 s after which Kubernetes kills what a pod left running."""
+"""Default time to wait for the lock. It exceeds the 30 s after which Kubernetes kills the processes of a deleted pod."""
 
 CHECK_INTERVAL_S = 0.2
-"""How often the holder looks whether its lock file is still the one that others would lock."""
+"""Interval at which the holder checks that its lock file still exists under its path."""
 
 SETTLE_S = 1.0
-"""How long the first holder of a new lock file waits: a holder of the file that was there before has noticed by then."""
+"""Time for which the first holder of a new lock file waits, so that the holder of a replaced file has ended."""
 
 POLL_INTERVAL_S = 0.1
 
@@ -35,16 +35,17 @@ _GONE = {errno.ENOENT, errno.ENOTDIR, errno.ESTALE}
 
 
 class ServiceLock:
-    """The right to write the state and the audit log of a service, and to speak to its autopilot or camera.
+    """Exclusive access to the state, the audit log, and the autopilot or camera of a service.
 
-    It is never given back: the files stay locked until the process has ended, as its threads may write until then.
+    The lock is held until the process ends, because its threads may write until then. It fences a force-deleted pod: the new
+    pod waits until the old process has ended.
 
     Args:
-        service: its name, for the log and the lock file.
-        state: its state directory, which has the first lock. Where that file is replaced or vanishes, another process can
-            lock what is there now: the holder ends at once, without another write.
-        audit: its audit log, which has the second lock, as two state directories could share it.
-        end: ends the process.
+        service: Name of the service, for the log and the lock file.
+        state: State directory, which contains the first lock file. If that file is replaced or removed, another process could
+            lock the new file, so the holder ends immediately without another write.
+        audit: Audit log. The second lock file is next to it, because two state directories could share an audit log.
+        end: Ends the process.
     """
 
     def __init__(self, service: str, state: Path, audit: Path, end: Callable[[int], object] = os._exit) -> None:
@@ -56,10 +57,10 @@ class ServiceLock:
         self._left = threading.Event()
 
     async def acquire(self, timeout_s: float, stop: asyncio.Event) -> bool:
-        """Wait until no other process holds the lock; False when `stop` was set first.
+        """Wait for the lock. Return False if `stop` is set first.
 
         Raises:
-            CannotServe: another process holds it still after the timeout, or there can be no lock.
+            CannotServe: Another process holds the lock after the timeout, or the disk does not support locks.
         """
         deadline = time.monotonic() + timeout_s
         for path in (self._path, self._audit):
@@ -68,13 +69,13 @@ class ServiceLock:
             except OSError as error:
                 reason = error.strerror or error
                 raise CannotServe(
-                    f"{path}: cannot be locked: {reason}; give --state and --audit on a disk that is writable and has locks"
+                    f"{path}: cannot lock: {reason}; use a writable disk that supports locks for --state and --audit"
                 ) from None
             if handle is None:
                 return False
             if path == self._path:
                 self._held = _identity(os.fstat(handle))
-                if _holder(handle).get("file") != list(self._held):
+                if _read_holder(handle).get("file") != list(self._held):
                     await _pause(stop, SETTLE_S)
             self._sign(handle)
         return not stop.is_set()
@@ -87,10 +88,10 @@ class ServiceLock:
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                holder = _told(_holder(handle))
+                holder = _format_holder(_read_holder(handle))
                 os.close(handle)
                 if time.monotonic() >= deadline:
-                    raise CannotServe(f"{path} is still held by {holder}; end that process, and start again") from None
+                    raise CannotServe(f"{path} is still held by {holder}; end that process, and restart") from None
                 if not waits:
                     log.warning("%s: waiting for %s, held by %s", self._service, path, holder)
                     waits = True
@@ -101,23 +102,23 @@ class ServiceLock:
                 raise
             if _is_still(path, _identity(os.fstat(handle))):
                 if waits:
-                    log.info("%s: no other process runs any more, going on (file=%s)", self._service, path)
+                    log.info("%s: lock acquired (file=%s)", self._service, path)
                 return handle
-            os.close(handle)  # it was replaced while we waited
+            os.close(handle)  # The file was replaced while this process waited.
         return None
 
     def _sign(self, handle: int) -> None:
-        """Say in the file who holds it; that is for readers of logs, and a full disk does not matter."""
+        """Write the holder to the lock file for log messages. A full disk is ignored."""
         now = datetime.now(UTC).isoformat(timespec="seconds")
-        said = {"pid": os.getpid(), "host": socket.gethostname(), "since": now, "file": _identity(os.fstat(handle))}
+        holder = {"pid": os.getpid(), "host": socket.gethostname(), "since": now, "file": _identity(os.fstat(handle))}
         with suppress(OSError):
             os.ftruncate(handle, 0)
-            os.pwrite(handle, json.dumps(said).encode() + b"\n", 0)
+            os.pwrite(handle, json.dumps(holder).encode() + b"\n", 0)
 
     @contextmanager
     def watched(self) -> Iterator[None]:
-        """End the process as soon as its lock file is no longer the one that others would lock, while in the block."""
-        # A thread of its own, as the event loop may hang, and so may a disk.
+        """End the process if its lock file is replaced or removed, while in the block."""
+        # Use a thread, because the event loop or the disk may hang.
         thread = threading.Thread(target=self._watch, name="lock", daemon=True)
         thread.start()
         try:
@@ -129,10 +130,10 @@ class ServiceLock:
         while not self._left.wait(CHECK_INTERVAL_S):
             if not _is_still(self._path, self._held):
                 log.critical(
-                    "%s: another process may serve by now, as the lock file was replaced or its directory is gone; this"
-                    " one ends at once (file=%s)", self._service, self._path,
+                    "%s: lock lost because its file was replaced or its directory removed; another process may serve, so"
+                    " this one ends now (file=%s)", self._service, self._path,
                 )  # fmt: skip
-                # Not by an exception: on the way out journal and audit log would be written, which may be the other's.
+                # Do not raise: cleanup would write the journal and the audit log, which another process may own now.
                 self._end(1)
                 return
 
@@ -144,34 +145,34 @@ def _open(path: Path) -> int:
     except OSError as error:
         if error.errno != errno.EROFS:
             raise
-        # A disk that failed in flight is read-only from then on: a service that comes back still brings the drone home.
+        # A disk that failed in flight is read-only. The restarted service must still fly the drone home.
         return os.open(path, os.O_RDONLY | flags)
 
 
-def _identity(found: os.stat_result) -> tuple[int, int]:
-    return found.st_dev, found.st_ino
+def _identity(stat: os.stat_result) -> tuple[int, int]:
+    return stat.st_dev, stat.st_ino
 
 
 def _is_still(path: Path, identity: tuple[int, int]) -> bool:
-    """Whether a path leads to a file; an error of the disk tells nothing, and ends no flight."""
+    """Return False if the path no longer refers to the file. A disk error counts as True, because it must not end a flight."""
     try:
         return _identity(path.stat(follow_symlinks=False)) == identity
     except OSError as error:
         return error.errno not in _GONE
 
 
-def _holder(handle: int) -> dict[str, object]:
-    """What the holder of a lock file says of itself; nothing where it could not."""
+def _read_holder(handle: int) -> dict[str, object]:
+    """Read the holder from a lock file. The result is empty if the holder could not write it."""
     with suppress(OSError, ValueError):
-        said = json.loads(os.pread(handle, 4096, 0))
-        if isinstance(said, dict):
-            return said
+        holder = json.loads(os.pread(handle, 4096, 0))
+        if isinstance(holder, dict):
+            return holder
     return {}
 
 
-def _told(holder: dict[str, object]) -> str:
+def _format_holder(holder: dict[str, object]) -> str:
     if "pid" not in holder:
-        return "a process that did not say which"
+        return "an unknown process"
     return f"pid {holder['pid']} on {holder.get('host')} since {holder.get('since')}"
 
 

@@ -30,7 +30,7 @@ def serve(service: click.Group, tmp_path: Path, *more: str) -> Result:
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        (b"kind: [", "is not YAML"),
+        (b"kind: [", "invalid YAML"),
         (b"\xff\xfe\x00", "cannot be read"),
         (b"- a list", "must contain one manifest of kind Drone"),
         (b"kind: Zone", "must contain one manifest of kind Drone"),

@@ -437,7 +437,7 @@ async def test_an_older_grant_in_flight_brings_the_drone_home(rig: Rig) -> None:
     await driver.next(LOST, 15)
     await rig.until(lambda t: t.mode == "LAND" and t.controller == "system", 30)
     refused = [e for e in rig.entries("grant") if e["change"] == "refused"]
-    assert "not after the one of" in refused[-1]["reason"]
+    assert "not after the Grant of" in refused[-1]["reason"]
     code, why = await denied(flown(driver.going(0, 20)))
     assert (code, why.code) == (Status.PERMISSION_DENIED, "NoGrant")
 

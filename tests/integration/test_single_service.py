@@ -72,7 +72,7 @@ async def test_a_second_service_gives_up_with_one_sentence(rig: Rig) -> None:
     assert said[-1].startswith(
         f"Error: {rig.directory / 'state' / 'mobility.lock'} is still held by pid {rig.pid('service')} on "
     )
-    assert said[-1].endswith("end that process, and start again")
+    assert said[-1].endswith("end that process, and restart")
     assert "Traceback" not in rig.log("second")
     rig.start_service("--lock-timeout", "1", "--state", str(rig.directory / "other"), name="third")
     assert await rig.ended("third") == 1
@@ -100,7 +100,7 @@ async def test_a_service_whose_lock_is_lost_falls_silent(rig: Rig, lose: Callabl
     entries = len(rig.entries())
     lose(rig)
     assert await rig.ended("service", 3) == 1
-    assert "mobility: another process may serve by now" in rig.log("service")
+    assert "mobility: lock lost" in rig.log("service")
     written = [entry["kind"] for entry in rig.entries()[entries:]]
     assert set(written) <= {"state"}, "nothing more than the flight recorder's entries until then"
     await until_mode(rig.link, ARDUCOPTER.return_retracing)

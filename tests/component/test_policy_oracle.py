@@ -171,13 +171,13 @@ def test_oracle_no_permitted_goto_leaves_an_inclusion_zone(
 
 @_cases
 @given(
-    asked=st.floats(0.5, 200),
+    requested=st.floats(0.5, 200),
     lower=st.one_of(st.none(), st.floats(0, 60)),
     upper=st.one_of(st.none(), st.floats(0, 60)),
     refuse=st.booleans(),
 )
 def test_oracle_altitude_verdicts_match_the_rules(
-    asked: float, lower: float | None, upper: float | None, refuse: bool
+    requested: float, lower: float | None, upper: float | None, refuse: bool
 ) -> None:
     if lower is None and upper is None:
         return
@@ -185,11 +185,13 @@ def test_oracle_altitude_verdicts_match_the_rules(
         lower, upper = upper, lower
     limits = {k: v for k, v in (("lowerLimit", lower), ("upperLimit", upper)) if v is not None}
     grant = compiled(altitude(action="refuse" if refuse else "enforce", **limits))
-    breaks = (upper is not None and asked > upper + 1e-6) or (lower is not None and asked < lower - 1e-6)
-    want = max(min(asked, 120.0, upper if upper is not None else math.inf), lower if lower is not None else -math.inf)
-    for call in (goto(10, 10, asked), Call("Takeoff", TakeoffArgs(asked))):
+    breaks = (upper is not None and requested > upper + 1e-6) or (lower is not None and requested < lower - 1e-6)
+    want = max(
+        min(requested, 120.0, upper if upper is not None else math.inf), lower if lower is not None else -math.inf
+    )
+    for call in (goto(10, 10, requested), Call("Takeoff", TakeoffArgs(requested))):
         verdict = ask(grant, call, at(alt=0.0) if call.method == "Takeoff" else at())
-        low = min(max(asked, lower or 0.0), upper or 120.0) < MIN_LEG_ALTITUDE_M and not any(
+        low = min(max(requested, lower or 0.0), upper or 120.0) < MIN_LEG_ALTITUDE_M and not any(
             edge is not None and edge < MIN_LEG_ALTITUDE_M for edge in (lower, upper)
         )
         if breaks and refuse:
@@ -202,7 +204,7 @@ def test_oracle_altitude_verdicts_match_the_rules(
             assert verdict.permits
             flown = verdict.args.alt if isinstance(verdict.args, GotoArgs) else verdict.args.altitude_m  # type: ignore[union-attr]
             assert math.isclose(flown or 0.0, want, abs_tol=1e-5)
-            assert (verdict.action == "correct") == (abs(want - asked) > 1e-5)
+            assert (verdict.action == "correct") == (abs(want - requested) > 1e-5)
 
 
 @_cases

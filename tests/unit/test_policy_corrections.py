@@ -241,8 +241,8 @@ class World:
         match method:
             case "Goto":
                 fast = draw.uniform(0.5, 14) if draw.random() < 0.5 else None
-                asked = draw.uniform(1, 90) if draw.random() < 0.8 else None
-                return goto(draw.uniform(-80, 80), draw.uniform(-80, 80), asked, speed_mps=fast), at(
+                altitude_m = draw.uniform(1, 90) if draw.random() < 0.8 else None
+                return goto(draw.uniform(-80, 80), draw.uniform(-80, 80), altitude_m, speed_mps=fast), at(
                     x, y, alt, **motion
                 )
             case "Takeoff":
@@ -330,17 +330,17 @@ def test_corrected_calls_are_allowed_unchanged_and_break_no_policy() -> None:
     corrected = dict.fromkeys(("Goto", "Takeoff", "SetSpeed", "SetVelocity"), 0)
     again = conflicts = 0
     for world, call, now, verdict in corrections(range(examples(20_000, 400))):
-        told = f"seed {world.seed}: {call} in {now} -> {verdict}"
+        context = f"seed {world.seed}: {call} in {now} -> {verdict}"
         if verdict.action == "deny":
             conflicts += 1
-            assert verdict.policies, told
-            assert all(name in verdict.reason for name in verdict.policies), told
+            assert verdict.policies, context
+            assert all(name in verdict.reason for name in verdict.policies), context
             continue
         corrected[call.method] += 1
         again += verdict.reason.count("corrected") > 1
-        assert holds(world.grant, call, verdict, now), told
+        assert holds(world.grant, call, verdict, now), context
         # A call that begins with a stop is judged again after it.
-        assert verdict.brake_first or not list(broken(world.rules, verdict.args, now)), told
+        assert verdict.brake_first or not list(broken(world.rules, verdict.args, now)), context
     assert min(corrected.values()) > 10, corrected
     assert again > 5
     assert conflicts > 5

@@ -173,17 +173,17 @@ _FILTERS = st.builds(
 
 @_cases
 @given(st.lists(_FILTERS, max_size=6), st.lists(_FILTERS, max_size=4))
-def test_combined_filters_satisfy_each_filter(asked: list[Filter], more: list[Filter]) -> None:
-    composed = combine_filters(asked)
-    assert composed == combine_filters(reversed(asked)) == combine_filters(composed)
+def test_combined_filters_satisfy_each_filter(required: list[Filter], more: list[Filter]) -> None:
+    composed = combine_filters(required)
+    assert composed == combine_filters(reversed(required)) == combine_filters(composed)
     done = {one.action for one in composed}
     hidden = {"blurAverage", "blurMedian", "black"}
-    for one in asked:
+    for one in required:
         assert one.action in done or "black" in done or (one.action == "blurFaces" and done & hidden)
-    assert remaining_filters(asked, composed) == ()
+    assert remaining_filters(required, composed) == ()
     # Filters applied later replace missing or milder earlier filters.
     both = (*composed, *remaining_filters(more, composed))
-    assert remaining_filters(combine_filters([*asked, *more]), both) == ()
+    assert remaining_filters(combine_filters([*required, *more]), both) == ()
 
 
 def test_combined_filters_use_stricter_face_method() -> None:

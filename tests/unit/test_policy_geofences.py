@@ -91,7 +91,7 @@ def test_goto_into_through_or_near_exclusion_zone_is_denied() -> None:
 
 def test_reason_shows_distances_below_a_tenth_of_a_metre() -> None:
     zone_at = exclusion(box(50, -20, 80, 20))
-    told = [
+    verdicts = [
         ask(compiled(exclusion(ring([(50, 0.01), (40, -20), (60, -20)]))), goto(100, 0)),
         ask(compiled(zone_at), goto(50.01, 0)),
         ask(compiled(zone_at), goto(49.99, 0)),
@@ -101,12 +101,12 @@ def test_reason_shows_distances_below_a_tenth_of_a_metre() -> None:
         ask(compiled(), goto(0, 200.01)),
         ask(compiled(), Call("CaptureImage"), at(0, 200.01)),
     ]
-    for verdict in told:
+    for verdict in verdicts:
         assert not verdict.permits
         assert " 0.0 m" not in verdict.reason, verdict
-    assert "touches zone no-fly-zone" in told[0].reason
-    assert "less than 0.1 m inside zone no-fly-zone" in told[1].reason
-    assert "comes within 0.1 m of zone no-fly-zone" in told[2].reason
+    assert "touches zone no-fly-zone" in verdicts[0].reason
+    assert "less than 0.1 m inside zone no-fly-zone" in verdicts[1].reason
+    assert "comes within 0.1 m of zone no-fly-zone" in verdicts[2].reason
 
 
 def test_reason_distinguishes_turn_from_leg_through_zone() -> None:

@@ -68,11 +68,11 @@ def test_velocity_leg_contains_the_flown_path_with_pending_setpoints(seed: int) 
 
 def test_pending_setpoint_may_end_braking() -> None:
     braking = at(0, 0, east_mps=8, forward_mps2=-2.5, latency_s=0.5)
-    told = at(0, 0, east_mps=8, forward_mps2=-2.5, latency_s=0.5, pending=((0.0, 8.0, 0.0),))
+    pending_turn = at(0, 0, east_mps=8, forward_mps2=-2.5, latency_s=0.5, pending=((0.0, 8.0, 0.0),))
     stopped = at(0, 0, east_mps=8, forward_mps2=-2.5, latency_s=0.5, pending=((0.0, 0.0, 0.0),))
-    assert motion_before_reaction(told).speed_mps == 8.0
+    assert motion_before_reaction(pending_turn).speed_mps == 8.0
     assert motion_before_reaction(stopped).speed_mps == motion_before_reaction(braking).speed_mps < 7.0
-    assert stop_point(told, (0.0, 0.0))[0] > stop_point(braking, (0.0, 0.0))[0] + 3.0
+    assert stop_point(pending_turn, (0.0, 0.0))[0] > stop_point(braking, (0.0, 0.0))[0] + 3.0
 
 
 def test_drone_with_pending_setpoint_counts_as_moving() -> None:

@@ -32,10 +32,10 @@ def test_leg_through_thin_zone_is_allowed_only_when_the_drone_cannot_stop_before
     now: Situation = at(
         0, 0, north_mps=speed, latency_s=latency, forward_mps2=forward, airframe=RETRACES, speed_setpoint_mps=max(speed, 5.0)
     )  # fmt: skip
-    asked = (
+    call = (
         Call("SetVelocity", VelocityArgs(speed, 0.0, hold_s=2.0)) if velocity else goto(0, away + thick + 5.0 + beyond)
     )
-    verdict = judge(asked, now, grant)
+    verdict = judge(call, now, grant)
     if verdict.permits and not verdict.brake_first:
         flown = verdict.args
         if isinstance(flown, VelocityArgs) and math.hypot(flown.north_mps, flown.east_mps) < speed - 0.1:

@@ -76,8 +76,8 @@ def test_velocity_into_zone_is_denied_or_taken_over(action: str) -> None:
 
 def test_velocity_is_scaled_by_adjusting_fence() -> None:
     grant = compiled(exclusion(box(-50, 14, 50, 60), "adjust"), operationArea=[])
-    asked = fly(8, 1, hold=2.0)
-    verdict = ask(grant, asked)
+    call = fly(8, 1, hold=2.0)
+    verdict = ask(grant, call)
     new = flown(verdict)
     assert (verdict.action, verdict.code, verdict.policies) == ("correct", "VelocityScaled", ("no-fly",))
     assert 1 < new.north_mps < 7

@@ -325,7 +325,7 @@ def test_import_limits_the_points_of_a_file(monkeypatch):
 
 
 def test_import_rejects_duplicate_keys():
-    with pytest.raises(InvalidObject, match="line 1: type is given twice"):
+    with pytest.raises(InvalidObject, match="line 1: type is also defined on line 1"):
         formats.read_geojson('{"type": "Feature", "type": "FeatureCollection"}')
 
 
@@ -444,7 +444,7 @@ def test_import_notes_contain_no_control_characters(tmp_path):
         {"type": "Feature", "properties": {"name": name}, "geometry": square} for name in ("school", "a\x1b[2J")
     ]
     source.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
-    told = CliRunner().invoke(command, ["import", str(source), "--from", "geojson", "--leave-out", "a\x1b[2J"])
-    assert told.exit_code == 0
-    assert "a\\x1b[2J" in told.stderr
-    assert "\x1b" not in told.output
+    result = CliRunner().invoke(command, ["import", str(source), "--from", "geojson", "--leave-out", "a\x1b[2J"])
+    assert result.exit_code == 0
+    assert "a\\x1b[2J" in result.stderr
+    assert "\x1b" not in result.output

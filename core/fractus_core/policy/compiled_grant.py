@@ -27,7 +27,7 @@ MAX_FRAME_REACH_M = 500_000.0
 """Zones farther than this from the origin are left out of the frame, because no drone reaches them."""
 MAX_UNINDEXED = 4
 """Up to this number of zones, testing each zone is faster than an index."""
-_WITHIN = frozenset({"inclusion", "grant"})
+_PERMITTING_KINDS = frozenset({"inclusion", "grant"})
 """Kinds of policies that permit something inside their zones. Approximations of these zones must not be larger than the
 zone."""
 OPERATION_AREA = "operation-area"
@@ -276,7 +276,7 @@ def _union(frame: LocalFrame, areas: tuple[Area, ...]) -> BaseGeometry | None:
 
 
 def _policy_zones(frame: LocalFrame, rule: Rule, policy: GrantedPolicy) -> list[PolicyZone]:
-    within = rule.spec.kind in _WITHIN
+    within = rule.spec.kind in _PERMITTING_KINDS
     return [
         PolicyZone(
             rule, zone.name, _prepared(area_polygon(frame, zone.area, within=within)), zone.altitude, zone.schedule

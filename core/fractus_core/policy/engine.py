@@ -59,9 +59,9 @@ def judge(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
         grant: Permissions and restrictions of the component.
     """
     if not now.is_plausible:
-        now = _unsound(now)
+        now = _with_unknown_motion(now)
     verdict = _judge_once(call, now, grant)
-    if verdict.action == "correct" and call.method in _ARGS:
+    if verdict.action == "correct" and call.method in _ARGUMENT_TYPES:
         verdict = _settle(call, verdict, now, grant)
     return replace(verdict, brake_first=True) if _must_brake(call, verdict, now, grant) else verdict
 
@@ -89,11 +89,11 @@ def _must_brake(call: Call, verdict: Verdict, now: Situation, grant: CompiledGra
     if verdict.brake_first or not is_moving(now):
         return verdict.brake_first
     if verdict.permits:
-        return call.method in _COURSES and must_stop_first(now, grant)
+        return call.method in _COURSE_METHODS and must_stop_first(now, grant)
     return verdict.action == "takeover"
 
 
-def _unsound(now: Situation) -> Situation:
+def _with_unknown_motion(now: Situation) -> Situation:
     """Return a situation with unknown position and motion, to be used instead of one with implausible numbers.
 
     Raises:
@@ -123,7 +123,7 @@ def judge_access(call: Call, now: Situation, grant: CompiledGrant) -> Verdict | 
     if denied is not None:
         return denied
     allowances = grant.allowances.get(method)
-    if allowances is not None and not _allowing(allowances, now, grant):
+    if allowances is not None and not _is_allowed(allowances, now, grant):
         rules = by_priority(
             {p.rule.name: p.rule for p in allowances.zones} | {r.name: r for r in allowances.everywhere}
         )
@@ -144,7 +144,7 @@ def judge_denials(method: str, now: Situation, grant: CompiledGrant) -> Verdict 
     forbidding = (
         rules_in_view(denials, now, grant)
         if method in PICTURE_METHODS
-        else _matching(denials, now, grant, now.position_error_m)
+        else _rules_here(denials, now, grant, now.position_error_m)
     )
     if not forbidding:
         return None
@@ -165,13 +165,13 @@ def _outside_operation_area(method: str, now: Situation, grant: CompiledGrant) -
     )
 
 
-def _allowing(index: PolicyIndex, now: Situation, grant: CompiledGrant) -> bool:
+def _is_allowed(index: PolicyIndex, now: Situation, grant: CompiledGrant) -> bool:
     """Return True if some policy of an index certainly holds at both readings of an uncertain time."""
     readings = {float(now.time_s), earliest_time(now.time_s)}
-    return all(_matching(index, replace(now, time_s=t), grant, 0.0, certain=True) for t in readings)
+    return all(_rules_here(index, replace(now, time_s=t), grant, 0.0, certain=True) for t in readings)
 
 
-def _matching(
+def _rules_here(
     index: PolicyIndex,
     now: Situation,
     grant: CompiledGrant,
@@ -201,19 +201,19 @@ def _matching(
 
 
 def _check_arguments(call: Call) -> Verdict | None:
-    expected = _ARGS.get(call.method)
+    expected = _ARGUMENT_TYPES.get(call.method)
     if expected is not None and not isinstance(call.args, expected):
         return deny("InvalidArgument", f"{call.method} needs its arguments")
-    for name, value, lower, upper, unit in _figures(call):
+    for name, value, lower, upper, unit in _numbers(call):
         if value is not None and not (math.isfinite(value) and lower <= value <= upper):
             return deny("InvalidArgument", f"{name} must be {lower:g} to {upper:g} {unit}, not {value:g}")
     return None
 
 
-_Figure = tuple[str, float | None, float, float, str]
+_Number = tuple[str, float | None, float, float, str]
 
 
-def _figures(call: Call) -> tuple[_Figure, ...]:  # noqa: PLR0911 - one line a method
+def _numbers(call: Call) -> tuple[_Number, ...]:  # noqa: PLR0911 - one line a method
     """Return the numbers among the arguments, each with name, bounds and unit."""
     match call.args:
         case TakeoffArgs(altitude_m):
@@ -244,11 +244,11 @@ def _figures(call: Call) -> tuple[_Figure, ...]:  # noqa: PLR0911 - one line a m
             return ()
 
 
-_COURSES = frozenset({"Goto", "SetVelocity"})
+_COURSE_METHODS = frozenset({"Goto", "SetVelocity"})
 """Methods that change the course of a flying drone."""
 
 # Picture methods are missing here because their correction changes the picture, not the arguments.
-_ARGS: dict[str, type] = {
+_ARGUMENT_TYPES: dict[str, type] = {
     "Takeoff": TakeoffArgs,
     "Goto": GotoArgs,
     "SetSpeed": SetSpeedArgs,

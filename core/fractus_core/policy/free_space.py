@@ -22,9 +22,9 @@ Floats = NDArray[np.float64]
 CORNER_M = 0.1
 """Distance of waypoints beyond the margin of their legs, so that rounding makes no leg illegal."""
 
-_SIMPLER_M = 0.2
+_SIMPLIFY_TOLERANCE_M = 0.2
 """Tolerance when simplifying a shape with many corners. The shape is grown by this amount first."""
-_MAX_PLAIN_CORNERS = 24
+_MAX_EXACT_CORNERS = 24
 """Shapes with at most this number of corners are not simplified."""
 _SEGMENTS = 3
 """Straight pieces around a corner, per quarter of a circle. Each additional piece is an additional corner to search."""
@@ -123,8 +123,10 @@ def _outline(shape: BaseGeometry, away_m: float) -> BaseGeometry:
     """Return a shape grown or shrunk by at least a distance, with few corners."""
     # GEOS rounds the number of pieces, so a piece may span half as much again as its share of a quarter circle.
     away_m /= math.cos(0.75 * math.pi / 2 / _SEGMENTS)
-    if shapely.get_num_coordinates(shape) > _MAX_PLAIN_CORNERS:
-        return shape.buffer(away_m + math.copysign(_SIMPLER_M, away_m), quad_segs=_SEGMENTS).simplify(_SIMPLER_M)
+    if shapely.get_num_coordinates(shape) > _MAX_EXACT_CORNERS:
+        return shape.buffer(away_m + math.copysign(_SIMPLIFY_TOLERANCE_M, away_m), quad_segs=_SEGMENTS).simplify(
+            _SIMPLIFY_TOLERANCE_M
+        )
     return shape.buffer(away_m, quad_segs=_SEGMENTS)
 
 

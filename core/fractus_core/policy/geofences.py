@@ -72,9 +72,9 @@ def find_breaches(
     """Return every fence that a leg breaks, most restrictive first."""
     air = AirVolume(leg.ground, margin_m, leg.lower_m - height_margin_m, leg.upper_m + height_margin_m)
     breaches = [
-        *_operation_area(leg, now, grant, margin_m),
-        *_exclusions(leg, now, grant, air),
-        *_inclusions(leg, now, grant, air),
+        *_check_operation_area(leg, now, grant, margin_m),
+        *_check_exclusions(leg, now, grant, air),
+        *_check_inclusions(leg, now, grant, air),
     ]
     return sorted(breaches, key=lambda b: (-b.severity, -b.priority, b.policy))
 
@@ -113,7 +113,7 @@ _EFFECTS: dict[Takeover, str] = exhaustive(
 )
 
 
-def _operation_area(leg: Leg, now: Situation, grant: CompiledGrant, margin_m: float) -> Iterator[Breach]:
+def _check_operation_area(leg: Leg, now: Situation, grant: CompiledGrant, margin_m: float) -> Iterator[Breach]:
     """Check the fence that every grant implies: fly to the operation area and stay there."""
     operation_area = grant.operation_area
     border = grant.operation_area_border
@@ -164,7 +164,7 @@ def _area_breach(reason: str, enters: bool) -> Breach:
     return Breach(OPERATION_AREA, 0, "ignore", "OutsideOperationArea", reason, enters, lambda _part: False)
 
 
-def _exclusions(leg: Leg, now: Situation, grant: CompiledGrant, air: AirVolume) -> Iterator[Breach]:
+def _check_exclusions(leg: Leg, now: Situation, grant: CompiledGrant, air: AirVolume) -> Iterator[Breach]:
     if not grant.exclusions.zones:
         return
     margin_m = air.margin_m
@@ -249,7 +249,7 @@ def _exclusion_breach(zone: PolicyZone, leg: Leg, margin_m: float, enters: bool)
         reason = f"the target is {format_distance(depth_m)} inside zone {zone.name}"
     elif shape.intersects(leg.ground):
         code = "LegThroughExclusionZone"
-        reason = _crossing(zone, leg)
+        reason = _crossing_reason(zone, leg)
     else:
         away_m = shape.distance(leg.ground)
         code = "TooCloseToExclusionZone"
@@ -265,7 +265,7 @@ def _exclusion_breach(zone: PolicyZone, leg: Leg, margin_m: float, enters: bool)
     )
 
 
-def _crossing(zone: PolicyZone, leg: Leg) -> str:
+def _crossing_reason(zone: PolicyZone, leg: Leg) -> str:
     inside_m = zone.shape.intersection(leg.line).length
     if inside_m >= 0.05:
         return f"the leg crosses zone {zone.name} for {inside_m:.1f} m"
@@ -273,7 +273,7 @@ def _crossing(zone: PolicyZone, leg: Leg) -> str:
     return f"the {'leg' if zone.shape.intersects(leg.line) else 'turn onto the leg'} touches zone {zone.name}"
 
 
-def _inclusions(leg: Leg, now: Situation, grant: CompiledGrant, air: AirVolume) -> Iterator[Breach]:
+def _check_inclusions(leg: Leg, now: Situation, grant: CompiledGrant, air: AirVolume) -> Iterator[Breach]:
     for fence in grant.inclusions:
         if not fence.rule.in_force(now.time_s):
             continue
@@ -338,13 +338,13 @@ def _stays_inside(shape: BaseGeometry, border: BaseGeometry, leg: Leg, now: Situ
         return False
     if shape.covers(leg.braking_path) and not shape.covers(ground):
         return False
-    if shape.covers(certain_path) and not shape.covers(_from_rest(certain_path, leg)):
+    if shape.covers(certain_path) and not shape.covers(_path_from_rest(certain_path, leg)):
         return False
 
     def keeps(part: BaseGeometry) -> bool:
         return bool(shape.covers(part) and not border.dwithin(part, margin_m))
 
-    return _gains(leg, keeps, lambda point: signed_depth_m(shape, border, point))
+    return _only_gains_distance(leg, keeps, lambda point: signed_depth_m(shape, border, point))
 
 
 def _leads_out(shape: BaseGeometry, leg: Leg, margin_m: float, clearance_m: float) -> bool:
@@ -352,7 +352,7 @@ def _leads_out(shape: BaseGeometry, leg: Leg, margin_m: float, clearance_m: floa
     if clearance_m > 0 and shape.distance(leg.ground) < clearance_m - 1e-6:
         return False
     border = shape.boundary
-    return _gains(
+    return _only_gains_distance(
         leg,
         lambda part: not shape.dwithin(part, margin_m),
         lambda point: -signed_depth_m(shape, border, point),
@@ -364,15 +364,17 @@ def _leads_away(shape: BaseGeometry, leg: Leg, certain: BaseGeometry) -> bool:
     clearance_m = _clearance_outside(shape, certain)
     if clearance_m == 0:
         return True
-    return float(shape.distance(_from_rest(certain, leg))) >= clearance_m - 1e-6
+    return float(shape.distance(_path_from_rest(certain, leg))) >= clearance_m - 1e-6
 
 
-def _from_rest(certain: BaseGeometry, leg: Leg) -> BaseGeometry:
+def _path_from_rest(certain: BaseGeometry, leg: Leg) -> BaseGeometry:
     """Return the line from the earliest point of rest to the target."""
     return shapely.linestrings((shapely.get_coordinates(certain)[-1], leg.target))
 
 
-def _gains(leg: Leg, keeps: Callable[[BaseGeometry], bool], clearance: Callable[[BaseGeometry], float]) -> bool:
+def _only_gains_distance(
+    leg: Leg, keeps: Callable[[BaseGeometry], bool], clearance: Callable[[BaseGeometry], float]
+) -> bool:
     """Return True if a leg that begins too close only gains distance, until it keeps its distance to the end.
 
     The fence is tested as it is, because growing or shrinking a shape of ten thousand corners takes seconds.

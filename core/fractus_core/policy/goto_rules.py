@@ -62,7 +62,7 @@ def judge_goto(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     if position is None:
         return DENY_POSITION_UNKNOWN
     target = grant.frame.xy(args.lat, args.lon)
-    if not math.dist(target, position) <= MAX_RANGE_M or _beyond(args, grant):
+    if not math.dist(target, position) <= MAX_RANGE_M or _is_beyond_frame(args, grant):
         return deny("InvalidArgument", f"the target is more than {MAX_RANGE_M / 1000:.0f} km away")
     if args.speed_mps is not None and args.speed_mps > now.speed_setpoint_mps:
         now = replace(now, speed_setpoint_mps=args.speed_mps)
@@ -126,8 +126,8 @@ def _judge_from(request: _Request, target: XY) -> Verdict:
     if args.alt is not None and args.reference == "terrain":
         reason = "no terrain model is loaded; the ground is taken as level with home"
         notes.append(Correction(altitude, "TerrainAssumedFlat", reason))
-    result = _fly_leg(request, _Aim(target, altitude), notes, adjusting=True)
-    return result if isinstance(result, Verdict) else _outcome(args, result, notes, grant)
+    result = _permitted_leg(request, _Aim(target, altitude), notes, adjusting=True)
+    return result if isinstance(result, Verdict) else _goto_verdict(args, result, notes, grant)
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +149,7 @@ class _Aim:
     speed_mps: float | None = None
 
 
-def _beyond(args: GotoArgs, grant: CompiledGrant) -> bool:
+def _is_beyond_frame(args: GotoArgs, grant: CompiledGrant) -> bool:
     """Return True if the target lies on the far side of the globe, which the frame cannot represent."""
     frame = grant.frame
     if abs(args.lat - frame.lat) < NEAR_DEG and abs(args.lon - frame.lon) < NEAR_DEG:
@@ -159,18 +159,18 @@ def _beyond(args: GotoArgs, grant: CompiledGrant) -> bool:
     return abs(lat - args.lat) > 1e-6 or abs((lon - args.lon + 180.0) % 360.0 - 180.0) > 1e-5
 
 
-def _fly_leg(request: _Request, aim: _Aim, notes: list[Correction], adjusting: bool) -> _Aim | Verdict:
+def _permitted_leg(request: _Request, aim: _Aim, notes: list[Correction], adjusting: bool) -> _Aim | Verdict:
     """Return the permitted part of a leg, or the verdict that forbids it."""
     now = request.now
     grant = request.grant
-    leg = _leg(request.position, aim.target, now, aim.altitude_m)
+    leg = _build_leg(request.position, aim.target, now, aim.altitude_m)
     limited = _within_limits(request, leg, aim, notes)
     if isinstance(limited, Verdict):
         return limited
-    leg = _leg(request.position, aim.target, now, limited.altitude_m)
+    leg = _build_leg(request.position, aim.target, now, limited.altitude_m)
     breaches = find_breaches(leg, now, grant, margin_m(now), height_margin_m(now))
     adjustable = adjusting and bool(breaches) and all(b.action == "adjust" for b in breaches)
-    shorter = _last_legal(leg, breaches) if adjustable else None
+    shorter = _last_legal_point(leg, breaches) if adjustable else None
     if shorter is None:
         problem = breach_verdict(breaches) if breaches else check_return(aim.target, limited.altitude_m, now, grant)
         if problem is None or limited.altitude_m == aim.altitude_m:
@@ -178,14 +178,14 @@ def _fly_leg(request: _Request, aim: _Aim, notes: list[Correction], adjusting: b
         return choose_objection(problem, _objection(request, aim), correction_verdict(None, notes))
     names = distinct(b.policy for b in breaches)
     notes.append(Correction(0.0, "LegShortened", f"{breaches[0].reason}; the leg ends at the last legal point", names))
-    return _fly_leg(request, replace(limited, target=shorter), notes, adjusting=False)
+    return _permitted_leg(request, replace(limited, target=shorter), notes, adjusting=False)
 
 
 def _objection(request: _Request, aim: _Aim) -> Verdict | None:
     """Return the objection of fences and the return route to a leg, without its limits."""
     now = request.now
     grant = request.grant
-    leg = _leg(request.position, aim.target, now, aim.altitude_m)
+    leg = _build_leg(request.position, aim.target, now, aim.altitude_m)
     breaches = find_breaches(leg, now, grant, margin_m(now), height_margin_m(now))
     return breach_verdict(breaches) if breaches else check_return(aim.target, aim.altitude_m, now, grant)
 
@@ -223,7 +223,7 @@ def _within_limits(request: _Request, leg: Leg, aim: _Aim, notes: list[Correctio
     return _Aim(aim.target, height.value, speed.value if speed.code or requested_mps is not None else None)
 
 
-def _leg(position: XY, target: XY, now: Situation, altitude_m: float) -> Leg:
+def _build_leg(position: XY, target: XY, now: Situation, altitude_m: float) -> Leg:
     altitudes = [now.altitude_m, stop_altitude_m(now), altitude_m]
     turn = turn_point(now, position, target)
     stops = turning_stops(now, position, target)
@@ -258,7 +258,7 @@ def check_return(target: XY, altitude_m: float, now: Situation, grant: CompiledG
     return replace(problem, reason=f"{problem.reason}, and no legal route around it was found")
 
 
-def _last_legal(leg: Leg, breaches: list[Breach]) -> XY | None:
+def _last_legal_point(leg: Leg, breaches: list[Breach]) -> XY | None:
     """Return the farthest point of a leg that no breached fence forbids, or None if the leg to it is too short."""
     length_m = math.dist(leg.stop, leg.target)
     (x, y), (tx, ty) = leg.stop, leg.target
@@ -274,7 +274,7 @@ def _last_legal(leg: Leg, breaches: list[Breach]) -> XY | None:
     return along(low - 0.01 / length_m) if low * length_m >= MIN_LEG_M else None
 
 
-def _outcome(args: GotoArgs, result: _Aim, notes: list[Correction], grant: CompiledGrant) -> Verdict:
+def _goto_verdict(args: GotoArgs, result: _Aim, notes: list[Correction], grant: CompiledGrant) -> Verdict:
     moved = any(note.code == "LegShortened" for note in notes)
     lat, lon = grant.frame.latlon(*result.target) if moved else (args.lat, args.lon)
     new = replace(args, lat=lat, lon=lon, alt=result.altitude_m, reference="home", speed_mps=result.speed_mps)

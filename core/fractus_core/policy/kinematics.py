@@ -54,12 +54,12 @@ def height_margin_m(now: Situation) -> float:
 
 def is_moving(now: Situation) -> bool:
     """Return True if the drone is too fast to turn on the spot, or may be when a command takes effect."""
-    if _fast(now.north_mps, now.east_mps, now.down_mps):
+    if _exceeds_stationary_speed(now.north_mps, now.east_mps, now.down_mps):
         return True
-    return bool(now.pending) and any(_fast(*velocity) for velocity in now.pending)
+    return bool(now.pending) and any(_exceeds_stationary_speed(*velocity) for velocity in now.pending)
 
 
-def _fast(north_mps: float, east_mps: float, down_mps: float) -> bool:
+def _exceeds_stationary_speed(north_mps: float, east_mps: float, down_mps: float) -> bool:
     return math.hypot(north_mps, east_mps) >= STATIONARY_MPS or abs(down_mps) >= STATIONARY_MPS
 
 
@@ -76,11 +76,11 @@ def pending_outcomes(now: Situation, position: XY) -> list[tuple[XY, Situation]]
         return []
     airframe = now.airframe
     points = []
-    for north, east, down in _extremes(now.pending):
-        dn, de = _taken_up(
+    for north, east, down in _bounding_velocities(now.pending):
+        dn, de = _velocity_change(
             (now.north_mps, now.east_mps), (north, east), airframe.accel_mps2, airframe.jerk_mps3, now.latency_s
         )
-        climb, _ = _taken_up(
+        climb, _ = _velocity_change(
             (now.down_mps, 0.0), (down, 0.0), airframe.climb_accel_mps2, airframe.jerk_mps3, now.latency_s
         )
         begun = (now.north_mps + dn / 2, now.east_mps + de / 2)
@@ -94,7 +94,7 @@ def pending_outcomes(now: Situation, position: XY) -> list[tuple[XY, Situation]]
     return points
 
 
-def _taken_up(present: XY, target_velocity: XY, accel: float, jerk: float, lasting_s: float) -> XY:
+def _velocity_change(present: XY, target_velocity: XY, accel: float, jerk: float, lasting_s: float) -> XY:
     """Return the change of a velocity toward a wanted one, including the change while the acceleration decays."""
     change = math.dist(present, target_velocity)
     share = min(accel * (lasting_s + accel / (2 * jerk)) / change, 1.0) if change > 0 else 0.0
@@ -105,7 +105,7 @@ MAX_PENDING_VELOCITIES = 4
 """Above this number of pending velocities, the corners of their bounding box replace them."""
 
 
-def _extremes(velocities: tuple[tuple[float, float, float], ...]) -> tuple[tuple[float, float, float], ...]:
+def _bounding_velocities(velocities: tuple[tuple[float, float, float], ...]) -> tuple[tuple[float, float, float], ...]:
     if len(velocities) <= MAX_PENDING_VELOCITIES:
         return velocities
     (south, north), (west, east), (up, down) = ((min(axis), max(axis)) for axis in zip(*velocities, strict=True))
@@ -141,27 +141,27 @@ def motion_before_reaction(situation: Situation) -> MotionBeforeReaction:
     """
     airframe = situation.airframe
     speed = math.hypot(situation.north_mps, situation.east_mps)
-    bite_s = airframe.accel_mps2 / (2 * airframe.jerk_mps3)
+    braking_delay_s = airframe.accel_mps2 / (2 * airframe.jerk_mps3)
     forward = situation.forward_mps2
     if forward is None:
         forward = airframe.accel_mps2 if STATIONARY_MPS <= speed < situation.speed_setpoint_mps else 0.0
-    elif forward < 0.0 and any(_fast(*velocity) for velocity in situation.pending):
+    elif forward < 0.0 and any(_exceeds_stationary_speed(*velocity) for velocity in situation.pending):
         forward = 0.0  # A pending setpoint may have ended the braking.
     forward = min(max(forward, -airframe.accel_mps2), airframe.accel_mps2)
     if forward <= 0.0:
         # A braking drone keeps braking, so its speed is lower when the command takes effect.
         left = max(speed + forward * situation.latency_s, 0.0)
-        bite_s *= 1.0 + forward / airframe.accel_mps2
-        return MotionBeforeReaction(left, (speed + left) / 2 * situation.latency_s + left * bite_s)
+        braking_delay_s *= 1.0 + forward / airframe.accel_mps2
+        return MotionBeforeReaction(left, (speed + left) / 2 * situation.latency_s + left * braking_delay_s)
     late_s = situation.latency_s
-    easing_s = forward / airframe.jerk_mps3
+    jerk_limit_s = forward / airframe.jerk_mps3
     first = speed + forward * late_s
-    last = first + forward * easing_s / 2
-    run = (speed + first) / 2 * late_s + first * easing_s + forward * easing_s**2 / 3
+    last = first + forward * jerk_limit_s / 2
+    run = (speed + first) / 2 * late_s + first * jerk_limit_s + forward * jerk_limit_s**2 / 3
     if situation.forward_mps2 is None and last > situation.speed_setpoint_mps:
         last = max(situation.speed_setpoint_mps, speed)
-        run = min(run, last * (late_s + easing_s))
-    return MotionBeforeReaction(last, run + last * bite_s)
+        run = min(run, last * (late_s + jerk_limit_s))
+    return MotionBeforeReaction(last, run + last * braking_delay_s)
 
 
 def stop_point(situation: Situation, position: XY) -> XY:
@@ -352,18 +352,20 @@ def velocity_leg(now: Situation, position: XY, args: VelocityArgs) -> Leg:
     known = now.forward_mps2 is not None and not now.pending
     braked = reaction.speed_mps if known else speed - airframe.accel_mps2 * now.latency_s
     slowest = max(min(speed, braked), 0.0)
-    ways = _course((ahead[0] * slowest, ahead[1] * slowest), target_velocity, lasting_s, airframe, control)
+    ways = _displacements((ahead[0] * slowest, ahead[1] * slowest), target_velocity, lasting_s, airframe, control)
     late = (ahead[0] * reaction.run_m, ahead[1] * reaction.run_m)
-    ways += [(x + late[0], y + late[1]) for x, y in _course(present, target_velocity, lasting_s, airframe, control)]
+    ways += [
+        (x + late[0], y + late[1]) for x, y in _displacements(present, target_velocity, lasting_s, airframe, control)
+    ]
     climb = -now.down_mps
-    climbs = _course((climb, 0.0), (-args.down_mps, 0.0), lasting_s, airframe, (airframe.climb_accel_mps2, 1.0))
+    climbs = _displacements((climb, 0.0), (-args.down_mps, 0.0), lasting_s, airframe, (airframe.climb_accel_mps2, 1.0))
     late_m = climb * reaction_s(now, airframe.climb_accel_mps2)
     climbs += [(up + late_m, 0.0) for up, _ in climbs]
     for (x, y), other in pending_outcomes(now, (0.0, 0.0)):
-        displacements = _course((other.east_mps, other.north_mps), target_velocity, lasting_s, airframe, control)
+        displacements = _displacements((other.east_mps, other.north_mps), target_velocity, lasting_s, airframe, control)
         ways[:0] = [(x, y), stop_point(other, (x, y)), *((x + dx, y + dy) for dx, dy in displacements)]
         rise = other.altitude_m - now.altitude_m
-        displacements = _course(
+        displacements = _displacements(
             (-other.down_mps, 0.0), (-args.down_mps, 0.0), lasting_s, airframe, (airframe.climb_accel_mps2, 1.0)
         )
         climbs += [
@@ -377,7 +379,7 @@ def velocity_leg(now: Situation, position: XY, args: VelocityArgs) -> Leg:
     return Leg(position, stop, stop, corners[-1], min(heights), max(heights), corners, follows_velocity=True)
 
 
-def _course(
+def _displacements(
     present: XY, target_velocity: XY, lasting_s: float, airframe: Airframe, control: tuple[float, float]
 ) -> list[XY]:
     """Return displacements whose hull contains the motion from one velocity to another and to rest.

@@ -88,35 +88,45 @@ def monitor(
         return Verdict("takeover", None, "PositionUnknown", "the drone's position is unknown", (), "hover")
     start = grant.frame.xy(lat, lon)
     margin = now.position_error_m + TRACKING_SHARE * now.airframe.tracking_m
-    surging = [(start, now), *pending_outcomes(now, start)] if fences_changed else []
+    outlooks = [(start, now), *pending_outcomes(now, start)] if fences_changed else []
     # An accelerating drone flies on a leg that was judged with room for it, and brakes at its end in time.
     now = replace(now, forward_mps2=min(now.forward_mps2 or 0.0, 0.0))
     stop = stop_point(now, start)
     ahead = (
-        stop if current_leg is None else _arrival(now, start, stop, grant.frame.xy(current_leg.lat, current_leg.lon))
+        stop
+        if current_leg is None
+        else _rest_position(now, start, stop, grant.frame.xy(current_leg.lat, current_leg.lon))
     )
-    level_m = _level_m(now, current_leg, grant)
-    worst = _worst(_fences(now, grant, _look_ahead(now, start, ahead, margin, level_m), system_flies=system_flies))
+    level_m = _rest_altitude_m(now, current_leg, grant)
+    worst = _worst(
+        _fence_reactions(now, grant, _stopping_path(now, start, ahead, margin, level_m), system_flies=system_flies)
+    )
     if worst is not None:
         return replace(worst, brake_first=worst.action == "takeover" and is_moving(now))
-    for begin, then in surging:
+    for begin, then in outlooks:
         # The drone's way may end before the fence. It is stopped now, and taken over only if it really goes too far.
-        further = _look_ahead(then, begin, stop_point(then, begin), margin, _level_m(then, current_leg, grant))
-        worst = _worst(_fences(then, grant, further, system_flies=True))
+        further = _stopping_path(
+            then, begin, stop_point(then, begin), margin, _rest_altitude_m(then, current_leg, grant)
+        )
+        worst = _worst(_fence_reactions(then, grant, further, system_flies=True))
         if worst is not None:
             return replace(worst, action="deny", takeover="hover")
     if fences_changed and current_leg is not None:
         # A leg that has become illegal is stopped at once. A later stop would depend on the link at that moment.
         worst = _worst(
-            _fences(now, grant, _rest_of_leg(now, grant, start, current_leg, margin), system_flies=system_flies)
+            _fence_reactions(
+                now, grant, _rest_of_leg(now, grant, start, current_leg, margin), system_flies=system_flies
+            )
         )
         if worst is not None:
             return replace(worst, brake_first=worst.action == "takeover" and is_moving(now))
     rest_m = _altitude_after_stop_m(now, level_m)
     # A climb initiated by the autopilot was never judged and may end anywhere, so it gets only part of the tolerance.
-    unasked = system_flies and current_leg is None and now.down_mps < -CLIMBING_MPS
-    findings = _heights(now, grant, start, stop, rest_m, sinks_back=system_flies, share=0.5 if unasked else 1.0)
-    return findings or _speeds(now, grant, start)
+    unjudged_climb = system_flies and current_leg is None and now.down_mps < -CLIMBING_MPS
+    correction = _check_altitude(
+        now, grant, start, stop, rest_m, sinks_back=system_flies, share=0.5 if unjudged_climb else 1.0
+    )
+    return correction or _check_speed(now, grant, start)
 
 
 def _worst(findings: list[tuple[int, Verdict]]) -> Verdict | None:
@@ -128,7 +138,7 @@ def _worst(findings: list[tuple[int, Verdict]]) -> Verdict | None:
     return findings[min(ranked)[2]][1] if ranked else None
 
 
-def _arrival(now: Situation, start: XY, stop: XY, target: XY) -> XY:
+def _rest_position(now: Situation, start: XY, stop: XY, target: XY) -> XY:
     """Return the point of rest of a drone that flies to a target.
 
     This is the target itself as long as the drone can brake for it as planned. A drone commanded to stop flies on for
@@ -148,8 +158,8 @@ def _arrival(now: Situation, start: XY, stop: XY, target: XY) -> XY:
     return target if arrives else stop
 
 
-def _level_m(now: Situation, current_leg: GotoArgs | None, grant: CompiledGrant) -> float:
-    """Return the altitude of rest of a drone that climbs or sinks to the altitude of its leg. See `_arrival`."""
+def _rest_altitude_m(now: Situation, current_leg: GotoArgs | None, grant: CompiledGrant) -> float:
+    """Return the altitude of rest of a drone that climbs or sinks to the altitude of its leg. See `_rest_position`."""
     rest_m = stop_altitude_m(now)
     climb = -now.down_mps
     if current_leg is None or current_leg.alt is None or climb == 0.0:
@@ -189,35 +199,35 @@ def must_stop_first(now: Situation, grant: CompiledGrant) -> bool:
         return False
     outlooks = [(position, replace(now, forward_mps2=0.0)), *pending_outcomes(now, position)]
     return any(
-        _fences(
+        _fence_reactions(
             then,
             grant,
-            _look_ahead(then, begin, stop_point(then, begin), margin_m(then), stop_altitude_m(then)),
+            _stopping_path(then, begin, stop_point(then, begin), margin_m(then), stop_altitude_m(then)),
             system_flies=True,
         )
         for begin, then in outlooks
     )
 
 
-def _look_ahead(now: Situation, start: XY, stop: XY, margin: float, rest_m: float) -> _Ahead:
+def _stopping_path(now: Situation, start: XY, stop: XY, margin: float, rest_m: float) -> _StoppingPath:
     path = shapely.points(start) if start == stop else shapely.linestrings((start, stop))
     lower = min(now.altitude_m, rest_m) - now.altitude_error_m
     upper = max(now.altitude_m, rest_m) + now.altitude_error_m
     # A fence below does not keep a landing drone in the air.
     ends_m = max(rest_m, now.altitude_m) if now.vertical else rest_m
-    return _Ahead(
+    return _StoppingPath(
         AirVolume(path, margin, lower, upper), shapely.points(start), shapely.points(stop), now.altitude_m, ends_m
     )
 
 
-def _rest_of_leg(now: Situation, grant: CompiledGrant, start: XY, leg: GotoArgs, margin: float) -> _Ahead:
+def _rest_of_leg(now: Situation, grant: CompiledGrant, start: XY, leg: GotoArgs, margin: float) -> _StoppingPath:
     level_m = None if leg.alt is None else altitude_above_home_m(leg.alt, leg.reference, now.home, grant.flat_terrain)
     end = grant.frame.xy(leg.lat, leg.lon)
-    return _look_ahead(now, start, end, margin, now.altitude_m if level_m is None else level_m)
+    return _stopping_path(now, start, end, margin, now.altitude_m if level_m is None else level_m)
 
 
 @dataclass(frozen=True, slots=True)
-class _Ahead:
+class _StoppingPath:
     """Way to the point where the drone can stop, with its ends and their altitudes above home."""
 
     air: AirVolume
@@ -248,17 +258,19 @@ class _Finding:
     what: str
 
 
-def _fences(now: Situation, grant: CompiledGrant, ahead: _Ahead, *, system_flies: bool) -> list[tuple[int, Verdict]]:
+def _fence_reactions(
+    now: Situation, grant: CompiledGrant, ahead: _StoppingPath, *, system_flies: bool
+) -> list[tuple[int, Verdict]]:
     """Return the reactions of fences, each with the priority of its policy."""
     findings: list[tuple[int, _Finding | None]] = [
-        (zone.rule.spec.priority, _kept_out(zone, ahead, now, grant.flat_terrain))
+        (zone.rule.spec.priority, _check_exclusion(zone, ahead, now, grant.flat_terrain))
         for zone in grant.exclusions.near(ahead.air, now, grant.flat_terrain)
     ]
     if grant.flight_area is not None and grant.flight_area_border is not None:
         area = _Fence(
             OPERATION_AREA, "ignore", "the operation area", "OutsideOperationArea", "OperationAreaBorderAhead"
         )
-        findings.append((0, _kept_in(grant.flight_area, grant.flight_area_border, ahead, area, leaves=False)))
+        findings.append((0, _check_inclusion(grant.flight_area, grant.flight_area_border, ahead, area, leaves=False)))
     for inclusion in grant.inclusions:
         if inclusion.rule.in_force(now.time_s):
             shape, border = inclusion.at(ahead.air.lower_m, ahead.air.upper_m, now, grant.flat_terrain)
@@ -266,13 +278,13 @@ def _fences(now: Situation, grant: CompiledGrant, ahead: _Ahead, *, system_flies
             rule = inclusion.rule
             name = f"{zones} of policy {rule.name}"
             fence = _Fence(rule.name, rule.spec.geofence_action, name, "OutsideInclusionZone", "InclusionBorderAhead")
-            leaves = inclusion.banded and _leaves_by_height(inclusion, ahead, now, grant.flat_terrain)
-            findings.append((rule.spec.priority, _kept_in(shape, border, ahead, fence, leaves=leaves)))
+            leaves = inclusion.banded and _leaves_altitudes(inclusion, ahead, now, grant.flat_terrain)
+            findings.append((rule.spec.priority, _check_inclusion(shape, border, ahead, fence, leaves=leaves)))
     reactions = [(priority, _reaction(f, system_flies=system_flies)) for priority, f in findings if f is not None]
     return [(priority, verdict) for priority, verdict in reactions if verdict is not None]
 
 
-def _kept_out(zone: PolicyZone, ahead: _Ahead, now: Situation, flat: bool) -> _Finding:
+def _check_exclusion(zone: PolicyZone, ahead: _StoppingPath, now: Situation, flat: bool) -> _Finding:
     shape = zone.shape
     border = zone.shape.boundary
     around = bool(shape.intersects(ahead.present))
@@ -281,33 +293,33 @@ def _kept_out(zone: PolicyZone, ahead: _Ahead, now: Situation, flat: bool) -> _F
     inside = around and band_may_overlap(
         zone.band, ahead.present_m - error_m, ahead.present_m + error_m, now.home, flat
     )
-    rest_m, here_m = (signed_depth_m(shape, border, point) for point in (ahead.rest, ahead.present))
-    worse = rest_m > here_m + DEEPER_M or (crosses and not around)
+    rest_m, depth_now_m = (signed_depth_m(shape, border, point) for point in (ahead.rest, ahead.present))
+    worse = rest_m > depth_now_m + DEEPER_M or (crosses and not around)
     if crosses and zone.band is not None:
         # The drone may approach from above or below. If its position is inside the zone's outline, the smaller depth
         # counts.
-        rest_m, here_m = (
+        rest_m, depth_now_m = (
             min(depth_m, band_depth_m(zone.band, altitude_m, now.home, flat))
-            for depth_m, altitude_m in ((rest_m, ahead.rest_m), (here_m, ahead.present_m))
+            for depth_m, altitude_m in ((rest_m, ahead.rest_m), (depth_now_m, ahead.present_m))
         )
-        worse = worse or here_m < 0.0 <= rest_m or (rest_m > here_m + DEEPER_M and rest_m > -error_m)
+        worse = worse or depth_now_m < 0.0 <= rest_m or (rest_m > depth_now_m + DEEPER_M and rest_m > -error_m)
     name = f"zone {zone.name} of policy {zone.rule.name}"
     fence = _Fence(zone.rule.name, zone.rule.spec.geofence_action, name, "InsideExclusionZone", "ExclusionZoneAhead")
     return _Finding(fence, inside, worse, "is inside" if inside else "is about to enter")
 
 
-def _leaves_by_height(fence: Inclusion, ahead: _Ahead, now: Situation, flat: bool) -> bool:
+def _leaves_altitudes(fence: Inclusion, ahead: _StoppingPath, now: Situation, flat: bool) -> bool:
     """Return True if a drone moves farther away from the altitudes of all zones it must stay in."""
     around = [zone.band for zone in fence.zones if zone.shape.intersects(ahead.present)]
-    rest_m, here_m = (
+    rest_m, depth_now_m = (
         max((band_depth_m(band, m, now.home, flat) for band in around), default=math.inf)
         for m in (ahead.rest_m, ahead.present_m)
     )
-    return rest_m < 0.0 <= here_m or (rest_m < here_m - DEEPER_M and rest_m < now.altitude_error_m)
+    return rest_m < 0.0 <= depth_now_m or (rest_m < depth_now_m - DEEPER_M and rest_m < now.altitude_error_m)
 
 
-def _kept_in(
-    shape: BaseGeometry, border: BaseGeometry, ahead: _Ahead, fence: _Fence, *, leaves: bool
+def _check_inclusion(
+    shape: BaseGeometry, border: BaseGeometry, ahead: _StoppingPath, fence: _Fence, *, leaves: bool
 ) -> _Finding | None:
     path = ahead.air.ground
     if shape.covers(path) and not border.dwithin(path, ahead.air.margin_m):
@@ -315,8 +327,8 @@ def _kept_in(
     outside = not shape.covers(ahead.present)
     worse = leaves
     if not shape.is_empty:
-        deep_m = signed_depth_m(shape, border, ahead.present)
-        worse = worse or signed_depth_m(shape, border, ahead.rest) < deep_m - DEEPER_M
+        depth_now_m = signed_depth_m(shape, border, ahead.present)
+        worse = worse or signed_depth_m(shape, border, ahead.rest) < depth_now_m - DEEPER_M
     worse = worse or (not outside and not shape.covers(path))
     return _Finding(fence, outside, worse, "is outside" if outside else "is about to leave")
 
@@ -338,7 +350,7 @@ def _reaction(findings: _Finding, *, system_flies: bool) -> Verdict | None:
     return None
 
 
-def _heights(
+def _check_altitude(
     now: Situation, grant: CompiledGrant, start: XY, stop: XY, rest_m: float, *, sinks_back: bool, share: float
 ) -> Verdict | None:
     """Return the correction of an altitude that breaks limits, or None.
@@ -362,7 +374,7 @@ def _heights(
     high, low = max(now.altitude_m, rest_m), min(now.altitude_m, rest_m)
     if over is not None and over.upper is not None and high > over.upper + share * slack and not sinks_back:
         reason = f"the drone climbs to {high:.1f} m, above the limit of {over.upper:.1f} m"
-        return _changed_height(_Trespass(over, over.upper, "AltitudeAboveLimit", reason), now, grant, stop)
+        return _altitude_correction(_LimitViolation(over, over.upper, "AltitudeAboveLimit", reason), now, grant, stop)
     if unknown:
         sinking = now.down_mps > -SINKING_MPS
         return None if sinking else replace(deny_unknown_datum(unknown[0]), takeover="hover")
@@ -370,12 +382,12 @@ def _heights(
         if over is not None and over.upper is not None and over.upper < under.lower:
             return None
         reason = f"the drone sinks to {low:.1f} m, below the limit of {under.lower:.1f} m"
-        return _changed_height(_Trespass(under, under.lower, "AltitudeBelowLimit", reason), now, grant, stop)
+        return _altitude_correction(_LimitViolation(under, under.lower, "AltitudeBelowLimit", reason), now, grant, stop)
     return None
 
 
 @dataclass(frozen=True, slots=True)
-class _Trespass:
+class _LimitViolation:
     """A broken altitude limit, and the altitude that complies with it."""
 
     bound: Bound
@@ -384,7 +396,7 @@ class _Trespass:
     reason: str
 
 
-def _changed_height(findings: _Trespass, now: Situation, grant: CompiledGrant, stop: XY) -> Verdict:
+def _altitude_correction(findings: _LimitViolation, now: Situation, grant: CompiledGrant, stop: XY) -> Verdict:
     """Return the correction to an altitude, or a stop if zones block the way to it."""
     names = (findings.bound.name,) if findings.bound.name else ()
     column = vertical_leg(stop, min(now.altitude_m, findings.height_m), max(now.altitude_m, findings.height_m))
@@ -395,7 +407,7 @@ def _changed_height(findings: _Trespass, now: Situation, grant: CompiledGrant, s
     return Verdict("correct", GotoArgs(lat, lon, findings.height_m), findings.code, findings.reason, names)
 
 
-def _speeds(now: Situation, grant: CompiledGrant, start: XY) -> Verdict | None:
+def _check_speed(now: Situation, grant: CompiledGrant, start: XY) -> Verdict | None:
     """Return the correction of a speed that breaks limits, or None."""
     if grant.max_speed_mps is None and not grant.speed_limits:
         return None

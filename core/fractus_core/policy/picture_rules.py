@@ -14,12 +14,12 @@ from fractus_core.policy.compiled_grant import AirVolume, CompiledGrant, PolicyI
 from fractus_core.policy.decision_types import Filter, Situation, Verdict, deny
 from fractus_core.policy.footprint import exposure_footprint
 
-_IN_ORDER: tuple[FilterAction, ...] = exhaustive(
+_FILTER_ORDER: tuple[FilterAction, ...] = exhaustive(
     FilterAction, ("blurFaces", "removeBackground", "blurMedian", "blurAverage", "black")
 )
 """Filters from mildest to strictest, which is also the order of their application."""
-_FALLBACKS: tuple[Fallback, ...] = exhaustive(Fallback, ("blurAverage", "black", "refuse"))
-_WHOLE: frozenset[FilterAction] = frozenset({"blurMedian", "blurAverage", "black"})
+_FALLBACK_ORDER: tuple[Fallback, ...] = exhaustive(Fallback, ("blurAverage", "black", "refuse"))
+_WHOLE_PICTURE_FILTERS: frozenset[FilterAction] = frozenset({"blurMedian", "blurAverage", "black"})
 """Filters of the whole picture. They leave no face to find."""
 
 
@@ -58,14 +58,14 @@ def combine_filters(filters: Iterable[Filter]) -> tuple[Filter, ...]:
         required.setdefault(item.action, []).append(item)
     if "black" in required:
         return (Filter("black"),)
-    if required.keys() & _WHOLE:
+    if required.keys() & _WHOLE_PICTURE_FILTERS:
         required.pop("blurFaces", None)
-    return tuple(_strictest(required[action]) for action in _IN_ORDER if action in required)
+    return tuple(_strictest(required[action]) for action in _FILTER_ORDER if action in required)
 
 
 def _strictest(alike: list[Filter]) -> Filter:
     method: FaceMethod = "gaussian" if all(item.faces == "gaussian" for item in alike) else "pixelate"
-    return Filter(alike[0].action, method, max((item.fallback for item in alike), key=_FALLBACKS.index))
+    return Filter(alike[0].action, method, max((item.fallback for item in alike), key=_FALLBACK_ORDER.index))
 
 
 def remaining_filters(required: Iterable[Filter], applied: Iterable[Filter]) -> tuple[Filter, ...]:
@@ -82,7 +82,7 @@ def remaining_filters(required: Iterable[Filter], applied: Iterable[Filter]) -> 
 def _satisfied(required: Filter, applied_filters: Sequence[Filter]) -> bool:
     if required.action != "blurFaces":
         return any(item.action == required.action for item in applied_filters)
-    if any(item.action in _WHOLE for item in applied_filters):
+    if any(item.action in _WHOLE_PICTURE_FILTERS for item in applied_filters):
         return True
     return any(
         item.action == "blurFaces" and (item.faces == "pixelate" or required.faces == "gaussian")

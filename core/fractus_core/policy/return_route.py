@@ -54,11 +54,11 @@ def return_altitudes_m(now: Situation, grant: CompiledGrant, worth_m: float) -> 
         lowest = max((b.lower for b in bounds if b.lower is not None), default=-math.inf)
         highest = lowest_ceiling_m(bounds, unknown, now.altitude_m)
         altitudes += [min(max(altitude_m, lowest), highest) for altitude_m in (best, now.altitude_m)]
-    below = [lower for lower in _heights_below_m(lane, now, grant) if lowest <= lower <= min(highest, best)]
+    below = [lower for lower in _altitudes_below_zones_m(lane, now, grant) if lowest <= lower <= min(highest, best)]
     return (*dict.fromkeys((*altitudes, now.altitude_m, *below[:MAX_LOWERED_ALTITUDES])),)
 
 
-def _heights_below_m(lane: BaseGeometry, now: Situation, grant: CompiledGrant) -> list[float]:
+def _altitudes_below_zones_m(lane: BaseGeometry, now: Situation, grant: CompiledGrant) -> list[float]:
     """Return altitudes above home just below the zones around a lane, highest first.
 
     The zones are at most the lane's length away.
@@ -168,14 +168,16 @@ def check_straight_return(
     for part in parts:
         air = AirVolume(part.ground, margin, part.lower_m - slack, part.upper_m + slack)
         for zone in grant.exclusions.near(air, now, grant.flat_terrain):
-            return _blocked(f"{description}, is blocked by zone {zone.name} of policy {zone.rule.name}", zone.rule.name)
+            return _deny_return(
+                f"{description}, is blocked by zone {zone.name} of policy {zone.rule.name}", zone.rule.name
+            )
     for fence in grant.inclusions:
         if fence.rule.in_force(now.time_s):
             shape, _ = fence.at(least_m, return_m, now, grant.flat_terrain)
             if not shape.covers(lane):
-                return _blocked(f"{description}, leaves the zones of policy {fence.rule.name}", fence.rule.name)
+                return _deny_return(f"{description}, leaves the zones of policy {fence.rule.name}", fence.rule.name)
     return None
 
 
-def _blocked(description: str, policy: str) -> Verdict:
+def _deny_return(description: str, policy: str) -> Verdict:
     return deny("WayHomeBlocked", f"the straight return from the target, {description}", (policy,))

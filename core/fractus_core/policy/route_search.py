@@ -31,7 +31,7 @@ QUICK_MAX_LEGS_TESTED = 250
 QUICK_MAX_EXCESS = 5.0
 """The same limits for a search that only decides if a route exists while a caller waits: about 25 ms."""
 
-_MAX_DETOUR = 1.2
+_MAX_CLEARANCE_DETOUR = 1.2
 _MAX_ROUNDING_M = 1.5
 _ROUNDING = 1e-6
 _START = 0
@@ -75,7 +75,7 @@ def find_route(
         the target. The start is not included. None if no legal route exists, if home or a limit's datum is unknown, or
         if the search gives up.
     """
-    return _finished(route_steps(start, target, now, grant, altitude_m, from_m=from_m))
+    return _run_to_end(route_steps(start, target, now, grant, altitude_m, from_m=from_m))
 
 
 def route_steps(
@@ -87,10 +87,12 @@ def route_steps(
         return None
     roomy, narrow = (_Search(start, target, _spaces(now, grant, figures[-2:], room_m)) for room_m in CLEARANCES_M)
     result = yield from roomy.steps()
-    if result is not None and _length_m(start, result) <= _MAX_DETOUR * math.dist(start, target):
+    if result is not None and _length_m(start, result) <= _MAX_CLEARANCE_DETOUR * math.dist(start, target):
         return (yield from roomy.rounded(result))
     shorter = (yield from narrow.steps()) if not roomy.exhausted else None
-    if shorter is not None and (result is None or _length_m(start, shorter) < _length_m(start, result) / _MAX_DETOUR):
+    if shorter is not None and (
+        result is None or _length_m(start, shorter) < _length_m(start, result) / _MAX_CLEARANCE_DETOUR
+    ):
         return (yield from narrow.rounded(shorter))
     return (yield from roomy.rounded(result)) if result is not None else None
 
@@ -115,7 +117,7 @@ def quick_route(
         return None
     heights_m = (altitude_m, altitude_m if from_m is None else from_m)
     spaces = _spaces(now, grant, heights_m, CLEARANCES_M[1])
-    return _finished(_Search(start, target, spaces, max_excess=max_excess, max_legs=QUICK_MAX_LEGS_TESTED).steps())
+    return _run_to_end(_Search(start, target, spaces, max_excess=max_excess, max_legs=QUICK_MAX_LEGS_TESTED).steps())
 
 
 def _spaces(
@@ -130,7 +132,7 @@ def _spaces(
     return cruise, cruise if low == high else FreeSpace.between(now, grant, low, high, room_m)
 
 
-def _finished(search: RouteSteps) -> tuple[XY, ...] | None:
+def _run_to_end(search: RouteSteps) -> tuple[XY, ...] | None:
     while True:
         try:
             next(search)
@@ -143,7 +145,7 @@ def _length_m(start: XY, route: tuple[XY, ...]) -> float:
     return sum(math.dist(a, b) for a, b in itertools.pairwise((start, *route)))
 
 
-def _meeting(before: XY, first: XY, second: XY, after: XY) -> XY | None:
+def _intersection(before: XY, first: XY, second: XY, after: XY) -> XY | None:
     """Return the intersection of two legs when both are extended. None if it is far away or behind."""
     ux, uy, vx, vy = first[0] - before[0], first[1] - before[1], second[0] - after[0], second[1] - after[1]
     across = ux * vy - uy * vx
@@ -223,7 +225,7 @@ class _Search:
         while i + 2 < len(points):
             yield
             before, first, second, after = points[i - 1 : i + 3]
-            corner = _meeting(before, first, second, after)
+            corner = _intersection(before, first, second, after)
             if corner is not None and self._clears(before, corner) and self._clears(corner, after):
                 points[i : i + 2] = [corner]
             else:

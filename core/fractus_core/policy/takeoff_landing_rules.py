@@ -34,15 +34,17 @@ def judge_takeoff(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     if isinstance(clamped, Verdict):
         return clamped
     correction = correction_verdict(TakeoffArgs(clamped.value), [clamped])
-    problem = _climb(position, now, grant, clamped.value)
+    problem = _climb_problem(position, now, grant, clamped.value)
     if problem is None or not clamped.code:
         return problem or correction
-    return choose_objection(problem, _climb(position, now, grant, args.altitude_m), correction)
+    return choose_objection(problem, _climb_problem(position, now, grant, args.altitude_m), correction)
 
 
-def _climb(position: XY, now: Situation, grant: CompiledGrant, altitude_m: float) -> Verdict | None:
+def _climb_problem(position: XY, now: Situation, grant: CompiledGrant, altitude_m: float) -> Verdict | None:
     """Return the objection of fences and the return route to a climb, or None."""
-    return _column(position, now, grant, now.altitude_m, altitude_m) or check_return(position, altitude_m, now, grant)
+    return _vertical_problem(position, now, grant, now.altitude_m, altitude_m) or check_return(
+        position, altitude_m, now, grant
+    )
 
 
 def judge_arm(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
@@ -50,7 +52,7 @@ def judge_arm(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     position = grant.locate(now)
     if position is None:
         return DENY_POSITION_UNKNOWN
-    return _column(position, now, grant, now.altitude_m, now.altitude_m) or Verdict("allow", call.args)
+    return _vertical_problem(position, now, grant, now.altitude_m, now.altitude_m) or Verdict("allow", call.args)
 
 
 def judge_land(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
@@ -59,10 +61,12 @@ def judge_land(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     if position is None:
         return DENY_POSITION_UNKNOWN
     ground = stop_point(now, position)
-    return _column(ground, now, grant, 0.0, now.altitude_m) or Verdict("allow", call.args)
+    return _vertical_problem(ground, now, grant, 0.0, now.altitude_m) or Verdict("allow", call.args)
 
 
-def _column(position: XY, now: Situation, grant: CompiledGrant, lower_m: float, upper_m: float) -> Verdict | None:
+def _vertical_problem(
+    position: XY, now: Situation, grant: CompiledGrant, lower_m: float, upper_m: float
+) -> Verdict | None:
     """Return the denial of a vertical motion, or of standing, by fences. It is never a takeover."""
     leg = vertical_leg(position, min(lower_m, upper_m), max(lower_m, upper_m))
     breaches = find_breaches(leg, now, grant, margin_m(now), height_margin_m(now))

@@ -106,30 +106,30 @@ def judge_velocity(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     if position is None:
         return DENY_POSITION_UNKNOWN
     setpoint = _Setpoint(args, now, grant, position)
-    problem = _within_speed(setpoint) or _within_heights(setpoint)
+    problem = _correct_speed(setpoint) or _correct_altitude(setpoint)
     if problem is not None:
         return problem
     limits = len(setpoint.notes)
-    problem = _within_fences(setpoint) or _way_home_blocked(setpoint)
+    problem = _correct_to_fences(setpoint) or _return_problem(setpoint)
     if problem is None:
         return correction_verdict(setpoint.args, setpoint.notes)
     if not limits:
         return problem
     setpoint.args = args
-    breaches = _breached(setpoint, args)
+    breaches = _setpoint_breaches(setpoint, args)
     return choose_objection(
         problem,
-        breach_verdict(breaches) if breaches else _way_home_blocked(setpoint),
+        breach_verdict(breaches) if breaches else _return_problem(setpoint),
         correction_verdict(None, setpoint.notes[:limits]),
     )
 
 
-def _way_home_blocked(setpoint: _Setpoint) -> Verdict | None:
+def _return_problem(setpoint: _Setpoint) -> Verdict | None:
     leg = setpoint.leg
     return check_return(leg.target, leg.upper_m, setpoint.now, setpoint.grant)
 
 
-def _within_speed(setpoint: _Setpoint) -> Verdict | None:
+def _correct_speed(setpoint: _Setpoint) -> Verdict | None:
     args = setpoint.args
     requested = math.hypot(args.north_mps, args.east_mps)
     bounds = [replace(b, lower=None) for b in speed_bounds(setpoint.grant, setpoint.now, setpoint.air)]
@@ -143,7 +143,7 @@ def _within_speed(setpoint: _Setpoint) -> Verdict | None:
     return None
 
 
-def _within_heights(setpoint: _Setpoint) -> Verdict | None:
+def _correct_altitude(setpoint: _Setpoint) -> Verdict | None:
     """Correct the vertical part to the altitude limits, or return a denial."""
     now = setpoint.now
     grant = setpoint.grant
@@ -173,7 +173,7 @@ def _within_heights(setpoint: _Setpoint) -> Verdict | None:
 def _no_room(setpoint: _Setpoint, lower: Bound, upper: Bound | None) -> Verdict | None:
     """Return a denial if a vertical speed corrected to stay above one limit would exceed another."""
     edge = math.inf if upper is None or upper.upper is None else upper.upper
-    if upper is None or not _beyond(setpoint, setpoint.args, edge, above=True):
+    if upper is None or not _exceeds_limit(setpoint, setpoint.args, edge, above=True):
         return None
     names = distinct((upper.name, lower.name))
     reason = f"at this vertical speed the drone comes to rest neither below {edge:.1f} m nor above {lower.lower or 0.0:.1f} m"
@@ -184,7 +184,7 @@ def _lead_back(setpoint: _Setpoint, bound: Bound, *, above: bool) -> Verdict | N
     """Scale the vertical part so that the drone comes to rest within a limit, or turn it back toward the limit."""
     edge = (bound.upper if above else bound.lower) or 0.0
     args = setpoint.args
-    if not _beyond(setpoint, args, edge, above=above):
+    if not _exceeds_limit(setpoint, args, edge, above=above):
         return None
     word, side = ("Above", "above") if above else ("Below", "below")
     default_source = "the drone" if above else "the ground"
@@ -197,12 +197,14 @@ def _lead_back(setpoint: _Setpoint, bound: Bound, *, above: bool) -> Verdict | N
     back = RETURN_CLIMB_MPS if above else -RETURN_CLIMB_MPS
     strays_m = setpoint.now.airframe.tracking_m
     near = edge + strays_m if above else edge - strays_m
-    if not toward and (abs(args.down_mps) >= RETURN_CLIMB_MPS or not _beyond(setpoint, args, near, above=above)):
+    if not toward and (abs(args.down_mps) >= RETURN_CLIMB_MPS or not _exceeds_limit(setpoint, args, near, above=above)):
         return None
     level = replace(args, down_mps=0.0)
     if not bound.name and not above:
-        new = level if _beyond(setpoint, level, edge, above=above) else _scaled_climb(setpoint, edge, above=above)
-    elif _beyond(setpoint, level, edge, above=above):
+        new = (
+            level if _exceeds_limit(setpoint, level, edge, above=above) else _scaled_climb(setpoint, edge, above=above)
+        )
+    elif _exceeds_limit(setpoint, level, edge, above=above):
         new = replace(args, down_mps=back)
     else:
         new = _scaled_climb(setpoint, edge, above=above)
@@ -213,7 +215,7 @@ def _lead_back(setpoint: _Setpoint, bound: Bound, *, above: bool) -> Verdict | N
     return None
 
 
-def _beyond(setpoint: _Setpoint, args: VelocityArgs, edge: float, *, above: bool) -> bool:
+def _exceeds_limit(setpoint: _Setpoint, args: VelocityArgs, edge: float, *, above: bool) -> bool:
     leg = setpoint.sweep(args)
     return leg.upper_m > edge + ROUNDING_SLACK if above else leg.lower_m < edge - ROUNDING_SLACK
 
@@ -227,7 +229,7 @@ def _scaled_climb(setpoint: _Setpoint, edge: float, *, above: bool) -> VelocityA
     for _ in range(_HALVINGS):
         share = (low + high) / 2
         scaled = replace(args, down_mps=args.down_mps * share)
-        if _beyond(setpoint, scaled, edge, above=above):
+        if _exceeds_limit(setpoint, scaled, edge, above=above):
             high = share
         else:
             low = share
@@ -235,8 +237,8 @@ def _scaled_climb(setpoint: _Setpoint, edge: float, *, above: bool) -> VelocityA
     return best
 
 
-def _within_fences(setpoint: _Setpoint) -> Verdict | None:
-    breaches = _breached(setpoint, setpoint.args)
+def _correct_to_fences(setpoint: _Setpoint) -> Verdict | None:
+    breaches = _setpoint_breaches(setpoint, setpoint.args)
     if not breaches:
         return None
     args = setpoint.args
@@ -249,7 +251,7 @@ def _within_fences(setpoint: _Setpoint) -> Verdict | None:
     for _ in range(_HALVINGS):
         share = (low + high) / 2
         scaled = _scaled(args, share)
-        if _breached(setpoint, scaled):
+        if _setpoint_breaches(setpoint, scaled):
             high = share
         else:
             low = share
@@ -268,7 +270,7 @@ def _scaled(args: VelocityArgs, share: float) -> VelocityArgs:
     )
 
 
-def _breached(setpoint: _Setpoint, args: VelocityArgs) -> list[Breach]:
+def _setpoint_breaches(setpoint: _Setpoint, args: VelocityArgs) -> list[Breach]:
     now = setpoint.now
     slack = height_margin_m(now) + now.airframe.tracking_m
     return find_breaches(setpoint.sweep(args), now, setpoint.grant, _margin_m(now), slack)

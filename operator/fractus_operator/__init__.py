@@ -1,1 +1,1 @@
-"""The operator: plans Applications, compiles their grants, and keeps the cluster as both ask for."""
+"""Kubernetes operator of Fractus: plans Applications, issues Grants, and creates the child objects."""

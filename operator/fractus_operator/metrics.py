@@ -1,4 +1,4 @@
-"""What the operator tells Prometheus; docs/metrics.md describes each name."""
+"""Prometheus metrics of the operator, documented in docs/metrics.md."""
 
 from __future__ import annotations
 
@@ -14,32 +14,32 @@ _SECONDS = (0.001, 0.005, 0.02, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
 
 RECONCILES = Histogram(
     "fractus_operator_reconcile_seconds",
-    "How long a step of reconciliation took, waiting for the API server included.",
+    "Duration of a reconciliation step, including requests to the API server.",
     "kind",
     _SECONDS,
 )
 ERRORS = Counter(
     "fractus_operator_reconcile_errors_total",
-    "Steps that failed and are tried again; Bug where it was not the API server that refused.",
+    "Failed reconciliation steps, which are retried. Reason Bug if the API server did not cause the failure.",
     "kind",
     "reason",
 )
 PHASES = Histogram(
     "fractus_operator_plan_phase_seconds",
-    "Phases of deploying an Application: observe, plan, grants, rollout; ways: what policies say of its way.",
+    "Duration of the phases of deploying an Application: observe, plan, grants, rollout, routes (route check).",
     "phase",
     _SECONDS,
 )
 
-Phase = Literal["observe", "plan", "grants", "rollout", "ways"]
+Phase = Literal["observe", "plan", "grants", "rollout", "routes"]
 
 
 @contextmanager
 def reconciling(kind: str) -> Iterator[None]:
-    """Measure one step of reconciliation; one that raises counts as failed.
+    """Measure one reconciliation step. A step that raises counts as failed.
 
     Args:
-        kind: Of what is reconciled.
+        kind: Kind of the reconciled objects.
     """
     with RECONCILES.timed(kind):
         try:
@@ -56,15 +56,15 @@ def phase(name: Phase) -> Iterator[None]:
         yield
 
 
-class Observed:
-    """Figures that are read when they are asked for.
+class MetricsSource:
+    """Metrics whose values are read at each scrape.
 
     Args:
-        lease_s: For how many seconds this operator may still act; none where it does not lead.
-        watches: By plural of the kind: whether its watch is open, and seconds since the API server said anything.
-        phases: The phases of all Applications.
-        states: The flight states of all Drones.
-        expires_s: Unix time at which the certificate authority expires; None while it is not known.
+        lease_s: Returns for how many seconds this operator may still act. 0 if it is not the leader.
+        watches: Returns, by plural of the kind, if the watch is open, and seconds since the last message of the API server.
+        phases: Returns the phases of all Applications.
+        states: Returns the flight states of all Drones.
+        expires_s: Expiry of the certificate authority in Unix time, if known.
     """
 
     def __init__(
@@ -82,11 +82,11 @@ class Observed:
         self._expires_s = expires_s
 
     def collect(self) -> Iterator[Figure]:
-        """The figures as they are now."""
+        """Return the current values."""
         watches = self._watches()
         yield gauge(
             "fractus_operator_lease_left_seconds",
-            "For how long this operator may still act; 0: it does not lead.",
+            "Seconds for which this operator may still act. 0 if it is not the leader.",
             self._lease_s(),
         )
         yield gauge(
@@ -97,14 +97,14 @@ class Observed:
         )
         yield gauge(
             "fractus_operator_watch_age_seconds",
-            "Since the API server said anything about a kind; above 100 the watch is dead.",
+            "Seconds since the last message of the API server about a kind. Above 100 the watch is dead.",
             {kind: age_s for kind, (_, age_s) in watches.items()},
             "kind",
         )
         yield gauge("fractus_applications", "Applications by phase.", Tally(self._phases()), "phase")
         yield gauge(
             "fractus_drones",
-            "Drones by flight state; offline: it was on the ground when last heard of, and no application may fly it; unknown: it may be in the air.",
+            "Drones by flight state. offline: on the ground at the last report, and no Application may fly it. unknown: may be in the air.",
             Tally(self._states()),
             "state",
         )
@@ -112,6 +112,6 @@ class Observed:
             yield gauge(CERTIFICATE_EXPIRY, "When the certificate authority expires, in Unix time.", self._expires_s)
 
 
-def text(observed: Observed) -> bytes:
-    """All metrics in Prometheus' text format."""
-    return text_of((RECONCILES.figure(), ERRORS.figure(), PHASES.figure(), *observed.collect()))
+def text(source: MetricsSource) -> bytes:
+    """Return all metrics in the text format of Prometheus."""
+    return text_of((RECONCILES.figure(), ERRORS.figure(), PHASES.figure(), *source.collect()))

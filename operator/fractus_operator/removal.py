@@ -17,7 +17,8 @@ from http import HTTPStatus
 from fractus_core.api.names import CLASS_LABEL, NODE_SIGNER
 from fractus_runtime.kubernetes import LEASE
 
-from fractus_operator.cluster.kinds import (
+from fractus_operator.ca_secret import NAME as AUTHORITY
+from fractus_operator.kinds import (
     CONFIG_MAP,
     DAEMON_SET,
     DEPLOYMENT,
@@ -28,9 +29,8 @@ from fractus_operator.cluster.kinds import (
     Body,
     Kind,
 )
-from fractus_operator.cluster.labels import LEASE_NAME, is_location_label
-from fractus_operator.cluster.store import KubeError, NotFound, Store, Unconfigured
-from fractus_operator.identity.ca_secret import NAME as AUTHORITY
+from fractus_operator.labels import LEASE_NAME, is_location_label
+from fractus_operator.store import KubeError, NotFound, Store, Unconfigured
 
 WIPE = "fractus-wipe"
 """The chart's DaemonSet whose pods are ready once their node's data is gone."""
@@ -139,7 +139,7 @@ async def remove(store: Store, namespace: str, *, keep_authority: bool = False) 
             if ours:
                 what = f"location labels of the node {node['metadata']['name']}"
                 with _noting(problems, what):
-                    await store.label(NODE, node["metadata"]["name"], dict.fromkeys(ours))
+                    await store.set_labels(NODE, node["metadata"]["name"], dict.fromkeys(ours))
                     print(f"removed the {what}")
     return problems
 

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 
 from fractus_core.api.nodes import DRONE_REPORT_S, GROUNDED_ANNOTATION, ON_MISSION, is_airborne
 
-from fractus_operator.cluster.kinds import APPLICATION, DRONE, Body, Kind, key_of
-from fractus_operator.cluster.labels import FINALIZER
-from fractus_operator.cluster.store import KubeError, NotFound, Store, Unconfigured
+from fractus_operator.kinds import APPLICATION, DRONE, Body, Kind, key_of
+from fractus_operator.labels import FINALIZER
+from fractus_operator.store import KubeError, NotFound, Store, Unconfigured
 
 NOT_REPORTED = "its last report"
 _REPORTS_S = 3 * DRONE_REPORT_S

@@ -7,8 +7,8 @@ import json
 from typing import Any
 
 import pytest
-from fractus_operator.cluster.kinds import DEPLOYMENT, Body
-from fractus_operator.cluster.store import FIELD_MANAGER, Conflict, Invalid, KubeError, Store
+from fractus_operator.kinds import DEPLOYMENT, Body
+from fractus_operator.store import FIELD_MANAGER, Conflict, Invalid, KubeError, Store
 from kube_server import Request, answer, listening
 from kube_server import Server as HttpServer
 
@@ -44,7 +44,7 @@ class Server:
 
 async def asked(server: Server) -> None:
     async with listening(HttpServer(server)) as access, contextlib.aclosing(Store(access)) as store:
-        await store.count_as_applied(DEPLOYMENT, KEY)
+        await store.take_ownership(DEPLOYMENT, KEY)
 
 
 async def test_what_was_created_counts_as_applied_and_others_keep_theirs() -> None:
@@ -92,7 +92,7 @@ WANTED: Body = {
 
 async def rewritten(server: Server) -> None:
     async with listening(HttpServer(server)) as access, contextlib.aclosing(Store(access)) as store:
-        await store.rewrite(DEPLOYMENT, OBSERVED, WANTED)
+        await store.replace_spec(DEPLOYMENT, OBSERVED, WANTED)
 
 
 async def test_a_rewrite_is_of_this_object_and_leaves_labels_of_others() -> None:

@@ -191,7 +191,7 @@ def test_a_complete_mission_leaves_only_its_plan(world: World, operator: Operato
     world.drone_status("drone-1", "flying")
     end_mission(world, namespace, "Complete", "all control points were returned")
     status = world.phase(namespace, "Returning")
-    assert status["message"] == "all control points were returned; drone-1 is on its way home"
+    assert status["message"] == "all control points were returned; drone-1 is returning"
     wait_for(lambda: set(world.children(namespace)) == {"deploymentplans/traffic"}, "children to go")
     world.drone_status("drone-1", "inactive")
     status = world.phase(namespace, "Completed")
@@ -324,7 +324,7 @@ def fresh(world: World, namespace: str, before: set[str]) -> set[str]:
 def test_the_phase_is_what_the_drone_does(world: World, operator: OperatorProcess, namespace: str) -> None:
     status = running(world, namespace)
     assert "flies" not in status["message"]
-    assert "drone-1 stands, its mission has not begun" in status["message"]
+    assert "drone-1 is on the ground, its mission has not begun" in status["message"]
     assert world.condition(namespace, "MissionComplete")["reason"] == "MissionWaiting"
     navigator = f"spiffe://fractus.dev/ns/{namespace}/app/traffic/component/Navigator/instance/traffic-navigator"
     path = f"{FRACTUS}/drones/drone-1/status"
@@ -340,7 +340,7 @@ def test_the_phase_is_what_the_drone_does(world: World, operator: OperatorProces
     assert "controller" not in lost
     ready = world.condition(namespace, "Ready")
     assert (ready["status"], ready["reason"]) == ("Unknown", "TelemetryLost")
-    assert "drone-1 was flying when it was last heard of" in ready["message"]
+    assert "at its last report it was flying" in ready["message"]
     world.drone_status("drone-1", "inactive")
     assert "has landed" in world.phase(namespace, "Landed")["message"]
     assert {"MissionBegun", "TelemetryLost"} <= set(events(world, namespace))
@@ -390,7 +390,7 @@ def test_pods_that_the_namespace_does_not_let_be_made_are_told(
     world.put(traffic(namespace))
     wait_for(lambda: world.condition(namespace, "Ready").get("reason") == "PodsRefused", "the refusal in the status")
     message = world.condition(namespace, "Ready")["message"]
-    assert "no pod of traffic-" in message
+    assert "pods of traffic-" in message
     assert "50m" in message
     assert "50m" in world.status(namespace)["message"]
     world.api.delete(path)

@@ -315,7 +315,7 @@ def test_a_drone_that_is_not_heard_of_any_more_is_unknown(guarded: World, permit
     wait_for(lambda: condition(guarded, "drone-1", "Ready").get("status") == "Unknown", permitted.log)
     assert condition(guarded, "drone-1", "Ready")["reason"] == "AgentSilent"
     assert (
-        "last heard of at 2026-01-01 00:00:00 UTC, when the drone was flying"
+        "the last report of its agent is of 2026-01-01 00:00:00 UTC, when the drone was flying"
         in condition(guarded, "drone-1", "Ready")["message"]
     )
     status = (guarded.api.get(path) or {})["status"]

@@ -62,7 +62,7 @@ def test_an_operator_leaves_the_lease_to_the_release_before(
     try:
         with without_kind(world):
             process.start()
-            wait_for(lambda: "operator: waits for kinds" in process.log(), process.log)
+            wait_for(lambda: "operator: waiting for kinds" in process.log(), process.log)
             assert "upgrade the chart fractus-crds (missing=NodeGrants)" in process.log()
             assert not healthy()
             assert world.api.get(LEASE) is None

@@ -10,9 +10,9 @@ from typing import Any, cast
 import pytest
 from fractus_core.api import Drone
 from fractus_core.api.model import API_VERSION
-from fractus_operator.cluster.store import KubeError
-from fractus_operator.reconcile import drone_events
-from fractus_operator.reconcile.drone_events import BURST, DroneEvents
+from fractus_operator import drone_events
+from fractus_operator.drone_events import BURST, DroneEventRecorder
+from fractus_operator.store import KubeError
 
 NOW = datetime(2026, 6, 1, 12, 0, tzinfo=UTC)
 KEY = ("", "drone-1")
@@ -49,10 +49,10 @@ class Cluster:
         async def synced() -> None:
             return
 
-        live = SimpleNamespace(drone=self.drones.get, synced=synced, applications=self.applications)
-        self.events = DroneEvents(cast(Any, self), cast(Any, live), lambda _drone: self.holders, lambda: NOW)
+        cache = SimpleNamespace(drone=self.drones.get, synced=synced, applications=self.applications)
+        self.events = DroneEventRecorder(cast(Any, self), cast(Any, cache), lambda _drone: self.holders, lambda: NOW)
 
-    async def record_event(
+    async def create_event(
         self, regarding: Any, *, reason: str, message: str, name: str, warning: bool, **_: object
     ) -> None:
         assert regarding["kind"] == "Drone"
@@ -73,7 +73,7 @@ class Cluster:
             else:
                 self.drones["drone-1"] = each
             self.events.changed(KEY)
-            await self.events.tell(KEY)
+            await self.events.reconcile(KEY)
         return [reason for reason, _ in self.posted.values()][before:]
 
     def sentences(self) -> list[str]:
@@ -192,7 +192,7 @@ async def test_what_may_not_be_told_yet_is_told_later(cluster: Cluster, monkeypa
     monkeypatch.setattr(drone_events, "BURST", 1)
     cluster.holders = []
     await cluster.see(drone("inactive", at_s=0), drone("flying", at_s=1), drone("inactive", at_s=2))
-    running = asyncio.create_task(cluster.events.worklist.run())
+    running = asyncio.create_task(cluster.events.work_queue.run())
     async with asyncio.timeout(20.0):
         await cluster.landed.wait()
     running.cancel()

@@ -12,8 +12,8 @@ import yaml
 from fractus_core.api import Application, Depot, DirectLink, Drone, EdgeNode
 from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.planning.link_planning import flown_path, plan_links
-from fractus_operator.cluster.pods import PodView
-from fractus_operator.reconcile.links import direct_links, link_name, retargeted
+from fractus_operator.pods import PodView
+from fractus_operator.resources.direct_link import direct_links, link_name, retargeted
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "links"
 INPUT = yaml.safe_load((GOLDEN / "input.yaml").read_text())

@@ -8,8 +8,8 @@ from datetime import UTC, datetime
 from typing import Any, cast
 
 import pytest
-from fractus_operator.reconcile import link_events
-from fractus_operator.reconcile.link_events import LinkEvents, LinkReport, news, read_report
+from fractus_operator import link_events
+from fractus_operator.link_events import LinkEventRecorder, LinkReport, link_changes, parse_link_report
 
 SPEC = {"drone": "drone-1", "node": "edge-1", "application": {"namespace": "city", "name": "traffic", "uid": "u1"}}
 KEY = ("", "city.traffic-drone-1-edge-1")
@@ -18,18 +18,18 @@ NOW = datetime(2026, 6, 1, 12, 0, tzinfo=UTC)
 
 def report(phase: str = "Idle", traffic: str = "cloud", switches: int = 0, message: str = "") -> LinkReport:
     status = {"phase": phase, "traffic": traffic, "switches": switches, "message": message}
-    return read_report({"spec": SPEC, "status": status})
+    return parse_link_report({"spec": SPEC, "status": status})
 
 
 def reasons(told: LinkReport, now: LinkReport) -> list[str]:
-    return [reason for reason, _ in news(told, now)]
+    return [reason for reason, _ in link_changes(told, now)]
 
 
 UP, DIRECT = report("Up"), report("Up", "direct", 1, "it is faster")
 
 
 def test_each_change_is_told_in_the_order_in_which_it_happens() -> None:
-    assert reasons(read_report({"spec": SPEC}), report("Connecting")) == []
+    assert reasons(parse_link_report({"spec": SPEC}), report("Connecting")) == []
     assert reasons(report(), UP) == ["LinkUp"]
     assert reasons(UP, DIRECT) == ["TrafficDirect"]
     assert reasons(report(), DIRECT) == ["LinkUp", "TrafficDirect"]
@@ -38,10 +38,10 @@ def test_each_change_is_told_in_the_order_in_which_it_happens() -> None:
 
 
 def test_an_event_says_why_and_what_it_left_out() -> None:
-    ((_, sentence),) = news(UP, DIRECT)
+    ((_, sentence),) = link_changes(UP, DIRECT)
     assert sentence == "calls of drone-1 take the direct link to edge-1: it is faster"
-    ((_, sentence),) = news(UP, replace(DIRECT, switches=7))
-    assert sentence.endswith("it is faster (it has changed 7 times since the last Event)")
+    ((_, sentence),) = link_changes(UP, replace(DIRECT, switches=7))
+    assert sentence.endswith("it is faster (changed 7 times since the last Event)")
 
 
 class Recorder:
@@ -52,7 +52,7 @@ class Recorder:
         self.names: set[str] = set()
         self.down = asyncio.Event()
 
-    async def record_event(self, regarding: Any, *, reason: str, name: str, **_: object) -> None:
+    async def create_event(self, regarding: Any, *, reason: str, name: str, **_: object) -> None:
         self.events.append((regarding["metadata"]["uid"], reason))
         self.names.add(name)
         if reason == "LinkDown":
@@ -65,18 +65,18 @@ def posted() -> Recorder:
 
 
 @pytest.fixture
-def events(posted: Recorder) -> LinkEvents:
-    return LinkEvents(cast(Any, posted), lambda: NOW)
+def events(posted: Recorder) -> LinkEventRecorder:
+    return LinkEventRecorder(cast(Any, posted), lambda: NOW)
 
 
-async def see(events: LinkEvents, *reports: LinkReport | None) -> None:
+async def see(events: LinkEventRecorder, *reports: LinkReport | None) -> None:
     """Let the watch show these one after the other."""
     for now in reports:
-        events.changed(KEY, events._now.get(KEY), now)
-        await events.tell(KEY)
+        events.changed(KEY, events._current.get(KEY), now)
+        await events.reconcile(KEY)
 
 
-async def test_what_is_there_when_the_operator_starts_is_old_news(events: LinkEvents, posted: Recorder) -> None:
+async def test_what_is_there_when_the_operator_starts_is_old_news(events: LinkEventRecorder, posted: Recorder) -> None:
     await see(events, DIRECT, replace(DIRECT, message="still faster"))
     assert posted.events == []
     await see(events, report(switches=2))
@@ -85,7 +85,7 @@ async def test_what_is_there_when_the_operator_starts_is_old_news(events: LinkEv
 
 
 async def test_a_link_that_comes_and_goes_is_told_of_now_and_then(
-    events: LinkEvents, posted: Recorder, monkeypatch: pytest.MonkeyPatch
+    events: LinkEventRecorder, posted: Recorder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(link_events, "PERIOD_S", 1e6)
     await see(events, report())
@@ -93,21 +93,21 @@ async def test_a_link_that_comes_and_goes_is_told_of_now_and_then(
         await see(events, replace(DIRECT, switches=2 * flap + 1), report(switches=2 * flap + 2))
     assert posted.events == [("u1", "LinkUp"), ("u1", "TrafficDirect")]
     monkeypatch.setattr(link_events, "PERIOD_S", 0.0)
-    await events.tell(KEY)
+    await events.reconcile(KEY)
     assert posted.events[2:] == [("u1", "TrafficCloud"), ("u1", "LinkDown")]
 
 
 async def test_what_is_not_due_yet_is_told_later(
-    events: LinkEvents, posted: Recorder, monkeypatch: pytest.MonkeyPatch
+    events: LinkEventRecorder, posted: Recorder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(link_events, "PERIOD_S", 0.2)
     await see(events, report(), DIRECT, report(switches=2))
-    running = asyncio.create_task(events.worklist.run())
+    running = asyncio.create_task(events.work_queue.run())
     async with asyncio.timeout(20.0):
         await posted.down.wait()
     running.cancel()
 
 
-async def test_a_link_that_is_made_again_begins_again(events: LinkEvents, posted: Recorder) -> None:
+async def test_a_link_that_is_made_again_begins_again(events: LinkEventRecorder, posted: Recorder) -> None:
     await see(events, report(), None, DIRECT, replace(DIRECT, switches=3))
     assert posted.events == []

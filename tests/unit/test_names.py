@@ -7,7 +7,7 @@ import pytest
 from depth import examples
 from fractus_core.api import Component
 from fractus_core.planning import instance_name
-from fractus_operator.cluster.labels import grant_name, label_value, secret_name, service_name
+from fractus_operator.labels import grant_name, label_value, secret_name, service_name
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

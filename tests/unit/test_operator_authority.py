@@ -11,7 +11,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, ExtensionOID
 from fractus_core.identity.authority import COMPONENT_LIFE, Authority, BrokenAuthority
-from fractus_operator.identity.node_requests import NODE_NAME_CLAIM, review
+from fractus_operator.csr_controller import NODE_NAME_CLAIM, review
 
 NOW = datetime(2026, 6, 1, 12, 0, tzinfo=UTC)
 IDENTITY = "spiffe://fractus.dev/ns/a/app/b/component/C/instance/b-c"

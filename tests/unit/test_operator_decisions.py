@@ -11,26 +11,24 @@ from fractus_core.api import Application, Drone, EdgeNode, Grant
 from fractus_core.api.plans import DeploymentPlanSpec, PlannedInstance
 from fractus_core.control import Outcome, OutcomeKind
 from fractus_core.planning.inventory import Host, Inventory, amount_of
-from fractus_operator.cluster.pods import PodView, read_host, read_pod, refusals
-from fractus_operator.cluster.store import Store
-from fractus_operator.inventory.live import LiveInventory
-from fractus_operator.reconcile import status
-from fractus_operator.reconcile.conditions import ConditionUpdate, merge
-from fractus_operator.reconcile.difference import contains, is_current, stamped
-from fractus_operator.reconcile.flight_status import flight
-from fractus_operator.reconcile.location import geohash, location_labels
-from fractus_operator.reconcile.missions import mission_outcome
-from fractus_operator.reconcile.replanning import (
+from fractus_operator import status
+from fractus_operator.cache import ClusterCache
+from fractus_operator.comparison import contains, is_current, stamped
+from fractus_operator.conditions import ConditionUpdate, merge
+from fractus_operator.node_controller import geohash, location_labels
+from fractus_operator.node_liveness import displayed_flight_state
+from fractus_operator.pods import PodView, parse_host, parse_pod, refusals
+from fractus_operator.replanning import (
     _with_names_of,
     of_generation,
     replan_reason,
     stuck_nodes,
     waits_for_landing,
 )
-from fractus_operator.reconcile.reporting import announced
-from fractus_operator.reconcile.silence import shown_state
-from fractus_operator.reconcile.status import Blocked
 from fractus_operator.settings import BadSetting, Settings
+from fractus_operator.status import Blocked, flight, mission_outcome
+from fractus_operator.status_reporter import transition_events
+from fractus_operator.store import Store
 
 NOW = datetime(2026, 6, 1, 12, 0, tzinfo=UTC)
 V1 = "fractus.dev/v1alpha1"
@@ -57,13 +55,13 @@ def test_stages_that_are_reached_together_are_told_by_one_event() -> None:
     stages = [ConditionUpdate(stage, "True", stage, f"{stage} it is") for stage in ("Planned", "Granted", "Deployed")]
     ready = ConditionUpdate("Ready", "True", "PodsReady", "all pods are ready")
     waiting = ConditionUpdate("Ready", "False", "PodsNotReady", "one to go", progress=True)
-    (only,) = announced([*stages, waiting])
+    (only,) = transition_events([*stages, waiting])
     assert (only.reason, only.message) == ("Planned", "Planned it is; Granted it is; Deployed it is")
-    assert [update.reason for update in announced([*stages, ready])] == ["Planned", "PodsReady"]
-    assert list(announced([stages[2], ready])) == [stages[2], ready], "one alone is told as it is"
+    assert [update.reason for update in transition_events([*stages, ready])] == ["Planned", "PodsReady"]
+    assert list(transition_events([stages[2], ready])) == [stages[2], ready], "one alone is told as it is"
     refused = ConditionUpdate("Deployed", "False", "NameTaken", "a Secret is in the way")
     not_ready = ConditionUpdate("Ready", "False", "NameTaken", "a Secret is in the way")
-    told = list(announced([*stages[:2], refused, not_ready]))
+    told = list(transition_events([*stages[:2], refused, not_ready]))
     assert [(update.reason, update.warning) for update in told] == [("Planned", False), ("NameTaken", True)]
 
 
@@ -217,7 +215,7 @@ def test_a_pod_that_may_not_be_made_is_told_with_the_reason() -> None:
     update = status.deployed(PLAN, pods, 0, refused={"a-1": why, "a-c": "of its last rollout"})
     ready = next(c for c in update.conditions if c.type == "Ready")
     assert (ready.reason, ready.warning) == ("PodsRefused", True)
-    assert update.message == ready.message == f"waiting for a-1; no pod of a-1 can be made: {why}"
+    assert update.message == ready.message == f"waiting for a-1; pods of a-1 cannot be created: {why}"
     assert status.deployed(PLAN, [*pods, view("a-1")], 0, refused={"a-1": why}).phase == "Running"
     failure = {"type": "ReplicaFailure", "status": "True", "reason": "FailedCreate", "message": why}
     scaled = {"type": "Available", "status": "False", "message": "no"}
@@ -233,7 +231,7 @@ def test_a_failed_component_is_named_with_its_exit_code_and_last_lines() -> None
     never = {"state": {"waiting": {"reason": "ImagePullBackOff", "message": "no such image"}}}
     well = {"state": {"running": {}}, "lastState": {"terminated": {"exitCode": 0}}}
     body = {"metadata": {"name": "p", "namespace": "ns"}, "spec": {}}
-    failures = [read_pod(body | {"status": {"containerStatuses": [c]}}).failure for c in (again, never, well)]
+    failures = [parse_pod(body | {"status": {"containerStatuses": [c]}}).failure for c in (again, never, well)]
     assert failures == ["exit code 1: Traceback | ValueError: no route", "ImagePullBackOff: no such image", ""]
     pods = [view("a-c"), view("a-c"), view("a-1", ready=False, failure=failures[0])]
     update = status.deployed(PLAN, pods, 0)
@@ -282,7 +280,7 @@ def test_a_mission_that_is_over_is_returning_until_the_drone_has_landed() -> Non
                    "lastTransitionTime": NOW} for c in update.conditions]  # fmt: skip
     reported = {"drone": "d", "conditions": conditions}
     silent = status.still_over(reported, flown("unknown", "flying"))
-    assert (silent.phase, "last heard of" in silent.message) == ("Returning", True)
+    assert (silent.phase, "at its last report" in silent.message) == ("Returning", True)
     for landed in (flown("inactive"), None):
         update = status.still_over(reported, landed)
         assert (update.phase, update.message, update.controller) == ("Failed", "driver lost", None)
@@ -365,7 +363,7 @@ def test_a_pod_asks_for_the_larger_of_its_phases() -> None:
         "metadata": {"name": "p", "namespace": "ns", "labels": {"x": "y", "fractus.dev/instance": "i"}},
         "spec": {"containers": [asks("100m"), asks("200m")], "initContainers": [asks("1")], "overhead": {"cpu": "50m"}},
     }
-    pod = read_pod(body)
+    pod = parse_pod(body)
     assert pod.requests["cpu"] == pytest.approx(1.05)
     assert (pod.instance, pod.ready, pod.labels) == ("i", False, {"fractus.dev/instance": "i"})
 
@@ -377,7 +375,7 @@ def test_what_runs_beside_a_pods_containers_is_asked_for_too() -> None:
         return {"resources": {"requests": {"cpu": cpu}}, **more}
 
     def asked(**spec: Any) -> float:
-        return read_pod({"metadata": {"name": "p", "namespace": "ns"}, "spec": spec}).requests["cpu"]
+        return parse_pod({"metadata": {"name": "p", "namespace": "ns"}, "spec": spec}).requests["cpu"]
 
     proxy, main = asks("200m", restartPolicy="Always"), asks("300m")
     assert asked(containers=[main], initContainers=[proxy]) == pytest.approx(0.5)
@@ -393,7 +391,7 @@ def test_what_runs_beside_a_pods_containers_is_asked_for_too() -> None:
 )  # fmt: skip
 def test_a_label_alone_hides_no_pod_that_runs(spec: dict, phase: str, kept: bool) -> None:
     metadata = {"name": "p", "namespace": "ns", "labels": {"fractus.dev/finished": "20260601T120000Z"}}
-    pod = read_pod({"metadata": metadata, "spec": spec, "status": {"phase": phase}})
+    pod = parse_pod({"metadata": metadata, "spec": spec, "status": {"phase": phase}})
     assert (pod.finished_at is not None) == kept
 
 
@@ -424,8 +422,8 @@ def test_only_a_drone_that_may_be_in_the_air_is_unknown(state: str, last: str, m
             }
         ]
     body = {"apiVersion": V1, "kind": "Drone", "metadata": {"name": "d"}, "spec": {}}
-    assert shown_state(Drone.from_body({**body, "status": told})) == shown
-    assert shown_state(Drone.from_body(body)) == "offline"
+    assert displayed_flight_state(Drone.from_body({**body, "status": told})) == shown
+    assert displayed_flight_state(Drone.from_body(body)) == "offline"
 
 
 def test_a_node_s_heartbeat_changes_nothing() -> None:
@@ -436,8 +434,8 @@ def test_a_node_s_heartbeat_changes_nothing() -> None:
             "status": {"conditions": [condition], "allocatable": {"cpu": "2"}},
         }
 
-    assert read_host(node("1")) == read_host(node("2"))
-    assert not read_host({"metadata": {"name": "n"}, "spec": {"unschedulable": True}}).schedulable
+    assert parse_host(node("1")) == parse_host(node("2"))
+    assert not parse_host({"metadata": {"name": "n"}, "spec": {"unschedulable": True}}).schedulable
 
 
 @pytest.mark.parametrize(
@@ -450,8 +448,8 @@ def test_a_node_s_heartbeat_changes_nothing() -> None:
 )
 def test_only_the_taint_that_kubelets_heed_guards_a_node(key: str, effect: str, guarded: bool) -> None:
     node = {"metadata": {"name": "n"}, "spec": {"taints": [{"key": key, "effect": effect}]}}
-    assert read_host(node).guarded is guarded
-    assert not read_host({"metadata": {"name": "n"}}).guarded
+    assert parse_host(node).guarded is guarded
+    assert not parse_host({"metadata": {"name": "n"}}).guarded
 
 
 # -- settings --
@@ -494,12 +492,12 @@ def edge_body(version: int, ready: str) -> dict[str, Any]:
 
 
 async def test_an_edge_node_that_becomes_ready_wakes_applications_and_one_that_stays_so_does_not() -> None:
-    live = LiveInventory(cast(Store, None))
-    live.edge_nodes.note(("", "e"), edge_body(1, "False"))
-    with live.subscriptions.subscribe(("default", "app")) as inputs:
-        live.edge_nodes.note(("", "e"), edge_body(2, "False"))
+    cache = ClusterCache(cast(Store, None))
+    cache.edge_nodes.record_write(("", "e"), edge_body(1, "False"))
+    with cache.subscriptions.subscribe(("default", "app")) as inputs:
+        cache.edge_nodes.record_write(("", "e"), edge_body(2, "False"))
         assert not await inputs.changed(0)
-        live.edge_nodes.note(("", "e"), edge_body(3, "True"))
+        cache.edge_nodes.record_write(("", "e"), edge_body(3, "True"))
         assert await inputs.changed(1)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import kopf
 import pytest
-from fractus_operator.handlers import Progress
+from fractus_operator.handlers import InMemoryProgress
 from kopf._core.actions.execution import Outcome
 from kopf._core.actions.progression import State
 
@@ -25,11 +25,11 @@ def body(uid: str = "1", **annotations: str) -> kopf.Body:
 )
 def test_annotations_neither_skip_a_teardown_nor_put_it_off(noted: str) -> None:
     """Who may edit an Application writes them, and another may want its drone home."""
-    assert Progress("kopf.fractus.dev").fetch(key=TEARDOWN, body=body(**{NOTE: noted})) is None
+    assert InMemoryProgress("kopf.fractus.dev").fetch(key=TEARDOWN, body=body(**{NOTE: noted})) is None
 
 
 def test_a_teardown_that_failed_is_tried_again_in_time() -> None:
-    progress, patch = Progress("kopf.fractus.dev"), kopf.Patch()
+    progress, patch = InMemoryProgress("kopf.fractus.dev"), kopf.Patch()
     record: Any = {"started": "2026-01-01T00:00:00+00:00", "delayed": "2026-01-01T00:00:05+00:00", "retries": 1}
     progress.store(key=TEARDOWN, record=record, body=body(), patch=patch)
     assert json.loads(patch["metadata"]["annotations"][NOTE]) == record, "whose change wakes kopf"
@@ -43,7 +43,7 @@ def test_a_teardown_that_failed_is_tried_again_in_time() -> None:
 
 async def test_what_is_remembered_is_not_stored_again_as_long_as_it_is_the_same() -> None:
     """Else kopf waits for the event of a patch that changes nothing, and never tries again."""
-    progress, patch = Progress("kopf.fractus.dev"), kopf.Patch()
+    progress, patch = InMemoryProgress("kopf.fractus.dev"), kopf.Patch()
     handler: Any = SimpleNamespace(id=TEARDOWN)
     failed = Outcome(final=False, delay=5.0, exception=kopf.TemporaryError("later"))
     state = State.from_scratch().with_purpose("delete").with_handlers([handler]).with_outcomes({TEARDOWN: failed})

@@ -9,17 +9,16 @@ from typing import cast
 import pytest
 from exposed import assert_documented, values
 from fractus_operator import metrics
-from fractus_operator.cluster.kinds import Key
-from fractus_operator.cluster.store import KubeError
-from fractus_operator.inventory.live import LiveInventory
-from fractus_operator.inventory.subscriptions import Subscriptions
-from fractus_operator.metrics import ERRORS, Observed
-from fractus_operator.reconcile.applications import Applications, BeingDeleted
-from fractus_operator.reconcile.worklist import Worklist
+from fractus_operator.application_controller import ApplicationController, BeingDeleted
+from fractus_operator.cache import ClusterCache
+from fractus_operator.kinds import Key
+from fractus_operator.metrics import ERRORS, MetricsSource
+from fractus_operator.store import KubeError
+from fractus_operator.work_queue import Subscriptions, WorkQueue
 
 
-def observed() -> Observed:
-    return Observed(
+def observed() -> MetricsSource:
+    return MetricsSource(
         lambda: 6.5, lambda: {"drones": (True, 3.0)}, lambda: ["Flying", "Flying", "Queued"], lambda: ["flying"], 2e9
     )
 
@@ -48,12 +47,12 @@ async def test_a_step_that_fails_is_counted(error: Exception, reason: str) -> No
         return ERRORS.counted("thing", reason)
 
     before = count()
-    worklist = Worklist("thing", reconcile)
-    worklist.add(("", "a"))
-    task = asyncio.create_task(worklist.run())
+    work_queue = WorkQueue("thing", reconcile)
+    work_queue.add(("", "a"))
+    task = asyncio.create_task(work_queue.run())
     async with asyncio.timeout(20.0):
         await failed.wait()
-        while not worklist.failures:  # noqa: ASYNC110 (nothing tells when)
+        while not work_queue.failures:  # noqa: ASYNC110 (nothing tells when)
             await asyncio.sleep(0)
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
@@ -61,12 +60,12 @@ async def test_a_step_that_fails_is_counted(error: Exception, reason: str) -> No
 
 
 async def test_an_application_that_is_being_deleted_is_no_failure() -> None:
-    class Leaving(Applications):
+    class Leaving(ApplicationController):
         def __init__(self) -> None:
             async def synced() -> None:
                 pass
 
-            self._live = cast(LiveInventory, SimpleNamespace(synced=synced, subscriptions=Subscriptions()))
+            self._cache = cast(ClusterCache, SimpleNamespace(synced=synced, subscriptions=Subscriptions()))
 
         async def reconcile(self, key: Key) -> float:
             raise BeingDeleted

@@ -11,13 +11,13 @@ from typing import Any
 import pytest
 from fractus_core.api import grants
 from fractus_core.api.grants import NODE_GRANTS_NAMESPACE, ReportedGrant, unpack
-from fractus_operator.cluster import kinds
-from fractus_operator.cluster.kinds import Body, Kind
-from fractus_operator.cluster.node_accounts import ACCOUNT_KINDS, account_object, is_as_made
-from fractus_operator.cluster.store import Store
-from fractus_operator.inventory.live import LiveInventory
-from fractus_operator.reconcile.grant_reports import reported_status
-from fractus_operator.reconcile.node_grants import NodeGrantsKeeper
+from fractus_operator import kinds
+from fractus_operator.cache import ClusterCache
+from fractus_operator.kinds import Body, Kind
+from fractus_operator.node_controller import NodeGrantsController
+from fractus_operator.node_objects import ACCOUNT_KINDS, account_object, is_unmodified
+from fractus_operator.resources.grant import reported_status
+from fractus_operator.store import Store
 from fractus_runtime.kubernetes import Conflict, Invalid, KubeError, NotFound
 
 
@@ -52,10 +52,10 @@ def test_a_report_becomes_the_status_and_takes_no_end_back(
 @pytest.mark.parametrize("kind", ACCOUNT_KINDS, ids=lambda kind: kind.name)
 def test_an_account_that_gives_other_rights_is_not_as_made(kind: Kind) -> None:
     made = account_object(kind, "drone-1")
-    assert is_as_made(kind, made | {"secrets": []})
+    assert is_unmodified(kind, made | {"secrets": []})
     for field in made.keys() - {"apiVersion", "kind", "metadata"}:
-        assert not is_as_made(kind, made | {field: []})
-    assert not is_as_made(kind, made | {"metadata": {"name": "drone-2"}}) or kind is kinds.SERVICE_ACCOUNT
+        assert not is_unmodified(kind, made | {field: []})
+    assert not is_unmodified(kind, made | {"metadata": {"name": "drone-2"}}) or kind is kinds.SERVICE_ACCOUNT
 
 
 class Api(Store):
@@ -122,27 +122,27 @@ class Cluster:
 
     def __init__(self) -> None:
         self.api = Api()
-        self.live = LiveInventory(self.api)
-        self.keeper = NodeGrantsKeeper(self.api, self.live)
-        self.tasks = [asyncio.create_task(worklist.run()) for worklist in self.keeper.worklists()]
-        for reflector in self.live.reflectors():
-            reflector.synced.set()
+        self.cache = ClusterCache(self.api)
+        self.keeper = NodeGrantsController(self.api, self.cache)
+        self.tasks = [asyncio.create_task(work_queue.run()) for work_queue in self.keeper.work_queues()]
+        for informer in self.cache.informers():
+            informer.synced.set()
         self._versions = itertools.count(1000)
 
     def drone(self, name: str) -> None:
         spec = {"home": {"lat": 1.0, "lon": 1.0, "alt": 1.0}, "services": {}}
         body = kinds.DRONE.header(name, uid=name, resourceVersion=str(next(self._versions))) | {"spec": spec}
-        self.live.drones._take("MODIFIED", body)
+        self.cache.drones._take("MODIFIED", body)
 
     def no_drone(self, name: str) -> None:
-        self.live.drones._drop(("", name))
+        self.cache.drones._drop(("", name))
 
     def host(self, name: str) -> None:
         body = kinds.NODE.header(name, uid=name, resourceVersion=str(next(self._versions))) | {"spec": {}, "status": {}}
-        self.live.hosts._take("MODIFIED", body)
+        self.cache.hosts._take("MODIFIED", body)
 
     def no_host(self, name: str) -> None:
-        self.live.hosts._drop(("", name))
+        self.cache.hosts._drop(("", name))
 
     def grant(self, name: str, node: str, **metadata: Any) -> Body:
         spec = {
@@ -155,27 +155,27 @@ class Cluster:
         known = {"uid": f"uid of {name}", "labels": labels, "generation": 1, **metadata}
         body = kinds.GRANT.header(name, **known, resourceVersion=str(next(self._versions))) | {"spec": spec}
         self.api.objects[kinds.GRANT.path("", name)] = json.loads(json.dumps(body))
-        self.live.children[kinds.GRANT]._take("MODIFIED", body)
+        self.cache.children[kinds.GRANT]._take("MODIFIED", body)
         return body
 
     def no_grant(self, name: str) -> None:
         del self.api.objects[kinds.GRANT.path("", name)]
-        self.live.children[kinds.GRANT]._drop(("", name))
+        self.cache.children[kinds.GRANT]._drop(("", name))
 
     def report(self, node: str, *reports: ReportedGrant) -> None:
         body = json.loads(json.dumps(self.api.node(node)["NodeGrants"]))
         body["status"] = {"observedGeneration": 1, "grants": [each.to_dict() for each in reports]}
         body["metadata"]["resourceVersion"] = str(next(self._versions))
-        self.live.node_objects.known._take("MODIFIED", body)
+        self.cache.node_objects.known._take("MODIFIED", body)
 
     def status(self, grant: str) -> Any:
         return self.api.objects[kinds.GRANT.path("", grant)].get("status")
 
     def gone(self, kind: Kind, node: str) -> None:
         """The watch tells of a deletion."""
-        objects = self.live.node_objects
-        reflector: Any = objects.known if kind is kinds.NODE_GRANTS else objects.accounts[kind]
-        reflector._drop((NODE_GRANTS_NAMESPACE, node))
+        objects = self.cache.node_objects
+        informer: Any = objects.known if kind is kinds.NODE_GRANTS else objects.accounts[kind]
+        informer._drop((NODE_GRANTS_NAMESPACE, node))
 
     async def until(self, condition: Any) -> None:
         async with asyncio.timeout(10):
@@ -184,7 +184,7 @@ class Cluster:
 
     async def settled(self) -> None:
         """All that was added is done."""
-        await self.until(lambda: not any(w._waiting or w._under_way for w in self.keeper.worklists()))
+        await self.until(lambda: not any(w._waiting or w._in_progress for w in self.keeper.work_queues()))
 
 
 @pytest.fixture
@@ -211,12 +211,12 @@ async def test_a_node_gets_its_account_and_an_object_that_says_that_nothing_is_g
 
 
 async def test_nothing_is_decided_before_all_is_known(cluster: Cluster) -> None:
-    cluster.live.children[kinds.GRANT].synced.clear()
+    cluster.cache.children[kinds.GRANT].synced.clear()
     cluster.drone("drone-1")
     for _ in range(20):
         await asyncio.sleep(0)
     assert cluster.api.asked == []
-    cluster.live.children[kinds.GRANT].synced.set()
+    cluster.cache.children[kinds.GRANT].synced.set()
     await cluster.until(lambda: cluster.api.granted("drone-1") == [])
 
 
@@ -302,7 +302,7 @@ async def test_what_one_object_does_not_take_is_the_newest(
     assert held[-1] == "z-oldest"
     assert held[:-1] == [f"g{hour}" for hour in range(len(held) - 1)]
     assert 2 <= len(held) <= 4
-    assert f"left_out={10 - len(held)}" in caplog.text
+    assert f"omitted={10 - len(held)}" in caplog.text
     cluster.no_grant("z-oldest")
     await cluster.settled()
     assert cluster.api.granted("drone-1") == [f"g{hour}" for hour in range(len(held))], "revoked, and one more fits"
@@ -318,13 +318,13 @@ async def test_what_is_deleted_or_changed_by_hand_is_made_again(cluster: Cluster
     before = cluster.api.objects[path]
     if kind is kinds.NODE_GRANTS:
         changed = before | {"spec": {"count": 0, "packed": ""}}
-        reflector: Any = cluster.live.node_objects.known
+        informer: Any = cluster.cache.node_objects.known
     else:
         changed = before | {"rules": [], "subjects": [], "automountServiceAccountToken": True}
-        reflector = cluster.live.node_objects.accounts[kind]
+        informer = cluster.cache.node_objects.accounts[kind]
     version = str(next(cluster._versions))
     cluster.api.objects[path] = json.loads(json.dumps(changed))
-    reflector._take("MODIFIED", changed | {"metadata": before["metadata"] | {"resourceVersion": version}})
+    informer._take("MODIFIED", changed | {"metadata": before["metadata"] | {"resourceVersion": version}})
     await cluster.settled()
     wanted = {field: value for field, value in before.items() if field != "metadata"}
     assert {field: cluster.api.objects[path].get(field) for field in wanted} == wanted

@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 from fractus_operator import removal
-from fractus_operator.cluster.kinds import POD, SIGNING_REQUEST
-from fractus_operator.cluster.store import Store
+from fractus_operator.kinds import POD, SIGNING_REQUEST
 from fractus_operator.removal import await_wiped, main, remove, run, unwiped
+from fractus_operator.store import Store
 from fractus_runtime.kubernetes import KubeError, NotFound
 
 NODES = [{"metadata": {"name": name}} for name in ("drone-2", "drone-1", "edge-1")]
@@ -46,7 +46,7 @@ class Cluster:
         self.ready = [pod("edge-1", "True"), pod("drone-1", "True")]
         self.looks = 0
         self.deleted: list[str] = []
-        self.labelled: list[str] = []
+        self.labels: list[str] = []
         self.fails, self.refuses = fails, refuses
 
     async def get(self, kind: Any, name: str, namespace: str) -> Any:
@@ -76,10 +76,10 @@ class Cluster:
             raise KubeError(403, "Forbidden", f"{key[1]} may not be deleted")
         self.deleted.append(f"{kind.name} {key[1]}")
 
-    async def label(self, kind: Any, name: str, labels: object) -> None:
+    async def set_labels(self, kind: Any, name: str, labels: object) -> None:
         if name in self.refuses:
             raise KubeError(403, "Forbidden", f"{name} may not be changed")
-        self.labelled.append(name)
+        self.labels.append(name)
 
     async def aclose(self) -> None:
         pass
@@ -133,7 +133,7 @@ async def test_what_is_refused_does_not_keep_the_rest(monkeypatch: pytest.Monkey
         assert what in said
     assert "/data/fractus was not wiped on drone-2: remove it there (rm -rf /data/fractus)" in said
     assert cluster.deleted == ["Lease fractus-operator", "CertificateSigningRequest two", "DaemonSet fractus-wipe"]
-    assert cluster.labelled == ["drone-1", "edge-1"]
+    assert cluster.labels == ["drone-1", "edge-1"]
     assert "wiped" not in await run("fractus-system", "")
 
 
@@ -168,7 +168,7 @@ async def test_nothing_of_an_installed_system_is_removed(
     assert said.startswith("nothing was removed")
     assert why in said
     assert cluster.deleted == ["DaemonSet fractus-wipe"], "which would wipe nodes in use"
-    assert not cluster.labelled
+    assert not cluster.labels
     cluster.operator = {"metadata": {"name": "fractus-operator", "deletionTimestamp": "2026-01-01T00:00:00Z"}}
     await run("fractus-system", "/data/fractus", timeout_s=0.05)
     assert "Secret fractus-ca" in cluster.deleted

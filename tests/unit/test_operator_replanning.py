@@ -8,8 +8,8 @@ import pytest
 from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.planning import Infeasible, Inventory, Settings
 from fractus_core.planning.legality import with_legality
-from fractus_operator.reconcile.replanning import Choice, choose_plan
-from fractus_operator.reconcile.status import Blocked, blocked, deployed
+from fractus_operator.replanning import Choice, choose_plan
+from fractus_operator.status import Blocked, blocked, deployed
 from test_plan_legality import FORBID, WARN, fenced
 from test_planning import PATH, STORE, VIEWER, application, drone, host, inventory, navigator
 

@@ -12,11 +12,16 @@ from fractus_core.api.plans import DeploymentPlanSpec, DroneChoice
 from fractus_core.control import OutcomeKind
 from fractus_core.planning import flight_of, plan
 from fractus_core.planning.mission import Flight
-from fractus_operator.cluster.pods import PlannedRequest, PodView
-from fractus_operator.cluster.reading import OwnedPlan, PartPool, read_submitted
-from fractus_operator.inventory.bookings import Bookings
-from fractus_operator.inventory.claims import Flown, claims
-from fractus_operator.reconcile.shared_flights import offered_flights, shared_flight_lost, shared_flight_outcome
+from fractus_operator.bookings import Bookings
+from fractus_operator.drone_claims import (
+    ActiveMission,
+    claims,
+    offered_flights,
+    shared_flight_lost,
+    shared_flight_outcome,
+)
+from fractus_operator.parsing import OwnedPlan, parse_application
+from fractus_operator.pods import PlannedRequest, PodView
 from test_planning import PATH, VIEWER, application, at, drone, inventory, manifest, navigator
 
 HOST = application(navigator(PATH))
@@ -26,17 +31,17 @@ OWN = DeploymentPlanSpec(application="traffic", drone=DroneChoice(node="d"))
 RIDE = DeploymentPlanSpec(application="guest", drone=DroneChoice(node="d", shared_with="default/traffic"))
 
 
-def flown(state: str = "inactive", x: float = 0.0, **more: Any) -> Flown:
+def flown(state: str = "inactive", x: float = 0.0, **more: Any) -> ActiveMission:
     status = {"flightState": state, "position": at(x, 0, 10)}
     flying = Drone.from_body(manifest("Drone", "d", drone("d").spec.to_dict(), status=status))
-    return Flown(HOST, OWN, flying, in_flight=state != "inactive", **more)
+    return ActiveMission(HOST, OWN, flying, in_flight=state != "inactive", **more)
 
 
 def submitted(phase: str | None) -> Any:
     complete = {"type": "MissionComplete", "status": str(phase in {"Completed", "Returning"})}
     status = {"phase": phase, "observedGeneration": 1, "conditions": [complete]} if phase else {}
     body = {**manifest("Application", "traffic", {"components": []}), "status": status}
-    return read_submitted(body)
+    return parse_application(body)
 
 
 def test_a_drone_that_has_not_begun_offers_its_whole_way() -> None:
@@ -77,11 +82,11 @@ def test_a_guest_loses_its_ride_for_a_reason() -> None:
     assert shared_flight_lost(GUEST, RIDE, OWN, whole, 7.0) is None
     assert shared_flight_lost(GUEST, RIDE, OWN, None, 7.0) is None
     assert shared_flight_lost(GUEST, OWN, None, None, 7.0) is None
-    assert "does not fly d any more" in str(shared_flight_lost(GUEST, RIDE, None, whole, 7.0))
+    assert "no longer flies d" in str(shared_flight_lost(GUEST, RIDE, None, whole, 7.0))
     other = OWN.model_copy(update={"drone": DroneChoice(node="e")})
-    assert "flies e now" in str(shared_flight_lost(GUEST, RIDE, other, whole, 7.0))
+    assert "now flies e" in str(shared_flight_lost(GUEST, RIDE, other, whole, 7.0))
     elsewhere = Flight(("default", "traffic"), ((*whole.legs[0][:1],),))
-    assert "does not visit pointsOfInterest.points[0]" in str(shared_flight_lost(GUEST, RIDE, OWN, elsewhere, 7.0))
+    assert "no longer visits pointsOfInterest.points[0]" in str(shared_flight_lost(GUEST, RIDE, OWN, elsewhere, 7.0))
 
 
 def grant(name: str, uid: str, created: str) -> Grant:
@@ -119,17 +124,6 @@ def test_of_two_that_fly_one_drone_the_older_grant_counts() -> None:
     assert claims(plans, [])["d"].uid == "a"
 
 
-def test_grants_share_the_areas_they_have_in_common() -> None:
-    ring = [{"lat": 0.0, "lon": 0.0}, {"lat": 0.0, "lon": 1.0}, {"lat": 1.0, "lon": 0.0}]
-    area = [{"polygon": {"exterior": ring}}]
-    spec = grant("a", "a", "2026-01-01T00:00:00Z").spec.to_dict()
-    pool = PartPool(parts=2)
-    read = [pool.grant(manifest("Grant", name, {**spec, "operationArea": area, "corridor": area})) for name in "ab"]
-    first, second = (found.spec for found in read if found is not None)
-    assert first.operation_area is first.corridor is second.operation_area is second.corridor
-    assert pool.grant(manifest("Grant", "odd", {"node": 1})) is None
-
-
 # -- bookings --
 
 
@@ -157,9 +151,9 @@ def test_what_is_planned_is_booked_once_and_own_pods_are_free() -> None:
     bookings, mine = Bookings(), pod("mine", "a", 1.0, app="me")
     for each in (mine, pod("theirs", "a", 2.0, app="them"), pod("bare", "a", 4.0)):
         bookings.pod_changed(None, each)
-    bookings.planned(("ns", "me"), [PlannedRequest("mine-2", "b", {"cpu": 8.0})])
+    bookings.plan_changed(("ns", "me"), [PlannedRequest("mine-2", "b", {"cpu": 8.0})])
     theirs = [PlannedRequest("theirs", "a", {"cpu": 2.0}), PlannedRequest("theirs-2", "a", {"cpu": 16.0})]
-    bookings.planned(("ns", "them"), theirs)
+    bookings.plan_changed(("ns", "them"), theirs)
     assert bookings.on("a", ("ns", "me"), [mine])["cpu"] == 2.0 + 4.0 + 16.0
     assert bookings.on("b", ("ns", "me")).get("cpu", 0.0) == 0.0
     assert bookings.on("a")["cpu"] == 1.0 + 2.0 + 4.0 + 16.0

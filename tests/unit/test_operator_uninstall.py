@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from fractus_operator import uninstall_check
-from fractus_operator.cluster.store import KubeError, NotFound, Store
+from fractus_operator.store import KubeError, NotFound, Store
 from fractus_operator.uninstall_check import check, objection
 
 

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 from fractus_core import api
 from fractus_runtime.figures import Figure, gauge
-from fractus_runtime.kubernetes import Body, Client, Key, Kind, KubeError, Reflector
+from fractus_runtime.kubernetes import Body, Client, Informer, Key, Kind, KubeError
 
 from fractus_view import objects
 from fractus_view.events import Applications, Areas, Contact, Event, Gone, Links, Policies, Problem
@@ -54,8 +54,8 @@ class Cluster:
         self._changed: set[type[api.Resource]] = set()
         self._drones: set[str] = set()
         self._heard_ms = now_ms()
-        self._reflectors: dict[type[api.Resource], Reflector[Any]] = {
-            model: self._reflector(model, namespace if model.NAMESPACED else "") for model in KINDS
+        self._informers: dict[type[api.Resource], Informer[Any]] = {
+            model: self._informer(model, namespace if model.NAMESPACED else "") for model in KINDS
         }
 
     def picture(self, id_: str) -> bytes | None:
@@ -73,20 +73,20 @@ class Cluster:
         Raises:
             KubeError: the API server cannot be reached, has not our kinds, or refuses them.
         """
-        for reflector in self._reflectors.values():
-            await self._ask(reflector.kind)
+        for informer in self._informers.values():
+            await self._ask(informer.kind)
 
     async def run(self) -> None:
         """Watch until cancelled."""
         async with asyncio.TaskGroup() as group:
-            for reflector in self._reflectors.values():
-                group.create_task(reflector.run())
+            for informer in self._informers.values():
+                group.create_task(informer.run())
             group.create_task(self._keep_contact())
             group.create_task(self._tell())
 
     def figures(self) -> Iterator[Figure]:
         """What Prometheus is told of the watches."""
-        listed = [each for each in self._reflectors.values() if each.synced.is_set()]
+        listed = [each for each in self._informers.values() if each.synced.is_set()]
         opened = {each.kind.plural: float(each.watching) for each in listed}
         yield gauge("fractus_view_watch_open", "1 while the watch of a kind is open; of a cluster.", opened, "kind")
         ages_s = {each.kind.plural: each.age_s() for each in listed}
@@ -99,7 +99,7 @@ class Cluster:
 
     # What is so
 
-    def _reflector(self, model: type[T], namespace: str) -> Reflector[T]:
+    def _informer(self, model: type[T], namespace: str) -> Informer[T]:
         def parse(body: Body) -> T:
             try:
                 return model.from_body(body)
@@ -113,11 +113,11 @@ class Cluster:
                 self._drones.add(key[1])
 
         kind = Kind(api.API_VERSION, model.KIND, model.PLURAL, model.NAMESPACED)
-        return Reflector(self._client, kind, parse, changed, namespace=namespace)
+        return Informer(self._client, kind, parse, changed, namespace=namespace)
 
     async def _tell(self) -> None:
-        for reflector in self._reflectors.values():
-            await reflector.synced.wait()
+        for informer in self._informers.values():
+            await informer.synced.wait()
         self._changed = set(KINDS)
         while True:
             changed, self._changed = self._changed, set()
@@ -148,7 +148,7 @@ class Cluster:
             yield Policies(now_ms, sorted(map(objects.policy, self._all(api.Policy)), key=lambda each: each.name))
 
     def _drone(self, name: str, now_ms: int) -> Iterator[Event]:
-        drone: api.Drone | None = self._reflectors[api.Drone].get(("", name))
+        drone: api.Drone | None = self._informers[api.Drone].get(("", name))
         if drone is None:
             yield Gone(name, now_ms)
             return
@@ -158,7 +158,7 @@ class Cluster:
             yield fix
 
     def _all(self, model: type[T]) -> Iterator[T]:
-        return self._reflectors[model].values()
+        return self._informers[model].values()
 
     # Whether it is so now
 
@@ -176,9 +176,9 @@ class Cluster:
 
     async def _problem(self) -> str | None:
         """Why what is known may not be so any more; None: it is."""
-        unheard = [each for each in self._reflectors.values() if not (each.watching and each.synced.is_set())]
+        unheard = [each for each in self._informers.values() if not (each.watching and each.synced.is_set())]
         try:
-            await self._ask((unheard or list(self._reflectors.values()))[0].kind)
+            await self._ask((unheard or list(self._informers.values()))[0].kind)
         except KubeError as error:
             return str(error)
         return f"{unheard[0].kind.plural} are not watched yet" if unheard else None

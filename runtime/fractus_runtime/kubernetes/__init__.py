@@ -13,7 +13,7 @@ from fractus_runtime.kubernetes.blocking import BlockingClient
 from fractus_runtime.kubernetes.client import POD, Client, Page
 from fractus_runtime.kubernetes.connection import ContentType
 from fractus_runtime.kubernetes.errors import Conflict, Expired, Invalid, KubeError, NotFound
-from fractus_runtime.kubernetes.informer import Reflector
+from fractus_runtime.kubernetes.informer import Informer
 from fractus_runtime.kubernetes.leader_election import LEASE, Lease, LeaseThread, LostLease
 from fractus_runtime.kubernetes.objects import Body, Key, Kind, key_of
 
@@ -28,6 +28,7 @@ __all__ = [
     "Conflict",
     "ContentType",
     "Expired",
+    "Informer",
     "Invalid",
     "Key",
     "Kind",
@@ -37,7 +38,6 @@ __all__ = [
     "LostLease",
     "NotFound",
     "Page",
-    "Reflector",
     "Unconfigured",
     "from_environment",
     "in_cluster",

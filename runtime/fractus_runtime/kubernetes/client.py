@@ -206,16 +206,23 @@ class Client(Connection):
         params = {"fieldManager": self.field_manager, "fieldValidation": "Strict" if strict else "Warn"}
         return await self.request("POST", kind.path(key_of(body)[0]), body, params=params)
 
-    async def apply(self, kind: Kind, body: Body, *, subresource: str = "", field_manager: str | None = None) -> Body:
-        """Make an object's fields as given, by server-side apply; fields of others stay.
+    async def apply(
+        self,
+        kind: Kind,
+        body: Body,
+        *,
+        subresource: str = "",
+        field_manager: str | None = None,
+    ) -> Body:
+        """Set the fields of an object by server-side apply. Fields of other managers stay.
 
-        With metadata.uid in the body, an object that is gone, or another one of its name, is left alone.
+        With metadata.uid in the body, neither a deleted object nor another one of its name is written.
 
         Args:
-            kind: of the object.
-            body: the fields.
-            subresource: such as status.
-            field_manager: instead of the client's, where several programs of its name each say a part.
+            kind: Kind of the object.
+            body: The fields.
+            subresource: Subresource, such as status.
+            field_manager: Replaces the field manager of the client, if several of its parts each own some fields.
 
         Raises:
             Conflict: metadata.uid does not match.

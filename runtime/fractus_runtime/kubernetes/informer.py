@@ -25,7 +25,7 @@ _STEADY_S = 1.0
 """A watch that ends sooner, without an event, is followed by a pause, as a failure is."""
 
 
-class Reflector(Generic[T]):
+class Informer(Generic[T]):
     """A current local copy of a collection.
 
     Only what `parse` returns is kept, so a large collection costs what is used of it. Every
@@ -81,7 +81,7 @@ class Reflector(Generic[T]):
         """How many objects there are."""
         return len(self._objects)
 
-    def note(self, key: Key, body: Body) -> None:
+    def record_write(self, key: Key, body: Body) -> None:
         """Take what a write of our own returned, ahead of the watch, which then has nothing older to say of it.
 
         An answer that comes after the watch or a list told of that moment is old news: it says nothing more.

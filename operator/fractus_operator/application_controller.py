@@ -1,0 +1,364 @@
+"""Controller of Applications: observes, decides, applies the difference, reports the status, and tears down at the end."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from datetime import datetime, timedelta
+
+from fractus_core.api import Application, InvalidObject
+from fractus_core.api.plans import DeploymentPlanSpec
+from fractus_core.identity.authority import Authority
+from fractus_core.identity.grant_signer import GrantSigner
+from fractus_core.planning.inventory import Inventory, Settings
+from fractus_core.planning.planner import Infeasible
+from fractus_core.validation import check_application
+
+from fractus_operator import kinds, status
+from fractus_operator.application_grants import REFUSALS, ApplicationGrants
+from fractus_operator.cache import ClusterCache, ObservedApplication
+from fractus_operator.child_objects import ChildObjects, NameTaken
+from fractus_operator.cleanup import FinishedPods
+from fractus_operator.drone_claims import shared_flight_outcome
+from fractus_operator.kinds import Key
+from fractus_operator.labels import FINALIZER
+from fractus_operator.metrics import phase as timed
+from fractus_operator.metrics import reconciling
+from fractus_operator.parsing import SETTLED, Submitted
+from fractus_operator.pods import refusals
+from fractus_operator.replanning import (
+    choose_plan,
+    flown_generation,
+    mission_changed,
+    present_plan,
+    stuck_nodes,
+    waits_for_landing,
+)
+from fractus_operator.rollout import Rollout
+from fractus_operator.route_check_cache import RouteCheckCache
+from fractus_operator.status import Blocked, Phase, StatusUpdate, flight, mission_outcome
+from fractus_operator.status_reporter import StatusReporter
+from fractus_operator.store import Backoff, KubeError, Store
+
+logger = logging.getLogger(__name__)
+
+RESYNC_S = 30.0
+_FIRST_RETRY_S = 1.0
+_MAX_RETRY_S = 30.0
+_MAX_PAUSE_S = 1.0
+_PAUSE_FACTOR = 2.0
+"""Duration of the pause after a reconciliation, relative to its own duration. Under load, each one then runs less often."""
+
+EXCLUSION = timedelta(minutes=5)
+"""Duration for which plans of an Application avoid a node on which the scheduler placed no pod."""
+
+_RIGHTS = (kinds.GRANT, kinds.DIRECT_LINK)
+"""Kinds that are deleted first when a mission is over. Pods follow."""
+_AFTER_PODS = (
+    kinds.DISRUPTION_BUDGET,
+    kinds.ENDPOINT_SLICE,
+    kinds.NETWORK_POLICY,
+    kinds.SERVICE,
+)
+"""Kinds that are deleted last when a mission is over. The plan is kept as the record of the mission."""
+
+
+class BeingDeleted(Exception):
+    """The Application is being deleted, so there is nothing more to reconcile."""
+
+
+@dataclass
+class _ApplicationState:
+    """State of one Application between reconciliations. Losing it, as in a restart, is harmless."""
+
+    lock: asyncio.Lock = field(default_factory=asyncio.Lock)
+    excluded: dict[str, tuple[datetime, str]] = field(default_factory=dict)
+    checked: tuple[object, ...] = ()
+
+    def check(self, application: Application, inventory: Inventory, rules: int) -> None:
+        """Validate an Application, once for each generation and each revision of the rules.
+
+        Raises:
+            InvalidObject: It names unknown depots, or has invalid regions.
+        """
+        revision = (application.metadata.uid, application.metadata.generation, rules)
+        if self.checked != revision:
+            check_application(application, inventory.depots)
+            self.checked = revision
+
+    def exclude(self, stuck: dict[str, str], now: datetime) -> dict[str, str]:
+        """Exclude nodes from plans for a while. Return all excluded nodes with the reason."""
+        self.excluded = {node: (end, reason) for node, (end, reason) in self.excluded.items() if end > now}
+        self.excluded |= {node: (now + EXCLUSION, reason) for node, reason in stuck.items()}
+        return {node: reason for node, (_, reason) in self.excluded.items()}
+
+
+class ApplicationController:
+    """Brings every Application to the state that its spec, the inventory and its mission require."""
+
+    def __init__(
+        self,
+        store: Store,
+        cache: ClusterCache,
+        authority: Authority,
+        clock: Callable[[], datetime],
+        settings: Settings | None = None,
+    ) -> None:
+        self._cache = cache
+        self._clock = clock
+        self._settings = settings or Settings()
+        signer = GrantSigner(authority, clock)
+        self._objects = ChildObjects(store, cache.children, signer)
+        self._grants = ApplicationGrants(cache, self._objects, signer, self._settings)
+        self._finished_pods = FinishedPods(store, cache, self._objects, clock)
+        self._rollout = Rollout(self._objects, cache, authority, clock)
+        self._reporter = StatusReporter(store, cache.applications, clock)
+        self._route_checks = RouteCheckCache(cache.subscriptions.wake, clock)
+        self._states: dict[Key, _ApplicationState] = {}
+
+    async def follow(self, key: Key, stopped: Callable[[], bool]) -> None:
+        """Reconcile an Application whenever one of its inputs changes, until it is deleted or `stopped` returns True."""
+        backoff = Backoff(_FIRST_RETRY_S, _MAX_RETRY_S)
+        loop = asyncio.get_running_loop()
+        await self._cache.synced()
+        with self._cache.subscriptions.subscribe(key) as inputs:
+            while not stopped():
+                started = loop.time()
+                try:
+                    with reconciling("application"):
+                        try:
+                            next_s = await self.reconcile(key)
+                        except BeingDeleted:
+                            return  # caught here, so that it does not count as a failure
+                    backoff.succeeded()
+                except KubeError as error:
+                    next_s = backoff.delay_s()
+                    logger.warning(
+                        "application controller: reconcile failed (application=%s/%s retry_s=%.1f error=%s)",
+                        *key,
+                        next_s,
+                        error,
+                    )
+                    await self._reporter.report_failure(self._cache.applications.get(key), backoff.attempts, error)
+                took_s = loop.time() - started
+                if await inputs.changed(next_s):
+                    # Changes come in bursts, such as the pods of a plan. A change by a user ends the pause.
+                    await inputs.pause(min(_PAUSE_FACTOR * took_s, _MAX_PAUSE_S))
+
+    async def reconcile(self, key: Key) -> float:
+        """Take one step towards the desired state. The operator may be killed at any point, and the step repeated.
+
+        Returns:
+            Seconds until the next step if no input changes before.
+
+        Raises:
+            BeingDeleted: The Application is being deleted.
+            KubeError: The API server refused a write, or could not be reached.
+        """
+        submitted = self._cache.applications.get(key)
+        if submitted is None:
+            return RESYNC_S
+        metadata = submitted.metadata
+        if metadata.deletion_timestamp:
+            raise BeingDeleted
+        # Without the finalizer nothing is created, because a deletion would then leave Grants behind.
+        if FINALIZER not in metadata.finalizers:
+            return RESYNC_S
+        state = self._states.setdefault(key, _ApplicationState())
+        async with state.lock:
+            if metadata.uid == self._cache.torn_down.get(key):
+                raise BeingDeleted
+            return min(await self._step(self._cache.observe(submitted), state), RESYNC_S)
+
+    async def teardown(self, key: Key, uid: str) -> None:
+        """Delete every Grant of an Application that is being deleted, and then its other objects.
+
+        When its Grant is deleted, the services of the drone return it to its depot. The garbage collector deletes owned
+        objects that are missing in a stale cache. Pods without an owner are searched for.
+
+        Raises:
+            KubeError: The API server refused a deletion, or could not be reached.
+        """
+        await self._cache.synced()
+        self._cache.torn_down[key] = uid
+        state = self._states.setdefault(key, _ApplicationState())
+        async with state.lock:
+            await self._objects.revoke(key)
+            await self._finished_pods.tear_down(key)
+        self._states.pop(key, None)
+        for part in (self._grants, self._route_checks, self._reporter, self._rollout, self._cache):
+            part.forget(key)
+
+    # -- steps --
+
+    async def _step(self, observed: ObservedApplication, state: _ApplicationState) -> float:
+        """Take one step. Return the seconds until the next one."""
+        submitted = observed.submitted
+        self._cache.subscriptions.set_placed(observed.key, placed=False)
+        next_s = await self._clean_up_finished(observed)
+        if next_s is not None:
+            return next_s
+        outcome = mission_outcome(observed.uid, observed.grants) or shared_flight_outcome(observed.plan, *observed.host)
+        if outcome is not None:
+            # The outcome is reported before anything is deleted, because the Grants are its only other record.
+            choice = observed.plan.drone if observed.plan is not None else None
+            name = choice.node if choice is not None else self._reporter.last(submitted).get("drone")
+            drone = self._cache.drone(name) if name is not None else None
+            update = status.finished(outcome, name, drone, observed.pods)
+            await self._reporter.report(submitted, update, flown_generation(submitted.application, observed.plan))
+            await self._finish(submitted)
+            return RESYNC_S
+        present = self._present_status(observed)
+        try:
+            await self._grants.refresh(observed)
+            update, next_s = await self._deploy(self._cache.observe(submitted), state)
+        except Blocked as blocked:
+            # Without an await before this line, so that resources released by other Applications from now on cause a wake-up.
+            self._cache.subscriptions.set_placed(observed.key, placed=False, full=blocked.full)
+            await self._reporter.report(submitted, status.blocked(blocked, present))
+            if observed.plan is not None:
+                await self._rollout.keep_running(observed.key, submitted.application, observed.plan, observed.pods)
+            return blocked.retry_s
+        await self._reporter.report(submitted, update)
+        return next_s
+
+    async def _clean_up_finished(self, observed: ObservedApplication) -> float | None:
+        """Clean up if the mission is over. Return the seconds until the next step, or None if a new mission may begin."""
+        reported = self._reporter.last(observed.submitted)
+        if reported.get("phase") not in SETTLED:
+            return None
+        submitted = observed.submitted
+        application = submitted.application
+        reported_generation = reported.get("observedGeneration") == submitted.metadata.generation
+        flown = self._cache.plans.latest(observed.key, observed.uid)
+        # An invalid Application names no other mission. The record of the last mission stays until it is valid.
+        same_mission = observed.plan is None and (application is None or not mission_changed(application, flown))
+        if reported_generation or same_mission:
+            next_s = await self._finish(submitted) if observed.plan is None else RESYNC_S
+            if reported_generation and observed.plan is None and application is not None and flown is not None:
+                await self._rollout.keep_plan(application, flown)
+            returning = reported["phase"] == "Returning"
+            if returning or not reported_generation:
+                # A drone that has returned may already fly for another Application.
+                drone = self._cache.drone(reported.get("drone") or "") if returning else None
+                await self._reporter.report(submitted, status.still_over(reported, drone))
+            return next_s
+        if observed.plan is not None:
+            return None
+        # Otherwise the old plan would claim its drone for the next mission, and exempt it from checks.
+        removed = await self._start_over(observed.key)
+        # The Grants of the last mission must be deleted before a new one begins.
+        return 1.0 if removed else None
+
+    async def _deploy(self, observed: ObservedApplication, state: _ApplicationState) -> tuple[StatusUpdate, float]:
+        """Plan, compile Grants, and apply.
+
+        There is no await between reading the inventory and the decision, so two Applications never get the same drone.
+
+        Raises:
+            Blocked: The Application cannot proceed at present.
+            KubeError: The API server cannot be reached.
+        """
+        with timed("observe"):
+            inventory, lost = self._cache.planning_input(observed, self._settings.safety_radius_m)
+        if lost is not None:
+            await self._start_over(observed.key)
+            raise Blocked("Queued", "Planned", *lost, retry_s=1.0)
+        application = observed.submitted.application
+        if application is None:
+            raise Blocked("Invalid", "Planned", "Invalid", str(observed.submitted.error))
+        if observed.plan is not None and waits_for_landing(application, observed.plan, observed.in_flight):
+            await self._rollout.renew_certificates(application, observed.plan, observed.pods)
+            await self._rollout.update_addresses(observed.key, observed.plan, observed.pods)
+            present = self._deployed_status(observed, observed.plan, len(observed.grants))
+            return status.waiting_for_landing(present, observed.in_flight or ""), RESYNC_S
+        try:
+            state.check(application, inventory, observed.rules)
+            with timed("plan"):
+                plan, next_s = self._plan(application, observed, inventory, state)
+        except InvalidObject as error:
+            raise Blocked("Invalid", "Planned", "Invalid", str(error)) from error
+        except Infeasible as infeasible:
+            phase: Phase = "Queued" if infeasible.reason == "DroneBusy" else "Pending"
+            raise Blocked(phase, "Planned", infeasible.reason, infeasible.message, full=infeasible.full) from infeasible
+        try:
+            with timed("grants"):
+                grants = self._grants.compile(application, plan, observed, inventory)
+        except InvalidObject as error:
+            raise Blocked("Pending", "Granted", "PolicyInvalid", str(error)) from error
+        await self._reporter.report_queued(observed.submitted, plan, self._rollout.in_progress)
+        try:
+            with timed("rollout"):
+                complete = await self._rollout.apply(application, plan, grants, observed.pods, observed.rules)
+        except NameTaken as error:
+            raise Blocked("Pending", "Deployed", "NameTaken", str(error), retry_s=2.0) from error
+        except KubeError as error:
+            if error.status not in REFUSALS:
+                raise
+            raise Blocked("Pending", "Deployed", error.reason, str(error), retry_s=10.0) from error
+        return self._deployed_status(observed, plan, len(grants)), next_s if complete else 0.0
+
+    def _plan(
+        self,
+        application: Application,
+        observed: ObservedApplication,
+        inventory: Inventory,
+        state: _ApplicationState,
+    ) -> tuple[DeploymentPlanSpec, float]:
+        """Return the plan to deploy and the seconds until the next step. A new plan becomes active at once."""
+        now = self._clock()
+        stuck, recheck_s = stuck_nodes(observed.plan, observed.pods, now)
+        stuck = {node: reason for node, reason in stuck.items() if node != observed.in_flight}
+        settings = replace(self._settings, excluded=state.exclude(stuck, now), time_s=now.timestamp())
+        unchecked = present_plan(application, observed.plan)
+        present = unchecked
+        if unchecked is not None:
+            present = self._route_checks.checked(
+                observed.key, application, unchecked, rules=observed.rules, inventory=inventory, settings=settings
+            )
+        choice = choose_plan(application, present, inventory, settings, stuck=stuck, in_flight=observed.in_flight)
+        self._cache.subscriptions.set_placed(observed.key, placed=choice.suits, full=choice.full)
+        if choice.plan is not observed.plan:
+            self._cache.plans.decide(observed.key, observed.uid, choice.plan)
+        if choice.plan is not unchecked:
+            logger.info(
+                "application controller: planned (application=%s/%s reason=%s drone=%s)",
+                *observed.key,
+                choice.reason or "PoliciesChanged",
+                choice.plan.drone.node if choice.plan.drone is not None else "none",
+            )
+        if choice.reason is not None:
+            self._route_checks.put(observed.key, choice.plan, observed.rules)
+        return choice.plan, (recheck_s or RESYNC_S) if choice.fits else RESYNC_S
+
+    async def _start_over(self, key: Key) -> bool:
+        """Delete all objects of an Application, including its plan. Return True if there were any."""
+        removed = await self._objects.remove(key, *_RIGHTS, kinds.DEPLOYMENT, *_AFTER_PODS, kinds.DEPLOYMENT_PLAN)
+        pods = await self._finished_pods.remove(key)
+        self._cache.forget(key)
+        return removed or pods
+
+    async def _finish(self, submitted: Submitted) -> float:
+        """Delete the objects of a finished mission, except its plan and its kept pods. Return the seconds until the next step."""
+        key = submitted.key
+        rights = await self._objects.remove(key, *_RIGHTS)
+        pods = await self._finished_pods.stop(submitted)
+        others = await self._objects.remove(key, *_AFTER_PODS)
+        if rights or pods or others:
+            self._cache.forget(key)
+        return min(await self._finished_pods.expire(submitted), RESYNC_S)
+
+    def _present_status(self, observed: ObservedApplication) -> StatusUpdate | None:
+        """Return the status of the deployed part of the active plan, or None if nothing is deployed."""
+        if observed.plan is None or not self._objects.of(observed.key, kinds.DEPLOYMENT):
+            return None
+        return self._deployed_status(observed, observed.plan, 0)
+
+    def _deployed_status(self, observed: ObservedApplication, plan: DeploymentPlanSpec, granted: int) -> StatusUpdate:
+        node = plan.drone.node if plan.drone is not None else None
+        reported = self._reporter.last(observed.submitted)
+        flown = flight(node, self._cache.drone(node), reported) if node is not None else None
+        refused = refusals(self._objects.of(observed.key, kinds.DEPLOYMENT))
+        return status.deployed(plan, observed.pods, granted, flown, refused)

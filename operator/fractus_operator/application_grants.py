@@ -1,0 +1,107 @@
+"""Grants of Applications: compiled for a plan, and updated when policies change between plans."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from fractus_core.api import Application, Grant
+from fractus_core.api.grants import GrantSpec
+from fractus_core.api.plans import DeploymentPlanSpec
+from fractus_core.identity.grant_signer import GrantSigner
+from fractus_core.planning.grant_compiler import compile_grants, refresh
+from fractus_core.planning.inventory import Inventory, Settings
+
+from fractus_operator.cache import ClusterCache, ObservedApplication
+from fractus_operator.child_objects import ChildObjects
+from fractus_operator.kinds import Key
+from fractus_operator.store import Conflict, KubeError, NotFound
+
+logger = logging.getLogger(__name__)
+
+REFUSALS = frozenset({400, 403, 422})
+"""HTTP statuses with which the API server refuses an object itself. The user has to change something."""
+
+Inputs = tuple[object, ...]
+"""Versions of the inputs of Grants, and of the Grants themselves."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Compiled:
+    inputs: Inputs
+    plan: DeploymentPlanSpec
+    grants: tuple[GrantSpec, ...]
+
+
+class ApplicationGrants:
+    """Compiles and updates Grants. Results are cached, because most reconciliations find no changed input."""
+
+    def __init__(self, cache: ClusterCache, objects: ChildObjects, signer: GrantSigner, settings: Settings) -> None:
+        self._cache = cache
+        self._objects = objects
+        self._signer = signer
+        self._settings = settings
+        self._refreshed: dict[Key, Inputs] = {}
+        self._compiled: dict[Key, _Compiled] = {}
+
+    async def refresh(self, observed: ObservedApplication) -> None:
+        """Update the policies in existing Grants. This does not depend on whether the Application can be planned.
+
+        Raises:
+            KubeError: The API server cannot be reached.
+        """
+        valid = self._valid_grants(observed)
+        inputs = _inputs(observed.rules, valid)
+        if self._refreshed.get(observed.key) == inputs:
+            return
+        inventory = self._cache.snapshot(observed.key, observed.uid)
+        grants = [(grant, refresh(grant.spec, inventory)) for grant in valid]
+        stale = [(grant, spec) for grant, spec in grants if spec != grant.spec]
+        if stale:
+            self._refreshed.pop(observed.key, None)
+        else:
+            self._refreshed[observed.key] = inputs
+        try:
+            await self._objects.refresh(stale)
+        except KubeError as error:
+            # Either the watch reports a newer Grant, or the next reconciliation fails in the same way.
+            logger.warning("application grants: Grants not updated (application=%s/%s error=%s)", *observed.key, error)
+            if error.status not in REFUSALS and not isinstance(error, Conflict | NotFound):
+                raise
+
+    def compile(
+        self,
+        application: Application,
+        plan: DeploymentPlanSpec,
+        observed: ObservedApplication,
+        inventory: Inventory,
+    ) -> tuple[GrantSpec, ...]:
+        """Return the Grants of a plan.
+
+        Raises:
+            InvalidObject: Nothing can be granted.
+        """
+        valid = self._valid_grants(observed)
+        inputs = _inputs(observed.rules, valid, application.metadata.uid, application.metadata.generation)
+        known = self._compiled.get(observed.key)
+        if known is not None and known.inputs == inputs and known.plan is plan:
+            return known.grants
+        grants = compile_grants(application, plan, inventory, self._settings, [grant.spec for grant in valid])
+        self._compiled[observed.key] = _Compiled(inputs, plan, tuple(grants))
+        return tuple(grants)
+
+    def forget(self, key: Key) -> None:
+        """Drop the cached results of a deleted Application."""
+        self._refreshed.pop(key, None)
+        self._compiled.pop(key, None)
+
+    def _valid_grants(self, observed: ObservedApplication) -> list[Grant]:
+        """Return the Grants that the operator signed for this Application. Those of another uid are never signed again."""
+        own = (grant for grant in observed.grants if grant.spec.application.uid == observed.uid)
+        return [grant for grant in own if self._signer.problem(grant) is None]
+
+
+def _inputs(rules: int, grants: Sequence[Grant], *more: object) -> Inputs:
+    versions = sorted((g.name, g.metadata.uid or "", g.metadata.resource_version or "") for g in grants)
+    return (rules, *versions, *more)

@@ -1,0 +1,419 @@
+"""Cache of the cluster: informers of all inputs, indexes on them, the input of planning, and wake-ups of reconcilers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from fractus_core.api import DeploymentPlan, Depot, DirectLink, Drone, EdgeNode, Grant, Policy, Zone
+from fractus_core.api.names import NODE_SIGNER
+from fractus_core.api.plans import DeploymentPlanSpec
+from fractus_core.planning.candidates import readiness
+from fractus_core.planning.inventory import Flight, Host, Inventory
+from fractus_core.planning.spatial_index import NodeLocations
+
+from fractus_operator import kinds
+from fractus_operator.active_plans import ActivePlans
+from fractus_operator.bookings import BookedHosts, Bookings, ByName
+from fractus_operator.drone_claims import DroneHolders, Fleet, may_share, offered_flights, shared_flight_lost
+from fractus_operator.kinds import Body, Key, Kind
+from fractus_operator.labels import label_key
+from fractus_operator.node_objects import NodeObjects
+from fractus_operator.node_services import NodeServices, parse_revision
+from fractus_operator.owned_objects import GroupedObjects, OwnedObjects, application_label_key
+from fractus_operator.parsing import Submitted, Unreadable, optional_parser, parse_application, tolerant_parser
+from fractus_operator.pods import (
+    REFUSED,
+    REPLICA_FAILURE,
+    PlannedRequest,
+    PodView,
+    parse_host,
+    parse_pod,
+    refusal_of,
+)
+from fractus_operator.store import Informer, Store
+from fractus_operator.work_queue import Subscriptions
+
+_WITHOUT_STATUS = frozenset({kinds.DEPLOYMENT, kinds.DIRECT_LINK})
+"""Kinds of child objects whose status changes often and is not an input."""
+
+
+@dataclass(frozen=True, slots=True)
+class ObservedApplication:
+    """An Application with the inputs of its next step, read at the same time. Valid until the next await.
+
+    Attributes:
+        plan: The active plan, if any.
+        pods: Pods of the current mission.
+        grants: All Grants under its name, including those of an earlier Application of this name.
+        host: The Application whose flight it shares, and the active plan of that one.
+        in_flight: The drone of its plan while it is in flight.
+        rules: Revision of the inputs of Grants.
+    """
+
+    submitted: Submitted
+    plan: DeploymentPlanSpec | None
+    pods: Sequence[PodView]
+    grants: Sequence[Grant]
+    host: tuple[Submitted | None, DeploymentPlanSpec | None]
+    in_flight: str | None
+    rules: int
+
+    @property
+    def key(self) -> Key:
+        """(namespace, name) of the Application."""
+        return self.submitted.key
+
+    @property
+    def uid(self) -> str:
+        """The uid of the Application."""
+        return self.submitted.uid
+
+
+class ClusterCache:
+    """The cluster as the operator knows it, current within the delay of a watch event.
+
+    Args:
+        store: The API server.
+        namespace: Namespace of the Fractus services.
+
+    Attributes:
+        torn_down: The uids of Applications whose teardown has begun. Nothing more is created for them.
+        rules_revision: Number of changes of the inputs of Grants: zones, policies, depots, and specs of nodes.
+    """
+
+    def __init__(self, store: Store, namespace: str = "fractus-system") -> None:
+        self.services = NodeServices(namespace)
+        self.revisions = Informer(
+            store, kinds.CONTROLLER_REVISION, parse_revision, self.services.revision_changed, namespace=namespace
+        )
+        self.node_objects = NodeObjects(store)
+        self.hosts = Informer(store, kinds.NODE, parse_host, self._host_changed)
+        self.pods = Informer(store, kinds.POD, parse_pod, self._pod_changed)
+        self.drones = Informer(store, kinds.DRONE, optional_parser(Drone), self._drone_changed)
+        self.edge_nodes = Informer(store, kinds.EDGE_NODE, optional_parser(EdgeNode), self._edge_node_changed)
+        self.depots = Informer(store, kinds.DEPOT, optional_parser(Depot), self._depot_changed)
+        self.zones = Informer(store, kinds.ZONE, tolerant_parser(Zone), self._zone_changed)
+        self.policies = Informer(store, kinds.POLICY, tolerant_parser(Policy), self._policy_changed)
+        self.applications = Informer(store, kinds.APPLICATION, parse_application, self._application_changed)
+        self.signing_requests = Informer(
+            store,
+            kinds.SIGNING_REQUEST,
+            _unchanged,
+            lambda key, _old, _new: self._notify(kinds.SIGNING_REQUEST, key),
+            selectors={"fieldSelector": f"spec.signerName={NODE_SIGNER}"},
+        )
+        self.children: dict[Kind, OwnedObjects] = {
+            kind: OwnedObjects(
+                store, kind, _without_status if kind in _WITHOUT_STATUS else _unchanged, self._child_changed
+            )
+            for kind in kinds.CHILDREN
+        }
+        self.subscriptions = Subscriptions()
+        self.fleet = Fleet(self.drones, self.applications)
+        self._bookings = Bookings()
+        self.plans = ActivePlans(self.applications, self.subscriptions.wake, self.fleet, self._requests_changed)
+        self.torn_down: dict[Key, str] = {}
+        self.rules_revision = 0
+        self._listeners: dict[Kind, list[Callable[[Key], None]]] = {}
+        self._grants: GroupedObjects[Grant] = GroupedObjects()
+        self._known_grants: dict[Key, Grant] = {}
+        self._pods: GroupedObjects[PodView] = GroupedObjects()
+        self._locations = NodeLocations()
+
+    def informers(self) -> list[Informer[Any]]:
+        """Return all informers. Run each one in its own task."""
+        own: list[Informer[Any]] = [r for r in vars(self).values() if isinstance(r, Informer)]
+        return own + list(self.children.values()) + self.node_objects.informers()
+
+    async def synced(self) -> None:
+        """Wait until every collection was listed once. Decisions need all of them."""
+        for informer in self.informers():
+            await informer.synced.wait()
+
+    def oldest_contact_s(self) -> float:
+        """Return the seconds since the last message of the watch that has been silent for longest."""
+        return max(informer.age_s() for informer in self.informers())
+
+    def add_listener(self, kind: Kind, listener: Callable[[Key], None]) -> None:
+        """Call the listener with the key of every object of the kind that is created, changed or deleted."""
+        self._listeners.setdefault(kind, []).append(listener)
+
+    # -- reading --
+
+    def observe(self, submitted: Submitted) -> ObservedApplication:
+        """Return an Application with the inputs of its next step."""
+        key = submitted.key
+        plan = self.plans.get(key, submitted.uid)
+        return ObservedApplication(
+            submitted,
+            plan,
+            pods=self.pods_of(key),
+            grants=self.grants_of(key),
+            host=self.plans.flight_host(plan),
+            in_flight=self.fleet.drone_in_flight(plan),
+            rules=self.rules_revision,
+        )
+
+    def snapshot(self, key: Key, uid: str, flights: Mapping[str, Flight] | None = None) -> Inventory:
+        """Return the input of planning and of Grants. It is valid until the next await.
+
+        Args:
+            key: Application that is being planned. Resources of its own pods count as free.
+            uid: Its uid. Claims under its name with another uid belong to another holder.
+            flights: Flights of claimed drones that the Application may share.
+        """
+        own = label_key(key)
+        return Inventory(
+            hosts=BookedHosts(self.hosts, self._bookings, own, self._pods.of(own)),
+            drones=ByName(self.drones),
+            edge_nodes=ByName(self.edge_nodes),
+            depots=self.depots_by_name(),
+            zones={z.name: z for z in self.zones.values() if isinstance(z, Zone)},
+            policies={p.name: p for p in self.policies.values() if isinstance(p, Policy)},
+            unreadable_zones={z.name: z.problem for z in self.zones.values() if isinstance(z, Unreadable)},
+            unreadable_policies={p.name: p.problem for p in self.policies.values() if isinstance(p, Unreadable)},
+            claimed=DroneHolders(self.fleet.claims(), uid),
+            flights=flights or {},
+            locations=self._locations,
+        )
+
+    def planning_input(
+        self, observed: ObservedApplication, radius_m: float
+    ) -> tuple[Inventory, tuple[str, str] | None]:
+        """Return the input of planning for an Application, and why its plan lost its drone, if it did.
+
+        Args:
+            observed: The Application, observed without an await since.
+            radius_m: Maximum distance of a drone from its path, in metres.
+
+        Returns:
+            The inventory. Reason (CamelCase) and sentence, if another Application holds the drone, or if the shared flight
+            is over or has another route.
+        """
+        application = observed.submitted.application
+        plan = observed.plan
+        flights: Mapping[str, Flight] = {}
+        if may_share(application):
+            others = (m for m in self.fleet.active_missions() if m.application.key != observed.key)
+            flights = offered_flights(others, self.depots_by_name(), radius_m, plan)
+        inventory = self.snapshot(observed.key, observed.uid, flights)
+        if plan is None or plan.drone is None:
+            return inventory, None
+        node = plan.drone.node
+        if plan.drone.shared_with is None:
+            claim = self.fleet.claims().get(node)
+            lost = claim is not None and claim.uid != observed.uid
+            return inventory, ("DroneBusy", f"another Application holds {node}") if lost else None
+        if application is None:
+            return inventory, None
+        message = shared_flight_lost(application, plan, observed.host[1], flights.get(node), radius_m)
+        return inventory, ("SharedFlightLost", message) if message is not None else None
+
+    def drone(self, name: str) -> Drone | None:
+        """Return a valid Drone by name, or None."""
+        return self.drones.get(("", name))
+
+    def depots_by_name(self) -> Mapping[str, Depot]:
+        """Return the depots by name."""
+        return ByName(self.depots)
+
+    def pods_of(self, key: Key, *, kept: bool = False) -> list[PodView]:
+        """Return the pods of the current mission of an Application, or the kept pods of its last mission."""
+        return [pod for pod in self._pods.of(label_key(key)) if (pod.finished_at is not None) == kept]
+
+    def grants_of(self, key: Key) -> list[Grant]:
+        """Return the Grants of an Application, including those of an earlier Application of this name."""
+        return list(self._grants.of(key))
+
+    def forget(self, key: Key) -> None:
+        """Drop the plan of an Application whose mission is over. Its drone is free when it has returned."""
+        if self.plans.forget(key):
+            self.subscriptions.wake_waiting()
+
+    # -- handlers of informers --
+
+    def _host_changed(self, key: Key, old: Host | None, new: Host | None) -> None:
+        self._notify(kinds.NODE, key)
+        if new is None:
+            self._locations.remove_host(key[1])
+        else:
+            self._locations.upsert_host(new.name, new.is_cloud)
+        if _host_inputs(old) != _host_inputs(new):
+            self.subscriptions.wake_all()
+
+    def _pod_changed(self, key: Key, old: PodView | None, new: PodView | None) -> None:
+        self._bookings.pod_changed(old, new)
+        self.services.pod_changed(key, old, new)
+        for pod in (old, new):
+            if pod is not None and pod.application is not None:
+                owner = (pod.namespace, pod.application)
+                if pod is new:
+                    self._pods.put(owner, key, pod)
+                else:
+                    self._pods.drop(owner, key)
+                self.subscriptions.wake(owner)
+        occupied = _occupied(old)
+        if occupied is not None and occupied != _occupied(new):
+            self.subscriptions.wake_for_capacity(occupied[0])
+
+    def _drone_changed(self, key: Key, old: Drone | None, new: Drone | None) -> None:
+        self.fleet.drone_changed(key[1], new)
+        self._notify(kinds.DRONE, key)
+        if new is None:
+            self._locations.remove_drone(key[1])
+        elif old is None or (old.spec.depot, old.spec.home) != (new.spec.depot, new.spec.home):
+            self._locations.upsert_drone(new)
+        if _rules_differ(old, new):
+            self._rules_changed()
+        elif old is not None and new is not None and _planning_inputs(old) != _planning_inputs(new):
+            # A takeoff releases nothing: neither the drone, nor a longer part of a flight to share.
+            took_off = new.in_air and not old.in_air and _ready(old) == _ready(new)
+            if not took_off:
+                self.subscriptions.wake_waiting()
+            self._wake_applications_on(new.name)
+        elif old is not None and new is not None and _reported_state(old) != _reported_state(new):
+            self._wake_applications_on(new.name)
+
+    def _requests_changed(self, application: Key, requests: Sequence[PlannedRequest]) -> None:
+        for node in self._bookings.plan_changed(application, requests):
+            self.subscriptions.wake_for_capacity(node)
+
+    def _wake_applications_on(self, drone: str) -> None:
+        """Wake the Applications on a drone, including those that share its flight."""
+        for application in self.fleet.applications_on(drone):
+            self.subscriptions.wake(application)
+
+    def _edge_node_changed(self, key: Key, old: EdgeNode | None, new: EdgeNode | None) -> None:
+        self._notify(kinds.EDGE_NODE, key)
+        if new is None:
+            self._locations.remove_edge_node(key[1])
+        elif old is None or old.spec.location != new.spec.location:
+            self._locations.upsert_edge_node(new)
+        if _rules_differ(old, new):
+            self._rules_changed()
+        elif old is not None and new is not None and _ready(old) != _ready(new):
+            self.subscriptions.wake_all()
+
+    def _depot_changed(self, key: Key, old: Depot | None, new: Depot | None) -> None:
+        if new is None:
+            self._locations.remove_depot(key[1])
+        else:
+            self._locations.upsert_depot(new)
+        self._spec_changed(kinds.DEPOT, key, old, new)
+
+    def _zone_changed(self, key: Key, old: Zone | Unreadable | None, new: Zone | Unreadable | None) -> None:
+        self._spec_changed(kinds.ZONE, key, old, new)
+
+    def _policy_changed(self, key: Key, old: Policy | Unreadable | None, new: Policy | Unreadable | None) -> None:
+        self._spec_changed(kinds.POLICY, key, old, new)
+
+    def _spec_changed(self, kind: Kind, key: Key, old: Any, new: Any) -> None:
+        self._notify(kind, key)
+        if old is None or new is None or type(old) is not type(new) or old.spec != new.spec:
+            self._rules_changed(urgent=True)
+
+    def _rules_changed(self, *, urgent: bool = False) -> None:
+        self.rules_revision += 1
+        self.subscriptions.wake_all(urgent=urgent, first=self.fleet.applications_in_flight())
+
+    def _application_changed(self, key: Key, old: Submitted | None, new: Submitted | None) -> None:
+        self.plans.application_changed(key)
+        self._notify(kinds.APPLICATION, key)
+        if new is None:
+            self.plans.forget(key)
+            self.torn_down.pop(key, None)
+        if old is None or new is None or old.settled_generation != new.settled_generation:
+            self.plans.wake_guests(key)
+            # A new Application releases nothing.
+            if old is not None:
+                self.subscriptions.wake_waiting()
+        self.subscriptions.wake(key, urgent=_changed_by_user(old, new))
+
+    def _child_changed(self, key: Key, old: Body | None, new: Body | None) -> None:
+        body = new or old or {}
+        if body.get("kind") == Grant.KIND:
+            self._grant_changed(key, new)
+            self.node_objects.grant_changed(key, old, new)
+        elif body.get("kind") == DeploymentPlan.KIND:
+            self.plans.plan_object_changed(key, new)
+            if new is None:
+                self.subscriptions.wake_waiting()
+        elif body.get("kind") == DirectLink.KIND:
+            self._notify(kinds.DIRECT_LINK, key)
+        self.subscriptions.wake(application_label_key(body))
+
+    def _grant_changed(self, key: Key, new: Body | None) -> None:
+        grant = optional_parser(Grant)(new) if new is not None else None
+        known = self._known_grants.pop(key, None)
+        if known is not None:
+            self._grants.drop(_grant_owner(known), key)
+        if grant is not None:
+            self._known_grants[key] = grant
+            self._grants.put(_grant_owner(grant), key, grant)
+        self.fleet.grant_changed(key, known, grant)
+        if grant is None:
+            self.subscriptions.wake_waiting()
+        self._notify(kinds.GRANT, key)
+
+    def _notify(self, kind: Kind, key: Key) -> None:
+        for listener in self._listeners.get(kind, ()):
+            listener(key)
+
+
+def _host_inputs(host: Host | None) -> tuple[object, ...] | None:
+    """Return the fields of a Node that planning uses. The location is a field of its Drone or EdgeNode."""
+    return (host.is_cloud, host.allocatable, host.ready, host.schedulable) if host is not None else None
+
+
+def _changed_by_user(old: Submitted | None, new: Submitted | None) -> bool:
+    """Return True if a user changed the spec of an Application. A change of its status does not count."""
+    return old is not None and new is not None and old.metadata.generation != new.metadata.generation
+
+
+def _occupied(pod: PodView | None) -> tuple[str, Mapping[str, float]] | None:
+    """Return the node and the resources that a pod occupies, or None if it occupies none."""
+    return (pod.node, pod.requests) if pod is not None and pod.node is not None and not pod.finished else None
+
+
+def _grant_owner(grant: Grant) -> Key:
+    return grant.spec.application.namespace, grant.spec.application.name
+
+
+def _rules_differ(old: Drone | EdgeNode | None, new: Drone | EdgeNode | None) -> bool:
+    """Return True if a node was created, deleted, or changed in a field that policies select or Grants contain."""
+    return old is None or new is None or old.spec != new.spec or old.metadata.labels != new.metadata.labels
+
+
+def _planning_inputs(drone: Drone) -> tuple[object, ...]:
+    """Return the fields of a drone's status that planning uses. The position is not one of them."""
+    return drone.in_air, _ready(drone)
+
+
+def _reported_state(drone: Drone) -> tuple[object, ...]:
+    """Return the fields of a drone's status that its Application reports."""
+    return (drone.status.flight_state, drone.status.controller) if drone.status is not None else ()
+
+
+def _ready(node: Drone | EdgeNode) -> str | None:
+    condition = readiness(node.status)
+    return condition.status if condition is not None else None
+
+
+def _without_status(body: Body) -> Body:
+    """Return a child object without its status, except for the condition that pods cannot be created."""
+    kept = {name: value for name, value in body.items() if name != "status"}
+    refused = refusal_of(body)
+    if refused:
+        failure = {"type": REPLICA_FAILURE, "status": "True", "reason": REFUSED, "message": refused}
+        kept["status"] = {"conditions": [failure]}
+    kept["metadata"] = {n: v for n, v in body["metadata"].items() if n != "resourceVersion"}
+    annotations = dict(kept["metadata"].get("annotations") or {})
+    annotations.pop("deployment.kubernetes.io/revision", None)
+    kept["metadata"]["annotations"] = annotations
+    return kept
+
+
+def _unchanged(body: Body) -> Body:
+    return body

@@ -1,0 +1,61 @@
+"""Compares desired with observed objects, so that an unchanged object is not written again."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import Any
+
+from fractus_operator.kinds import Body
+from fractus_operator.labels import CERTIFICATE_ANNOTATION, DIGEST_ANNOTATION
+
+
+def digest(desired: Body) -> str:
+    """Return a digest of a desired object. A renewed certificate does not change it."""
+    annotations = desired["metadata"].get("annotations") or {}
+    if CERTIFICATE_ANNOTATION in annotations:
+        rest = {name: value for name, value in annotations.items() if name != CERTIFICATE_ANNOTATION}
+        desired = {**desired, "metadata": {**desired["metadata"], "annotations": rest}}
+    return hashlib.sha256(json.dumps(desired, sort_keys=True, separators=(",", ":")).encode()).hexdigest()[:16]
+
+
+def stamped(desired: Body) -> Body:
+    """Return the object with the digest of its content as an annotation."""
+    metadata = dict(desired["metadata"])
+    metadata["annotations"] = {**metadata.get("annotations", {}), DIGEST_ANNOTATION: digest(desired)}
+    return {**desired, "metadata": metadata}
+
+
+def is_current(desired: Body, observed: Body | None) -> bool:
+    """Return True if applying the stamped object would change nothing.
+
+    This is the case if the digest equals that of the last apply, so that no field was dropped since, and if every field
+    still has the applied value, so that nobody else changed one.
+    """
+    if observed is None:
+        return False
+    stamp = (observed["metadata"].get("annotations") or {}).get(DIGEST_ANNOTATION)
+    return stamp == desired["metadata"].get("annotations", {}).get(DIGEST_ANNOTATION) and contains(observed, desired)
+
+
+def contains(observed: Any, desired: Any) -> bool:
+    """Return True if every field of the desired value has that value in the observed value.
+
+    The observed value may have more fields. Missing and empty values are equal.
+    """
+    if observed == desired:
+        # Fast path for areas with many points.
+        return True
+    if isinstance(desired, dict):
+        if not desired:
+            return observed is None or isinstance(observed, dict)
+        return isinstance(observed, dict) and all(contains(observed.get(key), value) for key, value in desired.items())
+    if isinstance(desired, list):
+        if not desired:
+            return not observed
+        return (
+            isinstance(observed, list)
+            and len(observed) == len(desired)
+            and all(contains(o, d) for o, d in zip(observed, desired, strict=True))
+        )
+    return observed is None and desired in ("", None, False)

@@ -1,0 +1,67 @@
+"""Conditions of an object's status: merges observations into them and reports which ones are transitions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Literal
+
+from fractus_core.api import Condition
+
+_MAX_MESSAGE_LENGTH = 32768
+
+
+@dataclass(frozen=True, slots=True)
+class ConditionUpdate:
+    """The observed value of one condition.
+
+    Attributes:
+        reason: CamelCase.
+        message: One sentence.
+        progress: True if a status other than True is an expected step and not a problem.
+        adverse: True if status True is the problem.
+    """
+
+    type: str
+    status: Literal["True", "False", "Unknown"]
+    reason: str
+    message: str = ""
+    progress: bool = False
+    adverse: bool = False
+
+    @property
+    def warning(self) -> bool:
+        """True if an Event about the condition should be a warning."""
+        return (self.status == "True") == self.adverse and not self.progress
+
+
+def merge(
+    previous: Sequence[Condition], updates: Iterable[ConditionUpdate], generation: int | None, now: datetime
+) -> tuple[tuple[Condition, ...], tuple[ConditionUpdate, ...]]:
+    """Merge new observations into the conditions of an object.
+
+    lastTransitionTime changes only with the status. Conditions without an update are removed.
+
+    Returns:
+        The conditions in the order of the updates, and the updates whose status or reason is new.
+    """
+    before = {condition.type: condition for condition in previous}
+    merged: list[Condition] = []
+    transitions: list[ConditionUpdate] = []
+    for update in updates:
+        old = before.get(update.type)
+        same_status = old is not None and old.status == update.status
+        merged.append(
+            Condition(
+                type=update.type,
+                status=update.status,
+                reason=update.reason,
+                message=update.message[:_MAX_MESSAGE_LENGTH],
+                last_transition_time=old.last_transition_time if old is not None and same_status else now,
+                observed_generation=generation,
+            )
+        )
+        if old is None or not same_status or old.reason != update.reason:
+            transitions.append(update)
+    return tuple(merged), tuple(transitions)

@@ -1,0 +1,176 @@
+"""Parsers of custom resources. An object that cannot be parsed does not stop the others."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, Protocol, TypeVar
+
+from fractus_core.api import Application, Condition, DeploymentPlan, InvalidObject, Metadata, Resource
+from fractus_core.api.plans import DeploymentPlanSpec
+from pydantic import ValidationError
+
+from fractus_operator.kinds import Body, Key
+
+logger = logging.getLogger(__name__)
+
+R = TypeVar("R", bound=Resource)
+T_co = TypeVar("T_co", covariant=True)
+
+SETTLED = frozenset({"Returning", "Completed", "Failed"})
+"""Phases of an Application whose mission is over. In phase Returning, its drone is still in the air."""
+
+
+class CachedObjects(Protocol[T_co]):
+    """The current objects of a kind by key, as an informer caches them."""
+
+    def get(self, key: Key) -> T_co | None:
+        """Return the object with this key, or None."""
+
+    def items(self) -> Iterator[tuple[Key, T_co]]:
+        """Iterate over all objects with their keys."""
+
+    def values(self) -> Iterator[T_co]:
+        """Iterate over all objects."""
+
+    def __len__(self) -> int:
+        """Return the number of objects."""
+
+
+@dataclass(frozen=True)
+class _Object:
+    body: Body
+
+    @property
+    def metadata(self) -> Metadata:
+        """The parsed metadata."""
+        return Metadata.model_validate(self.body["metadata"])
+
+
+@dataclass(frozen=True)
+class Submitted(_Object):
+    """An Application as submitted.
+
+    Attributes:
+        application: The parsed Application, or None if it is invalid.
+        error: Reason why it is invalid.
+    """
+
+    application: Application | None
+    error: InvalidObject | None
+
+    @property
+    def uid(self) -> str:
+        """metadata.uid."""
+        return str(self.body["metadata"].get("uid", ""))
+
+    @property
+    def key(self) -> Key:
+        """(namespace, name)."""
+        return self.body["metadata"].get("namespace", ""), self.body["metadata"]["name"]
+
+    @property
+    def completed(self) -> bool:
+        """True if the mission was completed, even if the drone is still returning."""
+        conditions = (self.body.get("status") or {}).get("conditions") or ()
+        return any(c["type"] == "MissionComplete" and c["status"] == "True" for c in conditions)
+
+    @property
+    def settled_generation(self) -> int | None:
+        """The generation whose mission is over. None before and during a mission."""
+        status = self.body.get("status") or {}
+        return int(status.get("observedGeneration") or 0) if status.get("phase") in SETTLED else None
+
+
+@dataclass(frozen=True, slots=True)
+class OwnedPlan:
+    """A plan and the uid of its Application."""
+
+    uid: str
+    spec: DeploymentPlanSpec
+
+
+@dataclass(frozen=True)
+class Unreadable(_Object):
+    """An object that the API server accepted but that cannot be parsed."""
+
+    problem: str
+
+    @property
+    def name(self) -> str:
+        """metadata.name."""
+        return str(self.body["metadata"]["name"])
+
+    @property
+    def spec(self) -> Any:
+        """The unparsed spec."""
+        return self.body.get("spec")
+
+    @property
+    def conditions(self) -> tuple[Condition, ...]:
+        """The conditions, or an empty tuple if they cannot be parsed."""
+        try:
+            return tuple(Condition.model_validate(c) for c in (self.body.get("status") or {}).get("conditions") or ())
+        except ValidationError:
+            return ()
+
+
+def parse_object(model: type[R], body: Body) -> R:
+    """Parse an object.
+
+    Raises:
+        InvalidObject: The object cannot be parsed, for any reason.
+    """
+    try:
+        return model.model_validate(body)
+    except ValidationError as error:
+        raise InvalidObject.from_pydantic(error) from None
+    except Exception as error:
+        raise InvalidObject("", f"the object cannot be parsed: {type(error).__name__}: {error}") from error
+
+
+def parse_application(body: Body) -> Submitted:
+    """Parse an Application. If it is invalid, the result contains the reason."""
+    try:
+        return Submitted(body, parse_object(Application, body), None)
+    except InvalidObject as error:
+        return Submitted(body, None, error)
+
+
+def parse_plan(body: Body) -> OwnedPlan | None:
+    """Parse a DeploymentPlan. Return None if it is invalid or has no owner."""
+    plan = optional_parser(DeploymentPlan)(body)
+    if plan is None or not plan.metadata.owner_references:
+        return None
+    return OwnedPlan(plan.metadata.owner_references[0].uid, plan.spec)
+
+
+def optional_parser(model: type[R]) -> Callable[[Body], R | None]:
+    """Return a parser whose result is None for an invalid object."""
+
+    def parse(body: Body) -> R | None:
+        try:
+            return parse_object(model, body)
+        except InvalidObject as error:
+            logger.warning(
+                "parsing: invalid object ignored (kind=%s name=%s error=%s)",
+                model.KIND,
+                body["metadata"]["name"],
+                error,
+            )
+            return None
+
+    return parse
+
+
+def tolerant_parser(model: type[R]) -> Callable[[Body], R | Unreadable]:
+    """Return a parser whose result is `Unreadable` for an invalid object, which must not be ignored."""
+
+    def parse(body: Body) -> R | Unreadable:
+        try:
+            return parse_object(model, body)
+        except InvalidObject as error:
+            return Unreadable(body, str(error))
+
+    return parse

@@ -1,0 +1,242 @@
+"""Views of Pods and Nodes that contain only the fields the operator uses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import NamedTuple
+
+from fractus_core.api.names import CLASS_LABEL
+from fractus_core.planning.inventory import Host, amount_of
+
+from fractus_operator.kinds import Body
+from fractus_operator.labels import (
+    APPLICATION_LABEL,
+    COMPONENT_LABEL,
+    FINISHED_FORMAT,
+    FINISHED_LABEL,
+    INSTANCE_LABEL,
+    MANAGED_BY,
+    MANAGED_LABEL,
+)
+
+_MAX_LOG = 400
+"""Maximum length of the kept log lines of a failed container, and of a message why pods cannot be created."""
+FINISHED_DEADLINE_S = 1
+"""Value of `activeDeadlineSeconds` that stops a running pod: the shortest one that is valid, counted from its start."""
+_CANNOT_START = frozenset({"ImagePullBackOff", "ErrImagePull", "InvalidImageName", "CreateContainerConfigError"})
+REPLICA_FAILURE = "ReplicaFailure"
+"""Condition type of a Deployment whose pods cannot be created (reason REFUSED) or deleted."""
+REFUSED = "FailedCreate"
+_ENDED = frozenset({"Succeeded", "Failed"})
+_KEPT_LABELS = (APPLICATION_LABEL, COMPONENT_LABEL, INSTANCE_LABEL, MANAGED_LABEL)
+
+
+class PlannedRequest(NamedTuple):
+    """The resource requests of a planned instance on its node."""
+
+    instance: str
+    node: str
+    amounts: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class PodView:
+    """A Pod.
+
+    Attributes:
+        requests: Effective resource requests in base units.
+        deployment: Name of the Deployment that created it through a ReplicaSet, if any.
+        daemon_set: Name of the DaemonSet that created it, if any.
+        revision: Hash of the template of its DaemonSet.
+        finished_at: Time since which it is stopped and only kept for its logs, if so.
+        failure: Exit code and last log lines of the last failure of its container, or an empty string.
+        unschedulable_since: Time since which the scheduler has found no node for it, if so.
+        unschedulable_message: Message of the scheduler.
+    """
+
+    namespace: str
+    name: str
+    node: str | None
+    labels: Mapping[str, str]
+    requests: Mapping[str, float]
+    ready: bool
+    finished: bool
+    terminating: bool
+    ip: str | None
+    deployment: str | None = None
+    daemon_set: str | None = None
+    revision: str = ""
+    finished_at: datetime | None = None
+    failure: str = ""
+    unschedulable_since: datetime | None = None
+    unschedulable_message: str = ""
+
+    @property
+    def instance(self) -> str | None:
+        """The planned instance of the pod."""
+        return self.labels.get(INSTANCE_LABEL)
+
+    @property
+    def application(self) -> str | None:
+        """The value of the Application label of the pod."""
+        return self.labels.get(APPLICATION_LABEL)
+
+    @property
+    def managed(self) -> bool:
+        """True if a Deployment of the operator created the pod, even if that Deployment was deleted since."""
+        return self.labels.get(MANAGED_LABEL) == MANAGED_BY and self.deployment in {None, self.instance}
+
+    @property
+    def takes_calls(self) -> bool:
+        """True if the pod is ready, has an address, and is not terminating."""
+        return self.ready and not self.terminating and bool(self.ip)
+
+    @property
+    def component(self) -> str | None:
+        """The component of the pod."""
+        return self.labels.get(COMPONENT_LABEL)
+
+
+def parse_pod(body: Body) -> PodView:
+    """Parse a Pod."""
+    metadata = body["metadata"]
+    spec = body["spec"]
+    status = body.get("status") or {}
+    labels = metadata.get("labels") or {}
+    conditions = {c["type"]: c for c in status.get("conditions") or ()}
+    ready = conditions.get("Ready", {}).get("status") == "True"
+    scheduled = conditions.get("PodScheduled", {})
+    unschedulable = scheduled.get("status") == "False" and scheduled.get("reason") == "Unschedulable"
+    since = scheduled.get("lastTransitionTime") if unschedulable else None
+    return PodView(
+        namespace=metadata["namespace"],
+        name=metadata["name"],
+        node=spec.get("nodeName"),
+        labels={key: labels[key] for key in _KEPT_LABELS if key in labels},
+        requests=_requests(spec),
+        ready=ready,
+        finished=status.get("phase") in _ENDED,
+        terminating="deletionTimestamp" in metadata,
+        ip=status.get("podIP"),
+        deployment=_deployment(metadata),
+        daemon_set=daemon_set(metadata),
+        revision=revision_hash(metadata),
+        finished_at=_finished_at(labels) if _stops(spec, status) else None,
+        failure=_failure(status),
+        unschedulable_since=datetime.fromisoformat(since) if since else None,
+        unschedulable_message=scheduled.get("message", "") if unschedulable else "",
+    )
+
+
+def _stops(spec: Body, status: Body) -> bool:
+    """Return True if a pod has ended or is being stopped. The label alone must not hide a running pod."""
+    return status.get("phase") in _ENDED or spec.get("activeDeadlineSeconds") == FINISHED_DEADLINE_S
+
+
+def _finished_at(labels: Mapping[str, str]) -> datetime | None:
+    if FINISHED_LABEL not in labels:
+        return None
+    try:
+        return datetime.strptime(labels[FINISHED_LABEL], FINISHED_FORMAT).replace(tzinfo=UTC)
+    except ValueError:
+        # Users of the namespace may write the label. With an invalid value the pod is removed at once.
+        return datetime.min.replace(tzinfo=UTC)
+
+
+def _failure(status: Body) -> str:
+    for container in status.get("containerStatuses") or ():
+        ended = (container.get("state") or {}).get("terminated") or (container.get("lastState") or {}).get("terminated")
+        if ended and ended.get("exitCode"):
+            lines = " | ".join(str(ended.get("message") or ended.get("reason") or "").split("\n"))[-_MAX_LOG:].strip(
+                " |"
+            )
+            return f"exit code {ended['exitCode']}" + (f": {lines}" if lines else "")
+        waiting = (container.get("state") or {}).get("waiting") or {}
+        if waiting.get("reason") in _CANNOT_START:
+            return f"{waiting['reason']}: {waiting.get('message', '')}".rstrip(": ")
+    return ""
+
+
+def _deployment(metadata: Body) -> str | None:
+    """Return the name of the Deployment of a pod, from the name of its ReplicaSet: NAME-HASH."""
+    owner = _controller(metadata, "ReplicaSet")
+    return owner.rpartition("-")[0] if owner is not None else None
+
+
+def daemon_set(metadata: Body) -> str | None:
+    """Return the name of the DaemonSet that controls an object, if any."""
+    return _controller(metadata, "DaemonSet")
+
+
+def revision_hash(metadata: Body) -> str:
+    """Return the hash of the DaemonSet template of a pod or ControllerRevision."""
+    return str((metadata.get("labels") or {}).get("controller-revision-hash", ""))
+
+
+def refusal_of(deployment: Body) -> str:
+    """Return why the API server refuses pods of a Deployment (quota, Pod Security), or an empty string."""
+    for condition in (deployment.get("status") or {}).get("conditions") or ():
+        if (condition["type"], condition["status"], condition.get("reason")) == (REPLICA_FAILURE, "True", REFUSED):
+            return str(condition.get("message") or REFUSED)[:_MAX_LOG]
+    return ""
+
+
+def refusals(deployments: Iterable[Body]) -> dict[str, str]:
+    """Return why pods are refused, by name of the Deployment. Deployments without a refusal are omitted."""
+    messages = {body["metadata"]["name"]: refusal_of(body) for body in deployments}
+    return {name: message for name, message in messages.items() if message}
+
+
+def _controller(metadata: Body, kind: str) -> str | None:
+    for owner in metadata.get("ownerReferences") or ():
+        if owner.get("controller") and (owner.get("apiVersion"), owner.get("kind")) == ("apps/v1", kind):
+            return str(owner["name"])
+    return None
+
+
+def _requests(spec: Body) -> dict[str, float]:
+    """Return the effective requests of a Pod, as the scheduler counts them.
+
+    They are the maximum of the containers that run at the same time, or the requests of the pod itself, plus the overhead.
+    An init container with restartPolicy Always, such as the proxy of a service mesh, continues to run with the later ones.
+    """
+    total: dict[str, float] = {"pods": 1.0}
+    maximum: dict[str, float] = {}
+    for container in spec.get("initContainers") or ():
+        for resource, amount in _declared_requests(container).items():
+            together = total.get(resource, 0.0) + amount
+            maximum[resource] = max(maximum.get(resource, 0.0), together)
+            if container.get("restartPolicy") == "Always":
+                total[resource] = together
+    for container in spec.get("containers") or ():
+        for resource, amount in _declared_requests(container).items():
+            total[resource] = total.get(resource, 0.0) + amount
+    for resource, amount in maximum.items():
+        total[resource] = max(total.get(resource, 0.0), amount)
+    total |= _declared_requests(spec)
+    for resource, amount in (spec.get("overhead") or {}).items():
+        total[resource] = total.get(resource, 0.0) + amount_of(amount)
+    return total
+
+
+def _declared_requests(part: Body) -> dict[str, float]:
+    resources = part.get("resources") or {}
+    return {name: amount_of(q) for name, q in (resources.get("requests") or {}).items()}
+
+
+def parse_host(body: Body) -> Host:
+    """Parse a Node. Its heartbeats do not change the result."""
+    metadata = body["metadata"]
+    spec = body.get("spec") or {}
+    status = body.get("status") or {}
+    ready = any(c["type"] == "Ready" and c["status"] == "True" for c in status.get("conditions") or ())
+    return Host(
+        name=metadata["name"],
+        labels=dict(metadata.get("labels") or {}),
+        allocatable={name: amount_of(quantity) for name, quantity in (status.get("allocatable") or {}).items()},
+        ready=ready,
+        schedulable=not spec.get("unschedulable", False),
+        guarded=any(t["key"] == CLASS_LABEL and t["effect"] == "NoExecute" for t in spec.get("taints") or ()),
+    )

@@ -1,0 +1,66 @@
+"""All child objects of an Application that follow from its plan and Grants."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+
+from fractus_core.api import Application, Drone
+from fractus_core.api.grants import GrantSpec
+from fractus_core.api.plans import DeploymentPlanSpec
+
+from fractus_operator import kinds, labels
+from fractus_operator.kinds import Body, Kind
+from fractus_operator.labels import label_value, owned_object
+from fractus_operator.pods import PodView
+from fractus_operator.resources.deployment import deployment
+from fractus_operator.resources.grant import grant
+from fractus_operator.resources.network_policy import network_policies
+from fractus_operator.resources.service import base_pods, endpoint_slice, service
+
+
+def children(
+    application: Application,
+    plan: DeploymentPlanSpec,
+    grants: Iterable[GrantSpec],
+    pods: Sequence[PodView],
+    drone: Callable[[str], Drone | None],
+) -> dict[Kind, list[Body]]:
+    """Return the desired child objects by kind, except DirectLinks and Secrets.
+
+    DirectLinks also depend on the addresses of Services. Secrets contain keys, which are generated only when needed.
+
+    Args:
+        application: The Application.
+        plan: Its plan.
+        grants: Grants of its instances.
+        pods: Its current pods.
+        drone: Returns the Drone of a name, or None.
+    """
+    desired: dict[Kind, list[Body]] = {kind: [] for kind in kinds.CHILDREN}
+    desired[kinds.DEPLOYMENT_PLAN] = [deployment_plan(application, plan)]
+    desired[kinds.GRANT] = [grant(application, spec) for spec in grants]
+    desired[kinds.NETWORK_POLICY] = network_policies(application, plan)
+    for component in application.spec.components:
+        if component.container.ports:
+            desired[kinds.SERVICE].append(service(application, component))
+            if component.placement == "hybrid":
+                pods_of_base = base_pods(component.name, plan, pods)
+                desired[kinds.ENDPOINT_SLICE].append(endpoint_slice(application, component, pods_of_base))
+    if plan.drone is not None:
+        desired[kinds.DISRUPTION_BUDGET] = [disruption_budget(application)]
+    for placed in plan.placements:
+        node = drone(placed.node) if placed.node is not None else None
+        desired[kinds.DEPLOYMENT].append(deployment(application, placed, node))
+    return desired
+
+
+def deployment_plan(application: Application, plan: DeploymentPlanSpec) -> Body:
+    """Return the DeploymentPlan of an Application. It has the name of the Application."""
+    return owned_object(kinds.DEPLOYMENT_PLAN, application, application.name, {}, spec=plan.to_dict())
+
+
+def disruption_budget(application: Application) -> Body:
+    """Return the PodDisruptionBudget that prevents evictions, such as those of kubectl drain, on the drone."""
+    on_drone = {labels.APPLICATION_LABEL: label_value(application.name), labels.PLACEMENT_LABEL: "drone"}
+    spec = {"maxUnavailable": 0, "selector": {"matchLabels": on_drone}}
+    return owned_object(kinds.DISRUPTION_BUDGET, application, application.name, {}, spec=spec)

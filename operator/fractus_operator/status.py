@@ -1,0 +1,362 @@
+"""Status of an Application: phase, message and conditions, from its plan, pods, Grants and drone. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Any, Literal, assert_never
+
+from fractus_core.api import Condition, Drone, Grant
+from fractus_core.api.plans import DeploymentPlanSpec
+from fractus_core.control import Outcome, OutcomeKind
+
+from fractus_operator.conditions import ConditionUpdate
+from fractus_operator.pods import PodView
+
+FlightPhase = Literal["Waiting", "TakingOff", "Flying", "Returning", "Landed", "Unknown"]
+Phase = Literal["Pending", "Queued", "Deploying", "Running", FlightPhase, "Completed", "Failed", "Invalid"]
+
+STAGES = ("Planned", "Granted", "Deployed")
+"""Conditions that an Application reaches one after the other."""
+MISSION_BEGUN = "MissionBegun"
+_REASONS = {
+    OutcomeKind.COMPLETE: "MissionComplete",
+    OutcomeKind.REVOKED: "MissionRevoked",
+    OutcomeKind.FAILED: "MissionFailed",
+}
+_MAX_NAMED = 3
+"""Maximum number of instances that a message names. The others are counted."""
+_ACTIVITY = {
+    "unknown": "in an unknown state",
+    "inactive": "on the ground",
+    "charging": "charging",
+    "takingOff": "taking off",
+    "flying": "flying",
+    "landing": "landing",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class StatusUpdate:
+    """The new status of an Application.
+
+    Attributes:
+        message: One sentence.
+        conditions: In the order of the status.
+    """
+
+    phase: Phase
+    message: str
+    conditions: tuple[ConditionUpdate, ...]
+    drone: str | None = None
+    pods: str | None = None
+    controller: str | None = None
+
+
+class Blocked(Exception):
+    """An Application cannot proceed at present.
+
+    Attributes:
+        phase: Invalid, Pending or Queued.
+        stage: Condition that is not reached.
+        reason: CamelCase.
+        message: One sentence.
+        retry_s: Seconds until the next step if no input changes.
+        full: Nodes that would be suitable if they had free capacity.
+    """
+
+    def __init__(
+        self,
+        phase: Phase,
+        stage: str,
+        reason: str,
+        message: str,
+        *,
+        retry_s: float = 30.0,
+        full: Collection[str] = frozenset(),
+    ) -> None:
+        self.phase = phase
+        self.stage = stage
+        self.reason = reason
+        self.message = message
+        self.retry_s = retry_s
+        self.full = full
+        super().__init__(message)
+
+
+# -- flight and mission --
+
+
+@dataclass(frozen=True, slots=True)
+class FlightStatus:
+    """The flight of an Application that has a drone.
+
+    Attributes:
+        phase: Waiting before the takeoff, Landed after it, Unknown while the drone does not report.
+        activity: Sentence about the drone.
+        controller: Who flies while the drone is in the air: system, pilot, or a component.
+        begun: True if the drone has taken off for the Application.
+    """
+
+    phase: FlightPhase
+    activity: str
+    controller: str | None
+    begun: bool
+
+
+def flight(name: str, drone: Drone | None, reported: Mapping[str, Any]) -> FlightStatus:
+    """Return the status of a flight.
+
+    Args:
+        name: Name of the drone of the plan.
+        drone: The drone, or None if its object does not exist.
+        reported: Last reported status of the Application.
+    """
+    status = drone.status if drone is not None else None
+    in_air = status is not None and status.in_air
+    begun = in_air or (reported.get("drone") == name and _has_begun(reported))
+    if status is None or status.flight_state == "unknown":
+        last = (
+            _ACTIVITY[status.last_flight_state] if status is not None and status.last_flight_state else "on the ground"
+        )
+        return FlightStatus("Unknown", f"{name} is in an unknown state, at its last report it was {last}", None, begun)
+    if not in_air:
+        if begun:
+            return FlightStatus("Landed", f"{name} has landed", None, begun)
+        return FlightStatus("Waiting", f"{name} is on the ground, its mission has not begun", None, begun)
+    controller = controller_name(status.controller)
+    flown_by = f", flown by {controller}" if controller else ""
+    phase: FlightPhase = "TakingOff" if status.flight_state == "takingOff" else "Flying"
+    return FlightStatus(phase, f"{name} is {_ACTIVITY[status.flight_state]}{flown_by}", controller, begun)
+
+
+def controller_name(controller: str | None) -> str | None:
+    """Return the short name of a drone's controller: system, pilot, or the component of an identity."""
+    if not controller:
+        return None
+    return controller.partition("/component/")[2].partition("/")[0] or controller
+
+
+def mission_outcome(uid: str | None, grants: Iterable[Grant]) -> Outcome | None:
+    """Return the mission outcome of the Application with this uid, or None while its mission continues.
+
+    The node of its driver reports the outcome, or that of the component whose points of interest the system visits.
+    """
+    for grant in grants:
+        spec = grant.spec
+        status = grant.status
+        leads = spec.class_ == "driver" or spec.tour
+        if not leads or spec.application.uid != uid or status is None:
+            continue
+        match status.phase:
+            case "Complete":
+                return Outcome(OutcomeKind.COMPLETE, status.message or f"{spec.component} finished its mission")
+            case "Failed":
+                return Outcome(OutcomeKind.FAILED, status.message or f"the mission of {spec.component} failed")
+            case "Revoked":
+                message = status.message or f"the control of {spec.component} was revoked"
+                return Outcome(OutcomeKind.REVOKED, message)
+            case "Pending" | "Active" | None:
+                continue
+            case _:
+                assert_never(status.phase)
+    return None
+
+
+def _has_begun(reported: Mapping[str, Any]) -> bool:
+    conditions = reported.get("conditions") or ()
+    return any(c["type"] == "MissionComplete" and c["reason"] == MISSION_BEGUN for c in conditions)
+
+
+# -- status updates --
+
+
+def deployed(
+    plan: DeploymentPlanSpec,
+    pods: Sequence[PodView],
+    granted: int,
+    flown: FlightStatus | None = None,
+    refused: Mapping[str, str] = MappingProxyType({}),
+) -> StatusUpdate:
+    """Return the status of an Application whose child objects are all applied.
+
+    Args:
+        plan: The active plan.
+        pods: Its current pods.
+        granted: Number of instances with Grants.
+        flown: Status of the flight, if the plan has a drone.
+        refused: Why pods cannot be created, by instance.
+    """
+    alive = [pod for pod in pods if not pod.terminating and not pod.finished]
+    missing: list[str] = []
+    ready = 0
+    for placed in plan.placements:
+        ready_here = min(sum(pod.ready for pod in alive if pod.instance == placed.instance), placed.replicas)
+        ready += ready_here
+        if ready_here < placed.replicas:
+            missing.append(placed.instance)
+    desired = sum(placed.replicas for placed in plan.placements)
+    if missing:
+        more = f" and {len(missing) - _MAX_NAMED} more" if len(missing) > _MAX_NAMED else ""
+        message = f"waiting for {', '.join(missing[:_MAX_NAMED])}{more}"
+        failures = _failures(pod for pod in alive if pod.instance in missing and not pod.ready)
+        refusals = _refusals({name: refused[name] for name in missing if name in refused})
+        message += "".join(f"; {text}" for text in (refusals, failures) if text)
+        reason = "PodsNotReady"
+        if refusals:
+            reason = "PodsRefused"
+        elif failures:
+            reason = "ComponentFailed"
+        readiness = ConditionUpdate("Ready", "False", reason, message, progress=not failures and not refusals)
+    else:
+        message = f"all {desired} pods are ready"
+        readiness = ConditionUpdate("Ready", "True", "PodsReady", message)
+    phase: Phase = "Deploying" if missing else "Running"
+    if flown is not None:
+        message = f"{message}; {flown.activity}"
+        # A drone in the air is more important than a restarting pod.
+        if not missing or flown.phase not in {"Waiting", "Landed"}:
+            phase = flown.phase
+        if flown.phase == "Unknown":
+            readiness = ConditionUpdate("Ready", "Unknown", "TelemetryLost", flown.activity)
+    conditions = [
+        ConditionUpdate("Planned", "True", "Planned", _plan_summary(plan)),
+        ConditionUpdate("Granted", "True", "Granted", f"{granted} instances may use services of their nodes"),
+        ConditionUpdate("Deployed", "True", "Deployed", f"{len(plan.placements)} instances are deployed"),
+        readiness,
+    ]
+    if plan.drone is not None and plan.drone.policy_conflict is not None:
+        conditions.append(_policy_conflict(plan.drone.policy_conflict))
+    if flown is not None and flown.begun:
+        text = "the drone has taken off"
+        conditions.append(ConditionUpdate("MissionComplete", "False", MISSION_BEGUN, text, progress=True))
+    elif flown is not None:
+        text = "the drone has not taken off yet"
+        conditions.append(ConditionUpdate("MissionComplete", "False", "MissionWaiting", text, progress=True))
+    drone = plan.drone.node if plan.drone is not None else None
+    controller = flown.controller if flown is not None else None
+    return StatusUpdate(phase, message, tuple(conditions), drone, f"{ready}/{desired}", controller)
+
+
+def queued_rollout(plan: DeploymentPlanSpec, others: int) -> StatusUpdate:
+    """Return the status of a planned Application while the operator is rolling out many others.
+
+    Args:
+        plan: Its plan.
+        others: Number of the other Applications.
+    """
+    message = f"{_plan_summary(plan)}; {others} other Applications are being rolled out"
+    return StatusUpdate(
+        "Pending", message, (ConditionUpdate("Ready", "False", "OperatorBusy", message, progress=True),)
+    )
+
+
+def apply_failed(reported: Mapping[str, Any], reason: str, error: str) -> StatusUpdate:
+    """Return the status of an Application whose child objects cannot be applied: its last status with the error.
+
+    Args:
+        reported: Last reported status, or empty.
+        reason: CamelCase.
+        error: Error message of the API server.
+    """
+    message = f"cannot apply child objects, retrying: {error}"
+    known = (Condition.model_validate(c) for c in reported.get("conditions") or ())
+    # Reached stages stay. Stages that were not reached may be reached by now, so they are removed.
+    kept = [
+        ConditionUpdate(c.type, c.status, c.reason, c.message)
+        for c in known
+        if c.type != "Deployed" and (c.status != "False" or c.type not in {*STAGES, "Ready"})
+    ]
+    failing = [ConditionUpdate("Deployed", "False", reason, message)]
+    if all(each.type != "Ready" for each in kept):
+        failing.append(ConditionUpdate("Ready", "False", reason, message))
+    present = {name: reported.get(name) for name in ("drone", "pods", "controller")}
+    phase: Phase = "Pending" if reported.get("phase") in {None, "Queued", "Invalid"} else reported["phase"]
+    return StatusUpdate(phase, message, (*kept, *failing), **present)
+
+
+def waiting_for_landing(present: StatusUpdate, drone: str) -> StatusUpdate:
+    """Return the status of an Application whose changed manifest is applied after its drone has landed."""
+    message = (
+        f"the changed manifest is applied when {drone} has landed; set spec.updatePolicy: Immediate to apply it at once"
+    )
+    update = ConditionUpdate("Updated", "False", "WaitsForLanding", message, progress=True)
+    return replace(present, message=f"{present.message}; {message}", conditions=(*present.conditions, update))
+
+
+def finished(outcome: Outcome, name: str | None, drone: Drone | None, pods: Sequence[PodView] = ()) -> StatusUpdate:
+    """Return the status of an Application whose mission is over, even if its drone is still returning.
+
+    Args:
+        outcome: Outcome of the mission.
+        name: Name of the drone.
+        drone: The drone, if it exists.
+        pods: Its pods. After an incomplete mission, their failures are reported because the pods are deleted now.
+    """
+    complete = outcome.kind is OutcomeKind.COMPLETE
+    reason = _REASONS[outcome.kind]
+    message = outcome.reason
+    failures = "" if complete else _failures(pods)
+    if failures:
+        message += f"; {failures}"
+    conditions = (
+        ConditionUpdate("Ready", "False", reason, message, progress=complete),
+        ConditionUpdate("MissionComplete", "True" if complete else "False", reason, message),
+    )
+    return _mission_over(conditions, name, drone)
+
+
+def still_over(reported: Mapping[str, Any], drone: Drone | None) -> StatusUpdate:
+    """Return the status of an Application whose mission was reported to be over. Its drone may have landed since."""
+    kept = (Condition.model_validate(c) for c in reported.get("conditions") or ())
+    conditions = tuple(ConditionUpdate(c.type, c.status, c.reason, c.message) for c in kept)
+    return _mission_over(conditions, reported.get("drone"), drone)
+
+
+def blocked(by: Blocked, present: StatusUpdate | None) -> StatusUpdate:
+    """Return the status of an Application that cannot proceed, with the status of its deployed part."""
+    queued = by.phase == "Queued"
+    conditions = (
+        *(ConditionUpdate(stage, "True", stage) for stage in STAGES[: STAGES.index(by.stage)]),
+        ConditionUpdate(by.stage, "False", by.reason, by.message, progress=queued),
+        ConditionUpdate("Ready", "False", by.reason, by.message, progress=queued),
+    )
+    if by.reason == "PolicyConflict":
+        conditions = (*conditions, _policy_conflict(by.message))
+    kept = (present.drone, present.pods, present.controller) if present is not None else ()
+    return StatusUpdate(by.phase, by.message, conditions, *kept)
+
+
+def _mission_over(conditions: tuple[ConditionUpdate, ...], name: str | None, drone: Drone | None) -> StatusUpdate:
+    mission = next(c for c in conditions if c.type == "MissionComplete")
+    phase: Phase = "Completed" if mission.status == "True" else "Failed"
+    message = mission.message
+    controller = None
+    if drone is not None and drone.status is not None and drone.in_air:
+        phase = "Returning"
+        if drone.status.flight_state == "unknown":
+            message += f"; {name} was returning at its last report"
+        else:
+            message += f"; {name} is returning"
+        controller = controller_name(drone.status.controller)
+    return StatusUpdate(phase, message, conditions, drone=name, controller=controller)
+
+
+def _policy_conflict(message: str) -> ConditionUpdate:
+    return ConditionUpdate("PolicyConflict", "True", "PolicyConflict", message, adverse=True)
+
+
+def _plan_summary(plan: DeploymentPlanSpec) -> str:
+    nodes = len({placed.node for placed in plan.placements if placed.node is not None})
+    summary = f"{len(plan.placements)} instances on {nodes} drone and edge nodes and in the cloud"
+    return f"{plan.drone.node} flies; {summary}" if plan.drone is not None else summary
+
+
+def _failures(pods: Iterable[PodView]) -> str:
+    return "; ".join(sorted(f"{pod.instance} failed with {pod.failure}" for pod in pods if pod.failure)[:_MAX_NAMED])
+
+
+def _refusals(refused: Mapping[str, str]) -> str:
+    listed = sorted(refused.items())[:_MAX_NAMED]
+    return "; ".join(f"pods of {name} cannot be created: {message}" for name, message in listed)

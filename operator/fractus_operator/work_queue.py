@@ -1,0 +1,258 @@
+"""Queues and subscriptions that start reconciliations: of keys, of periodic steps, and of Applications."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Awaitable, Callable, Collection, Iterable, Iterator
+from contextlib import contextmanager, suppress
+
+from fractus_operator.kinds import Key
+from fractus_operator.labels import label_key
+from fractus_operator.metrics import reconciling
+from fractus_operator.store import Backoff, KubeError
+
+logger = logging.getLogger(__name__)
+
+_FIRST_RETRY_S = 1.0
+_MAX_RETRY_S = 60.0
+
+
+async def run_periodically(name: str, step: Callable[[], Awaitable[None]], period_s: float) -> None:
+    """Repeat a step until cancelled. After a failure the pause grows.
+
+    Args:
+        name: Name of the step in the log.
+        step: Reads the complete state and corrects it.
+        period_s: Pause between the end of a step and the next one, in seconds.
+    """
+    backoff = Backoff(period_s, _MAX_RETRY_S)
+    while True:
+        pause_s = period_s
+        try:
+            with reconciling(name):
+                await step()
+            backoff.succeeded()
+        except Exception as error:
+            pause_s = backoff.delay_s()
+            expected = isinstance(error, KubeError)
+            logger.log(
+                logging.INFO if expected else logging.WARNING,
+                "%s: step failed (retry_s=%.1f error=%s)",
+                name,
+                pause_s,
+                error if expected else repr(error),
+                exc_info=None if expected else error,
+            )
+        await asyncio.sleep(pause_s)
+
+
+@contextmanager
+def skip_failed_node(name: str, node: str) -> Iterator[None]:
+    """Log an error of one node's part of a step, so that the step continues with the other nodes.
+
+    Args:
+        name: Name of the step in the log.
+        node: Name of the drone or edge node.
+
+    Raises:
+        KubeError: The API server did not respond. It would not respond for other nodes either.
+    """
+    try:
+        yield
+    except (KubeError, ValueError) as error:
+        if isinstance(error, KubeError) and not error.status:
+            raise
+        logger.warning("%s: step failed for a node (node=%s error=%s)", name, node, error)
+
+
+class WorkQueue:
+    """A queue that calls `reconcile(key)` for each added key, never twice at the same time for one key.
+
+    A failed key is retried after a growing pause with jitter. Reconciliation is level-triggered, so a later attempt
+    uses the latest state.
+
+    Args:
+        name: Kind of the keys, in the log.
+        reconcile: Brings one key to its desired state.
+        after: Awaited before each call of `reconcile`.
+        workers: Number of keys that are reconciled at the same time.
+
+    Attributes:
+        failures: The back-off of each key whose last attempt failed.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        reconcile: Callable[[Key], Awaitable[None]],
+        *,
+        after: Callable[[], Awaitable[None]] | None = None,
+        workers: int = 1,
+    ) -> None:
+        self.name = name
+        self.failures: dict[Key, Backoff] = {}
+        self._reconcile = reconcile
+        self._after = after
+        self._workers = workers
+        self._in_progress: set[Key] = set()
+        self._waiting: dict[Key, None] = {}
+        self._added = asyncio.Event()
+        self._retries: dict[Key, asyncio.TimerHandle] = {}
+
+    def add(self, key: Key) -> None:
+        """Queue the key for reconciliation."""
+        handle = self._retries.pop(key, None)
+        if handle is not None:
+            handle.cancel()
+        self._waiting[key] = None
+        self._added.set()
+
+    async def run(self) -> None:
+        """Reconcile until cancelled."""
+        async with asyncio.TaskGroup() as group:
+            for _ in range(self._workers):
+                group.create_task(self._work())
+
+    async def _work(self) -> None:
+        while True:
+            await self._added.wait()
+            key = next((key for key in self._waiting if key not in self._in_progress), None)
+            if key is None:
+                self._added.clear()
+                continue
+            del self._waiting[key]
+            self._in_progress.add(key)
+            try:
+                await self._attempt(key)
+            finally:
+                self._in_progress.discard(key)
+                if key in self._waiting:
+                    self._added.set()
+
+    async def _attempt(self, key: Key) -> None:
+        try:
+            if self._after is not None:
+                await self._after()
+            with reconciling(self.name):
+                await self._reconcile(key)
+        except Exception as error:
+            backoff = self.failures.setdefault(key, Backoff(_FIRST_RETRY_S, _MAX_RETRY_S))
+            pause_s = backoff.delay_s()
+            expected = isinstance(error, KubeError)
+            logger.log(
+                logging.INFO if expected and backoff.attempts <= 2 else logging.WARNING,
+                "work queue: reconcile failed (kind=%s name=%s retry_s=%.1f error=%s)",
+                self.name,
+                "/".join(filter(None, key)),
+                pause_s,
+                error if expected else repr(error),
+                exc_info=None if expected else error,
+            )
+            if key not in self._waiting:
+                self._retries[key] = asyncio.get_running_loop().call_later(pause_s, self.add, key)
+        else:
+            self.failures.pop(key, None)
+
+
+class Subscription:
+    """Wakes the reconciler of one Application when one of its inputs changed."""
+
+    def __init__(self) -> None:
+        self._changed = asyncio.Event()
+        self._urgent = asyncio.Event()
+
+    def wake(self, *, urgent: bool = False) -> None:
+        """Record a change. An urgent change also ends a pause."""
+        self._changed.set()
+        if urgent:
+            self._urgent.set()
+
+    async def changed(self, timeout_s: float) -> bool:
+        """Wait for a change since the last call. Return False after the timeout."""
+        try:
+            async with asyncio.timeout(timeout_s):
+                await self._changed.wait()
+        except TimeoutError:
+            return False
+        finally:
+            self._changed.clear()
+        return True
+
+    async def pause(self, duration_s: float) -> None:
+        """Wait while changes accumulate, until one is urgent."""
+        with suppress(TimeoutError):
+            async with asyncio.timeout(duration_s):
+                await self._urgent.wait()
+        self._urgent.clear()
+
+
+class Subscriptions:
+    """The subscriptions of all Applications, by the value of their label."""
+
+    def __init__(self) -> None:
+        self._by_application: dict[Key, list[Subscription]] = {}
+        self._placed: set[Key] = set()
+        self._full_nodes: dict[Key, Collection[str]] = {}
+
+    @contextmanager
+    def subscribe(self, key: Key) -> Iterator[Subscription]:
+        """Subscribe to changes that concern one Application, while the context lasts."""
+        label = label_key(key)
+        subscription = Subscription()
+        self._by_application.setdefault(label, []).append(subscription)
+        try:
+            yield subscription
+        finally:
+            self._by_application[label].remove(subscription)
+            if not self._by_application[label]:
+                del self._by_application[label]
+                self._placed.discard(label)
+                self._full_nodes.pop(label, None)
+
+    def set_placed(self, key: Key, *, placed: bool, full: Collection[str] = frozenset()) -> None:
+        """Record whether an Application has a suitable plan. With one it waits only for free capacity.
+
+        Args:
+            key: The Application.
+            placed: True if it has a suitable plan.
+            full: Nodes that it would use if they had free capacity.
+        """
+        label = label_key(key)
+        if placed:
+            self._placed.add(label)
+        else:
+            self._placed.discard(label)
+        self._full_nodes.pop(label, None)
+        if full:
+            self._full_nodes[label] = full
+
+    def wake(self, key: Key, *, urgent: bool = False) -> None:
+        """Wake one Application."""
+        for subscription in self._by_application.get(label_key(key), ()):
+            subscription.wake(urgent=urgent)
+
+    def wake_waiting(self) -> None:
+        """Wake every Application without a suitable plan, because another one released resources."""
+        for label in self._by_application.keys() - self._placed:
+            for subscription in self._by_application[label]:
+                subscription.wake()
+
+    def wake_for_capacity(self, node: str) -> None:
+        """Wake every Application that would use a node if it had free capacity, because capacity was released."""
+        for label, full in self._full_nodes.items():
+            if node in full:
+                for subscription in self._by_application.get(label, ()):
+                    subscription.wake()
+
+    def wake_all(self, *, urgent: bool = False, first: Iterable[Key] = ()) -> None:
+        """Wake every Application, because an input of all of them changed.
+
+        Args:
+            urgent: End pauses.
+            first: Applications to wake before the others, such as those whose drones are in flight.
+        """
+        in_order = dict.fromkeys((*map(label_key, first), *self._by_application))
+        for label in in_order:
+            for subscription in self._by_application.get(label, ()):
+                subscription.wake(urgent=urgent)

@@ -1,0 +1,263 @@
+"""The reflector against a scripted API server: breaks, expiry, retries; no network."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import random
+from collections.abc import AsyncIterator
+from typing import Any
+
+import pytest
+from fractus_runtime.kubernetes import Body, Expired, Informer, Key, Kind, KubeError, Page
+from fractus_runtime.kubernetes import informer as informer_module
+
+POLICY = Kind("fractus.dev/v1alpha1", "Policy", "policies", namespaced=False)
+ZONE = Kind("fractus.dev/v1alpha1", "Zone", "zones", namespaced=False)
+
+
+def zone(name: str, version: int, value: int = 0) -> Body:
+    return {"metadata": {"name": name, "resourceVersion": str(version)}, "value": value}
+
+
+class Script:
+    """Gives lists and watches in the order written; then waits indefinitely."""
+
+    def __init__(self, *steps: Any) -> None:
+        self.steps = list(steps)
+        self.calls: list[str] = []
+        self.done = asyncio.Event()
+
+    async def list_page(self, kind: Any, *, continue_: str = "", **_: Any) -> Page:
+        self.calls.append(f"list {continue_}".strip())
+        step = await self._next()
+        if isinstance(step, Exception):
+            raise step
+        return Page(step)
+
+    async def watch(self, kind: Any, *, resource_version: str, **_: Any) -> AsyncIterator[tuple[str, Body]]:
+        self.calls.append(f"watch {resource_version}")
+        for event in await self._next():
+            if isinstance(event, Exception):
+                raise event
+            yield event
+
+    async def _next(self) -> Any:
+        if not self.steps:
+            self.done.set()
+            await asyncio.Event().wait()
+        return self.steps.pop(0)
+
+
+def page(version: int, *items: Body, continue_: str = "") -> Body:
+    return {"metadata": {"resourceVersion": str(version), "continue": continue_}, "items": list(items)}
+
+
+async def follow(
+    script: Script, monkeypatch: pytest.MonkeyPatch
+) -> tuple[dict[Key, int], list[tuple[Key, int | None, int | None]]]:
+    """Run a reflector through the script; what it holds then, and what it reported."""
+    monkeypatch.setattr(informer_module, "_BACKOFF_S", (0.0, 0.0))
+    changes: list[tuple[Key, int | None, int | None]] = []
+    informer: Informer[int] = Informer(
+        script,  # type: ignore[arg-type]
+        ZONE,
+        lambda body: body["value"],
+        lambda key, old, new: changes.append((key, old, new)),
+        rng=random.Random(1),
+    )
+    task = asyncio.create_task(informer.run())
+    async with asyncio.timeout(5):
+        await script.done.wait()
+        await informer.synced.wait()
+    task.cancel()
+    return dict(informer.items()), changes
+
+
+async def test_a_list_in_pages_is_one_list(monkeypatch: pytest.MonkeyPatch) -> None:
+    script = Script(page(5, zone("a", 1, 1), continue_="more"), page(5, zone("b", 2, 2)))
+    held, changes = await follow(script, monkeypatch)
+    assert held == {("", "a"): 1, ("", "b"): 2}
+    assert sorted(changes) == [(("", "a"), None, 1), (("", "b"), None, 2)]
+    assert script.calls == ["list", "list more", "watch 5"]
+
+
+async def test_a_watch_goes_on_from_where_it_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    events = [("ADDED", zone("a", 6, 1)), ("BOOKMARK", {"metadata": {"resourceVersion": "9"}})]
+    script = Script(page(5), events, [("MODIFIED", zone("a", 10, 2)), ("DELETED", zone("a", 11, 2))])
+    held, changes = await follow(script, monkeypatch)
+    assert held == {}
+    assert changes == [(("", "a"), None, 1), (("", "a"), 1, 2), (("", "a"), 2, None)]
+    assert script.calls == ["list", "watch 5", "watch 9", "watch 11"]
+
+
+async def test_an_expired_watch_lists_again_and_reports_the_difference(monkeypatch: pytest.MonkeyPatch) -> None:
+    script = Script(
+        page(5, zone("gone", 1, 1), zone("same", 2, 2), zone("new", 3, 3)),
+        [Expired(410, "Expired", "too old")],
+        page(50, zone("same", 2, 2), zone("new", 40, 4)),
+    )
+    held, changes = await follow(script, monkeypatch)
+    assert held == {("", "same"): 2, ("", "new"): 4}
+    assert sorted(changes[3:]) == [(("", "gone"), 1, None), (("", "new"), 3, 4)]
+    assert script.calls == ["list", "watch 5", "list", "watch 50"]
+
+
+@pytest.mark.parametrize("watch", [[], [Expired(410, "Expired", "too old")]], ids=["ends at once", "expires"])
+async def test_a_watch_that_comes_to_nothing_is_opened_less_and_less_often(
+    watch: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pauses: list[float] = []
+
+    async def sleep(seconds: float) -> None:
+        pauses.append(seconds)
+
+    monkeypatch.setattr(asyncio, "sleep", sleep)
+
+    class Same(Script):
+        async def _next(self) -> Any:
+            return await super()._next() if len(pauses) >= 7 else page(5) if "list" in self.calls[-1] else watch
+
+    script = Same()
+    informer: Informer[int] = Informer(script, ZONE, lambda body: body["value"], lambda *_: None)  # type: ignore[arg-type]
+    task = asyncio.create_task(informer.run())
+    async with asyncio.timeout(5):
+        await script.done.wait()
+    task.cancel()
+    assert 0.2 <= pauses[0] <= 0.4
+    assert all(later > before * 0.9 for before, later in itertools.pairwise(pauses))
+    assert pauses[-1] >= 12
+
+
+async def test_a_broken_connection_is_taken_up_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    broken = KubeError(0, "Unreachable", "reset")
+    script = Script(broken, page(5), [("ADDED", zone("a", 6, 1)), broken], [("MODIFIED", zone("a", 7, 2))])
+    held, _ = await follow(script, monkeypatch)
+    assert held == {("", "a"): 2}
+    assert script.calls == ["list", "list", "watch 5", "watch 6", "watch 7"]
+
+
+async def test_after_a_long_silence_it_lists_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An API server that was restored from a backup tells a watch nothing until it comes to the watch's version once more."""
+    monkeypatch.setattr(informer_module, "_SILENCE_S", 0.0)
+    silent = [KubeError(0, "Unreachable", "TimeoutError")]
+    script = Script(page(50, zone("a", 40, 4), zone("b", 41, 5)), silent, page(9, zone("a", 7, 3)))
+    held, _ = await follow(script, monkeypatch)
+    assert held == {("", "a"): 3}
+    assert script.calls == ["list", "watch 50", "list", "watch 9"]
+
+
+async def test_an_unchanged_view_wakes_no_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    script = Script(page(5, zone("a", 1, 1)), [("MODIFIED", zone("a", 6, 1))])
+    _, changes = await follow(script, monkeypatch)
+    assert changes == [(("", "a"), None, 1)]
+
+
+async def test_an_object_that_cannot_be_read_hides_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    odd = {"metadata": {"name": "a", "resourceVersion": "6"}}
+    script = Script(page(5, zone("a", 1, 1), odd | {"metadata": {"name": "odd"}}), [("MODIFIED", odd)])
+    held, _ = await follow(script, monkeypatch)
+    assert held == {("", "a"): 1}
+
+
+def test_an_own_write_is_told_and_outlives_older_news() -> None:
+    changes: list[tuple[int | None, int | None]] = []
+    read: list[Body] = []
+
+    def value(body: Body) -> int:
+        read.append(body)
+        return int(body["value"])
+
+    informer: Informer[int] = Informer(
+        Script(),  # type: ignore[arg-type]
+        ZONE,
+        value,
+        lambda _key, old, new: changes.append((old, new)),
+    )
+    informer.record_write(("", "a"), zone("a", 7, 2))
+    informer._take("MODIFIED", zone("a", 6, 1))
+    assert informer.get(("", "a")) == 2
+    informer._take("MODIFIED", zone("a", 7, 2))
+    assert len(read) == 1, "what the watch repeats is not read again"
+    informer._take("MODIFIED", zone("a", 8, 3))
+    assert changes == [(None, 2), (2, 3)]
+    informer.record_write(("", "a"), zone("a", 9, 4))
+    informer._take("DELETED", zone("a", 9, 4))
+    assert informer.get(("", "a")) is None
+
+
+async def test_a_late_answer_to_an_own_write_says_nothing_newer() -> None:
+    events = [
+        ("MODIFIED", zone("done", 10, 1)),
+        ("MODIFIED", zone("done", 11, 2)),
+        ("ADDED", zone("gone", 12, 1)),
+        ("DELETED", zone("gone", 13, 1)),
+        ("BOOKMARK", {"metadata": {"resourceVersion": "20"}}),
+    ]
+    script = Script(page(5, zone("done", 5, 0)), events)
+    informer: Informer[int] = Informer(script, ZONE, lambda body: body["value"], lambda *_: None)  # type: ignore[arg-type]
+    task = asyncio.create_task(informer.run())
+    async with asyncio.timeout(5):
+        await script.done.wait()
+    informer.record_write(("", "done"), zone("done", 10, 1))
+    informer.record_write(("", "gone"), zone("gone", 12, 1))
+    informer.record_write(("", "older"), zone("older", 20, 1))
+    assert dict(informer.items()) == {("", "done"): 2}
+    informer.record_write(("", "done"), zone("done", 21, 3))
+    informer.record_write(("", "gone"), zone("gone", 22, 4))
+    assert dict(informer.items()) == {("", "done"): 3, ("", "gone"): 4}
+    task.cancel()
+
+
+async def test_an_answer_between_two_pages_is_no_newer_than_the_list() -> None:
+    late: list[Body] = []
+
+    class Between(Script):
+        async def _next(self) -> Any:
+            for body in late:
+                informer.record_write(("", body["metadata"]["name"]), body)
+            late[:] = [zone("a", 10, 1)]
+            return await super()._next()
+
+    script = Between(page(12, zone("a", 11, 2), continue_="more"), page(12, zone("b", 2, 2)))
+    informer: Informer[int] = Informer(script, ZONE, lambda body: body["value"], lambda *_: None)  # type: ignore[arg-type]
+    task = asyncio.create_task(informer.run())
+    async with asyncio.timeout(5):
+        await script.done.wait()
+    assert dict(informer.items()) == {("", "a"): 2, ("", "b"): 2}
+    task.cancel()
+
+
+def test_paths_of_objects() -> None:
+    assert ZONE.path(name="a", subresource="status") == "/apis/fractus.dev/v1alpha1/zones/a/status"
+    assert POLICY.path() == "/apis/fractus.dev/v1alpha1/policies"
+
+
+async def test_it_knows_whether_a_watch_is_open() -> None:
+    ended, is_open, listed_again = asyncio.Event(), asyncio.Event(), asyncio.Event()
+
+    class Watched(Script):
+        async def watch(self, kind: Any, *, opened: Any, **_: Any) -> AsyncIterator[tuple[str, Body]]:
+            opened()
+            is_open.set()
+            await ended.wait()
+            raise KubeError(400, "Invalid", "gone")
+            yield
+
+        async def list_page(self, kind: Any, **_: Any) -> Page:
+            if ended.is_set():
+                listed_again.set()
+                await asyncio.Event().wait()
+            return Page(page(1))
+
+    kept = Informer(Watched(), ZONE, lambda body: body, lambda *_: None)  # type: ignore[arg-type]
+    assert not kept.watching
+    task = asyncio.create_task(kept.run())
+    async with asyncio.timeout(20.0):
+        await is_open.wait()
+        assert kept.watching
+        ended.set()
+        await listed_again.wait()
+        assert not kept.watching
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)

@@ -1,0 +1,305 @@
+"""Claims, bookings and plans that are kept event by event are those that all objects together give."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from typing import Any, cast
+
+import hypothesis.strategies as st
+import pytest
+from depth import examples
+from fractus_core.api.plans import DeploymentPlanSpec
+from fractus_core.planning.candidates import requests
+from fractus_operator import kinds
+from fractus_operator.cache import ClusterCache
+from fractus_operator.drone_claims import Claim, claims
+from fractus_operator.kinds import Body, Key, Kind, key_of
+from fractus_operator.parsing import OwnedPlan, parse_plan
+from fractus_operator.store import Informer, Store
+from hypothesis import settings
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+from test_planning import component, manifest
+
+APPLICATIONS = st.sampled_from([("ns", "a"), ("ns", "b"), ("ms", "a")])
+UIDS = st.sampled_from(["1", "2"])
+DRONES = ("d", "e")
+NODES = ("d", "e", "n")
+KINDS = (kinds.APPLICATION, kinds.DEPLOYMENT_PLAN, kinds.GRANT, kinds.DRONE, kinds.POD)
+FIRST = "2026-01-01T00:00:00Z"
+
+
+def labels(key: Key, **more: str) -> dict[str, str]:
+    made = {"app.kubernetes.io/managed-by": "fractus", "fractus.dev/application": key[1]}
+    return made | {"fractus.dev/namespace": key[0]} | {f"fractus.dev/{name}": value for name, value in more.items()}
+
+
+def plan_spec(node: str, host: Key | None, generation: int, placed_on: str) -> dict[str, Any]:
+    shared = {"sharedWith": "/".join(host)} if host is not None else {}
+    placement = {
+        "component": "C",
+        "instance": "c-1",
+        "node": placed_on,
+        "placement": "edge",
+        "role": "static",
+        "location": 0,
+    }
+    return {
+        "application": "any",
+        "applicationGeneration": generation,
+        "drone": {"node": node, "score": 1.0, **shared},
+        "placements": [placement],
+    }
+
+
+class EventsOfTheCluster(RuleBasedStateMachine):
+    """Objects come, change and go at the API server; the operator hears of it late, again, or by another list."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.cache = ClusterCache(cast(Store, None))
+        self.woken: set[Key] = set()
+        self.cache.plans._wake = self.woken.add
+        self.version = 0
+        self.there: dict[Kind, dict[Key, Body]] = {kind: {} for kind in KINDS}
+        self.unheard: dict[Kind, list[tuple[str, Body]]] = {kind: [] for kind in KINDS}
+        self.decided: dict[Key, OwnedPlan] = {}
+        self.last: dict[str, Claim] = {}
+
+    # -- at the API server --
+
+    def put(self, kind: Kind, body: Body) -> None:
+        self.version += 1
+        body["metadata"]["resourceVersion"] = str(self.version)
+        self.there[kind][key_of(body)] = body
+        self.unheard[kind].append(("MODIFIED", body))
+
+    def remove(self, kind: Kind, key: Key) -> None:
+        body = self.there[kind].pop(key, None)
+        if body is not None:
+            self.version += 1
+            body = copy.deepcopy(body)
+            body["metadata"]["resourceVersion"] = str(self.version)
+            self.unheard[kind].append(("DELETED", body))
+
+    @rule(
+        key=APPLICATIONS,
+        uid=UIDS,
+        generation=st.integers(1, 3),
+        returning=st.none() | st.integers(1, 3),
+        cpu=st.integers(1, 3),
+    )
+    def application(self, key: Key, uid: str, generation: int, returning: int | None, cpu: int) -> None:
+        container = {"image": "i", "resources": {"limits": {"cpu": str(cpu)}}}
+        locations = [{"center": {"lat": 0, "lon": 0}, "radius": 9, "instances": 1}]
+        spec = {"components": [component("C", "edge", container=container, locations=locations)]}
+        metadata = {"namespace": key[0], "name": key[1], "uid": f"{key}{uid}", "generation": generation}
+        status = {"phase": "Completed", "observedGeneration": returning, "drone": "d"} if returning is not None else {}
+        self.put(kinds.APPLICATION, {**manifest("Application", key[1], spec), "metadata": metadata, "status": status})
+
+    @rule(
+        key=APPLICATIONS,
+        uid=UIDS,
+        node=st.sampled_from(DRONES),
+        host=st.none() | APPLICATIONS,
+        generation=st.integers(1, 3),
+        placed_on=st.sampled_from(NODES),
+        decided=st.booleans(),
+    )
+    def plan(
+        self, key: Key, uid: str, node: str, host: Key | None, generation: int, placed_on: str, decided: bool
+    ) -> None:
+        spec = plan_spec(node, host, generation, placed_on)
+        if decided:
+            plan = DeploymentPlanSpec.model_validate(spec)
+            self.decided[key] = OwnedPlan(f"{key}{uid}", plan)
+            self.cache.plans.decide(key, f"{key}{uid}", plan)
+            return
+        owner = {"apiVersion": "v1", "kind": "Application", "name": key[1], "uid": f"{key}{uid}"}
+        body = manifest("DeploymentPlan", key[1], spec)
+        body["metadata"] = {"namespace": key[0], "name": key[1], "ownerReferences": [owner], "labels": labels(key)}
+        self.put(kinds.DEPLOYMENT_PLAN, body)
+
+    @rule(key=APPLICATIONS)
+    def forget(self, key: Key) -> None:
+        self.decided.pop(key, None)
+        self.cache.forget(key)
+
+    @rule(
+        name=st.sampled_from("gh"),
+        key=APPLICATIONS,
+        uid=UIDS,
+        node=st.sampled_from(DRONES),
+        created=st.none() | st.sampled_from([FIRST, "2026-01-02T00:00:00Z"]),
+    )
+    def grant(self, name: str, key: Key, uid: str, node: str, created: str | None) -> None:
+        owner = {"namespace": key[0], "name": key[1], "uid": f"{key}{uid}"}
+        body = manifest("Grant", name, {"node": node, "application": owner, "component": "C", "instance": "c-1"})
+        body["metadata"] = {"name": name, "labels": labels(key)} | ({"creationTimestamp": created} if created else {})
+        self.put(kinds.GRANT, body)
+
+    @rule(name=st.sampled_from(DRONES), flies=st.booleans())
+    def drone(self, name: str, flies: bool) -> None:
+        status = {"flightState": "flying" if flies else "inactive"}
+        spec = {"home": {"lat": 0, "lon": 0}, "services": {}}
+        self.put(kinds.DRONE, {**manifest("Drone", name, spec, status=status), "metadata": {"name": name}})
+
+    @rule(
+        name=st.sampled_from("pqr"),
+        key=APPLICATIONS,
+        node=st.none() | st.sampled_from(NODES),
+        cpu=st.integers(1, 3),
+        ended=st.booleans(),
+        ours=st.booleans(),
+    )
+    def pod(self, name: str, key: Key, node: str | None, cpu: int, ended: bool, ours: bool) -> None:
+        container = {"resources": {"requests": {"cpu": str(cpu)}}}
+        metadata = {"namespace": key[0], "name": name, "labels": labels(key, instance="c-1") if ours else {}}
+        status = {"phase": "Succeeded" if ended else "Running"}
+        self.put(
+            kinds.POD, {"metadata": metadata, "spec": {"nodeName": node, "containers": [container]}, "status": status}
+        )
+
+    @rule(kind=st.sampled_from(KINDS), choice=st.randoms(use_true_random=False))
+    def delete(self, kind: Kind, choice: Any) -> None:
+        if self.there[kind]:
+            self.remove(kind, choice.choice(sorted(self.there[kind])))
+
+    # -- what is heard of it --
+
+    def informer(self, kind: Kind) -> Informer[Any]:
+        return next(r for r in self.cache.informers() if r.kind == kind)
+
+    def take(self, kind: Kind, type_: str, body: Body) -> None:
+        key, informer = key_of(body), self.informer(kind)
+        known = informer.get(key) is not None
+        informer._take(type_, copy.deepcopy(body))
+        # What was deleted before the last answer told of it is there again, and its plan stays.
+        if kind is kinds.APPLICATION and known and informer.get(key) is None:
+            self.decided.pop(key, None)
+
+    @rule(kind=st.sampled_from(KINDS), again=st.booleans())
+    def hear(self, kind: Kind, again: bool) -> None:
+        heard, self.unheard[kind] = self.unheard[kind], []
+        for type_, body in heard:
+            for _ in range(1 + again):
+                self.take(kind, type_, body)
+
+    @precondition(lambda self: any(self.unheard.values()))
+    @rule(kind=st.sampled_from(KINDS))
+    def hear_one(self, kind: Kind) -> None:
+        if self.unheard[kind]:
+            self.take(kind, *self.unheard[kind].pop(0))
+
+    @rule(kind=st.sampled_from(KINDS))
+    def answer(self, kind: Kind) -> None:
+        """A write of ours returns before the watch tells of it."""
+        if self.unheard[kind] and self.unheard[kind][-1][0] != "DELETED":
+            body = copy.deepcopy(self.unheard[kind][-1][1])
+            self.informer(kind).record_write(key_of(body), body)
+
+    @rule(kind=st.sampled_from(KINDS))
+    def list_again(self, kind: Kind) -> None:
+        """What was deleted meanwhile is found only by its absence."""
+        self.unheard[kind] = []
+        for body in self.there[kind].values():
+            self.take(kind, "MODIFIED", body)
+        informer = self.informer(kind)
+        for key in {key for key, _ in informer.items()} - self.there[kind].keys():
+            informer._drop(key)
+            if kind is kinds.APPLICATION:
+                self.decided.pop(key, None)
+
+    # -- what all of it gives --
+
+    def plans(self) -> dict[Key, OwnedPlan]:
+        """The plans made last."""
+        stored = {key: parse_plan(body) for key, body in self.cache.children[kinds.DEPLOYMENT_PLAN].items()}
+        return {key: plan for key, plan in stored.items() if plan is not None} | self.decided
+
+    def active(self) -> dict[Key, OwnedPlan]:
+        found = {}
+        for key, plan in self.plans().items():
+            submitted = self.cache.applications.get(key)
+            if submitted is not None and submitted.uid == plan.uid:
+                returning = submitted.settled_generation
+                if returning is None or (plan.spec.application_generation or 0) > returning:
+                    found[key] = plan
+        return found
+
+    def booked(self, node: str, own: Key) -> float:
+        pods = [p for p in self.cache.pods.values() if p.node == node and not p.finished]
+        of_others = [p for p in pods if (p.namespace, p.application) != own]
+        bound = {(p.namespace, p.instance) for p in pods if p.application is not None}
+        return sum(p.requests["cpu"] for p in of_others) + sum(self.unbound(node, own, bound))
+
+    def unbound(self, node: str, own: Key, bound: Iterable[tuple[str, str | None]]) -> Iterator[float]:
+        for key, plan in self.active().items():
+            submitted = self.cache.applications.get(key)
+            assert submitted is not None
+            assert submitted.application is not None
+            for placed in plan.spec.placements:
+                if key != own and placed.node == node and (key[0], placed.instance) not in bound:
+                    yield requests(submitted.application.spec.components[0])["cpu"]
+
+    @invariant()
+    def plans_in_force_are_those_of_missions_that_are_not_over(self) -> None:
+        plans = self.active()
+        for key in [("ns", "a"), ("ns", "b"), ("ms", "a")]:
+            assert self.cache.plans.active(key) == plans.get(key)
+        for node in DRONES:
+            on = {key for key, plan in plans.items() if plan.spec.drone is not None and plan.spec.drone.node == node}
+            assert set(self.cache.fleet.applications_on(node)) == on
+
+    @invariant()
+    def each_drone_has_the_application_that_all_plans_and_grants_give_it(self) -> None:
+        plans = self.active()
+        held = claims(plans, self.cache._known_grants.values())
+        for drone in self.cache.drones.values():
+            if drone is not None and drone.in_air and drone.name not in held:
+                last = self.last.get(drone.name) or self.cache.fleet._claim_from_status(drone.name)
+                held[drone.name] = replace(last, returning=True)
+        self.last.update(held)
+        assert dict(self.cache.fleet.claims()) == held
+        heard = {
+            (b["spec"]["application"]["uid"], b["spec"]["node"]) for b in self.cache.children[kinds.GRANT].values()
+        }
+        drones = [(plan.uid, plan.spec.drone) for plan in plans.values() if plan.spec.drone is not None]
+        sharing = {(uid, drone.node) for uid, drone in drones if drone.shared_with is not None}
+        assert {node for _, node in heard - sharing} <= set(held), (
+            "a drone with the grant of one that shares no flight is not free"
+        )
+        owners = {(claim.uid, node) for node, claim in held.items() if not claim.returning}
+        own = {
+            plan.spec.drone.node
+            for plan in plans.values()
+            if plan.spec.drone is not None
+            and plan.spec.drone.shared_with is None
+            and (plan.uid, plan.spec.drone.node) in owners
+            and self.cache.drone(plan.spec.drone.node) is not None
+        }
+        assert {flown.drone.name for flown in self.cache.fleet.active_missions()} == own
+        flying = {key for key, plan in plans.items() if self.cache.fleet.drone_in_flight(plan.spec) is not None}
+        assert set(self.cache.fleet.applications_in_flight()) == flying
+
+    @invariant()
+    def each_node_has_booked_on_it_what_runs_or_is_planned_there(self) -> None:
+        for name in NODES:
+            for own in [("ns", "a"), ("ns", "z")]:
+                found = self.cache._bookings.on(name, own, [p for p in self.cache.pods_of(own) if p.node == name])
+                assert found.get("cpu", 0.0) == pytest.approx(self.booked(name, own))
+
+    @invariant()
+    def who_shares_a_flight_is_woken_by_its_host(self) -> None:
+        for host in [("ns", "a"), ("ns", "b"), ("ms", "a")]:
+            self.woken.clear()
+            self.cache.plans.wake_guests(host)
+            named = "/".join(host)
+            assert self.woken == {
+                key for key, p in self.plans().items() if p.spec.drone and p.spec.drone.shared_with == named
+            }
+
+
+TestEventsOfTheCluster = EventsOfTheCluster.TestCase
+TestEventsOfTheCluster.settings = settings(max_examples=examples(60), stateful_step_count=40, deadline=None)

@@ -1,0 +1,469 @@
+"""How the operator makes what an application needs: what waits for what, on an API server of the test's own."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import defaultdict
+from datetime import UTC, datetime
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+import yaml
+from fractus_core.api import Application
+from fractus_core.api.plans import DeploymentPlanSpec
+from fractus_operator import kinds
+from fractus_operator.cache import ClusterCache
+from fractus_operator.child_objects import ChildObjects, NameTaken
+from fractus_operator.cleanup import FinishedPods, OrphanedPods
+from fractus_operator.kinds import Body, Key, Kind
+from fractus_operator.owned_objects import OwnedObjects
+from fractus_operator.resources.deployment import owned_object
+from fractus_operator.rollout import Rollout
+from fractus_operator.store import Conflict, KubeError, NotFound, Store
+
+INPUT = yaml.safe_load((Path(__file__).parents[1] / "golden" / "operator" / "input.yaml").read_text())
+APPLICATION = Application.from_body(INPUT["application"])
+PLAN = DeploymentPlanSpec.model_validate(INPUT["plan"])
+
+NOW = datetime(2026, 6, 1, 12, 0, tzinfo=UTC)
+
+
+PLACED = PLAN.model_copy(update={"placements": PLAN.placements[:2], "drone": None})
+
+
+class Copy(dict[Key, Body]):
+    """What the watch showed of a kind: nothing."""
+
+    def record_write(self, key: Key, body: Body) -> None:
+        """Nothing is remembered."""
+
+
+class Webhooks:
+    """An API server that never answers writes of one kind."""
+
+    def __init__(self, hanging: Kind | None, full: int = 0) -> None:
+        self.hanging = hanging
+        self.hangs = 0
+        self.full = asyncio.Event()
+        self.full_at = full
+        self.said: list[str] = []
+        self.there: dict[tuple[Kind, str], Body] = {}
+        self.frozen = False
+
+    async def get(self, kind: Kind, name: str, namespace: str = "") -> Body:
+        self.said.append(f"get {kind.name}")
+        if (kind, name) not in self.there:
+            raise NotFound(404, "NotFound", name)
+        return self.there[kind, name]
+
+    async def create(self, kind: Kind, body: Body) -> Body:
+        if (kind, body["metadata"]["name"]) in self.there:
+            self.said.append(f"create {kind.name} refused")
+            raise Conflict(409, "AlreadyExists", "it is there")
+        return await self.written("create", kind, body)
+
+    async def apply(self, kind: Kind, body: Body) -> Body:
+        self.frozen = False
+        return await self.written("apply", kind, body)
+
+    async def replace_spec(self, kind: Kind, _observed: Body, body: Body) -> Body:
+        return await self.written("replace spec", kind, body)
+
+    async def delete(self, kind: Kind, key: Key, _uid: str) -> None:
+        self.said.append(f"delete {kind.name}")
+        del self.there[kind, key[1]]
+
+    async def take_ownership(self, kind: Kind, _key: Key) -> None:
+        self.said.append(f"own {kind.name}")
+        if self.frozen:
+            raise KubeError(422, "Invalid", "its image may not be used any more")
+
+    async def written(self, how: str, kind: Kind, body: Body) -> Body:
+        if kind is self.hanging:
+            self.hangs += 1
+            if self.hangs == self.full_at:
+                self.full.set()
+            await asyncio.Event().wait()
+        self.said.append(f"{how} {kind.name}")
+        return body
+
+
+def made_on(store: Webhooks) -> ChildObjects:
+    signer = SimpleNamespace(sign=lambda body, _=None: body, problem=lambda _grant: "unsigned")
+    return ChildObjects(cast(Any, store), cast(Any, defaultdict(Copy)), cast(Any, signer))
+
+
+@pytest.mark.parametrize("hanging", [kinds.SERVICE, kinds.DEPLOYMENT])
+async def test_hanging_webhook_delays_neither_plans_nor_grants(hanging: Kind) -> None:
+    store = Webhooks(hanging, full=16)
+    children = made_on(store)
+    many = [hanging.header(f"s{i}", "city") for i in range(20)]
+    stuck = asyncio.create_task(children.apply(APPLICATION, {hanging: many}))
+    async with asyncio.timeout(10.0):
+        await store.full.wait()
+    store.said.clear()
+    wanted = {kind: [kind.header("other", "city")] for kind in (kinds.DEPLOYMENT_PLAN, kinds.GRANT)}
+    async with asyncio.timeout(10.0):
+        await children.apply(APPLICATION, wanted)
+    assert store.said == ["create DeploymentPlan", "create Grant"]
+    stuck.cancel()
+    await asyncio.gather(stuck, return_exceptions=True)
+
+
+def standing(kind: Kind, **metadata: Any) -> Body:
+    return {**kind.header("one", "city", uid="1", **metadata), "spec": {"old": True}}
+
+
+async def test_taken_name_is_created_once_and_then_looked_up() -> None:
+    """Each failed creation counts against the quota of the namespace."""
+    store = Webhooks(None)
+    store.there[kinds.SERVICE, "one"] = standing(kinds.SERVICE)
+    children = made_on(store)
+    for _ in range(2):
+        with pytest.raises(NameTaken, match="does not belong to this Application"):
+            await children.apply(APPLICATION, {kinds.SERVICE: [kinds.SERVICE.header("one", "city")]})
+    assert store.said == ["create Service refused", "get Service", "get Service"]
+    store.there.clear()
+    await children.apply(APPLICATION, {kinds.SERVICE: [kinds.SERVICE.header("one", "city")]})
+    assert store.said[3:] == ["get Service", "create Service"]
+
+
+async def test_inadmissible_object_is_replaced_before_ownership_changes() -> None:
+    store = Webhooks(None)
+    owners = [{"uid": APPLICATION.metadata.uid}]
+    store.there[kinds.DEPLOYMENT, "one"] = standing(kinds.DEPLOYMENT, ownerReferences=owners)
+    store.frozen = True
+    await made_on(store).apply(APPLICATION, {kinds.DEPLOYMENT: [kinds.DEPLOYMENT.header("one", "city")]})
+    assert store.said[2:] == ["own Deployment", "apply Deployment", "own Deployment", "apply Deployment"]
+
+
+async def test_refused_object_does_not_stop_later_kinds() -> None:
+    store = Webhooks(None)
+    store.there[kinds.SERVICE, "one"] = standing(kinds.SERVICE)
+    desired = {kind: [kind.header("one", "city")] for kind in (kinds.SERVICE, kinds.DEPLOYMENT)}
+    with pytest.raises(NameTaken):
+        await made_on(store).apply(APPLICATION, desired)
+    assert store.said[2:] == ["create Deployment"]
+
+
+@pytest.mark.parametrize(
+    ("node", "then"), [("n1", ["replace spec Grant"]), ("n2", ["delete Grant", "create Grant"])], ids=["stays", "moved"]
+)
+async def test_a_grant_that_is_there_is_rewritten_unless_its_node_changes(node: str, then: list[str]) -> None:
+    store = Webhooks(None)
+    of = {"uid": APPLICATION.metadata.uid}
+    store.there[kinds.GRANT, "one"] = {**kinds.GRANT.header("one", uid="1"), "spec": {"application": of, "node": "n1"}}
+    wanted = {**kinds.GRANT.header("one", labels={}), "spec": {"application": of, "node": node}}
+    await made_on(store).apply(APPLICATION, {kinds.GRANT: [wanted]})
+    assert store.said == ["create Grant refused", "get Grant", *then]
+
+
+async def test_the_grant_of_another_application_is_left_alone() -> None:
+    store = Webhooks(None)
+    spec = {"application": {"uid": "another"}, "node": "n1"}
+    store.there[kinds.GRANT, "one"] = {**kinds.GRANT.header("one", uid="1"), "spec": spec}
+    with pytest.raises(NameTaken):
+        await made_on(store).apply(APPLICATION, {kinds.GRANT: [{**kinds.GRANT.header("one", labels={}), "spec": spec}]})
+    assert store.said == ["create Grant refused", "get Grant"]
+
+
+async def test_what_a_controller_made_with_our_labels_is_left_to_it() -> None:
+    """EndpointSlices have the labels of their Service: one that is removed before it comes back."""
+    store = Spelling(None)
+    copies = {kind: OwnedObjects(cast(Any, store), kind, lambda body: body, lambda *_: None) for kind in kinds.CHILDREN}
+    children = ChildObjects(cast(Any, store), copies, cast(Any, None))
+    for name, owner, by in (
+        ("ours", "Application", "operator.fractus.dev"),
+        ("theirs", "Service", "endpointslice-controller.k8s.io"),
+    ):
+        body = owned_object(kinds.ENDPOINT_SLICE, APPLICATION, name, {"endpointslice.kubernetes.io/managed-by": by})
+        body["metadata"]["ownerReferences"][0]["kind"] = owner
+        copies[kinds.ENDPOINT_SLICE].record_write((APPLICATION.key[0], name), body)
+    assert await children.remove(APPLICATION.key, kinds.ENDPOINT_SLICE)
+    assert store.said == ["delete EndpointSlice"]
+
+
+async def test_pods_are_followed_in_slices_of_the_operator_only() -> None:
+    """Kubernetes says itself where a Service with a selector leads, and admission refuses what another writes there."""
+    store = Spelling(None)
+    copies = {kind: OwnedObjects(cast(Any, store), kind, lambda body: body, lambda *_: None) for kind in kinds.CHILDREN}
+    children = ChildObjects(cast(Any, store), copies, cast(Any, None))
+    for name, by in (("ours", "operator.fractus.dev"), ("theirs", "endpointslice-controller.k8s.io")):
+        made = owned_object(kinds.ENDPOINT_SLICE, APPLICATION, name, {"endpointslice.kubernetes.io/managed-by": by})
+        made["endpoints"] = [{"addresses": ["10.0.0.7"]}]
+        copies[kinds.ENDPOINT_SLICE].record_write((APPLICATION.key[0], name), made)
+    rollout = Rollout(children, cast(Any, None), cast(Any, None), lambda: NOW)
+    await rollout.update_addresses(APPLICATION.key, PLAN, [])
+    assert store.said == ["patch EndpointSlice ours"]
+
+
+@pytest.mark.parametrize("owner", ["Application", "Service"])
+async def test_a_deployment_with_another_owner_is_removed(owner: str) -> None:
+    """Who may edit a namespace may give it another owner: it would outlive its application."""
+    store = Spelling(None)
+    copies = {kind: OwnedObjects(cast(Any, store), kind, lambda body: body, lambda *_: None) for kind in kinds.CHILDREN}
+    body = owned_object(kinds.DEPLOYMENT, APPLICATION, "one", {})
+    body["metadata"]["ownerReferences"][0]["kind"] = owner
+    copies[kinds.DEPLOYMENT].record_write((APPLICATION.key[0], "one"), body)
+    assert await ChildObjects(cast(Any, store), copies, cast(Any, None)).remove(APPLICATION.key, kinds.DEPLOYMENT)
+    assert store.said == ["delete Secret", "delete Deployment"]
+
+
+@pytest.mark.parametrize("kept", [True, False])
+async def test_a_deployment_that_a_finalizer_keeps_takes_no_pods_along(kept: bool) -> None:
+    """So they are removed one by one; those of one that is gone are left to the garbage collector."""
+    store = Spelling(None)
+    labels = {"app.kubernetes.io/managed-by": "fractus", "fractus.dev/instance": "one"}
+
+    def made(kind: Kind, uid: str, owner: str) -> Body:
+        return kind.header("one", "city", uid=uid, labels=labels, ownerReferences=[{"uid": owner}]) | {"spec": {}}
+
+    deployment = made(kinds.DEPLOYMENT, "d", "app")
+    # Not even by its label is it found again: that may have been taken off, too.
+    store.kept = frozenset({(kinds.DEPLOYMENT, "one")} if kept else ())
+    listed = {
+        kinds.DEPLOYMENT: [],
+        kinds.REPLICA_SET: [made(kinds.REPLICA_SET, "r", "d")],
+        kinds.POD: [made(kinds.POD, "p", "r")],
+    }
+
+    async def list_whole(kind: Kind, **_: object) -> Any:
+        return SimpleNamespace(items=listed[kind])
+
+    cast(Any, store).list_whole = list_whole
+    copies = {kind: OwnedObjects(cast(Any, store), kind, lambda body: body, lambda *_: None) for kind in kinds.CHILDREN}
+    deployment["metadata"]["labels"] = labels | {"fractus.dev/application": "a"}
+    copies[kinds.DEPLOYMENT].record_write(("city", "one"), deployment)
+    cache = SimpleNamespace(applications={("city", "a"): SimpleNamespace(settled_generation=None)})
+    children = ChildObjects(cast(Any, store), copies, cast(Any, None))
+    await FinishedPods(cast(Any, store), cast(Any, cache), children, lambda: NOW).tear_down(("city", "a"))
+    assert store.said == ["delete Secret", "delete Deployment", *(["delete ReplicaSet", "delete Pod"] if kept else [])]
+
+
+async def test_a_pod_that_was_kept_is_left_to_no_garbage_collector() -> None:
+    store = Spelling(None)
+    labels = {"app.kubernetes.io/managed-by": "fractus", "fractus.dev/instance": "one"}
+    kept = kinds.POD.header("one-x", "city", uid="p", labels=labels, ownerReferences=[{"uid": "app"}]) | {"spec": {}}
+
+    async def list_whole(kind: Kind, **_: object) -> Any:
+        return SimpleNamespace(items=[kept] if kind is kinds.POD else [])
+
+    cast(Any, store).list_whole = list_whole
+    copies = {kind: OwnedObjects(cast(Any, store), kind, lambda body: body, lambda *_: None) for kind in kinds.CHILDREN}
+    cache = SimpleNamespace(applications={("city", "a"): SimpleNamespace(settled_generation=1)})
+    children = ChildObjects(cast(Any, store), copies, cast(Any, None))
+    await FinishedPods(cast(Any, store), cast(Any, cache), children, lambda: NOW).tear_down(("city", "a"))
+    assert store.said == ["delete Pod"]
+
+
+class Late(Store):
+    """An API server that carries out some requests after they had no answer, with what its controllers make of that."""
+
+    def __init__(self) -> None:
+        self.there: dict[tuple[str, Key], Body] = {}
+
+    def put(self, kind: Kind, name: str, *owners: Body, **metadata: Any) -> Body:
+        labels = {
+            "app.kubernetes.io/managed-by": "fractus",
+            "fractus.dev/application": "a",
+            "fractus.dev/instance": "one",
+        }
+        owning = [{"kind": o["kind"], "apiVersion": o["apiVersion"], "name": o["metadata"]["name"]} for o in owners]
+        references = [
+            {**o, "uid": owner["metadata"]["uid"], "controller": True} for o, owner in zip(owning, owners, strict=True)
+        ]
+        known = {"uid": f"{kind.name}/{name}", "resourceVersion": "1", "labels": labels, **metadata}
+        if references:
+            known["ownerReferences"] = references
+        body = kind.header(name, "city", **known) | {"spec": {}}
+        self.there[kind.path("city"), ("city", name)] = body
+        return body
+
+    async def request(self, method: str, path: str, body: Any = None, **_: Any) -> Body:
+        collection, _, name = path.rpartition("/")
+        if method == "DELETE":
+            if self.there.pop((collection, ("city", name)), None) is None:
+                raise NotFound(404, "NotFound", name)
+            return {"kind": "Status"}
+        return {"items": [found for (of, _), found in self.there.items() if of == path], "metadata": {}}
+
+    def names(self) -> set[str]:
+        return {f"{body['kind']}/{body['metadata']['name']}" for body in self.there.values()}
+
+
+def seen_by(store: Late) -> ClusterCache:
+    """What the watch of pods shows."""
+    cache = ClusterCache(store)
+    for informer in cache.informers():
+        informer.synced.set()
+    for (_, key), body in store.there.items():
+        if body["kind"] == "Pod":
+            cache.pods.record_write(key, body)
+    return cache
+
+
+async def test_what_is_made_after_a_teardown_is_removed_though_no_garbage_collector_finds_it() -> None:
+    """A deletion that leaves pods to be kept was carried out late, while a controller made what it had just seen removed again."""
+    store = Late()
+    cache = seen_by(store)
+    children = ChildObjects(store, cache.children, cast(Any, None))
+    await FinishedPods(store, cache, children, lambda: NOW).tear_down(("city", "a"))
+    owned = store.put(kinds.REPLICA_SET, "one-7f")
+    store.put(kinds.POD, "one-7f-x", owned)
+    lost = OrphanedPods(store, cache := seen_by(store))
+    await lost.step()
+    assert store.names() == {"ReplicaSet/one-7f", "Pod/one-7f-x"}, "the garbage collector has its time"
+    store.put(kinds.APPLICATION, "a")
+    await lost.step()
+    assert {"ReplicaSet/one-7f", "Pod/one-7f-x"} < store.names(), "the watch of Applications is behind"
+    await store.delete(kinds.APPLICATION, ("city", "a"))
+    await lost.step()
+    assert store.names() == set()
+
+
+async def test_a_creation_that_was_carried_out_late_is_undone() -> None:
+    store = Late()
+    deployment = store.put(kinds.DEPLOYMENT, "one", kinds.APPLICATION.header("a", "city", uid="gone"))
+    store.put(kinds.POD, "one-7f-x", store.put(kinds.REPLICA_SET, "one-7f", deployment))
+    lost = OrphanedPods(store, seen_by(store))
+    for _ in range(2):
+        await lost.step()
+    assert store.names() == set()
+
+
+async def test_a_copy_of_a_deployment_is_who_made_it_s() -> None:
+    store = Late()
+    store.put(kinds.POD, "one-7f-x", store.put(kinds.REPLICA_SET, "one-7f", store.put(kinds.DEPLOYMENT, "one")))
+    lost = OrphanedPods(store, seen_by(store))
+    for _ in range(3):
+        await lost.step()
+    assert len(store.there) == 3
+
+
+class Spelling(Webhooks):
+    """An API server that spells what it is given in its own way; finalizers keep some of it."""
+
+    kept: frozenset[tuple[Kind, str]] = frozenset()
+
+    async def written(self, how: str, kind: Kind, body: Body) -> Body:
+        written = await super().written(how, kind, body)
+        return {**written, "spec": {"cpu": "500m"}, "metadata": {**written["metadata"], "resourceVersion": "1"}}
+
+    async def delete(self, kind: Kind, key: Key, _uid: str | None = None, *, orphan: bool = False) -> bool:
+        self.said.append(f"delete {kind.name}")
+        return (kind, key[1]) not in self.kept
+
+    async def patch(self, kind: Kind, key: Key, changes: Body, _type: object) -> Body:
+        self.said.append(f"patch {kind.name} {key[1]}")
+        return {"metadata": {"name": key[1], "namespace": key[0]}, **changes}
+
+
+async def test_normalised_object_is_forgotten_when_deleted() -> None:
+    store = Spelling(None)
+    copies = {kind: OwnedObjects(cast(Any, store), kind, lambda body: body, lambda *_: None) for kind in kinds.CHILDREN}
+    children = ChildObjects(cast(Any, store), copies, cast(Any, None))
+    one = owned_object(kinds.DEPLOYMENT, APPLICATION, "one", {}, spec={"cpu": 0.5})
+    for _ in range(2):
+        await children.apply(APPLICATION, {kinds.DEPLOYMENT: [one]})
+    assert store.said == ["create Deployment"], "an object that the API server normalised is not written again"
+    nothing: dict[Kind, list[Body]] = {kind: [] for kind in kinds.CHILDREN}
+    await children.prune(APPLICATION, nothing)
+    assert store.said[1:] == ["delete Secret", "delete Deployment"]
+    assert not children._normalised
+
+
+class Secrets:
+    """An API server that lets Secrets be written and deleted, and never read."""
+
+    def __init__(self, *there: str) -> None:
+        self.there = set(there)
+        self.said: list[str] = []
+        self.refused = False
+        self.full = False
+
+    async def create(self, kind: Kind, body: Body) -> Body:
+        self.said.append("create")
+        if self.full:
+            raise KubeError(403, "Forbidden", "exceeded quota")
+        if body["metadata"]["name"] in self.there:
+            raise Conflict(409, "AlreadyExists", "it is there")
+        self.there.add(body["metadata"]["name"])
+        return body
+
+    async def replace(self, kind: Kind, body: Body) -> Body:
+        self.said.append("replace")
+        if body["metadata"]["name"] not in self.there:
+            raise NotFound(404, "NotFound", "it is gone")
+        return body
+
+    async def delete(self, kind: Kind, key: Key, _uid: str = "", *, orphan: bool = False) -> bool:
+        if kind is kinds.SECRET:
+            if self.refused:
+                raise KubeError(422, "Invalid", "no")
+            self.there.discard(key[1])
+        self.said.append(f"delete {kind.name}")
+        return True
+
+
+@pytest.mark.parametrize(
+    ("why", "there", "said"),
+    [
+        ("new", False, ["create"]),
+        ("new", True, ["create", "replace"]),
+        ("renewed", True, ["replace"]),
+        ("renewed", False, ["replace", "create"]),
+        ("lost", True, ["create"]),
+        ("lost", False, ["create"]),
+    ],
+)
+async def test_secrets_are_written_without_a_look(why: Any, there: bool, said: list[str]) -> None:
+    store = Secrets(*["one-tls"] * there)
+    children = made_on(cast(Any, store))
+    assert await children.write_secret(APPLICATION, "one", kinds.SECRET.header("one-tls", "city"), why)
+    assert store.said == said
+    assert store.there == {"one-tls"}
+
+
+@pytest.mark.parametrize("why", ["new", "renewed", "lost"])
+async def test_a_quota_that_is_used_up_is_said_of_a_secret_that_is_not_there(why: Any) -> None:
+    """The API server looks at quotas first: it would refuse to make one that is there, and no try would ever succeed."""
+    secret = kinds.SECRET.header("one-tls", "city")
+    store = Secrets("one-tls")
+    store.full = True
+    assert await made_on(cast(Any, store)).write_secret(APPLICATION, "one", secret, why)
+    assert store.said[-1] == "replace"
+    store.there.clear()
+    with pytest.raises(KubeError, match="exceeded quota"):
+        await made_on(cast(Any, store)).write_secret(APPLICATION, "one", secret, why)
+
+
+async def test_no_secret_of_anothers_deployment_is_written() -> None:
+    store = Secrets()
+    copies = {kind: OwnedObjects(cast(Any, store), kind, lambda body: body, lambda *_: None) for kind in kinds.CHILDREN}
+    copies[kinds.DEPLOYMENT].record_write(
+        (APPLICATION.key[0], "one"), kinds.DEPLOYMENT.header("one", APPLICATION.key[0])
+    )
+    children = ChildObjects(cast(Any, store), copies, cast(Any, None))
+    assert not await children.write_secret(APPLICATION, "one", kinds.SECRET.header("one-tls", "city"), "new")
+    assert store.said == []
+
+
+async def test_the_secret_of_a_deployment_goes_with_it_and_is_deleted_again_where_that_was_refused() -> None:
+    store = Secrets("one-tls")
+    copies = {kind: OwnedObjects(cast(Any, store), kind, lambda body: body, lambda *_: None) for kind in kinds.CHILDREN}
+    children = ChildObjects(cast(Any, store), copies, cast(Any, None))
+    copies[kinds.DEPLOYMENT].record_write(
+        (APPLICATION.key[0], "one"), owned_object(kinds.DEPLOYMENT, APPLICATION, "one", {})
+    )
+    store.refused = True
+    with pytest.raises(KubeError, match="no"):
+        await children.remove(APPLICATION.key, kinds.DEPLOYMENT)
+    assert store.said == ["delete Deployment"], "what runs goes all the same"
+    store.refused = False
+    await children.remove(APPLICATION.key, kinds.SERVICE)
+    assert store.there == set()
+    store.said.clear()
+    await children.remove(APPLICATION.key, kinds.SERVICE)
+    assert store.said == []

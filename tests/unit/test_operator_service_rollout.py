@@ -1,0 +1,462 @@
+"""Services of nodes: which are replaced when, and which nodes are not heard of any more."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from datetime import UTC, datetime
+from typing import Any
+
+import pytest
+from fractus_core.api import Drone, EdgeNode
+from fractus_operator.cache import ClusterCache
+from fractus_operator.conditions import ConditionUpdate
+from fractus_operator.kinds import GRANT
+from fractus_operator.mission_condition import MissionConditionController
+from fractus_operator.node_conditions import NodeConditionWriter
+from fractus_operator.node_liveness import NodeLivenessController, ObservationClock, StaleNodeDetector
+from fractus_operator.node_services import NodeServices, Revision, parse_revision
+from fractus_operator.pods import PodView, parse_pod
+from fractus_operator.service_rollout import ServiceRollout, ServicesOfNode, next_step
+from fractus_operator.store import KubeError, Store
+
+V1 = "fractus.dev/v1alpha1"
+
+
+def pod(node: str = "d1", revision: str = "new", **changes: Any) -> PodView:
+    labels = {"controller-revision-hash": revision}
+    owner = {"apiVersion": "apps/v1", "kind": "DaemonSet", "name": "fractus-mobility", "controller": True}
+    metadata = {
+        "namespace": "fractus-system",
+        "name": f"m-{node}-{revision}",
+        "labels": labels,
+        "ownerReferences": [owner],
+    }
+    return parse_pod({"metadata": metadata | changes, "spec": {"nodeName": node}})
+
+
+def node(
+    name: str, *, outdated: bool = True, starting: bool = False, obstacle: str = "", starting_s: float = 0.0
+) -> ServicesOfNode:
+    pods = (pod(name, "old"),) if outdated else ()
+    waited_for = {"fractus-mobility": "m"} if starting else {}
+    return ServicesOfNode(name, pods, waited_for, (obstacle, f"{name} is so") if obstacle else None, starting_s)
+
+
+def step_of(*nodes: ServicesOfNode, ready: int = 0) -> tuple[list[str], dict[str, ConditionUpdate]]:
+    chosen, said = next_step(nodes, len(nodes), lambda _: ready)
+    return [n.node for n in chosen], said
+
+
+def test_one_node_is_replaced_at_a_time() -> None:
+    chosen, said = step_of(node("d1"), node("d2"), node("d3"))
+    assert chosen == ["d1"]
+    assert [said[n].reason for n in ("d1", "d2", "d3")] == ["Replacing", "Queued", "Queued"]
+    assert "when the services of d1 are ready" in said["d2"].message
+    assert "m-d2-old" in said["d2"].message
+
+
+def test_others_wait_for_services_that_start() -> None:
+    chosen, said = step_of(node("d1", outdated=False, starting=True), node("d2"))
+    assert not chosen
+    assert said["d1"].reason == "Starting"
+    assert "when the services of d1 are ready" in said["d2"].message
+
+
+@pytest.mark.parametrize("obstacle", ["InTheAir", "OnMission", "NodeUnreachable"])
+def test_a_drone_that_flies_may_fly_or_is_out_of_reach_keeps_its_services(obstacle: str) -> None:
+    chosen, said = step_of(node("d1", obstacle=obstacle), node("d2"))
+    assert chosen == ["d2"], "and no other waits for it"
+    assert (said["d1"].status, said["d1"].reason) == ("False", obstacle)
+    assert "d1 is so" in said["d1"].message
+
+
+def test_a_node_out_of_reach_holds_no_other_up() -> None:
+    chosen, _ = step_of(node("d1", outdated=False, starting=True, obstacle="NodeUnreachable"), node("d2"))
+    assert chosen == ["d2"]
+
+
+STUCK = {"outdated": False, "starting": True, "starting_s": 601.0}
+
+
+def test_a_node_that_never_gets_ready_is_left_behind_and_said() -> None:
+    chosen, said = step_of(node("d1", **STUCK), node("d2"))
+    assert chosen == ["d2"]
+    assert (said["d1"].reason, said["d1"].warning) == ("NotReady", True)
+    assert "m: not ready for 10 minutes; the rollout continues without it" in said["d1"].message
+
+
+def test_a_release_that_does_not_start_stops_at_the_second_node() -> None:
+    failed = [node("d1", **STUCK), node("d2", **STUCK)]
+    chosen, said = step_of(*failed, node("d3"))
+    assert not chosen
+    assert "other nodes wait" in said["d1"].message
+    assert step_of(*failed, node("d3"), ready=2)[0] == ["d3"], "others run it"
+
+
+def test_what_runs_badly_already_is_replaced_last() -> None:
+    ready = replace(node("d2"), outdated=(replace(pod("d2", "old"), ready=True),))
+    assert step_of(node("d1"), ready)[0] == ["d2"]
+
+
+def test_large_fleets_take_one_of_twenty() -> None:
+    assert len(step_of(*(node(f"d{i:03}") for i in range(100)))[0]) == 5
+
+
+def test_what_is_asked_for_is_the_revision_with_the_highest_number() -> None:
+    services = NodeServices("fractus-system")
+    old, new = pod(revision="old"), pod(revision="new")
+    for one in (old, new):
+        services.pod_changed((one.namespace, one.name), None, one)
+    assert services.is_current(old), "no revision is known yet"
+    services.revision_changed(("", "a"), None, Revision("fractus-mobility", 1, "old"))
+    services.revision_changed(("", "b"), None, Revision("fractus-mobility", 2, "new"))
+    services.revision_changed(("", "c"), None, Revision("fractus-camera", 9, "else"))
+    assert (services.is_current(old), services.is_current(new)) == (False, True)
+    services.revision_changed(("", "a"), None, Revision("fractus-mobility", 3, "old"))
+    assert (services.is_current(old), services.is_current(new)) == (True, False), "rolled back"
+    services.pod_changed((old.namespace, old.name), old, None)
+    assert (len(services), list(services.on("d1"))) == (1, [new])
+    assert services.ready("fractus-mobility") == 0
+    for change in (replace(old, ready=True), old, replace(old, ready=True)):
+        services.pod_changed((old.namespace, old.name), services._pods["d1"].get((old.namespace, old.name)), change)
+    assert services.ready("fractus-mobility") == 1
+
+
+def test_only_what_changed_is_looked_at_again() -> None:
+    services = NodeServices("fractus-system")
+    for one in (pod("d1"), pod("d2")):
+        services.pod_changed((one.namespace, one.name), None, one)
+    assert services.take_changed() == {"d1", "d2"}
+    assert not services.take_changed()
+    services.revision_changed(("", "a"), None, Revision("fractus-mobility", 1, "old"))
+    assert services.take_changed() == {"d1", "d2"}, "another release is asked for"
+    services.revision_changed(("", "b"), None, Revision("fractus-mobility", 0, "older"))
+    assert not services.take_changed()
+    gone = pod("d2")
+    services.pod_changed((gone.namespace, gone.name), gone, None)
+    assert services.take_changed() == {"d2"}
+
+
+def test_pods_and_revisions_of_others_are_no_services() -> None:
+    services = NodeServices("fractus-system")
+    for other in (pod(ownerReferences=[]), pod(namespace="default")):
+        services.pod_changed((other.namespace, other.name), None, other)
+    assert not len(services)
+    assert parse_revision({"metadata": {"name": "x", "namespace": "fractus-system"}, "revision": 1}) is None
+
+
+# -- silence --
+
+
+def drone(seen: str | None, state: str = "flying") -> Drone:
+    status = {"flightState": state, "lastFlightState": state} | ({"lastSeen": seen} if seen else {})
+    return Drone.from_body({"apiVersion": V1, "kind": "Drone", "metadata": {"name": "d"}, "spec": {}, "status": status})
+
+
+def at(second: int) -> str:
+    return datetime(2026, 1, 1, 0, 0, second, tzinfo=UTC).isoformat()
+
+
+def test_a_drone_in_the_air_is_silent_after_fifteen_seconds() -> None:
+    silence = StaleNodeDetector()
+    assert not silence.stale_nodes([drone(at(0))], 100.0)
+    assert not silence.stale_nodes([drone(at(0))], 115.0)
+    assert silence.stale_nodes([drone(at(0))], 115.1)
+    assert not silence.stale_nodes([drone(at(5))], 116.0), "it reports again"
+
+
+@pytest.mark.parametrize("jump", ["2020-01-01T00:00:00Z", "2031-01-01T00:00:00Z"])
+def test_the_clock_of_a_node_counts_for_nothing(jump: str) -> None:
+    silence = StaleNodeDetector()
+    silence.stale_nodes([drone(at(0))], 100.0)
+    assert not silence.stale_nodes([drone(jump)], 114.0)
+    assert not silence.stale_nodes([drone(jump)], 129.0)
+    assert silence.stale_nodes([drone(jump)], 129.1)
+
+
+def test_what_reports_rarely_is_silent_later() -> None:
+    silence, standing = StaleNodeDetector(), drone(at(0), "inactive")
+    spec = {"location": {"lat": 1, "lon": 2}}
+    body = {"apiVersion": V1, "kind": "EdgeNode", "metadata": {"name": "e"}, "spec": spec}
+    edge = EdgeNode.from_body({**body, "status": {"lastSeen": at(0)}})
+    assert not silence.stale_nodes([standing, edge], 0.0)
+    assert not silence.stale_nodes([standing, edge], 90.0)
+    assert silence.stale_nodes([standing, edge], 91.0) == [standing]
+    assert silence.stale_nodes([standing, edge], 181.0) == [standing, edge]
+
+
+def test_a_node_that_never_reported_is_not_silent() -> None:
+    silence = StaleNodeDetector()
+    for now_s in (0.0, 1000.0):
+        assert not silence.stale_nodes([drone(None)], now_s)
+
+
+def test_an_outage_of_the_api_server_is_no_silence_of_nodes() -> None:
+    now_s, hears = [0.0], [True]
+    clock, silence = ObservationClock(lambda: now_s[0], lambda: hears[0]), StaleNodeDetector()
+
+    def silent_after(seconds: int) -> bool:
+        found = False
+        for _ in range(seconds):
+            now_s[0] += 1.0
+            found = bool(silence.stale_nodes([drone(at(0))], clock.now_s()))
+        return found
+
+    assert not silent_after(5)
+    hears[0] = False
+    assert not silent_after(600)
+    hears[0] = True
+    assert not silent_after(15), "agents try again at most 15 s apart"
+    assert not silent_after(10)
+    assert silent_after(6)
+
+
+def test_an_operator_that_was_held_up_gives_nodes_their_time() -> None:
+    now_s = [0.0]
+    clock = ObservationClock(lambda: now_s[0], lambda: True)
+    now_s[0] += 60.0
+    assert clock.now_s() <= 3.0
+
+
+# -- steps --
+
+
+class Api(Store):
+    """What the API server has of drones; it refuses writes of some."""
+
+    def __init__(self) -> None:
+        # Without a connection: `request` answers.
+        self.field_manager = "test"
+        self.objects: dict[str, dict[str, Any]] = {}
+        self.refused: set[str] = set()
+        self.forbidden: set[str] = set()
+        self.asked: list[tuple[str, str]] = []
+
+    async def request(self, method: str, path: str, body: Any = None, **_: Any) -> Any:
+        name = path.removesuffix("/status").rpartition("/")[2]
+        if method != "GET":
+            self.asked.append((method, name))
+        if name in self.refused:
+            raise KubeError(422, "Invalid", f"{name} is refused")
+        if method in self.forbidden:
+            raise KubeError(403, "Forbidden", f"the account cannot {method} {path}")
+        if method == "PUT":
+            self.objects[name] = body
+        if method == "PATCH":
+            # As an apply of a list whose items are told apart by their type.
+            status = self.objects[name].setdefault("status", {})
+            new = {condition["type"]: condition for condition in body["status"]["conditions"]}
+            others = [each for each in status.get("conditions", ()) if each["type"] not in new]
+            status["conditions"] = [*others, *new.values()]
+        return json.loads(json.dumps(self.objects.get(name, {})))
+
+
+@pytest.fixture
+async def cache() -> ClusterCache:
+    """Three drones on the ground, with one outdated service each; all of it is known."""
+    found = ClusterCache(Api())
+    for informer in found.informers():
+        informer.synced.set()
+    for name in ("d1", "d2", "d3"):
+        body = drone(at(0), "inactive").to_dict()
+        body["metadata"]["name"] = name
+        found.drones.record_write(("", name), body)
+        ready = {"conditions": [{"type": "Ready", "status": "True"}]}
+        found.hosts.record_write(("", name), {"metadata": {"name": name}, "spec": {}, "status": ready})
+        shown(found, pod(name, "old"))
+    found.services.revision_changed(("", "b"), None, Revision("fractus-mobility", 2, "new"))
+    return found
+
+
+def shown(cache: ClusterCache, new: PodView) -> None:
+    cache.services.pod_changed((new.namespace, new.name), None, new)
+
+
+def removed(cache: ClusterCache, old: PodView) -> None:
+    cache.services.pod_changed((old.namespace, old.name), old, None)
+
+
+def reported(cache: ClusterCache, api: Api) -> NodeConditionWriter:
+    for body in cache.drones.values():
+        api.objects.setdefault(body.name, body.to_dict())
+    return NodeConditionWriter(api, cache, lambda: datetime(2026, 1, 1, tzinfo=UTC))
+
+
+def told(api: Api, name: str, type_: str) -> str:
+    conditions = api.objects[name]["status"].get("conditions", ())
+    return next((c["reason"] for c in conditions if c["type"] == type_), "")
+
+
+async def test_a_pod_that_gets_no_successor_stops_the_rollout(cache: ClusterCache) -> None:
+    api = Api()
+    now_s = [0.0]
+    rollout = ServiceRollout(api, cache, reported(cache, api), lambda: now_s[0])
+
+    async def step() -> list[str]:
+        api.asked.clear()
+        await rollout.step()
+        for name, body in api.objects.items():
+            if name in {"d1", "d2", "d3"}:
+                cache.drones.record_write(("", name), json.loads(json.dumps(body)))
+        return [name for method, name in api.asked if method == "DELETE"]
+
+    assert await step() == ["m-d1-old"]
+    removed(cache, pod("d1", "old"))
+    assert not await step(), "no other is deleted before the first has its successor"
+    now_s[0] = 600.0
+    assert not await step(), "nor before it was given its time"
+    assert told(api, "d1", "ServicesCurrent") == "Starting"
+    starting = pod("d1", "new")
+    shown(cache, starting)
+    assert not await step()
+    shown(cache, replace(starting, ready=True))
+    assert await step() == ["m-d2-old"]
+    removed(cache, pod("d2", "old"))
+    cache.hosts._drop(("", "d2"))
+    assert await step() == ["m-d3-old"], "a node that is gone is owed nothing"
+
+
+async def test_a_node_that_never_gets_ready_keeps_no_other_from_a_release(cache: ClusterCache) -> None:
+    api, now_s = Api(), [0.0]
+    rollout = ServiceRollout(api, cache, reported(cache, api), lambda: now_s[0])
+    await rollout.step()
+    removed(cache, pod("d1", "old"))
+    shown(cache, pod("d1", "new"))
+    for now_s[0] in (10.0, 605.0):
+        await rollout.step()
+        assert [name for method, name in api.asked if method == "DELETE"] == ["m-d1-old"]
+    now_s[0] = 620.0
+    await rollout.step()
+    assert [name for method, name in api.asked if method == "DELETE"] == ["m-d1-old", "m-d2-old"]
+    assert told(api, "d1", "ServicesCurrent") == "NotReady"
+
+
+async def test_a_fleet_that_is_as_it_should_be_is_not_looked_through(
+    cache: ClusterCache, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cache.services.revision_changed(("", "c"), None, Revision("fractus-mobility", 3, "old"))
+    for name in ("d1", "d2", "d3"):
+        shown(cache, replace(pod(name, "old"), ready=True))
+    rollout = ServiceRollout(api := Api(), cache, reported(cache, api), lambda: 0.0)
+    await rollout.step()
+    monkeypatch.setattr(cache.services, "on", None)
+    await rollout.step()
+    assert not api.asked
+
+
+async def test_a_pod_that_may_not_be_deleted_holds_no_other_back(cache: ClusterCache) -> None:
+    api = Api()
+    for name in map(str, range(40)):
+        shown(cache, pod(f"e{name}", "old"))
+        cache.hosts.record_write(
+            ("", f"e{name}"),
+            {"metadata": {"name": f"e{name}"}, "status": {"conditions": [{"type": "Ready", "status": "True"}]}},
+        )
+    api.refused = {"m-d1-old", "d2"}
+    await ServiceRollout(api, cache, reported(cache, api), lambda: 0.0).step()
+    assert [name for method, name in api.asked if method == "DELETE"] == ["m-d1-old", "m-d2-old"]
+    assert told(api, "d1", "ServicesCurrent") == "Refused"
+    assert told(api, "d3", "ServicesCurrent") == "Queued", "after d2, whose status is refused"
+
+
+@pytest.mark.parametrize("seen", [None, "2026-01-01T00:00:00z", "yesterday"])
+async def test_any_time_of_a_report_can_be_compared(cache: ClusterCache, seen: str | None) -> None:
+    api, now_s = Api(), [0.0]
+    watch = NodeLivenessController(cache, reported(cache, api), lambda: now_s[0])
+    await watch.step()
+    api.objects["d1"]["status"] = {"lastSeen": seen} if seen else {}
+    api.refused = {"d2"}
+    now_s[0] = 1000.0
+    await watch.step()
+    assert told(api, "d1", "Ready") == ("AgentSilent" if seen and seen.endswith("z") else "")
+    assert told(api, "d3", "Ready") == "AgentSilent", "after d2, whose status is refused"
+
+
+# -- missions --
+
+
+def granted(cache: ClusterCache, name: str, node: str | None) -> None:
+    """A Grant appears, or goes (None)."""
+    owner = {"namespace": "ns", "name": "app", "uid": "u"}
+    grants = cache.children[GRANT]
+    if node is None:
+        grants._drop(("", name))
+    else:
+        spec = {"node": node, "application": owner, "component": "A", "instance": "a"}
+        grants.record_write(("", name), {"apiVersion": V1, "kind": "Grant", "metadata": {"name": name}, "spec": spec})
+
+
+async def test_a_drone_may_take_off_until_it_reports_after_its_last_grant(cache: ClusterCache) -> None:
+    api = Api()
+    missions = MissionConditionController(api, cache, reported(cache, api), lambda: datetime(2026, 1, 1, tzinfo=UTC))
+    changed: list[Any] = []
+    cache.add_listener(GRANT, lambda key: changed.append(missions.grant_changed(key)))
+
+    async def said(**status: Any) -> str:
+        api.objects["d1"]["status"] |= status
+        cache.drones.record_write(("", "d1"), json.loads(json.dumps(api.objects["d1"])))
+        await missions.reconcile(("", "d1"))
+        cache.drones.record_write(("", "d1"), json.loads(json.dumps(api.objects["d1"])))
+        return told(api, "d1", "OnMission")
+
+    assert await said() == "", "nothing was ever granted"
+    granted(cache, "ns.a", "d1")
+    assert await said() == "Granted"
+    assert api.asked == [("PATCH", "d1")], "it takes one request, and no look before"
+    assert cache.drones.get(("", "d1")).may_take_off  # type: ignore[union-attr]
+    granted(cache, "ns.a", None)
+    assert await said() == "NotHeardOf"
+    assert await said() == "NotHeardOf"
+    assert await said(lastSeen=at(30), flightState="unknown") == "NotHeardOf"
+    assert cache.drones.get(("", "d1")).may_take_off  # type: ignore[union-attr]
+    for _ in range(2):
+        assert await said(lastSeen=at(31), flightState="inactive") == "NotHeardOf", (
+            "it may be older than the Grant's end"
+        )
+    assert await said(lastSeen=at(59)) == "NoGrant"
+    assert not cache.drones.get(("", "d1")).may_take_off  # type: ignore[union-attr]
+
+
+async def test_what_was_said_of_a_drone_is_not_said_again_before_the_watch_shows_it(cache: ClusterCache) -> None:
+    """Grants of an application come one by one."""
+    api = Api()
+    missions = MissionConditionController(api, cache, reported(cache, api), lambda: datetime(2026, 1, 1, tzinfo=UTC))
+    cache.add_listener(GRANT, lambda key: bool(missions.grant_changed(key)))
+    for name in ("ns.a", "ns.b", "ns.c"):
+        granted(cache, name, "d1")
+        await missions.reconcile(("", "d1"))
+    assert api.asked == [("PATCH", "d1")]
+
+
+def test_a_drone_that_someone_saw_on_the_ground_is_there_until_its_next_report() -> None:
+    flying = drone(at(0)).to_dict()
+
+    def in_air(annotation: str) -> bool:
+        flying["metadata"]["annotations"] = {"fractus.dev/grounded": annotation}
+        return Drone.from_body(json.loads(json.dumps(flying))).in_air
+
+    assert not in_air("2026-01-01T00:00:00Z")
+    for other in ("2026-01-01T00:00:01Z", "2026-01-01T00:00:00", "yes", ""):
+        assert in_air(other)
+
+
+async def test_a_role_of_an_earlier_release_keeps_no_condition_from_a_drone(
+    cache: ClusterCache, caplog: pytest.LogCaptureFixture
+) -> None:
+    """After `helm rollback` it allows updates only: admission goes by OnMission, and would take the drone for idle."""
+    api = Api()
+    api.forbidden = {"PATCH"}
+    missions = MissionConditionController(api, cache, reported(cache, api), lambda: datetime(2026, 1, 1, tzinfo=UTC))
+    cache.add_listener(GRANT, lambda key: bool(missions.grant_changed(key)))
+    for name, reason in (("ns.a", "Granted"), (None, "NotHeardOf"), (None, "NotHeardOf")):
+        granted(cache, "ns.a", "d1" if name else None)
+        await missions.reconcile(("", "d1"))
+        assert told(api, "d1", "OnMission") == reason
+    assert api.asked == [("PATCH", "d1"), ("PUT", "d1")] * 2, "nothing is tried again and again"
+    (said,) = (record.getMessage() for record in caplog.records if record.levelname == "WARNING")
+    assert "upgrade the chart fractus, because its ClusterRole belongs to another release" in said
+    api.forbidden = {"PATCH", "PUT"}
+    granted(cache, "ns.c", "d2")
+    with pytest.raises(KubeError, match="cannot PUT"):
+        await missions.reconcile(("", "d2"))

@@ -1,0 +1,118 @@
+"""What the operator says of applications, and when it does without."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+import yaml
+from fractus_core.api.plans import DeploymentPlanSpec
+from fractus_operator.cache import ClusterCache
+from fractus_operator.conditions import ConditionUpdate
+from fractus_operator.kinds import Body, Kind
+from fractus_operator.parsing import Submitted, parse_application
+from fractus_operator.status import StatusUpdate
+from fractus_operator.status_reporter import StatusReporter
+from fractus_operator.store import Conflict, KubeError, Store
+
+INPUT = yaml.safe_load((Path(__file__).parents[1] / "golden" / "operator" / "input.yaml").read_text())
+PLAN = DeploymentPlanSpec.model_validate(INPUT["plan"])
+NOW = datetime(2026, 6, 1, 12, 0, tzinfo=UTC)
+DONE = StatusUpdate("Completed", "done", (ConditionUpdate("Ready", "False", "MissionComplete", "done", progress=True),))
+
+
+class Statuses:
+    """An API server that takes the status of applications and Events, or refuses them all."""
+
+    def __init__(self) -> None:
+        self.refusal: KubeError | None = None
+        self.written: list[Body] = []
+        self.events: list[str] = []
+
+    async def apply(self, _kind: Kind, body: Body, *, subresource: str) -> Body:
+        assert subresource == "status"
+        if self.refusal is not None:
+            raise self.refusal
+        self.written.append(body["status"])
+        return {**INPUT["application"], **body, "metadata": {**INPUT["application"]["metadata"], **body["metadata"]}}
+
+    async def create_event(self, _regarding: Body, *, reason: str, **_: Any) -> None:
+        self.events.append(reason)
+
+
+def new() -> tuple[Statuses, ClusterCache, StatusReporter, Submitted]:
+    """An application without a status."""
+    api, cache = Statuses(), ClusterCache(cast(Store, None))
+    submitted = parse_application({k: v for k, v in INPUT["application"].items() if k != "status"})
+    cache.applications.record_write(submitted.key, submitted.body)
+    return api, cache, StatusReporter(cast(Any, api), cache.applications, lambda: NOW), submitted
+
+
+async def test_who_waits_for_many_others_is_told_that_it_is_planned() -> None:
+    api, _, reporter, submitted = new()
+    await reporter.report_queued(submitted, PLAN, 1)
+    assert not api.written, "its first status comes soon enough"
+    await reporter.report_queued(submitted, PLAN, 20)
+    (said,) = api.written
+    assert (said["phase"], said["conditions"][0]["reason"]) == ("Pending", "OperatorBusy")
+    assert "20 other Applications" in said["message"]
+    assert not api.events, "an Event would be another request"
+    await reporter.report_queued(submitted, PLAN, 21)
+    assert len(api.written) == 1, "who has a status is not told"
+
+
+async def test_a_first_status_that_is_refused_stops_nothing() -> None:
+    api, _, reporter, submitted = new()
+    api.refusal = KubeError(429, "TooManyRequests", "later")
+    await reporter.report_queued(submitted, PLAN, 20)
+    assert not reporter.last(submitted)
+
+
+async def test_an_outcome_that_conflicts_is_not_taken_for_recorded() -> None:
+    """What follows removes the grants, the only other record of it: the mission would be flown again."""
+    api, cache, reporter, submitted = new()
+    api.refusal = Conflict(409, "Conflict", "it changed meanwhile")
+    with pytest.raises(Conflict):
+        await reporter.report(submitted, DONE)
+    cache.applications._drop(submitted.key)
+    await reporter.report(submitted, DONE)
+    assert not reporter.last(submitted)
+
+
+async def test_what_fails_for_long_is_not_left_at_a_sentence_that_is_not_true_any_more() -> None:
+    """Such as that many others come first, while a webhook refuses each of its Deployments."""
+    api, _, reporter, submitted = new()
+    await reporter.report_queued(submitted, PLAN, 20)
+    error = KubeError(500, "InternalError", "failed calling webhook")
+    for attempts in (1, 2):
+        await reporter.report_failure(submitted, attempts, error)
+    assert len(api.written) == 1, "a moment's failure costs no request"
+    for attempts in (3, 4):
+        await reporter.report_failure(
+            submitted, attempts, KubeError(500, "InternalError", f"failed calling webhook in {attempts} s")
+        )
+    _, said = api.written
+    assert (said["phase"], [(c["type"], c["reason"]) for c in said["conditions"]]) == (
+        "Pending",
+        [("Deployed", "InternalError"), ("Ready", "InternalError")],
+    )
+    assert "failed calling webhook" in said["message"]
+    assert api.events == ["InternalError"]
+
+
+async def test_a_flight_goes_on_while_its_application_cannot_be_reconciled() -> None:
+    api, _, reporter, submitted = new()
+    ready = (ConditionUpdate("Ready", "True", "PodsReady"), ConditionUpdate("Deployed", "True", "Deployed"))
+    await reporter.report(submitted, StatusUpdate("Flying", "it flies", ready, drone="drone-1", pods="3/3"))
+    api.refusal = error = KubeError(429, "TooManyRequests", "later")
+    await reporter.report_failure(submitted, 3, error)
+    api.refusal = None
+    await reporter.report_failure(submitted, 4, error)
+    assert (api.written[1]["phase"], api.written[1]["drone"], api.written[1]["pods"]) == ("Flying", "drone-1", "3/3")
+    assert [c["status"] for c in api.written[1]["conditions"]] == ["True", "False"]
+    await reporter.report(submitted, DONE)
+    await reporter.report_failure(submitted, 5, error)
+    await reporter.report_failure(None, 5, error)
+    assert len(api.written) == 3, "the outcome of a mission has no other record"

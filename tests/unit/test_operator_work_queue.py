@@ -1,0 +1,119 @@
+"""The worklist: each key once, failures again later."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+from fractus_operator import work_queue as work_queue_module
+from fractus_operator.kinds import Key
+from fractus_operator.work_queue import WorkQueue, run_periodically
+from fractus_runtime.kubernetes import KubeError
+
+
+async def test_an_unforeseen_failure_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(work_queue_module, "_FIRST_RETRY_S", 0.001)
+    attempts: list[Key] = []
+    done = asyncio.Event()
+
+    async def reconcile(key: Key) -> None:
+        attempts.append(key)
+        if key == ("", "bad") and attempts.count(key) == 1:
+            raise KeyError("spec")
+        if ("", "good") in attempts and attempts.count(("", "bad")) == 2:
+            done.set()
+
+    work_queue = WorkQueue("test", reconcile)
+    work_queue.add(("", "bad"))
+    work_queue.add(("", "good"))
+    task = asyncio.create_task(work_queue.run())
+    async with asyncio.timeout(5):
+        await done.wait()
+    task.cancel()
+
+
+async def test_a_key_is_reconciled_once_for_many_changes() -> None:
+    seen: list[Key] = []
+    done = asyncio.Event()
+
+    async def reconcile(key: Key) -> None:
+        seen.append(key)
+        if key == ("", "last"):
+            done.set()
+
+    work_queue = WorkQueue("test", reconcile)
+    for _ in range(5):
+        work_queue.add(("", "a"))
+    work_queue.add(("", "last"))
+    task = asyncio.create_task(work_queue.run())
+    async with asyncio.timeout(5):
+        await done.wait()
+    task.cancel()
+    assert seen == [("", "a"), ("", "last")]
+
+
+async def test_a_change_during_a_reconcile_is_not_lost() -> None:
+    seen: list[int] = []
+    done = asyncio.Event()
+    value = 1
+
+    async def reconcile(key: Key) -> None:
+        nonlocal value
+        seen.append(value)
+        if value == 1:
+            value = 2
+            work_queue.add(key)
+            await asyncio.sleep(0)
+        else:
+            done.set()
+
+    work_queue = WorkQueue("test", reconcile)
+    work_queue.add(("", "a"))
+    task = asyncio.create_task(work_queue.run())
+    async with asyncio.timeout(5):
+        await done.wait()
+    task.cancel()
+    assert seen == [1, 2]
+
+
+async def test_a_failure_is_tried_again_and_holds_up_no_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(work_queue_module, "_FIRST_RETRY_S", 0.001)
+    attempts: dict[Key, int] = {}
+    done = asyncio.Event()
+
+    async def reconcile(key: Key) -> None:
+        attempts[key] = attempts.get(key, 0) + 1
+        if key == ("", "bad") and attempts[key] < 4:
+            raise KubeError(500, "InternalError", "not now")
+        if key == ("", "bad"):
+            done.set()
+
+    work_queue = WorkQueue("test", reconcile)
+    work_queue.add(("", "bad"))
+    work_queue.add(("", "good"))
+    task = asyncio.create_task(work_queue.run())
+    async with asyncio.timeout(5):
+        await done.wait()
+        await asyncio.sleep(0)
+    task.cancel()
+    assert attempts == {("", "bad"): 4, ("", "good"): 1}
+    assert work_queue.failures == {}
+
+
+@pytest.mark.parametrize("failure", [ValueError("no time"), KubeError(500, "InternalError", "not now")])
+async def test_a_step_that_fails_is_made_again(failure: Exception, caplog: pytest.LogCaptureFixture) -> None:
+    steps: list[int] = []
+    done = asyncio.Event()
+
+    async def step() -> None:
+        steps.append(1)
+        if len(steps) == 1:
+            raise failure
+        done.set()
+
+    task = asyncio.create_task(run_periodically("test", step, 0.001))
+    async with asyncio.timeout(5):
+        await asyncio.wait((task, asyncio.ensure_future(done.wait())), return_when=asyncio.FIRST_COMPLETED)
+    assert not task.done()
+    task.cancel()
+    assert ("Traceback" in caplog.text) == isinstance(failure, ValueError)

@@ -8,7 +8,7 @@ import random
 from collections.abc import Callable
 from dataclasses import replace
 
-from fractus_runtime.mavlink_codec import Message
+from fractus_runtime.mavlink_codec import Message, Value, message_class
 from fractus_vehicle.copter import SUPPORTED_MODES
 from fractus_vehicle.simulation import Simulation
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -32,9 +32,18 @@ class RecordingPilot(Pilot):
     def read(self) -> list[Message]:
         messages = super().read()
         for message in messages:
-            values = [round(v, 3) + 0.0 if isinstance(v, float) else v for v in message.values.values()]
+            kind = message_class(message.name)
+            lengths = dict(zip(kind.ordered_fieldnames, kind.array_lengths, strict=True))
+            values = [_hashed(value, lengths[name]) for name, value in message.values.items()]
             self.heard.update(f"{message.name}{values}".encode())
         return messages
+
+
+def _hashed(value: Value, length: int) -> Value:
+    """Return a value as the digests contain it: rounded, and text with the NULs that fill its field."""
+    if isinstance(value, bytes):
+        return value.ljust(length, b"\0")
+    return round(value, 3) + 0.0 if isinstance(value, float) else value
 
 
 def pilot_of(seed: int, **parameters: float) -> RecordingPilot:

@@ -8,7 +8,7 @@ from collections.abc import Collection, Mapping
 
 from fractus_runtime.mavlink_codec import Message, message
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
-from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
+from fractus_services.mobility.mavlink.mavlink_autopilot import MavlinkAutopilot
 
 BY_NAME = 65535
 """The index in answers to names, and in the news of a change."""

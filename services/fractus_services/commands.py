@@ -196,7 +196,7 @@ def mobility() -> None:
 @click.option("--verbose", "-v", is_flag=True, help="Log more.")
 def serve_mobility(verbose: bool, **given: Any) -> None:
     """Serve until stopped. Waits for certificates and for the autopilot."""
-    from fractus_services.mobility.mavlink.startup import with_heartbeats  # noqa: PLC0415 - keeps the command line fast
+    from fractus_services.mobility.mavlink.startup_heartbeat import with_heartbeats  # noqa: PLC0415 - keeps the command line fast
 
     async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
         # Imports take most of the start, on a small computer longer than the heartbeat time-out of a drone in flight.

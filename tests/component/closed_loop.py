@@ -27,11 +27,11 @@ from fractus_services.errors import AutopilotError, Refused
 from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.journal import Journal
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
-from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
 from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes
 from fractus_services.mobility.mavlink.fence import MissionFence
-from fractus_services.mobility.mavlink.neighbours import Memory
-from fractus_services.mobility.mavlink.returning import MavlinkReturn
+from fractus_services.mobility.mavlink.mavlink_autopilot import MavlinkAutopilot
+from fractus_services.mobility.mavlink.rtl_parameters import RtlParameters
+from fractus_services.mobility.mavlink.vehicle_identification import KnownVehicleFile
 from fractus_services.mobility.rpc.components import MobilityComponents
 from fractus_vehicle.earth import Place
 from fractus_vehicle.simulation import Simulation
@@ -382,7 +382,7 @@ class Drone:
     """The mobility service of one drone, without its gRPC server."""
 
     def __init__(
-        self, directory: Path, account: Account, *, grace_s: float = 10.0, memory: Memory | None = None
+        self, directory: Path, account: Account, *, grace_s: float = 10.0, known_vehicle: KnownVehicleFile | None = None
     ) -> None:
         self.grants = Grants()
         self._account = account
@@ -395,12 +395,12 @@ class Drone:
             on_found=lambda: self.parts.observer.found(),  # noqa: PLW0108
             on_heartbeat=lambda: self.parts.observer.heartbeat(),  # noqa: PLW0108
             on_parameter=lambda name: self.parts.observer.parameter(name),  # noqa: PLW0108
-            memory=memory,
+            known_vehicle=known_vehicle,
         )
         self.journal = Journal(directory)
         self.journal._write = lambda _data: None  # type: ignore[method-assign]
         self.parts = MobilityComponents(
-            self.autopilot, MavlinkFailsafes(self.autopilot), MissionFence(self.autopilot, directory), MavlinkReturn(self.autopilot, directory),
+            self.autopilot, MavlinkFailsafes(self.autopilot), MissionFence(self.autopilot, directory), RtlParameters(self.autopilot, directory),
             journal=self.journal, grants=self.grants, audit=self.audit,  # type: ignore[arg-type]
             clock=lambda: 1_790_000_000.0 + self.autopilot.now, grace_s=grace_s, boarding_s=0.0, state=ControlState(),
         )  # fmt: skip

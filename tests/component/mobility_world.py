@@ -23,9 +23,9 @@ from fractus_services.mobility.authority.journal import Journal
 from fractus_services.mobility.autopilot import COURSE_S, Checked
 from fractus_services.mobility.flight.service import Progress
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
-from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
 from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes
-from fractus_services.mobility.mavlink.returning import MavlinkReturn
+from fractus_services.mobility.mavlink.mavlink_autopilot import MavlinkAutopilot
+from fractus_services.mobility.mavlink.rtl_parameters import RtlParameters
 from fractus_services.mobility.mavlink.timing import PROBE_S
 from fractus_services.mobility.rpc.components import MobilityComponents
 from parameter_vehicle import FAILSAFES, MOVEMENT, told
@@ -325,7 +325,7 @@ class World:
         self.fence = Fence()
         facts = self.plane.vehicle
         parts = MobilityComponents(
-            self.plane, MavlinkFailsafes(self.plane), self.fence, MavlinkReturn(self.plane, directory), journal=self.journal, grants=self.grants,  # type: ignore[arg-type]
+            self.plane, MavlinkFailsafes(self.plane), self.fence, RtlParameters(self.plane, directory), journal=self.journal, grants=self.grants,  # type: ignore[arg-type]
             audit=self.audit, clock=lambda: 1_790_000_000.0 + self.plane.now, grace_s=grace_s, boarding_s=boarding_s,  # type: ignore[arg-type]
             state=ControlState(decided=known, armed_seen=facts.armed if known else None, expected_mode=GUIDED),
         )  # fmt: skip

@@ -41,7 +41,7 @@ def test_what_flies_needs_no_library_of_pictures() -> None:
 
 def test_the_first_heartbeats_of_a_start_wait_for_no_large_import() -> None:
     """A drone in flight waits for them: what takes a small computer seconds to import comes afterwards."""
-    _, imported = after("import fractus_services.commands, fractus_services.mobility.mavlink.startup")
+    _, imported = after("import fractus_services.commands, fractus_services.mobility.mavlink.startup_heartbeat")
     assert "pymavlink" in imported
     assert not imported & {"grpc", "google", "numpy", "shapely", "pydantic", "yaml", "cryptography", "fractus_core"}
 

@@ -23,7 +23,7 @@ def slow(plane: Plane, each_way_s: float) -> None:
 async def measured(plane: Plane, each_way_s: float) -> None:
     """Wait until the service knows the delay of a link."""
     slow(plane, each_way_s)
-    while not 2 * each_way_s <= plane.way_s < math.inf:
+    while not 2 * each_way_s <= plane.downlink_latency_s < math.inf:
         await plane.update(0.1)
 
 
@@ -79,7 +79,7 @@ def test_acknowledgements_measure_a_slow_link_to_a_vehicle_that_answers_nothing_
             slow(plane, 0.5)
             await asyncio.sleep(20.0)
             assert plane.timing.unanswering
-            assert 1.0 <= plane.way_s < 1.1
+            assert 1.0 <= plane.downlink_latency_s < 1.1
 
     fly(flight)
 

@@ -18,7 +18,7 @@ from fractus_services.errors import AutopilotError, Refused, Unavailable
 from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.home import home_moved
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
-from fractus_services.mobility.mavlink.home_watch import HomeWatch
+from fractus_services.mobility.mavlink.telemetry_requests import HomePositionMonitor
 from fractus_services.mobility.mavlink.vehicle import Vehicle
 from fractus_services.mobility.rpc.telemetry import located
 from mobility_world import FRAME, GROUND_M, GUIDED, LOITER, SMART_RTL, World, at, end, refusal, spec
@@ -119,7 +119,7 @@ def test_a_home_that_cannot_be_set_back_ends_the_flight(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("refused", [True, False])
 def test_a_home_that_does_not_stay_set_back_keeps_no_drone_in_the_air(tmp_path: Path, refused: bool) -> None:
-    """Refused by the autopilot, or moved again and again: where the path is remembered, it leads to where the mission armed."""
+    """Refused by the autopilot, or moved again and again: where the path is read_known_vehicle, it leads to where the mission armed."""
 
     async def again_and_again(world: World) -> None:
         while True:
@@ -311,19 +311,19 @@ async def test_home_that_is_not_told_is_asked_for_a_few_times_a_second() -> None
     class Refusing:
         vehicle, connected, asked = Vehicle(stack=ARDUCOPTER, armed=True, heartbeat_at=10.0), True, 0
 
-        async def ask_home(self) -> None:
+        async def request_home(self) -> None:
             self.asked += 1
             raise AutopilotError("refused", refused=True)
 
     autopilot = Refusing()
     assert autopilot.vehicle.in_air
-    watch = HomeWatch(autopilot)
+    monitor = HomePositionMonitor(autopilot)
     for amsl_m in (50.0, 90.0):
         autopilot.vehicle.amsl_m = amsl_m
-        watch.take("GLOBAL_POSITION_INT")
+        monitor.take("GLOBAL_POSITION_INT")
     for _ in range(20):
         await asyncio.sleep(0)
-        watch.take("ATTITUDE")
+        monitor.take("ATTITUDE")
     assert autopilot.asked == 1
-    assert watch._asking is not None
-    watch._asking.cancel()
+    assert monitor._request is not None
+    monitor._request.cancel()

@@ -12,7 +12,7 @@ from fractus_core.control import StreamState
 from fractus_core.policy.decision_types import TakeoffArgs
 from fractus_runtime.mavlink_codec import Endpoint, Parser
 from fractus_services.errors import Refused
-from fractus_services.mobility.mavlink.neighbours import SURE_S, Memory
+from fractus_services.mobility.mavlink.vehicle_identification import CONFIRM_AFTER_S, KnownVehicleFile
 from mobility_world import end, goto
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sky_drone import fly, ready, until
@@ -88,7 +88,7 @@ def test_nothing_arms_while_two_vehicles_are_heard(tmp_path: Path) -> None:
 
             speaking = asyncio.ensure_future(speak(sky.wires[0]))
             await until(lambda: drone.autopilot.vehicle.unclear)
-            with pytest.raises(Refused, match=r"other vehicles are heard on its link, too \(MAVLink systems 2\)"):
+            with pytest.raises(Refused, match=r"other vehicles are on its link \(MAVLink systems 2\)"):
                 await drone.service.arm(grant)
             assert not sky.truth.armed
             speaking.cancel()
@@ -154,11 +154,13 @@ def test_a_service_that_starts_again_leaves_a_stranger_alone_and_finds_its_own(s
         turning = asyncio.ensure_future(sky.turn())
 
         def started() -> Drone:
-            return Drone(directory, Account(0), memory=Memory(directory / "vehicle.json", "tcp:vehicle:1"))
+            return Drone(
+                directory, Account(0), known_vehicle=KnownVehicleFile(directory / "vehicle.json", "tcp:vehicle:1")
+            )
 
         first = started()
         await until(lambda: first.autopilot.connected)
-        await asyncio.sleep(SURE_S + 2.0)
+        await asyncio.sleep(CONFIRM_AFTER_S + 2.0)
         await first.close()
         for wire in sky.wires:
             wire.close()
@@ -179,14 +181,16 @@ def test_a_stranger_on_a_new_link_is_neither_prepared_nor_brought_home(tmp_path:
     async def work(sky: Sky, directory: Path) -> None:
         sky.craft.receive = lambda *_: None  # type: ignore[method-assign]
         told = told_to(sky, 2)
-        drone = Drone(directory, Account(0), memory=Memory(directory / "vehicle.json", "tcp:vehicle:1"))
+        drone = Drone(
+            directory, Account(0), known_vehicle=KnownVehicleFile(directory / "vehicle.json", "tcp:vehicle:1")
+        )
         for _ in range(20):
             for wire in sky.wires:
                 wire._protocol.data_received(FLYING)
             await asyncio.sleep(1.0)
         assert not told
         assert not drone.autopilot.found
-        assert "unknown vehicle with running motors is heard (MAVLink system 2)" in drone.control.arming_problem
+        assert "unknown vehicle is armed (MAVLink system 2)" in drone.control.arming_problem
         await drone.close()
 
     fly(work, tmp_path)

@@ -225,7 +225,7 @@ def test_what_cannot_be_limited_does_not_arm(tmp_path: Path) -> None:
             await world.drive(grant)
             why = await refusal(world.service.arm(grant))
             assert why.verdict.code == "ReturnNotLimited"
-            assert "WPNAV_SPEED cannot be set to 350; it stays 1000" in str(why)
+            assert "WPNAV_SPEED cannot be set to 350; it remains 1000" in str(why)
             assert not world.plane.vehicle.armed
             await world.until(lambda: held(world) == OWNED, 30)
 

@@ -14,8 +14,8 @@ from fractus_core.api.names import node_identity
 from fractus_proto.v1 import mobility_pb2 as pb
 from fractus_proto.v1 import types_pb2
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
-from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
-from fractus_services.mobility.mavlink.itemlists import download
+from fractus_services.mobility.mavlink.mavlink_autopilot import MavlinkAutopilot
+from fractus_services.mobility.mavlink.mission_protocol import download
 from mobility_rig import (
     FRAME,
     NAVIGATOR_MISSION,

@@ -12,7 +12,7 @@ import pytest
 from fractus_core.control.state import FlightMode
 from fractus_proto.v1 import mobility_pb2 as pb
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
-from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
+from fractus_services.mobility.mavlink.mavlink_autopilot import MavlinkAutopilot
 from mobility_rig import DRIVER, FRAME, NAVIGATOR_MISSION, Driver, Rig, denied, fence, flown, grant, outcomes, xy
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -81,7 +81,7 @@ async def test_a_killed_service_finds_its_drone_again(rig: Rig) -> None:
     await goto_once_located(again, 0, 40)
     reply = await again.stub.ReturnControl(pb.ReturnControlRequest(), timeout=5)
     assert reply.mission_complete
-    assert "heartbeats keep it from its failsafe" in rig.log("service"), "while it was imported"
+    assert "drone in flight, sending heartbeats" in rig.log("service"), "while it was imported"
     await rig.until(lambda t: not t.armed, 90, "landing")
 
 

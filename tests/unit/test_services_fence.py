@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from fractus_services.mobility.mavlink import acknowledgements
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
-from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
+from fractus_services.mobility.mavlink.mavlink_autopilot import MavlinkAutopilot
 
 
 class Overtaken(Exception):
@@ -41,11 +41,11 @@ async def test_no_duty_no_heartbeat(monkeypatch: pytest.MonkeyPatch) -> None:
     duty, sent = False, list[Any]()
     autopilot = MavlinkAutopilot("tcp:127.0.0.1:1", ARDUCOPTER, alive=lambda: duty)
     monkeypatch.setattr(autopilot, "send", sent.append)
-    autopilot.beat()
+    autopilot.send_heartbeat()
     assert [m.name for m in sent] == ["PARAM_REQUEST_READ"], "it knocks, so that it is answered"
     autopilot.target = (1, 1)
-    autopilot.beat()
+    autopilot.send_heartbeat()
     assert len(sent) == 1
     duty = True
-    autopilot.beat()
+    autopilot.send_heartbeat()
     assert sent[-1].name == "HEARTBEAT"

@@ -6,7 +6,7 @@ import pytest
 from fractus_core.control.state import FlightMode, ModeKind
 from fractus_runtime.mavlink_codec import Message, enum_names, message
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER, ArduCopter
-from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
+from fractus_services.mobility.mavlink.mavlink_autopilot import MavlinkAutopilot
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 

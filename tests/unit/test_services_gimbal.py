@@ -13,8 +13,7 @@ from fractus_runtime.mavlink_codec import message
 from fractus_services.errors import AutopilotError, PreconditionFailed
 from fractus_services.mobility.autopilot import Permit, always
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
-from fractus_services.mobility.mavlink.gimbal import attitude_of
-from fractus_services.mobility.mavlink.pointing import point
+from fractus_services.mobility.mavlink.gimbal import attitude_of, point
 from fractus_services.mobility.mavlink.vehicle import Vehicle
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -176,7 +175,7 @@ async def test_it_is_pointed_without_rates(limits: dict[str, float] | None) -> N
 
 async def test_a_gimbal_that_does_not_turn_that_far_is_not_asked() -> None:
     autopilot = Commanded(limits=LIMITS)
-    with pytest.raises(PreconditionFailed, match="from -90 to 20 degrees of pitch, not to 45"):
+    with pytest.raises(PreconditionFailed, match="pitch is limited to -90 to 20 degrees; 45 was requested"):
         await point(autopilot, 45.0, 0.0, always)
     assert autopilot.sent == []
 

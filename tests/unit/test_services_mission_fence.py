@@ -16,9 +16,8 @@ from fractus_core.geo import LocalFrame
 from fractus_runtime.mavlink_codec import Message
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.mavlink import fence as module
-from fractus_services.mobility.mavlink.bounds import ROOM_M, Item, bounds_of
-from fractus_services.mobility.mavlink.fence import MissionFence
-from fractus_services.mobility.mavlink.itemlists import NoLists, NoSpace
+from fractus_services.mobility.mavlink.fence import ROOM_M, MissionFence, MissionItem, fence_bounds
+from fractus_services.mobility.mavlink.mission_protocol import ItemsUnsupported, NoSpace
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from parameter_vehicle import ParameterVehicle
@@ -44,7 +43,7 @@ def spec(*areas: dict[str, Any], **more: Any) -> GrantSpec:
     return GrantSpec.model_validate(body)
 
 
-def outline(items: tuple[Item, ...]) -> Any:
+def outline(items: tuple[MissionItem, ...]) -> Any:
     return shapely.Polygon([FRAME.xy(i.lat_e7 / 1e7, i.lon_e7 / 1e7) for i in items])
 
 
@@ -54,7 +53,7 @@ class Vehicle(ParameterVehicle):
     def __init__(self) -> None:
         values = {"FENCE_ENABLE": 0.0, "FENCE_TYPE": 7.0, "FENCE_ALT_MAX": 100.0, "FENCE_ACTION": 2.0}
         super().__init__(values | {"FS_GCS_ENABLE": 1.0, "FENCE_OPTIONS": 1.0, "FENCE_TOTAL": 0.0})
-        self.items: tuple[Item, ...] = ()
+        self.items: tuple[MissionItem, ...] = ()
         self.written: list[str] = []
 
     def send(self, outgoing: Message) -> None:
@@ -71,7 +70,7 @@ def vehicle(monkeypatch: pytest.MonkeyPatch) -> Vehicle:
         vehicle.items = tuple(items)
         vehicle.values["FENCE_TOTAL"] = float(len(vehicle.items))
 
-    async def download(_autopilot: Any) -> tuple[Item, ...]:
+    async def download(_autopilot: Any) -> tuple[MissionItem, ...]:
         return vehicle.items
 
     monkeypatch.setattr(module, "upload", upload)
@@ -83,7 +82,7 @@ LIMITS = {"limits": {"maxAltitude": 60, "maxSpeed": 12}}
 
 
 def test_bounds_lie_outside_of_what_is_granted() -> None:
-    bounds = bounds_of(spec(area(-50, -50, 50, 50), corridor=[area(0, -120, 10, 0)], **LIMITS))
+    bounds = fence_bounds(spec(area(-50, -50, 50, 50), corridor=[area(0, -120, 10, 0)], **LIMITS))
     assert bounds is not None
     assert bounds.altitude_m == 65.0
     whole = shapely.union(shapely.box(-50, -50, 50, 50), shapely.box(0, -120, 10, 0))
@@ -93,7 +92,7 @@ def test_bounds_lie_outside_of_what_is_granted() -> None:
 
 
 def test_areas_apart_become_one_polygon() -> None:
-    bounds = bounds_of(spec(area(0, 0, 50, 50), area(200, 0, 250, 50)))
+    bounds = fence_bounds(spec(area(0, 0, 50, 50), area(200, 0, 250, 50)))
     assert bounds is not None
     assert bounds.altitude_m is None
     assert outline(bounds.items).contains(shapely.box(0, 0, 250, 50))
@@ -101,7 +100,7 @@ def test_areas_apart_become_one_polygon() -> None:
 
 def test_a_round_area_has_few_vertices() -> None:
     circle = {"circle": {"center": {"lat": 39.36, "lon": 22.95}, "radius": 5000}}
-    bounds = bounds_of(spec(circle))
+    bounds = fence_bounds(spec(circle))
     assert bounds is not None
     assert 4 <= len(bounds.items) <= 60
     assert outline(bounds.items).contains(shapely.Point(0, 0).buffer(5000))
@@ -118,7 +117,7 @@ def test_fewer_vertices_lie_further_out(circles: list[tuple[float, float, float]
     for x, y, radius in circles:
         lat, lon = FRAME.latlon(x, y)
         areas.append({"circle": {"center": {"lat": lat, "lon": lon}, "radius": radius}})
-    bounds = bounds_of(spec(*areas), vertices)
+    bounds = fence_bounds(spec(*areas), vertices)
     assert bounds is not None
     assert 3 <= len(bounds.items) <= vertices
     whole = shapely.union_all([shapely.Point(x, y).buffer(radius, 64) for x, y, radius in circles])
@@ -151,13 +150,13 @@ async def test_a_vehicle_with_little_space_gets_fewer_vertices(
 
 
 def test_nothing_bounded_nothing_loaded() -> None:
-    assert bounds_of(spec()) is None
+    assert fence_bounds(spec()) is None
 
 
 async def test_a_fence_is_raised_and_put_back(vehicle: Vehicle, tmp_path: Path) -> None:
     vehicle.values["FENCE_TOTAL"] = 1.0
     before = dict(vehicle.values)
-    vehicle.items = (Item(5003, 30.0, 1, 2),)
+    vehicle.items = (MissionItem(5003, 30.0, 1, 2),)
     fence = MissionFence(vehicle, tmp_path)
     await fence.raise_around(spec(area(-50, -50, 50, 50), **LIMITS), retraces=True)
     assert vehicle.written[-1] == "FENCE_ENABLE", "it is switched on when all else stands"
@@ -172,13 +171,13 @@ async def test_a_fence_is_raised_and_put_back(vehicle: Vehicle, tmp_path: Path) 
     await again.raise_around(spec(area(-10, -10, 10, 10)), retraces=False)
     await again.lower(lambda: True)
     assert vehicle.values == before
-    assert vehicle.items == (Item(5003, 30.0, 1, 2),)
+    assert vehicle.items == (MissionItem(5003, 30.0, 1, 2),)
     assert not again.raised
 
 
 async def test_the_owners_own_fence_stays_in_force(vehicle: Vehicle, tmp_path: Path) -> None:
     vehicle.values |= {"FENCE_ENABLE": 1.0, "FENCE_TYPE": 3.0, "FENCE_ALT_MAX": 40.0, "FENCE_OPTIONS": 3.0}
-    vehicle.items = (Item(5003, 30.0, 1, 2),)
+    vehicle.items = (MissionItem(5003, 30.0, 1, 2),)
     fence = MissionFence(vehicle, tmp_path)
     await fence.raise_around(spec(area(-50, -50, 50, 50), **LIMITS), retraces=True)
     assert [n for n in vehicle.written if n == "FENCE_ENABLE"] == ["FENCE_ENABLE"] * 2, (
@@ -186,7 +185,7 @@ async def test_the_owners_own_fence_stays_in_force(vehicle: Vehicle, tmp_path: P
     )
     assert (vehicle.written[0], vehicle.written[-1]) == ("FENCE_ENABLE", "FENCE_ENABLE")
     assert vehicle.values["FENCE_ENABLE"] == 1.0
-    assert vehicle.items[0] == Item(5003, 30.0, 1, 2)
+    assert vehicle.items[0] == MissionItem(5003, 30.0, 1, 2)
     assert len(vehicle.items) == 5
     assert vehicle.values["FENCE_ALT_MAX"] == 40.0
     assert vehicle.values["FENCE_TYPE"] == 7.0
@@ -227,8 +226,8 @@ def test_a_vehicle_without_fences_is_left_alone_and_one_that_is_silent_is_none(
 async def test_a_vehicle_without_item_lists_is_left_alone(
     vehicle: Vehicle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async def unsupported(*_: Any) -> tuple[Item, ...]:
-        raise NoLists("the autopilot keeps no fence items")
+    async def unsupported(*_: Any) -> tuple[MissionItem, ...]:
+        raise ItemsUnsupported("the autopilot keeps no fence items")
 
     monkeypatch.setattr(module, "download", unsupported)
     fence = MissionFence(vehicle, tmp_path)
@@ -245,7 +244,7 @@ async def test_what_is_read_back_must_be_what_was_sent(
 
     monkeypatch.setattr(module, "upload", forgetful)
     fence = MissionFence(vehicle, tmp_path)
-    with pytest.raises(AutopilotError, match="stores 3 fence items"):
+    with pytest.raises(AutopilotError, match="stored 3 fence items"):
         await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
 
 
@@ -276,14 +275,14 @@ async def test_no_fence_is_changed_while_the_motors_run(vehicle: Vehicle, tmp_pa
     vehicle.values |= OWNED
     vehicle.vehicle.armed = True
     fence = MissionFence(vehicle, tmp_path)
-    with pytest.raises(AutopilotError, match="the motors run"):
+    with pytest.raises(AutopilotError, match="the motors are running"):
         await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
     assert not vehicle.written
     vehicle.vehicle.armed = False
     await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
     vehicle.vehicle.armed = True
     vehicle.written.clear()
-    with pytest.raises(AutopilotError, match="the motors run"):
+    with pytest.raises(AutopilotError, match="the motors are running"):
         await fence.lower(lambda: True)
     assert not vehicle.written
     assert fence.raised
@@ -301,7 +300,7 @@ async def test_motors_that_start_while_the_fence_is_asked_for_keep_it_on(vehicle
 
     vehicle.send = heard  # type: ignore[method-assign]
     fence = MissionFence(vehicle, tmp_path)
-    with pytest.raises(AutopilotError, match="not switched off"):
+    with pytest.raises(AutopilotError, match="cannot be disabled"):
         await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
     assert not vehicle.written
 
@@ -311,7 +310,7 @@ async def test_a_fence_that_cannot_be_raised_leaves_the_owners(
     vehicle: Vehicle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
     vehicle.values |= OWNED
-    vehicle.items = (Item(5003, 30.0, 1, 2),)
+    vehicle.items = (MissionItem(5003, 30.0, 1, 2),)
     before = dict(vehicle.values)
 
     async def full(_autopilot: Any, items: Any) -> None:
@@ -325,7 +324,7 @@ async def test_a_fence_that_cannot_be_raised_leaves_the_owners(
     with pytest.raises((AutopilotError, asyncio.CancelledError)):
         await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
     assert vehicle.values == before
-    assert vehicle.items == (Item(5003, 30.0, 1, 2),)
+    assert vehicle.items == (MissionItem(5003, 30.0, 1, 2),)
     assert not fence.raised
 
 
@@ -359,7 +358,7 @@ async def test_in_flight_what_another_station_changes_of_the_fence_is_set_back(
     )  # fmt: skip
     assert vehicle.values == raised
     vehicle.values["FENCE_ACTION"], vehicle.fixed = 0.0, ("FENCE_ACTION",)
-    with pytest.raises(AutopilotError, match="FENCE_ACTION cannot be set to 1; it stays 0"):
+    with pytest.raises(AutopilotError, match="FENCE_ACTION cannot be set to 1; it remains 0"):
         await fence.hold()
 
 
@@ -367,7 +366,7 @@ async def test_a_fence_that_another_station_replaced_is_told(vehicle: Vehicle, t
     fence = MissionFence(vehicle, tmp_path)
     await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
     vehicle.values["FENCE_TOTAL"] = 1.0
-    with pytest.raises(AutopilotError, match="another station changed its fence, which has 1 items and had 4"):
+    with pytest.raises(AutopilotError, match="another station changed its fence from 4 to 1 items"):
         await fence.hold()
 
 
@@ -378,10 +377,10 @@ async def test_other_items_in_place_of_as_many_are_told(
     await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
     vehicle.items = tuple(replace(item, lat_e7=item.lat_e7 + 5000) for item in vehicle.items)
     assert await fence.hold() == (), "it was read a moment ago"
-    with pytest.raises(AutopilotError, match="other items than were loaded"):
+    with pytest.raises(AutopilotError, match="replaced the items of its fence"):
         await MissionFence(vehicle, tmp_path).hold()
     monkeypatch.setattr(module, "ITEMS_AGAIN_S", 0.0)
-    with pytest.raises(AutopilotError, match="other items than were loaded"):
+    with pytest.raises(AutopilotError, match="replaced the items of its fence"):
         await fence.hold()
 
 

@@ -12,7 +12,7 @@ from fractus_core.control import ControlState, Mission, Outcome, OutcomeKind
 from fractus_proto.v1.mobility_pb2 import MissionOutcome
 from fractus_runtime.mavlink_codec import Message, Value, message
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
-from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
+from fractus_services.mobility.mavlink.mavlink_autopilot import MavlinkAutopilot
 from fractus_services.mobility.mavlink.vehicle import Vehicle
 from fractus_services.mobility.rpc.telemetry import telemetry_of
 from virtual_time import Loop
@@ -56,7 +56,7 @@ def test_an_accuracy_that_is_not_told_any_more_is_not_the_last_one() -> None:
 
 
 def told(vehicle: Vehicle, now: float, missions: bool = False, heard: int = 0, way_s: float = 0.0) -> Any:
-    autopilot = SimpleNamespace(vehicle=vehicle, now=now, connected=True, way_s=way_s)
+    autopilot = SimpleNamespace(vehicle=vehicle, now=now, connected=True, downlink_latency_s=way_s)
     ended = Mission("uid", "identity", outcome=Outcome(OutcomeKind.REVOKED, "why"))
     state = ControlState(missions={"uid": ended, "other": Mission("other", "identity")})
     control: Any = SimpleNamespace(

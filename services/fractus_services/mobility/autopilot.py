@@ -266,7 +266,7 @@ class Autopilot(Protocol):
         """The vehicle's seconds from the state that is known to the effect of a command sent now, at most; infinite: too long to fly by."""
 
     @property
-    def way_s(self) -> float:
+    def downlink_latency_s(self) -> float:
         """Seconds that a message takes here, at most; infinite while that is not known."""
 
     @property
@@ -289,7 +289,7 @@ class Autopilot(Protocol):
     def connected(self) -> bool:
         """Whether the vehicle is heard."""
 
-    def beat(self) -> None:
+    def send_heartbeat(self) -> None:
         """Send a heartbeat now, if the companion does its duty."""
 
     async def update(self, timeout_s: float) -> bool:
@@ -307,7 +307,7 @@ class Autopilot(Protocol):
     async def set_home(self, lat: float, lon: float, amsl_m: float) -> None:
         """Fix home, so that arming elsewhere does not move it."""
 
-    async def ask_home(self) -> None:
+    async def request_home(self) -> None:
         """Ask for the home position now."""
 
     async def take_off(self, altitude_m: float, permit: Permit = ...) -> None:

@@ -152,7 +152,7 @@ class Arming:
                     await autopilot.update(UPDATE_TIMEOUT_S)
                 unanswered = False
                 await autopilot.set_home(*home)
-                await self._control.tasks.attempt(autopilot.ask_home)
+                await self._control.tasks.attempt(autopilot.request_home)
                 permit()
             except Exception as error:
                 unanswered = unanswered and not (isinstance(error, AutopilotError) and error.refused)

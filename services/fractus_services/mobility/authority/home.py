@@ -67,7 +67,7 @@ async def restore_home(autopilot: Autopilot, control: ControlAccess) -> None:
     if mission is None or mission.home is None or not home_moved(control.state, autopilot.vehicle):
         return
     await autopilot.set_home(*mission.home)
-    await autopilot.ask_home()
+    await autopilot.request_home()
     deadline = autopilot.now + HOME_TIMEOUT_S
     while home_moved(control.state, autopilot.vehicle):
         if autopilot.now > deadline:

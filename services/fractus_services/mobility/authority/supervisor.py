@@ -59,7 +59,7 @@ class Supervisor:
         control.dispatch(Tick())
         self._ticked_at = now
         if not was_alive and self.alive():
-            control.autopilot.beat()
+            control.autopilot.send_heartbeat()
         needed = not self._idle()
         if needed:
             self._needed_at = now

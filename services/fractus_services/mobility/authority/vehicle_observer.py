@@ -135,7 +135,7 @@ class VehicleObserver:
                     await self._verify()
                     self._control.changes.notify()
                     if autopilot.vehicle.home is None:
-                        await self._control.tasks.attempt(autopilot.ask_home)
+                        await self._control.tasks.attempt(autopilot.request_home)
                 except AutopilotError as error:
                     log.warning("observer: autopilot not prepared yet, retrying (error=%s)", error)
                 except Exception:

@@ -1,4 +1,4 @@
-"""Which sending of a command an acknowledgement answers: COMMAND_ACK names the command alone."""
+"""Matching of acknowledgements to commands: COMMAND_ACK contains the command id only, not which transmission it answers."""
 
 from __future__ import annotations
 
@@ -17,23 +17,24 @@ log = logging.getLogger(__name__)
 ACK_TIMEOUT_S = 0.7
 MAX_ACK_TIMEOUT_S = 3.0
 SLACK_S = 0.2
-"""How much later than the slowest answer of late an acknowledgement may come."""
+"""An acknowledgement may be slower than the slowest recent answer by this time."""
 
 MAX_OPEN = 16
-"""Sendings of one command that are remembered: a vehicle that acknowledges none must not fill the memory."""
+"""Remembered transmissions of one command, so that a vehicle without acknowledgements cannot fill the memory."""
 
 Answer = asyncio.Future[int]
 
 
 class Acknowledgements:
-    """Sendings that are not acknowledged yet, by command.
+    """Transmissions that are not acknowledged yet, by command.
 
-    A command that was sent twice is acknowledged twice, and the second answer is not that of the next command of its kind. Links
-    keep the order, so each answer goes to the oldest sending that can still be answered by the measured delay of the link.
+    A command that was sent twice is acknowledged twice, and the second acknowledgement must not count for the next command with the
+    same id. Links preserve the order, so each acknowledgement is assigned to the oldest transmission that can still be answered
+    according to the measured delay of the link.
 
     Args:
-        sysid: the system that commands; others get their own answers.
-        timing: how long answers take; is told how long these did.
+        sysid: System id of the sender of the commands. Acknowledgements for other systems are ignored.
+        timing: Delays of the link; receives the delay of each acknowledgement.
     """
 
     def __init__(self, sysid: int, timing: Timing) -> None:
@@ -45,59 +46,62 @@ class Acknowledgements:
 
     @property
     def timeout_s(self) -> float:
-        """After what time a sending is taken for lost."""
+        """Time after which a transmission counts as lost."""
         return max(ACK_TIMEOUT_S, min(self._timing.answer_s + SLACK_S, MAX_ACK_TIMEOUT_S))
 
     def _answerable_s(self, now: float) -> float:
-        """For what time a sending can be answered.
+        """Return for how long a transmission can still be answered.
 
-        Where no answer came for some time, the link gets slow just now; after a longer time it was cut, and what was sent is lost.
+        A short time without answers means that the link is becoming slow. After a longer time the link was interrupted, and what was
+        sent is lost.
         """
         takes_s = max(self._timing.answer_s, min(self._timing.silence_s(now), MAX_ACK_TIMEOUT_S))
         return max(ACK_TIMEOUT_S, takes_s + SLACK_S)
 
     def sent(self, command: int, answer: Answer, now: float) -> None:
-        """A command is sent, for the first time or again.
+        """Record that a command is being sent, for the first time or again.
 
         Args:
-            command: which.
-            answer: gets the result, of this sending or another one of the same command.
-            now: monotonic seconds.
+            command: MAV_CMD.
+            answer: Future that receives the result of this or another transmission of the same command.
+            now: Monotonic seconds.
         """
         self._sent.setdefault(command, deque(maxlen=MAX_OPEN)).append((now, answer))
         self._latest[command] = answer
 
     def overtaken(self, command: int, answer: Answer) -> bool:
-        """Whether another command of the kind was sent after the one that this answer is for."""
+        """Return True if another command with the same id was sent after the command of this answer."""
         return self._latest.get(command, answer) is not answer
 
     def take(self, acknowledgement: Message, now: float) -> None:
-        """Hand the result on to those that wait for it."""
-        if acknowledgement.integer("target_system") not in {0, self._sysid} or self._doubled(acknowledgement, now):
+        """Assign an acknowledgement to its transmission and set the result."""
+        if acknowledgement.integer("target_system") not in {0, self._sysid} or self._is_duplicate(acknowledgement, now):
             return
-        command, result = acknowledgement.integer("command"), acknowledgement.integer("result")
-        sendings = self._sent.setdefault(command, deque(maxlen=MAX_OPEN))
-        # The last one is kept: when the link gets slow, its answer comes before the delay is measured.
-        while len(sendings) > 1 and now - sendings[0][0] > self._answerable_s(now):
-            sendings.popleft()
-        if not sendings:
-            log.debug("commands: an acknowledgement that answers nothing (command=%d, result=%d)", command, result)
+        command = acknowledgement.integer("command")
+        result = acknowledgement.integer("result")
+        transmissions = self._sent.setdefault(command, deque(maxlen=MAX_OPEN))
+        # Keep the last transmission: when the link becomes slow, its answer arrives before the new delay is measured.
+        while len(transmissions) > 1 and now - transmissions[0][0] > self._answerable_s(now):
+            transmissions.popleft()
+        if not transmissions:
+            log.debug("commands: unexpected acknowledgement (command=%d, result=%d)", command, result)
             return
-        sent_at, answer = sendings.popleft()
-        # That of a command which was given up measures the link as well.
+        sent_at, answer = transmissions.popleft()
+        # The acknowledgement of an abandoned command measures the link as well.
         self._timing.acknowledged(sent_at, now)
         if result == mavlink.MAV_RESULT_IN_PROGRESS:
-            sendings.appendleft((now, answer))  # the final answer is still to come
+            transmissions.appendleft((now, answer))  # the final acknowledgement follows
         elif answer.done():
-            log.debug("commands: an acknowledgement of an earlier sending (command=%d, result=%d)", command, result)
+            log.debug("commands: acknowledgement of an earlier transmission (command=%d, result=%d)", command, result)
         else:
             answer.set_result(result)
 
-    def _doubled(self, acknowledgement: Message, now: float) -> bool:
-        """Whether a network delivers the frame of the last acknowledgement once more: frames are numbered."""
-        (frame, at), self._last = self._last, (acknowledgement.frame, now)
+    def _is_duplicate(self, acknowledgement: Message, now: float) -> bool:
+        """Return True if the network delivered the last acknowledgement again. Frames contain sequence numbers."""
+        frame, at = self._last
+        self._last = acknowledgement.frame, now
         return frame != b"" and frame == acknowledgement.frame and now - at < ACK_TIMEOUT_S
 
     def forget(self) -> None:
-        """The link broke: what was sent on it is not answered any more."""
+        """Drop all transmissions, because the connection broke."""
         self._sent.clear()

@@ -10,8 +10,8 @@ from dataclasses import replace
 from fractus_core.policy.decision_types import Airframe
 
 from fractus_services.mobility.autopilot import Checked
-from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
 from fractus_services.mobility.mavlink.flight_stack import Names, Setting
+from fractus_services.mobility.mavlink.mavlink_autopilot import MavlinkAutopilot
 from fractus_services.mobility.mavlink.parameters import ParameterLost, Parameters, Spellings, same
 
 log = logging.getLogger(__name__)

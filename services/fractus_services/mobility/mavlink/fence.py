@@ -1,4 +1,4 @@
-"""The vehicle's own fence as the last line: raised around a mission's outer bounds, and put back as it was after it."""
+"""The vehicle's own geofence as the last line of defence: raised around a mission's outer bounds, and restored afterwards."""
 
 from __future__ import annotations
 
@@ -10,57 +10,121 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
+import shapely
 from fractus_core.api.grants import GrantSpec
+from fractus_core.geo import LocalFrame, area_center, area_polygon
 from fractus_runtime.files import remove_temporary, write_file
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_services.errors import AutopilotError
-from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
-from fractus_services.mobility.mavlink.bounds import MAX_VERTICES, Bounds, Item, bounds_of
-from fractus_services.mobility.mavlink.itemlists import NoLists, NoSpace, download, upload
+from fractus_services.mobility.mavlink.mavlink_autopilot import MavlinkAutopilot
+from fractus_services.mobility.mavlink.mission_protocol import ItemsUnsupported, MissionItem, NoSpace, download, upload
 from fractus_services.mobility.mavlink.parameters import same
 
 log = logging.getLogger(__name__)
 
 _RESTORE_TIMEOUT_S = 5.0
 ITEMS_AGAIN_S = 60.0
-"""In flight the items are read again after this time: of others in their place, as many as there were, no message tells."""
+"""Interval of reading the items in flight. No message shows if another station replaced them by as many others."""
 
 _SWITCHED = mavlink.FENCE_TYPE_ALT_MAX | mavlink.FENCE_TYPE_CIRCLE | mavlink.FENCE_TYPE_POLYGON
-"""Without the floor, which the autopilot switches by itself."""
+"""All fence types except the minimum altitude, which the autopilot enables by itself."""
 
 _CLOSE_E7 = 2
-"""Autopilots that store floats give positions back a few centimetres off."""
+"""Autopilots that store floats return positions that differ by a few centimetres."""
+
+
+ROOM_M = 10.0
+"""Margin between the granted area and the fence, in metres. The service's own monitor acts long before the fence."""
+
+HEADROOM_M = 5.0
+MAX_VERTICES = (60, 30, 15, 8, 4)
+"""Numbers of vertices, tried in this order. The capacity depends on the autopilot's board and on the owner's fence."""
+
+_SIMPLER_M = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
+
+
+@dataclass(frozen=True, slots=True)
+class FenceBounds:
+    """Outer bounds that the vehicle itself must not leave.
+
+    Attributes:
+        items: Vertices of the polygon; empty if the grant has no area.
+        altitude_m: Altitude above home; None if the grant has no limit.
+    """
+
+    items: tuple[MissionItem, ...]
+    altitude_m: float | None
+
+
+def fence_bounds(spec: GrantSpec, vertices: int = MAX_VERTICES[0]) -> FenceBounds | None:
+    """Return the outer bounds of operation area, corridor and airframe, with a margin; None if the grant has no bounds.
+
+    A vehicle must be inside every inclusion polygon of its fence. Areas that do not touch are therefore replaced by their convex
+    hull.
+
+    Args:
+        spec: Specification of the Grant.
+        vertices: Maximum number of vertices, at least 4. With fewer vertices, the polygon is larger and never smaller.
+    """
+    altitude = spec.limits.max_altitude + HEADROOM_M if spec.limits is not None else None
+    items: tuple[MissionItem, ...] = ()
+    if spec.operation_area:
+        frame = LocalFrame.at(area_center(spec.operation_area[0]))
+        whole = shapely.union_all([area_polygon(frame, area) for area in (*spec.operation_area, *spec.corridor)])
+        corners = [frame.latlon(x, y) for x, y in list(_outline(whole, vertices).exterior.coords)[:-1]]
+        count = len(corners)
+        items = tuple(
+            MissionItem(
+                mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION, float(count), round(lat * 1e7), round(lon * 1e7)
+            )
+            for lat, lon in corners
+        )
+    return FenceBounds(items, altitude) if items or altitude is not None else None
+
+
+def _outline(whole: shapely.Geometry, vertices: int) -> shapely.Polygon:
+    """Return the smallest of several polygons with a limited number of vertices around a geometry and its margin."""
+    outlines: list[shapely.Geometry] = []
+    for simpler_m in _SIMPLER_M:
+        # Simplification may shrink the shape by about its tolerance, so the shape is grown by that much before.
+        grown = whole.buffer(ROOM_M + simpler_m, join_style="mitre", mitre_limit=2.0).simplify(simpler_m)
+        outlines += [grown, grown.convex_hull]
+    box = whole.buffer(ROOM_M + _SIMPLER_M[0]).minimum_rotated_rectangle
+    rings = [shapely.Polygon(each.exterior) for each in (*outlines, box) if isinstance(each, shapely.Polygon)]
+    # GEOS may also drop a ring's first corner, and shrink the shape by more.
+    roomy = (ring for ring in rings if ring.exterior.distance(whole) >= ROOM_M)
+    return min((ring for ring in roomy if len(ring.exterior.coords) - 1 <= vertices), key=lambda ring: float(ring.area))
 
 
 @dataclass(frozen=True, slots=True)
 class Owned:
-    """The fence that the vehicle's owner left.
+    """The fence of the vehicle's owner.
 
     Attributes:
-        parameters: those that the vehicle has.
-        items: its polygons and circles.
-        raised: the parameters of the mission's fence, once that stands.
-        around: its items, beside those of the owner that are in force; None of a fence that an older release raised.
+        parameters: Fence parameters that the vehicle has.
+        items: Polygons and circles.
+        raised: Parameters of the mission's fence once it is raised.
+        around: Items of the mission's fence, including active items of the owner; None for a fence that an older release raised.
     """
 
     parameters: dict[str, float]
-    items: tuple[Item, ...]
+    items: tuple[MissionItem, ...]
     raised: dict[str, float] = field(default_factory=dict)
-    around: tuple[Item, ...] | None = None
+    around: tuple[MissionItem, ...] | None = None
 
 
 class MissionFence:
-    """Raises and lowers the vehicle's fence. What the owner had is on disk before anything is changed.
+    """Raises and lowers the vehicle's fence. The owner's fence is stored on disk before anything is changed.
 
-    Where the owner's own fence is in force, it stays so: the mission's is added, and the lower ceiling counts.
+    An active fence of the owner stays active: the mission's fence is added to it, and the lower ceiling applies.
 
     Args:
-        autopilot: the link.
-        directory: the service's state directory.
+        autopilot: Link to the vehicle.
+        directory: State directory of the service.
 
     Attributes:
-        missing: why there is no fence; empty when the autopilot offers one.
+        missing: Reason why the vehicle has no fence; empty if it has one.
     """
 
     def __init__(self, autopilot: MavlinkAutopilot, directory: Path) -> None:
@@ -69,29 +133,29 @@ class MissionFence:
         self._parameters = autopilot.vehicle_parameters
         self._path = directory / "fence.json"
         self._lock = asyncio.Lock()
-        self._standing: tuple[Bounds, bool] | None = None
+        self._standing: tuple[FenceBounds, bool] | None = None
         self._compared_at = self._switched_at = -math.inf
         self.missing = ""
 
     @property
     def raised(self) -> bool:
-        """Whether the vehicle has a fence of ours."""
+        """True while the vehicle has a fence of the service."""
         return self._path.exists()
 
     async def raise_around(self, spec: GrantSpec, *, retraces: bool) -> None:
-        """Load the outer bounds of a grant, switch the fence on, and read all of it back.
+        """Load the outer bounds of a grant, enable the fence, and verify everything by reading it back.
 
-        An autopilot without fences is left as it is, see `missing`.
+        An autopilot without fence support stays as it is, see `missing`.
 
         Args:
-            spec: the grant.
-            retraces: whether the vehicle that breaches it is to fly back the way it came.
+            spec: Specification of the Grant.
+            retraces: True if a vehicle that breaches the fence should return along its path.
 
         Raises:
-            AutopilotError: the fence does not stand, or the motors run; the text says why.
-            OSError: what the owner had cannot be stored.
+            AutopilotError: The fence is not raised, or the motors run. The text states the reason.
+            OSError: The owner's fence cannot be stored.
         """
-        bounds = bounds_of(spec)
+        bounds = fence_bounds(spec)
         if bounds is None:
             return
         async with self._lock:
@@ -99,29 +163,29 @@ class MissionFence:
                 return
             try:
                 await self._raise(spec, bounds, retraces)
-            except NoLists as error:
-                self._lacks(str(error))
+            except ItemsUnsupported as error:
+                self._set_missing(str(error))
 
     async def lower(self, idle: Callable[[], bool]) -> None:
-        """Put back what the owner had, if anything was changed.
+        """Restore the owner's fence if it was changed.
 
         Args:
-            idle: whether no mission needs the fence; asked when no other change of it is under way.
+            idle: Returns True if no mission needs the fence. Called while no other change is in progress.
 
         Raises:
-            AutopilotError: it cannot be; it is tried again next time.
+            AutopilotError: The fence cannot be restored. The next call tries again.
         """
         async with self._lock:
             owned = await asyncio.to_thread(self._load) if idle() else None
             if owned is None:
                 return
-            await self._put_back(owned)
+            await self._restore(owned)
 
     async def hold(self) -> tuple[str, ...]:
-        """Set back what another station changed of the fence that is raised; what that was, in sentences.
+        """Restore what another station changed of the raised fence, and return the changes as sentences.
 
         Raises:
-            AutopilotError: it cannot be, or the vehicle has other fence items by now.
+            AutopilotError: The fence cannot be restored, or the vehicle has other fence items.
         """
         async with self._lock:
             owned = await asyncio.to_thread(self._load)
@@ -130,24 +194,24 @@ class MissionFence:
             return await self._keep(owned)
 
     async def _keep(self, owned: Owned) -> tuple[str, ...]:
-        raised, total = owned.raised, self._stack.fence_total
+        raised = owned.raised
+        total = self._stack.fence_total
         changed = await self._set(raised) + await self._switch_on()
         if total in raised:
             items = (await self._parameters.read([(total,)])).get(total, 0.0)
             if items != raised[total]:
-                raise AutopilotError(
-                    f"another station changed its fence, which has {items:g} items and had {raised[total]:g}"
-                )
+                raise AutopilotError(f"another station changed its fence from {raised[total]:g} to {items:g} items")
         if owned.around is not None and self._autopilot.now - self._compared_at >= ITEMS_AGAIN_S:
             if not _same(await download(self._autopilot), owned.around):
-                raise AutopilotError("another station changed its fence, which has other items than were loaded")
+                raise AutopilotError("another station replaced the items of its fence")
             self._compared_at = self._autopilot.now
         return changed
 
     async def _switch_on(self) -> tuple[str, ...]:
-        """Switch on the fence that a command of another station, or a radio's switch, switched off: no parameter tells of that.
+        """Enable the fence again if it was disabled by another station's command or a switch of the radio. No parameter shows that.
 
-        Not while the autopilot comes down, which may do so itself, nor under a pilot, whose switch it is.
+        The fence stays disabled while the autopilot lands or returns, because the autopilot may have disabled it, and while a pilot
+        flies.
         """
         vehicle = self._autopilot.vehicle
         left_alone = vehicle.armed and not vehicle.mode.commanded
@@ -155,21 +219,21 @@ class MissionFence:
             return ()
         await self._autopilot.command(mavlink.MAV_CMD_DO_FENCE_ENABLE, 1, _SWITCHED)
         self._switched_at = self._autopilot.now
-        return ("the fence was switched off and is on",)
+        return ("the fence was disabled and is enabled again",)
 
     async def _offered(self) -> bool:
-        """Whether the autopilot knows fences."""
+        """Return True if the autopilot supports fences."""
         if await self._parameters.read([(self._stack.fence_switch,)]):
             self.missing = ""
             return True
-        self._lacks(f"the autopilot has no {self._stack.fence_switch}")
+        self._set_missing(f"the autopilot has no {self._stack.fence_switch}")
         return False
 
-    def _lacks(self, why: str) -> None:
-        self.missing = why
-        log.warning("fence: the vehicle has none of its own as a last line (reason=%s)", why)
+    def _set_missing(self, reason: str) -> None:
+        self.missing = reason
+        log.warning("fence: not supported by the vehicle (reason=%s)", reason)
 
-    async def _raise(self, spec: GrantSpec, bounds: Bounds, retraces: bool) -> None:
+    async def _raise(self, spec: GrantSpec, bounds: FenceBounds, retraces: bool) -> None:
         owned = await asyncio.to_thread(self._load)
         if owned is None:
             owned = await self._read()
@@ -177,11 +241,11 @@ class MissionFence:
         switch = self._stack.fence_switch
         kept = owned.items if owned.parameters.get(switch, 0.0) else ()
         if self._autopilot.vehicle.armed:
-            raise AutopilotError("the motors run; the fence stays as it is")
+            raise AutopilotError("the motors are running; the fence cannot be changed")
         if self._standing == (bounds, retraces) and await self._stands(owned):
             return
         self._standing = None
-        # ArduPilot works out which kinds of fence are in force when it is switched on, and not again: so off first.
+        # ArduPilot determines the active fence types only when the fence is enabled, so it is disabled first.
         try:
             await self._set({switch: 0.0})
             around = await self._load_around(spec, kept)
@@ -198,11 +262,15 @@ class MissionFence:
             raise
         log.info("fence: raised (vertices=%d, ceiling_m=%s)", len(around) - len(kept), bounds.altitude_m)
 
-    async def _load_around(self, spec: GrantSpec, kept: Sequence[Item]) -> tuple[Item, ...]:
-        """Load the outer bounds beside what is kept, with fewer vertices where the vehicle has no space; what was loaded."""
+    async def _load_around(self, spec: GrantSpec, kept: Sequence[MissionItem]) -> tuple[MissionItem, ...]:
+        """Load the outer bounds in addition to the kept items, with fewer vertices if the capacity is exceeded.
+
+        Returns:
+            The loaded items.
+        """
         tried = -1
         for vertices in MAX_VERTICES:
-            bounds = bounds_of(spec, vertices)
+            bounds = fence_bounds(spec, vertices)
             items = bounds.items if bounds is not None else ()
             if len(items) == tried:
                 continue
@@ -210,14 +278,16 @@ class MissionFence:
             try:
                 await self._write((*kept, *items))
             except NoSpace as error:
-                log.warning("fence: too many items (vertices=%d, kept=%d, error=%s)", tried, len(kept), error)
+                log.warning(
+                    "fence: item list exceeds the capacity (vertices=%d, kept=%d, error=%s)", tried, len(kept), error
+                )
                 refused = error
             else:
                 return (*kept, *items)
         raise refused
 
     async def _stands(self, owned: Owned) -> bool:
-        """Whether the fence is as it was raised before: arming that is tried again need not load it again."""
+        """Return True if the fence is still raised as before, so that a repeated arming need not load it again."""
         try:
             self._compared_at = -math.inf
             await self._keep(owned)
@@ -228,50 +298,50 @@ class MissionFence:
         return True
 
     async def _recover(self, owned: Owned) -> None:
-        """After a failure, put back what the owner had if that is possible at once; `lower` tries again later."""
+        """Restore the owner's fence after a failure if that is possible at once. Otherwise, `lower` tries again later."""
         try:
             async with asyncio.timeout(_RESTORE_TIMEOUT_S):
-                await self._put_back(owned)
+                await self._restore(owned)
         except (AutopilotError, OSError) as error:
-            log.warning("fence: the owner's is not put back yet (error=%s)", str(error) or "it takes too long")
+            log.warning("fence: owner's fence not restored yet (error=%s)", str(error) or "timeout")
 
-    async def _put_back(self, owned: Owned) -> None:
+    async def _restore(self, owned: Owned) -> None:
         self._standing = None
         await self._set({self._stack.fence_switch: 0.0})
         await self._write(owned.items)
         await self._set(owned.parameters)
         await asyncio.to_thread(self._path.unlink, True)
-        log.info("fence: as its owner left it")
+        log.info("fence: owner's fence restored")
 
     async def _read(self) -> Owned:
         parameters = await self._parameters.read([(name,) for name in self._stack.fence_parameters])
         return Owned(parameters, await download(self._autopilot))
 
-    async def _write(self, items: Sequence[Item]) -> None:
+    async def _write(self, items: Sequence[MissionItem]) -> None:
         await upload(self._autopilot, items)
         stored = await download(self._autopilot)
         if not _same(stored, items):
             raise AutopilotError(
-                f"the autopilot stores {len(stored)} fence items that are not the {len(items)} it was sent"
+                f"the autopilot stored {len(stored)} fence items that differ from the {len(items)} items sent"
             )
 
     async def _set(self, values: Mapping[str, float]) -> tuple[str, ...]:
-        """Set parameters of the fence in their order, those that differ; which, in sentences.
+        """Set the fence parameters that differ, in their order, and return the changes as sentences.
 
         Raises:
-            AutopilotError: one cannot be set, or the motors run and the fence would be switched off.
+            AutopilotError: A parameter cannot be set, or the fence would be disabled while the motors run.
         """
-        told = await self._parameters.read([(name,) for name in values])
+        current = await self._parameters.read([(name,) for name in values])
         changed = []
         for name in self._stack.fence_parameters:
-            if name not in values or same(told.get(name, math.nan), values[name]):
+            if name not in values or same(current.get(name, math.nan), values[name]):
                 continue
             if name == self._stack.fence_switch and not values[name] and self._autopilot.vehicle.armed:
-                raise AutopilotError("the motors run; the fence is not switched off")
+                raise AutopilotError("the motors are running; the fence cannot be disabled")
             after = await self._parameters.write(name, values[name])
             if not same(after, values[name]):
-                raise AutopilotError(f"{name} cannot be set to {values[name]:g}; it stays {after:g}")
-            changed.append(f"{name} was {told.get(name, math.nan):g} and is {after:g}")
+                raise AutopilotError(f"{name} cannot be set to {values[name]:g}; it remains {after:g}")
+            changed.append(f"{name} was {current.get(name, math.nan):g} and is {after:g}")
         return tuple(changed)
 
     def _load(self) -> Owned | None:
@@ -279,7 +349,7 @@ class MissionFence:
         try:
             stored = json.loads(self._path.read_bytes())
             items, around = (
-                tuple(Item(**item) for item in found) if found is not None else None
+                tuple(MissionItem(**item) for item in found) if found is not None else None
                 for found in (stored["items"], stored.get("around"))
             )
             return Owned(dict(stored["parameters"]), items or (), stored.get("raised", {}), around)
@@ -287,7 +357,7 @@ class MissionFence:
             return None
         except (ValueError, KeyError, TypeError) as error:
             log.critical(
-                "fence: the owner's is not put back, its file cannot be read (file=%s, error=%s)", self._path, error
+                "fence: cannot restore the owner's fence, its file is invalid (file=%s, error=%s)", self._path, error
             )
             return None
 
@@ -295,7 +365,7 @@ class MissionFence:
         write_file(self._path, json.dumps(asdict(owned)).encode())
 
 
-def _same(stored: Sequence[Item], sent: Sequence[Item]) -> bool:
+def _same(stored: Sequence[MissionItem], sent: Sequence[MissionItem]) -> bool:
     return len(stored) == len(sent) and all(
         a.command == b.command
         and abs(a.param1 - b.param1) < 1e-3

@@ -1,4 +1,4 @@
-"""The one link to the autopilot: connects until it is stopped, streams the vehicle's state, carries messages both ways."""
+"""Connection to the autopilot: reconnects, sends heartbeats, updates the vehicle's state and distributes its messages."""
 
 from __future__ import annotations
 
@@ -6,19 +6,18 @@ import asyncio
 import logging
 import math
 import random
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 
 from fractus_runtime.mavlink_codec import Endpoint, Message, message
 
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.mavlink.companion import COMPONENT_ID, SYSTEM_ID, heartbeat
 from fractus_services.mobility.mavlink.flight_stack import FlightStack
-from fractus_services.mobility.mavlink.listeners import Listeners
-from fractus_services.mobility.mavlink.neighbours import Memory, Neighbours, Source
 from fractus_services.mobility.mavlink.timing import PROBE_S, Timing
 from fractus_services.mobility.mavlink.transport import BadUrl, Transport, open_link
 from fractus_services.mobility.mavlink.vehicle import Vehicle
+from fractus_services.mobility.mavlink.vehicle_identification import KnownVehicleFile, Source, VehicleSelector
 
 log = logging.getLogger(__name__)
 
@@ -29,27 +28,58 @@ BACKOFF_S = (0.2, 3.0)
 
 
 def ignore(_data: bytes) -> None:
-    """What takes copies of frames that no one wants."""
+    """Discard a copy of received or sent bytes."""
+
+
+class MessageSubscriptions:
+    """Message queues of subscribers, filtered by message name.
+
+    Args:
+        sysid: System id of the subscribers. Messages for other systems are dropped, because an answer to another station on
+            the same link does not mean that this system's command arrived.
+    """
+
+    def __init__(self, sysid: int) -> None:
+        self._sysid = sysid
+        self._open: list[tuple[frozenset[str], asyncio.Queue[Message]]] = []
+
+    def take(self, message: Message) -> None:
+        """Add a message to the queues of its subscribers."""
+        if message.has("target_system") and message.integer("target_system") not in {0, self._sysid}:
+            return
+        for names, queue in self._open:
+            if message.name in names:
+                queue.put_nowait(message)
+
+    @contextmanager
+    def subscribe(self, *names: str) -> Iterator[asyncio.Queue[Message]]:
+        """Queue the messages with these names until the block ends."""
+        subscription = frozenset(names), asyncio.Queue[Message]()
+        self._open.append(subscription)
+        try:
+            yield subscription[1]
+        finally:
+            self._open.remove(subscription)
 
 
 class Link:
-    """A link to one vehicle.
+    """Connection to one vehicle.
 
     Args:
-        url: where the autopilot is, see `open_link`.
-        stack: its firmware.
-        alive: whether the companion does its duty; when not, no heartbeat holds off the autopilot's own failsafe.
-        on_found: called when the vehicle is heard first, again after each reconnection.
-        on_heartbeat: called for every heartbeat after the state took it.
-        sysid: the system that speaks at this end.
-        memory: keeps which vehicle is the drone's own; without it the one that is heard first is.
-        received: takes a copy of all bytes that come; returns at once and raises nothing, and so does the next.
-        sent: takes a copy of each frame that goes.
+        url: URL of the autopilot, see `open_link`.
+        stack: Firmware of the autopilot.
+        alive: Returns True while the companion works. Otherwise no heartbeats are sent, so that the autopilot's own failsafe acts.
+        on_found: Callback invoked when the vehicle is identified, again after each reconnection.
+        on_heartbeat: Callback invoked for each heartbeat of the vehicle after the state was updated.
+        sysid: System id of this end of the link.
+        known_vehicle: File with the identity of the drone's own vehicle. Without it, the first vehicle is taken.
+        received: Callback that receives a copy of all received bytes. It must neither block nor raise.
+        sent: Callback that receives a copy of each sent frame. It must neither block nor raise.
 
     Attributes:
-        vehicle: the streamed state.
-        timing: how late that comes, and how late commands take effect.
-        target: system and component of the vehicle, from its first heartbeat until the connection breaks.
+        vehicle: State of the vehicle.
+        timing: Measured delays of state and commands.
+        target: System and component id of the vehicle, from its identification until the connection breaks.
     """
 
     def __init__(
@@ -61,23 +91,27 @@ class Link:
         on_found: Callable[[], None] = lambda: None,
         on_heartbeat: Callable[[], None] = lambda: None,
         sysid: int = SYSTEM_ID,
-        memory: Memory | None = None,
+        known_vehicle: KnownVehicleFile | None = None,
         received: Callable[[bytes], None] = ignore,
         sent: Callable[[bytes], None] = ignore,
     ) -> None:
-        self._copy_received, self._copy_sent = received, sent
         self.url = url
-        self._sysid = sysid
         self.stack = stack
-        self._alive, self._on_found, self._on_heartbeat = alive, on_found, on_heartbeat
         self.vehicle = Vehicle(stack=stack)
         self.timing = Timing()
+        self.target: Source | None = None
+        self._alive = alive
+        self._on_found = on_found
+        self._on_heartbeat = on_heartbeat
+        self._copy_received = received
+        self._copy_sent = sent
+        self._sysid = sysid
         self._endpoint = Endpoint(sysid, COMPONENT_ID)
         self._transport: Transport | None = None
-        self.target: Source | None = None
-        self._neighbours = Neighbours(memory)
-        self._broken, self._updated = asyncio.Event(), asyncio.Event()
-        self._listeners = Listeners(sysid)
+        self._selector = VehicleSelector(known_vehicle)
+        self._broken = asyncio.Event()
+        self._updated = asyncio.Event()
+        self._subscriptions = MessageSubscriptions(sysid)
 
     @property
     def now(self) -> float:
@@ -86,17 +120,17 @@ class Link:
 
     @property
     def found(self) -> bool:
-        """Whether the vehicle was heard since the link came up."""
+        """True if the vehicle was identified since the connection was opened."""
         return self.target is not None
 
     @property
     def connected(self) -> bool:
-        """Whether the vehicle is heard."""
+        """True while heartbeats of the vehicle arrive."""
         return self.target is not None and self.now - self.vehicle.heartbeat_at < SILENCE_S
 
     @property
     def pace(self) -> float:
-        """How many of the vehicle's seconds go by in one of ours."""
+        """Seconds of the vehicle's clock per second of real time."""
         return self.timing.pace
 
     @property
@@ -106,45 +140,48 @@ class Link:
 
     @property
     def link_problem(self) -> str:
-        """Why the link lets nothing arm; empty when nothing is wrong."""
+        """Reason why the link's delay forbids arming; empty if there is none."""
         return self.timing.problem(self.now)
 
     async def run(self) -> None:
-        """Keep the link open until cancelled."""
+        """Keep the connection open until cancelled.
+
+        Raises:
+            BadUrl: The URL is invalid.
+        """
         delay = BACKOFF_S[0]
-        said = ""
+        logged = ""
         while True:
             try:
                 self._broken.clear()
-                # Half a frame of the connection that broke must not swallow the beginning of this one.
+                # Half a frame of the old connection must not swallow the first frame of the new one.
                 self._endpoint = Endpoint(self._sysid, COMPONENT_ID)
                 self._transport = await open_link(self.url, self._received, self._closed)
             except BadUrl:
                 raise
             except (OSError, TimeoutError) as error:
                 problem = f"{type(error).__name__} {error}".strip()
-                if problem != said:
-                    log.warning(
-                        "link: no connection to the autopilot yet, trying again (url=%s, error=%s)", self.url, problem
-                    )
-                    said = problem
+                if problem != logged:
+                    log.warning("link: cannot connect to the autopilot, retrying (url=%s, error=%s)", self.url, problem)
+                    logged = problem
             else:
-                said, delay = "", BACKOFF_S[0]
+                logged = ""
+                delay = BACKOFF_S[0]
                 await self._serve()
-                log.warning("link: the connection to the autopilot broke (url=%s)", self.url)
+                log.warning("link: connection to the autopilot broke (url=%s)", self.url)
             await asyncio.sleep(delay * random.uniform(0.5, 1.0))  # noqa: S311 - jitter
             delay = min(delay * 2, BACKOFF_S[1])
 
     async def _serve(self) -> None:
-        """Heartbeats until the link breaks or falls silent."""
+        """Send heartbeats and probes until the connection breaks or the vehicle is silent."""
         opened = due = self.now
-        beat_at = -math.inf
+        heartbeat_sent_at = -math.inf
         try:
             while not self._broken.is_set():
-                # The failsafe that heartbeats hold off counts the vehicle's seconds.
-                if self.now - beat_at >= HEARTBEAT_S / self.timing.pace - PROBE_S / 2:
-                    beat_at = self.now
-                    self.beat()
+                # The failsafe that heartbeats hold off counts seconds of the vehicle's clock.
+                if self.now - heartbeat_sent_at >= HEARTBEAT_S / self.timing.pace - PROBE_S / 2:
+                    heartbeat_sent_at = self.now
+                    self.send_heartbeat()
                 self._probe(due)
                 due = max(due + PROBE_S, self.now - PROBE_S)
                 try:
@@ -152,7 +189,7 @@ class Link:
                         await self._broken.wait()
                 except TimeoutError:
                     if self.now - max(opened, self.vehicle.heartbeat_at) > RECONNECT_AFTER_S:
-                        log.warning("link: the autopilot is silent, connecting again (url=%s)", self.url)
+                        log.warning("link: no heartbeat from the autopilot, reconnecting (url=%s)", self.url)
                         break
         finally:
             if self._transport is not None:
@@ -168,23 +205,23 @@ class Link:
         if number is not None:
             self.send(message("TIMESYNC", ts1=number))
 
-    def beat(self) -> None:
-        """Send a heartbeat now, if the companion does its duty."""
+    def send_heartbeat(self) -> None:
+        """Send a heartbeat now if the companion works."""
         if not self._alive():
             if not self.found:
-                self._knock()
+                self._send_first_message()
             return
         self.send(heartbeat())
 
-    def _knock(self) -> None:
-        """Speak without a heartbeat: an autopilot behind UDP answers only those it has heard."""
+    def _send_first_message(self) -> None:
+        """Send a message other than a heartbeat: an autopilot behind UDP sends only to peers that sent something."""
         self.send(message("PARAM_REQUEST_READ", param_index=-1, param_id=self.stack.witness.encode()))
 
     def _lost(self) -> None:
-        """The link broke: what was agreed with the vehicle on it no longer holds."""
+        """Reset everything that was agreed with the vehicle on the broken connection."""
 
     def send(self, outgoing: Message) -> None:
-        """Send a message; without a link it is dropped."""
+        """Send a message. Without a connection it is dropped."""
         if self._transport is not None:
             frame = self._endpoint.encode(outgoing.name, outgoing.values)
             self._transport.write(frame)
@@ -192,24 +229,24 @@ class Link:
 
     def _closed(self, error: Exception | None) -> None:
         if error is not None:
-            log.warning("link: the connection failed (url=%s, error=%s)", self.url, error)
+            log.warning("link: connection failed (url=%s, error=%s)", self.url, error)
         self._broken.set()
 
     def _received(self, data: bytes) -> None:
         self._copy_received(data)
         for incoming in self._endpoint.decode(data):
             source = (incoming.sysid, incoming.compid)
-            if self.target is None and self._neighbours.finds(incoming, self.now, flying=self.vehicle.armed):
+            if self.target is None and self._selector.select(incoming, self.now, flying=self.vehicle.armed):
                 self.target = source
                 self.vehicle.take(incoming, self.now)
                 self._on_found()
             if incoming.name == "HEARTBEAT":
-                self.vehicle.unclear = self._neighbours.problem(incoming, self.now)
+                self.vehicle.unclear = self._selector.problem(incoming, self.now)
             if source == self.target:
                 self.take(incoming)
 
     def take(self, incoming: Message) -> None:
-        """Hand on a message of the vehicle."""
+        """Process a message of the vehicle."""
         at = self.now
         if incoming.name == "GLOBAL_POSITION_INT":
             late_s = self.timing.sampled(incoming.integer("time_boot_ms"), at)
@@ -223,26 +260,26 @@ class Link:
             if self._restarted():
                 return
         self.vehicle.take(incoming, at)
-        self._listeners.take(incoming)
+        self._subscriptions.take(incoming)
         if incoming.name == "HEARTBEAT":
             self._on_heartbeat()
         if incoming.name in {"GLOBAL_POSITION_INT", "HEARTBEAT", "EXTENDED_SYS_STATE"}:
             self.notify()
 
     def _restarted(self) -> bool:
-        """Whether the vehicle has restarted: streams, parameters and what else was agreed with it begin as on a new connection."""
+        """Return True if the vehicle has restarted; then reconnect, because rates, parameters and other agreements are void."""
         if self.timing.restarted and not self._broken.is_set():
-            log.warning("link: the autopilot has restarted, connecting again (url=%s)", self.url)
+            log.warning("link: autopilot restarted, reconnecting (url=%s)", self.url)
             self._broken.set()
         return self.timing.restarted
 
     def notify(self) -> None:
-        """Wake those that wait for an update of the vehicle's state."""
+        """Wake the callers of `update`."""
         self._updated.set()
         self._updated = asyncio.Event()
 
     async def update(self, timeout_s: float) -> bool:
-        """Wait for a message of the vehicle; False when none came in time."""
+        """Wait for an update of the vehicle's state; return False after the timeout."""
         event = self._updated
         try:
             async with asyncio.timeout(timeout_s):
@@ -251,25 +288,25 @@ class Link:
             return False
         return True
 
-    def listening(self, *kinds: str) -> AbstractContextManager[asyncio.Queue[Message]]:
-        """The vehicle's messages of some kinds, from now until the block ends."""
-        return self._listeners.listening(*kinds)
+    def subscribe(self, *names: str) -> AbstractContextManager[asyncio.Queue[Message]]:
+        """Queue the vehicle's messages with these names until the block ends."""
+        return self._subscriptions.subscribe(*names)
 
     def recipient(self) -> dict[str, int]:
-        """The vehicle, as messages name their target, even if it is silent at the moment.
+        """Return the target fields of messages to the vehicle, even if the vehicle is silent.
 
         Raises:
-            AutopilotError: it was not heard since the link came up.
+            AutopilotError: The vehicle was not identified since the connection was opened.
         """
         if self.target is None:
             raise AutopilotError("the autopilot is not connected", link=True)
         return {"target_system": self.target[0], "target_component": self.target[1]}
 
     def address(self) -> dict[str, int]:
-        """The vehicle, as messages name their target.
+        """Return the target fields of messages to the vehicle.
 
         Raises:
-            AutopilotError: it is not connected.
+            AutopilotError: The vehicle is not connected.
         """
         if not self.connected:
             raise AutopilotError("the autopilot is not connected", link=True)

@@ -208,7 +208,7 @@ class Timing:
         """The longest delay of late, there and back, in the vehicle's seconds; infinite while there is none."""
         return max((delay_s for _, delay_s, _ in self._delays), default=math.inf)
 
-    def way_s(self, now: float) -> float:
+    def downlink_latency_s(self, now: float) -> float:
         """Our seconds that any message takes at most, by the longest delay of late there and back; infinite: not known."""
         return math.inf if now - self._heard_at > STALE_S else self.delay_s / self.pace
 

@@ -1,4 +1,4 @@
-"""Byte links to an autopilot: TCP, UDP and serial, by the connection strings that MAVLink tools use."""
+"""Byte links to an autopilot over TCP, UDP and serial lines, with the URLs that MAVLink tools use."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Any, Protocol
 
 from fractus_runtime.mavlink_codec import Parser
 
-from fractus_services.mobility.mavlink.neighbours import tells_vehicle
+from fractus_services.mobility.mavlink.vehicle_identification import is_vehicle_heartbeat
 
 Receive = Callable[[bytes], None]
 Closed = Callable[[Exception | None], None]
@@ -24,18 +24,18 @@ log = logging.getLogger(__name__)
 
 CONNECT_TIMEOUT_S = 5.0
 PEER_SILENCE_S = 3.0
-"""An autopilot that is silent for so long may come back from another port."""
+"""An autopilot that is silent for this time may continue from another port."""
 
 
 class BadUrl(ValueError):
-    """A connection string that names no link."""
+    """The URL of the autopilot is invalid."""
 
 
 class Transport(Protocol):
-    """An open byte link."""
+    """Open byte link."""
 
     def write(self, data: bytes) -> None:
-        """Send bytes, without waiting."""
+        """Send bytes without waiting."""
 
     def close(self) -> None:
         """Close the link."""
@@ -54,15 +54,15 @@ class _Stream(asyncio.Protocol):
 
 
 class _Datagrams(asyncio.DatagramProtocol):
-    """A UDP link.
+    """UDP link.
 
-    One that listens belongs to the sender of the first heartbeat of an autopilot: others are neither heard nor spoken to
-    until that one has been silent for a while.
+    A listening link belongs to the sender of the first heartbeat of an autopilot. Datagrams of other senders are dropped until that
+    sender has been silent for a while.
 
     Args:
-        receive: takes what arrives.
-        closed: called once when the link breaks.
-        connected: whether the socket has its peer already, and hears no other.
+        receive: Callback for received bytes.
+        closed: Callback invoked once when the link breaks.
+        connected: True if the socket is connected to its peer and receives nothing from other senders.
     """
 
     def __init__(self, receive: Receive, closed: Closed, connected: bool) -> None:
@@ -70,7 +70,7 @@ class _Datagrams(asyncio.DatagramProtocol):
         self._closed = closed
         self._connected = connected
         self._peer: tuple[Any, ...] | None = None
-        self._heard_at = 0.0
+        self._received_at = 0.0
         self._transport: Any = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -84,13 +84,13 @@ class _Datagrams(asyncio.DatagramProtocol):
     def _from_peer(self, data: bytes, addr: tuple[Any, ...]) -> bool:
         now = time.monotonic()
         if addr != self._peer:
-            if self._peer is not None and now - self._heard_at < PEER_SILENCE_S:
+            if self._peer is not None and now - self._received_at < PEER_SILENCE_S:
                 return False
             if not _from_autopilot(data):
                 return False
-            log.info("link: heard an autopilot (host=%s, port=%s)", addr[0], addr[1])
+            log.info("link: autopilot detected (host=%s, port=%s)", addr[0], addr[1])
             self._peer = addr
-        self._heard_at = now
+        self._received_at = now
         return True
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -110,11 +110,11 @@ class _Datagrams(asyncio.DatagramProtocol):
 
 
 def _from_autopilot(data: bytes) -> bool:
-    """Whether a datagram holds a sound heartbeat of a flight controller."""
-    return any(map(tells_vehicle, Parser().feed(data)))
+    """Return True if a datagram contains an intact heartbeat of a flight controller."""
+    return any(map(is_vehicle_heartbeat, Parser().feed(data)))
 
 
-def _loopback(host: str) -> bool:
+def _is_loopback(host: str) -> bool:
     if host == "localhost":
         return True
     try:
@@ -124,12 +124,12 @@ def _loopback(host: str) -> bool:
 
 
 class _Serial:
-    """A serial device in raw mode, read by the event loop."""
+    """Serial device in raw mode, read by the event loop."""
 
     def __init__(self, device: str, baud: int, receive: Receive, closed: Closed) -> None:
         speed = getattr(termios, f"B{baud}", None)
         if speed is None:
-            raise BadUrl(f"serial speed {baud} is not one that this system knows; use 57600, 115200 or 921600")
+            raise BadUrl(f"serial speed {baud} is not supported; use 57600, 115200 or 921600")
         self._receive = receive
         self._closed = closed
         self._loop = asyncio.get_running_loop()
@@ -163,7 +163,7 @@ class _Serial:
             try:
                 os.write(self._fd, data)
             except BlockingIOError:
-                return  # the line is slower than we talk; the next setpoint replaces this one
+                return  # the line is slower than the messages; the next setpoint replaces this one
             except OSError as error:
                 self._fail(error)
 
@@ -175,7 +175,7 @@ class _Serial:
 
 
 def _configure(fd: int, speed: int) -> None:
-    """Raw bytes at a speed, without modem lines, and for no other process: an autopilot has one owner."""
+    """Configure a raw line without modem control for exclusive use, because an autopilot has one owner."""
     tty.setraw(fd)
     settings = termios.tcgetattr(fd)
     settings[2] = (settings[2] | termios.CLOCAL | termios.CREAD) & ~termios.CRTSCTS
@@ -188,36 +188,34 @@ async def open_link(url: str, receive: Receive, closed: Closed) -> Transport:
     """Open a link.
 
     Args:
-        url: `tcp:HOST:PORT`, `udpin:HOST:PORT`, `udpout:HOST:PORT` or `serial:DEVICE:BAUD`. MAVLink proves nothing
-            about its sender, so `udpin` listens to this computer only; `udpout` and `tcp` pick the peer themselves.
-        receive: takes what arrives.
-        closed: called once when the link breaks.
+        url: `tcp:HOST:PORT`, `udpin:HOST:PORT`, `udpout:HOST:PORT` or `serial:DEVICE:BAUD`. MAVLink does not authenticate
+            senders, so `udpin` accepts loopback addresses only. `udpout` and `tcp` choose their peer.
+        receive: Callback for received bytes.
+        closed: Callback invoked once when the link breaks.
 
     Raises:
-        BadUrl: the string names no link.
-        OSError: the link cannot be opened.
+        BadUrl: The URL is invalid.
+        OSError: The link cannot be opened.
     """
     scheme, _, rest = url.partition(":")
-    where, _, number = rest.rpartition(":")
-    if scheme not in {"tcp", "udpin", "udpout", "serial"} or not where or not number.isdigit():
+    address, _, number = rest.rpartition(":")
+    if scheme not in {"tcp", "udpin", "udpout", "serial"} or not address or not number.isdigit():
         raise BadUrl(
-            f"{url!r} is no autopilot link; use tcp:HOST:PORT, udpin:HOST:PORT, udpout:HOST:PORT or serial:DEVICE:BAUD"
+            f"{url!r} is not an autopilot URL; use tcp:HOST:PORT, udpin:HOST:PORT, udpout:HOST:PORT or serial:DEVICE:BAUD"
         )
-    if scheme == "udpin" and not _loopback(where):
-        raise BadUrl(
-            f"{url!r} would take an autopilot from any host that reaches this one; use udpin:127.0.0.1:{number}"
-        )
+    if scheme == "udpin" and not _is_loopback(address):
+        raise BadUrl(f"{url!r} would accept an autopilot on any host; use udpin:127.0.0.1:{number}")
     if scheme == "serial":
-        return _Serial(where, int(number), receive, closed)
+        return _Serial(address, int(number), receive, closed)
     loop = asyncio.get_running_loop()
     async with asyncio.timeout(CONNECT_TIMEOUT_S):
         if scheme == "tcp":
-            transport, _ = await loop.create_connection(lambda: _Stream(receive, closed), where, int(number))
+            transport, _ = await loop.create_connection(lambda: _Stream(receive, closed), address, int(number))
             return transport
-        place = (where, int(number))
+        endpoint = (address, int(number))
         _, protocol = await loop.create_datagram_endpoint(
             lambda: _Datagrams(receive, closed, scheme == "udpout"),
-            local_addr=place if scheme == "udpin" else None,
-            remote_addr=place if scheme == "udpout" else None,
+            local_addr=endpoint if scheme == "udpin" else None,
+            remote_addr=endpoint if scheme == "udpout" else None,
         )
         return protocol

@@ -22,13 +22,12 @@ from fractus_services.grpc_server import run_until, serve_grpc
 from fractus_services.metrics import ServiceMetrics, common_figures
 from fractus_services.mobility.authority.journal import Journal
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
-from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
 from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes
 from fractus_services.mobility.mavlink.fence import MissionFence
-from fractus_services.mobility.mavlink.neighbours import Memory
-from fractus_services.mobility.mavlink.returning import MavlinkReturn
-from fractus_services.mobility.mavlink.startup import VEHICLE_FILE, came_to_serve
-from fractus_services.mobility.mavlink.traced import TracedAutopilot
+from fractus_services.mobility.mavlink.mavlink_autopilot import MavlinkAutopilot
+from fractus_services.mobility.mavlink.rtl_parameters import RtlParameters
+from fractus_services.mobility.mavlink.startup_heartbeat import VEHICLE_FILE, mark_served
+from fractus_services.mobility.mavlink.vehicle_identification import KnownVehicleFile
 from fractus_services.mobility.rpc.components import MobilityComponents
 from fractus_services.mobility.rpc.flight_metrics import flight_figures
 from fractus_services.mobility.rpc.handlers import MobilityHandlers
@@ -96,9 +95,9 @@ def _connect(
     def on_found() -> None:
         found.set()
         components.observer.found()
-        components.control.tasks.spawn(came_to_serve(options.state))
+        components.control.tasks.spawn(mark_served(options.state))
 
-    autopilot = TracedAutopilot(
+    autopilot = MavlinkAutopilot(
         url,
         ARDUCOPTER,
         # The components need the autopilot, so its callbacks look them up when they are called.
@@ -106,7 +105,7 @@ def _connect(
         on_found=on_found,
         on_heartbeat=lambda: components.observer.heartbeat(),  # noqa: PLW0108
         on_parameter=lambda name: components.observer.parameter(name),  # noqa: PLW0108
-        memory=Memory(options.state / VEHICLE_FILE, url),
+        known_vehicle=KnownVehicleFile(options.state / VEHICLE_FILE, url),
         received=recorder.take_received,
         sent=recorder.take_sent,
     )
@@ -114,7 +113,7 @@ def _connect(
         autopilot,
         MavlinkFailsafes(autopilot),
         MissionFence(autopilot, options.state),
-        MavlinkReturn(autopilot, options.state),
+        RtlParameters(autopilot, options.state),
         journal=Journal(options.state),
         grants=grants,
         audit=audit,

@@ -87,7 +87,7 @@ def telemetry_of(
     )
     message.time.FromNanoseconds(int(time_s * 1e9))
     # Ages are measured from the arrival of the fastest messages, whose own latency is at most this.
-    downlink_latency_s = control.autopilot.way_s
+    downlink_latency_s = control.autopilot.downlink_latency_s
     if located(control):
         message.position.CopyFrom(position_of(vehicle))
         message.velocity.CopyFrom(velocity_of(vehicle))

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from fractus_runtime.mavlink_codec import Endpoint, Parser
-from fractus_services.mobility.mavlink import startup
+from fractus_services.mobility.mavlink import startup_heartbeat
 from fractus_services.mobility.mavlink.companion import COMPONENT_ID, SYSTEM_ID
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from virtual_time import Loop
@@ -57,7 +57,7 @@ class Air:
 
 def served(directory: Path) -> Path:
     (directory / "vehicle.json").write_text(json.dumps({"link": URL, "system": 1, "component": 1}))
-    asyncio.run(startup.came_to_serve(directory))
+    asyncio.run(startup_heartbeat.mark_served(directory))
     return directory
 
 
@@ -65,10 +65,12 @@ def start(
     air: Air, directory: Path, monkeypatch: pytest.MonkeyPatch, *, url: str | None = None, takes_s: float = 7.5
 ) -> list[float]:
     """When heartbeats were sent during a start."""
-    monkeypatch.setattr(startup, "open_link", air.open_link)
+    monkeypatch.setattr(startup_heartbeat, "open_link", air.open_link)
     with asyncio.Runner(loop_factory=Loop) as runner:
         begun_s = runner.get_loop().time()
-        assert runner.run(startup.with_heartbeats(asyncio.sleep(takes_s, "server"), directory, url)) == "server"
+        assert (
+            runner.run(startup_heartbeat.with_heartbeats(asyncio.sleep(takes_s, "server"), directory, url)) == "server"
+        )
     return [round(at - begun_s, 1) for at in air.beats]
 
 
@@ -85,7 +87,7 @@ def test_a_start_that_takes_too_long_leaves_the_drone_to_its_failsafe(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     beats = start(Air(), served(tmp_path), monkeypatch, takes_s=60.0)
-    assert startup.TIMEOUT_S - 1.5 < beats[-1] <= startup.TIMEOUT_S
+    assert startup_heartbeat.TIMEOUT_S - 1.5 < beats[-1] <= startup_heartbeat.TIMEOUT_S
 
 
 def test_a_start_that_fails_leaves_the_next_one_no_heartbeats(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,15 +7,15 @@ import asyncio
 import pytest
 from fractus_runtime.mavlink_codec import Message, message
 from fractus_services.errors import AutopilotError
-from fractus_services.mobility.mavlink import itemlists
+from fractus_services.mobility.mavlink import mission_protocol
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
-from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
-from fractus_services.mobility.mavlink.bounds import Item
 from fractus_services.mobility.mavlink.companion import COMPONENT_ID, SYSTEM_ID
-from fractus_services.mobility.mavlink.itemlists import NoLists, NoSpace, download, upload
+from fractus_services.mobility.mavlink.fence import MissionItem
+from fractus_services.mobility.mavlink.mavlink_autopilot import MavlinkAutopilot
+from fractus_services.mobility.mavlink.mission_protocol import ItemsUnsupported, NoSpace, download, upload
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-ITEMS = tuple(Item(5001, 3.0, 393600000 + i, 229500000 - i) for i in range(3))
+ITEMS = tuple(MissionItem(5001, 3.0, 393600000 + i, 229500000 - i) for i in range(3))
 
 
 class Keeper(MavlinkAutopilot):
@@ -66,7 +66,7 @@ class Keeper(MavlinkAutopilot):
 
 @pytest.fixture(autouse=True)
 def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(itemlists, "ANSWER_TIMEOUT_S", 0.01)
+    monkeypatch.setattr(mission_protocol, "ANSWER_TIMEOUT_S", 0.01)
 
 
 @pytest.mark.parametrize("lost", [(), (1,), (2,), (3, 4), (6,), (8, 9, 10), (11,)])
@@ -85,9 +85,9 @@ async def test_a_refusal_is_told(result: int, why: str) -> None:
 
 
 async def test_a_vehicle_without_such_lists_is_told_apart() -> None:
-    with pytest.raises(NoLists):
+    with pytest.raises(ItemsUnsupported):
         await upload(Keeper(result=3), ITEMS)
-    with pytest.raises(NoLists):
+    with pytest.raises(ItemsUnsupported):
         await download(Keeper(result=3))
 
 

@@ -1,4 +1,4 @@
-"""How the autopilot flies during a mission, home by itself above all: as that and its limits ask for, and as its owner chose after it."""
+"""Flight parameters of the autopilot during a mission, above all of RTL and SmartRTL; the owner's values are restored afterwards."""
 
 from __future__ import annotations
 
@@ -12,18 +12,20 @@ from fractus_core.policy.return_route import ReturnBounds
 from fractus_runtime.files import write_file
 
 from fractus_services.errors import AutopilotError
-from fractus_services.mobility.mavlink.autopilot import MavlinkAutopilot
+from fractus_services.mobility.mavlink.mavlink_autopilot import MavlinkAutopilot
 from fractus_services.mobility.mavlink.parameters import same
 
 log = logging.getLogger(__name__)
 
 
-class MavlinkReturn:
-    """Lowers height and speed of RTL and SmartRTL, and lets hold what a mission needs, see `ReturnLimits`. What the owner had is on disk before it is changed.
+class RtlParameters:
+    """Lowers altitude and speed of RTL and SmartRTL and sets the parameters that a mission needs, see `ReturnLimits`.
+
+    The owner's values are stored on disk before they are changed.
 
     Args:
-        autopilot: the link.
-        directory: the service's state directory.
+        autopilot: Link to the vehicle.
+        directory: State directory of the service.
     """
 
     def __init__(self, autopilot: MavlinkAutopilot, directory: Path) -> None:
@@ -37,50 +39,50 @@ class MavlinkReturn:
 
     @property
     def limited(self) -> bool:
-        """Whether the vehicle has values of ours."""
+        """True while the vehicle has values of the service."""
         return bool(self._owned)
 
     async def limit(self, bounds: ReturnBounds) -> tuple[str, ...]:
-        """Set what is above the bounds, and what was lowered more than they ask; what changed, in sentences.
+        """Lower what exceeds the bounds, raise what was lowered more than necessary, and return the changes as sentences.
 
         Raises:
-            AutopilotError: it cannot be set, or the link broke.
-            OSError: what the owner had cannot be stored.
+            AutopilotError: A parameter cannot be set, or the link broke.
+            OSError: The owner's values cannot be stored.
         """
         async with self._lock:
-            told = await self._parameters.read(self._names)
-            # What the file says of another release's names is not this vehicle's.
-            owned = told | {name: value for name, value in self._owned.items() if name in told}
+            current = await self._parameters.read(self._names)
+            # Ignore stored names that this release of the firmware does not have.
+            owned = current | {name: value for name, value in self._owned.items() if name in current}
             wanted = self._stack.return_values(owned, bounds) | self._flown(owned)
-            changed = {name: value for name, value in wanted.items() if not same(told[name], value)}
+            changed = {name: value for name, value in wanted.items() if not same(current[name], value)}
             if changed:
                 self._owned = {name: owned[name] for name in wanted}
                 await asyncio.to_thread(write_file, self._path, json.dumps(self._owned).encode())
                 self._remember()
                 await self._set(changed)
-            return tuple(f"{name} was {told[name]:g} and is {value:g}" for name, value in changed.items())
+            return tuple(f"{name} was {current[name]:g} and is {value:g}" for name, value in changed.items())
 
     async def lift(self, idle: Callable[[], bool]) -> None:
-        """Put back what the owner had, if anything was changed.
+        """Restore the owner's values if any was changed.
 
         Args:
-            idle: whether no mission needs the limits; asked when no other change of them is under way.
+            idle: Returns True if no mission needs the limits. Called while no other change is in progress.
 
         Raises:
-            AutopilotError: it cannot be; it is tried again next time.
+            AutopilotError: A value cannot be restored. The next call tries again.
         """
         async with self._lock:
             if not idle() or not self._owned:
                 return
-            told = await self._parameters.read(self._names)
-            await self._set({name: value for name, value in self._owned.items() if name in told})
+            current = await self._parameters.read(self._names)
+            await self._set({name: value for name, value in self._owned.items() if name in current})
             await asyncio.to_thread(self._path.unlink, True)
             self._owned = {}
             self._remember()
-            log.info("returning: as the vehicle's owner left it")
+            log.info("rtl: owner's parameters restored")
 
     def _flown(self, owned: dict[str, float]) -> dict[str, float]:
-        """What must hold during a mission, as far as the vehicle has it; the owner's where that will do."""
+        """Return the values that a mission needs, for the parameters that the vehicle has. Suitable values of the owner stay."""
         return {
             name: owned[name] if setting.holds(owned[name]) else setting.value
             for setting in self._stack.flown
@@ -92,11 +94,11 @@ class MavlinkReturn:
         for name, value in values.items():
             after = await self._parameters.write(name, value)
             if not same(after, value):
-                raise AutopilotError(f"{name} cannot be set to {value:g}; it stays {after:g}")
-            log.info("returning: set (name=%s, value=%g)", name, value)
+                raise AutopilotError(f"{name} cannot be set to {value:g}; it remains {after:g}")
+            log.info("rtl: parameter set (name=%s, value=%g)", name, value)
 
     def _remember(self) -> None:
-        """Legs are flown with the owner's speed, as far as limits on them allow, not with that of the autopilot's return."""
+        """Let legs be flown with the owner's speed, within their limits, instead of the lowered speed of the return flight."""
         self._parameters.leg_speed = {n: v for n, v in self._owned.items() if n in self._stack.leg_speed}
 
     def _load(self) -> dict[str, float]:
@@ -105,5 +107,7 @@ class MavlinkReturn:
         except FileNotFoundError:
             return {}
         except (ValueError, AttributeError, TypeError) as error:
-            log.critical("returning: the owner's values are lost (file=%s, error=%s)", self._path, error)
+            log.critical(
+                "rtl: cannot read the owner's parameters, they are lost (file=%s, error=%s)", self._path, error
+            )
             return {}

@@ -9,7 +9,7 @@ from contextlib import asynccontextmanager, suppress
 import grpc
 import pytest
 from fractus.errors import InvalidRequest, Unavailable
-from fractus.exchange import ATTEMPT, ID, SERVICE, Answers, Request, Requester, Responder
+from fractus.exchange import ATTEMPT_HEADER, ID_HEADER, SERVICE, Answers, Request, Requester, Responder
 
 
 class Worker:
@@ -128,7 +128,7 @@ async def test_refused_request_is_not_retried() -> None:
             await asking.ask("work", b"x")
         with pytest.raises(InvalidRequest):
             await asking.ask("play", b"x")
-        with pytest.raises(InvalidRequest, match="at most 16 MiB"):
+        with pytest.raises(InvalidRequest, match="exceeds 16 MiB"):
             await asking.ask("work", b"x" * (16 * 2**20 + 1))
     assert asking.repeated == 0
 
@@ -158,7 +158,7 @@ async def test_request_without_response_fails_at_its_timeout() -> None:
 async def test_request_without_id_is_refused() -> None:
     worker = Worker()
     async with worker.serving() as responder, grpc.aio.insecure_channel(f"127.0.0.1:{responder.port}") as channel:
-        for metadata in ((), ((ID, "x" * 300),)):
+        for metadata in ((), ((ID_HEADER, "x" * 300),)):
             with pytest.raises(grpc.aio.AioRpcError) as caught:
                 await channel.unary_unary(f"/{SERVICE}/work")(b"x", metadata=metadata)
             assert caught.value.code() is grpc.StatusCode.INVALID_ARGUMENT
@@ -183,6 +183,6 @@ async def test_non_numeric_attempt_counts_as_first() -> None:
     worker = Worker()
     async with worker.serving() as responder, grpc.aio.insecure_channel(f"127.0.0.1:{responder.port}") as channel:
         for number, attempt in enumerate(("9" * 5000, "x", "-1", "")):
-            metadata = ((ID, str(number)), (ATTEMPT, attempt))
+            metadata = ((ID_HEADER, str(number)), (ATTEMPT_HEADER, attempt))
             assert await channel.unary_unary(f"/{SERVICE}/work")(b"x", metadata=metadata) == b"did x"
     assert worker.done == ["0", "1", "2", "3"]

@@ -11,7 +11,7 @@ from typing import Any
 import atheris
 
 with atheris.instrument_imports(include=["fractus.exchange"]):
-    from fractus.exchange import ATTEMPT, ID, Request, Responder
+    from fractus.exchange import ATTEMPT_HEADER, ID_HEADER, Request, Responder
 import grpc
 from virtual_time import fly
 
@@ -73,12 +73,12 @@ async def requests(given: atheris.FuzzedDataProvider) -> None:
         said: list[tuple[str, str | bytes]] = []
         if given.ConsumeIntInRange(0, 7):
             said.append(
-                (ID, given.PickValueInList(IDS) if given.ConsumeBool() else given.ConsumeUnicodeNoSurrogates(80))
+                (ID_HEADER, given.PickValueInList(IDS) if given.ConsumeBool() else given.ConsumeUnicodeNoSurrogates(80))
             )
         if given.ConsumeIntInRange(0, 3):
-            said.append((ATTEMPT, given.PickValueInList(ATTEMPTS)))
+            said.append((ATTEMPT_HEADER, given.PickValueInList(ATTEMPTS)))
         if not given.ConsumeIntInRange(0, 7):
-            said.append((given.PickValueInList([ID, ATTEMPT]), given.ConsumeUnicodeNoSurrogates(10)))
+            said.append((given.PickValueInList([ID_HEADER, ATTEMPT_HEADER]), given.ConsumeUnicodeNoSurrogates(10)))
         task = asyncio.ensure_future(call(given.PickValueInList([b"", b"x", b"y"]), Context(tuple(said))))
         running.append(task)
         if given.ConsumeBool():

@@ -1,6 +1,6 @@
-"""What the mobility service needs of an autopilot: the state of its vehicle, its commands, and what it does by itself.
+"""Interface between the mobility service and an autopilot: vehicle state, commands, failsafes, return limits and fence.
 
-This is the seam: `authority` and `flight` know an autopilot by this module alone, `mavlink` is what is behind it.
+`authority` and `flight` use this module only. `mavlink` implements it.
 """
 
 from __future__ import annotations
@@ -20,60 +20,57 @@ from fractus_core.policy.return_route import ReturnBounds
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 Permit = Callable[[], None]
-"""Asked before each sending of a command; raises when it must not be sent any more."""
+"""Called before each transmission of a command. Raises an exception if the command must no longer be sent."""
 
 BEING_SET = "they are being set"
-"""The problem of failsafes that are not read back yet."""
+"""Problem of failsafes that are not read back yet."""
 
 LANDED_MAX_AGE_S = 2.0
 SURELY_M, UNTOLD_M = 1.5, 0.5
-"""Above the first a drone flies though it says it stands on the ground; above the second when it does not say."""
+"""Altitude above which a drone flies although it reports ON_GROUND, and altitude above which it flies if it reports nothing."""
 _IN_AIR = frozenset(
     {mavlink.MAV_LANDED_STATE_IN_AIR, mavlink.MAV_LANDED_STATE_TAKEOFF, mavlink.MAV_LANDED_STATE_LANDING}
 )
 DEFAULT_ERROR_M = 1.5
-"""Position error, 1 sigma, of a GPS that tells none."""
+"""Default 1-sigma position error if the GPS reports none, in metres."""
 
 MAX_POSITION_AGE_S = 1.0
-"""A position older than this is no position: at 20 Hz in flight, twenty in a row were lost."""
+"""An older position counts as unknown: at 20 Hz in flight, 20 positions in a row were lost."""
 
 WIND_MAX_AGE_S = 10.0
-"""The wind was estimated longer ago than this by an autopilot that has stopped to tell."""
+"""Maximum age of the wind estimate."""
 
 READY_MAX_AGE_S = 5.0
-"""What the autopilot told of its readiness longer ago says nothing: at 1 Hz, four messages in a row were lost."""
+"""Maximum age of the reported readiness: at 1 Hz, four messages in a row were lost."""
 
 COURSE_S = 0.3
-"""Velocities this far back, by the vehicle's clock, tell how the drone speeds up."""
+"""Period of velocities, on the vehicle's clock, from which the acceleration is computed."""
 
 LEG_MPS = 1000.0
-"""Of a leg that was begun a moment ago only the direction is known: it is pending with this speed, and so vertically."""
+"""Pending speed of a leg, horizontally and vertically. Only the direction of a recently started leg is known."""
 
 SLOW_MPS = 0.1
-"""Below this speed a drone has no course: its velocity is noise."""
+"""Below this speed the velocity is noise and gives no course."""
 
 
 @dataclass(slots=True)
 class VehicleState:
-    """What the autopilot last said of the vehicle; times are monotonic seconds.
+    """Latest state that the autopilot reported. Times are monotonic seconds.
 
     Attributes:
-        position_at: when the position would have come, had it come as fast as the fastest of late.
-        yaw_deg: heading as the position says it; `heading_deg` is the attitude's.
-        gimbal: how it turns the camera, yaw from true north, as measured; its time is that of the older of two measurements,
-            for its yaw counts from the nose.
-        ground_home: home as it was told last while the vehicle did not fly, or first after it was armed; None until then.
-        ready: whether its checks before arming pass, in the mode in which it is.
-        checks_at: when it told that.
-        estimated: whether its estimator has an absolute position, and predicts one.
-        estimated_at: when it told that.
-        path_lost: whether the autopilot has given up remembering its path since it was armed.
-        satellites: that the receiver sees; None until it has told.
-        wind_at: when the autopilot told of the wind.
-        reports: number, MAV_SEVERITY and text of what the autopilot said of late.
-        unclear: why it is not certain which vehicle on the link is the drone's own; empty when it is.
-        silent_s: how long before its last heartbeat came the one before that.
-        located: whether GPS has a three-dimensional fix of some accuracy; positions without one are not taken.
+        position_at: Time of the position, corrected for the delay beyond that of the fastest recent message.
+        yaw_deg: Heading from the position message; `heading_deg` is from the attitude message.
+        gimbal: Measured attitude of the camera, yaw from true north. `gimbal_at` is the older of the gimbal's and the vehicle's
+            attitude, because the yaw is measured from the vehicle's heading.
+        ground_home: Latest home that was reported while the vehicle did not fly, or the first one after arming.
+        ready: True if the pre-arm checks of the current mode pass, reported at `checks_at`.
+        estimated: True if the estimator has and predicts an absolute position, reported at `estimated_at`.
+        path_lost: True if the autopilot has stopped recording its path since it was armed.
+        satellites: Number of visible satellites; None until it is reported.
+        reports: Number, MAV_SEVERITY and text of recent status texts.
+        unclear: Reason why the drone's own vehicle is not certain; empty if it is certain.
+        silent_s: Interval between the last two heartbeats.
+        located: True if GPS has an accurate three-dimensional fix. Positions without such a fix are ignored.
     """
 
     lat: float | None = None
@@ -124,13 +121,13 @@ class VehicleState:
 
     @property
     def standing(self) -> bool:
-        """Whether the autopilot says, as lately as it says the rest, that it stands on the ground."""
+        """True if EXTENDED_SYS_STATE reports ON_GROUND and is as recent as the other messages."""
         told = max(self.heartbeat_at, self.position_at) - self.landed_at <= LANDED_MAX_AGE_S
         return told and self.landed_state == mavlink.MAV_LANDED_STATE_ON_GROUND
 
     @property
     def in_air(self) -> bool:
-        """Whether it flies, in doubt it does."""
+        """True if the vehicle flies, or if that is uncertain."""
         if not self.armed:
             return False
         if self.landed_state in _IN_AIR:
@@ -141,11 +138,11 @@ class VehicleState:
 
     @property
     def speed_mps(self) -> float:
-        """Horizontal speed over ground."""
+        """Horizontal ground speed."""
         return math.hypot(self.north_mps, self.east_mps)
 
     def unready(self, now: float) -> str:
-        """Why it would not arm in the mode in which it obeys the companion; empty when it would, as far as it has told lately."""
+        """Return why the autopilot would refuse to arm in GUIDED, according to recent messages; empty if it would not."""
         if now - self.checks_at > READY_MAX_AGE_S:
             return "it does not tell whether its checks pass (SYS_STATUS)"
         if not self.ready:
@@ -158,26 +155,26 @@ class VehicleState:
         return self.unclear if self.home is not None else "it has no home yet (HOME_POSITION)"
 
     def position_fresh(self, now: float) -> bool:
-        """Whether the position is recent enough to judge and to fly by; `now` is monotonic, as `position_at` is."""
+        """Return True if the position is recent enough to judge and to fly by."""
         return now - self.position_at <= MAX_POSITION_AGE_S
 
     def keeps_place(self, now: float) -> bool:
-        """Whether it surely stays above one place."""
+        """Return True if the vehicle certainly stays above one place."""
         return self.position_fresh(now) and self.speed_mps < STATIONARY_MPS
 
     def at_rest(self, now: float) -> bool:
-        """Whether it surely stands, in the sense of the policy engine."""
+        """Return True if the vehicle is certainly stationary, as the policy engine defines it."""
         return self.keeps_place(now) and abs(self.down_mps) < STATIONARY_MPS
 
     def distance_m(self, lat: float, lon: float) -> float:
-        """How far away a place is over ground; infinite while the position is unknown."""
+        """Return the horizontal distance to a place; infinite while the position is unknown."""
         if self.lat is None or self.lon is None:
             return math.inf
         return math.hypot(*LocalFrame(lat, lon).xy(self.lat, self.lon))
 
     @property
     def forward_mps2(self) -> float | None:
-        """How much it speeds up along its course, over the last velocities; None while these are too few."""
+        """Acceleration along the course; None while too few velocities are known."""
         if len(self.courses) < 2:
             return None
         (begun, north, east), (now, *_) = self.courses[0], self.courses[-1]
@@ -188,7 +185,7 @@ class VehicleState:
 
     @property
     def flight_state(self) -> str:
-        """inactive, takingOff, flying or landing."""
+        """Flight state: inactive, takingOff, flying or landing."""
         if not self.in_air:
             return "inactive"
         if self.landed_state == mavlink.MAV_LANDED_STATE_TAKEOFF:
@@ -199,16 +196,16 @@ class VehicleState:
 
 @dataclass(frozen=True, slots=True)
 class Checked:
-    """What the autopilot will do by itself, and what it will not.
+    """Result of the verification of the failsafes.
 
     Attributes:
-        problem: why nothing may arm; empty when every needed failsafe was read back.
-        missing: optional ones that the vehicle does not offer.
-        remembers: whether the vehicle can go back the way it came; `airframe.retraces` says that its failsafes will.
-        airframe: how it moves, from its own parameters.
-        speed_mps: the speed it flies legs with.
-        changed: what was set, in sentences.
-        lost: whether the problem is only that the vehicle did not answer.
+        problem: Reason why arming is refused; empty if every required failsafe was read back.
+        missing: Optional settings that the vehicle does not have.
+        remembers: True if the vehicle can return along its path; `airframe.retraces` shows if its failsafes will.
+        airframe: Dynamics from the vehicle's parameters.
+        speed_mps: Speed of legs.
+        changed: Changed settings as sentences.
+        lost: True if the only problem is that the vehicle did not answer.
     """
 
     problem: str
@@ -221,13 +218,13 @@ class Checked:
 
 
 class Modes(Protocol):
-    """The flight modes that the service itself uses.
+    """Flight modes that the service uses.
 
     Attributes:
-        guided: the mode in which the autopilot obeys the companion.
-        land: the mode in which it lands where it is.
-        return_straight: the mode in which it flies home straight.
-        return_retracing: the mode in which it flies home on the path that it came; `return_straight` where there is none.
+        guided: Mode in which the autopilot follows the companion's commands.
+        land: Mode that lands at the current position.
+        return_straight: Mode that flies home on a straight line.
+        return_retracing: Mode that flies home along the path; equal to `return_straight` if the firmware has none.
     """
 
     guided: FlightMode
@@ -237,21 +234,21 @@ class Modes(Protocol):
 
 
 class Autopilot(Protocol):
-    """One vehicle, and what it can be told. Commands raise AutopilotError when the vehicle refuses, or is not heard.
+    """One vehicle and its commands. Commands raise AutopilotError if the vehicle refuses or is silent.
 
     Attributes:
-        starting: held by the one who prepares to start the motors.
+        starting: Lock held while the start of the motors is being prepared.
     """
 
     starting: asyncio.Lock
 
     @property
     def vehicle(self) -> VehicleState:
-        """The streamed state."""
+        """Latest state of the vehicle."""
 
     @property
     def stack(self) -> Modes:
-        """Its firmware."""
+        """Firmware of the autopilot."""
 
     @property
     def now(self) -> float:
@@ -259,115 +256,115 @@ class Autopilot(Protocol):
 
     @property
     def pace(self) -> float:
-        """How many of the vehicle's seconds go by in one of ours: more than one in a simulator that runs faster."""
+        """Seconds of the vehicle's clock per second of real time; above 1 in an accelerated simulation."""
 
     @property
     def latency_s(self) -> float:
-        """The vehicle's seconds from the state that is known to the effect of a command sent now, at most; infinite: too long to fly by."""
+        """Upper bound of the time from the known state to the effect of a command sent now, in seconds of the vehicle's clock. Infinite if the link is too slow to fly."""
 
     @property
     def downlink_latency_s(self) -> float:
-        """Seconds that a message takes here, at most; infinite while that is not known."""
+        """Upper bound of the delay of a received message in seconds; infinite while it is unknown."""
 
     @property
     def pending(self) -> tuple[tuple[float, float, float], ...]:
-        """Velocities north, east and down that commands of late ask for, which the state that is known may not show yet."""
+        """Velocities (north, east, down) of recent setpoints that the known state may not show yet."""
 
     @property
     def link_problem(self) -> str:
-        """Why the link lets nothing arm; empty when nothing is wrong."""
+        """Reason why the link's delay forbids arming; empty if there is none."""
 
     @property
     def at_rest(self) -> bool:
-        """Whether the vehicle surely stands, and was told nothing else."""
+        """True if the vehicle is certainly stationary and has no pending setpoint."""
 
     @property
     def found(self) -> bool:
-        """Whether the vehicle was heard since the link came up."""
+        """True if the vehicle was identified since the connection was opened."""
 
     @property
     def connected(self) -> bool:
-        """Whether the vehicle is heard."""
+        """True while heartbeats of the vehicle arrive."""
 
     def send_heartbeat(self) -> None:
-        """Send a heartbeat now, if the companion does its duty."""
+        """Send a heartbeat now if the companion works."""
 
     async def update(self, timeout_s: float) -> bool:
-        """Wait for a message of the vehicle; False when none came in time."""
+        """Wait for an update of the vehicle's state; return False after the timeout."""
 
     async def set_mode(self, mode: FlightMode, permit: Permit = ...) -> None:
-        """Change the flight mode and wait until the autopilot flies it."""
+        """Change the flight mode and wait until the autopilot reports it."""
 
     async def arm(self, permit: Permit = ...) -> None:
         """Start the motors."""
 
     async def disarm(self, permit: Permit = ...) -> None:
-        """Stop the motors; the autopilot refuses in the air."""
+        """Stop the motors. The autopilot refuses in the air."""
 
     async def set_home(self, lat: float, lon: float, amsl_m: float) -> None:
-        """Fix home, so that arming elsewhere does not move it."""
+        """Set home, so that arming elsewhere does not move it."""
 
     async def request_home(self) -> None:
-        """Ask for the home position now."""
+        """Request the home position now."""
 
     async def take_off(self, altitude_m: float, permit: Permit = ...) -> None:
-        """Begin to climb to an altitude above home."""
+        """Start to climb to an altitude above home."""
 
     async def go_to(
         self, lat: float, lon: float, altitude_m: float, yaw_deg: float | None, permit: Permit = ...
     ) -> None:
-        """Begin to fly straight to a point; altitude above home. Its speed is to be set each time, see `set_speed`."""
+        """Start to fly straight to a point; altitude above home. Set the speed after each call, see `set_speed`."""
 
     async def set_speed(self, speed_mps: float, permit: Permit = ...) -> None:
-        """Fly the leg under way with this horizontal speed over ground; the next one may begin with the default again."""
+        """Set the horizontal ground speed of the current leg. The next leg may start with the default speed."""
 
     async def turn(self, yaw_deg: float, permit: Permit = ...) -> None:
-        """Point the nose, on the leg under way."""
+        """Turn to a heading during the current leg."""
 
     async def point_gimbal(self, pitch_deg: float, yaw_deg: float, permit: Permit = ...) -> None:
-        """Turn the camera: pitch over the horizon, yaw clockwise from the nose."""
+        """Point the camera: pitch above the horizon, yaw clockwise from the vehicle's heading."""
 
     def stop(self) -> None:
-        """Brake and hold."""
+        """Brake and hold the position."""
 
     def fly(self, north_mps: float, east_mps: float, down_mps: float, yaw_deg: float | None = None) -> None:
-        """Fly with a velocity over ground, until it times out in the autopilot."""
+        """Fly with a velocity over ground until it times out in the autopilot."""
 
     async def set_rates(self, flying: bool) -> None:
-        """Ask for the streams, more often in the air."""
+        """Request the message rates, higher in the air."""
 
 
 class Failsafes(Protocol):
-    """What the autopilot does by itself when the companion falls silent, or the battery runs low."""
+    """The autopilot's own failsafes for a silent companion or a low battery."""
 
     async def configure(self, *, flying: bool = False, before: Checked | None = None) -> Checked:
-        """Set them, read each one back, and learn how the vehicle moves."""
+        """Set the failsafes, read each one back, and return them with the vehicle's dynamics."""
 
     async def choose_return(self, checked: Checked, *, retrace: bool) -> Checked:
-        """Let them bring the drone home straight, or, where the vehicle can, on the path that it came."""
+        """Let the failsafes return straight, or along the path if the vehicle supports that."""
 
     async def learn_return(self, checked: Checked) -> Checked:
-        """Learn at which altitude the autopilot flies home by itself."""
+        """Update the altitude of the autopilot's own return flight."""
 
     def concerns(self, name: str) -> bool:
-        """Whether a parameter is one of those that are set or read here."""
+        """Return True if a parameter is set or read by the failsafes."""
 
     def learn(self, checked: Checked) -> Checked:
-        """How the vehicle moves by what it has told until now."""
+        """Update the vehicle's dynamics from the parameters known so far."""
 
 
 class ReturnLimits(Protocol):
-    """How the autopilot flies during a mission, and how high and how fast home by itself."""
+    """Flight parameters of the autopilot during a mission, above all altitude and speed of its own return flight."""
 
     @property
     def limited(self) -> bool:
-        """Whether the vehicle has values of ours."""
+        """True while the vehicle has values of the service."""
 
     async def limit(self, bounds: ReturnBounds) -> tuple[str, ...]:
-        """Set what is above the bounds, what was lowered more than they ask, and what a mission needs; what changed, in sentences."""
+        """Lower what exceeds the bounds, raise what was lowered more than necessary, and return the changes as sentences."""
 
     async def lift(self, idle: Callable[[], bool]) -> None:
-        """Put back what the owner had, if anything was changed."""
+        """Restore the owner's values if any was changed."""
 
 
 class Fence(Protocol):
@@ -375,26 +372,29 @@ class Fence(Protocol):
 
     @property
     def missing(self) -> str:
-        """Why there is none; empty when the autopilot offers one."""
+        """Reason why the vehicle has no fence; empty if it has one."""
 
     @property
     def raised(self) -> bool:
-        """Whether the vehicle has a fence of ours."""
+        """True while the vehicle has a fence of the service."""
 
     async def raise_around(self, spec: GrantSpec, *, retraces: bool) -> None:
-        """Load the outer bounds of a grant, switch the fence on, and read all of it back."""
+        """Load the outer bounds of a grant, enable the fence, and verify everything by reading it back."""
 
     async def lower(self, idle: Callable[[], bool]) -> None:
-        """Put back what the owner had, if anything was changed."""
+        """Restore the owner's fence if it was changed."""
 
     async def hold(self) -> tuple[str, ...]:
-        """Set back what another station changed of the mission's fence; what that was, in sentences."""
+        """Restore what another station changed of the mission's fence, and return the changes as sentences."""
 
 
 Approach = Callable[[TaskKind, Callable[[], bool], int], Awaitable[FlightMode]]
-"""Flies to where the autopilot may come down by itself, and says in which mode it does the rest; asked with whether the drone is to
-land or to return, whether the system still has it, and how often the autopilot refused."""
+"""Fly to a place where the autopilot may land or return by itself, and return the mode for the rest.
+
+Called with the task (land or return), a function that returns True while the system has control, and the number of refusals by the
+autopilot.
+"""
 
 
 def always() -> None:
-    """The permit of what may be sent at any time."""
+    """Permit a command at any time."""

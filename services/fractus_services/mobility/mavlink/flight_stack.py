@@ -1,7 +1,7 @@
-"""What one kind of autopilot does in its own way: the seam between the mobility service and its firmware.
+"""Interface to the autopilot's firmware.
 
-MAVLink says how to ask for a mode, a parameter or a fence, not which modes and parameters there are. All that is a
-firmware's own is behind `FlightStack`; `ardupilot` has the one of ArduCopter.
+MAVLink defines how modes, parameters and fences are requested, but not which modes and parameters exist. Everything that is specific
+to a firmware is behind `FlightStack`. `ardupilot` implements it for ArduCopter.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from fractus_core.policy.return_route import ReturnBounds
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """One parameter that must hold.
+    """One parameter value that must hold.
 
     Attributes:
-        names: its name, and older or newer spellings of it.
-        value: what it is set to.
-        accepted: values that may stay as they are.
-        span: values above the first and up to the second may stay, too.
-        needed: whether arming is refused when the vehicle does not have it.
-        why: what it does, for people.
-        also: what else must hold where the vehicle has it under one of its names.
+        names: Name of the parameter, and its names in older or newer releases.
+        value: Value that is set.
+        accepted: Values that may stay.
+        span: Values above the first and up to the second may stay, too.
+        needed: True if arming is refused when the vehicle does not have the parameter.
+        why: Purpose of the setting, for people.
+        also: Further setting that must hold if the vehicle has the parameter under this name.
     """
 
     names: tuple[str, ...]
@@ -38,51 +38,50 @@ class Setting:
     span: tuple[float, float] | None = None
 
     def holds(self, value: float) -> bool:
-        """Whether a value may stay as it is."""
+        """Return True if a value may stay."""
         within = self.span is not None and self.span[0] < value <= self.span[1]
         return value == self.value or value in self.accepted or within
 
 
 Names = tuple[tuple[str, float], ...]
-"""A parameter's name, and older or newer spellings of it, each with what its values are multiplied by."""
+"""Name of a parameter, and its names in older or newer releases, each with the factor of its values."""
 
 
 class ParameterReader(Protocol):
-    """Figures from the parameters that the vehicle told, and what is wrong with them.
+    """Values of the vehicle's parameters, and problems with them.
 
     Attributes:
-        problems: which are not numbers, or missing.
+        problems: Parameters that are missing or not a number.
     """
 
     problems: list[str]
 
     def read(self, names: Names, otherwise: float, *, needed: bool = True) -> float:
-        """A figure; another when the vehicle tells none that can be used, which is a problem if it is needed."""
+        """Return a scaled value, or the default if the parameter is missing or invalid; that is a problem if it is needed."""
 
 
 class FlightStack(Protocol):
-    """The firmware of an autopilot.
+    """Firmware of an autopilot.
 
     Attributes:
-        guided: the mode in which it obeys the companion.
-        land: the mode in which it lands where it is.
-        return_straight: the mode in which it flies home straight.
-        return_retracing: the mode in which it flies home on the path that it came; `return_straight` where there is none.
-        witness: a parameter that each such autopilot has: one that does not tell it does not answer at all.
-        failsafes: what must hold before anything may arm, and stays.
-        flown: what must hold while it flies for a mission; its owner may have it otherwise.
-        straight: failsafes that bring the drone home straight.
-        retracing: failsafes that bring it home on its own path; the first one tells in flight which of both was chosen.
-        path_memory: the parameter with the number of points of its path that it remembers, and how many are enough to rely
-            on that.
-        movement: parameters that tell how it moves, by their spellings.
-        leg_speed: the parameter with the speed of its legs, by its spellings.
-        returning: parameters that tell how high and how fast it flies home by itself, by their spellings.
-        fence_switch: the parameter that switches the fence on.
-        fence_total: the parameter that counts the fence's items.
-        fence_parameters: those of the fence in the order in which they are set, the switch last.
-        gimbal_type: the parameter with the type of its first gimbal.
-        measured_gimbals: types of which it reports what they measure; of others it may repeat what they were told.
+        guided: Mode in which the autopilot follows the companion's commands.
+        land: Mode that lands at the current position.
+        return_straight: Mode that flies home on a straight line.
+        return_retracing: Mode that flies home along the path; equal to `return_straight` if the firmware has none.
+        witness: Parameter that every autopilot with this firmware has. If it is not reported, the autopilot does not answer at all.
+        failsafes: Settings that must hold before arming and afterwards.
+        flown: Settings that must hold during a mission. The owner may have other values.
+        straight: Failsafe settings for a straight return.
+        retracing: Failsafe settings for a return along the path. The first one shows in flight which return was chosen.
+        path_memory: Parameter with the capacity of the path memory in points, and the capacity that is sufficient.
+        movement: Parameters that determine the dynamics, each with its names.
+        leg_speed: Names of the parameter with the speed of legs.
+        returning: Parameters that determine altitude and speed of the autopilot's return flight, each with its names.
+        fence_switch: Parameter that enables the fence.
+        fence_total: Parameter that counts the fence items.
+        fence_parameters: Fence parameters in the order in which they are set, the switch last.
+        gimbal_type: Parameter with the type of the first gimbal.
+        measured_gimbals: Gimbal types with a measured attitude. Other types may report their target.
     """
 
     guided: FlightMode
@@ -105,45 +104,45 @@ class FlightStack(Protocol):
     measured_gimbals: frozenset[float]
 
     def foreign(self, vehicle_type: int, autopilot: int) -> str:
-        """What flies instead, by MAV_TYPE and MAV_AUTOPILOT of its heartbeat; empty when it is this firmware's."""
+        """Return a description of a vehicle with another firmware, by its MAV_TYPE and MAV_AUTOPILOT; empty for this firmware."""
 
     def mode(self, custom_mode: int) -> FlightMode:
-        """The flight mode of a heartbeat's `custom_mode`."""
+        """Return the flight mode of a heartbeat's `custom_mode`."""
 
     def mode_parameters(self, mode: FlightMode) -> tuple[float, ...]:
-        """The parameters of MAV_CMD_DO_SET_MODE behind the first, which asks for a mode of the firmware's own."""
+        """Return the parameters of MAV_CMD_DO_SET_MODE after the first, which requests a custom mode."""
 
     def explains_refusal(self, text: str) -> bool:
-        """Whether a status text says why a command was refused."""
+        """Return True if a status text states why a command was refused."""
 
     def tells_failsafe(self, text: str) -> bool:
-        """Whether a status text says that a failsafe acts."""
+        """Return True if a status text reports an active failsafe."""
 
     def tells_path_lost(self, text: str) -> bool:
-        """Whether a status text says that the vehicle forgot the path that it came."""
+        """Return True if a status text reports that the recorded path was discarded."""
 
     def return_values(self, owned: Mapping[str, float], bounds: ReturnBounds) -> dict[str, float]:
-        """Parameters with which it flies home by itself no higher and no faster than it may.
+        """Return parameters that limit altitude and speed of the autopilot's return flight.
 
         Args:
-            owned: the owner's, as far as the vehicle has them.
-            bounds: how high and how fast it may fly.
+            owned: Values of the owner, for the parameters that the vehicle has.
+            bounds: Limits of altitude and speed.
         """
 
     def airframe(self, reader: ParameterReader, known: Airframe, speed_mps: float) -> tuple[Airframe, float]:
-        """How the vehicle moves, and the speed of its legs; what cannot be used is as it is known."""
+        """Return the vehicle's dynamics and the speed of its legs. Invalid parameters keep their known values."""
 
     def return_altitude_m(self, reader: ParameterReader, known_m: float) -> float:
-        """How high it climbs to fly home by itself, under the fence that it has by now."""
+        """Return the altitude of the autopilot's return flight under its current fence."""
 
     def fence_values(
         self, owned: Mapping[str, float], *, ceiling_m: float | None, polygon: bool, retraces: bool
     ) -> dict[str, float]:
-        """The parameters of a fence around a mission, beside the owner's own where that is in force.
+        """Return the parameters of a fence around a mission, in addition to an active fence of the owner.
 
         Args:
-            owned: the owner's, as far as the vehicle has them.
-            ceiling_m: above home; None without a limit.
-            polygon: whether there is an area that must not be left.
-            retraces: whether the vehicle that breaches it is to fly back the way it came.
+            owned: Values of the owner, for the parameters that the vehicle has.
+            ceiling_m: Maximum altitude above home; None without a limit.
+            polygon: True if the mission is limited to an area.
+            retraces: True if a vehicle that breaches the fence should return along its path.
         """

@@ -1,10 +1,10 @@
-"""How late the vehicle's state comes and how late it obeys: measured upper bounds, in seconds of the vehicle's own clock.
+"""Upper bounds of the delays of vehicle state and commands, in seconds of the vehicle's clock.
 
-The autopilot stamps its positions and the TIMESYNC requests that it hears with one clock, whose offset to ours is not
-known. Let E be the latest reading of that clock that its positions prove. A request that is sent at E and heard at H
-took the vehicle at most H - E longer than the fastest position takes to come: the way there and that way back together.
-A position stamped S is E - S older than the fastest one would be. Their sum, E - S + max(H - E), bounds the time from a
-position to the effect of a command that is sent now: the unknown offset cancels, whichever way is the slower one.
+The autopilot stamps its positions and the TIMESYNC requests that it receives with one clock. The offset of this clock is unknown.
+Let E be the latest reading of that clock that received positions prove. A request that is sent at E and received at H took at most
+H - E longer than the fastest position: uplink and downlink together. A position stamped S is E - S older than the fastest one would
+be. The sum E - S + max(H - E) bounds the time from a position to the effect of a command that is sent now. The unknown offset
+cancels, whichever direction is slower.
 """
 
 from __future__ import annotations
@@ -17,54 +17,55 @@ from itertools import islice
 from fractus_services.mobility.autopilot import MAX_POSITION_AGE_S
 
 PROBE_S = 0.2
-"""How often the delay is measured."""
+"""Interval of measurements."""
 
 WINDOW_S = 10.0
-"""The longest delay of this time counts."""
+"""Period of which the longest delay counts."""
 
 ENVELOPE_S = 2.0
-"""Positions of this time tell what the vehicle's clock shows now."""
+"""Period of positions that prove the current reading of the vehicle's clock."""
 
 STALE_S = 3.0
-"""Without an answer for this time, in which fifteen were due, the delay is not known."""
+"""The delay is unknown after this time without an answer, in which 15 answers were due."""
 
 UNANSWERED = 10
-"""A vehicle that leaves this number of requests in a row without an answer is measured by its acknowledgements of commands."""
+"""After this number of consecutive unanswered requests, acknowledgements of commands measure the link."""
 
 RATE_S = (1.0, 10.0)
-"""The vehicle's clock is compared with ours over at least the first and at most the second time."""
+"""Shortest and longest period over which the vehicle's clock is compared."""
 
 REACTION_S = 0.25
-"""What comes on top: the autopilot's loops, the time to tilt, and one command that was lost or overtaken and is sent again."""
+"""Additional delay: the autopilot's loops, the time to tilt, and one lost or overtaken command that is sent again."""
 
 MAX_ARMING_DELAY_S, MAX_DELAY_S = 1.2, 1.8
-"""A link that delays by more than the first, there and back, lets nothing arm; above the second a flying drone hovers."""
+"""A round-trip delay above the first forbids arming. Above the second, a flying drone hovers."""
 
 MAX_PACE = 6.0
-"""A simulator that runs faster than this multiple of real time cannot be followed."""
+"""Fastest simulation that the service can follow, as a multiple of real time."""
 
 OVERTAKEN_S = 5.0
-"""A position that is older than the last by less than this was overtaken on its way. One that is older by more is of long ago, or the
-vehicle has restarted: then the next one goes on from it."""
+"""A position that is older than the last one by less than this was overtaken. An older one is either very late, or the vehicle has
+restarted. In the latter case the next position continues from it.
+"""
 
 _WRAP_MS = 1 << 32
 _SLACK_S = 0.5
-"""Positions may wait in the autopilot before they are sent; a reply that contradicts them by more is of another clock."""
+"""Positions may wait in the autopilot before they are sent. A reply that differs by more is from another clock."""
 
 
 class Timing:
-    """Measures one link; times are our monotonic seconds unless they are said to be the vehicle's.
+    """Delays of one link. Times are monotonic seconds unless they are stated to be on the vehicle's clock.
 
     Attributes:
-        pace: how many of the vehicle's seconds go by in one of ours.
-        restarted: whether the vehicle's clock has begun again since the last reset.
+        pace: Seconds of the vehicle's clock per second of real time.
+        restarted: True if the vehicle's clock has restarted since the last reset.
     """
 
     def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything: another link, or a vehicle that has restarted."""
+        """Reset for another link, or for a vehicle that has restarted."""
         self._boot_ms = 0
         self._sampled = self._arrived_at = self._resumed_at = self._compared_from = -math.inf
         self._samples: deque[tuple[float, float]] = deque()
@@ -78,15 +79,14 @@ class Timing:
         self._begun_ms: int | None = None
 
     def sampled(self, boot_ms: int, now: float) -> float | None:
-        """Take the time stamp of a position.
+        """Process the time stamp of a position.
 
         Args:
-            boot_ms: the vehicle's clock; it wraps after 49 days.
-            now: when it arrived.
+            boot_ms: Reading of the vehicle's clock, which wraps after 49 days.
+            now: Time of arrival.
 
         Returns:
-            How much later it came than the fastest of the last ones, in our seconds; None for a position that came
-            twice, or that a later one has overtaken.
+            Delay beyond that of the fastest recent position, in seconds of real time. None for a duplicate or an overtaken position.
         """
         if self._samples:
             later_s = self._since(boot_ms)
@@ -120,17 +120,17 @@ class Timing:
         return (self._present(now) - self._sampled) / self.pace
 
     def age_s(self, boot_ms: int, now: float) -> float:
-        """How much later a message with a time stamp came than the fastest of the last positions, in our seconds; 0 while there are none."""
+        """Return the delay of a time-stamped message beyond that of the fastest recent position, in seconds of real time; 0 without positions."""
         if not self._samples:
             return 0.0
         return max(self._present(now) - self._sampled - self._since(boot_ms), 0.0) / self.pace
 
     def _since(self, boot_ms: float) -> float:
-        """The vehicle's seconds from the last position to a reading of its clock, which may have wrapped between."""
+        """Return the seconds from the last position to a reading of the vehicle's clock, which may have wrapped."""
         return ((boot_ms - self._boot_ms + _WRAP_MS / 2) % _WRAP_MS - _WRAP_MS / 2) / 1e3
 
     def _present(self, at: float) -> float:
-        """The latest reading of the vehicle's clock that its positions prove for a moment."""
+        """Return the latest reading of the vehicle's clock that received positions prove for a time."""
         return max(self._at(sample, at) for sample in self._samples)
 
     def _at(self, sample: tuple[float, float], at: float) -> float:
@@ -138,7 +138,7 @@ class Timing:
         return stamp + self.pace * (at - arrived)
 
     def _compare(self, now: float) -> None:
-        """How fast the vehicle's clock runs: as fast as ours, unless that is certainly wrong."""
+        """Update the pace of the vehicle's clock. It is 1 unless that is certainly wrong."""
         if now < self._compared_from:
             return
         if not self._history or now - self._history[-1][0] >= RATE_S[0] / 4:
@@ -155,9 +155,10 @@ class Timing:
         self.pace = rate + min(error, 0.1 * rate) if rate > 1.0 + min(error, 1.0) else 1.0
 
     def request(self, due: float) -> int | None:
-        """Begin a measurement that was due at a moment: that it is sent late counts. The `ts1` of its TIMESYNC, if any.
+        """Start a measurement and return the `ts1` of its TIMESYNC, if any.
 
-        Its number is random: replies to the requests of others are heard as well.
+        A late transmission counts from the time at which it was due. The number is random, because replies to other stations are received,
+        too.
         """
         if not self._samples:
             return None
@@ -169,7 +170,7 @@ class Timing:
         return number
 
     def replied(self, tc1_ns: int, ts1: int, now: float) -> None:
-        """Take a TIMESYNC message: a reply to ours once, nothing else."""
+        """Process a TIMESYNC message. Only the first reply to a request of this station counts."""
         asked = self._asked.pop(ts1, None) if tc1_ns != 0 else None
         if asked is None or not self._samples:
             return
@@ -209,20 +210,20 @@ class Timing:
         return max((delay_s for _, delay_s, _ in self._delays), default=math.inf)
 
     def downlink_latency_s(self, now: float) -> float:
-        """Our seconds that any message takes at most, by the longest delay of late there and back; infinite: not known."""
+        """Return an upper bound of the delay of a message in seconds of real time: the longest recent round trip. Infinite if it is unknown."""
         return math.inf if now - self._heard_at > STALE_S else self.delay_s / self.pace
 
     @property
     def answer_s(self) -> float:
-        """Our seconds that the slowest answer of late took; 0 while there is none."""
+        """Longest recent time until an answer, in seconds of real time; 0 without answers."""
         return max((took_s for _, _, took_s in self._delays), default=0.0)
 
     def silence_s(self, now: float) -> float:
-        """Our seconds since the last answer: one that is under way may take as long already; infinite: there was none."""
+        """Return the seconds since the last answer; infinite without answers. An answer on its way may take that long already."""
         return now - self._heard_at
 
     def latency_s(self, now: float) -> float:
-        """The vehicle's seconds from its last position to the effect of a command that is sent now; infinite: not known."""
+        """Return the seconds of the vehicle's clock from its last position to the effect of a command sent now; infinite if unknown."""
         if now - self._heard_at > STALE_S or self.delay_s > MAX_DELAY_S:
             return math.inf
         age_s = self._present(now) - self._sampled
@@ -231,9 +232,9 @@ class Timing:
         return age_s + delay_s + REACTION_S if age_s <= MAX_POSITION_AGE_S else math.inf
 
     def _overdue_s(self, now: float) -> float:
-        """By how much the first request after the last answered one waits longer than the slowest answer of late took.
+        """Return how much longer the oldest unanswered request has waited than the slowest recent answer took.
 
-        A link that gets slow tells by no answer until the first slow one is there: meanwhile it is slower by this at the least.
+        The first slow answer arrives late. Until then the link counts as slower by this time at least.
         """
         if self.unanswering and now - self._answered > STALE_S:
             return 0.0  # It is measured by its acknowledgements; before that, its answers may only have become slow.
@@ -241,7 +242,7 @@ class Timing:
         return max(now - waiting - self.answer_s, 0.0)
 
     def problem(self, now: float) -> str:
-        """Why nothing may arm over this link; empty when nothing is wrong."""
+        """Return why this link forbids arming; empty if it does not."""
         if self.pace > MAX_PACE:
             return (
                 f"the autopilot's clock runs {self.pace:.1f} times as fast as real time, and more than {MAX_PACE:g} times"

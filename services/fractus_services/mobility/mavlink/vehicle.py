@@ -1,4 +1,4 @@
-"""The state of the vehicle, from the messages of its autopilot."""
+"""State of the vehicle, updated from the messages of its autopilot."""
 
 from __future__ import annotations
 
@@ -15,43 +15,43 @@ from fractus_services.mobility.mavlink.gimbal import attitude_of
 
 _UNKNOWN_U8 = 0xFF
 _UNKNOWN_U16 = 0xFFFF
-"""What 8 and 16 bits say of a value that is not known."""
+"""Values of 8 and 16 bits that mean "unknown"."""
 
 _POSITIONED = mavlink.EKF_POS_HORIZ_ABS | mavlink.EKF_PRED_POS_HORIZ_ABS
 
 MIN_ERROR_M, MAX_ERROR_M = 0.5, 10.0
-"""A GPS that says it is better is not believed; one that is worse gives no position."""
+"""Range of the position error: smaller reported errors are raised to the first, and larger ones give no position."""
 
 STATUS_MAX_AGE_S = 10.0
-"""How long it counts what estimator and GPS said of the position. They tell it once a second or more, and are asked for it again
-where they do not: after so long a silence the estimator may only reckon where it is."""
+"""Maximum age of the estimator and GPS status.
+
+The autopilot sends them at least once per second. After a longer silence the estimator may be using dead reckoning.
+"""
 
 STOPPED_S = 0.7
-"""For so long heartbeats, one a second, must say that the motors have stopped in flight, before they are believed to have."""
+"""Heartbeats, one per second, must report stopped motors in flight for this time before they are accepted."""
 
 STARTED_S = 5.0
-"""A drone whose motors have run for less may be about to take off; one that was not heard for as long may have landed meanwhile."""
+"""A drone whose motors have run for less may be about to take off. After a longer silence it may have landed."""
 
 PATH_KEPT_S = 12.0
-"""ArduCopter gives the path up, and says so once, when it had no position for 15 s: a little less is waited, for that text may be
-lost. One that tells nothing for so long may have given it up meanwhile."""
+"""ArduCopter discards its path after 15 s without a position and reports that once. This limit is lower, because the text may be lost."""
 
 
 @dataclass(slots=True)
 class Vehicle(VehicleState):
-    """The state, and how it follows from messages.
+    """Vehicle state with the rules that update it from messages.
 
     Attributes:
-        stack: the firmware that says it.
-        foreign: what flies instead of a vehicle with this firmware; empty when nothing does.
-        gimbal_measured: whether the firmware measures where its gimbal points, and does not repeat where it was told to; None
-            until it has told of which type that is.
-        placed_at: when its estimator had a position last.
-        received_at: when its GPS told of its fix.
-        fenced: whether its own fence is switched on; None for one that has none. Told at `checks_at`.
-        started_at: when a heartbeat said first that its motors run.
-        stopping_at: when the first of its last heartbeats said that they had stopped in flight; infinite: the last did not.
-        gimbal_limits: the least and the greatest pitch and yaw of its gimbal, degrees; None until it has told.
+        stack: Firmware of the autopilot.
+        foreign: Description of a vehicle with another firmware; empty for this firmware.
+        gimbal_measured: True if the firmware measures the attitude of its gimbal; None until it reports the gimbal's type.
+        placed_at: Time at which the estimator last had a position.
+        received_at: Time of the last GPS message.
+        fenced: True if the vehicle's fence is enabled, None if it has no fence; reported at `checks_at`.
+        started_at: Time of the first heartbeat that reported running motors.
+        stopping_at: Time of the first of the latest heartbeats that reported stopped motors in flight; infinite if the last did not.
+        gimbal_limits: Smallest and largest pitch and yaw of the gimbal, degrees; None until they are reported.
     """
 
     stack: FlightStack = field(kw_only=True)
@@ -65,7 +65,7 @@ class Vehicle(VehicleState):
     stopping_at: float = math.inf
 
     def take(self, message: Message, now: float) -> None:
-        """Update from one message."""
+        """Update the state from a message."""
         handler = _HANDLERS.get(message.name)
         if handler is not None:
             handler(self, message, now)
@@ -76,8 +76,8 @@ def _heartbeat(vehicle: Vehicle, message: Message, now: float) -> None:
     vehicle.heartbeat_at = now
     vehicle.foreign = vehicle.stack.foreign(message.integer("type"), message.integer("autopilot"))
     armed = bool(message.integer("base_mode") & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
-    # Those from before the start may come late, or once more, and have no time stamp. Taken for true, they make the next one tell
-    # of motors that others have started.
+    # Heartbeats from before the start may arrive late or twice, and they have no time stamp. If they were accepted, the next
+    # heartbeat would seem to report motors that another station started.
     flies = vehicle.in_air or now - vehicle.started_at < STARTED_S
     stops = vehicle.armed and not armed and flies and vehicle.silent_s < STARTED_S
     vehicle.stopping_at = min(vehicle.stopping_at, now) if stops else math.inf
@@ -85,7 +85,7 @@ def _heartbeat(vehicle: Vehicle, message: Message, now: float) -> None:
         return
     vehicle.mode = vehicle.stack.mode(message.integer("custom_mode"))
     if armed and not vehicle.armed:
-        # Arming moves home to where the vehicle stands; what it told before says nothing of this flight.
+        # Arming moves home to the position of the vehicle, so the previous home does not apply to this flight.
         vehicle.ground_home = None
         vehicle.started_at = now
     vehicle.armed = armed
@@ -94,14 +94,14 @@ def _heartbeat(vehicle: Vehicle, message: Message, now: float) -> None:
 
 
 def _place(lat_e7: int, lon_e7: int) -> tuple[float, float] | None:
-    """Degrees; None for what is no place, and for the zeroes that ArduPilot sends until its estimator has an origin and home is set."""
+    """Return a place in degrees; None if it is invalid, or zero as ArduPilot sends it before the origin and home are set."""
     if (lat_e7 == 0 and lon_e7 == 0) or abs(lat_e7) > 90 * 10**7 or abs(lon_e7) > 180 * 10**7:
         return None
     return lat_e7 / 1e7, lon_e7 / 1e7
 
 
 def _position(vehicle: Vehicle, message: Message, now: float) -> None:
-    # With a GPS that has its fix the estimator may fly without: it then tells where it has reckoned to be, and drifts.
+    # Even with a GPS fix the estimator may be using dead reckoning, and its position drifts.
     told = math.isfinite(vehicle.estimated_at)
     reckons = told and not (vehicle.estimated and now - vehicle.estimated_at <= STATUS_MAX_AGE_S)
     if reckons or not vehicle.located or now - vehicle.received_at > STATUS_MAX_AGE_S:
@@ -144,7 +144,7 @@ def _gimbal_limits(vehicle: Vehicle, message: Message, _now: float) -> None:
         least, most = (
             [math.degrees(message.real(f"{axis}_{end}")) for axis in ("pitch", "yaw")] for end in ("min", "max")
         )
-        # A float32 of radians is a little off the degrees that it stands for.
+        # A float32 in radians differs slightly from the degrees that it represents.
         limits = tuple((round(low, 3), round(high, 3)) for low, high in zip(least, most, strict=True))
         vehicle.gimbal_limits = limits if all(low < high for low, high in limits) else None
 
@@ -152,7 +152,7 @@ def _gimbal_limits(vehicle: Vehicle, message: Message, _now: float) -> None:
 def _parameter(vehicle: Vehicle, message: Message, _now: float) -> None:
     if message.text("param_id") == vehicle.stack.gimbal_type:
         measures = message.real("param_value") in vehicle.stack.measured_gimbals
-        # A type that is changed is another one after the next start only: from then on it is asked for again.
+        # A changed type takes effect after the next start, which requests it again.
         vehicle.gimbal_measured = measures and vehicle.gimbal_measured is not False
 
 
@@ -161,7 +161,7 @@ def _home(vehicle: Vehicle, message: Message, _now: float) -> None:
     if place is None:
         return
     vehicle.home = Home(*place, message.integer("altitude") / 1e3)
-    # The first one after arming may have been lost: the next then counts, wherever the vehicle is by now.
+    # The first home after arming may have been lost. Then the next one counts, wherever the vehicle is.
     if not vehicle.in_air or vehicle.ground_home is None:
         vehicle.ground_home = vehicle.home
 
@@ -171,7 +171,7 @@ def _landed(vehicle: Vehicle, message: Message, now: float) -> None:
 
 
 def _status(vehicle: Vehicle, message: Message, now: float) -> None:
-    # -1 and 0xFFFF: the autopilot does not measure it.
+    # -1 and 0xFFFF: not measured.
     percent, millivolts = message.integer("battery_remaining"), message.integer("voltage_battery")
     centiamperes = message.integer("current_battery")
     vehicle.battery_remaining = percent / 100 if percent >= 0 else math.nan
@@ -187,9 +187,9 @@ def _status(vehicle: Vehicle, message: Message, now: float) -> None:
 
 
 def _estimator(vehicle: Vehicle, message: Message, now: float) -> None:
-    # The checks pass without a position in modes that need none; the flags tell whether GUIDED has what it needs.
+    # In modes that need no position the checks pass without one. The flags show if GUIDED has what it needs.
     vehicle.estimated = message.integer("flags") & _POSITIONED == _POSITIONED
-    # A service that begins in flight has heard of no position before: a vehicle that has one kept its path as far as anyone knows.
+    # A service that starts in flight has no earlier position. A vehicle with a position is assumed to have kept its path.
     begins = vehicle.placed_at == -math.inf and vehicle.estimated
     lost = vehicle.armed and not begins and now - vehicle.placed_at > PATH_KEPT_S
     vehicle.path_lost = vehicle.path_lost or lost

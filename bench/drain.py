@@ -1,11 +1,11 @@
-"""Calls that a planned switch costs a client that knows nothing of it, by how often the client calls.
+"""Calls lost in a planned switch by a gRPC client without retries, by its call rate.
 
-One gRPC client calls all the time while its service is led to and fro between two servers, in network namespaces of this program's
-own. The other column closes the connections at once, as after the loss of a link. A call is lost where its request was sent in the
-time between the look that found the connection idle and the moment in which the client notices that it was closed: so the
-more of the time a client has a request under way, the more it loses.
+One gRPC client calls while its service is switched to and fro between two servers, in network namespaces of this program.
+The second column closes the connections at once, as after the loss of a link. A call is lost if its request is sent between
+the check that found the connection quiet and the moment at which the client notices that the connection was closed. So the
+loss grows with the share of time in which the client has a call in progress.
 
-Run it as root: uv run python bench/drain.py [--quick] [--json FILE]
+Run as root: uv run python bench/drain.py [--quick] [--json FILE]
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from fractus_agent.redirector.redirector import Redirector
 from redirect_rig import DIRECT, VIP, Rig, rig
 
 RATES = (20, 50, 100, 200, 400)
-SAFE_RATE = 50
-"""Calls a second up to which nothing is to be lost."""
+SAFE_RATE = 20
+"""Highest call rate, in calls per second, at which no call may be lost."""
 
 
 async def lost(world: Rig, redirector: Redirector, rate: int, switches: int, *, planned: bool) -> tuple[int, float]:
-    """Calls that failed, and calls a second that there were."""
+    """Return the number of failed calls, and the achieved calls per second."""
     client = world.client(10_000_000, 1 / rate)
     loop = asyncio.get_running_loop()
     begun = loop.time()
@@ -46,7 +46,7 @@ async def lost(world: Rig, redirector: Redirector, rate: int, switches: int, *, 
 
 
 async def measure(switches: int) -> list[dict[str, object]]:
-    """A claim for each rate."""
+    """Return a claim for each call rate."""
     claims: list[dict[str, object]] = []
     with tempfile.TemporaryDirectory() as folder, rig() as world:
         (Path(folder) / "pod").symlink_to(world.path("dpod"))

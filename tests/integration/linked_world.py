@@ -1,4 +1,4 @@
-"""A drone with a pod, edge nodes with a pod each, a cloud, and a radio: network namespaces in which agents run direct links."""
+"""Network namespaces of drones, edge nodes, their pods and a cloud, with a simulated radio, in which agents run links."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _PER_EAST, _PER_NORTH = (
 
 
 def place(east: float, north: float, up: float = 0.0) -> dict[str, Any]:
-    """A position of a manifest."""
+    """Return a position of a manifest."""
     lat, lon = ORIGIN[0] + north / _PER_NORTH, ORIGIN[1] + east / _PER_EAST
     return {"lat": lat, "lon": lon, "alt": up, "altitudeReference": "home"}
 
@@ -68,16 +68,16 @@ while True:
     except grpc.RpcError as error:
         print(number, "REOPENED", error.code().name, flush=True)
 """
-"""A client whose one stream never ends, and is never idle for long."""
+"""Client with one endless stream that is rarely idle."""
 
 FOREIGN = """table ip kube-proxy {
     chain pre { type nat hook prerouting priority -100; ip daddr 10.97.0.9 tcp dport 80 dnat to 10.88.0.2:8080; }
 }"""
-"""Another program's rules."""
+"""Rules of another program."""
 
 
 class Agent:
-    """A node in a network namespace, with a radio, an uplink to the cloud, a pod, and an agent's direct links."""
+    """Node in a network namespace, with a radio, an uplink to the cloud, a pod, and a link manager."""
 
     def __init__(self, world: World, name: str, kind: str, at: tuple[float, float]) -> None:
         self.world, self.name, self.kind, self.at = world, name, kind, at
@@ -94,7 +94,7 @@ class Agent:
         self.add_radio()
         self.run("nft", "-f", "-", text=FOREIGN)
         self.certify(name)
-        # So slow that a link is better also where a busy machine hardly gets to carry its frames.
+        # So slow that a link is better even on a busy machine.
         self.describe(uplink_mbps=1)
         self._process: subprocess.Popen[str] | None = None
         self._reading: threading.Thread | None = None
@@ -102,7 +102,7 @@ class Agent:
         self.statuses: dict[str, dict[str, Any]] = {}
 
     def add_pod(self) -> None:
-        """The namespace of its pod, as the container runtime makes it."""
+        """Create the namespace of its pod, as the container runtime does."""
         name, net = f"{self.name}p", f"10.88.{self.number}"
         self.world.namespace(name)
         (self.pods / "pod").unlink(missing_ok=True)
@@ -111,7 +111,7 @@ class Agent:
         run(*self.world.inside(name), "ip", "route", "add", "default", "via", f"{net}.1")
 
     def lose_power(self) -> None:
-        """Agent and pod end; what is not on disk is gone: pods' namespaces, packet filter, connections, addresses of the device."""
+        """Kill agent and pod, and remove all state that is not on disk."""
         self.kill()
         self.world.end(f"{self.name}p")
         self.run("ip", "link", "del", "pod0")
@@ -123,7 +123,7 @@ class Agent:
         self.add_pod()
 
     def describe(self, uplink_mbps: float) -> None:
-        """What the node's description says."""
+        """Write the node's description."""
         interfaces = [
             {"technology": "4G", "bandwidth": uplink_mbps},
             {
@@ -148,22 +148,22 @@ class Agent:
             self.world.radio.add_station(self.name, tap, Station((*self.at, 0.0), self.hardware, "net"))
 
     def uplink(self, *, up: bool) -> None:
-        """The way to the cloud goes, or comes back."""
+        """Take the uplink to the cloud down, or bring it up."""
         run(*self.world.inside(self.name), "ip", "link", "set", "lte0", "up" if up else "down")
         if up:
             way = f"10.90.{self.number}.2"
             run(*self.world.inside(self.name), "ip", "route", "replace", "default", "via", way)
 
     def api(self, *, up: bool) -> None:
-        """The API server is in reach of the agent, or not."""
+        """Make the API server reachable or unreachable for the agent."""
         self._write("api.json", up)
 
     def lose_radio(self) -> None:
-        """The device goes, as one on USB does."""
+        """Remove the device, as if it was unplugged."""
         self._rename("wlan0", "gone0")
 
     def regain_radio(self) -> None:
-        """It comes back, without its address."""
+        """Add the device again, without its address."""
         self._rename("gone0", "wlan0")
 
     def _rename(self, before: str, after: str) -> None:
@@ -171,12 +171,12 @@ class Agent:
             run(*self.world.inside(self.name), "ip", "link", "set", before, *words)
 
     def join(self, address: str) -> None:
-        """Be in the network of the direct links without an agent."""
+        """Join the network of the direct links without an agent."""
         for words in (["addr", "add", f"{address}/16", "dev", "wlan0"], ["link", "set", "wlan0", "up"]):
             run(*self.world.inside(self.name), "ip", *words)
 
     def reaches(self, address: str, port: int) -> bool:
-        """Whether a connection can be made from the node."""
+        """Return True if a TCP connection can be opened from the node."""
         program = f"import socket; socket.create_connection(({address!r}, {port}), 2).close()"
         done = subprocess.run(
             [*self.world.inside(self.name), sys.executable, "-c", program], capture_output=True, timeout=30, check=False
@@ -184,7 +184,7 @@ class Agent:
         return done.returncode == 0
 
     def metrics(self) -> dict[str, float]:
-        """What Prometheus is told on the node's loopback."""
+        """Return the Prometheus metrics of the agent."""
         program = (
             "import urllib.request as r; print(r.urlopen('http://127.0.0.1:46812/metrics', timeout=10).read().decode())"
         )
@@ -193,7 +193,7 @@ class Agent:
         return {name: float(value) for name, value in samples}
 
     def certify(self, name: str, authority: Authority | None = None) -> None:
-        """Give it a node's certificate."""
+        """Issue a node certificate."""
         tls = self.folder / "tls"
         tls.mkdir(exist_ok=True)
         for file, content in (authority or self.world.authority).issue_node(name, datetime.now(UTC)).items():
@@ -205,16 +205,16 @@ class Agent:
         fresh.replace(self.folder / name)
 
     def plan(self, *links: dict[str, Any]) -> None:
-        """What the operator wrote."""
+        """Set the DirectLinks that the operator planned."""
         self._write("links.json", list(links))
 
     def fly(self, east: float, north: float = 0.0, velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
-        """Where the drone is and what telemetry says of it."""
+        """Set the position of the drone's radio and its telemetry."""
         self.see(east, north, velocity)
         self.world.command(station=self.name, position=[east, north, 0.0])
 
     def see(self, east: float, north: float = 0.0, velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
-        """What telemetry says alone."""
+        """Set the telemetry only."""
         where = place(east, north)
         self._write("telemetry.json", {"lat": where["lat"], "lon": where["lon"], "up": 0.0, "velocity": velocity})
 
@@ -242,13 +242,13 @@ class Agent:
         return self._process.pid
 
     def kill(self) -> None:
-        """As kubelet, the kernel or a loss of power would."""
+        """Kill the agent."""
         assert self._process is not None
         self._process.kill()
         self._end()
 
     def stop(self) -> None:
-        """As an upgrade would."""
+        """Stop the agent, as an upgrade does."""
         assert self._process is not None
         assert self._process.stdin is not None
         self._process.stdin.close()
@@ -272,7 +272,7 @@ class Agent:
         return path.read_text() if path.exists() else ""
 
     def audit(self, kind: str) -> list[dict[str, Any]]:
-        """Entries of its audit log, whose chain is sound and signed."""
+        """Verify the audit log, and return its entries of a kind."""
         path = self.folder / "audit" / "links.jsonl"
         lines = path.read_bytes().splitlines(keepends=True)
         signed = read_checkpoint(path.with_suffix(".checkpoint").read_bytes())
@@ -292,18 +292,18 @@ class Agent:
         ).stdout
 
     def cut_at(self) -> list[float]:
-        """When it switched at once, as after the loss of a link, by its own clock: Unix time in seconds."""
+        """Return the Unix times of its abrupt switches, in seconds."""
         lines = (line.split(" ", 1) for line in self.log().splitlines() if "redirector: switched" in line)
         return [float(at) for at, text in lines if "planned=False" in text]
 
     def redirects(self) -> set[str]:
-        """Elements of the map, such as `10.96.0.5 . tcp . 8080`."""
+        """Return the elements of the map, such as `10.96.0.5 . tcp . 8080`."""
         return set(
             re.findall(r"([\d.]+ \. \w+ \. \d+) timeout", self._show("nft", "list", "map", "ip", "fractus", "targets"))
         )
 
     def tables(self) -> set[str]:
-        """Ours, and not those of another program."""
+        """Return the tables of the agent."""
         return set(self._show("nft", "list", "tables").split("\n")) - {"", "table ip kube-proxy"}
 
     def addresses(self) -> list[str]:
@@ -313,12 +313,12 @@ class Agent:
         return sorted(self._show("ip", "route").splitlines())
 
     def run(self, *words: str, text: str = "") -> str:
-        """Run a command in its namespace, with this as its input; its output."""
+        """Run a command in its namespace with some input, and return its output."""
         inside = [*self.world.inside(self.name), *words]
         return subprocess.run(inside, input=text, capture_output=True, text=True, timeout=30, check=True).stdout
 
     def state(self) -> dict[str, Any]:
-        """All that links may change of a node: packet filter, routes, addresses, its device, and connections of ours."""
+        """Return all state of a node that links may change: packet filter, routes, addresses, device and connections."""
         addresses = re.sub(r"(?m)^\d+: | valid_lft.*", "", self._show("ip", "-o", "-4", "address"))
         return {
             "ruleset": self._show("nft", "list", "ruleset"),
@@ -335,7 +335,7 @@ class Agent:
 
 
 class World:
-    """The namespaces, the radio on a thread, and an authority."""
+    """All namespaces, the radio in a thread, and a certificate authority."""
 
     def __init__(self, directory: Path) -> None:
         self.directory = directory
@@ -470,7 +470,7 @@ class World:
 
 
 def _forget_connections() -> None:
-    """Empty the connection tracking of the namespace that this runs in."""
+    """Delete all conntrack entries of the current namespace."""
     netlink = Netlink(NETLINK_NETFILTER)
     try:
         sequence = netlink.sequence()
@@ -481,7 +481,7 @@ def _forget_connections() -> None:
 
 
 class Client:
-    """A client that calls the virtual address, and what it was answered."""
+    """Client that calls the virtual address, with the replies that it received."""
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self.answers: list[list[str]] = []
@@ -509,7 +509,7 @@ class Client:
 
 
 def until(holds: Callable[[], object], what: str, world: World | None = None, timeout_s: float = TIMEOUT_S) -> float:
-    """Wait for something; how long it took."""
+    """Wait for a condition, and return the elapsed time."""
     begun = time.monotonic()
     while time.monotonic() - begun < timeout_s:
         if holds():
@@ -520,7 +520,7 @@ def until(holds: Callable[[], object], what: str, world: World | None = None, ti
 
 
 def flying(world: World, *edges: Agent) -> Agent:
-    """A drone that has a link to each edge node, with everything running."""
+    """Start a drone with a DirectLink to each edge node, and all agents and servers."""
     drone = world.agents.get("d1") or world.drone()
     links = [world.link(drone, edge) for edge in edges]
     world.serve()
@@ -533,7 +533,7 @@ def flying(world: World, *edges: Agent) -> Agent:
 
 
 def unchanged(world: World, before: Mapping[str, Mapping[str, Any]]) -> None:
-    """Have no link planned any more; then every node is as it was before."""
+    """Delete all DirectLinks, and check that every node is in its previous state."""
 
     def changes() -> list[tuple[str, str, Any, Any]]:
         now = world.states()
@@ -554,7 +554,7 @@ def unchanged(world: World, before: Mapping[str, Mapping[str, Any]]) -> None:
 
 @contextmanager
 def linked_world(directory: Path) -> Iterator[World]:
-    """A world that is removed at the end."""
+    """Create a world, and remove it at the end."""
     found = World(directory)
     try:
         yield found

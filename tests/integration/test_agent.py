@@ -317,7 +317,7 @@ def test_what_the_operator_did_not_sign_is_not_stored(server: ApiServer, drone: 
     server.admin.merge(path, {"spec": {"control": "full"}})
     server.publish("drone-1")
     wait_for(lambda: phase(server, "mine") == "Pending" and not drone.grants(), "no grant", timeout_s=30)
-    assert "changed after it was signed" in server.reported("drone-1", "mine")["message"]
+    assert "changed after signing" in server.reported("drone-1", "mine")["message"]
     server.admin.merge(path, {"spec": good})
     server.publish("drone-1")
     wait_for(lambda: phase(server, "mine") == "Active" and drone.grants() == {"mine"}, "the grant again", timeout_s=30)

@@ -19,7 +19,7 @@ def world(tmp_path: Path) -> Iterator[World]:
 
 
 @pytest.mark.parametrize("left", ["nothing", "half"])
-def test_nodes_that_lose_power_with_a_link_in_use(world: World, left: str) -> None:
+def test_nodes_recover_after_power_loss_during_a_link(world: World, left: str) -> None:
     edge, drone = world.edge("e1", 20.0), world.drone()
     before = world.states()
     flying(world, edge)
@@ -84,7 +84,7 @@ asyncio.run(main())
 
 
 @pytest.mark.parametrize("fault", ["silent", "no routes", "no probes"])
-def test_a_peer_that_pairs_and_then_leaves_it_at_that(world: World, fault: str) -> None:
+def test_peer_that_stops_after_pairing_is_left(world: World, fault: str) -> None:
     bad, other, drone = world.edge("e1", 5.0), world.edge("e2", 30.0), world.drone()
     before = {name: state for name, state in world.states().items() if name != "e1"}
     # The bad one promises more, and so it is asked first.
@@ -119,7 +119,7 @@ while True:  # "that address is here"
 """
 
 
-def test_a_stranger_with_the_address_of_the_paired_node(world: World) -> None:
+def test_node_with_the_address_of_the_peer_gets_no_traffic(world: World) -> None:
     edge, drone, stranger = world.edge("e1", 20.0), world.drone(), world.edge("e9", 5.0)
     before = {name: state for name, state in world.states().items() if name != "e9"}
     flying(world, edge)
@@ -147,7 +147,7 @@ def test_a_stranger_with_the_address_of_the_paired_node(world: World) -> None:
 
 
 @pytest.mark.parametrize("loss", ["planned", "abrupt"])
-def test_a_long_stream_is_reopened_and_answers_each_once(world: World, loss: str) -> None:
+def test_long_stream_is_reopened_without_lost_or_repeated_replies(world: World, loss: str) -> None:
     edge, drone = world.edge("e1", 20.0), world.drone()
     before = world.states()
     flying(world, edge)

@@ -1,4 +1,4 @@
-"""Direct links of agents on real devices, netfilter and sockets: what traffic does, and what is left afterwards."""
+"""Link manager with real devices, netfilter and sockets: traffic, faults and cleanup."""
 
 from __future__ import annotations
 
@@ -18,42 +18,46 @@ def world(tmp_path: Path) -> Iterator[World]:
         yield found
 
 
-def test_traffic_takes_the_link_and_comes_back_before_it_ends(world: World) -> None:
+def test_traffic_moves_to_the_link_and_back_before_the_link_ends(world: World) -> None:
     edge = world.edge("e1", 20.0)
     drone = flying(world, edge)
     client = world.client(drone, 100_000, 0.1)
-    until(lambda: client.by == "e1", "an answer over the link", world)
+    until(lambda: client.by == "e1", "a reply over the link", world)
     name = "app-d1-e1"
     until(lambda: drone.status(name).get("traffic") == "direct", "the status", world)
     status = drone.status(name)
     assert (status["phase"], status["observedGeneration"], status["switches"]) == ("Up", 1, 1)
     assert status["bandwidth"] > 1.0
     assert drone.condition(name, "TrafficDirect")["status"] == "True"
-    until(lambda: edge.condition(name, "PeerReady").get("status") == "True", "the peer's word", world)
+    until(lambda: edge.condition(name, "PeerReady").get("status") == "True", "the condition of the edge node", world)
     metrics = drone.metrics()
     assert metrics['fractus_link_up{path="e1"}'] == 1
     assert metrics["fractus_switches_total"] == metrics["fractus_traffic_direct"] == 1
     assert metrics['fractus_path_bandwidth_mbps{path="e1"}'] > metrics['fractus_path_bandwidth_mbps{path="cloud"}'] == 1
     assert metrics['fractus_path_quality{path="e1"}'] > 0
-    until(lambda: drone.metrics().get('fractus_service_sent_mbps{service="10.96.0.5:8080/TCP"}'), "its flow", world)
-    # The drone flies away: traffic is led back while the link still works, so that no call is lost.
+    until(
+        lambda: drone.metrics().get('fractus_service_sent_mbps{service="10.96.0.5:8080/TCP"}'),
+        "the traffic rate",
+        world,
+    )
+    # The drone flies away: traffic moves back while the link still works, so that no call is lost.
     drone.fly(70.0, velocity=(3.0, 0.0, 0.0))
     drone.fly(-57.0, velocity=(-3.0, 0.0, 0.0))
-    until(lambda: client.by == "cloud", "an answer of the cloud", world)
+    until(lambda: client.by == "cloud", "a reply of the cloud", world)
     assert not client.failed
     until(lambda: drone.status(name).get("traffic") == "cloud", "the status", world)
 
 
-def test_nothing_is_left_when_links_are_planned_no_more(world: World) -> None:
+def test_link_manager_cleans_up_when_links_are_no_longer_planned(world: World) -> None:
     edge = world.edge("e1", 20.0)
     before = edge.routes()
     drone = flying(world, edge)
     client = world.client(drone, 100_000, 0.1)
-    until(lambda: client.by == "e1", "an answer over the link", world)
+    until(lambda: client.by == "e1", "a reply over the link", world)
     assert drone.addresses() == [f"{link_address('d1')}/16"]
     assert len(edge.redirects()) == 1
     drone.plan()
-    until(lambda: client.by == "cloud", "an answer of the cloud", world)
+    until(lambda: client.by == "cloud", "a reply of the cloud", world)
     until(lambda: not drone.tables() and not drone.addresses(), "a clean drone", world)
     until(lambda: not edge.redirects(), "no redirect on the edge", world)
     edge.plan()
@@ -70,58 +74,58 @@ def test_nothing_is_left_when_links_are_planned_no_more(world: World) -> None:
     assert [list(entry["services"].values()) for entry in edge.audit("routes")] == [[f"{edge.pod}:{VIP.port}"]]
 
 
-def test_an_abrupt_loss_is_over_within_a_second(world: World) -> None:
+def test_traffic_returns_to_the_cloud_within_a_second_after_link_loss(world: World) -> None:
     edge = world.edge("e1", 20.0)
     drone = flying(world, edge)
     client = world.client(drone, 100_000, 0.02)
-    until(lambda: client.by == "e1", "an answer over the link", world)
+    until(lambda: client.by == "e1", "a reply over the link", world)
     who = [answer[1] for answer in client.answers]
-    assert "FAILED" not in who, "the planned switch onto the link costs none"
+    assert "FAILED" not in who, "the planned switch to the link loses no call"
     switched, gaps = [], []
-    # 0.6 s until the loss is noticed, a millisecond for the switch; several losses, for a machine that is busy with other work.
+    # The loss is detected after 0.6 s, and the switch takes a millisecond. Several losses, because the machine may be busy.
     while len(gaps) < 5 and not (gaps and min(switched) < 1.0 and min(gaps) < 1.0):
         begun, lost_at = len(client.answers) - 1, time.time()
         world.command(station="d1", off=True)
-        until(lambda: client.by == "cloud", "an answer of the cloud", world)
+        until(lambda: client.by == "cloud", "a reply of the cloud", world)
         assert not drone.redirects()
         answers = client.answers[begun:]
         led = next(number for number, answer in enumerate(answers) if answer[1] == "cloud")
         gaps.append(float(answers[led][2]) - max(float(a[2]) for a in answers[:led] if a[1] == "e1"))
-        # This client repeats nothing: the call that was cut fails.
+        # This client does not repeat calls: the call that was cut fails.
         assert sum(answer[1] == "FAILED" for answer in answers) <= 1
         switched.append(next(at for at in drone.cut_at() if at > lost_at) - lost_at)
         until(lambda: drone.status("app-d1-e1").get("traffic") == "cloud", "the status", world)
-        # It comes back when the radio does, and no attempt in between hurts.
+        # Traffic returns to the link when the radio works again.
         world.command(station="d1", off=False)
-        until(lambda: client.by == "e1", "an answer over the link again", world)
+        until(lambda: client.by == "e1", "a reply over the link again", world)
     print("from the loss to the switch, and from reply to reply:", switched, gaps)
     assert min(switched) < 1.0, switched
     assert min(gaps) < 1.0, gaps
 
 
-def test_an_agent_that_is_killed_leaves_the_cloud_path_and_starts_clean(world: World) -> None:
+def test_killed_agent_leaves_the_cloud_path_and_restarts_cleanly(world: World) -> None:
     edge = world.edge("e1", 20.0)
     drone = flying(world, edge)
     client = world.client(drone, 100_000, 0.1)
-    until(lambda: client.by == "e1", "an answer over the link", world)
+    until(lambda: client.by == "e1", "a reply over the link", world)
     drone.kill()
-    until(lambda: client.by == "cloud", "an answer of the cloud, though no agent leads there", world)
+    until(lambda: client.by == "cloud", "a reply of the cloud without an agent", world)
     until(lambda: not drone.redirects() and not edge.redirects(), "redirects that ended by themselves", world)
-    # The new one knows its links from disk: the API server may be out of reach.
+    # The new agent restores its links from disk, because the API server may be unreachable.
     (drone.folder / "links.json").unlink()
     drone.start()
-    until(lambda: client.by == "e1", "an answer over the link again", world)
+    until(lambda: client.by == "e1", "a reply over the link again", world)
     assert "restored from disk" in drone.log()
     assert len(drone.redirects()) == 1
     assert drone.addresses() == [f"{link_address('d1')}/16"]
 
 
-def test_what_agents_that_were_killed_left_is_removed_though_no_link_is_planned(world: World) -> None:
+def test_state_of_killed_agents_is_removed_without_planned_links(world: World) -> None:
     edge = world.edge("e1", 20.0)
     drone = flying(world, edge)
     client = world.client(drone, 100_000, 0.1)
-    until(lambda: client.by == "e1", "an answer over the link", world)
-    for agent in (drone, edge):  # the mission ends while there is no agent
+    until(lambda: client.by == "e1", "a reply over the link", world)
+    for agent in (drone, edge):  # the mission ends while no agent is running
         agent.kill()
         agent.plan()
         for stored in (agent.folder / "links").glob("*.json"):
@@ -131,10 +135,10 @@ def test_what_agents_that_were_killed_left_is_removed_though_no_link_is_planned(
     until(lambda: not drone.tables() and not edge.tables(), "no table", world)
     until(lambda: not drone.addresses() and not edge.addresses(), "no address", world)
     assert world.conntrack(drone) == world.conntrack(edge) == 0
-    until(lambda: client.by == "cloud", "an answer of the cloud", world)
+    until(lambda: client.by == "cloud", "a reply of the cloud", world)
 
 
-def test_instances_are_isolated_before_there_is_a_radio(world: World) -> None:
+def test_instances_are_isolated_without_a_radio(world: World) -> None:
     edge = world.edge("e1", 20.0)
     drone = world.drone()
     service = world.link(drone, edge)["spec"]["services"][0] | {
@@ -152,22 +156,22 @@ def test_instances_are_isolated_before_there_is_a_radio(world: World) -> None:
     drone.plan(link)
     drone.start()
     client = world.client(drone, 100_000, 0.1)
-    until(lambda: client.by == "e1", "an answer over the link", world)
+    until(lambda: client.by == "e1", "a reply over the link", world)
     assert not drone.reaches(edge.pod, VIP.port)
 
 
-def test_the_edge_nodes_agent_is_killed_and_comes_back(world: World) -> None:
+def test_link_is_restored_after_the_edge_agent_is_killed(world: World) -> None:
     edge = world.edge("e1", 20.0)
     drone = flying(world, edge)
     client = world.client(drone, 100_000, 0.05)
-    until(lambda: client.by == "e1", "an answer over the link", world)
+    until(lambda: client.by == "e1", "a reply over the link", world)
     edge.kill()
-    until(lambda: client.by == "cloud", "an answer of the cloud", world)
+    until(lambda: client.by == "cloud", "a reply of the cloud", world)
     edge.start()
-    until(lambda: client.by == "e1", "an answer over the link again", world)
+    until(lambda: client.by == "e1", "a reply over the link again", world)
 
 
-def test_two_drones_compete_for_one_edge_node(world: World) -> None:
+def test_second_drone_waits_for_a_busy_edge_node(world: World) -> None:
     edge, first, second = world.edge("e1", 20.0), world.drone("d1"), world.drone("d2")
     before = world.states()
     links = [world.link(first, edge), world.link(second, edge)]
@@ -192,7 +196,7 @@ def test_two_drones_compete_for_one_edge_node(world: World) -> None:
 
 
 @pytest.mark.parametrize("fault", ["silent", "impostor"])
-def test_a_peer_that_does_not_pair_costs_nothing(world: World, fault: str) -> None:
+def test_peer_that_does_not_pair_costs_no_calls(world: World, fault: str) -> None:
     edge, other = world.edge("e1", 5.0), world.edge("e2", 30.0)
     if fault == "impostor":
         edge.certify("e2")
@@ -215,7 +219,7 @@ def test_a_peer_that_does_not_pair_costs_nothing(world: World, fault: str) -> No
     assert len(client.failed) <= 1  # in the planned switch, by a client that repeats nothing
 
 
-def test_a_missing_device_is_a_condition_and_is_used_when_it_comes(world: World) -> None:
+def test_missing_device_is_reported_and_used_when_it_appears(world: World) -> None:
     edge = world.edge("e1", 20.0)
     drone = world.drone()
     link = world.link(drone, edge)
@@ -227,21 +231,21 @@ def test_a_missing_device_is_a_condition_and_is_used_when_it_comes(world: World)
     drone.start()
     client = world.client(drone, 100_000, 0.1)
     until(lambda: drone.condition("app-d1-e1", "Linked").get("reason") == "DeviceMissing", "the condition", world)
-    until(lambda: client.by == "cloud", "an answer of the cloud", world)
+    until(lambda: client.by == "cloud", "a reply of the cloud", world)
     drone.regain_radio()
-    until(lambda: client.by == "e1", "an answer over the link", world)
+    until(lambda: client.by == "e1", "a reply over the link", world)
     drone.lose_radio()
-    until(lambda: client.by == "cloud", "an answer of the cloud", world)
+    until(lambda: client.by == "cloud", "a reply of the cloud", world)
     drone.regain_radio()
-    until(lambda: client.by == "e1", "an answer over the link again", world)
+    until(lambda: client.by == "e1", "a reply over the link again", world)
 
 
-def test_what_is_not_paired_reaches_nothing(world: World) -> None:
+def test_unpaired_node_reaches_nothing_over_the_link(world: World) -> None:
     edge = world.edge("e1", 20.0)
     drone = flying(world, edge)
     stranger = world.drone("d9")
     client = world.client(drone, 100_000, 0.1)
-    until(lambda: client.by == "e1", "an answer over the link", world)
+    until(lambda: client.by == "e1", "a reply over the link", world)
     stranger.join(str(link_address("d9")))
     (route,) = edge.redirects()
     port = int(route.split(" . ")[2])
@@ -261,29 +265,29 @@ while True:
 """
 
 
-def test_a_hundred_changes_in_a_minute_end_where_they_should(world: World) -> None:
+def test_a_hundred_changes_in_a_minute_end_in_the_last_state(world: World) -> None:
     edge, drone = world.edge("e1", 20.0), world.drone()
     before = world.states()
     flying(world, edge)
     client = world.client(drone, 100_000, 0.05)
-    until(lambda: client.by == "e1", "an answer over the link", world)
+    until(lambda: client.by == "e1", "a reply over the link", world)
     for number in range(100):
         world.command(station="d1", off=number % 2 == 0)
         time.sleep(0.2 if number % 7 else 1.5)
     world.command(station="d1", off=False)
-    until(lambda: client.by == "e1", "an answer over the link", world, timeout_s=120)
+    until(lambda: client.by == "e1", "a reply over the link", world, timeout_s=120)
     assert len(drone.redirects()) == 1
     assert len(edge.redirects()) == 1
     assert drone.addresses() == [f"{link_address('d1')}/16"]
     unchanged(world, before)
-    until(lambda: client.by == "cloud", "an answer of the cloud", world)
+    until(lambda: client.by == "cloud", "a reply of the cloud", world)
 
 
-def test_the_loss_of_the_uplink_leaves_direct_traffic_alone(world: World) -> None:
+def test_uplink_loss_does_not_affect_direct_traffic(world: World) -> None:
     edge = world.edge("e1", 20.0)
     drone = flying(world, edge)
     client = world.client(drone, 100_000, 0.05)
-    until(lambda: client.by == "e1", "an answer over the link", world)
+    until(lambda: client.by == "e1", "a reply over the link", world)
     until(lambda: drone.status("app-d1-e1").get("traffic") == "direct", "the status", world)
     drone.uplink(up=False)
     for agent in (drone, edge):
@@ -296,18 +300,18 @@ def test_the_loss_of_the_uplink_leaves_direct_traffic_alone(world: World) -> Non
     for agent in (drone, edge):
         agent.api(up=True)
     drone.fly(-57.0, velocity=(-3.0, 0.0, 0.0))
-    until(lambda: client.by == "cloud", "an answer of the cloud", world)
+    until(lambda: client.by == "cloud", "a reply of the cloud", world)
     until(lambda: drone.status("app-d1-e1").get("traffic") == "cloud", "the status", world)
     assert not client.failed
 
 
-def test_a_cloud_path_that_is_cut_is_left_though_it_was_the_better_one(world: World) -> None:
+def test_unreachable_cloud_path_is_left_even_if_it_was_better(world: World) -> None:
     edge = world.edge("e1", 20.0)
     drone = flying(world, edge)
     client = world.client(drone, 100_000, 0.05)
-    until(lambda: client.by == "e1", "an answer over the link", world)
+    until(lambda: client.by == "e1", "a reply over the link", world)
     drone.describe(uplink_mbps=900)
-    until(lambda: client.by == "cloud", "an answer of the cloud", world)
+    until(lambda: client.by == "cloud", "a reply of the cloud", world)
     drone.uplink(up=False)
     for agent in (drone, edge):
         agent.api(up=False)
@@ -323,19 +327,19 @@ def test_a_cloud_path_that_is_cut_is_left_though_it_was_the_better_one(world: Wo
     until(lambda: drone.status("app-d1-e1").get("traffic") == "cloud", "the status", world)
 
 
-def test_an_agent_that_dies_in_the_middle_of_a_switch(world: World) -> None:
+def test_agent_killed_during_a_switch_recovers(world: World) -> None:
     edge, drone = world.edge("e1", 20.0), world.drone()
     before = world.states()
     flying(world, edge)
     world.python("d1p", STREAM, f"{VIP.address}:{VIP.port}")  # never idle, so that a switch takes all its time
     client = world.client(drone, 100_000, 0.1)
-    until(lambda: client.by == "e1", "an answer over the link", world)
+    until(lambda: client.by == "e1", "a reply over the link", world)
     drone.fly(-57.0, velocity=(-3.0, 0.0, 0.0))
     until(lambda: not drone.redirects(), "the switch", world)
     drone.kill()  # its old connections are being drained
     drone.fly(0.0)
     drone.start()
-    until(lambda: client.by == "e1", "an answer over the link again", world)
+    until(lambda: client.by == "e1", "a reply over the link again", world)
     assert len(drone.redirects()) == 1
     unchanged(world, before)
-    until(lambda: client.by == "cloud", "an answer of the cloud", world)
+    until(lambda: client.by == "cloud", "a reply of the cloud", world)

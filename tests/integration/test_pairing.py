@@ -144,7 +144,7 @@ def air(tmp_path: Path) -> Iterator[Air]:
     found.close()
 
 
-def test_two_nodes_hear_each_other_pair_and_part(air: Air) -> None:
+def test_two_nodes_discover_each_other_pair_and_disconnect(air: Air) -> None:
     edge, drone = air.node("e1"), air.node("d1")
     edge.expect("heard d1")
     drone.expect("heard e1")
@@ -158,7 +158,7 @@ def test_two_nodes_hear_each_other_pair_and_part(air: Air) -> None:
     edge.expect("ended d1")
 
 
-def test_a_drone_changes_peers_and_has_one_at_a_time(air: Air) -> None:
+def test_drone_changes_its_peer_and_has_one_link_at_a_time(air: Air) -> None:
     first, second, drone = air.node("e1"), air.node("e2"), air.node("d1")
     drone.tell("want e1")
     drone.expect("link up e1")
@@ -169,7 +169,7 @@ def test_a_drone_changes_peers_and_has_one_at_a_time(air: Air) -> None:
     second.expect("accepted d1")
 
 
-def test_both_ends_notice_the_loss_of_the_link(air: Air) -> None:
+def test_both_ends_detect_the_loss_of_the_link(air: Air) -> None:
     edge, drone = air.node("e1"), air.node("d1")
     drone.tell("want e1")
     drone.expect("link up e1")
@@ -184,16 +184,16 @@ def test_both_ends_notice_the_loss_of_the_link(air: Air) -> None:
     drone.expect("link up e1")
 
 
-def test_a_peer_that_hears_and_never_answers(air: Air) -> None:
+def test_pairing_with_an_unresponsive_peer_times_out(air: Air) -> None:
     air.node("e1")
     drone = air.node("d1")
     air.command(station="e1", silent=True)
     drone.tell("want e1")
-    assert "e1_does_not_answer:_time-out" in drone.expect("link none -")
+    assert "e1_does_not_respond:_timeout" in drone.expect("link none -")
 
 
 @pytest.mark.parametrize("fault", ["other name", "other authority", "component", "expired"])
-def test_an_imposter_is_not_linked_to(air: Air, fault: str) -> None:
+def test_node_without_the_peers_certificate_is_not_linked(air: Air, fault: str) -> None:
     if fault == "other name":
         files = air.files("e2")
     elif fault == "expired":
@@ -211,19 +211,19 @@ def test_an_imposter_is_not_linked_to(air: Air, fault: str) -> None:
     drone = air.node("d1")
     drone.tell("want e1")
     assert drone.expect("link none -")
-    # The honest node, when it comes, is linked to: nothing is left of the imposter.
+    # A second attempt fails as well.
     drone.tell("want e1")
     drone.expect("link none -")
 
 
-def test_an_edge_node_takes_no_drone_that_it_was_not_told_of(air: Air) -> None:
+def test_edge_node_refuses_a_drone_without_direct_link(air: Air) -> None:
     edge, drone = air.node("e1"), air.node("d1")
     edge.tell("refuse no DirectLink names d1")
     drone.tell("want e1")
     assert "no_DirectLink_names_d1" in drone.expect("link none -")
 
 
-def test_two_drones_compete_for_one_place(air: Air) -> None:
+def test_second_drone_is_refused_while_the_first_is_linked(air: Air) -> None:
     edge = air.node("e1", max_peers=1)
     first, second = air.node("d1"), air.node("d2")
     first.tell("want e1")
@@ -237,7 +237,7 @@ def test_two_drones_compete_for_one_place(air: Air) -> None:
     second.expect("link up e1")
 
 
-def test_a_peer_that_dies_and_comes_back(air: Air) -> None:
+def test_link_is_restored_after_the_peer_restarts(air: Air) -> None:
     edge, drone = air.node("e1"), air.node("d1")
     drone.tell("want e1")
     drone.expect("link up e1")
@@ -245,7 +245,7 @@ def test_a_peer_that_dies_and_comes_back(air: Air) -> None:
     edge.expect("ended d1")
 
 
-def test_beacons_are_no_more_than_names() -> None:
+def test_beacons_contain_a_valid_node_name_only() -> None:
     assert decode(encode("e1")) == "e1"
     for data in (
         b"",
@@ -262,7 +262,7 @@ def test_beacons_are_no_more_than_names() -> None:
     assert decode(encode("x" * 254)) is None
 
 
-def test_addresses_follow_from_names_and_avoid_what_is_reserved() -> None:
+def test_link_addresses_are_derived_from_names_and_avoid_reserved_ranges() -> None:
     found = {link_address(f"node-{n}") for n in range(2000)}
     assert len(found) > 1900
     assert all(str(address).startswith("169.254.") for address in found)

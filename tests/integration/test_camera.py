@@ -131,7 +131,7 @@ async def test_the_description_that_the_agent_hands_over_is_judged_by_at_once(ri
     handover = NodeObjectFile(handed)
     camera = stub(rig, rig.start_camera("--node-object", str(handed)))
     assert (await denied(capture(camera)))[1].code == "PositionUnknown", "not even the kind of node is known"
-    await rig.until_logged("camera", "it counts as seeing everything (missing=services.camera)")
+    await rig.until_logged("camera", "the camera counts as seeing everything (missing=services.camera)")
 
     async def becomes(code: str) -> None:
         found: str | None = None
@@ -192,7 +192,7 @@ async def test_policies_that_come_later_hold_for_pictures_from_before(rig: Rig) 
             break
         await asyncio.sleep(0.05)
     assert list(chunks[0].decision.policies) == ["privacy"]
-    assert "blurAverage instead" in chunks[0].decision.reason, "4 m up, 640 pixels: too few for faces"
+    assert "blurAverage is applied" in chunks[0].decision.reason, "4 m up, 640 pixels: too few for faces"
     blurred = b"".join(c.data for c in chunks)
     assert len(blurred) == chunks[0].image.size_bytes < len(plain)
     assert not chunks[0].image.HasField("position")
@@ -306,7 +306,7 @@ async def test_an_ip_camera_that_breaks_and_comes_back(rig: Rig) -> None:
         shown = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         assert shown.shape == (320, 320, 3)
         assert abs(float(shown.mean()) - 200) < 3
-        for broken, sentence in (("503", "503"), ("text", "no picture")):
+        for broken, sentence in (("503", "503"), ("text", "returned no image")):
             Snapshots.broken = broken
             code, why = await denied(capture(camera))
             assert (code, why.code) == (grpc.StatusCode.UNAVAILABLE, "CameraFailed")

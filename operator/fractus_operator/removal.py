@@ -1,6 +1,7 @@
-"""`python -m fractus_operator.removal`: after Fractus was uninstalled, removes what it made itself.
+"""`python -m fractus_operator.removal`: removes the objects that Fractus created at run time, after it was uninstalled.
 
-The authority, the operator's Lease, the location labels of Nodes, and requests for certificates: helm knows of none of them.
+These are the certificate authority, the Lease of the operator, the location labels of Nodes, and signing requests. helm does not
+know them.
 """
 
 from __future__ import annotations
@@ -33,23 +34,23 @@ from fractus_operator.labels import LEASE_NAME, is_location_label
 from fractus_operator.store import KubeError, NotFound, Store, Unconfigured
 
 WIPE = "fractus-wipe"
-"""The chart's DaemonSet whose pods are ready once their node's data is gone."""
+"""DaemonSet of the chart whose pods are ready when the data of their node is deleted."""
 OPERATOR = "fractus-operator"
-"""The chart's Deployment of the operator."""
+"""Deployment of the operator."""
 
 _WIPING_S = 120.0
-"""How long nodes get to remove their data; the chart's Job has 240 s in all."""
+"""Maximum time in which nodes delete their data, in seconds. The deadline of the chart's Job is 240 s."""
 _PERIOD_S = 2.0
-_ASKING_S = 30.0
-"""How long an API server that does not answer is asked whether the operator is still installed."""
+_CHECK_TIMEOUT_S = 30.0
+"""Time for which the check that the operator is uninstalled is repeated if the API server does not respond, in seconds."""
 
 
 def unwiped(nodes: Sequence[Body], pods: Sequence[Body]) -> list[str]:
-    """Return the names of the nodes whose data is not known to be gone.
+    """Return the names of the nodes whose data may still exist.
 
     Args:
         nodes: All drones and edge nodes.
-        pods: Of the DaemonSet.
+        pods: Pods of the DaemonSet.
     """
     wiped = {
         pod["spec"].get("nodeName")
@@ -60,35 +61,36 @@ def unwiped(nodes: Sequence[Body], pods: Sequence[Body]) -> list[str]:
 
 
 @contextmanager
-def _noting(problems: list[str], what: str) -> Iterator[None]:
-    """Keep what is refused, so that the rest is removed all the same."""
+def _recording(problems: list[str], what: str) -> Iterator[None]:
+    """Record a refused request, so that the rest is removed."""
     try:
         yield
     except KubeError as error:
         problems.append(f"{what}: {error}")
 
 
-async def still_installed(store: Store, namespace: str, timeout_s: float = _ASKING_S) -> str:
-    """Return why nothing may be removed, in a sentence; empty once the operator is uninstalled.
+async def still_installed(store: Store, namespace: str, timeout_s: float = _CHECK_TIMEOUT_S) -> str:
+    """Return why nothing may be removed, as a sentence, or an empty string if the operator is uninstalled.
 
-    An API server that does not answer, or has no time, is asked again until the end.
+    The request is repeated until the timeout if the API server does not respond or is overloaded.
 
-    What renders the chart and knows no hooks of helm (helm template, kustomize) makes this Job along with what it would take down.
+    Tools that render the chart but do not support helm hooks (helm template, kustomize) create this Job together with the
+    installation that it would remove.
     """
     try:
         operator = await _operator(store, namespace, timeout_s)
     except NotFound:
         return ""
     except KubeError as error:
-        # The right to look comes in one Role with those to remove what this protects.
+        # The same Role contains this right and the rights to remove the objects.
         if error.status == HTTPStatus.FORBIDDEN:
             return ""
-        return f"nothing was removed, for it is not known whether Fractus is still installed ({error})"
+        return f"nothing was removed, because it is unknown whether Fractus is still installed ({error})"
     if "deletionTimestamp" in operator["metadata"]:
         return ""
     return (
-        f"nothing was removed: Fractus is installed in {namespace}, and this Job is for helm uninstall only; leave hooks out "
-        "where you render the chart (helm template --no-hooks)"
+        f"nothing was removed: Fractus is installed in {namespace}, and this Job is for helm uninstall only; omit hooks if "
+        "you render the chart (helm template --no-hooks)"
     )
 
 
@@ -107,21 +109,21 @@ async def _operator(store: Store, namespace: str, timeout_s: float) -> Body:
 
 
 async def remove(store: Store, namespace: str, *, keep_authority: bool = False) -> list[str]:
-    """Remove what the operator and the agents made in the cluster; what is gone already is no error.
+    """Remove the objects that the operator and the agents created. A missing object is no error.
 
     Args:
-        store: Kubernetes.
-        namespace: Where the system lived.
-        keep_authority: Leave its Secret, which was there before.
+        store: The API server.
+        namespace: Namespace of the Fractus services.
+        keep_authority: Keep the Secret of the authority, which existed before the installation.
 
     Returns:
-        What could not be removed, and why.
+        The objects that could not be removed, with the error.
     """
     problems: list[str] = []
 
     async def delete(kind: Kind, key: tuple[str, str]) -> None:
         what = f"{kind.name} {'/'.join(filter(None, key))}"
-        with _noting(problems, what):
+        with _recording(problems, what):
             await store.delete(kind, key)
             print(f"removed {what}")
 
@@ -129,29 +131,29 @@ async def remove(store: Store, namespace: str, *, keep_authority: bool = False) 
         await delete(SECRET, (namespace, AUTHORITY))
     await delete(CONFIG_MAP, (namespace, AUTHORITY))
     await delete(LEASE, (namespace, LEASE_NAME))
-    with _noting(problems, "requests for certificates"):
-        # Of an agent that ended while it waited for one.
+    with _recording(problems, "requests for certificates"):
+        # Requests of agents that ended before they got a certificate.
         for request in await store.list(SIGNING_REQUEST, selectors={"fieldSelector": f"spec.signerName={NODE_SIGNER}"}):
             await delete(SIGNING_REQUEST, ("", request["metadata"]["name"]))
-    with _noting(problems, "location labels of nodes"):
+    with _recording(problems, "location labels of nodes"):
         for node in await store.list(NODE):
             ours = [label for label in node["metadata"].get("labels") or {} if is_location_label(label)]
             if ours:
                 what = f"location labels of the node {node['metadata']['name']}"
-                with _noting(problems, what):
+                with _recording(problems, what):
                     await store.set_labels(NODE, node["metadata"]["name"], dict.fromkeys(ours))
                     print(f"removed the {what}")
     return problems
 
 
 async def await_wiped(store: Store, namespace: str, timeout_s: float = _WIPING_S) -> list[str]:
-    """Wait until the data of all nodes is gone; an API server that does not answer is asked again until the end.
+    """Wait until the data of all nodes is deleted. Requests without a response are repeated until the timeout.
 
     Returns:
-        The names of the nodes whose data is not known to be gone.
+        The names of the nodes whose data may still exist.
 
     Raises:
-        KubeError: the API server did not answer at the end either.
+        KubeError: The last request failed as well.
     """
     end = time.monotonic() + timeout_s
     while True:
@@ -172,14 +174,12 @@ async def _removed(store: Store, namespace: str, wiped: str, keep_authority: boo
     problems: list[str] = []
     refused = await remove(store, namespace, keep_authority=keep_authority)
     if refused:
-        problems.append(f"not all that Fractus made in the cluster was removed: {', '.join(refused)}")
+        problems.append(f"some objects of Fractus were not removed: {', '.join(refused)}")
     if wiped:
         try:
             left = await await_wiped(store, namespace, timeout_s)
         except KubeError as error:
-            problems.append(
-                f"it is not known on which nodes {wiped} was wiped ({error}): see to it there (rm -rf {wiped})"
-            )
+            problems.append(f"it is unknown on which nodes {wiped} was wiped ({error}): check them (rm -rf {wiped})")
         else:
             if left:
                 problems.append(f"{wiped} was not wiped on {', '.join(left)}: remove it there (rm -rf {wiped})")
@@ -187,46 +187,46 @@ async def _removed(store: Store, namespace: str, wiped: str, keep_authority: boo
 
 
 async def run(namespace: str, wiped: str, *, keep_authority: bool = False, timeout_s: float = _WIPING_S) -> str:
-    """Remove all of it. The DaemonSet that wipes goes in any case: it would wipe what is installed next.
+    """Remove all objects. The DaemonSet that wipes nodes is always deleted, because it would wipe the next installation.
 
     Args:
-        namespace: where the system lived.
-        wiped: the directory of nodes that is wiped; empty: none is.
-        keep_authority: leave the Secret of the authority, which was there before.
-        timeout_s: how long nodes get.
+        namespace: Namespace of the Fractus services.
+        wiped: Directory of nodes that is wiped. Empty: none.
+        keep_authority: Keep the Secret of the authority, which existed before the installation.
+        timeout_s: Maximum time in which nodes delete their data, in seconds.
 
     Returns:
-        What was not removed and what to do, in a sentence; empty when nothing is left.
+        What was not removed and what to do, as a sentence, or an empty string.
 
     Raises:
-        Unconfigured: there are no credentials.
+        Unconfigured: There are no credentials.
     """
     store = await Store.connect()
     problems: list[str] = []
     try:
-        installed = await still_installed(store, namespace, min(_ASKING_S, timeout_s))
+        installed = await still_installed(store, namespace, min(_CHECK_TIMEOUT_S, timeout_s))
         problems += [installed] if installed else await _removed(store, namespace, wiped, keep_authority, timeout_s)
     finally:
         if wiped:
-            with _noting(problems, f"kubectl -n {namespace} delete daemonset {WIPE}, before anything is installed"):
+            with _recording(problems, f"kubectl -n {namespace} delete daemonset {WIPE}, before anything is installed"):
                 await store.delete(DAEMON_SET, (namespace, WIPE))
         await store.aclose()
     return "; ".join(problems)
 
 
 def main() -> int:
-    """Run the removal as a program; returns its exit code."""
+    """Run the removal as a program. Return its exit code."""
     parser = argparse.ArgumentParser(prog="fractus_operator.removal")
     parser.add_argument("--namespace", required=True)
     parser.add_argument("--wiped", default="", metavar="DIRECTORY", help="wait until nodes have wiped it")
     parser.add_argument("--keep-authority", action="store_true", help="leave the Secret of the authority")
     arguments = parser.parse_args()
-    # The Job's deadline, or a drained node.
+    # Sent at the deadline of the Job, or when its node is drained.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit("ended before all was removed"))
     try:
         left = asyncio.run(run(arguments.namespace, arguments.wiped, keep_authority=arguments.keep_authority))
     except Unconfigured as error:
-        left = f"what Fractus made was not removed: {error}"
+        left = f"the objects of Fractus were not removed: {error}"
     if left:
         print(left, file=sys.stderr)
     return 1 if left else 0

@@ -1,4 +1,4 @@
-"""What an installation sets: read once from the environment."""
+"""Settings of the operator, read once from the environment."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _PLANNING = {
     "climb_speed_mps": "FRACTUS_PLANNING_CLIMB_SPEED",
     "battery_reserve": "FRACTUS_PLANNING_BATTERY_RESERVE",
 }
-"""Which variable sets which figure of the planning."""
+"""Environment variables of the numeric settings of planning."""
 
 
 _TEXTS = {
@@ -30,11 +30,11 @@ _TEXTS = {
     "identity": "FRACTUS_IDENTITY",
     "health": "FRACTUS_HEALTH",
 }
-"""Which variable sets what is taken as it is."""
+"""Environment variables of the settings that are strings."""
 
 
 FORMER_AGENT_ACCOUNT = "fractus-agent"
-"""The service account of the agents of earlier releases."""
+"""Service account of the agents of earlier releases."""
 
 DEFAULT_LEASE_S = 10.0
 MIN_LEASE_S = 1.0
@@ -46,15 +46,18 @@ class BadSetting(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """How the operator runs.
+    """Settings of the operator.
 
     Attributes:
-        namespace: where the system lives.
-        agent_account: name of the agents' service account in that namespace.
-        health: URL that the liveness endpoint listens on.
-        metrics_port: where Prometheus finds /metrics; 0: nowhere.
-        identity: under which this operator leads, such as the name of its pod; empty: one that no other process has.
-        lease_s: for how long no other operator leads after this one was last heard of.
+        namespace: Namespace of the Fractus services.
+        agent_account: Name of the service account of agents in that namespace.
+        health: URL of the liveness endpoint.
+        metrics_port: Port of /metrics. 0 disables it.
+        identity: Identity of this operator in the election, such as the name of its pod. Empty: a random identity.
+        lease_s: Seconds after the last renewal of this operator's Lease until another operator may lead.
+        log_level: Minimum level of log lines.
+        log_format: Format of log lines, text or json.
+        planning: Settings of planning.
     """
 
     namespace: str = "fractus-system"
@@ -69,7 +72,7 @@ class Settings:
 
     @property
     def agent_users(self) -> frozenset[str]:
-        """User names of the agents, also of those that an upgrade has yet to replace."""
+        """User names of the agents, including agents that an upgrade has not replaced yet."""
         accounts = (self.agent_account, FORMER_AGENT_ACCOUNT)
         return frozenset(f"system:serviceaccount:{self.namespace}:{account}" for account in accounts)
 
@@ -78,7 +81,7 @@ class Settings:
         """Read FRACTUS_SYSTEM_NAMESPACE, FRACTUS_AGENT_ACCOUNT, FRACTUS_HEALTH, FRACTUS_IDENTITY, FRACTUS_LEASE, FRACTUS_METRICS_PORT, FRACTUS_LOG_LEVEL, FRACTUS_LOG_FORMAT and the FRACTUS_PLANNING_*.
 
         Raises:
-            BadSetting: naming the variable.
+            BadSetting: A variable is invalid. The message names it.
         """
         level = environment.get("FRACTUS_LOG_LEVEL", "INFO").upper()
         if level not in logging.getLevelNamesMapping():

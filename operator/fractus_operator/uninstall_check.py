@@ -1,4 +1,4 @@
-"""`python -m fractus_operator.uninstall_check`: tells whether Fractus can be uninstalled without leaving a drone in the air."""
+"""`python -m fractus_operator.uninstall_check`: checks that Fractus can be uninstalled without leaving a drone in the air."""
 
 from __future__ import annotations
 
@@ -14,35 +14,35 @@ from fractus_operator.store import KubeError, NotFound, Store, Unconfigured
 
 NOT_REPORTED = "its last report"
 _REPORTS_S = 3 * DRONE_REPORT_S
-"""How long two reports may take; the chart's Job has 150 s in all."""
+"""Maximum time of two reports, in seconds. The deadline of the chart's Job is 150 s."""
 _PERIOD_S = 2.0
 
 
 def objection(applications: Sequence[Body], drones: Sequence[Body]) -> str:
-    """Return why Fractus is still needed and what to do, in a sentence; empty when it is not.
+    """Return why Fractus must not be uninstalled yet and what to do, as a sentence, or an empty string.
 
     Args:
         applications: All Application objects.
-        drones: All Drone objects. One that never reported is taken to be on the ground.
+        drones: All Drone objects. A drone that never reported counts as on the ground.
     """
     kept = ["/".join(key_of(body)) for body in applications if FINALIZER in body["metadata"].get("finalizers", ())]
     if kept:
         return (
-            f"Fractus still has to take down {_listed(kept)}: delete all Applications first "
+            f"Fractus still runs {_listed(kept)}: delete all Applications first "
             "(kubectl delete applications.fractus.dev --all -A), then uninstall"
         )
     watched = [body for body in drones if not _grounded_by_hand(body)]
     flying = [f"{body['metadata']['name']} ({body['status']['flightState']})" for body in watched if _flies(body)]
     if flying:
         return (
-            f"Fractus still flies {_listed(flying)}: wait until kubectl get drones.fractus.dev says inactive or charging, "
+            f"Fractus still flies {_listed(flying)}: wait until kubectl get drones.fractus.dev shows inactive or charging, "
             "then uninstall"
         )
     unsure = [body["metadata"]["name"] for body in watched if _may_take_off(body)]
     if unsure:
         return (
             f"{_listed(unsure)} may have taken off since {NOT_REPORTED}: wait for its next report, or, if you see it on the "
-            "ground, annotate it fractus.dev/grounded (docs/upgrades.md), then uninstall"
+            "ground, set its annotation fractus.dev/grounded (docs/upgrades.md), then uninstall"
         )
     return ""
 
@@ -68,31 +68,31 @@ def _listed(names: Sequence[str], most: int = 5) -> str:
 
 
 async def check() -> str:
-    """Return the objection that the cluster's present state gives rise to; drones that have landed get the time for two reports.
+    """Return the objection for the current state of the cluster. Waits for up to two reports of drones that have landed.
 
     Raises:
-        Unconfigured: there are no credentials.
-        KubeError: the API server refused, or could not be reached.
+        Unconfigured: There are no credentials.
+        KubeError: The API server refused a request, or could not be reached.
     """
     store = await Store.connect()
-    found = "whether drones fly could not be found out: the API server did not answer in time"
+    problem = "cannot check for drones in flight: the API server did not respond in time"
     try:
         async with asyncio.timeout(_REPORTS_S) as waited:
             while True:
-                found = objection(await _all(store, APPLICATION), await _all(store, DRONE))
-                if NOT_REPORTED not in found:
-                    return found
+                problem = objection(await _all(store, APPLICATION), await _all(store, DRONE))
+                if NOT_REPORTED not in problem:
+                    return problem
                 await asyncio.sleep(_PERIOD_S)
     except TimeoutError:
         if not waited.expired():
             raise
-        return found
+        return problem
     finally:
         await store.aclose()
 
 
 async def _all(store: Store, kind: Kind) -> list[Body]:
-    """All objects of a kind; none where the kind itself is gone, so that Fractus can be removed after it."""
+    """Return all objects of a kind. If the kind was deleted, there are none, so that Fractus can be removed after its kinds."""
     try:
         return await store.list(kind)
     except NotFound:
@@ -100,14 +100,14 @@ async def _all(store: Store, kind: Kind) -> list[Body]:
 
 
 def main() -> int:
-    """Run the check as a program; returns its exit code."""
+    """Run the check as a program. Return its exit code."""
     try:
-        found = asyncio.run(check())
+        problem = asyncio.run(check())
     except (Unconfigured, KubeError) as error:
-        found = f"whether drones fly could not be found out: {error}"
-    if found:
-        print(found, file=sys.stderr)
-    return 1 if found else 0
+        problem = f"cannot check for drones in flight: {error}"
+    if problem:
+        print(problem, file=sys.stderr)
+    return 1 if problem else 0
 
 
 if __name__ == "__main__":

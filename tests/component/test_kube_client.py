@@ -247,14 +247,14 @@ async def test_a_list_that_makes_progress_has_more_time_than_an_object() -> None
     slow = Server(CHUNKED + b"".join(chunk(page[i : i + 1]) for i in range(len(page))) + chunk(b""), delay_s=0.15)
     async with client_of(slow) as client:
         assert (await client.list_page(ZONE, timeout_s=10.0)).resource_version == "7"
-        with pytest.raises(KubeError, match=r"no answer in 0\.1 s"):
+        with pytest.raises(KubeError, match=r"no response in 0\.1 s"):
             await client.request("GET", "/x", timeout_s=0.1)
 
 
 async def test_a_list_that_makes_no_progress_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fractus_runtime.kubernetes.connection.REQUEST_TIMEOUT_S", 0.2)
     async with client_of(Server(CHUNKED + chunk(b'{"items"'))) as client, asyncio.timeout(5.0):
-        with pytest.raises(KubeError, match="no answer"):
+        with pytest.raises(KubeError, match="no response"):
             await client.list(ZONE)
 
 
@@ -262,7 +262,7 @@ async def test_a_write_to_an_api_server_that_stalls_ends_before_another_may_act(
     left_s = 0.02
     server = Server(b"")
     async with client_of(server, may_write_s=lambda: left_s) as client:
-        with pytest.raises(KubeError, match=r"no answer in 0\.0 s"):
+        with pytest.raises(KubeError, match=r"no response in 0\.0 s"):
             await client.create(ZONE, ZONE.header("a"))
         left_s, before = 0.0, len(server.requests)
         with pytest.raises(KubeError, match="another operator may act"):

@@ -228,7 +228,7 @@ def test_of_two_operators_one_acts_and_the_other_takes_over(
         assert f"planned (application={namespace}/second " in second.log()
         first.signal(signal.SIGCONT)
         wait_for(lambda: not first.running, "the first one to end")
-        assert "two has acted since one last did" in first.log()
+        assert "two has acted since one last held the Lease" in first.log()
         assert f"planned (application={namespace}/second " not in first.log()
     finally:
         if first.running:

@@ -230,7 +230,7 @@ def test_what_is_refused_is_told(world: World, left: list[str], tmp_path: Path) 
     world.api.delete(role)
     done = remove(world, tmp_path)
     assert done.returncode == 1
-    assert "not all that Fractus made in the cluster was removed" in done.stderr
+    assert "some objects of Fractus were not removed" in done.stderr
     assert f"Secret {SYSTEM}/fractus-ca" in done.stderr
     assert [path for path in left if world.api.get(path)] == [path for path in left if SYSTEM in path]
 

@@ -146,7 +146,7 @@ async def test_who_finds_the_lease_of_an_earlier_time_must_start_again() -> None
     for _ in range(3):
         await step(only)
     shelf.body, shelf.writes = backup, writes
-    with pytest.raises(LostLease, match="gone back to version 1 of the Lease from 4, as after a restore"):
+    with pytest.raises(LostLease, match="went back from 4 to 1, as after a restore"):
         await step(only)
     again = lease(shelf, clock, "again")
     await step(again)

@@ -79,7 +79,7 @@ async def test_an_api_server_that_does_not_answer_is_an_objection(monkeypatch: p
 
     monkeypatch.setattr(Store, "connect", connect)
     monkeypatch.setattr(uninstall_check, "_REPORTS_S", 0.05)
-    assert "the API server did not answer" in await check()
+    assert "the API server did not respond" in await check()
 
 
 class Answers:

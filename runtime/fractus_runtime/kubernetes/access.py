@@ -1,4 +1,4 @@
-"""Where the API server is, and who asks: from a kubeconfig, a pod's service account, or a certificate."""
+"""Address and credentials of the API server: from a kubeconfig, a pod's service account, or a certificate."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ class Unconfigured(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Access:
-    """How to reach an API server.
+    """Address and credentials of an API server.
 
     Attributes:
-        configuration: What the official client asks with.
-        renew: Reads the credentials again into the configuration, for when the API server no longer takes them:
-            a token file was rotated, or a credential plugin has a fresh token.
+        configuration: Configuration of the official client.
+        renew: Reads the credentials into the configuration again, if the API server rejects them: a token file was
+            rotated, or a credential plugin has a new token.
     """
 
     configuration: Configuration
@@ -40,17 +40,21 @@ class Access:
 
 
 async def kubeconfig(path: str | Path, context: str | None = None) -> Access:
-    """Access by a context of a kubeconfig, or its current one; several are separated as in KUBECONFIG.
+    """Return the access of a context of a kubeconfig.
+
+    Args:
+        path: Path of the kubeconfig. Several paths are separated as in KUBECONFIG.
+        context: Name of the context. Default: the current context.
 
     Raises:
-        Unconfigured: there is none, or it has no such context that is whole.
+        Unconfigured: The kubeconfig does not exist, or has no such complete context.
     """
     configuration = Configuration()
 
     async def load() -> None:
         try:
             await load_kube_config(str(path), context=context, client_configuration=configuration, persist_config=False)
-        # The loader does not check types: a kubeconfig of other shapes ends in whatever Python says of them.
+        # The loader does not check types, so an invalid kubeconfig raises arbitrary errors.
         except (ConfigException, OSError, yaml.YAMLError, AttributeError, TypeError, ValueError) as error:
             raise Unconfigured(f"the kubeconfig {path} cannot be used: {error}") from error
 
@@ -59,10 +63,10 @@ async def kubeconfig(path: str | Path, context: str | None = None) -> Access:
 
 
 async def in_cluster(directory: Path = SERVICE_ACCOUNT) -> Access:
-    """Access by the service account of this pod; its token is read again every minute, and when it is refused.
+    """Return the access of the service account of this pod. Its token is read every minute, and when it is rejected.
 
     Raises:
-        Unconfigured: this is no pod, or it has no service account.
+        Unconfigured: This process does not run in a pod, or the pod has no service account.
     """
     loader = InClusterConfigLoader(str(directory / "token"), str(directory / "ca.crt"))
     configuration = Configuration()
@@ -78,13 +82,13 @@ async def in_cluster(directory: Path = SERVICE_ACCOUNT) -> Access:
 
 
 async def from_environment(context: str | None = None) -> Access:
-    """Access by the service account of this pod or, outside of one, by KUBECONFIG or kubectl's own kubeconfig.
+    """Return the access of the service account of this pod, or outside a pod that of KUBECONFIG or kubectl's kubeconfig.
 
     Args:
-        context: of the kubeconfig; who names one does not mean the pod.
+        context: Context of the kubeconfig. With a context, the service account is not used.
 
     Raises:
-        Unconfigured: there is none of them.
+        Unconfigured: There are no credentials.
     """
     if context is None:
         try:
@@ -100,7 +104,7 @@ async def from_environment(context: str | None = None) -> Access:
 def with_certificate(
     server: str, ca: Path | None = None, certificate: tuple[Path, Path] | None = None, token: str = ""
 ) -> Access:
-    """Access by a client certificate (certificate and key) or a token."""
+    """Return the access by a client certificate (certificate and key) or a token."""
     configuration = Configuration(host=server, ssl_ca_cert=None if ca is None else str(ca))
     if certificate is not None:
         configuration.cert_file, configuration.key_file = map(str, certificate)
@@ -108,22 +112,22 @@ def with_certificate(
         configuration.api_key["BearerToken"] = f"Bearer {token}"
 
     async def nothing() -> None:
-        """Neither changes."""
+        """Do nothing. Neither changes."""
 
     return Access(configuration, nothing)
 
 
 def with_tokens(configuration: Configuration, token: Callable[[], Awaitable[str]], life_s: float) -> Access:
-    """Access to the API server of a configuration by tokens that are asked for: the first before the first request.
+    """Return the access to an API server by tokens that are requested when needed.
 
     Args:
-        configuration: of any other access to it; its credentials are left out.
-        token: asks for a new one.
-        life_s: how long one is used before the next is asked for; it should be valid for twice as long.
+        configuration: Configuration of another access to the same API server. Its credentials are not used.
+        token: Requests a new token.
+        life_s: Time for which a token is used, in seconds. It should be valid for twice as long.
     """
     own = copy.copy(configuration)
     own.cert_file = own.key_file = None
-    # The client asks the hook for a token where it has had one, if only an empty one.
+    # The client calls the hook only if it has a token, which may be empty.
     own.api_key = {"BearerToken": ""}
     renew_at_s = -math.inf
 
@@ -141,7 +145,7 @@ def with_tokens(configuration: Configuration, token: Callable[[], Awaitable[str]
         except KubeError:
             if not own.api_key["BearerToken"]:
                 raise
-            # The one that there is may be good for as long again; where it is not, the API server says so.
+            # The present token may be valid for as long again. Otherwise the API server rejects it.
             renew_at_s = time.monotonic() + life_s / 10
 
     own.refresh_api_key_hook = in_time

@@ -1,4 +1,4 @@
-"""How long to wait before trying again: exponential, with jitter and a cap."""
+"""Exponential back-off with jitter and a maximum."""
 
 from __future__ import annotations
 
@@ -6,7 +6,13 @@ import random
 
 
 class Backoff:
-    """Delays that double from first_s up to cap_s, each cut by up to half so that nodes do not march in step."""
+    """Delays between retries that double up to a maximum. Jitter shortens each delay by up to half, so that nodes diverge.
+
+    Args:
+        first_s: First delay, in seconds.
+        cap_s: Maximum delay, in seconds.
+        rng: Source of the jitter.
+    """
 
     def __init__(self, first_s: float, cap_s: float, rng: random.Random | None = None) -> None:
         self._first_s = first_s
@@ -16,15 +22,15 @@ class Backoff:
 
     @property
     def attempts(self) -> int:
-        """Delays given since the last success."""
+        """Number of delays since the last success."""
         return self._attempts
 
     def delay_s(self) -> float:
-        """The next delay in seconds."""
+        """Return the next delay in seconds."""
         full_s = min(self._cap_s, self._first_s * 2.0 ** min(self._attempts, 32))
         self._attempts += 1
         return full_s * self._rng.uniform(0.5, 1.0)
 
     def succeeded(self) -> None:
-        """Start from the first delay again."""
+        """Reset to the first delay."""
         self._attempts = 0

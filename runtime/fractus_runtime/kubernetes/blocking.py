@@ -1,4 +1,4 @@
-"""The client for programs without an event loop: tools that bring clusters up, tests and benchmarks."""
+"""Client for programs without an event loop: tools that start clusters, tests and benchmarks."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _POLL_S = 0.05
 
 
 class BlockingClient:
-    """One API server by paths; any number of threads may use it at the same time."""
+    """The API server by paths. It is thread-safe."""
 
     def __init__(self, access: Access, field_manager: str, *, trust_env: bool = False) -> None:
         self._loop = asyncio.new_event_loop()
@@ -53,37 +53,37 @@ class BlockingClient:
         params: Mapping[str, str] | None = None,
         timeout_s: float = REQUEST_TIMEOUT_S,
     ) -> Body:
-        """Send one request; the object in the answer.
+        """Send one request and return the object in the response.
 
         Raises:
-            KubeError: it was refused, or there was no answer in time.
+            KubeError: The request was refused, or there was no response in time.
         """
         return self._run(
             self._client.request(method, path, body, content_type=content_type, params=params, timeout_s=timeout_s)
         )
 
     def get(self, path: str) -> Body | None:
-        """Read an object; None when there is none."""
+        """Return an object, or None if it does not exist."""
         try:
             return self.call("GET", path)
         except NotFound:
             return None
 
     def list(self, path: str, **params: str) -> list[Body]:
-        """The items of a collection."""
+        """Return the items of a collection."""
         return list(self.call("GET", path, params=params, timeout_s=LIST_TIMEOUT_S)["items"])
 
     def apply(self, path: str, body: Mapping[str, Any], manager: str = "") -> Body:
-        """Make an object be as given, by server-side apply; `path` is the object's own."""
+        """Apply an object by server-side apply. `path` is the path of the object."""
         params = {"fieldManager": manager or self._client.field_manager, "force": "true"}
         return self.call("PATCH", path, dict(body), content_type=ContentType.APPLY, params=params)
 
     def merge(self, path: str, body: Mapping[str, Any]) -> Body:
-        """Merge a patch into an object."""
+        """Apply a merge patch to an object."""
         return self.call("PATCH", path, dict(body), content_type=ContentType.MERGE)
 
     def delete(self, path: str, grace_s: int | None = None) -> None:
-        """Delete an object and, in the background, what it owns; one that is gone already is no error."""
+        """Delete an object and, in the background, the objects that it owns. A missing object is no error."""
         options: Body = {"propagationPolicy": "Background"}
         if grace_s is not None:
             options["gracePeriodSeconds"] = grace_s
@@ -93,14 +93,14 @@ class BlockingClient:
             return
 
     def ready(self) -> bool:
-        """Whether the API server says that it is ready."""
+        """Return True if the API server reports that it is ready."""
         return self._run(self._client.ready())
 
     def wait_ready(self, timeout_s: float) -> None:
         """Wait until the API server is ready.
 
         Raises:
-            KubeError: it was not in time.
+            KubeError: It was not ready in time.
         """
         deadline = time.monotonic() + timeout_s
         while not self.ready():

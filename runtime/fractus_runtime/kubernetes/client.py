@@ -1,7 +1,7 @@
-"""Objects of Kubernetes as plain dicts: reads, lists by pages, watches, server-side applies, deletes.
+"""Requests for Kubernetes objects as plain dicts: reads, paged lists, watches, server-side apply, deletes.
 
-Dicts need no class for each kind, and the API server checks them better than a class could. The official client's own watch has no
-bound on silence and its lists have no pages, so both are here.
+Dicts need no class for each kind, and the API server validates them. Watch and list are implemented here, because the watch of
+the official client has no limit on silence, and its lists have no pages.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from fractus_runtime.kubernetes.errors import Conflict, NotFound, from_status
 from fractus_runtime.kubernetes.objects import Body, Key, Kind, key_of
 
 LIST_TIMEOUT_S = 120.0
-"""Lists are long where links are slow: one that makes progress goes on, so that it does not start over again and again."""
+"""Maximum time of one page of a list, in seconds. Over slow links, a list that makes progress must not be restarted."""
 PAGE = 250
-"""Objects a page: while one is read it takes several times its size."""
+"""Objects in a page. Decoding a page takes several times its size in memory."""
 
 POD = Kind("v1", "Pod", "pods", namespaced=True)
 
@@ -41,10 +41,10 @@ class Page:
 
 
 async def _lines(content: aiohttp.StreamReader, silence_s: float | None) -> AsyncIterator[bytes]:
-    """What comes, by lines with their ends; one that was cut off has none."""
+    """Iterate over the lines of a stream, with their line ends. The last line may be cut off and have none."""
     rest = b""
     while True:
-        # aiohttp's own time-out ends with the connection, also where that never tells the reader.
+        # The timeout of aiohttp ends with the connection, even if the reader is not notified.
         async with asyncio.timeout(silence_s):
             chunk = await content.readany()
         if not chunk:
@@ -57,15 +57,15 @@ async def _lines(content: aiohttp.StreamReader, silence_s: float | None) -> Asyn
 
 
 class Client(Connection):
-    """An API server by kinds of objects."""
+    """The API server by kinds of objects."""
 
     def account(self, name: str, namespace: str, node: str) -> Client:
-        """A client that acts as a ServiceAccount, by tokens that this one asks for; each is bound to a Node, for an hour.
+        """Return a client of a ServiceAccount. This client requests its tokens, each bound to a Node and valid for an hour.
 
         Args:
-            name: of the ServiceAccount.
-            namespace: of the ServiceAccount.
-            node: with which tokens end.
+            name: Name of the ServiceAccount.
+            namespace: Namespace of the ServiceAccount.
+            node: Node of the tokens. They become invalid when it is deleted.
         """
         request: Body = {
             "apiVersion": "authentication.k8s.io/v1",
@@ -87,7 +87,7 @@ class Client(Connection):
         """Read an object.
 
         Raises:
-            NotFound: there is none of that name.
+            NotFound: There is no object of that name.
         """
         return await self.request("GET", kind.path(namespace, name))
 
@@ -103,14 +103,14 @@ class Client(Connection):
         """Read one page of a collection.
 
         Args:
-            kind: Which collection.
-            namespace: Which part of it; empty: all namespaces.
-            selectors: labelSelector and fieldSelector, where wanted.
-            continue_: What the page before gave, to go on from.
-            timeout_s: How long the page may take; within that, it must make progress.
+            kind: Kind of the objects.
+            namespace: Namespace of the objects. Empty: all namespaces.
+            selectors: labelSelector and fieldSelector, if any.
+            continue_: Continuation token of the previous page.
+            timeout_s: Maximum time of the page, in seconds. It must make progress meanwhile.
 
         Raises:
-            Expired: the list changed so much that it must be read from its beginning.
+            Expired: The continuation token is too old. Read the list from its beginning.
         """
         params = {"limit": str(PAGE), **(selectors or {})}
         if continue_:
@@ -129,7 +129,7 @@ class Client(Connection):
         selectors: Mapping[str, str] | None = None,
         timeout_s: float = LIST_TIMEOUT_S,
     ) -> Page:
-        """Read a whole collection as one page, over all namespaces or of one; the time-out is for each part of it."""
+        """Read a whole collection as one page, over all namespaces or one. The timeout is for each page of it."""
         read = partial(self.list_page, kind, namespace=namespace, selectors=selectors, timeout_s=timeout_s)
         page = await read()
         items = page.items
@@ -150,20 +150,20 @@ class Client(Connection):
         silence_s: float,
         opened: Callable[[], None] = lambda: None,
     ) -> AsyncIterator[tuple[str, Body]]:
-        """Follow a collection: (ADDED | MODIFIED | DELETED | BOOKMARK, object), until the server ends it.
+        """Watch a collection: yield (ADDED | MODIFIED | DELETED | BOOKMARK, object) until the API server ends the watch.
 
         Args:
-            kind: Which collection.
-            resource_version: Where to go on from.
-            namespace: As for the list.
-            selectors: As for the list.
-            timeout_s: The server ends the watch after this time.
-            silence_s: The connection counts as dead after this time without a byte (the server sends a
-                bookmark about every minute).
-            opened: Called once the API server has begun to answer, which may be long before the first event.
+            kind: Kind of the objects.
+            resource_version: Resource version to continue from.
+            namespace: Namespace of the objects. Empty: all namespaces.
+            selectors: labelSelector and fieldSelector, if any.
+            timeout_s: Time after which the API server ends the watch, in seconds.
+            silence_s: Time without a byte after which the connection counts as dead, in seconds. The API server sends a
+                bookmark about every minute.
+            opened: Called when the response begins, which may be long before the first event.
 
         Raises:
-            Expired: the resource version is too old.
+            Expired: The resource version is too old.
         """
         params = {
             "watch": "true",
@@ -183,13 +183,13 @@ class Client(Connection):
                         yield event["type"], event["object"]
 
     async def log(self, pod: Key, params: Mapping[str, str], *, silence_s: float | None) -> AsyncGenerator[bytes, None]:
-        """Lines of a container's log, without their ends, until the log ends or, followed, the container does.
+        """Iterate over the lines of a container's log, without line ends. A followed log ends when the container does.
 
         Args:
             pod: (namespace, name).
-            params: those of the log subresource: container, follow, previous, sinceTime, timestamps and so on.
-            silence_s: How long nothing may come. None where the log is followed: a container may say nothing for hours,
-                and a kubelet answers with its first line.
+            params: Parameters of the log subresource: container, follow, previous, sinceTime, timestamps and so on.
+            silence_s: Maximum time without a line, in seconds. None for a followed log, because a container may log nothing
+                for hours, and the kubelet responds with its first line.
         """
         path = POD.path(*pod, "log")
         with translated(f"GET {path}"):
@@ -198,10 +198,10 @@ class Client(Connection):
                     yield line.rstrip(b"\r\n")
 
     async def create(self, kind: Kind, body: Body, *, strict: bool = True) -> Body:
-        """Create an object; if strict, what the API server does not know is refused, as by an apply, not dropped.
+        """Create an object. If strict, unknown fields are refused, as by an apply, and not dropped.
 
         Raises:
-            Conflict: one of that name exists; or, where its reason is not AlreadyExists, try again.
+            Conflict: An object of that name exists (reason AlreadyExists), or the request must be repeated (other reasons).
         """
         params = {"fieldManager": self.field_manager, "fieldValidation": "Strict" if strict else "Warn"}
         return await self.request("POST", kind.path(key_of(body)[0]), body, params=params)
@@ -250,31 +250,31 @@ class Client(Connection):
         )
 
     async def replace(self, kind: Kind, body: Body, *, subresource: str = "") -> Body:
-        """Write a whole object, such as a signing request's approval, which takes no apply.
+        """Replace a whole object, such as the approval of a signing request, which does not support apply.
 
         Raises:
-            Conflict: the object changed since it was read.
+            Conflict: The object was changed since it was read.
         """
         params = {"fieldManager": self.field_manager}
         return await self.request("PUT", kind.path(*key_of(body), subresource), body, params=params)
 
     async def delete(self, kind: Kind, key: Key, uid: str | None = None, *, orphan: bool = False) -> bool:
-        """Delete an object; one that is gone already is no error.
+        """Delete an object. A missing object is no error.
 
         Args:
-            kind: Of the object.
+            kind: Kind of the object.
             key: (namespace, name).
-            uid: Delete only the object that has it.
-            orphan: Leave what it owns, which goes in the background otherwise.
+            uid: Delete only the object with this uid.
+            orphan: Keep the objects that it owns. Otherwise they are deleted in the background.
 
         Returns:
-            Whether this request removed it; not so while a finalizer or a grace period keeps it.
+            True if this request removed the object. False while a finalizer or a grace period keeps it.
         """
         options: Body = {"propagationPolicy": "Orphan" if orphan else "Background"}
         if uid is not None:
             options["preconditions"] = {"uid": uid}
         try:
-            # A Status is the answer where it is gone, else the object as it is kept.
+            # The response is a Status if the object is removed, else the kept object.
             return (await self.request("DELETE", kind.path(*key), options)).get("kind") == "Status"
         except NotFound:
             return False

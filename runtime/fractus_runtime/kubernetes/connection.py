@@ -1,4 +1,4 @@
-"""A connection to the API server: requests over the official client (kubernetes.aio, aiohttp), and their time-outs."""
+"""Connection to the API server: requests through the official client (kubernetes.aio, aiohttp) with timeouts."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from fractus_runtime.kubernetes.objects import Body
 REQUEST_TIMEOUT_S = 15.0
 MAX_CONNECTIONS = 100
 _KEPT_OPEN_S = 60.0
-"""Connections stay open between two changes, for less than the API server's 90 s: each costs a TLS handshake."""
+"""Time for which idle connections are kept, below the 90 s of the API server. A new one costs a TLS handshake."""
 _KEEPALIVE = {"TCP_KEEPIDLE": 10, "TCP_KEEPINTVL": 5, "TCP_KEEPCNT": 3}
-"""A connection whose other side is gone without a word is found dead after 25 s."""
+"""TCP keep-alive that detects a dead connection after 25 s."""
 _FAILURES = (aiohttp.ClientError, TimeoutError, OSError, ConfigException, Unconfigured)
 
 
 class ContentType(StrEnum):
-    """How a body is meant."""
+    """Content type of a request body."""
 
     JSON = "application/json"
     APPLY = "application/apply-patch+yaml"
@@ -40,18 +40,18 @@ class ContentType(StrEnum):
 
 
 class Connection:
-    """An API server by paths.
+    """The API server by paths.
 
-    Every request ends within its time-out, with an answer or a KubeError.
+    Every request ends within its timeout, with a response or a KubeError.
 
     Args:
-        access: Where the API server is, and who asks.
-        field_manager: Who owns the fields that are written.
-        may_write_s: For how many seconds writes may still take effect; none where another process may write instead.
-        trust_env: Whether proxies of the environment are used.
+        access: Address and credentials of the API server.
+        field_manager: Owner of the written fields.
+        may_write_s: Returns for how many seconds writes may still take effect. 0 if another process may write instead.
+        trust_env: Use the proxies of the environment.
 
     Raises:
-        Unconfigured: a certificate or key cannot be read.
+        Unconfigured: A certificate or key cannot be read.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class Connection:
             raise Unconfigured(f"the certificates of the cluster cannot be used: {error}") from error
 
     async def aclose(self) -> None:
-        """Close every connection; requests from now on fail as if the API server were out of reach."""
+        """Close every connection. Later requests fail as if the API server were unreachable."""
         self._closed = True
         await self._rest.close()
 
@@ -89,10 +89,10 @@ class Connection:
         params: Mapping[str, str] | None = None,
         timeout_s: float = REQUEST_TIMEOUT_S,
     ) -> Body:
-        """Send one request; the object in the answer.
+        """Send one request and return the object in the response.
 
         Raises:
-            KubeError: it was refused, or there was no answer in time.
+            KubeError: The request was refused, or there was no response in time.
         """
         if method != "GET":
             timeout_s = min(timeout_s, self._may_write_s())
@@ -101,18 +101,18 @@ class Connection:
         silence_s = min(timeout_s, REQUEST_TIMEOUT_S)
         with translated(f"{method} {path}"):
             try:
-                # As a whole: aiohttp's own time-outs are for each part of a request, and start over with every byte.
+                # For the whole request: the timeouts of aiohttp are for its parts, and restart with every byte.
                 async with (
                     asyncio.timeout(timeout_s),
                     self.answer(method, path, params, body, content_type, silence_s=silence_s) as response,
                 ):
                     result: Body = json.loads(await response.read())
             except TimeoutError as error:
-                raise unreachable(f"{method} {path}: no answer in {timeout_s:.1f} s") from error
+                raise unreachable(f"{method} {path}: no response in {timeout_s:.1f} s") from error
         return result
 
     async def ready(self) -> bool:
-        """Whether the API server says that it is ready."""
+        """Return True if the API server reports that it is ready."""
         try:
             async with asyncio.timeout(REQUEST_TIMEOUT_S), self.answer("GET", "/readyz", None):
                 return True
@@ -120,7 +120,7 @@ class Connection:
             return False
 
     async def answers(self, timeout_s: float) -> bool:
-        """Whether anything is heard from the API server within some seconds, be it a refusal: the path to it works."""
+        """Return True if the API server responds in time, even with a refusal, so that the path to it works."""
         try:
             async with asyncio.timeout(timeout_s), self.answer("GET", "/livez", None):
                 return True
@@ -142,10 +142,10 @@ class Connection:
         *,
         silence_s: float | None = REQUEST_TIMEOUT_S,
     ) -> AsyncIterator[aiohttp.ClientResponse]:
-        """The answer to a request, once its head is here and says success.
+        """Send a request and yield the response after its headers, if they report success.
 
         Raises:
-            KubeError: the API server refused it.
+            KubeError: The API server refused the request.
         """
         url = str(self._access.configuration.host) + path
         if params:
@@ -170,19 +170,19 @@ class Connection:
                 yield response
                 return
             finally:
-                # This closes the connection where the answer was not read to its end.
+                # If the response was not read to its end, this closes the connection.
                 response.release()
 
     async def _headers(self, content_type: ContentType) -> dict[str, str]:
         headers = {"Accept": "application/json", "Content-Type": content_type.value}
         bearer = (await self._access.configuration.auth_settings()).get("BearerToken")
         if bearer is not None and bearer["value"]:
-            # A token file may end with a newline, which no header may hold.
+            # A token file may end with a newline, which is not valid in a header.
             headers["Authorization"] = bearer["value"].strip()
         return headers
 
     def _open(self) -> None:
-        """Make the pool of connections, once there is a loop; the official client's own keeps them for 15 s only."""
+        """Create the connection pool when there is an event loop. The pool of the official client keeps connections for 15 s."""
         if self._closed:
             raise aiohttp.ClientConnectionError("the connection was closed")
         if self._rest.pool_manager is None:
@@ -197,13 +197,13 @@ class Connection:
                     socket_factory=_socket,
                 ),
                 cookie_jar=aiohttp.DummyCookieJar(),
-                # Looking for proxies takes a request as long as all else, so not where there are none.
+                # Looking up proxies doubles the time of a request, so it is done only if there are any.
                 trust_env=self._trust_env and bool(getproxies_environment()),
             )
 
 
 def _socket(address: aiohttp.AddrInfoType) -> socket.socket:
-    """One that asks the other side whether it is there: a watch sends nothing, and would not notice that it is gone."""
+    """Create a socket with keep-alive. A watch sends nothing, and would not detect a dead connection."""
     made = socket.socket(*address[:3])
     made.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for option, value in _KEEPALIVE.items():
@@ -215,13 +215,13 @@ def _socket(address: aiohttp.AddrInfoType) -> socket.socket:
 async def _refuse_redirect(
     _session: aiohttp.ClientSession, _context: object, redirect: aiohttp.TraceRequestRedirectParams
 ) -> None:
-    """An API server does not redirect; what does could have Secrets sent to it, in plain text."""
+    """Refuse a redirect. The API server sends none, and another server could receive Secrets in plain text."""
     raise aiohttp.ClientError(f"refused a redirect to {redirect.response.headers.get('Location', 'nowhere')}")
 
 
 @contextmanager
 def translated(what: str) -> Iterator[None]:
-    """What went wrong with a connection, as a KubeError."""
+    """Raise connection errors as KubeError."""
     try:
         yield
     except (*_FAILURES, ValueError) as error:

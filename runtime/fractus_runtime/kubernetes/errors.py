@@ -1,4 +1,4 @@
-"""What the API server refuses, by what a caller does about it."""
+"""Errors of requests to the API server, by how a caller handles them."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from fractus_runtime.kubernetes.objects import Body
 
 
 class KubeError(Exception):
-    """The API server refused a request, or could not be reached; where it is no subclass, try again later.
+    """The API server refused a request, or could not be reached. If it is no subclass, retry later.
 
     Attributes:
-        status: HTTP status; 0 where there was no answer.
-        reason: Kubernetes' CamelCase reason, such as Forbidden; "Unreachable" where there was no answer.
+        status: HTTP status. 0 if there was no response.
+        reason: CamelCase reason of Kubernetes, such as Forbidden. "Unreachable" if there was no response.
     """
 
     def __init__(self, status: int, reason: str, message: str) -> None:
@@ -22,31 +22,36 @@ class KubeError(Exception):
 
 
 class Invalid(KubeError):
-    """The object itself is refused (400, 422): the same request fails again."""
+    """The object itself is invalid (400, 422). The same request fails again."""
 
 
 class NotFound(KubeError):
-    """There is no such object, or no such kind yet."""
+    """The object does not exist, or its kind does not (404)."""
 
 
 class Conflict(KubeError):
-    """An object of that name exists, or it changed meanwhile (409): read it again."""
+    """An object of that name exists, or it was changed meanwhile (409). Read it again."""
 
 
 class Expired(KubeError):
-    """The resource version is too old to continue from (410): list again."""
+    """The resource version is too old to continue (410). List again."""
 
 
 _BY_STATUS: dict[int, type[KubeError]] = {400: Invalid, 404: NotFound, 409: Conflict, 410: Expired, 422: Invalid}
 
 
 def unreachable(message: str) -> KubeError:
-    """The error where there was no answer."""
+    """Return the error for a request without a response."""
     return KubeError(0, "Unreachable", message)
 
 
 def from_status(code: int, status: Any) -> KubeError:
-    """The error of an HTTP status and of what came with it, a Status object unless a proxy on the way answered."""
+    """Return the error for a response.
+
+    Args:
+        code: HTTP status.
+        status: The response body: a Status object, or anything else if a proxy responded.
+    """
     body: Body = status if isinstance(status, dict) else {"message": str(status)[:500]}
     code = int(body.get("code") or code)
     message = str(body.get("message") or f"HTTP {code}")

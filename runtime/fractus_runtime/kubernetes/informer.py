@@ -1,4 +1,4 @@
-"""Keeps a local copy of a collection current: list, then watch, and list again where the watch cannot go on."""
+"""Informer: keeps a local copy of a collection up to date with list and watch."""
 
 from __future__ import annotations
 
@@ -22,15 +22,28 @@ _WATCH_TIMEOUT_S = (240, 300)
 _SILENCE_S = 100.0
 _BACKOFF_S = (0.4, 30.0)
 _STEADY_S = 1.0
-"""A watch that ends sooner, without an event, is followed by a pause, as a failure is."""
+"""Minimum duration of a watch in seconds. A shorter one without an event is followed by a pause, as after a failure."""
 
 
 class Informer(Generic[T]):
-    """A current local copy of a collection.
+    """A local copy of a collection, updated by a watch.
 
-    Only what `parse` returns is kept, so a large collection costs what is used of it. Every
-    difference is reported to `on_change(key, old, new)`, also those found by listing again. Of a namespaced kind it
-    holds all namespaces, or one.
+    Only the results of `parse` are kept, so that a large collection takes little memory. Every change is reported to
+    `on_change(key, old, new)`, including changes that are found by listing again.
+
+    Args:
+        client: The API server.
+        kind: Kind of the objects.
+        parse: Returns the part of an object to keep.
+        on_change: Called with the key, the old and the new value of each changed object. None for no object.
+        selectors: labelSelector and fieldSelector, if any.
+        namespace: Namespace of the objects. Empty: all namespaces.
+        rng: Source of the jitter.
+
+    Attributes:
+        synced: Set when the collection was listed once.
+        restarts: Number of ended watches.
+        watching: True while a watch is open.
     """
 
     def __init__(
@@ -49,55 +62,54 @@ class Informer(Generic[T]):
         self.synced = asyncio.Event()
         self.restarts = 0
         self.watching = False
-        """Whether a watch is open: what changes at the API server is heard of, as far as the connection holds."""
         self._client = client
         self._parse = parse
         self._on_change = on_change
         self._selectors = dict(selectors or {})
         self._rng = rng or random.Random()  # noqa: S311  (jitter)
         self._objects: dict[Key, T] = {}
-        self._noted: dict[Key, int] = {}
+        self._own_writes: dict[Key, int] = {}
         self._backoff = Backoff(*_BACKOFF_S, self._rng)
         self._reached = 0
         self._last_contact = float("-inf")
 
     def get(self, key: Key) -> T | None:
-        """The object with this key, or None."""
+        """Return the object with this key, or None."""
         return self._objects.get(key)
 
     def __contains__(self, key: Key) -> bool:
-        """Whether there is an object with this key, be it one that `parse` makes nothing of."""
+        """Return True if there is an object with this key, even if `parse` returned None for it."""
         return key in self._objects
 
     def items(self) -> Iterator[tuple[Key, T]]:
-        """Every object with its key."""
+        """Iterate over all objects with their keys."""
         return iter(self._objects.items())
 
     def values(self) -> Iterator[T]:
-        """Every object."""
+        """Iterate over all objects."""
         return iter(self._objects.values())
 
     def __len__(self) -> int:
-        """How many objects there are."""
+        """Return the number of objects."""
         return len(self._objects)
 
     def record_write(self, key: Key, body: Body) -> None:
-        """Take what a write of our own returned, ahead of the watch, which then has nothing older to say of it.
+        """Add the result of a write of this process, before the watch reports it. Older events are then ignored.
 
-        An answer that comes after the watch or a list told of that moment is old news: it says nothing more.
+        A result that is older than the state that the watch or a list has reported is ignored.
         """
         version = _version(body)
         if 0 < version <= self._reached:
             return
-        self._noted[key] = version
+        self._own_writes[key] = version
         self._put(key, body)
 
     def age_s(self) -> float:
-        """Seconds since the API server last said anything about the collection."""
+        """Return the seconds since the last message of the API server about the collection."""
         return asyncio.get_running_loop().time() - self._last_contact
 
     async def run(self) -> None:
-        """List and watch until cancelled; failures are retried with growing, jittered pauses."""
+        """List and watch until cancelled. After failures, the pause grows."""
         version = ""
         loop = asyncio.get_running_loop()
         while True:
@@ -110,13 +122,14 @@ class Informer(Generic[T]):
                     version = seen
                     self._backoff.succeeded()
             except Expired:
-                logger.info("reflector of %s: the watch expired; listing again", self.kind.plural)
-                version, ended = "", False
+                logger.info("informer: watch expired, listing again (kind=%s)", self.kind.plural)
+                version = ""
+                ended = False
             except KubeError as error:
                 if error.status not in (0, 429) and error.status < 500:
                     version = ""
                 log = logger.warning if self._backoff.attempts else logger.info
-                log("reflector of %s: %s", self.kind.plural, error)
+                log("informer: list or watch failed (kind=%s error=%s)", self.kind.plural, error)
                 ended = False
             else:
                 ended = True
@@ -125,7 +138,7 @@ class Informer(Generic[T]):
             if steady:
                 self._backoff.succeeded()
             if self.age_s() >= _SILENCE_S:
-                # An API server sends bookmarks. One that was restored from a backup says nothing until it comes to this version again.
+                # The API server sends bookmarks. After a restore from a backup it sends nothing until it reaches this version.
                 version = ""
             if not (steady and ended):
                 await asyncio.sleep(self._backoff.delay_s())
@@ -133,9 +146,9 @@ class Informer(Generic[T]):
 
     def _opened(self) -> None:
         self.watching = True
-        self._heard()
+        self._record_contact()
 
-    def _heard(self) -> None:
+    def _record_contact(self) -> None:
         self._last_contact = asyncio.get_running_loop().time()
 
     async def _list(self) -> str:
@@ -145,8 +158,8 @@ class Informer(Generic[T]):
             page = await self._client.list_page(
                 self.kind, namespace=self._namespace, selectors=self._selectors, continue_=continue_
             )
-            self._heard()
-            # All pages show the same moment: what a later one brings is no older than an answer that comes meanwhile.
+            self._record_contact()
+            # All pages have the same resource version, so a result of a write that arrives meanwhile may be older.
             self._reach(page.resource_version)
             for item in page.items:
                 listed.add(key_of(item))
@@ -156,8 +169,8 @@ class Informer(Generic[T]):
                 break
         version = _number(page.resource_version)
         for key in self._objects.keys() - listed:
-            # What was made while the list was on its way is not in it.
-            if self._noted.get(key, 0) <= version:
+            # An object that was created after the list is missing in it.
+            if self._own_writes.get(key, 0) <= version:
                 self._drop(key)
         self.synced.set()
         return page.resource_version
@@ -173,22 +186,22 @@ class Informer(Generic[T]):
             silence_s=_SILENCE_S,
             opened=self._opened,
         ):
-            self._heard()
+            self._record_contact()
             if type_ != "BOOKMARK":
                 self._take(type_, body)
             self._reach(body["metadata"]["resourceVersion"])
             yield body["metadata"]["resourceVersion"]
 
     def _reach(self, version: str) -> None:
-        """Remember up to which moment everything was told."""
+        """Record the resource version up to which all changes are known."""
         self._reached = max(self._reached, _number(version))
 
     def _take(self, type_: str, body: Body) -> None:
         key = key_of(body)
-        version, noted = _version(body), self._noted.get(key, 0)
-        if version < noted or (noted and version == noted and type_ != "DELETED"):
+        version, own_write = _version(body), self._own_writes.get(key, 0)
+        if version < own_write or (own_write and version == own_write and type_ != "DELETED"):
             return
-        self._noted.pop(key, None)
+        self._own_writes.pop(key, None)
         if type_ == "DELETED":
             self._drop(key)
         else:
@@ -198,29 +211,31 @@ class Informer(Generic[T]):
         try:
             new = self._parse(self._typed(body))
         except Exception:
-            # One object of an unforeseen shape must not hide all others: its last readable version stays.
-            logger.exception("reflector of %s: %s cannot be read", self.kind.plural, "/".join(filter(None, key)))
+            # One invalid object must not hide all others. Its last valid version is kept.
+            logger.exception(
+                "informer: object cannot be parsed (kind=%s name=%s)", self.kind.plural, "/".join(filter(None, key))
+            )
             return
         old = self._objects.get(key)
         self._objects[key] = new
         if old is None or old != new:
-            self._tell(key, old, new)
+            self._notify(key, old, new)
 
     def _drop(self, key: Key) -> None:
-        self._noted.pop(key, None)
+        self._own_writes.pop(key, None)
         if key in self._objects:
-            self._tell(key, self._objects.pop(key), None)
+            self._notify(key, self._objects.pop(key), None)
 
-    def _tell(self, key: Key, old: T | None, new: T | None) -> None:
+    def _notify(self, key: Key, old: T | None, new: T | None) -> None:
         try:
             self._on_change(key, old, new)
         except Exception:
             logger.exception(
-                "reflector of %s: a change of %s was not handled", self.kind.plural, "/".join(filter(None, key))
+                "informer: handler of a change failed (kind=%s name=%s)", self.kind.plural, "/".join(filter(None, key))
             )
 
     def _typed(self, item: Body) -> Body:
-        """Items of a list come without their kind: give it to them. Who manages which field, half of an object, goes."""
+        """Add apiVersion and kind, which items of a list do not have. Remove managedFields, half of the size of an object."""
         item["metadata"].pop("managedFields", None)
         item.setdefault("apiVersion", self.kind.api_version)
         item.setdefault("kind", self.kind.name)
@@ -228,7 +243,7 @@ class Informer(Generic[T]):
 
 
 def _version(body: Body) -> int:
-    """An object's resource version as a number, which grows; 0 where it is none."""
+    """Return an object's resource version as a number, or 0 if it is none. It increases with each change."""
     return _number(str(body["metadata"].get("resourceVersion", "")))
 
 

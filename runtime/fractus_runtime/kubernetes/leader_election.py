@@ -1,7 +1,7 @@
-"""Leader election: only the process that holds a Lease acts, so that two that overlap for a moment never both do.
+"""Leader election: only the process that holds a Lease acts, so that two processes never act at the same time.
 
-The official client's election goes by the wall clock, gives a request five minutes, and ends with the first refused connection;
-this one never lets two act at once.
+The election of the official client uses the wall clock, allows five minutes for a request, and ends at the first refused
+connection. It can have two leaders for a moment.
 """
 
 from __future__ import annotations
@@ -25,31 +25,32 @@ _HELD_SHARE = 0.7
 _RETRY_S = 1.0
 _RETRIES = 20
 _ANSWER_SHARE = _HELD_SHARE / 2
-"""How much of the duration an answer may take: one that stalls leaves time to ask again before the Lease is lost."""
+"""Maximum time of a response, as a share of the duration. After a stalled one, a retry is possible before the Lease is lost."""
 
 
 class LostLease(Exception):
-    """What this operator remembers may be wrong, and it must start again.
+    """The state in memory may be wrong, so the process must restart.
 
-    Another one has acted since it last did, or the API server has gone back to an earlier state, as of a backup.
+    Another process has acted since, or the API server was restored to an earlier state.
     """
 
 
 class Lease:
-    """A Lease of coordination.k8s.io, held by one operator at a time.
+    """A Lease of coordination.k8s.io, held by one process at a time.
 
-    Another operator takes it only after it has seen it unchanged for its whole duration, by its own clock; the holder counts
-    as such for a part of that, from before it asked. So clocks need not agree, and a holder that was frozen knows better.
+    Another process takes it only after it has observed it unchanged for its whole duration, by its own clock. The holder acts
+    only for a part of the duration, counted from before its request. So clocks need not agree, and a holder that was frozen
+    does not act any more.
 
-    The Lease is also what tells that the API server has gone back: its version, as that of every object, only grows. Watches would
-    go on from versions that are yet to come, and tell of nothing until then.
+    The Lease also detects a restore of the API server to an earlier state, because its version never decreases otherwise. After
+    a restore, watches would continue from future versions and report nothing until these are reached.
 
     Args:
-        client: The API server, through connections of its own: no burst of other requests keeps a renewal waiting.
+        client: The API server, with separate connections, so that no burst of requests delays a renewal.
         key: Namespace and name of the Lease.
-        identity: Who asks; a process that is started again under the same identity goes on where it was.
-        duration_s: How long no other process may act after the holder was last heard of.
-        time: Monotonic seconds, which go on while the process is frozen.
+        identity: Identity of this process. A restarted process with the same identity continues to hold the Lease.
+        duration_s: Seconds after the last renewal until another process may act.
+        time: Monotonic seconds that continue while the process is frozen.
     """
 
     def __init__(self, client: Client, key: Key, identity: str, duration_s: float, time: Callable[[], float]) -> None:
@@ -67,25 +68,25 @@ class Lease:
 
     @property
     def left_s(self) -> float:
-        """Seconds for which this operator may still act; none where it does not hold the Lease."""
+        """Seconds for which this process may still act. 0 if it does not hold the Lease."""
         return max(self._until - self._time(), 0.0)
 
     async def held(self) -> None:
-        """Wait until this operator may act."""
+        """Wait until this process may act."""
         while not self.left_s:
             self._acquired.clear()
             await self._acquired.wait()
 
     async def run(self) -> None:
-        """Take the Lease and keep it, until cancelled; it is given back then.
+        """Take the Lease and renew it until cancelled. It is released then.
 
         Raises:
-            LostLease: another operator has held it since, or it is one of an earlier time.
+            LostLease: Another process has held it since, or the Lease is of an earlier state.
         """
         try:
             while True:
                 asked = self._time()
-                # After a renewal that came to nothing, whether it stalled or was refused, there is time for one more.
+                # After a failed renewal there is time for another one.
                 pause_s = min(_RETRY_S, self._duration_s / _RETRIES)
                 try:
                     async with asyncio.timeout(_ANSWER_SHARE * self._duration_s):
@@ -94,9 +95,9 @@ class Lease:
                         self._hold(asked)
                     pause_s = self._duration_s / _RENEWALS if taken else min(_RETRY_S, self._duration_s / _RENEWALS)
                 except KubeError as error:
-                    logger.info("lease: not renewed: %s", error)
+                    logger.info("lease: not renewed (error=%s)", error)
                 except TimeoutError:
-                    logger.info("lease: not renewed: no answer in %.1f s", _ANSWER_SHARE * self._duration_s)
+                    logger.info("lease: not renewed (error=no response in %.1f s)", _ANSWER_SHARE * self._duration_s)
                 await asyncio.sleep(pause_s)
         finally:
             await self._give_back()
@@ -108,11 +109,11 @@ class Lease:
         self._acquired.set()
 
     async def _ask(self) -> bool:
-        """Take or renew the Lease, if it is ours or free.
+        """Take or renew the Lease, if this process holds it or it is free. Return True on success.
 
         Raises:
-            LostLease: another operator has held it since, or it is one of an earlier time.
-            KubeError: the API server did not take it.
+            LostLease: Another process has held it since, or the Lease is of an earlier state.
+            KubeError: The API server refused the request, or did not respond.
         """
         try:
             body = await self._client.get(LEASE, self._name, self._namespace)
@@ -122,7 +123,7 @@ class Lease:
         spec = body.get("spec") or {}
         if self._transitions is not None and spec.get("leaseTransitions") != self._transitions:
             raise LostLease(
-                f"{spec.get('holderIdentity') or 'another operator'} has acted since {self._identity} last did"
+                f"{spec.get('holderIdentity') or 'another process'} has acted since {self._identity} last held the Lease"
             )
         if (spec.get("holderIdentity") or "") not in ("", self._identity) and not self._expired(body):
             return False
@@ -136,19 +137,19 @@ class Lease:
         return True
 
     def _check_history(self, body: Body) -> None:
-        """Check that a Lease which this operator has held is not one of an earlier time.
+        """Check that the Lease is not of an earlier state than the one that this process has held.
 
         Raises:
-            LostLease: it is.
+            LostLease: It is.
         """
         if 0 < _version(body) < self._version:
             raise LostLease(
-                f"the API server has gone back to version {_version(body)} of the Lease from {self._version}, as after a"
-                f" restore: what {self._identity} knows is of another history"
+                f"the version of the Lease went back from {self._version} to {_version(body)}, as after a restore of the API"
+                f" server: the state of {self._identity} is not valid any more"
             )
 
     def _expired(self, body: Body) -> bool:
-        """Whether a Lease of another process has not changed for its duration, as far as this process has seen."""
+        """Return True if this process has observed no change of the Lease of another process for its duration."""
         spec = body.get("spec") or {}
         now, state = self._time(), (spec.get("holderIdentity"), spec.get("renewTime"))
         if state != self._seen:
@@ -173,9 +174,9 @@ class Lease:
         return {**body, "spec": wanted}
 
     async def _give_back(self) -> None:
-        """Let the next one begin at once; called when nothing of ours is under way any more.
+        """Release the Lease, so that the next process can act at once. No write of this process may be in progress.
 
-        Whose Lease it is the API server tells: it may have taken a renewal whose answer never came.
+        The holder is read from the API server, because a renewal without a response may have taken effect.
         """
         self._until = float("-inf")
         try:
@@ -184,24 +185,24 @@ class Lease:
                 if (body.get("spec") or {}).get("holderIdentity") == self._identity:
                     await self._client.replace(LEASE, self._wanted(body, free=True))
         except (KubeError, TimeoutError) as error:
-            logger.info("lease: not released: %s", error)
+            logger.info("lease: not released (error=%s)", error)
 
 
 def _version(body: Body) -> int:
-    """The version of an object as a number, which grows; 0 where it is none."""
+    """Return the version of an object as a number, or 0 if it is none. It increases with each change."""
     version = str(body["metadata"].get("resourceVersion", ""))
     return int(version) if version.isdecimal() else 0
 
 
 class LeaseThread:
-    """A Lease that is kept in a thread with an event loop of its own: what keeps the caller's loop busy delays no renewal.
+    """A Lease that is renewed in a separate thread and event loop, so that a busy caller delays no renewal.
 
     Args:
-        connect: Makes the client, in that thread.
+        connect: Creates the client, in that thread.
         key: Namespace and name of the Lease.
-        identity: Who asks.
-        duration_s: How long no other process may act after the holder was last heard of.
-        time: Monotonic seconds, which go on while the process is frozen.
+        identity: Identity of this process.
+        duration_s: Seconds after the last renewal until another process may act.
+        time: Monotonic seconds that continue while the process is frozen.
     """
 
     def __init__(
@@ -219,7 +220,7 @@ class LeaseThread:
 
     @property
     def left_s(self) -> float:
-        """Seconds for which this process may still act; none where it does not hold the Lease. Any thread may ask."""
+        """Seconds for which this process may still act. 0 if it does not hold the Lease. Thread-safe."""
         return self._lease.left_s if self._lease is not None else 0.0
 
     async def held(self) -> None:
@@ -227,13 +228,15 @@ class LeaseThread:
         await self._acquired.wait()
 
     async def run(self) -> None:
-        """Take the Lease and keep it, until cancelled; it is given back then, before this returns.
+        """Take the Lease and renew it until cancelled. It is released before this returns.
 
         Raises:
-            LostLease: another process has held it since, or it is one of an earlier time.
-            Unconfigured: there are no credentials.
+            LostLease: Another process has held it since, or the Lease is of an earlier state.
+            Unconfigured: There are no credentials.
         """
-        caller, stop, cancelled = asyncio.get_running_loop(), asyncio.Event(), threading.Event()
+        caller = asyncio.get_running_loop()
+        stop = asyncio.Event()
+        cancelled = threading.Event()
         inside: list[asyncio.AbstractEventLoop] = []
 
         async def keep() -> None:

@@ -1,4 +1,4 @@
-"""Objects as JSON has them, and where the API server keeps those of a kind."""
+"""Kubernetes objects as decoded JSON, their keys, and the REST paths of their kinds."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import Any
 
 Body = dict[str, Any]
-"""An object as the API server gives and takes it."""
+"""An object as decoded JSON."""
 
 Key = tuple[str, str]
-"""(namespace, name); the namespace is empty for cluster-scoped objects."""
+"""(namespace, name). The namespace is empty for cluster-scoped objects."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +22,7 @@ class Kind:
     namespaced: bool
 
     def path(self, namespace: str = "", name: str = "", subresource: str = "") -> str:
-        """Path of a collection (no name), an object, or one of its subresources."""
+        """Return the path of a collection (without name), an object, or one of its subresources."""
         root = "/apis/" if "/" in self.api_version else "/api/"
         parts = [root + self.api_version]
         if self.namespaced and namespace:
@@ -31,7 +31,7 @@ class Kind:
         return "/".join(parts)
 
     def header(self, name: str, namespace: str = "", **metadata: Any) -> Body:
-        """The beginning of an object of this kind."""
+        """Return apiVersion, kind and metadata of an object of this kind."""
         meta: Body = {"name": name, **metadata}
         if self.namespaced:
             meta["namespace"] = namespace
@@ -39,6 +39,6 @@ class Kind:
 
 
 def key_of(body: Body) -> Key:
-    """The key of an object."""
+    """Return the key of an object."""
     metadata = body["metadata"]
     return (metadata.get("namespace", ""), metadata["name"])

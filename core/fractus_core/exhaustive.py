@@ -1,4 +1,4 @@
-"""Tables over closed sets: a member that is added to the set and not to the table fails at import, not in flight."""
+"""Tables over closed sets. A member that is missing in a table causes an error at import, not in flight."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ C = TypeVar("C", bound=Collection[Any])
 
 
 def exhaustive(members: Any, table: C) -> C:
-    """The table, which has one entry for each member of a closed set and no other.
+    """Return a table after checking that it has exactly one entry for each member of a closed set.
 
-    Where each member needs code of its own, `match` with `assert_never` says the same to mypy.
+    If each member needs its own code, use `match` with `assert_never` instead, which mypy checks.
 
     Args:
-        members: a `Literal`.
-        table: its members, or a mapping from them.
+        members: A `Literal` type.
+        table: A collection of its members, or a mapping with them as keys.
 
     Raises:
-        TypeError: a member is missing, or something is not a member.
+        TypeError: A member is missing, or an entry is not a member.
     """
     wrong = set(get_args(members)) ^ set(table)
     if wrong or len(get_args(members)) != len(table):

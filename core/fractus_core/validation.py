@@ -1,4 +1,4 @@
-"""What a schema cannot say: rings that cross, zones and depots that do not exist."""
+"""Validation beyond the schema: crossing rings, missing zones and depots."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from fractus_core.planning.operation_area import check_crossings, route_of
 from fractus_core.policy.selectors import is_attribute
 
 MAX_WAYPOINTS = 2000
-"""Waypoints and points of interest of one application: far more than a battery lasts for."""
+"""Maximum number of waypoints of an application, far more than a battery lasts for."""
 
 
 def check_area(area: Area, field: str) -> None:
-    """Refuse rings that cross themselves, holes outside, and areas of continental size.
+    """Refuse rings that cross themselves, holes outside the exterior, and areas of continental size.
 
     Raises:
-        InvalidObject: with the field below `field`.
+        InvalidObject: The area is invalid. The field of the error is below `field`.
     """
     try:
         check_extent(area)
@@ -28,40 +28,41 @@ def check_area(area: Area, field: str) -> None:
 
 
 def check_zone(zone: Zone) -> None:
-    """Refuse a zone whose geometry is broken.
+    """Refuse a zone with invalid geometry.
 
     Raises:
-        InvalidObject: naming the ring.
+        InvalidObject: The geometry is invalid. The error names the ring.
     """
     check_area(zone.spec.area, "spec.area")
 
 
 def check_policy(policy: Policy, zones: Collection[str]) -> None:
-    """Refuse a policy that selects zones which do not exist, or nodes by attributes that none can have.
+    """Refuse a policy that selects missing zones, or nodes by unknown attributes.
 
     Raises:
-        InvalidObject: naming the first such zone or attribute.
+        InvalidObject: A zone is missing or an attribute is unknown. The error names the first one.
     """
     for i, expression in enumerate(policy.spec.selector.nodes):
         if not is_attribute(expression.key):
-            holds_for = "no node" if policy.spec.kind == "grant" else "every node"
+            selected = "no node" if policy.spec.kind == "grant" else "every node"
             raise InvalidObject(
                 f"spec.selector.nodes[{i}].key",
-                f"no Drone or EdgeNode has an attribute {expression.key}, so that this selects {holds_for}; correct the name",
+                f"Drones and EdgeNodes have no attribute {expression.key}, so the policy applies to {selected}; correct the name",
             )
     for i, name in enumerate(policy.spec.selector.zones):
         if name not in zones:
-            known = ", ".join(sorted(zones)[:10]) or "there is none yet"
+            known = ", ".join(sorted(zones)[:10]) or "none"
             raise InvalidObject(
-                f"spec.selector.zones[{i}]", f"there is no Zone {name} ({known}); apply it, or correct the name"
+                f"spec.selector.zones[{i}]",
+                f"Zone {name} does not exist (existing: {known}); apply it or correct the name",
             )
 
 
 def check_application(application: Application, depots: Mapping[str, Depot]) -> None:
-    """Refuse an application that names unknown depots, has broken regions, or ways that cross too often.
+    """Refuse an application with unknown depots, invalid regions, or paths that cross too often.
 
     Raises:
-        InvalidObject: naming the field.
+        InvalidObject: The application is invalid. The error names the field.
     """
     driver = application.spec.driver
     if driver is not None:

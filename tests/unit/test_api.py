@@ -249,7 +249,7 @@ def test_limits_beyond_anything_that_flies(limit):
 
 def test_policy_with_an_unknown_zone_names_it():
     spec = {"type": "GeofenceControl", "kind": "exclusion", "selector": {"zones": ["a", "b"]}}
-    with pytest.raises(InvalidObject, match=r"spec\.selector\.zones\[1\]: there is no Zone b \(a\)"):
+    with pytest.raises(InvalidObject, match=r"spec\.selector\.zones\[1\]: Zone b does not exist \(existing: a\)"):
         check_policy(Policy.from_body(manifest("Policy", "p", spec)), {"a"})
 
 

@@ -128,7 +128,7 @@ def test_a_path_with_too_many_meshes_is_refused_with_a_sentence(monkeypatch):
     monkeypatch.setattr(grant_compiler, "MAX_HOLES", 0)
     meshes = [at(0, 0, 10), at(60, 0, 10), at(60, 60, 10), at(0, 60, 10), at(0, 0, 10)]
     with pytest.raises(
-        InvalidObject, match=r"^spec\.components: .* 1 holes, more than .*; give fewer waypoints, or a region"
+        InvalidObject, match=r"^spec\.components: .* 1 holes, more than .*; use fewer waypoints, or a region"
     ):
         compiled(components=[navigator(meshes)])
 
@@ -335,10 +335,10 @@ def test_an_exclusion_with_a_mistyped_attribute_holds_and_is_told(operator):
     (grant,) = compiled(mistyped, zones=[near])
     assert [p.name for p in grant.policies] == ["fence"]
     with pytest.raises(
-        InvalidObject, match=r"nodes\[0\]\.key: no Drone or EdgeNode has an attribute camra.* every node"
+        InvalidObject, match=r"nodes\[0\]\.key: Drones and EdgeNodes have no attribute camra.* every node"
     ):
         check_policy(mistyped, ["z"])
     allowing = policy("may", nodes=[{"key": "camra", **operator}], type="AccessControl", kind="grant", methods=["Goto"])
     assert compiled(allowing)[0].policies == ()
-    with pytest.raises(InvalidObject, match="selects no node"):
+    with pytest.raises(InvalidObject, match="applies to no node"):
         check_policy(allowing, [])

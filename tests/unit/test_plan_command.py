@@ -176,7 +176,7 @@ def test_bookings_of_one_application_are_seen_by_the_next(run):
     result = run([SCENE[3], node("e1", "edge"), *(named(application(big), n) for n in ("one", "two"))])
     assert "default/one: feasible" in result.output
     assert "default/two: infeasible (NoEdgeNode)" in result.output
-    assert "cpu: 3 asked, 1 free" in result.output
+    assert "cpu: 3 requested, 1 free" in result.output
 
 
 def test_a_plan_in_force_is_kept(run, tmp_path):
@@ -255,7 +255,7 @@ BOW_TIE = [{"lat": 0, "lon": 0}, {"lat": 1e-3, "lon": 1e-3}, {"lat": 0, "lon": 1
         ([node("n", "edge") | {"spec": "x"}], "Node n: spec: must be an object, not 'x'"),
         ([node("n", "edge") | {"status": {"allocatable": [1]}}], "Node n: status.allocatable: must be an object"),
         ([node("n", "edge") | {"status": {"conditions": ["Ready"]}}], "Node n: status.conditions: must be a list"),
-        ([manifest("Policy", "p", SELECTS)], "p: spec.selector.zones[0]: there is no Zone nowhere"),
+        ([manifest("Policy", "p", SELECTS)], "p: spec.selector.zones[0]: Zone nowhere does not exist"),
         (
             [manifest("Zone", "z", {"area": {"polygon": {"exterior": BOW_TIE}}})],
             "z: spec.area.polygon.exterior: the ring crosses itself",

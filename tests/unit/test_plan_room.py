@@ -53,7 +53,7 @@ def test_two_components_that_fit_one_by_one_but_not_together_are_named():
     aboard = [navigator(PATH) | {"container": asking("x", "drone", 600)["container"]}]
     aboard.append(asking("P", "drone", 600, services=VIEWER["services"], **{"class": "passenger"}))
     stock = inventory([drone("d")], hosts=[host("d", "drone", cpu=1.0)])
-    with pytest.raises(Infeasible, match=r"Navigator, P do not fit together \(cpu: 1\.2 asked, 1 free\)"):
+    with pytest.raises(Infeasible, match=r"Navigator, P do not fit together \(cpu: 1\.2 requested, 1 free\)"):
         plan(application(*aboard), stock)
 
 

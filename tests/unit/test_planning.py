@@ -351,7 +351,7 @@ def test_a_plan_books_what_it_places():
     greedy["container"]["resources"] = {"requests": {"cpu": "3"}}
     other = component("Other", "edge", locations=[{"center": at(0, 0), "radius": 5}])
     other["container"]["resources"] = {"requests": {"cpu": "2"}}
-    with pytest.raises(Infeasible, match=r"cpu: 2 asked, 1 free"):
+    with pytest.raises(Infeasible, match=r"cpu: 2 requested, 1 free"):
         plan(application(greedy, other), inventory(edges=[edge("e1", (0, 0))]))
 
 

@@ -1,1 +1,1 @@
-"""Who is who: the certificate authority, and the signatures of Grants."""
+"""Identities: the certificate authority, and the signing of Grants."""

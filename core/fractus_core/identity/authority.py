@@ -1,4 +1,4 @@
-"""The certificate authority of the system: its key, and the short-lived certificates that it issues."""
+"""Certificate authority of the system: its key, and the short-lived certificates that it issues."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ COMPONENT_LIFE = timedelta(hours=24)
 NODE_LIFE = timedelta(days=30)
 SIGNER_LIFE = timedelta(days=30)
 _CLOCK_SKEW = timedelta(hours=2)
-"""How much earlier than now certificates begin: a clock that is set back by an hour must cut off no new connection."""
+"""Backdating of certificates, so that a clock that is set back by an hour does not break new connections."""
 _RENEW_AFTER = 2 / 3
 
 Data = dict[str, str]
-"""The data of a TLS Secret: base64 of tls.crt, tls.key and ca.crt."""
+"""Data of a TLS Secret: tls.crt, tls.key and ca.crt in base64."""
 
 
 class BrokenAuthority(Exception):
-    """What is stored of an authority is no usable key and certificate."""
+    """The stored key or certificate of an authority is unusable."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +66,7 @@ class Authority:
         """Read an authority from the data of its Secret.
 
         Raises:
-            BrokenAuthority: the data is not a matching P-256 key and certificate.
+            BrokenAuthority: The data does not contain a matching P-256 key and certificate.
         """
         try:
             key = serialization.load_pem_private_key(base64.b64decode(data["tls.key"]), password=None)
@@ -78,21 +78,21 @@ class Authority:
         return cls(key, certificate)
 
     def to_data(self) -> Data:
-        """The data of the authority's Secret."""
+        """Return the data of the authority's Secret."""
         return {"tls.crt": _encoded(self.certificate_pem), "tls.key": _encoded(_key_pem(self.key))}
 
     @property
     def certificate_pem(self) -> bytes:
-        """The CA certificate."""
+        """CA certificate in PEM format."""
         return self.certificate.public_bytes(serialization.Encoding.PEM)
 
     def issue_component(self, identity: str, now: datetime, life: timedelta = COMPONENT_LIFE) -> Data:
         """Make a key and a client certificate for a component instance.
 
         Args:
-            identity: Its SPIFFE id, the only subject alternative name.
-            now: The time it is valid from.
-            life: How long it is valid.
+            identity: SPIFFE ID of the instance, the only subject alternative name.
+            now: Current time.
+            life: Validity period from now.
         """
         key = ec.generate_private_key(ec.SECP256R1())
         certificate = self._issue(
@@ -106,18 +106,18 @@ class Authority:
         return self._data(key, certificate)
 
     def issue_node(self, node: str, now: datetime, life: timedelta = NODE_LIFE) -> Data:
-        """Make a key and the certificate of a node's services, for nodes without an agent that keeps its own key.
+        """Make a key and the certificate of a node's services, for nodes without an agent that has its own key.
 
         Args:
-            node: Its name.
-            now: The time it is valid from.
-            life: How long it is valid.
+            node: Name of the node.
+            now: Current time.
+            life: Validity period from now.
         """
         key = ec.generate_private_key(ec.SECP256R1())
         return self._data(key, self._node_certificate(key.public_key(), node, now, life))
 
     def issue_signer(self, now: datetime) -> tuple[ec.EllipticCurvePrivateKey, x509.Certificate]:
-        """Make a key and a certificate that is good for signing Grants and for nothing else."""
+        """Make a key and a certificate that is valid only for signing Grants."""
         key = ec.generate_private_key(ec.SECP256R1())
         pem = self._issue(
             key.public_key(),
@@ -138,7 +138,7 @@ class Authority:
         }
 
     def is_current(self, data: Data, identity: str, now: datetime) -> bool:
-        """Whether a component's certificate is ours, for this identity, and not due for renewal."""
+        """Return True if a component certificate is from this authority, for this identity, and not due for renewal."""
         try:
             certificate = x509.load_pem_x509_certificate(base64.b64decode(data["tls.crt"]))
             certificate.verify_directly_issued_by(self.certificate)
@@ -151,9 +151,9 @@ class Authority:
         return now < renewal_time(certificate)
 
     def sign_node(self, request: x509.CertificateSigningRequest, node: str, now: datetime) -> bytes:
-        """Issue the certificate of a node's services and agent for the key of a request; PEM.
+        """Issue the certificate of a node's services and agent for the key of a request, in PEM format.
 
-        Only the key is taken from the request: the names are made here.
+        Only the key of the request is used. The names in the request are ignored.
         """
         key = request.public_key()
         if not isinstance(key, ec.EllipticCurvePublicKey):
@@ -201,7 +201,7 @@ class Authority:
 
 
 def renewal_time(certificate: x509.Certificate) -> datetime:
-    """When a certificate is due for renewal: after two thirds of its life."""
+    """Return the time at which a certificate is due for renewal: after two thirds of its validity."""
     start, end = certificate.not_valid_before_utc, certificate.not_valid_after_utc
     return start + (end - start) * _RENEW_AFTER
 
@@ -221,7 +221,7 @@ def _key_usage(*, signs_certificates: bool = False, signs_grants: bool = False) 
 
 
 def _short(text: str) -> str:
-    """A common name has 64 characters at most (X.520); identities are read from the alternative names."""
+    """Shorten a common name to 64 characters (X.520). Identities are read from the alternative names instead."""
     return shortened(text, 64, digits=16)
 
 

@@ -1,4 +1,4 @@
-"""Signs Grants in the operator's name, and verifies which are signed already."""
+"""Signing and verification of Grants by the operator."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from fractus_core.policy.grant_signatures import SIGNATURE_ANNOTATION, SIGNER_AN
 
 _TICK = timedelta(microseconds=1)
 _MAX_VERIFIED = 4096
-"""Signatures that are remembered as good, so that an unchanged Grant costs nothing."""
+"""Maximum number of cached valid signatures, so that unchanged Grants are verified only once."""
 
 
 class GrantSigner:
-    """Signs Grants with a key that never leaves this process; a certificate of the authority is its proof.
+    """Signs Grants with a key that never leaves this process and that a certificate of the authority proves.
 
     Args:
-        authority: The authority that all nodes trust.
-        clock: The present time.
+        authority: Authority that all nodes trust.
+        clock: Returns the current time.
     """
 
     def __init__(self, authority: Authority, clock: Callable[[], datetime]) -> None:
@@ -36,25 +36,25 @@ class GrantSigner:
         self._verified: dict[tuple[object, ...], None] = {}
 
     def sign(self, body: dict[str, Any], replaces: Grant | None = None) -> dict[str, Any]:
-        """The manifest of a Grant, signed, and issued later than the one that it replaces.
+        """Return the signed manifest of a Grant, issued later than the Grant that it replaces.
 
         Args:
-            body: The manifest.
-            replaces: The Grant as it is, if there is one.
+            body: Manifest of the Grant.
+            replaces: Existing Grant, if any.
         """
         now = self._clock()
         key, certificate = self._present_signer(now)
         before = replaces.spec.issued_at if replaces is not None else None
-        # A time beyond the life of every certificate is forged or damaged: following it would end all signing.
+        # A time after the expiry of the certificate is forged or damaged. Following it would make all signing impossible.
         if before is not None and before.tzinfo is not None and before < certificate.not_valid_after_utc:
             self._last_issued = max(self._last_issued, before)
-        # Strictly later also when the clock stands still or went back: nodes keep the Grant that was issued last.
+        # The time must increase even if the clock stops or goes back, because nodes keep the latest Grant.
         self._last_issued = issued_at = max(now, self._last_issued + _TICK)
         named = {**body, "spec": {**body["spec"], "mission": _mission(body, replaces)}}
         return sign(named, key, certificate, issued_at)
 
     def problem(self, grant: Grant) -> str | None:
-        """Why a Grant, as it is, is not valid; None if the operator of this system signed it."""
+        """Return why a Grant is invalid, or None if the operator of this system signed it."""
         annotations, metadata = grant.metadata.annotations, grant.metadata
         fingerprint = (
             metadata.uid,
@@ -80,10 +80,10 @@ class GrantSigner:
 
 
 def _mission(body: dict[str, Any], replaces: Grant | None) -> str:
-    """The mission of a Grant: the one that it names, or else that of the same object before, or else a new one.
+    """Return the mission of a Grant: the one in its spec, or that of the replaced object, or a new one.
 
-    `metadata.uid` names the mission where no API server gives objects their uid. On another node it is a new mission: the
-    first node has ended its own when the Grant left, and would refuse to fly it again.
+    `metadata.uid` is used as the mission of objects that do not come from an API server. A Grant on another node starts a new
+    mission, because the first node ended the old one when the Grant left it and would refuse to fly it again.
     """
     uid = (body.get("metadata") or {}).get("uid")
     kept = None

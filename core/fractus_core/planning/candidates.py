@@ -48,7 +48,7 @@ class Ledger:
             free = host.allocatable.get(resource, 0.0) - host.requested.get(resource, 0.0)
             free -= sum(amounts.get(resource, 0.0) for amounts in (*placed.values(), *kept))
             if amount > free + 1e-9:
-                return f"{resource}: {amount:g} asked, {max(free, 0.0):g} free"
+                return f"{resource}: {amount:g} requested, {max(free, 0.0):g} free"
         return None
 
     def take(self, node: str, component: Component) -> None:

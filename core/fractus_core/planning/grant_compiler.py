@@ -36,22 +36,22 @@ from fractus_core.policy.footprint import MAX_SIGHT_M
 from fractus_core.policy.selectors import application_reference, node_attributes, policy_applies
 
 ROUNDING_M = 0.01
-"""How far the outline of a granted area may be from the planned one: a third of the points do."""
+"""Tolerance of the granted area's outline. It reduces the number of points to a third."""
 
 MAX_ROUNDING_M = 0.16
-"""How far it may be where an outline has more points than a ring takes."""
+"""Maximum tolerance for an outline with more points than a ring may have."""
 
 AROUND_WAY_M = 100.0
-"""Zones further than this from where a drone may be do not change its way."""
+"""Zones further than this from the corridor of a drone do not affect its route."""
 
 _ONLY_THERE = frozenset({"inclusion", "grant"})
-"""Kinds of policies that allow something in their zones and nowhere else: zones out of reach count, too."""
+"""Kinds of policies that allow something only in their zones, so zones out of reach matter as well."""
 
 _Bounds = tuple[Point, float]
-"""A place, and how far from there zones count, in metres."""
+"""A position, and the distance from it in metres up to which zones matter."""
 
 FIXED_NODE_REACH_M = 1000.0
-"""Zones further than this from a fixed node do not concern it, unless its camera may see them."""
+"""Zones further than this from a fixed node do not affect it, unless its camera may see them."""
 
 
 def compile_grants(
@@ -61,22 +61,22 @@ def compile_grants(
     settings: Settings | None = None,
     present: Iterable[GrantSpec] = (),
 ) -> tuple[GrantSpec, ...]:
-    """One Grant for each planned instance that uses system services or has the drone flown, in the plan's order.
+    """Compile a Grant for each planned instance that uses system services or has points of interest, in the plan's order.
 
-    Policies are those whose node and application selectors match, with their zones resolved; zones that the node can
-    neither reach nor see are left out.
+    A Grant contains the policies whose node and application selectors match, with their zones resolved. Zones that the node
+    can neither reach nor see are omitted.
 
     Args:
-        application: As submitted.
-        plan: Where its instances run.
-        inventory: As of now.
-        settings: As for the plan.
-        present: The application's grants as they are. An instance that has one, on the same node, keeps a broken
-            policy as it was granted last.
+        application: Application of the plan.
+        plan: Placements of its instances.
+        inventory: Current inventory.
+        settings: Settings of the plan.
+        present: Existing Grants of the application. An instance with a Grant on the same node keeps its last version of a
+            policy that is now invalid.
 
     Raises:
-        InvalidObject: a policy that holds for a new instance selects a zone which does not exist or is broken, or a
-            policy cannot be read. Nothing is granted then: what cannot be enforced must not be flown.
+        InvalidObject: A policy for a new instance selects a missing or invalid zone, or a policy cannot be read. Then no
+            Grant is issued, because a flight without enforceable policies is not allowed.
     """
     settings = settings or Settings()
     before = {(grant.instance, grant.node): grant for grant in present}
@@ -95,7 +95,7 @@ def compile_grants(
             grants.append(refresh(last, inventory))
             continue
         if placed.placement == "drone" and area is not None:
-            # All of them are on one drone.
+            # All drone components run on one drone.
             drone = inventory.drones[placed.node]
             aboard = aboard or _drone_grant(
                 application, drone, inventory, area, component=component.name, instance=placed.instance
@@ -112,29 +112,29 @@ def compile_grants(
 
 
 def check_policies(inventory: Inventory) -> None:
-    """Refuse new grants while there is a policy that cannot be read: for whom it holds is unknown.
+    """Refuse new Grants while a policy cannot be read, because it may apply to any component.
 
     Raises:
-        InvalidObject: naming the policy.
+        InvalidObject: A policy cannot be read.
     """
     for name, problem in sorted(inventory.unreadable_policies.items()):
         raise InvalidObject(f"Policy {name}", f"{problem}; correct or delete it")
 
 
 def refresh(grant: GrantSpec, inventory: Inventory) -> GrantSpec:
-    """The grant with its policies brought up to date; all else stays as it was granted.
+    """Return a Grant with updated policies and otherwise unchanged.
 
-    It needs neither the application nor its plan, so that no trouble with these keeps a policy from a grant in use.
-    A policy that is broken, or has a broken zone, stays as it was granted last.
+    The application and its plan are not needed, so problems with them cannot keep a policy from a Grant in use. If a policy
+    or one of its zones is invalid, the last granted version is kept.
     """
     return grant.model_copy(update={"policies": _policies(grant, inventory, grant.policies)})
 
 
 def flight_grant(application: Application, drone: Drone, inventory: Inventory, area: OperationArea) -> GrantSpec:
-    """The grant that an application would be flown under, as far as its way is concerned: with all methods of motion.
+    """Return the Grant with which the route of an application is judged, with all methods of the mobility service.
 
-    It has the policies that hold for the component that says where to fly, without zones far from the way. Policies that
-    cannot be resolved are left out: while there are such, nothing is granted.
+    It contains the policies for the component that determines the flight, without zones far from the route. Unresolvable
+    policies are omitted, because no Grant is issued while they exist.
     """
     leader = application.spec.leader or next(application.spec.on("drone"))
     grant = _drone_grant(application, drone, inventory, area, component=leader.name, instance=leader.name)
@@ -170,10 +170,10 @@ def _drone_grant(
 
 
 def _outlined(shape: BaseGeometry) -> BaseGeometry:
-    """The shape with as many points and holes as an Area takes, its outline moved no further than that needs.
+    """Simplify a shape to the maximum number of points and holes of an Area, with the smallest sufficient tolerance.
 
     Raises:
-        InvalidObject: it has too many even so.
+        InvalidObject: The shape has too many points or holes even with the maximum tolerance.
     """
     tolerance_m = ROUNDING_M
     while tolerance_m <= MAX_ROUNDING_M:
@@ -187,7 +187,7 @@ def _outlined(shape: BaseGeometry) -> BaseGeometry:
     raise InvalidObject(
         "spec.components",
         f"the area that the drone flies in has {points} corners and {holes} holes, more than {MAX_RING_POINTS} and {MAX_HOLES};"
-        " give fewer waypoints, or a region instead of a path",
+        " use fewer waypoints, or a region instead of a path",
     )
 
 
@@ -209,13 +209,13 @@ def _granted_aboard(
 
 
 def _guides(component: Component, plan: DeploymentPlanSpec) -> bool:
-    """Whether a component without a driver has a drone of its own, which the system flies where it wants."""
+    """Return True if the system flies a drone to the points of interest of the component."""
     flown = plan.drone is not None and plan.drone.shared_with is None
     return flown and component.points_of_interest is not None
 
 
 def _opened(component: Component, inventory: Inventory) -> tuple[Any, ...]:
-    """Control points with depots replaced by their positions: the node knows no depots."""
+    """Return the control points with depots replaced by positions, because nodes do not know the depots."""
     opened = []
     for point in component.control_points:
         if point.point is not None and point.point.depot is not None:
@@ -248,16 +248,16 @@ def _policies(
     last: Sequence[GrantedPolicy] | None,
     bounds: _Bounds | None = None,
 ) -> tuple[GrantedPolicy, ...]:
-    """The policies for a grant, by name.
+    """Return the policies of a Grant, sorted by name.
 
     Args:
-        grant: Its owner, component and node say which policies hold.
-        inventory: As of now.
-        last: The policies as they were granted last, to fall back on; None: nothing was granted yet.
-        bounds: A place, and how far from there zones count, whether sound or not; None: as far as the node gets.
+        grant: Grant whose application, component and node select the policies.
+        inventory: Current inventory.
+        last: Policies of the previous Grant as a fallback, or None for a new Grant.
+        bounds: Position and distance up to which zones matter, whether valid or not, or None for the range of the node.
 
     Raises:
-        InvalidObject: a policy is broken, and `last` is None.
+        InvalidObject: A policy is invalid, and `last` is None.
     """
     node = inventory.drones.get(grant.node) or inventory.edge_nodes.get(grant.node)
     attributes = node_attributes(node) if node is not None else {"name": grant.node}
@@ -266,7 +266,7 @@ def _policies(
     bounds = bounds or _bounds(grant, node, inventory)
     granted = {name: policy for name, policy in kept.items() if name in inventory.unreadable_policies}
     for name, policy in inventory.policies.items():
-        # The attributes of a node without a description are unknown: what held for it goes on.
+        # The attributes of a node without a description are unknown, so its previous policies still apply.
         known = node is not None or name not in kept or not policy.spec.selector.nodes
         if known and not policy_applies(policy.spec, grant.application, grant.component, attributes):
             continue
@@ -286,12 +286,12 @@ def _policies(
 def _granted(
     policy: Policy, inventory: Inventory, bounds: _Bounds | None, beyond: _Bounds | None = None
 ) -> GrantedPolicy | None:
-    """The policy with its zones; None if all of them are out of reach.
+    """Return a policy with its zones, or None if all its zones are out of reach.
 
-    Zones that are easily seen to be out of reach of `beyond` are not looked at any closer.
+    Zones that are obviously out of reach of `beyond` are not validated.
 
     Raises:
-        InvalidObject: a zone does not exist, or is broken; or zones that are united where they are enforced cross too often.
+        InvalidObject: A zone is missing or invalid, or zones whose union is enforced cross too often.
     """
     named = dict.fromkeys(policy.spec.selector.zones)
     zones = [
@@ -309,21 +309,21 @@ def _granted(
     if named and not near:
         return None
     check_united(policy, near)
-    # What is left out is not selected either, so that a node can tell a zone that is far from one that is missing.
+    # Omitted zones are removed from the selector, so that a node can distinguish them from missing zones.
     granted = tuple(zone.granted for zone in near)
     selector = policy.spec.selector.model_copy(update={"zones": tuple(zone.name for zone in granted)})
     return GrantedPolicy(name=policy.name, spec=policy.spec.model_copy(update={"selector": selector}), zones=granted)
 
 
 def _regards_pictures(spec: PolicySpec) -> bool:
-    """Whether a policy counts also for zones that a camera sees from afar."""
+    """Return True if a policy also applies to zones that a camera sees from a distance."""
     return spec.type == "PrivacyControl" or not PICTURE_METHODS.isdisjoint(spec.methods)
 
 
 def _bounds(grant: GrantSpec, node: Drone | EdgeNode | None, inventory: Inventory) -> _Bounds | None:
-    """Where the node has its place, and how far from there zones concern it; None: wherever they are.
+    """Return the position of a node and the distance up to which zones matter, or None if all zones matter.
 
-    It is made of what a grant keeps, so that it is the same when a grant is made and when it is refreshed.
+    The result depends only on data that a Grant keeps, so it is the same when the Grant is issued and when it is refreshed.
     """
     if isinstance(node, EdgeNode):
         return ground_point(node.spec.location), FIXED_NODE_REACH_M
@@ -351,44 +351,44 @@ def _zone(policy: Policy, index: int, name: str, inventory: Inventory) -> SoundZ
 
 
 _GENEROUS = 1.05
-"""Room for what the frame of a large zone bends."""
+"""Safety factor for the distortion of the frame of a large zone."""
 
 
 def surely_beyond(zone: Zone | None, base: Point, reach_m: float) -> bool:
-    """Whether a zone is out of reach, told in microseconds; False where that needs a closer look."""
+    """Return True if a zone is obviously out of reach. This quick test returns False in all other cases."""
     if zone is None or zone.spec.area.polygon is None:
         return zone is not None and _circle_beyond(zone.spec.area, base, reach_m)
     ring = zone.spec.area.polygon.exterior
-    # No point of a polygon is further from a corner than half its outline.
+    # No point of a polygon is further from a corner than half the length of its outline.
     outline_m = sum(distance_m(a, b) for a, b in itertools.pairwise((*ring, ring[0])))
     return distance_m(ring[0], base) > (reach_m + outline_m / 2) * _GENEROUS
 
 
 def _circle_beyond(area: Area, base: Point, reach_m: float) -> bool:
-    """Whether an area is a circle that is surely out of reach."""
+    """Return True if an area is a circle that is certainly out of reach."""
     circle = area.circle
     return circle is not None and distance_m(circle.center, base) > (reach_m + circle.radius) * _GENEROUS
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SoundZone:
-    """A zone as it is granted, with its outline in a frame of its own; it equals none but itself."""
+    """A validated zone as in Grants, with its outline in a local frame. Instances are compared by identity."""
 
     granted: GrantedZone
     frame: LocalFrame
     outline: shapely.Polygon
 
     def is_within(self, reach_m: float, base: Point) -> bool:
-        """Whether some of it is within reach of a place."""
+        """Return True if part of the zone is within a distance of a position."""
         return not _circle_beyond(self.granted.area, base, reach_m) and self.distance_m(base) <= reach_m
 
     def distance_m(self, base: Point) -> float:
-        """From a place to the nearest point of it."""
+        """Return the distance from a position to the zone in metres."""
         return float(self.outline.distance(shapely.Point(*self.frame.xy(base.lat, base.lon))))
 
 
 _SOUND: dict[int, SoundZone] = {}
-"""Zones that were looked at, by the identity of their objects: to hash and compare all their points takes longer than that."""
+"""Validated zones by the identity of their objects, because hashing all points would take longer than validating them."""
 
 
 def _looked_at(zone: Zone) -> SoundZone:
@@ -403,10 +403,10 @@ def _looked_at(zone: Zone) -> SoundZone:
 
 
 def sound(zone: Zone) -> SoundZone:
-    """A zone as grants have it; of one object it is made once, and kept as long as that is.
+    """Validate a zone for Grants. The result is cached as long as the object exists.
 
     Raises:
-        InvalidObject: it is broken.
+        InvalidObject: The geometry of the zone is invalid.
     """
     known = _SOUND.get(id(zone))
     if known is None:
@@ -417,13 +417,13 @@ def sound(zone: Zone) -> SoundZone:
 
 @lru_cache(maxsize=32)
 def zone_crossings(zones: tuple[SoundZone, ...], at_most: int) -> int:
-    """How often the edges of several zones cross; no more than `at_most` + 1 are counted."""
+    """Count the crossings of the edges of zones, up to `at_most` + 1."""
     lines = []
     for zone in zones if len(zones) > 1 else ():
         for ring in shapely.get_rings(zone.outline):
             lats, lons = zone.frame.latlon_array(shapely.get_coordinates(ring))
             lines.append(np.column_stack([lons, lats]))
-    # Whatever a degree measures, edges cross in degrees or do not; but on one side of the antimeridian.
+    # Crossings are the same in degrees as in metres, if all longitudes are on one side of the antimeridian.
     middle_lon = float(lines[0][0, 0]) if lines else 0.0
     for line in lines:
         line[:, 0] = (line[:, 0] - middle_lon + 540.0) % 360.0 - 180.0
@@ -431,17 +431,17 @@ def zone_crossings(zones: tuple[SoundZone, ...], at_most: int) -> int:
 
 
 def check_united(policy: Policy, zones: Sequence[SoundZone]) -> None:
-    """Refuse a policy whose zones are united where it is enforced, and would take too long for that.
+    """Refuse an inclusion policy whose enforcement would take too long to compute the union of its zones.
 
     Args:
-        policy: to be enforced.
-        zones: those of its zones that count.
+        policy: Policy to enforce.
+        zones: Relevant zones of the policy.
 
     Raises:
-        InvalidObject: their edges cross too often.
+        InvalidObject: The edges of the zones cross too often.
     """
     if policy.spec.kind == "inclusion" and zone_crossings(tuple(zones), MAX_CROSSINGS) > MAX_CROSSINGS:
         raise InvalidObject(
             f"Policy {policy.name} spec.selector.zones",
-            f"edges of its zones cross more than {MAX_CROSSINGS} times; make one zone of them, or give them fewer corners",
+            f"edges of its zones cross more than {MAX_CROSSINGS} times; combine them into one zone, or use fewer corners",
         )

@@ -76,7 +76,7 @@ def plan_in_steps(
     except Infeasible:
         if previous is None:
             raise
-    # What runs takes no room from what must run: without keeping it in place there may be a plan.
+    # Without reservations for running instances a plan may exist.
     return (
         yield from _plan_once(PlanBuilder(application, inventory, settings or Settings(), previous, reserving=False))
     )
@@ -96,7 +96,7 @@ def _plan_once(builder: PlanBuilder) -> Generator[str, None, DeploymentPlanSpec]
     yield "static.candidates"
     place_static(builder, locations)
     yield "static.host"
-    # Hybrid components go beside those that have their places already, so these come first.
+    # Hybrid components are placed near other components, which therefore come first.
     for placement in _IN_ORDER:
         for component in builder.spec.on(placement):
             match placement:
@@ -163,5 +163,5 @@ def _place_cloud(builder: PlanBuilder, component: Component, replicas: int) -> N
         component,
         "NoCloudNode",
         f"no cloud node can host {component.name}",
-        "no Node has the label fractus.dev/class=cloud, or fractus.dev/cloud=true beside another class",
+        "no Node has the label fractus.dev/class=cloud, or fractus.dev/cloud=true in addition to another class",
     )

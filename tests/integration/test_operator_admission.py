@@ -236,7 +236,7 @@ def test_the_operator_writes_nothing_that_it_has_not_made(
         other = [{"op": "replace", "path": "/spec/containers/0/image", "value": "registry.test/other:1"}]
         change = ContentType.JSON_PATCH
         denied(
-            lambda: client.call("PATCH", f"{pods}/ours", other, content_type=change), "does not change what they run"
+            lambda: client.call("PATCH", f"{pods}/ours", other, content_type=change), "but not change their containers"
         )
         client.merge(f"{pods}/ours", {"spec": {"activeDeadlineSeconds": 1}})
         node, labels = "/api/v1/nodes/edge-1", "may write only the location labels of nodes"

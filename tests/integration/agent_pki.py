@@ -1,4 +1,4 @@
-"""A certificate authority for tests, and the operator's part of the CSR API."""
+"""Certificate authority for tests, and a fake of the CSR API with its signer."""
 
 import base64
 from datetime import UTC, datetime, timedelta
@@ -11,7 +11,7 @@ from cryptography.x509.oid import NameOID
 
 
 class TestAuthority:
-    """Signs what it is given."""
+    """Certificate authority that signs every request."""
 
     __test__ = False
 
@@ -40,7 +40,7 @@ class TestAuthority:
         self.pem = self.certificate.public_bytes(serialization.Encoding.PEM)
 
     def sign(self, request_pem: bytes, begin: datetime | None = None, life: timedelta = timedelta(days=30)) -> bytes:
-        """A certificate for a signing request, names taken over."""
+        """Return a certificate for a signing request, with its names."""
         request = x509.load_pem_x509_csr(request_pem)
         assert request.is_signature_valid
         names = request.extensions.get_extension_for_class(x509.SubjectAlternativeName)
@@ -62,7 +62,7 @@ class TestAuthority:
 
 
 class FakeSigner:
-    """The store as identity sees it, with an operator behind it that signs, denies or keeps silent."""
+    """Fake store whose operator signs, denies or ignores signing requests."""
 
     def __init__(self, authority: TestAuthority) -> None:
         self.ca = authority
@@ -78,7 +78,7 @@ class FakeSigner:
             raise self.error
         return self.published
 
-    async def request_certificate(self, name: str, request_pem: bytes, life_s: int) -> None:
+    async def request_certificate(self, name: str, request_pem: bytes, lifetime_s: int) -> None:
         if self.error:
             raise self.error
         self.made += 1
@@ -90,5 +90,5 @@ class FakeSigner:
     async def certificate_request(self, name: str) -> dict[str, Any] | None:
         return self.requests.get(name)
 
-    async def drop_certificate_requests(self) -> None:
+    async def delete_certificate_requests(self) -> None:
         self.requests.clear()

@@ -322,12 +322,12 @@ class Endpoint:
             for field, default in _default_fields(name).items()
         ]
         try:
-            frame = kind(*fields).pack(self._protocol)  # type: ignore[arg-type]
+            frame = kind(*fields).pack(self._protocol)  # type: ignore[arg-type]  # pymavlink has no types
         except (struct.error, OverflowError):
             if not self._saturate:
                 raise
             fields = [_saturated(type_, value) for type_, value in zip(kind.fieldtypes, fields, strict=True)]
-            frame = kind(*fields).pack(self._protocol)  # type: ignore[arg-type]
+            frame = kind(*fields).pack(self._protocol)  # type: ignore[arg-type]  # pymavlink has no types
         self._protocol.seq = (self._protocol.seq + 1) & 0xFF
         return bytes(frame)
 

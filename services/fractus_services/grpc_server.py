@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 STOP_TIMEOUT_S = 2.0
 
 
-class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[misc]
+class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[misc]  # grpc has no types
     """Traces calls, and decodes requests after their callers are authenticated and counted.
 
     Args:

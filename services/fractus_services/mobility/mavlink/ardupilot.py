@@ -1,4 +1,4 @@
-"""ArduCopter: its modes, parameters, failsafes, fence and texts, from 4.5 to the names of 4.7."""
+"""ArduCopter 4.5 to 4.7: modes, parameters, failsafes, fence and status texts."""
 
 from __future__ import annotations
 
@@ -32,41 +32,44 @@ _COPTERS = frozenset(
 _NUMBERS = {mode: number for number, mode in _MODES.items()}
 
 _LISTENS = "listens for the companion's heartbeats, and takes no ground station for it"
-# Releases that know the new name can take a whole range of systems for the companion.
+# Releases with the new name can accept a range of systems as the companion.
 _LISTENS_TO_ONE = Setting(
     ("MAV_GCS_SYSID_HI",), 0, frozenset(float(n) for n in range(1, SYSTEM_ID + 1)), False, _LISTENS
 )
 
 _UNSTEERED = 1 << 4 | 1 << 5 | 1 << 6
-"""Bits of GUID_OPTIONS: it corrects neither position nor velocity, and flies on when it is told to stop; or it flies to positions as
-in a mission, at WPNAV_SPEED whatever speed it is told, and by its own ways around obstacles."""
+"""Bits of GUID_OPTIONS that are not allowed.
+
+With the first two, the autopilot corrects neither position nor velocity and does not stop on command. With the third, it flies to
+positions as in a mission: at WPNAV_SPEED regardless of the commanded speed, and with its own detours around obstacles.
+"""
 _STEERED = frozenset(float(options) for options in range(256) if not options & _UNSTEERED)
 
-# FS_GCS_ENABLE and FENCE_ACTION: returns, or goes back on its path. BATT_FS_LOW_ACT numbers them otherwise.
+# Values of FS_GCS_ENABLE and FENCE_ACTION: RTL, and SmartRTL. BATT_FS_LOW_ACT uses other numbers.
 _RETURN, _RETRACE = 1.0, 3.0
 
 _COMES_DOWN = frozenset({1.0, 2.0, 3.0, 5.0})
-"""FENCE_ACTION; others only report, or let the drone hover until its battery is low."""
+"""Values of FENCE_ACTION that bring the drone down. Others only report, or hover until the battery is low."""
 
 ENABLE, TYPE, ALTITUDE, ACTION, OPTIONS = "FENCE_ENABLE", "FENCE_TYPE", "FENCE_ALT_MAX", "FENCE_ACTION", "FENCE_OPTIONS"
 AUTOENABLE, MARGIN = "FENCE_AUTOENABLE", "FENCE_MARGIN"
 _UNION = 2
-"""Bit of FENCE_OPTIONS: it is enough to be inside one of the polygons."""
+"""Bit of FENCE_OPTIONS: being inside of one polygon is sufficient."""
 _DEFAULT_FENCES = float(mavlink.FENCE_TYPE_ALT_MAX | mavlink.FENCE_TYPE_CIRCLE | mavlink.FENCE_TYPE_POLYGON)
 _DEFAULT_MARGIN_M = 2.0
 
 _ACCEL: Names = (("WPNAV_ACCEL", 0.01), ("WP_ACC", 1.0))
 _GAIN: Names = (("PSC_POSXY_P", 1.0), ("PSC_NE_POS_P", 1.0))
 _CLIMB: Names = (("WPNAV_ACCEL_Z", 0.01), ("WP_ACC_Z", 1.0))
-# 4.7.0 and 4.7.1 spell it in two ways.
+# 4.7.0 and 4.7.1 use different names.
 _JERK: Names = (("PSC_JERK_XY", 1.0), ("PSC_NE_JERK", 1.0), ("PSC_JERK_NE", 1.0))
-# Of the position controller in degrees, where it is not 0, and of the vehicle.
+# Maximum lean of the position controller in degrees unless it is 0, and of the vehicle.
 _OWN_LEAN: Names = (("PSC_ANGLE_MAX", 1.0),)
 _LEAN: Names = (("ANGLE_MAX", 0.01), ("ATC_ANGLE_MAX", 1.0))
 _MAX_LEAN_DEG = 80.0
 _GRAVITY_MPS2 = 9.81
 _WIND_LEAN_DEG = 4.0
-"""What 6 m/s of wind take of the lean, which a vehicle then does not have for braking."""
+"""Lean angle that 6 m/s of wind take and that is not available for braking."""
 _RETURN_ALTITUDE: Names = (("RTL_ALT", 0.01), ("RTL_ALT_M", 1.0))
 _SPEED: Names = (("WPNAV_SPEED", 0.01), ("WP_SPD", 1.0))
 _MOVEMENT = (_ACCEL, _GAIN, _CLIMB, _JERK, _OWN_LEAN, _LEAN, _RETURN_ALTITUDE, _SPEED)
@@ -75,11 +78,11 @@ _RETURN_CLIMB: Names = (("RTL_CLIMB_MIN", 0.01), ("RTL_CLIMB_MIN_M", 1.0))
 _MIN_SPEED_MPS = 0.2
 _MIN_ACCEL_MPS2 = 0.1
 _NO_RALLY_KM = 2.0**-10
-"""Rally points further away than that, a metre, do not count; 0 would let all of them. A number that a float32 holds."""
+"""Rally points at a greater distance (one metre) are ignored; 0 would allow all of them. Exactly representable as float32."""
 
 
 class ArduCopter:
-    """The seam's side of ArduCopter, see `FlightStack`."""
+    """Implementation of `FlightStack` for ArduCopter."""
 
     guided = _MODES[mavlink.COPTER_MODE_GUIDED]
     land = _MODES[mavlink.COPTER_MODE_LAND]
@@ -94,7 +97,7 @@ class ArduCopter:
         Setting(("FS_GCS_TIMEOUT",), 5, frozenset(), False, "after five seconds of silence"),
         Setting(("BATT_FS_CRT_ACT",), 1, frozenset({1.0}), False, "lands on a critical battery"),
         Setting(("FS_EKF_ACTION",), 1, frozenset({1.0, 3.0}), False, "lands when it no longer knows where it is"),
-        # 0 switches that failsafe off.
+        # 0 disables this failsafe.
         Setting(
             ("FS_EKF_THRESH",), 0.75, frozenset(), False, "notices that it no longer knows where it is", span=(0.0, 1.0)
         ),
@@ -105,7 +108,7 @@ class ArduCopter:
         Setting(
             ("RTL_ALT_TYPE",), 0, frozenset(), False, "returns at an altitude above home, not above the ground below"
         ),
-        # 0 switches that cone off; what is more than three times as high only climbs higher.
+        # 0 disables the cone. A slope above three times the default only climbs higher.
         Setting(
             ("RTL_CONE_SLOPE",),
             RTL_CONE_SLOPE,
@@ -143,40 +146,48 @@ class ArduCopter:
     fence_parameters: tuple[str, ...] = (TYPE, ALTITUDE, ACTION, OPTIONS, ENABLE)
 
     gimbal_type = "MNT1_TYPE"
-    # Alexmos, SToRM32 on a serial line, MAVLink (Gremsy), Siyi, Xacti, Viewpro, Topotek. Servos, SToRM32 over MAVLink and CADDX
-    # report their targets; what a script reports is its own affair.
+    # Alexmos, serial SToRM32, MAVLink (Gremsy), Siyi, Xacti, Viewpro, Topotek. Servos, MAVLink SToRM32 and CADDX report their
+    # targets. Reports of scripts are not trusted.
     measured_gimbals = frozenset({3.0, 5.0, 6.0, 8.0, 10.0, 11.0, 12.0})
 
     def foreign(self, vehicle_type: int, autopilot: int) -> str:
-        """Modes and parameters of ArduPilot's rovers and planes mean something else, as do all of other firmware."""
+        """Reject other vehicles: modes and parameters of ArduPilot's rovers and planes, and of other firmware, have other meanings."""
         if autopilot == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA and vehicle_type in _COPTERS:
             return ""
         return f"the vehicle is no ArduCopter (MAV_AUTOPILOT {autopilot}, MAV_TYPE {vehicle_type})"
 
     def mode(self, custom_mode: int) -> FlightMode:
-        """The mode of a number; one of a later release has only that for its name, and is a pilot's."""
+        """Return the mode of a number. A mode of a later release is named by its number and counts as a pilot's mode."""
         return _MODES.get(custom_mode) or FlightMode(f"MODE{custom_mode}")
 
     def mode_parameters(self, mode: FlightMode) -> tuple[float, ...]:
-        """Its number."""
+        """Return the number of a mode."""
         return (float(_NUMBERS[mode]),)
 
     def explains_refusal(self, text: str) -> bool:
-        """Texts of the checks before arming, modes and takeoff."""
+        """Recognise texts of pre-arm checks, mode changes and takeoffs."""
         return text.startswith(("Arm", "PreArm", "Mode", "Takeoff"))
 
     def tells_failsafe(self, text: str) -> bool:
-        """`GCS Failsafe`, `Battery 1 is low ... failsafe`, `Fence breached`; not `Failsafe Cleared`, `Failsafe - Continuing`, `Fence enabled`."""
+        """Recognise active failsafes.
+
+        Matches `GCS Failsafe`, `Battery 1 is low ... failsafe` and `Fence breached`, but not `Failsafe Cleared`, `Failsafe - Continuing`
+        or `Fence enabled`.
+        """
         lower = text.lower()
         acts = "failsafe" in lower or ("fence" in lower and "breach" in lower)
         return acts and "cleared" not in lower and "continuing" not in lower
 
     def tells_path_lost(self, text: str) -> bool:
-        """SmartRTL ran out of memory, or of time to simplify the path."""
+        """Recognise that SmartRTL exceeded its memory or its time limit."""
         return text.startswith("SmartRTL deactivated")
 
     def return_values(self, owned: Mapping[str, float], bounds: ReturnBounds) -> dict[str, float]:
-        """RTL_ALT; RTL_SPEED, which is WPNAV_SPEED when it is 0; WPNAV_SPEED for SmartRTL; and no climb above the height that ways home are judged for."""
+        """Return limited values of the return parameters.
+
+        These are RTL_ALT, RTL_SPEED (0 means WPNAV_SPEED), WPNAV_SPEED for SmartRTL, and RTL_CLIMB_MIN of 0, so that the drone does not
+        climb above the altitude for which return flights are judged.
+        """
         speed_mps = max(bounds.speed_mps, _MIN_SPEED_MPS)
         found = {}
         for names, most in (
@@ -184,13 +195,16 @@ class ArduCopter:
         ):  # fmt: skip
             for name, scale in names:
                 if name in owned:
-                    # Centimetres are whole numbers.
+                    # Parameters in centimetres are integers.
                     limit = most if scale == 1.0 or math.isinf(most) else math.floor(round(most / scale, 3))
                     found[name] = min(owned[name], float(limit))
         return found
 
     def airframe(self, reader: ParameterReader, known: Airframe, speed_mps: float) -> tuple[Airframe, float]:
-        """Accelerations, as far as it may lean for them, and gains; releases before 4.7 have centimetres, later ones metres."""
+        """Return accelerations, limited by the maximum lean angle, and gains.
+
+        Releases before 4.7 use centimetres, later ones metres.
+        """
         read = reader.read
         airframe = Airframe(
             accel_mps2=max(min(read(_ACCEL, known.accel_mps2), _leant_mps2(reader)), _MIN_ACCEL_MPS2),
@@ -202,7 +216,7 @@ class ArduCopter:
         return airframe, read(_SPEED, speed_mps)
 
     def return_altitude_m(self, reader: ParameterReader, known_m: float) -> float:
-        """RTL_ALT, but never above its own fence's ceiling, less the fence's margin."""
+        """Return RTL_ALT, limited by the fence's ceiling minus its margin."""
 
         def read(name: str, otherwise: float, *, needed: bool = False) -> float:
             return reader.read(((name, 1.0),), otherwise, needed=needed)
@@ -217,7 +231,11 @@ class ArduCopter:
     def fence_values(
         self, owned: Mapping[str, float], *, ceiling_m: float | None, polygon: bool, retraces: bool
     ) -> dict[str, float]:
-        """The lower ceiling, both kinds of fence, the owner's action if it brings the drone down; and inside every polygon, not only inside one."""
+        """Return the parameters of the mission's fence.
+
+        The lower ceiling and both fence types apply. The owner's action stays if it brings the drone down. The drone must be inside of
+        every polygon instead of one of them.
+        """
         action = _RETRACE if retraces else _RETURN
         kinds = (mavlink.FENCE_TYPE_ALT_MAX if ceiling_m is not None else 0) | (
             mavlink.FENCE_TYPE_POLYGON if polygon else 0
@@ -237,7 +255,7 @@ class ArduCopter:
 
 
 def _leant_mps2(reader: ParameterReader) -> float:
-    """The horizontal acceleration that the vehicle surely reaches, however much it is told to brake with."""
+    """Return the horizontal acceleration that the vehicle certainly reaches within its lean angle."""
     lean_deg = reader.read(_OWN_LEAN, 0.0, needed=False)
     if lean_deg <= 0.0:
         lean_deg = reader.read(_LEAN, _MAX_LEAN_DEG, needed=False)

@@ -1,4 +1,4 @@
-"""The autopilot as the last line: its own failsafes, set and read back before anything may arm, and kept in flight."""
+"""The autopilot's failsafes as the last line of defence: set and read back before arming, and verified in flight."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ _DEFAULT_SPEED_MPS = 5.0
 
 
 class Reader:
-    """Figures from the parameters that the vehicle told, and what is wrong with them.
+    """Values from the vehicle's parameters, and problems with them.
 
     Args:
-        told: the parameters; one that is not there the vehicle does not have.
+        told: Reported parameters; the vehicle does not have others.
 
     Attributes:
-        problems: which are not numbers, or missing.
+        problems: Parameters that are missing or not a number.
     """
 
     def __init__(self, told: Mapping[str, float]) -> None:
@@ -34,7 +34,7 @@ class Reader:
         self.problems: list[str] = []
 
     def read(self, names: Names, otherwise: float, *, needed: bool = True) -> float:
-        """A figure; another when the vehicle tells none that can be used, which is a problem if it is needed."""
+        """Return a scaled value, or the default if the parameter is missing or invalid; that is a problem if it is needed."""
         for name, scale in names:
             if name in self._told:
                 if math.isfinite(self._told[name]):
@@ -50,14 +50,14 @@ class _Settings:
     """One pass over the settings.
 
     Args:
-        parameters: the vehicle's.
-        told: their values as they were read.
+        parameters: Access to the vehicle's parameters.
+        told: Their values as they were read.
 
     Attributes:
-        told: their values by now.
-        problems: which do not hold.
-        missing: which the vehicle does not have.
-        changed: which were set, as sentences.
+        told: Current values.
+        problems: Settings that do not hold.
+        missing: Settings that the vehicle does not have.
+        changed: Changed settings as sentences.
     """
 
     def __init__(self, parameters: Parameters, told: dict[str, float]) -> None:
@@ -68,10 +68,10 @@ class _Settings:
         self.changed: list[str] = []
 
     async def establish(self, settings: Iterable[Setting]) -> bool:
-        """Let settings hold; False when one of them does not.
+        """Make settings hold and return False if one of them does not.
 
         Raises:
-            ParameterLost: it is not known whether one holds.
+            ParameterLost: It is unknown if a setting holds.
         """
         problems = len(self.problems)
         for setting in settings:
@@ -110,7 +110,7 @@ class MavlinkFailsafes:
     """Sets and reads the failsafes by their parameters, see `Failsafes`.
 
     Args:
-        autopilot: the link.
+        autopilot: Link to the vehicle.
     """
 
     def __init__(self, autopilot: MavlinkAutopilot) -> None:
@@ -134,24 +134,24 @@ class MavlinkFailsafes:
         self._concerned = frozenset((*(name for names in self._wanted for name in names), *also))
 
     def concerns(self, name: str) -> bool:
-        """Whether a parameter is one of those that are set or read here."""
+        """Return True if a parameter is set or read by the failsafes."""
         return name in self._concerned
 
     async def configure(self, *, flying: bool = False, before: Checked | None = None) -> Checked:
-        """Set the failsafes, read each one back, and learn how the vehicle moves.
+        """Set the failsafes, read each one back, and return them with the vehicle's dynamics.
 
-        In flight the way home stays as it was chosen when the drone was armed, and what does not answer as it was.
+        In flight, the return flight stays as it was chosen at arming, and values that cannot be read keep their last value.
 
         Args:
-            flying: whether the motors run.
-            before: what was known in this flight until now.
+            flying: True if the motors run.
+            before: Result of the last verification in this flight.
 
         Raises:
-            AutopilotError: the link broke, or nothing was known of a drone in flight and nothing can be read.
+            AutopilotError: The link broke, or no parameter of a drone in flight can be read and none is known.
         """
         before = before if flying else None
         if not flying and self._autopilot.vehicle.foreign:
-            log.error("failsafes: none are set (problem=%s)", self._autopilot.vehicle.foreign)
+            log.error("failsafes: not set, unsupported vehicle (problem=%s)", self._autopilot.vehicle.foreign)
             return Checked(self._autopilot.vehicle.foreign, (), Airframe(), _DEFAULT_SPEED_MPS)
         try:
             checked = await self._configure(flying, before)
@@ -161,7 +161,7 @@ class MavlinkFailsafes:
             known = before or Checked("", (), Airframe(), _DEFAULT_SPEED_MPS)
             checked = replace(known, problem=str(error), changed=(), lost=True)
         if checked.problem:
-            log.error("failsafes: not verified, arming is refused (problem=%s)", checked.problem)
+            log.error("failsafes: not verified, refusing to arm (problem=%s)", checked.problem)
         elif before is None or checked.changed:
             log.info("failsafes: set and read back (not_offered=%s)", ",".join(checked.missing) or "none")
         return checked
@@ -169,7 +169,7 @@ class MavlinkFailsafes:
     async def _configure(self, flying: bool, before: Checked | None) -> Checked:
         stack = self._stack
         settings = _Settings(self._parameters, await self._parameters.read(self._wanted))
-        # On the ground the owner has the rest as it likes: it is set, and put back, with the limits of a mission.
+        # On the ground the owner may choose the other settings. They are set and restored with the limits of a mission.
         await settings.establish((*stack.failsafes, *stack.flown) if flying else stack.failsafes)
         missing = tuple(settings.missing)
         parameter, least_points = stack.path_memory
@@ -183,19 +183,19 @@ class MavlinkFailsafes:
         return Checked(problem, missing, airframe, speed, remembers, tuple(settings.changed))
 
     def learn(self, checked: Checked) -> Checked:
-        """How the vehicle moves by what it has told until now."""
+        """Update the vehicle's dynamics from the parameters known so far."""
         airframe, speed = self._stack.airframe(self._reader(self._parameters.told), checked.airframe, checked.speed_mps)
         return replace(checked, airframe=replace(airframe, retraces=checked.airframe.retraces), speed_mps=speed)
 
     def _reader(self, told: Mapping[str, float]) -> Reader:
-        """Figures with the owner's speed of legs, as far as it has a name that the vehicle knows."""
+        """Return a reader in which the speed of legs is the owner's, under the name that the vehicle knows."""
         return Reader({name: self._parameters.leg_speed.get(name, value) for name, value in told.items()})
 
     async def choose_return(self, checked: Checked, *, retrace: bool) -> Checked:
-        """Let the failsafes bring the drone home straight, or, where the vehicle can, on the path that it came.
+        """Let the failsafes return straight, or along the path if the vehicle supports that.
 
         Raises:
-            AutopilotError: the link broke.
+            AutopilotError: The link broke.
         """
         retrace = retrace and checked.remembers
         if retrace == checked.airframe.retraces or checked.problem:
@@ -210,12 +210,12 @@ class MavlinkFailsafes:
         return replace(checked, problem="; ".join(settings.problems), airframe=airframe)
 
     async def learn_return(self, checked: Checked) -> Checked:
-        """Learn at which altitude the autopilot flies home by itself, under the fence that it has by now.
+        """Update the altitude of the autopilot's own return flight under its current fence.
 
-        What cannot be read stays as it was, and is a problem.
+        A value that cannot be read stays as it was and is a problem.
 
         Raises:
-            AutopilotError: the link broke.
+            AutopilotError: The link broke.
         """
         try:
             reader = Reader(await self._parameters.read(self._stack.movement))
@@ -226,19 +226,22 @@ class MavlinkFailsafes:
         return replace(checked, problem=problem, airframe=replace(checked.airframe, return_altitude_m=height_m))
 
     def _chosen(self, settings: _Settings, before: Checked | None) -> bool:
-        """Whether the path was chosen as the way home of the flight under way; only the vehicle knows after a restart of the service."""
+        """Return True if the return along the path was chosen for this flight. After a restart of the service, only the vehicle knows."""
         if before is not None:
             return before.airframe.retraces
         companion = self._stack.retracing[0]
         return settings.told.get(companion.names[0]) in companion.accepted | {companion.value}
 
     async def _choose(self, settings: _Settings, *, retrace: bool) -> bool:
-        """Whether the failsafes retrace the path now."""
+        """Set the return of the failsafes and return True if it follows the path."""
         problems = len(settings.problems)
         if retrace:
             if await settings.establish(self._stack.retracing):
                 return True
-            log.warning("failsafes: the drone will fly home straight (problems=%s)", "; ".join(settings.problems))
+            log.warning(
+                "failsafes: return along the path not available, straight return set (problems=%s)",
+                "; ".join(settings.problems),
+            )
             del settings.problems[problems:]
         await settings.establish(self._stack.straight)
         return False

@@ -1,4 +1,4 @@
-"""The vehicle's parameters as it tells them: one whose answer was lost is told apart from one that it does not have."""
+"""The vehicle's parameters: read and written reliably, with a distinction between a lost answer and an absent parameter."""
 
 from __future__ import annotations
 
@@ -15,50 +15,50 @@ from fractus_services.errors import AutopilotError
 ANSWER_TIMEOUT_S = 0.7
 ATTEMPTS = 8
 ATTEMPTS_BEFORE_LIST = 4
-"""The list has some 1,400 parameters, half a minute at 57,600 baud: it is asked for only when a name gets no answer."""
+"""The list has about 1,400 parameters and takes half a minute at 57,600 baud. It is requested only for unanswered names."""
 
 WINDOW = 12
-"""Requests under way at a time: ArduPilot keeps 20, and drops the others."""
+"""Concurrent requests. ArduPilot queues 20 and drops the rest."""
 
 LIST_QUIET_S = 2.0
 LIST_TIMEOUT_S = 180.0
 FEW_MISSING = 0.05
-"""Share of the list that is asked for one by one; when more is missing, the whole list is asked for again."""
+"""If a larger share of the list is missing, the complete list is requested again instead of single entries."""
 
 Spellings = tuple[str, ...]
-"""The names of one parameter in older and newer releases: a vehicle has it under one of them."""
+"""Names of one parameter in older and newer releases. A vehicle has the parameter under one of them."""
 
 
 class ParameterLost(AutopilotError):
-    """Whether the vehicle has a parameter, or which value it has, is not known: it does not answer."""
+    """The vehicle does not answer, so the value or the existence of a parameter is unknown."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(reason, link=True)
 
 
 class Recipient(Protocol):
-    """The link, as far as parameters need it."""
+    """Link interface that `Parameters` needs."""
 
     def send(self, outgoing: Message) -> None:
         """Send a message."""
 
     def recipient(self) -> dict[str, int]:
-        """The vehicle, as messages name their target."""
+        """Return the target fields of messages to the vehicle."""
 
 
 class Parameters:
-    """Reads and writes parameters, and hears when someone else changes them.
+    """Reads and writes parameters, and reports changes by other stations.
 
-    A parameter is absent only when the vehicle's whole list is known and does not have it; ArduPilot leaves out of its list
-    what belongs to a part that is switched off, so that it is asked for by its name first, and again afterwards.
+    A parameter is absent only if the complete list is known and does not contain it. ArduPilot omits parameters of disabled features from
+    its list, so a parameter is requested by name first, and again afterwards.
 
     Args:
-        link: to the vehicle.
-        on_change: called with the name of a parameter that has another value than before, when this service did not write it.
+        link: Link to the vehicle.
+        on_change: Callback invoked with the name of a parameter whose value changed, unless this service wrote it.
 
     Attributes:
-        told: the values that the vehicle told last, by name.
-        leg_speed: the owner's speed of legs while the vehicle's own ways home are slower; legs are flown with it.
+        told: Latest reported values by name.
+        leg_speed: The owner's speed of legs while the return flight is limited; legs are flown with this speed.
     """
 
     def __init__(self, link: Recipient, on_change: Callable[[str], None] = lambda _name: None) -> None:
@@ -71,7 +71,7 @@ class Parameters:
         self.forget()
 
     def forget(self) -> None:
-        """The link broke: what answers next may be another vehicle, or another release."""
+        """Reset after the connection broke: the next answers may be from another vehicle or release."""
         self.told: dict[str, float] = {}
         self._news = asyncio.Event()
         self._number = 0
@@ -110,7 +110,7 @@ class Parameters:
         """
         begun, asked = self._number, tuple(wanted)
         wanted = [names for names in asked if not self._absent.issuperset(names)]
-        # What was absent may be there by now: it is asked for, and not waited for.
+        # An absent parameter may exist by now: it is requested, but not waited for.
         for name in self._absent.intersection(name for names in asked for name in names):
             self._request(name.encode(), -1)
 
@@ -132,11 +132,11 @@ class Parameters:
         return {name: self.told[name] for name in found if name is not None}
 
     async def write(self, name: str, value: float) -> float:
-        """Set a parameter that the vehicle has; returns what it says it is then, which is another value when it refuses.
+        """Set a parameter that the vehicle has, and return the value that it reports, which differs if the vehicle refuses.
 
         Raises:
-            ParameterLost: it does not say anything.
-            AutopilotError: the vehicle is not connected.
+            ParameterLost: The vehicle does not answer.
+            AutopilotError: The vehicle is not connected.
         """
         async with self._locks.setdefault(name, asyncio.Lock()):
             self._written[name] = value
@@ -154,7 +154,7 @@ class Parameters:
                 while others < 2 and await self._answered(lambda: self._heard.get(name, 0) > heard):  # noqa: B023
                     if same(self.told[name], value):
                         return value
-                    # The first other value may be a late answer to a question from before.
+                    # The first differing value may be a late answer to an earlier request.
                     heard, others = self._heard[name], others + 1
                 if others > 1:
                     break
@@ -164,21 +164,21 @@ class Parameters:
         return self.told[name]
 
     def _known(self, names: Spellings) -> bool:
-        """Whether the vehicle is known to have a parameter."""
+        """Return True if the vehicle has reported the parameter."""
         return any(name in self._heard for name in names)
 
     def _spelt(self, names: Spellings) -> str:
         return next((name for name in names if name in self._heard), " or ".join(names))
 
     async def _ask(self, wanted: list[Spellings], fresh: Callable[[Spellings], bool], attempts: int) -> list[Spellings]:
-        """Ask for parameters by name; returns those without an answer."""
+        """Request parameters by name and return those without an answer."""
         for _ in range(attempts):
             wanted = [names for names in wanted if not fresh(names)]
             asked = [(names, name) for names in wanted for name in self._to_ask(names)]
             for begin in range(0, len(asked), WINDOW):
                 window = asked[begin : begin + WINDOW]
                 for _, name in window:
-                    # An index of -1 asks by name.
+                    # An index of -1 requests by name.
                     self._request(name.encode(), -1)
                 await self._answered(lambda: all(fresh(names) for names, _ in window))  # noqa: B023
         return [names for names in wanted if not fresh(names)]
@@ -195,7 +195,7 @@ class Parameters:
         return self._size is not None and len(self._list) == self._size
 
     async def _fetch_list(self) -> bool:
-        """Learn the names of all parameters; False when the list does not become complete."""
+        """Request the complete list and return False if it stays incomplete."""
         async with self._listing:
             silent = 0
             try:
@@ -209,7 +209,7 @@ class Parameters:
             return self._complete
 
     async def _fetch(self) -> None:
-        """Ask for the list, or for what it lacks."""
+        """Request the list, or its missing entries."""
         size = self._size or 0
         if size - len(self._list) > FEW_MISSING * size or not size:
             self._link.send(message("PARAM_REQUEST_LIST", **self._link.recipient()))
@@ -224,7 +224,7 @@ class Parameters:
             await self._answered(lambda: all(index in self._list for index in window))
 
     async def _answered(self, done: Callable[[], bool], timeout_s: float | None = None) -> bool:
-        """Wait until something was heard; False when it was not in time."""
+        """Wait for a condition on received values; return False after the timeout."""
         if done():
             return True
         try:
@@ -237,5 +237,5 @@ class Parameters:
 
 
 def same(a: float, b: float) -> bool:
-    """Whether two values are one 32-bit float, which PARAM_VALUE carries."""
+    """Return True if two values are the same 32-bit float, as PARAM_VALUE transmits them."""
     return math.isclose(a, b, rel_tol=1e-6, abs_tol=1e-6)

@@ -70,7 +70,7 @@ def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("lost", [(), (1,), (2,), (3, 4), (6,), (8, 9, 10), (11,)])
-async def test_what_is_written_is_read(lost: tuple[int, ...]) -> None:
+async def test_uploaded_items_are_downloaded_despite_lost_messages(lost: tuple[int, ...]) -> None:
     keeper = Keeper(*lost)
     await upload(keeper, ITEMS)
     assert await download(keeper) == ITEMS
@@ -79,19 +79,19 @@ async def test_what_is_written_is_read(lost: tuple[int, ...]) -> None:
 
 
 @pytest.mark.parametrize(("result", "why"), [(4, "no space"), (14, "denied"), (77, "result 77")])
-async def test_a_refusal_is_told(result: int, why: str) -> None:
+async def test_upload_raises_the_reason_of_a_refusal(result: int, why: str) -> None:
     with pytest.raises(AutopilotError, match=why):
         await upload(Keeper(result=result), ITEMS)
 
 
-async def test_a_vehicle_without_such_lists_is_told_apart() -> None:
+async def test_unsupported_list_raises_items_unsupported() -> None:
     with pytest.raises(ItemsUnsupported):
         await upload(Keeper(result=3), ITEMS)
     with pytest.raises(ItemsUnsupported):
         await download(Keeper(result=3))
 
 
-async def test_silence_ends_it() -> None:
+async def test_upload_and_download_raise_when_the_vehicle_is_silent() -> None:
     silent = range(1, 100)
     with pytest.raises(AutopilotError, match="stopped answering") as written:
         await upload(Keeper(*silent), ITEMS)
@@ -101,7 +101,7 @@ async def test_silence_ends_it() -> None:
     assert read.value.link
 
 
-async def test_without_a_vehicle_nothing_is_sent() -> None:
+async def test_nothing_is_sent_without_a_connected_vehicle() -> None:
     keeper = Keeper()
     keeper.target = None
     with pytest.raises(AutopilotError, match="not connected"):
@@ -111,7 +111,7 @@ async def test_without_a_vehicle_nothing_is_sent() -> None:
 @pytest.mark.parametrize(
     ("result", "kind"), [(mavlink.MAV_MISSION_ERROR, AutopilotError), (mavlink.MAV_MISSION_NO_SPACE, NoSpace)]
 )
-async def test_a_refusal_says_what_the_autopilot_says(result: int, kind: type[AutopilotError]) -> None:
+async def test_refusal_contains_the_status_text_of_the_autopilot(result: int, kind: type[AutopilotError]) -> None:
     keeper = Keeper(result=result)
     text = message("STATUSTEXT", severity=4, text=b"Invalid vertex count (2)")
     asyncio.get_running_loop().call_later(0.1, keeper.take, text)
@@ -119,7 +119,7 @@ async def test_a_refusal_says_what_the_autopilot_says(result: int, kind: type[Au
         await upload(keeper, ITEMS)
 
 
-async def test_a_lost_answer_to_the_last_item_is_no_refusal() -> None:
+async def test_lost_acknowledgement_of_the_last_item_is_not_a_refusal() -> None:
     class Finished(Keeper):
         """As ArduPilot, which answers ERROR to an item that it does not await."""
 
@@ -135,7 +135,7 @@ async def test_a_lost_answer_to_the_last_item_is_no_refusal() -> None:
     assert await download(keeper) == ITEMS
 
 
-async def test_an_item_that_came_twice_ends_no_upload() -> None:
+async def test_duplicate_item_does_not_end_the_upload() -> None:
     class Impatient(Keeper):
         """It asks for the second item again before that has come, and tells that the copy is out of order."""
 
@@ -156,6 +156,6 @@ async def test_an_item_that_came_twice_ends_no_upload() -> None:
     assert await download(keeper) == ITEMS
 
 
-async def test_a_vehicle_that_finds_everything_out_of_order_ends_it() -> None:
+async def test_persistent_invalid_sequence_ends_the_upload() -> None:
     with pytest.raises(AutopilotError, match="stopped answering"):
         await upload(Keeper(result=mavlink.MAV_MISSION_INVALID_SEQUENCE), ITEMS)

@@ -55,11 +55,11 @@ def measured(way_s: float, silence: Callable[[float], float] = lambda _now: 0.2)
     ("way_s", "timeout_s"),
     [(0.02, ACK_TIMEOUT_S), (0.5, 0.7), (1.0, 1.2), (2.0, 2.2), (2.9, MAX_ACK_TIMEOUT_S), (math.inf, ACK_TIMEOUT_S)],
 )
-def test_a_sending_is_lost_when_no_message_takes_as_long(way_s: float, timeout_s: float) -> None:
+def test_transmission_is_lost_after_the_longest_measured_delay(way_s: float, timeout_s: float) -> None:
     assert link(way_s).timeout_s == pytest.approx(timeout_s)
 
 
-async def test_the_answer_to_what_was_sent_again_does_not_deny_the_next_command() -> None:
+async def test_second_acknowledgement_of_a_repeated_command_does_not_deny_the_next_one() -> None:
     acks, first, later = link(), Answer(), Answer()
     acks.sent(SPEED, first, 0.0)
     acks.sent(SPEED, first, 0.7)
@@ -72,7 +72,7 @@ async def test_the_answer_to_what_was_sent_again_does_not_deny_the_next_command(
     assert later.result() == ACCEPTED
 
 
-async def test_nor_does_an_early_acceptance_let_a_denied_one_pass() -> None:
+async def test_earlier_acceptance_does_not_accept_a_denied_command() -> None:
     acks, first, later = link(), Answer(), Answer()
     for at in (0.0, 0.7):
         acks.sent(SPEED, first, at)
@@ -84,7 +84,7 @@ async def test_nor_does_an_early_acceptance_let_a_denied_one_pass() -> None:
 
 
 @pytest.mark.parametrize("way_s", [0.05, 0.5, 1.0, 2.0])
-async def test_a_lost_sending_takes_no_answer_from_the_next_command(way_s: float) -> None:
+async def test_lost_transmission_does_not_consume_the_next_acknowledgement(way_s: float) -> None:
     acks, first, later = link(way_s), Answer(), Answer()
     again = acks.timeout_s
     acks.sent(SPEED, first, 0.0)
@@ -96,7 +96,7 @@ async def test_a_lost_sending_takes_no_answer_from_the_next_command(way_s: float
     assert later.result() == DENIED
 
 
-async def test_an_answer_to_a_command_that_was_given_up_is_not_for_the_next() -> None:
+async def test_acknowledgement_of_an_abandoned_command_is_not_assigned_to_the_next() -> None:
     acks, first, later = link(), Answer(), Answer()
     acks.sent(SPEED, first, 0.0)
     first.cancel()
@@ -107,7 +107,7 @@ async def test_an_answer_to_a_command_that_was_given_up_is_not_for_the_next() ->
     assert later.result() == ACCEPTED
 
 
-async def test_a_link_that_gets_slow_still_answers() -> None:
+async def test_acknowledgements_are_assigned_while_the_link_becomes_slow() -> None:
     acks, answer = link(0.02), Answer()
     for at in (0.0, 0.7):
         acks.sent(SPEED, answer, at)
@@ -115,7 +115,7 @@ async def test_a_link_that_gets_slow_still_answers() -> None:
     assert answer.result() == ACCEPTED
 
 
-async def test_answers_that_stay_away_may_be_on_their_way() -> None:
+async def test_missing_acknowledgements_may_still_arrive() -> None:
     timing, first, later = measured(0.02, lambda now: now), Answer(), Answer()
     acks = Acknowledgements(245, timing)
     acks.sent(SPEED, first, 0.1)
@@ -125,7 +125,7 @@ async def test_answers_that_stay_away_may_be_on_their_way() -> None:
     assert not later.done()
 
 
-async def test_while_the_delay_is_not_known_late_answers_are_reckoned_with() -> None:
+async def test_late_acknowledgements_are_expected_while_the_delay_is_unknown() -> None:
     acks, first, later = link(math.inf), Answer(), Answer()
     for at in (0.0, 0.7, 1.4):
         acks.sent(SPEED, first, at)
@@ -138,7 +138,7 @@ async def test_while_the_delay_is_not_known_late_answers_are_reckoned_with() -> 
     assert later.result() == ACCEPTED
 
 
-async def test_progress_is_no_answer_and_keeps_the_sending_open() -> None:
+async def test_in_progress_keeps_the_transmission_open() -> None:
     acks, first, later = link(), Answer(), Answer()
     acks.sent(SPEED, first, 0.0)
     acks.take(ack(IN_PROGRESS), 1.0)
@@ -149,7 +149,7 @@ async def test_progress_is_no_answer_and_keeps_the_sending_open() -> None:
     assert not later.done()
 
 
-async def test_answers_to_others_and_of_other_commands_are_left_alone() -> None:
+async def test_acknowledgements_for_other_systems_and_commands_are_ignored() -> None:
     acks, answer = link(), Answer()
     acks.sent(SPEED, answer, 0.0)
     acks.take(ack(DENIED, target=255), 0.5)
@@ -159,7 +159,7 @@ async def test_answers_to_others_and_of_other_commands_are_left_alone() -> None:
     assert answer.result() == ACCEPTED
 
 
-async def test_a_frame_that_a_network_doubles_answers_once() -> None:
+async def test_duplicate_frame_is_ignored() -> None:
     autopilot, parser, acks, first, later = Endpoint(1, 1), Parser(), link(0.05), Answer(), Answer()
 
     def heard(result: int) -> Message:
@@ -176,7 +176,7 @@ async def test_a_frame_that_a_network_doubles_answers_once() -> None:
     assert later.result() == DENIED
 
 
-async def test_a_connection_that_broke_owes_no_answers(caplog: pytest.LogCaptureFixture) -> None:
+async def test_transmissions_are_dropped_when_the_connection_breaks(caplog: pytest.LogCaptureFixture) -> None:
     acks, before, after = link(), Answer(), Answer()
     acks.sent(SPEED, before, 0.0)
     acks.forget()
@@ -190,14 +190,14 @@ async def test_a_connection_that_broke_owes_no_answers(caplog: pytest.LogCapture
     assert after.result() == ACCEPTED
 
 
-async def test_a_vehicle_that_acknowledges_nothing_does_not_fill_the_memory() -> None:
+async def test_number_of_open_transmissions_is_limited() -> None:
     acks = link()
     for at in range(10 * MAX_OPEN):
         acks.sent(SPEED, Answer(), float(at))
     assert len(acks._sent[SPEED]) == MAX_OPEN
 
 
-async def test_what_is_sent_later_overtakes() -> None:
+async def test_later_command_overtakes_an_unanswered_one() -> None:
     acks, first, later = link(), Answer(), Answer()
     acks.sent(MODE, first, 0.0)
     assert not acks.overtaken(MODE, first)

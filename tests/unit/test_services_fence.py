@@ -24,7 +24,7 @@ def link(monkeypatch: pytest.MonkeyPatch) -> tuple[MavlinkAutopilot, list[Any]]:
     return autopilot, sent
 
 
-async def test_a_command_is_not_sent_again_once_it_is_overtaken(link: tuple[MavlinkAutopilot, list[Any]]) -> None:
+async def test_command_is_not_repeated_after_a_later_command(link: tuple[MavlinkAutopilot, list[Any]]) -> None:
     autopilot, sent = link
     autopilot.target, autopilot.vehicle.heartbeat_at = (1, 1), asyncio.get_running_loop().time()
 
@@ -37,7 +37,7 @@ async def test_a_command_is_not_sent_again_once_it_is_overtaken(link: tuple[Mavl
     assert len(sent) == 1
 
 
-async def test_no_duty_no_heartbeat(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_no_heartbeat_is_sent_while_the_companion_does_not_work(monkeypatch: pytest.MonkeyPatch) -> None:
     duty, sent = False, list[Any]()
     autopilot = MavlinkAutopilot("tcp:127.0.0.1:1", ARDUCOPTER, alive=lambda: duty)
     monkeypatch.setattr(autopilot, "send", sent.append)

@@ -63,7 +63,7 @@ def report(told: Vehicle, now: float = 10.0, flags: int = ARDUPILOT_4_6, **more:
     yaw=st.floats(-180, 180),
     heading=st.floats(0, 359),
 )
-def test_the_quaternion_turns_the_camera(roll: float, pitch: float, yaw: float, heading: float) -> None:
+def test_attitude_matches_the_quaternion(roll: float, pitch: float, yaw: float, heading: float) -> None:
     status = message("GIMBAL_DEVICE_ATTITUDE_STATUS", q=quaternion(roll, pitch, yaw), flags=ARDUPILOT_4_6)
     found = attitude_of(status, heading)
     assert found is not None
@@ -81,7 +81,7 @@ def test_the_quaternion_turns_the_camera(roll: float, pitch: float, yaw: float, 
         (NORTH | mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK, 30.0),
     ],
 )
-def test_yaw_counts_from_where_the_flags_say(flags: int, yaw_deg: float) -> None:
+def test_yaw_reference_follows_the_flags(flags: int, yaw_deg: float) -> None:
     found = report(vehicle(heading_deg=90.0), flags=flags)
     assert found is not None
     assert (found.pitch_deg, found.yaw_deg) == (pytest.approx(-45.0), pytest.approx(yaw_deg))
@@ -105,18 +105,18 @@ def test_yaw_counts_from_where_the_flags_say(flags: int, yaw_deg: float) -> None
         {"q": (1.1, 0.0, 0.0, 0.0)},
     ],
 )  # fmt: skip
-def test_what_is_not_sure_is_unknown_at_once(told: dict[str, Any]) -> None:
+def test_ambiguous_attitude_is_unknown(told: dict[str, Any]) -> None:
     drone = vehicle()
     assert report(drone) is not None
     assert report(drone, 10.1, **told) is None
 
 
 @pytest.mark.parametrize("kind", [None, 0.0, SERVO, 2.0, 4.0, 7.0, 9.0, 13.0, 99.0])
-def test_where_a_gimbal_was_told_to_point_is_not_where_it_points(kind: float | None) -> None:
+def test_attitude_of_a_gimbal_that_reports_its_target_is_unknown(kind: float | None) -> None:
     assert report(vehicle(kind)) is None
 
 
-def test_another_type_counts_from_the_next_start_on() -> None:
+def test_changed_gimbal_type_takes_effect_after_a_restart() -> None:
     drone = vehicle(SERVO)
     drone.take(message("PARAM_VALUE", param_id=b"MNT1_TYPE", param_value=SIYI), 10.0)
     assert report(drone) is None, "the servos are still driven"
@@ -125,14 +125,14 @@ def test_another_type_counts_from_the_next_start_on() -> None:
     assert report(drone) is not None
 
 
-def test_a_second_gimbal_is_not_the_cameras() -> None:
+def test_second_gimbal_is_ignored() -> None:
     drone = vehicle()
     first = report(drone)
     assert report(drone, 10.2, gimbal_device_id=2, q=quaternion(0, 0, 0)) == first
     assert drone.gimbal_at == 10.0
 
 
-def test_it_is_as_old_as_the_heading_that_its_yaw_counts_from() -> None:
+def test_gimbal_attitude_is_as_old_as_the_heading() -> None:
     drone = vehicle()
     report(drone, 10.8)
     assert drone.gimbal_at == 10.0
@@ -166,14 +166,14 @@ LIMITS = {"pitch_min": -90.0, "pitch_max": 20.0, "yaw_min": -180.0, "yaw_max": 1
 
 
 @pytest.mark.parametrize("limits", [None, LIMITS])
-async def test_it_is_pointed_without_rates(limits: dict[str, float] | None) -> None:
+async def test_point_sends_no_rates(limits: dict[str, float] | None) -> None:
     autopilot = Commanded(limits=limits)
     await point(autopilot, -90.0, 180.0, always)
     assert autopilot.sent[0][:3] == (mavlink.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW, -90.0, 180.0)
     assert all(math.isnan(rate) for rate in autopilot.sent[0][3:])
 
 
-async def test_a_gimbal_that_does_not_turn_that_far_is_not_asked() -> None:
+async def test_point_refuses_angles_outside_of_the_limits() -> None:
     autopilot = Commanded(limits=LIMITS)
     with pytest.raises(PreconditionFailed, match="pitch is limited to -90 to 20 degrees; 45 was requested"):
         await point(autopilot, 45.0, 0.0, always)
@@ -187,12 +187,12 @@ async def test_a_gimbal_that_does_not_turn_that_far_is_not_asked() -> None:
         (AutopilotError("no answer", link=True), AutopilotError, "no answer"),
     ],
 )
-async def test_what_goes_wrong_is_told(error: AutopilotError, raised: type[Exception], said: str) -> None:
+async def test_point_raises_the_reason_of_a_failure(error: AutopilotError, raised: type[Exception], said: str) -> None:
     with pytest.raises(raised, match=said):
         await point(Commanded(error), -45.0, 0.0, always)
 
 
-async def test_a_driver_that_has_lost_the_drone_points_nothing() -> None:
+async def test_point_sends_nothing_without_permit() -> None:
     def refused() -> None:
         raise PreconditionFailed("ControlLost", "gone")
 

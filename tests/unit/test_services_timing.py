@@ -370,7 +370,7 @@ def test_what_our_own_loop_delays_counts() -> None:
     assert timing.delay_s == pytest.approx(0.4, abs=0.01)
 
 
-def test_one_position_from_long_ago_is_none_and_two_that_go_on_from_there_are_of_a_vehicle_that_has_restarted() -> None:
+def test_restarted_vehicle_is_detected_after_two_consistent_old_timestamps() -> None:
     timing = Timing()
     for number in range(100):
         assert timing.sampled(60_000 + 50 * number, 1.0 + 0.05 * number) is not None

@@ -38,13 +38,13 @@ def link(connected: bool) -> tuple[Any, Socket, list[bytes]]:
     return made, socket, heard
 
 
-def test_a_connected_link_speaks_first() -> None:
+def test_udpout_sends_before_it_receives() -> None:
     made, socket, _ = link(connected=True)
     made.write(b"hello")
     assert socket.sent == [(b"hello", None)]
 
 
-def test_a_listening_link_belongs_to_the_first_autopilot(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_udpin_accepts_only_the_first_autopilot(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
     monkeypatch.setattr(transport.time, "monotonic", lambda: now[0])
     made, socket, heard = link(connected=False)
@@ -65,7 +65,7 @@ def test_a_listening_link_belongs_to_the_first_autopilot(monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "192.168.1.7", "drone.example"])
-def test_listening_to_other_hosts_is_refused(host: str) -> None:
+def test_udpin_refuses_addresses_other_than_loopback(host: str) -> None:
     with pytest.raises(BadUrl, match=r"use udpin:127\.0\.0\.1"):
         asyncio.run(open_link(f"udpin:{host}:14550", lambda _data: None, lambda _error: None))
 
@@ -99,7 +99,7 @@ class Line:
                 await self.news.wait()
 
 
-async def test_a_serial_line_carries_bytes_both_ways() -> None:
+async def test_serial_line_transfers_bytes_in_both_directions() -> None:
     line = Line()
     link = await line.open()
     sent = bytes(range(256))  # with what terminals make of control characters left alone
@@ -113,7 +113,7 @@ async def test_a_serial_line_carries_bytes_both_ways() -> None:
     assert not line.closed
 
 
-async def test_a_serial_line_that_is_unplugged_breaks_once() -> None:
+async def test_unplugged_serial_line_is_closed_once() -> None:
     line = Line()
     link = await line.open()
     os.close(line.far)
@@ -122,7 +122,7 @@ async def test_a_serial_line_that_is_unplugged_breaks_once() -> None:
     assert len(line.closed) == 1
 
 
-async def test_a_serial_line_that_takes_nothing_blocks_no_writer() -> None:
+async def test_full_serial_line_does_not_block() -> None:
     line = Line()
     link = await line.open()
     for _ in range(100):
@@ -132,7 +132,7 @@ async def test_a_serial_line_that_takes_nothing_blocks_no_writer() -> None:
     os.close(line.far)
 
 
-async def test_no_serial_line(tmp_path: Path) -> None:
+async def test_invalid_serial_line_raises(tmp_path: Path) -> None:
     plain = tmp_path / "file"
     plain.touch()
     for device in (plain, tmp_path / "gone"):

@@ -75,7 +75,7 @@ def start(
 
 
 @pytest.mark.parametrize("url", [None, URL])
-def test_a_drone_in_flight_hears_heartbeats_while_the_service_starts(
+def test_heartbeats_are_sent_to_a_drone_in_flight_during_the_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, url: str | None
 ) -> None:
     air = Air()
@@ -83,14 +83,12 @@ def test_a_drone_in_flight_hears_heartbeats_while_the_service_starts(
     assert air.opened == [URL, URL]
 
 
-def test_a_start_that_takes_too_long_leaves_the_drone_to_its_failsafe(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_heartbeats_stop_when_the_start_takes_too_long(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     beats = start(Air(), served(tmp_path), monkeypatch, takes_s=60.0)
     assert startup_heartbeat.TIMEOUT_S - 1.5 < beats[-1] <= startup_heartbeat.TIMEOUT_S
 
 
-def test_a_start_that_fails_leaves_the_next_one_no_heartbeats(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_heartbeats_are_sent_after_a_failed_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     served(tmp_path)
     assert start(Air(), tmp_path, monkeypatch)
     air = Air()
@@ -105,11 +103,13 @@ def test_a_start_that_fails_leaves_the_next_one_no_heartbeats(tmp_path: Path, mo
     [Air(armed=False), Air(state=mavlink.MAV_STATE_STANDBY), Air(state=mavlink.MAV_STATE_CRITICAL), Air(sysid=2)],
     ids=["stands", "on the ground", "failsafe acts", "another vehicle"],
 )
-def test_no_one_else_hears_heartbeats(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, air: Air) -> None:
+def test_no_heartbeats_are_sent_to_other_vehicles_or_states(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, air: Air
+) -> None:
     assert start(air, served(tmp_path), monkeypatch) == []
 
 
-def test_another_link_or_an_unknown_vehicle_is_not_spoken_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_sent_to_another_url_or_an_unknown_vehicle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     air = Air()
     assert start(air, served(tmp_path), monkeypatch, url="tcp:127.0.0.1:5760") == []
     (tmp_path / "vehicle.json").unlink()
@@ -117,7 +117,7 @@ def test_another_link_or_an_unknown_vehicle_is_not_spoken_to(tmp_path: Path, mon
     assert air.opened == []
 
 
-def test_a_broken_link_keeps_no_service_from_starting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_broken_link_does_not_prevent_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Broken(Air):
         async def open_link(self, url: str, receive: Any, closed: Any) -> Air:
             raise ValueError(url)

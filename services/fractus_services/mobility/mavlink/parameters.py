@@ -81,13 +81,13 @@ class Parameters:
         self._absent: set[str] = set()
 
     def take(self, told: Message) -> None:
-        """Hear a PARAM_VALUE: an answer, or the news that another station changed something."""
+        """Process a PARAM_VALUE: an answer, or a report that another station changed a parameter."""
         name, value = told.text("param_id"), told.real("param_value")
         index, size = told.integer("param_index"), told.integer("param_count")
         self._number += 1
         before, self.told[name], self._heard[name] = self.told.get(name), value, self._number
         self._absent.discard(name)
-        # Answers to names have index 65535; those of the list count, until switching a part on changes its length.
+        # Answers to requests by name have index 65535. Indices of the list count until an enabled feature changes its length.
         if index < size:
             if size != self._size:
                 self._size, self._list = size, {}
@@ -102,11 +102,11 @@ class Parameters:
         self._request(name.encode(), -1)
 
     async def read(self, wanted: Iterable[Spellings]) -> dict[str, float]:
-        """The parameters that the vehicle has of those wanted, each under the name by which it has it, as it tells them now.
+        """Return the wanted parameters that the vehicle has, each under the name that the vehicle uses.
 
         Raises:
-            ParameterLost: for one of them it is not known.
-            AutopilotError: the vehicle is not connected.
+            ParameterLost: The value or the existence of a parameter is unknown.
+            AutopilotError: The vehicle is not connected.
         """
         begun, asked = self._number, tuple(wanted)
         wanted = [names for names in asked if not self._absent.issuperset(names)]

@@ -93,7 +93,8 @@ class Timing:
             if -OVERTAKEN_S < later_s <= 0.0:
                 return None
             if later_s <= 0.0:
-                # One from long ago that a network delivers now is no place to fly by: a vehicle that has restarted goes on from there.
+                # A position from long ago may be delivered very late and must be ignored. After a restart of the vehicle, further
+                # positions continue from it.
                 begun_ms, self._begun_ms = self._begun_ms, boot_ms
                 if begun_ms is None or not 0 < boot_ms - begun_ms < OVERTAKEN_S * 1e3:
                     return None
@@ -103,8 +104,8 @@ class Timing:
                 self.reset()
         self._begun_ms = None
         if now - self._arrived_at > MAX_POSITION_AGE_S:
-            # What was sent while nothing came measures the gap, not the link that is back. And what a connection kept
-            # meanwhile comes all at once: nothing of it says how fast the vehicle's clock runs.
+            # Requests sent during an interruption measure the interruption, not the link. Messages that a connection kept meanwhile
+            # arrive at once and show nothing about the pace of the clock.
             self._asked.clear()
             self._resumed_at = now
             self._history.clear()
@@ -148,10 +149,10 @@ class Timing:
         since_s = now - self._history[0][0]
         if since_s < RATE_S[0]:
             return
-        # A position that came late makes the clock seem fast as long as it is the first; its neighbour was in time.
+        # A late position makes the clock seem fast while it is the first one in the history. The next one was in time.
         rate = min((self._sampled - first) / (now - begun) for begun, first in islice(self._history, 2))
         error = (max(self.delay_s, 0.0) + 0.1) / since_s
-        # The error grows with what is measured by it: a delay that is not known does not count.
+        # The error grows with the measured delay, so an unknown delay does not count.
         self.pace = rate + min(error, 0.1 * rate) if rate > 1.0 + min(error, 1.0) else 1.0
 
     def request(self, due: float) -> int | None:
@@ -185,9 +186,10 @@ class Timing:
             self._take(max(delay_s, 0.0), sent, now)
 
     def acknowledged(self, sent: float, now: float) -> None:
-        """Take the acknowledgement of a command: of a vehicle that answers no TIMESYNC its round trip is the bound.
+        """Process the acknowledgement of a command.
 
-        A command that was sent again until the link was back measures the gap.
+        If the vehicle does not answer TIMESYNC, the round trip of the command is the bound. A command that was repeated until the link
+        recovered measures the interruption and does not count.
         """
         resumed = sent >= self._resumed_at and now - self._arrived_at <= MAX_POSITION_AGE_S
         if self.unanswering and resumed:
@@ -195,7 +197,7 @@ class Timing:
 
     @property
     def unanswering(self) -> bool:
-        """Whether the vehicle answers no TIMESYNC."""
+        """True if the vehicle does not answer TIMESYNC."""
         return self._unanswered >= UNANSWERED
 
     def _take(self, delay_s: float, sent: float, now: float) -> None:
@@ -206,7 +208,7 @@ class Timing:
 
     @property
     def delay_s(self) -> float:
-        """The longest delay of late, there and back, in the vehicle's seconds; infinite while there is none."""
+        """Longest recent round-trip delay in seconds of the vehicle's clock; infinite without measurements."""
         return max((delay_s for _, delay_s, _ in self._delays), default=math.inf)
 
     def downlink_latency_s(self, now: float) -> float:
@@ -227,7 +229,7 @@ class Timing:
         if now - self._heard_at > STALE_S or self.delay_s > MAX_DELAY_S:
             return math.inf
         age_s = self._present(now) - self._sampled
-        # By waiting alone nothing gets slower than can be flown with: one request may be lost, and the next one answered.
+        # Waiting alone never makes the link too slow to fly: one request may be lost and the next one answered.
         delay_s = min(self.delay_s + self.pace * self._overdue_s(now), MAX_DELAY_S)
         return age_s + delay_s + REACTION_S if age_s <= MAX_POSITION_AGE_S else math.inf
 
@@ -237,7 +239,7 @@ class Timing:
         The first slow answer arrives late. Until then the link counts as slower by this time at least.
         """
         if self.unanswering and now - self._answered > STALE_S:
-            return 0.0  # It is measured by its acknowledgements; before that, its answers may only have become slow.
+            return 0.0  # Acknowledgements measure this vehicle. Before that, its answers may only have become slow.
         waiting = min((sent for sent, _ in self._asked.values() if sent > self._answered), default=now)
         return max(now - waiting - self.answer_s, 0.0)
 

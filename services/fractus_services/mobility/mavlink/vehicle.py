@@ -114,7 +114,7 @@ def _position(vehicle: Vehicle, message: Message, now: float) -> None:
     vehicle.north_mps, vehicle.east_mps, vehicle.down_mps = (message.integer(name) / 100 for name in ("vx", "vy", "vz"))
     told_s = message.integer("time_boot_ms") / 1e3
     vehicle.courses.append((told_s, vehicle.north_mps, vehicle.east_mps))
-    # Also those of before a restart.
+    # Also drop velocities from before a restart.
     while not told_s - COURSE_S <= vehicle.courses[0][0] <= told_s:
         vehicle.courses.popleft()
     heading_cdeg = message.integer("hdg")
@@ -125,7 +125,7 @@ def _position(vehicle: Vehicle, message: Message, now: float) -> None:
 
 def _attitude(vehicle: Vehicle, message: Message, now: float) -> None:
     angles = [math.degrees(message.real(name)) for name in ("roll", "pitch", "yaw")]
-    # One that a later one has overtaken says nothing of now.
+    # An attitude that was overtaken by a later one is outdated.
     if all(map(math.isfinite, angles)) and now >= vehicle.attitude_at:
         vehicle.roll_deg, vehicle.pitch_deg, vehicle.heading_deg = angles[0], angles[1], angles[2] % 360.0
         vehicle.attitude_at = now

@@ -9,12 +9,12 @@ DEEP = bool(os.environ.get("FRACTUS_DEEP"))
 
 
 def examples(deep: int, quick: int | None = None) -> int:
-    """The number of examples of a test: `deep` in a deep run; else `quick`, or a quarter of `deep`."""
+    """Return the number of examples of a test: `deep` in a deep run, otherwise `quick` or a quarter of `deep`."""
     return deep if DEEP else quick or max(deep // 4, 10)
 
 
 def cells(*axes: Iterable[Any], quick: list[Any]) -> list[Any]:
-    """The cells of a table that a test tries: all of them in a deep run; else those of `quick`, which must be among them."""
+    """Return the parameter combinations of a test: all in a deep run, otherwise `quick`, a subset of them."""
     table = list(product(*axes)) if len(axes) > 1 else list(*axes)
     assert all(cell in table for cell in quick)
     return table if DEEP else quick

@@ -39,7 +39,7 @@ ZONES = {
 
 
 def problems(arguments: str) -> list[str]:
-    """Return what is wrong with the arguments of `fractus`: unknown commands and options."""
+    """Return the unknown commands and options in arguments of `fractus`."""
     words = shlex.split(arguments)
     command: click.Command = fractus
     context = click.Context(command)

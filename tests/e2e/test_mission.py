@@ -28,7 +28,7 @@ STILL_AT_WORK = ",!fractus.dev/finished"
 
 
 def all_stopped(pods: list[Object]) -> list[Object]:
-    """Finished pods once no container of theirs runs: their nodes' resources are free."""
+    """Return the pods if all have finished, otherwise an empty list."""
     return pods if pods and all(pod["status"]["phase"] in {"Succeeded", "Failed"} for pod in pods) else []
 
 
@@ -57,7 +57,7 @@ def test_traffic_monitoring_flies_under_policies(grounded: Kube) -> None:
     kube.wait("all pods of the example are Ready", lambda: ready(kube, "traffic-monitoring"), timeout_s=60)
     print(f"apply to all pods Ready: {time.monotonic() - started:.1f} s")
     kept = secrets(kube)
-    said = {f"{what} in flight": text for what, text in readable(kube).items()}
+    texts = {f"{name} in flight": text for name, text in readable(kube).items()}
 
     plan = kube.get("deploymentplan", "traffic-monitoring")
     placed = {(p["component"], p.get("node")) for p in plan["spec"]["placements"]}
@@ -102,8 +102,8 @@ def test_traffic_monitoring_flies_under_policies(grounded: Kube) -> None:
 
     assert {f"{SYSTEM}/fractus-ca/tls.key", f"key of {DRONE}"} <= kept.keys()
     assert any(re.fullmatch(r"default/traffic-monitoring-navigator\b.*-tls/tls\.key", name) for name in kept)
-    said |= readable(kube) | {"audit log": audit_text(kube)}
-    assert leaks(said, kept) == []
+    texts |= readable(kube) | {"audit log": audit_text(kube)}
+    assert leaks(texts, kept) == []
 
 
 def test_deleted_application_flies_the_drone_home(grounded: Kube) -> None:
@@ -129,11 +129,11 @@ def test_status_has_the_last_output_of_a_failed_component(grounded: Kube) -> Non
         found = condition(kube.get("application.fractus.dev", "failing"), "Ready")
         return found if found.get("reason") == "ComponentFailed" else None
 
-    told = kube.wait("its failure is told", failed, timeout_s=120)
-    last_words = "failed with exit code 1: no route to the river"
-    assert last_words in told["message"]
+    failure = kube.wait("its failure is reported", failed, timeout_s=120)
+    last_output = "failed with exit code 1: no route to the river"
+    assert last_output in failure["message"]
     messages = [e["message"] for e in kube.all("events", "default") if e["reason"] == "ComponentFailed"]
-    assert any(last_words in message for message in messages)
+    assert any(last_output in message for message in messages)
 
 
 def test_application_deleted_without_operator_leaves_no_objects(grounded: Kube) -> None:

@@ -95,7 +95,9 @@ def test_backup_is_restored_into_another_cluster_and_uninstalled(
     (folder / "values.yaml").write_text(yaml.safe_dump(values))
     for line in RESTORE:
         shell.type(line)
-    assert found.api.get(f"{FRACTUS}/drones/drone-1"), "before the agents, who would make it of what the node says"
+    assert found.api.get(f"{FRACTUS}/drones/drone-1"), (
+        "the Drone is restored before an agent can create it from the node description"
+    )
     found.drone_status("drone-1", "inactive")
     again = OperatorProcess(found.plane.kubeconfig, folder / "found.log")
     again.start()
@@ -114,7 +116,7 @@ def test_backup_is_restored_into_another_cluster_and_uninstalled(
         found.api.merge(f"{FRACTUS}/drones/drone-1", {"spec": {"home": at(9, 9, alt=9)}})
         shell.type("kubectl apply -f fractus.yaml")
         assert written(found) == before
-        # As it is kept in version control, which knows of no finalizer: the operator sets it again.
+        # The manifest from version control has no finalizer. The operator adds it again.
         shell.type("kubectl apply -f application.yaml")
         wait_for(lambda: written(found) == before, "the application to be as it was")
         shell.type(REMOVE[0])
@@ -129,14 +131,14 @@ INSIDE = "deployments,daemonsets,jobs,services,serviceaccounts,roles,rolebinding
 
 
 def remove(world: World, shell: Shell) -> None:
-    """Remove Fractus without helm's hooks, for which there is no kubelet here, as docs/upgrades.md does by hand."""
+    """Uninstall Fractus without helm's hooks, as docs/upgrades.md describes, because hooks need a kubelet."""
     world.api.merge(
         "/api/v1/nodes/drone-1", {"spec": {"taints": [{"key": "fractus.dev/class", "effect": "NoExecute"}]}}
     )
-    # As its agent reports once its Grants are gone.
+    # The status that the agent reports after its Grants are deleted.
     world.drone_status("drone-1", "inactive")
     attempt = f"kubectl -n {SYSTEM} delete daemonset fractus-mobility --dry-run=server || true"
-    wait_for(lambda: "deleted" in shell.type(attempt), "the policies to know that no drone is in the air")
+    wait_for(lambda: "deleted" in shell.type(attempt), "the admission policies to know that no drone is in the air")
     for line in REMOVE:
         if re.search(r"uninstall fractus(-crds)?$", line):
             shell.type(f"{line} --no-hooks")
@@ -145,7 +147,7 @@ def remove(world: World, shell: Shell) -> None:
             shell.type(line)
     for begins in ("kubectl delete crd", "kubectl label nodes", "kubectl taint nodes"):
         (line,) = re.findall(rf"`({begins}[^`]*)`", (ROOT / "docs/upgrades.md").read_text())
-        # Of nodes without that taint it says so, by its code as well.
+        # kubectl exits with 1 if nodes lack the taint.
         shell.type(line, code=1 if "taint" in line else 0)
     assert "fractus" not in shell.type(f"kubectl get {EVERYWHERE} -o name")
     assert "fractus" not in shell.type(f"kubectl get -n {SYSTEM} {INSIDE} -o name")

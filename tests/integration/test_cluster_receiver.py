@@ -25,7 +25,7 @@ def layout(tmp_path: Path) -> Layout:
 
 
 def buildah(*arguments: str) -> str:
-    """Run buildah; an image of ours alone, so no other is touched."""
+    """Run buildah. Tests use images of their own names only."""
     done = subprocess.run(["buildah", *arguments], capture_output=True, text=True, timeout=60, check=True)
     return done.stdout.strip()
 

@@ -1,4 +1,4 @@
-"""The search for secrets finds each of them, however it is written, and takes nothing else for one."""
+"""The search for secrets finds each in all encodings, and has no false positives."""
 
 from __future__ import annotations
 
@@ -44,23 +44,23 @@ PLANTED = {
 
 
 @pytest.mark.parametrize("text", PLANTED.values(), ids=PLANTED)
-def test_a_secret_is_found(text: str) -> None:
+def test_secret_is_found_in_each_encoding(text: str) -> None:
     assert leaks({"log": f"agent: starts {text} and goes on"}, {"key": KEY, "password": PASSWORD})
 
 
-def test_it_is_said_where_and_which() -> None:
-    told = {"log": "fine", "status": PASSWORD.decode()}
-    assert leaks(told, {"key": KEY, "password": PASSWORD}) == ["status tells password"]
+def test_finding_names_the_text_and_the_secret() -> None:
+    texts = {"log": "fine", "status": PASSWORD.decode()}
+    assert leaks(texts, {"key": KEY, "password": PASSWORD}) == ["status contains password"]
 
 
-def test_what_is_public_is_no_secret() -> None:
+def test_public_values_are_not_findings() -> None:
     certificate = DATA["tls.crt"].decode()
     der = PRIVATE.public_key().public_bytes(serialization.Encoding.DER, serialization.PublicFormat.SubjectPublicKeyInfo)
-    told = [
+    texts = [
         certificate,
         base64.b64encode(DATA["tls.crt"]).decode(),
         base64.b64encode(der).decode(),
         der.hex(),
         "eyJ.eyJ.x",
     ]
-    assert leaks({str(n): text for n, text in enumerate(told)}, {"key": KEY, "certificate": DATA["tls.crt"]}) == []
+    assert leaks({str(n): text for n, text in enumerate(texts)}, {"key": KEY, "certificate": DATA["tls.crt"]}) == []

@@ -1,4 +1,4 @@
-# The pods' network of a node of kind: what the plugins need to be told, and routes to the pods of the other nodes.
+# Pod network of a node: configuration of the CNI plugins, and routes to the pods of other nodes.
 set -eu
 cd /tmp
 while true; do

@@ -1,4 +1,4 @@
-"""Requests from the wire, as any component may send them: they are refused with a reason, or judged."""
+"""Fuzz requests to the mobility service: each is refused with a reason, or judged by the engine."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ REPLIES = {"allow", "correct", "deny"}
 
 
 def wire(message: bytes) -> Call:
-    """What a message asks for."""
+    """Decode a message into the call that it requests."""
     return proto_conversion.call_of(mobility_pb2.CheckCallRequest.FromString(message))
 
 
 def numbers(given: atheris.FuzzedDataProvider) -> Call:
-    """A call with any numbers, also such as are none."""
+    """Return a call with arbitrary numbers, NaN and infinity included."""
     which = given.ConsumeIntInRange(0, 2)
     if which == 0:
         request = mobility_pb2.GotoRequest(acceptance_radius_m=number(given, 10), speed_mps=number(given, 20))
@@ -51,7 +51,7 @@ def numbers(given: atheris.FuzzedDataProvider) -> Call:
 
 
 def one(data: bytes) -> None:
-    """One request: of these bytes, or of numbers that they give."""
+    """Judge one request, decoded from the bytes or built from numbers that they select."""
     try:
         call = wire(data[1:]) if data[:1] < b"\x40" else numbers(atheris.FuzzedDataProvider(data[1:]))
     except (DecodeError, Refused):

@@ -50,11 +50,11 @@ PLACES_M = [80.0, 0.0, 21.0]
 """North of home; the private zone reaches 20 m."""
 PATHS = ["../../other.jpg", "../other.json", "/etc/passwd", "20260601120000000-0000.jpg/..", "a" * 20_000, "\0", ".jpg"]
 logging.disable(logging.CRITICAL)
-os.fsync = os.fdatasync = lambda _file: None  # a power cut is not what is looked for
+os.fsync = os.fdatasync = lambda _file: None  # durability is not tested
 
 
 class Shutter:
-    """A camera that gives noise at once, or nothing."""
+    """A camera that returns a grey picture at once, or fails."""
 
     latency_s = 0.0
 
@@ -70,7 +70,7 @@ class Shutter:
 
 
 class Service:
-    """A camera service of two components, on a drone that stands where it is told to."""
+    """A camera service with two components, on a drone at a position that the fuzzer sets."""
 
     def __init__(self) -> None:
         self.drone, self.shutter, self.grants = Drone(), Shutter(), Grants()
@@ -97,12 +97,12 @@ class Service:
 
 @functools.cache
 def of(identity: str, days: int = 36500) -> bytes:
-    """The certificate of one caller, which is made once."""
+    """Return the certificate of a caller, from a cache."""
     return certificate(identity, days=days)
 
 
 async def calls(given: atheris.FuzzedDataProvider) -> None:
-    """Up to a dozen calls, one after the other or at once."""
+    """Make up to twelve calls, in sequence or in parallel."""
     service = Service()
     chains = [(of(FIRST.identity),), (of(SECOND.identity),), *STRANGE, (of(FIRST.identity, 1),)]
     running: list[asyncio.Task[None]] = []
@@ -135,7 +135,7 @@ async def _ended(running: list[asyncio.Task[None]]) -> None:
 
 
 def _named(given: atheris.FuzzedDataProvider, service: Service, name: str) -> bytes:
-    """A request for a size that there is, or a picture that there is, for its owner and for others."""
+    """Return a request for a valid size or an existing picture, of the caller or of the other component."""
     if name == "CaptureImage":
         sizes = [0, 16, 48, 64, 2**32 - 1]
         return bytes(
@@ -151,12 +151,12 @@ def _named(given: atheris.FuzzedDataProvider, service: Service, name: str) -> by
 
 
 async def one_call(service: Service, name: str, body: bytes, context: Context, caller: ActiveGrant | None) -> None:
-    """Make it, and look at what is answered."""
+    """Make a call and check its reply."""
     answer = await called(service.handlers[name], body, context)
     if answer is None and not context.written:
-        assert context.code is not None, f"{name} has no answer"
+        assert context.code is not None, f"{name} has no reply"
         return
-    assert caller is not None, f"{name} of a stranger is answered"
+    assert caller is not None, f"{name} of a caller without Grant is allowed"
     own = service.names.setdefault(caller.identity, [])
     if name == "CaptureImage":
         private_here = abs(service.drone.y) < 20
@@ -170,7 +170,7 @@ async def one_call(service: Service, name: str, body: bytes, context: Context, c
 
 
 def one(data: bytes) -> None:
-    """One sequence."""
+    """Run one sequence of calls."""
     OTHERS.write_bytes(b"other")
     fly(lambda: calls(atheris.FuzzedDataProvider(data)))
 

@@ -1,4 +1,4 @@
-"""Requests of other components, with any ids and attempts: each is carried out once, or refused with a status that says why."""
+"""Fuzz requests between components, with any ids and attempts: each runs once, or is refused with a status."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ class Context:
 
 
 class Peer:
-    """A component that answers, and counts what it carried out."""
+    """A component that replies, and counts the requests it has executed."""
 
     def __init__(self, given: atheris.FuzzedDataProvider) -> None:
         self._given = given
         self.done: Counter[tuple[str, bytes]] = Counter()
 
     async def handle(self, request: Request) -> bytes:
-        """Carry it out, refuse it for now or for good."""
+        """Execute a request, or refuse it temporarily or permanently."""
         assert request.attempt >= 0
         await asyncio.sleep(0.1)
         how = self._given.ConsumeIntInRange(0, 7)
@@ -56,7 +56,7 @@ class Peer:
 
 
 async def requests(given: atheris.FuzzedDataProvider) -> None:
-    """Up to a dozen, of a few ids."""
+    """Send up to twelve requests with few ids."""
     peer = Peer(given)
     method = Responder({}, 0)._method("M", peer.handle).unary_unary
 
@@ -70,16 +70,16 @@ async def requests(given: atheris.FuzzedDataProvider) -> None:
 
     running: list[asyncio.Task[Any]] = []
     for _ in range(given.ConsumeIntInRange(1, 12)):
-        said: list[tuple[str, str | bytes]] = []
+        metadata: list[tuple[str, str | bytes]] = []
         if given.ConsumeIntInRange(0, 7):
-            said.append(
+            metadata.append(
                 (ID_HEADER, given.PickValueInList(IDS) if given.ConsumeBool() else given.ConsumeUnicodeNoSurrogates(80))
             )
         if given.ConsumeIntInRange(0, 3):
-            said.append((ATTEMPT_HEADER, given.PickValueInList(ATTEMPTS)))
+            metadata.append((ATTEMPT_HEADER, given.PickValueInList(ATTEMPTS)))
         if not given.ConsumeIntInRange(0, 7):
-            said.append((given.PickValueInList([ID_HEADER, ATTEMPT_HEADER]), given.ConsumeUnicodeNoSurrogates(10)))
-        task = asyncio.ensure_future(call(given.PickValueInList([b"", b"x", b"y"]), Context(tuple(said))))
+            metadata.append((given.PickValueInList([ID_HEADER, ATTEMPT_HEADER]), given.ConsumeUnicodeNoSurrogates(10)))
+        task = asyncio.ensure_future(call(given.PickValueInList([b"", b"x", b"y"]), Context(tuple(metadata))))
         running.append(task)
         if given.ConsumeBool():
             await asyncio.sleep(0.05)
@@ -94,7 +94,7 @@ async def requests(given: atheris.FuzzedDataProvider) -> None:
 
 
 def one(data: bytes) -> None:
-    """One conversation."""
+    """Run one conversation."""
     fly(lambda: requests(atheris.FuzzedDataProvider(data)))
 
 

@@ -1,7 +1,7 @@
-"""Manifests as anyone may write them: a sentence says what is wrong, or all their applications are planned or refused.
+"""Fuzz manifests: each is refused with one sentence, or all of its applications are planned or refused.
 
-Bytes are read as a file; or they say what to change in the example's objects, which gets further than bytes alone do: their values,
-where on Earth all of it is, how it is spelt. What is planned can be written, and its grants can be enforced.
+The input is the content of a file, or selects changes of the example's objects: values, location, spelling. Such changes reach
+deeper than arbitrary bytes. Plans can be serialised, and their Grants can be compiled.
 """
 
 from __future__ import annotations
@@ -50,11 +50,11 @@ SPELLINGS = [
 logging.disable(logging.CRITICAL)
 
 Place = tuple[Any, Any]
-"""A list or object, and where in it a value is."""
+"""A list or object, and the index or key of a value."""
 
 
 def places(inside: Any) -> Iterator[Place]:
-    """Where every value of some objects is, but their kinds."""
+    """Return the places of all values in some objects, except kind and API version."""
     for key, value in inside.items() if isinstance(inside, dict) else enumerate(inside):
         if key not in {"apiVersion", "kind"}:
             yield inside, key
@@ -63,7 +63,7 @@ def places(inside: Any) -> Iterator[Place]:
 
 
 def move(inside: Any, lat: float, lon: float) -> None:
-    """Put the example elsewhere, in its shape: over the antimeridian, near a pole."""
+    """Move the example without changing its shape, for example across the antimeridian or near a pole."""
     for part in inside.values() if isinstance(inside, dict) else inside:
         if isinstance(part, dict | list):
             move(part, lat, lon)
@@ -74,7 +74,7 @@ def move(inside: Any, lat: float, lon: float) -> None:
 
 
 def changed(given: atheris.FuzzedDataProvider) -> list[Any]:
-    """The example with a few values that are others."""
+    """Return the example with a few changed values."""
     objects = copy.deepcopy(OBJECTS)
     if not given.ConsumeIntInRange(0, 3):
         move(objects, *given.PickValueInList(ELSEWHERE_DEG))
@@ -96,7 +96,7 @@ def changed(given: atheris.FuzzedDataProvider) -> list[Any]:
 
 
 def value(given: atheris.FuzzedDataProvider, before: Any) -> Any:
-    """Another value; of the same type more often than not."""
+    """Return another value, often of the same type."""
     if isinstance(before, bool):
         return not before
     if isinstance(before, int | float) and given.ConsumeBool():
@@ -111,7 +111,7 @@ def value(given: atheris.FuzzedDataProvider, before: Any) -> Any:
 
 
 def respelt(given: atheris.FuzzedDataProvider) -> str:
-    """The example, changed, with a few values in the spellings of YAML; before it perhaps one of aliases that repeat each other."""
+    """Return the changed example with unusual YAML spellings, sometimes after a document with nested aliases."""
     text = dump_documents(changed(given))
     lines = text.splitlines()
     for _ in range(given.ConsumeIntInRange(0, 4)):
@@ -125,13 +125,13 @@ def respelt(given: atheris.FuzzedDataProvider) -> str:
 
 
 def bomb(levels: int, width: int) -> str:
-    """A zone whose labels are lists of lists of lists."""
+    """Return a document with nested aliases (billion laughs)."""
     lists = [f"  l{i}: &l{i} [{', '.join([f'*l{i - 1}' if i else 'x'] * width)}]\n" for i in range(levels)]
     return "apiVersion: fractus.dev/v1alpha1\nkind: Zone\nmetadata:\n  name: z\nspec:\n" + "".join(lists) + "---\n"
 
 
 def planned(file: Path) -> None:
-    """Read a file, and plan its applications."""
+    """Read a file and plan its applications."""
     try:
         manifests = read_manifests([file])
         manifests.inventory()
@@ -149,8 +149,8 @@ def planned(file: Path) -> None:
 
 
 def one(data: bytes) -> None:
-    """One file."""
-    if data[:1] >= b"\x80":  # no text begins so
+    """Read and plan one file."""
+    if data[:1] >= b"\x80":  # never the beginning of UTF-8 text
         given = atheris.FuzzedDataProvider(data[1:])
         if data[0] % 2:
             JSON.write_text(json.dumps({"kind": "List", "items": changed(given)}))

@@ -1,7 +1,7 @@
-"""Sequences of calls, as any components may make them, through the handlers of the mobility service to a vehicle that flies.
+"""Fuzz sequences of calls of any callers to the mobility service, with a vehicle that flies in virtual time.
 
-Time is virtual. Whatever is called, by any caller: no handler fails, the vehicle does not move without a call of its driver, and it
-stays in its operation area and out of the zone. So it does whatever others say on its link, and when grants are revoked.
+No handler fails, the vehicle moves only after a call of its driver, and it stays inside its operation area and outside the zone. The
+same holds with other messages on its link, and when Grants are revoked.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 import atheris
 import grpc
 
-# First what flies: instrumented, it would be several times slower.
+# Imported first, without instrumentation, because the simulation would be several times slower with it.
 from mobility_world import World, spec, touring, zone
 
 with atheris.instrument_imports(include=["fractus_services.mobility.rpc", "fractus_services.admission"]):
@@ -48,23 +48,23 @@ TYPES = {
     for method in mobility_pb2.DESCRIPTOR.services_by_name["MobilityService"].methods
 }
 NAMES = sorted(TYPES)
-SAID = [
+VEHICLE_MESSAGES = [
     "HEARTBEAT", "GLOBAL_POSITION_INT", "EXTENDED_SYS_STATE", "SYS_STATUS", "HOME_POSITION", "ATTITUDE", "GPS_RAW_INT",
     "EKF_STATUS_REPORT", "STATUSTEXT", "COMMAND_ACK", "PARAM_VALUE", "TIMESYNC", "MISSION_REQUEST_INT", "MISSION_ACK",
 ]  # fmt: skip
 OTHERS = [(255, 190), (1, 154), (1, 191), (2, 1), (244, 191), (0, 0)]
-"""Who else speaks on a link: a ground station, a gimbal, another companion, another vehicle, someone with our own address, no one."""
+"""Other senders on the link: ground station, gimbal, companion computer, another vehicle, the service's own address, and none."""
 logging.disable(logging.CRITICAL)
 
 
 @functools.cache
 def of(identity: str, days: int = 36500) -> bytes:
-    """The certificate of one caller, which is made once."""
+    """Return the certificate of a caller, from a cache."""
     return certificate(identity, days=days)
 
 
 class Flight:
-    """One vehicle, its service, and who may call it."""
+    """A vehicle, its service and the callers."""
 
     def __init__(self, given: atheris.FuzzedDataProvider) -> None:
         self._given = given
@@ -72,9 +72,9 @@ class Flight:
         self._driven = False
 
     async def fly(self) -> None:
-        """Make the calls, then look at what came of them."""
+        """Make the calls, and then check the flight."""
         given = self._given
-        # Most flights are short, as those of many seconds take a hundred times longer.
+        # Most flights are short, because long flights take a hundred times longer.
         waits_s = WAITS_S if not given.ConsumeIntInRange(0, 7) else WAITS_S[:1]
         async with World(FOLDER, step_s=0.2) as world:
             active = world.grants.put(DRIVER)
@@ -95,7 +95,7 @@ class Flight:
             if in_flight:
                 self._driven = True
                 await world.up(active, 3.0)
-            lied = await self._calls(world, registry, chains, waits_s)
+            spoofed = await self._calls(world, registry, chains, waits_s)
             for task in self._running:
                 task.cancel()
             for outcome in await asyncio.gather(*self._running, return_exceptions=True):
@@ -103,8 +103,8 @@ class Flight:
                     raise outcome
             for task in world._tasks:
                 if task.done() and not task.cancelled() and task.exception() is not None:
-                    raise AssertionError("a part of the service ended") from task.exception()
-            if lied:
+                    raise AssertionError("a task of the service failed") from task.exception()
+            if spoofed:
                 return
             assert self._driven or toured or not world.plane.vehicle.armed, "no one drove"
             for x, y, _ in world.plane.trace:
@@ -114,13 +114,14 @@ class Flight:
     async def _calls(
         self, world: World, registry: Registry, chains: list[tuple[bytes, ...]], waits_s: list[float]
     ) -> bool:
-        """Up to a dozen; whether the vehicle said what it pleased in between."""
-        given, lied = self._given, False
+        """Make up to twelve calls. Return True if arbitrary messages were sent in the vehicle's name."""
+        given = self._given
+        spoofed = False
         for _ in range(12):
             if not given.remaining_bytes():
                 break
             if not given.ConsumeIntInRange(0, 9):
-                lied = self._says(world) or lied
+                spoofed = self._send_noise(world) or spoofed
                 continue
             if not given.ConsumeIntInRange(0, 15) and world.grants.active:
                 world.grants.remove(given.PickValueInList(list(world.grants.active.values())))
@@ -131,19 +132,21 @@ class Flight:
             self._driven = self._driven or chain == chains[0]
             deadline_s = given.PickValueInList(DEADLINES_S) if given.ConsumeBool() else DEADLINES_S[0]
             context = Context(chain, deadline_s)
-            call = _told(registry.handlers[name], request(given, TYPES[name]), context, of_node=chain == chains[-1])
+            call = _checked_call(
+                registry.handlers[name], request(given, TYPES[name]), context, of_node=chain == chains[-1]
+            )
             self._running.append(asyncio.ensure_future(call))
             await asyncio.sleep(given.PickValueInList(waits_s))
-        return lied
+        return spoofed
 
-    def _says(self, world: World) -> bool:
-        """Any bytes on the link; whether they are a message of the vehicle."""
+    def _send_noise(self, world: World) -> bool:
+        """Put arbitrary bytes on the link. Return True if they can be a message of the vehicle."""
         given = self._given
         if not given.ConsumeIntInRange(0, 7):
             world.plane._received(given.ConsumeBytes(given.ConsumeIntInRange(0, 300)))
             return True
         kind = (
-            message_class(given.PickValueInList(SAID))
+            message_class(given.PickValueInList(VEHICLE_MESSAGES))
             if given.ConsumeBool()
             else given.PickValueInList(MESSAGE_CLASSES)
         )
@@ -153,15 +156,15 @@ class Flight:
         return source not in OTHERS
 
 
-async def _told(handler: grpc.RpcMethodHandler, body: bytes, context: Context, *, of_node: bool) -> None:
-    """Make a call; how missions ended is told to no one but the node."""
+async def _checked_call(handler: grpc.RpcMethodHandler, body: bytes, context: Context, *, of_node: bool) -> None:
+    """Make a call. Only the node receives the outcome of missions."""
     await called(handler, body, context)
     for message in context.written:
-        assert of_node or not getattr(message, "missions", None), "another's mission is told"
+        assert of_node or not getattr(message, "missions", None), "the reply contains another component's mission"
 
 
 def one(data: bytes) -> None:
-    """One flight."""
+    """Run one flight."""
     fly(Flight(atheris.FuzzedDataProvider(data)).fly)
 
 

@@ -1,4 +1,4 @@
-"""Requests as the fuzzers make them: any bytes, or messages with any values; and the call that carries them."""
+"""Requests of fuzzers (arbitrary bytes, or messages with arbitrary values), and the gRPC context of their calls."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from policy_world import HOME
 
 CENTRE = {"latitude_deg": HOME.lat, "longitude_deg": HOME.lon}
 MAX_METADATA_BYTES = 8 * 1024
-"""Of a reply: clients take no more by default, and would see another error."""
+"""Maximum size of a reply's metadata. By default, clients replace a larger reply by another error."""
 DEADLINES_S = [5.0, None, 0.0, 0.4, 1e300, float("inf"), -1.0]
 
 _KEY = ec.generate_private_key(ec.SECP256R1())
@@ -24,7 +24,7 @@ _BEGIN = datetime(2020, 1, 1, tzinfo=UTC)
 
 
 def certificate(*uris: str, days: int = 36500) -> bytes:
-    """A certificate that names these identities."""
+    """Return a certificate with these identities."""
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "fuzz")])
     builder = (
         x509.CertificateBuilder().subject_name(name).issuer_name(name).public_key(_KEY.public_key()).serial_number(1)
@@ -45,16 +45,16 @@ STRANGE = (
     (certificate("spiffe://fractus.dev/a", "spiffe://fractus.dev/b"),),
     (certificate("https://fractus.dev/a"),),
 )
-"""Certificate chains of no one who has a grant."""
+"""Certificate chains without a Grant."""
 
 
 def number(given: atheris.FuzzedDataProvider, bound: float) -> float:
-    """One of a size that is flown, or any: infinity, a thousand digits, none at all."""
+    """Return a number of a realistic size, or any number, NaN and infinity included."""
     return given.ConsumeFloatInRange(-bound, bound) if given.ConsumeBool() else given.ConsumeFloat()
 
 
 def fill(given: atheris.FuzzedDataProvider, message: Any) -> None:
-    """Give some fields of a message a value of their type."""
+    """Set some fields of a message to values of their type."""
     for field in message.DESCRIPTOR.fields:
         if field.is_repeated or not given.ConsumeIntInRange(0, 3):
             continue
@@ -76,7 +76,7 @@ def fill(given: atheris.FuzzedDataProvider, message: Any) -> None:
 
 
 def request(given: atheris.FuzzedDataProvider, kind: Any) -> bytes:
-    """A request for a method that takes messages of a kind."""
+    """Return an encoded request for a method with this message type."""
     if not given.ConsumeIntInRange(0, 3):
         return given.ConsumeBytes(given.ConsumeIntInRange(0, 64))
     message = kind()
@@ -85,22 +85,22 @@ def request(given: atheris.FuzzedDataProvider, kind: Any) -> bytes:
 
 
 class Registry:
-    """What generated code adds handlers to; kept here by their names."""
+    """Registry to which generated code adds handlers. It keeps them by name."""
 
     def __init__(self, admission: Any) -> None:
         self._admission = admission
         self.handlers: dict[str, grpc.RpcMethodHandler] = {}
 
     def add_generic_rpc_handlers(self, _handlers: object) -> None:
-        """The same handlers once more."""
+        """Ignore the handlers, because they are registered twice."""
 
     def add_registered_method_handlers(self, _service: str, handlers: dict[str, grpc.RpcMethodHandler]) -> None:
-        """As they are served: decoded once their caller is let in."""
+        """Keep the handlers as the service wraps them: requests are decoded after the admission of their caller."""
         self.handlers |= {name: self._admission.decoded(handler) for name, handler in handlers.items()}
 
 
 class Context:
-    """gRPC's context of one call, which checks what the service answers."""
+    """gRPC context of a call that checks the replies of the service."""
 
     def __init__(self, chain: tuple[bytes, ...], remaining_s: float | None) -> None:
         self._chain, self._remaining_s = chain, remaining_s
@@ -130,7 +130,7 @@ class Context:
 
 
 async def called(handler: grpc.RpcMethodHandler, body: bytes, context: Context) -> Any:
-    """The answer of a handler; None if it refuses or streams."""
+    """Return the reply of a handler, or None if it refuses the call or streams."""
     handle = handler.stream_unary or handler.stream_stream
     context.body = body
     try:

@@ -1,4 +1,4 @@
-"""Zones in the formats of others, as anyone may write them: a reason why one is refused, or zones that are read as the same again."""
+"""Fuzz zones in external formats: each file is refused with a reason, or its zones survive a round trip."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ logging.disable(logging.CRITICAL)
 
 
 def text_of(given: atheris.FuzzedDataProvider, which: int) -> str:
-    """A file with some places changed, or any."""
+    """Return an example with some places changed, or arbitrary text."""
     if not given.ConsumeIntInRange(0, 7):
         return given.ConsumeUnicodeNoSurrogates(given.remaining_bytes())
     text = TEXTS[which]
@@ -55,7 +55,7 @@ def text_of(given: atheris.FuzzedDataProvider, which: int) -> str:
 
 
 def one(data: bytes) -> None:
-    """One file: what is read from it is written and read again."""
+    """Read one file, and write and read its zones again."""
     given = atheris.FuzzedDataProvider(data)
     which = given.ConsumeIntInRange(0, len(READERS) - 1)
     try:

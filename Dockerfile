@@ -1,37 +1,42 @@
 # Images of Fractus: docker build --target operator --tag localhost/fractus/operator:dev .
-# Each is Debian with Python, a virtual environment in /opt/fractus, and the code as the last layer.
-# Applications build on the image `component`. A release passes BASE with a digest (debian:trixie-slim@sha256:...).
+# Each is Debian with a virtual environment in /opt/fractus and the code as the last layer. A release passes BASE with a digest.
 ARG BASE=debian:trixie-slim
-
 FROM ${BASE} AS base
 ARG BASE
 LABEL org.opencontainers.image.base.name=${BASE}
 # Builds reset the time stamps of files, so bytecode must not be checked against them.
-RUN apt-get update -q \
- && DEBIAN_FRONTEND=noninteractive apt-get install -qy --no-install-recommends python3 iproute2 nftables procps >/dev/null \
+RUN apt-get update -q && DEBIAN_FRONTEND=noninteractive apt-get install -qy --no-install-recommends python3 iproute2 nftables procps >/dev/null \
  && rm -rf /var/lib/apt/lists/* /var/cache/* /var/log/* \
  && python3 -m compileall -qf --invalidation-mode unchecked-hash /usr/lib/python3.13 \
  && echo 'fractus:x:10001:10001::/home/fractus:/bin/sh' >> /etc/passwd && echo 'fractus:x:10001:' >> /etc/group && mkdir /home/fractus && chown 10001:10001 /home/fractus
-ENV PATH=/opt/fractus/bin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin LANG=C.UTF-8 \
-    PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1
+ENV PATH=/opt/fractus/bin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin LANG=C.UTF-8 PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1
 
-# ---- build: a virtual environment for each image, with the locked dependencies and without the code
+# ---- environments: the locked dependencies of each image, without the code
 FROM base AS build
-ARG UV_VERSION=0.13.8
 # The CA bundle of a proxy in front of the package index, mounted for the build only.
 ARG SSL_CERT_FILE=/etc/ssl/certs/ca-certificates.crt
 ENV SSL_CERT_FILE=${SSL_CERT_FILE} PIP_CERT=${SSL_CERT_FILE} UV_PYTHON=/usr/bin/python3 UV_PYTHON_DOWNLOADS=never \
-    UV_LINK_MODE=copy UV_PROJECT_ENVIRONMENT=/opt/fractus UV_COMPILE_BYTECODE=1 PYC_INVALIDATION_MODE=UNCHECKED_HASH
-RUN apt-get update -q \
- && DEBIAN_FRONTEND=noninteractive apt-get install -qy --no-install-recommends ca-certificates python3-venv >/dev/null \
- && python3 -m venv /opt/uv && /opt/uv/bin/pip install --quiet --no-cache-dir uv==${UV_VERSION}
+    UV_LINK_MODE=copy UV_PROJECT_ENVIRONMENT=/opt/fractus UV_COMPILE_BYTECODE=1 PYC_INVALIDATION_MODE=UNCHECKED_HASH \
+    SYNC="/opt/uv/bin/uv sync --quiet --frozen --no-dev --no-install-workspace"
+RUN apt-get update -q && DEBIAN_FRONTEND=noninteractive apt-get install -qy --no-install-recommends ca-certificates python3-venv >/dev/null && python3 -m venv /opt/uv \
+ && /opt/uv/bin/pip install --quiet --no-cache-dir uv==0.13.8
 WORKDIR /build
 COPY pyproject.toml uv.lock /build/
 COPY sim/pyproject.toml /build/sim/
-RUN --mount=type=cache,target=/root/.cache/uv mkdir /environments \
- && sync() { name=$1; shift; /opt/uv/bin/uv sync --quiet --frozen --no-dev --no-install-workspace "$@" && mv /opt/fractus "/environments/$name"; } \
- && sync component && sync operator --extra operator && sync agent --extra agent && sync mobility --extra mobility \
- && sync camera --extra services && sync view --extra view && sync sim --package fractus-sim
+FROM build AS component-environment
+RUN --mount=type=cache,target=/root/.cache/uv $SYNC
+FROM build AS operator-environment
+RUN --mount=type=cache,target=/root/.cache/uv $SYNC --extra operator
+FROM build AS agent-environment
+RUN --mount=type=cache,target=/root/.cache/uv $SYNC --extra agent
+FROM build AS mobility-environment
+RUN --mount=type=cache,target=/root/.cache/uv $SYNC --extra mobility
+FROM build AS camera-environment
+RUN --mount=type=cache,target=/root/.cache/uv $SYNC --extra services
+FROM build AS view-environment
+RUN --mount=type=cache,target=/root/.cache/uv $SYNC --extra view
+FROM build AS sim-environment
+RUN --mount=type=cache,target=/root/.cache/uv $SYNC --package fractus-sim
 
 # ---- code: the distributions fractus-drones and fractus-sim without dependencies; .dockerignore selects the build context
 FROM build AS code
@@ -42,9 +47,10 @@ RUN --mount=type=cache,target=/root/.cache/uv /opt/uv/bin/uv build --quiet --whe
       && rm -f /opt/fractus/lib/python3.13/site-packages/*.dist-info/uv_cache.json && mv /opt/fractus /$name; done
 
 # ---- images
-FROM base AS component
-COPY --from=build /environments/component /opt/fractus
+FROM base AS unprivileged
 USER 10001:10001
+FROM unprivileged AS component
+COPY --from=component-environment /opt/fractus /opt/fractus
 WORKDIR /home/fractus
 ENTRYPOINT ["python3"]
 COPY --from=code /fractus_drones /opt/fractus
@@ -57,34 +63,28 @@ WORKDIR /app
 FROM component AS example-links
 COPY examples/links/*.py /app/
 WORKDIR /app
-
-FROM base AS operator
-COPY --from=build /environments/operator /opt/fractus
-USER 10001:10001
+FROM unprivileged AS operator
+COPY --from=operator-environment /opt/fractus /opt/fractus
 ENTRYPOINT ["python3", "-m", "fractus_operator"]
 COPY --from=code /fractus_drones /opt/fractus
-FROM base AS view
-COPY --from=build /environments/view /opt/fractus
-USER 10001:10001
+FROM unprivileged AS view
+COPY --from=view-environment /opt/fractus /opt/fractus
 ENTRYPOINT ["fractus", "view"]
 COPY --from=code /fractus_drones /opt/fractus
 FROM base AS agent
-COPY --from=build /environments/agent /opt/fractus
+COPY --from=agent-environment /opt/fractus /opt/fractus
 ENTRYPOINT ["python3", "-m", "fractus_agent"]
 COPY --from=code /fractus_drones /opt/fractus
 FROM base AS mobility
-COPY --from=build /environments/mobility /opt/fractus
+COPY --from=mobility-environment /opt/fractus /opt/fractus
 ENTRYPOINT ["fractus"]
 COPY --from=code /fractus_drones /opt/fractus
 FROM base AS camera
-COPY --from=build /environments/camera /opt/fractus
+COPY --from=camera-environment /opt/fractus /opt/fractus
 ENTRYPOINT ["fractus"]
 COPY --from=code /fractus_drones /opt/fractus
-
-# The simulated vehicle as a pod, for clusters without the embedded cluster's machine beside them.
-FROM base AS sim
-COPY --from=build /environments/sim /opt/fractus
-USER 10001:10001
+FROM unprivileged AS sim
+COPY --from=sim-environment /opt/fractus /opt/fractus
 ENTRYPOINT ["python3", "-m", "fractus_vehicle"]
 COPY --from=code /fractus_drones /opt/fractus
 COPY --from=code /fractus_sim /opt/fractus

@@ -59,6 +59,9 @@ UNIT := -n 2 --dist loadfile
 GROUPS := --dist loadgroup
 # The end-to-end tests of the charts that also run on clusters of kind and kubeadm (tests/kind).
 ON_KIND := $(patsubst %,tests/e2e/test_%.py,mission refusals upgrade uninstall)
+# Built before the tests, so that no test waits for images. The cluster of KUBECONFIG must have them.
+E2E_IMAGES = $(if $(filter current,$(FRACTUS_E2E_CLUSTER)),,$(RUN) python -m fractus_cluster.images build \
+	operator agent mobility camera example-traffic-monitoring example-links)
 # Each worker starts an embedded cluster. The cluster of KUBECONFIG has one worker.
 E2E_WORKERS = $(if $(filter current,$(FRACTUS_E2E_CLUSTER)),0,2)
 
@@ -67,6 +70,7 @@ test: packages env lint ## The gate for every change: lint, types, unit, compone
 	$(RUN) fractus cluster binaries
 	$(PYTEST) $(UNIT) -m "not slow" tests/component tests/unit
 	$(PYTEST) -n 4 $(GROUPS) -m "not slow" tests/integration
+	$(E2E_IMAGES)
 	$(PYTEST) -n $(E2E_WORKERS) $(GROUPS) -m "not slow" tests/e2e
 
 .PHONY: test-all
@@ -74,6 +78,7 @@ test-all: packages env lint ## Everything: also slow tests, all golden flights a
 	$(RUN) fractus cluster binaries
 	FRACTUS_DEEP=1 $(PYTEST) $(UNIT) tests/component tests/unit
 	$(PYTEST) -n 4 $(GROUPS) tests/integration tests/e2e/test_cluster.py
+	$(E2E_IMAGES)
 	$(PYTEST) -n $(E2E_WORKERS) $(GROUPS) tests/e2e --ignore tests/e2e/test_cluster.py
 	$(MAKE) test-kind test-kubeadm
 

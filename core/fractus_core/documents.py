@@ -2,7 +2,7 @@
 
 Files must mean the same to Fractus as to other programs. So plain scalars have the types that kubectl gives them (a
 timestamp is a string, `on` is true, 1e3 is a number), duplicate keys are errors, and an alias counts as the values that
-it repeats. Values are built from parser events, so the limits apply before memory is spent (docs/decisions/0020-yaml-from-parser-events.md).
+it repeats. Values are built from parser events, so the limits apply before memory is spent (docs/decisions/0019-yaml-from-parser-events.md).
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Raw netlink messages for the redirector, because its map swap must take less than a millisecond.
 
-Addresses, neighbours and link state use pyroute2 instead (docs/decisions/0022). A netlink socket stays in the network
+Addresses, neighbours and link state use pyroute2 instead (docs/decisions/0025). A netlink socket stays in the network
 namespace in which it was opened.
 """
 

@@ -1,7 +1,7 @@
 """Elements of the agent's nftables maps, replaced in one raw netlink transaction, and the byte counters.
 
 The table itself is created with `nft` from the text of `ruleset`. A switch changes map elements only. The measured costs
-of the alternatives (the `nft` program, libnftables, pyroute2) are in docs/decisions/0022.
+of the alternatives (the `nft` program, libnftables, pyroute2) are in docs/decisions/0025.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The whole agent as a process against a real API server and a mobility service with real mTLS."""
+"""Agent process with a real API server and a fake mobility service with mTLS."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def server(tmp_path_factory: pytest.TempPathFactory, authority: TestAuthority) -
 
 
 class Mobility(mobility_pb2_grpc.MobilityServiceServicer):
-    """Sends the telemetry it is told, to the node's own identity only."""
+    """Fake mobility service that sends the current telemetry to the node's own identity only."""
 
     def __init__(self) -> None:
         self.now = Telemetry(
@@ -199,7 +199,7 @@ def phase(server: ApiServer, name: str, node: str = "drone-1") -> str | None:
     return server.reported(node, name).get("phase")
 
 
-def test_a_drones_life(server: ApiServer, drone: Node) -> None:
+def test_agent_of_drone_registers_reports_and_stores_grants(server: ApiServer, drone: Node) -> None:
     drone.describe()
     uid = add_grant(server, "mine", control="full")["metadata"]["uid"]
     add_grant(server, "not-mine", node="drone-2")
@@ -249,7 +249,7 @@ def test_a_drones_life(server: ApiServer, drone: Node) -> None:
     assert "Traceback" not in drone.log()
 
 
-def test_registration_and_the_owner(server: ApiServer, drone: Node) -> None:
+def test_agent_registers_the_node_and_keeps_the_owners_edits(server: ApiServer, drone: Node) -> None:
     drone.describe()
     drone.start()
     wait_for(drone.object, "drone", timeout_s=30)
@@ -276,7 +276,7 @@ def test_registration_and_the_owner(server: ApiServer, drone: Node) -> None:
     assert drone.condition("Described") == {}
 
 
-def test_grants_outlive_the_api_server(server: ApiServer, drone: Node) -> None:
+def test_agent_keeps_grants_while_the_api_server_is_down(server: ApiServer, drone: Node) -> None:
     drone.describe()
     for name in ("one", "two", "three"):
         add_grant(server, name)
@@ -306,7 +306,7 @@ def test_grants_outlive_the_api_server(server: ApiServer, drone: Node) -> None:
     wait_for(lambda: drone.grants() == {"three", "four"}, "reconciled grants after a restart", timeout_s=40)
 
 
-def test_what_the_operator_did_not_sign_is_not_stored(server: ApiServer, drone: Node) -> None:
+def test_agent_does_not_store_grants_with_bad_signatures(server: ApiServer, drone: Node) -> None:
     drone.describe()
     add_grant(server, "mine", control="partial")
     drone.start()
@@ -323,7 +323,7 @@ def test_what_the_operator_did_not_sign_is_not_stored(server: ApiServer, drone: 
     wait_for(lambda: phase(server, "mine") == "Active" and drone.grants() == {"mine"}, "the grant again", timeout_s=30)
 
 
-def test_a_denied_node_says_so(server: ApiServer, drone: Node) -> None:
+def test_agent_reports_a_denied_certificate(server: ApiServer, drone: Node) -> None:
     drone.describe()
     drone.start()
     item = wait_for(lambda: server.admin.list(REQUESTS), "signing request", timeout_s=30)[0]
@@ -338,7 +338,7 @@ def test_a_denied_node_says_so(server: ApiServer, drone: Node) -> None:
     assert "not in the fleet" in drone.log()
 
 
-def test_an_edge_node_registers(server: ApiServer, authority: TestAuthority, tmp_path: Path) -> None:
+def test_agent_of_edge_node_registers(server: ApiServer, authority: TestAuthority, tmp_path: Path) -> None:
     node = Node(server, authority, tmp_path, "edge-1", "EdgeNode")
     try:
         node.describe()
@@ -352,8 +352,8 @@ def test_an_edge_node_registers(server: ApiServer, authority: TestAuthority, tmp
         node.close()
 
 
-def test_a_direct_link_whose_device_is_missing(server: ApiServer, drone: Node) -> None:
-    """The whole agent with a DirectLink; its traffic is tried in test_connectivity.py."""
+def test_agent_reports_a_direct_link_with_missing_device(server: ApiServer, drone: Node) -> None:
+    """Run the agent with a DirectLink. Its traffic is tested in test_link_manager.py."""
     pairing = {"mode": "adhoc", "networkId": "fleet"}
     drone.describe(interfaces=[{"technology": "WiFi", "device": "fxnone0", "range": 80, "pairing": pairing}])
     drone.start()

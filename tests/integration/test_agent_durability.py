@@ -59,7 +59,7 @@ def die_everywhere(action: Callable[[], object], check: Callable[[bool], None]) 
     raise AssertionError("no end")
 
 
-def test_a_file_is_the_old_or_the_new(tmp_path: Path) -> None:
+def test_killed_write_file_leaves_the_old_or_the_new_file(tmp_path: Path) -> None:
     file = tmp_path / "g.json"
     old, new = b'{"version": 1}', b'{"version": 2, "long": "' + b"x" * 5000 + b'"}'
     write_file(file, old)
@@ -73,7 +73,7 @@ def test_a_file_is_the_old_or_the_new(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("before", ["nothing", "a set", "loose files", "half a set"])
-def test_a_set_is_all_old_or_all_new(tmp_path: Path, before: str) -> None:
+def test_killed_write_set_leaves_all_old_or_all_new_files(tmp_path: Path, before: str) -> None:
     old = dict.fromkeys(("tls.crt", "tls.key", "ca.crt"), b"old")
     new = dict.fromkeys(old, b"new")
     count = 0
@@ -128,7 +128,7 @@ while True:
 """
 
 
-def test_kill_9_leaves_only_whole_grants(tmp_path: Path) -> None:
+def test_killed_agent_leaves_only_complete_grants(tmp_path: Path) -> None:
     seed = int(os.environ.get("SEED", "20260501"))
     print("seed", seed)
     source = random.Random(seed)

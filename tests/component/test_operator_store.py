@@ -1,4 +1,4 @@
-"""Whose fields an object has, as the operator tells the API server."""
+"""Field ownership and spec replacement by the operator, against a fake API server."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ async def asked(server: Server) -> None:
         await store.take_ownership(DEPLOYMENT, KEY)
 
 
-async def test_what_was_created_counts_as_applied_and_others_keep_theirs() -> None:
+async def test_take_ownership_changes_only_own_fields() -> None:
     server = Server(CREATED, THEIRS, STATUS)
     await asked(server)
     (patch,) = server.patches
@@ -55,7 +55,7 @@ async def test_what_was_created_counts_as_applied_and_others_keep_theirs() -> No
     assert patch["/metadata/managedFields"] == [THEIRS, STATUS, {**CREATED, "operation": "Apply"}]
 
 
-async def test_what_was_applied_too_is_one_set() -> None:
+async def test_take_ownership_merges_applied_fields() -> None:
     server = Server(APPLIED, CREATED)
     await asked(server)
     (entry,) = server.patches[0]["/metadata/managedFields"]
@@ -63,17 +63,17 @@ async def test_what_was_applied_too_is_one_set() -> None:
 
 
 @pytest.mark.parametrize("entries", [(), (THEIRS,), (APPLIED, THEIRS, STATUS)])
-async def test_nothing_is_written_where_all_is_applied(entries: tuple[Body, ...]) -> None:
+async def test_take_ownership_writes_nothing_if_applied(entries: tuple[Body, ...]) -> None:
     server = Server(*entries)
     await asked(server)
     assert server.patches == []
 
 
-async def test_what_is_gone_is_no_trouble() -> None:
+async def test_take_ownership_ignores_deleted_object() -> None:
     await asked(Server(there=False))
 
 
-async def test_a_change_meanwhile_is_looked_at_again() -> None:
+async def test_take_ownership_retries_after_conflict() -> None:
     server = Server(CREATED, refusals=2)
     await asked(server)
     assert len(server.patches) == 1
@@ -95,7 +95,7 @@ async def rewritten(server: Server) -> None:
         await store.replace_spec(DEPLOYMENT, OBSERVED, WANTED)
 
 
-async def test_a_rewrite_is_of_this_object_and_leaves_labels_of_others() -> None:
+async def test_replace_spec_keeps_foreign_labels() -> None:
     server = Server()
     await rewritten(server)
     assert server.patches == [
@@ -109,9 +109,7 @@ async def test_a_rewrite_is_of_this_object_and_leaves_labels_of_others() -> None
 
 
 @pytest.mark.parametrize(("uid", "error"), [("u1", Invalid), ("u2", Conflict)])
-async def test_a_rewrite_that_is_refused_tells_whether_the_object_is_another_one(
-    uid: str, error: type[KubeError]
-) -> None:
+async def test_replace_spec_detects_recreated_object(uid: str, error: type[KubeError]) -> None:
     server = Server(refusals=1)
     server.refusal = answer({"reason": "Invalid"}, 422)
     server.metadata["uid"] = uid

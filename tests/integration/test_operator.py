@@ -61,7 +61,7 @@ def gone(world: World, namespace: str) -> bool:
     return world.application(namespace) is None and not left
 
 
-def test_a_manifest_becomes_a_plan_grants_and_pods(world: World, operator: OperatorProcess, namespace: str) -> None:
+def test_application_gets_plan_grants_and_pods(world: World, operator: OperatorProcess, namespace: str) -> None:
     status = running(world, namespace)
     application = world.application(namespace)
     assert application is not None
@@ -121,7 +121,7 @@ def test_a_certificate_names_its_instance_only(world: World, operator: OperatorP
     certificate.verify_directly_issued_by(x509.load_pem_x509_certificate(authority["data"]["ca.crt"].encode()))
 
 
-def test_with_nothing_changed_nothing_is_written(world: World, operator: OperatorProcess, namespace: str) -> None:
+def test_unchanged_application_causes_no_writes(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     before = versions(world, namespace)
     # A change that touches no input wakes the reconciler; a change of an input shows when it is done.
@@ -146,7 +146,7 @@ def _geohash(world: World, node: str) -> str | None:
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM])
-def test_a_restart_changes_nothing(world: World, operator: OperatorProcess, namespace: str, how: int) -> None:
+def test_restarted_operator_changes_nothing(world: World, operator: OperatorProcess, namespace: str, how: int) -> None:
     running(world, namespace)
     before = versions(world, namespace)
     operator.stop(how)
@@ -159,7 +159,9 @@ def test_a_restart_changes_nothing(world: World, operator: OperatorProcess, name
     assert versions(world, namespace) == before
 
 
-def test_a_killed_operator_finishes_what_it_began(world: World, operator: OperatorProcess, namespace: str) -> None:
+def test_killed_operator_completes_rollout_after_restart(
+    world: World, operator: OperatorProcess, namespace: str
+) -> None:
     world.put(traffic(namespace))
     wait_for(lambda: world.grants(namespace), "the first grant")
     operator.stop(signal.SIGKILL)
@@ -176,7 +178,7 @@ def _ready(world: World, plural: str, name: str) -> str | None:
     return next((c["status"] for c in conditions if c["type"] == "Ready"), None)
 
 
-def test_what_is_deleted_or_changed_by_hand_comes_back(world: World, operator: OperatorProcess, namespace: str) -> None:
+def test_deleted_or_modified_child_is_restored(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     path = f"/apis/apps/v1/namespaces/{namespace}/deployments/traffic-data-store"
     uid = (world.api.get(path) or {})["metadata"]["uid"]
@@ -186,7 +188,7 @@ def test_what_is_deleted_or_changed_by_hand_comes_back(world: World, operator: O
     wait_for(lambda: (world.api.get(path) or {})["spec"]["replicas"] == 1, "the number of replicas")
 
 
-def test_a_complete_mission_leaves_only_its_plan(world: World, operator: OperatorProcess, namespace: str) -> None:
+def test_complete_mission_keeps_only_its_plan(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     world.drone_status("drone-1", "flying")
     end_mission(world, namespace, "Complete", "all control points were returned")
@@ -321,7 +323,7 @@ def fresh(world: World, namespace: str, before: set[str]) -> set[str]:
     return {pod["metadata"]["uid"] for pod in world.pods(namespace)} - before
 
 
-def test_the_phase_is_what_the_drone_does(world: World, operator: OperatorProcess, namespace: str) -> None:
+def test_phase_follows_drone(world: World, operator: OperatorProcess, namespace: str) -> None:
     status = running(world, namespace)
     assert "flies" not in status["message"]
     assert "drone-1 is on the ground, its mission has not begun" in status["message"]
@@ -358,7 +360,7 @@ def test_a_failed_mission_is_reported(
     wait_for(lambda: not world.grants(namespace), "grants to go")
 
 
-def test_a_component_that_fails_is_told_with_its_last_words(
+def test_failed_component_is_reported_with_last_log_lines(
     world: World, operator: OperatorProcess, namespace: str
 ) -> None:
     running(world, namespace)
@@ -379,9 +381,7 @@ def test_a_component_that_fails_is_told_with_its_last_words(
     wait_for(lambda: any(last_words in event["message"] for event in world.api.list(path)), "the Event")
 
 
-def test_pods_that_the_namespace_does_not_let_be_made_are_told(
-    world: World, operator: OperatorProcess, namespace: str
-) -> None:
+def test_refused_pods_are_reported(world: World, operator: OperatorProcess, namespace: str) -> None:
     """As where it has a quota or limits, or enforces Pod Security: no pod is there that could say why."""
     path = f"/api/v1/namespaces/{namespace}/limitranges/small"
     limits = {"limits": [{"type": "Container", "max": {"cpu": "50m"}}]}
@@ -409,7 +409,7 @@ def test_a_changed_spec_flies_again_after_completion(world: World, operator: Ope
     assert world.status(namespace)["observedGeneration"] == 2
 
 
-def test_one_drone_is_for_one_application_until_it_is_home(
+def test_drone_is_held_by_one_application_until_it_has_returned(
     world: World, operator: OperatorProcess, namespace: str
 ) -> None:
     world.put(traffic(namespace))
@@ -443,9 +443,7 @@ def test_without_a_drone_it_waits_for_one(world: World, operator: OperatorProces
     assert world.phase(namespace, "Deploying")["drone"] == "drone-9"
 
 
-def test_a_node_that_the_scheduler_refuses_is_planned_around(
-    world: World, operator: OperatorProcess, namespace: str
-) -> None:
+def test_plan_avoids_unschedulable_node(world: World, operator: OperatorProcess, namespace: str) -> None:
     world.put(traffic(namespace))
     deployed(world, namespace)
     victim = next(
@@ -463,7 +461,7 @@ def test_a_node_that_the_scheduler_refuses_is_planned_around(
     assert "deployments/traffic-ground-viewer-edge-3" in children
 
 
-def test_a_node_out_of_reach_keeps_its_instances(world: World, operator: OperatorProcess, namespace: str) -> None:
+def test_unreachable_node_keeps_its_instances(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     before = versions(world, namespace)
     for name in ("drone-1", "edge-2"):
@@ -479,9 +477,7 @@ def test_a_node_out_of_reach_keeps_its_instances(world: World, operator: Operato
     assert versions(world, namespace) == before
 
 
-def test_an_upgraded_operator_restarts_nothing_in_the_air(
-    world: World, operator: OperatorProcess, namespace: str
-) -> None:
+def test_upgraded_operator_restarts_no_pod_in_flight(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     world.drone_status("drone-1", "flying")
     operator.stop()
@@ -500,9 +496,7 @@ def test_an_upgraded_operator_restarts_nothing_in_the_air(
     wait_for(lambda: grace_s("traffic-navigator") == 10, "the drone's pods to be renewed on the ground")
 
 
-def test_a_name_as_long_as_kubernetes_lets_it_be_is_deployed_and_told(
-    world: World, operator: OperatorProcess, namespace: str
-) -> None:
+def test_longest_valid_name_is_deployed_and_reported(world: World, operator: OperatorProcess, namespace: str) -> None:
     name = "a" + ".b" * 126
     assert len(name) == 253
     world.put(traffic(namespace, name))
@@ -512,7 +506,7 @@ def test_a_name_as_long_as_kubernetes_lets_it_be_is_deployed_and_told(
     wait_for(lambda: world.application(namespace, name) is None and not world.children(namespace), "everything to go")
 
 
-def test_deleting_leaves_nothing(world: World, operator: OperatorProcess, namespace: str) -> None:
+def test_deleted_application_leaves_no_objects(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     world.api.delete(world.path(traffic(namespace)))
     wait_for(lambda: gone(world, namespace), "everything to go")
@@ -520,7 +514,7 @@ def test_deleting_leaves_nothing(world: World, operator: OperatorProcess, namesp
 
 
 @pytest.mark.parametrize("noted", ['{"success":true}', '{"delayed":"9999-12-31T00:00:00+00:00"}', "no JSON"])
-def test_who_may_edit_an_application_cannot_keep_its_drone(
+def test_editor_of_application_cannot_keep_its_drone(
     world: World, operator: OperatorProcess, namespace: str, noted: str
 ) -> None:
     """By the annotations in which kopf notes how far a deletion is; another, such as the fleet's operator, deletes it."""
@@ -532,7 +526,7 @@ def test_who_may_edit_an_application_cannot_keep_its_drone(
     assert not world.grants(namespace)
 
 
-def test_deleting_while_the_operator_is_down_leaves_nothing(
+def test_deletion_while_operator_is_down_leaves_no_objects(
     world: World, operator: OperatorProcess, namespace: str
 ) -> None:
     running(world, namespace)
@@ -543,7 +537,7 @@ def test_deleting_while_the_operator_is_down_leaves_nothing(
     wait_for(lambda: gone(world, namespace), "everything to go")
 
 
-def test_a_grant_does_not_outlive_an_application_whose_finalizer_was_taken_off(
+def test_grant_is_deleted_if_finalizer_was_removed_by_hand(
     world: World, operator: OperatorProcess, namespace: str
 ) -> None:
     running(world, namespace)
@@ -555,9 +549,7 @@ def test_a_grant_does_not_outlive_an_application_whose_finalizer_was_taken_off(
     wait_for(lambda: not world.grants(namespace), "orphaned grants to go")
 
 
-def test_deleted_and_created_again_it_gets_a_plan_of_its_own(
-    world: World, operator: OperatorProcess, namespace: str
-) -> None:
+def test_recreated_application_gets_new_plan(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     old = (world.application(namespace) or {})["metadata"]["uid"]
     world.api.delete(world.path(traffic(namespace)))
@@ -576,7 +568,7 @@ def test_deleted_and_created_again_it_gets_a_plan_of_its_own(
     assert old not in {g["spec"]["application"]["uid"] for g in world.grants(namespace)}
 
 
-def test_the_object_of_another_is_not_taken(world: World, operator: OperatorProcess, namespace: str) -> None:
+def test_object_of_another_owner_is_not_taken_over(world: World, operator: OperatorProcess, namespace: str) -> None:
     theirs = {"apiVersion": "v1", "kind": "Service", "metadata": {"name": "traffic-data-store", "namespace": namespace},
               "spec": {"ports": [{"port": 1}]}}  # fmt: skip
     world.api.apply(f"/api/v1/namespaces/{namespace}/services/traffic-data-store", theirs)
@@ -589,7 +581,7 @@ def test_the_object_of_another_is_not_taken(world: World, operator: OperatorProc
     world.phase(namespace, "Deploying")
 
 
-def test_a_policy_whose_zone_is_missing_grants_nothing(world: World, operator: OperatorProcess, namespace: str) -> None:
+def test_policy_with_missing_zone_grants_nothing(world: World, operator: OperatorProcess, namespace: str) -> None:
     spec = {"type": "GeofenceControl", "kind": "exclusion", "selector": {"zones": ["school"]}}
     world.put(ours("Policy", "no-school", spec))
     wait_for(lambda: _ready(world, "policies", "no-school") == "False", "the policy's condition")
@@ -604,7 +596,7 @@ def test_a_policy_whose_zone_is_missing_grants_nothing(world: World, operator: O
     assert "no-school" in policies
 
 
-def test_a_new_policy_reaches_the_grants_of_a_running_application(
+def test_new_policy_updates_grants_of_running_application(
     world: World, operator: OperatorProcess, namespace: str
 ) -> None:
     running(world, namespace)
@@ -616,9 +608,7 @@ def test_a_new_policy_reaches_the_grants_of_a_running_application(
     assert world.status(namespace)["phase"] == "Waiting"
 
 
-def test_grants_are_signed_and_a_signature_that_is_changed_is_made_again(
-    world: World, operator: OperatorProcess, namespace: str
-) -> None:
+def test_grant_with_modified_signature_is_signed_again(world: World, operator: OperatorProcess, namespace: str) -> None:
     def sound() -> bool:
         try:
             return all(verify(Grant.from_body(body), authorities) for body in world.grants(namespace))
@@ -660,7 +650,7 @@ def test_nodes_get_location_labels(world: World, operator: OperatorProcess) -> N
     assert set(labels) == {"fractus.dev/class"}
 
 
-def test_a_node_is_labelled_as_guarded_while_its_taint_guards_it(world: World, operator: OperatorProcess) -> None:
+def test_node_has_guarded_label_while_tainted(world: World, operator: OperatorProcess) -> None:
     node = "/api/v1/nodes/edge-1"
 
     def taint(*effects: str) -> None:
@@ -680,7 +670,7 @@ def test_a_node_is_labelled_as_guarded_while_its_taint_guards_it(world: World, o
         taint()
 
 
-def test_a_small_change_moves_nothing_else(world: World, operator: OperatorProcess, namespace: str) -> None:
+def test_small_change_restarts_no_other_pod(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     before = versions(world, namespace)
     manifest = traffic(namespace)
@@ -699,7 +689,7 @@ def driver_env(world: World, namespace: str) -> dict[str, Any]:
     return {v["name"]: v.get("value") for v in spec["containers"][0]["env"]}
 
 
-def test_a_change_in_flight_waits_for_the_landing(world: World, operator: OperatorProcess, namespace: str) -> None:
+def test_change_in_flight_waits_for_landing(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     world.drone_status("drone-1", "flying")
     world.phase(namespace, "Flying")
@@ -723,7 +713,7 @@ def test_a_change_in_flight_waits_for_the_landing(world: World, operator: Operat
     wait_for(lambda: not world.condition(namespace, "Updated"), "the condition to go")
 
 
-def test_a_change_that_is_to_be_immediate_is(world: World, operator: OperatorProcess, namespace: str) -> None:
+def test_immediate_change_is_applied_in_flight(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     world.drone_status("drone-1", "flying")
     world.phase(namespace, "Flying")
@@ -752,9 +742,7 @@ def test_a_change_that_waits_when_the_mission_ends_is_another_mission(
     assert world.grants(namespace)
 
 
-def test_what_a_spec_does_not_say_any_more_is_taken_away(
-    world: World, operator: OperatorProcess, namespace: str
-) -> None:
+def test_field_removed_from_spec_is_removed(world: World, operator: OperatorProcess, namespace: str) -> None:
     """Also from what was created: a field of no other owner goes with the apply that lacks it."""
     manifest = traffic(namespace)
     container = manifest["spec"]["components"][4]["container"]
@@ -783,7 +771,7 @@ def test_what_a_spec_does_not_say_any_more_is_taken_away(
     assert [entry["operation"] for entry in ours] == ["Apply"]
 
 
-def test_a_passenger_that_goes_is_removed(world: World, operator: OperatorProcess, namespace: str) -> None:
+def test_removed_passenger_is_deleted(world: World, operator: OperatorProcess, namespace: str) -> None:
     store = component("DataStore", "cloud")
     passenger = viewer(egress=["DataStore"])
     world.put(traffic(namespace, "traffic", navigator(), passenger, store))

@@ -139,7 +139,7 @@ def killed_at_each_step(plane: ControlPlane, folder: Path) -> Iterator[tuple[Ope
 
 
 @pytest.mark.timeout(1500)
-def test_killed_after_each_write_it_ends_where_it_would_have(
+def test_operator_killed_after_any_write_reaches_same_state(
     control_plane: ControlPlane, world: World, namespace: str, tmp_path: Path
 ) -> None:
     with killed_at_each_step(control_plane, tmp_path) as (operator, points):

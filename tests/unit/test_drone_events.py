@@ -1,4 +1,4 @@
-"""Events of a drone's flights: each transition once, whatever the watch, the agent and the operator do; and no flood."""
+"""Events of a drone: each transition has one Event, also after restarts and repeated reports, and a flapping drone has few."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def ended(message: str) -> Any:
     return SimpleNamespace(body={"status": {"conditions": [condition]}})
 
 
-async def test_the_story_of_a_flight(cluster: Cluster) -> None:
+async def test_events_of_a_complete_flight(cluster: Cluster) -> None:
     assert await cluster.see(drone("inactive", at_s=0), drone("inactive", DRIVER, at_s=1)) == []
     assert await cluster.see(drone("takingOff", DRIVER, at_s=2)) == ["TookOff", "MissionBegun"]
     assert await cluster.see(drone("flying", DRIVER, at_s=6), drone("flying", DRIVER, at_s=11)) == []
@@ -113,7 +113,7 @@ async def test_the_story_of_a_flight(cluster: Cluster) -> None:
     ]
 
 
-async def test_what_does_not_fly_has_no_events(cluster: Cluster) -> None:
+async def test_drone_on_the_ground_has_no_events(cluster: Cluster) -> None:
     """Planning, and what follows from it, takes no further request."""
     cluster.holders = []
     await cluster.see(drone("inactive", at_s=0))
@@ -124,7 +124,7 @@ async def test_what_does_not_fly_has_no_events(cluster: Cluster) -> None:
     assert not cluster.posted
 
 
-async def test_an_operator_that_starts_tells_only_what_comes_then(cluster: Cluster) -> None:
+async def test_restarted_operator_posts_only_new_events(cluster: Cluster) -> None:
     await cluster.see(drone("inactive", at_s=0), drone("flying", DRIVER, at_s=5))
     before = dict(cluster.posted)
     cluster.start()
@@ -138,7 +138,7 @@ async def test_an_operator_that_starts_tells_only_what_comes_then(cluster: Clust
 
 
 @pytest.mark.parametrize("late_s", [1, 30, 60])
-async def test_reports_that_come_twice_or_late_are_not_told(cluster: Cluster, late_s: int) -> None:
+async def test_repeated_and_late_reports_have_no_events(cluster: Cluster, late_s: int) -> None:
     landed = drone("inactive", at_s=100)
     await cluster.see(drone("inactive", at_s=0), drone("flying", at_s=50), landed)
     before = dict(cluster.posted)
@@ -148,12 +148,12 @@ async def test_reports_that_come_twice_or_late_are_not_told(cluster: Cluster, la
     assert cluster.posted == before
 
 
-async def test_a_clock_that_is_set_back_silences_no_drone(cluster: Cluster) -> None:
+async def test_events_continue_after_clock_is_set_back(cluster: Cluster) -> None:
     await cluster.see(drone("inactive", at_s=86_400))
     assert await cluster.see(drone("flying", at_s=0)) == ["TookOff", "MissionBegun"]
 
 
-async def test_a_silent_drone_neither_landed_nor_changed_hands(cluster: Cluster) -> None:
+async def test_stale_drone_has_no_events(cluster: Cluster) -> None:
     await cluster.see(drone("inactive", at_s=0), drone("flying", DRIVER, at_s=5))
     silent = drone("unknown", None, at_s=5)
     assert await cluster.see(silent, drone("flying", DRIVER, at_s=500)) == []
@@ -161,13 +161,13 @@ async def test_a_silent_drone_neither_landed_nor_changed_hands(cluster: Cluster)
     assert cluster.sentences()[-1] == "drone-1 landed, between 12:08:20 and 12:15:00 UTC"
 
 
-async def test_a_drone_of_the_same_name_is_another(cluster: Cluster) -> None:
+async def test_recreated_drone_starts_new_events(cluster: Cluster) -> None:
     await cluster.see(drone("inactive", at_s=0))
     assert await cluster.see(drone("flying", at_s=5, uid="u2")) == []
     assert await cluster.see(None, drone("inactive", at_s=9, uid="u2")) == []
 
 
-async def test_what_fails_is_posted_later_and_the_rest_not_again(cluster: Cluster) -> None:
+async def test_failed_event_is_retried_and_others_are_not_repeated(cluster: Cluster) -> None:
     await cluster.see(drone("inactive", at_s=0))
     cluster.failing = 2
     with pytest.raises(KubeError):
@@ -176,7 +176,7 @@ async def test_what_fails_is_posted_later_and_the_rest_not_again(cluster: Cluste
     assert await cluster.see(drone("flying", at_s=10)) == ["MissionBegun"]
 
 
-async def test_a_drone_that_flaps_writes_few_events(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_flapping_drone_has_few_events(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(drone_events, "PERIOD_S", 1e6)
     cluster.holders = []
     for flap in range(2000):
@@ -187,7 +187,7 @@ async def test_a_drone_that_flaps_writes_few_events(cluster: Cluster, monkeypatc
     assert await cluster.see(drone("inactive", at_s=2001)) == ["Landed"], "how it is now is told when it may be"
 
 
-async def test_what_may_not_be_told_yet_is_told_later(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_delayed_events_are_posted_later(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(drone_events, "PERIOD_S", 0.2)
     monkeypatch.setattr(drone_events, "BURST", 1)
     cluster.holders = []

@@ -1,4 +1,4 @@
-"""The reflector against a scripted API server: breaks, expiry, retries; no network."""
+"""The informer against a scripted API server: broken watches, expiry, retries. No network."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ async def follow(
     return dict(informer.items()), changes
 
 
-async def test_a_list_in_pages_is_one_list(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_informer_reads_all_pages(monkeypatch: pytest.MonkeyPatch) -> None:
     script = Script(page(5, zone("a", 1, 1), continue_="more"), page(5, zone("b", 2, 2)))
     held, changes = await follow(script, monkeypatch)
     assert held == {("", "a"): 1, ("", "b"): 2}
@@ -82,7 +82,7 @@ async def test_a_list_in_pages_is_one_list(monkeypatch: pytest.MonkeyPatch) -> N
     assert script.calls == ["list", "list more", "watch 5"]
 
 
-async def test_a_watch_goes_on_from_where_it_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_informer_continues_watch_from_last_version(monkeypatch: pytest.MonkeyPatch) -> None:
     events = [("ADDED", zone("a", 6, 1)), ("BOOKMARK", {"metadata": {"resourceVersion": "9"}})]
     script = Script(page(5), events, [("MODIFIED", zone("a", 10, 2)), ("DELETED", zone("a", 11, 2))])
     held, changes = await follow(script, monkeypatch)
@@ -91,7 +91,7 @@ async def test_a_watch_goes_on_from_where_it_ended(monkeypatch: pytest.MonkeyPat
     assert script.calls == ["list", "watch 5", "watch 9", "watch 11"]
 
 
-async def test_an_expired_watch_lists_again_and_reports_the_difference(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_informer_lists_again_after_expired_watch(monkeypatch: pytest.MonkeyPatch) -> None:
     script = Script(
         page(5, zone("gone", 1, 1), zone("same", 2, 2), zone("new", 3, 3)),
         [Expired(410, "Expired", "too old")],
@@ -104,9 +104,7 @@ async def test_an_expired_watch_lists_again_and_reports_the_difference(monkeypat
 
 
 @pytest.mark.parametrize("watch", [[], [Expired(410, "Expired", "too old")]], ids=["ends at once", "expires"])
-async def test_a_watch_that_comes_to_nothing_is_opened_less_and_less_often(
-    watch: list[Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_informer_backs_off_after_empty_watches(watch: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
     pauses: list[float] = []
 
     async def sleep(seconds: float) -> None:
@@ -129,7 +127,7 @@ async def test_a_watch_that_comes_to_nothing_is_opened_less_and_less_often(
     assert pauses[-1] >= 12
 
 
-async def test_a_broken_connection_is_taken_up_again(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_informer_reconnects_after_broken_connection(monkeypatch: pytest.MonkeyPatch) -> None:
     broken = KubeError(0, "Unreachable", "reset")
     script = Script(broken, page(5), [("ADDED", zone("a", 6, 1)), broken], [("MODIFIED", zone("a", 7, 2))])
     held, _ = await follow(script, monkeypatch)
@@ -137,7 +135,7 @@ async def test_a_broken_connection_is_taken_up_again(monkeypatch: pytest.MonkeyP
     assert script.calls == ["list", "list", "watch 5", "watch 6", "watch 7"]
 
 
-async def test_after_a_long_silence_it_lists_again(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_informer_lists_again_after_long_silence(monkeypatch: pytest.MonkeyPatch) -> None:
     """An API server that was restored from a backup tells a watch nothing until it comes to the watch's version once more."""
     monkeypatch.setattr(informer_module, "_SILENCE_S", 0.0)
     silent = [KubeError(0, "Unreachable", "TimeoutError")]
@@ -147,20 +145,20 @@ async def test_after_a_long_silence_it_lists_again(monkeypatch: pytest.MonkeyPat
     assert script.calls == ["list", "watch 50", "list", "watch 9"]
 
 
-async def test_an_unchanged_view_wakes_no_one(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_informer_reports_no_unchanged_object(monkeypatch: pytest.MonkeyPatch) -> None:
     script = Script(page(5, zone("a", 1, 1)), [("MODIFIED", zone("a", 6, 1))])
     _, changes = await follow(script, monkeypatch)
     assert changes == [(("", "a"), None, 1)]
 
 
-async def test_an_object_that_cannot_be_read_hides_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_informer_skips_invalid_object(monkeypatch: pytest.MonkeyPatch) -> None:
     odd = {"metadata": {"name": "a", "resourceVersion": "6"}}
     script = Script(page(5, zone("a", 1, 1), odd | {"metadata": {"name": "odd"}}), [("MODIFIED", odd)])
     held, _ = await follow(script, monkeypatch)
     assert held == {("", "a"): 1}
 
 
-def test_an_own_write_is_told_and_outlives_older_news() -> None:
+def test_informer_keeps_own_write_over_older_event() -> None:
     changes: list[tuple[int | None, int | None]] = []
     read: list[Body] = []
 
@@ -186,7 +184,7 @@ def test_an_own_write_is_told_and_outlives_older_news() -> None:
     assert informer.get(("", "a")) is None
 
 
-async def test_a_late_answer_to_an_own_write_says_nothing_newer() -> None:
+async def test_informer_ignores_late_result_of_own_write() -> None:
     events = [
         ("MODIFIED", zone("done", 10, 1)),
         ("MODIFIED", zone("done", 11, 2)),
@@ -209,7 +207,7 @@ async def test_a_late_answer_to_an_own_write_says_nothing_newer() -> None:
     task.cancel()
 
 
-async def test_an_answer_between_two_pages_is_no_newer_than_the_list() -> None:
+async def test_informer_ignores_older_own_write_between_pages() -> None:
     late: list[Body] = []
 
     class Between(Script):
@@ -233,7 +231,7 @@ def test_paths_of_objects() -> None:
     assert POLICY.path() == "/apis/fractus.dev/v1alpha1/policies"
 
 
-async def test_it_knows_whether_a_watch_is_open() -> None:
+async def test_informer_reports_open_watch() -> None:
     ended, is_open, listed_again = asyncio.Event(), asyncio.Event(), asyncio.Event()
 
     class Watched(Script):

@@ -98,7 +98,7 @@ async def _nothing() -> None:
     return
 
 
-async def test_the_first_acts_and_the_second_waits_for_the_whole_duration() -> None:
+async def test_second_candidate_waits_for_lease_duration() -> None:
     shelf, clock = Shelf(), Clock()
     first, second = lease(shelf, clock, "first"), lease(shelf, clock, "second")
     await step(first, second)
@@ -116,7 +116,7 @@ async def test_the_first_acts_and_the_second_waits_for_the_whole_duration() -> N
     assert first.left_s == 0
 
 
-async def test_who_renews_goes_on_and_keeps_others_out() -> None:
+async def test_renewed_lease_keeps_others_out() -> None:
     shelf, clock = Shelf(), Clock()
     first, second = lease(shelf, clock, "first"), lease(shelf, clock, "second")
     for _ in range(20):
@@ -126,7 +126,7 @@ async def test_who_renews_goes_on_and_keeps_others_out() -> None:
         clock.now += 0.2 * DURATION_S
 
 
-async def test_a_frozen_holder_knows_that_it_must_start_again() -> None:
+async def test_frozen_holder_loses_lease() -> None:
     shelf, clock = Shelf(), Clock()
     first, second = lease(shelf, clock, "first"), lease(shelf, clock, "second")
     await step(first, second)
@@ -137,7 +137,7 @@ async def test_a_frozen_holder_knows_that_it_must_start_again() -> None:
         await step(first)
 
 
-async def test_who_finds_the_lease_of_an_earlier_time_must_start_again() -> None:
+async def test_restored_lease_is_lost() -> None:
     """As after the restore of a backup: its watches would wait for versions that are yet to come."""
     shelf, clock = Shelf(), Clock()
     only = lease(shelf, clock, "only")
@@ -155,7 +155,7 @@ async def test_who_finds_the_lease_of_an_earlier_time_must_start_again() -> None
     assert again.left_s > 0
 
 
-async def test_an_api_server_out_of_reach_takes_the_lease_until_it_is_back() -> None:
+async def test_lease_ends_while_api_server_is_unreachable() -> None:
     shelf, clock = Shelf(), Clock()
     only = lease(shelf, clock, "only")
     await step(only)
@@ -168,7 +168,7 @@ async def test_an_api_server_out_of_reach_takes_the_lease_until_it_is_back() -> 
     assert only.left_s > 0
 
 
-async def test_started_again_under_its_name_it_goes_on_at_once() -> None:
+async def test_restarted_holder_continues_at_once() -> None:
     shelf, clock = Shelf(), Clock()
     await step(lease(shelf, clock, "pod"))
     again = lease(shelf, clock, "pod")
@@ -176,7 +176,7 @@ async def test_started_again_under_its_name_it_goes_on_at_once() -> None:
     assert again.left_s > 0
 
 
-async def test_a_lease_that_is_given_back_is_free_at_once() -> None:
+async def test_released_lease_is_free_at_once() -> None:
     shelf, clock = Shelf(), Clock()
     first, second = lease(shelf, clock, "first"), lease(shelf, clock, "second")
     task = asyncio.create_task(first.run())
@@ -188,7 +188,7 @@ async def test_a_lease_that_is_given_back_is_free_at_once() -> None:
     assert second.left_s > 0
 
 
-async def test_of_two_that_ask_at_once_one_gets_it() -> None:
+async def test_one_of_two_concurrent_candidates_gets_lease() -> None:
     shelf, clock = Shelf(), Clock()
     racers = [lease(shelf, clock, f"r{i}") for i in range(5)]
     tasks: list[asyncio.Task[Any]] = [asyncio.create_task(racer.run()) for racer in racers]
@@ -200,7 +200,7 @@ async def test_of_two_that_ask_at_once_one_gets_it() -> None:
     await asyncio.gather(*tasks, return_exceptions=True)
 
 
-async def test_an_answer_that_stalls_is_given_up_in_time_to_ask_again() -> None:
+async def test_stalled_renewal_leaves_time_for_retry() -> None:
     shelf = Shelf()
     shelf.stalls = 2
     short = Lease(cast(Client, shelf), ("system", "fractus-operator"), "short", 0.1, asyncio.get_running_loop().time)
@@ -212,9 +212,7 @@ async def test_an_answer_that_stalls_is_given_up_in_time_to_ask_again() -> None:
 
 
 @pytest.mark.parametrize("failure", [KubeError(500, "InternalError", "not now"), TimeoutError()])
-async def test_after_a_failed_renewal_there_is_time_for_another(
-    monkeypatch: pytest.MonkeyPatch, failure: Exception
-) -> None:
+async def test_failed_renewal_leaves_time_for_retry(monkeypatch: pytest.MonkeyPatch, failure: Exception) -> None:
     shelf, clock = Shelf(), Clock()
     pauses: list[float] = []
     done = asyncio.Event()
@@ -246,7 +244,7 @@ async def test_after_a_failed_renewal_there_is_time_for_another(
     await asyncio.gather(task, return_exceptions=True)
 
 
-async def test_a_renewal_whose_answer_never_came_is_given_back() -> None:
+async def test_renewal_without_response_is_released() -> None:
     shelf, clock = Shelf(), Clock()
     first, second = lease(shelf, clock, "first"), lease(shelf, clock, "second")
     await step(first)
@@ -274,7 +272,7 @@ def _kept_in_a_thread(shelf: _Closable, identity: str, duration_s: float) -> Lea
     return LeaseThread(connect, ("system", "fractus-operator"), identity, duration_s, time.monotonic)
 
 
-async def test_a_busy_loop_loses_no_lease() -> None:
+async def test_busy_event_loop_keeps_lease() -> None:
     shelf = _Closable()
     kept = _kept_in_a_thread(shelf, "busy", 1.0)
     task = asyncio.create_task(kept.run())
@@ -292,7 +290,7 @@ async def test_a_busy_loop_loses_no_lease() -> None:
     assert shelf.closed
 
 
-async def test_a_lease_that_another_took_ends_what_keeps_it() -> None:
+async def test_taken_lease_ends_lease_thread() -> None:
     shelf = _Closable()
     kept = _kept_in_a_thread(shelf, "first", 0.5)
     task = asyncio.create_task(kept.run())
@@ -305,7 +303,7 @@ async def test_a_lease_that_another_took_ends_what_keeps_it() -> None:
     assert kept.left_s <= 0.5
 
 
-async def test_one_that_is_ended_at_once_ends() -> None:
+async def test_lease_thread_cancelled_at_once_ends() -> None:
     task = asyncio.create_task(_kept_in_a_thread(_Closable(), "short", 1.0).run())
     await asyncio.sleep(0)
     task.cancel()
@@ -314,7 +312,7 @@ async def test_one_that_is_ended_at_once_ends() -> None:
     assert task.cancelled()
 
 
-async def test_one_that_never_held_the_lease_does_not_say_so() -> None:
+async def test_lease_thread_without_lease_has_no_time_left() -> None:
     shelf = _Closable()
     await step(lease(shelf, Clock(), "first"))
     shelf.stalls = 1

@@ -1,4 +1,4 @@
-"""Events of direct links: each change once, in order, and no flood from a link that comes and goes."""
+"""Events of direct links: each change has one Event, in order, and a flapping link has few."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def reasons(told: LinkReport, now: LinkReport) -> list[str]:
 UP, DIRECT = report("Up"), report("Up", "direct", 1, "it is faster")
 
 
-def test_each_change_is_told_in_the_order_in_which_it_happens() -> None:
+def test_link_events_are_in_order() -> None:
     assert reasons(parse_link_report({"spec": SPEC}), report("Connecting")) == []
     assert reasons(report(), UP) == ["LinkUp"]
     assert reasons(UP, DIRECT) == ["TrafficDirect"]
@@ -37,7 +37,7 @@ def test_each_change_is_told_in_the_order_in_which_it_happens() -> None:
     assert reasons(DIRECT, report(switches=2)) == ["TrafficCloud", "LinkDown"]
 
 
-def test_an_event_says_why_and_what_it_left_out() -> None:
+def test_link_event_has_reason_and_number_of_changes() -> None:
     ((_, sentence),) = link_changes(UP, DIRECT)
     assert sentence == "calls of drone-1 take the direct link to edge-1: it is faster"
     ((_, sentence),) = link_changes(UP, replace(DIRECT, switches=7))
@@ -76,7 +76,7 @@ async def see(events: LinkEventRecorder, *reports: LinkReport | None) -> None:
         await events.reconcile(KEY)
 
 
-async def test_what_is_there_when_the_operator_starts_is_old_news(events: LinkEventRecorder, posted: Recorder) -> None:
+async def test_link_state_at_start_has_no_event(events: LinkEventRecorder, posted: Recorder) -> None:
     await see(events, DIRECT, replace(DIRECT, message="still faster"))
     assert posted.events == []
     await see(events, report(switches=2))
@@ -84,7 +84,7 @@ async def test_what_is_there_when_the_operator_starts_is_old_news(events: LinkEv
     assert len(posted.names) == 2
 
 
-async def test_a_link_that_comes_and_goes_is_told_of_now_and_then(
+async def test_flapping_link_has_few_events(
     events: LinkEventRecorder, posted: Recorder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(link_events, "PERIOD_S", 1e6)
@@ -97,7 +97,7 @@ async def test_a_link_that_comes_and_goes_is_told_of_now_and_then(
     assert posted.events[2:] == [("u1", "TrafficCloud"), ("u1", "LinkDown")]
 
 
-async def test_what_is_not_due_yet_is_told_later(
+async def test_delayed_link_event_is_posted_later(
     events: LinkEventRecorder, posted: Recorder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(link_events, "PERIOD_S", 0.2)
@@ -108,6 +108,6 @@ async def test_what_is_not_due_yet_is_told_later(
     running.cancel()
 
 
-async def test_a_link_that_is_made_again_begins_again(events: LinkEventRecorder, posted: Recorder) -> None:
+async def test_recreated_link_starts_new_events(events: LinkEventRecorder, posted: Recorder) -> None:
     await see(events, report(), None, DIRECT, replace(DIRECT, switches=3))
     assert posted.events == []

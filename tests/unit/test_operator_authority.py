@@ -1,4 +1,4 @@
-"""The authority: what it issues, when it renews, what it refuses."""
+"""The certificate authority and the CSR controller: issued certificates, renewal, refused requests."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def certificate(data: dict[str, str]) -> x509.Certificate:
     return x509.load_pem_x509_certificate(base64.b64decode(data["tls.crt"]))
 
 
-def test_a_component_gets_a_short_lived_client_certificate() -> None:
+def test_component_gets_short_lived_client_certificate() -> None:
     issued = certificate(AUTHORITY.issue_component(IDENTITY, NOW))
     assert issued.not_valid_after_utc == NOW + COMPONENT_LIFE
     assert list(issued.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value) == [
@@ -36,13 +36,13 @@ def test_a_component_gets_a_short_lived_client_certificate() -> None:
     issued.verify_directly_issued_by(AUTHORITY.certificate)
 
 
-def test_a_certificate_is_kept_for_two_thirds_of_its_life() -> None:
+def test_certificate_is_kept_for_two_thirds_of_its_lifetime() -> None:
     data = AUTHORITY.issue_component(IDENTITY, NOW)
     assert AUTHORITY.is_current(data, IDENTITY, NOW + timedelta(hours=15))
     assert not AUTHORITY.is_current(data, IDENTITY, NOW + timedelta(hours=17))
 
 
-def test_a_certificate_of_another_identity_or_authority_is_not_good() -> None:
+def test_certificate_is_invalid_for_other_identity_or_authority() -> None:
     data = AUTHORITY.issue_component(IDENTITY, NOW)
     assert not AUTHORITY.is_current(data, IDENTITY + "2", NOW)
     assert not Authority.generate(NOW).is_current(data, IDENTITY, NOW)
@@ -51,13 +51,13 @@ def test_a_certificate_of_another_identity_or_authority_is_not_good() -> None:
     assert not AUTHORITY.is_current({**data, "ca.crt": ""}, IDENTITY, NOW)
 
 
-def test_the_authority_survives_its_secret() -> None:
+def test_authority_is_restored_from_its_secret() -> None:
     again = Authority.from_data(AUTHORITY.to_data())
     assert again.certificate == AUTHORITY.certificate
     assert again.is_current(AUTHORITY.issue_component(IDENTITY, NOW), IDENTITY, NOW)
 
 
-def test_a_damaged_authority_is_not_replaced_in_silence() -> None:
+def test_damaged_authority_secret_raises_error() -> None:
     other = Authority.generate(NOW).to_data()
     with pytest.raises(BrokenAuthority, match=r"tls\.key"):
         Authority.from_data({**AUTHORITY.to_data(), "tls.key": other["tls.key"]})
@@ -65,7 +65,7 @@ def test_a_damaged_authority_is_not_replaced_in_silence() -> None:
         Authority.from_data({})
 
 
-def test_the_authority_signs_no_authorities() -> None:
+def test_authority_signs_no_ca_certificates() -> None:
     constraints = AUTHORITY.certificate.extensions.get_extension_for_class(x509.BasicConstraints).value
     assert (constraints.ca, constraints.path_length) == (True, 0)
     issued = certificate(AUTHORITY.issue_component(IDENTITY, NOW))
@@ -74,7 +74,7 @@ def test_the_authority_signs_no_authorities() -> None:
 
 
 @pytest.mark.parametrize("names", ["3002a300", "3000ff", "30048202ffff"])
-def test_a_request_whose_names_cannot_be_read_is_malformed(names: str) -> None:
+def test_csr_with_invalid_names_is_malformed(names: str) -> None:
     odd = x509.UnrecognizedExtension(ExtensionOID.SUBJECT_ALTERNATIVE_NAME, bytes.fromhex(names))
     builder = x509.CertificateSigningRequestBuilder().subject_name(x509.Name([])).add_extension(odd, critical=False)
     request = builder.sign(ec.generate_private_key(ec.SECP256R1()), hashes.SHA256())

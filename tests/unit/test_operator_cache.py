@@ -1,4 +1,4 @@
-"""Claims, bookings and plans that are kept event by event are those that all objects together give."""
+"""Claims, bookings and active plans that are updated by events equal those computed from all objects."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The charts: the kinds they install are those of the models, their values are documented and checked."""
+"""Charts: the installed CRDs match the models, and values are documented and validated."""
 
 from __future__ import annotations
 

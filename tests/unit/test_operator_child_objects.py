@@ -1,4 +1,4 @@
-"""How the operator makes what an application needs: what waits for what, on an API server of the test's own."""
+"""Child objects against a fake API server: order of writes, ownership, deletion, and Secrets."""
 
 from __future__ import annotations
 
@@ -151,7 +151,7 @@ async def test_refused_object_does_not_stop_later_kinds() -> None:
 @pytest.mark.parametrize(
     ("node", "then"), [("n1", ["replace spec Grant"]), ("n2", ["delete Grant", "create Grant"])], ids=["stays", "moved"]
 )
-async def test_a_grant_that_is_there_is_rewritten_unless_its_node_changes(node: str, then: list[str]) -> None:
+async def test_existing_grant_is_replaced_in_place_unless_its_node_changes(node: str, then: list[str]) -> None:
     store = Webhooks(None)
     of = {"uid": APPLICATION.metadata.uid}
     store.there[kinds.GRANT, "one"] = {**kinds.GRANT.header("one", uid="1"), "spec": {"application": of, "node": "n1"}}
@@ -160,7 +160,7 @@ async def test_a_grant_that_is_there_is_rewritten_unless_its_node_changes(node: 
     assert store.said == ["create Grant refused", "get Grant", *then]
 
 
-async def test_the_grant_of_another_application_is_left_alone() -> None:
+async def test_grant_of_another_application_is_not_written() -> None:
     store = Webhooks(None)
     spec = {"application": {"uid": "another"}, "node": "n1"}
     store.there[kinds.GRANT, "one"] = {**kinds.GRANT.header("one", uid="1"), "spec": spec}
@@ -169,7 +169,7 @@ async def test_the_grant_of_another_application_is_left_alone() -> None:
     assert store.said == ["create Grant refused", "get Grant"]
 
 
-async def test_what_a_controller_made_with_our_labels_is_left_to_it() -> None:
+async def test_endpoint_slice_of_kubernetes_is_not_deleted() -> None:
     """EndpointSlices have the labels of their Service: one that is removed before it comes back."""
     store = Spelling(None)
     copies = {kind: OwnedObjects(cast(Any, store), kind, lambda body: body, lambda *_: None) for kind in kinds.CHILDREN}
@@ -185,7 +185,7 @@ async def test_what_a_controller_made_with_our_labels_is_left_to_it() -> None:
     assert store.said == ["delete EndpointSlice"]
 
 
-async def test_pods_are_followed_in_slices_of_the_operator_only() -> None:
+async def test_addresses_are_updated_only_in_endpoint_slices_of_the_operator() -> None:
     """Kubernetes says itself where a Service with a selector leads, and admission refuses what another writes there."""
     store = Spelling(None)
     copies = {kind: OwnedObjects(cast(Any, store), kind, lambda body: body, lambda *_: None) for kind in kinds.CHILDREN}
@@ -200,7 +200,7 @@ async def test_pods_are_followed_in_slices_of_the_operator_only() -> None:
 
 
 @pytest.mark.parametrize("owner", ["Application", "Service"])
-async def test_a_deployment_with_another_owner_is_removed(owner: str) -> None:
+async def test_deployment_with_changed_owner_is_deleted(owner: str) -> None:
     """Who may edit a namespace may give it another owner: it would outlive its application."""
     store = Spelling(None)
     copies = {kind: OwnedObjects(cast(Any, store), kind, lambda body: body, lambda *_: None) for kind in kinds.CHILDREN}
@@ -212,7 +212,7 @@ async def test_a_deployment_with_another_owner_is_removed(owner: str) -> None:
 
 
 @pytest.mark.parametrize("kept", [True, False])
-async def test_a_deployment_that_a_finalizer_keeps_takes_no_pods_along(kept: bool) -> None:
+async def test_pods_of_deployment_with_foreign_finalizer_are_deleted_one_by_one(kept: bool) -> None:
     """So they are removed one by one; those of one that is gone are left to the garbage collector."""
     store = Spelling(None)
     labels = {"app.kubernetes.io/managed-by": "fractus", "fractus.dev/instance": "one"}
@@ -242,7 +242,7 @@ async def test_a_deployment_that_a_finalizer_keeps_takes_no_pods_along(kept: boo
     assert store.said == ["delete Secret", "delete Deployment", *(["delete ReplicaSet", "delete Pod"] if kept else [])]
 
 
-async def test_a_pod_that_was_kept_is_left_to_no_garbage_collector() -> None:
+async def test_teardown_deletes_kept_pods() -> None:
     store = Spelling(None)
     labels = {"app.kubernetes.io/managed-by": "fractus", "fractus.dev/instance": "one"}
     kept = kinds.POD.header("one-x", "city", uid="p", labels=labels, ownerReferences=[{"uid": "app"}]) | {"spec": {}}
@@ -304,7 +304,7 @@ def seen_by(store: Late) -> ClusterCache:
     return cache
 
 
-async def test_what_is_made_after_a_teardown_is_removed_though_no_garbage_collector_finds_it() -> None:
+async def test_orphaned_pods_created_after_teardown_are_deleted() -> None:
     """A deletion that leaves pods to be kept was carried out late, while a controller made what it had just seen removed again."""
     store = Late()
     cache = seen_by(store)
@@ -323,7 +323,7 @@ async def test_what_is_made_after_a_teardown_is_removed_though_no_garbage_collec
     assert store.names() == set()
 
 
-async def test_a_creation_that_was_carried_out_late_is_undone() -> None:
+async def test_deployment_created_after_teardown_is_deleted() -> None:
     store = Late()
     deployment = store.put(kinds.DEPLOYMENT, "one", kinds.APPLICATION.header("a", "city", uid="gone"))
     store.put(kinds.POD, "one-7f-x", store.put(kinds.REPLICA_SET, "one-7f", deployment))
@@ -333,7 +333,7 @@ async def test_a_creation_that_was_carried_out_late_is_undone() -> None:
     assert store.names() == set()
 
 
-async def test_a_copy_of_a_deployment_is_who_made_it_s() -> None:
+async def test_copy_of_deployment_without_owner_is_kept() -> None:
     store = Late()
     store.put(kinds.POD, "one-7f-x", store.put(kinds.REPLICA_SET, "one-7f", store.put(kinds.DEPLOYMENT, "one")))
     lost = OrphanedPods(store, seen_by(store))
@@ -418,7 +418,7 @@ class Secrets:
         ("lost", False, ["create"]),
     ],
 )
-async def test_secrets_are_written_without_a_look(why: Any, there: bool, said: list[str]) -> None:
+async def test_secret_is_written_without_reading_it(why: Any, there: bool, said: list[str]) -> None:
     store = Secrets(*["one-tls"] * there)
     children = made_on(cast(Any, store))
     assert await children.write_secret(APPLICATION, "one", kinds.SECRET.header("one-tls", "city"), why)
@@ -427,7 +427,7 @@ async def test_secrets_are_written_without_a_look(why: Any, there: bool, said: l
 
 
 @pytest.mark.parametrize("why", ["new", "renewed", "lost"])
-async def test_a_quota_that_is_used_up_is_said_of_a_secret_that_is_not_there(why: Any) -> None:
+async def test_exhausted_quota_is_reported_only_for_missing_secret(why: Any) -> None:
     """The API server looks at quotas first: it would refuse to make one that is there, and no try would ever succeed."""
     secret = kinds.SECRET.header("one-tls", "city")
     store = Secrets("one-tls")
@@ -439,7 +439,7 @@ async def test_a_quota_that_is_used_up_is_said_of_a_secret_that_is_not_there(why
         await made_on(cast(Any, store)).write_secret(APPLICATION, "one", secret, why)
 
 
-async def test_no_secret_of_anothers_deployment_is_written() -> None:
+async def test_secret_is_not_written_for_deployment_of_another_owner() -> None:
     store = Secrets()
     copies = {kind: OwnedObjects(cast(Any, store), kind, lambda body: body, lambda *_: None) for kind in kinds.CHILDREN}
     copies[kinds.DEPLOYMENT].record_write(
@@ -450,7 +450,7 @@ async def test_no_secret_of_anothers_deployment_is_written() -> None:
     assert store.said == []
 
 
-async def test_the_secret_of_a_deployment_goes_with_it_and_is_deleted_again_where_that_was_refused() -> None:
+async def test_secret_is_deleted_with_its_deployment_and_retried_after_refusal() -> None:
     store = Secrets("one-tls")
     copies = {kind: OwnedObjects(cast(Any, store), kind, lambda body: body, lambda *_: None) for kind in kinds.CHILDREN}
     children = ChildObjects(cast(Any, store), copies, cast(Any, None))

@@ -1,4 +1,4 @@
-"""The operator's pure decisions: conditions, differences, missions, locations, quantities, settings."""
+"""Pure decisions of the operator: conditions, comparison, missions, location labels, quantities, settings."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ V1 = "fractus.dev/v1alpha1"
 # -- conditions --
 
 
-def test_a_transition_is_reported_and_moves_the_time() -> None:
+def test_condition_transition_is_reported_and_sets_time() -> None:
     first, transitions = merge([], [ConditionUpdate("Ready", "False", "PodsNotReady")], 1, NOW)
     assert [n.reason for n in transitions] == ["PodsNotReady"]
     later = NOW + timedelta(minutes=1)
@@ -51,7 +51,7 @@ def test_a_transition_is_reported_and_moves_the_time() -> None:
     assert true[0].last_transition_time == later
 
 
-def test_stages_that_are_reached_together_are_told_by_one_event() -> None:
+def test_stages_reached_together_have_one_event() -> None:
     stages = [ConditionUpdate(stage, "True", stage, f"{stage} it is") for stage in ("Planned", "Granted", "Deployed")]
     ready = ConditionUpdate("Ready", "True", "PodsReady", "all pods are ready")
     waiting = ConditionUpdate("Ready", "False", "PodsNotReady", "one to go", progress=True)
@@ -65,7 +65,7 @@ def test_stages_that_are_reached_together_are_told_by_one_event() -> None:
     assert [(update.reason, update.warning) for update in told] == [("Planned", False), ("NameTaken", True)]
 
 
-def test_only_a_problem_is_a_warning() -> None:
+def test_condition_is_warning_only_for_problem() -> None:
     assert ConditionUpdate("Ready", "False", "X").warning
     assert not ConditionUpdate("Ready", "False", "X", progress=True).warning
     assert not ConditionUpdate("Ready", "True", "X").warning
@@ -74,7 +74,7 @@ def test_only_a_problem_is_a_warning() -> None:
 # -- differences --
 
 
-def test_an_applied_object_is_current_until_someone_changes_it() -> None:
+def test_applied_object_is_current_until_changed() -> None:
     desired = stamped(
         {"metadata": {"name": "a"}, "spec": {"replicas": 1, "ports": [{"port": 1}], "empty": {}, "none": []}}
     )
@@ -88,7 +88,7 @@ def test_an_applied_object_is_current_until_someone_changes_it() -> None:
         assert not is_current(desired, {**observed, "spec": {**observed["spec"], **spoil}}), spoil
 
 
-def test_a_field_that_is_dropped_is_a_difference() -> None:
+def test_dropped_field_is_a_difference() -> None:
     before = stamped({"metadata": {"name": "a"}, "spec": {"x": 1, "y": 2}})
     assert not is_current(stamped({"metadata": {"name": "a"}, "spec": {"x": 1}}), before)
 
@@ -96,7 +96,7 @@ def test_a_field_that_is_dropped_is_a_difference() -> None:
 @pytest.mark.parametrize(
     ("observed", "desired"), [(1, 1.0), (None, ""), (None, False), (None, {}), (None, []), ({"a": 1}, {})]
 )
-def test_what_the_api_server_stores_its_own_way_is_equal(observed: object, desired: object) -> None:
+def test_missing_and_empty_values_are_equal(observed: object, desired: object) -> None:
     assert contains(observed, desired)
 
 
@@ -127,13 +127,13 @@ PLAN = DeploymentPlanSpec(
 INVENTORY = Inventory(hosts={"edge-1": Host("edge-1")}, edge_nodes={"edge-1": edge("edge-1")})
 
 
-def test_a_plan_stands_while_its_nodes_exist() -> None:
+def test_plan_is_kept_while_its_nodes_exist() -> None:
     assert replan_reason(application(), PLAN, INVENTORY, {}) is None
     unreachable = replace(INVENTORY, hosts={"edge-1": Host("edge-1", ready=False)})
     assert replan_reason(application(), PLAN, unreachable, {}) is None
 
 
-def test_a_new_plan_is_made_for_a_reason() -> None:
+def test_replan_reason_names_the_cause() -> None:
     assert replan_reason(application(), None, INVENTORY, {}) == "NoPlanYet"
     assert replan_reason(application(2), PLAN, INVENTORY, {}) == "SpecChanged"
     same = PLAN.model_copy(update={"application_digest": application().spec.mission_digest})
@@ -146,14 +146,14 @@ def test_a_new_plan_is_made_for_a_reason() -> None:
     assert replan_reason(application(), PLAN, cordoned, {}, in_flight="edge-1") is None
 
 
-def test_a_drone_in_the_air_keeps_its_plan() -> None:
+def test_plan_is_kept_while_drone_is_in_flight() -> None:
     without = replace(INVENTORY, hosts={}, edge_nodes={})
     assert replan_reason(application(), PLAN, without, {}) == "NodeGone"
     assert replan_reason(application(), PLAN, without, {"edge-1": "full"}, in_flight="edge-1") is None
     assert replan_reason(application(2), PLAN, without, {}, in_flight="edge-1") == "SpecChanged"
 
 
-def test_a_changed_manifest_waits_while_the_drone_flies() -> None:
+def test_changed_manifest_waits_for_landing() -> None:
     assert waits_for_landing(application(2), PLAN, "d")
     assert not waits_for_landing(application(1), PLAN, "d")
     assert not waits_for_landing(application(2), PLAN, None)
@@ -162,7 +162,7 @@ def test_a_changed_manifest_waits_while_the_drone_flies() -> None:
     assert not waits_for_landing(now, PLAN, "d")
 
 
-def test_in_flight_what_stays_keeps_the_name_that_another_release_gave_it() -> None:
+def test_instances_in_flight_keep_names_of_another_release() -> None:
     named = PLAN.model_copy(update={"placements": (placed("old-1", "edge-1"), placed("old-c", None, replicas=2))})
     fresh = (placed("new-1", "edge-1"), placed("new-c", None, replicas=2), placed("new-2", "edge-2"))
     kept = _with_names_of(named, PLAN.model_copy(update={"placements": fresh}))
@@ -179,7 +179,7 @@ def view(instance: str, **more: object) -> PodView:
     return PodView("ns", f"{instance}-x", None, {"fractus.dev/instance": instance}, {}, **values)  # type: ignore[arg-type]
 
 
-def test_a_node_is_stuck_after_a_grace() -> None:
+def test_node_is_stuck_after_grace_period() -> None:
     waiting = view("a-1", ready=False, unschedulable_since=NOW - timedelta(seconds=2), unschedulable_message="no cpu")
     assert stuck_nodes(PLAN, [waiting], NOW) == ({}, 3.0)
     stuck, again_s = stuck_nodes(PLAN, [waiting], NOW + timedelta(seconds=10))
@@ -191,14 +191,14 @@ def test_a_node_is_stuck_after_a_grace() -> None:
     assert stuck_nodes(PLAN, [in_the_cloud, leaving, forged], NOW) == ({}, None)
 
 
-def test_a_node_is_not_stuck_while_the_pod_before_is_on_its_way_out() -> None:
+def test_node_is_not_stuck_while_previous_pod_terminates() -> None:
     waiting = view("a-1", unschedulable_since=NOW - timedelta(seconds=60), unschedulable_message="full")
     leaving = replace(view("a-0", terminating=True), node="edge-1")
     assert stuck_nodes(PLAN, [waiting, leaving], NOW) == ({}, 1.0)
     assert set(stuck_nodes(PLAN, [waiting], NOW)[0]) == {"edge-1"}
 
 
-def test_readiness_counts_each_instance_up_to_its_replicas() -> None:
+def test_status_counts_ready_pods_up_to_replicas() -> None:
     pods = [view("a-c"), view("a-c"), view("a-c"), view("a-1", ready=False)]
     update = status.deployed(PLAN, pods, 0)
     assert (update.phase, update.pods) == ("Deploying", "2/3")
@@ -209,7 +209,7 @@ def test_readiness_counts_each_instance_up_to_its_replicas() -> None:
     assert old.pods == "2/3"
 
 
-def test_a_pod_that_may_not_be_made_is_told_with_the_reason() -> None:
+def test_status_reports_why_pods_cannot_be_created() -> None:
     why = 'pods "a-1-5d8f-" is forbidden: exceeded quota: compute'
     pods = [view("a-c"), view("a-c")]
     update = status.deployed(PLAN, pods, 0, refused={"a-1": why, "a-c": "of its last rollout"})
@@ -225,7 +225,7 @@ def test_a_pod_that_may_not_be_made_is_told_with_the_reason() -> None:
     assert refusals([*bodies, {"metadata": {"name": "d"}}]) == {"a": why}
 
 
-def test_a_failed_component_is_named_with_its_exit_code_and_last_lines() -> None:
+def test_status_reports_exit_code_and_last_log_lines() -> None:
     ended = {"exitCode": 1, "message": "Traceback\nValueError: no route\n"}
     again = {"state": {"running": {}}, "lastState": {"terminated": ended}}
     never = {"state": {"waiting": {"reason": "ImagePullBackOff", "message": "no such image"}}}
@@ -250,7 +250,7 @@ def grant(phase: str | None, uid: str = "u1", class_: str = "driver") -> Grant:
     return Grant.from_body({"apiVersion": V1, "kind": "Grant", "metadata": {"name": "ns.n"}, "spec": spec, **status})
 
 
-def test_only_the_driver_of_this_application_ends_the_mission() -> None:
+def test_mission_outcome_is_that_of_the_driver() -> None:
     assert mission_outcome("u1", [grant(None), grant("Active"), grant("Pending")]) is None
     assert mission_outcome("u1", [grant("Complete", uid="u0"), grant("Failed", class_="passenger")]) is None
     assert mission_outcome("u1", [grant("Complete")]) == Outcome(OutcomeKind.COMPLETE, "because")
@@ -259,7 +259,7 @@ def test_only_the_driver_of_this_application_ends_the_mission() -> None:
 
 
 @pytest.mark.parametrize("kind", OutcomeKind)
-def test_every_outcome_is_reported(kind: OutcomeKind) -> None:
+def test_status_reports_every_mission_outcome(kind: OutcomeKind) -> None:
     update = status.finished(Outcome(kind, "because"), "d", None)
     complete = kind is OutcomeKind.COMPLETE
     assert (update.phase, update.message) == ("Completed" if complete else "Failed", "because")
@@ -273,7 +273,7 @@ def flown(state: str, last: str | None = None, controller: str | None = None) ->
     return Drone.from_body({**body, "status": {name: value for name, value in said.items() if value}})
 
 
-def test_a_mission_that_is_over_is_returning_until_the_drone_has_landed() -> None:
+def test_phase_is_returning_until_drone_has_landed() -> None:
     update = status.finished(Outcome(OutcomeKind.FAILED, "driver lost"), "d", flown("flying", controller="system"))
     assert (update.phase, update.controller) == ("Returning", "system")
     conditions = [{"type": c.type, "status": c.status, "reason": c.reason, "message": c.message,
@@ -297,7 +297,7 @@ def test_a_mission_that_is_over_is_returning_until_the_drone_has_landed() -> Non
         (None, True, "Unknown"),
     ],
 )
-def test_the_phase_of_a_flight_is_what_its_drone_does(drone: Drone | None, begun: bool, phase: str) -> None:
+def test_flight_phase_follows_drone_state(drone: Drone | None, begun: bool, phase: str) -> None:
     mission = {"type": "MissionComplete", "reason": "MissionBegun" if begun else "MissionWaiting"}
     found = flight("d", drone, {"drone": "d", "conditions": [mission]})
     assert found.phase == phase
@@ -305,12 +305,12 @@ def test_the_phase_of_a_flight_is_what_its_drone_does(drone: Drone | None, begun
     assert update.phase == ("Deploying" if phase in {"Waiting", "Landed"} else phase), "a pod is missing"
 
 
-def test_the_flight_of_another_drone_began_nothing() -> None:
+def test_flight_of_another_drone_does_not_begin_mission() -> None:
     mission = {"type": "MissionComplete", "reason": "MissionBegun"}
     assert flight("d", flown("inactive"), {"drone": "other", "conditions": [mission]}).phase == "Waiting"
 
 
-def test_what_blocks_is_reported_at_its_stage() -> None:
+def test_status_reports_blocked_stage() -> None:
     update = status.blocked(Blocked("Pending", "Granted", "PolicyInvalid", "no zone"), None)
     assert [(c.type, c.status) for c in update.conditions] == [
         ("Planned", "True"),
@@ -328,11 +328,11 @@ def test_what_blocks_is_reported_at_its_stage() -> None:
     ("lat", "lon", "cell"),
     [(57.64911, 10.40744, "u4pruydqqvj"), (-25.382708, -49.265506, "6gkzwgjzn82"), (42.605, -5.603, "ezs42")],
 )
-def test_geohashes_are_the_known_ones(lat: float, lon: float, cell: str) -> None:
+def test_geohash_of_known_positions(lat: float, lon: float, cell: str) -> None:
     assert geohash(lat, lon, len(cell)) == cell
 
 
-def test_a_drone_is_labelled_where_it_is() -> None:
+def test_location_labels_of_drone() -> None:
     spec = {"depot": "base", "home": {"lat": 1, "lon": 2}, "interfaces": [{"technology": "WiFi"}, {"technology": "4G"}]}
     body = {"apiVersion": V1, "kind": "Drone", "metadata": {"name": "d"}, "spec": spec}
     assert location_labels(Drone.from_body(body)) == {
@@ -351,11 +351,11 @@ def test_a_drone_is_labelled_where_it_is() -> None:
 @pytest.mark.parametrize(
     ("text", "value"), [("250m", 0.25), ("1Ki", 1024), ("1e3", 1000), ("500n", 5e-7), ("2E", 2e18), (3, 3)]
 )
-def test_quantities_of_any_spelling_are_read(text: str | int, value: float) -> None:
+def test_quantities_are_parsed(text: str | int, value: float) -> None:
     assert amount_of(text) == pytest.approx(value)
 
 
-def test_a_pod_asks_for_the_larger_of_its_phases() -> None:
+def test_pod_requests_are_maximum_of_init_and_main_containers() -> None:
     def asks(cpu: str) -> dict:
         return {"resources": {"requests": {"cpu": cpu}}}
 
@@ -368,7 +368,7 @@ def test_a_pod_asks_for_the_larger_of_its_phases() -> None:
     assert (pod.instance, pod.ready, pod.labels) == ("i", False, {"fractus.dev/instance": "i"})
 
 
-def test_what_runs_beside_a_pods_containers_is_asked_for_too() -> None:
+def test_pod_requests_include_sidecars_and_overhead() -> None:
     """As by a service mesh, whose proxy is an init container that stays: the scheduler counts it, too."""
 
     def asks(cpu: str, **more: str) -> dict:
@@ -389,7 +389,7 @@ def test_what_runs_beside_a_pods_containers_is_asked_for_too() -> None:
     [({}, "Running", False), ({}, "Failed", True), ({"activeDeadlineSeconds": 1}, "Running", True),
      ({"activeDeadlineSeconds": 2**31}, "Running", False)],
 )  # fmt: skip
-def test_a_label_alone_hides_no_pod_that_runs(spec: dict, phase: str, kept: bool) -> None:
+def test_finished_label_does_not_hide_running_pod(spec: dict, phase: str, kept: bool) -> None:
     metadata = {"name": "p", "namespace": "ns", "labels": {"fractus.dev/finished": "20260601T120000Z"}}
     pod = parse_pod({"metadata": metadata, "spec": spec, "status": {"phase": phase}})
     assert (pod.finished_at is not None) == kept
@@ -407,7 +407,9 @@ def test_a_label_alone_hides_no_pod_that_runs(spec: dict, phase: str, kept: bool
         ("unknown", None, None, "unknown"),
     ],
 )
-def test_only_a_drone_that_may_be_in_the_air_is_unknown(state: str, last: str, mission: str, shown: str) -> None:
+def test_displayed_state_is_unknown_only_if_drone_may_be_in_the_air(
+    state: str, last: str, mission: str, shown: str
+) -> None:
     told: dict[str, Any] = {"flightState": state, "lastSeen": "2026-06-01T12:00:00Z"}
     if last is not None:
         told["lastFlightState"] = last
@@ -426,7 +428,7 @@ def test_only_a_drone_that_may_be_in_the_air_is_unknown(state: str, last: str, m
     assert displayed_flight_state(Drone.from_body(body)) == "offline"
 
 
-def test_a_node_s_heartbeat_changes_nothing() -> None:
+def test_node_heartbeat_does_not_change_host() -> None:
     def node(beat: str) -> dict:
         condition = {"type": "Ready", "status": "True", "lastHeartbeatTime": beat}
         return {
@@ -446,7 +448,7 @@ def test_a_node_s_heartbeat_changes_nothing() -> None:
         ("node.kubernetes.io/unreachable", "NoExecute", False),
     ],
 )
-def test_only_the_taint_that_kubelets_heed_guards_a_node(key: str, effect: str, guarded: bool) -> None:
+def test_only_no_execute_taint_guards_node(key: str, effect: str, guarded: bool) -> None:
     node = {"metadata": {"name": "n"}, "spec": {"taints": [{"key": key, "effect": effect}]}}
     assert parse_host(node).guarded is guarded
     assert not parse_host({"metadata": {"name": "n"}}).guarded
@@ -475,7 +477,7 @@ def test_settings_come_from_the_environment() -> None:
         {"FRACTUS_LEASE": "0.5"},
     ],
 )
-def test_a_bad_setting_is_named(environment: dict[str, str]) -> None:
+def test_invalid_setting_is_named(environment: dict[str, str]) -> None:
     with pytest.raises(BadSetting, match=next(iter(environment))):
         Settings.from_environment(environment)
 
@@ -491,7 +493,7 @@ def edge_body(version: int, ready: str) -> dict[str, Any]:
     return {"apiVersion": V1, "kind": "EdgeNode", "metadata": metadata, "spec": spec, "status": status}
 
 
-async def test_an_edge_node_that_becomes_ready_wakes_applications_and_one_that_stays_so_does_not() -> None:
+async def test_applications_wake_when_edge_node_becomes_ready() -> None:
     cache = ClusterCache(cast(Store, None))
     cache.edge_nodes.record_write(("", "e"), edge_body(1, "False"))
     with cache.subscriptions.subscribe(("default", "app")) as inputs:
@@ -501,7 +503,7 @@ async def test_an_edge_node_that_becomes_ready_wakes_applications_and_one_that_s
         assert await inputs.changed(1)
 
 
-def test_only_how_it_is_carried_out_and_kept_is_no_part_of_the_mission() -> None:
+def test_update_policy_and_ttl_do_not_change_the_mission() -> None:
     spec = application().spec
     kept = spec.model_copy(update={"ttl_after_finished": 5, "update_policy": "Immediate"})
     assert kept.mission_digest == spec.mission_digest
@@ -511,7 +513,7 @@ def test_only_how_it_is_carried_out_and_kept_is_no_part_of_the_mission() -> None
     assert type(spec).model_validate(spec.model_dump(by_alias=True)).mission_digest == spec.mission_digest
 
 
-def test_a_plan_follows_the_generation_while_the_mission_is_the_same() -> None:
+def test_plan_follows_generation_of_the_same_mission() -> None:
     stamped = of_generation(application(), PLAN)
     assert stamped.application_digest == application().spec.mission_digest
     assert of_generation(application(), stamped) is stamped

@@ -1,4 +1,4 @@
-"""What kopf is told of an Application's teardown: what the operator knows, not what the Application says."""
+"""kopf handlers: the teardown of an Application does not depend on its annotations."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ def body(uid: str = "1", **annotations: str) -> kopf.Body:
 @pytest.mark.parametrize(
     "noted", ['{"success":true}', '{"delayed":"9999-12-31T00:00:00+00:00"}', "5", "no JSON", "[]", ""]
 )
-def test_annotations_neither_skip_a_teardown_nor_put_it_off(noted: str) -> None:
+def test_annotations_neither_skip_nor_delay_teardown(noted: str) -> None:
     """Who may edit an Application writes them, and another may want its drone home."""
     assert InMemoryProgress("kopf.fractus.dev").fetch(key=TEARDOWN, body=body(**{NOTE: noted})) is None
 
 
-def test_a_teardown_that_failed_is_tried_again_in_time() -> None:
+def test_failed_teardown_is_retried() -> None:
     progress, patch = InMemoryProgress("kopf.fractus.dev"), kopf.Patch()
     record: Any = {"started": "2026-01-01T00:00:00+00:00", "delayed": "2026-01-01T00:00:05+00:00", "retries": 1}
     progress.store(key=TEARDOWN, record=record, body=body(), patch=patch)
@@ -41,7 +41,7 @@ def test_a_teardown_that_failed_is_tried_again_in_time() -> None:
     assert progress.fetch(key=TEARDOWN, body=body()) is None
 
 
-async def test_what_is_remembered_is_not_stored_again_as_long_as_it_is_the_same() -> None:
+async def test_unchanged_progress_is_not_stored_again() -> None:
     """Else kopf waits for the event of a patch that changes nothing, and never tries again."""
     progress, patch = InMemoryProgress("kopf.fractus.dev"), kopf.Patch()
     handler: Any = SimpleNamespace(id=TEARDOWN)

@@ -1,4 +1,4 @@
-"""What the operator tells Prometheus."""
+"""Prometheus metrics of the operator."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def observed() -> MetricsSource:
     )
 
 
-def test_every_metric_is_described_and_told() -> None:
+def test_every_metric_is_documented() -> None:
     with metrics.reconciling("application"), metrics.phase("plan"):
         pass
     text = metrics.text(observed()).decode()
@@ -36,7 +36,7 @@ def test_every_metric_is_described_and_told() -> None:
 
 
 @pytest.mark.parametrize(("error", "reason"), [(KubeError(403, "Forbidden", "no"), "Forbidden"), (ValueError(), "Bug")])
-async def test_a_step_that_fails_is_counted(error: Exception, reason: str) -> None:
+async def test_failed_step_is_counted(error: Exception, reason: str) -> None:
     failed = asyncio.Event()
 
     async def reconcile(_: object) -> None:
@@ -59,7 +59,7 @@ async def test_a_step_that_fails_is_counted(error: Exception, reason: str) -> No
     assert count() == before + 1
 
 
-async def test_an_application_that_is_being_deleted_is_no_failure() -> None:
+async def test_deletion_is_not_counted_as_failure() -> None:
     class Leaving(ApplicationController):
         def __init__(self) -> None:
             async def synced() -> None:

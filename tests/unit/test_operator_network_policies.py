@@ -1,4 +1,4 @@
-"""Who may call a component's pods: NetworkPolicies, judged on pods as a network plugin would."""
+"""NetworkPolicies evaluated on pods as a network plugin would: which components may call a component."""
 
 from __future__ import annotations
 
@@ -43,21 +43,21 @@ def may_call(application: Application, sender: Body | str, instance: str) -> boo
 BASE, EDGE = "traffic-image-checker", "traffic-image-checker-edge-1"
 
 
-def test_callers_reach_the_cloud_base_and_no_one_else_does() -> None:
+def test_network_policy_allows_only_callers_to_cloud_base() -> None:
     assert may_call(APPLICATION, PODS["traffic-aerial-viewer"], BASE)
     assert not may_call(APPLICATION, PODS["traffic-navigator"], BASE)
     assert not may_call(APPLICATION, STRANGER, BASE)
     assert not may_call(APPLICATION, "169.254.7.7", BASE)
 
 
-def test_instances_at_the_edge_are_reached_over_direct_links_alone() -> None:
+def test_edge_instances_are_reached_only_over_direct_links() -> None:
     assert may_call(APPLICATION, "169.254.7.7", EDGE)
     assert not may_call(APPLICATION, "10.1.0.7", EDGE)
     assert not may_call(APPLICATION, PODS["traffic-aerial-viewer"], EDGE)
     assert not may_call(APPLICATION, STRANGER, EDGE)
 
 
-def test_what_names_no_caller_is_open() -> None:
+def test_component_without_callers_has_no_network_policy() -> None:
     body = copy.deepcopy(INPUT["application"])
     body["spec"]["components"][0]["container"]["ports"] = [{"port": 9000}]
     application = Application.from_body(body)
@@ -66,7 +66,7 @@ def test_what_names_no_caller_is_open() -> None:
 
 
 @pytest.mark.parametrize(("field", "component"), [("egress", "Navigator"), ("ingress", "ImageChecker")])
-def test_either_side_may_declare_who_calls(field: str, component: str) -> None:
+def test_caller_is_declared_by_either_side(field: str, component: str) -> None:
     body = copy.deepcopy(INPUT["application"])
     part = next(c for c in body["spec"]["components"] if c["name"] == component)
     part[field] = ["ImageChecker" if field == "egress" else "Navigator"]
@@ -75,7 +75,7 @@ def test_either_side_may_declare_who_calls(field: str, component: str) -> None:
     assert may_call(application, PODS["traffic-aerial-viewer"], BASE)
 
 
-def test_every_policy_has_a_name_of_its_own() -> None:
+def test_network_policies_have_different_names() -> None:
     body = copy.deepcopy(INPUT["application"])
     twin = copy.deepcopy(next(c for c in body["spec"]["components"] if c["name"] == "ImageChecker"))
     body["spec"]["components"].append({**twin, "name": "ImageCheckerEdge", "ingress": ["AerialViewer"]})

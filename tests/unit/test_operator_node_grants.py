@@ -1,4 +1,4 @@
-"""What the operator keeps for each node: its Grants in one object, an account, and the reports of its agent."""
+"""Objects of each node: NodeGrants, the account, and the reports of its agent."""
 
 from __future__ import annotations
 
@@ -43,14 +43,14 @@ def report(phase: Any, message: str = "", generation: int = 1, uid: str = "u") -
         ),
     ],
 )
-def test_a_report_becomes_the_status_and_takes_no_end_back(
+def test_report_becomes_grant_status_but_final_phase_stays(
     known: Body | None, said: ReportedGrant, wanted: Body | None
 ) -> None:
     assert reported_status({"metadata": {"name": "g"}, "status": known}, said) == wanted
 
 
 @pytest.mark.parametrize("kind", ACCOUNT_KINDS, ids=lambda kind: kind.name)
-def test_an_account_that_gives_other_rights_is_not_as_made(kind: Kind) -> None:
+def test_account_with_other_rights_is_modified(kind: Kind) -> None:
     made = account_object(kind, "drone-1")
     assert is_unmodified(kind, made | {"secrets": []})
     for field in made.keys() - {"apiVersion", "kind", "metadata"}:
@@ -199,7 +199,7 @@ async def cluster() -> AsyncIterator[Cluster]:
 ALL = {"ServiceAccount", "Role", "RoleBinding", "NodeGrants"}
 
 
-async def test_a_node_gets_its_account_and_an_object_that_says_that_nothing_is_granted(cluster: Cluster) -> None:
+async def test_node_gets_account_and_empty_node_grants(cluster: Cluster) -> None:
     cluster.drone("drone-1")
     await cluster.until(lambda: cluster.api.node("drone-1").keys() == ALL)
     assert cluster.api.granted("drone-1") == []
@@ -210,7 +210,7 @@ async def test_a_node_gets_its_account_and_an_object_that_says_that_nothing_is_g
     assert cluster.api.asked == []
 
 
-async def test_nothing_is_decided_before_all_is_known(cluster: Cluster) -> None:
+async def test_nodes_are_reconciled_only_after_sync(cluster: Cluster) -> None:
     cluster.cache.children[kinds.GRANT].synced.clear()
     cluster.drone("drone-1")
     for _ in range(20):
@@ -220,7 +220,7 @@ async def test_nothing_is_decided_before_all_is_known(cluster: Cluster) -> None:
     await cluster.until(lambda: cluster.api.granted("drone-1") == [])
 
 
-async def test_a_node_s_object_follows_its_grants_and_no_others(cluster: Cluster) -> None:
+async def test_node_grants_follow_grants_of_the_node(cluster: Cluster) -> None:
     cluster.drone("drone-1")
     cluster.grant("a", "drone-1")
     cluster.grant("b", "edge-1")
@@ -233,7 +233,7 @@ async def test_a_node_s_object_follows_its_grants_and_no_others(cluster: Cluster
     await cluster.until(lambda: cluster.api.granted("drone-1") == [])
 
 
-async def test_what_is_reported_is_copied_to_the_node_s_own_grants(cluster: Cluster) -> None:
+async def test_reports_are_copied_to_grants_of_the_same_node(cluster: Cluster) -> None:
     cluster.grant("a", "drone-1")
     cluster.grant("b", "edge-1")
     await cluster.until(lambda: cluster.api.granted("drone-1") == ["a"])
@@ -252,7 +252,7 @@ async def test_what_is_reported_is_copied_to_the_node_s_own_grants(cluster: Clus
     assert len(cluster.api.asked) == 1
 
 
-async def test_a_node_that_is_gone_is_told_that_nothing_is_granted_and_loses_all(cluster: Cluster) -> None:
+async def test_deleted_node_gets_empty_node_grants_before_removal(cluster: Cluster) -> None:
     cluster.drone("drone-1")
     cluster.grant("a", "drone-1")
     await cluster.until(lambda: cluster.api.node("drone-1").keys() == ALL and cluster.api.granted("drone-1") == ["a"])
@@ -265,7 +265,7 @@ async def test_a_node_that_is_gone_is_told_that_nothing_is_granted_and_loses_all
     assert [method for method, _ in cluster.api.asked] == ["PATCH", "DELETE", "DELETE", "DELETE", "DELETE"]
 
 
-async def test_a_node_that_may_come_back_keeps_an_object_that_says_that_nothing_is_granted(cluster: Cluster) -> None:
+async def test_unregistered_node_keeps_empty_node_grants(cluster: Cluster) -> None:
     cluster.host("edge-1")
     cluster.grant("a", "edge-1")
     await cluster.until(lambda: cluster.api.node("edge-1").keys() == ALL and cluster.api.granted("edge-1") == ["a"])
@@ -277,7 +277,7 @@ async def test_a_node_that_may_come_back_keeps_an_object_that_says_that_nothing_
     await cluster.until(lambda: not cluster.api.node("edge-1"))
 
 
-async def test_a_report_of_a_grant_that_was_made_again_is_dropped(cluster: Cluster) -> None:
+async def test_report_of_recreated_grant_is_dropped(cluster: Cluster) -> None:
     cluster.grant("a", "drone-1")
     await cluster.until(lambda: cluster.api.granted("drone-1") == ["a"])
     await cluster.settled()
@@ -289,7 +289,7 @@ async def test_a_report_of_a_grant_that_was_made_again_is_dropped(cluster: Clust
     assert cluster.status("a") is None
 
 
-async def test_what_one_object_does_not_take_is_the_newest(
+async def test_newest_grants_are_omitted_when_node_grants_is_full(
     cluster: Cluster, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     one = cluster.grant("z-oldest", "drone-1", creationTimestamp="2026-01-01T00:00:00Z")
@@ -309,7 +309,7 @@ async def test_what_one_object_does_not_take_is_the_newest(
 
 
 @pytest.mark.parametrize("kind", [*ACCOUNT_KINDS, kinds.NODE_GRANTS], ids=lambda kind: kind.name)
-async def test_what_is_deleted_or_changed_by_hand_is_made_again(cluster: Cluster, kind: Kind) -> None:
+async def test_deleted_or_modified_node_object_is_created_again(cluster: Cluster, kind: Kind) -> None:
     cluster.drone("drone-1")
     cluster.grant("a", "drone-1")
     await cluster.until(lambda: cluster.api.node("drone-1").keys() == ALL)
@@ -335,7 +335,7 @@ async def test_what_is_deleted_or_changed_by_hand_is_made_again(cluster: Cluster
     assert cluster.api.granted("drone-1") == ["a"]
 
 
-async def test_grants_that_change_while_others_are_packed_are_written_last(cluster: Cluster) -> None:
+async def test_grants_changed_during_packing_are_written(cluster: Cluster) -> None:
     for number in range(20):
         cluster.grant(f"g{number:02d}", "drone-1")
         await asyncio.sleep(0)

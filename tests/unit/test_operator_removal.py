@@ -1,4 +1,4 @@
-"""Which nodes have removed their data when Fractus was uninstalled."""
+"""Removal of run-time objects and of data on nodes after Fractus was uninstalled."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def pod(node: str | None, ready: str | None = None) -> dict[str, Any]:
     return {"spec": {"nodeName": node} if node else {}, "status": conditions}
 
 
-def test_a_node_is_wiped_once_its_pod_is_ready() -> None:
+def test_node_is_wiped_when_its_pod_is_ready() -> None:
     assert unwiped(NODES, []) == ["drone-1", "drone-2", "edge-1"]
     assert unwiped(NODES, [pod("edge-1", "True"), pod("drone-1", "False"), pod("drone-2"), pod(None)]) == [
         "drone-1",
@@ -100,19 +100,19 @@ def connect(monkeypatch: pytest.MonkeyPatch, cluster: Cluster) -> Any:
     return cluster
 
 
-async def test_nodes_out_of_reach_are_named() -> None:
+async def test_unreachable_nodes_are_named() -> None:
     cluster: Any = Cluster()
     assert await await_wiped(cluster, "fractus-system", timeout_s=0.05) == ["drone-2"]
     assert cluster.looks >= 2
 
 
 @pytest.mark.parametrize("cluster", [Cluster(), Cluster(fails=range(1, 2)), Cluster(fails=range(2, 3))])
-async def test_one_error_does_not_end_the_wait(cluster: Any) -> None:
+async def test_wait_for_wipe_continues_after_error(cluster: Any) -> None:
     cluster.ready.append(pod("drone-2", "True"))
     assert await await_wiped(cluster, "fractus-system", timeout_s=30.0) == []
 
 
-async def test_without_an_answer_it_is_not_known_which_nodes_are_left(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_unwiped_nodes_are_unknown_without_response(monkeypatch: pytest.MonkeyPatch) -> None:
     cluster = connect(monkeypatch, Cluster(fails=range(1, 1_000_000)))
     said = await run("fractus-system", "/data/fractus", timeout_s=0.05)
     assert "it is unknown on which nodes /data/fractus was wiped (the server is busy)" in said
@@ -120,7 +120,7 @@ async def test_without_an_answer_it_is_not_known_which_nodes_are_left(monkeypatc
     assert "DaemonSet fractus-wipe" in cluster.deleted
 
 
-async def test_what_is_refused_does_not_keep_the_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_refused_removal_does_not_stop_the_rest(monkeypatch: pytest.MonkeyPatch) -> None:
     cluster = connect(monkeypatch, Cluster(refuses=("fractus-ca", "one", "drone-2")))
     said = await run("fractus-system", "/data/fractus", timeout_s=0.05)
     assert "some objects of Fractus were not removed" in said
@@ -137,14 +137,14 @@ async def test_what_is_refused_does_not_keep_the_rest(monkeypatch: pytest.Monkey
     assert "wiped" not in await run("fractus-system", "")
 
 
-async def test_a_wiping_that_stays_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_remaining_wipe_daemon_set_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     connect(monkeypatch, Cluster(refuses=("fractus-wipe",)))
     assert "kubectl -n fractus-system delete daemonset fractus-wipe" in await run(
         "fractus-system", "/data/fractus", timeout_s=0.05
     )
 
 
-async def test_an_authority_of_before_stays() -> None:
+async def test_existing_authority_is_kept() -> None:
     cluster: Any = Cluster()
     assert await remove(cluster, "fractus-system", keep_authority=True) == []
     assert "Secret fractus-ca" not in cluster.deleted
@@ -158,7 +158,7 @@ async def test_an_authority_of_before_stays() -> None:
         (KubeError(0, "", "it did not answer in time"), "unknown whether Fractus is still installed (it did not"),
     ],
 )
-async def test_nothing_of_an_installed_system_is_removed(
+async def test_removal_removes_nothing_while_operator_is_installed(
     monkeypatch: pytest.MonkeyPatch, operator: object, why: str
 ) -> None:
     """Rendered by helm template, the Job is made with the rest: without its authority the fleet could not be granted anything."""
@@ -175,9 +175,7 @@ async def test_nothing_of_an_installed_system_is_removed(
 
 
 @pytest.mark.parametrize("status", [0, 429, 503])
-async def test_an_api_server_that_is_away_for_a_moment_is_asked_again(
-    status: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_check_for_operator_is_repeated_without_response(status: int, monkeypatch: pytest.MonkeyPatch) -> None:
     cluster = connect(monkeypatch, Cluster())
     answers = [KubeError(status, "", "not now"), KubeError(status, "", "not now"), NotFound(404, "NotFound", "none")]
 
@@ -198,7 +196,9 @@ def terminable() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("at", ["delete", "list_whole"])
-def test_an_end_from_outside_ends_the_wiping(terminable: None, monkeypatch: pytest.MonkeyPatch, at: str) -> None:
+def test_signal_during_removal_deletes_wipe_daemon_set(
+    terminable: None, monkeypatch: pytest.MonkeyPatch, at: str
+) -> None:
     """The Job's deadline, or a drained node: with the DaemonSet left, the next installation would be wiped."""
     cluster = connect(monkeypatch, Cluster())
     cluster.ready.append(pod("drone-2", "True"))  # so that it ends by itself, too

@@ -1,4 +1,4 @@
-"""Which plan the operator deploys: the one in force while it fits, and no other without need."""
+"""Choice of the plan: the active plan is kept while it fits."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ def without(name: str) -> Inventory:
     return inventory(drones.values(), hosts=hosts.values())
 
 
-def test_a_plan_that_fits_is_kept(plan: DeploymentPlanSpec) -> None:
+def test_fitting_plan_is_kept(plan: DeploymentPlanSpec) -> None:
     assert choose(plan, TWO) == Choice(plan, fits=True)
 
 
-def test_a_drone_that_is_gone_is_replaced_unless_it_flies(plan: DeploymentPlanSpec) -> None:
+def test_deleted_drone_is_replaced_unless_in_flight(plan: DeploymentPlanSpec) -> None:
     replaced = choose(plan, without("one"))
     assert replaced.reason == "NodeGone"
     assert replaced.plan.drone is not None
@@ -56,7 +56,7 @@ def test_a_drone_that_is_gone_is_replaced_unless_it_flies(plan: DeploymentPlanSp
     assert choose(plan, without("one"), in_flight="one").plan is plan
 
 
-def test_a_cordoned_node_is_left_only_for_another(plan: DeploymentPlanSpec) -> None:
+def test_cordoned_node_is_left_only_if_another_fits(plan: DeploymentPlanSpec) -> None:
     cordoned = host("one", "drone", schedulable=False)
     others = [found for name, found in TWO.hosts.items() if name != "one"]
     left = choose(plan, inventory(TWO.drones.values(), hosts=[cordoned, *others]))
@@ -65,7 +65,7 @@ def test_a_cordoned_node_is_left_only_for_another(plan: DeploymentPlanSpec) -> N
     assert choose(plan, alone) == Choice(plan)
 
 
-def test_a_node_that_the_scheduler_refuses_is_not_chosen_again(plan: DeploymentPlanSpec) -> None:
+def test_unschedulable_node_is_not_chosen_again(plan: DeploymentPlanSpec) -> None:
     other = choose(plan, TWO, stuck={"one": "no cpu"})
     assert other.reason == "NodeUnusable"
     assert other.plan.drone is not None
@@ -74,7 +74,7 @@ def test_a_node_that_the_scheduler_refuses_is_not_chosen_again(plan: DeploymentP
         choose(plan, TWO, stuck={"one": "no cpu", "two": "no cpu"})
 
 
-def test_a_conflict_with_policies_moves_a_plan_only_where_that_is_forbidden(plan: DeploymentPlanSpec) -> None:
+def test_policy_conflict_changes_plan_only_if_forbidden(plan: DeploymentPlanSpec) -> None:
     fences = fenced(200, 0)
     closed = replace(TWO, policies=fences.policies, zones=fences.zones)
     present = with_legality(APPLICATION, plan, closed, WARN)
@@ -91,7 +91,7 @@ def test_a_conflict_with_policies_moves_a_plan_only_where_that_is_forbidden(plan
     assert caught.value.reason == "PolicyConflict"
 
 
-def test_a_conflict_is_a_condition_that_warns(plan: DeploymentPlanSpec) -> None:
+def test_policy_conflict_is_a_warning_condition(plan: DeploymentPlanSpec) -> None:
     fences = fenced(200, 0)
     present = with_legality(APPLICATION, plan, replace(TWO, policies=fences.policies, zones=fences.zones), WARN)
     (condition,) = [c for c in deployed(present, [], 1).conditions if c.type == "PolicyConflict"]

@@ -1,4 +1,4 @@
-"""What the operator makes of a plan, against golden files; run with FRACTUS_GOLDEN=write to renew them."""
+"""Builders of child objects, compared with golden files. Run with FRACTUS_GOLDEN=write to update them."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ BUILT = built()
 
 
 @pytest.mark.parametrize("name", sorted(BUILT))
-def test_objects_are_as_the_golden_files_say(name: str) -> None:
+def test_objects_match_golden_files(name: str) -> None:
     path = GOLDEN / "expected" / f"{name}.yaml"
     if os.environ.get("FRACTUS_GOLDEN") == "write":
         path.parent.mkdir(exist_ok=True)
@@ -77,7 +77,7 @@ def test_objects_are_as_the_golden_files_say(name: str) -> None:
     assert BUILT[name] == yaml.safe_load(path.read_text())
 
 
-def test_every_golden_file_has_its_object() -> None:
+def test_every_golden_file_has_an_object() -> None:
     assert {path.stem for path in (GOLDEN / "expected").glob("*.yaml")} == set(BUILT)
 
 
@@ -93,7 +93,7 @@ def test_pods_have_no_privileges(instance: str) -> None:
     assert "nodeName" not in spec
 
 
-def test_a_manifest_cannot_override_what_the_system_says() -> None:
+def test_manifest_cannot_override_system_variables() -> None:
     env = BUILT["deployment-traffic-navigator"]["spec"]["template"]["spec"]["containers"][0]["env"]
     names = [variable["name"] for variable in env]
     assert len(names) == len(set(names))
@@ -101,7 +101,7 @@ def test_a_manifest_cannot_override_what_the_system_says() -> None:
     assert {"name": "SPEED", "value": "5"} in env
 
 
-def test_an_unlimited_drone_keeps_its_pods_for_ever() -> None:
+def test_drone_without_autonomy_limit_tolerates_taints_forever() -> None:
     placed = PLAN.placements[0]
     bare = Drone.from_body({**INPUT["drone"], "spec": {}})
     tolerations = deployment(APPLICATION, placed, bare)["spec"]["template"]["spec"]["tolerations"]

@@ -1,4 +1,4 @@
-"""What policies say of plans in force is worked out beside the event loop, and counts only for what it was asked of."""
+"""Route checks of active plans run in a worker thread, and apply only to the plan and rules that they were made for."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Notes:
                 await asyncio.sleep(0.001)
 
 
-async def test_it_is_worked_out_beside_the_loop_and_then_known(judge: Judge) -> None:
+async def test_route_check_runs_in_a_thread_and_is_cached(judge: Judge) -> None:
     notes, present = Notes(), plan()
     assert notes.ask(present) is present
     assert notes.ask(present) is present
@@ -81,7 +81,7 @@ async def test_it_is_worked_out_beside_the_loop_and_then_known(judge: Judge) -> 
     await notes.until(lambda: bool(notes.ask(noted)) and len(judge.asked) == 2)
 
 
-async def test_what_was_judged_by_other_rules_counts_for_nothing(judge: Judge) -> None:
+async def test_route_check_of_other_rules_is_not_used(judge: Judge) -> None:
     notes, present = Notes(), plan()
     judge.go.set()
     notes.ask(present, rules=1)
@@ -91,7 +91,7 @@ async def test_what_was_judged_by_other_rules_counts_for_nothing(judge: Judge) -
     await notes.until(lambda: notes.ask(present, rules=2) is not present)
 
 
-async def test_a_plan_that_was_made_meanwhile_is_not_replaced(judge: Judge) -> None:
+async def test_route_check_does_not_replace_newer_plan(judge: Judge) -> None:
     notes, present, newer = Notes(), plan(), plan()
     notes.ask(present)
     await notes.until(lambda: bool(judge.asked))
@@ -103,7 +103,7 @@ async def test_a_plan_that_was_made_meanwhile_is_not_replaced(judge: Judge) -> N
     assert len(judge.asked) == 1
 
 
-async def test_many_applications_keep_one_thread_busy(judge: Judge) -> None:
+async def test_route_checks_run_one_at_a_time(judge: Judge) -> None:
     notes = Notes()
     for number in range(5):
         notes.ask(plan(), key=("ns", str(number)))
@@ -116,7 +116,7 @@ async def test_many_applications_keep_one_thread_busy(judge: Judge) -> None:
     assert len(judge.asked) == 4, "one that is gone is not judged"
 
 
-async def test_what_cannot_be_judged_is_counted_and_not_tried_at_each_reconcile(
+async def test_failed_route_check_is_counted_and_cached(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def count() -> float:

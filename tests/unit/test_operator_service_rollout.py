@@ -1,4 +1,4 @@
-"""Services of nodes: which are replaced when, and which nodes are not heard of any more."""
+"""Rollout of node services, and detection of nodes that stopped reporting."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def step_of(*nodes: ServicesOfNode, ready: int = 0) -> tuple[list[str], dict[str
     return [n.node for n in chosen], said
 
 
-def test_one_node_is_replaced_at_a_time() -> None:
+def test_services_of_one_node_are_replaced_at_a_time() -> None:
     chosen, said = step_of(node("d1"), node("d2"), node("d3"))
     assert chosen == ["d1"]
     assert [said[n].reason for n in ("d1", "d2", "d3")] == ["Replacing", "Queued", "Queued"]
@@ -56,7 +56,7 @@ def test_one_node_is_replaced_at_a_time() -> None:
     assert "m-d2-old" in said["d2"].message
 
 
-def test_others_wait_for_services_that_start() -> None:
+def test_nodes_wait_while_services_of_another_start() -> None:
     chosen, said = step_of(node("d1", outdated=False, starting=True), node("d2"))
     assert not chosen
     assert said["d1"].reason == "Starting"
@@ -64,14 +64,14 @@ def test_others_wait_for_services_that_start() -> None:
 
 
 @pytest.mark.parametrize("obstacle", ["InTheAir", "OnMission", "NodeUnreachable"])
-def test_a_drone_that_flies_may_fly_or_is_out_of_reach_keeps_its_services(obstacle: str) -> None:
+def test_services_of_flying_or_unreachable_drone_are_kept(obstacle: str) -> None:
     chosen, said = step_of(node("d1", obstacle=obstacle), node("d2"))
     assert chosen == ["d2"], "and no other waits for it"
     assert (said["d1"].status, said["d1"].reason) == ("False", obstacle)
     assert "d1 is so" in said["d1"].message
 
 
-def test_a_node_out_of_reach_holds_no_other_up() -> None:
+def test_unreachable_node_does_not_stop_rollout() -> None:
     chosen, _ = step_of(node("d1", outdated=False, starting=True, obstacle="NodeUnreachable"), node("d2"))
     assert chosen == ["d2"]
 
@@ -79,14 +79,14 @@ def test_a_node_out_of_reach_holds_no_other_up() -> None:
 STUCK = {"outdated": False, "starting": True, "starting_s": 601.0}
 
 
-def test_a_node_that_never_gets_ready_is_left_behind_and_said() -> None:
+def test_node_that_is_never_ready_is_skipped_and_reported() -> None:
     chosen, said = step_of(node("d1", **STUCK), node("d2"))
     assert chosen == ["d2"]
     assert (said["d1"].reason, said["d1"].warning) == ("NotReady", True)
     assert "m: not ready for 10 minutes; the rollout continues without it" in said["d1"].message
 
 
-def test_a_release_that_does_not_start_stops_at_the_second_node() -> None:
+def test_broken_release_stops_at_second_node() -> None:
     failed = [node("d1", **STUCK), node("d2", **STUCK)]
     chosen, said = step_of(*failed, node("d3"))
     assert not chosen
@@ -94,16 +94,16 @@ def test_a_release_that_does_not_start_stops_at_the_second_node() -> None:
     assert step_of(*failed, node("d3"), ready=2)[0] == ["d3"], "others run it"
 
 
-def test_what_runs_badly_already_is_replaced_last() -> None:
+def test_unready_services_are_replaced_last() -> None:
     ready = replace(node("d2"), outdated=(replace(pod("d2", "old"), ready=True),))
     assert step_of(node("d1"), ready)[0] == ["d2"]
 
 
-def test_large_fleets_take_one_of_twenty() -> None:
+def test_one_of_twenty_nodes_is_replaced_at_a_time_in_large_fleet() -> None:
     assert len(step_of(*(node(f"d{i:03}") for i in range(100)))[0]) == 5
 
 
-def test_what_is_asked_for_is_the_revision_with_the_highest_number() -> None:
+def test_latest_revision_has_highest_number() -> None:
     services = NodeServices("fractus-system")
     old, new = pod(revision="old"), pod(revision="new")
     for one in (old, new):
@@ -123,7 +123,7 @@ def test_what_is_asked_for_is_the_revision_with_the_highest_number() -> None:
     assert services.ready("fractus-mobility") == 1
 
 
-def test_only_what_changed_is_looked_at_again() -> None:
+def test_only_changed_nodes_are_returned() -> None:
     services = NodeServices("fractus-system")
     for one in (pod("d1"), pod("d2")):
         services.pod_changed((one.namespace, one.name), None, one)
@@ -138,7 +138,7 @@ def test_only_what_changed_is_looked_at_again() -> None:
     assert services.take_changed() == {"d2"}
 
 
-def test_pods_and_revisions_of_others_are_no_services() -> None:
+def test_other_pods_and_revisions_are_ignored() -> None:
     services = NodeServices("fractus-system")
     for other in (pod(ownerReferences=[]), pod(namespace="default")):
         services.pod_changed((other.namespace, other.name), None, other)
@@ -158,7 +158,7 @@ def at(second: int) -> str:
     return datetime(2026, 1, 1, 0, 0, second, tzinfo=UTC).isoformat()
 
 
-def test_a_drone_in_the_air_is_silent_after_fifteen_seconds() -> None:
+def test_drone_in_flight_is_stale_after_fifteen_seconds() -> None:
     silence = StaleNodeDetector()
     assert not silence.stale_nodes([drone(at(0))], 100.0)
     assert not silence.stale_nodes([drone(at(0))], 115.0)
@@ -167,7 +167,7 @@ def test_a_drone_in_the_air_is_silent_after_fifteen_seconds() -> None:
 
 
 @pytest.mark.parametrize("jump", ["2020-01-01T00:00:00Z", "2031-01-01T00:00:00Z"])
-def test_the_clock_of_a_node_counts_for_nothing(jump: str) -> None:
+def test_clock_of_node_does_not_affect_staleness(jump: str) -> None:
     silence = StaleNodeDetector()
     silence.stale_nodes([drone(at(0))], 100.0)
     assert not silence.stale_nodes([drone(jump)], 114.0)
@@ -175,7 +175,7 @@ def test_the_clock_of_a_node_counts_for_nothing(jump: str) -> None:
     assert silence.stale_nodes([drone(jump)], 129.1)
 
 
-def test_what_reports_rarely_is_silent_later() -> None:
+def test_report_timeout_depends_on_report_period() -> None:
     silence, standing = StaleNodeDetector(), drone(at(0), "inactive")
     spec = {"location": {"lat": 1, "lon": 2}}
     body = {"apiVersion": V1, "kind": "EdgeNode", "metadata": {"name": "e"}, "spec": spec}
@@ -186,13 +186,13 @@ def test_what_reports_rarely_is_silent_later() -> None:
     assert silence.stale_nodes([standing, edge], 181.0) == [standing, edge]
 
 
-def test_a_node_that_never_reported_is_not_silent() -> None:
+def test_node_without_report_is_not_stale() -> None:
     silence = StaleNodeDetector()
     for now_s in (0.0, 1000.0):
         assert not silence.stale_nodes([drone(None)], now_s)
 
 
-def test_an_outage_of_the_api_server_is_no_silence_of_nodes() -> None:
+def test_api_server_outage_makes_no_node_stale() -> None:
     now_s, hears = [0.0], [True]
     clock, silence = ObservationClock(lambda: now_s[0], lambda: hears[0]), StaleNodeDetector()
 
@@ -212,7 +212,7 @@ def test_an_outage_of_the_api_server_is_no_silence_of_nodes() -> None:
     assert silent_after(6)
 
 
-def test_an_operator_that_was_held_up_gives_nodes_their_time() -> None:
+def test_delayed_step_makes_no_node_stale() -> None:
     now_s = [0.0]
     clock = ObservationClock(lambda: now_s[0], lambda: True)
     now_s[0] += 60.0
@@ -288,7 +288,7 @@ def told(api: Api, name: str, type_: str) -> str:
     return next((c["reason"] for c in conditions if c["type"] == type_), "")
 
 
-async def test_a_pod_that_gets_no_successor_stops_the_rollout(cache: ClusterCache) -> None:
+async def test_missing_successor_pod_stops_rollout(cache: ClusterCache) -> None:
     api = Api()
     now_s = [0.0]
     rollout = ServiceRollout(api, cache, reported(cache, api), lambda: now_s[0])
@@ -317,7 +317,7 @@ async def test_a_pod_that_gets_no_successor_stops_the_rollout(cache: ClusterCach
     assert await step() == ["m-d3-old"], "a node that is gone is owed nothing"
 
 
-async def test_a_node_that_never_gets_ready_keeps_no_other_from_a_release(cache: ClusterCache) -> None:
+async def test_node_that_is_never_ready_does_not_stop_rollout(cache: ClusterCache) -> None:
     api, now_s = Api(), [0.0]
     rollout = ServiceRollout(api, cache, reported(cache, api), lambda: now_s[0])
     await rollout.step()
@@ -332,9 +332,7 @@ async def test_a_node_that_never_gets_ready_keeps_no_other_from_a_release(cache:
     assert told(api, "d1", "ServicesCurrent") == "NotReady"
 
 
-async def test_a_fleet_that_is_as_it_should_be_is_not_looked_through(
-    cache: ClusterCache, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_current_fleet_is_not_checked_again(cache: ClusterCache, monkeypatch: pytest.MonkeyPatch) -> None:
     cache.services.revision_changed(("", "c"), None, Revision("fractus-mobility", 3, "old"))
     for name in ("d1", "d2", "d3"):
         shown(cache, replace(pod(name, "old"), ready=True))
@@ -345,7 +343,7 @@ async def test_a_fleet_that_is_as_it_should_be_is_not_looked_through(
     assert not api.asked
 
 
-async def test_a_pod_that_may_not_be_deleted_holds_no_other_back(cache: ClusterCache) -> None:
+async def test_refused_deletion_does_not_stop_rollout(cache: ClusterCache) -> None:
     api = Api()
     for name in map(str, range(40)):
         shown(cache, pod(f"e{name}", "old"))
@@ -361,7 +359,7 @@ async def test_a_pod_that_may_not_be_deleted_holds_no_other_back(cache: ClusterC
 
 
 @pytest.mark.parametrize("seen", [None, "2026-01-01T00:00:00z", "yesterday"])
-async def test_any_time_of_a_report_can_be_compared(cache: ClusterCache, seen: str | None) -> None:
+async def test_report_times_are_parsed(cache: ClusterCache, seen: str | None) -> None:
     api, now_s = Api(), [0.0]
     watch = NodeLivenessController(cache, reported(cache, api), lambda: now_s[0])
     await watch.step()
@@ -387,7 +385,7 @@ def granted(cache: ClusterCache, name: str, node: str | None) -> None:
         grants.record_write(("", name), {"apiVersion": V1, "kind": "Grant", "metadata": {"name": name}, "spec": spec})
 
 
-async def test_a_drone_may_take_off_until_it_reports_after_its_last_grant(cache: ClusterCache) -> None:
+async def test_mission_condition_ends_after_two_reports(cache: ClusterCache) -> None:
     api = Api()
     missions = MissionConditionController(api, cache, reported(cache, api), lambda: datetime(2026, 1, 1, tzinfo=UTC))
     changed: list[Any] = []
@@ -418,7 +416,7 @@ async def test_a_drone_may_take_off_until_it_reports_after_its_last_grant(cache:
     assert not cache.drones.get(("", "d1")).may_take_off  # type: ignore[union-attr]
 
 
-async def test_what_was_said_of_a_drone_is_not_said_again_before_the_watch_shows_it(cache: ClusterCache) -> None:
+async def test_condition_is_not_written_twice_before_watch_event(cache: ClusterCache) -> None:
     """Grants of an application come one by one."""
     api = Api()
     missions = MissionConditionController(api, cache, reported(cache, api), lambda: datetime(2026, 1, 1, tzinfo=UTC))
@@ -429,7 +427,7 @@ async def test_what_was_said_of_a_drone_is_not_said_again_before_the_watch_shows
     assert api.asked == [("PATCH", "d1")]
 
 
-def test_a_drone_that_someone_saw_on_the_ground_is_there_until_its_next_report() -> None:
+def test_grounded_annotation_is_valid_until_next_report() -> None:
     flying = drone(at(0)).to_dict()
 
     def in_air(annotation: str) -> bool:
@@ -441,7 +439,7 @@ def test_a_drone_that_someone_saw_on_the_ground_is_there_until_its_next_report()
         assert in_air(other)
 
 
-async def test_a_role_of_an_earlier_release_keeps_no_condition_from_a_drone(
+async def test_condition_is_updated_if_patch_is_forbidden(
     cache: ClusterCache, caplog: pytest.LogCaptureFixture
 ) -> None:
     """After `helm rollback` it allows updates only: admission goes by OnMission, and would take the drone for idle."""

@@ -1,4 +1,4 @@
-"""Guests on other applications' drones, and what planning sees of nodes and pods: pure decisions of the operator."""
+"""Drone claims, shared flights and bookings."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ def submitted(phase: str | None) -> Any:
     return parse_application(body)
 
 
-def test_a_drone_that_has_not_begun_offers_its_whole_way() -> None:
+def test_drone_on_the_ground_offers_complete_flight() -> None:
     assert offered_flights([flown()], DEPOTS, 7.0, None) == {"d": flight_of(HOST, DEPOTS)}
 
 
-def test_a_drone_in_the_air_offers_what_lies_ahead_and_only_if_that_is_known() -> None:
+def test_drone_in_flight_offers_remaining_flight() -> None:
     begun = offered_flights([flown("flying", 180)], DEPOTS, 7.0, None)["d"]
     assert begun.legs[0][0].lon == pytest.approx(at(180, 0)["lon"])
     assert offered_flights([flown("flying", 900)], DEPOTS, 7.0, None) == {}
@@ -56,7 +56,7 @@ def test_a_drone_in_the_air_offers_what_lies_ahead_and_only_if_that_is_known() -
     assert offered_flights([flown("flying", 900)], DEPOTS, 7.0, RIDE) == {"d": flight_of(HOST, DEPOTS)}
 
 
-def test_a_host_whose_manifest_was_changed_is_not_offered() -> None:
+def test_flight_of_changed_application_is_not_offered() -> None:
     changed = HOST.model_copy(update={"metadata": HOST.metadata.model_copy(update={"generation": 2})})
     assert offered_flights([replace(flown(), application=changed)], DEPOTS, 7.0, None) == {}
 
@@ -71,13 +71,13 @@ def test_a_host_whose_manifest_was_changed_is_not_offered() -> None:
         ("Running", OWN, False),
     ],
 )
-def test_a_guest_is_done_when_its_host_has_completed(phase: str, host_plan: Any, done: bool) -> None:
+def test_guest_is_complete_when_host_is(phase: str, host_plan: Any, done: bool) -> None:
     outcome = shared_flight_outcome(RIDE, submitted(phase), host_plan)
     assert (outcome is not None and outcome.kind is OutcomeKind.COMPLETE) is done
     assert shared_flight_outcome(OWN, submitted("Completed"), None) is None
 
 
-def test_a_guest_loses_its_ride_for_a_reason() -> None:
+def test_lost_shared_flight_has_a_reason() -> None:
     whole = flight_of(HOST, DEPOTS)
     assert shared_flight_lost(GUEST, RIDE, OWN, whole, 7.0) is None
     assert shared_flight_lost(GUEST, RIDE, OWN, None, 7.0) is None
@@ -96,7 +96,7 @@ def grant(name: str, uid: str, created: str) -> Grant:
     return Grant.from_body(body)
 
 
-def test_a_guest_claims_nothing_however_old_its_grant_is() -> None:
+def test_guest_claims_no_drone() -> None:
     plans = {("default", "guest"): OwnedPlan("g", RIDE), ("default", "traffic"): OwnedPlan("t", OWN)}
     old, new = grant("guest", "g", "2026-01-01T00:00:00Z"), grant("traffic", "t", "2026-01-02T00:00:00Z")
     assert claims(plans, [old, new])["d"].uid == "t"
@@ -105,7 +105,7 @@ def test_a_guest_claims_nothing_however_old_its_grant_is() -> None:
 
 
 @pytest.mark.parametrize("left_by", [None, "elsewhere"])
-def test_what_a_guest_leaves_behind_takes_no_drone_from_who_flies_it(left_by: str | None) -> None:
+def test_remaining_grant_of_guest_claims_no_drone(left_by: str | None) -> None:
     plans = {("default", "traffic"): OwnedPlan("t", OWN)}
     if left_by is not None:
         # It has a drone of its own by now, and its grant on the old one is yet to go.
@@ -117,7 +117,7 @@ def test_what_a_guest_leaves_behind_takes_no_drone_from_who_flies_it(left_by: st
     assert claims(plans, [left])["d"].uid == "g"
 
 
-def test_of_two_that_fly_one_drone_the_older_grant_counts() -> None:
+def test_older_grant_decides_between_two_claims() -> None:
     plans = {("default", "a"): OwnedPlan("a", OWN), ("default", "traffic"): OwnedPlan("t", OWN)}
     old, new = grant("traffic", "t", "2026-01-01T00:00:00Z"), grant("a", "a", "2026-01-02T00:00:00Z")
     assert claims(plans, [old, new])["d"].uid == "t"
@@ -133,7 +133,7 @@ def pod(name: str, node: str | None, cpu: float, **more: Any) -> PodView:
     return PodView("ns", name, node, labels, {"cpu": cpu}, **values)
 
 
-def test_bookings_follow_pods_one_at_a_time() -> None:
+def test_bookings_follow_pods() -> None:
     rng = random.Random(4)
     bookings, pods = Bookings(), {}
     for _ in range(300):
@@ -147,7 +147,7 @@ def test_bookings_follow_pods_one_at_a_time() -> None:
             assert bookings.on(node).get("cpu", 0.0) == sum(p.requests["cpu"] for p in there)
 
 
-def test_what_is_planned_is_booked_once_and_own_pods_are_free() -> None:
+def test_planned_instance_is_booked_once_and_own_pods_are_free() -> None:
     bookings, mine = Bookings(), pod("mine", "a", 1.0, app="me")
     for each in (mine, pod("theirs", "a", 2.0, app="them"), pod("bare", "a", 4.0)):
         bookings.pod_changed(None, each)
@@ -160,7 +160,7 @@ def test_what_is_planned_is_booked_once_and_own_pods_are_free() -> None:
     assert bookings.on("b")["cpu"] == 8.0
 
 
-def test_a_flight_that_a_guest_was_planned_on_is_the_one_it_is_judged_by() -> None:
+def test_guest_is_planned_and_checked_with_the_same_flight() -> None:
     shared = inventory(
         [drone("d")],
         claimed={"d": HOST.key},

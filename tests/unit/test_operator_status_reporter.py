@@ -1,4 +1,4 @@
-"""What the operator says of applications, and when it does without."""
+"""Status reporter: when the status of an Application is written, and when it is not."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def new() -> tuple[Statuses, ClusterCache, StatusReporter, Submitted]:
     return api, cache, StatusReporter(cast(Any, api), cache.applications, lambda: NOW), submitted
 
 
-async def test_who_waits_for_many_others_is_told_that_it_is_planned() -> None:
+async def test_queued_rollout_is_reported() -> None:
     api, _, reporter, submitted = new()
     await reporter.report_queued(submitted, PLAN, 1)
     assert not api.written, "its first status comes soon enough"
@@ -63,14 +63,14 @@ async def test_who_waits_for_many_others_is_told_that_it_is_planned() -> None:
     assert len(api.written) == 1, "who has a status is not told"
 
 
-async def test_a_first_status_that_is_refused_stops_nothing() -> None:
+async def test_refused_first_status_is_ignored() -> None:
     api, _, reporter, submitted = new()
     api.refusal = KubeError(429, "TooManyRequests", "later")
     await reporter.report_queued(submitted, PLAN, 20)
     assert not reporter.last(submitted)
 
 
-async def test_an_outcome_that_conflicts_is_not_taken_for_recorded() -> None:
+async def test_conflicting_outcome_is_not_taken_for_recorded() -> None:
     """What follows removes the grants, the only other record of it: the mission would be flown again."""
     api, cache, reporter, submitted = new()
     api.refusal = Conflict(409, "Conflict", "it changed meanwhile")
@@ -81,7 +81,7 @@ async def test_an_outcome_that_conflicts_is_not_taken_for_recorded() -> None:
     assert not reporter.last(submitted)
 
 
-async def test_what_fails_for_long_is_not_left_at_a_sentence_that_is_not_true_any_more() -> None:
+async def test_persistent_failure_replaces_outdated_message() -> None:
     """Such as that many others come first, while a webhook refuses each of its Deployments."""
     api, _, reporter, submitted = new()
     await reporter.report_queued(submitted, PLAN, 20)
@@ -102,7 +102,7 @@ async def test_what_fails_for_long_is_not_left_at_a_sentence_that_is_not_true_an
     assert api.events == ["InternalError"]
 
 
-async def test_a_flight_goes_on_while_its_application_cannot_be_reconciled() -> None:
+async def test_failure_report_keeps_flight_phase() -> None:
     api, _, reporter, submitted = new()
     ready = (ConditionUpdate("Ready", "True", "PodsReady"), ConditionUpdate("Deployed", "True", "Deployed"))
     await reporter.report(submitted, StatusUpdate("Flying", "it flies", ready, drone="drone-1", pods="3/3"))

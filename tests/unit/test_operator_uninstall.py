@@ -1,4 +1,4 @@
-"""When Fractus may be uninstalled: no Application to take down, no drone in the air."""
+"""Conditions under which Fractus may be uninstalled: no Application, and no drone in the air."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ def drone(name: str, state: str | None) -> dict[str, Any]:
     return {"metadata": {"name": name}, "status": {"flightState": state} if state else {}}
 
 
-def test_nothing_objects_when_all_is_on_the_ground() -> None:
+def test_uninstall_is_allowed_when_all_drones_are_on_the_ground() -> None:
     drones = [drone("a", "inactive"), drone("b", "charging"), drone("c", None), {"metadata": {"name": "d"}}]
     assert objection([], drones) == ""
     assert objection([application("new"), application("other", "example.com/else")], drones) == ""
 
 
-def test_applications_to_take_down_are_named() -> None:
+def test_uninstall_names_remaining_applications() -> None:
     said = objection([application("patrol", "fractus.dev/teardown"), application("new")], [])
     assert "default/patrol" in said
     assert "default/new" not in said
@@ -33,25 +33,25 @@ def test_applications_to_take_down_are_named() -> None:
 
 
 @pytest.mark.parametrize("state", ["flying", "returning"])
-def test_drones_in_the_air_are_named(state: str) -> None:
+def test_uninstall_names_drones_in_flight(state: str) -> None:
     said = objection([], [drone("drone-1", state), drone("drone-2", "inactive")])
     assert f"drone-1 ({state})" in said
     assert "drone-2" not in said
 
 
-def test_a_silent_drone_is_where_it_was() -> None:
+def test_uninstall_uses_last_state_of_stale_drone() -> None:
     silent = {"metadata": {"name": "drone-1"}, "status": {"flightState": "unknown", "lastFlightState": "landing"}}
     assert "drone-1 (unknown)" in objection([], [silent])
     silent["status"]["lastFlightState"] = "inactive"
     assert objection([], [silent]) == ""
 
 
-def test_long_lists_are_cut() -> None:
+def test_uninstall_shortens_long_lists() -> None:
     said = objection([], [drone(f"d{i}", "flying") for i in range(9)])
     assert "d4 (flying) and 4 more" in said
 
 
-def test_a_drone_that_may_have_taken_off_is_named_until_someone_sees_it_on_the_ground() -> None:
+def test_uninstall_names_drone_that_may_have_taken_off() -> None:
     seen = "2026-01-01T00:00:00Z"
     doubtful = drone("drone-1", "inactive")
     doubtful["status"] |= {"lastSeen": seen, "conditions": [{"type": "OnMission", "status": "Unknown"}]}
@@ -66,7 +66,7 @@ def test_a_drone_that_may_have_taken_off_is_named_until_someone_sees_it_on_the_g
     assert objection([], [doubtful, flying]) == ""
 
 
-async def test_an_api_server_that_does_not_answer_is_an_objection(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_uninstall_is_refused_without_response(monkeypatch: pytest.MonkeyPatch) -> None:
     class Silent:
         async def list(self, _: object) -> None:
             await asyncio.Event().wait()
@@ -98,7 +98,7 @@ class Answers:
         pass
 
 
-async def test_kinds_that_are_gone_keep_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_uninstall_is_allowed_without_kinds(monkeypatch: pytest.MonkeyPatch) -> None:
     """Removed before the chart that makes use of them, they would keep it indefinitely."""
     gone = NotFound(404, "NotFound", "the server could not find the requested resource")
     answers = Answers(Application=gone, Drone=gone)

@@ -1,4 +1,4 @@
-"""Which applications are woken by what others do, and what is kept of each."""
+"""Wake-ups of Applications by changes of others, and state that is kept for each Application."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def drone_body(version: int, state: str) -> dict[str, Any]:
     return {"apiVersion": V1, "kind": "Drone", "metadata": metadata, "spec": spec, "status": {"flightState": state}}
 
 
-async def test_what_another_application_leaves_wakes_only_those_without_a_plan_that_fits() -> None:
+async def test_released_drone_wakes_applications_without_suitable_plan() -> None:
     cache = ClusterCache(cast(Store, None))
     cache.drones.record_write(("", "d"), drone_body(1, "flying"))
     with cache.subscriptions.subscribe(("ns", "placed")) as placed, cache.subscriptions.subscribe(("ns", "new")) as new:
@@ -71,7 +71,7 @@ async def test_wake_all_wakes_applications_in_flight_first() -> None:
             assert not await inputs.changed(0), "each Application is woken once"
 
 
-async def test_a_manifest_that_is_applied_ends_a_rest_and_what_is_reported_does_not() -> None:
+async def test_changed_spec_ends_pause_but_changed_status_does_not() -> None:
     cache = ClusterCache(cast(Store, None))
 
     def seen(version: int, generation: int, phase: str) -> None:
@@ -89,7 +89,7 @@ async def test_a_manifest_that_is_applied_ends_a_rest_and_what_is_reported_does_
         assert inputs._urgent.is_set(), "who applies it waits for the answer"
 
 
-async def test_a_node_s_labels_wake_no_application_and_what_plans_depend_on_wakes_all() -> None:
+async def test_planning_inputs_of_node_wake_all_but_labels_do_not() -> None:
     """A drone that flies along gets another geohash every minute."""
     cache = ClusterCache(cast(Store, None))
     version = iter(range(1, 100))
@@ -125,7 +125,7 @@ def pod_body(version: int, node: str | None, phase: str = "Running") -> dict[str
     return {"metadata": metadata, "spec": {"nodeName": node, "containers": []}, "status": {"phase": phase}}
 
 
-async def test_what_leaves_a_node_wakes_those_alone_who_want_room_on_it() -> None:
+async def test_released_capacity_wakes_applications_that_need_the_node() -> None:
     cache = ClusterCache(cast(Store, None))
     key = ("ns", "p")
     with cache.subscriptions.subscribe(("ns", "here")) as here, cache.subscriptions.subscribe(("ns", "there")) as there:
@@ -149,7 +149,7 @@ async def test_what_leaves_a_node_wakes_those_alone_who_want_room_on_it() -> Non
     assert not cache.subscriptions._full_nodes
 
 
-def test_an_application_is_checked_again_where_it_or_a_rule_changed_and_not_at_each_look() -> None:
+def test_application_is_validated_again_when_it_or_rules_change() -> None:
     def applied(generation: int, uid: str) -> Application:
         points = [{"point": {"depot": "base"}, "path": [at(100, 0, 10)], "navigation": "pathBased"}]
         services = [{"service": "mobility", "methods": ["Goto"]}]
@@ -173,7 +173,7 @@ def full_node() -> Inventory:
     return inventory([], [edge("e1", (0, 0))], [host("e1", "edge", cpu=0.01)])
 
 
-async def test_who_finds_no_room_is_woken_by_what_leaves_the_node(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_infeasible_application_wakes_when_capacity_is_released(monkeypatch: pytest.MonkeyPatch) -> None:
     cache = ClusterCache(cast(Store, None))
     applications = ApplicationController(cast(Store, None), cache, Authority.generate(NOW), lambda: NOW)
     viewer = component("Viewer", "edge", locations=[{"center": at(0, 0), "radius": 100}])
@@ -237,7 +237,7 @@ def shared() -> ClusterCache:
     return cache
 
 
-async def test_an_application_hears_of_its_own_drone_and_of_the_flight_that_it_shares(shared: ClusterCache) -> None:
+async def test_drone_change_wakes_its_application_and_guests(shared: ClusterCache) -> None:
     with shared.subscriptions.subscribe(SHARING) as sharing:
         shared.drones.record_write(("", "d"), drone_body(2, "inactive"))
         assert await sharing.changed(1)
@@ -248,7 +248,7 @@ async def test_an_application_hears_of_its_own_drone_and_of_the_flight_that_it_s
         assert await sharing.changed(1)
 
 
-async def test_who_shares_a_flight_hears_at_once_when_its_plan_changes_or_goes(shared: ClusterCache) -> None:
+async def test_guest_wakes_when_plan_of_host_changes(shared: ClusterCache) -> None:
     stored = shared.children[kinds.DEPLOYMENT_PLAN]
     with shared.subscriptions.subscribe(SHARING) as sharing:
         decide(shared, HOST, node="other")
@@ -266,7 +266,7 @@ async def test_who_shares_a_flight_hears_at_once_when_its_plan_changes_or_goes(s
         assert not await sharing.changed(0)
 
 
-async def test_a_stored_plan_that_goes_wakes_those_who_wait_for_what_it_had(shared: ClusterCache) -> None:
+async def test_deleted_plan_wakes_waiting_applications(shared: ClusterCache) -> None:
     stored = shared.children[kinds.DEPLOYMENT_PLAN]
     shared.drones.record_write(("", "d"), drone_body(2, "inactive"))
     stored.record_write(HOST, plan_body("d", 1))
@@ -281,9 +281,7 @@ async def test_a_stored_plan_that_goes_wakes_those_who_wait_for_what_it_had(shar
 
 
 @pytest.mark.parametrize(("instances", "listens"), [(1, False), (2, True), ("*", True)])
-async def test_an_application_that_could_have_more_instances_hears_of_room_alone(
-    instances: int | str, listens: bool
-) -> None:
+async def test_placed_application_wakes_only_for_capacity(instances: int | str, listens: bool) -> None:
     cache = ClusterCache(cast(Store, None))
     applications = ApplicationController(cast(Store, None), cache, Authority.generate(NOW), lambda: NOW)
     viewer = component("Viewer", "edge", locations=[{"center": at(0, 0), "radius": 100, "instances": instances}])
@@ -303,7 +301,7 @@ async def test_an_application_that_could_have_more_instances_hears_of_room_alone
             assert await grows.changed(0) is listens
 
 
-async def test_a_plan_that_goes_before_its_pods_came_leaves_room() -> None:
+async def test_deleted_plan_without_pods_releases_capacity() -> None:
     cache = ClusterCache(cast(Store, None))
     spec = {"components": [component("Viewer", "edge", locations=[{"center": at(0, 0), "radius": 9}])]}
     metadata = {"namespace": "ns", "name": "gone", "uid": "gone", "resourceVersion": "1"}
@@ -318,7 +316,7 @@ async def test_a_plan_that_goes_before_its_pods_came_leaves_room() -> None:
         assert await waits.changed(0)
 
 
-async def test_an_application_that_appears_wakes_no_other() -> None:
+async def test_new_application_wakes_no_other() -> None:
     cache = ClusterCache(cast(Store, None))
     with cache.subscriptions.subscribe(("ns", "waits")) as waits:
         metadata = {"namespace": "ns", "name": "new", "uid": "new", "resourceVersion": "1"}
@@ -328,7 +326,7 @@ async def test_an_application_that_appears_wakes_no_other() -> None:
         assert await waits.changed(0)
 
 
-def test_objects_are_found_by_their_group_alone() -> None:
+def test_grouped_objects_are_found_by_group() -> None:
     grouped: GroupedObjects[str] = GroupedObjects()
     grouped.put(("a", "x"), ("a", "1"), "old")
     grouped.put(("a", "x"), ("a", "1"), "one")
@@ -340,7 +338,7 @@ def test_objects_are_found_by_their_group_alone() -> None:
     assert list(grouped._groups) == [("a", "y")]
 
 
-def test_what_is_remembered_of_a_teardown_goes_with_the_application() -> None:
+def test_teardown_is_forgotten_with_the_application() -> None:
     cache = ClusterCache(cast(Store, None))
     metadata = {"namespace": "ns", "name": "app", "uid": "u", "resourceVersion": "1"}
     cache.applications.record_write(

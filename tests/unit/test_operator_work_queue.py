@@ -1,4 +1,4 @@
-"""The worklist: each key once, failures again later."""
+"""The work queue reconciles each key once, and retries failures."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fractus_operator.work_queue import WorkQueue, run_periodically
 from fractus_runtime.kubernetes import KubeError
 
 
-async def test_an_unforeseen_failure_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_unexpected_failure_does_not_stop_queue(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(work_queue_module, "_FIRST_RETRY_S", 0.001)
     attempts: list[Key] = []
     done = asyncio.Event()
@@ -32,7 +32,7 @@ async def test_an_unforeseen_failure_ends_nothing(monkeypatch: pytest.MonkeyPatc
     task.cancel()
 
 
-async def test_a_key_is_reconciled_once_for_many_changes() -> None:
+async def test_key_is_reconciled_once_for_many_changes() -> None:
     seen: list[Key] = []
     done = asyncio.Event()
 
@@ -52,7 +52,7 @@ async def test_a_key_is_reconciled_once_for_many_changes() -> None:
     assert seen == [("", "a"), ("", "last")]
 
 
-async def test_a_change_during_a_reconcile_is_not_lost() -> None:
+async def test_change_during_reconcile_is_not_lost() -> None:
     seen: list[int] = []
     done = asyncio.Event()
     value = 1
@@ -76,7 +76,7 @@ async def test_a_change_during_a_reconcile_is_not_lost() -> None:
     assert seen == [1, 2]
 
 
-async def test_a_failure_is_tried_again_and_holds_up_no_one(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_failed_key_is_retried_and_delays_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(work_queue_module, "_FIRST_RETRY_S", 0.001)
     attempts: dict[Key, int] = {}
     done = asyncio.Event()
@@ -101,7 +101,7 @@ async def test_a_failure_is_tried_again_and_holds_up_no_one(monkeypatch: pytest.
 
 
 @pytest.mark.parametrize("failure", [ValueError("no time"), KubeError(500, "InternalError", "not now")])
-async def test_a_step_that_fails_is_made_again(failure: Exception, caplog: pytest.LogCaptureFixture) -> None:
+async def test_failed_step_is_repeated(failure: Exception, caplog: pytest.LogCaptureFixture) -> None:
     steps: list[int] = []
     done = asyncio.Event()
 

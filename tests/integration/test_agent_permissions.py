@@ -55,16 +55,22 @@ def _denied(client: BlockingClient) -> bool:
     try:
         client.merge(f"{FRACTUS}/drones/drone-1/status?dryRun=All", {"status": {"flightState": "flying"}})
     except KubeError as error:
-        return error.status == 403 and "may write the Drone" in str(error)
+        return error.status == 403 and "may write only the Drone" in str(error)
     return False
 
 
 def test_an_agent_reports_its_own_drone_only(world: World, agents: dict[str, BlockingClient]) -> None:
     state = {"status": {"flightState": "flying"}}
     agents["drone-1"].merge(f"{FRACTUS}/drones/drone-1/status", state)
-    denied(lambda: agents["edge-1"].merge(f"{FRACTUS}/drones/drone-1/status", state), "edge-1 only")
+    denied(
+        lambda: agents["edge-1"].merge(f"{FRACTUS}/drones/drone-1/status", state),
+        "only the Drone or EdgeNode of edge-1",
+    )
     world.add_drone("drone-2")
-    denied(lambda: agents["drone-1"].merge(f"{FRACTUS}/drones/drone-2/status", state), "drone-1 only")
+    denied(
+        lambda: agents["drone-1"].merge(f"{FRACTUS}/drones/drone-2/status", state),
+        "only the Drone or EdgeNode of drone-1",
+    )
 
 
 def test_an_agent_registers_its_own_node_only(world: World, agents: dict[str, BlockingClient]) -> None:
@@ -72,10 +78,14 @@ def test_an_agent_registers_its_own_node_only(world: World, agents: dict[str, Bl
     assert body is not None
     fresh = ours("EdgeNode", "edge-1", body["spec"])
     world.api.delete(f"{FRACTUS}/edgenodes/edge-1")
-    denied(lambda: agents["drone-1"].call("POST", f"{FRACTUS}/edgenodes", fresh), "drone-1 only")
+    denied(
+        lambda: agents["drone-1"].call("POST", f"{FRACTUS}/edgenodes", fresh), "only the Drone or EdgeNode of drone-1"
+    )
     agents["edge-1"].call("POST", f"{FRACTUS}/edgenodes", fresh)
     nameless = {**fresh, "metadata": {"generateName": "edge-"}}
-    denied(lambda: agents["edge-1"].call("POST", f"{FRACTUS}/edgenodes", nameless), "edge-1 only")
+    denied(
+        lambda: agents["edge-1"].call("POST", f"{FRACTUS}/edgenodes", nameless), "only the Drone or EdgeNode of edge-1"
+    )
     denied(lambda: agents["edge-1"].delete(f"{FRACTUS}/edgenodes/edge-1"), "cannot delete")
 
 
@@ -170,13 +180,17 @@ def test_an_agent_reads_and_reports_on_the_one_object_of_its_node(
     ("path", "request_", "words"),
     [
         pytest.param(
-            token_path("edge-1"), token_request("edge-1"), "of the account of drone-1 only", id="another node"
+            token_path("edge-1"), token_request("edge-1"), "only tokens of the account of drone-1", id="another node"
         ),
-        pytest.param(token_path("edge-1"), token_request(), "of the account of drone-1 only", id="another account"),
-        pytest.param(token_path("drone-1"), token_request("edge-1"), "to the Node drone-1 only", id="bound elsewhere"),
-        pytest.param(token_path("drone-1"), token_request(boundObjectRef=None), "to the Node drone-1 only", id="loose"),
-        pytest.param(token_path("drone-1"), token_request(expirationSeconds=3601), "for an hour at most", id="longer"),
-        pytest.param(token_path("default"), token_request(), "of the account of drone-1 only", id="default"),
+        pytest.param(
+            token_path("edge-1"), token_request(), "only tokens of the account of drone-1", id="another account"
+        ),
+        pytest.param(token_path("drone-1"), token_request("edge-1"), "bound to the Node drone-1", id="bound elsewhere"),
+        pytest.param(
+            token_path("drone-1"), token_request(boundObjectRef=None), "bound to the Node drone-1", id="loose"
+        ),
+        pytest.param(token_path("drone-1"), token_request(expirationSeconds=3601), "for at most one hour", id="longer"),
+        pytest.param(token_path("default"), token_request(), "only tokens of the account of drone-1", id="default"),
         pytest.param(token_path("fractus-node", SYSTEM), token_request(), "cannot create", id="its own"),
         pytest.param(token_path("fractus-operator", SYSTEM), token_request(), "cannot create", id="the operator"),
     ],
@@ -199,23 +213,25 @@ PODS = {"apiGroups": [""], "resources": ["pods"], "verbs": ["get"]}
 @pytest.mark.parametrize(
     ("kind", "body", "words"),
     [
-        pytest.param(ROLE, _rules("n", resourceNames=["m"]), "node of their name", id="another node"),
-        pytest.param(ROLE, _rules("n", resourceNames=[]), "node of their name", id="all nodes"),
-        pytest.param(ROLE, _rules("n", verbs=["patch"]), "node of their name", id="other verbs"),
-        pytest.param(ROLE, _rules("n", {**PODS}), "node of their name", id="more"),
-        pytest.param(ROLE, account_object(ROLE, "n") | {"metadata": {"name": "n"}}, "made itself", id="not labelled"),
+        pytest.param(ROLE, _rules("n", resourceNames=["m"]), "node that it is named after", id="another node"),
+        pytest.param(ROLE, _rules("n", resourceNames=[]), "node that it is named after", id="all nodes"),
+        pytest.param(ROLE, _rules("n", verbs=["patch"]), "node that it is named after", id="other verbs"),
+        pytest.param(ROLE, _rules("n", {**PODS}), "node that it is named after", id="more"),
+        pytest.param(
+            ROLE, account_object(ROLE, "n") | {"metadata": {"name": "n"}}, "that it has created", id="not labelled"
+        ),
         pytest.param(
             ROLE_BINDING,
             account_object(ROLE_BINDING, "drone-1")
             | {"subjects": [{"kind": "ServiceAccount", "name": "m", "namespace": NODES}]},
-            "node of their name",
+            "node that it is named after",
             id="another account",
         ),
         pytest.param(
             ROLE_BINDING,
             account_object(ROLE_BINDING, "drone-1")
             | {"subjects": [{"kind": "User", "apiGroup": "rbac.authorization.k8s.io", "name": "drone-1"}]},
-            "node of their name",
+            "node that it is named after",
             id="a user",
         ),
         pytest.param(
@@ -243,10 +259,10 @@ def test_the_operator_makes_no_account_elsewhere_and_takes_no_other_s(
     try:
         for kind in (*ACCOUNT_KINDS, NODE_GRANTS):
             denied(lambda kind=kind: client.call("POST", kind.path(SYSTEM), {}), "cannot create")
-        denied(lambda: client.delete(ROLE.path(NODES, "fractus:operator")), "made itself")
+        denied(lambda: client.delete(ROLE.path(NODES, "fractus:operator")), "that it has created")
         denied(lambda: client.call("POST", token_path("drone-1"), token_request()), "cannot create")
         path = NODE_GRANTS.path(NODES, "drone-1", "status")
-        denied(lambda: client.merge(path, {"status": {"observedGeneration": 3}}), "what agents report")
+        denied(lambda: client.merge(path, {"status": {"observedGeneration": 3}}), "reports of agents")
     finally:
         client.close()
 
@@ -281,7 +297,7 @@ def test_agents_of_the_release_before_keep_their_account_until_they_are_replaced
     mine, other, status = _grant(world, "edge-2"), _grant(world, "drone-1"), {"status": {"phase": "Complete"}}
     wait_for(lambda: agent.get(mine), "the right to read Grants")
     agent.merge(f"{mine}/status", status)
-    denied(lambda: agent.merge(f"{other}/status", status), "edge-2 only")
+    denied(lambda: agent.merge(f"{other}/status", status), "only on Grants of edge-2")
     denied(lambda: agent.call("POST", token_path("edge-2"), token_request("edge-2")), "cannot create")
     agent.close()
     world.api.delete(f"{pods}/old", grace_s=0)
@@ -309,7 +325,10 @@ def test_an_agent_reports_on_direct_links_of_its_node_only(world: World, agents:
     written = world.api.get(ours)
     assert written is not None
     assert (written["status"], written["spec"]["range"]) == ({"phase": "Up", "switches": 1}, 120)
-    denied(lambda: agents["drone-1"].merge(f"{other}/status", {"status": {"phase": "Up"}}), "drone-1 only")
+    denied(
+        lambda: agents["drone-1"].merge(f"{other}/status", {"status": {"phase": "Up"}}),
+        "only on direct links of drone-1",
+    )
     denied(lambda: agents["drone-1"].merge(ours, {"spec": {"range": 1000}}), "cannot patch")
     denied(lambda: agents["drone-1"].delete(ours), "cannot delete")
 
@@ -409,8 +428,8 @@ def test_no_other_gets_a_certificate_of_a_node(
     body = signing_request("drone-1")
     world.api.call("POST", REQUESTS, body)
     assert [c["reason"] for c in settled(world, body)["conditions"]] == ["WrongRequester"]
-    denied(lambda: agents["edge-1"].call("POST", REQUESTS, signing_request("drone-1")), "edge-1 only")
+    denied(lambda: agents["edge-1"].call("POST", REQUESTS, signing_request("drone-1")), "only certificates of edge-1")
     kubelet = signing_request(
         "drone-1", signerName="kubernetes.io/kube-apiserver-client-kubelet", usages=["client auth"]
     )
-    denied(lambda: agents["drone-1"].call("POST", REQUESTS, kubelet), "drone-1 only")
+    denied(lambda: agents["drone-1"].call("POST", REQUESTS, kubelet), "only certificates of drone-1")

@@ -34,14 +34,14 @@ PLACED = PLAN.model_copy(update={"placements": PLAN.placements[:2], "drone": Non
 
 
 class Copy(dict[Key, Body]):
-    """What the watch showed of a kind: nothing."""
+    """An empty cache of one kind."""
 
     def record_write(self, key: Key, body: Body) -> None:
-        """Nothing is remembered."""
+        """Ignore the write."""
 
 
 class Webhooks:
-    """An API server that never answers writes of one kind."""
+    """A fake API server that never responds to writes of one kind."""
 
     def __init__(self, hanging: Kind | None, full: int = 0) -> None:
         self.hanging = hanging
@@ -170,7 +170,7 @@ async def test_grant_of_another_application_is_not_written() -> None:
 
 
 async def test_endpoint_slice_of_kubernetes_is_not_deleted() -> None:
-    """EndpointSlices have the labels of their Service: one that is removed before it comes back."""
+    """EndpointSlices of Kubernetes have the labels of their Service, and are created again after a deletion."""
     store = Spelling(None)
     copies = {kind: OwnedObjects(cast(Any, store), kind, lambda body: body, lambda *_: None) for kind in kinds.CHILDREN}
     children = ChildObjects(cast(Any, store), copies, cast(Any, None))
@@ -186,7 +186,7 @@ async def test_endpoint_slice_of_kubernetes_is_not_deleted() -> None:
 
 
 async def test_addresses_are_updated_only_in_endpoint_slices_of_the_operator() -> None:
-    """Kubernetes says itself where a Service with a selector leads, and admission refuses what another writes there."""
+    """Kubernetes manages the EndpointSlice of a Service with a selector. Admission refuses writes of others."""
     store = Spelling(None)
     copies = {kind: OwnedObjects(cast(Any, store), kind, lambda body: body, lambda *_: None) for kind in kinds.CHILDREN}
     children = ChildObjects(cast(Any, store), copies, cast(Any, None))
@@ -201,7 +201,7 @@ async def test_addresses_are_updated_only_in_endpoint_slices_of_the_operator() -
 
 @pytest.mark.parametrize("owner", ["Application", "Service"])
 async def test_deployment_with_changed_owner_is_deleted(owner: str) -> None:
-    """Who may edit a namespace may give it another owner: it would outlive its application."""
+    """Users who may edit a namespace may change the owner, so that the Deployment would outlive its Application."""
     store = Spelling(None)
     copies = {kind: OwnedObjects(cast(Any, store), kind, lambda body: body, lambda *_: None) for kind in kinds.CHILDREN}
     body = owned_object(kinds.DEPLOYMENT, APPLICATION, "one", {})
@@ -213,7 +213,7 @@ async def test_deployment_with_changed_owner_is_deleted(owner: str) -> None:
 
 @pytest.mark.parametrize("kept", [True, False])
 async def test_pods_of_deployment_with_foreign_finalizer_are_deleted_one_by_one(kept: bool) -> None:
-    """So they are removed one by one; those of one that is gone are left to the garbage collector."""
+    """Pods of a Deployment that is gone are left to the garbage collector."""
     store = Spelling(None)
     labels = {"app.kubernetes.io/managed-by": "fractus", "fractus.dev/instance": "one"}
 
@@ -221,7 +221,7 @@ async def test_pods_of_deployment_with_foreign_finalizer_are_deleted_one_by_one(
         return kind.header("one", "city", uid=uid, labels=labels, ownerReferences=[{"uid": owner}]) | {"spec": {}}
 
     deployment = made(kinds.DEPLOYMENT, "d", "app")
-    # Not even by its label is it found again: that may have been taken off, too.
+    # The Deployment is not found by its label, which may have been removed as well.
     store.kept = frozenset({(kinds.DEPLOYMENT, "one")} if kept else ())
     listed = {
         kinds.DEPLOYMENT: [],
@@ -259,7 +259,7 @@ async def test_teardown_deletes_kept_pods() -> None:
 
 
 class Late(Store):
-    """An API server that carries out some requests after they had no answer, with what its controllers make of that."""
+    """A fake API server in which requests without a response take effect late, with the reactions of controllers."""
 
     def __init__(self) -> None:
         self.there: dict[tuple[str, Key], Body] = {}
@@ -294,7 +294,7 @@ class Late(Store):
 
 
 def seen_by(store: Late) -> ClusterCache:
-    """What the watch of pods shows."""
+    """Return a cache that contains the pods."""
     cache = ClusterCache(store)
     for informer in cache.informers():
         informer.synced.set()
@@ -305,7 +305,7 @@ def seen_by(store: Late) -> ClusterCache:
 
 
 async def test_orphaned_pods_created_after_teardown_are_deleted() -> None:
-    """A deletion that leaves pods to be kept was carried out late, while a controller made what it had just seen removed again."""
+    """A deletion that orphans pods takes effect late, while a controller creates deleted objects again."""
     store = Late()
     cache = seen_by(store)
     children = ChildObjects(store, cache.children, cast(Any, None))
@@ -314,7 +314,7 @@ async def test_orphaned_pods_created_after_teardown_are_deleted() -> None:
     store.put(kinds.POD, "one-7f-x", owned)
     lost = OrphanedPods(store, cache := seen_by(store))
     await lost.step()
-    assert store.names() == {"ReplicaSet/one-7f", "Pod/one-7f-x"}, "the garbage collector has its time"
+    assert store.names() == {"ReplicaSet/one-7f", "Pod/one-7f-x"}, "the garbage collector has time to delete them"
     store.put(kinds.APPLICATION, "a")
     await lost.step()
     assert {"ReplicaSet/one-7f", "Pod/one-7f-x"} < store.names(), "the watch of Applications is behind"
@@ -375,7 +375,7 @@ async def test_normalised_object_is_forgotten_when_deleted() -> None:
 
 
 class Secrets:
-    """An API server that lets Secrets be written and deleted, and never read."""
+    """A fake API server that allows writing and deleting Secrets, but not reading."""
 
     def __init__(self, *there: str) -> None:
         self.there = set(there)
@@ -428,7 +428,7 @@ async def test_secret_is_written_without_reading_it(why: Any, there: bool, said:
 
 @pytest.mark.parametrize("why", ["new", "renewed", "lost"])
 async def test_exhausted_quota_is_reported_only_for_missing_secret(why: Any) -> None:
-    """The API server looks at quotas first: it would refuse to make one that is there, and no try would ever succeed."""
+    """The API server checks quotas first, so that creating an existing Secret would always be refused."""
     secret = kinds.SECRET.header("one-tls", "city")
     store = Secrets("one-tls")
     store.full = True
@@ -460,7 +460,7 @@ async def test_secret_is_deleted_with_its_deployment_and_retried_after_refusal()
     store.refused = True
     with pytest.raises(KubeError, match="no"):
         await children.remove(APPLICATION.key, kinds.DEPLOYMENT)
-    assert store.said == ["delete Deployment"], "what runs goes all the same"
+    assert store.said == ["delete Deployment"], "the Deployment is deleted although its Secret is not"
     store.refused = False
     await children.remove(APPLICATION.key, kinds.SERVICE)
     assert store.there == set()

@@ -1,4 +1,4 @@
-"""What the operator's tests fly: one depot, drones, edge nodes, a cloud node; and the operator as a process."""
+"""Test inventory (one depot, drones, edge nodes, a cloud node) and the operator as a process."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ NODE_OBJECTS = (
     f"/apis/rbac.authorization.k8s.io/v1/namespaces/{NODES}/roles",
     f"/api/v1/namespaces/{NODES}/serviceaccounts",
 )
-"""Where the operator keeps what each node has."""
+"""Collections of the objects that the operator keeps for each node."""
 LAT, LON = 39.3606, 22.9307
 MOBILITY = [
     "Arm",
@@ -207,7 +207,7 @@ class World:
         return found
 
     def links(self, namespace: str, name: str = "traffic") -> dict[str, Body]:
-        """The DirectLinks of an application by the node that is asked."""
+        """Return the DirectLinks of an application by node."""
         selector = f"fractus.dev/namespace={namespace},fractus.dev/application={name}"
         return {body["spec"]["node"]: body for body in self.api.list(f"{FRACTUS}/directlinks", labelSelector=selector)}
 
@@ -217,7 +217,7 @@ class World:
         return [pod for pod in found if "deletionTimestamp" not in pod["metadata"]]
 
     def run_pods(self, namespace: str) -> None:
-        """Say of every pod that it is bound and ready, as scheduler and kubelet would."""
+        """Bind every pod and mark it as ready, as scheduler and kubelet would."""
         for number, pod in enumerate(self.pods(namespace)):
             name = pod["metadata"]["name"]
             if not pod["spec"].get("nodeName"):
@@ -279,7 +279,7 @@ class OperatorProcess:
 
     def __init__(self, kubeconfig: Path, log: Path, identity: str = "operator", **settings: str) -> None:
         self._kubeconfig = kubeconfig
-        # As a pod does, it keeps its identity when it is started again.
+        # Like a pod, it keeps its identity when it is restarted.
         self._settings = {"FRACTUS_IDENTITY": identity, **settings}
         self._log = log
         self.health = f"http://127.0.0.1:{free_port()}/healthz"
@@ -343,7 +343,7 @@ def fresh_namespace(world: World, name: str) -> Iterator[str]:
 
 
 def denied(attempt: Callable[[], object], words: str) -> None:
-    """Have the API server refuse what is attempted, with these words."""
+    """Assert that the API server refuses a request with this message."""
     with pytest.raises(KubeError) as refusal:
         attempt()
     assert refusal.value.status == 403, refusal.value

@@ -34,7 +34,7 @@ def drone(state: str, controller: str | None = "system", *, at_s: int, why: str 
 
 
 class Cluster:
-    """What the operator sees of a cluster, and the Events that it posts there; an operator may start again."""
+    """A fake cluster that records Events. The operator can be restarted."""
 
     def __init__(self) -> None:
         self.drones: dict[str, Drone] = {}
@@ -65,7 +65,7 @@ class Cluster:
             self.landed.set()
 
     async def see(self, *seen: Drone | None) -> list[str]:
-        """Reasons of what is posted after these reports."""
+        """Return the reasons of the Events after these reports."""
         before = len(self.posted)
         for each in seen:
             if each is None:
@@ -184,7 +184,7 @@ async def test_flapping_drone_has_few_events(cluster: Cluster, monkeypatch: pyte
     assert len(cluster.posted) == BURST
     assert cluster.sentences()[-1] == "drone-1 took off, flown by system"
     monkeypatch.setattr(drone_events, "PERIOD_S", 1e-9)
-    assert await cluster.see(drone("inactive", at_s=2001)) == ["Landed"], "how it is now is told when it may be"
+    assert await cluster.see(drone("inactive", at_s=2001)) == ["Landed"], "the current state is posted when allowed"
 
 
 async def test_delayed_events_are_posted_later(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -54,7 +54,7 @@ def plan_spec(node: str, host: Key | None, generation: int, placed_on: str) -> d
 
 
 class EventsOfTheCluster(RuleBasedStateMachine):
-    """Objects come, change and go at the API server; the operator hears of it late, again, or by another list."""
+    """Objects are created, changed and deleted. The operator receives events late, repeatedly, or by another list."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -166,7 +166,7 @@ class EventsOfTheCluster(RuleBasedStateMachine):
         if self.there[kind]:
             self.remove(kind, choice.choice(sorted(self.there[kind])))
 
-    # -- what is heard of it --
+    # -- received events --
 
     def informer(self, kind: Kind) -> Informer[Any]:
         return next(r for r in self.cache.informers() if r.kind == kind)
@@ -175,7 +175,7 @@ class EventsOfTheCluster(RuleBasedStateMachine):
         key, informer = key_of(body), self.informer(kind)
         known = informer.get(key) is not None
         informer._take(type_, copy.deepcopy(body))
-        # What was deleted before the last answer told of it is there again, and its plan stays.
+        # An object deleted before the last response is present again, and its plan stays.
         if kind is kinds.APPLICATION and known and informer.get(key) is None:
             self.decided.pop(key, None)
 
@@ -194,14 +194,14 @@ class EventsOfTheCluster(RuleBasedStateMachine):
 
     @rule(kind=st.sampled_from(KINDS))
     def answer(self, kind: Kind) -> None:
-        """A write of ours returns before the watch tells of it."""
+        """A write of the operator returns before the watch reports it."""
         if self.unheard[kind] and self.unheard[kind][-1][0] != "DELETED":
             body = copy.deepcopy(self.unheard[kind][-1][1])
             self.informer(kind).record_write(key_of(body), body)
 
     @rule(kind=st.sampled_from(KINDS))
     def list_again(self, kind: Kind) -> None:
-        """What was deleted meanwhile is found only by its absence."""
+        """An object that was deleted meanwhile is only missing in the list."""
         self.unheard[kind] = []
         for body in self.there[kind].values():
             self.take(kind, "MODIFIED", body)
@@ -211,7 +211,7 @@ class EventsOfTheCluster(RuleBasedStateMachine):
             if kind is kinds.APPLICATION:
                 self.decided.pop(key, None)
 
-    # -- what all of it gives --
+    # -- invariants --
 
     def plans(self) -> dict[Key, OwnedPlan]:
         """The plans made last."""

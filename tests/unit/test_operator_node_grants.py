@@ -59,7 +59,7 @@ def test_account_with_other_rights_is_modified(kind: Kind) -> None:
 
 
 class Api(Store):
-    """The objects of one API server; what it is asked is remembered."""
+    """A fake API server that records requests."""
 
     def __init__(self) -> None:
         self.field_manager = "test"
@@ -85,7 +85,7 @@ class Api(Store):
         elif method == "PATCH":
             found = self.objects[target]
             if path != target:
-                # As the API server: of a status no other field is looked at, unless a test asks for it.
+                # Like the API server, a patch of the status ignores other fields unless it tests them.
                 asked, given = body
                 if asked != {"op": "test", "path": "/metadata/uid", "value": found["metadata"]["uid"]}:
                     raise Invalid(422, "Invalid", path)
@@ -100,7 +100,7 @@ class Api(Store):
         return json.loads(json.dumps(self.objects[target]))
 
     def node(self, name: str) -> dict[str, Body]:
-        """What a node has, by kind."""
+        """Return the objects of a node by kind."""
         return {
             body["kind"]: body
             for path, body in self.objects.items()
@@ -118,7 +118,7 @@ class Api(Store):
 
 
 class Cluster:
-    """The keeper at work, and what its watches tell it."""
+    """Run the controller with the events of its watches."""
 
     def __init__(self) -> None:
         self.api = Api()
@@ -172,14 +172,14 @@ class Cluster:
         return self.api.objects[kinds.GRANT.path("", grant)].get("status")
 
     def gone(self, kind: Kind, node: str) -> None:
-        """The watch tells of a deletion."""
+        """Report a deletion by the watch."""
         objects = self.cache.node_objects
         informer: Any = objects.known if kind is kinds.NODE_GRANTS else objects.accounts[kind]
         informer._drop((NODE_GRANTS_NAMESPACE, node))
 
     async def until(self, condition: Any) -> None:
         async with asyncio.timeout(10):
-            while not condition():  # noqa: ASYNC110 (the worklists tell no one)
+            while not condition():  # noqa: ASYNC110 (the queues have no event)
                 await asyncio.sleep(0)
 
     async def settled(self) -> None:
@@ -281,7 +281,7 @@ async def test_report_of_recreated_grant_is_dropped(cluster: Cluster) -> None:
     cluster.grant("a", "drone-1")
     await cluster.until(lambda: cluster.api.granted("drone-1") == ["a"])
     await cluster.settled()
-    # The watch has not told of it yet.
+    # The watch has not reported it yet.
     cluster.api.objects[kinds.GRANT.path("", "a")]["metadata"]["uid"] = "another"
     cluster.report("drone-1", report("Complete", uid="uid of a"))
     await cluster.until(lambda: ("PATCH", f"{kinds.GRANT.path('', 'a')}/status") in cluster.api.asked)

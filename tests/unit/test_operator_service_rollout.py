@@ -223,10 +223,10 @@ def test_delayed_step_makes_no_node_stale() -> None:
 
 
 class Api(Store):
-    """What the API server has of drones; it refuses writes of some."""
+    """A fake API server with drones, which refuses writes to some of them."""
 
     def __init__(self) -> None:
-        # Without a connection: `request` answers.
+        # There is no connection. `request` returns the response.
         self.field_manager = "test"
         self.objects: dict[str, dict[str, Any]] = {}
         self.refused: set[str] = set()
@@ -244,7 +244,7 @@ class Api(Store):
         if method == "PUT":
             self.objects[name] = body
         if method == "PATCH":
-            # As an apply of a list whose items are told apart by their type.
+            # Apply a list whose items are identified by their type.
             status = self.objects[name].setdefault("status", {})
             new = {condition["type"]: condition for condition in body["status"]["conditions"]}
             others = [each for each in status.get("conditions", ()) if each["type"] not in new]
@@ -254,7 +254,7 @@ class Api(Store):
 
 @pytest.fixture
 async def cache() -> ClusterCache:
-    """Three drones on the ground, with one outdated service each; all of it is known."""
+    """Three drones on the ground, each with one outdated service."""
     found = ClusterCache(Api())
     for informer in found.informers():
         informer.synced.set()
@@ -442,7 +442,7 @@ def test_grounded_annotation_is_valid_until_next_report() -> None:
 async def test_condition_is_updated_if_patch_is_forbidden(
     cache: ClusterCache, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """After `helm rollback` it allows updates only: admission goes by OnMission, and would take the drone for idle."""
+    """After `helm rollback` the role allows only updates. Admission uses OnMission, and would take the drone for idle."""
     api = Api()
     api.forbidden = {"PATCH"}
     missions = MissionConditionController(api, cache, reported(cache, api), lambda: datetime(2026, 1, 1, tzinfo=UTC))

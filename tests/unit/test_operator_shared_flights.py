@@ -52,7 +52,7 @@ def test_drone_in_flight_offers_remaining_flight() -> None:
     begun = offered_flights([flown("flying", 180)], DEPOTS, 7.0, None)["d"]
     assert begun.legs[0][0].lon == pytest.approx(at(180, 0)["lon"])
     assert offered_flights([flown("flying", 900)], DEPOTS, 7.0, None) == {}
-    # Who is shared already was promised the whole way.
+    # A flight that is already shared is offered completely.
     assert offered_flights([flown("flying", 900)], DEPOTS, 7.0, RIDE) == {"d": flight_of(HOST, DEPOTS)}
 
 
@@ -108,7 +108,7 @@ def test_guest_claims_no_drone() -> None:
 def test_remaining_grant_of_guest_claims_no_drone(left_by: str | None) -> None:
     plans = {("default", "traffic"): OwnedPlan("t", OWN)}
     if left_by is not None:
-        # It has a drone of its own by now, and its grant on the old one is yet to go.
+        # It has its own drone now, and its Grant on the previous drone is not deleted yet.
         plans["default", "guest"] = OwnedPlan("g", OWN.model_copy(update={"drone": DroneChoice(node="e")}))
     left, flown_by = grant("guest", "g", "2026-01-01T00:00:00Z"), grant("traffic", "t", "2026-01-02T00:00:00Z")
     for grants in ([left, flown_by], [flown_by, left]):

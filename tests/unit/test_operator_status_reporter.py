@@ -60,7 +60,7 @@ async def test_queued_rollout_is_reported() -> None:
     assert "20 other Applications" in said["message"]
     assert not api.events, "an Event would be another request"
     await reporter.report_queued(submitted, PLAN, 21)
-    assert len(api.written) == 1, "who has a status is not told"
+    assert len(api.written) == 1, "an Application with a status is not reported as queued"
 
 
 async def test_refused_first_status_is_ignored() -> None:
@@ -71,7 +71,7 @@ async def test_refused_first_status_is_ignored() -> None:
 
 
 async def test_conflicting_outcome_is_not_taken_for_recorded() -> None:
-    """What follows removes the grants, the only other record of it: the mission would be flown again."""
+    """The next step deletes the Grants, the only other record of the outcome, so that the mission would be flown again."""
     api, cache, reporter, submitted = new()
     api.refusal = Conflict(409, "Conflict", "it changed meanwhile")
     with pytest.raises(Conflict):
@@ -82,7 +82,7 @@ async def test_conflicting_outcome_is_not_taken_for_recorded() -> None:
 
 
 async def test_persistent_failure_replaces_outdated_message() -> None:
-    """Such as that many others come first, while a webhook refuses each of its Deployments."""
+    """Example: the status reports a queue, while a webhook refuses each of its Deployments."""
     api, _, reporter, submitted = new()
     await reporter.report_queued(submitted, PLAN, 20)
     error = KubeError(500, "InternalError", "failed calling webhook")

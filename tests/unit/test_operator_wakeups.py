@@ -137,10 +137,10 @@ async def test_released_capacity_wakes_applications_that_need_the_node() -> None
         cache.pods.record_write(key, pod_body(3, "n", "Succeeded"))
         assert await here.changed(0)
         cache.pods._drop(key)
-        assert not await here.changed(0), "it had no room any more"
+        assert not await here.changed(0), "its capacity was exhausted"
         cache.pods.record_write(key, pod_body(4, "n"))
         cache.pods._drop(key)
-        assert await here.changed(0), "who is killed leaves room as well"
+        assert await here.changed(0), "a killed pod releases capacity as well"
         cache.subscriptions.set_placed(("ns", "here"), placed=True)
         cache.pods.record_write(key, pod_body(5, "n"))
         cache.pods._drop(key)
@@ -271,7 +271,7 @@ async def test_deleted_plan_wakes_waiting_applications(shared: ClusterCache) -> 
     shared.drones.record_write(("", "d"), drone_body(2, "inactive"))
     stored.record_write(HOST, plan_body("d", 1))
     with shared.subscriptions.subscribe(("ns", "waiting")) as waiting:
-        # What was decided is dropped before the watch shows that the object is gone, which still claims the drone until then.
+        # The decided plan is dropped before the watch reports the deletion of the object, which claims the drone until then.
         shared.forget(HOST)
         assert await waiting.changed(0)
         assert "d" in shared.fleet.claims()

@@ -30,7 +30,7 @@ def shell_lines(page: str, section: str = "") -> list[str]:
         text = rest.partition("\n## ")[0]
     lines: list[str] = []
     for block in _parts(text)[0]:
-        typed = [line for line in "\n".join(block).replace("\\\n", "").splitlines() if line.strip()]
+        typed = [line.strip() for line in "\n".join(block).replace("\\\n", "").splitlines() if line.strip()]
         prompts = [line.removeprefix("$ ") for line in typed if line.startswith("$ ")]
         lines += prompts or typed
     return lines

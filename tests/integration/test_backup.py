@@ -125,7 +125,7 @@ def test_backup_is_restored_into_another_cluster_and_uninstalled(
     remove(found, shell)
 
 
-REMOVE = shell_lines("docs/upgrades.md", "Uninstalling")
+REMOVE = shell_lines("docs/upgrades.md", "Uninstall")
 EVERYWHERE = "clusterroles,clusterrolebindings,validatingadmissionpolicies,validatingadmissionpolicybindings,priorityclasses,crds"
 INSIDE = "deployments,daemonsets,jobs,services,serviceaccounts,roles,rolebindings,secrets,configmaps,leases"
 

@@ -77,8 +77,9 @@ demo() {
 
 # Run the uninstall commands of docs/upgrades.md. No objects and no files of Fractus remain.
 uninstall() {
-  bash -e <(sed -n '/^### What stays, and wiping/,/^## /s/^    \(helm .* upgrade .*\)/\1/p' docs/upgrades.md)
-  bash -e <(sed -n '/^## Uninstalling/,/^## /s/^    \(kubectl delete app.*\|helm .* uninstall .*\)/\1/p' docs/upgrades.md)
+  grep -q '^### Wipe nodes$' docs/upgrades.md && grep -q '^## Uninstall$' docs/upgrades.md
+  bash -e <(sed -n '/^### Wipe nodes$/,/^##/s/^    \(helm .* upgrade .*\)/\1/p' docs/upgrades.md)
+  bash -e <(sed -n '/^## Uninstall$/,/^## /s/^    \(kubectl delete app.*\|helm .* uninstall .*\)/\1/p' docs/upgrades.md)
   kubectl wait --for=delete pod --all --namespace fractus-system --timeout=120s
   kubectl wait --for=delete namespace/fractus-nodes --timeout=120s
   kinds=$(kubectl api-resources --verbs=list --output=name | grep -v '^events')

@@ -13,7 +13,7 @@ log = logging.getLogger("navigator")
 
 
 async def fly(drone: fractus.Mobility, control: fractus.Control) -> None:
-    """Visit what is left of the waypoints of a control point, and what is asked for in between."""
+    """Visit the remaining waypoints of a control point, and the detours between them."""
     altitudes, detours = _altitudes(), _detours()
     tasks = [task.path or _positions(os.environ["ZIGZAG"]) for task in fractus.control_points()]
     first = 1 + sum(len(task) for task in tasks[: control.control_point])
@@ -26,7 +26,7 @@ async def fly(drone: fractus.Mobility, control: fractus.Control) -> None:
 
 
 async def go(drone: fractus.Mobility, what: str, to: fractus.Position, stay_s: float = 0.0) -> None:
-    """Fly somewhere, and hover there for a while; what policies forbid is passed over."""
+    """Fly to a position and hover there. Positions that policies forbid are skipped."""
     try:
         done = await drone.goto(to.lat, to.lon, to.alt)
     except fractus.PolicyDenied as refusal:
@@ -46,13 +46,13 @@ def _positions(text: str) -> tuple[fractus.Position, ...]:
 
 
 def _altitudes() -> dict[int, float]:
-    """ALTITUDES, such as `1:20,6:4`: other altitudes for some waypoints."""
+    """Parse ALTITUDES, for example `1:20,6:4`: other altitudes for some waypoints."""
     pairs = (part.split(":") for part in os.environ.get("ALTITUDES", "").split(",") if part)
     return {int(number): float(altitude) for number, altitude in pairs}
 
 
 def _detours() -> dict[int, tuple[fractus.Position, float]]:
-    """DETOURS, such as `2:39.3711,22.9307,10; 6:39.3704,22.9318,10,20`: where to go after some waypoints, and how many seconds to stay."""
+    """Parse DETOURS, for example `2:39.3711,22.9307,10; 6:39.3704,22.9318,10,20`: positions after waypoints, with seconds to stay."""
     found = {}
     for pair in filter(str.strip, os.environ.get("DETOURS", "").split(";")):
         number, place = pair.split(":")

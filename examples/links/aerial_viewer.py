@@ -1,6 +1,6 @@
-"""AerialViewer, a passenger of the drone: a picture each second to the ImageChecker, wherever that is reached best.
+"""AerialViewer, a passenger: sends one picture per second to the ImageChecker over the best path.
 
-It logs a line of JSON for each picture that it sends and for each answer.
+It logs a JSON line for each sent picture and each response.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ import fractus
 
 PERIOD_S = float(os.environ.get("PERIOD_S", "1"))
 LIFE = uuid.uuid4().hex
-"""Numbers begin again after a restart; the ids of requests must not."""
+"""Unique per start, because picture numbers start again after a restart and request ids must not repeat."""
 log = logging.getLogger("viewer")
 
 
 async def watch() -> None:
-    """Take and send pictures until SIGTERM; none waits for the one before."""
+    """Take and send pictures until SIGTERM, without waiting for earlier ones."""
     over, sending = asyncio.Event(), set[asyncio.Task[None]]()
     loop = asyncio.get_running_loop()
     loop.add_signal_handler(signal.SIGTERM, over.set)
@@ -43,7 +43,7 @@ async def watch() -> None:
 
 
 async def pass_on(camera: fractus.Camera, checker: fractus.Requester, number: int) -> None:
-    """Take a picture and have it checked."""
+    """Take a picture and send it to the ImageChecker."""
     try:
         picture = await look(camera)
     except fractus.FractusError as error:
@@ -61,14 +61,14 @@ async def pass_on(camera: fractus.Camera, checker: fractus.Requester, number: in
 
 
 async def look(camera: fractus.Camera) -> bytes:
-    """A picture from the drone's camera; where it has none, bytes of its size."""
+    """Return a picture of the drone's camera, or random bytes of the same size if there is no camera."""
     if size := int(os.environ.get("PICTURE_BYTES", "0")):
         return os.urandom(size)
     return (await camera.take()).data
 
 
 def tell(event: str, number: int, **more: Any) -> None:
-    """Log what became of a picture."""
+    """Log the result of one picture as a JSON line."""
     print(json.dumps({"event": event, "picture": number, "at": round(time.time(), 4), **more}), flush=True)
 
 

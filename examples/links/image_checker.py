@@ -16,7 +16,7 @@ PORT = 8080
 
 
 async def check(request: fractus.Request) -> bytes:
-    """Say who received the picture."""
+    """Return the name of the receiving instance."""
     by = os.environ["FRACTUS_NODE"]
     number = int(request.id.rpartition("-")[2])
     line = {"event": "received", "picture": number, "at": round(time.time(), 4), "by": by, "attempt": request.attempt}

@@ -11,7 +11,7 @@ log = logging.getLogger("navigator")
 
 
 async def fly(drone: fractus.Mobility, control: fractus.Control) -> None:
-    """Fly what is left of the path; after a restart in the air, arm and takeoff pass."""
+    """Fly the remaining path. After a restart in the air, arm and takeoff complete at once."""
     path = control.task.path
     await drone.arm()
     await drone.takeoff(path[0].alt)

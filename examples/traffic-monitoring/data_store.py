@@ -1,4 +1,4 @@
-"""DataStore, in the cloud: keeps what the ImageCheckers find, a JSON line each, for as long as its pod lives."""
+"""DataStore, in the cloud: stores the results of the ImageCheckers as JSON lines for the lifetime of its pod."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ kept: set[str | None] = set()
 
 
 def keep(body: bytes, headers: Message) -> dict[str, Any]:
-    """Append a result, unless it came before: two ImageCheckers may have looked at one picture when the path changed.
+    """Store a result once. Two ImageCheckers may check the same picture when the path changes.
 
     Raises:
         ValueError: it is not a JSON object.
@@ -28,7 +28,7 @@ def keep(body: bytes, headers: Message) -> dict[str, Any]:
     """
     result = json.loads(body)
     if not isinstance(result, dict):
-        raise ValueError("a result is a JSON object")  # noqa: TRY004 (the sender's mistake)
+        raise ValueError("a result is a JSON object")  # noqa: TRY004 (error of the sender)
     line = json.dumps(result, separators=(",", ":")) + "\n"
     request = result.get("request")
     with writing:
@@ -44,7 +44,7 @@ def keep(body: bytes, headers: Message) -> dict[str, Any]:
 
 
 def results(body: bytes, headers: Message) -> list[Any]:
-    """Everything kept so far, oldest first."""
+    """Return all stored results, oldest first."""
     with writing:
         lines = RESULTS.read_text().splitlines() if RESULTS.exists() else []
     return [json.loads(line) for line in lines]

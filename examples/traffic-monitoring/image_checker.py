@@ -1,4 +1,4 @@
-"""ImageChecker, near the camera or in the cloud: looks at a picture's bytes and reports to the DataStore."""
+"""ImageChecker, near the camera or in the cloud: reads a picture's header and reports to the DataStore."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ log = logging.getLogger("image-checker")
 
 
 async def check(request: fractus.Request) -> bytes:
-    """What the picture is; the result goes to the DataStore, with the request's id, by which it knows a repeated one.
+    """Return the properties of the picture, and send them to the DataStore with the request id that identifies repetitions.
 
     Raises:
         ValueError: it is no picture.
@@ -45,7 +45,7 @@ async def check(request: fractus.Request) -> bytes:
 
 
 def measure(picture: bytes) -> tuple[str, int, int]:
-    """Kind, width and height of a PNG or JPEG, from its headers.
+    """Return type, width and height of a PNG or JPEG from its header.
 
     Raises:
         ValueError: it is neither, or its headers are broken.

@@ -1,4 +1,4 @@
-"""Navigator, the drone's driver: flies its waypoints once, and after a restart goes on where it was."""
+"""Navigator, the driver: flies its waypoints once, and continues after a restart."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ log = logging.getLogger("navigator")
 
 
 async def fly(drone: fractus.Mobility, control: fractus.Control) -> None:
-    """Take off, and visit what is left of the path; in the air, arm and takeoff pass."""
+    """Take off and visit the remaining waypoints. After a restart in the air, arm and takeoff complete at once."""
     path = control.task.path
     await drone.arm()
     log.info("armed; taking off")
@@ -27,7 +27,7 @@ async def fly(drone: fractus.Mobility, control: fractus.Control) -> None:
 
 
 async def detour(drone: fractus.Mobility) -> None:
-    """Try for a closer look at DETOUR (lat,lon,alt), which policies may forbid."""
+    """Try to fly to DETOUR (lat,lon,alt), which policies may forbid."""
     lat, lon, alt = (float(part) for part in os.environ["DETOUR"].split(","))
     try:
         tell("detour", await drone.goto(lat, lon, alt))
@@ -36,7 +36,7 @@ async def detour(drone: fractus.Mobility) -> None:
 
 
 def tell(what: str, done: fractus.Progress) -> None:
-    """Log where a motion ended, and what a policy made of it."""
+    """Log the end of a motion and its corrections."""
     log.info("%s reached: %s%s", what, done.target, f" (corrected: {done.decision.reason})" if done.corrected else "")
 
 

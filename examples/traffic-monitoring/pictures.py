@@ -1,4 +1,4 @@
-"""Looks at the road: takes a picture at intervals and passes it to the ImageChecker."""
+"""Viewer: takes pictures at intervals and sends them to the ImageChecker."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ log = logging.getLogger("viewer")
 
 
 async def watch(interval_s: float) -> None:
-    """Take, fetch and send pictures until SIGTERM; what goes wrong with one of them is logged, and the next one taken."""
+    """Take, retrieve and send pictures until SIGTERM. A failure is logged, and the next picture is taken."""
     stop = asyncio.Event()
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, stop.set)
     number, said = 0, ""
@@ -42,7 +42,7 @@ async def watch(interval_s: float) -> None:
 
 
 async def look(camera: fractus.Camera, number: int) -> tuple[str, bytes]:
-    """A picture from the node's camera, or a test picture where a node has no camera service yet."""
+    """Return a picture of the node's camera, or a test picture if the node has no camera service."""
     try:
         picture = await camera.take()
     except fractus.Unavailable:
@@ -51,12 +51,12 @@ async def look(camera: fractus.Camera, number: int) -> tuple[str, bytes]:
 
 
 def pack(name: str, source: str, picture: bytes) -> bytes:
-    """A picture as it travels: a line of JSON that says whose it is, then its bytes."""
+    """Encode a picture: a JSON line with its source, followed by its bytes."""
     return json.dumps({"picture": name, "source": source}).encode() + b"\n" + picture
 
 
 def render(width: int, height: int, number: int) -> bytes:
-    """A grey PNG of a road with a car on it that moves with the number."""
+    """Return a grey PNG of a road with a car whose position depends on the number."""
     rows = []
     for y in range(height):
         road = height // 3 < y < 2 * height // 3
@@ -72,6 +72,6 @@ def render(width: int, height: int, number: int) -> bytes:
 
 
 def main(interval_s: float) -> None:
-    """Run a viewer."""
+    """Run a viewer until SIGTERM."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
     asyncio.run(watch(interval_s))

@@ -1,4 +1,4 @@
-"""The little HTTP that the components speak with each other, on the standard library alone."""
+"""Small HTTP server and client for the components, based on the standard library."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Handler = Callable[[bytes, Message], Any]
 
 
 def serve(port: int, get: Mapping[str, Handler], post: Mapping[str, Handler]) -> None:
-    """Answer requests with JSON until SIGTERM; GET /healthz is answered as well."""
+    """Serve requests with JSON responses until SIGTERM, including GET /healthz."""
     routes = {"GET": {"/healthz": lambda *_: {"status": "ok"}, **get}, "POST": post}
 
     class Requests(BaseHTTPRequestHandler):
@@ -31,7 +31,7 @@ def serve(port: int, get: Mapping[str, Handler], post: Mapping[str, Handler]) ->
                 return self.reply(200, handler(self.rfile.read(length), self.headers))
             except ValueError as error:
                 return self.reply(400, {"error": str(error)})
-            except OSError as error:  # what this component needs for its answer is away
+            except OSError as error:  # a dependency of this component is unreachable
                 return self.reply(503, {"error": str(error)})
 
         do_GET = do_POST = answer  # noqa: N815
@@ -45,7 +45,7 @@ def serve(port: int, get: Mapping[str, Handler], post: Mapping[str, Handler]) ->
             self.wfile.write(body)
 
         def log_message(self, format: str, *args: Any) -> None:
-            """Keep the log to what the components say."""
+            """Suppress the access log."""
 
     server = ThreadingHTTPServer(("", port), Requests)
     signal.signal(signal.SIGTERM, lambda *_: threading.Thread(target=server.shutdown).start())
@@ -54,11 +54,11 @@ def serve(port: int, get: Mapping[str, Handler], post: Mapping[str, Handler]) ->
 
 
 def post(address: str, path: str, body: bytes, headers: Mapping[str, str], timeout_s: float = 5.0) -> Any:
-    """Send a body to another component and return its JSON answer.
+    """Send a body to another component and return its JSON response.
 
     Raises:
         OSError: it cannot be reached, or refuses.
     """
     request = urllib.request.Request(f"http://{address}{path}", data=body, headers=dict(headers), method="POST")
-    with urllib.request.urlopen(request, timeout=timeout_s) as reply:  # nosec B310  # http, as said above
+    with urllib.request.urlopen(request, timeout=timeout_s) as reply:  # nosec B310  # plain HTTP, see the module docstring
         return json.load(reply)

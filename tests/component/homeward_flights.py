@@ -15,9 +15,9 @@ import numpy as np
 from fractus_core.policy.decision_types import GotoArgs, Situation, Verdict
 from fractus_core.policy.return_route import return_bounds
 from fractus_services.errors import Refused
-from fractus_services.mobility.flight.motions import HEIGHT_REACHED_M, REACHED_M
 from fractus_services.mobility.flight.return_to_launch import ReturnFlight
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
+from fractus_services.mobility.settings import SETTINGS
 from policy_flights import (
     EAST_M,
     HEIGHT_ERROR_M,
@@ -83,7 +83,7 @@ class WaysHome:
         Limits of altitude in zones do not count: the autopilot does not sink for them.
         """
         rests = np.linalg.norm(fleet.speed, axis=1) < AT_REST_MPS
-        there = np.linalg.norm(fleet.goal - fleet.place, axis=1) < REACHED_M
+        there = np.linalg.norm(fleet.goal - fleet.place, axis=1) < SETTINGS.reached_m
         straight = np.array([not a.retraces for a in fleet.airframes])
         who = np.arange(1, len(fleet.scenes), self.every)
         who = who[(rests & there & straight & fleet.arrives)[who]]
@@ -109,7 +109,7 @@ class _Away:
         self.homing: Any = None
         self._home = np.zeros(self.count, dtype=bool)
         self._legs: list[GotoArgs | None] = [None] * self.count
-        self._reached = np.full(self.count, REACHED_M)
+        self._reached = np.full(self.count, SETTINGS.reached_m)
         self._climbing = np.zeros(self.count, dtype=bool)
         self._ceilings = fleet.heights[:, 1].copy()
         """Limits of altitude that hold everywhere, or where those were that began above them."""
@@ -153,7 +153,10 @@ class _Away:
             elif leg is not None:
                 east, north = (leg.lon - HOME.lon) * EAST_M, (leg.lat - HOME.lat) * NORTH_M
                 x, y, z = fleet.seen[i]
-                if math.hypot(x - east, y - north) <= self._reached[i] and abs(z - (leg.alt or z)) <= HEIGHT_REACHED_M:
+                if (
+                    math.hypot(x - east, y - north) <= self._reached[i]
+                    and abs(z - (leg.alt or z)) <= SETTINGS.height_reached_m
+                ):
                     self._legs[i] = None
                     fleet.send(i, BRAKE)
             elif speeds[i] < AT_REST_MPS:
@@ -178,7 +181,7 @@ class _Away:
         if self._climbing[i] and fleet.place[i, 2] > fleet.goal[i, 2] - 1.0:
             self._climbing[i] = False
             fleet.goal[i, :2] = 0.0
-        elif not self._climbing[i] and math.hypot(*fleet.place[i, :2]) < REACHED_M:
+        elif not self._climbing[i] and math.hypot(*fleet.place[i, :2]) < SETTINGS.reached_m:
             self._home[i] = self.pardoned[i] = True
 
     def _look(self) -> None:

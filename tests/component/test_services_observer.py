@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from fractus_services.errors import AutopilotError
-from fractus_services.mobility.authority import vehicle_observer
+from fractus_services.mobility.settings import SETTINGS
 from mobility_world import World, spec
 from virtual_time import fly
 
@@ -76,8 +76,8 @@ def test_a_vehicle_that_tells_no_parameters_in_flight_comes_home(tmp_path: Path)
             await world.up(world.grants.put(spec()))
             world.plane.parameters.clear()
             silent_at = world.plane.now
-            await heard(world, lambda: taken_over(world), 2 * vehicle_observer.UNVERIFIED_TIMEOUT_S)
-            assert world.plane.now - silent_at > vehicle_observer.UNVERIFIED_TIMEOUT_S
+            await heard(world, lambda: taken_over(world), 2 * SETTINGS.unverified_timeout_s)
+            assert world.plane.now - silent_at > SETTINGS.unverified_timeout_s
             assert "has not reported" in world.outcome()
             await world.until(lambda: not world.plane.vehicle.armed)
             assert len(taken_over(world)) == 1
@@ -94,7 +94,7 @@ def test_parameters_that_answer_again_in_time_change_nothing(tmp_path: Path) -> 
                 told = dict(world.plane.parameters)
                 world.plane.parameters.clear()
                 begun = world.plane.now
-                silent_s = 0.7 * vehicle_observer.UNVERIFIED_TIMEOUT_S
+                silent_s = 0.7 * SETTINGS.unverified_timeout_s
                 await heard(world, lambda: world.plane.now - begun > silent_s, 2 * silent_s)  # noqa: B023
                 world.plane.parameters |= told
                 await heard(world, lambda: world.observer._unverified_since is None, 60)

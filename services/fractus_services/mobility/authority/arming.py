@@ -16,24 +16,7 @@ from fractus_services.errors import AutopilotError, PreconditionFailed, Refused,
 from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.autopilot import BEING_SET, Checked, Failsafes, Fence, Permit
-
-ARMING_TIMEOUT_S = 3.0
-"""Seconds to wait for the journal, and for the armed state after the autopilot accepted the command."""
-
-RETRY_S = 2.0
-"""Seconds between arming attempts."""
-
-UPDATE_TIMEOUT_S = 0.5
-"""Seconds to wait for one message of the vehicle."""
-
-FENCE_TIMEOUT_S = 45.0
-"""Seconds within which the vehicle's fence must be loaded and verified."""
-
-AT_HOME_M = 5.0
-"""Distance from home within which the autopilot may return on the path it flew."""
-
-MAX_HOME_DISTANCE_M = 50.0
-"""Distance from the home of the grant above which arming is refused, because the drone would return to a wrong place."""
+from fractus_services.mobility.settings import SETTINGS
 
 _TRANSIENT_CODES = frozenset(
     {"NotReady", "PositionUnknown", "LinkTooSlow", "FailsafesNotVerified", "FenceNotRaised", "ReturnNotLimited"}
@@ -93,13 +76,13 @@ class Arming:
                 judge()
                 await control.tasks.complete(self._arm_exclusively(grant, permit))
             except (AutopilotError, Refused) as error:
-                if not _is_transient(error) or control.autopilot.now + RETRY_S > until:
+                if not _is_transient(error) or control.autopilot.now + SETTINGS.arming_retry_s > until:
                     raise
                 log.warning("arming: attempt failed, retrying (identity=%s error=%s)", grant.identity, error)
                 yield str(error)
             else:
                 return
-            await asyncio.sleep(RETRY_S)
+            await asyncio.sleep(SETTINGS.arming_retry_s)
 
     async def _arm_exclusively(self, grant: ActiveGrant, permit: Permit) -> None:
         """Arm while no other caller arms, because preparations for the ground must not run on a flying drone."""
@@ -118,7 +101,7 @@ class Arming:
             raise PreconditionFailed(*ended_refusal(mission.outcome))
         home = self._home_of(grant, mission)
         self._control.dispatch(ArmingRequested(grant.key, grant.identity, home))
-        failure = await self._control.save(timeout_s=ARMING_TIMEOUT_S)
+        failure = await self._control.save(timeout_s=SETTINGS.arming_timeout_s)
         if failure:
             raise PreconditionFailed("JournalUnavailable", failure)
         permit()
@@ -145,11 +128,11 @@ class Arming:
             try:
                 unanswered = True
                 await autopilot.arm(permit)
-                deadline = autopilot.now + ARMING_TIMEOUT_S
+                deadline = autopilot.now + SETTINGS.arming_timeout_s
                 while not autopilot.vehicle.armed:
                     if autopilot.now > deadline:
                         raise AutopilotError("the autopilot acknowledged arming but did not arm")
-                    await autopilot.update(UPDATE_TIMEOUT_S)
+                    await autopilot.update(SETTINGS.arming_update_timeout_s)
                 unanswered = False
                 await autopilot.set_home(*home)
                 await self._control.tasks.attempt(autopilot.request_home)
@@ -170,14 +153,14 @@ class Arming:
         Returns:
             The verified failsafes. Failsafes that are set later were not chosen for this flight.
         """
-        at_home = self._control.autopilot.vehicle.distance_m(home[0], home[1]) <= AT_HOME_M
+        at_home = self._control.autopilot.vehicle.distance_m(home[0], home[1]) <= SETTINGS.at_home_m
         checked = self._require_verified()
         checked = self._update_checked(checked, await self._failsafes.choose_return(checked, retrace=at_home))
         try:
-            async with asyncio.timeout(FENCE_TIMEOUT_S):
+            async with asyncio.timeout(SETTINGS.fence_timeout_s):
                 await self._fence.raise_around(grant.spec, retraces=self._control.retraces)
         except (AutopilotError, OSError) as error:
-            problem = str(error) or f"timeout after {FENCE_TIMEOUT_S:.0f} s"
+            problem = str(error) or f"timeout after {SETTINGS.fence_timeout_s:.0f} s"
             reason = f"the vehicle's own fence cannot be raised around the operation area: {problem}"
             raise PreconditionFailed("FenceNotRaised", reason) from error
         self._require_verified(checked)
@@ -222,7 +205,7 @@ class Arming:
         base = grant.spec.home or grant.spec.depot
         if base is not None:
             distance_m = math.hypot(*LocalFrame(base.lat, base.lon).xy(lat, lon))
-            if distance_m > MAX_HOME_DISTANCE_M:
+            if distance_m > SETTINGS.max_home_distance_m:
                 raise PreconditionFailed(
                     "NotAtHome", f"the drone would return to a place {distance_m:.0f} m away from the home of its grant"
                 )

@@ -51,15 +51,10 @@ from fractus_services.mobility.authority.journal import Journal, record_of
 from fractus_services.mobility.authority.leases import FlightConstraints, Lease, Motion
 from fractus_services.mobility.authority.mode_controller import ModeController
 from fractus_services.mobility.autopilot import BEING_SET, Approach, Autopilot, Checked, Permit, always
+from fractus_services.mobility.settings import SETTINGS
 
 CORRECTION = "Correction"
 """Kind of the motions by which the monitor leads a driver's drone back into its limits."""
-
-DEFAULT_SPEED_MPS = 5.0
-"""Assumed speed of legs while the vehicle's parameters are unknown."""
-
-WAYPOINT_RADIUS_M = 5.0
-"""A leg that ends within this distance of the next waypoint of the path counts as reaching it."""
 
 
 class ControlStore:
@@ -234,7 +229,7 @@ class ControlStore:
         corrects = state.motion is not None and state.motion.kind == CORRECTION
         if state.speed_mps is not None and state.authority is Authority.DRIVER and not corrects:
             return state.speed_mps
-        return self._checked.speed_mps if self._checked is not None else DEFAULT_SPEED_MPS
+        return self._checked.speed_mps if self._checked is not None else SETTINGS.default_speed_mps
 
     def mission(self, grant: ActiveGrant) -> Mission:
         """Return the mission of a grant, or a new one if it is unknown."""
@@ -390,7 +385,9 @@ class ControlStore:
         points = grant.spec.control_points
         path = points[mission.points_done].path if mission.points_done < len(points) else None
         ahead = (path or ())[mission.waypoints : mission.waypoints + 1]
-        near = any(math.hypot(*LocalFrame(lat, lon).xy(point.lat, point.lon)) <= WAYPOINT_RADIUS_M for point in ahead)
+        near = any(
+            math.hypot(*LocalFrame(lat, lon).xy(point.lat, point.lon)) <= SETTINGS.waypoint_radius_m for point in ahead
+        )
         if near or not mission.leg_flown:
             self.dispatch(WaypointsDone(grant.key, mission.waypoints + near, leg=True))
 

@@ -14,12 +14,7 @@ from fractus_core.policy.decision_types import Home
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.authority.mode_controller import ControlAccess
 from fractus_services.mobility.autopilot import Autopilot, VehicleState
-
-MOVED_M = 2.0
-"""Distance in space above which home counts as moved. Smaller distances are within the margins of legs."""
-
-HOME_TIMEOUT_S = 2.0
-"""Seconds to wait for HOME_POSITION after home was set."""
+from fractus_services.mobility.settings import SETTINGS
 
 
 def home_moved(state: ControlState, vehicle: VehicleState) -> bool:
@@ -54,7 +49,7 @@ def home_altitude_inconsistent(state: ControlState, vehicle: VehicleState) -> bo
 
 def _differs(home: Home, origin: tuple[float, float, float]) -> bool:
     lat, lon, amsl_m = origin
-    return math.hypot(*LocalFrame(lat, lon).xy(home.lat, home.lon), home.amsl_m - amsl_m) > MOVED_M
+    return math.hypot(*LocalFrame(lat, lon).xy(home.lat, home.lon), home.amsl_m - amsl_m) > SETTINGS.home_moved_m
 
 
 async def restore_home(autopilot: Autopilot, control: ControlAccess) -> None:
@@ -68,8 +63,8 @@ async def restore_home(autopilot: Autopilot, control: ControlAccess) -> None:
         return
     await autopilot.set_home(*mission.home)
     await autopilot.request_home()
-    deadline = autopilot.now + HOME_TIMEOUT_S
+    deadline = autopilot.now + SETTINGS.home_timeout_s
     while home_moved(control.state, autopilot.vehicle):
         if autopilot.now > deadline:
             raise AutopilotError("autopilot acknowledged DO_SET_HOME but sent no HOME_POSITION", link=True)
-        await autopilot.update(HOME_TIMEOUT_S)
+        await autopilot.update(SETTINGS.home_timeout_s)

@@ -16,26 +16,9 @@ from fractus_core.control.state import FlightMode, TaskKind
 
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.autopilot import Approach, Autopilot, Permit, always
+from fractus_services.mobility.settings import SETTINGS
 
 log = logging.getLogger(__name__)
-
-RETRY_S = 0.5
-"""Seconds between attempts of a system task."""
-
-MAX_RETURN_ATTEMPTS = 6
-"""Number of refused attempts to return, after which the drone lands where it is."""
-
-SETTLE_TIMEOUT_S = 10.0
-"""Seconds for which braking continues until the drone is at rest."""
-
-SETTLED_MPS = 0.2
-"""Speed below which the drone counts as settled; well below the speed at which the policy engine considers it at rest."""
-
-BRAKE_TIMEOUT_S = 8.0
-"""Seconds to wait for the drone to come to rest before a return."""
-
-BRAKE_RESEND_S = 0.1
-"""Seconds of the vehicle's clock between stop setpoints."""
 
 
 class ControlAccess(Protocol):
@@ -105,13 +88,13 @@ class ModeController:
     async def settle(self) -> None:
         """Repeat the stop setpoint until the drone is at rest, because a single setpoint times out in the autopilot."""
         autopilot = self._autopilot
-        deadline = autopilot.now + SETTLE_TIMEOUT_S
+        deadline = autopilot.now + SETTINGS.settle_timeout_s
         while self._control.state.motion is None and autopilot.vehicle.mode.commanded and autopilot.now < deadline:
             speeds = autopilot.vehicle.speed_mps, abs(autopilot.vehicle.down_mps)
-            if autopilot.at_rest and max(speeds) < SETTLED_MPS:
+            if autopilot.at_rest and max(speeds) < SETTINGS.settled_mps:
                 return
             autopilot.stop()
-            await asyncio.sleep(BRAKE_RESEND_S / autopilot.pace)
+            await asyncio.sleep(SETTINGS.brake_resend_s / autopilot.pace)
 
     async def disarm(self) -> bool:
         """Disarm. Return False if the autopilot refuses, as it does in the air."""
@@ -137,7 +120,7 @@ class ModeController:
         while (vehicle.armed or self._control.state.starting_motors) and wanted():
             try:
                 if self._control.state.starting_motors:
-                    await self._autopilot.update(RETRY_S)
+                    await self._autopilot.update(SETTINGS.task_retry_s)
                     continue
                 if kind is TaskKind.HOVER:
                     await self._hover()
@@ -149,7 +132,7 @@ class ModeController:
             except AutopilotError as error:
                 attempts += 0 if error.link else 1
                 log.warning("modes: autopilot does not follow, retrying (task=%s error=%s)", kind.value, error)
-            await asyncio.sleep(RETRY_S)
+            await asyncio.sleep(SETTINGS.task_retry_s)
 
     async def _come_down(self, kind: TaskKind, attempts: int, wanted: Callable[[], bool], approach: Approach) -> None:
         """Land or return. A descent that the autopilot has already begun is only supervised."""
@@ -158,7 +141,7 @@ class ModeController:
         if kind is TaskKind.LAND or not vehicle.mode.comes_down or not expected:
             await self._brake(wanted)
             mode = self._autopilot.stack.land
-            if attempts < MAX_RETURN_ATTEMPTS:
+            if attempts < SETTINGS.max_return_attempts:
                 mode = await approach(kind, wanted, attempts)
             await self.change_mode(mode, lambda: _require(wanted))
         while vehicle.armed and vehicle.mode.comes_down:
@@ -168,19 +151,19 @@ class ModeController:
         """Brake in GUIDED until the drone is at rest, so that it turns home on the spot and not in a wide arc."""
         autopilot = self._autopilot
         vehicle = autopilot.vehicle
-        deadline = autopilot.now + BRAKE_TIMEOUT_S
+        deadline = autopilot.now + SETTINGS.brake_timeout_s
         autopilot.stop()
         while wanted() and vehicle.in_air and vehicle.mode.commanded and autopilot.now < deadline:
             if autopilot.at_rest or not vehicle.position_fresh(autopilot.now):
                 return
             autopilot.stop()
-            await autopilot.update(BRAKE_RESEND_S / autopilot.pace)
+            await autopilot.update(SETTINGS.brake_resend_s / autopilot.pace)
 
     async def _hover(self) -> None:
         """Hold now, and again when a takeoff in progress leaves the ground."""
         await self.hold()
         while self._autopilot.vehicle.armed and not self._autopilot.vehicle.in_air:
-            await self._autopilot.update(RETRY_S)
+            await self._autopilot.update(SETTINGS.task_retry_s)
         if self._autopilot.vehicle.armed:
             await self.hold()
             await self.settle()

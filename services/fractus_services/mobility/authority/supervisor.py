@@ -13,23 +13,9 @@ from fractus_core.control.events import Tick
 
 from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.autopilot import Fence, ReturnLimits
+from fractus_services.mobility.settings import SETTINGS
 
 log = logging.getLogger(__name__)
-
-TICK_TIMEOUT_S = 1.0
-"""Seconds without a tick after which the event loop may hang, so that the autopilot must not rely on it."""
-
-UNATTENDED_TIMEOUT_S = 3.0
-"""Seconds for which an armed drone may have no control authority although the state machine tries to take it over.
-
-After that the heartbeats stop, and the autopilot's own failsafe brings the drone home.
-"""
-
-LOWER_RETRY_S = 10.0
-"""Seconds between attempts to remove the fence and limits of a mission."""
-
-LOWER_AFTER_S = 5.0
-"""Seconds without need for the fence after which it is removed, so that a repeated arming attempt still finds it."""
 
 
 class Supervisor:
@@ -63,9 +49,9 @@ class Supervisor:
         needed = not self._idle()
         if needed:
             self._needed_at = now
-        due = now >= max(self._lower_at, self._needed_at + LOWER_AFTER_S)
+        due = now >= max(self._lower_at, self._needed_at + SETTINGS.lower_after_s)
         if not needed and due and (self._fence.raised or self._limits.limited):
-            self._lower_at = now + LOWER_RETRY_S
+            self._lower_at = now + SETTINGS.lower_retry_s
             if self._lowering is None or self._lowering.done():
                 self._lowering = control.tasks.spawn(self._lower())
 
@@ -77,8 +63,8 @@ class Supervisor:
         return (
             autopilot.found
             and state.decided
-            and autopilot.now - self._ticked_at <= TICK_TIMEOUT_S
-            and (since is None or autopilot.now - since < UNATTENDED_TIMEOUT_S)
+            and autopilot.now - self._ticked_at <= SETTINGS.tick_timeout_s
+            and (since is None or autopilot.now - since < SETTINGS.unattended_timeout_s)
         )
 
     def _idle(self) -> bool:

@@ -17,20 +17,9 @@ from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.authority.home import home_moved, restore_home
 from fractus_services.mobility.autopilot import BEING_SET, Failsafes, Fence
+from fractus_services.mobility.settings import SETTINGS
 
 log = logging.getLogger(__name__)
-
-MIN_RETRY_S = 0.5
-"""Shortest time between two checks whether the failsafes have to be verified."""
-
-MAX_RETRY_S = 30.0
-"""Longest time between two verifications on the ground, after repeated failures."""
-
-VERIFY_S = 10.0
-"""Seconds between verifications in flight, because the message about a change by another station may be lost."""
-
-UNVERIFIED_TIMEOUT_S = 60.0
-"""Seconds for which the failsafes of a connected, flying vehicle may be unverified before the system brings it home."""
 
 
 class VehicleObserver:
@@ -78,8 +67,8 @@ class VehicleObserver:
         since = self._unverified_since
         if not autopilot.vehicle.armed:
             self._unverified_since = None
-        elif since is not None and autopilot.now - since > UNVERIFIED_TIMEOUT_S:
-            self._bring_home(f"it has not reported its parameters for {UNVERIFIED_TIMEOUT_S:.0f} s")
+        elif since is not None and autopilot.now - since > SETTINGS.unverified_timeout_s:
+            self._bring_home(f"it has not reported its parameters for {SETTINGS.unverified_timeout_s:.0f} s")
         self._check_home()
 
     def _check_home(self) -> None:
@@ -126,7 +115,7 @@ class VehicleObserver:
     async def _prepare(self) -> None:
         """Set and verify the failsafes. Repeat until they are verified, because messages may be lost, and in flight."""
         autopilot = self._control.autopilot
-        retry_s = MIN_RETRY_S
+        retry_s = SETTINGS.verify_min_retry_s
         while autopilot.found:
             if autopilot.connected and self._verification_due():
                 self._changed.clear()
@@ -141,14 +130,17 @@ class VehicleObserver:
                 except Exception:
                     log.exception("observer: preparing the autopilot failed, retrying")
                 else:
-                    retry_s = min(2 * retry_s, VERIFY_S if autopilot.vehicle.armed else MAX_RETRY_S)
+                    retry_s = min(
+                        2 * retry_s,
+                        SETTINGS.verify_interval_s if autopilot.vehicle.armed else SETTINGS.verify_max_retry_s,
+                    )
             else:
-                retry_s = MIN_RETRY_S
+                retry_s = SETTINGS.verify_min_retry_s
                 if autopilot.connected:
                     await self._control.tasks.attempt(autopilot.set_rates, flying=autopilot.vehicle.armed)
-            await asyncio.sleep(MIN_RETRY_S)
+            await asyncio.sleep(SETTINGS.verify_min_retry_s)
             with suppress(TimeoutError):
-                async with asyncio.timeout(retry_s - MIN_RETRY_S):
+                async with asyncio.timeout(retry_s - SETTINGS.verify_min_retry_s):
                     await self._changed.wait()
 
     async def _verify(self) -> None:
@@ -211,5 +203,5 @@ class VehicleObserver:
         if checked is None or checked.problem == BEING_SET or self._changed.is_set():
             return True
         if control.autopilot.vehicle.armed:
-            return bool(checked.problem) or control.autopilot.now - self._verified_at >= VERIFY_S
+            return bool(checked.problem) or control.autopilot.now - self._verified_at >= SETTINGS.verify_interval_s
         return bool(checked.problem) and not control.state.preparing

@@ -11,18 +11,7 @@ from fractus_services.errors import Aborted, Unavailable, denied
 from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.flight.policy_gate import PolicyGate
-
-DRIVER_REST_FACTOR = 1.0
-"""Pause after a judgement for the driver in control, as a multiple of the time that the judgement took."""
-
-OTHERS_REST_FACTOR = 4.0
-"""The same for all other callers together.
-
-The pauses keep time for the monitor: a flood of calls takes only a part of the event loop.
-"""
-
-RETRY_AFTER_S = 0.5
-"""Suggested delay before a retry while the position of the drone is unknown."""
+from fractus_services.mobility.settings import SETTINGS
 
 DRIVER_METHODS = frozenset(
     {
@@ -122,7 +111,7 @@ class CallAuthorizer:
             self._control.take_over(verdict)
             raise denied(verdict)
         if verdict.code == DENY_POSITION_UNKNOWN.code and verdict.action == "deny":
-            raise Unavailable("AutopilotUnavailable", verdict.reason, retry_after_s=RETRY_AFTER_S)
+            raise Unavailable("AutopilotUnavailable", verdict.reason, retry_after_s=SETTINGS.position_retry_after_s)
         if not verdict.permits:
             if verdict.takeover is not None:
                 self._control.brake(verdict)
@@ -135,7 +124,9 @@ class CallAuthorizer:
         try:
             return self._gate.judge(call, grant, kind=kind, known=known)
         finally:
-            rest_s = (time.perf_counter() - begun) * (DRIVER_REST_FACTOR if has_control else OTHERS_REST_FACTOR)
+            rest_s = (time.perf_counter() - begun) * (
+                SETTINGS.driver_rest_factor if has_control else SETTINGS.others_rest_factor
+            )
             self._free_at[has_control] = max(self._free_at[has_control], self._control.autopilot.now + rest_s)
 
     def _deny_passenger(self, call: Call, grant: ActiveGrant, *, kind: str = "call") -> Verdict:

@@ -24,30 +24,13 @@ from fractus_services.mobility.authority.control_store import CORRECTION, Contro
 from fractus_services.mobility.authority.leases import Motion
 from fractus_services.mobility.authority.supervisor import Supervisor
 from fractus_services.mobility.autopilot import Permit
-from fractus_services.mobility.flight.motions import REACHED_M, fly_to
+from fractus_services.mobility.flight.motions import fly_to
 from fractus_services.mobility.flight.policy_gate import PolicyGate
 from fractus_services.mobility.flight.return_to_launch import ReturnFlight
 from fractus_services.mobility.flight.route_following import REPLAN_CODES, limited_mps
+from fractus_services.mobility.settings import SETTINGS
 
 log = logging.getLogger(__name__)
-
-TICK_S = 0.1
-"""Longest time between two checks in flight, in seconds of the vehicle's clock. Each position also starts one (20 Hz)."""
-
-IDLE_S = 0.5
-"""Longest time between two iterations on the ground."""
-
-RECORD_S = 0.5
-"""Seconds between two entries of the flight recorder."""
-
-CORRECTION_TIMEOUT_S = 3.0
-"""Seconds within which a correction must take effect before the same alarm is raised again."""
-
-GRANT_CHANGE_S = 30.0
-"""Seconds after a change of the constraints for which a drone may still accelerate on a leg judged before the change."""
-
-START_S = 2.0
-"""Seconds within which a drone starts to move after a command. A drone that keeps its position longer flies nothing."""
 
 
 Permits = Callable[[Motion | None], Permit]
@@ -88,7 +71,11 @@ class MotionMonitor:
         """Monitor until cancelled."""
         autopilot = self._control.autopilot
         while True:
-            await autopilot.update(TICK_S / autopilot.pace if autopilot.vehicle.in_air else IDLE_S)
+            await autopilot.update(
+                SETTINGS.monitor_interval_s / autopilot.pace
+                if autopilot.vehicle.in_air
+                else SETTINGS.monitor_idle_interval_s
+            )
             self._reset_return()
             if autopilot.vehicle.in_air:
                 self._control.dispatch(Airborne())
@@ -126,7 +113,7 @@ class MotionMonitor:
             return
         uncommanded = not mode.commanded or (control.state.returning and control.motion is None)
         acts = not uncommanded or self._may_take_back(verdict)
-        lasting = control.autopilot.now - self._alarm_at > CORRECTION_TIMEOUT_S
+        lasting = control.autopilot.now - self._alarm_at > SETTINGS.correction_timeout_s
         fresh = verdict.code != self._alarm or (lasting and acts)
         if fresh:
             self._alarm, self._alarm_at = verdict.code, control.autopilot.now
@@ -230,11 +217,11 @@ class MotionMonitor:
             self._grant = grant
             self._in_force = in_force
             self._changed_at = autopilot.now
-        begins = autopilot.now - control.state.motion_began_at < START_S
+        begins = autopilot.now - control.state.motion_began_at < SETTINGS.movement_timeout_s
         if (motion is None or motion.kind == "Takeoff") and not begins and autopilot.vehicle.keeps_place(autopilot.now):
             # Any later movement is judged under the present constraints, or later ones.
             self._changed_at = -math.inf
-        return autopilot.now - self._changed_at < GRANT_CHANGE_S
+        return autopilot.now - self._changed_at < SETTINGS.grant_change_s
 
     def _stop(self, verdict: Verdict, fresh: bool) -> None:
         """End the motion that causes the violation. A system flight then searches a different route.
@@ -313,7 +300,7 @@ class MotionMonitor:
         speed = limited_mps(control.cruise_mps, target, self._gate.situation(), compiled)
         leg = replace(target, speed_mps=speed)
         try:
-            async for _ in fly_to(control.autopilot, motion, leg, REACHED_M, permits(motion)):
+            async for _ in fly_to(control.autopilot, motion, leg, SETTINGS.reached_m, permits(motion)):
                 pass
         except Exception:
             control.fail_motion(motion)
@@ -323,7 +310,7 @@ class MotionMonitor:
     async def record(self) -> None:
         """Record the flight in the audit log until cancelled."""
         while True:
-            await asyncio.sleep(RECORD_S)
+            await asyncio.sleep(SETTINGS.record_interval_s)
             if self._control.autopilot.vehicle.armed:
                 self._audit.append("state", flight_record(self._control), now=False)
 

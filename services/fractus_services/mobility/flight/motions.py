@@ -15,66 +15,9 @@ from fractus_services.errors import Aborted, AutopilotError, Refused, Unavailabl
 from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.authority.leases import Motion
 from fractus_services.mobility.autopilot import Autopilot, Permit, VehicleState
+from fractus_services.mobility.settings import SETTINGS
 
 log = logging.getLogger(__name__)
-
-REACHED_M = 1.0
-"""Default distance to the target within which a leg is complete."""
-
-HEIGHT_REACHED_M = 0.8
-"""Difference of altitude within which a climb or leg is complete. ArduCopter approaches the last metre ever more slowly."""
-
-HEIGHT_REACHED_MPS = 0.6
-"""Vertical speed below which a climb is complete."""
-
-REPORT_S = 0.2
-"""Seconds between progress reports of a motion."""
-
-CLIMB_TIMEOUT_S = 20.0
-"""Seconds without progress after which a climb has failed."""
-
-CLIMB_PROGRESS_M = 0.2
-"""Gain of altitude that counts as progress of a climb."""
-
-STUCK_TIMEOUT_S = 6.0
-"""Seconds without progress after which the command of a leg is sent again.
-
-A stop setpoint may have overtaken the command, or the autopilot may have restarted its controller.
-"""
-
-LEG_PROGRESS_M = 0.3
-"""Approach to the target that counts as progress of a leg."""
-
-MAX_RESENDS = 3
-"""Number of times that the command of a leg is sent again."""
-
-HEADING_REACHED_DEG = 8.0
-"""Difference of heading within which a leg with a heading is complete."""
-
-HEADING_TIMEOUT_S = 8.0
-"""Seconds at the target after which a leg with a heading is complete in any case."""
-
-SPEED_TIMEOUT_S = 1.3
-"""Seconds within which the speed of a leg must be acknowledged. It is sent twice in this time.
-
-Without an acknowledgement the drone is stopped and the leg is started once more.
-"""
-
-REST_TIMEOUT_S = 12.0
-"""Seconds within which the drone must come to rest."""
-
-STOP_RESEND_S = 0.1
-"""Seconds of the vehicle's clock between stop setpoints."""
-
-SETPOINT_RESEND_S = 0.2
-"""Seconds of the vehicle's clock between repetitions of a velocity setpoint.
-
-A lost message must not leave the previous setpoint in force, and ArduCopter itself stops after GUID_TIMEOUT without one
-(1 s, set with the failsafes).
-"""
-
-MIN_HOLD_S = 1e-3
-"""Remaining hold time below which a velocity setpoint has expired. The event loop does not sleep for less."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,14 +40,14 @@ async def climb(autopilot: Autopilot, motion: Motion, altitude_m: float, permit:
     best_m = -math.inf
     while True:
         remaining_m = altitude_m - vehicle.altitude_m
-        complete = remaining_m < HEIGHT_REACHED_M and abs(vehicle.down_mps) < HEIGHT_REACHED_MPS
+        complete = remaining_m < SETTINGS.height_reached_m and abs(vehicle.down_mps) < SETTINGS.height_reached_mps
         yield Step(max(remaining_m, 0.0), complete)
         if complete:
             return
-        if vehicle.altitude_m > best_m + CLIMB_PROGRESS_M:
+        if vehicle.altitude_m > best_m + SETTINGS.climb_progress_m:
             best_m = vehicle.altitude_m
             progress_at = autopilot.now
-        if autopilot.now - progress_at > CLIMB_TIMEOUT_S:
+        if autopilot.now - progress_at > SETTINGS.climb_timeout_s:
             raise Aborted("NotFollowing", f"the drone does not climb above {vehicle.altitude_m:.1f} m")
         if not vehicle.armed:
             raise Aborted("Disarmed", "the autopilot disarmed before the drone took off")
@@ -160,20 +103,20 @@ async def fly_to(
         distance_m = vehicle.distance_m(args.lat, args.lon)
         height_m = abs(altitude - vehicle.altitude_m)
         remaining_m = math.hypot(distance_m, height_m)
-        complete = distance_m <= reached_m and height_m <= HEIGHT_REACHED_M
+        complete = distance_m <= reached_m and height_m <= SETTINGS.height_reached_m
         if complete and args.yaw_deg is not None:
             reached_at = autopilot.now if reached_at is None else reached_at
             progress_at = autopilot.now  # turning on the spot is progress
-            timed_out = autopilot.now - reached_at > HEADING_TIMEOUT_S
+            timed_out = autopilot.now - reached_at > SETTINGS.heading_timeout_s
             complete = _heading_reached(vehicle, args.yaw_deg) or timed_out
         yield Step(remaining_m, complete)
         if complete:
             return
-        if remaining_m < best_m - LEG_PROGRESS_M:
+        if remaining_m < best_m - SETTINGS.leg_progress_m:
             best_m = remaining_m
             progress_at = autopilot.now
-        if autopilot.now - progress_at > STUCK_TIMEOUT_S:
-            if resends == MAX_RESENDS:
+        if autopilot.now - progress_at > SETTINGS.stuck_timeout_s:
+            if resends == SETTINGS.max_leg_resends:
                 raise Aborted("NotFollowing", f"the drone stays {remaining_m:.1f} m away from the target")
             resends += 1
             progress_at = autopilot.now
@@ -186,7 +129,7 @@ async def _speed_acknowledged(autopilot: Autopilot, motion: Motion, permit: Perm
     if motion.speed_mps is None:
         return True
     try:
-        async with asyncio.timeout(SPEED_TIMEOUT_S):
+        async with asyncio.timeout(SETTINGS.speed_timeout_s):
             await autopilot.set_speed(motion.speed_mps, permit)
     except TimeoutError:
         return False
@@ -207,11 +150,11 @@ async def rise(
 ) -> AsyncGenerator[Step, None]:
     """Climb to an altitude above home over the present position at rest, unless the drone is high enough; see `fly_to`."""
     vehicle = autopilot.vehicle
-    if vehicle.lat is None or vehicle.lon is None or vehicle.altitude_m > altitude_m - HEIGHT_REACHED_M:
+    if vehicle.lat is None or vehicle.lon is None or vehicle.altitude_m > altitude_m - SETTINGS.height_reached_m:
         yield Step(0.0, True)
         return
     place = GotoArgs(vehicle.lat, vehicle.lon, altitude_m, speed_mps=speed_mps)
-    async with aclosing(fly_to(autopilot, motion, place, REACHED_M, permit, judged=judged)) as steps:
+    async with aclosing(fly_to(autopilot, motion, place, SETTINGS.reached_m, permit, judged=judged)) as steps:
         async for step in steps:
             yield step
 
@@ -222,7 +165,7 @@ async def come_to_rest(autopilot: Autopilot, motion: Motion, permit: Permit) -> 
     Raises:
         Refused: The motion was stopped, or the drone did not come to rest.
     """
-    deadline = autopilot.now + REST_TIMEOUT_S
+    deadline = autopilot.now + SETTINGS.rest_timeout_s
     sent_at = -math.inf
     motion.braking = True
     try:
@@ -230,7 +173,7 @@ async def come_to_rest(autopilot: Autopilot, motion: Motion, permit: Permit) -> 
             if autopilot.now > deadline:
                 speed = autopilot.vehicle.speed_mps
                 raise Aborted("NotStopping", f"the drone does not stop; it still flies {speed:.1f} m/s")
-            if autopilot.now - sent_at >= STOP_RESEND_S / autopilot.pace:
+            if autopilot.now - sent_at >= SETTINGS.stop_resend_s / autopilot.pace:
                 permit()
                 autopilot.stop()
                 sent_at = autopilot.now
@@ -242,11 +185,11 @@ async def come_to_rest(autopilot: Autopilot, motion: Motion, permit: Permit) -> 
 
 
 def _heading_reached(vehicle: VehicleState, yaw_deg: float) -> bool:
-    return abs((vehicle.yaw_deg - yaw_deg + 180.0) % 360.0 - 180.0) <= HEADING_REACHED_DEG
+    return abs((vehicle.yaw_deg - yaw_deg + 180.0) % 360.0 - 180.0) <= SETTINGS.heading_reached_deg
 
 
 async def _tick(autopilot: Autopilot, motion: Motion) -> None:
-    deadline = autopilot.now + REPORT_S
+    deadline = autopilot.now + SETTINGS.report_interval_s
     while autopilot.now < deadline:
         motion.check()
         await _next_message(autopilot)
@@ -254,7 +197,7 @@ async def _tick(autopilot: Autopilot, motion: Motion) -> None:
 
 
 async def _next_message(autopilot: Autopilot) -> None:
-    if not await autopilot.update(REPORT_S) and not autopilot.connected:
+    if not await autopilot.update(SETTINGS.report_interval_s) and not autopilot.connected:
         raise Unavailable(
             "AutopilotUnavailable", "the autopilot is no longer connected; its own failsafe brings the drone home"
         )
@@ -292,8 +235,8 @@ class VelocityHold:
         control = self._control
         pace = control.autopilot.pace
         until = control.autopilot.now + setpoint.hold_s / pace
-        while control.motion is motion and (remaining_s := until - control.autopilot.now) > MIN_HOLD_S:
-            await asyncio.sleep(min(remaining_s, SETPOINT_RESEND_S / pace))
+        while control.motion is motion and (remaining_s := until - control.autopilot.now) > SETTINGS.min_hold_s:
+            await asyncio.sleep(min(remaining_s, SETTINGS.setpoint_resend_s / pace))
             try:
                 permit()
             except Refused as refusal:

@@ -15,14 +15,9 @@ from fractus_services.errors import AutopilotError, Refused, Unavailable
 from fractus_services.grant_files import ActiveGrant, GrantFiles
 from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.flight.route_following import INTERNAL_ERROR, RouteFollower, SystemFlight, target_of
+from fractus_services.mobility.settings import SETTINGS
 
 log = logging.getLogger(__name__)
-
-CHECK_S = 0.5
-"""Longest time between two checks whether a mission can start."""
-
-STAY_S = 5.0
-"""Seconds for which the drone stays at a point of interest, if passengers may use services only there."""
 
 
 class PoiMissions:
@@ -66,7 +61,7 @@ class PoiMissions:
             grant = self._startable()
             if grant is not None:
                 control.begin_tour(grant, self._run_mission(grant))
-            await control.changes.wait(CHECK_S)
+            await control.changes.wait(SETTINGS.poi_check_interval_s)
 
     def _startable(self) -> ActiveGrant | None:
         """Return the grant whose mission can start or resume now; None if there is none."""
@@ -117,7 +112,7 @@ class PoiMissions:
         constraints = control.begin_transit(grant)
         flight = SystemFlight(constraints, "Tour", lambda motion: control.system_permit(constraints, motion))
         access = grant.spec.points_of_interest
-        stay_s = STAY_S if access is not None and access.service_access == "points" else 0.0
+        stay_s = SETTINGS.poi_stay_s if access is not None and access.service_access == "points" else 0.0
         points = grant.spec.tour
         visited = control.mission(grant).waypoints
         try:

@@ -24,7 +24,7 @@ from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.authority.home import home_moved, restore_home
 from fractus_services.mobility.authority.leases import Motion
-from fractus_services.mobility.flight.motions import REACHED_M, Step
+from fractus_services.mobility.flight.motions import Step
 from fractus_services.mobility.flight.policy_gate import PolicyGate
 from fractus_services.mobility.flight.route_following import (
     REPLAN_CODES,
@@ -34,20 +34,9 @@ from fractus_services.mobility.flight.route_following import (
     first_leg,
     limited_mps,
 )
+from fractus_services.mobility.settings import SETTINGS
 
 log = logging.getLogger(__name__)
-
-LEVEL_M = 1.0
-"""Change of altitude above which a return climbs or descends before it flies towards home."""
-
-LAST_LEG_M = 0.5
-"""Distance from home within which the last leg ends and the drone lands."""
-
-MAX_ATTEMPTS = 3
-"""Number of attempts to fly around zones if the autopilot refuses.
-
-After that the drone returns on the path it flew (SmartRTL), and if that is refused too, straight (RTL).
-"""
 
 
 class ReturnFlight:
@@ -89,19 +78,28 @@ class ReturnFlight:
         vehicle = control.autopilot.vehicle
         stack = control.autopilot.stack
         self.given_up = None
-        if kind is TaskKind.RETURN and attempts < MAX_ATTEMPTS:
+        if kind is TaskKind.RETURN and attempts < SETTINGS.max_route_attempts:
             await self._restore_home()
         # A landing in progress was chosen by a failsafe or a pilot. The battery may be too low for any other flight.
         landing = vehicle.mode.kind is ModeKind.LANDING or self._blind()
         if kind is TaskKind.LAND and (grant is None or landing or not self._lands_in_zone(grant)):
             return stack.land
-        if vehicle.in_air and not vehicle.mode.comes_down and attempts <= MAX_ATTEMPTS and self._path_is_home():
+        if (
+            vehicle.in_air
+            and not vehicle.mode.comes_down
+            and attempts <= SETTINGS.max_route_attempts
+            and self._path_is_home()
+        ):
             control.note("returnToLaunch", "home was moved; the drone returns on the path it flew", "HomeMoved")
             return stack.return_retracing
         if grant is None or not vehicle.in_air or vehicle.mode.comes_down or self._blind():
             return stack.return_straight
         try:
-            problem = await self._fly_home(grant, wanted) if attempts < MAX_ATTEMPTS else self._give_up(grant, attempts)
+            problem = (
+                await self._fly_home(grant, wanted)
+                if attempts < SETTINGS.max_route_attempts
+                else self._give_up(grant, attempts)
+            )
         except AutopilotError:
             raise
         except Exception:
@@ -109,7 +107,7 @@ class ReturnFlight:
             problem = "the route planner failed"
         if not problem:
             return self.descent(grant)
-        retraces = control.retraces and attempts <= MAX_ATTEMPTS
+        retraces = control.retraces and attempts <= SETTINGS.max_route_attempts
         path = "on the path it flew" if retraces else "straight"
         control.note(
             "returnToLaunch", f"no legal route home is known ({problem}); the drone returns {path}", "NoLegalWay"
@@ -199,7 +197,7 @@ class ReturnFlight:
         stack = autopilot.stack
         if grant is self.given_up:
             return stack.return_retracing
-        at_home = autopilot.vehicle.position_fresh(autopilot.now) and self._home_distance_m() <= 2 * REACHED_M
+        at_home = autopilot.vehicle.position_fresh(autopilot.now) and self._home_distance_m() <= 2 * SETTINGS.reached_m
         return stack.land if at_home else stack.return_straight
 
     def _cannot_rest(self, refusal: Refused, flight: SystemFlight) -> bool:
@@ -238,7 +236,7 @@ class ReturnFlight:
             raise Unavailable("AutopilotUnavailable", "another station moved home; it must be set back first")
         now = self._gate.situation()
         distance_m = self._home_distance_m()
-        if now.lat is None or now.lon is None or now.home is None or distance_m <= REACHED_M:
+        if now.lat is None or now.lon is None or now.home is None or distance_m <= SETTINGS.reached_m:
             return None
         for height in return_altitudes_m(now, flight.constraints.compiled, RTL_CONE_SLOPE * distance_m):
             vertical_first = may_change_altitude(now, flight.constraints.compiled, height)
@@ -253,11 +251,15 @@ class ReturnFlight:
             if first is None:
                 continue
             leg, last, _ = first
-            if vertical_first and abs(height - now.altitude_m) > LEVEL_M:
+            if vertical_first and abs(height - now.altitude_m) > SETTINGS.return_level_m:
                 leg = replace(leg, lat=now.lat, lon=now.lon)
                 last = False
             speed_mps = limited_mps(self._control.cruise_mps, leg, now, flight.constraints.compiled)
-            return NextLeg(replace(leg, speed_mps=speed_mps), last=False, reached_m=LAST_LEG_M if last else REACHED_M)
+            return NextLeg(
+                replace(leg, speed_mps=speed_mps),
+                last=False,
+                reached_m=SETTINGS.return_last_leg_m if last else SETTINGS.reached_m,
+            )
         raise PreconditionFailed("NoLegalWay", "zones surround the drone or its home")
 
 

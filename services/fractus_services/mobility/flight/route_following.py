@@ -22,19 +22,11 @@ from fractus_services.errors import Aborted, PreconditionFailed, Refused, Unavai
 from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.authority.leases import FlightConstraints, Motion
 from fractus_services.mobility.autopilot import Permit
-from fractus_services.mobility.flight.motions import HEIGHT_REACHED_M, REACHED_M, Step, come_to_rest, fly_to
+from fractus_services.mobility.flight.motions import Step, come_to_rest, fly_to
 from fractus_services.mobility.flight.policy_gate import PolicyGate
+from fractus_services.mobility.settings import SETTINGS
 
 log = logging.getLogger(__name__)
-
-MAX_REPLANS = 5
-"""Number of new routes that are searched after the monitor stopped the drone, under the same flight constraints."""
-
-MAX_LEGS = 60
-"""Number of legs after which a flight makes no progress, because every leg is planned again from the present position."""
-
-NEAR_M = 0.3
-"""Distance within which the drone is at a waypoint. Waypoints keep more than this beyond the margin of legs."""
 
 INTERNAL_ERROR = "the mobility service has an internal error; see its log"
 """Reason that clients receive when an internal error ends a mission. The log has the details."""
@@ -103,7 +95,9 @@ class ReplanBudget:
             self._compiled = self._constraints.compiled
             self._count = 0
         self._count += 1
-        if self._count > MAX_REPLANS or not (isinstance(refusal, Aborted) and refusal.verdict.code in REPLAN_CODES):
+        if self._count > SETTINGS.max_replans or not (
+            isinstance(refusal, Aborted) and refusal.verdict.code in REPLAN_CODES
+        ):
             return False
         log.info("route: leg stopped, searching a different route (attempt=%d reason=%s)", self._count, refusal)
         return True
@@ -121,7 +115,7 @@ class NextLeg:
 
     args: GotoArgs
     last: bool
-    reached_m: float = REACHED_M
+    reached_m: float = SETTINGS.reached_m
 
 
 async def first_leg(
@@ -144,7 +138,7 @@ async def first_leg(
         Refused: The constraints change faster than a route is found.
     """
     heights = tuple(dict.fromkeys(heights_m))
-    for _ in range(MAX_REPLANS + 1):
+    for _ in range(SETTINGS.max_replans + 1):
         grant = flight.constraints.compiled
         leg = await _first_leg(goal, heights, now, grant)
         if flight.constraints.compiled is grant:
@@ -163,7 +157,10 @@ async def _first_leg(
         if route is not None:
             # If the drone is at the first waypoint already, the next leg is legal from here, and this leg would only change
             # the altitude.
-            reached = math.dist(begin, route[0]) <= NEAR_M and abs(now.altitude_m - height) <= HEIGHT_REACHED_M
+            reached = (
+                math.dist(begin, route[0]) <= SETTINGS.at_waypoint_m
+                and abs(now.altitude_m - height) <= SETTINGS.height_reached_m
+            )
             first = min(reached, len(route) - 1)
             return GotoArgs(*frame.latlon(*route[first]), height), len(route) == first + 1, height
     return None
@@ -239,7 +236,7 @@ class RouteFollower:
         """Fly one attempt of `follow`, as one motion."""
         autopilot = self._control.autopilot
         permit = flight.permit(motion)
-        for _ in range(MAX_LEGS):
+        for _ in range(SETTINGS.max_legs):
             # A leg is judged from the present position. A moving drone would begin it elsewhere.
             if not autopilot.at_rest:
                 await come_to_rest(autopilot, motion, permit)
@@ -248,14 +245,14 @@ class RouteFollower:
                 return
             distance_m = autopilot.vehicle.distance_m(leg.args.lat, leg.args.lon)
             # A leg that is shorter than the usual radius, for example out of a zone's margin, is flown nevertheless.
-            short = NEAR_M < distance_m < 2 * leg.reached_m and not leg.last
-            reached_m = min(leg.reached_m, max(distance_m / 3, NEAR_M)) if short else leg.reached_m
+            short = SETTINGS.at_waypoint_m < distance_m < 2 * leg.reached_m and not leg.last
+            reached_m = min(leg.reached_m, max(distance_m / 3, SETTINGS.at_waypoint_m)) if short else leg.reached_m
             async with aclosing(fly_to(autopilot, motion, leg.args, reached_m, permit)) as steps:
                 async for step in steps:
                     yield Step(step.distance_m, step.complete and leg.last)
             if leg.last:
                 return
-        raise Aborted("NotFollowing", f"the drone did not reach its target within {MAX_LEGS} legs")
+        raise Aborted("NotFollowing", f"the drone did not reach its target within {SETTINGS.max_legs} legs")
 
     async def _next(self, flight: SystemFlight, target: GotoArgs) -> NextLeg:
         now = self._gate.situation()
@@ -278,7 +275,7 @@ class RouteFollower:
 
     def _arrived(self, leg: GotoArgs) -> bool:
         """Return True if the drone is at the end of a leg already."""
-        return self._control.autopilot.vehicle.distance_m(leg.lat, leg.lon) <= 2 * REACHED_M
+        return self._control.autopilot.vehicle.distance_m(leg.lat, leg.lon) <= 2 * SETTINGS.reached_m
 
     def _unreachable(self, flight: SystemFlight, target: GotoArgs) -> Refused:
         """Return the refusal for a missing route. The verdict on the straight leg names the zone in the way."""

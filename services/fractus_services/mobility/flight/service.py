@@ -25,33 +25,10 @@ from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.authority.leases import Motion
 from fractus_services.mobility.autopilot import Autopilot, Permit
 from fractus_services.mobility.flight.authorization import CallAuthorizer
-from fractus_services.mobility.flight.motions import (
-    REACHED_M,
-    Step,
-    VelocityHold,
-    climb,
-    come_down,
-    come_to_rest,
-    fly_to,
-    rise,
-)
+from fractus_services.mobility.flight.motions import Step, VelocityHold, climb, come_down, come_to_rest, fly_to, rise
 from fractus_services.mobility.flight.return_to_launch import ReturnFlight
 from fractus_services.mobility.flight.route_following import ReplanBudget, SystemFlight
-
-MIN_REACHED_M = 0.3
-"""Smallest acceptance radius of a goto."""
-
-MAX_REACHED_M = 50.0
-"""Largest acceptance radius of a goto."""
-
-REJUDGE_AFTER_S = 0.05
-"""Seconds of the vehicle's clock after which a waiting command is judged again from the present position.
-
-At 15 m/s the drone moves 0.75 m in this time.
-"""
-
-MAX_JUDGEMENTS = 6
-"""Number of judgements after which a call is given up, because a drone that does not come to rest cannot begin its leg."""
+from fractus_services.mobility.settings import SETTINGS
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,13 +177,17 @@ class MobilityService:
         """
         verdict = self.calls.allow_motion(Call("Goto", args), grant)
         _require_in_air(self._autopilot, "Goto")
-        radius = min(max(reached_m, MIN_REACHED_M), MAX_REACHED_M) if reached_m > 0 else REACHED_M
+        radius = (
+            min(max(reached_m, SETTINGS.min_acceptance_radius_m), SETTINGS.max_acceptance_radius_m)
+            if reached_m > 0
+            else SETTINGS.reached_m
+        )
 
         async def steps(motion: Motion) -> AsyncGenerator[Progress, None]:
             permit = self._control.driver_permit(grant, motion)
             call = Call("Goto", args)
             final = verdict
-            for _ in range(MAX_JUDGEMENTS):
+            for _ in range(SETTINGS.max_judgements):
                 final = await self._settle(call, grant, final, motion, permit)
                 leg = _leg(final, args, self._control.cruise_mps)
                 judged = self._rejudging_permit(call, grant, final, permit)
@@ -220,7 +201,9 @@ class MobilityService:
                     final = outdated.verdict
                 else:
                     return
-            raise Aborted("NotFollowing", f"the autopilot did not begin the leg after {MAX_JUDGEMENTS} commands")
+            raise Aborted(
+                "NotFollowing", f"the autopilot did not begin the leg after {SETTINGS.max_judgements} commands"
+            )
 
         return self._run("Goto", grant, steps)
 
@@ -231,7 +214,7 @@ class MobilityService:
         def check() -> None:
             nonlocal judged_at
             permit()
-            if self._autopilot.now - judged_at <= REJUDGE_AFTER_S / self._autopilot.pace:
+            if self._autopilot.now - judged_at <= SETTINGS.rejudge_after_s / self._autopilot.pace:
                 return
             judged_at = self._autopilot.now
             current = self.calls.allow_motion(call, self._control.require_control(grant).grant, verdict)
@@ -250,12 +233,12 @@ class MobilityService:
         Raises:
             Refused: The call is not legal from the new position, or the drone does not come to rest.
         """
-        for _ in range(MAX_JUDGEMENTS):
+        for _ in range(SETTINGS.max_judgements):
             begun = self._autopilot.now
             await self._control.modes.enter_guided(permit)
             if verdict.brake_first:
                 await come_to_rest(self._autopilot, motion, permit)
-            elif self._autopilot.now - begun <= REJUDGE_AFTER_S / self._autopilot.pace:
+            elif self._autopilot.now - begun <= SETTINGS.rejudge_after_s / self._autopilot.pace:
                 return verdict
             permit()
             verdict = self.calls.allow_motion(call, self._control.require_control(grant).grant, verdict)

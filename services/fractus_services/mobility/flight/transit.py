@@ -25,12 +25,7 @@ from fractus_services.mobility.flight.route_following import (
     above_home_m,
     target_of,
 )
-
-ARMING_TIMEOUT_S = 120.0
-"""Seconds for which the system tries to arm a drone whose autopilot refuses."""
-
-DEFAULT_ALTITUDE_M = 10.0
-"""Altitude above home to which the system takes off if the target has no altitude."""
+from fractus_services.mobility.settings import SETTINGS
 
 log = logging.getLogger(__name__)
 
@@ -110,14 +105,18 @@ class TransitFlight:
                     self._allow(Call("Arm"), flight)
                 else:
                     grant = flight.constraints.grant
-                    arming = self._arming.arm(grant, permit, lambda: self._allow(Call("Arm"), flight), ARMING_TIMEOUT_S)
+                    arming = self._arming.arm(
+                        grant, permit, lambda: self._allow(Call("Arm"), flight), SETTINGS.transit_arming_timeout_s
+                    )
                     async with aclosing(arming) as waiting:
                         async for reason in waiting:
                             yield f"the system arms the drone: {reason}"
                 allowed = self._allow(Call("Takeoff", TakeoffArgs(self._altitude_m(target, flight))), flight)
                 yield "the system takes off"
                 await control.modes.enter_guided(permit)
-                altitude_m = allowed.altitude_m if isinstance(allowed, TakeoffArgs) else DEFAULT_ALTITUDE_M
+                altitude_m = (
+                    allowed.altitude_m if isinstance(allowed, TakeoffArgs) else SETTINGS.default_takeoff_altitude_m
+                )
                 async for _ in climb(autopilot, motion, altitude_m, permit):
                     pass
             await control.modes.enter_guided(permit)
@@ -126,7 +125,7 @@ class TransitFlight:
 
     def _altitude_m(self, target: Position, flight: SystemFlight) -> float:
         if target.alt is None:
-            return DEFAULT_ALTITUDE_M
+            return SETTINGS.default_takeoff_altitude_m
         home = self._control.autopilot.vehicle.home
         return above_home_m(target.alt, target.altitude_reference, home, flight.constraints.compiled)
 

@@ -13,12 +13,7 @@ from fractus_services.errors import PolicyDenied, PreconditionFailed
 from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.authority.leases import Lease
-
-CHECK_S = 0.5
-"""Longest time between two checks for a waiting caller, because a change of the autopilot's readiness wakes no task."""
-
-EVENT_TIMEOUT_S = 5.0
-"""Seconds to wait for one event of a lease."""
+from fractus_services.mobility.settings import SETTINGS
 
 
 class ControlStreams:
@@ -58,7 +53,7 @@ class ControlStreams:
                     control.grant_control(lease)
             while True:
                 try:
-                    event = await lease.receive(EVENT_TIMEOUT_S)
+                    event = await lease.receive(SETTINGS.stream_event_timeout_s)
                 except TimeoutError:
                     continue
                 if event is None:
@@ -88,7 +83,7 @@ class ControlStreams:
             if reason != reported:
                 reported = reason
                 yield reason
-            await control.changes.wait(CHECK_S)
+            await control.changes.wait(SETTINGS.stream_check_interval_s)
 
     # Passengers
 
@@ -107,7 +102,7 @@ class ControlStreams:
                 yield event
             if event.final:
                 return
-            await control.changes.wait(CHECK_S)
+            await control.changes.wait(SETTINGS.stream_check_interval_s)
 
     def _mission_event(self, grant: ActiveGrant) -> ControlEvent:
         mission = self._control.mission(grant)

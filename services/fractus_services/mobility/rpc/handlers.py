@@ -32,18 +32,7 @@ from fractus_services.mobility.rpc.proto_conversion import (
     velocity_args,
 )
 from fractus_services.mobility.rpc.telemetry import located, position_of, telemetry_of, velocity_of
-
-MIN_INTERVAL_S = 0.05
-"""Shortest interval of a telemetry stream."""
-
-DEFAULT_INTERVAL_S = 0.2
-"""Interval of a telemetry stream if the request has none."""
-
-RESPONSE_RESERVE_S = 1.0
-"""Seconds before the deadline of an Arm call at which it is answered, so that the caller receives the refusal."""
-
-JUDGE_INTERVAL_S = 0.5
-"""Seconds between judgements of a telemetry stream, so that a revoked grant ends the stream within a second."""
+from fractus_services.mobility.settings import SETTINGS
 
 
 class CallContext(Protocol):
@@ -148,7 +137,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
     async def Arm(self, _request: mobility_pb2.ArmRequest, context: CallContext) -> mobility_pb2.ArmResponse:  # noqa: N802
         """See mobility.proto."""
         async with self.admission.call(context) as caller:
-            patience_s = (context.time_remaining() or 0.0) - RESPONSE_RESERVE_S
+            patience_s = (context.time_remaining() or 0.0) - SETTINGS.arm_response_reserve_s
             verdict = await self._service.arm(self._grant_of(caller), patience_s)
             return mobility_pb2.ArmResponse(decision=decision(verdict))
 
@@ -281,13 +270,17 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         async with self.admission.call(context, lasting=True) as caller:
             is_node = caller.identity == self._node
             wanted = request.interval_s
-            interval = max(wanted, MIN_INTERVAL_S) if math.isfinite(wanted) and wanted > 0 else DEFAULT_INTERVAL_S
+            interval = (
+                max(wanted, SETTINGS.telemetry_min_interval_s)
+                if math.isfinite(wanted) and wanted > 0
+                else SETTINGS.telemetry_default_interval_s
+            )
             loop = asyncio.get_running_loop()
             judged_at = -math.inf
             due = -math.inf
             last_text = 0
             while True:
-                if loop.time() - judged_at >= JUDGE_INTERVAL_S:
+                if loop.time() - judged_at >= SETTINGS.telemetry_judge_interval_s:
                     judged_at = loop.time()
                     caller.check()
                     if not is_node:
@@ -297,7 +290,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
                     sample = self._sample(missions=is_node, last_text=last_text)
                     last_text = sample.texts[-1].number if sample.texts else last_text
                     await context.write(sample)
-                await asyncio.sleep(max(min(due - loop.time(), JUDGE_INTERVAL_S), 0.0))
+                await asyncio.sleep(max(min(due - loop.time(), SETTINGS.telemetry_judge_interval_s), 0.0))
 
     def _sample(self, *, missions: bool, last_text: int) -> mobility_pb2.Telemetry:
         message = telemetry_of(

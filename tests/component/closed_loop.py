@@ -374,7 +374,7 @@ class Oracle:
         if kind in self._said:
             return
         self._said.add(kind)
-        mode = self._sky.truth.mode.name
+        mode = ARDUCOPTER.mode(self._sky.truth.mode).name
         self._account.wrong.append(f"{kind}: {what} at {self._sky.time() - 1000:.1f} s in {mode}")
 
 
@@ -555,7 +555,9 @@ class Flight:
                     await self._landed()
                     self.account.down = True
             if not self.account.down:
-                self.account.wrong.append(f"not down after {HOME_S:.0f} s, in {self.sky.truth.mode.name}")
+                self.account.wrong.append(
+                    f"not down after {HOME_S:.0f} s, in {ARDUCOPTER.mode(self.sky.truth.mode).name}"
+                )
         finally:
             for task in (following, trouble, *turning):
                 task.cancel()

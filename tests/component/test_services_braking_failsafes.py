@@ -10,6 +10,7 @@ from closed_loop import Sky
 from fractus_core.control import StreamState
 from fractus_core.policy.decision_types import TakeoffArgs, VelocityArgs
 from fractus_services.errors import AutopilotError, Refused
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sky_drone import fly, ready, until
 
 
@@ -19,12 +20,12 @@ def test_a_drone_that_a_lost_radio_brakes_comes_home(tmp_path: Path) -> None:
             await drone.service.arm(grant, 120.0)
             async for _ in drone.service.take_off(grant, TakeoffArgs(15.0)):
                 pass
-            modes: set[str] = set()
-            sky.witnesses.append(lambda: modes.add(sky.truth.mode.name))
+            modes: set[int] = set()
+            sky.witnesses.append(lambda: modes.add(sky.truth.mode))
             sky.truth.params.set("SIM_RC_FAIL", 1.0)
             await until(lambda: drone.state is StreamState.LOST)
             await until(lambda: not sky.truth.armed)
-            assert "BRAKE" in modes
+            assert mavlink.COPTER_MODE_BRAKE in modes
             assert "failsafe" in str(drone.control.state.missions["m1"].outcome)
 
     # 7: brake, or land.

@@ -11,8 +11,8 @@ from functools import partial
 
 from fractus_core.api.nodes import Drone, EdgeNode, direct_interface
 from fractus_core.linking import TelemetrySample
-from fractus_runtime.exposition import LastRead, serving
-from fractus_runtime.figures import Figure, text_of
+from fractus_runtime.metrics import BackgroundReader, serve_metrics
+from prometheus_client import Metric
 
 from fractus_agent.agent_metrics import AgentMetrics
 from fractus_agent.grants import GrantDirectory, GrantSynchronizer, GrantVerifier
@@ -67,7 +67,7 @@ class Agent:
             wall=_now,
             monotonic=time.monotonic,
         )
-        self._audit_heads = LastRead(partial(read_audit_heads, settings.audit))
+        self._audit_heads = BackgroundReader(partial(read_audit_heads, settings.audit))
         self._supervisor = Supervisor()
         self._supervisor.add("watchdog", run_watchdog)
         self._supervisor.add("grants", self._grants.follow)
@@ -86,10 +86,10 @@ class Agent:
             ExceptionGroup: A part failed.
         """
         self._on_change()
-        async with serving(self._settings.metrics, lambda: text_of(self._metrics())):
+        async with serve_metrics(self._settings.metrics, self._metrics):
             await self._supervisor.run()
 
-    def _metrics(self) -> Iterator[Figure]:
+    def _metrics(self) -> Iterator[Metric]:
         telemetry_age_s = None
         if self._has_mobility():
             telemetry_age_s = self._feed.age_s if self._feed is not None else math.inf
@@ -101,7 +101,7 @@ class Agent:
             telemetry_age_s=telemetry_age_s,
             grants=self._grants.counts(),
             checkpoints={log: (int(number), digest) for log, number, digest in heads},
-        ).metrics()
+        ).collect()
         if self._links is not None:
             yield from self._links.metrics()
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
-from fractus_runtime.exposition import CERTIFICATE_EXPIRY
-from fractus_runtime.figures import Figure, gauge, hash_number
+from fractus_runtime.metrics import CERTIFICATE_EXPIRY, gauge, hash_number
+from prometheus_client import Metric
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +29,7 @@ class AgentMetrics:
     grants: Mapping[str, int] = field(default_factory=dict)
     checkpoints: Mapping[str, tuple[int, str]] = field(default_factory=dict)
 
-    def metrics(self) -> Iterator[Figure]:
+    def collect(self) -> Iterator[Metric]:
         """Yield all metrics."""
         if self.expires_s is not None:
             yield gauge(CERTIFICATE_EXPIRY, "Expiry of the node's certificate in Unix time.", self.expires_s)

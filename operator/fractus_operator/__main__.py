@@ -9,14 +9,15 @@ import secrets
 import socket
 import sys
 import time
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Iterator
 from contextlib import AsyncExitStack, aclosing
 from datetime import UTC, datetime
 from typing import Any
 
 from fractus_core.identity.authority import Authority, BrokenAuthority
 from fractus_runtime import logs
-from fractus_runtime.exposition import serving
+from fractus_runtime.metrics import serve_metrics
+from prometheus_client import Metric
 
 from fractus_operator import handlers, kinds, metrics, node_liveness, service_rollout
 from fractus_operator.application_controller import ApplicationController
@@ -61,10 +62,15 @@ async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
     store = await Store.connect(may_write_s=lambda: lease.left_s)
     election = asyncio.create_task(lease.run())
     source = metrics.MetricsSource(lambda: lease.left_s)
+
+    def collect() -> Iterator[Metric]:
+        # The source is replaced when this operator becomes the leader.
+        return source.collect()
+
     metrics_server = AsyncExitStack()
     try:
         listen = f":{settings.metrics_port}" if settings.metrics_port else ""
-        await metrics_server.enter_async_context(serving(listen, lambda: metrics.text(source)))
+        await metrics_server.enter_async_context(serve_metrics(listen, collect))
         async with health_endpoint(settings.health):
             await _wait_for_leadership(lease, election)
         authority = await open_authority(store, settings.namespace)

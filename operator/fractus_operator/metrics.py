@@ -7,28 +7,30 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Literal
 
-from fractus_runtime.exposition import CERTIFICATE_EXPIRY
-from fractus_runtime.figures import Counter, Figure, Histogram, gauge, text_of
+from fractus_runtime.metrics import CERTIFICATE_EXPIRY, gauge
+from prometheus_client import Counter, Histogram, Metric
 
 _SECONDS = (0.001, 0.005, 0.02, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
 
 RECONCILES = Histogram(
     "fractus_operator_reconcile_seconds",
     "Duration of a reconciliation step, including requests to the API server.",
-    "kind",
-    _SECONDS,
+    ["kind"],
+    registry=None,
+    buckets=_SECONDS,
 )
 ERRORS = Counter(
     "fractus_operator_reconcile_errors_total",
     "Failed reconciliation steps, which are retried. Reason Bug if the API server did not cause the failure.",
-    "kind",
-    "reason",
+    ["kind", "reason"],
+    registry=None,
 )
 PHASES = Histogram(
     "fractus_operator_plan_phase_seconds",
     "Duration of the phases of deploying an Application: observe, plan, grants, rollout, routes (route check).",
-    "phase",
-    _SECONDS,
+    ["phase"],
+    registry=None,
+    buckets=_SECONDS,
 )
 
 Phase = Literal["observe", "plan", "grants", "rollout", "routes"]
@@ -41,18 +43,18 @@ def reconciling(kind: str) -> Iterator[None]:
     Args:
         kind: Kind of the reconciled objects.
     """
-    with RECONCILES.timed(kind):
+    with RECONCILES.labels(kind).time():
         try:
             yield
         except Exception as error:
-            ERRORS.count(kind, str(getattr(error, "reason", None) or "Bug"))
+            ERRORS.labels(kind, str(getattr(error, "reason", None) or "Bug")).inc()
             raise
 
 
 @contextmanager
 def phase(name: Phase) -> Iterator[None]:
     """Measure a phase of deploying an Application."""
-    with PHASES.timed(name):
+    with PHASES.labels(name).time():
         yield
 
 
@@ -81,8 +83,9 @@ class MetricsSource:
         self._states = states
         self._expires_s = expires_s
 
-    def collect(self) -> Iterator[Figure]:
-        """Return the current values."""
+    def collect(self) -> Iterator[Metric]:
+        """Yield all metrics."""
+        yield from (*RECONCILES.collect(), *ERRORS.collect(), *PHASES.collect())
         watches = self._watches()
         yield gauge(
             "fractus_operator_lease_left_seconds",
@@ -109,9 +112,4 @@ class MetricsSource:
             "state",
         )
         if self._expires_s is not None:
-            yield gauge(CERTIFICATE_EXPIRY, "When the certificate authority expires, in Unix time.", self._expires_s)
-
-
-def text(source: MetricsSource) -> bytes:
-    """Return all metrics in the text format of Prometheus."""
-    return text_of((RECONCILES.figure(), ERRORS.figure(), PHASES.figure(), *source.collect()))
+            yield gauge(CERTIFICATE_EXPIRY, "Expiry of the certificate authority in Unix time.", self._expires_s)

@@ -116,7 +116,7 @@ class RouteCheckCache:
                 result = plan
             except Exception:
                 # The failure is cached as well, so that the check is repeated after MAX_AGE and not at once.
-                ERRORS.count("routes", "Bug")
+                ERRORS.labels("routes", "Bug").inc()
                 logger.exception("route checks: check failed (application=%s/%s)", *key)
                 result = plan
         if self._checks.get(key) is not before:

@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from fractus_runtime.audit import AuditLog
-from fractus_runtime.exposition import CERTIFICATE_EXPIRY
-from fractus_runtime.figures import Counter, Figure, gauge, hash_number, text_of
+from fractus_runtime.metrics import CERTIFICATE_EXPIRY, gauge, hash_number
+from prometheus_client import Counter, Metric
 
 from fractus_services.grant_files import GrantFiles
 
@@ -21,24 +21,24 @@ class DecisionMetrics:
     def __init__(self) -> None:
         self._verdicts = Counter(
             "fractus_verdicts_total",
-            "Verdicts on calls: allow, correct or deny, and the code that callers see, empty where nothing was wrong.",
-            "action",
-            "code",
+            "Verdicts on calls: allow, correct or deny, and the code that the caller received. The code is empty if no policy was violated.",
+            ["action", "code"],
+            registry=None,
         )
         self._by_policy = Counter(
             "fractus_policy_verdicts_total",
-            "Verdicts on calls by the policies that decided; one of several counts for each, the 201st policy and later ones as other.",
-            "policy",
-            "action",
+            "Verdicts by deciding policy. A verdict of several policies counts for each of them. Policies after the 200th are counted as other.",
+            ["policy", "action"],
+            registry=None,
         )
         self._takeovers = Counter(
-            "fractus_takeovers_total", "Takeovers by the system or a pilot.", "controller", "code"
+            "fractus_takeovers_total", "Takeovers by the system or a pilot.", ["controller", "code"], registry=None
         )
         self._interventions = Counter(
             "fractus_monitor_interventions_total",
-            "What the motion monitor did about a drone in flight.",
-            "action",
-            "code",
+            "Interventions of the motion monitor in flight.",
+            ["action", "code"],
+            registry=None,
         )
         self._named: set[str] = set()
 
@@ -46,18 +46,18 @@ class DecisionMetrics:
         """Count an entry if it contains a decision."""
         match entry:
             case {"kind": "call", "action": str(action), "code": str(code), "policies": policies}:
-                self._verdicts.count(action, code)
+                self._verdicts.labels(action, code).inc()
                 for policy in policies:
-                    self._by_policy.count(self._name(policy), action)
+                    self._by_policy.labels(self._name(policy), action).inc()
             case {"kind": "takeover", "controller": str(controller), "code": str(code)}:
-                self._takeovers.count(controller, code)
+                self._takeovers.labels(controller, code).inc()
             case {"kind": "monitor", "action": str(action), "code": str(code)}:
-                self._interventions.count(action, code)
+                self._interventions.labels(action, code).inc()
 
-    def figures(self) -> Iterator[Figure]:
+    def collect(self) -> Iterator[Metric]:
         """Yield the current counts."""
         for counter in (self._verdicts, self._by_policy, self._takeovers, self._interventions):
-            yield counter.figure()
+            yield from counter.collect()
 
     def _name(self, policy: str) -> str:
         if len(self._named) < MAX_POLICIES:
@@ -73,30 +73,31 @@ class ServiceMetrics:
 
     def __init__(self) -> None:
         self._decisions = DecisionMetrics()
-        self._figures: list[Callable[[], Iterator[Figure]]] = [self._decisions.figures]
+        self._callbacks: list[Callable[[], Iterator[Metric]]] = [self._decisions.collect]
 
     def take_entry(self, entry: dict[str, Any]) -> None:
         """Count an entry of the audit log if it contains a decision."""
         self._decisions.take_entry(entry)
 
-    def observe(self, figures: Callable[[], Iterator[Figure]]) -> None:
+    def add_callback(self, callback: Callable[[], Iterator[Metric]]) -> None:
         """Add a callback that returns metrics at each scrape."""
-        self._figures.append(figures)
+        self._callbacks.append(callback)
 
-    def text(self) -> bytes:
-        """Return all metrics in Prometheus' text format."""
-        return text_of(figure for figures in self._figures for figure in figures())
+    def collect(self) -> Iterator[Metric]:
+        """Yield all metrics."""
+        for callback in self._callbacks:
+            yield from callback()
 
 
-def telemetry_age(age_s: float) -> Figure:
+def telemetry_age(age_s: float) -> Metric:
     """Return the age of the latest telemetry."""
-    description = "Age of the drone's position, as this service knows it; not of a camera that stands."
+    description = "Age of the latest position of the drone. A stationary camera has none."
     return gauge("fractus_telemetry_age_seconds", description, age_s)
 
 
-def common_figures(
+def common_metrics(
     expiry: Callable[[], float | None], grants: GrantFiles, audit: AuditLog, recording_problem: Callable[[], str]
-) -> Iterator[Figure]:
+) -> Iterator[Metric]:
     """Yield the metrics that all services have.
 
     Args:
@@ -107,20 +108,20 @@ def common_figures(
     """
     expires_s = expiry()
     if expires_s is not None:
-        yield gauge(CERTIFICATE_EXPIRY, "When the node's certificate expires, in Unix time.", expires_s)
+        yield gauge(CERTIFICATE_EXPIRY, "Expiry of the node's certificate in Unix time.", expires_s)
     yield gauge("fractus_grants", "Grants in force.", len(grants.active))
     head = audit.head
     yield gauge(
         "fractus_audit_sequence",
-        "Number of the last entry of the audit log on disk: the head of its chain.",
+        "Sequence number of the last entry of the audit log on disk, the head of its hash chain.",
         head.sequence,
     )
     digits = hash_number(head.hash)
     yield gauge(
         "fractus_audit_head",
-        "Hash of the last entry of the audit log on disk: its first 13 hexadecimal digits, as a number.",
+        "First 13 hexadecimal digits of the hash of the last entry of the audit log on disk, as a number.",
         digits,
     )
-    yield gauge("fractus_audit_waiting", "Entries of the audit log that are not on disk yet.", audit.waiting)
+    yield gauge("fractus_audit_waiting", "Entries of the audit log not yet written to disk.", audit.waiting)
     yield gauge("fractus_audit_failing", "1 while the audit log cannot be written.", bool(audit.failure))
-    yield gauge("fractus_recording_failing", "1 while nothing is recorded that should be.", bool(recording_problem()))
+    yield gauge("fractus_recording_failing", "1 while recording is enabled but fails.", bool(recording_problem()))

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from exposed import get, values
 from fractus_cluster.ports import free_port
 from fractus_services import node_description
 from fractus_services.camera import server
 from fractus_services.camera.settings import CameraSettings
+from scraping import get, values
 
 
 class Counted(server.ImageStore):

@@ -18,9 +18,8 @@ from unittest.mock import AsyncMock
 import pytest
 from aiohttp import ClientSession, hdrs, web
 from click.testing import CliRunner
-from exposed import scraped, values
 from fractus_cluster.ports import free_port
-from fractus_runtime.figures import text_of
+from fractus_runtime.metrics import metrics_text
 from fractus_services.recording import messages
 from fractus_services.recording.messages import Record
 from fractus_services.recording.segment_writer import McapWriter
@@ -31,6 +30,7 @@ from fractus_view.hub import RECENT, TRAIL, Hub, Trail
 from fractus_view.mcap_tail import Damaged, Tail
 from fractus_view.server import PAGE, View
 from fractus_view.sources import Following, Replay
+from scraping import scraped, values
 
 ROOT = Path(__file__).parents[2]
 START_NS = 1_780_000_000_000_000_000
@@ -417,7 +417,7 @@ async def test_an_open_page_counts(served: tuple[str, View]) -> None:
     shown.source = Hub()  # type: ignore[assignment]
 
     def pages() -> float:
-        return values(text_of(shown.figures()).decode())["fractus_view_pages",]
+        return values(metrics_text(shown.metrics()).decode())["fractus_view_pages",]
 
     async with ClientSession(headers={hdrs.AUTHORIZATION: f"Bearer {shown.token}"}) as session, asyncio.timeout(20):
         assert pages() == 0

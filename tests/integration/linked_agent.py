@@ -19,8 +19,7 @@ from fractus_agent.links.link_manager import LinkManager
 from fractus_agent.store import Event, KubeError, LinkEnd, Listed
 from fractus_core.api.nodes import Drone, EdgeNode
 from fractus_core.linking import TelemetrySample
-from fractus_runtime.exposition import serving
-from fractus_runtime.figures import text_of
+from fractus_runtime.metrics import serve_metrics
 
 POLL_S = 0.2
 
@@ -80,7 +79,7 @@ async def main(folder: Path) -> None:
     stdin = asyncio.StreamReader()
     await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(stdin), sys.stdin)
     reading = asyncio.create_task(stdin.read())
-    async with serving("127.0.0.1:46812", lambda: text_of(links.metrics())):
+    async with serve_metrics("127.0.0.1:46812", links.metrics):
         await asyncio.wait({running, reading}, return_when=asyncio.FIRST_COMPLETED)
     running.cancel()
     await asyncio.gather(running, return_exceptions=True)

@@ -21,7 +21,6 @@ import yaml
 from agent_pki import TestAuthority
 from agent_server import FRACTUS, NODE_GRANTS, REQUESTS, ApiServer, running
 from control_plane import wait_for
-from exposed import scraped
 from fractus_cluster.ports import free_port
 from fractus_core.api.grants import Grant
 from fractus_core.policy.grant_signatures import sign
@@ -29,6 +28,7 @@ from fractus_proto.v1 import mobility_pb2_grpc
 from fractus_proto.v1.mobility_pb2 import MissionOutcome, SubscribeTelemetryRequest, Telemetry
 from fractus_proto.v1.types_pb2 import Position
 from mobility_rig import issue_signer
+from scraping import scraped
 
 pytestmark = [pytest.mark.timeout(300), pytest.mark.xdist_group("agent")]  # they share an API server
 

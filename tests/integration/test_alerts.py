@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 import yaml
 from chart import CHARTS, render
-from exposed import DOCS, documented
+from scraping import DOCS, documented
 
 FILES = CHARTS / "fractus" / "files"
 RULES: list[dict[str, Any]] = yaml.safe_load((FILES / "alerts.yaml").read_text())["groups"][0]["rules"]

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import grpc
 import pytest
-from exposed import scraped
 from fractus_agent.registration.node_object_file import NodeObjectFile
 from fractus_cluster.ports import free_port
 from fractus_core.api.model import API_VERSION
@@ -36,6 +35,7 @@ from mobility_rig import (
     passenger_grant,
     xy,
 )
+from scraping import scraped
 
 Decision = types_pb2.Decision
 

@@ -7,26 +7,32 @@ from types import SimpleNamespace
 from typing import cast
 
 import pytest
-from exposed import assert_documented, values
 from fractus_operator import metrics
 from fractus_operator.application_controller import ApplicationController, BeingDeleted
 from fractus_operator.cache import ClusterCache
 from fractus_operator.kinds import Key
-from fractus_operator.metrics import ERRORS, MetricsSource
+from fractus_operator.metrics import MetricsSource
 from fractus_operator.store import KubeError
 from fractus_operator.work_queue import Subscriptions, WorkQueue
+from fractus_runtime.metrics import metrics_text
+from scraping import assert_documented, values
 
 
-def observed() -> MetricsSource:
+def source() -> MetricsSource:
     return MetricsSource(
         lambda: 6.5, lambda: {"drones": (True, 3.0)}, lambda: ["Flying", "Flying", "Queued"], lambda: ["flying"], 2e9
     )
 
 
+def failures(kind: str, reason: str) -> float:
+    text = metrics_text(source().collect()).decode()
+    return values(text).get(("fractus_operator_reconcile_errors_total", kind, reason), 0.0)
+
+
 def test_every_metric_is_documented() -> None:
     with metrics.reconciling("application"), metrics.phase("plan"):
         pass
-    text = metrics.text(observed()).decode()
+    text = metrics_text(source().collect()).decode()
     assert_documented(text, "Operator")
     seen = values(text)
     assert seen["fractus_operator_lease_left_seconds",] == 6.5
@@ -43,20 +49,17 @@ async def test_failed_step_is_counted(error: Exception, reason: str) -> None:
         failed.set()
         raise error
 
-    def count() -> float:
-        return ERRORS.counted("thing", reason)
-
-    before = count()
+    before = failures("thing", reason)
     work_queue = WorkQueue("thing", reconcile)
     work_queue.add(("", "a"))
     task = asyncio.create_task(work_queue.run())
     async with asyncio.timeout(20.0):
         await failed.wait()
-        while not work_queue.failures:  # noqa: ASYNC110 (nothing tells when)
+        while not work_queue.failures:  # noqa: ASYNC110 (there is no event to wait for)
             await asyncio.sleep(0)
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
-    assert count() == before + 1
+    assert failures("thing", reason) == before + 1
 
 
 async def test_deletion_is_not_counted_as_failure() -> None:
@@ -70,9 +73,6 @@ async def test_deletion_is_not_counted_as_failure() -> None:
         async def reconcile(self, key: Key) -> float:
             raise BeingDeleted
 
-    def count() -> float:
-        return ERRORS.counted("application", "Bug")
-
-    before = count()
+    before = failures("application", "Bug")
     await Leaving().follow(("ns", "a"), lambda: False)
-    assert count() == before
+    assert failures("application", "Bug") == before

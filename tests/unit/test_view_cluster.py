@@ -11,14 +11,14 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner
-from exposed import assert_documented, values
 from fractus_core import api
-from fractus_runtime.figures import text_of
 from fractus_runtime.kubernetes import Body, Kind, KubeError, Page
+from fractus_runtime.metrics import metrics_text
 from fractus_view import cluster as cluster_module
 from fractus_view import command, objects
 from fractus_view.cluster import KINDS, Cluster
 from fractus_view.server import View
+from scraping import assert_documented, values
 
 NOW_MS = 1_780_000_000_000
 
@@ -163,7 +163,7 @@ def last(events: list[dict[str, Any]], type_: str) -> dict[str, Any]:
 async def test_the_view_tells_prometheus_what_is_documented(monkeypatch: pytest.MonkeyPatch) -> None:
     async with watched(ApiServer(*ALL), Clock(), monkeypatch) as cluster:
         await until(cluster, lambda event: event["type"] == "policies")
-        text = text_of([*View(cluster, frozenset()).figures(), *cluster.figures()]).decode()
+        text = metrics_text([*View(cluster, frozenset()).metrics(), *cluster.metrics()]).decode()
     assert_documented(text, "View")
     seen = values(text)
     assert all(seen["fractus_view_watch_open", kind.PLURAL] == 1 for kind in KINDS)

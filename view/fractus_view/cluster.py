@@ -8,8 +8,9 @@ from collections.abc import AsyncIterator, Callable, Iterator
 from typing import Any, TypeVar
 
 from fractus_core import api
-from fractus_runtime.figures import Figure, gauge
 from fractus_runtime.kubernetes import Body, Client, Informer, Key, Kind, KubeError
+from fractus_runtime.metrics import gauge
+from prometheus_client import Metric
 
 from fractus_view import objects
 from fractus_view.events import Applications, Areas, Contact, Event, Gone, Links, Policies, Problem
@@ -84,15 +85,17 @@ class Cluster:
             group.create_task(self._keep_contact())
             group.create_task(self._tell())
 
-    def figures(self) -> Iterator[Figure]:
-        """What Prometheus is told of the watches."""
+    def metrics(self) -> Iterator[Metric]:
+        """Yield the metrics of the watches."""
         listed = [each for each in self._informers.values() if each.synced.is_set()]
         opened = {each.kind.plural: float(each.watching) for each in listed}
-        yield gauge("fractus_view_watch_open", "1 while the watch of a kind is open; of a cluster.", opened, "kind")
+        yield gauge(
+            "fractus_view_watch_open", "1 while the watch of a kind is open (view of a cluster).", opened, "kind"
+        )
         ages_s = {each.kind.plural: each.age_s() for each in listed}
         yield gauge(
             "fractus_view_watch_age_seconds",
-            "Since the API server said anything about a kind; above 100 the watch is dead.",
+            "Seconds since the last message of the API server about a kind. Above 100 the watch is dead.",
             ages_s,
             "kind",
         )

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import click
 from aiohttp import web
-from fractus_runtime.exposition import serving
-from fractus_runtime.figures import Figure, text_of
 from fractus_runtime.kubernetes import Client, KubeError, Unconfigured, from_environment, kubeconfig
+from fractus_runtime.metrics import serve_metrics
+from prometheus_client import Metric
 
 from fractus_view.cluster import Cluster
 from fractus_view.mcap_tail import MAGIC
@@ -177,10 +177,10 @@ async def _serve_cluster(config: Path | None, context: str | None, namespace: st
         except KubeError as error:
             remedy = _REMEDIES.get(error.status, "check your permissions: the role view is enough")
             raise click.ClickException(f"{error}; {remedy}") from error
-        await _serve(cluster, site, cluster.figures)
+        await _serve(cluster, site, cluster.metrics)
 
 
-async def _serve(source: Source, where: Site, figures: Callable[[], Iterable[Figure]] = tuple) -> None:
+async def _serve(source: Source, where: Site, metrics: Callable[[], Iterable[Metric]] = tuple) -> None:
     stopped = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -208,7 +208,7 @@ async def _serve(source: Source, where: Site, figures: Callable[[], Iterable[Fig
         if not _loopback(host):
             click.echo("view: others on this network can read what is sent, the token too: put TLS before it", err=True)
         following = None if given is None else asyncio.create_task(_follow_token(given, served))
-        async with serving(where.metrics, lambda: text_of([*served.figures(), *figures()])):
+        async with serve_metrics(where.metrics, lambda: [*served.metrics(), *metrics()]):
             await stopped.wait()
         if following is not None:
             following.cancel()

@@ -13,7 +13,8 @@ from ipaddress import ip_address
 from pathlib import Path
 
 from aiohttp import hdrs, web
-from fractus_runtime.figures import Counter, Figure, gauge
+from fractus_runtime.metrics import gauge
+from prometheus_client import Counter, Metric
 
 from fractus_view.sources import Source
 
@@ -67,8 +68,9 @@ class View:
     _answers: Counter = field(
         default_factory=lambda: Counter(
             "fractus_view_requests_total",
-            "Requests answered, health checks as well, by status code; 401: without the token.",
-            "code",
+            "Answered requests by status code, including health checks. 401: without the token.",
+            ["code"],
+            registry=None,
         )
     )
     _running: asyncio.Task[None] | None = None
@@ -90,13 +92,13 @@ class View:
         application.cleanup_ctx.append(self._run)
         return application
 
-    def figures(self) -> Iterator[Figure]:
-        """What Prometheus is told of the server."""
-        yield self._answers.figure()
-        yield gauge("fractus_view_pages", "Pages that are open now; at 64 there are no more.", len(self._streams))
+    def metrics(self) -> Iterator[Metric]:
+        """Yield the metrics of the server."""
+        yield from self._answers.collect()
+        yield gauge("fractus_view_pages", "Open pages, at most 64.", len(self._streams))
 
     async def _count(self, _request: web.Request, response: web.StreamResponse) -> None:
-        self._answers.count(str(response.status))
+        self._answers.labels(str(response.status)).inc()
 
     async def _run(self, _application: web.Application) -> AsyncIterator[None]:
         """Keep the source current while the server runs; without it the page would silently stand still."""

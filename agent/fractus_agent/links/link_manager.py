@@ -13,7 +13,7 @@ from pathlib import Path
 from fractus_core.api.nodes import Drone, Interface, direct_interface
 from fractus_core.linking import TelemetrySample
 from fractus_runtime.audit import AuditLog
-from fractus_runtime.figures import Figure
+from prometheus_client import Metric
 
 from fractus_agent.links import beacons, pairing
 from fractus_agent.links.audit_records import AuditRecorder
@@ -104,7 +104,7 @@ class LinkManager:
         """True if links are planned for this node."""
         return bool(self._direct_links.links)
 
-    def metrics(self) -> Iterator[Figure]:
+    def metrics(self) -> Iterator[Metric]:
         """Return the Prometheus metrics of the drone's links. An edge node has none."""
         return self._metrics.collect() if self._end == "drone" else iter(())
 

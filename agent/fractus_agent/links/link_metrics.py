@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from fractus_core.linking import LinkPhase, PathMetrics
-from fractus_runtime.figures import Figure, gauge
+from fractus_runtime.metrics import gauge
+from prometheus_client import Metric
+from prometheus_client.core import CounterMetricFamily
 
 from fractus_agent.links.direct_link_store import route_key
 from fractus_agent.links.link_status import DroneLinkReport
@@ -50,16 +52,16 @@ class LinkMetrics:
         self._switches += len(before ^ report.direct)
         self._report = report
 
-    def collect(self) -> Iterator[Figure]:
+    def collect(self) -> Iterator[Metric]:
         """Yield all metrics."""
-        text = "Changes of the path of a service."
-        yield Figure("fractus_switches_total", text, "counter", [("", {}, self._switches)])
+        description = "Changes of the path of a service."
+        yield CounterMetricFamily("fractus_switches_total", description, value=self._switches)
         by_name: dict[str, dict[str, float]] = {}
         for name, key, value in self._samples():
             by_name.setdefault(name, {})[key] = value
         for name, values in by_name.items():
-            label, text = _GAUGES[name]
-            yield gauge(name, text, values, label)
+            label, description = _GAUGES[name]
+            yield gauge(name, description, values, label)
 
     def _samples(self) -> Iterator[tuple[str, str, float]]:
         if (report := self._report) is None:

@@ -15,8 +15,8 @@ from fractus_core.api.nodes import Drone, EdgeNode
 from fractus_core.policy.lenses import bounding_lens
 from fractus_proto.v1 import camera_pb2_grpc
 from fractus_runtime.audit import AuditLog
-from fractus_runtime.exposition import LastRead, serving
-from fractus_runtime.figures import Figure
+from fractus_runtime.metrics import BackgroundReader, serve_metrics
+from prometheus_client import Metric
 
 from fractus_services.admission import CallAdmission
 from fractus_services.auth import TlsFiles
@@ -39,7 +39,7 @@ from fractus_services.decision_log import log_decision
 from fractus_services.grant_files import GrantFiles
 from fractus_services.grant_verifier import GrantVerifier
 from fractus_services.grpc_server import run_until, serve_grpc
-from fractus_services.metrics import ServiceMetrics, common_figures, telemetry_age
+from fractus_services.metrics import ServiceMetrics, common_metrics, telemetry_age
 from fractus_services.node_description import NodeDescription
 from fractus_services.options import CannotServe
 from fractus_services.recording.recorder import Recorder
@@ -68,7 +68,7 @@ class _PoseMetrics:
 
     history: PoseHistory | None = None
 
-    def figures(self) -> Iterator[Figure]:
+    def collect(self) -> Iterator[Metric]:
         if self.history is not None:
             yield telemetry_age(self.history.age_s)
 
@@ -130,9 +130,11 @@ async def run(settings: CameraSettings, stop: asyncio.Event) -> None:
     )
     authorizer = ImageAuthorizer(audit, create_detector(settings))
     components = _Components(settings, node, clock, tls, grants, authorizer, store, _PoseMetrics())
-    metrics.observe(partial(common_figures, LastRead(tls.expires_s), grants, audit, lambda: recorder.problem))
-    metrics.observe(components.pose_metrics.figures)
-    async with serving(settings.metrics, metrics.text):
+    metrics.add_callback(
+        partial(common_metrics, BackgroundReader(tls.expires_s), grants, audit, lambda: recorder.problem)
+    )
+    metrics.add_callback(components.pose_metrics.collect)
+    async with serve_metrics(settings.metrics, metrics.collect):
         while not stop.is_set():
             audit.append("started", {"node": node})
             await _serve(components, description, stop)

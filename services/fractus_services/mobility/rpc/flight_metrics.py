@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from fractus_core.control import Authority
-from fractus_runtime.figures import Figure, gauge
+from fractus_runtime.metrics import gauge
+from prometheus_client import Metric
 
 from fractus_services.metrics import telemetry_age
 from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.authority.supervisor import Supervisor
 
 
-def flight_figures(control: ControlStore, supervisor: Supervisor) -> Iterator[Figure]:
+def flight_metrics(control: ControlStore, supervisor: Supervisor) -> Iterator[Metric]:
     """Yield the present metrics of the drone."""
     autopilot = control.autopilot
     vehicle = autopilot.vehicle
@@ -41,6 +42,6 @@ def flight_figures(control: ControlStore, supervisor: Supervisor) -> Iterator[Fi
     )
     yield gauge(
         "fractus_battery_ratio",
-        "Remaining charge of the battery, 0 to 1; NaN while unknown.",
+        "Remaining charge of the battery, 0 to 1. NaN if unknown.",
         vehicle.battery_remaining,
     )

@@ -11,7 +11,7 @@ from typing import Any
 from fractus_core.api.nodes import Drone
 from fractus_proto.v1 import mobility_pb2_grpc
 from fractus_runtime.audit import AuditLog
-from fractus_runtime.exposition import LastRead, serving
+from fractus_runtime.metrics import BackgroundReader, serve_metrics
 
 from fractus_services.auth import TlsFiles
 from fractus_services.clock import Clock
@@ -19,7 +19,7 @@ from fractus_services.decision_log import log_decision
 from fractus_services.grant_files import GrantFiles
 from fractus_services.grant_verifier import GrantVerifier
 from fractus_services.grpc_server import run_until, serve_grpc
-from fractus_services.metrics import ServiceMetrics, common_figures
+from fractus_services.metrics import ServiceMetrics, common_metrics
 from fractus_services.mobility.authority.journal import Journal
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes
@@ -29,7 +29,7 @@ from fractus_services.mobility.mavlink.rtl_parameters import RtlParameters
 from fractus_services.mobility.mavlink.startup_heartbeat import VEHICLE_FILE, mark_served
 from fractus_services.mobility.mavlink.vehicle_identification import KnownVehicleFile
 from fractus_services.mobility.rpc.components import MobilityComponents
-from fractus_services.mobility.rpc.flight_metrics import flight_figures
+from fractus_services.mobility.rpc.flight_metrics import flight_metrics
 from fractus_services.mobility.rpc.handlers import MobilityHandlers
 from fractus_services.node_description import NodeDescription
 from fractus_services.options import CannotServe, MobilityOptions
@@ -173,10 +173,12 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
     calls = serve_grpc("mobility", options.listen, tls, register, handlers.admission, node=node)
     running = [autopilot.run(), grants.run(), monitor.run(), monitor.record(), poi_missions.run(), calls]
     running.append(_watch_description(description, url, found, fixed_link=bool(options.autopilot)))
-    metrics.observe(partial(common_figures, LastRead(tls.expires_s), grants, audit, lambda: recorder.problem))
-    metrics.observe(partial(flight_figures, control, components.supervisor))
+    metrics.add_callback(
+        partial(common_metrics, BackgroundReader(tls.expires_s), grants, audit, lambda: recorder.problem)
+    )
+    metrics.add_callback(partial(flight_metrics, control, components.supervisor))
     try:
-        async with serving(options.metrics, metrics.text):
+        async with serve_metrics(options.metrics, metrics.collect):
             await run_until(stop, *running)
     finally:
         control.close()

@@ -1,4 +1,4 @@
-"""The operator's metrics, as Prometheus finds them."""
+"""Scraping of the operator, and the PodMonitors and addresses that the chart configures."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from pathlib import Path
 
 from chart import render
 from control_plane import ControlPlane, wait_for
-from exposed import scraped
 from fractus_cluster.ports import free_port
 from operator_world import OperatorProcess, World, traffic
+from scraping import scraped
 
 
-def test_the_operator_tells_prometheus_what_it_does(
+def test_operator_serves_metrics_of_a_running_rollout(
     control_plane: ControlPlane, world: World, namespace: str, tmp_path: Path
 ) -> None:
     port = free_port()
@@ -30,7 +30,7 @@ def test_the_operator_tells_prometheus_what_it_does(
         world.put(traffic(namespace))
         world.phase(namespace, "Deploying")
         seen = wait_for(
-            lambda: (found := scraped(port)).get(("fractus_applications", "Deploying")) and found, operator.log
+            lambda: (samples := scraped(port)).get(("fractus_applications", "Deploying")) and samples, operator.log
         )
         assert seen["fractus_operator_lease_left_seconds",] > 0
         assert seen["fractus_operator_watch_open", "drones"] == 1
@@ -38,15 +38,15 @@ def test_the_operator_tells_prometheus_what_it_does(
         assert seen["fractus_operator_reconcile_seconds_count", "application"] > 0
         assert seen["fractus_operator_plan_phase_seconds_count", "plan"] > 0
         assert seen["fractus_drones", "inactive"] == 1
-        with urllib.request.urlopen(operator.health, timeout=20) as answer:
-            assert answer.status == 200
+        with urllib.request.urlopen(operator.health, timeout=20) as response:
+            assert response.status == 200
         assert json.loads(operator.log().splitlines()[-1])["level"]
         assert "healthz" not in operator.log()
     finally:
         operator.stop()
 
 
-def test_the_chart_makes_pod_monitors_where_it_is_asked_to() -> None:
+def test_chart_creates_pod_monitors_only_if_enabled() -> None:
     assert not [body for body in render() if body["kind"] == "PodMonitor"]
     arguments = ("--set", "metrics.podMonitor.enabled=true", "--set", "metrics.podMonitor.labels.release=kube")
     rendered = render(*arguments)
@@ -66,7 +66,7 @@ def test_the_chart_makes_pod_monitors_where_it_is_asked_to() -> None:
 
 
 def node_addresses(*arguments: str) -> set[tuple[str, bool]]:
-    """Where the workloads of nodes tell their metrics, and whether their pods say so."""
+    """Return the metrics addresses of the DaemonSets, and if their pods declare a port for metrics."""
     bodies = [body for body in render(*arguments) if body["kind"] == "DaemonSet"]
     assert len(bodies) == 3
     containers = [body["spec"]["template"]["spec"]["containers"][0] for body in bodies]
@@ -79,17 +79,17 @@ def node_addresses(*arguments: str) -> set[tuple[str, bool]]:
     }
 
 
-def test_nodes_are_open_to_the_network_only_where_prometheus_is_to_reach_them() -> None:
+def test_node_metrics_listen_on_the_network_only_if_configured() -> None:
     assert node_addresses() == {("127.0.0.1", False)}
-    open_to_all = {("$(FRACTUS_HOST)", True)}
-    assert node_addresses("--set=metrics.podMonitor.enabled=true") == open_to_all
-    assert node_addresses("--set=metrics.nodes.address=node") == open_to_all
+    node_address = {("$(FRACTUS_HOST)", True)}
+    assert node_addresses("--set=metrics.podMonitor.enabled=true") == node_address
+    assert node_addresses("--set=metrics.nodes.address=node") == node_address
     local = ("--set=metrics.podMonitor.enabled=true", "--set=metrics.nodes.address=localhost")
     assert node_addresses(*local) == {("127.0.0.1", False)}
     assert [body["metadata"]["name"] for body in render(*local) if body["kind"] == "PodMonitor"] == ["fractus-operator"]
 
 
-def test_nodes_tell_nothing_where_they_are_not_to() -> None:
+def test_node_metrics_are_absent_if_disabled() -> None:
     rendered = render("--set", "metrics.podMonitor.enabled=true", "--set", "metrics.nodes.enabled=false")
     assert [body["metadata"]["name"] for body in rendered if body["kind"] == "PodMonitor"] == ["fractus-operator"]
     for body in rendered:

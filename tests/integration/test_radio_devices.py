@@ -17,7 +17,7 @@ from fractus_radio.medium import Medium, Station
 from fractus_radio.propagation import Propagation
 from fractus_radio.radio import BadCommand, Radio
 from fractus_radio.taps import Tap
-from fractus_radio.uplink import CloudPath
+from fractus_radio.uplink import Uplink
 
 pytestmark = pytest.mark.root
 
@@ -50,7 +50,7 @@ class Air:
             for device, network in (("wlan0", "10.77.0"), ("lte0", "10.78.0")):
                 self.run(name, "ip", "addr", "add", f"{network}.{number}/24", "dev", device)
                 self.run(name, "ip", "link", "set", device, "up")
-        self.radio.add_uplink("a", (ends[0], ends[1]), (CloudPath(), CloudPath()))
+        self.radio.add_uplink("a", (ends[0], ends[1]), (Uplink(), Uplink()))
         self._asking, self._answering = (in_namespace(Path("/run/netns", name), _udp) for name in self.names)
         self._answering.bind(("", PORT))
         self._threads = [threading.Thread(target=target) for target in (self._carry, self._echo)]

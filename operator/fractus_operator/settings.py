@@ -11,7 +11,7 @@ from fractus_core.api import InvalidObject
 from fractus_core.planning.inventory import PolicyConflicts
 from fractus_core.planning.inventory import Settings as PlanningSettings
 from fractus_core.planning.plugins import UnknownPlugin, load_plugin
-from fractus_runtime.logs import FORMS
+from fractus_runtime.logs import FORMATS
 
 _PLANNING = {
     "safety_radius_m": "FRACTUS_PLANNING_SAFETY_RADIUS",
@@ -87,8 +87,8 @@ class Settings:
         if level not in logging.getLevelNamesMapping():
             raise BadSetting(f"FRACTUS_LOG_LEVEL: {level} is no level; use DEBUG, INFO, WARNING or ERROR")
         log_format = environment.get("FRACTUS_LOG_FORMAT") or "text"
-        if log_format not in FORMS:
-            raise BadSetting(f"FRACTUS_LOG_FORMAT: {log_format!r} is no form of logs; use {' or '.join(FORMS)}")
+        if log_format not in FORMATS:
+            raise BadSetting(f"FRACTUS_LOG_FORMAT: unknown log format {log_format!r}; use {' or '.join(FORMATS)}")
         planning = PlanningSettings(
             score_drone=_plugin(environment, "FRACTUS_PLANNING_RANKING"),
             cover=_plugin(environment, "FRACTUS_PLANNING_COVERING"),

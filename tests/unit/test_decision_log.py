@@ -7,7 +7,7 @@ import logging
 from typing import Any
 
 import pytest
-from fractus_runtime.logs import BURST, JsonFormatter, LogLimit
+from fractus_runtime.logs import BURST, CallerLogLimit, JsonFormatter
 from fractus_services.decision_log import log_decision
 
 CALL = {
@@ -63,8 +63,8 @@ def test_programs_find_caller_action_policies_and_reason(caplog: pytest.LogCaptu
     }  # fmt: skip
 
 
-def test_a_component_that_is_refused_all_the_time_hides_no_other(caplog: pytest.LogCaptureFixture) -> None:
-    limit = LogLimit(lambda: 1.0)
+def test_flood_of_refusals_of_one_caller_does_not_hide_another_caller(caplog: pytest.LogCaptureFixture) -> None:
+    limit = CallerLogLimit(lambda: 1.0)
     lines(caplog, *[CALL] * (BURST + 500), CALL | {"caller": "spiffe://fractus.dev/b"})
     written = [record.getMessage() for record in caplog.records if limit.filter(record)]
     assert len(written) == BURST + 1

@@ -12,7 +12,7 @@ from typing import Any
 
 import grpc
 from fractus_core.policy.decision_types import Verdict
-from fractus_runtime import spans
+from fractus_runtime import tracing
 from google.protobuf.message import DecodeError
 
 from fractus_services.auth import Caller, Callers
@@ -106,7 +106,7 @@ class CallAdmission:
         admitted = ""
         try:
             caller = self._callers.of(context.auth_context(), urgent)
-            spans.call().note("fractus.caller", caller.identity)
+            tracing.call_span().set_attribute("fractus.caller", caller.identity)
             self._admit(caller.identity, self._urgent_limiter if urgent else self._limiter, urgent)
             admitted = caller.identity
             self._open[admitted] += 1

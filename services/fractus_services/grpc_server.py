@@ -10,7 +10,6 @@ from typing import Any
 
 import grpc
 from fractus_runtime import tracing
-from fractus_runtime.spans import Tracer
 
 from fractus_services.admission import CallAdmission
 from fractus_services.auth import SERVER_OPTIONS, TlsFiles
@@ -26,12 +25,10 @@ class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[misc]  # grpc
 
     Args:
         admission: Authenticates and limits callers.
-        tracer: Tracer of calls, or None if tracing is off.
     """
 
-    def __init__(self, admission: CallAdmission, tracer: Tracer | None) -> None:
+    def __init__(self, admission: CallAdmission) -> None:
         self._admission = admission
-        self._tracer = tracer
         self._handlers: dict[str, grpc.RpcMethodHandler] = {}
 
     async def intercept_service(
@@ -45,19 +42,17 @@ class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[misc]  # grpc
             handler = await continuation(details)
             if handler is None:
                 return None
-            wrapped = self._admission.decoded(handler)
-            if self._tracer is not None:
-                wrapped = _traced(details.method.lstrip("/"), wrapped, self._tracer)
+            wrapped = _traced(details.method.lstrip("/"), self._admission.decoded(handler))
             self._handlers[details.method] = wrapped
         return wrapped
 
 
-def _traced(method: str, handler: grpc.RpcMethodHandler, tracer: Tracer) -> grpc.RpcMethodHandler:
+def _traced(method: str, handler: grpc.RpcMethodHandler) -> grpc.RpcMethodHandler:
     """Wrap a handler of a request stream in a span that begins before its caller is authenticated."""
     handle = handler.stream_unary or handler.stream_stream
 
     async def behaviour(requests: Any, context: Any) -> Any:
-        with tracer.serve(method, context.invocation_metadata()):
+        with tracing.server_span(method, context.invocation_metadata(), grpc.aio.AbortError):
             return await handle(requests, context)
 
     build = grpc.stream_unary_rpc_method_handler if handler.stream_unary else grpc.stream_stream_rpc_method_handler
@@ -83,8 +78,8 @@ async def serve_grpc(
     await tls.wait()
     # Importing the tracing libraries takes seconds on a small computer. A thread keeps the service responsive for a drone in
     # flight.
-    tracer = await asyncio.to_thread(tracing.tracer, name, node, os.environ)
-    server = grpc.aio.server(interceptors=[CallInterceptor(admission, tracer)], options=SERVER_OPTIONS)
+    close_tracing = await asyncio.to_thread(tracing.configure, name, node, os.environ)
+    server = grpc.aio.server(interceptors=[CallInterceptor(admission)], options=SERVER_OPTIONS)
     try:
         try:
             server.add_secure_port(listen, tls.server_credentials())
@@ -99,8 +94,7 @@ async def serve_grpc(
         await asyncio.Event().wait()
     finally:
         await asyncio.shield(server.stop(STOP_TIMEOUT_S))
-        if tracer is not None:
-            await asyncio.shield(asyncio.to_thread(tracer.close))
+        await asyncio.shield(asyncio.to_thread(close_tracing))
 
 
 async def run_until(stop: asyncio.Event, *parts: Coroutine[Any, Any, None]) -> None:

@@ -1,23 +1,20 @@
-"""What traces cost where no one wants them, and that nothing about them keeps a call from being served."""
+"""Spans of calls: setting up the export, the content of spans, and calls that must not fail because of tracing."""
 
 from __future__ import annotations
 
 import asyncio
-import logging
 import os
 import socket
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 
 import fractus.tracing
 import grpc
 import pytest
 from collector import Collector, collecting
-from fractus_runtime import span_export, spans, tracing
-from fractus_runtime.span_export import MAX_CALLS_PER_S, MAX_PARENTS, MAX_PARTS, ExportingTracer
+from fractus_runtime import tracing
 from opentelemetry import trace
 from opentelemetry.sdk.trace import TracerProvider
 from opentelemetry.sdk.trace.export import SimpleSpanProcessor
@@ -36,14 +33,12 @@ def collector(monkeypatch: pytest.MonkeyPatch) -> Iterator[Collector]:
 
 
 @pytest.fixture
-def tracer(collector: Collector) -> Iterator[ExportingTracer]:
-    logger = logging.getLogger("opentelemetry")
-    before = logger.propagate, logger.handlers
-    made = tracing.tracer("mobility", "drone-1", os.environ)
-    assert isinstance(made, ExportingTracer)
-    yield made
-    made.close()
-    logger.propagate, logger.handlers = before
+def close(collector: Collector, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], None]]:
+    """Export spans of this process to the collector. The value exports the last ones."""
+    monkeypatch.setattr(tracing, "_tracer", trace.NoOpTracer())
+    close = tracing.configure("mobility", "drone-1", os.environ)
+    yield close
+    close()
 
 
 @pytest.mark.parametrize("named", [tracing.collector, fractus.tracing.collector])
@@ -63,18 +58,18 @@ def tracer(collector: Collector) -> Iterator[ExportingTracer]:
         ({"OTEL_EXPORTER_OTLP_ENDPOINT": "http://a:1", "OTEL_TRACES_EXPORTER": "otlp"}, "http://a:1"),
     ],
 )
-def test_the_standard_variables_turn_traces_on(
+def test_collector_is_read_from_the_standard_variables(
     named: Callable[[dict[str, str]], str], environment: dict[str, str], found: str
 ) -> None:
     assert named(environment) == found
 
 
-SERVICE = "from fractus_runtime import tracing; assert tracing.tracer('mobility', 'n', os.environ) is None"
-SDK = "import fractus; from fractus.tracing import traced; channel = object(); assert traced(channel) is channel"
+SERVICE = "from fractus_runtime import tracing; tracing.configure('mobility', 'n', os.environ)()"
+SDK = "import fractus, grpc; from fractus.tracing import traced; traced(grpc.aio.insecure_channel('127.0.0.1:1'))"
 
 
-def ran(program: str, **environment: str) -> str:
-    """What a program says to stderr; it must end well."""
+def run_program(program: str, **environment: str) -> str:
+    """Run a program that must succeed, and return its stderr."""
     env = {name: value for name, value in os.environ.items() if not name.startswith("OTEL_")} | environment
     argv = [sys.executable, "-c", f"import os, sys; {program}"]
     return subprocess.run(argv, env=env, capture_output=True, text=True, check=True, timeout=120).stderr
@@ -84,131 +79,105 @@ def ran(program: str, **environment: str) -> str:
 @pytest.mark.parametrize(
     "off", [{}, {"OTEL_EXPORTER_OTLP_ENDPOINT": "http://127.0.0.1:1", "OTEL_SDK_DISABLED": "true"}]
 )
-def test_without_a_collector_nothing_is_imported(program: str, off: dict[str, str]) -> None:
-    said = ran(f"{program}; print(*sys.modules, file=sys.stderr)", **off)
-    assert "tracing" in said
-    assert not [name for name in said.split() if name.startswith(("opentelemetry", "fractus_runtime.span_export"))]
+def test_opentelemetry_sdk_is_not_imported_without_a_collector(program: str, off: dict[str, str]) -> None:
+    modules = run_program(f"{program}; print(*sys.modules, file=sys.stderr)", **off)
+    assert "opentelemetry.trace" in modules
+    assert not [name for name in modules.split() if name.startswith(("opentelemetry.sdk", "opentelemetry.exporter"))]
 
 
 @pytest.mark.parametrize("program", [SERVICE, SDK], ids=["service", "sdk"])
 @pytest.mark.parametrize(
-    ("wrong", "says"),
+    ("statement", "message"),
     [
-        ("sys.modules['opentelemetry'] = None", "add the extra `tracing` (missing=opentelemetry)"),
-        ("os.environ['OTEL_EXPORTER_OTLP_PROTOCOL'] = 'http/protobuf'", "name the collector's port for grpc"),
+        ("sys.modules['opentelemetry.sdk'] = None", "install the extra `tracing` (missing=opentelemetry.sdk"),
+        ("os.environ['OTEL_EXPORTER_OTLP_PROTOCOL'] = 'http/protobuf'", "use grpc and the collector's port for it"),
         ("os.environ['OTEL_EXPORTER_OTLP_TIMEOUT'] = 'soon'", "check the OTEL_ variables (error=could not convert"),
     ],
-    ids=["absent", "protocol", "timeout"],
+    ids=["not installed", "protocol", "timeout"],
 )
-def test_what_keeps_traces_off_is_said_and_harms_nothing(program: str, wrong: str, says: str) -> None:
-    said = ran(f"{wrong}; {program}", OTEL_EXPORTER_OTLP_ENDPOINT="http://127.0.0.1:1")
-    assert "tracing: off" in said
-    assert says in said
+def test_failure_to_set_up_tracing_is_logged_and_not_raised(program: str, statement: str, message: str) -> None:
+    output = run_program(f"{statement}; {program}", OTEL_EXPORTER_OTLP_ENDPOINT="http://127.0.0.1:1")
+    assert "tracing: off" in output
+    assert message in output
 
 
-def test_outside_of_a_traced_call_nothing_happens() -> None:
-    with spans.call().child("part") as part:
-        part.note("name", "value")
-        part.verdict("deny", "Code", ("policy",))
-    assert part is spans.call()
+def test_spans_are_no_ops_without_a_collector() -> None:
+    with (
+        tracing.server_span(METHOD, (("traceparent", PARENT.format(5)),), grpc.aio.AbortError),
+        tracing.child_span("part") as part,
+    ):
+        tracing.set_verdict(part, "deny", "Code", ("policy",))
+        assert not part.is_recording()
+        assert not tracing.call_span().is_recording()
 
 
-async def test_what_is_done_for_a_call_is_its_part_in_its_tasks_too(
-    tracer: ExportingTracer, collector: Collector
-) -> None:
-    async def later() -> None:
-        with spans.call().child("part") as part:
-            part.verdict("deny", "", ())
+async def test_child_spans_belong_to_the_call_in_its_tasks_too(close: Callable[[], None], collector: Collector) -> None:
+    async def judge() -> None:
+        with tracing.child_span("part") as part:
+            tracing.set_verdict(part, "deny", "", ())
 
-    with tracer.serve(METHOD, ()):
-        await asyncio.create_task(later())
-        with pytest.raises(OSError, match="lat"), spans.call().child("failed"):
+    with tracing.server_span(METHOD, (), grpc.aio.AbortError):
+        await asyncio.create_task(judge())
+        with pytest.raises(OSError, match="lat"), tracing.child_span("failed"):
             raise OSError("lat 50.1")
-    with spans.call().child("nothing"):
-        pass
-    with pytest.raises(asyncio.CancelledError), tracer.serve(METHOD, ()):
-        raise asyncio.CancelledError
-    told = collector.wait(lambda spans: spans if len(spans) == 4 else [])
-    part, failed, whole, cancelled = told
-    assert [one.name for one in told] == ["part", "failed", METHOD, METHOD]
-    assert {part.span.parent_span_id, failed.span.parent_span_id} == {whole.span.span_id}
+    close()
+    part, failed, call = collector.spans
+    assert [one.name for one in collector.spans] == ["part", "failed", METHOD]
+    assert {part.span.parent_span_id, failed.span.parent_span_id} == {call.span.span_id}
     assert part.told == {"fractus.verdict.action": "deny"}
-    assert failed.told == {"error.type": "OSError"}, "the text of an error may tell a position"
-    assert (whole.told["rpc.grpc.status_code"], cancelled.told["rpc.grpc.status_code"]) == (0, 1)
+    assert failed.told == {"error.type": "OSError"}, "the text of an error may contain a position"
+    assert not failed.span.events
+    assert not failed.span.status.message
+    assert call.told["rpc.grpc.status_code"] == 0
 
 
-def test_a_flood_of_calls_is_not_traced(
-    tracer: ExportingTracer, collector: Collector, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("error", "status"), [(asyncio.CancelledError(), 1), (ValueError("lat 50.1"), 2), (grpc.aio.AbortError(), 7)]
+)
+def test_call_span_has_the_status_of_a_failed_call(
+    error: BaseException, status: int, close: Callable[[], None], collector: Collector
 ) -> None:
-    monkeypatch.setattr(time, "monotonic", lambda: 1000.5)
-    for _ in range(MAX_CALLS_PER_S + 50):
-        with tracer.serve(METHOD, ()):
-            pass
-    monkeypatch.undo()
-    with tracer.serve("last/Call", ()):
-        pass
-    collector.wait(lambda spans: any(one.name == "last/Call" for one in spans))
-    assert len(collector.spans) == MAX_CALLS_PER_S + 1
+    with pytest.raises(type(error)), tracing.server_span(METHOD, (), grpc.aio.AbortError):
+        tracing.set_status(tracing.call_span(), 7)
+        raise error
+    close()
+    (call,) = collector.spans
+    assert call.told["rpc.grpc.status_code"] == status
+    assert "50.1" not in str(call.span)
 
 
-def test_a_call_of_many_parts_tells_how_many_are_left_out(tracer: ExportingTracer, collector: Collector) -> None:
-    with tracer.serve(METHOD, ()):
-        for _ in range(MAX_PARTS + 7):
-            with spans.call().child("part"):
-                pass
-    whole = collector.one(METHOD)
-    assert whole.told["fractus.parts_left_out"] == 7
-    assert len(collector.spans) == MAX_PARTS + 1
-
-
-def test_callers_take_bounded_memory(tracer: ExportingTracer) -> None:
-    for number in range(1, MAX_PARENTS + 100):
-        assert tracer._parent([("traceparent", PARENT.format(number))]) is not None
-    assert len(tracer._parents) == MAX_PARENTS
-    assert tracer._parent([("traceparent", PARENT.format(MAX_PARENTS))]) is None
-
-
-def test_what_is_too_long_is_cut(tracer: ExportingTracer, collector: Collector) -> None:
-    with tracer.serve(METHOD, ()):
-        spans.call().note("fractus.caller", "x" * 10_000)
-    assert len(collector.one(METHOD).told["fractus.caller"]) == span_export.MAX_LENGTH
-
-
-def test_a_sampler_may_leave_calls_out(collector: Collector, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sampler_of_the_environment_selects_traces(collector: Collector, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OTEL_TRACES_SAMPLER", "parentbased_always_off")
-    tracer = ExportingTracer("camera", "n", os.environ)
+    monkeypatch.setattr(tracing, "_tracer", trace.NoOpTracer())
+    close = tracing.configure("camera", "n", os.environ)
     for headers in ((), (("traceparent", PARENT.format(5)),)):
-        with tracer.serve(METHOD, headers), spans.call().child("part"):
+        with tracing.server_span(METHOD, headers, grpc.aio.AbortError), tracing.child_span("part"):
             pass
-    tracer.close()
-    assert [one.name for one in collector.spans] == ["part", METHOD], "its caller's trace goes on"
+    close()
+    assert [one.name for one in collector.spans] == ["part", METHOD], "a sampled trace of the caller continues"
 
 
-def test_a_failure_of_tracing_is_none_of_the_call(
-    tracer: ExportingTracer, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+def test_call_continues_if_a_span_cannot_be_started(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def fails(*_args: object, **_more: object) -> None:
-        raise RuntimeError("a sampler that someone wrote")
+    class FailingTracer(trace.NoOpTracer):
+        def start_span(self, *_args: object, **_options: object) -> trace.Span:
+            raise RuntimeError("custom sampler")
 
-    begun = tracer.serve(METHOD, ())
-    monkeypatch.setattr(type(tracer._tracer), "start_span", fails)
-    with begun, spans.call().child("part"):
-        assert "a part of a call is not traced (error=RuntimeError)" in caplog.text
-    with tracer.serve(METHOD, ()), spans.call().child("part"):
-        assert "tracing: a call is not traced (error=RuntimeError)" in caplog.text
+    monkeypatch.setattr(tracing, "_tracer", FailingTracer())
+    with tracing.server_span(METHOD, (), grpc.aio.AbortError), tracing.child_span("part"):
+        pass
+    assert caplog.text.count("tracing: span not started (error=RuntimeError)") == 2
 
 
-@pytest.mark.parametrize("closer", [span_export.closer, fractus.tracing._closer])
-def test_a_collector_that_never_answers_holds_up_no_end(
-    closer: Callable[[Callable[[], object]], Callable[[], None]],
-) -> None:
-    close = closer(threading.Event().wait)
+def test_closing_does_not_wait_for_a_blocked_export() -> None:
+    close = fractus.tracing._closer(threading.Event().wait)
     close()
 
 
-def test_a_component_ends_while_its_collector_is_silent() -> None:
+def test_component_ends_while_its_collector_does_not_respond() -> None:
     with socket.create_server(("127.0.0.1", 0)) as silent:
-        ran(
+        run_program(
             "from fractus import tracing; t = tracing._tracer(); t.start_span('one').end(); import threading;"
             " assert any(one.name == 'fractus-tracing' for one in threading.enumerate())",
             OTEL_EXPORTER_OTLP_ENDPOINT=f"http://127.0.0.1:{silent.getsockname()[1]}",
@@ -216,7 +185,7 @@ def test_a_component_ends_while_its_collector_is_silent() -> None:
         )
 
 
-async def test_a_program_that_has_set_up_opentelemetry_has_its_calls_in_its_own_traces(
+async def test_calls_are_exported_by_the_provider_of_the_program(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     exporter = InMemorySpanExporter()
@@ -225,19 +194,19 @@ async def test_a_program_that_has_set_up_opentelemetry_has_its_calls_in_its_own_
     monkeypatch.setattr(trace, "get_tracer_provider", lambda: provider)
     headers: list[dict[str, str]] = []
 
-    async def answer(request: bytes, context: grpc.aio.ServicerContext) -> bytes:
+    async def respond(request: bytes, context: grpc.aio.ServicerContext) -> bytes:
         headers.append(dict(context.invocation_metadata()))
         return request
 
     server = grpc.aio.server()
-    handler = grpc.unary_unary_rpc_method_handler(answer)
+    handler = grpc.unary_unary_rpc_method_handler(respond)
     server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler("a.B", {"C": handler}),))
     port = server.add_insecure_port("127.0.0.1:0")
     await server.start()
     async with grpc.aio.insecure_channel(f"127.0.0.1:{port}") as channel:
-        ask = fractus.tracing.traced(channel).unary_unary("/a.B/C")
+        echo = fractus.tracing.traced(channel).unary_unary("/a.B/C")
         with provider.get_tracer("mine").start_as_current_span("mission") as mission:
-            assert await ask(b"x", timeout=60) == b"x"
+            assert await echo(b"x", timeout=60) == b"x"
     await server.stop(None)
     call, _ = exporter.get_finished_spans()
     assert (call.name, call.attributes["rpc.grpc.status_code"]) == ("a.B/C", 0)

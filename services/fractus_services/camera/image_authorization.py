@@ -9,7 +9,7 @@ from dataclasses import asdict, replace
 from fractus_core.policy.decision_types import Call, Situation, Verdict
 from fractus_core.policy.engine import judge, judge_denials
 from fractus_core.policy.picture_rules import combine_filters, judge_privacy
-from fractus_runtime import spans
+from fractus_runtime import tracing
 from fractus_runtime.audit import AuditLog
 
 from fractus_services.camera.face_detection import FaceDetector
@@ -45,13 +45,13 @@ class ImageAuthorizer:
         Raises:
             Refused: The call is denied, or the engine failed.
         """
-        with spans.call().child("policy.judge") as span:
+        with tracing.child_span("policy.judge") as span:
             try:
                 verdict = judge(call, situation, grant.compiled)
             except Exception:
                 log.exception("policy: engine failed, call denied (method=%s)", call.method)
                 verdict = Verdict("deny", None, "InternalError", f"the policy engine failed on {call.method}")
-            span.verdict(verdict.action, verdict.code, verdict.policies)
+            tracing.set_verdict(span, verdict.action, verdict.code, verdict.policies)
         return self.enforce(call, grant, verdict, situation, record=record)
 
     def authorize_view(self, call: Call, grant: ActiveGrant, seen: Situation) -> Verdict:

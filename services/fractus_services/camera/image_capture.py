@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from fractus_core.policy.decision_types import Call, CaptureArgs, Situation, UncertainTime, Verdict, earliest_time
 from fractus_core.policy.footprint import exposure_footprint
 from fractus_core.policy.picture_rules import judge_privacy
-from fractus_runtime import spans
+from fractus_runtime import tracing
 
 from fractus_services.background import Background
 from fractus_services.camera.camera_properties import CameraProperties
@@ -149,7 +149,7 @@ class ImageCapture:
             problem = await asyncio.to_thread(self._store.quota_problem, owner)
             if problem:
                 raise ImageStoreFull(problem)
-            with spans.call().child("camera.capture"):
+            with tracing.child_span("camera.capture"):
                 frames = await self._take_frames(args, grant, before, recorded)
             if before.lens is not None:
                 # Policies judge a view of the described aspect ratio, so crop frames of another one.
@@ -219,8 +219,8 @@ class ImageCapture:
             view_px = full_size[0] if camera.pinhole else None
             return with_metadata(data, poses[-1], time_s=time_s, camera=camera.model, view_width_px=view_px)
 
-        with spans.call().child("camera.filters") as span:
-            span.note("fractus.filters", [planned.action for planned in plan.filters])
+        with tracing.child_span("camera.filters") as span:
+            span.set_attribute("fractus.filters", [planned.action for planned in plan.filters])
             data = await asyncio.to_thread(render)
         # A part of the view may show cut faces, which are not detected if they have to be hidden later.
         uncut = max(full_size[0] - requested_size[0], full_size[1] - requested_size[1]) <= _ROUNDING_PX

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from fractus_core.policy.decision_types import Call, Situation, Verdict
 from fractus_core.policy.picture_rules import remaining_filters
-from fractus_runtime import spans
+from fractus_runtime import tracing
 
 from fractus_services.background import Background
 from fractus_services.camera.face_detection import FaceDetector
@@ -123,8 +123,8 @@ class StoredImages:
             return encode_jpeg(apply_filters([picture], plan, self._detector, record.face_px, upright=upright))
 
         async with self._filter_queue.turn(owner):
-            with spans.call().child("camera.filters") as span:
-                span.note("fractus.filters", [planned.action for planned in plan.filters])
+            with tracing.child_span("camera.filters") as span:
+                span.set_attribute("fractus.filters", [planned.action for planned in plan.filters])
                 return await asyncio.to_thread(render)
 
     async def list(self, grant: ActiveGrant) -> tuple[Verdict, tuple[ImageRecord, ...]]:

@@ -10,7 +10,7 @@ from dataclasses import asdict, replace
 from fractus_core.policy.compiled_grant import CompiledGrant
 from fractus_core.policy.decision_types import Airframe, Call, Situation, Verdict
 from fractus_core.policy.engine import judge
-from fractus_runtime import spans
+from fractus_runtime import tracing
 from fractus_runtime.audit import AuditLog
 
 from fractus_services.grant_files import ActiveGrant
@@ -115,14 +115,14 @@ class PolicyGate:
             known: Verdict that was just recorded. An equal verdict is not recorded again.
         """
         now = self.situation()
-        with spans.call().child("policy.judge") as span:
+        with tracing.child_span("policy.judge") as span:
             try:
                 verdict = judge(call, now, compiled or grant.compiled)
             except Exception:
                 log.exception("policy: engine failed, call denied (method=%s)", call.method)
                 reason = f"the policy engine failed on {call.method}; nothing was done"
                 verdict = Verdict("deny", None, "InternalError", reason, (), "hover")
-            span.verdict(verdict.action, verdict.code, verdict.policies)
+            tracing.set_verdict(span, verdict.action, verdict.code, verdict.policies)
         if verdict != known and (call.method not in REFUSALS_ONLY or not verdict.permits):
             self.record(call, grant.identity, verdict, now, kind=kind)
         return verdict

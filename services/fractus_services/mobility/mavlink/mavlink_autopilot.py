@@ -9,7 +9,7 @@ from collections.abc import Callable
 from contextlib import nullcontext, suppress
 
 from fractus_core.control.state import FlightMode
-from fractus_runtime import spans
+from fractus_runtime import tracing
 from fractus_runtime.mavlink_codec import Message, Value, enum_name, message
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -171,7 +171,7 @@ class MavlinkAutopilot(Link):
         Raises:
             AutopilotError: The autopilot refused the command, or did not answer.
         """
-        with spans.call().child(f"autopilot.{enum_name('MAV_CMD', command)}"):
+        with tracing.child_span(f"autopilot.{enum_name('MAV_CMD', command)}"):
             # Commands of one kind wait for each other, because a repeated command could undo a later one. Mode changes do not wait
             # for an unanswered one, because the change may start the return flight.
             async with nullcontext() if command in _NOT_SERIALIZED else self._locks.setdefault(command, asyncio.Lock()):
@@ -298,7 +298,7 @@ class MavlinkAutopilot(Link):
         """Fly with a velocity over ground. The autopilot stops by itself after GUID_TIMEOUT. No acknowledgement."""
         if not self.found:
             return
-        with spans.call().child("autopilot.SET_POSITION_TARGET_LOCAL_NED"):
+        with tracing.child_span("autopilot.SET_POSITION_TARGET_LOCAL_NED"):
             self._setpoints.fly((north_mps, east_mps, down_mps), self.now)
             self.send(
                 message(

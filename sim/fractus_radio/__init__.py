@@ -1,1 +1,1 @@
-"""Simulated radio between nodes that are network namespaces: 802.11g ad hoc by airtime and range, and a mobile uplink."""
+"""Simulated radio between nodes in network namespaces: an 802.11g ad hoc network and a mobile uplink."""

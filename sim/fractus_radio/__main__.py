@@ -1,4 +1,4 @@
-"""`fractus-radio LAYOUT`: carries what the nodes of a layout send, until it is ended."""
+"""Command `fractus-radio LAYOUT`: carry frames between the nodes of a layout until terminated."""
 
 from __future__ import annotations
 
@@ -25,24 +25,24 @@ REAL_TIME_PRIORITY, HIGHEST = 10, -20
 
 
 class Frame:
-    """Metres east, north and up of a layout's origin."""
+    """Local frame in metres (east, north, up) around the origin of a layout."""
 
     def __init__(self, origin: Place) -> None:
         self._ground = LocalFrame(origin.lat, origin.lon)
         self._alt = origin.alt
 
     def position(self, lat: float, lon: float, alt: float) -> Position:
-        """Of degrees and metres above mean sea level."""
+        """Convert degrees and metres above mean sea level to the local frame."""
         east, north = self._ground.xy(lat, lon)
         return east, north, alt - self._alt
 
 
 def make_radio(layout: Layout) -> tuple[Radio, list[Follower]]:
-    """The radio of a layout with all its devices, and what follows its vehicles.
+    """Create the radio of a layout with all its devices, and followers of its vehicles.
 
     Raises:
-        OSError: a device cannot be made.
-        ValueError: a vehicle's address is wrong.
+        OSError: A device cannot be created.
+        ValueError: The address of a vehicle is invalid.
     """
     range_m = max((entry.range_m for entry in layout.stations), default=1.0)
     radio = Radio(Medium(Propagation.reaching(range_m, fading=layout.fading), layout.seed), layout.control)
@@ -70,7 +70,7 @@ def _follower(entry: StationEntry, vehicle: str, station: Station, frame: Frame)
 @click.command()
 @click.argument("layout", type=click.Path(path_type=Path, dir_okay=False, exists=True))
 def radio(layout: Path) -> None:
-    """Carry what the nodes of a LAYOUT file send over the air and their uplinks."""
+    """Carry frames between the nodes of a LAYOUT file over the simulated air and uplinks."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     try:
         carrier, followers = make_radio(Layout.model_validate_json(layout.read_bytes()))
@@ -80,10 +80,10 @@ def radio(layout: Path) -> None:
         signal.signal(number, lambda *_: sys.exit(0))
     for follower in followers:
         follower.start()
-    # On a busy machine frames would else wait for their turn longer than they travel.
+    # On a busy machine, frames would otherwise wait for the CPU longer than their travel time.
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(REAL_TIME_PRIORITY))
-    except OSError:  # control groups may have no share of real time
+    except OSError:  # the control group may not permit real-time scheduling
         with contextlib.suppress(OSError):
             os.nice(HIGHEST)
     try:

@@ -1,4 +1,4 @@
-"""Follows a vehicle that carries a station, so that the radio knows where it is."""
+"""Tracks the position of a vehicle that carries a radio station."""
 
 from __future__ import annotations
 
@@ -19,43 +19,43 @@ SYSTEM, COMPONENT = 246, 25
 RATE_HZ = 10.0
 CONNECT_TIMEOUT_S, READ_TIMEOUT_S = 5.0, 1.0
 SILENCE_S = 5.0
-ASK_EVERY_S = 5.0
+REQUEST_INTERVAL_S = 5.0
 RETRY_S = 1.0
 
-Told = Callable[[float, float, float], None]
-"""Takes a position: degrees north and east, metres above mean sea level."""
+PositionCallback = Callable[[float, float, float], None]
+"""Callback for a position: latitude and longitude in degrees, metres above mean sea level."""
 
 
 class Follower:
-    """Tells a vehicle's positions, in a thread of its own that ends with the process.
+    """Reports the positions of a vehicle from a daemon thread.
 
     Args:
-        namespace: where its MAVLink server listens.
-        address: host and port of that server.
-        told: called with each position.
+        namespace: Network namespace of the vehicle's MAVLink server.
+        address: Host and port of that server.
+        on_position: Called with each position.
     """
 
-    def __init__(self, namespace: Path, address: tuple[str, int], told: Told) -> None:
+    def __init__(self, namespace: Path, address: tuple[str, int], on_position: PositionCallback) -> None:
         self._namespace = namespace
         self._address = address
-        self._told = told
+        self._on_position = on_position
         self._thread = threading.Thread(target=self._run, name="follower", daemon=True)
 
     def start(self) -> None:
-        """Begin to follow; a link that breaks is opened again."""
+        """Start the thread. It reconnects after a connection is lost."""
         self._thread.start()
 
     def _run(self) -> None:
-        said = ""
+        last_error = ""
         while True:
             try:
                 with in_namespace(self._namespace, self._connect) as link:
-                    said = ""
+                    last_error = ""
                     self._follow(link)
             except OSError as error:
-                if str(error) != said:
-                    said = str(error)
-                    log.info("radio: no vehicle (address=%s:%d, error=%s)", *self._address, error)
+                if str(error) != last_error:
+                    last_error = str(error)
+                    log.info("radio: cannot connect to vehicle (address=%s:%d error=%s)", *self._address, error)
             time.sleep(RETRY_S)
 
     def _connect(self) -> socket.socket:
@@ -65,8 +65,9 @@ class Follower:
         link.settimeout(READ_TIMEOUT_S)
         endpoint = Endpoint(SYSTEM, COMPONENT)
         autopilot: int | None = None
-        asked_s, heard_s = 0.0, time.monotonic()
-        while time.monotonic() - heard_s < SILENCE_S:
+        requested_s = 0.0
+        received_s = time.monotonic()
+        while time.monotonic() - received_s < SILENCE_S:
             try:
                 data = link.recv(65536)
             except TimeoutError:
@@ -77,20 +78,20 @@ class Follower:
                 if message.name == "HEARTBEAT" and message.integer("autopilot") != mavlink.MAV_AUTOPILOT_INVALID:
                     autopilot = message.sysid
                 elif message.name == "GLOBAL_POSITION_INT" and message.sysid == autopilot:
-                    self._heard(message)
-                heard_s = time.monotonic()
-            # A restarted autopilot has forgotten what it was asked for.
-            if autopilot is not None and time.monotonic() - asked_s > ASK_EVERY_S:
-                asked_s = time.monotonic()
-                link.sendall(_ask(endpoint, autopilot))
+                    self._handle_position(message)
+                received_s = time.monotonic()
+            # Repeat the request, because a restarted autopilot has forgotten it.
+            if autopilot is not None and time.monotonic() - requested_s > REQUEST_INTERVAL_S:
+                requested_s = time.monotonic()
+                link.sendall(_encode_request(endpoint, autopilot))
 
-    def _heard(self, message: Message) -> None:
+    def _handle_position(self, message: Message) -> None:
         lat, lon = message.integer("lat"), message.integer("lon")
-        if lat or lon:  # zeroes are what an autopilot without a fix says
-            self._told(lat / 1e7, lon / 1e7, message.integer("alt") / 1000.0)
+        if lat or lon:  # an autopilot without a fix reports zeros
+            self._on_position(lat / 1e7, lon / 1e7, message.integer("alt") / 1000.0)
 
 
-def _ask(endpoint: Endpoint, autopilot: int) -> bytes:
+def _encode_request(endpoint: Endpoint, autopilot: int) -> bytes:
     return endpoint.encode(
         "COMMAND_LONG",
         {
@@ -104,13 +105,13 @@ def _ask(endpoint: Endpoint, autopilot: int) -> bytes:
 
 
 def parse_address(text: str) -> tuple[str, int]:
-    """Host and port of `tcp:HOST:PORT`.
+    """Parse `tcp:HOST:PORT`.
 
     Raises:
-        ValueError: it is something else.
+        ValueError: The text has another form.
     """
     kind, _, rest = text.partition(":")
     host, _, port = rest.rpartition(":")
     if kind != "tcp" or not host or not port.isdigit() or not 0 < int(port) < 65536:
-        raise ValueError(f"vehicle {text!r} is not tcp:HOST:PORT")
+        raise ValueError(f"vehicle address {text!r}: expected tcp:HOST:PORT")
     return host, int(port)

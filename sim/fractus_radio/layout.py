@@ -1,4 +1,4 @@
-"""The file that describes a radio: who is on the air where, and which uplinks there are."""
+"""Layout file of a radio: stations, their positions, and uplinks."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class _Value(BaseModel):
 
 
 class Place(_Value):
-    """A point: degrees (WGS 84), and metres above mean sea level."""
+    """A position: degrees (WGS 84) and metres above mean sea level."""
 
     lat: float
     lon: float
@@ -24,15 +24,15 @@ class Place(_Value):
 
 
 class StationEntry(_Value):
-    """A node on the air.
+    """A station on the air.
 
     Attributes:
-        name: By which commands name it.
-        namespace: Its network namespace, such as /run/netns/NAME.
-        device: Name of its device there, which the radio makes.
-        range_m: How far it reaches.
-        place: Where it stands, or stands first.
-        vehicle: MAVLink server in its namespace, `tcp:HOST:PORT`, of the vehicle that carries it; None for none.
+        name: Name of the station in commands.
+        namespace: Network namespace of the node, such as /run/netns/NAME.
+        device: Name of the network device that the radio creates in the namespace.
+        range_m: Radio range in metres.
+        place: Position, or initial position of a moving station.
+        vehicle: MAVLink server (`tcp:HOST:PORT`, in the namespace) of the vehicle that carries the station, if any.
     """
 
     name: str
@@ -44,26 +44,26 @@ class StationEntry(_Value):
 
     @property
     def address(self) -> bytes:
-        """Its MAC address: a locally administered one that follows from its name."""
+        """MAC address: locally administered, derived from the name."""
         return b"\x02" + hashlib.sha256(self.name.encode()).digest()[:5]
 
 
 class EndEntry(_Value):
-    """A persistent TAP device that is there already: an end of an uplink."""
+    """An existing persistent TAP device, one end of an uplink."""
 
     namespace: Path
     device: str
 
 
 class UplinkEntry(_Value):
-    """A mobile uplink; rate and delay hold each way.
+    """A mobile uplink. Rate and delay apply to each direction.
 
     Attributes:
-        name: By which commands name it.
-        near: The node's end.
-        far: The other end.
-        rate_bps: Bits a second.
-        delay_s: Seconds.
+        name: Name of the uplink in commands.
+        near: End at the node.
+        far: Remote end.
+        rate_bps: Bits per second.
+        delay_s: Delay in seconds.
     """
 
     name: str
@@ -74,13 +74,13 @@ class UplinkEntry(_Value):
 
 
 class Layout(_Value):
-    """A radio.
+    """Configuration of a radio.
 
     Attributes:
-        control: Path of the socket for commands.
-        origin: Of the metres in which commands give positions.
-        fading: Shape of Nakagami fading; None for a hard edge.
-        seed: Of fading.
+        control: Path of the command socket.
+        origin: Origin of the metric positions in commands.
+        fading: Shape of Nakagami fading; None for a hard edge of the range.
+        seed: Random seed of fading.
     """
 
     control: Path

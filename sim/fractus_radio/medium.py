@@ -1,6 +1,6 @@
-"""The air between stations: one frame at a time, for as long as it takes to send, acknowledged and repeated (802.11g, DCF).
+"""Model of the air between stations: one frame at a time, with airtime, acknowledgement and retries (802.11g DCF).
 
-A pure discrete-event model: it is given frames and the time, and says which frames arrive when.
+A pure discrete-event model: frames and times are inputs, arrivals are outputs.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ Position = tuple[float, float, float]
 
 RATE_BPS = 24e6
 HEADER_BYTES = 76
-"""LLC, MAC and check sum, as far as they are sent with the data rate."""
+"""LLC and MAC headers and checksum, transmitted at the data rate."""
 FIXED_S = 269e-6
-"""DIFS, mean first back-off, preambles, SIFS and the ACK; fits ns-3 within 2 us from 40 to 1400 bytes."""
+"""DIFS, mean first back-off, preambles, SIFS and ACK. Matches ns-3 within 2 us from 40 to 1400 bytes."""
 SLOT_S = 20e-6
 FIRST_WINDOW, MAX_WINDOW = 16, 1024
 ATTEMPTS = 7
@@ -30,7 +30,7 @@ GROUP_BIT = 0x01
 
 
 def airtime_s(frame_bytes: int, attempt: int = 0) -> float:
-    """For how long an attempt to send an Ethernet frame occupies the air; each repetition backs off for longer."""
+    """Return the airtime of an attempt to send an Ethernet frame. Each retry has a longer back-off."""
     window = min(FIRST_WINDOW << attempt, MAX_WINDOW)
     back_off_s = (window - FIRST_WINDOW) / 2 * SLOT_S
     return (frame_bytes - MIN_FRAME_BYTES + HEADER_BYTES) * 8 / RATE_BPS + FIXED_S + back_off_s
@@ -38,16 +38,16 @@ def airtime_s(frame_bytes: int, attempt: int = 0) -> float:
 
 @dataclass(slots=True)
 class Station:
-    """A radio.
+    """A radio station.
 
     Attributes:
-        position: in metres, in the frame that all stations share.
-        address: MAC address, by which frames find it.
-        network: stations hear each other in the same network only (SSID).
-        silent: hears, but sends nothing: a peer that pairs and never answers.
-        off: neither hears nor sends.
-        loss_db: loss beyond the path's, by a fade or interference.
-        reach: how far it reaches in units of the medium's range; a link reaches as far as the lesser of its ends.
+        position: Position in metres, in the common frame of all stations.
+        address: MAC address.
+        network: Network name (SSID). Stations hear only stations of their network.
+        silent: Receives but sends nothing, like a peer that pairs and never responds.
+        off: Neither receives nor sends.
+        loss_db: Additional loss by a fade or interference.
+        reach: Range relative to the range of the medium. A link has the shorter range of its ends.
     """
 
     position: Position
@@ -66,10 +66,10 @@ class Attempt:
     """A frame in the air.
 
     Attributes:
-        station: the sender.
+        station: Sender.
         frame: Ethernet frame.
-        number: 0 for the first.
-        arrived: whether an earlier attempt arrived and only its ACK was lost: the receiver drops the copy.
+        number: Number of the attempt, from 0.
+        arrived: True if an earlier attempt arrived and only its ACK was lost. The receiver then drops the copy.
     """
 
     station: str
@@ -87,11 +87,11 @@ class Arrival:
 
 
 class Medium:
-    """The air that all stations share.
+    """The air shared by all stations.
 
     Args:
-        propagation: the channel.
-        seed: of fading.
+        propagation: Channel model.
+        seed: Random seed of fading.
     """
 
     def __init__(self, propagation: Propagation, seed: int = 0) -> None:
@@ -108,7 +108,7 @@ class Medium:
         self._order.append(name)
 
     def offer(self, name: str, frame: bytes, now_s: float) -> None:
-        """A station wants to send an Ethernet frame; a full queue drops it."""
+        """Queue an Ethernet frame of a station. Drop it if the queue is full."""
         station = self.stations[name]
         if station.off or station.silent or len(frame) < MIN_FRAME_BYTES:
             return
@@ -121,11 +121,11 @@ class Medium:
 
     @property
     def next_s(self) -> float:
-        """When the next attempt ends; infinite while the air is free."""
+        """Time at which the current attempt ends; infinite while the air is free."""
         return self._free_s if self._sending is not None else math.inf
 
     def advance(self, now_s: float) -> Iterator[Arrival]:
-        """What has arrived by now."""
+        """Return the arrivals up to `now_s`."""
         while self._sending is not None and self._free_s <= now_s:
             attempt, self._sending = self._sending, None
             yield from self._end(attempt)
@@ -133,7 +133,7 @@ class Medium:
                 self._begin(self._free_s)
 
     def _begin(self, at_s: float) -> None:
-        """The next station in turn sends: contention is fair."""
+        """Start sending the next frame. Stations send in turn, so that contention is fair."""
         for _ in range(len(self._order)):
             name = self._order[0]
             self._order.rotate(-1)
@@ -144,7 +144,7 @@ class Medium:
 
     def _end(self, attempt: Attempt) -> Iterator[Arrival]:
         name, frame = attempt.station, attempt.frame
-        if frame[0] & GROUP_BIT:  # broadcasts are neither acknowledged nor repeated
+        if frame[0] & GROUP_BIT:  # broadcasts are neither acknowledged nor retried
             yield from (Arrival(other, frame) for other in self.stations if other != name and self._hears(name, other))
             return
         receiver = next((n for n, s in self.stations.items() if s.address == frame[:6] and n != name), None)
@@ -165,17 +165,19 @@ class Medium:
         return self._propagation.receives(_distance_m(a, b), self._chance, loss_db=a.loss_db + b.loss_db)
 
     def neighbours(self, name: str) -> Mapping[str, float]:
-        """The stations of the same network that a station hears, and their mean power in dBm: what a scan finds."""
-        own = self.stations[name]
-        found = {}
+        """Return the stations of the same network in range and their mean power in dBm, like a scan."""
+        scanner = self.stations[name]
+        powers = {}
         for other, station in self.stations.items():
-            if other != name and not own.off and not station.off and station.network == own.network:
-                power = self._propagation.received_dbm(_distance_m(own, station)) - own.loss_db - station.loss_db
+            if other != name and not scanner.off and not station.off and station.network == scanner.network:
+                power = (
+                    self._propagation.received_dbm(_distance_m(scanner, station)) - scanner.loss_db - station.loss_db
+                )
                 if power >= SENSITIVITY_DBM:
-                    found[other] = power
-        return found
+                    powers[other] = power
+        return powers
 
 
 def _distance_m(a: Station, b: Station) -> float:
-    """The distance at which stations that reach as far as the medium would hear each other as well as these do."""
+    """Return the distance, scaled so that the range of the medium applies to the link of two stations."""
     return math.dist(a.position, b.position) / min(a.reach, b.reach)

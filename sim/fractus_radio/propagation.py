@@ -1,6 +1,6 @@
-"""Whether a frame is received over a distance: log-distance path loss, with or without Nakagami fading.
+"""Reception of a frame over a distance: log-distance path loss with optional Nakagami fading.
 
-The figures follow ns-3's 802.11g ad hoc model, which the thesis used (8.9.3): a reference loss of 46.68 dB at 1 m, and
+The constants follow the 802.11g ad hoc model of ns-3 used in the thesis (8.9.3): reference loss of 46.68 dB at 1 m and
 reception down to -82 dBm.
 """
 
@@ -13,17 +13,17 @@ from dataclasses import dataclass
 REFERENCE_LOSS_DB = 46.68
 SENSITIVITY_DBM = -82.0
 OPEN_EXPONENT = 2.2
-"""Path-loss exponent over open ground, which places the edge of a declared range."""
+"""Path-loss exponent over open ground, used to convert a declared range to transmit power."""
 
 
 @dataclass(frozen=True, slots=True)
 class Propagation:
-    """A channel between stations.
+    """Channel between stations.
 
     Attributes:
-        power_dbm: transmit power.
-        exponent: of the path loss.
-        fading: shape of Nakagami fading; None for none, and then the range has a hard edge.
+        power_dbm: Transmit power.
+        exponent: Path-loss exponent.
+        fading: Shape of Nakagami fading; None for no fading and a hard edge of the range.
     """
 
     power_dbm: float
@@ -32,21 +32,21 @@ class Propagation:
 
     @classmethod
     def reaching(cls, range_m: float, *, fading: float | None = None) -> Propagation:
-        """The channel whose edge, without fading, is at a declared range."""
+        """Return a channel with a given range, if there is no fading."""
         power = SENSITIVITY_DBM + REFERENCE_LOSS_DB + 10 * OPEN_EXPONENT * math.log10(range_m)
         return cls(power, OPEN_EXPONENT, fading)
 
     def received_dbm(self, distance_m: float) -> float:
-        """Mean power at a distance; nearer than 1 m is as at 1 m."""
+        """Return the mean received power at a distance. Distances below 1 m count as 1 m."""
         return self.power_dbm - REFERENCE_LOSS_DB - 10 * self.exponent * math.log10(max(distance_m, 1.0))
 
     def receives(self, distance_m: float, chance: random.Random, *, loss_db: float = 0.0) -> bool:
-        """Whether one frame is received.
+        """Return True if a frame is received.
 
         Args:
-            distance_m: between the stations.
-            chance: source of fading.
-            loss_db: beyond the path's, by interference or an obstacle.
+            distance_m: Distance between the stations.
+            chance: Random source of fading.
+            loss_db: Additional loss by interference or an obstacle.
         """
         power = self.received_dbm(distance_m) - loss_db
         if self.fading is None:

@@ -1,8 +1,9 @@
-"""The radio as a process: TAP devices of all nodes on one air, and uplinks; positions and faults come over a socket.
+"""Radio process: connects the TAP devices of all nodes by the simulated air and uplinks, and executes commands.
 
-Commands are JSON objects, one a datagram, on a Unix socket:
-`{"station": "drone-1", "position": [0, 0, 20], "off": false, "silent": false, "loss_db": 0, "network": "fleet"}` changes what it
-names of a station, `{"uplink": "drone-1", "off": true, "rate_bps": 8e6, "delay_s": 0.06}` both directions of an uplink.
+Commands are JSON objects, one per datagram, on a Unix socket:
+`{"station": "drone-1", "position": [0, 0, 20], "off": false, "silent": false, "loss_db": 0, "network": "fleet"}`
+changes the given attributes of a station. `{"uplink": "drone-1", "off": true, "rate_bps": 8e6, "delay_s": 0.06}`
+changes both directions of an uplink.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ from fractus_radio.uplink import Uplink
 log = logging.getLogger(__name__)
 
 COMMAND_BYTES = 8192
-FRAMES_A_TURN = 32
-"""Frames read from one device before the others have their turn."""
+FRAMES_PER_TURN = 32
+"""Maximum number of frames read from one device before the other devices are served."""
 
 _NUMBER = (int, float)
 _STATION = {"position": list, "off": bool, "silent": bool, "loss_db": _NUMBER, "reach": _NUMBER, "network": str}
@@ -34,12 +35,12 @@ _UPLINK = {"off": bool, "rate_bps": _NUMBER, "delay_s": _NUMBER}
 
 
 class BadCommand(ValueError):
-    """A command that the radio does not understand."""
+    """An invalid command."""
 
 
 @dataclass(frozen=True, slots=True)
 class Wire:
-    """Both ends and directions of an uplink."""
+    """Ends and directions of an uplink."""
 
     ends: tuple[Tap, Tap]
     directions: tuple[Uplink, Uplink]
@@ -49,9 +50,9 @@ class Radio:
     """Carries frames between devices.
 
     Args:
-        medium: the air.
-        control: path of the socket for commands; its folder exists.
-        clock: monotonic seconds.
+        medium: Model of the air.
+        control: Path of the command socket, in an existing directory.
+        clock: Monotonic clock in seconds.
     """
 
     def __init__(self, medium: Medium, control: Path, *, clock: Callable[[], float] = time.monotonic) -> None:
@@ -63,22 +64,22 @@ class Radio:
         self._control = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
         control.unlink(missing_ok=True)
         self._control.bind(str(control))
-        self._selector.register(self._control, selectors.EVENT_READ, self._commanded)
+        self._selector.register(self._control, selectors.EVENT_READ, self._receive_command)
 
     def add_station(self, name: str, tap: Tap, station: Station) -> None:
-        """Put a device on the air."""
+        """Add a station with its device."""
         self._medium.add(name, station)
         self._taps[name] = tap
-        self._listen(tap, lambda frame, now_s: self._medium.offer(name, frame, now_s))
+        self._forward_from(tap, lambda frame, now_s: self._medium.offer(name, frame, now_s))
 
     def add_uplink(self, name: str, ends: tuple[Tap, Tap], directions: tuple[Uplink, Uplink]) -> None:
-        """Join two devices by an uplink; the first direction is from the first to the second."""
+        """Connect two devices by an uplink. The first direction leads from the first to the second device."""
         self._wires[name] = Wire(ends, directions)
         for tap, uplink in zip(ends, directions, strict=True):
-            self._listen(tap, uplink.offer)
+            self._forward_from(tap, uplink.offer)
 
     def turn(self, max_wait_s: float = 0.5) -> None:
-        """Wait for the next event, and handle what is due."""
+        """Wait for the next event and handle all due events."""
         due_s = min(
             (self._medium.next_s, *(u.next_s for wire in self._wires.values() for u in wire.directions)),
             default=math.inf,
@@ -94,40 +95,43 @@ class Radio:
                 for frame in uplink.advance(now_s):
                     end.write(frame)
 
-    def _listen(self, tap: Tap, offer: Callable[[bytes, float], None]) -> None:
-        """Hand on the frames of a device, until it is gone: one node's must not end the air of the others."""
+    def _forward_from(self, tap: Tap, offer: Callable[[bytes, float], None]) -> None:
+        """Carry the frames of a device until the device is removed.
 
-        def sent(now_s: float) -> None:
+        The loss of one device does not affect the others.
+        """
+
+        def forward(now_s: float) -> None:
             try:
-                for _ in range(FRAMES_A_TURN):
+                for _ in range(FRAMES_PER_TURN):
                     frame = tap.read()
                     if frame is None:
                         return
                     offer(frame, now_s)
             except OSError as error:
-                log.warning("radio: a device is gone (device=%s, error=%s)", tap.device, error)
+                log.warning("radio: device removed (device=%s error=%s)", tap.device, error)
                 self._selector.unregister(tap)
 
-        self._selector.register(tap, selectors.EVENT_READ, sent)
+        self._selector.register(tap, selectors.EVENT_READ, forward)
 
-    def _commanded(self, _now_s: float) -> None:
+    def _receive_command(self, _now_s: float) -> None:
         try:
             self.command(json.loads(self._control.recv(COMMAND_BYTES)))
         except (BadCommand, ValueError, RecursionError) as error:
             log.warning("radio: command refused (error=%s)", error)
 
     def command(self, command: Mapping[str, Any]) -> None:
-        """Change stations and uplinks.
+        """Change a station or an uplink.
 
         Raises:
-            BadCommand: it names what is not there, or has a wrong type; nothing was changed.
+            BadCommand: The command names an unknown object or has an invalid value. Nothing was changed.
         """
         if not isinstance(command, dict):
-            raise BadCommand("a command is a JSON object")
+            raise BadCommand("a command must be a JSON object")
         if name := command.get("station"):
             station = self._medium.stations.get(name) if isinstance(name, str) else None
             if station is None:
-                raise BadCommand(f"there is no station {name}; there are {', '.join(self._medium.stations)}")
+                raise BadCommand(f"unknown station {name}; known stations: {', '.join(self._medium.stations)}")
             changes = _checked(command, "station", _STATION)
             if "position" in changes:
                 changes["position"] = _position(changes["position"])
@@ -136,12 +140,12 @@ class Radio:
         elif name := command.get("uplink"):
             wire = self._wires.get(name) if isinstance(name, str) else None
             if wire is None:
-                raise BadCommand(f"there is no uplink {name}; there are {', '.join(self._wires) or 'none'}")
+                raise BadCommand(f"unknown uplink {name}; known uplinks: {', '.join(self._wires) or 'none'}")
             for field, value in _checked(command, "uplink", _UPLINK).items():
                 for uplink in wire.directions:
                     setattr(uplink, field, value)
         else:
-            raise BadCommand("a command names a station or an uplink")
+            raise BadCommand("a command must name a station or an uplink")
 
     def close(self) -> None:
         """Remove all devices."""
@@ -155,13 +159,13 @@ def _checked(command: Mapping[str, Any], subject: str, known: Mapping[str, Any])
     changes = {field: value for field, value in command.items() if field != subject}
     for field, value in changes.items():
         if field not in known:
-            raise BadCommand(f"{field} is not known of a {subject}; known are {', '.join(known)}")
+            raise BadCommand(f"unknown attribute {field} of a {subject}; known attributes: {', '.join(known)}")
         if not isinstance(value, known[field]) or (isinstance(value, bool) and known[field] is not bool):
-            raise BadCommand(f"{field} has a wrong type: {str(value)[:80]}")
+            raise BadCommand(f"{field} has the wrong type: {str(value)[:80]}")
         if known[field] == _NUMBER:
             changes[field] = _number(field, value)
     if min(changes.get("rate_bps", 1.0), changes.get("reach", 1.0)) <= 0.0 or changes.get("delay_s", 0.0) < 0.0:
-        raise BadCommand("rate_bps and reach are positive, and delay_s is not negative")
+        raise BadCommand("rate_bps and reach must be positive, and delay_s must not be negative")
     return changes
 
 
@@ -177,6 +181,6 @@ def _number(field: str, value: Any) -> float:
 
 def _position(value: list[Any]) -> tuple[float, float, float]:
     if len(value) != 3:
-        raise BadCommand("position takes three numbers: east, north and up in metres")
+        raise BadCommand("position must be three numbers: east, north and up in metres")
     east, north, up = (_number("position", each) for each in value)
     return east, north, up

@@ -1,4 +1,4 @@
-"""TAP devices in the nodes' network namespaces: the ends of the simulated radio."""
+"""TAP devices in the network namespaces of nodes, the endpoints of the simulated radio."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ FRAME_BYTES = 2048
 class Tap:
     """A network device whose frames this process reads and writes.
 
-    It is made in a namespace, and stays there and open wherever the process is; it goes with the process, unless it was
-    there before as a persistent one.
+    The device is created in a namespace and stays there. It is removed when the process exits, unless it is an existing
+    persistent device.
 
     Args:
-        namespace: of the node, /run/netns/NAME or /proc/PID/ns/net.
-        device: its name there.
-        address: its MAC address; None leaves it as it is.
-        mtu: of the device.
+        namespace: Namespace of the node, /run/netns/NAME or /proc/PID/ns/net.
+        device: Device name in the namespace.
+        address: MAC address; None to keep the default.
+        mtu: MTU of the device.
 
     Raises:
-        OSError: it cannot be made: no /dev/net/tun, no right, or the name is taken.
+        OSError: The device cannot be created: /dev/net/tun is missing, permission is denied, or the name is in use.
     """
 
     def __init__(self, namespace: Path, device: str, address: bytes | None, *, mtu: int = 1500) -> None:
         if len(device) > MAX_NAME:
-            raise ValueError(f"a device's name has at most {MAX_NAME} characters: {device}")
+            raise ValueError(f"device name {device!r} is longer than {MAX_NAME} characters")
         self.device = device
 
         def make() -> int:
@@ -57,14 +57,14 @@ class Tap:
             raise
 
     def fileno(self) -> int:
-        """For a selector."""
+        """File descriptor for a selector."""
         return self._number
 
     def read(self) -> bytes | None:
-        """A frame that the node sends; None when there is none.
+        """Return a frame sent by the node, or None if no frame is available.
 
         Raises:
-            OSError: the device is gone.
+            OSError: The device was removed.
         """
         try:
             return os.read(self._number, FRAME_BYTES)
@@ -72,7 +72,7 @@ class Tap:
             return None
 
     def write(self, frame: bytes) -> None:
-        """A frame for the node; lost while its device is down."""
+        """Deliver a frame to the node. The frame is lost while the device is down."""
         try:
             os.write(self._number, frame)
         except OSError:

@@ -1,4 +1,4 @@
-"""A mobile uplink: a rate and a delay each way, with a queue that drops at its end (thesis 8.9.3: 60 ms, 8 Mbit/s)."""
+"""Mobile uplink: rate and delay per direction, with a drop-tail queue (thesis 8.9.3: 60 ms, 8 Mbit/s)."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ QUEUE_BYTES = 128 * 1024
 
 @dataclass(slots=True)
 class Uplink:
-    """One direction of the uplink; a pure model that is told the time.
+    """One direction of an uplink, a pure model with time as input.
 
     Attributes:
-        rate_bps: bits a second.
-        delay_s: from the end of sending until arrival.
-        off: whether it carries nothing; what is under way is lost.
+        rate_bps: Bits per second.
+        delay_s: Delay from the end of transmission to arrival.
+        off: True if nothing is carried. Frames in transit are lost.
     """
 
     rate_bps: float = 8e6
@@ -28,7 +28,7 @@ class Uplink:
     _under_way: deque[tuple[float, bytes]] = field(default_factory=deque)
 
     def offer(self, frame: bytes, now_s: float) -> None:
-        """Send a frame; a full queue drops it."""
+        """Queue a frame. Drop it if the queue is full."""
         waiting_s = max(self._free_s - now_s, 0.0)
         if self.off or waiting_s * self.rate_bps / 8 > QUEUE_BYTES:
             self.dropped += 1
@@ -39,11 +39,11 @@ class Uplink:
 
     @property
     def next_s(self) -> float:
-        """When the next frame arrives; infinite while none is under way."""
+        """Time of the next arrival; infinite if no frame is in transit."""
         return self._under_way[0][0] if self._under_way else math.inf
 
     def advance(self, now_s: float) -> Iterator[bytes]:
-        """What has arrived by now."""
+        """Return the frames that have arrived by `now_s`."""
         while self._under_way and self._under_way[0][0] <= now_s:
             _, frame = self._under_way.popleft()
             if not self.off:

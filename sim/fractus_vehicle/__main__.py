@@ -1,4 +1,4 @@
-"""`fractus-vehicle`: runs simulated ArduCopters in real time (or faster) behind real links."""
+"""Command `fractus-vehicle`: run simulated ArduCopters over real links, in real time or faster."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MIN_SLEEP_S = 0.001
 
 
 class _Stop:
-    """Set by a signal."""
+    """Signal handler that records a stop request."""
 
     def __init__(self) -> None:
         self.wanted = False
@@ -40,9 +40,9 @@ class _Stop:
 def run(simulation: Simulation, hub: Hub, speedup: float, stop: _Stop, until_s: float | None = None) -> None:
     """Keep simulated time at `speedup` times real time (0: as fast as possible) until stopped.
 
-    Waking costs more than a step. The steps between two messages are not observable, so they are made up for together: the loop
-    sleeps until a message is due (`MAX_NAP` steps at most) or one arrives. That is heard at once, counts from the step it
-    arrived in, and is answered at the next one as ever.
+    Steps between two messages are not observable and waking costs more than a step. The loop therefore sleeps until a
+    message is due (at most `MAX_NAP` steps) or a message arrives, and then runs the missed steps together. A received
+    message takes effect in the step in which it arrived. The response is sent in the next step.
     """
     wall_0, time_0 = time.monotonic(), simulation.time_s
     woken, nap = False, 1
@@ -78,7 +78,7 @@ def _place(_context: click.Context, _option: click.Parameter, text: str) -> Plac
     except ValueError as error:
         raise click.BadParameter("expected LAT,LON,ALT_AMSL") from error
     if not (abs(lat) <= 90.0 and abs(lon) <= 180.0 and abs(alt) < 10_000.0):
-        raise click.BadParameter("latitude, longitude or altitude is out of range")
+        raise click.BadParameter("latitude, longitude or altitude out of range")
     return Place.from_degrees(lat, lon, alt)
 
 
@@ -99,7 +99,7 @@ def _wind(_context: click.Context, _option: click.Parameter, text: str | None) -
         raise click.BadParameter("expected SPEED,DIR[,TURBULENCE]")
     speed, direction, turbulence = [*numbers, 0.0, 0.0][:3]
     if not 0.0 <= speed < 60.0 or not 0.0 <= turbulence < 30.0:
-        raise click.BadParameter("wind speed must lie between 0 and 60 m/s")
+        raise click.BadParameter("wind speed must be in [0, 60) m/s and turbulence in [0, 30) m/s")
     return {"SIM_WIND_SPD": speed, "SIM_WIND_DIR": direction % 360.0, "SIM_WIND_TURB": turbulence}
 
 
@@ -120,8 +120,8 @@ def _parameters(_context: click.Context, _option: click.Parameter, texts: tuple[
     "links",
     multiple=True,
     metavar="LINK",
-    help="tcp:HOST:PORT, udpin:HOST:PORT, udpout:HOST:PORT, serial:DEVICE[:BAUD] or pty:PATH; repeat for more "
-    f"links.  [default: {DEFAULT_LISTEN}]",
+    help="MAVLink connection: tcp:HOST:PORT, udpin:HOST:PORT, udpout:HOST:PORT, serial:DEVICE[:BAUD] or pty:PATH; "
+    f"repeatable.  [default: {DEFAULT_LISTEN}]",
 )
 @click.option(
     "--home",
@@ -129,57 +129,69 @@ def _parameters(_context: click.Context, _option: click.Parameter, texts: tuple[
     default="-35.3632621,149.1652374,584.0",
     show_default=True,
     metavar="LAT,LON,ALT_AMSL",
-    help="Where the vehicle stands at the start.",
+    help="Start position.",
 )
-@click.option(
-    "--heading", "heading_deg", type=float, default=0.0, callback=_finite, help="Heading at the start, degrees."
-)
+@click.option("--heading", "heading_deg", type=float, default=0.0, callback=_finite, help="Start heading, degrees.")
 @click.option("--sysid", type=click.IntRange(1, MAX_SYSID), default=1, help="MAVLink system id.")
 @click.option(
     "--speedup",
     type=click.FloatRange(0.0),
     default=1.0,
     callback=_finite,
-    help="Times real time; 0: as fast as possible.",
+    help="Factor of simulated to real time; 0: as fast as possible.",
 )
-@click.option("--seed", type=int, default=1, help="Seed of all noise.")
-@click.option("--param", "parameters", multiple=True, callback=_parameters, metavar="NAME=VALUE", help="A parameter.")
-@click.option("--wind", callback=_wind, metavar="SPEED,DIR[,TURB]", help="Wind, m/s and degrees it comes from.")
+@click.option("--seed", type=int, default=1, help="Random seed of all noise.")
+@click.option(
+    "--param",
+    "parameters",
+    multiple=True,
+    callback=_parameters,
+    metavar="NAME=VALUE",
+    help="Set a parameter; repeatable.",
+)
+@click.option(
+    "--wind",
+    callback=_wind,
+    metavar="SPEED,DIR[,TURB]",
+    help="Wind: speed and turbulence in m/s, direction of origin in degrees.",
+)
 @click.option(
     "--ready-after",
     type=click.FloatRange(0.1),
     default=FULL_START_S,
     show_default=True,
     callback=_finite,
-    help="Seconds until ready to arm; less than the default runs through the whole start faster.",
+    help="Seconds until ready to arm. A shorter time speeds up the whole startup sequence.",
 )
-@click.option("--count", type=click.IntRange(1, 200), default=1, help="Number of vehicles; ports and ids count up.")
+@click.option(
+    "--count", type=click.IntRange(1, 200), default=1, help="Number of vehicles, with consecutive ports and system ids."
+)
 @click.option(
     "--spacing",
     type=click.FloatRange(-1000.0, 1000.0),
     default=10.0,
     callback=_finite,
-    help="Distance between vehicles, metres toward east.",
+    help="Distance between vehicles to the east, metres.",
 )
 @click.option(
     "--throttle",
     type=click.IntRange(900, 2100),
     default=1000,
     show_default=True,
-    help="Where the radio's throttle stick rests, microseconds; 1500 holds the height in LOITER.",
+    help="Throttle stick position of the RC transmitter, microseconds; 1500 holds the altitude in LOITER.",
 )
-@click.option("--store", type=click.Path(path_type=Path), help="File that keeps changed parameters.")
+@click.option("--store", type=click.Path(path_type=Path), help="File for changed parameters, read at startup.")
 @click.option(
     "--tlog",
     type=click.Path(path_type=Path),
-    help="Record a tlog of both directions (with --count, one a vehicle: NAME-SYSID).",
+    help="Record a tlog of both directions (with --count, one per vehicle: NAME-SYSID).",
 )
 @click.option(
     "--lockstep",
     metavar="HOST:PORT",
-    help="Advance only as a driver connected here asks: it writes a number of 10 ms steps a line, and reads the total.",
+    help="Let a TCP client drive time: it sends a number of 10 ms steps per line and receives the total number of steps.",
 )
-@click.option("--duration", type=float, callback=_finite, help="End after this many simulated seconds.")
+@click.option("--duration", type=float, callback=_finite, help="Exit after this many simulated seconds.")
 def vehicle(
     *,
     links: tuple[str, ...],
@@ -201,7 +213,7 @@ def vehicle(
 ) -> None:
     """Simulate ArduCopter-compatible vehicles that speak MAVLink 2."""
     if sysid + count - 1 > MAX_SYSID:
-        raise click.ClickException(f"--sysid {sysid} with --count {count}: system ids end at {MAX_SYSID}")
+        raise click.ClickException(f"--sysid {sysid} with --count {count}: system ids must not exceed {MAX_SYSID}")
     stop = _Stop()
     signal.signal(signal.SIGTERM, stop)
     signal.signal(signal.SIGINT, stop)

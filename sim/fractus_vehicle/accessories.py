@@ -1,4 +1,4 @@
-"""What hangs on the autopilot besides the motors: a gimbal, servos, relays, switches of a radio, and the test of a motor."""
+"""Devices besides the motors: gimbal, servos, relays, RC switches and the motor test."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from fractus_vehicle.state import VehicleState
 
 RELAYS, SERVOS = 6, 32
 RELAY_FUNCTION = 1
-# SERVOn_FUNCTION: free for commands; others belong to motors and such.
+# SERVOn_FUNCTION values of outputs that commands may set. Other values assign the output to a motor or another device.
 FREE_FUNCTIONS = frozenset({0, 1})
 MAX_MOTOR_TEST_S = 600.0
-# RCn_OPTION: switches that choose a mode when they are up.
+# RCn_OPTION values of switches that select a flight mode in the high position.
 SWITCHED_MODES = {
     4: mavlink.COPTER_MODE_RTL,
     16: mavlink.COPTER_MODE_AUTO,
@@ -31,7 +31,8 @@ SWITCHED_MODES = {
 }
 SWITCH_LOW, SWITCH_HIGH = 0, 2
 FENCE_SWITCH = 11
-# Refused without a camera, a mount, a gripper, a winch, a radio or a calibration under way.
+# Commands that fail because the simulated vehicle has no camera, mount, gripper, winch, receiver pairing or running
+# calibration.
 ABSENT = (
     mavlink.MAV_CMD_DO_GRIPPER,
     mavlink.MAV_CMD_DO_MOUNT_CONFIGURE,
@@ -49,7 +50,7 @@ ABSENT = (
     mavlink.MAV_CMD_ACCELCAL_VEHICLE_POS,
     mavlink.MAV_CMD_START_RX_PAIR,
 )
-# Accepted without an effect here.
+# Commands that are accepted and have no effect.
 TAKEN = (
     mavlink.MAV_CMD_DO_DIGICAM_CONFIGURE,
     mavlink.MAV_CMD_DO_DIGICAM_CONTROL,
@@ -61,7 +62,7 @@ TAKEN = (
 
 
 def point_gimbal(v: VehicleState, pitch_deg: float, yaw_deg: float, flags: int) -> int:
-    """DO_GIMBAL_MANAGER_PITCHYAW with angles; rates and the yaw that is locked to north are not simulated."""
+    """Handle DO_GIMBAL_MANAGER_PITCHYAW with angles. Rates and a yaw locked to north are not simulated."""
     if not v.gimbal.kind or flags & mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK:
         return mavlink.MAV_RESULT_FAILED
     if not (math.isfinite(pitch_deg) and math.isfinite(yaw_deg)):
@@ -71,7 +72,7 @@ def point_gimbal(v: VehicleState, pitch_deg: float, yaw_deg: float, flags: int) 
 
 
 def set_servo(v: VehicleState, channel: float, pwm_us: float) -> int:
-    """DO_SET_SERVO and DO_REPEAT_SERVO: one of the outputs that no motor has."""
+    """Handle DO_SET_SERVO and DO_REPEAT_SERVO for an output that is not assigned to a motor."""
     if not (math.isfinite(channel) and math.isfinite(pwm_us)) or not 1 <= int(channel) <= SERVOS:
         return mavlink.MAV_RESULT_FAILED
     number = int(channel)
@@ -83,7 +84,7 @@ def set_servo(v: VehicleState, channel: float, pwm_us: float) -> int:
 
 
 def set_relay(v: VehicleState, number: float) -> int:
-    """DO_SET_RELAY and DO_REPEAT_RELAY: relays that RELAYn_FUNCTION enables."""
+    """Handle DO_SET_RELAY and DO_REPEAT_RELAY for a relay enabled by RELAYn_FUNCTION."""
     if not math.isfinite(number) or not 0 <= int(number) < RELAYS:
         return mavlink.MAV_RESULT_FAILED
     enabled = int(v.params[f"RELAY{int(number) + 1}_FUNCTION"]) == RELAY_FUNCTION
@@ -91,7 +92,7 @@ def set_relay(v: VehicleState, number: float) -> int:
 
 
 def reset_battery(v: VehicleState, batteries: float, percent: float) -> int:
-    """BATTERY_RESET: sets the share of charge that is left, in percent, of the batteries in the mask."""
+    """Handle BATTERY_RESET: set the remaining charge, in percent, of the batteries in the mask."""
     if not (math.isfinite(batteries) and math.isfinite(percent)):
         return mavlink.MAV_RESULT_FAILED
     if int(batteries) & 1:
@@ -100,7 +101,10 @@ def reset_battery(v: VehicleState, batteries: float, percent: float) -> int:
 
 
 def start_motor_test(v: VehicleState, motor: float, duration_s: float) -> int:
-    """DO_MOTOR_TEST: on the ground, one motor for a time; the vehicle counts as armed meanwhile, whatever its checks say."""
+    """Handle DO_MOTOR_TEST: run one motor for `duration_s` seconds on the ground.
+
+    The vehicle reports armed during the test, independent of the arming checks.
+    """
     if not v.landed:
         v.say(mavlink.MAV_SEVERITY_CRITICAL, "Motor Test: vehicle not landed")
         return mavlink.MAV_RESULT_FAILED
@@ -114,7 +118,7 @@ def start_motor_test(v: VehicleState, motor: float, duration_s: float) -> int:
 
 
 def end_motor_test(v: VehicleState) -> None:
-    """Stop the motor when its time is over."""
+    """Stop the motor test after its duration."""
     if v.motor_test_until_s is not None and v.time_s >= v.motor_test_until_s:
         v.motor_test_until_s = None
         v.say(mavlink.MAV_SEVERITY_INFO, "finished motor test")

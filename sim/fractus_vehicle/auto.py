@@ -1,4 +1,4 @@
-"""AUTO: flying the stored mission."""
+"""AUTO mode: fly the stored mission."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from fractus_vehicle.rtl import ReturnToLaunch
 from fractus_vehicle.spline import SplineLeg
 from fractus_vehicle.state import CONTROL_STEP_S, VehicleState
 
-# Legs that need not stop at their end.
+# Waypoint commands that can be passed without a stop.
 CURVES = frozenset({mavlink.MAV_CMD_NAV_WAYPOINT, mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT})
 
 
 class AutoFlight(Flight):
-    """AUTO mode: runs NAV commands one after the other, DO commands at once when reached."""
+    """AUTO mode: run NAV commands in order, and DO commands as soon as they are reached."""
 
     def __init__(self, set_mode: Callable[[int], bool]) -> None:
         self._set_mode = set_mode
@@ -35,7 +35,7 @@ class AutoFlight(Flight):
         self._returning: ReturnToLaunch | None = None
         self.paused = False
         self._leg: Leg | SplineLeg | None = None
-        self._track: Point = (0.0, 0.0, 0.0)  # the direction in which the present leg arrives, if it does not stop
+        self._track: Point = (0.0, 0.0, 0.0)  # direction of arrival of the current leg; zero if the leg stops
         self._commands = MissionCommands()
         self._circle_centre: tuple[float, float] | None = None
         self._turned = 0.0
@@ -43,16 +43,16 @@ class AutoFlight(Flight):
 
     @property
     def landing(self) -> bool:
-        """Whether the mission's own landing or return is in its last descent."""
+        """True if the landing or return of the mission is in its final descent."""
         return self._landing or (self._returning is not None and self._returning.landing)
 
     def begin(self, v: VehicleState) -> None:
-        """Hold; the mission starts with the first step, which needs running motors."""
+        """Hold position. The mission starts in the first step with running motors."""
         v.control.hold_here()
         v.heading.follow_course()
 
     def _start(self, v: VehicleState) -> None:
-        """Continue at the current item, or start over."""
+        """Continue at the current item, or restart the mission."""
         self._started = True
         mission = v.mission
         if mission.complete or int(v.params["MIS_RESTART"]) == 1 or mission.current == 0:
@@ -62,13 +62,16 @@ class AutoFlight(Flight):
             self._start_from(v, mission.current)
 
     def wait(self, v: VehicleState) -> None:
-        """Motors off: the mission only names the item that it would begin with."""
+        """Announce the item that the mission will start with, while the motors are off."""
         if not self._announced and v.origin is not None:
             self._announced = True
             self._announce(v)
 
     def start_by_command(self, v: VehicleState) -> None:
-        """MISSION_START: a mission that does not run yet is named here, and again when its first step begins it."""
+        """Handle MISSION_START: announce the first item if the mission is not running yet.
+
+        The first step announces the item again when it starts the mission.
+        """
         if not self._started and not self._announced:
             self._announce(v)
 
@@ -79,7 +82,7 @@ class AutoFlight(Flight):
             v.say(mavlink.MAV_SEVERITY_INFO, f"Mission: {index} {title(v.mission.items[index])}")
 
     def pause(self, v: VehicleState, *, paused: bool) -> None:
-        """DO_PAUSE_CONTINUE: stop where it is; continuing repeats the current item."""
+        """Handle DO_PAUSE_CONTINUE: hold the current position, or restart the current item."""
         if paused and not self.paused:
             v.control.hold_here()
         elif not paused and self.paused and self._item is not None:
@@ -87,7 +90,7 @@ class AutoFlight(Flight):
         self.paused = paused
 
     def jump_to(self, v: VehicleState, index: int) -> None:
-        """Continue at an item (DO_SET_MISSION_CURRENT)."""
+        """Continue at item `index` (DO_SET_MISSION_CURRENT)."""
         self._started = True
         self._returning = None
         self._landing = False
@@ -95,7 +98,7 @@ class AutoFlight(Flight):
         self._start_from(v, index)
 
     def _start_from(self, v: VehicleState, index: int | None) -> None:
-        """Begin the next NAV command; the DO and CONDITION commands before it run while it is flown."""
+        """Begin the next NAV command. Run the DO and CONDITION commands before it during its flight."""
         waiting: list[int] = []
         for _ in range(len(v.mission.items) + 1):
             if index is None or index >= len(v.mission.items):
@@ -161,7 +164,7 @@ class AutoFlight(Flight):
                 self._leg = Leg(v, north, east, down)
 
     def _following(self, v: VehicleState, item: Item) -> Item | None:
-        """The waypoint after this one, where it is a curve or begins one; a stay in between ends that."""
+        """Return the next waypoint if it follows without a stop and is a CURVES command, otherwise None."""
         at = v.mission.peek_after(self._index)
         if item.command not in CURVES or item.param1 > 0.0 or at is None:
             return None
@@ -169,7 +172,11 @@ class AutoFlight(Flight):
         return following if following.command in CURVES else None
 
     def _arrival(self, v: VehicleState, item: Item, start: Point, end: Point) -> Point:
-        """In which direction a curve ends: along a straight leg that follows, or past its end towards the next one."""
+        """Return the direction in which a spline leg ends.
+
+        The direction follows the next leg if that is straight, or passes the end point towards the next spline
+        waypoint.
+        """
         following = self._following(v, item)
         if following is None:
             return (0.0, 0.0, 0.0)
@@ -178,7 +185,7 @@ class AutoFlight(Flight):
         return (north - base[0], east - base[1], down - base[2])
 
     def step(self, v: VehicleState) -> None:
-        """Fly the current item and go on when it is done."""
+        """Fly the current item, and begin the next item when it is complete."""
         if not self._started:
             self._start(v)
         item = self._item
@@ -212,7 +219,7 @@ class AutoFlight(Flight):
             self._finish_if_down(v)
 
     def _finish_if_down(self, v: VehicleState) -> None:
-        """A landing or return ends with the motors off; then the next item, if any, waits for the next start."""
+        """Complete the item when a landing or return has stopped the motors. The next item waits for the next start."""
         if v.armed:
             return
         self._item = None

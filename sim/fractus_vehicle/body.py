@@ -11,8 +11,8 @@ import random
 from dataclasses import dataclass
 
 GRAVITY = 9.80665
-# Hitting the ground while leaning, or while falling and turning fast, breaks propellers; a fall upright and without a turn
-# does not: the ground is as forgiving as SITL's.
+# The propellers break if the vehicle hits the ground while leaning, or while falling and rotating fast. An upright fall
+# without rotation does no damage, as in SITL.
 CRASH_IMPACT_MPS = 4.0
 CRASH_TURN_RPS = 1.0
 CRASH_LEAN_COSINE = 0.5
@@ -24,7 +24,7 @@ class Airframe:
     """Constants of the quadcopter (an X frame, near ArduPilot's simulated one)."""
 
     mass_kg: float = 1.8
-    arm_m: float = 0.17  # lever of a motor about the roll and pitch axes
+    arm_m: float = 0.17  # lever arm of a motor about the roll and pitch axes
     inertia_xy: float = 0.022
     inertia_z: float = 0.04
     yaw_lever_m: float = 0.06  # reaction torque per newton of thrust
@@ -52,7 +52,7 @@ class Wind:
     gust_d: float = 0.0
 
     def step(self, dt: float, rng: random.Random, height_m: float) -> tuple[float, float, float]:
-        """The air's velocity (NED) at a height; it fades out in the last metres above ground."""
+        """Return the velocity of the air (NED, m/s) at a height. Wind fades out in the last metres above the ground."""
         if self.turbulence_mps > 0.0:
             keep = math.exp(-dt / self.correlation_s)
             kick = self.turbulence_mps * math.sqrt(1.0 - keep * keep)
@@ -71,7 +71,7 @@ class Wind:
 
 
 def euler_of(quaternion: tuple[float, float, float, float]) -> tuple[float, float, float]:
-    """Roll, pitch, yaw in radians of an attitude."""
+    """Convert an attitude quaternion to roll, pitch and yaw in radians."""
     w, x, y, z = quaternion
     sine = 2.0 * (w * y - z * x)
     return (
@@ -82,7 +82,7 @@ def euler_of(quaternion: tuple[float, float, float, float]) -> tuple[float, floa
 
 
 class Body:
-    """Position, velocity, attitude, rates and motor thrusts, and how they evolve."""
+    """Rigid-body state: position, velocity, attitude, body rates and motor thrusts."""
 
     __slots__ = (
         "_ixy",
@@ -129,7 +129,13 @@ class Body:
         return euler_of(self.quaternion)
 
     def step(self, dt: float, commands: tuple[float, float, float, float], air: tuple[float, float, float]) -> None:
-        """Advance by `dt` seconds with motor thrust `commands` (newtons) in air that moves with velocity `air`."""
+        """Advance by `dt` seconds.
+
+        Args:
+            dt: Time step in seconds.
+            commands: Thrust demand of each motor in newtons.
+            air: Velocity of the air (NED, m/s).
+        """
         frame = self.airframe
         if self.crashed:
             commands = (0.0, 0.0, 0.0, 0.0)
@@ -189,7 +195,7 @@ class Body:
             self.on_ground = True
 
     def _topple(self) -> None:
-        """Come to rest on the side."""
+        """Roll the crashed vehicle onto its side."""
         half = CRASHED_ROLL_RAD / 2.0
         w, x, y, z = self.quaternion
         c, s = math.cos(half), math.sin(half)

@@ -1,8 +1,8 @@
-"""The path that the vehicle has flown since it was armed, kept short enough to be flown back: SmartRTL's memory.
+"""Recorded flight path of SmartRTL, from arming to the current position, simplified for the flight back.
 
-The method is ArduPilot's (AP_SmartRTL), written again: a point is dropped each SRTL_ACCURACY metres; points that lie
-within half of that of the line between their neighbours are removed (Ramer-Douglas-Peucker), and a loop is cut where
-two stretches of the path come closer than SRTL_ACCURACY. What does not fit into SRTL_POINTS ends it for the flight.
+Reimplements the method of ArduPilot (AP_SmartRTL). A point is recorded every SRTL_ACCURACY metres. Points within half
+that distance of the line between their neighbours are removed (Ramer-Douglas-Peucker). A loop is cut where two segments
+of the path come closer than SRTL_ACCURACY. Recording stops for the rest of the flight when SRTL_POINTS is exceeded.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ TIMEOUT_S = 15.0
 TIDY_AFTER = 50  # new points
 LOW_SPACE = 10  # free points
 LOW_SPACE_SAID_EVERY_S = 10.0
-PRUNE_SHARE = 0.99  # of the accuracy: closer stretches than this have nothing between them
-COMPARISONS_PER_TICK = 400  # bounds what tidying costs at one control step
+PRUNE_SHARE = 0.99  # of the accuracy: segments closer than this are joined
+COMPARISONS_PER_TICK = 400  # bounds the cost of path cleanup in one control step
 
 Point = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
 class Loop:
-    """A stretch that may be replaced by one point: path[start] becomes `joint`, what follows up to `end` goes."""
+    """A loop that one point can replace: `joint` replaces path[start] to path[end]."""
 
     start: int
     end: int
@@ -37,16 +37,16 @@ class Loop:
 
 
 class Breadcrumbs:
-    """The recorded path in local metres, home first."""
+    """Recorded path in local metres (north, east, down), starting at home."""
 
     def __init__(self, params: Mapping[str, float], say: Callable[[int, str], None]) -> None:
         self._params = params
         self._say = say
         self.active = False
         self.path: list[Point] = []
-        self._limit = min(max(int(params["SRTL_POINTS"]), 0), POINTS_MAX)  # as ArduPilot: read once, at the start
+        self._limit = min(max(int(params["SRTL_POINTS"]), 0), POINTS_MAX)  # read once at startup, like ArduPilot
         self._accuracy_m = 2.0
-        self._simplified = 0  # points that need no second look
+        self._simplified = 0  # leading points that are already simplified
         self._pruned = 0
         self._work: Iterator[None] | None = None
         self._next_s = 0.0
@@ -54,7 +54,7 @@ class Breadcrumbs:
         self._low_said_s = -math.inf
 
     def restart(self, now_s: float, here: Point | None) -> None:
-        """Forget the path and begin at the present position, if it is known (at the start, and when armed)."""
+        """Clear the path and start at the current position, if it is known (at startup and on arming)."""
         self._accuracy_m = self._params["SRTL_ACCURACY"]
         self.path.clear()
         self._simplified = self._pruned = 0
@@ -69,13 +69,13 @@ class Breadcrumbs:
             self.path.append(here)
 
     def step(self, now_s: float, here: Point | None, mode: int, *, armed: bool) -> None:
-        """Record, three times a second while armed, and tidy up; SMART_RTL itself leaves no crumbs.
+        """Record the position three times a second while armed, and simplify the path. SMART_RTL records nothing.
 
         Args:
-            now_s: The vehicle's time.
-            here: The position (north, east, down); None while it is unknown.
-            mode: The flight mode.
-            armed: Whether the motors run.
+            now_s: Vehicle time.
+            here: Position (north, east, down); None if unknown.
+            mode: Flight mode.
+            armed: True while the motors run.
         """
         if now_s >= self._next_s:
             self._next_s = now_s + UPDATE_INTERVAL_S
@@ -111,7 +111,7 @@ class Breadcrumbs:
         self._say(mavlink.MAV_SEVERITY_WARNING, f"SmartRTL deactivated: {reason}")
 
     def add(self, point: Point) -> bool:
-        """Append a point unless it is too near to the last one; False when there is no room."""
+        """Append a point unless it is too close to the last one. Return False if the path is full."""
         if self.path and math.dist(self.path[-1], point) < self._accuracy_m:
             return True
         if len(self.path) >= self._limit:
@@ -120,16 +120,16 @@ class Breadcrumbs:
         return True
 
     def pop(self) -> Point:
-        """Take the newest point, to fly there."""
+        """Remove and return the newest point, the next target of the flight back."""
         point = self.path.pop()
         self._simplified = min(self._simplified, len(self.path))
         self._pruned = min(self._pruned, len(self.path))
         return point
 
-    # -- tidying -----------------------------------------------------------------------------------------------
+    # -- simplification ----------------------------------------------------------------------------------------
 
     def thorough(self) -> Iterator[None]:
-        """Remove everything that can go; each turn is a bounded amount of work."""
+        """Simplify the whole path. Each iteration does a bounded amount of work."""
         self._work = None
         self.simplify()
         return self._prune(POINTS_MAX)
@@ -144,7 +144,7 @@ class Breadcrumbs:
         return None
 
     def simplify(self) -> None:
-        """Remove the new points that lie near the line between others."""
+        """Remove new points that lie close to the line between their neighbours."""
         keep = set(range(len(self.path)))
         stack = [(max(self._simplified - 1, 0), len(self.path) - 1)]
         while stack:
@@ -163,7 +163,7 @@ class Breadcrumbs:
         self._pruned = min(self._pruned, len(self.path))
 
     def _prune(self, enough: int) -> Iterator[None]:
-        """Find loops that end in new points, and cut them, newest first, until `enough` points are gone."""
+        """Cut loops that end in new points, newest first, until `enough` points are removed."""
         loops: list[Loop] = []
         count, done = 0, len(self.path)
         for last in range(done - 1, max(self._pruned, 3) - 1, -1):
@@ -191,7 +191,7 @@ class Breadcrumbs:
 
 
 def _with_loop(loops: list[Loop], new: Loop) -> list[Loop]:
-    """The loops with a new one: of loops that overlap, the longer remains."""
+    """Add a loop to the list. If loops overlap, keep the longer one."""
     if new.end <= new.start:
         return loops
     rivals = [loop for loop in loops if loop.start <= new.end and new.start <= loop.end]
@@ -201,7 +201,7 @@ def _with_loop(loops: list[Loop], new: Loop) -> list[Loop]:
 
 
 def distance_to_segment(point: Point, start: Point, end: Point) -> float:
-    """Distance of a point from a segment in space."""
+    """Return the distance of a point from a line segment in space, in metres."""
     dx, dy, dz = end[0] - start[0], end[1] - start[1], end[2] - start[2]
     px, py, pz = point[0] - start[0], point[1] - start[1], point[2] - start[2]
     length2 = dx * dx + dy * dy + dz * dz
@@ -210,9 +210,9 @@ def distance_to_segment(point: Point, start: Point, end: Point) -> float:
 
 
 def segment_gap(a: Point, b: Point, c: Point, d: Point) -> tuple[float, Point]:
-    """The distance between the segments a-b and c-d, and the point half way between where they are closest.
+    """Return the distance between segments a-b and c-d, and the midpoint of their closest points.
 
-    The closest points of two segments in space, after Ericson, "Real-Time Collision Detection", 5.1.9.
+    Algorithm: Ericson, "Real-Time Collision Detection", section 5.1.9.
     """
     ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     vx, vy, vz = d[0] - c[0], d[1] - c[1], d[2] - c[2]

@@ -1,4 +1,4 @@
-"""One link's share of the conversation: framing, its own streams and intervals, and a bounded outbox."""
+"""Vehicle end of one link: framing, message streams and a bounded send queue."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 from fractus_runtime.mavlink_codec import Endpoint, Message, Value
 
-# A client that does not read costs at most this much memory; what does not fit is dropped, as on a radio.
+# Limit of memory used by a client that does not read. Further frames are dropped, as on a radio link.
 OUTBOX_LIMIT = 256 * 1024
 PARAMETERS_PER_TICK = 23
-# Sums of intervals round differently from multiples of the step.
+# Tolerance for rounding: sums of intervals differ slightly from multiples of the step.
 TIME_SLACK_S = 1e-6
 AT_ONCE = -1e9
 
@@ -37,10 +37,10 @@ class Channel(Endpoint):
         discard: bool = False,
         port: int | None = None,
     ) -> None:
-        # A simulated quantity may run out of its field; a real autopilot's driver saturates as well.
+        # Simulated quantities may exceed the range of their field. The drivers of a real autopilot saturate, too.
         super().__init__(sysid, compid, saturate=True)
         self.name = name
-        self.port = port  # the autopilot's own number of this link, which selects its SRn_ parameters
+        self.port = port  # ArduPilot serial port number, selects the SRn_ parameters
         self.streams: dict[str, Stream] = {}
         self.next_due_s = 0.0
         self.peers: set[tuple[int, int]] = set()
@@ -53,7 +53,7 @@ class Channel(Endpoint):
         self._discard = discard
 
     def receive(self, data: bytes) -> list[Message]:
-        """Bytes from the wire to messages; remembers who speaks here."""
+        """Decode received bytes into messages and register their senders as peers."""
         messages = self.decode(data)
         for message in messages:
             if message.sysid and len(self.peers) < 64:
@@ -61,7 +61,7 @@ class Channel(Endpoint):
         return messages
 
     def send(self, name: str, values: Mapping[str, Value]) -> None:
-        """Queue a message of our own."""
+        """Encode and queue a message of this vehicle."""
         frame = self.encode(name, values)
         if self._tap is not None:
             self._tap(frame)
@@ -69,7 +69,7 @@ class Channel(Endpoint):
             self.forward(frame)
 
     def forward(self, frame: bytes) -> None:
-        """Queue a frame as it is."""
+        """Queue an encoded frame."""
         if self._waiting + len(frame) > OUTBOX_LIMIT:
             self.dropped += 1
             return
@@ -78,29 +78,29 @@ class Channel(Endpoint):
 
     @property
     def waiting(self) -> int:
-        """Bytes that wait to be sent."""
+        """Size of the queued frames in bytes."""
         return self._waiting
 
     @property
     def frames(self) -> deque[bytes]:
-        """Frames that wait to be sent, for datagram links."""
+        """Queued frames, for datagram links."""
         return self._outbox
 
     def take_frame(self) -> bytes:
-        """Take the oldest waiting frame."""
+        """Remove and return the oldest queued frame."""
         frame = self._outbox.popleft()
         self._waiting -= len(frame)
         return frame
 
     def take(self) -> bytes:
-        """Take everything that waits to be sent."""
+        """Remove and return all queued bytes."""
         data = b"".join(self._outbox)
         self._outbox.clear()
         self._waiting = 0
         return data
 
     def set_interval(self, name: str, interval_s: float | None) -> None:
-        """Send a message at an interval from now on, or no more (None)."""
+        """Send a message at an interval, or stop sending it (None)."""
         if interval_s is None:
             self.streams.pop(name, None)
         else:
@@ -108,21 +108,24 @@ class Channel(Endpoint):
             self.next_due_s = AT_ONCE
 
     def set_default(self, name: str, interval_s: float | None) -> None:
-        """Send a message at an interval, now and whenever its default rate is asked for."""
+        """Set the default interval of a message and apply it."""
         self._defaults[name] = interval_s
         self.set_interval(name, interval_s)
 
     def reset_interval(self, name: str) -> None:
-        """Go back to the default rate of a message."""
+        """Restore the default interval of a message."""
         self.set_interval(name, self._defaults.get(name))
 
     @property
     def speaks_s(self) -> float:
-        """When a stream is due or a parameter is sent next, in the vehicle's time."""
+        """Vehicle time at which the next stream message or parameter is due."""
         return AT_ONCE if self.parameters else self.next_due_s
 
     def due(self, now_s: float) -> list[str]:
-        """Names of the messages to send now; keeps long-term rates exact and never bursts to catch up."""
+        """Return the names of the messages due now.
+
+        Long-term rates are exact; missed messages are not sent in a burst.
+        """
         if now_s + TIME_SLACK_S < self.next_due_s:
             return []
         names: list[str] = []

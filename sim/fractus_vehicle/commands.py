@@ -1,4 +1,4 @@
-"""Answers to COMMAND_LONG and COMMAND_INT: what is allowed when, and the result that goes back."""
+"""Handlers of COMMAND_LONG and COMMAND_INT: check preconditions, execute, and acknowledge with a MAV_RESULT."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def _takeoff(vehicle: Vehicle, o: Order, _c: Channel) -> int:
     v = vehicle.state
     if o.frame != mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT:
         return mavlink.MAV_RESULT_DENIED
-    # ALT_HOLD takes off where the client does not ask to keep the position.
+    # ALT_HOLD can take off if the client does not require a horizontal position.
     takes_off = v.mode in TAKES_OFF or (v.mode == mavlink.COPTER_MODE_ALT_HOLD and o.params[2] != 0.0)
     if not v.armed or not v.landed or not takes_off or not v.altitude_m < o.z < ALTITUDE_MAX_M:
         return mavlink.MAV_RESULT_FAILED
@@ -93,7 +93,7 @@ def _mode_command(mode: int) -> Callable[[Vehicle, Order, Channel], int]:
 
 
 def set_mode_number(vehicle: Vehicle, base_mode: int, custom_mode: int) -> int:
-    """DO_SET_MODE and SET_MODE: only custom modes, as ArduPilot."""
+    """Handle DO_SET_MODE and SET_MODE. Only custom modes are accepted, as in ArduPilot."""
     v = vehicle.state
     if not base_mode & mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
         return mavlink.MAV_RESULT_DENIED
@@ -111,13 +111,13 @@ def _set_mode(vehicle: Vehicle, o: Order, _c: Channel) -> int:
 
 def _change_speed(vehicle: Vehicle, o: Order, _c: Channel) -> int:
     v = vehicle.state
-    kind = 3 if o.params[0] > 2.9 else 2 if o.params[0] > 1.9 else 0  # as the autopilot compares it
+    kind = 3 if o.params[0] > 2.9 else 2 if o.params[0] > 1.9 else 0  # thresholds of ArduPilot's comparison
     takes = v.mode in CHANGES_SPEED and v.control.limits.change_speed(kind, o.params[1])
     return mavlink.MAV_RESULT_ACCEPTED if takes else mavlink.MAV_RESULT_FAILED
 
 
 def _readable_place(v: VehicleState, o: Order) -> bool:
-    """Whether a command's altitude and frame say where it means; a frame that is none is complained about."""
+    """Return True if the altitude and frame define a position. Report an unknown frame in a STATUSTEXT."""
     if not abs(o.z) < ALTITUDE_MAX_M:
         return False
     if o.frame not in GLOBAL_FRAMES:
@@ -134,7 +134,8 @@ def _reposition(vehicle: Vehicle, o: Order, _c: Channel) -> int:
         return mavlink.MAV_RESULT_DENIED
     if not valid_coordinates(o.x, o.y) or not _readable_place(v, o):
         return mavlink.MAV_RESULT_DENIED
-    # No place, or no height above home or ground, would mean the present one, which is not taken here.
+    # Missing coordinates, or a missing height above home or ground, would mean the current position. ArduPilot denies
+    # that.
     if not o.has_place or (o.frame not in ABSOLUTE_FRAMES and abs(o.z) < CENTIMETRE):
         return mavlink.MAV_RESULT_DENIED
     north, east, down = item_target(v, o.item)
@@ -143,15 +144,15 @@ def _reposition(vehicle: Vehicle, o: Order, _c: Channel) -> int:
     if v.mode not in GUIDED_MODES and not vehicle.modes.change(mavlink.COPTER_MODE_GUIDED):
         return mavlink.MAV_RESULT_FAILED
     flight = vehicle.modes.flight
-    # On the ground it is noted, and a takeoff sets another target.
+    # On the ground the target has no effect, because a takeoff sets another one.
     if isinstance(flight, GuidedFlight) and not v.landed:
         flight.go_to(v, north, east, down)
-        v.heading.follow_course()  # its own heading is not looked at
+        v.heading.follow_course()  # the yaw parameter of the command is ignored
     return mavlink.MAV_RESULT_ACCEPTED
 
 
 def _yaw(vehicle: Vehicle, o: Order, _c: Channel) -> int:
-    """Taken in every mode; those that fly by themselves turn."""
+    """Handle CONDITION_YAW. Accepted in every mode, effective in automatic modes only."""
     v = vehicle.state
     angle, rate, direction, relative = o.params
     if relative not in (0.0, 1.0) or not 0.0 <= angle <= 360.0:
@@ -221,7 +222,11 @@ def _prearm(vehicle: Vehicle, _o: Order, _c: Channel) -> int:
 
 
 def _calibrate(vehicle: Vehicle, o: Order, _c: Channel) -> int:
-    """Takes what needs no pilot's hands, and has no effect on sensors that do not drift: gyroscopes, barometer, level."""
+    """Handle PREFLIGHT_CALIBRATION.
+
+    Accepts calibrations that need no handling by a pilot: gyroscopes, barometer, level. They have no effect because
+    simulated sensors do not drift.
+    """
     v = vehicle.state
     if v.armed or v.motor_test_until_s is not None:
         v.say(mavlink.MAV_SEVERITY_NOTICE, "Disarm to allow calibration")
@@ -249,7 +254,7 @@ def _storage(vehicle: Vehicle, o: Order, _c: Channel) -> int:
 
 
 def _switch(vehicle: Vehicle, o: Order, _c: Channel) -> int:
-    """DO_AUX_FUNCTION: what a switch of a radio would do; of the functions only modes and the fence have an effect."""
+    """Handle DO_AUX_FUNCTION: act like an RC switch. Only mode and fence functions have an effect."""
     function, position = o.params[:2]
     if not (math.isfinite(function) and math.isfinite(position)) or not SWITCH_LOW <= int(position) <= SWITCH_HIGH:
         return mavlink.MAV_RESULT_DENIED
@@ -260,13 +265,13 @@ def _switch(vehicle: Vehicle, o: Order, _c: Channel) -> int:
     return mavlink.MAV_RESULT_ACCEPTED
 
 
-# The modes that fly with speeds a client may change, and those that turn the nose by themselves.
+# Modes whose speed a client may change, and modes that control the heading.
 CHANGES_SPEED = GUIDED_MODES | {mavlink.COPTER_MODE_AUTO, mavlink.COPTER_MODE_RTL, mavlink.COPTER_MODE_SMART_RTL}
 TURNS = frozenset({mavlink.COPTER_MODE_GUIDED, mavlink.COPTER_MODE_AUTO, mavlink.COPTER_MODE_SMART_RTL})
 CENTIMETRE = 0.01
-# What a takeoff in a pilot's mode climbs at most.
+# Maximum climb of a takeoff in a pilot mode.
 PILOT_TAKEOFF_MAX_M = 10.0
-# PREFLIGHT_CALIBRATION, fifth parameter (the last one also the second).
+# Values of the fifth parameter of PREFLIGHT_CALIBRATION (the last one also of the second).
 LEVEL, SIMPLE_ACCELEROMETER, FORCE_SAVE = 2, 4, 76
 
 HANDLERS: dict[int, Callable[[Vehicle, Order, Channel], int]] = {
@@ -299,12 +304,12 @@ HANDLERS: dict[int, Callable[[Vehicle, Order, Channel], int]] = {
     mavlink.MAV_CMD_NAV_VTOL_LAND: _mode_command(mavlink.COPTER_MODE_LAND),
     mavlink.MAV_CMD_DO_AUX_FUNCTION: _switch,
 }
-# Commands that ArduPilot takes only with integer coordinates.
+# Commands that ArduPilot accepts in COMMAND_INT only.
 INT_ONLY = frozenset({mavlink.MAV_CMD_DO_REPOSITION})
 
 
 def handle_command(vehicle: Vehicle, message: Message, channel: Channel) -> None:
-    """Carry out a command and acknowledge it."""
+    """Execute a command and send COMMAND_ACK."""
     order = read_order(message)
     handler, answer = HANDLERS.get(order.command), ANSWERS.get(order.command)
     if answer is not None:

@@ -1,6 +1,6 @@
-"""The cascade from a target to motor thrusts: shaped trajectory, position, velocity, attitude, rate, mixer.
+"""Cascaded controller from target to motor thrust: trajectory shaping, position, velocity, attitude, rate, mixer.
 
-A flight mode sets the targets; `Control.step` does the rest at every physics step.
+Flight modes set the targets. `Control.step` computes motor thrusts in each physics step.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from fractus_vehicle.shaping import (
     wrap_pi,
 )
 
-# Slower than this counts as stopped: the position is held from then on.
+# The vehicle counts as stopped below this speed, and holds its position from then on.
 STOPPED_MPS = 0.05
 
 
@@ -29,7 +29,7 @@ Vector = tuple[float, float, float]
 
 
 class Axis(Enum):
-    """What is controlled: a position, a velocity, an attitude given from outside, or a trajectory given point by point."""
+    """Controlled quantity: a position, a velocity, an attitude, or a trajectory set point by point."""
 
     POSITION = "position"
     VELOCITY = "velocity"
@@ -39,20 +39,28 @@ class Axis(Enum):
 
 @dataclass(slots=True)
 class Limits:
-    """How fast the vehicle may move; filled from the parameters."""
+    """Motion limits, set from the parameters."""
 
     speed_mps: float = 10.0
     climb_mps: float = 2.5
     sink_mps: float = 1.5
     accel_mps2: float = 2.5
     accel_z_mps2: float = 1.0
-    jerk_mps3: float = 3.0  # toward a position
-    velocity_jerk_mps3: float = 5.0  # toward a velocity
+    jerk_mps3: float = 3.0  # for position targets
+    velocity_jerk_mps3: float = 5.0  # for velocity targets
     tilt_max_rad: float = math.radians(30.0)
     yaw_rate_rps: float = math.radians(60.0)
 
     def change_speed(self, kind: int, speed_mps: float) -> bool:
-        """DO_CHANGE_SPEED: 0 and 1 horizontal, 2 climb, 3 descent; False for another kind, or for no speed."""
+        """Handle DO_CHANGE_SPEED.
+
+        Args:
+            kind: 0 or 1 horizontal, 2 climb, 3 descent.
+            speed_mps: New limit in m/s.
+
+        Returns:
+            False for another kind or an invalid speed.
+        """
         if not speed_mps > 0.0 or not math.isfinite(speed_mps):
             return False
         if kind in (0, 1):
@@ -67,7 +75,7 @@ class Limits:
 
 
 class Estimate(NamedTuple):
-    """What the estimator tells the controllers: local NED position and velocity, attitude and body rates."""
+    """Estimator output: local position and velocity (NED), attitude and body rates."""
 
     north: float
     east: float
@@ -86,7 +94,7 @@ class Estimate(NamedTuple):
 
 @dataclass(slots=True)
 class Gains:
-    """Feedback gains; the position and velocity ones are ArduPilot's PSC parameters."""
+    """Feedback gains. Position and velocity gains are ArduPilot's PSC parameters."""
 
     position: float = 1.0
     velocity: float = 2.0
@@ -102,7 +110,7 @@ class Gains:
 
 
 class Control:
-    """Targets, the shaped trajectory toward them, and the feedback that follows it."""
+    """Targets, the shaped trajectory toward the targets, and the feedback that tracks the trajectory."""
 
     def __init__(self, airframe: Airframe) -> None:
         self.airframe = airframe
@@ -127,11 +135,11 @@ class Control:
         self._stopping = False
         self._braking_mps2 = 0.0
         self.thrust_share = 0.0
-        self.wanted_n = (0.0, 0.0, 0.0, 0.0)  # what each motor is asked for
+        self.wanted_n = (0.0, 0.0, 0.0, 0.0)  # thrust demand of each motor
         self.lean = (0.0, 0.0)
 
     def reset(self, est: Estimate) -> None:
-        """Start from where the vehicle is: no history, no targets elsewhere."""
+        """Reset targets and trajectory to the current estimate."""
         self.horizontal = self.vertical = Axis.POSITION
         self._stopping = False
         self.pos = [est.north, est.east, est.down]
@@ -148,13 +156,13 @@ class Control:
         self._integral = [0.0, 0.0, 0.0]
 
     def hold_here(self) -> None:
-        """Stop as soon as the limits allow, and hold position and altitude there."""
+        """Stop as soon as the limits allow, then hold position and altitude."""
         self.stop()
         vd = self.vel[2]
         self.go_to_altitude(self.pos[2] + vd * abs(vd) / (2.0 * BRAKING_SHARE * self.limits.accel_z_mps2))
 
     def stop(self, accel_mps2: float | None = None) -> None:
-        """Brake with the full acceleration (or a given one), then hold the position where that ends."""
+        """Brake with the maximum acceleration, or with `accel_mps2`, then hold the position reached."""
         vn, ve = self.vel[0], self.vel[1]
         speed = math.hypot(vn, ve)
         self._braking_mps2 = accel_mps2 or self.limits.accel_mps2
@@ -164,13 +172,13 @@ class Control:
         self._stopping = True
 
     def go_to_altitude(self, down: float) -> None:
-        """Climb or sink to an altitude and stay there."""
+        """Climb or descend to an altitude (local, down) and hold it."""
         self.vertical = Axis.POSITION
         self.target_down = down
         self.target_vd = 0.0
 
     def go_to(self, north: float, east: float, down: float | None = None) -> None:
-        """Fly to a point and stay; without `down` the vertical target stays as it is."""
+        """Fly to a point and hold it. Without `down` the vertical target is unchanged."""
         self.horizontal = Axis.POSITION
         self._stopping = False
         self.target = (north, east)
@@ -179,7 +187,7 @@ class Control:
             self.go_to_altitude(down)
 
     def fly(self, vn: float, ve: float, vd: float | None = None) -> None:
-        """Fly with a velocity; without `vd` the vertical target stays as it is."""
+        """Fly with a velocity. Without `vd` the vertical target is unchanged."""
         self.horizontal = Axis.VELOCITY
         self._stopping = False
         self.target_velocity = (vn, ve)
@@ -187,18 +195,18 @@ class Control:
             self.climb(vd)
 
     def track(self, position: Vector, velocity: Vector, acceleration: Vector) -> None:
-        """Follow a trajectory that is shaped elsewhere, from this point of it."""
+        """Set the current point of an externally shaped trajectory."""
         self.horizontal = self.vertical = Axis.PATH
         self._stopping = False
         self.pos[:], self.vel[:], self.acc[:] = position, velocity, acceleration
 
     def climb(self, vd: float) -> None:
-        """Follow a vertical speed (down positive)."""
+        """Track a vertical speed (positive down)."""
         self.vertical = Axis.VELOCITY
         self.target_vd = vd
 
     def step(self, dt: float, est: Estimate, thrust_full_n: float) -> tuple[float, float, float, float]:
-        """Advance the trajectory and return the thrust (newtons) each motor is asked for."""
+        """Advance the trajectory by `dt` seconds and return the thrust demand of each motor in newtons."""
         accel_n, accel_e = (0.0, 0.0) if self.horizontal is Axis.ATTITUDE else self._follow_xy(dt, est)
         accel_d = self._follow_z(dt, est)
         self._turn(dt)
@@ -236,7 +244,7 @@ class Control:
         error_n, error_e = pos[0] - est.north, pos[1] - est.east
         distance = math.hypot(error_n, error_e)
         if distance > 4.0:
-            # A gust or a failed motor: let the trajectory wait for the vehicle instead of running away.
+            # After a gust or motor failure the trajectory waits for the vehicle instead of running ahead.
             pos[0] = est.north + error_n * 4.0 / distance
             pos[1] = est.east + error_e * 4.0 / distance
         if self.horizontal is Axis.VELOCITY and distance > 2.0:
@@ -291,7 +299,7 @@ class Control:
         )
 
     def _thrust_and_lean(self, wanted: tuple[float, float, float], est: Estimate, full: float) -> float:
-        """Turn a wanted acceleration into a lean (kept in `self.lean`) and a collective thrust in newtons."""
+        """Convert a demanded acceleration to a lean angle (set in `self.lean`) and a collective thrust in newtons."""
         an, ae, ad = wanted
         yaw = self.yaw_setpoint
         vertical = clamp(GRAVITY - ad, 0.2 * GRAVITY, 3.0 * GRAVITY)
@@ -315,8 +323,8 @@ class Control:
     def _mix(self, thrust: float, est: Estimate, full: float) -> tuple[float, float, float, float]:
         gains, frame = self.gains, self.airframe
         roll, pitch = self.lean
-        # The wanted direction of the body's down axis, in the world and then in the body: thrust first, heading apart, so
-        # that a turn of the nose does not bend the way flown.
+        # Direction of the demanded body down axis in the world frame, then in the body frame. Thrust direction and
+        # heading are controlled separately, so that a yaw turn does not bend the flight path.
         cr, sr, cp, sp = math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch)
         cy, sy = math.cos(self.yaw_setpoint), math.sin(self.yaw_setpoint)
         dn, de, dd = cr * sp * cy + sr * sy, cr * sp * sy - sr * cy, cr * cp

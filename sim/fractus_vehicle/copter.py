@@ -1,4 +1,4 @@
-"""What ArduCopter adds to MAVLink, or leaves out of it: modes, frames, capabilities, magic numbers, its version."""
+"""ArduCopter's dialect of MAVLink: modes, frames, capabilities, magic numbers and version."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 @dataclass(frozen=True, slots=True)
 class ModeTraits:
-    """What a mode asks for: a position, a throttle stick that is handed through; and whether the motors start in it."""
+    """Requirements of a mode: a position, a throttle stick passed to the motors, and if the vehicle may arm in it."""
 
     needs_position: bool = True
     manual_throttle: bool = False
@@ -37,10 +37,11 @@ TRAITS = {
     mavlink.COPTER_MODE_ZIGZAG: ModeTraits(arms=True),
 }
 SUPPORTED_MODES = frozenset(TRAITS)
-# The modes that take targets from a companion, and those that a command makes take off.
+# Modes that accept targets of a companion computer, and modes in which NAV_TAKEOFF works.
 GUIDED_MODES = frozenset({mavlink.COPTER_MODE_GUIDED, mavlink.COPTER_MODE_GUIDED_NOGPS, mavlink.COPTER_MODE_AVOID_ADSB})
 TAKES_OFF = GUIDED_MODES | {mavlink.COPTER_MODE_LOITER, mavlink.COPTER_MODE_POSHOLD, mavlink.COPTER_MODE_ZIGZAG}
-# The modes that it has, but cannot enter without a pilot, a sensor or a setting: what it says before it refuses, and why.
+# Modes that exist but cannot be entered without a pilot, a sensor or a setting: STATUSTEXTs and the reason of the
+# refusal.
 UNAVAILABLE: dict[int, tuple[tuple[str, ...], str]] = {
     mavlink.COPTER_MODE_FLIP: ((), "init failed"),
     mavlink.COPTER_MODE_AUTOTUNE: ((), "init failed"),
@@ -53,14 +54,14 @@ UNAVAILABLE: dict[int, tuple[tuple[str, ...], str]] = {
 
 
 def mode_title(mode: int) -> str:
-    """What the autopilot calls a mode in its texts."""
+    """Return ArduPilot's name of a mode in STATUSTEXTs."""
     return _TITLES.get(mode) or enum_name("COPTER_MODE", mode)
 
 
 _TITLES = {mavlink.COPTER_MODE_SMART_RTL: "SMARTRTL", mavlink.COPTER_MODE_AUTO_RTL: "AUTO RTL"}
 
 
-# Altitudes of the sea, of home, and of the ground; the deprecated *_INT frames mean the same.
+# Frames with altitudes above mean sea level, terrain and home. The deprecated *_INT frames are equivalent.
 ABSOLUTE_FRAMES = frozenset({mavlink.MAV_FRAME_GLOBAL, mavlink.MAV_FRAME_GLOBAL_INT})
 TERRAIN_FRAMES = frozenset({mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT, mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT_INT})
 GLOBAL_FRAMES = (
@@ -69,7 +70,7 @@ GLOBAL_FRAMES = (
     | {mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT, mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT}
 )
 
-# The second parameter of MAV_CMD_COMPONENT_ARM_DISARM: disarm in flight, and arm in spite of the checks.
+# Second parameter of MAV_CMD_COMPONENT_ARM_DISARM: disarm in flight, and arm despite failed checks.
 FORCE_MAGIC = 21196
 FORCE_ARM_MAGIC = 2989
 
@@ -90,7 +91,7 @@ IGNORE_ACCELERATION = (
 )
 IGNORE_HEADING = mavlink.POSITION_TARGET_TYPEMASK_YAW_IGNORE | mavlink.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE
 POSITION_ONLY = IGNORE_VELOCITY | IGNORE_ACCELERATION | IGNORE_HEADING
-# POSITION_TARGET_GLOBAL_INT sets the unused bits, too.
+# POSITION_TARGET_GLOBAL_INT also sets the unused bits.
 GLOBAL_TARGET_ONLY = 0xF000 | POSITION_ONLY
 VELOCITY_ONLY = IGNORE_POSITION | IGNORE_ACCELERATION | IGNORE_HEADING
 

@@ -1,4 +1,4 @@
-"""How a vehicle comes down: fast when high, slowly near the ground, disarmed once it rests."""
+"""Landing descent: fast at height, slow near the ground, disarm after touchdown."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ LANDING_CONFIRMED_S = 1.0
 
 
 def descend(v: VehicleState) -> None:
-    """Sink as LAND does: fast when high, slowly below LAND_ALT_LOW, disarm once down."""
+    """Descend like LAND: fast at height, slowly below LAND_ALT_LOW. Disarm after touchdown."""
     p = v.params
     slow = p["LAND_SPEED"] / 100.0
     high = (p["LAND_SPEED_HIGH"] / 100.0) or v.control.limits.sink_mps

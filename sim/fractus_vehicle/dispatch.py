@@ -1,4 +1,4 @@
-"""Messages that arrive, by name: each to what it means for the vehicle."""
+"""Dispatch of received messages to their handlers, by message name."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Handler = Callable[[Vehicle, Message, Channel], None]
 
 
 def dispatch(vehicle: Vehicle, message: Message, channel: Channel) -> None:
-    """Handle one message; what is not for this vehicle or not known is ignored."""
+    """Handle one message. Ignore unknown messages and messages addressed to another system or component."""
     v = vehicle.state
     if message.sysid == v.sysid and message.compid == v.compid:
         return
@@ -39,7 +39,7 @@ def dispatch(vehicle: Vehicle, message: Message, channel: Channel) -> None:
 
 
 def _is_for_another(v: VehicleState, component: int) -> bool:
-    """Whether another part of the vehicle was heard that a message is for; without one, the autopilot takes it itself."""
+    """Return True if the addressed component is a known peer. Otherwise the autopilot handles the message itself."""
     if component in (0, v.compid):
         return False
     return any((v.sysid, component) in channel.peers for channel in v.channels)
@@ -111,7 +111,7 @@ def _timesync(vehicle: Vehicle, m: Message, c: Channel) -> None:
 
 
 def _file_transfer(_vehicle: Vehicle, m: Message, c: Channel) -> None:
-    """There is no file system: every request is refused at once, so that clients use the plain protocols instead."""
+    """Refuse every MAVFTP request, because there is no file system. Clients then use the plain protocols."""
     request = bytes(int(value) for value in m.array("payload"))
     sequence = (int.from_bytes(request[:2], "little") + 1) & 0xFFFF
     answer = sequence.to_bytes(2, "little") + bytes(
@@ -140,7 +140,10 @@ def _mission(vehicle: Vehicle, m: Message, c: Channel) -> None:
 
 
 def _mission_set_current(vehicle: Vehicle, m: Message, c: Channel) -> None:
-    """Answered with the number that was sent, which clients take for the acknowledgement, whatever item is current then."""
+    """Set the current item and reply with the requested number.
+
+    Clients take the number for the acknowledgement, even if another item is current afterwards.
+    """
     if set_current(vehicle, m.integer("seq")):
         c.send("MISSION_CURRENT", {**mission_current(vehicle.state), "seq": m.integer("seq")})
 
@@ -169,7 +172,7 @@ def _set_home(vehicle: Vehicle, m: Message, _c: Channel) -> None:
 
 
 def _setup_signing(vehicle: Vehicle, m: Message, _c: Channel) -> None:
-    """A key of zeros turns signing off; refused while armed, as ArduPilot."""
+    """Set the signing key, or disable signing if the key is all zeros. Refused while armed, as in ArduPilot."""
     v = vehicle.state
     if v.armed:
         v.say(mavlink.MAV_SEVERITY_DEBUG, "ERROR: Won't setup signing when armed")
@@ -200,7 +203,7 @@ HANDLERS: dict[str, Handler] = {
     "MISSION_SET_CURRENT": _mission_set_current,
     "RC_CHANNELS_OVERRIDE": _sticks,
     "MANUAL_CONTROL": _manual,
-    # The origin comes from GPS here; the answer tells where it is.
+    # The origin comes from GPS. The reply reports its position.
     "SET_GPS_GLOBAL_ORIGIN": _answer("GPS_GLOBAL_ORIGIN"),
     "SET_HOME_POSITION": _set_home,
     "SETUP_SIGNING": _setup_signing,

@@ -1,4 +1,4 @@
-"""Places on the ground: degrees times 1e7 to metres north and east of a reference, as ArduPilot computes them."""
+"""Conversion between geographic positions (degrees times 1e7) and local metres, with ArduPilot's formulas."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def _shrink(latitude_e7: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """A point: latitude and longitude in degrees times 1e7, altitude in metres above mean sea level."""
+    """Geographic position: latitude and longitude in degrees times 1e7, altitude in metres above mean sea level."""
 
     lat_e7: int
     lon_e7: int
@@ -23,11 +23,11 @@ class Place:
 
     @classmethod
     def from_degrees(cls, lat_deg: float, lon_deg: float, alt_m: float) -> Place:
-        """Make a place from degrees."""
+        """Create a place from degrees and metres above mean sea level."""
         return cls(round(lat_deg * 1e7), round(lon_deg * 1e7), alt_m)
 
     def offset(self, north_m: float, east_m: float, down_m: float = 0.0) -> Place:
-        """The place that lies so far away."""
+        """Return the place at an offset in metres (north, east, down)."""
         dlat = north_m / METRES_PER_UNIT
         dlon = east_m / (METRES_PER_UNIT * _shrink(self.lat_e7 + dlat / 2.0))
         lon = (self.lon_e7 + round(dlon) + 1_800_000_000) % 3_600_000_000 - 1_800_000_000
@@ -35,7 +35,7 @@ class Place:
         return Place(lat, lon, self.alt_m - down_m)
 
     def vector_to(self, other: Place) -> tuple[float, float, float]:
-        """North, east, down in metres from here to `other`."""
+        """Return the vector to `other` in metres (north, east, down)."""
         dlon = (other.lon_e7 - self.lon_e7 + 1_800_000_000) % 3_600_000_000 - 1_800_000_000
         shrink = _shrink((self.lat_e7 + other.lat_e7) / 2.0)
         return (
@@ -45,15 +45,15 @@ class Place:
         )
 
 
-# Nothing that ArduPilot takes for a place lies higher.
+# ArduPilot rejects positions above this altitude.
 ALTITUDE_MAX_M = 83_000.0
 
 
 def valid_place(lat_e7: int, lon_e7: int, alt_m: float) -> bool:
-    """Whether a point lies on the globe, at an altitude that makes sense."""
+    """Return True if the coordinates are valid and the altitude is plausible."""
     return valid_coordinates(lat_e7, lon_e7) and abs(alt_m) <= ALTITUDE_MAX_M
 
 
 def valid_coordinates(lat_e7: int, lon_e7: int) -> bool:
-    """Whether latitude and longitude lie on the globe."""
+    """Return True if latitude and longitude are in range."""
     return abs(lat_e7) <= 900_000_000 and abs(lon_e7) <= 1_800_000_000

@@ -1,4 +1,4 @@
-"""The estimator: waits for the sensors at the start, knows the local origin, and says whether position can be trusted."""
+"""Simulated EKF: startup sequence, local origin, estimate errors and validity of the position."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from fractus_vehicle.sensors import Drift, Gps
 GPS_INTERVAL_S = 0.2
 GPS_TIMEOUT_S = 7.0
 
-# What happens when in a start that takes this long, as a real one does; a shorter start runs through it faster.
+# Times of startup events in a sequence of this length, as measured on a real autopilot. A shorter `ready_after_s`
+# scales them.
 FULL_START_S = 41.0
 INITIALISED_S = 2.6
 FILTER_STARTED_S = 5.0
@@ -43,7 +44,7 @@ ANNOUNCEMENTS = (
     (9.5, "GPS 1: probing for u-blox at 230400 baud"),
     (FIRST_FIX_S, "GPS 1: detected u-blox"),
 )
-# Where the vehicle climbs through this height for the first time, the heading is aligned once more.
+# The heading is aligned again when the vehicle first climbs through this height.
 FINAL_ALIGNMENT_M = 2.5
 
 _FLAGS_STARTING = (
@@ -63,14 +64,14 @@ _FLAGS_READY = (
 
 
 def _tilted(q: tuple[float, float, float, float], tilt: list[float]) -> tuple[float, float, float, float]:
-    """An attitude turned by small angles about the body axes; exact enough to second order."""
+    """Rotate an attitude by small angles about the body axes, accurate to second order."""
     w, x, y, z = q
     a, b, c = 0.5 * tilt[0], 0.5 * tilt[1], 0.5 * tilt[2]
     return (w - x * a - y * b - z * c, x + w * a + y * c - z * b, y + w * b + z * a - x * c, z + w * c + x * b - y * a)
 
 
 class Estimator:
-    """Position, velocity and attitude with the errors of a GPS-aided estimate."""
+    """Position, velocity and attitude estimate with the errors of a GPS-aided EKF."""
 
     def __init__(
         self,
@@ -99,32 +100,32 @@ class Estimator:
         self._finally_aligned = False
 
     def since_boot(self, boot_s: float) -> bool:
-        """Whether the start has come to what a full one reaches `boot_s` after power on."""
+        """Return True if startup has reached the event that a full startup reaches after `boot_s` seconds."""
         return self._time_s * FULL_START_S >= boot_s * self._ready_after_s
 
     @property
     def initialised(self) -> bool:
-        """Whether the autopilot has finished its own start and runs its main loop."""
+        """True if the autopilot has completed its initialisation and runs the main loop."""
         return self.since_boot(INITIALISED_S)
 
     @property
     def active(self) -> bool:
-        """Whether the filter runs and the vehicle uses it."""
+        """True if the EKF runs and is in use."""
         return self.since_boot(FILTER_ACTIVE_S)
 
     @property
     def aligned(self) -> bool:
-        """Whether attitude and height can be trusted."""
+        """True if attitude and height are valid."""
         return self.since_boot(TILT_ALIGNED_S)
 
     @property
     def consistent(self) -> bool:
-        """Whether the accelerometers have agreed for long enough."""
+        """True if the accelerometers have been consistent for long enough."""
         return self.since_boot(ACCELS_CONSISTENT_S)
 
     @property
     def flags(self) -> int:
-        """What EKF_STATUS_REPORT says of the filter."""
+        """Flags of EKF_STATUS_REPORT."""
         if self.position_ok:
             return _FLAGS_READY
         if not self.aligned:
@@ -132,7 +133,7 @@ class Estimator:
         return _FLAGS_NO_POSITION if self.origin is not None else _FLAGS_STARTING
 
     def estimate(self, body: Body) -> Estimate:
-        """The estimate of the moment."""
+        """Return the current estimate."""
         drift = self._drift
         quaternion = _tilted(body.quaternion, drift.tilt)
         roll, pitch, yaw = euler_of(quaternion)
@@ -153,7 +154,7 @@ class Estimator:
         )
 
     def step(self, time_s: float, body: Body) -> None:
-        """Take a GPS fix when one is due and judge the position."""
+        """Take a GPS fix when it is due, and update the validity of the position."""
         self._time_s = time_s
         if time_s < self._next_fix_s:
             return
@@ -174,7 +175,7 @@ class Estimator:
         self._judge(time_s)
 
     def _announce(self, body: Body) -> None:
-        """Say what a start says when it gets there, and what the first climb does."""
+        """Send the STATUSTEXTs of the startup sequence and of the first climb."""
         while self._announced < len(ANNOUNCEMENTS) and self.since_boot(ANNOUNCEMENTS[self._announced][0]):
             self._inform(ANNOUNCEMENTS[self._announced][1])
             self._announced += 1

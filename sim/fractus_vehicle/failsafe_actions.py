@@ -1,4 +1,4 @@
-"""What a failsafe may do, by the numbers that ArduCopter's parameters have for it, and what it falls back on."""
+"""Failsafe actions: parameter values of ArduCopter, execution, and fallbacks."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from fractus_vehicle.state import VehicleState
 
 
 class Action(IntEnum):
-    """BATT_FS_*_ACT; the other parameters have tables of their own."""
+    """Values of BATT_FS_*_ACT. Other parameters have separate tables."""
 
     NONE = 0
     LAND = 1
@@ -24,7 +24,7 @@ class Action(IntEnum):
     BRAKE_LAND = 7
 
 
-# FS_GCS_ENABLE; a value that is none of these returns.
+# Values of FS_GCS_ENABLE. Any other value selects RTL.
 GCS_ACTIONS = {
     3: Action.SMART_RTL,
     4: Action.SMART_RTL_LAND,
@@ -32,7 +32,7 @@ GCS_ACTIONS = {
     6: Action.AUTO_LAND_START,
     7: Action.BRAKE_LAND,
 }
-# FS_THR_ENABLE; a value that is none of these lands.
+# Values of FS_THR_ENABLE. Any other value selects LAND.
 RADIO_ACTIONS = {
     1: Action.RTL,
     2: Action.RTL,
@@ -41,7 +41,7 @@ RADIO_ACTIONS = {
     6: Action.AUTO_LAND_START,
     7: Action.BRAKE_LAND,
 }
-# FENCE_ACTION; 0 only reports.
+# Values of FENCE_ACTION. 0 only reports the breach.
 FENCE_ACTIONS = {
     1: Action.RTL,
     2: Action.LAND,
@@ -52,7 +52,7 @@ FENCE_ACTIONS = {
 
 
 def act(v: VehicleState, modes: FlightModes, action: Action) -> None:
-    """Carry an action out; a mode that cannot be flown now gives way to the next best, LAND in the end."""
+    """Execute an action. If its mode is unavailable, fall back to the next best mode and finally to LAND."""
     match action:
         case Action.NONE:
             return
@@ -71,7 +71,7 @@ def act(v: VehicleState, modes: FlightModes, action: Action) -> None:
                 v.say(mavlink.MAV_SEVERITY_WARNING, "SmartRTL Unavailable, Using Land Mode")
                 _land(v, modes)
         case Action.AUTO_LAND_START:
-            # Missions with a landing sequence to jump to are not flown here: the autopilot's own fallback.
+            # Landing sequences in missions are not simulated. ArduPilot falls back to RTL without one.
             v.say(mavlink.MAV_SEVERITY_WARNING, "Trying RTL Mode")
             _return(v, modes)
         case Action.BRAKE_LAND:

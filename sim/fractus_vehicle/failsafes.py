@@ -1,4 +1,4 @@
-"""When the autopilot takes over by itself: station or radio lost, battery low, position lost, fence breached."""
+"""Failsafes: ground station or radio lost, battery low, position lost, fence breached, thrust loss, crash."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ POSITION_LOST_S = 1.0
 CRASH_ANGLE_DEG = 30.0
 CRASH_CONFIRMED_S = 2.0
 
-# Farther outside its fence than this, the autopilot only lands.
+# Beyond this distance outside the fence, the autopilot only lands.
 FENCE_GIVE_UP_M = 100.0
 # FS_EKF_ACTION
 EKF_REPORTS_ONLY, EKF_HOLDS_ALTITUDE, EKF_LANDS_ALWAYS = 0, 2, 3
-# Full throttle for so long, level, and still sinking: a motor no longer pulls.
+# Full throttle for THRUST_LOST_S, level and still sinking: potential thrust loss of a motor.
 THRUST_LOST_S = 1.0
 THRUST_LOST_SHARE = 0.9
 _PILOT_MODES = frozenset({mavlink.COPTER_MODE_STABILIZE, mavlink.COPTER_MODE_ALT_HOLD, mavlink.COPTER_MODE_LOITER})
@@ -30,7 +30,7 @@ _LAND_ACTIONS = frozenset({Action.LAND, Action.TERMINATE})
 
 
 class Option(IntFlag):
-    """FS_OPTIONS: what to continue in spite of a failsafe."""
+    """FS_OPTIONS: activities that continue despite a failsafe."""
 
     AUTO_ON_RADIO = 1
     AUTO_ON_GCS = 2
@@ -40,7 +40,10 @@ class Option(IntFlag):
 
 
 class Failsafes:
-    """Sets and clears the failsafes of a vehicle, and acts when one begins; times are those since when a cause holds."""
+    """Detect and clear the failsafes of a vehicle, and start their actions.
+
+    `_*_since_s` is the start time of a condition.
+    """
 
     def __init__(self, state: VehicleState, modes: FlightModes) -> None:
         self._state = state
@@ -56,11 +59,11 @@ class Failsafes:
         self._next_check_s = 0.0
 
     def heard_station(self) -> None:
-        """Note a heartbeat of the ground station that is watched for."""
+        """Record a heartbeat of the monitored ground station (SYSID_MYGCS)."""
         self._gcs_seen_s = self._state.time_s
 
     def step(self) -> None:
-        """Check everything; called at each control step, works at 10 Hz."""
+        """Run all checks at 10 Hz. Called in each control step."""
         v = self._state
         if v.time_s < self._next_check_s:
             return
@@ -74,7 +77,7 @@ class Failsafes:
         self._check_crash(v)
 
     def _check_thrust(self, v: VehicleState) -> None:
-        """Warn when all thrust is asked for, in level flight, and the vehicle sinks all the same."""
+        """Warn if the vehicle sinks in level flight at full thrust."""
         roll, pitch, _ = v.body.euler()
         level = math.hypot(roll - v.control.lean[0], pitch - v.control.lean[1]) < math.radians(CRASH_ANGLE_DEG)
         weak = v.armed and not v.landed and level and v.control.thrust_share > THRUST_LOST_SHARE and v.body.vd > 0.0
@@ -124,7 +127,7 @@ class Failsafes:
             self._take_over(v, "GCS", GCS_ACTIONS.get(setting, Action.RTL))
 
     def _check_radio(self, v: VehicleState) -> None:
-        """The receiver is simulated: SIM_RC_FAIL silences it; a station that overrides the sticks replaces it."""
+        """Check the simulated receiver: SIM_RC_FAIL silences it, overrides of a ground station replace it."""
         setting = int(v.params["FS_THR_ENABLE"])
         silent = int(v.params["SIM_RC_FAIL"]) != 0 and not v.receiver.overridden
         self._radio_lost_s = (v.time_s if self._radio_lost_s is None else self._radio_lost_s) if silent else None
@@ -146,7 +149,7 @@ class Failsafes:
             self._take_over(v, "Radio", RADIO_ACTIONS.get(setting, Action.LAND))
 
     def _take_over(self, v: VehicleState, what: str, action: Action) -> None:
-        """Say what happened and act, unless the vehicle is down, coming down, or disarmed."""
+        """Announce a failsafe and act, unless the vehicle is disarmed, on the ground or landing."""
         options = Option(int(v.params["FS_OPTIONS"]) & 31)
         if not v.armed:
             self._announce(v, what)

@@ -1,4 +1,4 @@
-"""The autopilot's own geofence: shapes, altitude band and home circle, and what a position breaches."""
+"""Geofence of the autopilot: shapes, altitude limits, home circle and the breaches of a position."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def _to_edge_m(north: float, east: float, a: Vertex, b: Vertex) -> float:
 
 
 def _ahead_m(here: Vertex, course: Vertex, a: Vertex, b: Vertex) -> float | None:
-    """How far ahead on a course an edge is crossed."""
+    """Return the distance along a course to the crossing of an edge, or None if the course misses the edge."""
     run_n, run_e = b[0] - a[0], b[1] - a[1]
     turn = course[0] * run_e - course[1] * run_n
     if abs(turn) < 1e-9:
@@ -40,7 +40,7 @@ def _ahead_m(here: Vertex, course: Vertex, a: Vertex, b: Vertex) -> float | None
 
 
 class FenceShapeError(ValueError):
-    """Fence items that do not form shapes."""
+    """Fence items that do not form valid shapes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,7 @@ class Polygon:
     inclusion: bool
 
     def contains(self, north: float, east: float) -> bool:
-        """Even-odd rule."""
+        """Return True if the point is inside (even-odd rule)."""
         inside = False
         previous = self.vertices[-1]
         for vertex in self.vertices:
@@ -63,12 +63,12 @@ class Polygon:
         return inside
 
     def distance_along_m(self, here: Vertex, course: Vertex) -> float | None:
-        """How far ahead the first edge lies on a course."""
+        """Return the distance along a course to the first edge, or None."""
         edges = zip(self.vertices, (*self.vertices[1:], self.vertices[0]), strict=True)
         return min((d for a, b in edges if (d := _ahead_m(here, course, a, b)) is not None), default=None)
 
     def edge_distance_m(self, north: float, east: float) -> float:
-        """Distance to the nearest edge."""
+        """Return the distance to the nearest edge in metres."""
         edges = zip(self.vertices, (*self.vertices[1:], self.vertices[0]), strict=True)
         return min(_to_edge_m(north, east, a, b) for a, b in edges)
 
@@ -83,11 +83,11 @@ class Circle:
     inclusion: bool
 
     def contains(self, north: float, east: float) -> bool:
-        """Whether the point lies inside."""
+        """Return True if the point is inside."""
         return math.hypot(north - self.north, east - self.east) <= self.radius_m
 
     def distance_along_m(self, here: Vertex, course: Vertex) -> float | None:
-        """How far ahead the rim lies on a course."""
+        """Return the distance along a course to the rim, or None."""
         north, east = here[0] - self.north, here[1] - self.east
         along = north * course[0] + east * course[1]
         square = along * along - (north * north + east * east - self.radius_m * self.radius_m)
@@ -97,7 +97,7 @@ class Circle:
         return min((way for way in ways if way >= 0.0), default=None)
 
     def edge_distance_m(self, north: float, east: float) -> float:
-        """Distance to the rim."""
+        """Return the distance to the rim in metres."""
         return abs(math.hypot(north - self.north, east - self.east) - self.radius_m)
 
 
@@ -106,7 +106,15 @@ Shape = Polygon | Circle
 
 @dataclass(frozen=True, slots=True)
 class FenceItem:
-    """One uploaded item: command, first parameter, position in local metres, and whether that lies on Earth."""
+    """One uploaded fence item.
+
+    Attributes:
+        command: MAV_CMD of the item.
+        param1: Vertex count or radius in metres.
+        north: Local position in metres.
+        east: Local position in metres.
+        valid: False if latitude or longitude is out of range.
+    """
 
     command: int
     param1: float
@@ -116,10 +124,10 @@ class FenceItem:
 
 
 def build_shapes(items: Sequence[FenceItem]) -> tuple[Shape, ...]:
-    """Group the items of an upload into shapes.
+    """Build fence shapes from the items of an upload.
 
     Raises:
-        FenceShapeError: with the autopilot's own words for what is wrong.
+        FenceShapeError: The items do not form valid shapes. The message is ArduPilot's STATUSTEXT.
     """
     shapes: list[Shape] = []
     if sum(item.command == mavlink.MAV_CMD_NAV_FENCE_RETURN_POINT for item in items) > 1:
@@ -130,7 +138,7 @@ def build_shapes(items: Sequence[FenceItem]) -> tuple[Shape, ...]:
         if not item.valid:
             raise FenceShapeError("Bad lat or lon")
         if item.command in (mavlink.MAV_CMD_NAV_FENCE_CIRCLE_INCLUSION, mavlink.MAV_CMD_NAV_FENCE_CIRCLE_EXCLUSION):
-            # A real autopilot aborts in the simulator where the radius is not a number.
+            # ArduPilot SITL aborts if the radius is NaN.
             if not item.param1 > 0.0:
                 raise FenceShapeError("Non-positive circle radius")
             inclusion = item.command == mavlink.MAV_CMD_NAV_FENCE_CIRCLE_INCLUSION
@@ -152,7 +160,7 @@ def build_shapes(items: Sequence[FenceItem]) -> tuple[Shape, ...]:
 
 
 def _vertices(items: Sequence[FenceItem], at: int) -> Sequence[FenceItem]:
-    """The corners of the polygon that begins at an item."""
+    """Return the vertices of the polygon that starts at index `at`."""
     first = items[at]
     count = int(first.param1) if math.isfinite(first.param1) else 0
     if count < 3:
@@ -172,7 +180,7 @@ def _vertices(items: Sequence[FenceItem], at: int) -> Sequence[FenceItem]:
 
 @dataclass(slots=True)
 class Fence:
-    """Settings, shapes and the breaches of the moment."""
+    """Settings, shapes and current breaches of the geofence."""
 
     enabled: bool = False
     types: int = 7
@@ -184,19 +192,26 @@ class Fence:
     breach_count: int = 0
     breach_time_s: float = 0.0
     margin_m: float = 2.0
-    avoid: bool = True  # velocities are limited before the fence
+    avoid: bool = True  # limit velocities in front of the fence
     limiting: bool = False
-    recovery_until_s: float = -math.inf  # until then a change of mode in the breach suspends the checks
+    recovery_until_s: float = -math.inf  # checks are suspended until then after a mode change during a breach
 
     @property
     def present(self) -> bool:
-        """Whether there is anything to enable: a limit, or a shape."""
+        """True if the fence has an enabled limit or shape."""
         return bool(self.types & ~mavlink.FENCE_TYPE_POLYGON) or (
             bool(self.types & mavlink.FENCE_TYPE_POLYGON) and bool(self.shapes)
         )
 
     def outside(self, north: float, east: float, altitude_m: float, home: Vertex = (0.0, 0.0)) -> int:
-        """What a point (local metres, altitude above home) would breach if the fence is enabled."""
+        """Return the FENCE_TYPE bits that a point would breach, or NO_BREACH if the fence is disabled.
+
+        Args:
+            north: Local position in metres.
+            east: Local position in metres.
+            altitude_m: Altitude above home.
+            home: Home position in local metres.
+        """
         found = NO_BREACH
         if not self.enabled:
             return found
@@ -211,7 +226,7 @@ class Fence:
         return found
 
     def distance_m(self, north: float, east: float, altitude_m: float, home: Vertex = (0.0, 0.0)) -> float:
-        """How far a point lies beyond the limits that it breaches, at least; 0 inside."""
+        """Return the distance of a point beyond the breached limits in metres, 0 inside."""
         found = self.outside(north, east, altitude_m, home)
         beyond = [0.0]
         if found & mavlink.FENCE_TYPE_ALT_MAX:
@@ -228,9 +243,14 @@ class Fence:
     def speed_allowed(
         self, north: float, east: float, home: Vertex, course: Vertex, brake: Callable[[float], float]
     ) -> float:
-        """How fast the vehicle may go along a course (a unit vector): slow enough to stop the margin before the fence.
+        """Return the maximum speed along a course that allows a stop at the margin before the fence, in m/s.
 
-        `brake` tells the greatest speed from which a vehicle stops within a distance.
+        Args:
+            north: Local position in metres.
+            east: Local position in metres.
+            home: Home position in local metres.
+            course: Unit vector of the course.
+            brake: Returns the maximum speed from which the vehicle stops within a distance.
         """
         if not (self.enabled and self.avoid):
             return math.inf
@@ -240,7 +260,7 @@ class Fence:
         allowed = math.inf
         for shape in shapes:
             if shape.contains(north, east) != shape.inclusion:
-                continue  # beyond it already: the breach is another matter
+                continue  # already outside this shape: handled as a breach
             ahead = shape.distance_along_m((north, east), course)
             if ahead is not None:
                 allowed = min(allowed, brake(max(ahead - self.margin_m, 0.0)))
@@ -258,7 +278,7 @@ class Fence:
 
     @property
     def breach_type(self) -> int:
-        """What FENCE_STATUS says of the breaches."""
+        """Breach type reported in FENCE_STATUS."""
         if self.breaches & mavlink.FENCE_TYPE_ALT_MIN:
             return mavlink.FENCE_BREACH_MINALT
         if self.breaches & mavlink.FENCE_TYPE_ALT_MAX:
@@ -267,7 +287,7 @@ class Fence:
 
 
 def breach_names(breaches: int) -> str:
-    """The breaches as ArduPilot writes them: `Max Alt and Circle fences`."""
+    """Return the breached fences in ArduPilot's wording, for example `Max Alt and Circle fences`."""
     names = [name for bit, name in NAMES.items() if breaches & bit]
     if len(names) <= 1:
         return f"{''.join(names)} fence".strip()

@@ -1,4 +1,4 @@
-"""What every flight mode is: an object that begins once and then sets the controller's targets at each step."""
+"""Base class of flight modes."""
 
 from __future__ import annotations
 
@@ -6,11 +6,14 @@ from fractus_vehicle.state import VehicleState
 
 
 class Flight:
-    """One mode in use; a new object each time the mode begins."""
+    """A flight in one mode.
+
+    A new object is created each time the mode begins. It sets the controller targets in each step.
+    """
 
     @property
     def landing(self) -> bool:
-        """Whether it is in its last descent."""
+        """True during the final descent."""
         return False
 
     def begin(self, v: VehicleState) -> None:

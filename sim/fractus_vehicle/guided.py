@@ -1,4 +1,4 @@
-"""GUIDED: takeoff, positions, velocities and attitudes that a companion computer asks for."""
+"""GUIDED mode: takeoff, position, velocity and attitude targets of a companion computer."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from fractus_vehicle.settings import leg_speeds_mps
 from fractus_vehicle.shaping import clamp, sqrt_controller
 from fractus_vehicle.state import CONTROL_STEP_S, VehicleState
 
-# Before a fence the vehicle counts on braking harder than it can: at 6 m/s a real one crosses a circle of 30 m by 2 m.
+# Fence avoidance overestimates the braking ability by this factor. At 6 m/s a real ArduCopter crosses a circle of 30 m
+# by 2 m.
 AVOIDANCE_OPTIMISM = 1.3
 
 
 class Task(Enum):
-    """What GUIDED does at the moment."""
+    """Current task of GUIDED mode."""
 
     IDLE = "idle"
     TAKEOFF = "takeoff"
@@ -43,9 +44,10 @@ class GuidedFlight(Flight):
         v.heading.follow_course()
 
     def use(self, v: VehicleState, controller: Task) -> None:
-        """Begin with positions or velocities: ArduCopter starts that controller, with the parameters' speeds.
+        """Select the position or velocity controller.
 
-        A speed that was set before is forgotten; stopping keeps the controller, and with it the speed.
+        ArduCopter starts a controller with the speeds of the parameters. A change of controller therefore discards a
+        commanded speed. Stopping keeps the controller and the speed.
         """
         if controller is not self._controller:
             self._controller = controller
@@ -59,7 +61,7 @@ class GuidedFlight(Flight):
         v.begin_takeoff(down)
 
     def go_to(self, v: VehicleState, north: float, east: float, down: float) -> None:
-        """Fly to a local position; while paused, once that is over."""
+        """Fly to a local position. While paused, store the position for the resume."""
         if self.paused:
             self._resume = (north, east, down)
             return
@@ -74,7 +76,10 @@ class GuidedFlight(Flight):
         velocity: tuple[float, float, float],
         position: tuple[float, float, float] | None = None,
     ) -> None:
-        """Fly with a velocity, or with a position that moves with it, until GUID_TIMEOUT; not while paused."""
+        """Fly with a velocity, or with a position that moves with the velocity, until GUID_TIMEOUT.
+
+        Ignored while paused.
+        """
         if self.paused:
             return
         self.use(v, Task.VELOCITY)
@@ -92,7 +97,7 @@ class GuidedFlight(Flight):
             control.target_vd = velocity[2]
 
     def _avoid(self, v: VehicleState) -> None:
-        """Fly the velocity that was asked for, slower where the fence lies ahead."""
+        """Fly the commanded velocity, slowed down in front of the fence."""
         if self._asked is None:
             return
         vn, ve, _ = self._asked
@@ -128,7 +133,7 @@ class GuidedFlight(Flight):
         v.control.hold_here()
 
     def pause(self, v: VehicleState, *, paused: bool) -> None:
-        """DO_PAUSE_CONTINUE: stop where it is; continuing goes to the last target."""
+        """Handle DO_PAUSE_CONTINUE: hold the current position, or continue to the last target."""
         if paused and not self.paused:
             self._resume = (*v.control.target, v.control.target_down) if self.task is Task.POSITION else None
             self.stop(v)
@@ -137,7 +142,7 @@ class GuidedFlight(Flight):
             self.go_to(v, *self._resume)
 
     def step(self, v: VehicleState) -> None:
-        """Follow the target; stop when it is too old."""
+        """Track the target, and stop when it has timed out."""
         if self.task is Task.TAKEOFF:
             if v.takeoff_done():
                 self.task = Task.POSITION
@@ -158,7 +163,7 @@ class GuidedFlight(Flight):
 
 
 class GuidedWithoutGps(GuidedFlight):
-    """GUIDED_NOGPS: only attitudes; level until one comes."""
+    """GUIDED_NOGPS mode: attitude targets only. Keeps level until a target arrives."""
 
     def begin(self, v: VehicleState) -> None:
         """Level out."""
@@ -166,7 +171,7 @@ class GuidedWithoutGps(GuidedFlight):
         self.lean(v, 0.0, 0.0, None, 0.0)
 
     def go_to(self, _v: VehicleState, _north: float, _east: float, _down: float) -> None:
-        """Positions mean nothing without one of its own."""
+        """Ignore position targets: there is no position estimate."""
 
     def fly(
         self,
@@ -174,7 +179,7 @@ class GuidedWithoutGps(GuidedFlight):
         _velocity: tuple[float, float, float],
         _position: tuple[float, float, float] | None = None,
     ) -> None:
-        """Nor do velocities."""
+        """Ignore velocity targets: there is no position estimate."""
 
     def stop(self, v: VehicleState) -> None:
         """Level out."""

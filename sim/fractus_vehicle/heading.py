@@ -1,4 +1,4 @@
-"""Where the nose points in automatic flight: along the course, at an angle, or at a place."""
+"""Heading control in automatic flight: along the course, at a fixed angle, or towards a region of interest."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from fractus_vehicle.control import Control, Estimate
 from fractus_vehicle.params import Parameters
 from fractus_vehicle.shaping import clamp, wrap_pi
 
-# Below this share of the speed allowed the nose keeps its heading instead of following the course.
+# Below this share of the speed limit the vehicle keeps its heading instead of following the course.
 COURSE_SHARE = 0.05
-# So near the angle that is asked for, a direction makes it turn no full circle.
+# Closer to the target angle than this, a commanded direction does not cause a full turn.
 THERE_RAD = math.radians(0.5)
 
 
 class Heading:
-    """Sets the controller's heading target."""
+    """Sets the heading target of the controller."""
 
     def __init__(self, control: Control, params: Parameters) -> None:
         self._control = control
@@ -26,25 +26,32 @@ class Heading:
         self._rate_rps = 0.0
 
     def follow_course(self) -> None:
-        """The default of WP_YAW_BEHAVIOR."""
+        """Follow the course, the default of WP_YAW_BEHAVIOR."""
         self._left = 0.0
         self._roi = None
         self._fixed = False
 
     def hold(self) -> None:
-        """Keep the heading that was set in the controller."""
+        """Keep the heading target of the controller."""
         self._left = 0.0
         self._roi = None
         self._fixed = True
 
     def look_at(self, point: tuple[float, float] | None) -> None:
-        """Keep the nose on a local point; None ends it."""
+        """Point the nose at a local position, or stop doing so (None)."""
         self._left = 0.0
         self._roi = point
         self._fixed = False
 
     def turn_to(self, angle_deg: float, rate_dps: float, direction: int, *, relative: bool) -> None:
-        """CONDITION_YAW: turn the nose, by the shorter way or, with a direction (-1 left, 1 right), by that one."""
+        """Handle CONDITION_YAW.
+
+        Args:
+            angle_deg: Target angle, or the angle to turn if `relative`.
+            rate_dps: Turn rate; 0 for the default.
+            direction: -1 left, 1 right, 0 the shorter way.
+            relative: Measure the angle from the current heading.
+        """
         control, angle = self._control, math.radians(angle_deg)
         control.target_yaw = control.yaw_setpoint
         if relative:
@@ -60,11 +67,11 @@ class Heading:
 
     @property
     def turned(self) -> bool:
-        """Whether a turn that was asked for is over."""
+        """True if the commanded turn is complete."""
         return self._left == 0.0
 
     def step(self, est: Estimate, dt: float) -> None:
-        """Go on with a turn, or follow the course or the place."""
+        """Continue a turn, or follow the course or the region of interest."""
         control = self._control
         if self._left:
             step = clamp(self._left, -self._rate_rps * dt, self._rate_rps * dt)

@@ -1,4 +1,4 @@
-"""Home, and where a return leads: home or a rally point."""
+"""Home position and the destination of return flights: home or a rally point."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from fractus_vehicle.telemetry import send_on_all
 
 
 def set_home(v: VehicleState, place: Place) -> None:
-    """Make a place home, in the mission as well, and announce it."""
+    """Set the home position, also in the mission, and send HOME_POSITION."""
     v.home = place
     v.mission.with_home(place)
     send_on_all(v, "HOME_POSITION")
 
 
 def set_home_here(v: VehicleState) -> bool:
-    """Make the present position home, and keep it when the vehicle arms; False while the position is unknown."""
+    """Set home to the current position and keep it on arming. Return False if the position is unknown."""
     if not v.position_ok:
         return False
     v.home_locked = True
@@ -28,7 +28,11 @@ def set_home_here(v: VehicleState) -> bool:
 
 
 def set_home_at(v: VehicleState, lat_e7: int, lon_e7: int, alt_amsl_m: float) -> bool:
-    """Make a given position home, and keep it when the vehicle arms; False when it is none, or without an origin."""
+    """Set home to a given position and keep it on arming.
+
+    Returns:
+        False if the position is invalid or the estimator has no origin yet.
+    """
     if not valid_place(lat_e7, lon_e7, alt_amsl_m) or (lat_e7 == 0 and lon_e7 == 0) or v.origin is None:
         return False
     v.home_locked = True
@@ -38,7 +42,14 @@ def set_home_at(v: VehicleState, lat_e7: int, lon_e7: int, alt_amsl_m: float) ->
 
 @dataclass(frozen=True, slots=True)
 class ReturnPoint:
-    """Where a return leads (local metres), what its altitudes count from, and how high above that it asks to be."""
+    """Destination of a return flight.
+
+    Attributes:
+        north: Local position in metres.
+        east: Local position in metres.
+        base_down: Local height of home, the reference of return altitudes.
+        altitude_m: Minimum return altitude above home.
+    """
 
     north: float
     east: float
@@ -46,12 +57,12 @@ class ReturnPoint:
     altitude_m: float
 
     def distance_m(self, here: tuple[float, float]) -> float:
-        """Distance over ground."""
+        """Return the horizontal distance in metres."""
         return math.dist((self.north, self.east), here)
 
 
 def return_point(v: VehicleState) -> ReturnPoint:
-    """Home, or the nearest rally point within RALLY_LIMIT_KM."""
+    """Return home, or the nearest rally point within RALLY_LIMIT_KM."""
     origin = v.origin or v.start
     home = v.home or origin
     here = (v.est.north, v.est.east)

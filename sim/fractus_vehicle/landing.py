@@ -1,4 +1,4 @@
-"""BRAKE, AVOID_ADSB and LAND: the modes that stop, and that come down where the vehicle is."""
+"""BRAKE, AVOID_ADSB and LAND modes."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ from fractus_vehicle.descent import descend
 from fractus_vehicle.flight import Flight
 from fractus_vehicle.state import VehicleState
 
-# BRAKE may decelerate with this, whatever WPNAV_ACCEL says; PSC_JERK_XY keeps it from doing so below some 11 m/s.
+# Deceleration limit of BRAKE, independent of WPNAV_ACCEL. PSC_JERK_XY prevents it from being reached below about 11
+# m/s.
 BRAKE_MPS2 = 7.5
-# A landing that a failsafe begins waits so long, for a pilot to object.
+# Delay of a landing that a failsafe has started, so that a pilot can intervene.
 FAILSAFE_PAUSE_S = 4.0
 
 
 class Hold(Flight):
-    """Stops and holds: AVOID_ADSB with nothing to avoid."""
+    """AVOID_ADSB mode without traffic: stop and hold."""
 
     def begin(self, v: VehicleState) -> None:
         """Stop and hold."""
@@ -22,7 +23,7 @@ class Hold(Flight):
 
 
 class Brake(Flight):
-    """Stops at once and holds."""
+    """BRAKE mode: stop at maximum deceleration and hold."""
 
     def begin(self, v: VehicleState) -> None:
         """Stop hard and hold."""
@@ -31,23 +32,23 @@ class Brake(Flight):
 
 
 class Land(Flight):
-    """Descends where it is and disarms."""
+    """LAND mode: descend at the current position and disarm."""
 
     def __init__(self) -> None:
         self._sink_from_s = 0.0
 
     @property
     def landing(self) -> bool:
-        """Always."""
+        """True: the whole mode is a final descent."""
         return True
 
     def pause(self, v: VehicleState) -> None:
-        """Wait before the descent, as every failsafe that lands does."""
+        """Delay the descent, as all failsafe landings do."""
         self._sink_from_s = v.time_s + FAILSAFE_PAUSE_S
         v.control.climb(0.0)
 
     def begin(self, v: VehicleState) -> None:
-        """Stop, or keep level when the position is unknown."""
+        """Stop, or keep level if the position is unknown."""
         v.touch_time_s = 0.0
         if v.position_ok:
             v.control.stop()
@@ -58,7 +59,7 @@ class Land(Flight):
         v.control.target_yaw = v.control.yaw_setpoint
 
     def step(self, v: VehicleState) -> None:
-        """Sink."""
+        """Descend after the delay."""
         if v.control.horizontal is not Axis.ATTITUDE and not v.position_ok:
             v.control.horizontal = Axis.ATTITUDE
             v.control.attitude = (0.0, 0.0)

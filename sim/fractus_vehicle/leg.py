@@ -1,4 +1,4 @@
-"""A straight line in space, flown from rest to rest as a real waypoint controller flies it: with WPNAV_JERK."""
+"""Straight leg, flown from rest to rest with the jerk limit WPNAV_JERK, like ArduPilot's waypoint controller."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from fractus_vehicle.profile import Profile
 from fractus_vehicle.shaping import clamp, shape_velocity, shape_velocity_xy
 from fractus_vehicle.state import CONTROL_STEP_S, VehicleState
 
-# A motion that is brought to rest beside the line is over once it is slower than this; how long that may take.
+# Previous motion counts as stopped below this speed. STOP_STEPS limits the time for it.
 RESTING_MPS = 0.02
 _STILL = (0.0, 0.0, 0.0)
 STOP_STEPS = 3000
@@ -19,7 +19,7 @@ Vector = tuple[float, float, float]
 
 
 def _stopping(v: VehicleState) -> list[tuple[Vector, Vector, Vector]]:
-    """How the motion of this moment comes to rest: positions, velocities and accelerations, one a control step."""
+    """Compute how the current motion comes to rest: position, velocity and acceleration in each control step."""
     control, limits, dt = v.control, v.control.limits, CONTROL_STEP_S
     pos, vel, acc = list(control.pos), list(control.vel), list(control.acc)
     rest: list[tuple[Vector, Vector, Vector]] = []
@@ -43,13 +43,16 @@ def _stopping(v: VehicleState) -> list[tuple[Vector, Vector, Vector]]:
 
 
 def resting_place(v: VehicleState) -> Vector:
-    """Where the trajectory of this moment would come to rest."""
+    """Return the position where the current trajectory would come to rest."""
     rest = _stopping(v)
     return rest[-1][0] if rest else (v.control.pos[0], v.control.pos[1], v.control.pos[2])
 
 
 class Leg:
-    """From where the trajectory would come to rest to a local point; made when the leg begins, and stepped until it is left."""
+    """Leg from the resting position of the current trajectory to a local point.
+
+    Create the leg when it begins, and call `step` until it is left.
+    """
 
     def __init__(self, v: VehicleState, north: float, east: float, down: float) -> None:
         control, limits = v.control, v.control.limits
@@ -80,11 +83,11 @@ class Leg:
 
     @property
     def finished(self) -> bool:
-        """Whether the trajectory has arrived."""
+        """True if the trajectory has reached the end."""
         return self._at >= len(self._rest) and self._time_s >= self._profile.duration_s
 
     def step(self, v: VehicleState) -> None:
-        """Move the trajectory along; a speed that is changed on the way is taken up with the acceleration that legs have."""
+        """Advance the trajectory by one control step. Apply a changed speed limit with the acceleration of legs."""
         control, limits, dt = v.control, v.control.limits, CONTROL_STEP_S
         if self.finished:
             if control.horizontal is Axis.PATH:
@@ -107,5 +110,5 @@ class Leg:
         )
 
     def reached(self, v: VehicleState, radius_m: float) -> bool:
-        """Whether the vehicle is within a radius of the end."""
+        """Return True if the vehicle is within a radius of the end."""
         return math.dist((v.est.north, v.est.east, v.est.down), self.end) <= radius_m

@@ -1,6 +1,6 @@
-"""The vehicle's links on this machine: TCP server, UDP in and out, serial devices and pseudo terminals.
+"""Links of the vehicle: TCP server, UDP in and out, serial devices and pseudo terminals.
 
-Everything is non-blocking and polled once per tick; a peer that does not read fills only its own bounded outbox.
+All links are non-blocking and polled once per tick. A peer that does not read fills only its own bounded outbox.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ MAX_PORT = 65535
 
 
 class LinkError(ValueError):
-    """A link that cannot be understood or opened."""
+    """A link specification that is invalid or cannot be opened."""
 
 
 @dataclass(frozen=True, slots=True)
 class LinkSpec:
-    """Where a link is: `tcp`, `udpin`, `udpout` with host and port, `serial` or `pty` with a path."""
+    """Parsed link specification: `tcp`, `udpin`, `udpout` with host and port, `serial` or `pty` with a path."""
 
     kind: str
     host: str = ""
@@ -41,10 +41,10 @@ class LinkSpec:
 
     @classmethod
     def parse(cls, text: str) -> LinkSpec:
-        """Read `kind:host:port`, `serial:path[:baud]` or `pty:path`.
+        """Parse `kind:host:port`, `serial:path[:baud]` or `pty:path`.
 
         Raises:
-            LinkError: the text is none of these.
+            LinkError: The text has none of these forms.
         """
         kind, _, rest = text.partition(":")
         if kind in ("tcp", "tcpin", "udpin", "udpout", "udp"):
@@ -61,10 +61,10 @@ class LinkSpec:
         raise LinkError(f"link {text!r}: expected tcp:, udpin:, udpout:, serial: or pty:")
 
     def shifted(self, by: int) -> LinkSpec:
-        """The same link for the vehicle that is `by` places further in a formation: next port (10 apart for TCP).
+        """Return the link of the vehicle at position `by` of a formation: next port (10 apart for TCP) or next path.
 
         Raises:
-            LinkError: there is no such port.
+            LinkError: The port number would be too large.
         """
         if by == 0:
             return self
@@ -72,7 +72,7 @@ class LinkSpec:
             return replace(self, path=f"{self.path}-{by}")
         port = self.port + by * (10 if self.kind == "tcp" else 1)
         if port > MAX_PORT:
-            raise LinkError(f"link {self}: vehicle {by + 1} would need port {port}; begin at a lower one")
+            raise LinkError(f"link {self}: vehicle {by + 1} would need port {port}; use a lower first port")
         return replace(self, port=port)
 
     def __str__(self) -> str:
@@ -80,7 +80,7 @@ class LinkSpec:
 
 
 class Hub:
-    """All links of all vehicles, behind one selector."""
+    """All links of all vehicles, multiplexed by one selector."""
 
     def __init__(self) -> None:
         self._selector = selectors.DefaultSelector()
@@ -88,10 +88,10 @@ class Hub:
         self._closers: list[Callable[[], None]] = []
 
     def open(self, spec: LinkSpec, craft: Craft, port: int) -> None:
-        """Open a link of a vehicle, the `port`-th of its own.
+        """Open a link of a vehicle as its serial port number `port`.
 
         Raises:
-            LinkError: the address is taken or the device is missing.
+            LinkError: The address is in use or the device is missing.
         """
         try:
             if spec.kind == "tcp":
@@ -104,11 +104,11 @@ class Hub:
             raise LinkError(f"link {spec}: {error.strerror or error}") from error
 
     def watch(self, fileno: int, on_readable: Callable[[], None]) -> None:
-        """Call `on_readable` at each poll at which there is something to read."""
+        """Call `on_readable` in each poll in which the descriptor is readable."""
         self._selector.register(fileno, selectors.EVENT_READ, on_readable)
 
     def forget(self, fileno: int) -> None:
-        """Watch no more."""
+        """Stop watching a descriptor."""
         self._selector.unregister(fileno)
 
     def at_flush(self, flush: Callable[[], None]) -> None:
@@ -116,32 +116,32 @@ class Hub:
         self._flushers.append(flush)
 
     def not_at_flush(self, flush: Callable[[], None]) -> None:
-        """Call `flush` no more."""
+        """Stop calling `flush`."""
         self._flushers.remove(flush)
 
     def at_close(self, close: Callable[[], None]) -> None:
-        """Call `close` at the end."""
+        """Call `close` when the hub closes."""
         self._closers.append(close)
 
     def poll(self, timeout_s: float = 0.0) -> None:
-        """Take in what has arrived, waiting at most `timeout_s` for it."""
+        """Receive available data. Wait at most `timeout_s` for it."""
         for key, _ in self._selector.select(timeout_s):
             key.data()
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait until something has arrived, which is left for the next poll; up to a millisecond short of `timeout_s`.
+        """Wait until data is available, which the next poll reads. Return True if so.
 
-        The system's clock for this ticks in milliseconds, and would be late otherwise.
+        Returns up to one millisecond before `timeout_s`, because the selector rounds timeouts up to milliseconds.
         """
         return bool(self._selector.select(math.floor(timeout_s * 1e3) / 1e3))
 
     def flush(self) -> None:
-        """Send what waits."""
+        """Send all queued data."""
         for flush in tuple(self._flushers):
             flush()
 
     def close(self) -> None:
-        """Close everything."""
+        """Close all links."""
         for close in self._closers:
             close()
         self._selector.close()
@@ -239,7 +239,7 @@ class _Udp:
         family = socket.AF_INET6 if ":" in spec.host else socket.AF_INET
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
-        # By the peer's address; the one channel of a connected socket has none.
+        # Channels by peer address. A connected socket has one channel with the key None.
         self._channels: dict[tuple[str, int] | None, Channel] = {}
         try:
             if spec.kind == "udpin":
@@ -285,7 +285,7 @@ class _Udp:
 
 
 class _Terminal:
-    """A serial device, or the near end of a pseudo terminal whose far end is linked at a path."""
+    """A serial device, or a pseudo terminal whose far end is linked at a path."""
 
     def __init__(self, hub: Hub, spec: LinkSpec, craft: Craft, port: int) -> None:
         self._craft = craft
@@ -294,7 +294,7 @@ class _Terminal:
         if spec.kind == "pty":
             path = Path(spec.path)
             if path.exists() and not path.is_symlink():
-                raise LinkError(f"link {spec}: there is a file of that name; give another path")
+                raise LinkError(f"link {spec}: path exists and is not a symbolic link; use another path")
             self._fd, self._far = os.openpty()
             tty.setraw(self._far)
             self._link = path
@@ -340,7 +340,7 @@ def _set_speed(fd: int, baud: int) -> None:
     tty.setraw(fd)
     speed = getattr(termios, f"B{baud}", None)
     if speed is None:
-        raise LinkError(f"baud rate {baud} is not supported here")
+        raise LinkError(f"baud rate {baud} is not supported on this system")
     attributes = termios.tcgetattr(fd)
     attributes[4] = attributes[5] = speed
     termios.tcsetattr(fd, termios.TCSANOW, attributes)

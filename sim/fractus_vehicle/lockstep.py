@@ -1,8 +1,8 @@
-"""Time that another process drives: the simulation advances only by as many steps as it is asked for.
+"""Lockstep mode: another process drives simulated time.
 
-The protocol is lines over TCP: the driver writes a number of control steps (10 ms each), the simulation takes in what has
-arrived on its links, advances, sends, and answers with the number of steps since its start. Together with a seed this
-makes runs repeatable to the byte.
+The protocol is line-based over TCP. The driver sends a number of control steps (10 ms each). The simulation receives
+pending data on its links, advances, sends, and replies with the number of steps since its start. With a fixed seed,
+runs are repeatable to the byte.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ POLL_S = 0.2
 
 
 class LockstepServer:
-    """Listens for the driver and keeps what it asked for."""
+    """TCP server that accepts one driver and collects its step requests."""
 
     def __init__(self, hub: Hub, host: str, port: int) -> None:
         self._hub = hub
@@ -38,12 +38,12 @@ class LockstepServer:
         hub.at_close(self._close)
 
     def take(self) -> int:
-        """The steps asked for since the last call."""
+        """Return the number of steps requested since the last call."""
         wanted, self._wanted = self._wanted, 0
         return wanted
 
     def answer(self, ticks: int) -> None:
-        """Tell the driver how far the simulation is."""
+        """Report the number of completed steps to the driver."""
         if self._driver is None:
             return
         try:
@@ -94,14 +94,14 @@ class LockstepServer:
 def run_lockstep(
     simulation: Simulation, hub: Hub, lockstep_server: LockstepServer, stopped: Callable[[], bool]
 ) -> None:
-    """Advance as the driver asks until stopped."""
+    """Advance by the requested steps until stopped."""
     while not stopped():
         hub.poll(POLL_S)
         steps = lockstep_server.take()
         if not steps:
             hub.flush()
             continue
-        # What was sent before the request has arrived by now: the links are polled once more before time moves.
+        # Poll the links again before time advances: data sent before the request has arrived by now.
         hub.poll()
         for _ in range(steps):
             simulation.step()

@@ -1,4 +1,4 @@
-"""The modes that a pilot flies with the sticks, or lets fly until the sticks move."""
+"""Pilot modes: controlled by the sticks."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from fractus_vehicle.state import CONTROL_STEP_S, VehicleState
 
 
 def stick_rate(pwm: int, dead_zone: int = 30) -> float:
-    """A stick's deflection from its centre, -1 to 1."""
+    """Return the deflection of a stick from its centre, -1 to 1."""
     offset = pwm - 1500
     if abs(offset) <= dead_zone:
         return 0.0
@@ -20,7 +20,10 @@ def stick_rate(pwm: int, dead_zone: int = 30) -> float:
 
 
 def pilot_climb(v: VehicleState) -> None:
-    """Climb and yaw rates from the sticks, as in ALT_HOLD and LOITER; takes off when the pilot raises throttle."""
+    """Set climb and yaw rates from the sticks, as in ALT_HOLD and LOITER.
+
+    Take off when the pilot raises the throttle.
+    """
     up = v.params["PILOT_SPEED_UP"] / 100.0
     down = (v.params["PILOT_SPEED_DN"] / 100.0) or up
     throttle = stick_rate(v.sticks[2], 100)
@@ -48,10 +51,10 @@ def pilot_climb(v: VehicleState) -> None:
 
 
 class Stabilize(Flight):
-    """Sticks set lean angles and thrust."""
+    """STABILIZE mode: sticks set lean angles and thrust."""
 
     def begin(self, v: VehicleState) -> None:
-        """Hand the lean angles to the sticks."""
+        """Switch to attitude control."""
         v.control.horizontal = Axis.ATTITUDE
 
     def step(self, v: VehicleState) -> None:
@@ -69,7 +72,7 @@ class Stabilize(Flight):
 
 
 class Acro(Stabilize):
-    """Sticks set rates of turn and thrust; a vehicle whose sticks are let go levels itself (ACRO_TRAINER 2)."""
+    """ACRO mode: sticks set rotation rates and thrust. Released sticks level the vehicle (ACRO_TRAINER 2)."""
 
     def step(self, v: VehicleState) -> None:
         """Follow the sticks."""
@@ -85,11 +88,11 @@ class Acro(Stabilize):
 
 
 class Throw(Flight):
-    """Waits with still motors to be thrown into the air, which nothing here does."""
+    """THROW mode: waits for a throw with stopped motors. Throws are not simulated."""
 
 
 class AltHold(Flight):
-    """Sticks set lean angles; the altitude holds unless the throttle leaves its centre."""
+    """ALT_HOLD mode: sticks set lean angles. The altitude is held while the throttle is centred."""
 
     def begin(self, v: VehicleState) -> None:
         """Hold the altitude."""
@@ -104,7 +107,7 @@ class AltHold(Flight):
 
 
 class Loiter(Flight):
-    """Holds position; sticks move it."""
+    """LOITER mode: holds the position while the sticks are centred."""
 
     def __init__(self) -> None:
         self._moving = False
@@ -130,14 +133,17 @@ class Loiter(Flight):
 
 
 class Circle(Flight):
-    """Circles around a point that lies CIRCLE_RADIUS ahead, the nose toward it; the throttle stick climbs and sinks."""
+    """CIRCLE mode: circles around a point CIRCLE_RADIUS ahead with the nose towards it.
+
+    The throttle stick climbs and sinks.
+    """
 
     def __init__(self) -> None:
         self._centre = (0.0, 0.0)
         self._angle = 0.0
 
     def begin(self, v: VehicleState) -> None:
-        """Set the centre ahead of where the vehicle stops."""
+        """Set the centre CIRCLE_RADIUS ahead of the stopping position."""
         v.control.hold_here()
         radius, yaw = v.params["CIRCLE_RADIUS"] / 100.0, v.est.yaw
         north, east = v.control.target
@@ -145,7 +151,7 @@ class Circle(Flight):
         self._angle = yaw + math.pi
 
     def step(self, v: VehicleState) -> None:
-        """Go on along the circle."""
+        """Advance along the circle."""
         radius = v.params["CIRCLE_RADIUS"] / 100.0
         pilot_climb(v)
         fastest = v.control.limits.speed_mps / max(radius, 1.0)

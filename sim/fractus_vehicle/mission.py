@@ -1,4 +1,4 @@
-"""The stored mission and where its execution stands."""
+"""Stored mission and the state of its execution."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from fractus_vehicle.mission_items import Item, ItemStore, home_item
 
 
 class Mission:
-    """The stored mission and the item it is at; item 0 is home, as in ArduPilot."""
+    """Stored mission and its current item. Item 0 is home, as in ArduPilot."""
 
     def __init__(self) -> None:
         self.store = ItemStore(
@@ -20,7 +20,7 @@ class Mission:
         self._jumps: dict[int, int] = {}
 
     def state(self, mode: int) -> int:
-        """MISSION_STATE of MISSION_CURRENT."""
+        """Return MISSION_STATE for MISSION_CURRENT."""
         if len(self.items) <= 1:
             return mavlink.MISSION_STATE_NO_MISSION
         if self.complete:
@@ -33,24 +33,27 @@ class Mission:
         return self.store.items
 
     def rewind(self) -> None:
-        """Start from the first item after home."""
+        """Reset to the beginning of the mission."""
         self.current = 0
         self.complete = False
         self._jumps.clear()
 
     def first_navigating(self, index: int) -> int | None:
-        """The first item from an index on, home excepted, that navigates."""
+        """Return the index of the first NAV item at or after `index`, excluding home, or None."""
         return next((at for at in range(max(index, 1), len(self.items)) if self.items[at].navigates), None)
 
     def takes_off(self, *, restart: bool) -> bool:
-        """Whether the mission, from the item on with which it would begin, takes off before it flies anywhere."""
+        """Return True if the first NAV item to execute, apart from delays, is a takeoff."""
         at = self.first_navigating(0 if restart else self.current)
         while at is not None and self.items[at].command == mavlink.MAV_CMD_NAV_DELAY:
             at = self.first_navigating(at + 1)
         return at is not None and self.items[at].command == mavlink.MAV_CMD_NAV_TAKEOFF
 
     def peek_after(self, index: int) -> int | None:
-        """The next item that navigates, without counting jumps as done; None where jumps only lead in a circle."""
+        """Return the index of the next NAV item without counting jumps.
+
+        Returns None if there is no such item or jumps form a loop.
+        """
         jumps = dict(self._jumps)
         at = self.next_after(index)
         for _ in self.items:
@@ -63,7 +66,7 @@ class Mission:
         return at
 
     def next_after(self, index: int) -> int | None:
-        """The item to execute after `index`, jumps followed; None at the end."""
+        """Return the index of the item to execute after `index`. Follow jumps. Return None at the end."""
         at = index + 1
         for _ in range(100):
             if at >= len(self.items):
@@ -83,14 +86,14 @@ class Mission:
         return None
 
     def tagged(self, tag: int) -> int | None:
-        """The first item that carries a tag."""
+        """Return the index of the first item with a JUMP_TAG, or None."""
         marks = (
             at for at, item in enumerate(self.items) if item.command == mavlink.MAV_CMD_JUMP_TAG and item.param1 == tag
         )
         return next(marks, None)
 
     def with_home(self, home: Place) -> None:
-        """Keep item 0 equal to home."""
+        """Update item 0 to the home position."""
         self.store.home = home_item(home)
         if self.items:
             self.items[0] = self.store.home

@@ -1,4 +1,4 @@
-"""DO and CONDITION commands of a mission: they run one after the other while the vehicle flies on."""
+"""DO and CONDITION commands of a mission, executed in order during NAV commands."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ YAW_REACHED_RAD = math.radians(2.0)
 
 
 class MissionCommands:
-    """What is pending beside the present NAV command; the next NAV command drops what is left."""
+    """Queue of DO and CONDITION commands. The next NAV command discards pending commands."""
 
     def __init__(self) -> None:
         self._indices: deque[int] = deque()
         self._begun_s: float | None = None
 
     def begin(self, v: VehicleState, indices: list[int]) -> None:
-        """Take the commands that stand before a NAV command that has just begun, and run what need not wait."""
+        """Queue the commands before a NAV command that has just begun, and run them up to the first unmet condition."""
         self._indices = deque(indices)
         self._begun_s = None
         self.step(v)
 
     def step(self, v: VehicleState) -> None:
-        """Go on until a condition has to be waited for."""
+        """Run commands up to the first unmet condition."""
         while self._indices:
             index = self._indices[0]
             if index >= len(v.mission.items):
@@ -79,11 +79,15 @@ def _do(v: VehicleState, item: Item) -> None:
         case mavlink.MAV_CMD_DO_SET_HOME:
             set_home_here(v) if item.param1 > 0.5 else set_home_at(v, item.x, item.y, item.z)
         case _:
-            pass  # nothing hangs on them: cameras, mounts, grippers
+            pass  # no device is simulated for cameras, mounts and grippers
 
 
 def switch_fence(v: VehicleState, action: float) -> bool:
-    """DO_FENCE_ENABLE: 0 off, 1 on, 2 only the floor off; False when there is nothing to switch on, or no such action."""
+    """Handle DO_FENCE_ENABLE: 0 disables the fence, 1 enables it, 2 disables only the minimum altitude.
+
+    Returns:
+        False if no fence is present, or the action is unknown.
+    """
     if action == 2.0:
         v.fence.types &= ~mavlink.FENCE_TYPE_ALT_MIN
         return True
@@ -94,7 +98,10 @@ def switch_fence(v: VehicleState, action: float) -> bool:
 
 
 def item_target(v: VehicleState, item: Item) -> tuple[float, float, float]:
-    """Where an item lies in the local frame; a missing position means here."""
+    """Return the local position (north, east, down) of an item.
+
+    An item without coordinates refers to the current target.
+    """
     origin = v.origin or v.start
     base = v.altitude_base_m(item.frame)
     if base is None:
@@ -144,5 +151,5 @@ _TITLES: dict[int, str] = {
 
 
 def title(item: Item) -> str:
-    """ArduPilot's word for a command."""
+    """Return ArduPilot's name of a command in STATUSTEXTs."""
     return _TITLES.get(item.command, "Cmd")

@@ -1,4 +1,4 @@
-"""Items of missions, fences and rally points: read from messages, judged, and kept in lists."""
+"""Items of missions, fences and rally points: decoding, validation and storage."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from fractus_vehicle.copter import GLOBAL_FRAMES
 from fractus_vehicle.earth import ALTITUDE_MAX_M, Place, valid_coordinates
 
-# Commands whose fourth parameter, a heading, may be NaN; no other parameter may.
+# Commands whose fourth parameter (heading) may be NaN. No other parameter may be NaN.
 NAN_HEADINGS = frozenset({mavlink.MAV_CMD_NAV_WAYPOINT, mavlink.MAV_CMD_NAV_LAND, mavlink.MAV_CMD_NAV_TAKEOFF})
 FENCE_COMMANDS = frozenset(range(5000, 5005))
 SUPPORTED = frozenset(
@@ -67,7 +67,7 @@ SUPPORTED = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """One item of a list; x and y are degrees times 1e7."""
+    """One item. `x` and `y` are degrees times 1e7."""
 
     command: int
     frame: int = mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT
@@ -82,12 +82,12 @@ class Item:
 
     @property
     def has_place(self) -> bool:
-        """Whether the item names a position (0, 0 means: here)."""
+        """True if the item has coordinates. 0, 0 means the current position."""
         return self.x != 0 or self.y != 0
 
     @property
     def navigates(self) -> bool:
-        """Whether this is a NAV command: one with a position, which a mission waits for."""
+        """True for NAV commands, which the mission waits for."""
         return (
             mavlink.MAV_CMD_NAV_WAYPOINT <= self.command < mavlink.MAV_CMD_NAV_LAST
             or self.command >= mavlink.MAV_CMD_NAV_FENCE_RETURN_POINT
@@ -95,7 +95,7 @@ class Item:
 
 
 def home_item(home: Place) -> Item:
-    """Item 0 of every mission: home, as ArduPilot keeps it."""
+    """Return item 0 of every mission: the home position."""
     return Item(
         mavlink.MAV_CMD_NAV_WAYPOINT, frame=mavlink.MAV_FRAME_GLOBAL, x=home.lat_e7, y=home.lon_e7, z=home.alt_m
     )
@@ -103,7 +103,7 @@ def home_item(home: Place) -> Item:
 
 @dataclass(slots=True)
 class ItemStore:
-    """One list; `home` stands for item 0 while a mission is empty."""
+    """List of stored items. `home` replaces item 0 while a mission is empty."""
 
     kind: int
     items: list[Item] = field(default_factory=list)
@@ -114,7 +114,7 @@ def _finite(value: float) -> float:
     return value if math.isfinite(value) else 0.0
 
 
-# The *_INT frames are deprecated, and are stored as what replaces them.
+# Replacements of the deprecated *_INT frames.
 _CURRENT_FRAMES: dict[int, int] = {
     mavlink.MAV_FRAME_GLOBAL_INT: mavlink.MAV_FRAME_GLOBAL,
     mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT: mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT,
@@ -123,7 +123,7 @@ _CURRENT_FRAMES: dict[int, int] = {
 }
 
 
-# Commands whose items have a place; of the others no frame is kept.
+# Commands with coordinates. The frame of other commands is not stored.
 PLACED = frozenset(
     {
         mavlink.MAV_CMD_NAV_WAYPOINT,
@@ -142,7 +142,7 @@ PLACED = frozenset(
 )
 
 
-# Of these, only a count of the parameters is stored: the first, a delay in whole seconds, or none.
+# Number of stored parameters of these commands: only the first one, a delay in whole seconds, or none.
 STORED_PARAMETERS: dict[int, int] = {
     mavlink.MAV_CMD_NAV_WAYPOINT: 1,
     mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT: 1,
@@ -153,7 +153,7 @@ _UINT16_MAX = 65535
 
 
 def _parameters(message: Message, command: int) -> tuple[float, float, float, float]:
-    """What is stored of the four parameters."""
+    """Return the four parameters as they are stored."""
     one, *more = (_finite(message.real(f"param{at}")) for at in range(1, 5))
     stored = STORED_PARAMETERS.get(command)
     if stored is None:
@@ -162,7 +162,7 @@ def _parameters(message: Message, command: int) -> tuple[float, float, float, fl
 
 
 def item_from(message: Message) -> Item:
-    """Read MISSION_ITEM_INT, or MISSION_ITEM with its degrees in floats."""
+    """Decode MISSION_ITEM_INT, or MISSION_ITEM with coordinates in floating-point degrees."""
     frame = message.integer("frame")
     x, y = message.real("x"), message.real("y")
     scale = 1e7 if frame in GLOBAL_FRAMES else 1e4
@@ -187,7 +187,7 @@ def item_from(message: Message) -> Item:
 
 
 def judge(item: Item, kind: int) -> int:
-    """Whether an item may be stored in a list of that kind."""
+    """Return MAV_MISSION_ACCEPTED if the item may be stored in a list of this kind, or the MAV_MISSION_RESULT error."""
     if kind == mavlink.MAV_MISSION_TYPE_FENCE:
         known = item.command in FENCE_COMMANDS
     elif kind == mavlink.MAV_MISSION_TYPE_RALLY:
@@ -198,7 +198,7 @@ def judge(item: Item, kind: int) -> int:
         return mavlink.MAV_MISSION_UNSUPPORTED
     if kind == mavlink.MAV_MISSION_TYPE_MISSION and item.command not in PLACED:
         return mavlink.MAV_MISSION_ACCEPTED
-    if kind != mavlink.MAV_MISSION_TYPE_FENCE:  # a fence is judged as a whole
+    if kind != mavlink.MAV_MISSION_TYPE_FENCE:  # a fence is validated as a whole
         if not valid_coordinates(item.x, item.y):
             beyond = abs(item.x) > 900_000_000
             return mavlink.MAV_MISSION_INVALID_PARAM5_X if beyond else mavlink.MAV_MISSION_INVALID_PARAM6_Y
@@ -208,7 +208,7 @@ def judge(item: Item, kind: int) -> int:
 
 
 def judge_numbers(message: Message) -> int:
-    """Whether the parameters of a mission's item are numbers, as ArduPilot wants them."""
+    """Return MAV_MISSION_ACCEPTED if all parameters are finite, or the error of the first invalid one."""
     may_be_nan = message.integer("command") in NAN_HEADINGS
     for at in range(1, 5):
         value = message.real(f"param{at}")

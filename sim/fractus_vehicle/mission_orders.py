@@ -1,4 +1,4 @@
-"""Commands about the stored mission: start it, choose its item, pause it."""
+"""Commands that control mission execution: start, select item, jump, pause."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MAX_TAG = 65535
 
 
 def start_mission(vehicle: Vehicle, o: Order, _c: Channel) -> int:
-    """MISSION_START, of the whole mission only."""
+    """Handle MISSION_START. Only the whole mission can be started."""
     if o.params[:2] != (0.0, 0.0):
         return mavlink.MAV_RESULT_DENIED
     if not vehicle.modes.change(mavlink.COPTER_MODE_AUTO):
@@ -29,7 +29,7 @@ def start_mission(vehicle: Vehicle, o: Order, _c: Channel) -> int:
 
 
 def choose_item(vehicle: Vehicle, o: Order, c: Channel) -> int:
-    """DO_SET_MISSION_CURRENT; with 1 as the second parameter, the mission starts over first."""
+    """Handle DO_SET_MISSION_CURRENT. Reset the mission first if the second parameter is 1."""
     v, number = vehicle.state, o.params[0]
     if not (math.isfinite(number) and 0 <= int(number) < len(v.mission.items)):
         return mavlink.MAV_RESULT_DENIED
@@ -42,7 +42,7 @@ def choose_item(vehicle: Vehicle, o: Order, c: Channel) -> int:
 
 
 def jump_to_tag(vehicle: Vehicle, o: Order, c: Channel) -> int:
-    """DO_JUMP_TAG."""
+    """Handle DO_JUMP_TAG."""
     v, tag = vehicle.state, o.params[0]
     if not 0.0 <= tag <= MAX_TAG:
         return mavlink.MAV_RESULT_DENIED
@@ -54,7 +54,11 @@ def jump_to_tag(vehicle: Vehicle, o: Order, c: Channel) -> int:
 
 
 def set_current(vehicle: Vehicle, index: int) -> bool:
-    """Make an item (or the first one that navigates after it) the current one; AUTO continues there; False if there is none."""
+    """Make an item current, or the first NAV item after it. AUTO mode continues there.
+
+    Returns:
+        False if there is no such item.
+    """
     v = vehicle.state
     if not 0 <= index < len(v.mission.items) or len(v.mission.items) == 1:
         return False
@@ -69,7 +73,7 @@ def set_current(vehicle: Vehicle, index: int) -> bool:
 
 
 def pause(vehicle: Vehicle, o: Order, _c: Channel) -> int:
-    """DO_PAUSE_CONTINUE, in the modes that fly by themselves."""
+    """Handle DO_PAUSE_CONTINUE in AUTO and GUIDED modes."""
     v, flight = vehicle.state, vehicle.modes.flight
     if not math.isfinite(o.params[0]) or int(o.params[0]) not in (0, 1):
         return mavlink.MAV_RESULT_DENIED
@@ -82,13 +86,13 @@ def pause(vehicle: Vehicle, o: Order, _c: Channel) -> int:
 
 
 def begin_landing_sequence(vehicle: Vehicle, _o: Order, _c: Channel) -> int:
-    """DO_LAND_START: no mission here has a landing sequence to jump to."""
+    """Handle DO_LAND_START. Landing sequences are not simulated."""
     vehicle.state.say(mavlink.MAV_SEVERITY_WARNING, "Unable to start landing sequence")
     vehicle.state.say(mavlink.MAV_SEVERITY_WARNING, "Mode change to AUTO RTL failed: No landing sequence found")
     return mavlink.MAV_RESULT_FAILED
 
 
 def begin_return_path(vehicle: Vehicle, _o: Order, _c: Channel) -> int:
-    """DO_RETURN_PATH_START: no mission here has a path to join."""
+    """Handle DO_RETURN_PATH_START. Return paths are not simulated."""
     vehicle.state.say(mavlink.MAV_SEVERITY_WARNING, "Mode change to AUTO RTL failed: No return path found")
     return mavlink.MAV_RESULT_FAILED

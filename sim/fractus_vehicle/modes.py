@@ -1,4 +1,4 @@
-"""The flight mode in use, and the change to another one."""
+"""Current flight mode and mode changes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from fractus_vehicle.smart_rtl import SmartReturn
 from fractus_vehicle.state import VehicleState
 from fractus_vehicle.telemetry import send_on_all
 
-# After a change of mode in a breach, the fence is not checked for so long.
+# The fence is not checked for this time after a mode change during a breach.
 MANUAL_RECOVERY_S = 10.0
 
 _FLIGHTS: dict[int, type[Flight]] = {
@@ -40,14 +40,14 @@ _FLIGHTS: dict[int, type[Flight]] = {
 
 
 class FlightModes:
-    """Which mode flies the vehicle; each change makes a new flight."""
+    """Current flight mode. Each change creates a new flight."""
 
     def __init__(self, state: VehicleState) -> None:
         self._state = state
         self.flight = self._new_flight(state.mode)
 
     def _refusal(self, mode: int) -> str | None:
-        """Why a mode cannot be entered now, or None; on the ground with the motors off nearly every mode can."""
+        """Return the reason why a mode cannot be entered now, or None. Few modes are refused while disarmed."""
         v = self._state
         if mode in UNAVAILABLE:
             for text in UNAVAILABLE[mode][0]:
@@ -67,7 +67,10 @@ class FlightModes:
         return None if begins else "init failed"
 
     def _has_mission(self) -> bool:
-        """Whether there is a mission that can be flown from where the vehicle is: on the ground, one that takes off."""
+        """Return True if the mission can be flown from the current state.
+
+        On the ground it must begin with a takeoff.
+        """
         v = self._state
         if len(v.mission.items) <= 1:
             return False
@@ -77,7 +80,7 @@ class FlightModes:
         return True
 
     def change(self, mode: int) -> bool:
-        """Change the mode as a ground station asks; False when it is refused."""
+        """Change the mode on request. Return False if the change is refused."""
         if mode == self._state.mode:
             return True
         refusal = self._refusal(mode)
@@ -88,7 +91,7 @@ class FlightModes:
         return True
 
     def force(self, mode: int) -> None:
-        """Change the mode without asking."""
+        """Change the mode without checks."""
         v = self._state
         self.flight.end(v)
         v.mode = mode
@@ -106,5 +109,5 @@ class FlightModes:
         send_on_all(v, "HEARTBEAT")
 
     def _new_flight(self, mode: int) -> Flight:
-        # A mission may end itself by another mode.
+        # Missions may end by a change to another mode.
         return AutoFlight(self.change) if mode == mavlink.COPTER_MODE_AUTO else _FLIGHTS[mode]()

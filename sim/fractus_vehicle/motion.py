@@ -1,4 +1,4 @@
-"""One control step of the body: from the controller's wishes through battery, wind and broken motors to motion."""
+"""Physics of one control step: controller output, battery, wind and failed motors to motion of the body."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from fractus_vehicle.state import ARMING_DELAY_S, CONTROL_STEP_S, VehicleState
 PHYSICS_PER_CONTROL = 2
 # Share of full thrust at which armed motors idle.
 IDLE_SPIN = 0.05
-# A vehicle that bounces tells of the first contact only.
+# After a bounce, further ground contacts are not reported for this time.
 IMPACT_TEXTS_S = 1.0
-# Turning faster than its gyroscopes measure, a vehicle has lost its attitude for good.
+# Beyond the range of its gyroscopes, the vehicle has lost its attitude permanently.
 GYRO_RANGE_RPS = math.radians(2000.0)
-# A throttle stick above this lifts off in a mode that hands the throttle to the pilot.
+# Throttle stick position above which the vehicle lifts off in STABILIZE mode.
 LIFT_THROTTLE_US = 1550
 
 
 def move(v: VehicleState) -> None:
-    """Advance body, battery and estimate."""
+    """Advance body, battery and estimate by one control step."""
     dt = CONTROL_STEP_S / PHYSICS_PER_CONTROL
     body = v.body
     full = body.airframe.full_thrust_n
-    # The mixer keeps the motors below MOT_SPIN_MAX; thrust goes with the square of their speed.
+    # The mixer limits the motors to MOT_SPIN_MAX. Thrust is proportional to the square of motor speed.
     share = v.battery.thrust_share * v.params["MOT_SPIN_MAX"] ** 2
     lifting = v.armed and _may_lift(v)
     if body.on_ground and not lifting:

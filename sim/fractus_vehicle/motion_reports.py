@@ -1,4 +1,4 @@
-"""Telemetry of motion: positions, attitudes, and the targets they follow."""
+"""Telemetry of motion: positions, attitudes and their targets."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _AUTOMATIC = frozenset(
 
 
 def global_position_int(v: VehicleState) -> Values:
-    """GLOBAL_POSITION_INT: the estimate; zeros until there is one."""
+    """Build GLOBAL_POSITION_INT from the estimate, with zeros before the first one."""
     e = v.est
     if v.origin is None:
         return {"time_boot_ms": boot_ms(v), "hdg": v.heading_cdeg}
@@ -41,7 +41,7 @@ def global_position_int(v: VehicleState) -> Values:
 
 
 def local_position_ned(v: VehicleState) -> Values | None:
-    """LOCAL_POSITION_NED, from the estimator's origin."""
+    """Build LOCAL_POSITION_NED, relative to the estimator's origin."""
     if v.origin is None:
         return None
     e = v.est
@@ -53,19 +53,19 @@ def _rates(v: VehicleState) -> dict[str, Value]:
 
 
 def attitude(v: VehicleState) -> Values:
-    """ATTITUDE."""
+    """Build ATTITUDE."""
     e = v.est
     return {"time_boot_ms": boot_ms(v), "roll": e.roll, "pitch": e.pitch, "yaw": e.yaw, **_rates(v)}
 
 
 def attitude_quaternion(v: VehicleState) -> Values:
-    """ATTITUDE_QUATERNION."""
+    """Build ATTITUDE_QUATERNION."""
     w, x, y, z = v.est.quaternion
     return {"time_boot_ms": boot_ms(v), "q1": w, "q2": x, "q3": y, "q4": z, **_rates(v)}
 
 
 def attitude_target(v: VehicleState) -> Values:
-    """ATTITUDE_TARGET."""
+    """Build ATTITUDE_TARGET."""
     roll, pitch = v.control.lean
     yaw = v.control.yaw_setpoint
     cr, sr = math.cos(roll / 2), math.sin(roll / 2)
@@ -81,7 +81,7 @@ def attitude_target(v: VehicleState) -> Values:
 
 
 def gimbal_device_attitude_status(v: VehicleState) -> Values | None:
-    """GIMBAL_DEVICE_ATTITUDE_STATUS, where there is a gimbal: over the horizon, and from the nose."""
+    """Build GIMBAL_DEVICE_ATTITUDE_STATUS, relative to horizon and nose, if there is a gimbal."""
     if not v.gimbal.kind:
         return None
     flags = (
@@ -94,7 +94,7 @@ def gimbal_device_attitude_status(v: VehicleState) -> Values | None:
 
 
 def gimbal_manager_information(v: VehicleState) -> Values | None:
-    """GIMBAL_MANAGER_INFORMATION, where there is a gimbal: how far it turns."""
+    """Build GIMBAL_MANAGER_INFORMATION with the angle limits, if there is a gimbal."""
     if not v.gimbal.kind:
         return None
     ranges = {"roll": ROLL_DEG, "pitch": PITCH_DEG, "yaw": YAW_DEG}
@@ -105,7 +105,7 @@ def gimbal_manager_information(v: VehicleState) -> Values | None:
 
 
 def vfr_hud(v: VehicleState) -> Values:
-    """VFR_HUD; `alt` is above mean sea level."""
+    """Build VFR_HUD. `alt` is above mean sea level."""
     e = v.est
     speed = math.hypot(e.vn, e.ve)
     return {
@@ -119,7 +119,7 @@ def vfr_hud(v: VehicleState) -> Values:
 
 
 def nav_controller_output(v: VehicleState) -> Values:
-    """NAV_CONTROLLER_OUTPUT."""
+    """Build NAV_CONTROLLER_OUTPUT."""
     c = v.control
     dn, de = c.target[0] - v.est.north, c.target[1] - v.est.east
     distance = math.hypot(dn, de) if c.horizontal is Axis.POSITION and not v.landed else 0.0
@@ -135,7 +135,7 @@ def nav_controller_output(v: VehicleState) -> Values:
 
 
 def position_target_global_int(v: VehicleState) -> Values | None:
-    """POSITION_TARGET_GLOBAL_INT while a guided or automatic flight has a place as its target."""
+    """Build POSITION_TARGET_GLOBAL_INT if a guided or automatic flight has a position target."""
     if v.origin is None or v.mode not in _AUTOMATIC or v.landed or v.control.horizontal is Axis.VELOCITY:
         return None
     place = v.origin.offset(*v.control.target, v.control.target_down)
@@ -150,7 +150,7 @@ def position_target_global_int(v: VehicleState) -> Values | None:
 
 
 def position_target_local_ned(v: VehicleState) -> Values | None:
-    """POSITION_TARGET_LOCAL_NED while in GUIDED: a place, or a velocity."""
+    """Build POSITION_TARGET_LOCAL_NED in GUIDED mode, with a position or a velocity."""
     if v.origin is None or v.mode != mavlink.COPTER_MODE_GUIDED or v.landed:
         return None
     c = v.control
@@ -162,7 +162,7 @@ def position_target_local_ned(v: VehicleState) -> Values | None:
 
 
 def home_position(v: VehicleState) -> Values | None:
-    """HOME_POSITION; None until home is known."""
+    """Build HOME_POSITION if home is known."""
     if v.home is None or v.origin is None:
         return None
     north, east, down = v.origin.vector_to(v.home)
@@ -177,7 +177,7 @@ def home_position(v: VehicleState) -> Values | None:
 
 
 def gps_global_origin(v: VehicleState) -> Values | None:
-    """GPS_GLOBAL_ORIGIN: where the local frame begins."""
+    """Build GPS_GLOBAL_ORIGIN, the origin of the local frame."""
     if v.origin is None:
         return None
     return {**_degrees(v.origin), "time_usec": boot_us(v)}
@@ -188,7 +188,7 @@ def _degrees(place: Place) -> dict[str, Value]:
 
 
 def altitude(v: VehicleState) -> Values:
-    """ALTITUDE."""
+    """Build ALTITUDE."""
     place = v.place
     home = v.home.alt_m if v.home is not None else v.start.alt_m
     relative = place.alt_m - home
@@ -204,7 +204,7 @@ def altitude(v: VehicleState) -> Values:
 
 
 def terrain_report(v: VehicleState) -> Values | None:
-    """TERRAIN_REPORT: the ground is flat, at the start's altitude, unless TERRAIN_ENABLE says that it is unknown."""
+    """Build TERRAIN_REPORT if TERRAIN_ENABLE is set. The ground is flat at the altitude of the start."""
     if not int(v.params["TERRAIN_ENABLE"]):
         return None
     place = v.place
@@ -219,7 +219,7 @@ def terrain_report(v: VehicleState) -> Values | None:
 
 
 def ahrs2(v: VehicleState) -> Values:
-    """AHRS2: the secondary estimate."""
+    """Build AHRS2, the secondary estimate."""
     e = v.est
     place = v.place
     return {
@@ -233,7 +233,7 @@ def ahrs2(v: VehicleState) -> Values:
 
 
 def simstate(v: VehicleState) -> Values:
-    """SIMSTATE: the truth behind the estimate."""
+    """Build SIMSTATE, the true state."""
     roll, pitch, yaw = v.body.euler()
     fn, fe, fd = v.body.specific_force
     place = v.true_place
@@ -253,7 +253,7 @@ def simstate(v: VehicleState) -> Values:
 
 
 def sim_state(v: VehicleState) -> Values:
-    """SIM_STATE: the truth once more, with velocity and height."""
+    """Build SIM_STATE, the true state with velocity and altitude."""
     w, x, y, z = v.body.quaternion
     place = v.true_place
     degrees = {"lat": place.lat_e7 * 1e-7, "lon": place.lon_e7 * 1e-7, "lat_int": place.lat_e7, "lon_int": place.lon_e7}
@@ -263,7 +263,7 @@ def sim_state(v: VehicleState) -> Values:
 
 
 def high_latency2(v: VehicleState) -> Values:
-    """HIGH_LATENCY2: what matters, in one small message."""
+    """Build HIGH_LATENCY2."""
     place, speed = v.place, math.hypot(v.est.vn, v.est.ve)
     return {
         "timestamp": boot_ms(v),

@@ -1,4 +1,4 @@
-"""Sensor noise as a function of seed and time: what one link asks for never changes what another one hears."""
+"""Sensor noise as a function of seed and time, so that requests on one link do not change the data of another link."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ import math
 import struct
 import zlib
 
-# Of ArduPilot's simulated sensors: what is there at rest, and what full throttle adds through the frame.
+# Noise of ArduPilot's simulated sensors: at rest, and added at full throttle.
 ACCEL_MPS2, ACCEL_THROTTLE_MPS2 = 0.05, 0.25
 GYRO_RPS, GYRO_THROTTLE_RPS = 0.002, 0.007
 MAG_MGAUSS = 1.0
 
 
 def gaussian(seed: int, tick: int, axis: int) -> float:
-    """A standard normal number that belongs to this moment and axis.
+    """Return a standard normal number for a tick and an axis.
 
-    A CRC, mixed twice, gives the pair of uniform numbers for a Box-Muller transform: far cheaper than seeding a generator
-    each time, and good enough for noise.
+    A CRC, mixed twice, yields two uniform numbers for a Box-Muller transform. This is much cheaper than seeding a
+    generator for each number, and good enough for noise.
     """
     key = struct.pack("<QIB", seed & 0xFFFFFFFFFFFFFFFF, tick & 0xFFFFFFFF, axis & 0xFF)
     one = _mixed(zlib.crc32(key))

@@ -1,4 +1,4 @@
-"""COMMAND_LONG and COMMAND_INT as one thing: a command with its numbers and, maybe, a position."""
+"""Common form of COMMAND_LONG and COMMAND_INT."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.mission_items import Item
 
-# The commands whose fifth and sixth parameters are degrees; of all others they are plain integers.
+# Commands whose fifth and sixth parameters are degrees. Those of other commands are plain integers.
 PLACED = frozenset(
     {
         mavlink.MAV_CMD_DO_SET_HOME,
@@ -24,7 +24,10 @@ _INT32_MAX = 2147483647
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """A command from either message, with its position as degrees times 1e7, or the two integers that others have there."""
+    """A command from either message.
+
+    `x` and `y` are degrees times 1e7, or plain integers for commands without coordinates.
+    """
 
     command: int
     params: tuple[float, float, float, float]
@@ -37,12 +40,12 @@ class Order:
 
     @property
     def item(self) -> Item:
-        """The order's position as a mission item, for frame arithmetic."""
+        """The position of the command as a mission item, for frame conversion."""
         return Item(command=self.command, frame=self.frame, x=self.x, y=self.y, z=self.z)
 
 
 def read_order(message: Message) -> Order:
-    """Read COMMAND_LONG or COMMAND_INT."""
+    """Decode COMMAND_LONG or COMMAND_INT."""
     numbers = (
         message.real("param1"),
         message.real("param2"),
@@ -63,5 +66,5 @@ def read_order(message: Message) -> Order:
 
 
 def _integer(value: float) -> int:
-    """The nearest integer that the field of COMMAND_INT holds; 0 for what is no number."""
+    """Return the nearest 32-bit integer, 0 for NaN."""
     return round(max(min(value, _INT32_MAX), -_INT32_MAX)) if not math.isnan(value) else 0

@@ -1,4 +1,4 @@
-"""The vehicle's parameters: ArduCopter's names, defaults and types, with what was changed."""
+"""Vehicle parameters: ArduCopter's names, defaults and types, with changed values."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ WIRE_TYPES = {
     "REAL32": mavlink.MAV_PARAM_TYPE_REAL32,
 }
 """MAV_PARAM_TYPE that PARAM_VALUE reports for each type of the table."""
-# Names of later ArduCopter releases for the same thing, accepted beside the ones of this release.
+# Names of later ArduCopter releases for the same parameters.
 ALIASES = {"MAV_GCS_SYSID": "SYSID_MYGCS", "MAV_SYSID": "SYSID_THISMAV"}
-# These describe what is stored or who the vehicle is on its links; a real autopilot lets a client overwrite them.
+# Item counts and the system id. A real autopilot lets a client overwrite them.
 READ_ONLY = frozenset({"MIS_TOTAL", "FENCE_TOTAL", "RALLY_TOTAL", "SYSID_THISMAV"})
-# What is added to a value before its fraction is cut off.
+# Added to a value before truncation to an integer.
 ROUNDING = 0.01
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One line of the table: a name, its default and its MAVLink type."""
+    """A row of the parameter table: name, default and type."""
 
     name: str
     default: float
@@ -43,17 +43,17 @@ class Parameter:
 
     @property
     def wire_type(self) -> int:
-        """What PARAM_VALUE says of its type."""
+        """MAV_PARAM_TYPE for PARAM_VALUE."""
         return WIRE_TYPES[self.kind]
 
     def coerce(self, value: float) -> float:
-        """The value as this type stores it: without its fraction, and the nearest one that fits.
+        """Convert a value to this type: limit it to the range and truncate integers.
 
         Raises:
-            ParameterValueError: the value is not a number.
+            ParameterValueError: The value is NaN.
         """
         if math.isnan(value):
-            raise ParameterValueError(f"parameter {self.name}: the value is not a number")
+            raise ParameterValueError(f"parameter {self.name}: the value must be a number")
         low, high = RANGES[self.kind]
         value = min(max(value, low), high)
         if self.kind == "REAL32":
@@ -64,7 +64,7 @@ class Parameter:
 
 @functools.cache
 def table() -> tuple[Parameter, ...]:
-    """All parameters in the order in which they are listed."""
+    """Return all parameters in list order."""
     text = resources.files(__package__).joinpath("parameters.txt").read_text(encoding="ascii")
     rows = (line.split() for line in text.splitlines() if line)
     return tuple(Parameter(name, float(default), kind) for name, default, kind in rows)
@@ -80,15 +80,18 @@ class UnknownParameterError(KeyError):
 
 
 class ParameterValueError(ValueError):
-    """A value that no parameter can have, or a file of values that cannot be read."""
+    """An invalid parameter value, or a parameter file that cannot be read."""
 
 
 def _stored(path: Path) -> Iterator[tuple[str, float]]:
-    """The lines of a file of changed parameters; one that is none of them is another program's, and must not be replaced."""
+    """Parse a file of changed parameters.
+
+    An unexpected line is an error, because the file may belong to another program and must not be overwritten.
+    """
     try:
         lines = path.read_text(encoding="ascii").splitlines()
     except UnicodeDecodeError as error:
-        raise ParameterValueError(f"{path}: is no file of parameters (NAME,VALUE a line)") from error
+        raise ParameterValueError(f"{path}: not a parameter file (expected one NAME,VALUE per line)") from error
     for number, line in enumerate(lines, start=1):
         name, _, text = line.partition(",")
         try:
@@ -122,15 +125,15 @@ class Parameters(Mapping[str, float]):
         return iter(self._values)
 
     def watch(self, watcher: Callable[[str], None]) -> None:
-        """Call `watcher` with the name after each change."""
+        """Call `watcher` with the name of each changed parameter."""
         self._watchers.append(watcher)
 
     def assign(self, name: str, value: float) -> float:
-        """Set a parameter as its owner does (also read-only ones) and return the stored value.
+        """Set a parameter without access checks (also read-only ones) and return the stored value.
 
         Raises:
-            UnknownParameterError: there is no such parameter.
-            ParameterValueError: the value is not a number.
+            UnknownParameterError: The parameter does not exist.
+            ParameterValueError: The value is NaN.
         """
         name = ALIASES.get(name, name)
         index = _index().get(name)
@@ -142,7 +145,7 @@ class Parameters(Mapping[str, float]):
         return self._values[name]
 
     def set(self, name: str, value: float) -> bool:
-        """Set a parameter as a ground station does; False when it is unknown, read-only or not a number."""
+        """Set a parameter for a client. Return False if it is unknown or read-only, or the value is not finite."""
         name = ALIASES.get(name, name)
         if name not in self._values or name in READ_ONLY or not math.isfinite(value):
             return False
@@ -152,12 +155,12 @@ class Parameters(Mapping[str, float]):
         return True
 
     def erase(self) -> None:
-        """Forget what clients have stored; until the next boot the values stay as they are."""
+        """Erase the stored changes. Current values stay until the next boot."""
         self._erased = set(self._values) - READ_ONLY
         self._save()
 
     def changes(self) -> dict[str, float]:
-        """The stored parameters that differ from their defaults: what the next boot finds."""
+        """Return the stored parameters that differ from their defaults, as restored by the next boot."""
         return {
             row.name: self._values[row.name]
             for row in table()
@@ -165,7 +168,11 @@ class Parameters(Mapping[str, float]):
         }
 
     def find(self, name: str, index: int = -1) -> tuple[str, Parameter, int] | None:
-        """A parameter by index or, with a negative index, by name: the name asked for, the row, its position."""
+        """Find a parameter by index, or by name if the index is negative.
+
+        Returns:
+            Requested name, table row and index, or None.
+        """
         if index >= 0:
             if index >= len(table()):
                 return None

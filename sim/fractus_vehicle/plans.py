@@ -1,4 +1,4 @@
-"""What storing a list of items changes on the vehicle: mission, fence and rally points."""
+"""Storage of missions, fences and rally points, with their effects on the vehicle."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from fractus_vehicle.state import VehicleState
 
 
 def stores_of(v: VehicleState) -> dict[int, ItemStore]:
-    """The three lists of one vehicle."""
+    """Return the mission, fence and rally lists by MAV_MISSION_TYPE."""
     return {store.kind: store for store in (v.mission.store, v.fence_items, v.rally)}
 
 
 def restore(v: VehicleState, kept: VehicleState) -> None:
-    """Take over the lists that were stored before a reboot."""
+    """Restore the lists stored before a reboot."""
     for mine, theirs in zip(stores_of(v).values(), stores_of(kept).values(), strict=True):
         if theirs.items:
             replace_items(v, mine, list(theirs.items))
 
 
 def replace_items(v: VehicleState, store: ItemStore, items: list[Item]) -> int:
-    """Store a list in place of what is there, unless the vehicle cannot use it."""
+    """Replace a stored list if the vehicle accepts the new one. Return the MAV_MISSION_RESULT."""
     result = _accept(v, store.kind, items)
     if result == mavlink.MAV_MISSION_ACCEPTED:
         store.items = items
@@ -33,7 +33,7 @@ def replace_items(v: VehicleState, store: ItemStore, items: list[Item]) -> int:
 
 
 def clear_items(v: VehicleState, store: ItemStore) -> int:
-    """Empty a list; a mission is kept while it is flown."""
+    """Clear a list. Return an error for a mission that is being flown."""
     if (
         store.kind == mavlink.MAV_MISSION_TYPE_MISSION
         and v.armed
@@ -63,9 +63,9 @@ def _accept(v: VehicleState, kind: int, items: list[Item]) -> int:
         case mavlink.MAV_MISSION_TYPE_RALLY:
             v.params.assign("RALLY_TOTAL", len(items))
         case mavlink.MAV_MISSION_TYPE_ALL:
-            raise ValueError("plans: a list has one kind; only MISSION_CLEAR_ALL names all of them")
+            raise ValueError("MAV_MISSION_TYPE_ALL is valid in MISSION_CLEAR_ALL only")
         case _:
-            raise ValueError(f"plans: unknown MAV_MISSION_TYPE {kind}")
+            raise ValueError(f"unknown MAV_MISSION_TYPE {kind}")
     return mavlink.MAV_MISSION_ACCEPTED
 
 

@@ -1,4 +1,4 @@
-"""Motion along a line from rest to rest, with limits on speed, acceleration and jerk: seven phases, in time and in reverse alike."""
+"""Seven-phase motion profile along a line, from rest to rest, with speed, acceleration and jerk limits."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 
 
 class Profile:
-    """Way, speed and acceleration over time."""
+    """Distance, speed and acceleration over time. The profile is symmetric in time."""
 
     def __init__(self, length_m: float, speed_mps: float, accel_mps2: float, jerk_mps3: float) -> None:
         speed = min(speed_mps, self._fastest(length_m, accel_mps2, jerk_mps3))
@@ -21,12 +21,12 @@ class Profile:
 
     @staticmethod
     def _fastest(length_m: float, accel: float, jerk: float) -> float:
-        """The speed that is just reached halfway."""
+        """Return the speed that can just be reached halfway."""
         speed = 0.5 * accel * (math.sqrt((accel / jerk) ** 2 + 4.0 * length_m / accel) - accel / jerk)
         return speed if speed * jerk >= accel * accel else (length_m * length_m * jerk / 4.0) ** (1.0 / 3.0)
 
     def at(self, time_s: float) -> tuple[float, float, float]:
-        """Way, speed and acceleration after a time."""
+        """Return distance, speed and acceleration after `time_s` seconds."""
         left_s = self.duration_s - time_s
         if left_s <= 0.0:
             return self.length_m, 0.0, 0.0
@@ -38,7 +38,7 @@ class Profile:
         return self.speed_mps * (time_s - 0.5 * self._rise_s), self.speed_mps, 0.0
 
     def _rise(self, t: float) -> tuple[float, float, float]:
-        """Speeding up: jerk, steady acceleration, jerk back."""
+        """Return distance, speed and acceleration while accelerating: jerk, constant acceleration, opposite jerk."""
         jerk, bend = self._jerk, self._bend_s
         if t <= bend:
             return jerk * t**3 / 6.0, 0.5 * jerk * t * t, jerk * t

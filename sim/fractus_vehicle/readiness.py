@@ -1,4 +1,4 @@
-"""Why a vehicle would not arm: ArduCopter's checks before the motors start, in its order and words."""
+"""Arming checks of ArduCopter, in its order and wording."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from fractus_vehicle.state import VehicleState
 
 
 class Check(IntFlag):
-    """ARMING_CHECK; 0 leaves only the mandatory checks."""
+    """Bits of ARMING_CHECK. 0 disables all but the mandatory checks."""
 
     ALL = 1
     GPS = 8
@@ -22,7 +22,7 @@ class Check(IntFlag):
 
 
 def arming_refusals(v: VehicleState) -> list[str]:
-    """The checks that fail now, in the order in which they are told; empty when the vehicle is ready to arm."""
+    """Return the texts of all failing checks, in reporting order. Empty if the vehicle is ready to arm."""
     if int(v.params["ARMING_CHECK"]) == 0:
         return mandatory_refusals(v)
     return [
@@ -35,12 +35,15 @@ def arming_refusals(v: VehicleState) -> list[str]:
 
 
 def mandatory_refusals(v: VehicleState) -> list[str]:
-    """The checks that hold for a forced arming, too."""
+    """Return the texts of failing checks that also apply to forced arming."""
     return [*_position_refusals(v), *_altitude_refusals(v)]
 
 
 def mode_refusal(v: VehicleState) -> str | None:
-    """Why the present mode cannot be armed in, or None; asked only once all checks pass."""
+    """Return the refusal if the vehicle cannot be armed in the current mode, or None.
+
+    Used after all checks have passed.
+    """
     return None if TRAITS[v.mode].arms else f"{mode_title(v.mode)} mode not armable"
 
 

@@ -1,4 +1,4 @@
-"""The radio receiver: sticks at rest, or what a ground station puts in their place."""
+"""Radio receiver: channels of the sticks, or overrides of a ground station."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ RELEASED, UNCHANGED = 0, 65535
 
 
 class Receiver:
-    """The channels in microseconds; overrides last for RC_OVERRIDE_TIME."""
+    """RC channels in microseconds. Overrides expire after RC_OVERRIDE_TIME."""
 
     def __init__(self, throttle_us: int = 1500) -> None:
         self._rest = (*STICKS_CENTRED[:2], throttle_us, *STICKS_CENTRED[3:])
@@ -18,7 +18,7 @@ class Receiver:
         self._until_s = 0.0
 
     def override(self, values: tuple[int, ...], until_s: float) -> None:
-        """Take a ground station's channels; 0 releases one, 65535 leaves it as it is."""
+        """Apply channel overrides. 0 releases a channel, 65535 leaves it unchanged."""
         channels = list(self.channels)
         for at, value in enumerate(values[: len(channels)]):
             if value == RELEASED:
@@ -30,11 +30,11 @@ class Receiver:
         self._until_s = until_s
 
     def release(self) -> None:
-        """Back to the sticks themselves."""
+        """Release all overrides."""
         self.channels = self._rest
         self.overridden = False
 
     def step(self, now_s: float) -> None:
-        """End overrides that are too old."""
+        """Release expired overrides."""
         if self.overridden and now_s > self._until_s:
             self.release()

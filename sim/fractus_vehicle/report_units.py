@@ -1,4 +1,4 @@
-"""What the builders of telemetry messages share: their type and the units of the wire."""
+"""Types and unit conversions of telemetry messages."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ def boot_us(vehicle: VehicleState) -> int:
 
 
 def centi(value: float) -> int:
-    """Hundredths, within 16 bits."""
+    """Convert to hundredths, limited to 16 bits."""
     return int(clamp(round(value * 100.0), -32768, 32767))
 
 
 def milli(value: float) -> int:
-    """Thousandths, within 16 bits."""
+    """Convert to thousandths, limited to 16 bits."""
     return int(clamp(round(value * 1000.0), -32768, 32767))

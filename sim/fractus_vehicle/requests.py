@@ -1,4 +1,4 @@
-"""Commands that only ask for something, or whose answer is all there is to them: messages, rates, devices that are not there."""
+"""Handlers of commands that only read data, set rates or address absent devices."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from fractus_vehicle.telemetry import send
 
 Answer = Callable[[VehicleState, Order, Channel], int]
 
-# Messages may come at this share of the main loop's rate.
+# Maximum message rate as a share of the main loop rate.
 MAX_LOOP_SHARE = 0.8
-# Intervals are kept in whole milliseconds; faster than a control step nothing changes.
+# Intervals are stored in whole milliseconds. Intervals below one control step have no effect.
 MIN_INTERVAL_MS, MAX_INTERVAL_MS = 10, 60_000
 EKF_SOURCE_SETS = 3
 FRAMES = {0: "PLUS", 1: "X"}
@@ -51,7 +51,7 @@ def _message_name(number: float) -> str | None:
 
 
 def _named(v: VehicleState, number: float) -> str | None:
-    """The message of a number; one that ArduCopter does not have is complained about."""
+    """Return the name of a message id. Report an unknown id in a STATUSTEXT."""
     name = _message_name(number)
     if name is None and math.isfinite(number):
         v.say(mavlink.MAV_SEVERITY_INFO, f"No ap_message for mavlink id ({int(number)})")
@@ -61,7 +61,7 @@ def _named(v: VehicleState, number: float) -> str | None:
 def _set_interval(v: VehicleState, o: Order, c: Channel) -> int:
     interval_us = o.params[1]
     name = _named(v, o.params[0])
-    # A real autopilot aborts in the simulator where the interval is not a number.
+    # ArduPilot SITL aborts if the interval is NaN.
     if name is None or not math.isfinite(interval_us) or interval_us < -1.0:
         return mavlink.MAV_RESULT_DENIED
     if interval_us < 0.0:
@@ -90,7 +90,7 @@ def _request_message(v: VehicleState, o: Order, c: Channel) -> int:
     name = _message_name(o.params[0])
     if name is None:
         return mavlink.MAV_RESULT_FAILED
-    send(v, c, name)  # accepted even where there is nothing to send now
+    send(v, c, name)  # accepted even if the message has no data now
     return mavlink.MAV_RESULT_ACCEPTED
 
 
@@ -115,12 +115,12 @@ def _high_latency(v: VehicleState, o: Order, _c: Channel) -> int:
 
 
 def _parachute(_v: VehicleState, o: Order, _c: Channel) -> int:
-    """There is none to release, but the switches are there."""
+    """Accept the defined actions, although there is no parachute."""
     return mavlink.MAV_RESULT_ACCEPTED if o.params[0] in (0.0, 1.0, 2.0) else mavlink.MAV_RESULT_FAILED
 
 
 def _ekf_sources(_v: VehicleState, o: Order, _c: Channel) -> int:
-    """All sets are the same here."""
+    """Accept a defined source set. All sets are equivalent."""
     return mavlink.MAV_RESULT_ACCEPTED if 1.0 <= o.params[0] < EKF_SOURCE_SETS + 1 else mavlink.MAV_RESULT_DENIED
 
 

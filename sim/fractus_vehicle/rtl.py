@@ -1,4 +1,4 @@
-"""RTL: up, back to home or a rally point, and down."""
+"""RTL mode: climb, return to home or a rally point, land."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class RtlStage(Enum):
 
 
 class ReturnToLaunch(Flight):
-    """Climbs, returns to home (or the nearest rally point), waits, lands, disarms."""
+    """RTL mode: climb, return to home or the nearest rally point, wait, land, disarm."""
 
     def __init__(self) -> None:
         self.stage = RtlStage.CLIMB
@@ -33,11 +33,11 @@ class ReturnToLaunch(Flight):
 
     @property
     def landing(self) -> bool:
-        """Whether it comes down for good."""
+        """True during the final descent."""
         return self.stage is RtlStage.LAND
 
     def begin(self, v: VehicleState) -> None:
-        """Choose target and altitude, and climb."""
+        """Choose the destination and altitude, and begin to climb."""
         p = v.params
         point = return_point(v)
         self._target, base_down = (point.north, point.east), point.base_down
@@ -59,7 +59,7 @@ class ReturnToLaunch(Flight):
         v.touch_time_s = 0.0
 
     def step(self, v: VehicleState) -> None:
-        """Go through the stages."""
+        """Fly the current stage and switch to the next one."""
         control = v.control
         if self._leg is not None:
             self._leg.step(v)
@@ -81,7 +81,7 @@ class ReturnToLaunch(Flight):
             descend(v)
 
     def _climb(self, v: VehicleState) -> None:
-        """Come to rest, and climb from there; the way back begins at its top."""
+        """Stop and climb at the stopping position. The return leg begins at the top."""
         if self._leg is None:
             self._leg = Leg(v, *resting_place(v)[:2], self._down)
         elif self._arrived(v):

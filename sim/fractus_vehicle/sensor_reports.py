@@ -18,7 +18,7 @@ SERVOS_REPORTED = 16
 
 
 def gps_raw_int(v: VehicleState) -> Values:
-    """GPS_RAW_INT: the receiver's own fix, with its noise."""
+    """Build GPS_RAW_INT from the noisy fix of the receiver."""
     g = v.gps
     if g.fix_type < mavlink.GPS_FIX_TYPE_2D_FIX or g.place is None:
         return {
@@ -47,7 +47,7 @@ def gps_raw_int(v: VehicleState) -> Values:
 def _imu(v: VehicleState) -> dict[str, Value]:
     w, x, y, z = v.body.quaternion
     fn, fe, fd = v.body.specific_force
-    # World to body.
+    # Rotate from world to body axes.
     bx = (1 - 2 * (y * y + z * z)) * fn + 2 * (x * y + w * z) * fe + 2 * (x * z - w * y) * fd
     by = 2 * (x * y - w * z) * fn + (1 - 2 * (x * x + z * z)) * fe + 2 * (y * z + w * x) * fd
     bz = 2 * (x * z + w * y) * fn + 2 * (y * z - w * x) * fe + (1 - 2 * (x * x + y * y)) * fd
@@ -72,23 +72,23 @@ def _imu(v: VehicleState) -> dict[str, Value]:
 
 
 def raw_imu(v: VehicleState) -> Values:
-    """RAW_IMU."""
+    """Build RAW_IMU."""
     return {"time_usec": boot_us(v), **_imu(v)}
 
 
 def scaled_imu2(v: VehicleState) -> Values:
-    """SCALED_IMU2."""
+    """Build SCALED_IMU2."""
     return {"time_boot_ms": boot_ms(v), **_imu(v)}
 
 
 def scaled_imu3(v: VehicleState) -> Values:
-    """SCALED_IMU3: of the third unit there is only the compass."""
+    """Build SCALED_IMU3. The third unit has only a compass."""
     whole = _imu(v)
     return {"time_boot_ms": boot_ms(v), **{name: whole[name] for name in ("xmag", "ymag", "zmag")}}
 
 
 def scaled_pressure(v: VehicleState) -> Values:
-    """SCALED_PRESSURE from the standard atmosphere."""
+    """Build SCALED_PRESSURE from the standard atmosphere."""
     altitude = v.true_altitude_amsl_m
     altitude += max(v.params["SIM_BARO_RND"], 0.0) * noise.gaussian(v.noise_seed, v.ticks, _BARO_AXIS)
     return {
@@ -99,7 +99,7 @@ def scaled_pressure(v: VehicleState) -> Values:
 
 
 def servo_output_raw(v: VehicleState) -> Values:
-    """SERVO_OUTPUT_RAW: motor 1 to 4."""
+    """Build SERVO_OUTPUT_RAW with motors 1 to 4 and set servos."""
     full = v.body.airframe.full_thrust_n
     values: dict[str, Value] = {"time_usec": boot_us(v) & 0xFFFFFFFF, "port": 0}
     values |= {f"servo{number}_raw": pwm for number, pwm in v.servos.items() if number <= SERVOS_REPORTED}
@@ -109,7 +109,7 @@ def servo_output_raw(v: VehicleState) -> Values:
 
 
 def rc_channels(v: VehicleState) -> Values:
-    """RC_CHANNELS: the sticks."""
+    """Build RC_CHANNELS."""
     values: dict[str, Value] = {"time_boot_ms": boot_ms(v), "chancount": 16, "rssi": 255}
     for at, pwm in enumerate(v.sticks, start=1):
         values[f"chan{at}_raw"] = pwm
@@ -117,23 +117,23 @@ def rc_channels(v: VehicleState) -> Values:
 
 
 def ahrs(_v: VehicleState) -> Values:
-    """AHRS."""
+    """Build AHRS."""
     return {"error_rp": 0.002, "error_yaw": 0.002}
 
 
 def wind(v: VehicleState) -> Values:
-    """WIND: direction it comes from, speed."""
+    """Build WIND: direction of origin and speed."""
     return {"direction": (v.wind.from_deg + 180.0) % 360.0 - 180.0, "speed": v.wind.speed_mps, "speed_z": 0.0}
 
 
 def vibration(v: VehicleState) -> Values:
-    """VIBRATION."""
+    """Build VIBRATION."""
     level = 3.0 * v.control.thrust_share if v.armed and not v.landed else 0.002
     return {"time_usec": boot_us(v), "vibration_x": level, "vibration_y": level, "vibration_z": 1.5 * level}
 
 
 def esc_telemetry(v: VehicleState) -> Values:
-    """ESC_TELEMETRY_1_TO_4."""
+    """Build ESC_TELEMETRY_1_TO_4."""
     full = v.body.airframe.full_thrust_n
     volts = round(v.battery.voltage_v * 100.0)
     amps = round(v.battery.current_a * 25.0)
@@ -149,7 +149,7 @@ def esc_telemetry(v: VehicleState) -> Values:
 
 
 def battery_status(v: VehicleState) -> Values:
-    """BATTERY_STATUS of the one battery."""
+    """Build BATTERY_STATUS."""
     cells = (round(v.battery.voltage_v * 1000.0),) + (UNKNOWN_U16,) * 9
     return {
         "id": 0,
@@ -173,7 +173,7 @@ def _charge_state(v: VehicleState) -> int:
 
 
 def ekf_status_report(v: VehicleState) -> Values:
-    """EKF_STATUS_REPORT."""
+    """Build EKF_STATUS_REPORT."""
     return {
         "flags": v.estimator.flags,
         "velocity_variance": 0.02 if v.position_ok else 1.2,

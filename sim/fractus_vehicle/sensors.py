@@ -1,4 +1,4 @@
-"""What the vehicle senses: the battery it drains, the GPS receiver, and the errors of its position estimate."""
+"""Battery, GPS receiver, and errors of the state estimate."""
 
 from __future__ import annotations
 
@@ -12,21 +12,24 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from fractus_vehicle.earth import Place
 from fractus_vehicle.shaping import clamp
 
-# Open-circuit voltage of a lithium polymer cell against the share of charge that is left.
+# Open-circuit voltage of a lithium polymer cell by state of charge.
 _CELL_CURVE = ((0.0, 3.27), (0.05, 3.60), (0.1, 3.69), (0.2, 3.75), (0.4, 3.80), (0.6, 3.90), (0.8, 4.03), (1.0, 4.20))
-# How far an estimated attitude wanders from the truth: roll, pitch, yaw.
+# Standard deviation of the estimated attitude: roll, pitch, yaw.
 TILT_SIGMA_RAD = (math.radians(0.15), math.radians(0.15), math.radians(0.6))
 TILT_CORRELATION_S = 20.0
 HOVER_CURRENT_A = 14.0
 
 
 class Battery:
-    """A lithium polymer pack: charge drawn by the motors; its voltage follows the charge only where SIM_BATT_CAP_AH says so."""
+    """Lithium polymer pack, discharged by the motors.
+
+    Its voltage drops with the charge only if SIM_BATT_CAP_AH is set.
+    """
 
     def __init__(self, full_v: float, capacity_mah: float, resistance_ohm: float = 0.035) -> None:
         self.full_v = full_v
         self.capacity_mah = max(capacity_mah, 1.0)
-        self.pack_mah = 0.0  # what the simulated pack holds; 0: it never empties
+        self.pack_mah = 0.0  # capacity of the simulated pack; 0 for unlimited
         self.resistance_ohm = resistance_ohm
         self.used_mah = 0.0
         self.used_j = 0.0
@@ -37,16 +40,16 @@ class Battery:
 
     @property
     def left(self) -> float:
-        """Share of charge left, 0 to 1."""
+        """State of charge, 0 to 1."""
         return clamp(1.0 - self.used_mah / self.capacity_mah, 0.0, 1.0)
 
     @property
     def percent(self) -> int:
-        """Charge left in percent, as the autopilot counts it."""
+        """State of charge in percent, as reported by the autopilot."""
         return round(self.left * 100.0)
 
     def _rest_voltage(self) -> float:
-        """Voltage without load; looked up again for each thousandth of the charge."""
+        """Return the open-circuit voltage, cached per thousandth of the charge."""
         left = round(clamp(1.0 - self.used_mah / self.pack_mah, 0.0, 1.0), 3)
         if self._rest_for != (left, self.full_v):
             self._rest_for = (left, self.full_v)
@@ -72,13 +75,13 @@ class Battery:
 
     @property
     def thrust_share(self) -> float:
-        """Full thrust at this voltage against full thrust on a full battery."""
+        """Full thrust at the current voltage, relative to a full battery."""
         return clamp(self.voltage_v / 12.6, 0.3, 1.4) ** 2
 
 
 @dataclass(slots=True)
 class Gps:
-    """The receiver: when it has a fix, where it believes to be."""
+    """GPS receiver: fix type and measured position."""
 
     fix_type: int = mavlink.GPS_FIX_TYPE_NO_GPS
     satellites: int = 0
@@ -89,7 +92,7 @@ class Gps:
     def update(
         self, truth: Place, velocity: tuple[float, float], *, noise_m: float, satellites: int, rng: random.Random
     ) -> None:
-        """Take a fix."""
+        """Take a fix at the true position with noise."""
         if noise_m > 0.0:
             truth = truth.offset(rng.gauss(0.0, noise_m), rng.gauss(0.0, noise_m), rng.gauss(0.0, 1.5 * noise_m))
         self.place = truth
@@ -107,7 +110,7 @@ class Gps:
 
 
 class Drift:
-    """The estimator's error: a slow wander while GPS holds it, running away by dead reckoning when it does not."""
+    """Error of the position estimate: bounded drift with GPS, unbounded dead-reckoning drift without."""
 
     def __init__(self, rng: random.Random, sigma_m: float = 0.12, correlation_s: float = 40.0) -> None:
         self._rng = rng
@@ -117,7 +120,7 @@ class Drift:
         self._blind = [0.0, 0.0]
         self._blind_rate = [0.0, 0.0]
         self.north = self.east = self.down = 0.0
-        self.tilt = [0.0, 0.0, 0.0]  # attitude error about the body axes, radians
+        self.tilt = [0.0, 0.0, 0.0]  # attitude error about the body axes in radians
         self.rate_n = self.rate_e = 0.0
 
     def step(self, dt: float, *, aided: bool) -> None:

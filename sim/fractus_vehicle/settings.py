@@ -1,4 +1,4 @@
-"""What parameters mean: limits, gains, fence, battery and wind, set from their values."""
+"""Conversion of parameters to settings of controllers, fence, battery and wind."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from fractus_vehicle.params import Parameters
 from fractus_vehicle.sensors import Battery
 from fractus_vehicle.shaping import clamp
 
-# The attitude controllers leave this share of the jerk that the parameter allows.
+# Share of the jerk parameter that remains available after the attitude controllers.
 JERK_SHARE = 0.75
 
-# AVOID_ENABLE: velocities are limited at the fence.
+# AVOID_ENABLE bit: limit velocities at the fence.
 AVOID_FENCE = 1
 
 LIMIT_PREFIXES = frozenset({"WPNAV", "PSC", "ANGLE", "ATC", "MOT", "LOIT"})
 
 
 def leg_speeds_mps(params: Parameters) -> tuple[float, float, float]:
-    """How fast legs are flown: over ground, up, and down."""
+    """Return the speeds of mission legs in m/s: horizontal, up and down."""
     return (
         max(params["WPNAV_SPEED"] / 100.0, 0.2),
         max(params["WPNAV_SPEED_UP"] / 100.0, 0.1),
@@ -30,7 +30,7 @@ def leg_speeds_mps(params: Parameters) -> tuple[float, float, float]:
 
 
 def set_limits(params: Parameters, control: Control) -> None:
-    """Speeds, accelerations, jerk, lean and gains of the controllers."""
+    """Set motion limits and gains of the controllers."""
     limits, gains = control.limits, control.gains
     limits.speed_mps, limits.climb_mps, limits.sink_mps = leg_speeds_mps(params)
     limits.accel_mps2 = max(params["WPNAV_ACCEL"] / 100.0, 0.5)
@@ -46,7 +46,10 @@ def set_limits(params: Parameters, control: Control) -> None:
 
 
 def set_fence(params: Parameters, fence: Fence, changed: str = "FENCE_ENABLE") -> None:
-    """The fence's switches and simple limits; only the parameter itself switches it, since commands do so, too."""
+    """Set the limits of the fence.
+
+    Only a change of FENCE_ENABLE switches the fence on or off, because commands can switch it too.
+    """
     if changed == "FENCE_ENABLE":
         fence.enabled = int(params["FENCE_ENABLE"]) != 0
     fence.types = int(params["FENCE_TYPE"])
@@ -57,14 +60,14 @@ def set_fence(params: Parameters, fence: Fence, changed: str = "FENCE_ENABLE") -
 
 
 def set_battery(params: Parameters, battery: Battery) -> None:
-    """Capacity and voltage of the full battery."""
+    """Set capacity and full voltage of the battery."""
     battery.capacity_mah = max(params["BATT_CAPACITY"], 1.0)
     battery.full_v = params["SIM_BATT_VOLTAGE"]
     battery.pack_mah = 1000.0 * max(params["SIM_BATT_CAP_AH"], 0.0)
 
 
 def set_wind(params: Parameters, wind: Wind) -> None:
-    """Mean wind and gusts."""
+    """Set mean wind and turbulence."""
     wind.speed_mps = max(params["SIM_WIND_SPD"], 0.0)
     wind.from_deg = params["SIM_WIND_DIR"]
     wind.turbulence_mps = max(params["SIM_WIND_TURB"], 0.0)

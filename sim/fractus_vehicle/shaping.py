@@ -1,32 +1,32 @@
-"""Motion shaping: how fast a target may be approached under speed, acceleration and jerk limits.
+"""Motion shaping: approach a target under speed, acceleration and jerk limits.
 
-The square-root controller and the kinematic shaping are ArduPilot's (AP_Math/control.cpp), written again for
-scalars and pairs of floats, because they decide the figures a user sees: time to target and peak speed.
+Reimplements the square-root controller and kinematic shaping of ArduPilot (AP_Math/control.cpp) for scalars and pairs
+of floats. They determine flight times and peak speeds.
 """
 
 from __future__ import annotations
 
 import math
 
-# Share of the acceleration limit with which a position is approached, so that it is not overshot. Fitted, together
-# with the share of PSC_JERK_XY in `settings`, to a real ArduCopter: 50 m in 9.3 s with a peak of 8.4 m/s.
+# Share of the acceleration limit used to approach a position without overshoot. Fitted to a real ArduCopter, together
+# with the share of PSC_JERK_XY in `settings`: 50 m in 9.3 s with a peak of 8.4 m/s.
 BRAKING_SHARE = 0.5
 
 
 def clamp(value: float, low: float, high: float) -> float:
-    """`value` limited to [low, high]."""
+    """Return `value` limited to [low, high]."""
     if value < low:
         return low
     return min(value, high)
 
 
 def wrap_pi(angle_rad: float) -> float:
-    """The angle in [-pi, pi)."""
+    """Wrap an angle to [-pi, pi)."""
     return (angle_rad + math.pi) % (2.0 * math.pi) - math.pi
 
 
 def sqrt_controller(error: float, gain: float, limit: float, dt: float) -> float:
-    """Proportional near zero, square root beyond, so that the correction's own rate never exceeds `limit`."""
+    """Return a correction whose rate of change never exceeds `limit`: linear near zero, a square root beyond."""
     linear = limit / (gain * gain)
     if error > linear:
         correction = math.sqrt(2.0 * limit * (error - linear / 2.0))
@@ -41,7 +41,7 @@ def sqrt_controller(error: float, gain: float, limit: float, dt: float) -> float
 def shape_velocity(
     target: float, velocity: float, acceleration: float, *, accel_max: float, jerk_max: float, dt: float
 ) -> float:
-    """Next acceleration that brings `velocity` to `target` under both limits."""
+    """Return the next acceleration that brings `velocity` to `target` under both limits."""
     wanted = sqrt_controller(target - velocity, jerk_max / accel_max, jerk_max, dt)
     wanted = clamp(wanted, -accel_max, accel_max)
     step = jerk_max * dt
@@ -59,7 +59,10 @@ def shape_position(
     jerk_max: float,
     dt: float,
 ) -> float:
-    """Next acceleration that closes a position `error` in one axis; speeds are limited to [speed_low, speed_high]."""
+    """Return the next acceleration that reduces a position `error` in one axis.
+
+    Speeds are limited to [speed_low, speed_high].
+    """
     target = sqrt_controller(error, 0.5 * jerk_max / accel_max, accel_max * BRAKING_SHARE, dt)
     return shape_velocity(
         clamp(target, speed_low, speed_high), velocity, acceleration, accel_max=accel_max, jerk_max=jerk_max, dt=dt
@@ -75,7 +78,7 @@ def shape_velocity_xy(
     jerk_max: float,
     dt: float,
 ) -> tuple[float, float]:
-    """`shape_velocity` for the horizontal plane: limits hold for the vector's length."""
+    """`shape_velocity` for the horizontal plane. The limits apply to the length of the vector."""
     error_n, error_e = target[0] - velocity[0], target[1] - velocity[1]
     size = math.hypot(error_n, error_e)
     wanted_n = wanted_e = 0.0
@@ -100,7 +103,7 @@ def shape_position_xy(
     dt: float,
     feedforward: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[float, float]:
-    """`shape_position` for the horizontal plane; `feedforward` is the target's own velocity."""
+    """`shape_position` for the horizontal plane. `feedforward` is the velocity of the target."""
     size = math.hypot(error[0], error[1])
     target_n, target_e = feedforward
     if size > 1e-9:

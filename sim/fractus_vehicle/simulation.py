@@ -1,4 +1,4 @@
-"""Some vehicles and their links' channels under one simulated time: receive, advance, forward, record."""
+"""Simulation of several vehicles with a common time: receive, advance, forward and record."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from fractus_vehicle.state import CONTROL_STEP_S, VehicleConfig
 from fractus_vehicle.streams import ALL_GROUPS, GROUPS
 from fractus_vehicle.vehicle import Vehicle
 
-# Never passed on from one link to another: they speak about the link itself.
+# Messages about a link itself, which are never forwarded.
 _LINK_LOCAL = frozenset({"RADIO_STATUS", "RADIO", "SETUP_SIGNING"})
 
 
 class Craft:
-    """One vehicle with its links; survives a reboot of the vehicle."""
+    """A vehicle with its links. It survives a reboot of the vehicle."""
 
     def __init__(self, config: VehicleConfig) -> None:
         self.config = config
@@ -29,7 +29,7 @@ class Craft:
         self._recorder: BinaryIO | None = None
 
     def open(self, name: str, port: int | None = None) -> Channel:
-        """Open a link and return its channel; `port` selects the SRn_ parameters of its default streams."""
+        """Open a link and return its channel. `port` selects the SRn_ parameters of its default streams."""
         channel = Channel(self.config.sysid, name=name, port=port)
         key = self.vehicle.signing_key
         if key is not None:
@@ -43,7 +43,7 @@ class Craft:
             self.vehicle.detach(channel)
 
     def receive(self, channel: Channel, data: bytes) -> None:
-        """Take bytes that arrived on a link."""
+        """Handle bytes received on a link."""
         for message in channel.receive(data):
             if self._recorder is not None:
                 self._log(message.frame)
@@ -51,7 +51,7 @@ class Craft:
             dispatch(self.vehicle, message, channel)
 
     def _route(self, source: Channel, message: Message) -> None:
-        """Pass a message on to the links where its target was heard, as ArduPilot does."""
+        """Forward a message to the links on which its target has sent messages, like ArduPilot."""
         if len(self.vehicle.state.channels) < 2 or message.name in _LINK_LOCAL or message.sysid == self.config.sysid:
             return
         system = message.integer("target_system") if message.has("target_system") else 0
@@ -71,7 +71,7 @@ class Craft:
             self._reboot()
 
     def _reboot(self) -> None:
-        """Restart where the vehicle stands, with what a real one keeps: parameters, plans and the signing key."""
+        """Restart the vehicle at its position. Keep parameters, plans and the signing key."""
         old, key = self.vehicle.state, self.vehicle.signing_key
         place = replace(old.true_place, alt_m=self.config.start.alt_m)
         heading_deg = math.degrees(old.body.euler()[2]) % 360.0
@@ -90,7 +90,7 @@ class Craft:
             self._recorder.write(struct.pack(">Q", self.vehicle.state.unix_us) + frame)
 
     def record(self, file: BinaryIO, rate_hz: float = 4.0) -> None:
-        """Write a tlog: what the vehicle says on a link of its own, with every stream at `rate_hz`, and all it is told."""
+        """Record a tlog of all sent streams at `rate_hz` and all received messages."""
         self._recorder = file
         channel = Channel(self.config.sysid, name="recorder", tap=self._log, discard=True)
         self.vehicle.attach(channel)
@@ -100,12 +100,12 @@ class Craft:
 
 
 def signing_clock(unix_us: int) -> int:
-    """The time of MAVLink signing: units of 10 µs since 1 January 2015."""
+    """Convert Unix time to MAVLink signing time: units of 10 µs since 1 January 2015."""
     return (unix_us - 1_420_070_400_000_000) // 10
 
 
 class Simulation:
-    """A fleet that shares time."""
+    """A fleet of vehicles with a common time."""
 
     def __init__(self, configs: list[VehicleConfig]) -> None:
         self.crafts = [Craft(config) for config in configs]
@@ -113,7 +113,7 @@ class Simulation:
 
     @property
     def time_s(self) -> float:
-        """Simulated time since the start."""
+        """Simulated time since the start in seconds."""
         return self.ticks * CONTROL_STEP_S
 
     def step(self) -> None:
@@ -123,7 +123,7 @@ class Simulation:
             craft.step()
 
     def quiet_steps(self, most: int) -> int:
-        """Steps until the next one that has something to say on a link, from 1 to `most`; texts are not foreseen."""
+        """Return the number of steps until a stream message is due, from 1 to `most`. STATUSTEXTs are not predicted."""
         quiet_s = min(
             (
                 channel.speaks_s - craft.vehicle.state.time_s
@@ -135,13 +135,13 @@ class Simulation:
         return math.ceil(min(max(quiet_s / CONTROL_STEP_S - 1e-3, 1.0), most))
 
     def advance(self, duration_s: float) -> None:
-        """Advance by a duration, in lockstep with the caller."""
+        """Advance by a duration in seconds."""
         for _ in range(round(duration_s / CONTROL_STEP_S)):
             self.step()
 
 
 def formation(config: VehicleConfig, count: int, spacing_m: float) -> list[VehicleConfig]:
-    """`count` vehicles in a row toward east, with consecutive system ids."""
+    """Return the configurations of `count` vehicles in a row to the east, with consecutive system ids."""
     return [
         replace(
             config,

@@ -1,4 +1,4 @@
-"""SMART_RTL: home along the path that was flown, and down where it began."""
+"""SMART_RTL mode: return along the flown path and land where it began."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from fractus_vehicle.home import return_point
 from fractus_vehicle.leg import Leg
 from fractus_vehicle.state import CONTROL_STEP_S, VehicleState
 
-# The last point is approached this much above it.
+# Height above the last point at which it is approached.
 ABOVE_LAST_M = 2.0
 STOPPED_MPS = 0.5
 
 
 class SmartStage(Enum):
-    """The stages of SMART_RTL, as ArduCopter names them."""
+    """Stages of SMART_RTL, with ArduCopter's names."""
 
     WAIT_FOR_PATH_CLEANUP = 1
     PATH_FOLLOW = 2
@@ -31,7 +31,7 @@ class SmartStage(Enum):
 
 
 class SmartReturn(Flight):
-    """Tidies the path while it stops, follows it backward, pauses 2 m above its beginning, lands, disarms."""
+    """SMART_RTL mode: stop, simplify the path, follow it backwards, pause 2 m above its start, land, disarm."""
 
     def __init__(self) -> None:
         self.stage = SmartStage.WAIT_FOR_PATH_CLEANUP
@@ -41,23 +41,23 @@ class SmartReturn(Flight):
 
     @property
     def landing(self) -> bool:
-        """Whether it comes down for good."""
+        """True during the final descent."""
         return self.stage is SmartStage.LAND
 
     def begin(self, v: VehicleState) -> None:
-        """Stop, and begin to tidy the path."""
+        """Stop and begin to simplify the path."""
         v.control.hold_here()
         v.heading.follow_course()
         v.touch_time_s = 0.0
         self._tidying = v.breadcrumbs.thorough()
 
     def end(self, v: VehicleState) -> None:
-        """Give back the point that was not reached, so that the path remains whole."""
+        """Put back the point that was not reached, so that the path stays complete."""
         if self.stage is SmartStage.PATH_FOLLOW and self._popped is not None and not v.breadcrumbs.add(self._popped):
             v.say(mavlink.MAV_SEVERITY_ERROR, "SmartRTL: lost one point")
 
     def step(self, v: VehicleState) -> None:
-        """Go through the stages."""
+        """Fly the current stage and switch to the next one."""
         if self.stage is SmartStage.WAIT_FOR_PATH_CLEANUP:
             try:
                 next(self._tidying)

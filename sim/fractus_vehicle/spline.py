@@ -1,4 +1,4 @@
-"""A curved leg of a mission: a cubic Hermite curve through its ends, as ArduPilot's spline waypoints."""
+"""Curved mission leg: a cubic Hermite curve between its ends, like ArduPilot's spline waypoints."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from fractus_vehicle.state import CONTROL_STEP_S, VehicleState
 
 _SAMPLES = 64
 _SLOWEST_MPS = 0.3
-# The tangent of an end where the vehicle stands, as a share of the way: with none, the curve has no direction there.
+# Length of the tangent at an end at rest, as a share of the distance. A zero tangent would leave the curve without
+# direction there.
 AT_REST = 0.1
 
 
 class SplineLeg:
-    """From where the trajectory is to a local point, along a curve that leaves and arrives in given directions."""
+    """Curve from the current trajectory to a local point, with given directions at both ends."""
 
     def __init__(self, v: VehicleState, end: Point, leave: Point, arrive: Point) -> None:
         pos, vel = v.control.pos, v.control.vel
@@ -38,7 +39,7 @@ class SplineLeg:
         self._allowed_mps = self._profile(v)
 
     def _profile(self, v: VehicleState) -> list[float]:
-        """The greatest speed at each sample of the curve, so that bends, climbs and the end can be braked for."""
+        """Return the maximum speed at each sample that allows braking for bends, climbs and the end."""
         allowed = [self._local_limit(v, step / _SAMPLES) for step in range(_SAMPLES + 1)]
         allowed[-1] = 0.0 if self._stops else allowed[-1]
         limits, left_m = v.control.limits, 0.0
@@ -47,14 +48,14 @@ class SplineLeg:
             way = math.dist(self.at(step / _SAMPLES), self.at((step + 1) / _SAMPLES))
             allowed[step] = min(allowed[step], math.sqrt(allowed[step + 1] ** 2 + braking * way))
             left_m += way
-            if self._stops:  # the last metres are those of a position that is flown to: the jerk allows no more
+            if self._stops:  # the last metres approach a position: the jerk limit allows no more
                 gain = 0.5 * limits.jerk_mps3 / limits.accel_mps2
                 slower = sqrt_controller(left_m, gain, BRAKING_SHARE * limits.accel_mps2, CONTROL_STEP_S)
                 allowed[step] = min(allowed[step], slower)
         return allowed
 
     def at(self, share: float) -> Point:
-        """The point at a share (0 to 1) of the curve's parameter."""
+        """Return the point at a share (0 to 1) of the curve parameter."""
         x, y, z = (((d * share + c) * share + b) * share + a for a, b, c, d in self._curve)
         return (x, y, z)
 
@@ -73,7 +74,7 @@ class SplineLeg:
         return min(wanted, math.sqrt(limits.accel_mps2 / curvature)) if curvature > 1e-6 else wanted
 
     def step(self, v: VehicleState) -> None:
-        """Move the trajectory along the curve."""
+        """Advance the trajectory along the curve by one control step."""
         control, dt = v.control, CONTROL_STEP_S
         if self._share >= 1.0:
             if control.horizontal is Axis.PATH:
@@ -94,7 +95,7 @@ class SplineLeg:
             dt=dt,
         )
         if self._speed_mps + self._accel_mps2 * dt > wanted:
-            # The profile can be braked along as it is; shaped once more, the vehicle would arrive too fast.
+            # The profile already allows for braking. Shaping it again would make the vehicle arrive too fast.
             self._accel_mps2 = max((wanted - self._speed_mps) / dt, -control.limits.accel_mps2)
         self._speed_mps = max(self._speed_mps + self._accel_mps2 * dt, 0.0)
         slope, bend = self._slopes(self._share)
@@ -108,7 +109,7 @@ class SplineLeg:
         )
 
     def _acceleration(self, slope: Point, bend: Point, pace: float, most_mps2: float) -> Point:
-        """What keeps the vehicle on the curve, and what changes its speed."""
+        """Return the acceleration that keeps the vehicle on the curve and changes its speed."""
         size2 = max(slope[0] ** 2 + slope[1] ** 2 + slope[2] ** 2, 1e-12)
         along = (slope[0] * bend[0] + slope[1] * bend[1] + slope[2] * bend[2]) / size2
         push, pace2 = self._accel_mps2 / math.sqrt(size2), pace * pace
@@ -117,11 +118,11 @@ class SplineLeg:
             (bend[1] - along * slope[1]) * pace2 + push * slope[1],
             (bend[2] - along * slope[2]) * pace2 + push * slope[2],
         )
-        # Where a short tangent bends the curve sharply, more than the vehicle can: what follows would have to undo it.
+        # Limit the acceleration where a short tangent bends the curve more sharply than the vehicle can fly.
         return _scaled(asked, min(1.0, most_mps2 / max(math.hypot(*asked), 1e-6)))
 
     def reached(self, v: VehicleState, radius_m: float) -> bool:
-        """Whether the curve is flown."""
+        """Return True if the curve is complete."""
         here = (v.est.north, v.est.east, v.est.down)
         return self._share >= 1.0 and (not self._stops or math.dist(here, self.end) <= radius_m)
 

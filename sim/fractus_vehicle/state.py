@@ -1,4 +1,4 @@
-"""What one vehicle is at a moment: body, senses, controllers, stored lists and flags, which the modes read and change."""
+"""State of one vehicle: body, sensors, controllers, stored lists and flags, shared by the flight modes."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ from fractus_vehicle.shaping import clamp
 CONTROL_STEP_S = 0.01
 ARMING_DELAY_S = 2.0
 TEXT_CHUNK = 50
-# The time of day at which runs begin that must be repeatable.
+# Start time of repeatable runs, microseconds since the Unix epoch.
 REPEATABLE_EPOCH_US = 1_700_000_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class VehicleConfig:
-    """What distinguishes one vehicle from another."""
+    """Configuration of one vehicle."""
 
     start: Place
     heading_deg: float = 0.0
@@ -54,7 +54,7 @@ class VehicleConfig:
 
 @dataclass(slots=True)
 class ActiveFailsafes:
-    """Which failsafes are active."""
+    """Currently active failsafes."""
 
     gcs: bool = False
     radio: bool = False
@@ -64,12 +64,12 @@ class ActiveFailsafes:
 
     @property
     def any(self) -> bool:
-        """Whether any of them is."""
+        """True if any failsafe is active."""
         return self.gcs or self.radio or self.battery or self.ekf
 
 
 class VehicleState:
-    """The state of one vehicle, and the questions and small changes that need no more than that."""
+    """State of one vehicle, with derived values and simple transitions."""
 
     def __init__(self, config: VehicleConfig) -> None:
         self.config = config
@@ -103,7 +103,7 @@ class VehicleState:
         self.breadcrumbs = Breadcrumbs(self.params, self.say)
         self.heading = Heading(self.control, self.params)
         self.gimbal = Gimbal(int(self.params["MNT1_TYPE"]))
-        self.item_reached: int | None = None  # of the mission, to be told at the end of a step: the last one counts
+        self.item_reached: int | None = None  # last reached mission item, reported at the end of a step
         self.impacts_told = 0
         self.impact_told_s = -math.inf
         self.receiver = Receiver(config.throttle_us)
@@ -127,10 +127,10 @@ class VehicleState:
         set_battery(self.params, self.battery)
         self.control.reset(self.est)
 
-    # -- time and place ----------------------------------------------------------------------------------------
+    # -- time and position -------------------------------------------------------------------------------------
 
     def advance_time(self) -> None:
-        """One control step later."""
+        """Advance time by one control step."""
         self.ticks += 1
         self.time_s = self.ticks * CONTROL_STEP_S
 
@@ -141,12 +141,12 @@ class VehicleState:
 
     @property
     def origin(self) -> Place | None:
-        """Where the local frame begins; None until the estimator has a position."""
+        """Origin of the local frame; None until the estimator has a position."""
         return self.estimator.origin
 
     @property
     def position_ok(self) -> bool:
-        """Whether the position can be trusted."""
+        """True if the estimated position is valid."""
         return self.estimator.position_ok
 
     @property
@@ -156,22 +156,22 @@ class VehicleState:
 
     @property
     def sticks(self) -> tuple[int, ...]:
-        """The channels of the radio, in microseconds."""
+        """RC channels in microseconds."""
         return self.receiver.channels
 
     @property
     def place(self) -> Place:
-        """Where the vehicle believes to be."""
+        """Estimated position."""
         return (self.origin or self.start).offset(self.est.north, self.est.east, self.est.down)
 
     @property
     def known_position(self) -> tuple[float, float, float] | None:
-        """The estimated position in the local frame; None while it cannot be trusted."""
+        """Estimated local position (north, east, down); None if it is not valid."""
         return (self.est.north, self.est.east, self.est.down) if self.position_ok else None
 
     @property
     def true_place(self) -> Place:
-        """Where the vehicle is."""
+        """True position."""
         return self.start.offset(self.body.north, self.body.east, self.body.down)
 
     @property
@@ -181,28 +181,31 @@ class VehicleState:
 
     @property
     def home_xy(self) -> tuple[float, float]:
-        """Home in local metres."""
+        """Home position in local metres (north, east)."""
         if self.home is None or self.origin is None:
             return (0.0, 0.0)
         return self.origin.vector_to(self.home)[:2]
 
     @property
     def altitude_m(self) -> float:
-        """Estimated altitude above home."""
+        """Estimated altitude above home in metres."""
         return self.altitude_at_m(self.est.down)
 
     def altitude_at_m(self, down: float) -> float:
-        """Altitude above home of a local height."""
+        """Convert a local height (down) to altitude above home."""
         origin = self.origin or self.start
         return origin.alt_m - down - (self.home or origin).alt_m
 
     @property
     def height_m(self) -> float:
-        """Estimated height above the ground (flat, at the altitude of the start)."""
+        """Estimated height above the ground in metres. The ground is flat at the altitude of the start."""
         return -self.est.down
 
     def altitude_base_m(self, frame: int) -> float | None:
-        """What altitudes of a global frame count from, AMSL; None for another frame or where terrain is unknown."""
+        """Return the AMSL altitude of the zero level of a global frame.
+
+        Returns None for other frames, and for terrain frames if TERRAIN_ENABLE is not set.
+        """
         if frame in ABSOLUTE_FRAMES:
             return 0.0
         if frame in TERRAIN_FRAMES:
@@ -210,10 +213,10 @@ class VehicleState:
         return (self.home or self.origin or self.start).alt_m if frame in GLOBAL_FRAMES else None
 
     def outside_fence(self, north: float, east: float, down: float) -> bool:
-        """Whether a local target lies outside the autopilot's own fence."""
+        """Return True if a local target lies outside the geofence of the autopilot."""
         return bool(self.fence.outside(north, east, self.altitude_at_m(down), self.home_xy))
 
-    # -- what telemetry and checks ask -------------------------------------------------------------------------
+    # -- derived values for telemetry and checks ---------------------------------------------------------------
 
     @property
     def heading_cdeg(self) -> int:
@@ -222,19 +225,19 @@ class VehicleState:
 
     @property
     def throttle_percent(self) -> int:
-        """Throttle for VFR_HUD."""
+        """Throttle in percent for VFR_HUD."""
         if not self.armed:
             return 0
         return round(clamp(sum(self.body.motors) / (4.0 * self.body.airframe.full_thrust_n), 0.0, 1.0) * 100.0)
 
     @property
     def flying_wanted(self) -> bool:
-        """Whether a takeoff is under way."""
+        """True during a takeoff."""
         return self.taking_off_until_m is not None
 
     @property
     def landed_state(self) -> int:
-        """MAV_LANDED_STATE."""
+        """Current MAV_LANDED_STATE."""
         if self.landed:
             return mavlink.MAV_LANDED_STATE_ON_GROUND
         if self.flying_wanted:
@@ -245,7 +248,7 @@ class VehicleState:
             else mavlink.MAV_LANDED_STATE_IN_AIR
         )
 
-    # -- texts -------------------------------------------------------------------------------------------------
+    # -- messages ----------------------------------------------------------------------------------------------
 
     def broadcast(self, name: str, values: Mapping[str, Value]) -> None:
         """Send a message on every link."""
@@ -253,9 +256,9 @@ class VehicleState:
             channel.send(name, values)
 
     def say(self, severity: int, text: str) -> None:
-        """Send a STATUSTEXT on every link, in chunks when it is long."""
+        """Send a STATUSTEXT on every link, split into chunks if it is long."""
         data = text.encode("ascii", "replace")
-        # MAVLink: chunks of one text share an id other than 0.
+        # All chunks of one text share a non-zero id.
         number = 1 + self.ticks % 65000 if len(data) > TEXT_CHUNK else 0
         for at in range(0, max(len(data), 1), TEXT_CHUNK):
             chunk: dict[str, Value] = {"text": data[at : at + TEXT_CHUNK], "id": number, "chunk_seq": at // TEXT_CHUNK}
@@ -274,14 +277,14 @@ class VehicleState:
         self.say(mavlink.MAV_SEVERITY_INFO, "Disarming motors")
 
     def land_complete(self) -> None:
-        """The vehicle rests on the ground."""
+        """Set the state to landed."""
         self.landed = True
         self.taking_off_until_m = None
         self.idle_since_s = self.time_s
 
     def begin_takeoff(self, down: float) -> None:
         """Spool up and climb to `down` (local)."""
-        if not self.flying_wanted:  # a takeoff that is asked for again finds the motors running
+        if not self.flying_wanted:  # the motors are already running if a takeoff is repeated
             ready = self.armed_at_s + ARMING_DELAY_S
             spool = self.params["MOT_SPOOL_TIME"] + 0.5 * self.params["TKOFF_SLEW_TIME"]
             self.lift_after_s = max(self.time_s, ready) + spool
@@ -290,7 +293,7 @@ class VehicleState:
         self.control.go_to(self.est.north, self.est.east, down)
 
     def takeoff_done(self) -> bool:
-        """Whether the climb of a takeoff is over; ends it."""
+        """End the takeoff if its climb is complete. Return True if no takeoff is in progress."""
         target = self.taking_off_until_m
         if target is None:
             return True

@@ -47,13 +47,13 @@ WITHOUT_POSITION_CONTROL = _ALTITUDE_ONLY | {
 
 
 def heartbeat(v: VehicleState) -> Values:
-    """HEARTBEAT as ArduCopter fills it."""
+    """Build HEARTBEAT like ArduCopter."""
     flags = (
         mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
         | mavlink.MAV_MODE_FLAG_STABILIZE_ENABLED
         | mavlink.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED
     )
-    # Set while the position controller runs, and before the main loop does.
+    # Set while the position controller runs, and until the main loop starts.
     if v.mode not in WITHOUT_POSITION_CONTROL or not v.estimator.initialised:
         flags |= mavlink.MAV_MODE_FLAG_GUIDED_ENABLED
     if v.armed or v.motor_test_until_s is not None:
@@ -74,7 +74,7 @@ def heartbeat(v: VehicleState) -> Values:
 
 
 def sys_status(v: VehicleState) -> Values:
-    """SYS_STATUS with the health bits that clients look at."""
+    """Build SYS_STATUS with health bits."""
     controls = _CONTROLS
     if v.mode in _ALTITUDE_ONLY:
         controls |= mavlink.MAV_SYS_STATUS_SENSOR_Z_ALTITUDE_CONTROL
@@ -109,12 +109,12 @@ def sys_status(v: VehicleState) -> Values:
 
 
 def extended_sys_state(v: VehicleState) -> Values:
-    """EXTENDED_SYS_STATE."""
+    """Build EXTENDED_SYS_STATE."""
     return {"vtol_state": mavlink.MAV_VTOL_STATE_MC, "landed_state": int(v.landed_state)}
 
 
 def autopilot_version(_v: VehicleState) -> Values:
-    """AUTOPILOT_VERSION."""
+    """Build AUTOPILOT_VERSION."""
     return {
         "capabilities": CAPABILITIES,
         "flight_sw_version": FLIGHT_VERSION,
@@ -126,7 +126,7 @@ def autopilot_version(_v: VehicleState) -> Values:
 
 
 def mission_current(v: VehicleState) -> Values:
-    """MISSION_CURRENT."""
+    """Build MISSION_CURRENT."""
     total = max(0, len(v.mission.items) - 1)
     return {
         "seq": v.mission.current,
@@ -137,22 +137,22 @@ def mission_current(v: VehicleState) -> Values:
 
 
 def hwstatus(_v: VehicleState) -> Values:
-    """HWSTATUS."""
+    """Build HWSTATUS."""
     return {"Vcc": 5000, "I2Cerr": 0}
 
 
 def power_status(_v: VehicleState) -> Values:
-    """POWER_STATUS."""
+    """Build POWER_STATUS."""
     return {"Vcc": 5000, "Vservo": 0, "flags": 0}
 
 
 def meminfo(_v: VehicleState) -> Values:
-    """MEMINFO."""
+    """Build MEMINFO."""
     return {"brkval": 0, "freemem": UNKNOWN_U16, "freemem32": 131072}
 
 
 def fence_status(v: VehicleState) -> Values | None:
-    """FENCE_STATUS, while a fence is enabled."""
+    """Build FENCE_STATUS if a fence is enabled."""
     if not v.fence.enabled:
         return None
     return {
@@ -165,5 +165,5 @@ def fence_status(v: VehicleState) -> Values | None:
 
 
 def system_time(v: VehicleState) -> Values:
-    """SYSTEM_TIME."""
+    """Build SYSTEM_TIME."""
     return {"time_unix_usec": v.unix_us, "time_boot_ms": boot_ms(v)}

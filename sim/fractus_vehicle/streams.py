@@ -1,4 +1,4 @@
-"""Which telemetry messages there are, and ArduCopter's grouping of them into streams."""
+"""Telemetry messages and their grouping into ArduCopter's streams."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ BUILDERS: dict[str, Builder] = {
     "ALTITUDE": motion_reports.altitude,
 }
 
-# What ArduCopter knows besides, and sends only with a device or in a state that does not occur here.
+# Messages that ArduCopter supports but sends only with a device or in a state that is not simulated.
 SILENT = frozenset(
     [
         "ADSB_VEHICLE",
@@ -92,7 +92,7 @@ SILENT = frozenset(
     ]
 )
 
-# MAV_DATA_STREAM groups as ArduCopter fills them; the second column names the SRn_ parameter.
+# MAV_DATA_STREAM groups of ArduCopter, with the suffix of their SRn_ parameter.
 GROUPS: dict[int, tuple[str, tuple[str, ...]]] = {
     mavlink.MAV_DATA_STREAM_RAW_SENSORS: (
         "RAW_SENS",
@@ -128,7 +128,7 @@ GROUPS: dict[int, tuple[str, tuple[str, ...]]] = {
             "ESC_TELEMETRY_1_TO_4",
         ),
     ),
-    # What is heard of other aircraft has no number of its own, but a rate among all.
+    # The ADSB stream has no group number, but has a rate parameter.
     -1: ("ADSB", ()),
 }
 ALL_GROUPS = tuple(GROUPS)

@@ -1,4 +1,4 @@
-"""Targets that a companion computer sends while the vehicle is in GUIDED: judged, and handed to the flight."""
+"""Target messages of a companion computer in GUIDED mode: validation and conversion to flight targets."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _BODY_FRAMES = frozenset({mavlink.MAV_FRAME_BODY_NED, mavlink.MAV_FRAME_BODY_OFF
 _OFFSET_FRAMES = frozenset({mavlink.MAV_FRAME_LOCAL_OFFSET_NED}) | _BODY_FRAMES
 _LOCAL_FRAMES = frozenset({mavlink.MAV_FRAME_LOCAL_NED}) | _OFFSET_FRAMES
 
-# A faster velocity is taken for a mistake.
+# Velocities above this limit are rejected as errors.
 SANE_MPS = 1000.0
 
 _NO_ATTITUDE = mavlink.ATTITUDE_TARGET_TYPEMASK_ATTITUDE_IGNORE
@@ -30,7 +30,7 @@ _RATES = (
     | mavlink.ATTITUDE_TARGET_TYPEMASK_BODY_PITCH_RATE_IGNORE
     | mavlink.ATTITUDE_TARGET_TYPEMASK_BODY_YAW_RATE_IGNORE
 )
-# How far from 1 the square of a quaternion's length may be.
+# Tolerance of the squared length of a unit quaternion.
 UNIT_TOLERANCE = 1e-3
 
 Vector = tuple[float, float, float]
@@ -46,7 +46,7 @@ def _rotated(v: VehicleState, vector: Vector) -> Vector:
 
 
 class Setpoint(NamedTuple):
-    """Local position, velocity and acceleration of one message, before its mask says which of them count."""
+    """Local position, velocity and acceleration of a message, before the type mask is applied."""
 
     position: Vector
     velocity: Vector
@@ -54,7 +54,7 @@ class Setpoint(NamedTuple):
 
 
 def local_target(v: VehicleState, flight: Flight, m: Message) -> None:
-    """SET_POSITION_TARGET_LOCAL_NED."""
+    """Handle SET_POSITION_TARGET_LOCAL_NED."""
     frame = m.integer("coordinate_frame")
     if frame not in _LOCAL_FRAMES:
         _stop(v, flight)
@@ -70,13 +70,13 @@ def local_target(v: VehicleState, flight: Flight, m: Message) -> None:
 
 
 def global_target(v: VehicleState, flight: Flight, m: Message) -> None:
-    """SET_POSITION_TARGET_GLOBAL_INT."""
+    """Handle SET_POSITION_TARGET_GLOBAL_INT."""
     frame = m.integer("coordinate_frame")
     lat, lon, alt = m.integer("lat_int"), m.integer("lon_int"), m.real("alt")
     origin, position = v.origin, (0.0, 0.0, 0.0)
     if origin is None or not isinstance(flight, GuidedFlight):
         return
-    if not m.integer("type_mask") & IGNORE_POSITION:  # else neither frame nor place is looked at
+    if not m.integer("type_mask") & IGNORE_POSITION:  # without a position, frame and coordinates are ignored
         if not valid_coordinates(lat, lon):
             _stop(v, flight)
             return
@@ -91,17 +91,17 @@ def global_target(v: VehicleState, flight: Flight, m: Message) -> None:
 
 
 def _stop(v: VehicleState, flight: Flight) -> None:
-    """What ArduCopter does with a target that it does not understand."""
+    """Stop, as ArduCopter does on an invalid target."""
     if isinstance(flight, GuidedFlight) and v.armed and not v.landed:
         v.taking_off_until_m = None
         flight.stop(v)
 
 
 def _target(v: VehicleState, flight: Flight, m: Message, asked: Setpoint) -> None:
-    """Judge type_mask and hand the target to GUIDED; a target outside the fence is dropped in silence."""
+    """Validate the type mask and pass the target to GUIDED. Silently drop targets outside the fence."""
     if not isinstance(flight, GuidedFlight) or not v.armed:
         return
-    # A target ends a takeoff, even one that has not left the ground: then the vehicle stays there, as the real one.
+    # A target ends a takeoff. If the vehicle has not left the ground yet, it stays there, like ArduCopter.
     v.taking_off_until_m = None
     if v.landed:
         return
@@ -124,7 +124,7 @@ def _target(v: VehicleState, flight: Flight, m: Message, asked: Setpoint) -> Non
     if position is not None and v.outside_fence(*position):
         return
     _fly(v, flight, position, velocity, asked.accel)
-    # A heading counts from the nose in the frames that do.
+    # In body frames the heading is relative to the nose.
     relative = m.name == "SET_POSITION_TARGET_LOCAL_NED" and m.integer("coordinate_frame") in _BODY_FRAMES
     _turn(v, yaw, yaw_rate, relative=relative)
 
@@ -157,7 +157,7 @@ def _turn(v: VehicleState, yaw: float | None, yaw_rate: float | None, *, relativ
 
 
 def attitude_target(v: VehicleState, flight: Flight, m: Message) -> None:
-    """SET_ATTITUDE_TARGET."""
+    """Handle SET_ATTITUDE_TARGET."""
     if not isinstance(flight, GuidedFlight) or not v.armed or m.integer("type_mask") & _NO_ATTITUDE:
         return
     w, x, y, z = m.array("q")
@@ -182,7 +182,13 @@ def attitude_target(v: VehicleState, flight: Flight, m: Message) -> None:
 
 
 def guided_item(v: VehicleState, flight: Flight, m: Message) -> bool:
-    """`current` 2 is a guided target, 3 a change of altitude (both deprecated, both still accepted); False if refused."""
+    """Handle a mission item with `current` 2 (guided target) or 3 (altitude change).
+
+    Both are deprecated but still accepted by ArduPilot.
+
+    Returns:
+        False if the target is refused.
+    """
     item = item_from(m)
     base = v.altitude_base_m(item.frame)
     if not isinstance(flight, GuidedFlight) or not v.armed or v.landed or v.origin is None or base is None:

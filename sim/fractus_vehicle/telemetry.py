@@ -1,4 +1,4 @@
-"""What the vehicle sends on its links: streams, parameters, and what a new link hears by default."""
+"""Sending of telemetry on links: streams, parameters and default rates."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ MAX_RATE_HZ = 100.0
 
 
 def send(v: VehicleState, channel: Channel, name: str) -> bool:
-    """Send one of the telemetry messages on one link; False when there is no such message now."""
+    """Send a telemetry message on one link. Return False if the message has no data now."""
     builder = BUILDERS.get(name)
     values = None if builder is None else builder(v)
     if values is None:
@@ -20,13 +20,13 @@ def send(v: VehicleState, channel: Channel, name: str) -> bool:
 
 
 def send_on_all(v: VehicleState, name: str) -> None:
-    """Send one of the telemetry messages on every link."""
+    """Send a telemetry message on every link."""
     for channel in v.channels:
         send(v, channel, name)
 
 
 def serve(v: VehicleState, channel: Channel) -> None:
-    """Send what is due on a link: its streams, and a part of the parameter list it asked for."""
+    """Send all due stream messages and a part of a requested parameter list on one link."""
     for name in channel.due(v.time_s):
         send(v, channel, name)
     for _ in range(min(PARAMETERS_PER_TICK, len(channel.parameters))):
@@ -34,7 +34,7 @@ def serve(v: VehicleState, channel: Channel) -> None:
 
 
 def send_parameter(v: VehicleState, channel: Channel, name: str, index: int, shown_index: int | None = None) -> None:
-    """Send PARAM_VALUE by name or index, if there is such a parameter."""
+    """Send PARAM_VALUE by name or index, if the parameter exists."""
     found = v.params.find(name, index)
     if found is None:
         return
@@ -52,7 +52,7 @@ def send_parameter(v: VehicleState, channel: Channel, name: str, index: int, sho
 
 
 def attach(v: VehicleState, channel: Channel) -> None:
-    """Open a link: HEARTBEAT at 1 Hz and silence otherwise, unless SR parameters ask for streams."""
+    """Open a link with HEARTBEAT at 1 Hz and the streams of its SRn_ parameters."""
     v.channels.append(channel)
     channel.set_default("HEARTBEAT", 1.0)
     for group in ALL_GROUPS:
@@ -60,7 +60,7 @@ def attach(v: VehicleState, channel: Channel) -> None:
 
 
 def follow_rate(v: VehicleState, parameter: str) -> None:
-    """Apply a changed SRn_ parameter to the links it is about."""
+    """Apply a changed SRn_ parameter to its links."""
     for channel in v.channels:
         for group in ALL_GROUPS:
             if parameter == f"SR{channel.port}_{GROUPS[group][0]}":

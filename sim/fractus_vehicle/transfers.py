@@ -1,4 +1,4 @@
-"""The vehicle's side of the MAVLink mission protocol: lists that clients upload and download."""
+"""Vehicle side of the MAVLink mission protocol: upload and download of lists."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from fractus_vehicle.channel import Channel
 from fractus_vehicle.mission_items import Item, ItemStore, item_from, judge, judge_numbers
 
-# What the storage of the autopilot holds.
+# Capacity of the autopilot's storage.
 MAX_ITEMS = {
     mavlink.MAV_MISSION_TYPE_MISSION: 650,
     mavlink.MAV_MISSION_TYPE_FENCE: 70,
@@ -19,18 +19,18 @@ MAX_ITEMS = {
 }
 UPLOAD_TIMEOUT_S = 8.0
 RETRY_S = 1.0
-# What is said when a list is stored.
+# STATUSTEXT sent when a list is stored.
 RECEIVED = {
     mavlink.MAV_MISSION_TYPE_MISSION: (mavlink.MAV_SEVERITY_INFO, "Flight plan received"),
     mavlink.MAV_MISSION_TYPE_FENCE: (mavlink.MAV_SEVERITY_DEBUG, "Fence Indexed OK"),
 }
-# What the lists are called in texts.
+# Names of the lists in STATUSTEXTs.
 TITLES = {
     mavlink.MAV_MISSION_TYPE_MISSION: "Mission",
     mavlink.MAV_MISSION_TYPE_FENCE: "Fence",
     mavlink.MAV_MISSION_TYPE_RALLY: "Rally",
 }
-# What is refused until an upload of the same list has ended (the older MISSION_REQUEST is answered all the same).
+# Requests refused during an upload of the same list. The older MISSION_REQUEST is still served.
 NOT_WHILE_UPLOADED = {
     "MISSION_REQUEST_LIST": mavlink.MAV_MISSION_DENIED,
     "MISSION_REQUEST_INT": mavlink.MAV_MISSION_DENIED,
@@ -40,7 +40,7 @@ NOT_WHILE_UPLOADED = {
 
 @dataclass(slots=True)
 class Upload:
-    """A transfer toward the vehicle."""
+    """An upload in progress."""
 
     channel: Channel
     sysid: int
@@ -55,7 +55,7 @@ class Upload:
     old_format: bool = False
 
     def is_from(self, message: Message) -> bool:
-        """Whether a message comes from the one that uploads."""
+        """Return True if the message comes from the uploading peer."""
         return (self.sysid, self.compid) == (message.sysid, message.compid)
 
 
@@ -64,7 +64,7 @@ def _address(peer: Message | Upload, kind: int) -> dict[str, Value]:
 
 
 class Transfers:
-    """The vehicle's side of the mission protocol, for all kinds and links (one upload of each kind at a time, as ArduPilot)."""
+    """Vehicle side of the mission protocol for all list kinds and links. Each kind allows one upload at a time."""
 
     def __init__(
         self,
@@ -85,7 +85,7 @@ class Transfers:
         channel.send("MISSION_ACK", _address(peer, kind) | {"type": int(result)})
 
     def handle(self, channel: Channel, message: Message, now_s: float) -> None:
-        """Answer one message of the protocol."""
+        """Handle one message of the protocol."""
         self.now_s = now_s
         kind_number = message.integer("mission_type") if message.has("mission_type") else 0
         if kind_number not in self._stores:
@@ -96,7 +96,7 @@ class Transfers:
             self._handle(channel, message, self._stores[kind_number])
 
     def detach(self, channel: Channel) -> None:
-        """Give up uploads from a link that closes."""
+        """Cancel the uploads of a link that closes."""
         self.uploads = {kind: up for kind, up in self.uploads.items() if up.channel is not channel}
 
     def _handle(self, channel: Channel, message: Message, store: ItemStore) -> None:
@@ -106,7 +106,7 @@ class Transfers:
                 self._begin(channel, message, store, range(message.integer("count")))
             case "MISSION_WRITE_PARTIAL_LIST":
                 start, end = message.integer("start_index"), message.integer("end_index")
-                # One item more than there are may be written: it is appended.
+                # A write may append one item.
                 if 0 <= start <= end <= len(store.items):
                     self._begin(channel, message, store, range(start, end + 1))
                 else:
@@ -123,10 +123,10 @@ class Transfers:
             case "MISSION_CLEAR_ALL":
                 self._ack(channel, message, kind, self._clear(store))
             case _:
-                pass  # MISSION_ACK: an upload that its sender gives up runs into its time limit
+                pass  # MISSION_ACK: an upload cancelled by its sender times out
 
     def _begin(self, channel: Channel, message: Message, store: ItemStore, wanted: range) -> None:
-        """Begin to ask for the items of `wanted`; all of a new list, or a part of the stored one."""
+        """Start the upload of the item range `wanted`: a whole new list, or a part of the stored list."""
         going_on = self.uploads.get(store.kind)
         if going_on is not None and not going_on.is_from(message):
             self._ack(channel, message, store.kind, mavlink.MAV_MISSION_DENIED)
@@ -165,7 +165,7 @@ class Transfers:
             self._say(mavlink.MAV_SEVERITY_WARNING, "got MISSION_ITEM; GCS should send MISSION_ITEM_INT")
         seq = message.integer("seq")
         if seq != up.next or not up.is_from(message):
-            # The upload goes on; an item that comes twice is told so, too.
+            # The upload continues. A repeated item gets the same error.
             refusal = mavlink.MAV_MISSION_INVALID_SEQUENCE if seq != up.next else mavlink.MAV_MISSION_DENIED
             self._ack(channel, message, store.kind, refusal)
             return
@@ -177,7 +177,8 @@ class Transfers:
             return
         up.items[seq : seq + 1] = [item]
         if store.kind == mavlink.MAV_MISSION_TYPE_MISSION and up.next < up.last:
-            # A mission is written as it arrives: an upload that ends here leaves so much of it, and nothing of the old one.
+            # Mission items are stored as they arrive. An aborted upload leaves the received items and none of the old
+            # ones.
             self._replace(store, list(up.items))
         up.next += 1
         up.heard_s = self.now_s
@@ -188,7 +189,7 @@ class Transfers:
         self._complete(channel, message, store, up.items)
 
     def _complete(self, channel: Channel, message: Message, store: ItemStore, items: list[Item]) -> None:
-        """Store a list that has arrived, and say so."""
+        """Store a completed list and acknowledge it."""
         verdict = self._replace(store, items)
         self._ack(channel, message, store.kind, verdict)
         if verdict == mavlink.MAV_MISSION_ACCEPTED and store.kind in RECEIVED:
@@ -208,7 +209,7 @@ class Transfers:
 
     def _give(self, channel: Channel, message: Message, store: ItemStore) -> None:
         seq = message.integer("seq")
-        # Item 0 of a mission is home, and may be read even when there is no mission.
+        # Item 0 of a mission is home and can be read even if the mission is empty.
         homes = [store.home] if store.home is not None and not store.items else store.items
         if not 0 <= seq < len(homes):
             self._ack(channel, message, store.kind, mavlink.MAV_MISSION_ERROR)
@@ -235,7 +236,7 @@ class Transfers:
         )
 
     def step(self, now_s: float) -> None:
-        """Repeat unanswered requests; give up after a while."""
+        """Repeat requests without a response, and cancel an upload after UPLOAD_TIMEOUT_S."""
         self.now_s = now_s
         for kind, up in list(self.uploads.items()):
             if now_s - up.heard_s > UPLOAD_TIMEOUT_S:

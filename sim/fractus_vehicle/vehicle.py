@@ -1,4 +1,4 @@
-"""One simulated ArduCopter, advanced by fixed steps, without a clock."""
+"""One simulated ArduCopter, advanced in fixed steps."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from fractus_vehicle.state import CONTROL_STEP_S, VehicleConfig, VehicleState
 from fractus_vehicle.telemetry import attach, follow_rate, send_parameter, serve
 from fractus_vehicle.transfers import Transfers
 
-# The modes that switch the motors off as soon as they have landed.
+# Modes that disarm immediately after landing.
 _LANDING_MODES = frozenset({mavlink.COPTER_MODE_LAND, mavlink.COPTER_MODE_RTL, mavlink.COPTER_MODE_SMART_RTL})
 
-# How often a disarmed vehicle tells why it would not arm, and the pressure that it measures on the ground.
+# Intervals at which a disarmed vehicle reports failed arming checks and the ground pressure.
 CHECKS_TOLD_S = 30.0
 PRESSURE_TOLD_S = 10.0
 FIRST_PRESSURE_S = 1.0
 
 
 class Vehicle:
-    """The vehicle: its state, the mode that flies it, its failsafes, and the lists that clients store on it."""
+    """The vehicle: state, flight mode, failsafes and mission protocol."""
 
     def __init__(self, config: VehicleConfig) -> None:
         self.state = VehicleState(config)
@@ -57,7 +57,7 @@ class Vehicle:
         self.transfers.detach(channel)
 
     def arm(self) -> None:
-        """Start the motors; the caller has checked that it is allowed."""
+        """Start the motors. The caller has run the arming checks."""
         v = self.state
         v.armed = True
         v.armed_at_s = v.idle_since_s = v.time_s
@@ -100,7 +100,7 @@ class Vehicle:
             serve(v, channel)
 
     def _tell_while_disarmed(self) -> None:
-        """What keeps the vehicle from arming, now and then, and the pressure on the ground that is measured until it does."""
+        """Report failed arming checks and the ground pressure at intervals."""
         v = self.state
         if v.time_s >= self._next_checks_s:
             self._next_checks_s += CHECKS_TOLD_S

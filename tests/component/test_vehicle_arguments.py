@@ -24,7 +24,7 @@ from vehicle_world import CONFIG
         (["--duration", "nan"], "finite"),
         (["--spacing", "inf"], "--spacing"),
         (["--wind", "3,nan"], "expected SPEED,DIR"),
-        (["--sysid", "240", "--count", "20"], "system ids end at 250"),
+        (["--sysid", "240", "--count", "20"], "system ids must not exceed 250"),
     ],
 )
 def test_numbers_that_make_no_sense_are_named(arguments: list[str], words: str):
@@ -35,7 +35,7 @@ def test_numbers_that_make_no_sense_are_named(arguments: list[str], words: str):
 
 def test_a_row_of_vehicles_does_not_run_out_of_ports():
     assert LinkSpec.parse("tcp:127.0.0.1:65525").shifted(1).port == 65535
-    with pytest.raises(LinkError, match="begin at a lower one"):
+    with pytest.raises(LinkError, match="use a lower first port"):
         LinkSpec.parse("tcp:127.0.0.1:65525").shifted(2)
 
 
@@ -43,7 +43,7 @@ def test_a_pseudoterminal_replaces_no_file(tmp_path: Path):
     kept = tmp_path / "kept"
     kept.write_text("mine")
     hub = Hub()
-    with pytest.raises(LinkError, match="give another path"):
+    with pytest.raises(LinkError, match="use another path"):
         hub.open(LinkSpec.parse(f"pty:{kept}"), Craft(CONFIG), 0)
     hub.close()
     assert kept.read_text() == "mine"

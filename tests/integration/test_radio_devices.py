@@ -135,16 +135,16 @@ def test_the_uplink_delays(air: Air) -> None:
 
 def test_bad_commands_change_nothing(air: Air) -> None:
     for command, what in (
-        ({"station": "c"}, "no station c"),
-        ({"station": "a", "speed": 3}, "speed is not known"),
+        ({"station": "c"}, "unknown station c"),
+        ({"station": "a", "speed": 3}, "unknown attribute speed"),
         ({"station": "a", "off": 1}, "wrong type"),
         ({"station": "a", "position": [1.0, float("nan"), 0.0]}, "position: nan is not a finite number"),
         ({"station": "a", "position": [10**400, 0, 0]}, "is not a finite number"),
         ({"station": "a", "position": [1.0, 2.0]}, "three numbers"),
-        ({"station": ["a"]}, "no station"),
-        ({"uplink": "a", "rate_bps": 0}, "rate_bps and reach are positive"),
+        ({"station": ["a"]}, "unknown station"),
+        ({"uplink": "a", "rate_bps": 0}, "rate_bps and reach must be positive"),
         ({"uplink": "a", "rate_bps": float("inf")}, "finite"),
-        ({}, "names a station"),
+        ({}, "must name a station"),
     ):
         with pytest.raises(BadCommand, match=what):
             air.radio.command(command)

@@ -91,25 +91,25 @@ def in_the_air() -> Flight:
         ({"check": "battery", "min": 80}, {"check": "battery", "min": 81}),
     ],
 )
-def test_a_check_holds_and_fails(holding: dict[str, Any], failing: dict[str, Any]) -> None:
+def test_check_holds_or_fails_as_expected(holding: dict[str, Any], failing: dict[str, Any]) -> None:
     holds, found = verdict(holding, flight())
     assert holds, found
     holds, found = verdict(failing, flight())
     assert not holds, found
 
 
-def test_a_vehicle_that_is_still_in_the_air_or_armed_has_not_landed() -> None:
+def test_landed_check_fails_while_airborne_or_armed() -> None:
     assert not verdict({"check": "landed"}, in_the_air())[0]
     assert not verdict({"check": "landed"}, flight(armed_at_end=True))[0]
     assert not verdict({"check": "landed"}, flight(samples=[sample(0, 0, 0, 0)]))[0]
 
 
-def test_one_failing_vehicle_fails_the_check_unless_it_is_left_out() -> None:
+def test_check_fails_if_one_selected_vehicle_fails() -> None:
     assert not verdict({"check": "landed"}, flight(), flight("e", samples=flight().samples[:40]))[0]
     assert verdict({"check": "landed", "vehicles": ["d"]}, flight(), flight("e", samples=flight().samples[:40]))[0]
 
 
-def test_a_dip_below_the_lower_altitude_fails() -> None:
+def test_altitude_check_fails_after_a_dip_below_the_minimum() -> None:
     dipped = flight()
     dipped.samples[30] = sample(30, 85, 0, 12)
     holds, found = verdict({"check": "altitude", "min": 15}, dipped)
@@ -117,7 +117,7 @@ def test_a_dip_below_the_lower_altitude_fails() -> None:
     assert "12.0 m" in found
 
 
-def test_zones_have_an_inside_and_a_band() -> None:
+def test_zone_checks_consider_area_and_altitude_band() -> None:
     through = flight(east=40.0)
     assert not verdict({"check": "outsideZone", "zone": "z"}, through)[0]
     above = {"altitude": {"upper": 15}}
@@ -131,7 +131,7 @@ def test_zones_have_an_inside_and_a_band() -> None:
     assert "m outside" in found
 
 
-def test_separation_is_measured_in_the_air_and_at_the_same_time() -> None:
+def test_separation_check_compares_simultaneous_airborne_samples() -> None:
     assert verdict({"check": "separation", "min": 7.9}, flight(), flight("e", east=8.0))[0]
     holds, found = verdict({"check": "separation", "min": 8.1}, flight(), flight("e", east=8.0))
     assert not holds
@@ -140,7 +140,7 @@ def test_separation_is_measured_in_the_air_and_at_the_same_time() -> None:
     assert verdict({"check": "separation", "min": 50}, flight(), flight("e", samples=later))[0]
 
 
-def test_a_task_that_was_broken_off_is_not_done() -> None:
+def test_task_check_fails_for_an_aborted_task() -> None:
     assert verdict({"check": "task"}, flight())[0]
     holds, found = verdict({"check": "task"}, flight(task="the autopilot changed to RTL"))
     assert not holds
@@ -156,7 +156,7 @@ def service(check: dict[str, Any], **more: Any) -> bool:
     return judge(experiment.checks[0], Evidence({}, findings=Findings(**more)))[0].holds
 
 
-def test_calls_are_found_in_audit_logs() -> None:
+def test_call_check_finds_matching_audit_entries() -> None:
     entry = {**CALL, "code": "InsideExclusionZone"}
     wanted = {"check": "call", "component": "Navigator", "method": "Goto", "action": "deny"}
     assert service({**wanted, "code": "InsideExclusionZone"}, calls=[entry])
@@ -166,7 +166,7 @@ def test_calls_are_found_in_audit_logs() -> None:
     assert service({**wanted, "absent": True})
 
 
-def test_broken_chains_phases_and_programs_are_judged() -> None:
+def test_audit_phase_and_program_checks_fail_on_problems() -> None:
     assert service({"check": "audit"}, audit_problems={"d/mobility.jsonl": ""})
     assert not service({"check": "audit"}, audit_problems={"d/mobility.jsonl": "line 3 was changed"})
     assert not service({"check": "audit"}), "no log proves nothing"
@@ -180,7 +180,7 @@ def car(name: str, north: float, kind: str = "car") -> Seen:
     return Seen(kind, at.lat_e7 / 1e7, at.lon_e7 / 1e7, name)
 
 
-def test_detections_are_scored_against_what_was_in_view() -> None:
+def test_detections_check_compares_with_objects_in_view() -> None:
     truths = [car("a", 0), car("a", 6), car("b", 30), car("c", 60, "person")]
     given = [car("", 1), car("", 7), car("", 50), car("", 60, "person")]
     assert score(given, truths, "car", 3.0) == Score(detections=3, right=2, objects=2, found=1)

@@ -24,7 +24,7 @@ def server() -> Iterator[socket.socket]:
     "problem",
     [ConnectionRefusedError("refused"), ExperimentError("network namespace drone-1: no such file or directory")],
 )
-def test_a_client_without_a_server_is_hung_up_and_the_next_one_served(
+def test_link_tap_disconnects_a_client_without_server_and_serves_the_next(
     tmp_path: Path, server: socket.socket, problem: Exception
 ) -> None:
     problems = [problem]

@@ -18,14 +18,14 @@ def content(**changes: Any) -> dict[str, Any]:
     return {"name": "x", "vehicles": [{"name": "d", "home": HOME}], **changes}
 
 
-def test_vehicles_alone_run_in_lockstep_and_programs_need_a_pace() -> None:
+def test_experiment_runs_in_lockstep_unless_it_has_programs() -> None:
     program = {"name": "p", "command": ["python", "p.py"], "vehicle": "d"}
     assert parse(content()).pace == 0
     assert parse(content(programs=[program])).pace == 1
     assert parse(content(speedup=4)).pace == 4
 
 
-def test_a_row_of_vehicles_is_spread_out_with_ids_of_its_own() -> None:
+def test_vehicle_row_is_expanded_with_spacing_and_consecutive_ids() -> None:
     row = {"name": "d", "count": 3, "spacing": 20, "bearing": 0, "home": HOME}
     found = parse(content(vehicles=[row, {"name": "last", "home": HOME}])).setups()
     assert [(s.name, s.system_id) for s in found] == [("d-1", 1), ("d-2", 2), ("d-3", 3), ("last", 4)]
@@ -34,19 +34,19 @@ def test_a_row_of_vehicles_is_spread_out_with_ids_of_its_own() -> None:
     assert found[2].home.lon == 4.0
 
 
-def test_a_file_says_the_same_after_a_round_trip() -> None:
+def test_experiment_is_unchanged_after_a_json_round_trip() -> None:
     once = load(EXAMPLES / "hello.yaml")
     assert parse(json.loads(json.dumps(once.to_dict()))) == once
 
 
 @pytest.mark.parametrize("name", [path.name for path in sorted(EXAMPLES.glob("*.yaml"))])
-def test_the_examples_are_understood(name: str) -> None:
+def test_example_experiments_are_valid(name: str) -> None:
     found = load(EXAMPLES / name)
     assert found.checks
     assert found.faults
 
 
-def test_the_schema_names_every_fault_and_check() -> None:
+def test_experiment_schema_contains_every_fault_and_check() -> None:
     text = json.dumps(Experiment.model_json_schema())
     for word in ("gpsLoss", "linkLoss", "batteryDrop", "motorFailure", "windGust", "nodePowerOff", "separation"):
         assert f'"{word}"' in text
@@ -57,27 +57,36 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "no vehicle": ({"vehicles": []}, "vehicles"),
     "unknown field": ({"drones": 3}, "drones"),
     "no home": ({"vehicles": [{"name": "d"}]}, "vehicles[0].home"),
-    "twice": ({"vehicles": [{"name": "d", "home": HOME}] * 2}, "the name d is given twice"),
+    "twice": ({"vehicles": [{"name": "d", "home": HOME}] * 2}, "the name d is used twice"),
     "no such fault": (
         {"faults": [{"fault": "gpsLos", "at": 1}]},
-        "faults[0].fault: there is no gpsLos; did you mean gpsLoss?",
+        "faults[0].fault: unknown value gpsLos; did you mean gpsLoss?",
     ),
-    "no such check": ({"checks": [{"check": "x"}]}, "checks[0].check: there is no x; there are landed, neverFlew"),
+    "no such check": (
+        {"checks": [{"check": "x"}]},
+        "checks[0].check: unknown value x; possible values: landed, neverFlew",
+    ),
     "no fault named": ({"faults": [{"at": 1}]}, "faults[0].fault: is missing"),
     "fault without time": ({"faults": [{"fault": "gpsLoss"}]}, "at"),
-    "fault for no one": ({"faults": [{**GUST, "vehicles": ["e"]}]}, "faults[0].vehicles: there is no vehicle e"),
+    "fault for no one": ({"faults": [{**GUST, "vehicles": ["e"]}]}, "faults[0].vehicles: unknown vehicle e"),
     "link of another mode": ({"faults": [{"fault": "linkLoss", "at": 1, "link": "uplink"}]}, "use groundStation"),
     "no node to power off": ({"faults": [{"fault": "nodePowerOff", "at": 1}]}, "mode standalone or cluster"),
     "half a place": (
         {"vehicles": [{"name": "d", "home": HOME, "task": [{"do": "goto", "north": 3, "alt": 3}]}]},
         "give lat and lon, or north and east",
     ),
-    "no such zone": ({"checks": [{"check": "outsideZone", "zone": "z"}]}, "there is no zone z; there are: none"),
-    "bad expression": ({"checks": [{"check": "statustext", "matches": "("}]}, "no regular expression"),
-    "fault never planned": ({"checks": [{"check": "mode", "mode": "RTL", "after": "gpsLoss"}]}, "no fault gpsLoss"),
-    "calls of vehicles alone": ({"checks": [{"check": "call", "action": "deny"}]}, "judge nothing"),
-    "no manifests": ({"mode": "standalone"}, "manifests: are needed"),
-    "no cluster": ({"mode": "cluster"}, "cluster: is needed"),
+    "no such zone": ({"checks": [{"check": "outsideZone", "zone": "z"}]}, "unknown zone z; known: none"),
+    "bad expression": ({"checks": [{"check": "statustext", "matches": "("}]}, "not a valid regular expression"),
+    "fault never planned": (
+        {"checks": [{"check": "mode", "mode": "RTL", "after": "gpsLoss"}]},
+        "unknown fault gpsLoss",
+    ),
+    "calls of vehicles alone": (
+        {"checks": [{"check": "call", "action": "deny"}]},
+        "only supported in modes standalone and cluster",
+    ),
+    "no manifests": ({"mode": "standalone"}, "manifests: are required"),
+    "no cluster": ({"mode": "cluster"}, "cluster: is required"),
     "lockstep with a program": (
         {"speedup": 0, "programs": [{"name": "p", "command": ["p"], "vehicle": "d"}]},
         "lockstep",
@@ -94,7 +103,7 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_what_is_wrong_is_named(case: str) -> None:
+def test_invalid_experiment_is_rejected_with_the_field_name(case: str) -> None:
     changes, words = BAD[case]
     with pytest.raises(InvalidObject) as refusal:
         parse(content(**changes))
@@ -102,6 +111,6 @@ def test_what_is_wrong_is_named(case: str) -> None:
     assert "\n" not in str(refusal.value)
 
 
-def test_a_file_that_is_missing_is_named(tmp_path: Path) -> None:
+def test_missing_experiment_file_is_rejected_with_its_name(tmp_path: Path) -> None:
     with pytest.raises(InvalidObject, match="cannot read"):
         load(tmp_path / "none.yaml")

@@ -67,7 +67,7 @@ def testbed(experiment: Experiment, tmp_path: Path) -> Empty:
 
 
 @pytest.mark.parametrize("error", [full(), KeyboardInterrupt()], ids=["disk full", "Ctrl-C"])
-def test_what_cannot_be_closed_keeps_nothing_else_open(testbed: Empty, error: BaseException) -> None:
+def test_testbed_closes_remaining_resources_after_a_close_error(testbed: Empty, error: BaseException) -> None:
     first, last, order = testbed.keep(Thing()), Thing(error), list[str]()
     testbed.at_end(lambda: order.append("done"))
     testbed.keep(last)
@@ -76,7 +76,7 @@ def test_what_cannot_be_closed_keeps_nothing_else_open(testbed: Empty, error: Ba
     assert (first.closed, last.closed, order) == (True, True, ["done"])
 
 
-def test_a_full_disk_at_the_start_closes_the_testbed_and_leaves_no_report_of_another_run(
+def test_testbed_is_closed_and_old_report_removed_if_the_disk_is_full_at_start(
     experiment: Experiment, testbed: Empty, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     thing = testbed.keep(Thing())
@@ -93,7 +93,7 @@ def test_a_full_disk_at_the_start_closes_the_testbed_and_leaves_no_report_of_ano
     assert not (tmp_path / "summary.md").exists()
 
 
-def test_a_full_disk_at_the_end_closes_the_testbed(
+def test_testbed_is_closed_if_the_disk_is_full_at_the_end(
     experiment: Experiment, testbed: Empty, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     thing = testbed.keep(Thing())
@@ -114,7 +114,7 @@ def interruptible() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("interruptible")
-def test_signals_wait_until_the_block_is_over() -> None:
+def test_signals_are_deferred_until_the_end_of_an_uninterrupted_block() -> None:
     steps = []
     with pytest.raises(KeyboardInterrupt):
         with uninterrupted():
@@ -125,14 +125,14 @@ def test_signals_wait_until_the_block_is_over() -> None:
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_the_guard_kills_what_it_was_not_told_to_leave_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_guard_kills_the_groups_that_were_not_released(monkeypatch: pytest.MonkeyPatch) -> None:
     killed: list[int] = []
     monkeypatch.setattr(reaper.os, "killpg", lambda group, _signal: killed.append(group))
     reaper.guard(io.StringIO("41\n42\n43\n-42\n"))
     assert killed == [41, 43]
 
 
-def test_a_page_that_cannot_be_written_whole_is_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_summary_page_is_absent_after_an_incomplete_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def half(path: Path, text: str) -> None:
         path.write_bytes(text[:3].encode())
         raise full()
@@ -146,7 +146,7 @@ def test_a_page_that_cannot_be_written_whole_is_not_there(tmp_path: Path, monkey
     assert not list(tmp_path.iterdir())
 
 
-def test_the_figures_are_written_before_pictures_and_the_page_after_them(
+def test_report_is_written_before_figures_and_the_page_after_them(
     experiment: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def undrawn(_scene: object) -> None:
@@ -162,16 +162,16 @@ def test_the_figures_are_written_before_pictures_and_the_page_after_them(
 
 
 @pytest.mark.parametrize(
-    ("error", "said"),
+    ("error", "expected"),
     [
-        (OSError(errno.ENOSPC, "No space left on device", "out/x/map.png"), "cannot write below out: out/x/map.png No"),
-        (full(), "broken off: No space left on device"),
-        (TimeoutError("no answer"), "broken off: no answer"),
-        (ConnectionResetError(), "broken off: ConnectionResetError"),
+        (OSError(errno.ENOSPC, "No space left on device", "out/x/map.png"), "cannot write to out: out/x/map.png: No"),
+        (full(), "aborted: No space left on device"),
+        (TimeoutError("no answer"), "aborted: no answer"),
+        (ConnectionResetError(), "aborted: ConnectionResetError"),
     ],
 )
-def test_only_what_names_a_file_is_said_to_be_one_that_cannot_be_written(
-    experiment: Experiment, error: OSError, said: str, monkeypatch: pytest.MonkeyPatch
+def test_experiment_command_reports_a_write_error_only_if_the_error_names_a_file(
+    experiment: Experiment, error: OSError, expected: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(*_: object, **_more: object) -> None:
         raise error
@@ -181,5 +181,5 @@ def test_only_what_names_a_file_is_said_to_be_one_that_cannot_be_written(
     monkeypatch.setattr(cli, "run", broken)
     result = CliRunner().invoke(cli.experiment, ["run", "x.yaml", "--out", "out"])
     assert result.exit_code == 1
-    assert said in result.output
+    assert expected in result.output
     assert "None" not in result.output

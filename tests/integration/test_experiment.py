@@ -38,7 +38,7 @@ def play(*arguments: str) -> Result:
     return CliRunner().invoke(command, ["run", *arguments])
 
 
-def test_two_runs_of_one_seed_leave_the_same_bytes(tmp_path: Path) -> None:
+def test_experiment_output_is_identical_for_the_same_seed(tmp_path: Path) -> None:
     found = parse(content(faults=[GUST], checks=[{"check": "task"}, {"check": "landed", "nearHome": 3}]))
     for name in ("one", "two", "other"):
         chosen = found if name != "other" else parse({**found.to_dict(), "seed": 2})
@@ -49,7 +49,7 @@ def test_two_runs_of_one_seed_leave_the_same_bytes(tmp_path: Path) -> None:
     assert logs[0]["d.tlog"] != logs[2]["d.tlog"]
 
 
-def test_what_is_left_can_be_read_by_others(tmp_path: Path) -> None:
+def test_experiment_output_is_readable_by_standard_tools(tmp_path: Path) -> None:
     slow = {"name": "d", "home": HOME, "readyAfter": 2, "task": [TASK[0], {"do": "speed", "speed": 2.5}, *TASK[1:]]}
     checks = [{"check": "landed"}, {"check": "reached", "north": 15, "east": 0}]
     outcome = run(parse(content(vehicles=[slow], faults=[GUST], checks=checks)), tmp_path)
@@ -82,7 +82,7 @@ def test_what_is_left_can_be_read_by_others(tmp_path: Path) -> None:
     assert fault.end_s - fault.begin_s == pytest.approx(4.0, abs=0.1)
 
 
-def test_failsafes_are_found_and_failed_checks_too(tmp_path: Path) -> None:
+def test_experiment_reports_failsafes_and_failed_checks(tmp_path: Path) -> None:
     done = play(str(EXAMPLES / "gps-loss.yaml"), "--out", str(tmp_path / "holds"), "--quiet")
     assert done.exit_code == 0, done.output
     deaf = {"name": "d", "home": HOME, "readyAfter": 2, "task": TASK[:2], "parameters": {"FS_GCS_ENABLE": 1}}
@@ -97,7 +97,7 @@ def test_failsafes_are_found_and_failed_checks_too(tmp_path: Path) -> None:
     assert not report["problem"]
 
 
-def test_bad_input_is_one_sentence_and_exit_code_1(tmp_path: Path) -> None:
+def test_experiment_command_exits_with_1_and_one_message_for_invalid_input(tmp_path: Path) -> None:
     file = tmp_path / "bad.yaml"
     file.write_text(json.dumps(content(faults=[{"fault": "gpsLoss"}])))
     done = play(str(file), "--out", str(tmp_path / "out"))
@@ -130,7 +130,7 @@ link.motors_disarmed_wait()
 """
 
 
-def test_a_program_flies_a_vehicle_faster_than_real_time(tmp_path: Path) -> None:
+def test_program_flies_a_vehicle_faster_than_real_time(tmp_path: Path) -> None:
     (tmp_path / "fly.py").write_text(PROGRAM)
     program = {"name": "fly", "command": ["python", "fly.py"], "vehicle": "d"}
     vehicle = {"name": "d", "home": HOME, "readyAfter": 2}
@@ -145,7 +145,7 @@ def test_a_program_flies_a_vehicle_faster_than_real_time(tmp_path: Path) -> None
     assert told.get_srcSystem() == 255
 
 
-def test_an_interrupted_run_leaves_no_process(tmp_path: Path) -> None:
+def test_interrupted_experiment_leaves_no_process(tmp_path: Path) -> None:
     (tmp_path / "wait.py").write_text("import time\nopen('began', 'w').close()\ntime.sleep(600)\n")
     program = {"name": "wait", "command": ["python", "wait.py"], "vehicle": "d"}
     file = tmp_path / "long.yaml"
@@ -169,7 +169,7 @@ def test_an_interrupted_run_leaves_no_process(tmp_path: Path) -> None:
     assert not left.stdout
 
 
-def test_processes_that_do_not_go_are_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_processes_are_killed_if_they_ignore_sigterm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fractus_sim.experiment.processes.GRACE_S", 1.0)
     stubborn = (
         "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up', flush=True); time.sleep(60)"
@@ -181,7 +181,7 @@ def test_processes_that_do_not_go_are_killed(tmp_path: Path, monkeypatch: pytest
     assert processes.exit_code("stubborn") == -signal.SIGKILL
 
 
-def test_what_a_program_left_behind_ends_with_it(tmp_path: Path) -> None:
+def test_child_processes_end_with_their_program(tmp_path: Path) -> None:
     processes = Processes(tmp_path)
     left = f"sleep 600; : {tmp_path}"
     processes.start("leader", ["/bin/sh", "-c", f"/bin/sh -c '{left}' & exit 3"], {"PATH": os.environ["PATH"]})
@@ -215,7 +215,7 @@ finally:
     [(signal.SIGKILL, None), (signal.SIGINT, signal.SIGINT), (signal.SIGHUP, signal.SIGTERM)],
     ids=["killed", "Ctrl-C twice", "terminal closed"],
 )
-def test_no_process_outlives_a_runner_that_is_in_a_hurry(
+def test_no_process_outlives_an_interrupted_runner(
     tmp_path: Path, first: signal.Signals, second: signal.Signals | None
 ) -> None:
     command = [sys.executable, "-c", RUNNER, str(tmp_path)]
@@ -243,7 +243,7 @@ def gone(mark: Path) -> bool:
     return True
 
 
-def test_an_autopilot_that_runs_already_is_flown_and_harmed_over_tcp(tmp_path: Path) -> None:
+def test_running_autopilot_is_flown_and_faulted_over_tcp(tmp_path: Path) -> None:
     processes, port = Processes(tmp_path), free_port()
     link, home = f"tcp:127.0.0.1:{port}", "50.8637,4.6785,25"
     arguments = ["--listen", link, "--home", home, "--speedup", "5", "--ready-after", "2"]

@@ -48,7 +48,7 @@ def said(ground: Standalone, words: str, count: int) -> None:
         time.sleep(0.1)
 
 
-def test_a_program_flies_and_its_computer_loses_power(tmp_path: Path) -> None:
+def test_program_flies_until_its_companion_computer_loses_power(tmp_path: Path) -> None:
     (tmp_path / "pilot.py").write_text(PROGRAM)
     (tmp_path / "hold").touch()
     with Standalone(tmp_path / "ground") as ground:
@@ -74,9 +74,9 @@ def test_a_program_flies_and_its_computer_loses_power(tmp_path: Path) -> None:
     assert takeoff is not None, "the tap of the link shows what the service told the autopilot"
 
 
-def test_what_is_wrong_is_said_at_once(tmp_path: Path) -> None:
+def test_standalone_rejects_invalid_use_immediately(tmp_path: Path) -> None:
     with Standalone(tmp_path) as ground:
-        with pytest.raises(ExperimentError, match="there is no drone drone-1; there are none"):
+        with pytest.raises(ExperimentError, match="no drone drone-1; known: none"):
             ground.grant(grant())
         with pytest.raises(ExperimentError, match="has no Grant"):
             ground.environment("spiffe://fractus.dev/ns/a/app/b/component/C/instance/d")

@@ -1,8 +1,9 @@
-"""Experiments: drones, services and programs on this machine, faults in time, checks, and a report.
+"""Experiments: simulated vehicles with timed faults, checks and a report.
 
-from fractus_sim.experiment import load, run
-outcome = run(load(Path("hello.yaml")), Path("out/hello"))
-assert outcome.holds
+Run an experiment file and require that all its checks hold:
+
+    outcome = run(load(Path("hello.yaml")), Path("out/hello"))
+    assert outcome.holds
 """
 
 from fractus_sim.experiment.errors import ExperimentError

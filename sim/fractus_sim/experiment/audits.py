@@ -1,4 +1,4 @@
-"""Reads the audit logs that services leave."""
+"""Reader of the audit logs of an experiment."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ JUDGED = frozenset({"call", "monitor", "takeover"})
 
 
 def read_audit(path: Path, name: str, findings: Findings) -> None:
-    """Verify an audit log with its segments, and keep its judgements."""
+    """Verify an audit log with its segments and add its policy decisions to the findings."""
     lines = [line for _, _, line in lines_of(logs([path])[path])]
     finding = verify(lines)
     findings.audit_problems[name] = f"line {finding.line} {finding.problem}" if finding.problem else ""

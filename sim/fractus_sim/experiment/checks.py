@@ -1,4 +1,4 @@
-"""What must hold, as an experiment's file spells it; judged by `judging` from what was recorded."""
+"""Check types of experiment files. `judging` evaluates them."""
 
 from __future__ import annotations
 
@@ -16,36 +16,38 @@ def _regular(text: str) -> str:
     try:
         re.compile(text)
     except re.error as error:
-        raise InvalidObject("", f"is no regular expression: {error}") from None
+        raise InvalidObject("", f"is not a valid regular expression: {error}") from None
     return text
 
 
 Expression = Annotated[str, Field(min_length=1), AfterValidator(_regular)]
-Seconds = Annotated[float, Field(gt=0, description="Seconds of the experiment, from when all vehicles were ready.")]
+Seconds = Annotated[float, Field(gt=0, description="Seconds since all vehicles were ready.")]
 
 
 class VehicleCheck(Model):
-    """A check that every vehicle concerned must pass."""
+    """A check that each of its vehicles must pass."""
 
-    vehicles: tuple[Name, ...] = Field(default=(), description="Names of vehicles; unset: all.")
+    vehicles: tuple[Name, ...] = Field(default=(), description="Names of vehicles. Unset: all vehicles.")
 
 
 class Landed(VehicleCheck):
-    """It flew, and stands on the ground, disarmed, at the end."""
+    """The vehicle flew, and is landed and disarmed at the end."""
 
     check: Literal["landed"]
     within: Seconds | None = None
-    near_home: float | None = Field(default=None, gt=0, description="Metres from where it took off, at most.")
+    near_home: float | None = Field(
+        default=None, gt=0, description="Maximum distance between landing and takeoff position, metres."
+    )
 
 
 class NeverFlew(VehicleCheck):
-    """It stayed on the ground."""
+    """The vehicle stayed on the ground."""
 
     check: Literal["neverFlew"]
 
 
 class Reached(VehicleCheck, Place):
-    """It was there once."""
+    """The vehicle reached a position at least once."""
 
     check: Literal["reached"]
     alt: Altitude | None = None
@@ -54,78 +56,79 @@ class Reached(VehicleCheck, Place):
 
 
 class ModeReached(VehicleCheck):
-    """The autopilot was in this mode."""
+    """The autopilot entered a mode."""
 
     check: Literal["mode"]
     mode: ModeName
     after: Name | Literal["gpsLoss", "linkLoss", "nodePowerOff", "batteryDrop", "motorFailure", "windGust"] | None = (
-        Field(default=None, description="Only after the first fault of this kind began.")
+        Field(default=None, description="Consider only the time after the first fault of this kind began.")
     )
-    within: Seconds | None = Field(default=None, description="Seconds after that fault, or from the start.")
+    within: Seconds | None = Field(default=None, description="Seconds after that fault, or after the start.")
 
 
 class StatusText(VehicleCheck):
-    """The autopilot said this."""
+    """The autopilot sent a STATUSTEXT that matches."""
 
     check: Literal["statustext"]
-    matches: Expression = Field(description="Regular expression, found anywhere in a text.")
-    absent: bool = Field(default=False, description="It must not be said instead.")
+    matches: Expression = Field(description="Regular expression that is searched for in each text.")
+    absent: bool = Field(default=False, description="Require that no text matches.")
 
 
 class AltitudeBand(VehicleCheck):
-    """While in the air and beyond takeoff and landing, it stayed between two altitudes."""
+    """The altitude stayed between two limits while airborne, excluding takeoff and landing."""
 
     check: Literal["altitude"]
     min: Altitude | None = Field(
-        default=None, description="Metres above home; judged from first reaching it to the last."
+        default=None,
+        description="Metres above home. Evaluated between the first and the last time that the vehicle is above this altitude.",
     )
     max: Altitude | None = Field(default=None, description="Metres above home.")
 
 
 class SpeedLimit(VehicleCheck):
-    """It was never faster over the ground."""
+    """The ground speed never exceeded a limit."""
 
     check: Literal["speed"]
     max: float = Field(gt=0, description="Metres per second.")
 
 
 class OutsideZone(VehicleCheck):
-    """It was never inside a zone's area and altitude band."""
+    """The vehicle was never inside the area and altitude band of a zone."""
 
     check: Literal["outsideZone"]
     zone: Name
-    margin: float = Field(default=0, ge=0, description="Metres it must keep from the zone's border.")
+    margin: float = Field(default=0, ge=0, description="Minimum distance to the border of the zone, metres.")
 
 
 class InsideZone(VehicleCheck):
-    """While in the air it was always inside a zone's area and altitude band."""
+    """The vehicle was always inside the area and altitude band of a zone while airborne."""
 
     check: Literal["insideZone"]
     zone: Name
 
 
 class Battery(VehicleCheck):
-    """So much charge was left at the end."""
+    """The remaining battery charge at the end is at least `min`."""
 
     check: Literal["battery"]
     min: float = Field(ge=0, le=100, description="Percent.")
 
 
 class TaskDone(VehicleCheck):
-    """It flew its task to the end, uninterrupted."""
+    """The vehicle completed its task without interruption."""
 
     check: Literal["task"]
 
 
 class Separation(VehicleCheck):
-    """Vehicles in the air kept apart."""
+    """Airborne vehicles kept a minimum distance to each other."""
 
     check: Literal["separation"]
-    min: float = Field(gt=0, description="Metres, in space.")
+    min: float = Field(gt=0, description="Metres, three-dimensional.")
 
 
 class ProgramEnded(Model):
-    """A program ended as it should."""
+    """A program ended with the expected exit code."""
 
     check: Literal["program"]
     program: Name
@@ -133,18 +136,18 @@ class ProgramEnded(Model):
 
 
 class CallJudged(Model):
-    """The services judged a call so (modes standalone and cluster; from the audit logs)."""
+    """An audit log contains a call with this verdict (modes standalone and cluster)."""
 
     check: Literal["call"]
     component: str | None = None
     method: str | None = None
     action: Literal["allow", "correct", "deny", "takeover"]
-    code: str | None = Field(default=None, description="Such as InsideExclusionZone.")
-    absent: bool = Field(default=False, description="There must be no such call instead.")
+    code: str | None = Field(default=None, description="Reason code, such as InsideExclusionZone.")
+    absent: bool = Field(default=False, description="Require that there is no such call.")
 
 
 class AuditSound(Model):
-    """The audit logs' chains verify (modes standalone and cluster)."""
+    """The hash chains of all audit logs are valid (modes standalone and cluster)."""
 
     check: Literal["audit"]
 
@@ -158,17 +161,17 @@ class ApplicationPhase(Model):
 
 
 class Detections(Model):
-    """A program's detections agree with what the camera world had in view (mode standalone, a vehicle with a camera).
+    """Detections of a program match the objects in view of the camera world (mode standalone, vehicle with a camera).
 
-    The program appends a JSON object a line, with `class`, `lat` and `lon`, to the file that the variable
-    FRACTUS_EXPERIMENT_DETECTIONS names.
+    The program appends one JSON object with `class`, `lat` and `lon` per line to the file named by the environment
+    variable FRACTUS_EXPERIMENT_DETECTIONS.
     """
 
     check: Literal["detections"]
-    kind: str = Field(description="Class of object, as the world's truth.json names it: car, person, ...")
-    radius: float = Field(default=3.0, gt=0, description="Metres within which a detection counts as the object.")
-    precision: float = Field(default=0, ge=0, le=1, description="Share of detections that are objects, at least.")
-    recall: float = Field(default=0, ge=0, le=1, description="Share of the objects seen that were detected, at least.")
+    kind: str = Field(description="Object class as in the truth.json of the camera world: car, person, ...")
+    radius: float = Field(default=3.0, gt=0, description="Maximum distance between a detection and its object, metres.")
+    precision: float = Field(default=0, ge=0, le=1, description="Minimum share of detections that match an object.")
+    recall: float = Field(default=0, ge=0, le=1, description="Minimum share of objects in view that were detected.")
 
 
 Check = Annotated[

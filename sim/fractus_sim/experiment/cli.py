@@ -1,4 +1,4 @@
-"""`fractus experiment`: run experiments, and print what their files may say."""
+"""`fractus experiment`: run and check experiments, and print the JSON schema of their files."""
 
 from __future__ import annotations
 
@@ -37,15 +37,15 @@ def run_(file: Path, out: Path | None, seed: int | None, speedup: float | None, 
     console = Console(highlight=False)
     break_off_on_signals()
     try:
-        found = _changed(load(file), seed=seed, speedup=speedup)
+        loaded = _changed(load(file), seed=seed, speedup=speedup)
     except InvalidObject as error:
         raise click.ClickException(str(error)) from None
-    folder = out or Path("out") / found.name
+    folder = out or Path("out") / loaded.name
     status = console.status("setting up")
     try:
         with status:
             progress = Progress() if quiet else _progress(console, status.update)
-            outcome = run(found, folder, base=file.parent.absolute(), progress=progress)
+            outcome = run(loaded, folder, base=file.parent.absolute(), progress=progress)
     except (ExperimentError, InvalidObject) as error:
         raise click.ClickException(str(error)) from None
     except OSError as error:
@@ -59,12 +59,12 @@ def run_(file: Path, out: Path | None, seed: int | None, speedup: float | None, 
 def check(file: Path) -> None:
     """Check FILE without running it."""
     try:
-        found = load(file)
+        loaded = load(file)
     except InvalidObject as error:
         raise click.ClickException(str(error)) from None
     click.echo(
-        f"{file}: mode {found.mode}, {len(found.setups())} vehicles, {len(found.faults)} faults,"
-        f" {len(found.checks)} checks"
+        f"{file}: mode {loaded.mode}, {len(loaded.setups())} vehicles, {len(loaded.faults)} faults,"
+        f" {len(loaded.checks)} checks"
     )
 
 
@@ -75,16 +75,16 @@ def schema() -> None:
 
 
 def _problem(error: OSError, folder: Path) -> str:
-    """What the system refused; only an error that names a file is one of files."""
-    said = error.strerror or str(error) or type(error).__name__
+    """Describe an operating system error, with the file if the error names one."""
+    reason = error.strerror or str(error) or type(error).__name__
     if error.filename:
-        return f"cannot write below {folder}: {error.filename} {said}"
-    return f"the experiment was broken off: {said}"
+        return f"cannot write to {folder}: {error.filename}: {reason}"
+    return f"the experiment was aborted: {reason}"
 
 
-def _changed(found: Experiment, **changes: float | None) -> Experiment:
+def _changed(loaded: Experiment, **changes: float | None) -> Experiment:
     given = {name: value for name, value in changes.items() if value is not None}
-    return parse({**found.to_dict(), **given}) if given else found
+    return parse({**loaded.to_dict(), **given}) if given else loaded
 
 
 def _progress(console: Console, update: object) -> Progress:
@@ -99,12 +99,12 @@ def _progress(console: Console, update: object) -> Progress:
 
 
 def _tell_outcome(console: Console, outcome: Outcome) -> None:
-    shown = Table("", "check", "vehicle", "found", title=outcome.experiment.name, title_justify="left")
+    shown = Table("", "check", "vehicle", "result", title=outcome.experiment.name, title_justify="left")
     for verdict in outcome.verdicts:
         mark = "[green]holds[/green]" if verdict.holds else "[red]failed[/red]"
         shown.add_row(mark, escape(verdict.check), verdict.vehicle, escape(verdict.found))
     if outcome.verdicts:
         console.print(shown)
     if outcome.problem:
-        console.print(f"[red]did not run to its end:[/red] {escape(outcome.problem)}", soft_wrap=True)
+        console.print(f"[red]aborted:[/red] {escape(outcome.problem)}", soft_wrap=True)
     console.print(f"report: {outcome.folder}/summary.md", soft_wrap=True)

@@ -1,4 +1,4 @@
-"""Mode cluster: the embedded Kubernetes cluster with Fractus on it, its drones' vehicles beside their nodes."""
+"""Experiment mode cluster: Fractus on the embedded Kubernetes cluster, with a simulated vehicle for each drone node."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ AUDIT_LOGS = ("mobility.jsonl", "camera.jsonl")
 
 
 class ClusterTestbed(Testbed):
-    """A cluster of the experiment's own, of its name; taken down at the end unless it ran before."""
+    """An embedded cluster named after the experiment, removed at the end unless it was already running."""
 
     def __init__(self, experiment: Experiment, folder: Path, base: Path, tell: Callable[[str], None]) -> None:
         super().__init__(experiment, folder, base, tell)
         if experiment.cluster is None:
-            raise ExperimentError("mode cluster needs a cluster")
+            raise ExperimentError("mode cluster needs the field `cluster`")
         self._part: ClusterPart = experiment.cluster
         self._spec = _spec(experiment, base / self._part.file)
         self._cluster = Cluster(self._spec, report=tell)
@@ -57,10 +57,10 @@ class ClusterTestbed(Testbed):
         self._began_s = time.monotonic()
 
     def set_up(self) -> None:
-        """Build images, bring the cluster up with Fractus on it, and wait until its drone is ready.
+        """Build images, start the cluster, install Fractus, and wait until the drones are ready.
 
         Raises:
-            ExperimentError: something did not come up.
+            ExperimentError: A part of the cluster did not start.
         """
         self.at_end(self._take_down)
         with _explained():
@@ -75,7 +75,7 @@ class ClusterTestbed(Testbed):
         self._began_s = time.monotonic()
 
     def tick(self) -> Moment:
-        """Wait for 50 ms."""
+        """Sleep for 50 ms."""
         time.sleep(TICK_S)
         return Moment(time.monotonic() - self._began_s, time.time_ns() // 1000)
 
@@ -83,7 +83,7 @@ class ClusterTestbed(Testbed):
         """Apply the Applications.
 
         Raises:
-            ExperimentError: the API server refused one.
+            ExperimentError: The API server rejected an Application.
         """
         with _explained():
             self._running_kube().apply(self._applications)
@@ -91,31 +91,31 @@ class ClusterTestbed(Testbed):
 
     @property
     def busy(self) -> bool:
-        """Whether an Application is not over."""
+        """True while an Application has not ended."""
         return any(self._phase.get(body["metadata"]["name"]) not in ENDED for body in self._applications)
 
     def cut_link(self, vehicle: str) -> None:
-        """Cut the node's uplink; services and vehicle go on."""
+        """Cut the uplink of a node. Services and vehicle keep running."""
         with _explained():
             self._cluster.node(vehicle).cut_link()
 
     def heal_link(self, vehicle: str) -> None:
-        """Give the node its uplink back."""
+        """Restore the uplink of a node."""
         with _explained():
             self._cluster.node(vehicle).heal_link()
 
     def power_off(self, node: str) -> None:
-        """Pull the node's power; its vehicle flies on."""
+        """Power off a node. Its vehicle keeps flying."""
         with _explained():
             self._cluster.set_power(node, on=False)
 
     def power_on(self, node: str) -> None:
-        """Give it back."""
+        """Power on a node."""
         with _explained():
             self._cluster.set_power(node, on=True)
 
     def collect(self) -> None:
-        """Read the audit logs from the drones' disks."""
+        """Read the audit logs from the disks of the drones."""
         self._stop.set()
         for setup in self.experiment.setups():
             folder = self._cluster.node(setup.name).own_state / "audit"
@@ -124,7 +124,7 @@ class ClusterTestbed(Testbed):
                     read_audit(folder / name, f"{setup.name}/{name}", self.findings)
 
     def _take_down(self) -> None:
-        """Take the cluster down, or only what was applied, if it ran before."""
+        """Remove the cluster. If it was running before, delete only the applied Applications."""
         self._stop.set()
         with _explained():
             if not self._was_running:
@@ -134,7 +134,7 @@ class ClusterTestbed(Testbed):
                 self._kube.delete(self._applications, DRONE_READY_S)
 
     def _attach(self, setup: VehicleSetup) -> None:
-        """Put a tap between the vehicle and its clients, and attach to the vehicle."""
+        """Insert a link tap between the vehicle and its clients, and connect the observer."""
         node = self._cluster.node(setup.name)
         namespace = node.wiring.namespace_path(setup.name)
         logs = self.folder / "logs"
@@ -150,7 +150,7 @@ class ClusterTestbed(Testbed):
         self.observe(setup, TcpLink(connect(), f"to the vehicle of {setup.name}"))
 
     def _watch(self) -> None:
-        """Follow the Applications' phases; what the API server does not answer is asked again."""
+        """Record the phases of the Applications. Failed requests are retried."""
         while not self._stop.wait(POLL_S):
             try:
                 found = self._running_kube().objects("applications")
@@ -164,16 +164,16 @@ class ClusterTestbed(Testbed):
 
     def _running_kube(self) -> Kube:
         if self._kube is None:
-            raise ExperimentError("the cluster is not up")
+            raise ExperimentError("the cluster is not running")
         return self._kube
 
 
 @contextmanager
 def _explained() -> Iterator[None]:
-    """What goes wrong on the cluster goes wrong with the experiment.
+    """Convert errors of the cluster to ExperimentError.
 
     Raises:
-        ExperimentError: a part of the cluster failed.
+        ExperimentError: A part of the cluster failed.
     """
     try:
         yield
@@ -182,10 +182,12 @@ def _explained() -> Iterator[None]:
 
 
 def _spec(experiment: Experiment, path: Path) -> ClusterSpec:
-    """The cluster with seed, wind and parameters for its vehicles, which listen behind our tap.
+    """Return the cluster specification with seed, wind and parameters of its vehicles.
+
+    The vehicles listen behind the link tap.
 
     Raises:
-        ExperimentError: it cannot be read, or a vehicle of the experiment is none of its.
+        ExperimentError: The file cannot be read, or has no vehicle of this name.
     """
     with _explained():
         spec = load_spec(path)
@@ -193,7 +195,7 @@ def _spec(experiment: Experiment, path: Path) -> ClusterSpec:
     setups = {setup.name: setup for setup in experiment.setups()}
     for name in setups:
         if name not in flying:
-            raise ExperimentError(f"{path} has no drone {name} with a vehicle; it has {', '.join(sorted(flying))}")
+            raise ExperimentError(f"{path} has no drone {name} with a vehicle; available: {', '.join(sorted(flying))}")
     nodes = [_prepared(node, setups[node.name], experiment) if node.name in setups else node for node in spec.nodes]
     return spec.model_copy(update={"name": experiment.name[:MAX_NAME], "nodes": tuple(nodes)})
 
@@ -219,18 +221,18 @@ def _prepared(node: NodeSpec, setup: VehicleSetup, experiment: Experiment) -> No
 
 
 def _port(spec: ClusterSpec, name: str) -> int:
-    """The port at which the node's services expect its autopilot."""
+    """Return the port where the services of the node connect to the autopilot."""
     node = next(node for node in spec.nodes if node.name == name)
     found = node.vehicle()
     listen = found[1] if found is not None else ""
     kind, _, rest = listen.partition(":")
     if kind != "tcp":
-        raise ExperimentError(f"{name}: its vehicle listens on {listen}; experiments need tcp:HOST:PORT")
+        raise ExperimentError(f"{name}: the vehicle listens on {listen}; experiments need tcp:HOST:PORT")
     return int(rest.rpartition(":")[2])
 
 
 def _manifests(part: ClusterPart, base: Path) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """The Applications, and everything else that is applied before."""
+    """Return the Applications, and all other objects (applied first)."""
     with _explained():
         every: list[Mapping[str, Any]] = [body for path in part.apply for body in documents(base / path)]
     applications = [dict(body) for body in every if body.get("kind") == "Application"]

@@ -1,4 +1,4 @@
-"""How well a program's detections agree with what the camera world had in view when it took its pictures."""
+"""Comparison of a program's detections with the objects in view of the camera world."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """Something that was somewhere: an object in a picture, or what a program took for one."""
+    """An object in a picture, or a detection of a program."""
 
     kind: str
     lat: float
@@ -34,7 +34,7 @@ class Seen:
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """Counts: detections, those that are objects, objects that were in view, those of them that were detected."""
+    """Numbers of detections, matching detections, objects in view, and detected objects."""
 
     detections: int
     right: int
@@ -43,23 +43,23 @@ class Score:
 
     @property
     def precision(self) -> float:
-        """Share of detections that are objects; 1 when there are none."""
+        """Share of detections that match an object. 1 if there are no detections."""
         return self.right / self.detections if self.detections else 1.0
 
     @property
     def recall(self) -> float:
-        """Share of objects that were detected; 1 when there were none."""
+        """Share of objects that were detected. 1 if there are no objects."""
         return self.found / self.objects if self.objects else 1.0
 
 
 def score(detections: Sequence[Seen], truths: Sequence[Seen], kind: str, radius_m: float) -> Score:
-    """Match detections of a class with objects of it, wherever these were while in view.
+    """Match detections of one class with the objects of that class.
 
     Args:
-        detections: What the program said.
-        truths: Each object of each picture; one that moved is there at each of its places.
-        kind: The class that counts.
-        radius_m: How near a detection must be.
+        detections: Detections of the program.
+        truths: Objects of each picture. A moving object appears once per position.
+        kind: Class to compare.
+        radius_m: Maximum distance between a detection and its object.
     """
     wanted = [truth for truth in truths if truth.kind == kind]
     given = [detection for detection in detections if detection.kind == kind]
@@ -73,19 +73,19 @@ def _apart_m(one: Seen, other: Seen) -> float:
 
 
 def read_detections(lines: Iterable[str]) -> list[Seen]:
-    """What programs wrote, a JSON object a line; a line that is none is passed over with a warning."""
+    """Parse detections, one JSON object per line. Malformed lines are logged and ignored."""
     found = []
     for number, line in enumerate(lines, 1):
         try:
             entry = json.loads(line)
             found.append(Seen(str(entry["class"]), float(entry["lat"]), float(entry["lon"])))
         except (ValueError, KeyError, TypeError) as error:
-            log.warning("experiment: no detection in a line (file=%s, line=%d, error=%s)", FILE, number, error)
+            log.warning("experiment: malformed detection ignored (file=%s line=%d error=%s)", FILE, number, error)
     return found
 
 
 class TruthWatch:
-    """Keeps what a camera world had in view at each snapshot, asking twice a second."""
+    """Records the objects in view of a camera world at each snapshot, polling twice a second."""
 
     def __init__(self, url: str, path: Path) -> None:
         self.seen: list[Seen] = []
@@ -97,7 +97,7 @@ class TruthWatch:
         self._thread.start()
 
     def close(self) -> None:
-        """Ask no more."""
+        """Stop polling."""
         self._stop.set()
         self._thread.join(2 * ANSWER_S)
 
@@ -112,16 +112,16 @@ class TruthWatch:
                     self.seen += seen_in(truth)
 
     def _ask(self) -> Mapping[str, Any] | None:
-        """The truth of the last snapshot; None while there is none, or the world does not answer."""
+        """Return the truth of the last snapshot, or None if there is no snapshot or the request fails."""
         try:
-            with urllib.request.urlopen(self._url, timeout=ANSWER_S) as answer:  # nosec B310  # noqa: S310 - our own loopback URL
+            with urllib.request.urlopen(self._url, timeout=ANSWER_S) as answer:  # nosec B310  # noqa: S310 - loopback URL
                 content: Mapping[str, Any] = json.load(answer)
                 return content
         except (OSError, ValueError, urllib.error.URLError) as error:
-            log.debug("experiment: no truth (url=%s, error=%s)", self._url, error)
+            log.debug("experiment: camera world did not respond (url=%s error=%s)", self._url, error)
             return None
 
 
 def seen_in(truth: Mapping[str, Any]) -> list[Seen]:
-    """The objects in one truth.json."""
+    """Return the objects of a truth.json document."""
     return [Seen(o["class"], o["lat"], o["lon"], str(o["id"])) for o in truth.get("objects", ())]

@@ -1,7 +1,7 @@
-"""What goes wrong with experiments before or beside their checks."""
+"""Exception of experiments."""
 
 from __future__ import annotations
 
 
 class ExperimentError(Exception):
-    """The experiment cannot be run, or not to its end; the text says what to do."""
+    """The experiment cannot be set up or completed. The message says what to do."""

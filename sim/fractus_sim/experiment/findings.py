@@ -1,4 +1,4 @@
-"""What is known of an experiment beside its vehicles' flights."""
+"""Results of an experiment that are not part of a flight recording."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from fractus_sim.experiment.detections import Seen
 
 @dataclass
 class Findings:
-    """What only the testbed knows, for checks and report.
+    """Results that the testbed collects for checks and report.
 
     Attributes:
-        programs: exit codes; None for one that had to be stopped.
-        calls: entries of the audit logs that are judgements.
-        audit_problems: by log; empty text for one that verifies.
-        phases: of each Application, in the order seen.
-        detections: what programs detected.
-        truths: what camera worlds had in view.
+        programs: Exit codes by program. None if the program had to be stopped.
+        calls: Audit log entries with a verdict.
+        audit_problems: Verification problem by log. Empty if the log is valid.
+        phases: Phases of each Application in the order observed.
+        detections: Detections of programs.
+        truths: Objects in view of the camera worlds.
     """
 
     programs: dict[str, int | None] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""Flies a vehicle's task from a ground station, a step at a time; each generator goes on at every poll."""
+"""Execution of a vehicle's task by a ground station. Each task is a generator that is resumed at every poll."""
 
 from __future__ import annotations
 
@@ -35,19 +35,19 @@ Flight = Generator[None, None, None]
 
 
 class TaskFailed(Exception):
-    """The vehicle refused a step, or its autopilot took over; the text says what happened."""
+    """The vehicle rejected a step, or the autopilot took over. The message says what happened."""
 
 
 def fly(station: Station, steps: Sequence[Step], tell: Callable[[str], None]) -> Flight:
     """Fly a task.
 
     Args:
-        station: The link to the vehicle.
-        steps: What to fly.
-        tell: Gets the name of each step as it begins.
+        station: Link to the vehicle.
+        steps: Steps of the task.
+        tell: Called with the title of each step when it begins.
 
     Raises:
-        TaskFailed: a step was refused, or the autopilot changed its mode by itself.
+        TaskFailed: A step was rejected, or the autopilot changed its mode.
     """
     speed_mps: float | None = None
     for step in steps:
@@ -75,10 +75,10 @@ def fly(station: Station, steps: Sequence[Step], tell: Callable[[str], None]) ->
 
 
 def _command(station: Station, command: int, *params: float) -> Flight:
-    """Send a command until it is answered.
+    """Send a command until it is acknowledged.
 
     Raises:
-        TaskFailed: it was refused, or never answered.
+        TaskFailed: The command was rejected or not acknowledged.
     """
     for _ in range(ATTEMPTS):
         station.command(command, *params)
@@ -88,12 +88,12 @@ def _command(station: Station, command: int, *params: float) -> Flight:
             if command in station.acks:
                 result = station.acks[command]
                 if result != mavlink.MAV_RESULT_ACCEPTED:
-                    said = f": {station.state.texts[-1][2]}" if station.state.texts else ""
+                    detail = f": {station.state.texts[-1][2]}" if station.state.texts else ""
                     raise TaskFailed(
-                        f"{enum_name('MAV_CMD', command)} was answered {enum_name('MAV_RESULT', result)}{said}"
+                        f"{enum_name('MAV_CMD', command)} was rejected with {enum_name('MAV_RESULT', result)}{detail}"
                     )
                 return
-    raise TaskFailed(f"{enum_name('MAV_CMD', command)} was not answered")
+    raise TaskFailed(f"{enum_name('MAV_CMD', command)} was not acknowledged")
 
 
 def _enter(station: Station, mode: int) -> Flight:
@@ -115,8 +115,8 @@ def _arm(station: Station) -> Flight:
         while station.now_s < again and not station.state.armed:
             yield
         if station.now_s > deadline:
-            said = station.state.texts[-1][2] if station.state.texts else "it says nothing"
-            raise TaskFailed(f"the vehicle does not arm: {said}")
+            detail = station.state.texts[-1][2] if station.state.texts else "no STATUSTEXT received"
+            raise TaskFailed(f"the vehicle does not arm: {detail}")
 
 
 def _take_off(station: Station, altitude_m: float) -> Flight:
@@ -138,7 +138,8 @@ def _go(station: Station, step: Goto, speed_mps: float | None) -> Flight:
             where = {"lat_int": lat, "lon_int": lon, "alt": step.alt}
             frame = {"coordinate_frame": int(RELATIVE_FRAME), "type_mask": int(POSITION_ONLY)}
             station.tell("SET_POSITION_TARGET_GLOBAL_INT", {**where, **frame})
-            if speed_mps is not None:  # the first leg begins with the parameters' speed, whatever was set before
+            # # The first leg starts with the speed of the parameters, regardless of earlier commands.
+            if speed_mps is not None:
                 station.command(mavlink.MAV_CMD_DO_CHANGE_SPEED, mavlink.SPEED_TYPE_GROUNDSPEED, speed_mps, -1)
         yield
         _expect(station, mavlink.COPTER_MODE_GUIDED)
@@ -172,16 +173,16 @@ def _expect(station: Station, mode: int) -> None:
 
 
 def _point(station: Station, place: Place) -> earth.Place:
-    """The place in degrees times 1e7.
+    """Resolve a place of the experiment file.
 
     Raises:
-        TaskFailed: it is relative to home, and the vehicle has none yet.
+        TaskFailed: The place is relative to home, and the home position is unknown.
     """
     if place.lat is not None and place.lon is not None:
         return earth.Place.from_degrees(place.lat, place.lon, 0.0)
     home = station.state.home
     if home is None:
-        raise TaskFailed("the vehicle has no home yet, so metres from home mean nothing")
+        raise TaskFailed("home position unknown; cannot resolve a position in metres from home")
     return earth.Place.from_degrees(home[0], home[1], 0.0).offset(place.north or 0.0, place.east or 0.0)
 
 
@@ -198,7 +199,7 @@ def _mission(station: Station, step: FlyMission) -> Flight:
 
 
 def _items(station: Station, step: FlyMission) -> list[dict[str, float]]:
-    """The mission as MISSION_ITEM_INT fields; the first is home, as ArduPilot keeps it."""
+    """Return the mission as MISSION_ITEM_INT fields. Item 0 is home, as in ArduPilot."""
     first: dict[str, float] = {"command": int(mavlink.MAV_CMD_NAV_WAYPOINT), "frame": mavlink.MAV_FRAME_GLOBAL}
     items: list[dict[str, float]] = [
         first,
@@ -218,7 +219,7 @@ def _upload(station: Station, items: Sequence[dict[str, float]]) -> Flight:
     """Upload a mission.
 
     Raises:
-        TaskFailed: the vehicle refused it, or does not ask for it.
+        TaskFailed: The vehicle rejected the mission or does not request its items.
     """
     station.tell("MISSION_COUNT", {"count": len(items)})
     deadline = station.now_s + ANSWER_S * ATTEMPTS
@@ -232,6 +233,6 @@ def _upload(station: Station, items: Sequence[dict[str, float]]) -> Flight:
                     station.tell("MISSION_ITEM_INT", {"seq": seq, "autocontinue": 1, **items[seq]})
             elif message.name == "MISSION_ACK":
                 if message.integer("type"):
-                    raise TaskFailed(f"the mission was refused with {message.integer('type')}")
+                    raise TaskFailed(f"the mission was rejected with MAV_MISSION_RESULT {message.integer('type')}")
                 return
-    raise TaskFailed("the vehicle did not take the mission")
+    raise TaskFailed("the vehicle did not complete the mission upload")

@@ -1,4 +1,4 @@
-"""Makes faults happen when they are due, and takes them away again."""
+"""Injection of faults into a running experiment."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ ATTEMPTS = 5
 
 @dataclass(frozen=True, slots=True)
 class Occurrence:
-    """A fault as it happened to one vehicle; seconds of the experiment.
+    """A fault that was injected. Times are seconds of the experiment.
 
     Attributes:
-        vehicle: empty for a node without a vehicle.
-        end_s: None while it lasts.
+        vehicle: Name of the vehicle. Empty for a node without a vehicle.
+        end_s: End of the fault. None while it lasts.
     """
 
     kind: str
@@ -40,12 +40,12 @@ class _Running:
 
 
 class Injector:
-    """All faults of an experiment.
+    """Injects all faults of an experiment.
 
     Args:
-        faults: What is to happen.
-        testbed: Its links and power are cut; its observers are what no fault cuts.
-        tell: Gets a sentence when a fault begins or ends.
+        faults: Faults of the experiment file.
+        testbed: Provides links and power to cut, and observers that no fault disconnects.
+        tell: Called with a message when a fault begins or ends.
     """
 
     def __init__(self, faults: Sequence[Fault], testbed: Testbed, tell: Callable[[str], None]) -> None:
@@ -56,10 +56,10 @@ class Injector:
         self._running = [self._prepare(fault, vehicle) for fault in faults for vehicle in self._victims(fault)]
 
     def step(self, now_s: float) -> None:
-        """Go on; to be called at every poll, after the observers were polled.
+        """Advance all faults. Call this after each poll of the observers.
 
         Raises:
-            ExperimentError: a vehicle does not take a parameter.
+            ExperimentError: A vehicle rejected a parameter.
         """
         self._now_s = now_s
         for name, observer in self._observers.items():
@@ -71,7 +71,7 @@ class Injector:
 
     @property
     def pending(self) -> bool:
-        """Whether a fault has begun and not ended."""
+        """True while a fault has begun and not ended."""
         return any(not running.over and running.index is not None for running in self._running)
 
     @property
@@ -126,7 +126,7 @@ class Injector:
         for name, value in before.items():
             yield from self._set(running.vehicle, name, value)
         self.occurrences[running.index] = replace(self.occurrences[running.index], end_s=self._now_s)
-        self._tell(f"{running.vehicle or 'cluster'}: {fault.title} is over")
+        self._tell(f"{running.vehicle or 'cluster'}: {fault.title} ended")
 
     def _read(self, vehicle: str, name: str) -> Generator[None, None, float]:
         observer = self._observers[vehicle]
@@ -142,7 +142,7 @@ class Injector:
             observer.set_parameter(name, value)
             if (yield from self._answered(observer, name)):
                 return
-        raise ExperimentError(f"{vehicle}: the autopilot does not take {name} = {value:g}, which a fault needs")
+        raise ExperimentError(f"{vehicle}: the autopilot rejected {name} = {value:g}, which a fault needs")
 
     def _answered(self, observer: Station, name: str) -> Generator[None, None, bool]:
         deadline_s = self._now_s + ANSWER_S

@@ -1,4 +1,4 @@
-"""Judges checks from what was recorded: pure functions of evidence, each verdict with its reason."""
+"""Evaluation of checks on recorded evidence. All functions are pure, and each verdict states its reason."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ MATCH_S = 0.2
 
 @dataclass(frozen=True)
 class Evidence:
-    """What was recorded; seconds of the experiment.
+    """Recorded evidence. Times are seconds of the experiment.
 
     Attributes:
-        flights: by vehicle.
-        zones: by name.
+        flights: Flights by vehicle.
+        zones: Zones by name.
     """
 
     flights: Mapping[str, Flight]
@@ -42,7 +42,7 @@ class Evidence:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Whether a check holds for a vehicle (or for the whole experiment: no vehicle), and what was found."""
+    """Result of a check for one vehicle, or for the whole experiment if `vehicle` is empty."""
 
     check: str
     vehicle: str
@@ -50,11 +50,11 @@ class Verdict:
     found: str
 
 
-_TOLD_AS_ZERO = ("north", "east", "alt", "exitCode")
+_SHOWN_IF_ZERO = ("north", "east", "alt", "exitCode")
 
 
 def judge(check: kinds.Check, evidence: Evidence) -> tuple[Verdict, ...]:
-    """Judge one check: a verdict for each vehicle concerned, or one."""
+    """Evaluate one check. Return one verdict per vehicle, or a single verdict."""
     if isinstance(check, kinds.VehicleCheck) and not isinstance(check, kinds.Separation):
         names = check.vehicles or tuple(evidence.flights)
         return tuple(
@@ -66,11 +66,11 @@ def judge(check: kinds.Check, evidence: Evidence) -> tuple[Verdict, ...]:
 
 
 def title(check: kinds.Check) -> str:
-    """A check in a few words."""
-    said = check.to_dict()
-    kind = said.pop("check")
-    said.pop("vehicles", None)
-    words = ", ".join(_word(name, value) for name, value in said.items() if value or name in _TOLD_AS_ZERO)
+    """Describe a check in a few words."""
+    fields = check.to_dict()
+    kind = fields.pop("check")
+    fields.pop("vehicles", None)
+    words = ", ".join(_word(name, value) for name, value in fields.items() if value or name in _SHOWN_IF_ZERO)
     return f"{kind}: {words}" if words else kind
 
 
@@ -83,24 +83,24 @@ def _word(name: str, value: object) -> str:
 def _landed(check: kinds.Landed, flight: Flight, evidence: Evidence) -> tuple[bool, str]:
     track = flight.track
     if track.takeoff_s is None:
-        return False, "it never flew"
+        return False, "never took off"
     if track.landing_s is None or flight.armed_at_end:
-        return False, "it is in the air" if track.landing_s is None else "it has landed, but its motors are armed"
+        return False, "still in the air" if track.landing_s is None else "landed, but still armed"
     miss_m = track.miss_m or 0.0
-    found = f"landed after {track.landing_s:.1f} s, {miss_m:.1f} m from its takeoff"
+    found = f"landed after {track.landing_s:.1f} s, {miss_m:.1f} m from the takeoff position"
     late = check.within is not None and track.landing_s > check.within
     return not late and (check.near_home is None or miss_m <= check.near_home), found
 
 
 def _never_flew(_check: kinds.NeverFlew, flight: Flight, _evidence: Evidence) -> tuple[bool, str]:
     takeoff_s = flight.track.takeoff_s
-    return takeoff_s is None, "it stayed on the ground" if takeoff_s is None else f"it took off at {takeoff_s:.1f} s"
+    return takeoff_s is None, "stayed on the ground" if takeoff_s is None else f"took off at {takeoff_s:.1f} s"
 
 
 def _reached(check: kinds.Reached, flight: Flight, _evidence: Evidence) -> tuple[bool, str]:
     home = flight.track.home
     if home is None:
-        return False, "its position was never known"
+        return False, "position never received"
     if check.lat is not None and check.lon is not None:
         target = Place.from_degrees(check.lat, check.lon, 0.0)
     else:
@@ -113,7 +113,7 @@ def _reached(check: kinds.Reached, flight: Flight, _evidence: Evidence) -> tuple
         off_m = math.hypot(north, east, 0.0 if check.alt is None else sample.place.alt_m - check.alt)
         if off_m < best_m:
             best_m, best_s = off_m, sample.time_s
-    return best_m <= check.tolerance, f"nearest {best_m:.1f} m, at {best_s:.1f} s"
+    return best_m <= check.tolerance, f"closest {best_m:.1f} m, at {best_s:.1f} s"
 
 
 def _mode(check: kinds.ModeReached, flight: Flight, evidence: Evidence) -> tuple[bool, str]:
@@ -121,13 +121,13 @@ def _mode(check: kinds.ModeReached, flight: Flight, evidence: Evidence) -> tuple
     if check.after is not None:
         begun = [o.begin_s for o in evidence.occurrences if o.kind == check.after and o.vehicle in {flight.name, ""}]
         if not begun:
-            return False, f"{check.after} never happened to it"
+            return False, f"{check.after} was not injected"
         begin_s = min(begun)
     after = [(at, mode) for at, mode in flight.modes if at >= begin_s]
     hit = next((at for at, mode in after if mode == check.mode), None)
     if hit is None:
         seen = ", ".join(dict.fromkeys(mode for _, mode in after)) or "no change"
-        return False, f"never; it was in {seen}"
+        return False, f"never; modes: {seen}"
     waited_s = hit - begin_s
     since = f"{waited_s:.1f} s after {check.after}" if check.after else f"at {hit:.1f} s"
     return check.within is None or waited_s <= check.within, f"{check.mode} {since}"
@@ -135,52 +135,53 @@ def _mode(check: kinds.ModeReached, flight: Flight, evidence: Evidence) -> tuple
 
 def _statustext(check: kinds.StatusText, flight: Flight, _evidence: Evidence) -> tuple[bool, str]:
     hit = next((text for text in flight.texts if re.search(check.matches, text.text)), None)
-    found = f"{hit.text!r} at {hit.time_s:.1f} s" if hit is not None else "it never said so"
+    found = f"{hit.text!r} at {hit.time_s:.1f} s" if hit is not None else "no matching text"
     return (hit is None) == check.absent, found
 
 
 def _altitude(check: kinds.AltitudeBand, flight: Flight, _evidence: Evidence) -> tuple[bool, str]:
     heights = [s.place.alt_m for s in flight.samples if s.in_air]
     if not heights:
-        return False, "it never flew"
+        return False, "never took off"
     holds, found = True, []
     if check.max is not None:
-        found.append(f"highest {max(heights):.1f} m")
+        found.append(f"maximum {max(heights):.1f} m")
         holds = max(heights) <= check.max
     if check.min is not None:
         above = [i for i, height in enumerate(heights) if height >= check.min]
         low_m = min(heights[above[0] : above[-1] + 1]) if above else max(heights)
-        found.append(f"lowest between {low_m:.1f} m")
+        found.append(f"minimum {low_m:.1f} m")
         holds = holds and low_m >= check.min
     return holds, ", ".join(found)
 
 
 def _speed(check: kinds.SpeedLimit, flight: Flight, _evidence: Evidence) -> tuple[bool, str]:
     fastest = flight.track.max_speed_mps
-    return fastest <= check.max, f"fastest {fastest:.1f} m/s"
+    return fastest <= check.max, f"maximum {fastest:.1f} m/s"
 
 
 def _outside(check: kinds.OutsideZone, flight: Flight, evidence: Evidence) -> tuple[bool, str]:
     distances = _distances_m(evidence.zones[check.zone], [s for s in flight.samples if s.in_air])
     if distances.size == 0:
-        return True, "it never flew"
+        return True, "never took off"
     nearest = float(distances.min())
-    found = f"nearest {nearest:.1f} m from its border" if nearest > 0 else f"up to {-nearest:.1f} m inside"
+    found = f"closest {nearest:.1f} m from the border" if nearest > 0 else f"up to {-nearest:.1f} m inside"
     return nearest > 0 and nearest >= check.margin, found
 
 
 def _inside(check: kinds.InsideZone, flight: Flight, evidence: Evidence) -> tuple[bool, str]:
     distances = _distances_m(evidence.zones[check.zone], [s for s in flight.samples if s.in_air])
     if distances.size == 0:
-        return False, "it never flew"
+        return False, "never took off"
     worst = float(distances.max())
-    return worst <= 0, f"always {-worst:.1f} m or more inside" if worst <= 0 else f"up to {worst:.1f} m outside"
+    return worst <= 0, f"always at least {-worst:.1f} m inside" if worst <= 0 else f"up to {worst:.1f} m outside"
 
 
 def _distances_m(zone: NamedZone, samples: Sequence[Sample]) -> np.ndarray:
-    """Metres to a zone's border over the ground: positive outside, negative inside; outside its band counts as outside.
+    """Return the distance to the border of a zone for each sample, in metres: positive outside, negative inside.
 
-    Below or above the band the distance is the vertical one where that is what separates.
+    A sample above or below the altitude band counts as outside. Its distance is the larger of the horizontal and the
+    vertical distance.
     """
     if not samples:
         return np.empty(0)
@@ -199,13 +200,13 @@ def _distances_m(zone: NamedZone, samples: Sequence[Sample]) -> np.ndarray:
 
 def _battery(check: kinds.Battery, flight: Flight, _evidence: Evidence) -> tuple[bool, str]:
     if not flight.samples:
-        return False, "it said nothing of its battery"
+        return False, "no battery status received"
     left = flight.samples[-1].battery * 100
     return left >= check.min, f"{left:.0f} % left"
 
 
 def _task(_check: kinds.TaskDone, flight: Flight, _evidence: Evidence) -> tuple[bool, str]:
-    return flight.task == "done", flight.task or "it was not over"
+    return flight.task == "done", flight.task or "not completed"
 
 
 def _separation(check: kinds.Separation, evidence: Evidence) -> tuple[bool, str]:
@@ -218,12 +219,12 @@ def _separation(check: kinds.Separation, evidence: Evidence) -> tuple[bool, str]
             if off_m < nearest_m:
                 nearest_m, who, when_s = off_m, f"{one} and {other}", a.time_s
     if not who:
-        return True, "no two were in the air together"
-    return nearest_m >= check.min, f"nearest {nearest_m:.1f} m, {who} at {when_s:.1f} s"
+        return True, "no two vehicles were in the air at the same time"
+    return nearest_m >= check.min, f"closest {nearest_m:.1f} m, {who} at {when_s:.1f} s"
 
 
 def _pairs(ones: Sequence[Sample], others: Sequence[Sample]) -> Iterable[tuple[Sample, Sample]]:
-    """Samples of two vehicles that are of the same moment, while both are in the air."""
+    """Yield simultaneous samples of two vehicles while both are in the air."""
     at = 0
     for one in ones:
         while at < len(others) - 1 and others[at].time_s < one.time_s - MATCH_S / 2:
@@ -234,7 +235,7 @@ def _pairs(ones: Sequence[Sample], others: Sequence[Sample]) -> Iterable[tuple[S
 
 def _program(check: kinds.ProgramEnded, evidence: Evidence) -> tuple[bool, str]:
     code = evidence.findings.programs.get(check.program)
-    return code == check.exit_code, "it had to be stopped" if code is None else f"exit code {code}"
+    return code == check.exit_code, "had to be stopped" if code is None else f"exit code {code}"
 
 
 def _call(check: kinds.CallJudged, evidence: Evidence) -> tuple[bool, str]:
@@ -250,32 +251,32 @@ def _call(check: kinds.CallJudged, evidence: Evidence) -> tuple[bool, str]:
 
     hits = [entry for entry in evidence.findings.calls if fits(entry)]
     if not hits:
-        return check.absent, f"none among {len(evidence.findings.calls)} entries"
-    return not check.absent, f"{len(hits)}, such as: {hits[0].get('reason') or hits[0].get('method', '')}"
+        return check.absent, f"no match in {len(evidence.findings.calls)} entries"
+    return not check.absent, f"{len(hits)}, for example: {hits[0].get('reason') or hits[0].get('method', '')}"
 
 
 def _audit(_check: kinds.AuditSound, evidence: Evidence) -> tuple[bool, str]:
     broken = [f"{log}: {problem}" for log, problem in evidence.findings.audit_problems.items() if problem]
     if not evidence.findings.audit_problems:
-        return False, "there is no audit log"
+        return False, "no audit log"
     count = len(evidence.findings.audit_problems)
-    return not broken, "; ".join(broken) or ("the log verifies" if count == 1 else f"{count} logs verify")
+    return not broken, "; ".join(broken) or ("the log is valid" if count == 1 else f"{count} logs are valid")
 
 
 def _phase(check: kinds.ApplicationPhase, evidence: Evidence) -> tuple[bool, str]:
     seen = evidence.findings.phases.get(check.application, ())
-    return check.phase in seen, f"it was {', '.join(seen)}" if seen else "it was never seen"
+    return check.phase in seen, f"phases: {', '.join(seen)}" if seen else "no phase observed"
 
 
 def _detections(check: kinds.Detections, evidence: Evidence) -> tuple[bool, str]:
     found = score(evidence.findings.detections, evidence.findings.truths, check.kind, check.radius)
-    said = (
+    result = (
         f"precision {found.precision:.2f} ({found.right} of {found.detections}),"
         f" recall {found.recall:.2f} ({found.found} of {found.objects})"
     )
     if not found.objects and not found.detections:
         return False, f"no {check.kind} was in view, and none was detected"
-    return found.precision >= check.precision and found.recall >= check.recall, said
+    return found.precision >= check.precision and found.recall >= check.recall, result
 
 
 _FOR_VEHICLES: Mapping[type, Callable[[Any, Flight, Evidence], tuple[bool, str]]] = {

@@ -1,4 +1,4 @@
-"""A tap in a TCP link: passes bytes on, records both directions as a tlog, and can cut the link like a dead radio."""
+"""A tap in a TCP link that forwards bytes, records both directions as a tlog, and can cut the link."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ BACKLOG_LIMIT = 1024 * 1024
 
 @dataclass(slots=True, eq=False)
 class _End:
-    """One end of a connection: where its bytes go, and what waits to be sent to it."""
+    """One end of a connection, with the bytes that wait to be sent to it."""
 
     socket: socket.socket
     framer: Framer
@@ -31,15 +31,15 @@ class _End:
 
 
 class LinkTap:
-    """Connects each client of a listening socket to a server, in a thread of its own.
+    """Forwards each client of a listening socket to a server, in one thread.
 
-    While the link is cut, connections stay open and what arrives is dropped, as on a radio out of reach; connections
-    that are opened meanwhile hear nothing.
+    While the link is cut, connections stay open and received data is dropped, as with a radio out of range. New
+    connections receive nothing.
 
     Args:
-        listener: a listening socket; closed with the tap.
-        connect: connects to the server; a client is hung up when it raises OSError or ExperimentError.
-        log: file of the tlog.
+        listener: Listening socket. It is closed with the tap.
+        connect: Connects to the server. If it raises OSError or ExperimentError, the client is disconnected.
+        log: File of the tlog.
     """
 
     def __init__(self, listener: socket.socket, connect: Callable[[], socket.socket], log: Path) -> None:
@@ -57,16 +57,16 @@ class LinkTap:
 
     @classmethod
     def between(cls, port: int, target: tuple[str, int], log: Path) -> LinkTap:
-        """A tap between a port of the loopback device and a server."""
+        """Return a tap between a loopback port and a server."""
         listener = socket.create_server(("127.0.0.1", port))
         return cls(listener, lambda: socket.create_connection(target, CONNECT_S), log)
 
     def cut(self) -> None:
-        """Let nothing pass from now on."""
+        """Drop all traffic from now on."""
         self._cut.set()
 
     def heal(self) -> None:
-        """Let everything pass again."""
+        """Forward traffic again."""
         self._cut.clear()
 
     def close(self) -> None:

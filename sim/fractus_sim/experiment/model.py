@@ -1,4 +1,4 @@
-"""An experiment as its file describes it: vehicles, surroundings, tasks, programs, faults in time, and checks."""
+"""Data model of experiment files: vehicles, environment, tasks, programs, timed faults and checks."""
 
 from __future__ import annotations
 
@@ -36,52 +36,56 @@ MAX_VEHICLES = 50
 
 
 class Wind(Model):
-    """The wind from the beginning on."""
+    """Wind at the start."""
 
     speed: float = Field(default=0, ge=0, lt=60, description="Metres per second.")
-    direction: float = Field(default=270, ge=0, lt=360, description="Degrees it comes from.")
+    direction: float = Field(default=270, ge=0, lt=360, description="Direction that the wind comes from, degrees.")
     turbulence: float = Field(default=0, ge=0, lt=30, description="Standard deviation, metres per second.")
 
 
 class CameraWorld(Model):
-    """What cameras see (mode standalone)."""
+    """World that cameras see (mode standalone)."""
 
-    seed: int = Field(default=1, description="Of the generated ground.")
-    arguments: tuple[str, ...] = Field(default=(), description="Further arguments of `fractus camera-world`.")
+    seed: int = Field(default=1, description="Seed of the generated ground.")
+    arguments: tuple[str, ...] = Field(default=(), description="Additional arguments of `fractus camera-world`.")
 
 
 class VehicleEntry(Model):
-    """A vehicle, or a row of equal ones."""
+    """A vehicle, or a row of identical vehicles."""
 
-    name: Name = Field(description="With a count above 1, -1, -2, ... is appended.")
+    name: Name = Field(description="If `count` is above 1, -1, -2, ... is appended.")
     count: int = Field(default=1, ge=1, le=MAX_VEHICLES)
     spacing: float = Field(default=10, gt=0, le=1000, description="Metres between the vehicles of a row.")
     bearing: float = Field(default=90, ge=0, lt=360, description="Direction in which the row extends, degrees.")
     home: Home | None = None
     heading: float = Field(default=0, ge=0, lt=360, description="Degrees.")
-    parameters: dict[ParameterName, float] = Field(default_factory=dict, description="Of the autopilot.")
+    parameters: dict[ParameterName, float] = Field(default_factory=dict, description="Autopilot parameters.")
     ready_after: float = Field(default=5, ge=1, le=120, description="Seconds until the autopilot is ready to arm.")
     connection: str | None = Field(
         default=None,
         pattern=r"^tcp:[^:\s]+:\d{1,5}$",
-        description="tcp:HOST:PORT of an autopilot that runs already, such as ArduPilot's SITL (mode vehicles).",
+        description="tcp:HOST:PORT of a running autopilot, such as ArduPilot SITL (mode vehicles).",
     )
-    camera: bool = Field(default=False, description="With a camera and its service (mode standalone).")
-    task: tuple[Step, ...] = Field(default=(), max_length=500, description="What the runner's ground station flies.")
+    camera: bool = Field(default=False, description="Add a camera and the camera service (mode standalone).")
+    task: tuple[Step, ...] = Field(
+        default=(), max_length=500, description="Steps that the ground station of the experiment flies."
+    )
 
     @model_validator(mode="after")
     def _stands_somewhere(self) -> Self:
         if self.connection is not None and (self.count > 1 or self.home is not None or self.parameters):
-            raise InvalidObject("connection", "count, home and parameters are not ours to give to a running autopilot")
+            raise InvalidObject(
+                "connection", "count, home and parameters cannot be set for a running autopilot; remove them"
+            )
         return self
 
     def names(self) -> tuple[str, ...]:
-        """Names of its vehicles."""
+        """Names of the vehicles of this entry."""
         return (self.name,) if self.count == 1 else tuple(f"{self.name}-{at + 1}" for at in range(self.count))
 
 
 class NamedZone(Model):
-    """A piece of air that checks and pictures speak of."""
+    """An airspace volume that checks and figures refer to."""
 
     name: Name
     kind: Literal["exclusion", "inclusion", "other"] = "other"
@@ -90,37 +94,37 @@ class NamedZone(Model):
 
 
 class Program(Model):
-    """A program that runs beside the vehicles.
+    """A program that runs during the experiment.
 
-    In mode vehicles it finds its vehicle's MAVLink connection in FRACTUS_VEHICLE; in mode standalone it runs as a
-    component of the application, with the environment of that component's pod.
+    In mode vehicles, the environment variable FRACTUS_VEHICLE contains the MAVLink connection of the vehicle. In mode
+    standalone, the program runs as a component of the application, with the environment of the component's pod.
     """
 
     name: Name
-    command: tuple[str, ...] = Field(min_length=1, description="Relative paths are relative to the file.")
-    vehicle: Name | None = Field(default=None, description="Mode vehicles: which vehicle it flies.")
-    component: str | None = Field(default=None, description="Mode standalone: which component it is.")
+    command: tuple[str, ...] = Field(min_length=1, description="Relative paths are relative to the experiment file.")
+    vehicle: Name | None = Field(default=None, description="Vehicle that the program flies (mode vehicles).")
+    component: str | None = Field(default=None, description="Component that the program implements (mode standalone).")
     port: int | None = Field(
         default=None,
         ge=1024,
         le=65535,
-        description="Mode standalone: where it listens; others find it by its component.",
+        description="Port where the program listens; other programs find it by its component (mode standalone).",
     )
     environment: dict[str, str] = Field(default_factory=dict)
-    background: bool = Field(default=False, description="Do not wait for its end; it is stopped at the end.")
+    background: bool = Field(default=False, description="Do not wait for the program; stop it at the end.")
 
 
 class ClusterPart(Model):
-    """The embedded cluster, and what is applied to it."""
+    """The embedded cluster and its manifests."""
 
-    file: str = Field(description="Cluster file, relative to the experiment's file.")
-    images: tuple[str, ...] = Field(default=(), description="Further targets of the Dockerfile to build.")
-    apply: tuple[str, ...] = Field(min_length=1, description="Manifests; the Applications among them are applied last.")
+    file: str = Field(description="Cluster file, relative to the experiment file.")
+    images: tuple[str, ...] = Field(default=(), description="Additional targets of the Dockerfile to build.")
+    apply: tuple[str, ...] = Field(min_length=1, description="Manifests. The Applications among them are applied last.")
 
 
 @dataclass(frozen=True, slots=True)
 class VehicleSetup:
-    """One vehicle, with the entry it comes from."""
+    """One vehicle and its entry."""
 
     name: str
     system_id: int
@@ -129,31 +133,32 @@ class VehicleSetup:
 
 
 class Experiment(Model):
-    """One experiment."""
+    """An experiment."""
 
     name: Name
     description: str = ""
     mode: Mode = Field(
         default="vehicles",
-        description="vehicles: autopilots alone; standalone: with Fractus' services as local processes; cluster: on the"
+        description="vehicles: autopilots only; standalone: with the services of Fractus as local processes; cluster: on the"
         " embedded Kubernetes cluster.",
     )
-    seed: int = Field(default=1, ge=0, description="Of all noise.")
+    seed: int = Field(default=1, ge=0, description="Seed of all noise.")
     speedup: float | None = Field(
         default=None,
         ge=0,
         le=100,
-        description="Times real time; 0 (mode vehicles, the default without programs): in lockstep, as fast as possible,"
-        " byte for byte repeatable.",
+        description="Factor of real time. 0 (mode vehicles, default without programs): lockstep, as fast as possible and"
+        " exactly repeatable.",
     )
-    timeout: float = Field(default=300, gt=0, le=7200, description="Seconds of the experiment, at most.")
-    settle: float = Field(default=3, ge=0, le=600, description="Seconds to go on when all is done.")
+    timeout: float = Field(default=300, gt=0, le=7200, description="Maximum duration, seconds of the experiment.")
+    settle: float = Field(default=3, ge=0, le=600, description="Seconds to continue after everything has ended.")
     wind: Wind = Wind()
     world: CameraWorld = CameraWorld()
     vehicles: tuple[VehicleEntry, ...] = Field(min_length=1, max_length=MAX_VEHICLES)
     zones: tuple[NamedZone, ...] = ()
     manifests: tuple[str, ...] = Field(
-        default=(), description="Mode standalone: Application, Policy, Zone, Depot and Drone files or directories."
+        default=(),
+        description="Files or directories with Application, Policy, Zone, Depot and Drone manifests (mode standalone).",
     )
     programs: tuple[Program, ...] = ()
     cluster: ClusterPart | None = None
@@ -170,18 +175,18 @@ class Experiment(Model):
 
     @property
     def pace(self) -> float:
-        """Times real time; 0: lockstep."""
+        """Factor of real time. 0 means lockstep."""
         if self.speedup is not None:
             return self.speedup
         return 0.0 if self.mode == "vehicles" and not self.programs and not self.external else 1.0
 
     @property
     def external(self) -> bool:
-        """Whether a vehicle is not ours."""
+        """True if a vehicle is a running autopilot outside of the experiment."""
         return any(entry.connection is not None for entry in self.vehicles)
 
     def setups(self) -> tuple[VehicleSetup, ...]:
-        """Every vehicle, rows spread out, with consecutive system ids."""
+        """Return all vehicles with consecutive system ids. Rows are expanded."""
         found: list[VehicleSetup] = []
         for entry in self.vehicles:
             for at, name in enumerate(entry.names()):
@@ -189,15 +194,15 @@ class Experiment(Model):
         return tuple(found)
 
     def zone(self, name: str) -> NamedZone:
-        """A zone by name."""
+        """Return a zone by name."""
         return next(zone for zone in self.zones if zone.name == name)
 
 
 def load(path: Path) -> Experiment:
-    """Read an experiment's file.
+    """Read an experiment file.
 
     Raises:
-        InvalidObject: the file is missing, not YAML, or a field is wrong; the message names it.
+        InvalidObject: The file is missing, is not YAML, or has an invalid field that the message names.
     """
     try:
         content, found = parse_document(path.read_bytes(), str(path))
@@ -212,10 +217,10 @@ def load(path: Path) -> Experiment:
 
 
 def parse(content: object) -> Experiment:
-    """Make an experiment of parsed YAML.
+    """Create an experiment from parsed YAML.
 
     Raises:
-        InvalidObject: a field is wrong; the message names it.
+        InvalidObject: A field is invalid. The message names the field.
     """
     try:
         return Experiment.model_validate(content)
@@ -224,19 +229,19 @@ def parse(content: object) -> Experiment:
 
 
 def _unknown_tag(error: ValidationError) -> InvalidObject | None:
-    """The sentence for a fault, check or step that does not exist; None when that is not what is wrong."""
+    """Return the error for an unknown fault, check or step. Return None for other validation errors."""
     finding = error.errors(include_url=False)[0]
     context = finding.get("ctx", {})
     field = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in finding["loc"]).lstrip(".")
     name = str(context.get("discriminator", "")).strip("'")
     if finding["type"] == "union_tag_not_found":
-        return InvalidObject(f"{field}.{name}", "is missing; `fractus experiment schema` lists what there is")
+        return InvalidObject(f"{field}.{name}", "is missing; `fractus experiment schema` lists the possible values")
     if finding["type"] != "union_tag_invalid":
         return None
     known = [tag.strip(" '") for tag in str(context["expected_tags"]).split(",")]
     near = difflib.get_close_matches(str(context["tag"]), known, n=1)
-    hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}"
-    return InvalidObject(f"{field}.{name}", f"there is no {context['tag']}; {hint}")
+    hint = f"did you mean {near[0]}?" if near else f"possible values: {', '.join(known)}"
+    return InvalidObject(f"{field}.{name}", f"unknown value {context['tag']}; {hint}")
 
 
 def _spread(entry: VehicleEntry, at: int) -> Home | None:
@@ -252,39 +257,42 @@ def _check_vehicles(experiment: Experiment) -> None:
     names = [name for entry in experiment.vehicles for name in entry.names()]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        raise InvalidObject("vehicles", f"the name {twice[0]} is given twice; give each its own name")
+        raise InvalidObject("vehicles", f"the name {twice[0]} is used twice; names must be unique")
     if len(names) > MAX_VEHICLES:
-        raise InvalidObject("vehicles", f"there are {len(names)}; at most {MAX_VEHICLES} fly in one experiment")
+        raise InvalidObject("vehicles", f"{len(names)} vehicles; the maximum is {MAX_VEHICLES}")
     for index, entry in enumerate(experiment.vehicles):
         if entry.home is None and entry.connection is None and experiment.mode != "cluster":
             raise InvalidObject(
-                f"vehicles[{index}].home", f"is needed in mode {experiment.mode}: where {entry.name} stands"
+                f"vehicles[{index}].home", f"is required in mode {experiment.mode}: the start position of {entry.name}"
             )
         if entry.connection is not None and experiment.mode != "vehicles":
-            raise InvalidObject(f"vehicles[{index}].connection", "is for mode vehicles")
+            raise InvalidObject(f"vehicles[{index}].connection", "is only supported in mode vehicles")
         if entry.task and experiment.mode != "vehicles":
             raise InvalidObject(
-                f"vehicles[{index}].task", f"is for mode vehicles; in mode {experiment.mode} applications fly the drone"
+                f"vehicles[{index}].task",
+                f"is only supported in mode vehicles; in mode {experiment.mode} applications fly the drone",
             )
         if entry.camera and experiment.mode != "standalone":
-            raise InvalidObject(f"vehicles[{index}].camera", "is for mode standalone")
+            raise InvalidObject(f"vehicles[{index}].camera", "is only supported in mode standalone")
 
 
 def _check_mode(experiment: Experiment) -> None:
     mode = experiment.mode
     if (experiment.cluster is not None) != (mode == "cluster"):
-        raise InvalidObject("cluster", "is needed in mode cluster, and only there")
+        raise InvalidObject("cluster", "is required in mode cluster and not supported in other modes")
     if bool(experiment.manifests) != (mode == "standalone"):
-        raise InvalidObject("manifests", "are needed in mode standalone, and only there")
+        raise InvalidObject("manifests", "are required in mode standalone and not supported in other modes")
     if mode == "cluster" and (experiment.speedup not in {None, 1.0} or experiment.programs):
-        raise InvalidObject("", "in mode cluster time is real and programs are pods: leave speedup and programs out")
+        raise InvalidObject("", "mode cluster runs in real time and programs are pods; remove speedup and programs")
     if experiment.speedup == 0 and (mode != "vehicles" or experiment.programs or experiment.external):
-        raise InvalidObject("speedup", "0 (lockstep) is for mode vehicles without programs and connections")
+        raise InvalidObject(
+            "speedup", "0 (lockstep) is only supported in mode vehicles without programs and connections"
+        )
     names = {name for entry in experiment.vehicles for name in entry.names()}
     for index, program in enumerate(experiment.programs):
         wanted, field = (program.vehicle, "vehicle") if mode == "vehicles" else (program.component, "component")
         if wanted is None:
-            raise InvalidObject(f"programs[{index}].{field}", f"is needed in mode {mode}")
+            raise InvalidObject(f"programs[{index}].{field}", f"is required in mode {mode}")
         if mode == "vehicles":
             _known(f"programs[{index}].vehicle", [wanted], names, "vehicle")
 
@@ -303,7 +311,7 @@ def _check_faults(experiment: Experiment) -> None:
             if experiment.mode == "vehicles":
                 raise InvalidObject(f"{where}.fault", "nodePowerOff needs a node; use mode standalone or cluster")
             if fault.node is not None and experiment.mode != "cluster":
-                raise InvalidObject(f"{where}.node", "is for mode cluster; name vehicles")
+                raise InvalidObject(f"{where}.node", "is only supported in mode cluster; use `vehicles`")
 
 
 def _check_checks(experiment: Experiment) -> None:
@@ -319,13 +327,11 @@ def _check_checks(experiment: Experiment) -> None:
         if isinstance(check, ProgramEnded):
             _known(f"{where}.program", [check.program], programs, "program")
         if isinstance(check, CallJudged) and experiment.mode == "vehicles":
-            raise InvalidObject(
-                f"{where}.check", "call is for modes standalone and cluster: vehicles alone judge nothing"
-            )
+            raise InvalidObject(f"{where}.check", "call is only supported in modes standalone and cluster")
         if isinstance(check, ApplicationPhase) and experiment.mode != "cluster":
-            raise InvalidObject(f"{where}.check", "phase is for mode cluster")
+            raise InvalidObject(f"{where}.check", "phase is only supported in mode cluster")
         if isinstance(check, TaskDone) and not any(entry.task for entry in experiment.vehicles):
-            raise InvalidObject(f"{where}.check", "task: no vehicle has one")
+            raise InvalidObject(f"{where}.check", "task: no vehicle has a task")
         if isinstance(check, Detections) and not any(entry.camera for entry in experiment.vehicles):
             raise InvalidObject(f"{where}.check", "detections needs a vehicle with a camera (mode standalone)")
         after = getattr(check, "after", None)
@@ -337,4 +343,4 @@ def _known(field: str, given: Iterable[str], there: Iterable[str], what: str) ->
     for name in given:
         if name not in there:
             known = ", ".join(sorted(there)) or "none"
-            raise InvalidObject(field, f"there is no {what} {name}; there are: {known}")
+            raise InvalidObject(field, f"unknown {what} {name}; known: {known}")

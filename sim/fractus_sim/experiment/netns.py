@@ -1,4 +1,4 @@
-"""Sockets in another network namespace, such as that of an embedded cluster's node."""
+"""Sockets in another network namespace, such as the namespace of a node of the embedded cluster."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from fractus_sim.experiment.errors import ExperimentError
 
 
 def connect_in(namespace: Path, port: int, timeout_s: float) -> socket.socket:
-    """Connect to a port of a namespace's loopback device.
+    """Connect to a loopback port inside a network namespace.
 
     Raises:
-        ExperimentError: the namespace cannot be entered, or no process listens.
+        ExperimentError: The namespace cannot be entered, or the connection was refused.
     """
     return _inside(namespace, lambda: socket.create_connection(("127.0.0.1", port), timeout_s))
 
 
 def listen_in(namespace: Path, port: int) -> socket.socket:
-    """Listen on a port of a namespace's loopback device.
+    """Listen on a loopback port inside a network namespace.
 
     Raises:
-        ExperimentError: the namespace cannot be entered, or the port is taken.
+        ExperimentError: The namespace cannot be entered, or the port is in use.
     """
     return _inside(namespace, lambda: socket.create_server(("127.0.0.1", port)))
 

@@ -1,4 +1,4 @@
-"""What came of an experiment."""
+"""Result of an experiment."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from fractus_sim.report.record import Judgement
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of an experiment; seconds of the experiment.
+    """Result of an experiment. Times are seconds of the experiment.
 
     Attributes:
-        problem: why it did not run to its end; empty when it could.
-        duration_s: how long it took, in the vehicles' time.
-        wall_s: how long it took here.
+        problem: Reason why the experiment was aborted. Empty if it completed.
+        duration_s: Duration in simulated time.
+        wall_s: Duration in real time.
         events: (seconds, vehicle or empty, text) of tasks and faults.
-        judgements: what policies corrected or refused.
+        judgements: Calls that policies corrected or denied.
     """
 
     experiment: Experiment
@@ -39,5 +39,5 @@ class Outcome:
 
     @property
     def holds(self) -> bool:
-        """Whether it ran to its end and every check holds."""
+        """True if the experiment completed and every check holds."""
         return not self.problem and all(verdict.holds for verdict in self.verdicts)

@@ -1,4 +1,4 @@
-"""Local processes that end with us: started with a log of their own, watched, stopped in reverse order."""
+"""Local processes with log files that end with the experiment."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ _TAIL_BYTES = 600
 
 
 class Processes:
-    """The processes of one experiment, by name.
+    """Processes of one experiment, by name.
 
-    Each runs in a session of its own, so that Ctrl-C reaches only us, and we end them in good order: the last that was
-    started goes first, with SIGTERM, and with SIGKILL if it does not go. What a process has started and left behind in
-    its group is killed when it ends, as in a container. If we are killed ourselves, all of them are.
+    Each process runs in its own session, so Ctrl-C does not reach it. Processes are stopped in reverse order of their
+    start, with SIGTERM and then SIGKILL. When a process ends, all remaining processes of its group are killed, as in a
+    container. If the experiment itself is killed, a guard process kills all groups.
     """
 
     def __init__(self, logs: Path) -> None:
@@ -35,13 +35,13 @@ class Processes:
         self._reaper = Reaper()
 
     def start(self, name: str, argv: Sequence[str], environment: Mapping[str, str], folder: Path | None = None) -> None:
-        """Start a process; its output is appended to `NAME.log`.
+        """Start a process. Its output is appended to `NAME.log`.
 
         Raises:
-            ExperimentError: it cannot be started, or one of that name runs.
+            ExperimentError: The process cannot be started, or a process with this name is running.
         """
         if self.running(name):
-            raise ExperimentError(f"{name} runs already")
+            raise ExperimentError(f"{name} is already running")
         self._logs.mkdir(parents=True, exist_ok=True)
         with self.log(name).open("ab") as output, uninterrupted():
             try:
@@ -61,61 +61,61 @@ class Processes:
             self._reaper.hold(process.pid)
 
     def log(self, name: str) -> Path:
-        """The file with what a process writes."""
+        """Path of the log file of a process."""
         return self._logs / f"{name}.log"
 
     def running(self, name: str) -> bool:
-        """Whether a process of that name runs."""
+        """True if a process with this name is running."""
         return name in self._running and self._code(self._running[name]) is None
 
     def exit_code(self, name: str) -> int | None:
-        """How a process ended; None while it runs.
+        """Return the exit code of a process, or None while it is running.
 
         Raises:
-            ExperimentError: there was none of that name.
+            ExperimentError: No process with this name was started.
         """
         if name not in self._running:
-            raise ExperimentError(f"no process {name}; there are {', '.join(sorted(self._running)) or 'none'}")
+            raise ExperimentError(f"no process {name}; known: {', '.join(sorted(self._running)) or 'none'}")
         return self._code(self._running[name])
 
     def dead(self) -> dict[str, int]:
-        """Processes that have ended, with their exit codes."""
+        """Return the exit codes of the processes that have ended."""
         return {name: code for name, process in self._running.items() if (code := self._code(process)) is not None}
 
     def wait(self, name: str, condition: Callable[[], bool], timeout_s: float) -> None:
-        """Wait until a condition holds while a process must run.
+        """Wait for a condition while a process is running.
 
         Raises:
-            ExperimentError: the process ended, or the time is over; the message ends with the tail of its log.
+            ExperimentError: The process ended, or the timeout expired. The message ends with the tail of its log.
         """
         deadline = time.monotonic() + timeout_s
         while not condition():
             if not self.running(name):
-                raise ExperimentError(f"{name} ended with {self.exit_code(name)}: {self.log_tail(name)}")
+                raise ExperimentError(f"{name} ended with exit code {self.exit_code(name)}: {self.log_tail(name)}")
             if time.monotonic() > deadline:
                 raise ExperimentError(f"{name} was not ready within {timeout_s:.0f} s: {self.log_tail(name)}")
             time.sleep(POLL_S)
 
     def wait_end(self, name: str, timeout_s: float) -> int | None:
-        """Wait for a process to end by itself; its exit code, None when it still runs after the time."""
+        """Wait for a process to end. Return its exit code, or None after the timeout."""
         deadline = time.monotonic() + timeout_s
         while (code := self.exit_code(name)) is None and time.monotonic() < deadline:
             time.sleep(POLL_S)
         return code
 
     def log_tail(self, name: str) -> str:
-        """The end of a process' log, as one line."""
+        """Return the end of the log of a process as one line."""
         path = self.log(name)
         text = path.read_bytes()[-_TAIL_BYTES:].decode("utf-8", "replace") if path.exists() else ""
-        return " | ".join(line.strip() for line in text.splitlines()[-4:] if line.strip()) or "it said nothing"
+        return " | ".join(line.strip() for line in text.splitlines()[-4:] if line.strip()) or "the log is empty"
 
     def stop(self, *names: str, kill: bool = False) -> None:
-        """End processes; those that run no more are passed over. Interrupted, it kills them and is done at once."""
+        """Stop processes. Processes that have ended are ignored. If interrupted, kill the processes without waiting."""
         chosen = [self._running[name] for name in names if self.running(name)]
         try:
             if not kill:
                 for process in chosen:
-                    # Not by Popen, which would wait for one that has just ended, and leave its group alone.
+                    # Popen.terminate would reap a process that has just ended, and its group would not be killed.
                     with contextlib.suppress(ProcessLookupError, PermissionError):
                         os.kill(process.pid, signal.SIGTERM)
                 self._wait_ended(chosen)
@@ -126,9 +126,9 @@ class Processes:
             self._wait_ended(chosen)
 
     def stop_all(self, *stages: Callable[[str], bool]) -> None:
-        """End everything: first all processes that the first testbed's predicate names, and so on, then the rest.
+        """Stop all processes in stages: the processes selected by the first predicate first, the unselected ones last.
 
-        Interrupted, it kills what is left and is done at once.
+        If interrupted, kill the remaining processes without waiting.
         """
         names = list(reversed(self._running))
         try:
@@ -147,9 +147,9 @@ class Processes:
             time.sleep(STOP_POLL_S)
 
     def _code(self, process: subprocess.Popen[bytes]) -> int | None:
-        """How a process ended, with the end of its group; None while it runs."""
+        """Return the exit code of a process, or None while it is running. Kill its group when it has ended."""
         if process.returncode is None and _has_ended(process.pid):
-            # Not waited for yet, so the number is still its own, as its group's.
+            # The process is not reaped yet, so its id is still valid as the group id.
             _kill_group(process.pid)
             self._reaper.let_go(process.pid)
         return process.poll()
@@ -168,7 +168,7 @@ def _kill_group(group: int) -> None:
 
 
 def listening(port: int) -> bool:
-    """Whether a process accepts connections on a port of the loopback device."""
+    """True if a process accepts connections on a loopback port."""
     with socket.socket() as probe:
         probe.settimeout(1.0)
         return probe.connect_ex(("127.0.0.1", port)) == 0

@@ -1,4 +1,4 @@
-"""Ends process groups when the process that started them is gone, even after SIGKILL."""
+"""Guard process that kills process groups when the process that started them ends, even by SIGKILL."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ _CLOSE_S = 5.0
 
 
 class Reaper:
-    """A guard beside us that is told which process groups are ours, and kills them when our end of its pipe closes."""
+    """A guard process that holds a list of process groups, and kills them when the pipe to it closes."""
 
     def __init__(self) -> None:
         self._guard: subprocess.Popen[bytes] | None = None
         self._pipe = -1
 
     def hold(self, group: int) -> None:
-        """Have a group killed when we end."""
+        """Kill a process group when the current process ends."""
         if self._guard is None:
             theirs, self._pipe = os.pipe()
             try:
@@ -37,11 +37,11 @@ class Reaper:
         self._say(group)
 
     def let_go(self, group: int) -> None:
-        """Leave a group alone that is no more; its number may soon be another's."""
+        """Release a process group that has ended, because its id can be reused."""
         self._say(-group)
 
     def close(self) -> None:
-        """Have the groups that are still held killed."""
+        """Kill the process groups that are still held."""
         if self._guard is None:
             return
         guard, self._guard = self._guard, None
@@ -54,12 +54,12 @@ class Reaper:
 
     def _say(self, number: int) -> None:
         if self._guard is not None:
-            with contextlib.suppress(BrokenPipeError):  # the guard was killed; we end our processes ourselves
+            with contextlib.suppress(BrokenPipeError):  # # The guard was killed. The processes are stopped without it.
                 os.write(self._pipe, b"%d\n" % number)
 
 
 def guard(lines: Iterable[str]) -> None:
-    """Read groups, and with a minus those to leave alone, to the end of the input; then kill the others."""
+    """Read ids of groups to hold (positive) and to release (negative) until end of input, then kill the held groups."""
     held: set[int] = set()
     for line in lines:
         number = int(line)

@@ -1,4 +1,4 @@
-"""Writes down what vehicles say: samples for checks and pictures, and an MCAP file for Foxglove and the like."""
+"""Recording of vehicle telemetry: samples for checks and figures, and an MCAP file for Foxglove."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class McapLog(McapWriter):
 
 @dataclass(frozen=True, slots=True)
 class Text:
-    """A STATUSTEXT."""
+    """A STATUSTEXT message."""
 
     time_s: float
     severity: int
@@ -52,11 +52,11 @@ class Text:
 
 @dataclass
 class Flight:
-    """What was seen of one vehicle; seconds of the experiment.
+    """Recording of one vehicle. Times are seconds of the experiment.
 
     Attributes:
-        armed_at_end: whether its motors were on when it was last heard.
-        task: how its task ended: empty while it goes on, `done`, or why not.
+        armed_at_end: True if the vehicle was armed in its last message.
+        task: Result of the task: empty while it runs, `done`, or the reason of its failure.
     """
 
     name: str
@@ -68,19 +68,19 @@ class Flight:
 
     @property
     def track(self) -> Track:
-        """The flight as pictures and pages take it."""
+        """The flight as a track for figures and pages."""
         return Track(self.name, tuple(self.samples))
 
 
 class Recorder:
-    """Takes down what one vehicle says to its observer."""
+    """Records the messages of one vehicle."""
 
     def __init__(self, flight: Flight, log: McapLog) -> None:
         self.flight = flight
         self._log = log
 
     def take(self, station: Station, messages: list[Message], now_s: float, unix_us: int) -> None:
-        """Write down messages, in order."""
+        """Record messages in order."""
         state, flight = station.state, self.flight
         for message in messages:
             if message.name == "GLOBAL_POSITION_INT" and (state.lat or state.lon):
@@ -94,9 +94,11 @@ class Recorder:
                 content = {"time_s": round(now_s, 3), **angles}
                 self._write(Record("attitude", "fractus.Attitude", unix_us * 1000, content))
             elif message.name == "STATUSTEXT":
-                said = Text(now_s, message.integer("severity"), message.text("text"))
-                flight.texts.append(said)
-                self._write(text(unix_us * 1000, "text", flight.name, _LEVELS[min(said.severity, 7)], said.text))
+                status_text = Text(now_s, message.integer("severity"), message.text("text"))
+                flight.texts.append(status_text)
+                self._write(
+                    text(unix_us * 1000, "text", flight.name, _LEVELS[min(status_text.severity, 7)], status_text.text)
+                )
             elif message.name == "HEARTBEAT":
                 flight.armed_at_end = state.armed
                 if not flight.modes or flight.modes[-1][1] != state.mode:

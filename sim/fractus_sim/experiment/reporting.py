@@ -1,4 +1,4 @@
-"""What an experiment leaves behind for people and programs: one page, figures, tracks and pictures."""
+"""Report of an experiment: summary page, figures, tracks and machine-readable results."""
 
 from __future__ import annotations
 
@@ -31,9 +31,10 @@ _QUIET_SEVERITY = 6
 
 
 def write_outcome(outcome: Outcome) -> None:
-    """Write report.json, tracks.geojson, map.png, profile.png and summary.md into the experiment's folder.
+    """Write report.json, tracks.geojson, map.png, profile.png and summary.md into the folder of the experiment.
 
-    The figures first, so that no picture which cannot be drawn costs them; the page last, as it shows all else.
+    Results are written first so that a failure to draw a figure does not lose them. The page is written last because it
+    links all other files.
     """
     folder = outcome.folder
     (folder / "report.json").write_text(json.dumps(figures(outcome), indent=2) + "\n")
@@ -45,13 +46,13 @@ def write_outcome(outcome: Outcome) -> None:
 
 
 def remove_report(folder: Path) -> None:
-    """Remove what an earlier run wrote there, so that a run that is broken off does not show another's report."""
+    """Remove the report of an earlier run, so that an aborted run does not show an outdated report."""
     for name in (PAGE, "report.json", "tracks.geojson", "map.png", "profile.png"):
         (folder / name).unlink(missing_ok=True)
 
 
 def scene_of(outcome: Outcome) -> Scene:
-    """The experiment's map: metres east and north of where the first vehicle stood."""
+    """Return the map of the experiment, in metres east and north of the start of the first vehicle."""
     tracks = _tracks(outcome)
     first = tracks[0].samples[0].place
     frame = LocalFrame(first.lat, first.lon)
@@ -74,7 +75,7 @@ def scene_of(outcome: Outcome) -> Scene:
 
 
 def profile_of(outcome: Outcome) -> Profile:
-    """The experiment from the side, with its faults."""
+    """Return the profile of altitude, speed and battery over time, with faults."""
     tracks = _tracks(outcome)
     end_s = max(track.samples[-1].time_s for track in tracks)
     spans = [
@@ -103,7 +104,7 @@ def profile_of(outcome: Outcome) -> Profile:
 
 
 def summary(outcome: Outcome) -> str:
-    """The page, in Markdown."""
+    """Return the summary page in Markdown."""
     pictures = ""
     if _tracks(outcome):
         pictures = "![map](map.png)\n\n![altitude, speed and battery](profile.png)"
@@ -122,7 +123,7 @@ def summary(outcome: Outcome) -> str:
 
 
 def figures(outcome: Outcome) -> dict[str, Any]:
-    """The page's figures, for programs."""
+    """Return the results as JSON-compatible values."""
     return {
         "experiment": outcome.experiment.name,
         "mode": outcome.experiment.mode,
@@ -151,7 +152,7 @@ def figures(outcome: Outcome) -> dict[str, Any]:
 
 
 def features(outcome: Outcome) -> dict[str, Any]:
-    """Tracks, zones and faults as a GeoJSON FeatureCollection."""
+    """Return tracks, zones and faults as a GeoJSON FeatureCollection."""
     found: list[dict[str, Any]] = [path(track) for track in _tracks(outcome)]
     for zone in outcome.experiment.zones:
         frame = LocalFrame(*_middle(outcome))
@@ -164,8 +165,8 @@ def features(outcome: Outcome) -> dict[str, Any]:
         track = _by_name(outcome).get(occurrence.vehicle)
         at = _sample_at(track, occurrence.begin_s) if track is not None else None
         if at is not None:
-            said = {"fault": occurrence.kind, "title": occurrence.title, "drone": occurrence.vehicle}
-            found.append(feature(point(lonlat(at.place)), what="fault", time=round(occurrence.begin_s, 3), **said))
+            fields = {"fault": occurrence.kind, "title": occurrence.title, "drone": occurrence.vehicle}
+            found.append(feature(point(lonlat(at.place)), what="fault", time=round(occurrence.begin_s, 3), **fields))
     return {"type": "FeatureCollection", "features": found}
 
 
@@ -192,7 +193,7 @@ def _whom(tracks: Sequence[Track]) -> str:
 
 
 def _lettered(outcome: Outcome) -> list[tuple[str, Occurrence]]:
-    """Faults as pictures letter them: one that hits several vehicles at once counts once."""
+    """Assign letters to faults. A fault that affects several vehicles at the same time gets one letter."""
     seen: dict[tuple[str, float], Occurrence] = {}
     for occurrence in sorted(outcome.occurrences, key=lambda o: o.begin_s):
         seen.setdefault((occurrence.title, round(occurrence.begin_s)), occurrence)
@@ -212,9 +213,9 @@ def _sample_at(track: Track, time_s: float) -> Sample | None:
 def _headline(outcome: Outcome) -> str:
     failed = [verdict for verdict in outcome.verdicts if not verdict.holds]
     if outcome.problem:
-        word = f"**Did not run to its end: {outcome.problem}.**"
+        word = f"**Aborted: {outcome.problem}.**"
     elif not outcome.verdicts:
-        word = "**Ran to its end.** It has no checks."
+        word = "**Completed.** There are no checks."
     elif len(outcome.verdicts) == 1:
         word = "**The check failed.**" if failed else "**The check holds.**"
     elif failed:
@@ -235,7 +236,7 @@ def _checks(outcome: Outcome) -> str:
     if not outcome.verdicts:
         return ""
     rows = [("holds" if v.holds else "**failed**", v.check, v.vehicle or "-", v.found) for v in outcome.verdicts]
-    return "## Checks\n\n" + table(("", "Check", "Vehicle", "Found"), rows)
+    return "## Checks\n\n" + table(("", "Check", "Vehicle", "Result"), rows)
 
 
 def _vehicle(track: Track, outcome: Outcome) -> dict[str, Any]:
@@ -279,19 +280,19 @@ def _events(outcome: Outcome) -> str:
     rows = [(letters.get((text, round(at)), ""), f"{at:.1f} s", who or "-", text) for at, who, text in merged]
     if not rows:
         return ""
-    left = f"\n\n{len(rows) - _PAGE_EVENTS} more are in report.json." if len(rows) > _PAGE_EVENTS else ""
-    return "## What happened\n\n" + table(("", "At", "Vehicle", "What"), rows[:_PAGE_EVENTS]) + left
+    left = f"\n\n{len(rows) - _PAGE_EVENTS} more events are in report.json." if len(rows) > _PAGE_EVENTS else ""
+    return "## Events\n\n" + table(("", "Time", "Vehicle", "Event"), rows[:_PAGE_EVENTS]) + left
 
 
 def _texts(outcome: Outcome) -> str:
-    """What autopilots said that is more than information."""
+    """Return a table of STATUSTEXT messages more severe than INFO."""
     loud = [
         (f"{text.time_s:.1f} s", flight.name, text.text)
         for flight in outcome.flights.values()
         for text in flight.texts
         if text.severity < _QUIET_SEVERITY
     ]
-    return "## Autopilots' warnings\n\n" + table(("At", "Vehicle", "Text"), loud[:_PAGE_TEXTS]) if loud else ""
+    return "## Autopilot warnings\n\n" + table(("At", "Vehicle", "Text"), loud[:_PAGE_TEXTS]) if loud else ""
 
 
 def _files(outcome: Outcome) -> str:

@@ -1,4 +1,4 @@
-"""Runs an experiment from its file to its verdicts."""
+"""Execution of an experiment, from its file to the verdicts."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ SHOW_EVERY_S = 0.2
 
 
 def _silent(_line: str) -> None:
-    """Take a line of progress and drop it."""
+    """Ignore a progress line."""
 
 
 @dataclass
 class Progress:
-    """Where a run tells what happens.
+    """Callbacks for progress of a run.
 
     Attributes:
-        tell: gets what happened, a line at a time.
-        show: gets the state of things a few times a second.
+        tell: Called with one line per event.
+        show: Called with the current state a few times per second.
     """
 
     tell: Callable[[str], None] = _silent
@@ -44,7 +44,7 @@ class Progress:
 
 @dataclass
 class _Session:
-    """One run under way."""
+    """State of a running experiment."""
 
     experiment: Experiment
     testbed: Testbed
@@ -63,7 +63,7 @@ class _Session:
 
     @property
     def now_s(self) -> float:
-        """Seconds of the experiment; negative before vehicles are ready."""
+        """Seconds of the experiment. Negative before the vehicles are ready."""
         return self.moment.time_s - self.start.time_s if self.begun else self.moment.time_s - LONG_AGO_S
 
     def tell(self, vehicle: str, text: str) -> None:
@@ -73,7 +73,7 @@ class _Session:
         self.log.write("/events", "fractus.Event", self.moment.unix_us * 1000, content)
 
     def poll(self) -> None:
-        """Let a little time pass, and take in what vehicles say."""
+        """Advance time by one tick, and process the messages of the vehicles."""
         self.moment = self.testbed.tick()
         for station in self.testbed.pilots.values():
             station.poll(self.now_s, self.moment.unix_us)
@@ -83,7 +83,7 @@ class _Session:
                 self.recorders[name].take(observer, messages, self.now_s, self.moment.unix_us)
 
     def step_tasks(self) -> None:
-        """Go on with every task; one whose vehicle has landed by itself is over."""
+        """Resume every task. Abort the task of a vehicle that has landed without a command."""
         for name, task in self.tasks.items():
             if self.flights[name].task:
                 continue
@@ -91,8 +91,8 @@ class _Session:
             if state.armed or state.flying or name not in self.injector.takeoffs_s:
                 self.down_since_s.pop(name, None)
             elif self.now_s - self.down_since_s.setdefault(name, self.now_s) > DOWN_S:
-                self.flights[name].task = "the vehicle landed by itself"
-                self.tell(name, f"task broken off: {self.flights[name].task}")
+                self.flights[name].task = "the vehicle landed without a command"
+                self.tell(name, f"task aborted: {self.flights[name].task}")
                 continue
             try:
                 next(task)
@@ -101,10 +101,10 @@ class _Session:
                 self.tell(name, "task done")
             except TaskFailed as failure:
                 self.flights[name].task = str(failure)
-                self.tell(name, f"task broken off: {failure}")
+                self.tell(name, f"task aborted: {failure}")
 
     def over(self) -> bool:
-        """Whether all is done and has been calm for as long as it should."""
+        """Return True if everything has ended and the settle time has passed."""
         states = {name: observer.state for name, observer in self.testbed.observers.items()}
         flown = self.injector.takeoffs_s
         waiting = any(not self.flights[name].task for name in self.tasks)
@@ -118,17 +118,17 @@ class _Session:
 
 
 def run(experiment: Experiment, out: Path, *, base: Path | None = None, progress: Progress | None = None) -> Outcome:
-    """Run an experiment and leave logs, tracks, pictures and report in a folder.
+    """Run an experiment, and write logs, tracks, figures and the report to a folder.
 
     Args:
-        experiment: What to run; `fractus_sim.experiment.model.load` reads a file.
-        out: The folder; what an earlier run left there is overwritten.
-        base: What relative paths in the experiment are relative to; by default the working directory.
-        progress: Told what happens.
+        experiment: Experiment to run. `fractus_sim.experiment.model.load` reads a file.
+        out: Output folder. Files of an earlier run are overwritten.
+        base: Base directory of relative paths in the experiment. Default: the working directory.
+        progress: Callbacks for progress.
 
     Raises:
-        ExperimentError: it could not be set up; the message says what to do.
-        OSError: a file could not be written.
+        ExperimentError: The experiment could not be set up. The message says what to do.
+        OSError: A file could not be written.
     """
     from fractus_sim.experiment.reporting import remove_report, write_outcome  # noqa: PLC0415 - matplotlib is slow
 
@@ -164,15 +164,18 @@ def _testbed(experiment: Experiment, out: Path, base: Path, progress: Progress) 
 
 
 def _run_session(session: _Session) -> str:
-    """Set up, wait until vehicles are ready, and fly; returns why it did not end as it should, or nothing.
+    """Set up the testbed, wait until the vehicles are ready, and fly.
+
+    Returns:
+        The reason why the experiment was aborted, or an empty string.
 
     Raises:
-        ExperimentError: it could not be set up.
+        ExperimentError: The experiment could not be set up.
     """
     testbed, experiment, progress = session.testbed, session.experiment, session.progress
     testbed.set_up()
     for name, endpoint in testbed.endpoints.items():
-        progress.tell(f"{name}: QGroundControl, Mission Planner or MAVProxy can attach to {endpoint}")
+        progress.tell(f"{name}: connect QGroundControl, Mission Planner or MAVProxy to {endpoint}")
     _wait_ready(session)
     session.start, session.begun = session.moment, True
     session.injector = Injector(experiment.faults, testbed, lambda text: _tell_fault(session, text))
@@ -187,7 +190,7 @@ def _run_session(session: _Session) -> str:
         problem = str(error)
         session.tell("", problem)
     for vehicle, title in session.injector.missed:
-        session.tell(vehicle, f"{title}: it was over before")
+        session.tell(vehicle, f"{title}: not injected, the experiment ended before")
     testbed.collect()
     return problem
 
@@ -202,8 +205,8 @@ def _wait_ready(session: _Session) -> None:
             return
         if session.moment.time_s > deadline_s:
             texts = session.testbed.observers[waiting[0]].state.texts
-            said = texts[-1][2] if texts else "it says nothing"
-            raise ExperimentError(f"{waiting[0]} was not ready to arm within {deadline_s:.0f} s: {said}")
+            detail = texts[-1][2] if texts else "no STATUSTEXT received"
+            raise ExperimentError(f"{waiting[0]} was not ready to arm within {deadline_s:.0f} s: {detail}")
 
 
 def _until_over(session: _Session) -> str:
@@ -217,7 +220,7 @@ def _until_over(session: _Session) -> str:
         if time.monotonic() - shown_s > SHOW_EVERY_S:
             shown_s = time.monotonic()
             session.progress.show(_status(session))
-    return f"it was not over after {session.experiment.timeout:g} s"
+    return f"not completed within {session.experiment.timeout:g} s"
 
 
 def _status(session: _Session) -> str:
@@ -263,5 +266,5 @@ def _outcome(session: _Session, out: Path, problem: str, wall_s: float) -> Outco
 
 
 def _since_start(judged: Judgement, session: _Session) -> Judgement:
-    """A judgement with its time on the experiment's clock."""
+    """Return a judgement with its time converted to seconds of the experiment."""
     return replace(judged, time_s=(judged.time_s - session.start.unix_us / 1e6) * (session.experiment.pace or 1.0))

@@ -1,4 +1,4 @@
-"""Mode standalone: drones with Fractus' services as local processes, planned and granted from manifests."""
+"""Experiment mode standalone: drones with the services of Fractus as local processes, and Grants from manifests."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ CONNECT_S = 10.0
 
 
 class ServiceTestbed(Testbed):
-    """Drones with their services; programs run as the components that they are in the manifests."""
+    """Drones with their services. Programs run as components of the manifests."""
 
     def __init__(self, experiment: Experiment, folder: Path, base: Path, tell: Callable[[str], None]) -> None:
         super().__init__(experiment, folder, base, tell)
@@ -47,10 +47,10 @@ class ServiceTestbed(Testbed):
         self._began_s = time.monotonic()
 
     def set_up(self) -> None:
-        """Plan the applications, bring the drones up, and grant what was planned.
+        """Plan the applications, start the drones, and issue the planned Grants.
 
         Raises:
-            ExperimentError: an application cannot be planned, or a process did not come up.
+            ExperimentError: An application cannot be planned, or a process did not start.
         """
         grants = list(granted(self._manifests))
         described = self._manifests.of(Drone)
@@ -68,17 +68,17 @@ class ServiceTestbed(Testbed):
         self._began_s = time.monotonic()
 
     def tick(self) -> Moment:
-        """Wait for 20 ms.
+        """Sleep for 20 ms.
 
         Raises:
-            ExperimentError: a vehicle or a service has ended.
+            ExperimentError: A vehicle or a service has ended.
         """
         time.sleep(TICK_S)
         self._ground.check()
         return Moment((time.monotonic() - self._began_s) * self.experiment.pace, time.time_ns() // 1000)
 
     def begin(self) -> None:
-        """Start the programs, each as its component."""
+        """Start the programs as their components."""
         addresses = {
             program.component: f"127.0.0.1:{program.port}"
             for program in self.experiment.programs
@@ -89,20 +89,20 @@ class ServiceTestbed(Testbed):
 
     @property
     def busy(self) -> bool:
-        """Whether a program runs that is waited for."""
+        """True while a foreground program is running."""
         return any(self._ground.processes.running(p.name) for p in self.experiment.programs if not p.background)
 
     @property
     def flies(self) -> list[str]:
-        """All vehicles, unless the end of programs says when it is over."""
+        """All vehicles, or none if foreground programs determine the end of the experiment."""
         return [] if any(not p.background for p in self.experiment.programs) else list(self.observers)
 
     def cut_link(self, vehicle: str) -> None:
-        """Cut companion computer and autopilot apart."""
+        """Cut the link between companion computer and autopilot."""
         self._ground.drones[vehicle].cut_link()
 
     def heal_link(self, vehicle: str) -> None:
-        """Join them again."""
+        """Restore the link between companion computer and autopilot."""
         self._ground.drones[vehicle].heal_link()
 
     def power_off(self, node: str) -> None:
@@ -110,11 +110,11 @@ class ServiceTestbed(Testbed):
         self._ground.power_off(node)
 
     def power_on(self, node: str) -> None:
-        """Start them again."""
+        """Restart services and programs of a drone."""
         self._ground.power_on(node, wait=False)
 
     def collect(self) -> None:
-        """End programs and services, and read what they wrote into their audit logs."""
+        """Stop programs and services, and read their audit logs."""
         for program in self.experiment.programs:
             self.findings.programs[program.name] = self._ground.processes.exit_code(program.name)
         self._ground.stop_services()
@@ -130,9 +130,9 @@ class ServiceTestbed(Testbed):
 
     def _setup(self, setup: VehicleSetup, described: Drone | None) -> DroneSetup:
         if described is None:
-            raise ExperimentError(f"the manifests have no Drone {setup.name}; add one, so that it can be planned for")
+            raise ExperimentError(f"the manifests contain no Drone {setup.name}; add one")
         if setup.home is None:
-            raise ExperimentError(f"{setup.name} stands nowhere; give it a home")
+            raise ExperimentError(f"{setup.name} has no start position; set `home`")
         entry, wind, world = setup.entry, self.experiment.wind, self.experiment.world
         camera = CameraSetup(("--seed", str(world.seed), *world.arguments)) if entry.camera else None
         return DroneSetup(
@@ -162,7 +162,7 @@ class ServiceTestbed(Testbed):
         known = {component.name for app in self._manifests.applications() for component in app.spec.components}
         if program.component not in known:
             raise ExperimentError(
-                f"program {program.name}: no application has a component {program.component}; there are:"
+                f"program {program.name}: no application has a component {program.component}; known:"
                 f" {', '.join(sorted(known))}"
             )
         self._ground.run_beside(
@@ -171,10 +171,10 @@ class ServiceTestbed(Testbed):
 
 
 def read(paths: Sequence[Path]) -> Manifests:
-    """Manifests of files and directories.
+    """Read the manifests of files and directories.
 
     Raises:
-        ExperimentError: they cannot be read.
+        ExperimentError: A manifest cannot be read.
     """
     try:
         return read_manifests(paths)
@@ -183,10 +183,10 @@ def read(paths: Sequence[Path]) -> Manifests:
 
 
 def granted(manifests: Manifests) -> Iterable[GrantSpec]:
-    """What the operator would grant.
+    """Yield the Grants that the operator would create.
 
     Raises:
-        ExperimentError: an application cannot be planned.
+        ExperimentError: An application cannot be planned.
     """
     settings = Settings()
     try:
@@ -201,6 +201,6 @@ def granted(manifests: Manifests) -> Iterable[GrantSpec]:
 
 
 def grant_manifest(spec: GrantSpec) -> dict[str, Any]:
-    """The Grant as the operator would write it."""
+    """Return the Grant object as the operator would create it."""
     metadata = {"name": spec.instance, "uid": f"uid-{spec.instance}"}
     return {"apiVersion": API_VERSION, "kind": "Grant", "metadata": metadata, "spec": spec.to_dict()}

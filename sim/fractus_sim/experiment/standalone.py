@@ -1,18 +1,19 @@
-"""Drones without Kubernetes: vehicle, mobility service, camera world and camera service of each as local processes.
+"""Drones without Kubernetes: vehicle, mobility service, camera world and camera service as local processes.
 
     with Standalone(Path("out/field")) as ground:
         drone = ground.add_drone(DroneSetup("drone-1", home=(50.8637, 4.6785, 25.0), camera=CameraSetup()))
-        identity = ground.grant(manifest)            # a Grant: signed, and where the services look for it
+        identity = ground.grant(manifest)      # sign a Grant and store it for the services
         ground.run("navigator", [sys.executable, "navigator.py"], identity)
         ground.wait_program("navigator", timeout_s=120.0)
 
-A program gets the environment that its pod would have (FRACTUS_*), so programs on the SDK run unchanged. All processes
-end with the block, whatever happens in it.
+Each program gets the environment of its pod (FRACTUS_*), so programs that use the SDK run unchanged. All processes end
+with the block.
 
-The directory that is left:
-    pki/           keys and certificates (fractus_cli.standalone)
-    logs/          NAME.log of each process, DRONE.tlog of each autopilot link, both directions
-    DRONE/         grants/, state/, pictures/, node.yaml, mobility.jsonl and camera.jsonl (audit logs)
+Files in the directory:
+
+    pki/       keys and certificates (fractus_cli.standalone)
+    logs/      NAME.log of each process, DRONE.tlog of each autopilot link in both directions
+    DRONE/     grants/, state/, pictures/, node.yaml, mobility.jsonl and camera.jsonl (audit logs)
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from fractus_sim.experiment.standalone_drone import LOOPBACK, DroneSetup, Runnin
 
 @dataclass(frozen=True, slots=True)
 class _Program:
-    """A program as it was started, to be started again when its node gets its power back."""
+    """Command of a program, kept to restart the program when its node is powered on."""
 
     node: str
     command: tuple[str, ...]
@@ -44,7 +45,7 @@ class _Program:
 
 
 class Standalone:
-    """Drones, their services, and programs that use them, in one directory; a context manager."""
+    """Drones, their services and programs in one directory. Use it as a context manager."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder.absolute()
@@ -63,14 +64,14 @@ class Standalone:
         self.close()
 
     def add_drone(self, setup: DroneSetup) -> RunningDrone:
-        """Bring a drone up; returns when its services listen (its autopilot may not be ready to arm yet).
+        """Start a drone and wait until its services listen. The autopilot may not be ready to arm yet.
 
         Raises:
-            ExperimentError: a process did not come up, or the name is taken.
-            InvalidObject: its description is no Drone's.
+            ExperimentError: A process did not start, or the name is in use.
+            InvalidObject: The description is not a valid Drone.
         """
         if setup.name in self.drones:
-            raise ExperimentError(f"there are two drones {setup.name}; give each its own name")
+            raise ExperimentError(f"the drone name {setup.name} is used twice; names must be unique")
         (self.folder / "logs").mkdir(exist_ok=True)
         drone = RunningDrone(setup, self.folder, self.pki.node(setup.name), self.processes)
         self.drones[setup.name] = drone
@@ -78,17 +79,17 @@ class Standalone:
         return drone
 
     def grant(self, manifest: Mapping[str, Any]) -> str:
-        """Sign a Grant and put it where the services of its node find it; replaces the one of the same name.
+        """Sign a Grant and store it for the services of its node. A Grant with the same name is replaced.
 
         Args:
-            manifest: of kind Grant; `fractus_core.planning.grant_compiler.compile_grants` makes the spec.
+            manifest: Object of kind Grant. `fractus_core.planning.grant_compiler.compile_grants` creates its spec.
 
         Returns:
-            The identity of the component instance that it is for.
+            Identity of the component instance.
 
         Raises:
-            ExperimentError: its node is none of the drones here.
-            InvalidObject: it is no Grant.
+            ExperimentError: The node is unknown.
+            InvalidObject: The manifest is not a valid Grant.
         """
         grant = Grant.from_body(manifest)
         drone = self._drone(grant.spec.node)
@@ -97,23 +98,23 @@ class Standalone:
         return grant.spec.identity
 
     def revoke(self, identity: str) -> None:
-        """Take the Grant of a component instance away.
+        """Remove the Grant of a component instance.
 
         Raises:
-            ExperimentError: it has none.
+            ExperimentError: The instance has no Grant.
         """
         grant = self._granted(identity)
         (self._drone(grant.spec.node).grants / f"{grant.metadata.name}.json").unlink(missing_ok=True)
 
     def environment(self, identity: str, services: Mapping[str, str] | None = None) -> dict[str, str]:
-        """The environment of a component's pod: who it is, where its services are, what it flies.
+        """Return the environment of a component's pod: identity, service addresses and control points.
 
         Args:
-            identity: as `grant` returned it.
-            services: host:port of each component that it may call, by the component's name.
+            identity: Identity returned by `grant`.
+            services: host:port of each component that this component may call, by component name.
 
         Raises:
-            ExperimentError: no Grant was given to it.
+            ExperimentError: The identity has no Grant.
         """
         spec = self._granted(identity).spec
         drone = self._drone(spec.node)
@@ -146,18 +147,18 @@ class Standalone:
         services: Mapping[str, str] | None = None,
         folder: Path | None = None,
     ) -> None:
-        """Start a program as a component instance; its output goes to `logs/NAME.log`.
+        """Start a program as a component instance. Its output is written to `logs/NAME.log`.
 
         Args:
-            name: of the program.
-            command: the program and its arguments.
-            identity: as `grant` returned it.
-            environment: further variables.
-            services: see `environment`.
-            folder: its working directory.
+            name: Name of the program.
+            command: Program and arguments.
+            identity: Identity returned by `grant`.
+            environment: Additional environment variables.
+            services: See `environment`.
+            folder: Working directory.
 
         Raises:
-            ExperimentError: it cannot be started, or no Grant was given to the identity.
+            ExperimentError: The program cannot be started, or the identity has no Grant.
         """
         variables = {**self.environment(identity, services), **(environment or {})}
         self._start(name, _Program(self._granted(identity).spec.node, tuple(command), variables, folder))
@@ -174,14 +175,14 @@ class Standalone:
         """Start a program that uses no system service, such as a component in the cloud.
 
         Args:
-            name: of the program.
-            command: the program and its arguments.
-            environment: further variables.
-            services: see `environment`.
-            folder: its working directory.
+            name: Name of the program.
+            command: Program and arguments.
+            environment: Additional environment variables.
+            services: See `environment`.
+            folder: Working directory.
 
         Raises:
-            ExperimentError: it cannot be started.
+            ExperimentError: The program cannot be started.
         """
         variables = {address_variable(c): address for c, address in (services or {}).items()}
         variables |= {"FRACTUS_HOST_IP": LOOPBACK, "FRACTUS_INSTANCE": name}
@@ -189,10 +190,10 @@ class Standalone:
         self._start(name, _Program("", tuple(command), variables, folder))
 
     def power_off(self, node: str) -> None:
-        """Pull the power of a drone's companion computer: services and programs die at once, the vehicle flies on.
+        """Power off the companion computer of a drone. Services and programs are killed; the vehicle keeps flying.
 
         Raises:
-            ExperimentError: there is no such drone.
+            ExperimentError: The drone is unknown.
         """
         programs = [name for name, program in self._programs.items() if program.node == node]
         self._off[node] = tuple(name for name in programs if self.processes.running(name))
@@ -200,14 +201,14 @@ class Standalone:
         self._drone(node).power_off()
 
     def power_on(self, node: str, *, wait: bool = True) -> None:
-        """Give the power back: services start again, and the programs that ran when it went.
+        """Power on the companion computer of a drone: restart its services and the programs that were running.
 
         Args:
-            node: the drone.
-            wait: start the programs when services listen, rather than at once.
+            node: Name of the drone.
+            wait: Start the programs after the services listen instead of immediately.
 
         Raises:
-            ExperimentError: one did not come up.
+            ExperimentError: A process did not start.
         """
         drone = self._drone(node)
         drone.power_on(wait=wait)
@@ -215,27 +216,27 @@ class Standalone:
             self._start(name, self._programs[name])
 
     def wait_program(self, name: str, timeout_s: float) -> int | None:
-        """Wait for a program to end; its exit code, None when it runs on."""
+        """Wait for a program to end. Return its exit code, or None after the timeout."""
         return self.processes.wait_end(name, timeout_s)
 
     def check(self) -> None:
-        """Make sure that vehicles and services run.
+        """Check that all vehicles and services are running.
 
         Raises:
-            ExperimentError: one has ended; the message ends with the tail of its log.
+            ExperimentError: A process has ended. The message ends with the tail of its log.
         """
         for name, code in self.processes.dead().items():
             if name not in self._programs and not any(name.startswith(f"{node}-") for node in self._off):
-                raise ExperimentError(f"{name} ended with {code}: {self.processes.log_tail(name)}")
+                raise ExperimentError(f"{name} ended with exit code {code}: {self.processes.log_tail(name)}")
 
     def stop_services(self) -> None:
-        """End programs and services in good order, so that their logs are complete; vehicles go on."""
+        """Stop programs, then services, so that their logs are complete. Vehicles keep running."""
         self.processes.stop(*self._programs)
         for drone in self.drones.values():
             self.processes.stop(drone.process("camera"), drone.process("mobility"))
 
     def close(self) -> None:
-        """End every process: programs first, then services, then vehicles."""
+        """Stop all processes: programs first, then services, then vehicles."""
         with ExitStack() as links:
             for drone in self.drones.values():
                 links.callback(drone.close)
@@ -249,7 +250,7 @@ class Standalone:
 
     def _drone(self, node: str) -> RunningDrone:
         if node not in self.drones:
-            raise ExperimentError(f"there is no drone {node}; there are {', '.join(self.drones) or 'none'}")
+            raise ExperimentError(f"no drone {node}; known: {', '.join(self.drones) or 'none'}")
         return self.drones[node]
 
     def _granted(self, identity: str) -> Grant:

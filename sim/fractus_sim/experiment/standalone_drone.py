@@ -1,4 +1,4 @@
-"""One drone without Kubernetes: its vehicle, services and camera world as local processes."""
+"""One drone without Kubernetes: vehicle, services and camera world as local processes."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ _MOBILITY_METHODS = (
 
 @dataclass(frozen=True, slots=True)
 class CameraSetup:
-    """A camera on a drone, looking at a camera world of its own.
+    """A camera of a drone, with its own camera world.
 
     Attributes:
-        world: further arguments of `fractus camera-world`, such as `("--seed", "7")`; None: no world, the driver's test
-            picture.
-        features: what the drone's description says of the camera, over `resolution` and `methods`.
+        world: Additional arguments of `fractus camera-world`, such as `("--seed", "7")`. None: no camera world, the
+            driver's test picture.
+        features: Camera fields of the drone description, in addition to `resolution` and `methods`.
     """
 
     world: Sequence[str] | None = ()
@@ -42,17 +42,17 @@ class CameraSetup:
 
 @dataclass(frozen=True, slots=True)
 class DroneSetup:
-    """One drone.
+    """Configuration of one drone.
 
     Attributes:
-        name: of the node.
-        home: latitude and longitude in degrees, ground height in metres above mean sea level.
-        parameters: of the autopilot, by ArduPilot's names.
-        description: spec of its Drone manifest; connections are filled in here.
-        camera: None: neither camera world nor camera service.
-        vehicle_arguments: further arguments of `fractus-vehicle`, such as `("--wind", "4,270,1")`.
-        service_arguments: further arguments of `fractus mobility serve`.
-        autopilot: `tcp:HOST:PORT` of one that runs already; None: a simulated one is started.
+        name: Name of the node.
+        home: Latitude and longitude in degrees, ground height in metres above mean sea level.
+        parameters: Autopilot parameters by ArduPilot name.
+        description: Spec of the Drone manifest. Connections are added automatically.
+        camera: Camera configuration. None: neither camera world nor camera service.
+        vehicle_arguments: Additional arguments of `fractus-vehicle`, such as `("--wind", "4,270,1")`.
+        service_arguments: Additional arguments of `fractus mobility serve`.
+        autopilot: `tcp:HOST:PORT` of a running autopilot. None: a simulated autopilot is started.
     """
 
     name: str
@@ -71,17 +71,17 @@ class DroneSetup:
 
 
 class RunningDrone:
-    """A drone that was brought up.
+    """A running drone.
 
     Attributes:
-        station_link: the vehicle's link for a ground station of ours, such as `tcp:127.0.0.1:21235`.
-        guest_link: another one, for QGroundControl, Mission Planner or MAVProxy.
-        mobility_address: host:port of its mobility service.
-        camera_address: host:port of its camera service, if it has one.
-        world_url: of its camera world, if it has one.
-        grants: directory of its Grants.
-        audit: audit log of the mobility service; the camera's is `camera.jsonl` beside it.
-        tlog: what passed between service and autopilot.
+        station_link: MAVLink endpoint for the ground station of the experiment, such as `tcp:127.0.0.1:21235`.
+        guest_link: MAVLink endpoint for QGroundControl, Mission Planner or MAVProxy.
+        mobility_address: host:port of the mobility service.
+        camera_address: host:port of the camera service, or None.
+        world_url: URL of the camera world, or None.
+        grants: Directory of the Grants.
+        audit: Audit log of the mobility service. The camera service writes `camera.jsonl` in the same directory.
+        tlog: Traffic between mobility service and autopilot.
     """
 
     def __init__(self, setup: DroneSetup, folder: Path, tls: Path, processes: Processes) -> None:
@@ -104,18 +104,18 @@ class RunningDrone:
 
     @property
     def name(self) -> str:
-        """Its node's name."""
+        """Name of the node."""
         return self.setup.name
 
     def process(self, role: str) -> str:
-        """Name of its process of a role: vehicle, world, mobility or camera."""
+        """Return the process name of a role: vehicle, world, mobility or camera."""
         return f"{self.name}-{role}"
 
     def start(self) -> None:
-        """Bring it up and wait until its services listen.
+        """Start the drone and wait until its services listen.
 
         Raises:
-            ExperimentError: a process did not come up.
+            ExperimentError: A process did not start.
         """
         for folder in (self.grants, self.folder / "state"):
             folder.mkdir(parents=True, exist_ok=True)
@@ -130,13 +130,13 @@ class RunningDrone:
         self.power_on()
 
     def power_on(self, *, wait: bool = True) -> None:
-        """Start its companion computer: mobility service and camera service.
+        """Start the mobility and camera services of the companion computer.
 
         Args:
-            wait: return when they listen.
+            wait: Wait until the services listen.
 
         Raises:
-            ExperimentError: one did not come up.
+            ExperimentError: A service did not start.
         """
         self._processes.start(self.process("mobility"), self._mobility_command(), base_environment())
         if self._camera_port is not None:
@@ -147,21 +147,21 @@ class RunningDrone:
             self._await("camera", self._camera_port)
 
     def power_off(self) -> None:
-        """Pull the power of its companion computer: its services die at once, the vehicle flies on."""
+        """Kill the services of the companion computer. The vehicle keeps flying."""
         self._processes.stop(self.process("mobility"), self.process("camera"), kill=True)
 
     def cut_link(self) -> None:
-        """Cut the wire between companion computer and autopilot."""
+        """Cut the link between companion computer and autopilot."""
         if self._tap is not None:
             self._tap.cut()
 
     def heal_link(self) -> None:
-        """Restore it."""
+        """Restore the link between companion computer and autopilot."""
         if self._tap is not None:
             self._tap.heal()
 
     def close(self) -> None:
-        """Close what is left when its processes have ended."""
+        """Close the link tap after the processes have ended."""
         if self._tap is not None:
             self._tap.close()
 
@@ -180,7 +180,7 @@ class RunningDrone:
         if self.setup.camera is not None:
             camera = services.setdefault("camera", {})
             camera.setdefault("methods", list(_CAMERA_METHODS))
-            # The camera world's own, unless it is told otherwise.
+            # Defaults of the camera world.
             camera.setdefault("horizontalFieldOfView", 62.2)
             camera.setdefault("lens", {"model": "pinhole"})
             camera.setdefault("mount", {"pitch": -90, "stabilised": True})
@@ -242,6 +242,6 @@ def _module(name: str) -> list[str]:
 
 
 def base_environment() -> dict[str, str]:
-    """Our environment without what Fractus says in it, for processes that get their own."""
+    """Return the environment of the current process without FRACTUS_* variables."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith("FRACTUS_")}
     return {**kept, "PYTHONUNBUFFERED": "1", "MALLOC_ARENA_MAX": "2"}

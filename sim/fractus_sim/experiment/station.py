@@ -1,4 +1,4 @@
-"""A ground station's end of a MAVLink link: heartbeats, commands, parameters, and what the vehicle says."""
+"""Ground station end of a MAVLink link: heartbeats, commands, parameters, and the state of the vehicle."""
 
 from __future__ import annotations
 
@@ -41,31 +41,31 @@ RATES_HZ: Mapping[str, float] = {
 
 
 class Link(Protocol):
-    """Something that carries bytes to a vehicle and back, without waiting."""
+    """A non-blocking byte link to a vehicle."""
 
     def send(self, data: bytes) -> None:
         """Send bytes."""
 
     def receive(self) -> bytes:
-        """What has arrived since."""
+        """Return the bytes received since the last call."""
 
     def close(self) -> None:
-        """Close it."""
+        """Close the link."""
 
 
 class ChannelLink:
-    """A link to a vehicle in this process."""
+    """A link to a vehicle in the same process."""
 
     def __init__(self, craft: Craft, name: str) -> None:
         self._craft = craft
         self._channel: Channel = craft.open(name)
 
     def send(self, data: bytes) -> None:
-        """Hand bytes to the vehicle."""
+        """Pass bytes to the vehicle."""
         self._craft.receive(self._channel, data)
 
     def receive(self) -> bytes:
-        """What the vehicle has sent since."""
+        """Return the bytes that the vehicle has sent since the last call."""
         return self._channel.take()
 
     def close(self) -> None:
@@ -83,10 +83,10 @@ class TcpLink:
 
     @classmethod
     def connect(cls, host: str, port: int, timeout_s: float) -> TcpLink:
-        """Connect, trying again until the time is over.
+        """Connect, and retry until the timeout.
 
         Raises:
-            ExperimentError: no autopilot answered.
+            ExperimentError: The connection failed.
         """
         deadline = time.monotonic() + timeout_s
         while True:
@@ -94,14 +94,16 @@ class TcpLink:
                 return cls(socket.create_connection((host, port), 2.0), f"tcp:{host}:{port}")
             except OSError as error:
                 if time.monotonic() > deadline:
-                    raise ExperimentError(f"no autopilot answers at tcp:{host}:{port}: {error.strerror}") from None
+                    raise ExperimentError(
+                        f"cannot connect to the autopilot at tcp:{host}:{port}: {error.strerror}"
+                    ) from None
                 time.sleep(0.1)
 
     def send(self, data: bytes) -> None:
-        """Send bytes; what the socket does not take at once is lost, as on a radio.
+        """Send bytes. Bytes that exceed the socket buffer are dropped, as on a radio.
 
         Raises:
-            ExperimentError: the vehicle closed the link.
+            ExperimentError: The vehicle closed the link.
         """
         try:
             self._socket.send(data)
@@ -111,10 +113,10 @@ class TcpLink:
             raise ExperimentError(f"link {self._what}: {error.strerror}") from None
 
     def receive(self) -> bytes:
-        """What has arrived since.
+        """Return the bytes received since the last call.
 
         Raises:
-            ExperimentError: the vehicle closed the link.
+            ExperimentError: The vehicle closed the link.
         """
         parts: list[bytes] = []
         while True:
@@ -125,7 +127,7 @@ class TcpLink:
             except OSError as error:
                 raise ExperimentError(f"link {self._what}: {error.strerror}") from None
             if not data:
-                raise ExperimentError(f"link {self._what}: the autopilot closed it")
+                raise ExperimentError(f"link {self._what}: closed by the autopilot")
             parts.append(data)
 
     def close(self) -> None:
@@ -136,13 +138,13 @@ class TcpLink:
 
 @dataclass(slots=True)
 class State:
-    """What the vehicle said last; degrees, metres, volts."""
+    """Last reported state of the vehicle. Units: degrees, metres, volts."""
 
     heard: bool = False
     mode: str = ""
     armed: bool = False
-    checked: bool = False  # its checks before arming pass, in its present mode
-    located: bool = False  # its estimator has a position, which flights by the autopilot need
+    checked: bool = False  # # pre-arm checks pass in the current mode
+    located: bool = False  # # the estimator has a position
     flying: bool = False
     lat: float = 0.0
     lon: float = 0.0
@@ -161,17 +163,17 @@ class State:
 
     @property
     def ready(self) -> bool:
-        """Whether it would arm for a flight by the autopilot."""
+        """True if the vehicle would arm in a mode that needs a position."""
         return self.checked and self.located and self.home is not None
 
 
 class Station:
-    """One station and one vehicle.
+    """A ground station that communicates with one vehicle.
 
     Attributes:
-        now_s: time of the last poll, on the caller's clock.
-        state: what the vehicle said last.
-        cut: while True nothing passes, as without a radio.
+        now_s: Time of the last poll, on the clock of the caller.
+        state: Last reported state of the vehicle.
+        cut: True while the link drops all traffic.
     """
 
     def __init__(
@@ -191,10 +193,10 @@ class Station:
         self._asked = False
 
     def poll(self, now_s: float, unix_us: int) -> list[Message]:
-        """Take in what the vehicle said, and beat the heart when it is time.
+        """Process received messages, and send a heartbeat if it is due.
 
         Raises:
-            ExperimentError: the link was closed.
+            ExperimentError: The link was closed.
         """
         self.now_s, self._unix_us = now_s, unix_us
         data = self._link.receive()
@@ -228,22 +230,22 @@ class Station:
         self._link.send(frame)
 
     def tell(self, name: str, values: Mapping[str, Value]) -> None:
-        """Send a message to the vehicle's autopilot."""
+        """Send a message to the autopilot of the vehicle."""
         self.send(name, {**values, "target_system": self._system_id, "target_component": 1})
 
     def command(self, command: int, *params: float) -> None:
-        """Send COMMAND_LONG; the answer will be in `acks`."""
+        """Send COMMAND_LONG. The result is stored in `acks`."""
         self.acks.pop(command, None)
         values: dict[str, Value] = {f"param{at}": float(value) for at, value in enumerate(params, start=1)}
         self.tell("COMMAND_LONG", {**values, "command": command})
 
     def read_parameter(self, name: str) -> None:
-        """Ask for a parameter; it will be in `parameters`."""
+        """Request a parameter. Its value is stored in `parameters`."""
         self.parameters.pop(name, None)
         self.tell("PARAM_REQUEST_READ", {"param_id": name.encode("ascii"), "param_index": -1})
 
     def set_parameter(self, name: str, value: float) -> None:
-        """Set a parameter; what the vehicle made of it will be in `parameters`."""
+        """Set a parameter. The value that the vehicle reports is stored in `parameters`."""
         self.parameters.pop(name, None)
         self.tell(
             "PARAM_SET",

@@ -1,4 +1,4 @@
-"""What a vehicle is told to fly, as an experiment's file spells it."""
+"""Task steps of experiment files."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Altitude = Annotated[float, Field(ge=0, le=5000, description="Metres above home.
 
 
 class Place(Model):
-    """A place over the ground: degrees, or metres from the vehicle's own home."""
+    """A horizontal position: degrees, or metres from the home position of the vehicle."""
 
     lat: Latitude | None = None
     lon: Longitude | None = None
@@ -29,25 +29,25 @@ class Place(Model):
 
     @property
     def words(self) -> str:
-        """The place in words."""
+        """The place as text."""
         if self.lat is not None and self.lon is not None:
             return f"{self.lat:.6f}, {self.lon:.6f}"
         return f"{self.north:g} m north, {self.east:g} m east"
 
 
 class TaskStep(Model):
-    """One thing to do."""
+    """One step of a task."""
 
     TITLE: ClassVar[str]
 
     @property
     def title(self) -> str:
-        """The step in a few words."""
+        """Short description of the step."""
         return self.TITLE.format(step=self)
 
 
 class Takeoff(TaskStep):
-    """Arm in GUIDED and climb."""
+    """Arm in GUIDED and take off."""
 
     TITLE = "takeoff to {step.alt:g} m"
     do: Literal["takeoff"]
@@ -55,16 +55,16 @@ class Takeoff(TaskStep):
 
 
 class Goto(Place, TaskStep):
-    """Fly there and stop."""
+    """Fly to a position and stop."""
 
     TITLE = "goto {step.words} at {step.alt:g} m"
     do: Literal["goto"]
     alt: Altitude
-    within: float = Field(default=1.5, gt=0, le=100, description="Metres that count as there.")
+    within: float = Field(default=1.5, gt=0, le=100, description="Maximum distance to the target, metres.")
 
 
 class Speed(TaskStep):
-    """Fly at this speed from now on."""
+    """Set the ground speed of the following steps."""
 
     TITLE = "speed {step.speed:g} m/s"
     do: Literal["speed"]
@@ -72,7 +72,7 @@ class Speed(TaskStep):
 
 
 class Hold(TaskStep):
-    """Stay for a while."""
+    """Hold the position."""
 
     TITLE = "hold {step.seconds:g} s"
     do: Literal["hold"]
@@ -88,35 +88,35 @@ class SetMode(TaskStep):
 
 
 class Waypoint(Place):
-    """A point of a mission."""
+    """A waypoint of a mission."""
 
     alt: Altitude
-    hold: float = Field(default=0, ge=0, le=3600, description="Seconds to stay.")
+    hold: float = Field(default=0, ge=0, le=3600, description="Hold time, seconds.")
 
 
 class FlyMission(TaskStep):
-    """Upload a mission, take off, and fly it in AUTO to its end."""
+    """Upload a mission, take off, and fly it in AUTO until it ends."""
 
     do: Literal["mission"]
-    takeoff: Altitude = Field(description="Metres above home to climb to first.")
+    takeoff: Altitude = Field(description="Takeoff altitude, metres above home.")
     waypoints: tuple[Waypoint, ...] = Field(min_length=1, max_length=500)
     land: Literal["home", "last"] = Field(default="home", description="Return to launch, or land at the last waypoint.")
 
     @property
     def title(self) -> str:
-        """The step in a few words."""
+        """Short description of the step."""
         return f"mission of {len(self.waypoints)} waypoints"
 
 
 class ReturnToLaunch(TaskStep):
-    """Fly home and land."""
+    """Return to launch and land."""
 
     TITLE = "return to launch"
     do: Literal["returnToLaunch"]
 
 
 class Land(TaskStep):
-    """Land here."""
+    """Land at the current position."""
 
     TITLE = "land"
     do: Literal["land"]

@@ -1,4 +1,4 @@
-"""Where an experiment runs: the three modes, behind one interface."""
+"""Common interface of the three experiment modes."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ from fractus_sim.experiment.tlog import TlogWriter
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """Seconds since the testbed was set, on its own clock, and the time of day in microseconds."""
+    """Seconds since the start of the testbed on its own clock, and Unix time in microseconds."""
 
     time_s: float
     unix_us: int
 
 
 class Closable(Protocol):
-    """Something to be closed."""
+    """An object with a `close` method."""
 
     def close(self) -> None:
-        """End it."""
+        """Close the object."""
 
 
 _Kept = TypeVar("_Kept", bound=Closable)
 
 
 class Testbed(ABC):
-    """The vehicles of an experiment and what stands around them.
+    """Vehicles of an experiment and their environment.
 
     Attributes:
-        observers: for each vehicle a link that records, injects faults, and is never cut.
-        pilots: for each vehicle a ground station that flies its task; not in modes where applications fly.
-        endpoints: for each vehicle where QGroundControl or Mission Planner can attach.
+        observers: Link of each vehicle that records and injects faults. It is never cut.
+        pilots: Ground station of each vehicle that flies its task. Empty in modes where applications fly.
+        endpoints: MAVLink endpoint of each vehicle for QGroundControl or Mission Planner.
     """
 
     def __init__(self, experiment: Experiment, folder: Path, base: Path, tell: Callable[[str], None]) -> None:
@@ -51,69 +51,69 @@ class Testbed(ABC):
         self._kept = ExitStack()
 
     def keep(self, resource: _Kept) -> _Kept:
-        """Have something closed with the testbed; say so as soon as it is made."""
+        """Register an object to be closed with the testbed. Call this right after its creation."""
         self._kept.callback(resource.close)
         return resource
 
     def at_end(self, action: Callable[[], object]) -> None:
-        """Have something done when the testbed is closed."""
+        """Register an action to run when the testbed is closed."""
         self._kept.callback(action)
 
     def observe(self, setup: VehicleSetup, link: Link) -> None:
-        """Have a vehicle recorded by a link of its own."""
+        """Record a vehicle over a separate link."""
         log = self.keep(TlogWriter(self.folder / "logs" / f"{setup.name}-observer.tlog"))
         self.observers[setup.name] = self.keep(Station(link, setup.system_id, log, own_id=OBSERVER_ID, beats=False))
 
     def close(self) -> None:
-        """End everything that was started, the last first; what fails or is interrupted keeps nothing else from its end."""
+        """Close everything in reverse order. Failures and interrupts do not skip the remaining objects."""
         self._kept.close()
 
     @abstractmethod
     def set_up(self) -> None:
-        """Bring everything up.
+        """Start all parts.
 
         Raises:
-            ExperimentError: something did not come up.
+            ExperimentError: A part did not start.
         """
 
     @abstractmethod
     def tick(self) -> Moment:
-        """Let a little time pass.
+        """Advance time by one tick.
 
         Raises:
-            ExperimentError: something that must run has ended.
+            ExperimentError: A required process has ended.
         """
 
     @abstractmethod
     def begin(self) -> None:
-        """Vehicles are ready: start programs, apply applications."""
+        """Start programs or apply Applications. Called when the vehicles are ready."""
 
     @property
     def busy(self) -> bool:
-        """Whether something that was begun is not over."""
+        """True while a program or Application has not ended."""
         return False
 
     @property
     def flies(self) -> Sequence[str]:
-        """Vehicles of which at least one must have flown before the experiment can be over."""
+        """Vehicles of which at least one must fly before the experiment can end."""
         return ()
 
     @abstractmethod
     def cut_link(self, vehicle: str) -> None:
-        """Let nothing pass on the vehicle's link of this mode."""
+        """Drop all traffic on the link of a vehicle."""
 
     @abstractmethod
     def heal_link(self, vehicle: str) -> None:
-        """Let everything pass again."""
+        """Restore the link of a vehicle."""
 
     @abstractmethod
     def power_off(self, node: str) -> None:
-        """Pull a node's power."""
+        """Power off a node."""
 
     @abstractmethod
     def power_on(self, node: str) -> None:
-        """Give it back."""
+        """Power on a node."""
 
     @abstractmethod
     def collect(self) -> None:
-        """Gather what is left for `findings`, before everything is taken down."""
+        """Collect results into `findings` before the testbed is closed."""

@@ -1,4 +1,4 @@
-"""Mode vehicles: autopilots in this process, in lockstep or paced; or autopilots elsewhere, over TCP."""
+"""Experiment mode vehicles: simulated autopilots in this process, or external autopilots over TCP."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ CONNECT_S = 20.0
 
 
 class VehicleTestbed(Testbed):
-    """Vehicles alone."""
+    """Vehicles without services."""
 
     def __init__(self, experiment: Experiment, folder: Path, base: Path, tell: Callable[[str], None]) -> None:
         super().__init__(experiment, folder, base, tell)
@@ -44,10 +44,10 @@ class VehicleTestbed(Testbed):
         self._last_wall_s = 0.0
 
     def set_up(self) -> None:
-        """Make the vehicles and their links.
+        """Create the vehicles and their links.
 
         Raises:
-            ExperimentError: a parameter is unknown, or a running autopilot does not answer.
+            ExperimentError: A parameter is unknown, or a running autopilot does not respond.
         """
         self._logs.mkdir(parents=True, exist_ok=True)
         for setup in self.experiment.setups():
@@ -59,7 +59,7 @@ class VehicleTestbed(Testbed):
         self._last_wall_s = time.monotonic()
 
     def tick(self) -> Moment:
-        """Advance by 20 ms, waiting until they are due unless in lockstep."""
+        """Advance by 20 ms. Wait for real time unless in lockstep."""
         if not self._pace:
             for _ in range(STEPS_PER_TICK):
                 self._simulation.step()
@@ -84,37 +84,37 @@ class VehicleTestbed(Testbed):
 
     @property
     def busy(self) -> bool:
-        """Whether a program runs that is waited for."""
+        """True while a foreground program is running."""
         return any(self._processes.running(p.name) for p in self.experiment.programs if not p.background)
 
     @property
     def flies(self) -> list[str]:
-        """Vehicles that programs fly."""
+        """Vehicles that are flown by programs."""
         flown = {p.vehicle for p in self.experiment.programs}
         return [s.name for s in self.experiment.setups() if s.name in flown and not s.entry.task]
 
     def cut_link(self, vehicle: str) -> None:
-        """Cut the ground station and the programs off."""
+        """Cut the links of the ground station and the programs."""
         self.pilots[vehicle].cut = True
         for tap in self._taps.get(vehicle, ()):
             tap.cut()
 
     def heal_link(self, vehicle: str) -> None:
-        """Give them their link back."""
+        """Restore the links of the ground station and the programs."""
         self.pilots[vehicle].cut = False
         for tap in self._taps.get(vehicle, ()):
             tap.heal()
 
     def power_off(self, node: str) -> None:
-        """Never: vehicles alone have no nodes, and the model refuses the fault."""
-        raise ExperimentError(f"{node} is no node in mode vehicles")
+        """Raise an error. The data model rejects this fault in mode vehicles."""
+        raise ExperimentError(f"{node}: mode vehicles has no nodes to power off")
 
     def power_on(self, node: str) -> None:
-        """Never, as `power_off`."""
-        raise ExperimentError(f"{node} is no node in mode vehicles")
+        """Raise an error. The data model rejects this fault in mode vehicles."""
+        raise ExperimentError(f"{node}: mode vehicles has no nodes to power on")
 
     def collect(self) -> None:
-        """Note how the programs ended."""
+        """Record the exit codes of the programs."""
         for program in self.experiment.programs:
             self.findings.programs[program.name] = self._processes.exit_code(program.name)
 
@@ -167,7 +167,7 @@ class VehicleTestbed(Testbed):
     def _config(self, setup: VehicleSetup) -> VehicleConfig:
         home, wind, entry = setup.home, self.experiment.wind, setup.entry
         if home is None:
-            raise ExperimentError(f"{setup.name} stands nowhere; give it a home")
+            raise ExperimentError(f"{setup.name} has no start position; set `home`")
         blow = {"SIM_WIND_SPD": wind.speed, "SIM_WIND_DIR": wind.direction, "SIM_WIND_TURB": wind.turbulence}
         return VehicleConfig(
             start=Place.from_degrees(home.lat, home.lon, home.alt),
@@ -181,6 +181,6 @@ class VehicleTestbed(Testbed):
 
 
 def command_of(program: Program) -> list[str]:
-    """A program's command; `python` is the interpreter that runs us."""
+    """Return the command of a program. `python` is replaced by the current interpreter."""
     first, *rest = program.command
     return [sys.executable if first in {"python", "python3"} else first, *rest]

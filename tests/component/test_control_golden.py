@@ -46,12 +46,12 @@ def flown() -> list[str]:
 
 
 @pytest.mark.parametrize("name", flown())
-def test_a_flight_is_flown_as_it_was_recorded(tmp_path: Path, name: str) -> None:
+def test_golden_flight_matches_recorded_trace(tmp_path: Path, name: str) -> None:
     recorded = json.loads((GOLDEN / f"{name}.json").read_text())
     assert trace_of(tmp_path, courses()[name]).trace == recorded, "control_flights.py says how to record it again"
 
 
-def test_every_recorded_flight_is_flown() -> None:
+def test_golden_flights_and_recordings_have_the_same_names() -> None:
     assert {path.stem for path in GOLDEN.glob("*.json")} == set(courses())
 
 

@@ -31,7 +31,7 @@ class Slow:
         self._world.fence.raised = True
 
 
-def test_who_asks_twice_arms_once(tmp_path: Path) -> None:
+def test_arming_happens_once_for_two_concurrent_requests(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -48,7 +48,7 @@ def test_who_asks_twice_arms_once(tmp_path: Path) -> None:
     fly(flight)
 
 
-def test_who_waits_to_arm_must_still_be_allowed_to(tmp_path: Path) -> None:
+def test_queued_arming_is_refused_after_driver_returns_control(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -71,7 +71,7 @@ FRESH = Checked("", (), Airframe(retraces=True), 8.0, remembers=True)
 
 @pytest.mark.parametrize("found", [None, FRESH])
 @pytest.mark.parametrize("during", ["choice", "fence", "mode"])
-def test_failsafes_that_are_set_again_meanwhile_forbid_arming(
+def test_arming_is_refused_if_failsafe_verification_changes_meanwhile(
     tmp_path: Path, during: str, found: Checked | None
 ) -> None:
     async def flight() -> None:
@@ -118,7 +118,7 @@ def test_failsafes_that_are_set_again_meanwhile_forbid_arming(
     fly(flight)
 
 
-def test_a_link_that_comes_back_in_flight_leaves_the_way_home_as_chosen(tmp_path: Path) -> None:
+def test_return_mode_is_kept_after_link_reconnects_in_flight(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=True) as world:
             control, plane = world.control, world.plane
@@ -142,7 +142,7 @@ def test_a_link_that_comes_back_in_flight_leaves_the_way_home_as_chosen(tmp_path
     fly(flight)
 
 
-def test_nothing_arms_without_its_fence(tmp_path: Path) -> None:
+def test_arming_is_refused_if_fence_upload_fails(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -158,7 +158,7 @@ def test_nothing_arms_without_its_fence(tmp_path: Path) -> None:
     fly(flight)
 
 
-def test_nothing_arms_far_from_the_home_of_its_grant(tmp_path: Path) -> None:
+def test_arming_is_refused_far_from_grant_home(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             world.plane.xy = [60.0, 0.0]
@@ -174,7 +174,9 @@ def test_nothing_arms_far_from_the_home_of_its_grant(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("part", ["journal", "audit"])
-def test_nothing_arms_that_leaves_no_trace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: str) -> None:
+def test_arming_is_refused_if_journal_or_audit_log_is_unwritable(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: str
+) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -195,7 +197,7 @@ def test_nothing_arms_that_leaves_no_trace(tmp_path: Path, monkeypatch: pytest.M
     fly(flight)
 
 
-def test_a_refused_arming_is_tried_again_while_the_caller_waits(tmp_path: Path) -> None:
+def test_arming_is_retried_until_caller_deadline(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -214,7 +216,7 @@ def test_a_refused_arming_is_tried_again_while_the_caller_waits(tmp_path: Path) 
     fly(flight)
 
 
-def test_nothing_arms_for_a_caller_that_has_hung_up(tmp_path: Path) -> None:
+def test_arming_retries_stop_after_caller_cancels(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -234,7 +236,7 @@ def test_nothing_arms_for_a_caller_that_has_hung_up(tmp_path: Path) -> None:
     fly(flight)
 
 
-def test_a_waiting_driver_is_told_why_the_system_does_not_arm(tmp_path: Path) -> None:
+def test_waiting_driver_receives_reason_why_arming_fails(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             plane, arm, heard = world.plane, mavlink.MAV_CMD_COMPONENT_ARM_DISARM, list[str]()
@@ -254,7 +256,7 @@ def test_a_waiting_driver_is_told_why_the_system_does_not_arm(tmp_path: Path) ->
     fly(flight)
 
 
-def test_what_is_not_ready_is_not_asked_to_arm(tmp_path: Path) -> None:
+def test_arming_is_refused_without_position_estimate(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())

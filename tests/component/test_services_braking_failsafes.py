@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sky_drone import fly, ready, until
 
 
-def test_a_drone_that_a_lost_radio_brakes_comes_home(tmp_path: Path) -> None:
+def test_drone_returns_home_after_radio_failsafe_brakes(tmp_path: Path) -> None:
     async def work(sky: Sky, directory: Path) -> None:
         async with ready(sky, directory) as (drone, grant):
             await drone.service.arm(grant, 120.0)
@@ -32,7 +32,7 @@ def test_a_drone_that_a_lost_radio_brakes_comes_home(tmp_path: Path) -> None:
     fly(work, tmp_path, {"FS_THR_ENABLE": 7.0})
 
 
-def test_an_owners_fence_that_brakes_brings_the_drone_home(tmp_path: Path) -> None:
+def test_drone_returns_home_after_owner_fence_brakes(tmp_path: Path) -> None:
     async def work(sky: Sky, directory: Path) -> None:
         async with ready(sky, directory) as (drone, grant):
             await drone.service.arm(grant, 120.0)

@@ -44,7 +44,9 @@ async def armed(sky: Sky, directory: Path) -> Checked:
 @pytest.mark.parametrize(
     ("loss", "seed"), cells([(0.0, 1), (0.1, 2), (0.1, 3), (0.3, 4)], quick=[(0.0, 1), (0.1, 2), (0.1, 3)])
 )
-def test_nothing_arms_with_figures_that_are_not_the_vehicles(tmp_path: Path, loss: float, seed: int) -> None:
+def test_arming_uses_vehicle_parameters_after_cold_start_with_frame_loss(
+    tmp_path: Path, loss: float, seed: int
+) -> None:
     sky = Sky(seed, Weather(there_s=0.03, back_s=0.03, loss=loss), SLOW)
     with asyncio.Runner(loop_factory=lambda: sky) as runner:
         checked = runner.run(armed(sky, tmp_path))

@@ -27,7 +27,7 @@ FLOW = (
 DRIFT_MPS = 0.3
 
 
-def test_a_drone_that_drifts_without_knowing_where_it_is_comes_home(
+def test_drone_returns_home_if_estimator_has_no_absolute_position(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def work(sky: Sky, directory: Path) -> None:

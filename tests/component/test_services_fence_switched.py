@@ -14,7 +14,7 @@ from sky_drone import fly, ready, until
 FENCE_SWITCH, OFF = 11.0, 0.0
 
 
-def test_it_is_switched_on_again_in_flight_and_before_the_next_one(tmp_path: Path) -> None:
+def test_vehicle_fence_is_switched_on_again_in_flight_and_before_next_arming(tmp_path: Path) -> None:
     async def work(sky: Sky, directory: Path) -> None:
         station = Endpoint(255, mavlink.MAV_COMP_ID_MISSIONPLANNER)
 

@@ -37,7 +37,7 @@ WALL = (-40.0, 25.0, 40.0, 40.0)
 # The system's ways
 
 
-def test_the_transit_flies_around_a_wall_there_and_home(tmp_path: Path) -> None:
+def test_transit_and_return_fly_around_exclusion_zone(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=True) as world:
             grant = world.grants.put(partial(zone("wall", "ignore", *WALL), corridor=[]))
@@ -56,7 +56,7 @@ def test_the_transit_flies_around_a_wall_there_and_home(tmp_path: Path) -> None:
     fly(flight)
 
 
-def test_a_zone_that_appears_on_the_way_is_flown_around(tmp_path: Path) -> None:
+def test_transit_replans_around_zone_added_in_flight(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=True) as world:
             grant = world.grants.put(partial())
@@ -71,7 +71,7 @@ def test_a_zone_that_appears_on_the_way_is_flown_around(tmp_path: Path) -> None:
     fly(flight)
 
 
-def test_a_zone_that_demands_the_drone_ends_the_transit(tmp_path: Path) -> None:
+def test_transit_ends_revoked_if_zone_with_revoke_appears_ahead(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(partial())
@@ -89,9 +89,7 @@ def test_a_zone_that_demands_the_drone_ends_the_transit(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("measured", [True, False])
-def test_a_drone_that_speeds_up_toward_a_new_zone_is_stopped_before_it_is_known_that_it_will_enter(
-    tmp_path: Path, measured: bool
-) -> None:
+def test_accelerating_drone_brakes_before_new_zone_without_takeover(tmp_path: Path, measured: bool) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             world.plane.measured = measured
@@ -112,7 +110,7 @@ def test_a_drone_that_speeds_up_toward_a_new_zone_is_stopped_before_it_is_known_
 
 @pytest.mark.parametrize("speed_mps", [2.0, 6.0, 11.0])
 @pytest.mark.parametrize("measured", [True, False])
-def test_a_leg_that_is_shortened_is_flown_to_its_end(tmp_path: Path, speed_mps: float, measured: bool) -> None:
+def test_shortened_leg_is_flown_to_its_corrected_target(tmp_path: Path, speed_mps: float, measured: bool) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             world.plane.measured = measured
@@ -129,7 +127,7 @@ def test_a_leg_that_is_shortened_is_flown_to_its_end(tmp_path: Path, speed_mps: 
     fly(flight)
 
 
-def test_a_driver_that_asks_again_and_again_for_a_way_that_is_refused_keeps_no_drone_in_the_air(tmp_path: Path) -> None:
+def test_repeated_refused_transits_do_not_extend_driver_grace(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(partial(zone("around", "ignore", -20, 50, 20, 90)))
@@ -147,7 +145,7 @@ def test_a_driver_that_asks_again_and_again_for_a_way_that_is_refused_keeps_no_d
     fly(flight)
 
 
-def test_no_way_to_the_control_point_is_told(tmp_path: Path) -> None:
+def test_transit_is_refused_with_policy_name_if_control_point_is_unreachable(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(partial(zone("around", "ignore", -20, 50, 20, 90)))
@@ -160,9 +158,7 @@ def test_no_way_to_the_control_point_is_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("retraces", "mode"), [(True, SMART_RTL), (False, RTL)])
-def test_without_any_legal_way_home_the_drone_comes_home_all_the_same(
-    tmp_path: Path, retraces: bool, mode: FlightMode
-) -> None:
+def test_return_uses_autopilot_mode_if_no_legal_route_exists(tmp_path: Path, retraces: bool, mode: FlightMode) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=retraces) as world:
             grant = world.grants.put(spec())
@@ -179,7 +175,7 @@ def test_without_any_legal_way_home_the_drone_comes_home_all_the_same(
     fly(flight)
 
 
-def test_a_path_that_the_vehicle_forgot_is_not_relied_on(tmp_path: Path) -> None:
+def test_smart_rtl_is_not_assumed_after_vehicle_lost_its_path(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=True) as world:
             assert world.gate.situation().airframe.retraces
@@ -189,7 +185,7 @@ def test_a_path_that_the_vehicle_forgot_is_not_relied_on(tmp_path: Path) -> None
     fly(flight)
 
 
-def test_a_removed_grant_keeps_its_fences_on_the_way_home(tmp_path: Path) -> None:
+def test_return_respects_zones_of_removed_grant(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=True) as world:
             grant = world.grants.put(spec(zone("wall", "ignore", *WALL)))
@@ -204,7 +200,7 @@ def test_a_removed_grant_keeps_its_fences_on_the_way_home(tmp_path: Path) -> Non
     fly(flight)
 
 
-def test_a_lost_driver_is_brought_home_around_the_wall(tmp_path: Path) -> None:
+def test_drone_of_lost_driver_hovers_and_returns_around_zone(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=True) as world:
             grant = world.grants.put(spec(zone("wall", "ignore", *WALL)))
@@ -227,7 +223,7 @@ def test_a_lost_driver_is_brought_home_around_the_wall(tmp_path: Path) -> None:
     fly(flight)
 
 
-def test_a_new_wall_on_the_way_home_is_flown_around(tmp_path: Path) -> None:
+def test_return_replans_around_zone_added_in_flight(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=True) as world:
             grant = world.grants.put(spec(zone("wall", "ignore", *WALL)))
@@ -251,7 +247,7 @@ def test_a_new_wall_on_the_way_home_is_flown_around(tmp_path: Path) -> None:
 # Tours
 
 
-def test_a_tour_visits_its_points_and_comes_home(tmp_path: Path) -> None:
+def test_poi_mission_visits_all_points_and_returns(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=True, boarding_s=30) as world:
             grant = world.grants.put(touring(zone("wall", "ignore", *WALL), tour=((0, 70), (60, 70))))
@@ -269,7 +265,7 @@ def test_a_tour_visits_its_points_and_comes_home(tmp_path: Path) -> None:
     fly(flight)
 
 
-def test_passengers_that_never_call_are_flown_after_boarding(tmp_path: Path) -> None:
+def test_poi_mission_starts_after_boarding_time_without_passenger_call(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path, boarding_s=30) as world:
             world.grants.put(touring(tour=((0, 30),)))
@@ -280,7 +276,7 @@ def test_passengers_that_never_call_are_flown_after_boarding(tmp_path: Path) -> 
     fly(flight)
 
 
-def test_a_pilot_ends_a_tour_and_a_mission_that_ended_is_not_flown_again(tmp_path: Path) -> None:
+def test_poi_mission_ends_after_pilot_takeover_and_is_not_restarted(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             world.grants.put(touring(tour=((0, 100),)))
@@ -300,7 +296,7 @@ def test_a_pilot_ends_a_tour_and_a_mission_that_ended_is_not_flown_again(tmp_pat
     fly(flight)
 
 
-def test_a_point_out_of_reach_ends_the_tour_and_says_why(tmp_path: Path) -> None:
+def test_poi_mission_fails_with_reason_if_point_is_unreachable(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             world.grants.put(touring(tour=((0, 30), (0, 500))))
@@ -312,7 +308,7 @@ def test_a_point_out_of_reach_ends_the_tour_and_says_why(tmp_path: Path) -> None
     fly(flight)
 
 
-def test_a_tour_goes_on_with_the_service_that_follows(tmp_path: Path) -> None:
+def test_poi_mission_resumes_at_next_point_after_service_restart(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             world.grants.put(touring(tour=((0, 40), (0, 80))))
@@ -328,7 +324,7 @@ def test_a_tour_goes_on_with_the_service_that_follows(tmp_path: Path) -> None:
     fly(flight)
 
 
-def test_a_tour_waits_while_a_driver_has_the_drone(tmp_path: Path) -> None:
+def test_poi_mission_waits_until_driver_returns_control(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -348,7 +344,7 @@ def test_a_tour_waits_while_a_driver_has_the_drone(tmp_path: Path) -> None:
 # Turns, and what is not sent any more
 
 
-def test_a_sharp_turn_is_flown_from_standstill(tmp_path: Path) -> None:
+def test_goto_brakes_first_before_sharp_turn_near_zone(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec(zone("no-fly", "ignore", -200, 63, 200, 100)))
@@ -366,7 +362,7 @@ def test_a_sharp_turn_is_flown_from_standstill(tmp_path: Path) -> None:
     fly(flight)
 
 
-def test_a_drone_that_does_not_stop_begins_no_leg(tmp_path: Path) -> None:
+def test_goto_is_refused_if_drone_does_not_stop(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec(zone("no-fly", "ignore", -200, 190, 200, 199)))
@@ -384,7 +380,7 @@ def test_a_drone_that_does_not_stop_begins_no_leg(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("event", ["takeover", "returned", "revoked", "lost"])
-def test_a_command_that_waits_is_not_sent_once_it_is_stale(tmp_path: Path, event: str) -> None:
+def test_pending_command_is_dropped_after_control_is_lost(tmp_path: Path, event: str) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -416,7 +412,7 @@ def test_a_command_that_waits_is_not_sent_once_it_is_stale(tmp_path: Path, event
     fly(flight)
 
 
-def test_a_goto_that_is_sent_again_is_judged_again(tmp_path: Path) -> None:
+def test_resent_goto_is_judged_again(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -433,7 +429,7 @@ def test_a_goto_that_is_sent_again_is_judged_again(tmp_path: Path) -> None:
     fly(flight)
 
 
-def test_a_takeoff_that_is_sent_again_climbs_on_or_is_done(tmp_path: Path) -> None:
+def test_repeated_takeoff_climbs_further_or_completes_without_descending(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             roof = zone("roof", "ignore", -30, -30, 30, 60)
@@ -456,7 +452,7 @@ def test_a_takeoff_that_is_sent_again_climbs_on_or_is_done(tmp_path: Path) -> No
     fly(flight)
 
 
-def test_armed_elsewhere_the_vehicle_does_not_rely_on_its_path(tmp_path: Path) -> None:
+def test_smart_rtl_is_not_used_after_arming_away_from_home(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=True) as world:
             grant = world.grants.put(spec())
@@ -474,7 +470,7 @@ def test_armed_elsewhere_the_vehicle_does_not_rely_on_its_path(tmp_path: Path) -
 # Heading
 
 
-def test_a_leg_with_a_heading_waits_for_the_nose(tmp_path: Path) -> None:
+def test_goto_with_heading_waits_for_yaw(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -488,7 +484,7 @@ def test_a_leg_with_a_heading_waits_for_the_nose(tmp_path: Path) -> None:
     fly(flight)
 
 
-def test_altitudes_are_flown_in_the_datum_they_are_given_in(tmp_path: Path) -> None:
+def test_goto_altitude_is_converted_from_amsl_and_refused_for_unknown_terrain(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -509,7 +505,7 @@ async def _begun(world: World, grant: ActiveGrant, args: GotoArgs) -> None:
 # Arming
 
 
-def test_a_journal_that_fails_in_flight_ends_no_flight(tmp_path: Path) -> None:
+def test_flight_continues_if_journal_write_fails_in_flight(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -529,7 +525,7 @@ def test_a_journal_that_fails_in_flight_ends_no_flight(tmp_path: Path) -> None:
 # A drone without authority
 
 
-def test_a_drone_without_authority_is_taken_by_the_system(tmp_path: Path) -> None:
+def test_system_takes_over_armed_drone_without_authority_after_restart(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             await world.up(world.grants.put(spec()))
@@ -543,7 +539,7 @@ def test_a_drone_without_authority_is_taken_by_the_system(tmp_path: Path) -> Non
     fly(flight)
 
 
-def test_a_planner_that_fails_brings_the_drone_home_straight(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_drone_returns_home_straight_if_planner_raises(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*_: object, **__: object) -> None:
         raise ZeroDivisionError
 

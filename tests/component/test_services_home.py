@@ -66,9 +66,7 @@ def said(world: World) -> list[dict[str, Any]]:
 
 
 @pytest.mark.parametrize("where", [AWAY, UP, DOWN])
-def test_home_that_is_moved_in_flight_is_set_back_before_the_drone_flies_on(
-    tmp_path: Path, where: tuple[float, float, float]
-) -> None:
+def test_moved_home_is_restored_before_flight_continues(tmp_path: Path, where: tuple[float, float, float]) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world, flying(world, CEILING) as grant:
             leg = asyncio.ensure_future(refusal(world.service.goto(grant, GotoArgs(*at(0, 90), 12.0), 0)))
@@ -91,7 +89,7 @@ def test_home_that_is_moved_in_flight_is_set_back_before_the_drone_flies_on(
     fly(flight)
 
 
-def test_the_way_home_leads_to_where_home_was_fixed(tmp_path: Path) -> None:
+def test_return_leads_to_original_home_after_home_was_moved(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world, flying(world) as grant:
             await end(world.service.goto(grant, GotoArgs(*at(0, 90), 12.0), 0))
@@ -105,7 +103,7 @@ def test_the_way_home_leads_to_where_home_was_fixed(tmp_path: Path) -> None:
     fly(flight)
 
 
-def test_a_home_that_cannot_be_set_back_ends_the_flight(tmp_path: Path) -> None:
+def test_mission_ends_if_moved_home_cannot_be_restored(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world, flying(world):
             world.plane.refuses.add(mavlink.MAV_CMD_DO_SET_HOME)
@@ -118,7 +116,7 @@ def test_a_home_that_cannot_be_set_back_ends_the_flight(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("refused", [True, False])
-def test_a_home_that_does_not_stay_set_back_keeps_no_drone_in_the_air(tmp_path: Path, refused: bool) -> None:
+def test_drone_lands_at_original_home_if_home_keeps_moving(tmp_path: Path, refused: bool) -> None:
     """Refused by the autopilot, or moved again and again: where the path is read_known_vehicle, it leads to where the mission armed."""
 
     async def again_and_again(world: World) -> None:
@@ -141,7 +139,7 @@ def test_a_home_that_does_not_stay_set_back_keeps_no_drone_in_the_air(tmp_path: 
     fly(flight)
 
 
-def test_a_pilot_may_move_home_and_who_hands_the_drone_back_finds_it_where_it_was(tmp_path: Path) -> None:
+def test_home_moved_by_pilot_is_restored_after_handback(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world, flying(world) as grant:
             await end(world.service.goto(grant, GotoArgs(*at(0, 50), 12.0), 0))
@@ -160,7 +158,7 @@ def test_a_pilot_may_move_home_and_who_hands_the_drone_back_finds_it_where_it_wa
     fly(flight)
 
 
-def test_no_picture_is_judged_by_a_height_above_a_home_that_was_moved_while_a_pilot_flies(tmp_path: Path) -> None:
+def test_camera_position_is_unknown_while_home_is_moved_in_pilot_flight(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             world.grants.put(spec())
@@ -193,7 +191,7 @@ def heartbeat(world: World, *, armed: bool) -> None:
     world.observer.heartbeat()
 
 
-def test_heights_count_from_where_a_pilot_armed_also_when_the_first_home_was_lost(tmp_path: Path) -> None:
+def test_pilot_flight_fixes_home_from_first_message_after_arming(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             plane = world.plane
@@ -213,7 +211,7 @@ def test_heights_count_from_where_a_pilot_armed_also_when_the_first_home_was_los
     fly(flight)
 
 
-def test_a_pilots_flight_from_where_a_mission_landed_counts_from_there(tmp_path: Path) -> None:
+def test_pilot_flight_after_landed_mission_uses_new_home(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world, flying(world) as grant:
             plane = world.plane
@@ -235,7 +233,7 @@ def test_a_pilots_flight_from_where_a_mission_landed_counts_from_there(tmp_path:
     fly(flight)
 
 
-def test_an_attempt_to_arm_that_came_to_nothing_leaves_no_home_behind(tmp_path: Path) -> None:
+def test_failed_arming_does_not_fix_home(tmp_path: Path) -> None:
     """Refused beside iron, the drone is carried to a better place, and its estimate of its height has settled meanwhile."""
 
     async def flight() -> None:
@@ -265,7 +263,7 @@ def test_an_attempt_to_arm_that_came_to_nothing_leaves_no_home_behind(tmp_path: 
 
 
 @pytest.mark.parametrize("up_m", [-40.0, 40.0])
-def test_home_that_is_moved_up_or_down_is_noticed_though_the_news_of_it_is_lost(
+def test_vertical_home_move_is_detected_without_home_position_message(
     up_m: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Another station on the same port has stopped the stream that tells of home, and the one message about its move is lost."""
@@ -305,7 +303,7 @@ def test_home_that_is_moved_up_or_down_is_noticed_though_the_news_of_it_is_lost(
     sky_drone.fly(work, tmp_path)
 
 
-async def test_home_that_is_not_told_is_asked_for_a_few_times_a_second() -> None:
+async def test_home_position_request_is_rate_limited_after_refusal() -> None:
     """A refusal comes at once."""
 
     class Refusing:

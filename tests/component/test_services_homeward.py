@@ -44,7 +44,7 @@ async def beyond_the_wall(world: World) -> None:
     await world.control.return_control(grant)
 
 
-def test_a_driver_turns_home_from_standstill(tmp_path: Path) -> None:
+def test_return_to_launch_begins_after_drone_stopped(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -68,7 +68,7 @@ def test_a_driver_turns_home_from_standstill(tmp_path: Path) -> None:
     fly(flight)
 
 
-def test_a_drone_that_finds_no_rest_flies_home_all_the_same(tmp_path: Path) -> None:
+def test_return_to_launch_proceeds_if_gusts_prevent_standstill(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -85,7 +85,7 @@ def test_a_drone_that_finds_no_rest_flies_home_all_the_same(tmp_path: Path) -> N
     fly(flight)
 
 
-def test_one_refused_command_leads_through_no_zone(tmp_path: Path) -> None:
+def test_return_avoids_zone_after_one_refused_command(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=True) as world:
             plane = world.plane
@@ -102,7 +102,7 @@ def test_one_refused_command_leads_through_no_zone(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("remembers", "mode"), [(True, SMART_RTL), (False, RTL)])
-def test_an_autopilot_that_refuses_again_and_again_brings_the_drone_home_itself(
+def test_return_is_left_to_autopilot_after_three_refused_commands(
     tmp_path: Path, remembers: bool, mode: FlightMode
 ) -> None:
     async def flight() -> None:
@@ -129,7 +129,7 @@ def test_an_autopilot_that_refuses_again_and_again_brings_the_drone_home_itself(
 
 
 @pytest.mark.parametrize("how", ["returned", "grace", "removed", "refused", "unused"])
-def test_no_fence_outlives_its_mission(tmp_path: Path, how: str) -> None:
+def test_fence_is_lowered_after_mission_ends(tmp_path: Path, how: str) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -161,7 +161,7 @@ def test_no_fence_outlives_its_mission(tmp_path: Path, how: str) -> None:
     fly(flight)
 
 
-def test_a_fence_is_not_lowered_under_who_arms(tmp_path: Path) -> None:
+def test_fence_is_not_lowered_during_arming(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -179,7 +179,7 @@ def test_a_fence_is_not_lowered_under_who_arms(tmp_path: Path) -> None:
     fly(flight)
 
 
-def test_the_way_home_is_judged_below_the_fence_of_the_mission(tmp_path: Path) -> None:
+def test_return_altitude_is_capped_below_fence(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -191,7 +191,7 @@ def test_the_way_home_is_judged_below_the_fence_of_the_mission(tmp_path: Path) -
     fly(flight)
 
 
-def test_failsafes_are_set_again_when_a_message_was_lost(tmp_path: Path) -> None:
+def test_failsafe_setup_is_retried_after_missing_parameter(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             control, plane = world.control, world.plane
@@ -210,7 +210,7 @@ def test_failsafes_are_set_again_when_a_message_was_lost(tmp_path: Path) -> None
     fly(flight)
 
 
-def test_failsafes_are_set_again_when_setting_them_broke(tmp_path: Path) -> None:
+def test_failsafe_setup_is_retried_after_exception(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             control, plane = world.control, world.plane
@@ -231,7 +231,9 @@ def test_failsafes_are_set_again_when_setting_them_broke(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("who", ["tour", "driver"])
-def test_a_fault_of_ours_ends_the_mission_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, who: str) -> None:
+def test_internal_error_ends_mission_without_arming_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, who: str
+) -> None:
     def broken(*_: object, **__: object) -> None:
         raise ZeroDivisionError
 
@@ -256,7 +258,7 @@ SLOW = {"maxAltitude": 60, "maxSpeed": 4}
 
 
 @pytest.mark.parametrize("who", ["driver", "failsafe", "system"])
-def test_what_appears_on_the_way_home_is_flown_around_as_fast_as_allowed(tmp_path: Path, who: str) -> None:
+def test_return_avoids_new_zone_within_speed_limit(tmp_path: Path, who: str) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             plane = world.plane
@@ -291,7 +293,7 @@ def test_what_appears_on_the_way_home_is_flown_around_as_fast_as_allowed(tmp_pat
     fly(flight)
 
 
-def test_what_appears_before_a_pilot_who_chose_to_return_is_told_and_left(
+def test_pilot_rtl_toward_new_zone_is_reported_without_takeover(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def flight() -> None:
@@ -316,7 +318,7 @@ def test_what_appears_before_a_pilot_who_chose_to_return_is_told_and_left(
 
 
 @pytest.mark.parametrize("failsafe", [False, True])
-def test_a_return_that_a_new_service_finds_is_left_unless_a_failsafe_began_it(tmp_path: Path, failsafe: bool) -> None:
+def test_restarted_service_takes_over_only_failsafe_return(tmp_path: Path, failsafe: bool) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             plane = world.plane
@@ -343,7 +345,7 @@ def test_a_return_that_a_new_service_finds_is_left_unless_a_failsafe_began_it(tm
 
 @pytest.mark.parametrize("who", ["driver", "system"])
 @pytest.mark.parametrize("low", [12.0, 5.0])
-def test_the_way_home_keeps_limits_of_height_and_speed(tmp_path: Path, who: str, low: float) -> None:
+def test_return_keeps_altitude_and_speed_limits(tmp_path: Path, who: str, low: float) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             plane = world.plane
@@ -375,7 +377,7 @@ def test_the_way_home_keeps_limits_of_height_and_speed(tmp_path: Path, who: str,
 
 
 @pytest.mark.parametrize("code", ["AltitudeAboveLimit", "SpeedAboveLimit"])
-def test_a_failsafe_that_breaks_a_limit_is_relieved(tmp_path: Path, code: str) -> None:
+def test_failsafe_return_above_limit_is_replaced_by_landing(tmp_path: Path, code: str) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             plane = world.plane
@@ -396,7 +398,7 @@ def test_a_failsafe_that_breaks_a_limit_is_relieved(tmp_path: Path, code: str) -
 
 
 @pytest.mark.parametrize("upper", [10.0, 40.0])
-def test_a_takeover_that_lands_does_not_come_down_into_the_zone_below(tmp_path: Path, upper: float) -> None:
+def test_landing_takeover_flies_home_if_zone_is_below(tmp_path: Path, upper: float) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -420,7 +422,7 @@ async def refusal_of(world: World, leg: GotoArgs) -> None:
         await end(world.service.goto(grant, leg, 0))
 
 
-def test_what_is_the_last_line_already_is_not_ended(tmp_path: Path) -> None:
+def test_rtl_without_legal_route_is_not_interrupted_by_monitor(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             plane = world.plane
@@ -437,7 +439,7 @@ def test_what_is_the_last_line_already_is_not_ended(tmp_path: Path) -> None:
     fly(flight)
 
 
-def test_a_driver_that_flies_on_is_kept_from_zones_by_the_same_grant(tmp_path: Path) -> None:
+def test_monitor_stops_failsafe_return_into_zone_after_earlier_return_was_given_up(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=True) as world:
             plane = world.plane
@@ -457,7 +459,7 @@ def test_a_driver_that_flies_on_is_kept_from_zones_by_the_same_grant(tmp_path: P
     fly(flight)
 
 
-def test_a_failsafe_that_lands_is_not_sent_elsewhere(tmp_path: Path) -> None:
+def test_failsafe_landing_into_zone_is_not_redirected(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             plane = world.plane
@@ -476,7 +478,7 @@ def test_a_failsafe_that_lands_is_not_sent_elsewhere(tmp_path: Path) -> None:
     fly(flight)
 
 
-def test_an_autopilot_that_lands_by_itself_breaks_no_lower_limit(tmp_path: Path) -> None:
+def test_landing_does_not_violate_minimum_altitude(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             low = {"type": "LimitControl", "kind": "altitude", "lowerLimit": 5.0}
@@ -498,7 +500,7 @@ def changes(world: World, name: str, value: float, *, told: bool = True) -> None
 
 
 @pytest.mark.parametrize("told", [True, False])
-def test_a_failsafe_that_is_changed_in_flight_is_set_back(tmp_path: Path, told: bool) -> None:
+def test_failsafe_parameter_changed_in_flight_is_restored(tmp_path: Path, told: bool) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             world.observer.found()
@@ -513,7 +515,7 @@ def test_a_failsafe_that_is_changed_in_flight_is_set_back(tmp_path: Path, told: 
     fly(flight)
 
 
-def test_how_the_vehicle_moves_is_heard_at_once(tmp_path: Path) -> None:
+def test_changed_acceleration_parameter_is_applied_in_flight(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             world.observer.found()
@@ -530,7 +532,7 @@ def test_how_the_vehicle_moves_is_heard_at_once(tmp_path: Path) -> None:
     fly(flight)
 
 
-def test_a_failsafe_that_cannot_be_set_back_ends_the_flight(tmp_path: Path) -> None:
+def test_mission_ends_if_failsafe_parameter_cannot_be_restored(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             world.observer.found()
@@ -546,7 +548,7 @@ def test_a_failsafe_that_cannot_be_set_back_ends_the_flight(tmp_path: Path) -> N
     fly(flight)
 
 
-def test_what_is_changed_on_the_ground_is_verified_before_anything_arms(tmp_path: Path) -> None:
+def test_parameter_changed_on_ground_is_verified_before_arming(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             world.observer.found()
@@ -563,7 +565,7 @@ def test_what_is_changed_on_the_ground_is_verified_before_anything_arms(tmp_path
     fly(flight)
 
 
-def test_what_appears_above_a_climbing_drone_is_not_climbed_into(tmp_path: Path) -> None:
+def test_takeoff_stops_below_zone_added_above(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -581,7 +583,7 @@ def test_what_appears_above_a_climbing_drone_is_not_climbed_into(tmp_path: Path)
     fly(flight)
 
 
-def test_it_flies_home_below_a_zone_that_appears_close_overhead(tmp_path: Path) -> None:
+def test_return_stays_below_zone_added_close_overhead(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -602,7 +604,7 @@ def test_it_flies_home_below_a_zone_that_appears_close_overhead(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("how", ["schedule", "validity"])
-def test_a_leg_into_a_zone_that_begins_is_stopped_at_once(tmp_path: Path, how: str) -> None:
+def test_goto_stops_when_scheduled_zone_becomes_active_on_leg(tmp_path: Path, how: str) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             began = datetime.fromtimestamp(world.gate.situation().time_s + 25.0, UTC)

@@ -44,7 +44,7 @@ async def fastest(world: World, motion: Any) -> float:
 # Speeds
 
 
-def test_a_leg_is_flown_with_its_speed_whatever_was_flown_before(tmp_path: Path) -> None:
+def test_goto_uses_its_own_speed_regardless_of_previous_motion(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -61,7 +61,7 @@ def test_a_leg_is_flown_with_its_speed_whatever_was_flown_before(tmp_path: Path)
     fly(flight)
 
 
-def test_the_system_keeps_to_speed_limits(tmp_path: Path) -> None:
+def test_transit_keeps_speed_limit(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(partial(limit("speed", 3.0)))
@@ -76,7 +76,7 @@ def test_the_system_keeps_to_speed_limits(tmp_path: Path) -> None:
     fly(flight)
 
 
-def test_a_speed_that_is_corrected_holds_when_the_leg_is_sent_again(tmp_path: Path) -> None:
+def test_corrected_speed_holds_when_leg_is_resent(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -108,9 +108,7 @@ def slow_zone() -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("asked_mps", [None, 3.0])
-def test_a_change_of_speed_keeps_to_what_the_leg_under_way_may_be_flown_with(
-    tmp_path: Path, asked_mps: float | None
-) -> None:
+def test_set_speed_is_limited_by_current_leg(tmp_path: Path, asked_mps: float | None) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec(slow_zone()))
@@ -133,7 +131,7 @@ def test_a_change_of_speed_keeps_to_what_the_leg_under_way_may_be_flown_with(
     fly(flight)
 
 
-def test_a_leg_under_way_is_flown_faster_where_that_is_legal(tmp_path: Path) -> None:
+def test_set_speed_accelerates_current_leg_if_legal(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec(slow_zone()))
@@ -147,7 +145,7 @@ def test_a_leg_under_way_is_flown_faster_where_that_is_legal(tmp_path: Path) -> 
     fly(flight)
 
 
-def test_a_leg_that_cannot_be_judged_faster_gets_no_faster(tmp_path: Path) -> None:
+def test_set_speed_keeps_current_speed_if_leg_would_be_denied(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -162,7 +160,7 @@ def test_a_leg_that_cannot_be_judged_faster_gets_no_faster(tmp_path: Path) -> No
     fly(flight)
 
 
-def test_the_next_driver_does_not_inherit_a_speed(tmp_path: Path) -> None:
+def test_speed_setpoint_is_not_inherited_by_next_driver(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -179,9 +177,7 @@ def test_the_next_driver_does_not_inherit_a_speed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("driven_mps", "limited"), [(0.3, False), (12.0, False), (12.0, True)])
-def test_the_system_flies_home_at_the_speed_of_the_vehicle_within_limits(
-    tmp_path: Path, driven_mps: float, limited: bool
-) -> None:
+def test_return_uses_vehicle_speed_within_limits(tmp_path: Path, driven_mps: float, limited: bool) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=True) as world:
             wall = zone("wall", "ignore", *WALL)
@@ -206,7 +202,7 @@ def test_the_system_flies_home_at_the_speed_of_the_vehicle_within_limits(
     fly(flight)
 
 
-def test_a_driver_that_comes_back_has_its_speed_again(tmp_path: Path) -> None:
+def test_speed_setpoint_is_restored_when_driver_reconnects(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -221,7 +217,7 @@ def test_a_driver_that_comes_back_has_its_speed_again(tmp_path: Path) -> None:
     fly(flight)
 
 
-def test_the_monitor_leads_a_slow_driver_back_at_the_speed_of_the_vehicle(tmp_path: Path) -> None:
+def test_altitude_correction_uses_vehicle_speed_instead_of_driver_speed(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -238,7 +234,7 @@ def test_the_monitor_leads_a_slow_driver_back_at_the_speed_of_the_vehicle(tmp_pa
     fly(flight)
 
 
-def test_a_correction_that_came_too_late_for_its_motion_is_made_for_the_next(tmp_path: Path) -> None:
+def test_late_speed_correction_applies_to_next_motion(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -256,7 +252,7 @@ def test_a_correction_that_came_too_late_for_its_motion_is_made_for_the_next(tmp
     fly(flight)
 
 
-def test_a_leg_that_begins_too_fast_is_not_told_to_fly_faster_than_it_may(tmp_path: Path) -> None:
+def test_speed_correction_does_not_raise_requested_speed(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -275,7 +271,7 @@ def test_a_leg_that_begins_too_fast_is_not_told_to_fly_faster_than_it_may(tmp_pa
     fly(flight)
 
 
-def test_a_correction_that_a_pilot_came_before_is_not_made(tmp_path: Path) -> None:
+def test_correction_is_dropped_after_pilot_takeover(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -294,7 +290,7 @@ def test_a_correction_that_a_pilot_came_before_is_not_made(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("what", ["course", "launch"])
-def test_what_the_system_may_not_fly_ends_no_motion(tmp_path: Path, what: str) -> None:
+def test_refused_system_flight_leaves_current_motion_running(tmp_path: Path, what: str) -> None:
     def forbidden(_motion: object) -> Any:
         def check() -> None:
             raise PreconditionFailed("ControlLost", "the driver is gone")
@@ -324,7 +320,7 @@ def test_what_the_system_may_not_fly_ends_no_motion(tmp_path: Path, what: str) -
 # Commands that are lost
 
 
-def test_a_goto_whose_command_was_lost_is_judged_where_the_drone_is_by_then(tmp_path: Path) -> None:
+def test_goto_is_judged_again_at_current_position_after_lost_command(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             plane = world.plane
@@ -353,7 +349,7 @@ def test_a_goto_whose_command_was_lost_is_judged_where_the_drone_is_by_then(tmp_
 
 
 @pytest.mark.parametrize(("lost", "arrives"), [(3, True), (100, False)])
-def test_a_leg_whose_speed_is_lost_is_stopped_and_begun_once_more(tmp_path: Path, lost: int, arrives: bool) -> None:
+def test_goto_stops_and_restarts_once_after_lost_speed_command(tmp_path: Path, lost: int, arrives: bool) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             plane = world.plane
@@ -390,7 +386,7 @@ def test_a_leg_whose_speed_is_lost_is_stopped_and_begun_once_more(tmp_path: Path
 
 
 @pytest.mark.parametrize("target", [(0.0, 20.0), (40.0, 30.0)])
-def test_what_is_permitted_while_the_drone_brakes_before_a_new_zone_is_flown(
+def test_permitted_goto_is_flown_while_drone_brakes_before_new_zone(
     tmp_path: Path, target: tuple[float, float]
 ) -> None:
     async def flight() -> None:
@@ -413,7 +409,7 @@ def test_what_is_permitted_while_the_drone_brakes_before_a_new_zone_is_flown(
     fly(flight)
 
 
-def test_a_correction_is_not_undone_by_the_motion_that_it_ends(tmp_path: Path) -> None:
+def test_altitude_correction_is_not_stopped_by_replaced_motion(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -445,7 +441,7 @@ async def homeward(world: World) -> bool:
     return world.plane.velocity[0] > 0
 
 
-def test_the_way_home_stays_inside_an_inclusion_zone_that_shrinks(tmp_path: Path) -> None:
+def test_return_stays_inside_shrunk_inclusion_zone(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=True) as world:
             side = 1 if await homeward(world) else -1
@@ -465,7 +461,7 @@ def test_the_way_home_stays_inside_an_inclusion_zone_that_shrinks(tmp_path: Path
     fly(flight)
 
 
-def test_a_drone_that_loses_its_position_on_the_way_home_flies_on_no_further(tmp_path: Path) -> None:
+def test_return_brakes_if_position_is_lost(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=True) as world:
             await homeward(world)
@@ -501,9 +497,7 @@ def changed(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
     return told
 
 
-def test_a_way_that_was_judged_by_an_earlier_grant_is_looked_at_with_other_eyes(
-    tmp_path: Path, changed: list[bool]
-) -> None:
+def test_monitor_flags_fences_changed_until_drone_rests(tmp_path: Path, changed: list[bool]) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -526,9 +520,7 @@ def test_a_way_that_was_judged_by_an_earlier_grant_is_looked_at_with_other_eyes(
     fly(flight)
 
 
-def test_a_goto_that_counts_as_complete_at_once_has_still_been_judged_before(
-    tmp_path: Path, changed: list[bool]
-) -> None:
+def test_monitor_flags_fences_changed_after_immediately_completed_goto(tmp_path: Path, changed: list[bool]) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -542,7 +534,7 @@ def test_a_goto_that_counts_as_complete_at_once_has_still_been_judged_before(
     fly(flight)
 
 
-def test_a_takeoff_whose_acknowledgement_is_lost_goes_on(tmp_path: Path) -> None:
+def test_takeoff_continues_after_lost_acknowledgement(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -583,7 +575,7 @@ async def cut(world: World, seconds: float, *, frozen: bool = False) -> None:
 
 
 @pytest.mark.parametrize(("seconds", "frozen"), [(1.5, False), (3.0, False), (4.5, False), (5.0, True)])
-def test_a_driver_flies_on_after_a_short_cut_of_the_link(tmp_path: Path, seconds: float, frozen: bool) -> None:
+def test_driver_keeps_control_after_short_link_outage(tmp_path: Path, seconds: float, frozen: bool) -> None:
     async def flight() -> None:
         async with World(tmp_path, grace_s=10.0) as world:
             grant = world.grants.put(spec())
@@ -608,7 +600,7 @@ def test_a_driver_flies_on_after_a_short_cut_of_the_link(tmp_path: Path, seconds
     fly(flight)
 
 
-def test_a_cut_that_outlasts_the_grace_ends_the_mission(tmp_path: Path) -> None:
+def test_mission_ends_if_link_outage_outlasts_grace(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path, grace_s=5.0) as world:
             grant = world.grants.put(spec())
@@ -625,7 +617,7 @@ def test_a_cut_that_outlasts_the_grace_ends_the_mission(tmp_path: Path) -> None:
     fly(flight)
 
 
-def test_nothing_flies_while_the_link_is_too_slow(tmp_path: Path) -> None:
+def test_motions_are_unavailable_while_link_is_too_slow(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path, grace_s=15.0) as world:
             grant = world.grants.put(spec())
@@ -643,7 +635,7 @@ def test_nothing_flies_while_the_link_is_too_slow(tmp_path: Path) -> None:
     fly(flight)
 
 
-def test_a_slow_link_lets_no_one_arm(tmp_path: Path) -> None:
+def test_arming_is_not_ready_with_slow_link(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             world.plane.uplink_s = world.plane.downlink_s = 0.7

@@ -54,9 +54,7 @@ def heard_first(sky: Sky, *frames: bytes) -> None:
 
 
 @pytest.mark.parametrize("stranger", [GIMBAL, TRACKER, OTHER], ids=["gimbal", "tracker", "other"])
-def test_in_flight_no_one_else_takes_the_place_of_the_autopilot_whose_link_broke(
-    stranger: bytes, tmp_path: Path
-) -> None:
+def test_reconnected_link_ignores_heartbeats_of_foreign_components_in_flight(stranger: bytes, tmp_path: Path) -> None:
     async def work(sky: Sky, directory: Path) -> None:
         async with ready(sky, directory) as (drone, grant):
             await drone.service.arm(grant, 120.0)
@@ -76,7 +74,7 @@ def test_in_flight_no_one_else_takes_the_place_of_the_autopilot_whose_link_broke
     fly(work, tmp_path)
 
 
-def test_nothing_arms_while_two_vehicles_are_heard(tmp_path: Path) -> None:
+def test_arming_is_refused_while_two_vehicles_are_on_the_link(tmp_path: Path) -> None:
     async def work(sky: Sky, directory: Path) -> None:
         async with ready(sky, directory) as (drone, grant):
             assert not drone.autopilot.vehicle.unready(drone.autopilot.now)
@@ -98,7 +96,7 @@ def test_nothing_arms_while_two_vehicles_are_heard(tmp_path: Path) -> None:
     fly(work, tmp_path)
 
 
-def test_what_another_station_is_answered_acknowledges_no_command_of_ours(tmp_path: Path) -> None:
+def test_command_is_resent_if_acknowledgement_belongs_to_another_station(tmp_path: Path) -> None:
     async def work(sky: Sky, directory: Path) -> None:
         async with ready(sky, directory) as (drone, _):
             (wire,) = sky.wires
@@ -149,7 +147,9 @@ def told_to(sky: Sky, system: int) -> list[str]:
 
 
 @pytest.mark.parametrize("stranger", [OTHER, FLYING], ids=["standing", "flying"])
-def test_a_service_that_starts_again_leaves_a_stranger_alone_and_finds_its_own(stranger: bytes, tmp_path: Path) -> None:
+def test_restarted_service_selects_known_vehicle_and_sends_nothing_to_foreign_vehicle(
+    stranger: bytes, tmp_path: Path
+) -> None:
     async def work(sky: Sky, directory: Path) -> None:
         turning = asyncio.ensure_future(sky.turn())
 
@@ -177,7 +177,7 @@ def test_a_service_that_starts_again_leaves_a_stranger_alone_and_finds_its_own(s
     fly(work, tmp_path)
 
 
-def test_a_stranger_on_a_new_link_is_neither_prepared_nor_brought_home(tmp_path: Path) -> None:
+def test_unknown_armed_vehicle_receives_no_commands(tmp_path: Path) -> None:
     async def work(sky: Sky, directory: Path) -> None:
         sky.craft.receive = lambda *_: None  # type: ignore[method-assign]
         told = told_to(sky, 2)

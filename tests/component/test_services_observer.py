@@ -28,7 +28,7 @@ def taken_over(world: World) -> list[dict[str, Any]]:
 
 
 @pytest.mark.parametrize("link", [False, True])
-def test_a_full_disk_hides_no_other_loss_of_the_last_line(tmp_path: Path, link: bool) -> None:
+def test_changed_fence_ends_mission_although_return_limit_check_fails(tmp_path: Path, link: bool) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             world.observer.found()
@@ -53,7 +53,7 @@ def test_a_full_disk_hides_no_other_loss_of_the_last_line(tmp_path: Path, link: 
     fly(flight)
 
 
-def test_a_way_home_that_cannot_be_limited_any_more_is_flown_by_the_system(tmp_path: Path) -> None:
+def test_system_returns_drone_if_rtl_limits_cannot_be_applied(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             world.observer.found()
@@ -69,7 +69,7 @@ def test_a_way_home_that_cannot_be_limited_any_more_is_flown_by_the_system(tmp_p
     fly(flight)
 
 
-def test_a_vehicle_that_tells_no_parameters_in_flight_comes_home(tmp_path: Path) -> None:
+def test_drone_returns_home_if_parameters_stay_unverified(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             world.observer.found()
@@ -85,7 +85,7 @@ def test_a_vehicle_that_tells_no_parameters_in_flight_comes_home(tmp_path: Path)
     fly(flight)
 
 
-def test_parameters_that_answer_again_in_time_change_nothing(tmp_path: Path) -> None:
+def test_short_parameter_outages_do_not_end_mission(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             world.observer.found()

@@ -22,7 +22,7 @@ from sky_drone import fly, ready, until
 
 
 @pytest.mark.parametrize("mode", [mavlink.COPTER_MODE_LOITER, mavlink.COPTER_MODE_GUIDED])
-def test_a_driver_does_not_fly_what_others_have_armed(mode: int, tmp_path: Path) -> None:
+def test_drone_armed_by_another_station_belongs_to_pilot(mode: int, tmp_path: Path) -> None:
     async def work(sky: Sky, directory: Path) -> None:
         station = Endpoint(255, mavlink.MAV_COMP_ID_MISSIONPLANNER)
 
@@ -50,7 +50,7 @@ def test_a_driver_does_not_fly_what_others_have_armed(mode: int, tmp_path: Path)
     fly(work, tmp_path)
 
 
-def test_motors_whose_start_the_broken_link_did_not_confirm_are_the_drivers(tmp_path: Path) -> None:
+def test_driver_keeps_control_if_link_breaks_before_arming_is_confirmed(tmp_path: Path) -> None:
     """The autopilot obeys, the link is cut at that moment, and the heartbeat that shows running motors comes seconds later."""
 
     async def work(sky: Sky, directory: Path) -> None:
@@ -84,7 +84,7 @@ def test_motors_whose_start_the_broken_link_did_not_confirm_are_the_drivers(tmp_
 
 
 @pytest.mark.parametrize("mode", [GUIDED, RTL])
-def test_what_others_have_armed_is_theirs_also_after_a_restart_of_the_service(mode: FlightMode, tmp_path: Path) -> None:
+def test_drone_armed_by_others_stays_with_pilot_after_service_restart(mode: FlightMode, tmp_path: Path) -> None:
     async def work() -> None:
         async with World(tmp_path) as world:
             world.grants.put(spec())
@@ -106,7 +106,7 @@ def test_what_others_have_armed_is_theirs_also_after_a_restart_of_the_service(mo
     virtual_time.fly(work)
 
 
-def test_motors_that_others_start_just_after_the_driver_did_are_theirs(tmp_path: Path) -> None:
+def test_rearmed_motors_belong_to_pilot_after_confirmed_disarm(tmp_path: Path) -> None:
     """The start was answered, and then the motors stopped again: no answer is missing any more."""
 
     async def work() -> None:

@@ -33,7 +33,7 @@ def lose_mode_changes(wire: Wire, count: int, monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.parametrize("after_s", [0.1, 0.5, 1.0])
-def test_a_pilot_who_takes_over_while_the_system_changes_the_mode_keeps_the_drone(
+def test_pilot_keeps_control_when_taking_over_during_system_mode_change(
     after_s: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The first commands to land are lost: those that follow would come after the pilot's, and the system's would count."""

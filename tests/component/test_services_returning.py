@@ -28,7 +28,7 @@ def held(world: World) -> dict[str, float]:
     return {name: world.plane.parameters[name] for name in OWNED}
 
 
-def test_the_strictest_limit_between_home_and_the_operation_area_counts() -> None:
+def test_return_bounds_use_strictest_limit_between_home_and_operation_area() -> None:
     everywhere = compiled(altitude(upperLimit=30), speed(upperLimit=10))
     assert return_bounds(at(), everywhere) == ReturnBounds(30.0, 10.0)
     near, far = box(20, 20, 40, 40), box(5000, 5000, 5100, 5100)
@@ -41,7 +41,7 @@ def test_the_strictest_limit_between_home_and_the_operation_area_counts() -> Non
     assert return_bounds(at(), compiled(limits=None)) == ReturnBounds()
 
 
-def test_a_limit_of_unknown_datum_lets_the_autopilot_climb_nowhere_and_leaves_the_others_as_they_are() -> None:
+def test_return_bounds_forbid_climb_if_limit_datum_is_unknown() -> None:
     above_terrain = {"altitudeReference": "terrain"}
     unknown = altitude("terrain", upperLimit=30, **above_terrain)
     assert return_bounds(at(), compiled(unknown, limits=None)).height_m == 0.0
@@ -57,7 +57,7 @@ def test_a_limit_of_unknown_datum_lets_the_autopilot_climb_nowhere_and_leaves_th
     assert return_altitudes_m(at(alt=10, airframe=Airframe(return_altitude_m=40)), limited, 100.0)[0] == 20.0
 
 
-def test_heights_just_below_zones_overhead_are_the_last_to_be_tried() -> None:
+def test_return_altitudes_end_with_heights_below_overhead_zones() -> None:
     now = at(50, 0, alt=33, airframe=Airframe(return_altitude_m=40))
     zones = [exclusion(box(*where), name=name, lower=low) for name, low, where in (
         ("above", 35, (20, -20, 80, 20)), ("lower", 20, (0, -5, 10, 5)), ("ground", 12, (0, 5, 10, 15)),
@@ -80,14 +80,14 @@ def test_heights_just_below_zones_overhead_are_the_last_to_be_tried() -> None:
         ({}, ReturnBounds(12.0, 3.5), {}),
     ],
 )  # fmt: skip
-def test_parameters_follow_from_bounds(
+def test_rtl_parameters_follow_from_return_bounds(
     owned: dict[str, float], bounds: ReturnBounds, expected: dict[str, float]
 ) -> None:
     assert ARDUCOPTER.return_values(owned, bounds) == expected
 
 
 @pytest.mark.parametrize("restarted", [False, True])
-def test_it_is_limited_while_a_mission_lasts(tmp_path: Path, restarted: bool) -> None:
+def test_rtl_limits_are_applied_during_mission_and_restored_after(tmp_path: Path, restarted: bool) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             world.plane.parameters |= OWNED
@@ -129,9 +129,7 @@ HELD = {
 
 
 @pytest.mark.parametrize("restarted", [False, True])
-def test_what_a_mission_needs_otherwise_holds_while_it_lasts_and_is_the_owners_before_and_after(
-    tmp_path: Path, restarted: bool
-) -> None:
+def test_mission_parameters_are_held_during_mission_and_restored_after(tmp_path: Path, restarted: bool) -> None:
     def found(world: World) -> dict[str, float]:
         return {name: world.plane.parameters[name] for name in FLOWN}
 
@@ -161,7 +159,7 @@ def test_what_a_mission_needs_otherwise_holds_while_it_lasts_and_is_the_owners_b
 
 
 @pytest.mark.parametrize("name", FLOWN)
-def test_nothing_arms_where_it_cannot_be_set(tmp_path: Path, name: str) -> None:
+def test_arming_is_refused_if_mission_parameter_cannot_be_set(tmp_path: Path, name: str) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             world.plane.parameters |= FLOWN
@@ -176,7 +174,7 @@ def test_nothing_arms_where_it_cannot_be_set(tmp_path: Path, name: str) -> None:
     fly(flight)
 
 
-def test_it_is_put_back_although_the_fence_is_not(tmp_path: Path) -> None:
+def test_rtl_parameters_are_restored_if_fence_cannot_be_lowered(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             world.plane.parameters |= OWNED
@@ -195,7 +193,7 @@ def test_it_is_put_back_although_the_fence_is_not(tmp_path: Path) -> None:
     fly(flight)
 
 
-def test_it_follows_the_limits_in_flight_and_legs_keep_their_speed(tmp_path: Path) -> None:
+def test_rtl_limits_follow_grant_changes_in_flight(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             world.plane.parameters |= OWNED
@@ -216,7 +214,7 @@ def test_it_follows_the_limits_in_flight_and_legs_keep_their_speed(tmp_path: Pat
     fly(flight)
 
 
-def test_what_cannot_be_limited_does_not_arm(tmp_path: Path) -> None:
+def test_arming_is_refused_if_rtl_speed_cannot_be_limited(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             world.plane.parameters |= OWNED
@@ -232,7 +230,7 @@ def test_what_cannot_be_limited_does_not_arm(tmp_path: Path) -> None:
     fly(flight)
 
 
-def test_values_of_a_release_with_other_names_are_left_alone(tmp_path: Path) -> None:
+def test_saved_values_with_parameter_names_of_another_firmware_are_ignored(tmp_path: Path) -> None:
     """Since the file was written, the vehicle got firmware that spells its parameters otherwise."""
     (tmp_path / "return.json").write_text('{"RTL_ALT_M": 40.0, "WP_SPD": 10.0, "RTL_SPEED_MS": 0.0}')
 
@@ -252,7 +250,7 @@ def test_values_of_a_release_with_other_names_are_left_alone(tmp_path: Path) -> 
     fly(flight)
 
 
-def test_only_values_of_another_release_are_forgotten(tmp_path: Path) -> None:
+def test_saved_values_are_deleted_if_all_belong_to_another_firmware(tmp_path: Path) -> None:
     (tmp_path / "return.json").write_text('{"RTL_ALT_M": 40.0, "WP_SPD": 3.0}')
 
     async def flight() -> None:
@@ -266,7 +264,7 @@ def test_only_values_of_another_release_are_forgotten(tmp_path: Path) -> None:
     fly(flight)
 
 
-def test_a_file_of_garbage_limits_all_the_same(tmp_path: Path) -> None:
+def test_rtl_limits_are_applied_if_saved_values_are_corrupt(tmp_path: Path) -> None:
     (tmp_path / "return.json").write_text("[")
 
     async def flight() -> None:

@@ -22,7 +22,7 @@ KEPT_M = 1.0
 
 
 @pytest.mark.parametrize("action", ["ignore", "returnToLaunch"])
-def test_a_drone_that_another_station_sends_into_a_zone_is_stopped_before_it(action: str, tmp_path: Path) -> None:
+def test_drone_commanded_by_another_station_stops_before_zone(action: str, tmp_path: Path) -> None:
     async def work(sky: Sky, directory: Path) -> None:
         station, oracle = Endpoint(255, mavlink.MAV_COMP_ID_MISSIONPLANNER), Oracle(sky, Account(0))
 
@@ -59,9 +59,7 @@ def test_a_drone_that_another_station_sends_into_a_zone_is_stopped_before_it(act
 
 
 @pytest.mark.parametrize(("speed_mps", "stopped"), [(0.45, False), (0.6, True)])
-def test_a_gust_stops_no_drone_that_keeps_its_place_beside_a_fence(
-    speed_mps: float, stopped: bool, tmp_path: Path
-) -> None:
+def test_gust_does_not_brake_hovering_drone_beside_zone(speed_mps: float, stopped: bool, tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec(zone("wall", "ignore", *WALL.bounds)))

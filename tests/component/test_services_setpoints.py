@@ -17,7 +17,7 @@ from virtual_time import fly
 WALL = (-40.0, 25.0, 40.0, 40.0)
 
 
-def test_a_setpoint_runs_out(tmp_path: Path) -> None:
+def test_velocity_setpoint_expires_after_hold_time(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -34,7 +34,7 @@ def test_a_setpoint_runs_out(tmp_path: Path) -> None:
     fly(flight)
 
 
-def test_setpoints_that_follow_each_other_fly_on(tmp_path: Path) -> None:
+def test_velocity_setpoints_in_succession_keep_drone_moving(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -49,7 +49,7 @@ def test_setpoints_that_follow_each_other_fly_on(tmp_path: Path) -> None:
     fly(flight)
 
 
-def test_a_setpoint_toward_a_zone_is_not_flown_into_it(tmp_path: Path) -> None:
+def test_velocity_setpoints_do_not_enter_exclusion_zone(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec(zone("no-fly", "ignore", -50, 30, 50, 60)))
@@ -69,7 +69,7 @@ def test_a_setpoint_toward_a_zone_is_not_flown_into_it(tmp_path: Path) -> None:
     fly(flight)
 
 
-def test_a_goto_ends_setpoints_and_setpoints_end_a_goto(tmp_path: Path) -> None:
+def test_goto_and_velocity_setpoint_replace_each_other(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -85,7 +85,7 @@ def test_a_goto_ends_setpoints_and_setpoints_end_a_goto(tmp_path: Path) -> None:
     fly(flight)
 
 
-def test_a_lost_driver_ends_its_setpoint(tmp_path: Path) -> None:
+def test_velocity_setpoint_ends_when_driver_is_lost(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -102,7 +102,7 @@ def test_a_lost_driver_ends_its_setpoint(tmp_path: Path) -> None:
     fly(flight)
 
 
-def test_a_setpoint_right_after_another_motion_runs_out_as_well(tmp_path: Path) -> None:
+def test_velocity_setpoint_expires_directly_after_hover(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -120,7 +120,7 @@ def test_a_setpoint_right_after_another_motion_runs_out_as_well(tmp_path: Path) 
     fly(flight)
 
 
-def test_a_second_stream_of_the_driver_ends_the_setpoint_of_the_first(tmp_path: Path) -> None:
+def test_velocity_setpoint_ends_when_driver_opens_second_stream(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -136,7 +136,7 @@ def test_a_second_stream_of_the_driver_ends_the_setpoint_of_the_first(tmp_path: 
     fly(flight)
 
 
-def test_a_setpoint_that_fails_ends_the_one_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_velocity_setpoint_stops_previous_setpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -159,7 +159,7 @@ def test_a_setpoint_that_fails_ends_the_one_before(tmp_path: Path, monkeypatch: 
     fly(flight)
 
 
-def test_a_setpoint_that_waited_is_watched_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_delayed_velocity_setpoint_expires_after_hold_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -181,7 +181,7 @@ def test_a_setpoint_that_waited_is_watched_as_well(tmp_path: Path, monkeypatch: 
     fly(flight)
 
 
-def test_a_drone_that_slows_down_to_a_setpoint_is_not_taken_to_brake_on(tmp_path: Path) -> None:
+def test_deceleration_to_setpoint_is_not_extrapolated_below_it(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             world.plane.measured = True

@@ -17,7 +17,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sky_drone import fly, ready, until
 
 
-def test_heartbeats_of_standing_motors_in_flight_take_the_drone_from_no_one(
+def test_stale_disarmed_heartbeats_in_flight_do_not_end_control(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def work(sky: Sky, directory: Path) -> None:
@@ -50,7 +50,7 @@ def test_heartbeats_of_standing_motors_in_flight_take_the_drone_from_no_one(
     fly(work, tmp_path)
 
 
-def test_motors_that_stop_in_the_air_are_seen_to(tmp_path: Path) -> None:
+def test_disarm_in_flight_is_detected(tmp_path: Path) -> None:
     async def work(sky: Sky, directory: Path) -> None:
         async with ready(sky, directory) as (drone, grant):
             await drone.service.arm(grant, 120.0)
@@ -62,7 +62,7 @@ def test_motors_that_stop_in_the_air_are_seen_to(tmp_path: Path) -> None:
     fly(work, tmp_path)
 
 
-def test_a_drone_that_landed_while_its_link_was_cut_is_not_taken_for_a_flying_one(tmp_path: Path) -> None:
+def test_landing_during_link_outage_is_not_reported_as_found_in_air(tmp_path: Path) -> None:
     async def work(sky: Sky, directory: Path) -> None:
         async with ready(sky, directory) as (drone, grant):
             await drone.service.arm(grant, 120.0)
@@ -78,7 +78,7 @@ def test_a_drone_that_landed_while_its_link_was_cut_is_not_taken_for_a_flying_on
     fly(work, tmp_path)
 
 
-def test_a_drone_that_landed_as_its_connection_broke_is_not_taken_for_a_flying_one(tmp_path: Path) -> None:
+def test_landing_during_connection_loss_is_not_reported_as_found_in_air(tmp_path: Path) -> None:
     async def work(sky: Sky, directory: Path) -> None:
         async with ready(sky, directory) as (drone, grant):
             await drone.service.arm(grant, 120.0)

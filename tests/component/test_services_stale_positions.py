@@ -15,9 +15,7 @@ from mobility_world import FRAME, end, goto
 from sky_drone import fly, ready, until
 
 
-def test_a_position_at_home_from_long_ago_is_not_where_a_drone_on_its_way_home_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_stale_home_position_does_not_land_returning_drone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     async def work(sky: Sky, directory: Path) -> None:
         def away_m() -> float:
             place = sky.truth.true_place

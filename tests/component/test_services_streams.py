@@ -19,7 +19,7 @@ from sky_drone import fly, ready, until
 STATION = 255
 
 
-def test_an_autopilot_that_restarts_is_prepared_again(tmp_path: Path) -> None:
+def test_rebooted_autopilot_gets_failsafes_again_before_arming(tmp_path: Path) -> None:
     async def work(sky: Sky, directory: Path) -> None:
         async with ready(sky, directory) as (drone, grant):
             await until(lambda: sky.simulation.time_s > 20.0)
@@ -38,7 +38,7 @@ def test_an_autopilot_that_restarts_is_prepared_again(tmp_path: Path) -> None:
     fly(work, tmp_path)
 
 
-def test_streams_that_another_station_stopped_come_again(tmp_path: Path) -> None:
+def test_telemetry_streams_stopped_by_another_station_are_requested_again(tmp_path: Path) -> None:
     async def work(sky: Sky, directory: Path) -> None:
         async with ready(sky, directory) as (drone, grant):
             await drone.service.arm(grant, 120.0)
@@ -61,7 +61,7 @@ def test_streams_that_another_station_stopped_come_again(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("kind", ["SYS_STATUS", "GLOBAL_POSITION_INT"])
-def test_a_stream_whose_request_was_lost_comes_though_the_answer_to_another_one_came_twice(
+def test_lost_stream_request_is_repeated_despite_duplicate_acknowledgement(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def work(sky: Sky, directory: Path) -> None:

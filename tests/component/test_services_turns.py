@@ -88,7 +88,7 @@ def costly(world: World, method: str, monkeypatch: pytest.MonkeyPatch) -> list[f
     return at_s
 
 
-async def test_others_have_their_turn_during_a_long_computation(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_long_computation_yields_to_other_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(background, "time", Clock())
     turns = 0
 
@@ -109,7 +109,7 @@ async def test_others_have_their_turn_during_a_long_computation(monkeypatch: pyt
     assert turns > 80, "every four milliseconds"
 
 
-def test_fences_that_change_during_a_search_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_route_search_uses_fences_changed_during_search(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=True) as world:
             grant = world.grants.put(partial())
@@ -131,7 +131,7 @@ def test_fences_that_change_during_a_search_count(tmp_path: Path, monkeypatch: p
     fly(flight)
 
 
-def test_who_asks_much_waits_and_who_drives_waits_less(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_throttling_delays_driver_less_than_other_callers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
@@ -156,7 +156,7 @@ def test_who_asks_much_waits_and_who_drives_waits_less(tmp_path: Path, monkeypat
     fly(flight)
 
 
-def test_takeoffs_take_turns_as_any_costly_call(world: Callable[[], World], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_takeoff_calls_are_throttled(world: Callable[[], World], monkeypatch: pytest.MonkeyPatch) -> None:
     async def flight() -> None:
         async with world() as w:
             grant = w.grants.put(spec())
@@ -173,7 +173,9 @@ def test_takeoffs_take_turns_as_any_costly_call(world: Callable[[], World], monk
     fly(flight)
 
 
-def test_a_takeoff_that_cannot_be_is_not_judged(world: Callable[[], World], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_takeoff_without_control_or_arming_is_refused_before_policy_check(
+    world: Callable[[], World], monkeypatch: pytest.MonkeyPatch
+) -> None:
     async def flight() -> None:
         async with world() as w:
             grant = w.grants.put(spec())
@@ -193,7 +195,9 @@ def test_a_takeoff_that_cannot_be_is_not_judged(world: Callable[[], World], monk
     fly(flight)
 
 
-def test_a_cheap_call_shortens_no_rest(world: Callable[[], World], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_throttle_delay_is_not_shortened_by_cheap_call(
+    world: Callable[[], World], monkeypatch: pytest.MonkeyPatch
+) -> None:
     async def flight() -> None:
         async with world() as w:
             grant = w.grants.put(spec())
@@ -211,7 +215,7 @@ def test_a_cheap_call_shortens_no_rest(world: Callable[[], World], monkeypatch: 
     fly(flight)
 
 
-def test_no_call_is_carried_out_after_a_later_one(world: Callable[[], World], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_throttled_call_is_replaced_by_later_call(world: Callable[[], World], monkeypatch: pytest.MonkeyPatch) -> None:
     async def flight() -> None:
         async with world() as w:
             grant = w.grants.put(spec())

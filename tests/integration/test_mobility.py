@@ -40,7 +40,7 @@ from scraping import scraped
 Decision = types_pb2.Decision
 
 
-async def test_a_whole_mission_with_a_correction_and_refusals(rig: Rig) -> None:
+async def test_mobility_mission_applies_corrections_and_denials(rig: Rig) -> None:
     rig.write_grant(grant(altitude_limit(5, 15), fence("no-fly", "exclusion", "ignore", -60, -10, -40, 10)))
     rig.write_grant(passenger_grant())
     port = free_port()
@@ -140,7 +140,7 @@ async def _first_event(driver: Driver) -> None:
         return
 
 
-async def test_who_may_call(rig: Rig, tmp_path: Path) -> None:
+async def test_mobility_authentication_rejects_foreign_and_expired_identities(rig: Rig, tmp_path: Path) -> None:
     from mobility_rig import Authority
 
     rig.write_grant(grant())
@@ -174,7 +174,7 @@ async def test_who_may_call(rig: Rig, tmp_path: Path) -> None:
     assert (code, why.code) == (grpc.StatusCode.FAILED_PRECONDITION, "NotInControl")
 
 
-async def test_a_certificate_that_expires_during_a_long_connection(rig: Rig) -> None:
+async def test_mobility_connection_is_rejected_after_certificate_expires(rig: Rig) -> None:
     rig.write_grant(grant())
     rig.start_service()
     rig.start_vehicle()
@@ -192,7 +192,7 @@ async def test_a_certificate_that_expires_during_a_long_connection(rig: Rig) -> 
     assert code in {grpc.StatusCode.UNAUTHENTICATED, grpc.StatusCode.UNAVAILABLE}
 
 
-async def test_renewed_server_certificates_are_used(rig: Rig) -> None:
+async def test_mobility_uses_renewed_server_certificate(rig: Rig) -> None:
     rig.write_grant(grant())
     rig.start_service()
     rig.start_vehicle()
@@ -204,7 +204,7 @@ async def test_renewed_server_certificates_are_used(rig: Rig) -> None:
     await rig.stub(DRIVER).GetPosition(pb.GetPositionRequest(), timeout=5)
 
 
-async def test_an_autopilot_that_is_described_later_is_used(rig: Rig) -> None:
+async def test_mobility_restarts_when_node_description_names_autopilot(rig: Rig) -> None:
     handed = rig.directory / "node.json"
     rig.write_grant(grant())
     rig.start_service("--autopilot", "", "--node-object", str(handed))
@@ -224,7 +224,7 @@ async def test_an_autopilot_that_is_described_later_is_used(rig: Rig) -> None:
     await rig.until(lambda t: t.ready and t.HasField("position"), 20)
 
 
-async def test_cancelled_motion_stops_the_drone(rig: Rig) -> None:
+async def test_cancelled_goto_stops_drone(rig: Rig) -> None:
     rig.write_grant(grant())
     rig.start_service()
     rig.start_vehicle(1.0)
@@ -239,7 +239,7 @@ async def test_cancelled_motion_stops_the_drone(rig: Rig) -> None:
     assert xy(still.position)[1] < 70
 
 
-async def test_a_flood_of_calls_harms_no_one_else(rig: Rig) -> None:
+async def test_flood_of_calls_is_rejected_without_affecting_driver(rig: Rig) -> None:
     rig.write_grant(grant())
     rig.write_grant(passenger_grant())
     rig.start_service()

@@ -77,7 +77,7 @@ def partial(*policies: dict[str, Any], at: tuple[float, float]) -> dict[str, Any
     return grant(*policies, control="partial", controlPoints=points, services=services)
 
 
-async def test_the_transit_flies_around_zones_to_the_control_point_and_home(rig: Rig) -> None:
+async def test_transit_flies_around_zone_to_control_point_and_home(rig: Rig) -> None:
     rig.write_grant(partial(fence("wall", "exclusion", "ignore", *WALL), at=(0, 70)))
     rig.start_service()
     rig.start_vehicle(3.0)
@@ -98,7 +98,7 @@ async def test_the_transit_flies_around_zones_to_the_control_point_and_home(rig:
     assert not rig.log("service").count("Traceback")
 
 
-async def test_passengers_without_a_driver_are_flown_through_their_points(rig: Rig) -> None:
+async def test_poi_mission_visits_points_of_passenger_without_driver(rig: Rig) -> None:
     tour = positions((30, 30), (-30, 30))
     everywhere = [{"service": "mobility", "methods": ["GetControl", "GetPosition"]}]
     poi = {"points": tour, "serviceAccess": "path"}
@@ -132,7 +132,7 @@ def setpoint(north: float, east: float = 0.0, down: float = 0.0, hold_s: float =
     return pb.SetVelocityRequest(velocity=velocity, hold_s=hold_s)
 
 
-async def test_velocities_run_out_and_keep_inside(rig: Rig) -> None:
+async def test_velocity_setpoint_expires_and_is_denied_toward_zone(rig: Rig) -> None:
     rig.write_grant(grant(altitude_limit(5, 15), fence("no-fly", "exclusion", "land", 50, -50, 90, 50)))
     rig.start_service()
     rig.start_vehicle(2.0)
@@ -154,7 +154,7 @@ async def test_velocities_run_out_and_keep_inside(rig: Rig) -> None:
     assert math.dist(before, after) < 1.0, "nothing of it was flown"
 
 
-async def test_asking_does_nothing(rig: Rig) -> None:
+async def test_check_call_returns_verdict_without_effect(rig: Rig) -> None:
     rig.write_grant(grant(altitude_limit(5, 15), fence("no-fly", "exclusion", "revoke", -60, -10, -40, 10)))
     rig.write_grant(passenger_grant())
     rig.start_service()
@@ -200,7 +200,7 @@ async def parameter(autopilot: MavlinkAutopilot, name: str) -> float:
     return (await autopilot.vehicle_parameters.read([(name,)]))[name]
 
 
-async def test_the_vehicle_itself_turns_back_at_the_outer_bounds(rig: Rig) -> None:
+async def test_vehicle_fence_returns_drone_without_service(rig: Rig) -> None:
     rig.write_grant(grant(corridor=[area(-20, -20, 20, 20)]))
     rig.start_service()
     rig.start_vehicle(2.0)
@@ -229,7 +229,7 @@ async def test_the_vehicle_itself_turns_back_at_the_outer_bounds(rig: Rig) -> No
     task.cancel()
 
 
-async def test_the_owners_fence_comes_back_after_the_mission(rig: Rig) -> None:
+async def test_owner_fence_is_restored_after_mission(rig: Rig) -> None:
     rig.write_grant(grant())
     rig.start_service()
     rig.start_vehicle(3.0, "--param", "FENCE_ALT_MAX=77")
@@ -247,7 +247,7 @@ async def test_the_owners_fence_comes_back_after_the_mission(rig: Rig) -> None:
     task.cancel()
 
 
-async def test_a_vehicle_that_refuses_the_fence_is_not_armed(rig: Rig) -> None:
+async def test_arming_is_refused_if_owner_fence_cannot_be_saved(rig: Rig) -> None:
     (rig.directory / "state" / "fence.json").mkdir(parents=True)  # what the owner had cannot be stored there
     rig.write_grant(grant())
     rig.start_service()
@@ -261,7 +261,7 @@ async def test_a_vehicle_that_refuses_the_fence_is_not_armed(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize("kind", ["serial", "udpin", "udpout"])
-async def test_links_of_every_kind_reach_the_autopilot(rig: Rig, kind: str) -> None:
+async def test_mavlink_connection_reaches_autopilot(rig: Rig, kind: str) -> None:
     port, pty = free_port(), rig.directory / "pty"
     ours, theirs = {
         "serial": (f"serial:{pty}:115200", f"pty:{pty}"),

@@ -37,7 +37,7 @@ def speed(telemetry: pb.Telemetry) -> float:
     return math.hypot(velocity.north_mps, velocity.east_mps, velocity.down_mps)
 
 
-async def test_a_lost_driver_means_hover_then_home(rig: Rig) -> None:
+async def test_lost_driver_causes_hover_then_return(rig: Rig) -> None:
     driver = await flying(rig)
     going = driver.going(0, 90)
     await rig.until(lambda t: t.velocity.north_mps > 3)
@@ -54,7 +54,7 @@ async def test_a_lost_driver_means_hover_then_home(rig: Rig) -> None:
     assert math.hypot(*xy(landed.position)) < 2
 
 
-async def test_a_driver_that_comes_back_in_time_goes_on(rig: Rig) -> None:
+async def test_driver_resumes_control_within_grace(rig: Rig) -> None:
     driver = await flying(rig)
     await driver.goto(0, 40)
     driver.drop()
@@ -67,7 +67,7 @@ async def test_a_driver_that_comes_back_in_time_goes_on(rig: Rig) -> None:
     assert (await rig.telemetry()).controller == DRIVER
 
 
-async def test_a_killed_service_finds_its_drone_again(rig: Rig) -> None:
+async def test_killed_service_resumes_flight_after_restart(rig: Rig) -> None:
     driver = await flying(rig, speedup=1.0)
     going = driver.going(0, 90)
     await rig.until(lambda t: t.velocity.north_mps > 3)
@@ -85,7 +85,7 @@ async def test_a_killed_service_finds_its_drone_again(rig: Rig) -> None:
     await rig.until(lambda t: not t.armed, 90, "landing")
 
 
-async def test_a_service_that_stays_dead_leaves_it_to_the_autopilot(rig: Rig) -> None:
+async def test_autopilot_returns_home_while_service_is_down(rig: Rig) -> None:
     await flying(rig, speedup=2.0)
     rig.kill("service")
     # The autopilot's failsafe acts after five of its seconds; then the service must not hand the drone back.
@@ -133,7 +133,7 @@ async def first(driver: Driver) -> None:
             return
 
 
-async def test_a_zone_that_appears_in_flight_stops_the_drone(rig: Rig) -> None:
+async def test_zone_added_in_flight_stops_drone(rig: Rig) -> None:
     driver = await flying(rig, speedup=1.0)
     going = driver.going(0, 90)
     await rig.until(lambda t: xy(t.position)[1] > 5)
@@ -148,7 +148,7 @@ async def test_a_zone_that_appears_in_flight_stops_the_drone(rig: Rig) -> None:
     await driver.goto(0, 20)
 
 
-async def test_a_zone_around_the_drone_with_a_takeover(rig: Rig) -> None:
+async def test_zone_added_around_drone_revokes_control_and_lands(rig: Rig) -> None:
     driver = await flying(rig, speedup=1.0)
     rig.write_grant(grant(fence("new", "exclusion", "revoke", -30, -30, 30, 30)))
     event = await driver.next(LOST, 10)
@@ -161,7 +161,7 @@ async def test_a_zone_around_the_drone_with_a_takeover(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize("action", ["land", "returnToLaunch", "revoke"])
-async def test_a_request_into_a_zone_that_takes_the_drone(rig: Rig, action: str) -> None:
+async def test_goto_into_zone_with_takeover_action_ends_mission(rig: Rig, action: str) -> None:
     driver = await flying(rig, fence("no-fly", "exclusion", action, -60, -10, -40, 10))
     code, why = await denied(flown(driver.going(-50, 0)))
     assert code == grpc.StatusCode.PERMISSION_DENIED
@@ -173,7 +173,7 @@ async def test_a_request_into_a_zone_that_takes_the_drone(rig: Rig, action: str)
     assert rig.entries("takeover")[0]["policies"] == ["no-fly"]
 
 
-async def test_a_grant_removed_in_flight_brings_the_drone_home(rig: Rig) -> None:
+async def test_grant_removed_in_flight_returns_drone_home(rig: Rig) -> None:
     driver = await flying(rig)
     going = driver.going(0, 90)
     await rig.until(lambda t: t.velocity.north_mps > 3)
@@ -186,7 +186,7 @@ async def test_a_grant_removed_in_flight_brings_the_drone_home(rig: Rig) -> None
     await rig.until(lambda t: not t.armed, 90, "landing")
 
 
-async def test_a_grant_file_of_garbage_grants_nothing(rig: Rig) -> None:
+async def test_corrupt_grant_file_revokes_control(rig: Rig) -> None:
     driver = await flying(rig)
     path = rig.grants / "app-navigator.json"
     fresh = path.with_suffix(".new")
@@ -196,7 +196,7 @@ async def test_a_grant_file_of_garbage_grants_nothing(rig: Rig) -> None:
     await rig.until(lambda t: t.mode == "LAND", 30)
 
 
-async def test_a_pilot_takes_the_drone_and_keeps_it(rig: Rig) -> None:
+async def test_pilot_mode_change_ends_control_of_driver(rig: Rig) -> None:
     driver = await flying(rig)
     going = driver.going(0, 90)
     await rig.until(lambda t: t.velocity.north_mps > 3)
@@ -220,7 +220,7 @@ async def test_a_pilot_takes_the_drone_and_keeps_it(rig: Rig) -> None:
     task.cancel()
 
 
-async def test_a_stopped_driver_process_is_noticed(rig: Rig) -> None:
+async def test_suspended_driver_process_is_detected_as_lost(rig: Rig) -> None:
     """SIGSTOP leaves the connection open: only unanswered pings tell."""
     await asyncio.sleep(0)
     rig.write_grant(grant())
@@ -234,7 +234,7 @@ async def test_a_stopped_driver_process_is_noticed(rig: Rig) -> None:
     rig.tell("driver", signal.SIGCONT)
 
 
-async def test_partial_control_begins_where_the_transit_brings_it(rig: Rig) -> None:
+async def test_partial_control_begins_at_control_point_after_transit(rig: Rig) -> None:
     path = [dict(zip(("lat", "lon", "alt"), (*FRAME.latlon(x, y), 12.0), strict=True)) for x, y in ((30, 40), (60, 40))]
     rig.write_grant(
         grant(
@@ -274,7 +274,7 @@ async def told(driver: Driver, reason: str) -> None:
             pass
 
 
-async def test_a_driver_lost_during_the_transits_takeoff_strands_no_one(rig: Rig) -> None:
+async def test_driver_lost_during_transit_takeoff_ends_mission_and_lands(rig: Rig) -> None:
     rig.write_grant(partial())
     rig.start_service()
     rig.start_vehicle()
@@ -285,7 +285,7 @@ async def test_a_driver_lost_during_the_transits_takeoff_strands_no_one(rig: Rig
     await rig.until(lambda t: not t.armed, 90, "landing")
 
 
-async def test_a_grant_revoked_while_arming_flies_nowhere(rig: Rig) -> None:
+async def test_grant_revoked_during_arming_prevents_takeoff(rig: Rig) -> None:
     rig.write_grant(partial())
     rig.start_service()
     rig.start_vehicle(1.0)
@@ -297,7 +297,7 @@ async def test_a_grant_revoked_while_arming_flies_nowhere(rig: Rig) -> None:
     assert state.position.altitude_m < 5
 
 
-async def test_landing_on_the_way_does_not_move_home(rig: Rig) -> None:
+async def test_landing_during_mission_does_not_move_home(rig: Rig) -> None:
     driver = await flying(rig)
     await driver.goto(0, 60)
     await flown(driver.stub.Land(pb.LandRequest(), timeout=60))
@@ -307,7 +307,7 @@ async def test_landing_on_the_way_does_not_move_home(rig: Rig) -> None:
     assert math.dist(xy(state.home), (0, 0)) < 2
 
 
-async def test_a_service_that_lost_its_journal_brings_the_drone_home(rig: Rig) -> None:
+async def test_service_without_journal_returns_flying_drone_home(rig: Rig) -> None:
     await flying(rig, speedup=1.0)
     rig.kill("service")
     for path in (rig.directory / "state").glob("journal*"):

@@ -56,7 +56,7 @@ async def restart(rig: Rig) -> None:
     rig.tell("vehicle", signal.SIGCONT)
 
 
-async def test_sdk_mission_with_real_service(rig: Rig) -> None:
+async def test_sdk_mission_survives_service_restart_and_takeover(rig: Rig) -> None:
     rig.write_grant(
         grant(
             altitude_limit(5, 7),
@@ -91,7 +91,7 @@ async def test_sdk_mission_with_real_service(rig: Rig) -> None:
     assert outcomes(state)[NAVIGATOR_MISSION].startswith("revoked:")
 
 
-async def test_sdk_returns_control_to_real_service(rig: Rig) -> None:
+async def test_sdk_returns_control_and_mission_completes(rig: Rig) -> None:
     rig.write_grant(grant())
     rig.start_service()
     rig.start_vehicle()
@@ -108,7 +108,7 @@ async def test_sdk_returns_control_to_real_service(rig: Rig) -> None:
                 raise AssertionError("control after the mission")
 
 
-async def test_sdk_watch_with_real_service(rig: Rig) -> None:
+async def test_sdk_watch_streams_report_vehicle_state(rig: Rig) -> None:
     rig.write_grant(grant())
     rig.start_service()
     rig.start_vehicle()
@@ -134,7 +134,7 @@ async def _until(items: AsyncIterator[T], over: Callable[[T], bool]) -> AsyncIte
             return
 
 
-async def test_sdk_dry_runs_and_passenger_tour(rig: Rig) -> None:
+async def test_sdk_dry_runs_and_passenger_poi_mission(rig: Rig) -> None:
     rig.write_grant(grant(altitude_limit(5, 15), fence("no-fly", "exclusion", "revoke", -60, -10, -40, 10)))
     rig.start_service()
     rig.start_vehicle()
@@ -188,7 +188,7 @@ CALL_EVERY_S = 0.05
 LIFE_S = 8.0
 
 
-async def test_no_call_is_lost_during_certificate_renewal(rig: Rig) -> None:
+async def test_sdk_calls_succeed_during_certificate_renewal(rig: Rig) -> None:
     """Of server and client, of mobility and camera, with control of the drone held all the while."""
     rig.write_grant(
         grant(services=[{"service": "mobility", "methods": ALL}, {"service": "camera", "methods": ["ListImages"]}])

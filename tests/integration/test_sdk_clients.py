@@ -113,7 +113,7 @@ async def test_refusal_contains_code_reason_and_policies(stage: Stage) -> None:
     assert "exclusion zone hospital (by no-fly-hospital)" in str(refusal.value)
 
 
-async def test_cancelled_motion_stops_the_drone(stage: Stage) -> None:
+async def test_cancelled_goto_stops_drone(stage: Stage) -> None:
     stage.drone.release = asyncio.Event()
     async with stage.client() as drone, drone.control():
         with pytest.raises(TimeoutError):

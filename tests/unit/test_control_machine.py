@@ -209,17 +209,17 @@ def reached(depth: int, every: int = 1) -> Iterator[ControlState]:
     yield from frontier
 
 
-def test_every_event_is_walked() -> None:
+def test_control_events_are_all_covered() -> None:
     kinds = {kind for union in get_args(told.Event) for kind in (get_args(union) or (union,))}
     assert {type(event) for event in EVENTS} == kinds
 
 
-def test_every_state_within_some_events_keeps_what_always_holds() -> None:
+def test_control_invariants_hold_in_all_states_within_few_events() -> None:
     assert len(list(reached(4) if DEEP else reached(3, every=3))) > 4_000
 
 
 @given(st.lists(st.tuples(st.sampled_from(EVENTS), st.sampled_from((0.0, 0.1, 1.0, LATE_S))), max_size=60))
-def test_long_histories_keep_what_always_holds(history: list[tuple[told.Event, float]]) -> None:
+def test_control_invariants_hold_in_long_histories(history: list[tuple[told.Event, float]]) -> None:
     state, now = FOUND, 0.0
     for event, passed_s in history:
         now += passed_s
@@ -232,7 +232,7 @@ def test_long_histories_keep_what_always_holds(history: list[tuple[told.Event, f
 
 
 @given(st.lists(st.sampled_from(EVENTS), max_size=40))
-def test_a_flying_vehicle_without_events_comes_home_in_the_end(history: list[told.Event]) -> None:
+def test_flying_vehicle_returns_home_without_further_events(history: list[told.Event]) -> None:
     state, now = FOUND, 0.0
     for event in history:
         state, _ = transition(state, event, now)

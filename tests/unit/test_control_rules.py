@@ -66,9 +66,7 @@ def test_control_is_granted_and_returned() -> None:
         ),
     ],
 )
-def test_a_mission_that_flew_nothing_of_its_path_is_not_complete(
-    done: tuple[told.Event, ...], kind: OutcomeKind
-) -> None:
+def test_mission_fails_if_no_leg_of_its_path_was_flown(done: tuple[told.Event, ...], kind: OutcomeKind) -> None:
     state, _ = told_of(*FLIES, *done, told.ControlReturned("a", 1, paths=True))
     outcome = state.missions["a"].outcome
     assert outcome is not None
@@ -77,7 +75,7 @@ def test_a_mission_that_flew_nothing_of_its_path_is_not_complete(
 
 
 @pytest.mark.parametrize("action", ["hover", "land", "returnToLaunch", "revoke"])
-def test_a_takeover_ends_the_mission_unless_it_only_hovers(action: Any) -> None:
+def test_takeover_ends_mission_unless_action_is_hover(action: Any) -> None:
     state, _ = told_of(*FLIES, told.TakeoverDemanded(action, "Code", "why"))
     kinds = {
         "hover": None,
@@ -91,7 +89,7 @@ def test_a_takeover_ends_the_mission_unless_it_only_hovers(action: Any) -> None:
     assert state.lease is None
 
 
-def test_a_lost_driver_has_its_grace_and_then_the_vehicle_comes_home() -> None:
+def test_vehicle_returns_home_after_grace_of_lost_driver() -> None:
     state, _ = told_of(*FLIES, told.StreamClosed(1))
     assert state.task == SystemTask(1, TaskKind.HOVER)
     assert state.grace == Grace(5.0, "a", "driver lost")
@@ -117,7 +115,7 @@ def refused_transit(state: ControlState, lease_id: int, begins: float, ends: flo
     return state
 
 
-def test_transits_that_are_refused_begin_no_grace_again() -> None:
+def test_refused_transits_do_not_restart_grace() -> None:
     state, _ = told_of(*FLIES, told.StreamClosed(1))
     for attempt in range(3):
         state = refused_transit(state, 2 + attempt, 1.0 + attempt, 1.5 + attempt)
@@ -128,7 +126,7 @@ def test_transits_that_are_refused_begin_no_grace_again() -> None:
 
 
 @pytest.mark.parametrize("again", [told.VehicleFound(), told.TakeoverDemanded("hover", "Code", "why")])
-def test_what_is_found_or_taken_again_and_again_gets_no_more_time_for_its_driver(again: told.Event) -> None:
+def test_repeated_takeover_or_reconnect_does_not_extend_grace(again: told.Event) -> None:
     state, _ = told_of(*FLIES, told.StreamClosed(1))
     for now in (1.0, 3.0, 4.5):
         state, _ = transition(state, again, now)
@@ -139,7 +137,7 @@ def test_what_is_found_or_taken_again_and_again_gets_no_more_time_for_its_driver
     assert home.missions["a"].outcome is not None
 
 
-def test_a_driver_that_waits_for_anothers_vehicle_takes_none_of_its_time() -> None:
+def test_grace_is_unchanged_by_waiting_driver_of_other_mission() -> None:
     other = told.GrantRef("b", commands_vehicle=True)
     waits = (told.GrantChanged(None, other), told.StreamOpened(2, "b", "B"))
     landed = (told.VehicleObserved(GROUND), told.Heartbeat(), told.StreamClosed(1))
@@ -149,7 +147,7 @@ def test_a_driver_that_waits_for_anothers_vehicle_takes_none_of_its_time() -> No
     assert (gone.lease, gone.deadline) == (None, 5.0)
 
 
-def test_a_grace_waits_for_the_end_of_a_transit_and_a_driver_that_gets_the_vehicle_ends_it() -> None:
+def test_grace_is_paused_during_transit_and_ends_when_control_is_granted() -> None:
     state, _ = told_of(*FLIES, told.StreamClosed(1))
     asks = (told.StreamOpened(2, "a", "A"), told.TransitRequested(2), told.TransitBegan(9, "a", "A"))
     flying, _ = told_of(*asks, state=state)
@@ -164,7 +162,7 @@ def test_a_grace_waits_for_the_end_of_a_transit_and_a_driver_that_gets_the_vehic
     assert home.missions["a"].outcome == Outcome(OutcomeKind.FAILED, "driver lost")
 
 
-def test_a_way_home_that_fails_each_time_is_left_to_the_autopilot() -> None:
+def test_return_is_left_to_autopilot_after_three_failures() -> None:
     state = replace(ControlState(), decided=True, armed_seen=True, vehicle=FLYING)
     takes = 0
     for tick in range(100):
@@ -178,7 +176,7 @@ def test_a_way_home_that_fails_each_time_is_left_to_the_autopilot() -> None:
     assert (landed.unattended, landed.attended) == (0, True)
 
 
-def test_a_second_stream_that_leaves_while_it_waits_leaves_no_authority_behind() -> None:
+def test_closed_second_stream_leaves_no_driver_authority() -> None:
     second = (told.StreamOpened(2, "a", "A"), told.StreamClosed(2))
     state, _ = told_of(*ASKS, *second)
     assert state.authority is Authority.SYSTEM
@@ -187,7 +185,7 @@ def test_a_second_stream_that_leaves_while_it_waits_leaves_no_authority_behind()
 
 
 @pytest.mark.parametrize("mode", [GUIDED, LOITER])
-def test_a_vehicle_that_others_arm_is_no_drivers(mode: FlightMode) -> None:
+def test_vehicle_armed_by_others_belongs_to_pilot(mode: FlightMode) -> None:
     chosen = told.VehicleObserved(replace(GROUND, mode=mode)), told.Heartbeat()
     state, _ = told_of(*ASKS, *chosen)
     assert state.controller == "A", "on the ground a mode is no one's"
@@ -204,7 +202,7 @@ def test_a_vehicle_that_others_arm_is_no_drivers(mode: FlightMode) -> None:
     assert landed.controller == "A", "nothing was flown for the mission: it goes on"
 
 
-def test_a_cancelled_motion_hovers_for_a_driver_that_is_still_there() -> None:
+def test_cancelled_motion_hovers_if_driver_is_still_connected() -> None:
     state, _ = told_of(*FLIES, told.MotionBegan(7, "Land"), told.MotionCancelled(7))
     assert state.motion == ActiveMotion(7, "Land", hover_at=0.3)
     assert not transition(state, told.Tick(), 0.2)[1]
@@ -214,7 +212,7 @@ def test_a_cancelled_motion_hovers_for_a_driver_that_is_still_there() -> None:
     assert [type(action).__name__ for action in actions] == ["StopMotion", "HoldPosition"]
 
 
-def test_a_vehicle_that_a_pilot_hands_back_waits_for_its_driver() -> None:
+def test_vehicle_handed_back_by_pilot_hovers_during_driver_grace() -> None:
     loiter, guided = (told.VehicleObserved(replace(FLYING, mode=mode)) for mode in (LOITER, GUIDED))
     state, _ = told_of(*FLIES, loiter, told.Heartbeat(), guided, told.Heartbeat())
     assert state.authority is Authority.SYSTEM
@@ -222,7 +220,7 @@ def test_a_vehicle_that_a_pilot_hands_back_waits_for_its_driver() -> None:
     assert state.grace == Grace(5.0, "a", "driver lost")
 
 
-def test_a_mode_that_the_system_did_not_ask_for_is_a_pilots() -> None:
+def test_unrequested_mode_change_gives_authority_to_pilot() -> None:
     asked = told.VehicleObserved(replace(FLYING, mode=RTL))
     ours, _ = told_of(
         *FLIES, told.ModeChangeBegan(RTL), asked, told.Heartbeat(), told.ModeChangeEnded(RTL, GUIDED, True)
@@ -235,7 +233,7 @@ def test_a_mode_that_the_system_did_not_ask_for_is_a_pilots() -> None:
     assert (failsafe.authority, failsafe.returning) == (Authority.SYSTEM, True)
 
 
-def test_a_failsafe_that_brakes_leaves_the_vehicle_to_no_pilot() -> None:
+def test_braking_failsafe_starts_return_instead_of_pilot_authority() -> None:
     braking = replace(FLYING, mode=FlightMode("BRAKE", ModeKind.BRAKING))
     chosen, _ = told_of(*FLIES, told.VehicleObserved(braking), told.Heartbeat())
     assert chosen.authority is Authority.PILOT
@@ -251,7 +249,7 @@ def test_a_failsafe_that_brakes_leaves_the_vehicle_to_no_pilot() -> None:
         assert later.authority is Authority.PILOT, "who has chosen it has the vehicle"
 
 
-def test_a_vehicle_that_is_found_braked_by_a_failsafe_comes_home() -> None:
+def test_vehicle_found_in_brake_mode_returns_home_if_failsafe_is_active() -> None:
     braking = replace(FLYING, mode=FlightMode("BRAKE", ModeKind.BRAKING))
     for facts, authority, task in (
         (replace(braking, failsafe=True), Authority.SYSTEM, TaskKind.RETURN),
@@ -261,7 +259,7 @@ def test_a_vehicle_that_is_found_braked_by_a_failsafe_comes_home() -> None:
         assert (found.authority, found.task.kind if found.task is not None else None) == (authority, task)
 
 
-def test_motors_that_were_asked_for_are_ours_whenever_they_are_seen() -> None:
+def test_requested_arming_belongs_to_driver_if_seen_late() -> None:
     late = (*ARMS[:2], ARMS[3], told.Heartbeat())
     state, _ = told_of(*ASKS, *late)
     assert (state.authority, state.armed_by_others) == (Authority.DRIVER, False)
@@ -278,7 +276,7 @@ def test_motors_that_were_asked_for_are_ours_whenever_they_are_seen() -> None:
         (ARMED, 1.0, False, Authority.PILOT),
     ],
 )
-def test_motors_that_show_after_a_start_without_answers_are_ours_for_a_while(
+def test_unconfirmed_arming_belongs_to_driver_for_limited_time(
     facts: VehicleFacts, late_s: float, unanswered: bool, authority: Authority
 ) -> None:
     start = told.MotorStart(begins=True), told.MotorStart(begins=False, unanswered=unanswered)
@@ -288,7 +286,7 @@ def test_motors_that_show_after_a_start_without_answers_are_ours_for_a_while(
     assert (state.authority, state.armed_by_others) == (authority, authority is Authority.PILOT)
 
 
-def test_a_mode_change_whose_answers_were_lost_is_the_systems() -> None:
+def test_unconfirmed_mode_change_belongs_to_system_for_limited_time() -> None:
     flies = replace(FLYING, mode=RTL)
     ours, _ = told_of(*FLIES, told.VehicleObserved(replace(flies, failsafe=True)), told.Heartbeat())
     given_up, _ = told_of(told.ModeChangeBegan(GUIDED), told.ModeChangeEnded(GUIDED, RTL, done=False), state=ours)
@@ -301,7 +299,7 @@ def test_a_mode_change_whose_answers_were_lost_is_the_systems() -> None:
     assert transition(observed, shown[1], LATE_S)[0].authority is Authority.PILOT, "too late to be ours"
 
 
-def test_a_mode_that_is_obeyed_late_is_the_systems_while_the_next_one_is_asked_for() -> None:
+def test_late_mode_change_belongs_to_system_while_next_one_is_pending() -> None:
     given_up = (told.ModeChangeBegan(LAND), told.ModeChangeEnded(LAND, GUIDED, done=False))
     shows = {
         mode: (told.VehicleObserved(replace(FLYING, mode=mode)), told.Heartbeat()) for mode in (LAND, GUIDED, LOITER)
@@ -318,7 +316,7 @@ def test_a_mode_that_is_obeyed_late_is_the_systems_while_the_next_one_is_asked_f
     assert state.authority is Authority.PILOT, "too late to be ours"
 
 
-def test_a_mode_that_was_asked_for_before_a_failsafe_is_no_pilots() -> None:
+def test_late_mode_change_requested_before_failsafe_belongs_to_system() -> None:
     returns = (told.VehicleObserved(replace(FLYING, mode=RTL, failsafe=True)), told.Heartbeat())
     asked = (told.ModeChangeBegan(LAND), *returns, told.ModeChangeEnded(LAND, GUIDED, done=False))
     lands = (told.VehicleObserved(replace(FLYING, mode=LAND, failsafe=True)), told.Heartbeat())
@@ -328,7 +326,7 @@ def test_a_mode_that_was_asked_for_before_a_failsafe_is_no_pilots() -> None:
     assert told_of(*FLIES, *refused, *lands)[0].authority is Authority.PILOT
 
 
-def test_a_mode_that_the_autopilot_refused_is_not_the_systems() -> None:
+def test_refused_mode_change_does_not_belong_to_system() -> None:
     refused = (told.ModeChangeBegan(RTL), told.ModeChangeEnded(RTL, GUIDED, done=False, refused=True))
     state, _ = told_of(*FLIES, *refused)
     returns = replace(FLYING, mode=RTL)
@@ -338,7 +336,7 @@ def test_a_mode_that_the_autopilot_refused_is_not_the_systems() -> None:
     assert failsafe.missions["a"].outcome is not None
 
 
-def test_a_return_that_is_obeyed_late_is_watched_by_the_system() -> None:
+def test_late_return_mode_is_supervised_by_system_without_driver() -> None:
     given_up = (told.ModeChangeBegan(RTL), told.ModeChangeEnded(RTL, GUIDED, done=False))
     shown = (told.VehicleObserved(replace(FLYING, mode=RTL)), told.Heartbeat())
     alone, _ = told_of(*FLIES, *given_up, told.StreamClosed(1), *shown)
@@ -348,7 +346,7 @@ def test_a_return_that_is_obeyed_late_is_watched_by_the_system() -> None:
 
 
 @pytest.mark.parametrize("mode", [GUIDED, RTL])
-def test_a_driver_that_is_lost_on_its_way_home_may_come_back_on_it(mode: FlightMode) -> None:
+def test_driver_lost_during_return_can_resume_control(mode: FlightMode) -> None:
     homeward = (told.MotionBegan(1, "ReturnToLaunch"), told.ModeChangeBegan(mode))
     turns = (
         told.VehicleObserved(replace(FLYING, mode=mode)),
@@ -367,7 +365,7 @@ def test_a_driver_that_is_lost_on_its_way_home_may_come_back_on_it(mode: FlightM
     )
 
 
-def test_a_return_that_a_pilot_chooses_after_a_failsafe_is_the_pilots() -> None:
+def test_return_mode_chosen_by_pilot_after_failsafe_belongs_to_pilot() -> None:
     flies = replace(FLYING, failsafe=True)
     heard = [(told.VehicleObserved(replace(flies, mode=mode)), told.Heartbeat()) for mode in (RTL, GUIDED, RTL)]
     taken = (told.ModeChangeBegan(GUIDED), *heard[1], told.ModeChangeEnded(GUIDED, RTL, done=True))
@@ -379,7 +377,7 @@ def test_a_return_that_a_pilot_chooses_after_a_failsafe_is_the_pilots() -> None:
 @pytest.mark.parametrize(("silent_s", "mode", "authority"), [
     (5.1, RTL, Authority.SYSTEM), (2.0, RTL, Authority.PILOT), (5.1, LOITER, Authority.PILOT),
 ])  # fmt: skip
-def test_a_return_that_began_while_the_link_was_cut_is_the_failsafes(
+def test_return_begun_during_link_outage_counts_as_failsafe(
     silent_s: float, mode: FlightMode, authority: Authority
 ) -> None:
     heard = told.VehicleObserved(replace(FLYING, mode=mode, silent_s=silent_s))
@@ -388,7 +386,7 @@ def test_a_return_that_began_while_the_link_was_cut_is_the_failsafes(
     assert state.returning is (authority is Authority.SYSTEM)
 
 
-def test_a_return_that_is_found_is_told_from_one_of_the_system() -> None:
+def test_found_return_is_distinguished_from_return_of_system() -> None:
     known, _ = told_of(told.ArmingRequested("a", "A", (1.0, 2.0, 3.0)), told.VehicleObserved(replace(FLYING, mode=RTL)))
     found, _ = told_of(told.VehicleFound(), state=replace(known, expected_mode=None))
     assert found.task is not None and found.task.found
@@ -399,7 +397,7 @@ def test_a_return_that_is_found_is_told_from_one_of_the_system() -> None:
     assert again.task is not None and not again.task.found
 
 
-def test_a_failsafe_that_is_found_without_a_mission_is_the_systems() -> None:
+def test_found_failsafe_without_mission_belongs_to_system() -> None:
     for failsafe, authority in ((True, Authority.SYSTEM), (False, Authority.PILOT)):
         flies = replace(FLYING, mode=RTL, failsafe=failsafe)
         found, _ = told_of(told.VehicleFound(), state=ControlState(vehicle=flies))
@@ -408,7 +406,7 @@ def test_a_failsafe_that_is_found_without_a_mission_is_the_systems() -> None:
         assert found.returning is failsafe
 
 
-def test_a_mission_that_a_pilot_landed_is_not_granted_again() -> None:
+def test_mission_landed_by_pilot_is_not_granted_again() -> None:
     pilots = FlightMode("LOITER", ModeKind.OTHER)
     taken = (told.VehicleObserved(replace(FLYING, mode=pilots)), told.Heartbeat(), told.StreamOpened(2, "a", "A"))
     waiting, _ = told_of(*FLIES, *taken)
@@ -425,7 +423,7 @@ def test_a_mission_that_a_pilot_landed_is_not_granted_again() -> None:
     assert again.flight is None
 
 
-def test_a_waiting_driver_that_loses_its_grant_ends_no_other_mission() -> None:
+def test_removed_grant_of_waiting_driver_does_not_end_other_mission() -> None:
     other = told.GrantRef("b", commands_vehicle=True)
     grounded = (*ASKS, told.StreamClosed(1), told.GrantChanged(None, other), told.StreamOpened(2, "b", "B"))
     state, _ = told_of(*grounded)
@@ -437,7 +435,7 @@ def test_a_waiting_driver_that_loses_its_grant_ends_no_other_mission() -> None:
     assert [action.event.state for action in actions if isinstance(action, SendEvent)] == [StreamState.LOST]
 
 
-def test_a_mission_that_is_over_is_refused_with_what_begins_another() -> None:
+def test_refusal_of_ended_mission_explains_how_to_fly_again() -> None:
     code, reason = ended_refusal(Outcome(OutcomeKind.FAILED, "the driver did not come back"))
     assert code == "MissionEnded"
     assert reason.endswith("; another flight needs a Grant with another uid")

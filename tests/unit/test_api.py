@@ -1,4 +1,4 @@
-"""Kinds: what is accepted, and the sentence for what is not."""
+"""API models of all kinds: accepted manifests, and error messages of refused ones."""
 
 import math
 import pathlib
@@ -21,11 +21,11 @@ ROOT = pathlib.Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda k: k.KIND)
-def test_crds_are_not_older_than_the_models(kind):
+def test_crds_match_models(kind):
     assert yaml.safe_load((ROOT / "crds" / f"{kind.PLURAL}.yaml").read_text()) == crd(kind), "run `make generate`"
 
 
-def test_every_number_has_its_unit_or_meaning():
+def test_crd_describes_every_number():
     def walk(schema, path):
         if schema.get("type") in {"number", "integer"} and "status" not in path and not path.endswith("*"):
             yield path, schema.get("description", "")
@@ -43,7 +43,7 @@ def test_every_number_has_its_unit_or_meaning():
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda k: k.KIND)
-def test_kubectl_explains_every_field(kind):
+def test_crd_describes_every_field(kind):
     def walk(schema, path):
         for name, inner in schema.get("properties", {}).items():
             yield from () if inner.get("description") else (f"{path}.{name}",)
@@ -65,7 +65,7 @@ def edge_component(**more):
     return component("GroundViewer", "edge", **({"locations": [{"center": {"lat": 1, "lon": 2}, "radius": 10}]} | more))
 
 
-def test_sentences_of_bad_applications():
+def test_invalid_application_error_names_field_and_remedy():
     plain = {"lat": 1, "lon": 2}
     cases = [
         ([VIEWER | {"egress": []}], "spec.components[0].pointsOfInterest: an application with drone components needs"),
@@ -95,24 +95,24 @@ def test_sentences_of_bad_applications():
         assert bad(*components).startswith(sentence), (bad(*components), sentence)
 
 
-def test_nan_is_refused_everywhere():
+def test_application_with_nan_is_refused():
     assert "finite number" in bad(navigator([{"lat": float("nan"), "lon": 2}]))
 
 
-def test_a_good_application_survives_the_round_trip():
+def test_application_survives_dict_round_trip():
     app = application(navigator(PATH), VIEWER, CHECKER, STORE)
     assert Application.from_body(app.to_dict()) == app
     assert [c.slug for c in app.spec.components] == ["navigator", "aerial-viewer", "image-checker", "data-store"]
 
 
-def test_unknown_depot_names_the_field():
+def test_unknown_depot_error_names_field():
     with pytest.raises(
         InvalidObject, match=r"spec\.components\[0\]\.controlPoints\[0\]\.point\.depot: there is no Depot base"
     ):
         check_application(application(navigator(PATH)), {})
 
 
-def test_crossing_region_names_the_ring():
+def test_self_crossing_region_error_names_ring():
     cross = [{"lat": 0, "lon": 0}, {"lat": 1e-3, "lon": 1e-3}, {"lat": 0, "lon": 1e-3}, {"lat": 1e-3, "lon": 0}]
     point = {"navigation": "regionBased", "region": {"polygon": {"exterior": cross}}}
     app = application(navigator(PATH) | {"controlPoints": [point]})
@@ -126,8 +126,8 @@ def star(east, spikes, radius_m=100):
     return [at(east + r * math.cos(turn * i), r * math.sin(turn * i)) for i, r in enumerate(radii)]
 
 
-def test_regions_that_cross_too_often_are_refused_before_they_are_united():
-    """Uniting a few that are as spiky as a manifest may say takes minutes, in which no other application is reconciled."""
+def test_regions_with_too_many_crossings_are_refused_before_union():
+    """The union of a few regions with the maximum number of spikes takes minutes and blocks other Applications."""
 
     def flown(*regions):
         points = [{"navigation": "regionBased", "region": {"polygon": {"exterior": r}}} for r in regions]
@@ -144,7 +144,7 @@ def test_regions_that_cross_too_often_are_refused_before_they_are_united():
         operation_area(app.spec, {}, 7.0)
 
 
-def test_a_way_that_crosses_itself_too_often_is_refused():
+def test_path_with_too_many_self_crossings_is_refused():
     def grid(lines):
         ends = [at(20 * (i // 2), 20 * lines * (((i + 1) // 2) % 2), 10) for i in range(2 * lines)]
         across = [at(20 * lines * (((i + 1) // 2) % 2), 20 * (i // 2), 10) for i in range(2 * lines)]
@@ -159,7 +159,7 @@ def test_a_way_that_crosses_itself_too_often_is_refused():
         check_application(application(guide), {})
 
 
-def test_area_of_continental_size_is_refused():
+def test_zone_area_over_1000_km_is_refused():
     corners = [{"lat": 0, "lon": 0}, {"lat": 50, "lon": 0}, {"lat": 50, "lon": 50}]
     zone = Zone.from_body(manifest("Zone", "z", {"area": {"polygon": {"exterior": corners}}}))
     with pytest.raises(InvalidObject, match=r"spec\.area\.polygon\.exterior\[0\]: is more than 1000 km"):
@@ -219,7 +219,7 @@ def test_area_of_continental_size_is_refused():
         ),
     ],
 )
-def test_sentences_of_bad_policies(spec, sentence):
+def test_invalid_policy_error_names_field_and_remedy(spec, sentence):
     with pytest.raises(InvalidObject) as caught:
         Policy.from_body(manifest("Policy", "p", spec))
     assert str(caught.value).startswith(sentence)
@@ -236,29 +236,29 @@ def test_sentences_of_bad_policies(spec, sentence):
         {"kind": "altitude", "upperLimit": 1, "lowerLimit": -10, "altitudeReference": "terrain"},
     ],
 )
-def test_limits_that_can_be_kept(limit):
+def test_limit_policy_accepts_extreme_but_possible_limits(limit):
     assert Policy.from_body(manifest("Policy", "p", {"type": "LimitControl", **limit})).spec.kind == limit["kind"]
 
 
 @pytest.mark.parametrize("limit", [-1001, 20_001, float("nan"), float("inf")])
-def test_limits_beyond_anything_that_flies(limit):
+def test_limit_policy_refuses_impossible_altitude(limit):
     spec = {"type": "LimitControl", "kind": "altitude", "upperLimit": limit}
     with pytest.raises(InvalidObject, match=r"spec\.upperLimit"):
         Policy.from_body(manifest("Policy", "p", spec))
 
 
-def test_policy_with_an_unknown_zone_names_it():
+def test_policy_with_unknown_zone_error_names_zone():
     spec = {"type": "GeofenceControl", "kind": "exclusion", "selector": {"zones": ["a", "b"]}}
     with pytest.raises(InvalidObject, match=r"spec\.selector\.zones\[1\]: Zone b does not exist \(existing: a\)"):
         check_policy(Policy.from_body(manifest("Policy", "p", spec)), {"a"})
 
 
 @pytest.mark.parametrize(("text", "value"), [("250m", 0.25), ("2", 2), ("512Mi", 2**29), ("1.5G", 1.5e9), (3, 3)])
-def test_quantities(text, value):
+def test_quantity_is_parsed_to_number(text, value):
     assert quantity(text) == pytest.approx(value)
 
 
-def test_volumes_become_those_of_a_pod():
+def test_volumes_are_converted_to_pod_volumes():
     volumes = [
         {"name": "scratch", "mountPath": "/scratch", "emptyDir": {"sizeLimit": "64Mi", "medium": "memory"}},
         {"name": "models", "mountPath": "/models", "claim": "models", "readOnly": True},
@@ -296,7 +296,7 @@ def unix(text):
         ({"validUntil": "2026-06-01T12:00:00Z"}, "2026-06-01T12:00:00+00:00", False),
     ],
 )
-def test_schedules(time, moment, active):
+def test_schedule_is_active_within_its_window(time, moment, active):
     window = ActiveTime.model_validate(time)
     assert window.active(unix(moment)) is active
     assert active_at((), unix(moment))
@@ -314,7 +314,7 @@ def test_schedules(time, moment, active):
         ),
     ],
 )
-def test_sentences_of_bad_schedules(time, sentence):
+def test_invalid_schedule_error_names_field(time, sentence):
     area = {"circle": {"center": {"lat": 1, "lon": 2}, "radius": 5}}
     with pytest.raises(InvalidObject) as caught:
         Zone.from_body(manifest("Zone", "z", {"area": area, "schedule": [time]}))
@@ -331,14 +331,14 @@ def test_sentences_of_bad_schedules(time, sentence):
         ({"components": [STORE | {"container": "x" * 500}]}, "spec.components[0].container: must be an object with"),
     ],
 )
-def test_wrong_types_are_told_in_words_of_manifests(spec, sentence):
+def test_wrong_type_error_uses_manifest_terms(spec, sentence):
     with pytest.raises(InvalidObject) as caught:
         Application.from_body(manifest("Application", "a", spec))
     assert str(caught.value).startswith(sentence)
     assert len(str(caught.value)) < 200
 
 
-def test_too_many_waypoints_are_refused():
+def test_application_with_too_many_waypoints_is_refused():
     path = [{"lat": 50 + i * 1e-6, "lon": 4} for i in range(1000)]
     point = {"navigation": "pathBased", "path": path}
     app = application(navigator(PATH) | {"control": "partial", "controlPoints": [point] * 3})
@@ -347,7 +347,7 @@ def test_too_many_waypoints_are_refused():
 
 
 @pytest.mark.parametrize("control", [{}, {"control": "full"}])
-def test_full_control_takes_one_control_point(control):
+def test_full_control_permits_one_control_point(control):
     point = {"navigation": "pathBased", "path": PATH}
     with pytest.raises(InvalidObject, match=r"controlPoints: a driver with full control has one control point"):
         application(navigator(PATH) | control | {"controlPoints": [point, point]})
@@ -361,7 +361,7 @@ def test_full_control_takes_one_control_point(control):
         ("networkId", ["fleet", "Fleet 7!", "n" * 32], ["", "n" * 33, "réseau", "a\nb"]),
     ],
 )
-def test_names_of_devices_and_networks_are_what_nodes_can_have(field: str, good: list[str], bad: list[str]) -> None:
+def test_interface_accepts_valid_device_and_network_names_only(field: str, good: list[str], bad: list[str]) -> None:
     def interface(name: str) -> dict[str, Any]:
         pairing = {"networkId": name if field == "networkId" else "net"}
         return {"technology": "WiFi", "device": name if field == "device" else "wlan0", "range": 80, "pairing": pairing}

@@ -18,7 +18,7 @@ def corridor(path, width=7):
 
 @given(paths, spots, st.floats(20, 400))
 @settings(max_examples=examples(60), deadline=None)
-def test_samples_lie_inside_and_measure_area(path, centre, radius):
+def test_coverage_samples_lie_inside_and_measure_area(path, centre, radius):
     shape = corridor(path)
     samples = Samples(shape)
     xy = samples.xy()
@@ -32,7 +32,7 @@ def test_samples_lie_inside_and_measure_area(path, centre, radius):
     assert counted / len(samples) == pytest.approx(exact, abs=0.015)
 
 
-def test_samples_leave_holes_out_and_reach_every_part():
+def test_coverage_samples_exclude_holes_and_include_every_part():
     ring = shapely.Point(0, 0).buffer(100).difference(shapely.Point(0, 0).buffer(60))
     shape = ring.union(shapely.box(300, 300, 320, 320))
     xy = Samples(shape).xy()
@@ -40,7 +40,7 @@ def test_samples_leave_holes_out_and_reach_every_part():
     assert (xy > 300).all(axis=1).any()
 
 
-def test_a_long_narrow_path_is_sampled_across():
+def test_coverage_samples_of_long_narrow_path_measure_area():
     shape = shapely.LineString([(0, 0), (40_000, 40_000)]).buffer(7)
     samples = Samples(shape)
     assert samples.spacing_m <= 3.6
@@ -48,7 +48,7 @@ def test_a_long_narrow_path_is_sampled_across():
 
 
 def plain_greedy(points, discs, share, unfit):
-    """The textbook loop: look at every candidate in every round; among equals the first."""
+    """Return the picks of the textbook algorithm: every candidate in every round, the first among equals."""
     reached = {
         name: {i for i, p in enumerate(points) if (p[0] - x) ** 2 + (p[1] - y) ** 2 <= r * r}
         for name, (x, y, r) in discs.items()
@@ -74,7 +74,7 @@ discs = st.lists(
 
 @given(paths, discs, st.sets(st.integers(0, 13), max_size=4), st.sampled_from([0.3, 0.95, 1.0]))
 @settings(max_examples=examples(80), deadline=None)
-def test_lazy_greedy_equals_plain_greedy(path, found, unfit, share):
+def test_lazy_greedy_coverage_equals_plain_greedy(path, found, unfit, share):
     samples = Samples(corridor(path, width=25))
     named = {f"n{i:02d}": disc for i, disc in enumerate(found)}
     refused = {f"n{i:02d}" for i in unfit}
@@ -85,7 +85,7 @@ def test_lazy_greedy_equals_plain_greedy(path, found, unfit, share):
     assert [(p.name, round(p.share * len(samples))) for p in picks] == wanted
 
 
-def test_more_candidates_than_a_batch_still_equal_plain_greedy():
+def test_lazy_greedy_coverage_equals_plain_greedy_for_more_than_one_batch():
     rng = np.random.default_rng(5)
     samples = Samples(corridor([(0, 0), (300, 80), (600, -40)]))
     xy = np.column_stack((rng.uniform(-50, 650, 700), rng.uniform(-80, 120, 700)))
@@ -102,7 +102,7 @@ def test_more_candidates_than_a_batch_still_equal_plain_greedy():
     assert found == wanted
 
 
-def test_what_is_there_already_counts_and_what_is_kept_stays():
+def test_greedy_coverage_keeps_nodes_and_counts_covered_samples():
     samples = Samples(corridor([(0, 0), (400, 0)]))
     xy = np.array([[100.0, 0], [120.0, 0], [300.0, 0]])
     reach = np.full(3, 110.0)

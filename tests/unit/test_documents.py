@@ -1,4 +1,4 @@
-"""Files of users: what their values are, on which line, and the sentence for what no one can mean."""
+"""Parser of YAML and JSON files of users: values, line numbers, limits and error messages."""
 
 import json
 import time
@@ -27,17 +27,17 @@ def parsed(text, **how):
         ("1.2.3", "1.2.3"), ("'5'", "5"), ('"on"', "on"), ("!!str 5", "5"), ("|-\n  5", "5"), ("=", "="),
     ],
 )  # fmt: skip
-def test_scalars_are_what_kubectl_takes_them_for(text, value):
+def test_yaml_scalars_are_parsed_as_by_kubectl(text, value):
     ((found,),) = (tuple(one.values()) for one in parsed(f"a: {text}"))
     assert (found, type(found)) == (value, type(value))
 
 
-def test_aliases_and_merges_are_what_they_stand_for():
+def test_yaml_aliases_and_merges_are_expanded():
     (found,) = parsed("a: &a {p: 1, q: 2}\nb:\n  <<: *a\n  r: 3\nc: [*a, &n 5, *n]")
     assert found == {"a": {"p": 1, "q": 2}, "b": {"p": 1, "q": 2, "r": 3}, "c": [{"p": 1, "q": 2}, 5, 5]}
 
 
-def test_json_is_read_as_such():
+def test_json_is_parsed_as_by_json_module():
     text = '{"a": "\\ud83d\\ude00 \\/ \\\\ud83d\\u00e9",\n\t"b": [1, 2.5, true, null, "on"]}'
     assert parsed(text, is_json=True) == (json.loads(text),)
 
@@ -45,7 +45,7 @@ def test_json_is_read_as_such():
 @pytest.mark.parametrize(
     "number", [0x7F, 0x80, 0x85, 0x9F, 0xA0, 0x2028, 0x2029, 0xFEFF, 0xFFFD, 0xFFFE, 0xFFFF, 0x10FFFF]
 )
-def test_json_has_characters_that_yaml_has_not(number):
+def test_json_accepts_characters_that_yaml_forbids(number):
     text = f'{{"a{chr(number)}": "b{chr(number)} c", "d": ["{chr(number)}\\u00e9"]}}'
     assert parsed(text, is_json=True) == (json.loads(text),)
     (found,) = parse_documents(f'{{"a": "{chr(number)}",\n"b": {{}}}}'.encode(), "f", is_json=True).values
@@ -75,7 +75,7 @@ def test_json_has_characters_that_yaml_has_not(number):
         (BOMB, "f.yaml:6: aliases repeat more than 100000 values"),
     ],
 )  # fmt: skip
-def test_what_no_one_can_mean_has_its_line(text, sentence):
+def test_invalid_yaml_error_has_line(text, sentence):
     begun = time.process_time()
     with pytest.raises(BadDocument) as refused:
         parsed(text)
@@ -94,13 +94,13 @@ def test_what_no_one_can_mean_has_its_line(text, sentence):
         ('{"a":' * 200 + "1" + "}" * 200, "f.yaml:1: lists or objects are nested deeper"),
     ],
 )
-def test_what_is_no_json_has_its_line(text, sentence):
+def test_invalid_json_error_has_line(text, sentence):
     with pytest.raises(BadDocument) as refused:
         parsed(text, is_json=True)
     assert str(refused.value).startswith(sentence)
 
 
-def test_limits(monkeypatch):
+def test_document_limits_are_enforced(monkeypatch):
     for name, value, sentence in (("MAX_NODES", 10, "more than 10 values"), ("MAX_BYTES", 0, "larger than 0 MiB")):
         with monkeypatch.context() as patched, pytest.raises(BadDocument, match=sentence):
             patched.setattr(documents, name, value)
@@ -112,7 +112,7 @@ def test_limits(monkeypatch):
     assert parse_document(b"", "f")[0] is None
 
 
-def test_lines_of_fields():
+def test_document_returns_line_of_field():
     text = "---\nkind: A\nspec:\n  list:\n    - {p: 1}\n    -\n      p: 2\n      q: [3]\n---\nkind: B\n"
     found = parse_documents(text.encode(), "f")
     first, second = found.values
@@ -122,7 +122,7 @@ def test_lines_of_fields():
     assert found.where({}) == "f"
 
 
-def test_a_large_zone_is_read_in_reasonable_time():
+def test_large_zone_is_parsed_within_four_seconds():
     text = "ring:\n" + "".join(f"  - {{lat: {50 + i / 1e6}, lon: {4 + i / 1e6}}}\n" for i in range(50_000))
     begun = time.process_time()
     (found,) = parsed(text)
@@ -130,7 +130,7 @@ def test_a_large_zone_is_read_in_reasonable_time():
     assert len(found["ring"]) == 50_000
 
 
-def test_what_is_written_is_read_back():
+def test_dumped_documents_are_parsed_unchanged():
     texts = [
         "",
         "on",

@@ -1,4 +1,4 @@
-"""Missions: how long, in which order, who may come along."""
+"""Missions: duration, order of points, and flights that passengers can share."""
 
 import itertools
 import math
@@ -25,8 +25,8 @@ def flight(*legs, **more):
     return Flight(("default", "other"), tuple(tuple(place(*p) for p in leg) for leg in legs), **more)
 
 
-def walked(leg, step=0.25):
-    """Places along a polyline, no further apart than a step."""
+def walk(leg, step=0.25):
+    """Yield points along a polyline, at most `step` metres apart."""
     for (ax, ay), (bx, by) in itertools.pairwise(leg):
         pieces = max(1, math.ceil(math.hypot(bx - ax, by - ay) / step))
         for i in range(pieces + 1):
@@ -34,8 +34,8 @@ def walked(leg, step=0.25):
 
 
 def visits(leg, points, radius, ordered):
-    """Oracle: walk the path in small steps and tick points off."""
-    steps = list(walked(leg))
+    """Return True if the path visits all points. Oracle: walks the path in small steps."""
+    steps = list(walk(leg))
     left = list(points)
     if not ordered:
         return all(any(math.dist(s, p) <= radius for s in steps) for p in points)
@@ -51,8 +51,8 @@ def visits(leg, points, radius, ordered):
     st.booleans(),
 )
 @settings(max_examples=examples(150), deadline=None)
-def test_points_are_visited_in_order_along_the_path(leg, offsets, ordered):
-    steps = list(walked(leg))
+def test_first_missed_equals_walk_along_path(leg, offsets, ordered):
+    steps = list(walk(leg))
     assume(len(steps) > 10)
     points = [
         (steps[int(t * (len(steps) - 1))][0] + dx, steps[int(t * (len(steps) - 1))][1] + dy) for t, dx, dy in offsets
@@ -65,13 +65,13 @@ def test_points_are_visited_in_order_along_the_path(leg, offsets, ordered):
         assert missed is not None
 
 
-def test_a_path_flown_twice_may_be_met_on_the_second_pass():
+def test_first_missed_accepts_point_on_second_pass():
     there_and_back = flight([(0, 0), (300, 0), (0, 0)])
     assert first_missed([place(200, 0), place(100, 0)], there_and_back, 7, ordered=True) is None
     assert first_missed([place(200, 0), place(100, 0)], flight([(0, 0), (300, 0)]), 7, ordered=True) == 1
 
 
-def test_altitude_counts_where_both_sides_give_it():
+def test_first_missed_compares_altitude_when_both_have_it():
     climbing = flight([(0, 0, 10), (300, 0, 40)])
     assert first_missed([place(150, 0, 25)], climbing, 7, ordered=True) is None
     assert first_missed([place(150, 0, 60)], climbing, 7, ordered=True) == 0
@@ -79,7 +79,7 @@ def test_altitude_counts_where_both_sides_give_it():
     assert first_missed([place(150, 0, 60, altitude_reference="amsl")], climbing, 7, ordered=True) is None
 
 
-def test_what_lies_behind_the_drone_is_not_visited_and_nothing_is_known_between_legs():
+def test_first_missed_ignores_path_behind_drone_and_gaps_between_legs():
     legs = [(0, 0), (100, 0), (200, 0)]
     assert first_missed([place(50, 0)], flight(legs, reached=2), 7, ordered=True) == 0
     assert first_missed([place(150, 0)], flight(legs, reached=2), 7, ordered=True) is None
@@ -87,7 +87,7 @@ def test_what_lies_behind_the_drone_is_not_visited_and_nothing_is_known_between_
     assert first_missed([place(150, 0)], flight([(0, 0), (100, 0)], [(200, 0), (300, 0)]), 7, ordered=True) == 0
 
 
-def test_flight_of_a_driver_breaks_at_regions():
+def test_flight_of_driver_is_interrupted_by_regions():
     square = [at(400, 0), at(500, 0), at(500, 100), at(400, 100)]
     points = [
         {"navigation": "pathBased", "path": [at(100, 0), at(200, 0)]},
@@ -102,7 +102,7 @@ def test_flight_of_a_driver_breaks_at_regions():
 
 @given(st.lists(spots, min_size=1, max_size=7))
 @settings(max_examples=examples(60), deadline=None)
-def test_short_tours_are_shortest(points):
+def test_short_tour_is_optimal_for_few_points(points):
     def length(order):
         return sum(math.dist(points[a], points[b]) for a, b in itertools.pairwise(order))
 
@@ -115,14 +115,14 @@ def test_short_tours_are_shortest(points):
 
 @given(st.lists(spots, min_size=10, max_size=30))
 @settings(max_examples=examples(30), deadline=None)
-def test_longer_tours_visit_all_and_beat_the_order_given(points):
+def test_short_tour_of_many_points_is_no_longer_than_given_order(points):
     tour = short_tour(points)
     assert sorted(tour) == list(range(len(points)))
     length = sum(math.dist(points[a], points[b]) for a, b in itertools.pairwise(tour))
     assert length <= sum(math.dist(a, b) for a, b in itertools.pairwise(points)) + 1e-6
 
 
-def test_time_of_a_mission_by_hand():
+def test_mission_estimate_equals_manual_calculation():
     app = application(navigator([at(300, 0, 30), at(300, 400, 30)]))
     depots = inventory().depots
     area = operation_area(app.spec, depots, 7)
@@ -135,7 +135,7 @@ def test_time_of_a_mission_by_hand():
     assert found.top_m == 30
 
 
-def test_stay_in_a_region_counts():
+def test_mission_estimate_includes_time_in_region():
     region = {"circle": {"center": at(300, 0), "radius": 50}}
     app = application(
         navigator(PATH) | {"controlPoints": [{"navigation": "regionBased", "region": region, "duration": 9}]}
@@ -146,7 +146,7 @@ def test_stay_in_a_region_counts():
     )
 
 
-def test_the_system_flies_to_between_and_from_control_points():
+def test_transit_legs_connect_home_and_control_points():
     points = [{"navigation": "pathBased", "path": [at(x, 0), at(x + 50, 0)]} for x in (100, 400)]
     spec = application(navigator(PATH) | {"control": "partial", "controlPoints": points}).spec
     area = operation_area(spec, {}, 7)
@@ -157,7 +157,7 @@ def test_the_system_flies_to_between_and_from_control_points():
     assert transit_legs(full, area, HOME, inventory().depots) == []
 
 
-def test_unordered_points_are_joined_by_a_short_way():
+def test_operation_area_joins_unordered_points_by_short_tour():
     poi = {"points": [at(x, 0) for x in (0, 300, 100, 200)], "ordered": False}
     spec = application(VIEWER | {"egress": [], "pointsOfInterest": poi}).spec
     area = operation_area(spec, {}, 7)
@@ -165,7 +165,7 @@ def test_unordered_points_are_joined_by_a_short_way():
     assert [round(FRAME.xy(p.lat, p.lon)[0]) for p in area.route] == [0, 100, 200, 300]
 
 
-def test_area_has_a_part_for_each_control_point():
+def test_operation_area_has_part_for_each_control_point():
     points = [{"navigation": "pathBased", "path": [at(x, 0), at(x + 50, 0)]} for x in (100, 400)]
     spec = application(navigator(PATH) | {"control": "partial", "controlPoints": points}).spec
     area = operation_area(spec, {}, 7)

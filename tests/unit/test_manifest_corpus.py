@@ -1,4 +1,4 @@
-"""The corpus of manifests as `fractus plan` judges it; tests/integration has the API server's verdicts."""
+"""The corpus of manifests as validated by `fractus plan`. tests/integration compares it with the API server."""
 
 import json
 import re
@@ -11,7 +11,7 @@ from fractus_core.api.model import MAX_OBJECT_BYTES
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.refused)
-def test_manifests_are_taken_or_refused_with_their_sentence_and_line(case, tmp_path):
+def test_corpus_manifest_is_accepted_or_refused_with_line(case, tmp_path):
     file = tmp_path / "m.yaml"
     file.write_text(case.text)
     if not case.refused:
@@ -24,13 +24,13 @@ def test_manifests_are_taken_or_refused_with_their_sentence_and_line(case, tmp_p
     assert len(str(refused.value).splitlines()) == 1
 
 
-def test_the_corpus_has_both_verdicts():
+def test_corpus_has_accepted_and_refused_manifests():
     refused = [case for case in CASES if case.refused]
     assert len(refused) > 90
     assert len(CASES) - len(refused) >= 10
 
 
-def test_a_sentence_has_no_characters_that_a_terminal_acts_on(tmp_path):
+def test_manifest_error_escapes_control_characters(tmp_path):
     file = tmp_path / "m.json"
     body = {"apiVersion": "fractus.dev/v1alpha1", "kind": "Policy", "metadata": {"name": "a\n\x1b[2J\x7f"}, "spec": {}}
     file.write_text(json.dumps(body))
@@ -39,7 +39,7 @@ def test_a_sentence_has_no_characters_that_a_terminal_acts_on(tmp_path):
     assert str(refused.value).isprintable()
 
 
-def test_an_object_that_etcd_does_not_take_is_refused():
+def test_object_larger_than_etcd_limit_is_refused():
     ring = [{"lat": 50 + i / 1e6, "lon": 4 + i / 1e6} for i in range(10_000)]
     shape = {"polygon": {"exterior": ring, "holes": [ring] * 5}}
     body = {"apiVersion": "fractus.dev/v1alpha1", "kind": "Zone", "metadata": {"name": "z"}, "spec": {"area": shape}}
@@ -50,7 +50,7 @@ def test_an_object_that_etcd_does_not_take_is_refused():
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.KIND)
-def test_what_is_no_object_has_a_sentence(kind):
+def test_body_that_is_not_an_object_raises_invalid_object(kind):
     for body in ({}, {"spec": 5}, {"metadata": []}, {"metadata": {"name": "a"}, "spec": [[]]}):
         with pytest.raises(InvalidObject):
             kind.from_body(body)

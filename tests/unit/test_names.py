@@ -1,4 +1,4 @@
-"""Names of what is made for a component: labels that tell every namespace, application, component and node apart."""
+"""Names of child objects: labels that are unique for each namespace, application, component and node."""
 
 import itertools
 import re
@@ -23,7 +23,7 @@ def instance(application, component, node=None):
 
 
 def divisions(tokens):
-    """Every way to read a row of words as an application, a component and perhaps a node, with hyphens or with dots."""
+    """Return all divisions of words into application, component and optional node, joined by hyphens or dots."""
     found = []
     for i, j in itertools.combinations(range(1, len(tokens) + 1), 2):
         component, node = "-".join(tokens[i:j]), tokens[j:]
@@ -46,7 +46,7 @@ words = st.lists(st.sampled_from(["a", "b", "e", "1", "edge", "stat", "c2", "x" 
         (("a.b", "C"), ("a-b", "C")),
     ],
 )
-def test_instances_that_are_joined_alike_are_told_apart(one, other):
+def test_instance_names_differ_when_joined_parts_are_equal(one, other):
     assert instance(*one) != instance(*other)
     if len(one) == 2:
         assert service_name(one[0], named(one[1])) != service_name(other[0], named(other[1]))
@@ -54,10 +54,10 @@ def test_instances_that_are_joined_alike_are_told_apart(one, other):
 
 @given(words)
 @settings(max_examples=examples(400, 40), deadline=None)
-def test_every_division_of_the_same_words_has_its_own_name(tokens):
+def test_instance_names_differ_for_every_division_of_same_words(tokens):
     divided = divisions(tokens)
     names = [instance(*parts) for parts in divided]
-    # What looks like a name that was made already, hash and all, takes no other's.
+    # A name that looks like a generated name, including its hash, also differs from all others.
     made = {parts for name in names for parts in divisions(name.split("-"))} if len(tokens) < 4 else set()
     everything = list(dict.fromkeys([*divided, *made]))
     names = [instance(*parts) for parts in everything]
@@ -73,7 +73,7 @@ kubernetes = st.text("ab1-.", min_size=1, max_size=72).map(lambda text: f"{text.
 components = st.text("aAB1-", max_size=38).map(lambda text: f"a{text}".strip("-"))
 
 
-def told_apart_by(parts):
+def identity_of(parts):
     namespace, application, component, node = parts
     return namespace, application, named(component).slug, node
 
@@ -82,11 +82,11 @@ def told_apart_by(parts):
     st.lists(
         st.tuples(st.sampled_from(["a", "a-b", "b"]), kubernetes, components, st.none() | kubernetes),
         min_size=2,
-        unique_by=told_apart_by,
+        unique_by=identity_of,
     )
 )
 @settings(max_examples=examples(400, 40), deadline=None)
-def test_no_two_instances_share_a_grant(instances):
+def test_grant_names_differ_for_different_instances(instances):
     names = [grant_name(namespace, instance(*parts)) for namespace, *parts in instances]
     assert len(set(names)) == len(names)
     assert all(LABEL.fullmatch(instance(*parts)) for _, *parts in instances)
@@ -100,17 +100,17 @@ def test_no_two_instances_share_a_grant(instances):
         (("traffic", "Checker", "e12"), "traffic-checker-e12"),
     ],
 )
-def test_names_that_can_be_read_back_have_no_hash(parts, name):
+def test_unambiguous_instance_names_have_no_hash(parts, name):
     assert instance(*parts) == name
 
 
-def test_other_names_begin_with_what_they_are_joined_of():
+def test_ambiguous_instance_names_have_readable_prefix():
     assert re.fullmatch(r"traffic-monitoring-data-store-[0-9a-f]{10}", instance("traffic-monitoring", "DataStore"))
     assert re.fullmatch(r"a-1st-viewer-[0-9a-f]{10}", service_name("1st", named("Viewer")))
     assert instance("traffic-monitoring", "DataStore") == instance("traffic-monitoring", "DataStore")
 
 
-def test_a_name_that_looks_shortened_is_no_label_of_another():
+def test_label_value_of_shortened_name_differs():
     long = "v" * 200
     assert label_value(label_value(long)) != label_value(long)
     assert len(label_value(label_value(long))) <= 63

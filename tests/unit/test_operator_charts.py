@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[2]
 CHARTS = ROOT / "charts"
 
 
-def test_the_chart_carries_the_generated_kinds() -> None:
+def test_chart_contains_generated_crds() -> None:
     carried = {
         path.name: yaml.safe_load(path.read_text()) for path in (CHARTS / "fractus-crds" / "files").glob("*.yaml")
     }
@@ -27,7 +27,7 @@ def test_the_chart_carries_the_generated_kinds() -> None:
 
 
 @pytest.mark.parametrize("chart", ["fractus", "fractus-crds", "fractus-demo"])
-def test_every_value_is_in_the_schema_and_the_other_way_round(chart: str) -> None:
+def test_chart_values_and_schema_have_same_keys(chart: str) -> None:
     values = yaml.safe_load((CHARTS / chart / "values.yaml").read_text())
     schema = json.loads((CHARTS / chart / "values.schema.json").read_text())
 
@@ -42,7 +42,7 @@ def test_every_value_is_in_the_schema_and_the_other_way_round(chart: str) -> Non
     compare(values, schema, chart)
 
 
-def test_the_charts_have_the_version_of_the_package_and_the_images_of_the_checkout() -> None:
+def test_chart_version_and_images_match_package() -> None:
     import tomllib
 
     version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
@@ -52,7 +52,7 @@ def test_the_charts_have_the_version_of_the_package_and_the_images_of_the_checko
         assert image_name("agent", described["appVersion"]) == image_name("agent")
 
 
-def test_the_charts_ask_for_the_kubernetes_that_is_said() -> None:
+def test_chart_requires_documented_kubernetes_version() -> None:
     least = ".".join(map(str, MIN_VERSION))
     for page in ("README.md", "docs/clusters.md"):
         assert f"Kubernetes {least} or later" in (ROOT / page).read_text()
@@ -61,13 +61,13 @@ def test_the_charts_ask_for_the_kubernetes_that_is_said() -> None:
         assert described["kubeVersion"] == f">={least}.0-0"
 
 
-def test_the_templates_know_the_defaults() -> None:
+def test_chart_templates_have_default_values() -> None:
     known = (CHARTS / "fractus" / "files" / "values.yaml").read_text()
     assert known == (CHARTS / "fractus" / "values.yaml").read_text(), "run `make generate`"
 
 
 @pytest.mark.parametrize("chart", ["fractus", "fractus-crds", "fractus-demo"])
-def test_the_readme_has_the_values(chart: str) -> None:
+def test_chart_readme_lists_values(chart: str) -> None:
     spec = importlib.util.spec_from_file_location("pages", ROOT / "docs" / "pages.py")
     assert spec is not None
     assert spec.loader is not None
@@ -84,5 +84,5 @@ def test_the_readme_has_the_values(chart: str) -> None:
         ]
 
     for name in leaves(yaml.safe_load((CHARTS / chart / "values.yaml").read_text()), ""):
-        # What is written in braces has one row.
+        # A value in braces has one row.
         assert f"`{name}`" in text or f"`{name.rpartition('.')[0]}`" in text, name

@@ -1,4 +1,4 @@
-"""Plans that stand: what makes them grow, what may not be displaced, and who may come along with a flight under way."""
+"""Changes of an active plan: scale-up, running instances that stay, and passengers on the remaining flight."""
 
 import pytest
 from fractus_core.api.geometry import Position
@@ -16,7 +16,7 @@ def ground(locations, name="GroundViewer"):
     return component(name, "edge", services=CAMERA, locations=locations)
 
 
-# -- plans that stand --
+# -- active plans --
 
 
 def everywhere(instances="*"):
@@ -24,7 +24,7 @@ def everywhere(instances="*"):
 
 
 @pytest.mark.parametrize("instances", ["*", 3])
-def test_a_location_with_too_few_instances_grows_onto_a_new_node(instances):
+def test_plan_scales_up_to_new_node_when_location_has_too_few_instances(instances):
     app = everywhere(instances)
     stock = inventory([drone("d")], [edge("e1", (0, 0)), edge("e2", (50, 0))])
     before = plan(app, stock)
@@ -36,7 +36,7 @@ def test_a_location_with_too_few_instances_grows_onto_a_new_node(instances):
     assert next_free_node(app, more, Settings(), after) is None
 
 
-def test_a_node_that_does_not_suit_is_no_room():
+def test_scale_up_ignores_full_and_excluded_nodes():
     app = everywhere()
     before = plan(app, inventory([drone("d")], [edge("e1", (0, 0))]))
     full = host("e2", "edge", cpu=0.01)
@@ -49,7 +49,7 @@ def test_a_node_that_does_not_suit_is_no_room():
     assert next_free_node(app, stock, Settings(), before) == "e2"
 
 
-def test_what_comes_first_in_the_manifest_does_not_drive_out_what_runs():
+def test_plan_keeps_running_instance_when_earlier_component_needs_node():
     first = ground([{"center": at(0, 0), "radius": 100, "instances": "*"}], name="First")
     second = ground([{"center": at(0, 0), "radius": 100, "instances": 1}], name="Second")
     app = application(first, second)
@@ -62,7 +62,7 @@ def test_what_comes_first_in_the_manifest_does_not_drive_out_what_runs():
     assert set(map(where, after.placements)) == {("Second", "e1"), ("First", "e2")}
 
 
-def test_what_runs_gives_way_where_there_is_no_other_plan():
+def test_plan_moves_running_instance_when_no_other_plan_exists():
     first = ground([{"center": at(0, 0), "radius": 100, "instances": 1}], name="First")
     second = ground([{"center": at(0, 0), "radius": 100, "instances": "*"}], name="Second")
     stock = inventory([], [edge("e1", (0, 0))], [host("e1", "edge", cpu=0.15)])
@@ -71,7 +71,7 @@ def test_what_runs_gives_way_where_there_is_no_other_plan():
     assert set(map(where, after.placements)) == {("First", "e1")}
 
 
-def test_a_drone_that_took_someone_along_is_judged_again_when_it_is_to_fly_for_him():
+def test_plan_checks_shared_drone_again_when_passenger_flies_alone():
     app = passenger([at(120, 0), at(250, 3)])
     along = plan(app, shared([drone("b", battery=0.21)], {"b": flown_by_other()}))
     with pytest.raises(Infeasible) as caught:
@@ -79,10 +79,10 @@ def test_a_drone_that_took_someone_along_is_judged_again_when_it_is_to_fly_for_h
     assert caught.value.rejected[0].reason == "FlightTooLong"
 
 
-# -- what is left of a flight --
+# -- remaining flight --
 
 
-def test_of_a_flight_only_what_lies_ahead_is_offered():
+def test_remaining_flight_contains_only_path_ahead():
     whole = flown_by_other()
     rest = remaining_flight(whole, Position(**at(150, 3)), 7.0)
     assert misses(passenger([at(200, 0), at(290, 0)]), rest, 7.0) is None
@@ -91,7 +91,7 @@ def test_of_a_flight_only_what_lies_ahead_is_offered():
     assert remaining_flight(whole, Position(**at(150, 60)), 7.0) is None
 
 
-def test_of_two_passages_the_last_counts():
+def test_remaining_flight_starts_at_last_passage_of_position():
     there_and_back = application(navigator([at(0, 0), at(200, 0), at(0, 0)]))
     whole = flight_of(there_and_back, inventory().depots)
     rest = remaining_flight(whole, Position(**at(100, 0)), 7.0)

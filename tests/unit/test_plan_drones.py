@@ -1,4 +1,4 @@
-"""Which drone an application gets: one that flies already and may be shared, or one that is there for it."""
+"""Choice of the drone: a flying drone that can be shared, or an idle drone near the start."""
 
 import dataclasses
 
@@ -34,7 +34,7 @@ def flown_by_other():
     return dataclasses.replace(flight_of(app, inventory().depots), holder=OTHER)
 
 
-def test_passengers_come_along_with_a_drone_that_flies_by():
+def test_passenger_shares_drone_that_visits_its_points():
     stock = shared([drone("busy", battery=0.5), drone("idle")], {"busy": flown_by_other()})
     result = plan(passenger([at(120, 0), at(250, 3)]), stock)
     assert (result.drone.node, result.drone.shared_with) == ("busy", "default/other")
@@ -43,7 +43,7 @@ def test_passengers_come_along_with_a_drone_that_flies_by():
     assert result.drone.transit == ()
 
 
-def test_passengers_do_not_come_along_against_the_order():
+def test_passenger_does_not_share_drone_that_visits_points_in_another_order():
     stock = shared([drone("busy"), drone("idle")], {"busy": flown_by_other()})
     result = plan(passenger([at(250, 3), at(120, 0)]), stock)
     assert (result.drone.node, result.drone.shared_with) == ("idle", None)
@@ -57,13 +57,13 @@ def test_passengers_do_not_come_along_against_the_order():
     assert plan(passenger([at(250, 3), at(120, 0)], ordered=False), stock).drone.node == "busy"
 
 
-def test_a_driver_never_shares():
+def test_driver_never_shares_drone():
     with pytest.raises(Infeasible) as caught:
         plan(application(navigator(PATH)), shared([drone("busy")], {"busy": flown_by_other()}))
     assert caught.value.reason == "DroneBusy"
 
 
-def test_a_passenger_that_came_along_stays_aboard():
+def test_passenger_stays_on_shared_drone_when_replanned():
     app = passenger([at(120, 0), at(250, 3)])
     stock = shared([drone("b"), drone("c")], {"b": flown_by_other(), "c": flown_by_other()})
     first = plan(app, stock)
@@ -73,10 +73,10 @@ def test_a_passenger_that_came_along_stays_aboard():
     assert plan(app, tired).drone.node == "c"
 
 
-# -- which drones are there --
+# -- drones near the start --
 
 
-def test_partial_control_takes_drones_of_depots_nearby():
+def test_partial_control_uses_drones_of_nearby_depots():
     start = {"position": at(900, 0)}
     fleet = [drone("near", home=(0, 0)), drone("far", home=(9000, 0))]
     partial = application(navigator([at(950, 0, 10)], point=start, control="partial"))
@@ -88,7 +88,7 @@ def test_partial_control_takes_drones_of_depots_nearby():
         plan(application(navigator([at(950, 0, 10)], point=start)), inventory(fleet))
 
 
-def test_partial_control_from_a_named_depot_takes_its_drones_and_those_near_it():
+def test_partial_control_from_depot_uses_its_drones_and_nearby_drones():
     fleet = [
         drone("away", home=(2500, 0), minutes=60),
         drone("far", home=(2500, 10), depot="other", minutes=60),
@@ -103,7 +103,7 @@ def test_partial_control_from_a_named_depot_takes_its_drones_and_those_near_it()
     assert reasons(plan(application(navigator(PATH)), inventory(fleet)))["Navigator", "near"] == "OtherDepot"
 
 
-def test_full_control_at_a_position_takes_the_drones_of_the_depot_there():
+def test_full_control_at_position_uses_drones_of_depot_there():
     start = {"position": at(15, 0)}
     fleet = [drone("kept", home=(400, 0)), drone("stray", home=(60, 0), depot=None)]
     result = plan(application(navigator(PATH, point=start)), inventory(fleet))
@@ -111,21 +111,21 @@ def test_full_control_at_a_position_takes_the_drones_of_the_depot_there():
     assert reasons(result) == {("Navigator", "stray"): "TooFar"}
 
 
-def test_a_drone_that_cannot_climb_so_high_is_rejected_with_the_figures():
+def test_drone_with_too_low_maximum_altitude_is_rejected_with_figures():
     with pytest.raises(Infeasible) as caught:
         plan(application(navigator([at(100, 0, 95)])), inventory([drone("d")]))
     assert [r.reason for r in caught.value.rejected] == ["TooHigh"]
     assert "climbs to 80 m; the path goes up to 95 m" in caught.value.message
 
 
-def test_a_drone_that_could_never_fly_it_does_not_make_the_application_wait():
+def test_claimed_drone_with_too_short_flight_time_is_not_waited_for():
     with pytest.raises(Infeasible) as caught:
         plan(application(navigator(PATH)), inventory([drone("d", minutes=2)], claimed={"d": OTHER}))
     assert caught.value.reason == "NoDrone"
     assert "even with a full battery" in caught.value.message
 
 
-def test_flight_time_message_has_its_figures():
+def test_flight_time_message_contains_figures():
     with pytest.raises(
         Infeasible,
         match=r"can fly 0\.8 min with its reserve kept, with its battery at 25%; the mission takes 2\.\d min for \d+ m",

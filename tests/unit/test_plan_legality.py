@@ -1,4 +1,4 @@
-"""What the policies say of a mission's way before takeoff: in the plan, by the engine that judges the flight."""
+"""Legality of a planned path before takeoff, judged by the policy engine that also judges the flight."""
 
 import math
 import random
@@ -32,7 +32,7 @@ def stock(*policies, zones=(), drones=None, **more):
 
 
 def fenced(x, y, radius=20, **more):
-    """An inventory with a zone to keep out of."""
+    """Return an inventory with an exclusion zone."""
     return stock(policy("keep-out", zones=["z"], **FENCE | more), zones=[zone("z", (x, y), radius)])
 
 
@@ -40,7 +40,7 @@ def outcomes(choice: DroneChoice):
     return [(leg.flown_by, leg.outcome, leg.policies) for leg in choice.legality]
 
 
-def test_a_legal_way_has_nothing_to_say():
+def test_legality_is_empty_for_permitted_path():
     for inventory_ in (stock(), fenced(2000, 2000)):
         choice = plan(APP, inventory_, FORBID).drone
         assert choice.legality == ()
@@ -48,11 +48,11 @@ def test_a_legal_way_has_nothing_to_say():
         assert choice.mission == plan(APP, inventory_).drone.mission
 
 
-def test_policies_are_not_asked_without_a_time():
+def test_legality_is_not_checked_without_time():
     assert plan(APP, fenced(200, 0)).drone.legality == ()
 
 
-def test_a_leg_through_a_zone_is_known_before_takeoff():
+def test_legality_reports_leg_through_zone_before_takeoff():
     choice = plan(APP, fenced(200, 0), WARN).drone
     assert outcomes(choice)[0] == ("driver", "Denied", ("keep-out",))
     assert choice.policy_conflict.startswith("policies do not allow the leg to 39.3606")
@@ -63,7 +63,7 @@ def test_a_leg_through_a_zone_is_known_before_takeoff():
     assert [(r.node, r.reason) for r in caught.value.rejected] == [("d", "PolicyConflict")]
 
 
-def test_the_plan_says_what_the_engine_says_in_flight():
+def test_legality_matches_engine_verdict_in_flight():
     inventory_ = fenced(200, 0)
     found = plan(APP, inventory_, WARN)
     (grant,) = compile_grants(APP, found, inventory_)
@@ -75,7 +75,7 @@ def test_the_plan_says_what_the_engine_says_in_flight():
     assert (verdict.code, verdict.reason) == (leg.reason, leg.message)
 
 
-def test_the_system_flies_around_a_zone_and_the_plan_counts_that():
+def test_transit_detour_around_zone_counts_in_mission_distance():
     partial = application(navigator([at(300, 60, 10), at(330, 60, 10)], point={"position": at(280, 0)}, **NEAR))
     inventory_ = fenced(140, 0)
     choice = plan(partial, inventory_, FORBID).drone
@@ -84,7 +84,7 @@ def test_the_system_flies_around_a_zone_and_the_plan_counts_that():
     assert choice.mission.distance > plan(partial, inventory_).drone.mission.distance
 
 
-def test_a_zone_around_a_point_is_a_conflict_of_a_tour():
+def test_legality_reports_conflict_when_zone_contains_point_of_interest():
     tour = application(guide([at(100, 0, 10), at(300, 0, 10)]))
     choice = plan(tour, fenced(300, 0), WARN).drone
     assert next(leg for leg in outcomes(choice) if leg[1] == "Denied") == ("system", "Denied", ("keep-out",))
@@ -92,13 +92,13 @@ def test_a_zone_around_a_point_is_a_conflict_of_a_tour():
         plan(tour, fenced(300, 0), FORBID)
 
 
-def test_a_depot_inside_a_zone_is_a_conflict():
+def test_legality_reports_conflict_when_zone_contains_depot():
     choice = plan(APP, fenced(0, 0), WARN).drone
     assert choice.legality[0].start == choice.legality[0].end
     assert choice.policy_conflict is not None
 
 
-def test_a_limit_of_speed_makes_a_mission_too_long():
+def test_legality_reports_conflict_when_speed_limit_makes_mission_too_long():
     slow = policy("slow", type="LimitControl", kind="speed", upperLimit=0.5)
     choice = plan(APP, stock(slow), WARN).drone
     assert {leg[1:] for leg in outcomes(choice)} == {("Corrected", ("slow",))}
@@ -112,7 +112,7 @@ def test_a_limit_of_speed_makes_a_mission_too_long():
         plan(APP, short, FORBID)
 
 
-def test_a_limit_of_altitude_is_told_and_no_conflict():
+def test_legality_reports_altitude_limit_without_conflict():
     low = policy("low", type="LimitControl", kind="altitude", upperLimit=8)
     choice = plan(APP, stock(low), FORBID).drone
     assert {leg[1:] for leg in outcomes(choice)} == {("Corrected", ("low",))}
@@ -121,7 +121,7 @@ def test_a_limit_of_altitude_is_told_and_no_conflict():
 
 
 @pytest.mark.parametrize("how", [WARN, FORBID])
-def test_a_drone_that_may_fly_is_preferred(how):
+def test_plan_prefers_drone_without_policy_conflict(how):
     fleet = [drone("a", minutes=30), drone("b", battery=0.9, minutes=30)]
     banned = policy("ban", zones=["z"], nodes=[{"key": "name", "operator": "In", "values": ["a"]}], **FENCE)
     inventory_ = stock(banned, zones=[zone("z", (200, 0))], drones=fleet)
@@ -132,7 +132,7 @@ def test_a_drone_that_may_fly_is_preferred(how):
     assert plan(APP, inventory_).drone.node == "a"
 
 
-def test_a_drone_that_has_the_application_stays_unless_that_is_forbidden():
+def test_plan_keeps_drone_with_policy_conflict_unless_forbidden():
     fleet = [drone("a", battery=0.9, minutes=30), drone("b", minutes=30)]
     alone = stock(drones=fleet[:1])
     before = plan(APP, alone, WARN)
@@ -144,7 +144,7 @@ def test_a_drone_that_has_the_application_stays_unless_that_is_forbidden():
     assert plan(APP, inventory_, FORBID, previous=before).drone.node == "b"
 
 
-def test_who_comes_along_has_no_way_of_its_own():
+def test_passenger_on_shared_drone_has_no_legality():
     tour = application(guide([at(120, 0), at(250, 3)]))
     base = shared([drone("busy", minutes=30)], {"busy": flown_by_other()})
     fences = fenced(200, 0)
@@ -153,7 +153,7 @@ def test_who_comes_along_has_no_way_of_its_own():
     assert choice.legality == ()
 
 
-def test_policies_that_begin_or_end_during_the_mission_count():
+def test_legality_includes_policies_that_begin_or_end_during_mission():
     for begin_s, end_s, conflicts in ((60, 9000, True), (-9000, 60, True), (9000, 9060, False), (-9000, -60, False)):
         window = {"validFrom": _utc(NOW + begin_s), "validUntil": _utc(NOW + end_s)}
         choice = plan(APP, fenced(200, 0, **window), WARN).drone
@@ -164,14 +164,14 @@ def _utc(time_s):
     return datetime.fromtimestamp(time_s, UTC).isoformat()
 
 
-def test_a_driver_in_a_region_finds_its_own_way():
+def test_legality_permits_zone_inside_region_of_driver():
     region = {"polygon": {"exterior": [at(100, -100), at(300, -100), at(300, 100), at(100, 100)]}}
     driver = navigator(PATH) | {"controlPoints": [{"navigation": "regionBased", "region": region, "duration": 5}]}
     choice = plan(application(driver), fenced(200, 0, radius=10), FORBID).drone
     assert [leg for leg in choice.legality if leg.outcome == "Denied"] == []
 
 
-def test_a_plan_in_force_follows_policies_and_zones():
+def test_legality_of_active_plan_follows_policies_and_zones():
     before = plan(APP, stock(), WARN)
     assert with_legality(APP, before, stock(), WARN) is before
     after = with_legality(APP, before, fenced(200, 0), WARN)
@@ -182,7 +182,7 @@ def test_a_plan_in_force_follows_policies_and_zones():
     assert gone is before
 
 
-def test_many_legs_are_listed_up_to_a_number():
+def test_legality_lists_limited_number_of_legs():
     path = [at(100 + i % 2 * 40, i, 10) for i in range(2 * MAX_LISTED)]
     slow = policy("slow", type="LimitControl", kind="speed", upperLimit=4)
     choice = plan(application(navigator(path)), stock(slow, drones=[drone("d", minutes=60)]), WARN).drone
@@ -190,12 +190,12 @@ def test_many_legs_are_listed_up_to_a_number():
     assert choice.legality_omitted == 2 * MAX_LISTED + 1 - MAX_LISTED
 
 
-def test_what_cannot_be_resolved_is_left_to_the_grants():
+def test_legality_ignores_policy_with_unknown_zone():
     broken = policy("keep-out", zones=["nowhere"], **FENCE)
     assert plan(APP, stock(broken), FORBID).drone.policy_conflict is None
 
 
-def test_zones_that_the_drone_passes_above_are_no_conflict():
+def test_legality_permits_path_above_zone():
     flat = Zone.from_body(
         manifest("Zone", "z", {"area": {"circle": {"center": at(200, 0), "radius": 20}}, "altitude": {"upper": 5}})
     )
@@ -203,7 +203,7 @@ def test_zones_that_the_drone_passes_above_are_no_conflict():
     assert plan(APP, below, FORBID).drone.legality == ()
 
 
-def test_every_zone_around_the_way_counts():
+def test_legality_uses_every_zone_near_path():
     rng = random.Random(5)
 
     def area():
@@ -226,7 +226,7 @@ def test_every_zone_around_the_way_counts():
     assert 50 < len(near) < 300
 
 
-def test_a_corridor_too_narrow_for_a_driver_is_known_before_takeoff():
+def test_legality_reports_corridor_too_narrow_for_driver():
     partial = application(navigator(PATH, point={"position": at(100, 0)}, control="partial"))
     far = policy("far", type="LimitControl", kind="altitude", upperLimit=70)
     narrow = replace(WARN, safety_radius_m=2.0)
@@ -235,7 +235,7 @@ def test_a_corridor_too_narrow_for_a_driver_is_known_before_takeoff():
     assert plan(partial, stock(far), WARN).drone.legality == ()
 
 
-def test_a_plan_looks_for_a_limited_number_of_ways_around():
+def test_legality_limits_number_of_detour_searches():
     walls = [zone(f"z{i}", (115, 60 * i), 10) for i in range(MAX_SEARCHES + 5)]
     tour = application(guide([p for i in range(len(walls)) for p in (at(50, 60 * i, 10), at(180, 60 * i, 10))]))
     fleet = [drone(f"d{i}", home=(i, 0), minutes=1000) for i in range(3)]
@@ -248,7 +248,7 @@ def test_a_plan_looks_for_a_limited_number_of_ways_around():
     assert sorted(r.reason for r in caught.value.rejected) == ["NotJudged", "NotJudged", "PolicyConflict"]
 
 
-def test_a_denied_waypoint_that_strands_its_driver_is_told():
+def test_legality_reports_waypoints_unreachable_after_denied_waypoint():
     corner = application(navigator([at(100, 0, 10), at(200, 0, 10), at(200, 100, 10), at(200, 200, 10)]))
     choice = plan(corner, fenced(200, 0), WARN).drone
     assert "a driver that skips it cannot reach any of the 2 waypoints after it" in choice.legality[0].message

@@ -1,4 +1,4 @@
-"""Plans of random scenes: who is a candidate, what stays, and that nothing depends on order."""
+"""Properties of plans of random scenes: candidates, stable placements, independence of order."""
 
 import dataclasses
 import itertools
@@ -52,8 +52,8 @@ interfaces = st.lists(
 
 
 @given(interfaces, interfaces)
-def test_the_interfaces_of_direct_links_match_and_reach_by_the_lesser(ours, theirs):
-    """An agent makes links over one interface; what it has no device for links no one."""
+def test_direct_reach_is_smaller_range_of_matching_interfaces(ours, theirs):
+    """An agent links over one interface, and only over an interface with a device."""
     firsts = [[i for i in each if i.device and i.range and i.pairing][:1] for each in (ours, theirs)]
     reaches = [
         min(a.range, b.range)
@@ -81,7 +81,7 @@ TRAFFIC = application(navigator(PATH), VIEWER, VIEWERS, BOTH, STORE)
 
 
 def scene(seed, count=14):
-    """A random fleet and edge around the path; the first two nodes always suit."""
+    """Return a random fleet and random edge nodes around the path. The first two edge nodes are always suitable."""
     rng = random.Random(seed)
     edges = [edge("a0", (150, 10)), edge("a1", (160, -10))]
     edges += [
@@ -100,7 +100,7 @@ def scene(seed, count=14):
 
 @given(st.integers(0, 10_000), st.randoms(use_true_random=False))
 @settings(max_examples=examples(25), deadline=None)
-def test_plans_do_not_depend_on_order(seed, shuffler):
+def test_plan_of_random_scene_does_not_depend_on_order(seed, shuffler):
     fleet, edges, hosts = scene(seed)
     first = plan(TRAFFIC, inventory(fleet, edges, hosts))
     for things in (fleet, edges, hosts):
@@ -110,7 +110,7 @@ def test_plans_do_not_depend_on_order(seed, shuffler):
 
 @given(st.integers(0, 10_000))
 @settings(max_examples=examples(25), deadline=None)
-def test_static_instances_are_the_nearest_that_suit(seed):
+def test_static_instances_are_placed_on_nearest_suitable_nodes(seed):
     fleet, edges, hosts = scene(seed)
     stock = inventory(fleet, edges, hosts)
     result = plan(TRAFFIC, stock)
@@ -132,7 +132,7 @@ def test_static_instances_are_the_nearest_that_suit(seed):
 
 @given(st.integers(0, 10_000))
 @settings(max_examples=examples(25), deadline=None)
-def test_every_candidate_by_place_is_placed_passed_over_or_rejected_for_a_true_reason(seed):
+def test_rejected_candidates_have_correct_reasons(seed):
     fleet, edges, hosts = scene(seed)
     stock = inventory(fleet, edges, hosts)
     result = plan(TRAFFIC, stock)
@@ -151,7 +151,7 @@ def test_every_candidate_by_place_is_placed_passed_over_or_rejected_for_a_true_r
 
 @given(st.integers(0, 10_000), st.data())
 @settings(max_examples=examples(25), deadline=None)
-def test_replanning_keeps_all_that_still_fits(seed, data):
+def test_replanning_random_scene_keeps_placements_that_still_fit(seed, data):
     fleet, edges, hosts = scene(seed)
     before = plan(TRAFFIC, inventory(fleet, edges, hosts))
     again = plan(TRAFFIC, inventory(fleet, edges, hosts), previous=before)
@@ -173,7 +173,7 @@ def where(placed):
     return (placed.component, placed.node)
 
 
-def test_a_cheaper_cover_does_not_move_what_covers():
+def test_replanning_keeps_coverage_when_cheaper_coverage_exists():
     narrow = [edge("n1", (100, 0)), edge("n2", (200, 0)), edge("n3", (290, 0))]
     app = application(navigator(PATH), VIEWER, CHECKER)
     before = plan(app, inventory([drone("d")], narrow))
@@ -187,7 +187,7 @@ def test_a_cheaper_cover_does_not_move_what_covers():
 
 @given(st.integers(0, 10_000))
 @settings(max_examples=examples(15), deadline=None)
-def test_locations_that_followed_every_change_plan_the_same(seed):
+def test_plan_with_incremental_node_locations_equals_new_plan(seed):
     fleet, edges, hosts = scene(seed)
     stock = inventory(fleet, edges, hosts)
     rng = random.Random(seed)
@@ -208,7 +208,7 @@ def test_locations_that_followed_every_change_plan_the_same(seed):
     assert plan(TRAFFIC, dataclasses.replace(stock, locations=followed)) == plan(TRAFFIC, stock)
 
 
-def test_drones_without_a_home_stand_in_their_depot_once_there_is_one():
+def test_drone_without_home_is_located_at_its_depot():
     kept = Drone.from_body(
         manifest("Drone", "d", drone("d").spec.to_dict() | {"home": None}, status=drone("d").status.to_dict())
     )
@@ -227,7 +227,7 @@ def test_drones_without_a_home_stand_in_their_depot_once_there_is_one():
 # -- plug-ins and bounds --
 
 
-def test_plug_ins_replace_ranking_and_coverage():
+def test_plugins_replace_drone_score_and_coverage():
     fleet = [drone("a"), drone("b"), drone("c", battery=0.9)]
     chosen = plan(
         application(navigator(PATH)), inventory(fleet), Settings(score_drone=lambda facts: -facts.remaining_min)
@@ -244,7 +244,7 @@ def test_plug_ins_replace_ranking_and_coverage():
     assert nodes_of(plan(app, stock), "ImageChecker") == [None, "e1"]
 
 
-def test_far_nodes_are_listed_up_to_a_number_and_the_rest_is_counted():
+def test_rejected_nodes_are_listed_up_to_limit_and_rest_is_counted():
     edges = [edge("here", (0, 0))] + [edge(f"e{i:02d}", (500 + i, 0)) for i in range(40)]
     edges += [edge(f"blind{i:02d}", (i, 1), camera=False) for i in range(30)]
     viewer = VIEWERS | {"egress": [], "locations": [{"center": at(0, 0), "radius": 100}]}
@@ -257,7 +257,7 @@ def test_far_nodes_are_listed_up_to_a_number_and_the_rest_is_counted():
     assert (len(few.rejected), few.rejected_omitted) == (35, 15 + 20)
 
 
-def test_every_node_is_listed_hosts_something_is_not_needed_or_is_counted():
+def test_rejected_nodes_are_listed_or_counted_for_each_component():
     fleet = [drone("d", minutes=30), *(drone(f"f{i:02d}", home=(9000 + i, 0), depot=None) for i in range(30))]
     edges = [edge("short", (200, 60), wifi=40), edge("near", (200, 0))]
     edges += [edge(f"e{i:02d}", (150, 600 + i)) for i in range(50)]
@@ -305,7 +305,10 @@ def test_plan_at_80_degrees_across_the_antimeridian():
 
 
 def anywhere(rng, lat, lon):
-    """A place around one, that may be a pole or on the antimeridian; near a pole at any longitude."""
+    """Return a random position near (lat, lon), which may be a pole or on the antimeridian.
+
+    Near a pole, the longitude is arbitrary.
+    """
     spread = rng.choice([0, 1e-6, 1e-4, 1e-2, 0.1, 1])
     there = rng.choice([lon + rng.uniform(-spread, spread), rng.uniform(-180, 180) if abs(lat) > 80 else lon])
     return {
@@ -314,8 +317,8 @@ def anywhere(rng, lat, lon):
     }
 
 
-def asked_for(rng, place):
-    """Components that use the drone in one of the ways that a manifest can."""
+def random_components(rng, place):
+    """Return components that use the drone, with a random kind of control point or points of interest."""
     path = [place() | {"alt": 10} for _ in range(rng.randint(1, 5))]
     way = rng.choice(["depot", "path", "circle", "polygon", "points"])
     if way == "points":
@@ -338,7 +341,7 @@ def asked_for(rng, place):
 )
 @example(7029, 90, 1, 180)
 @settings(max_examples=examples(300, 60), deadline=None)
-def test_any_place_gives_a_plan_or_a_reason(seed, lat, side, lon):
+def test_any_location_on_earth_gives_plan_or_reason(seed, lat, side, lon):
     rng = random.Random(seed)
 
     def place():
@@ -356,7 +359,9 @@ def test_any_place_gives_a_plan_or_a_reason(seed, lat, side, lon):
     base = Depot.from_body(manifest("Depot", "base", {"location": place(), "radius": rng.choice([20, 10_000])}))
     stock = dataclasses.replace(inventory([flying], nodes), depots={"base": base})
     try:
-        result = plan(application(*asked_for(rng, place)), stock, Settings(depot_radius_m=1e9, battery_reserve=0))
+        result = plan(
+            application(*random_components(rng, place)), stock, Settings(depot_radius_m=1e9, battery_reserve=0)
+        )
     except Infeasible as error:
         assert error.reason in {"NoDrone", "NoCloudNode"}
     except InvalidObject as error:

@@ -1,4 +1,4 @@
-"""What fits on nodes: components together, and locations that compete for them."""
+"""Capacity of nodes: components that must fit together, and locations that compete for nodes."""
 
 import itertools
 
@@ -21,10 +21,10 @@ from test_planning import (
     navigator,
 )
 
-# -- what fits together --
+# -- components on one node --
 
 
-def asking(name, placement, milli, **more):
+def component_requesting(name, placement, milli, **more):
     made = component(name, placement, **more)
     return made | {"container": made["container"] | {"resources": {"requests": {"cpu": f"{milli}m"}}}}
 
@@ -34,10 +34,10 @@ millis = st.integers(1, 12).map(lambda tenths: 100 * tenths)
 
 @given(millis, st.lists(millis, max_size=3), millis)
 @settings(max_examples=examples(60), deadline=None)
-def test_a_drone_flies_what_fits_on_it_together(driver, passengers, free):
-    aboard = [navigator(PATH) | {"container": asking("Navigator", "drone", driver)["container"]}]
+def test_drone_is_chosen_only_if_all_its_components_fit(driver, passengers, free):
+    aboard = [navigator(PATH) | {"container": component_requesting("Navigator", "drone", driver)["container"]}]
     aboard += [
-        asking(f"P{i}", "drone", milli, services=VIEWER["services"], **{"class": "passenger"})
+        component_requesting(f"P{i}", "drone", milli, services=VIEWER["services"], **{"class": "passenger"})
         for i, milli in enumerate(passengers)
     ]
     stock = inventory([drone("d")], hosts=[host("d", "drone", cpu=free / 1000)])
@@ -49,9 +49,9 @@ def test_a_drone_flies_what_fits_on_it_together(driver, passengers, free):
     assert flown == ("d" if driver + sum(passengers) <= free else None)
 
 
-def test_two_components_that_fit_one_by_one_but_not_together_are_named():
-    aboard = [navigator(PATH) | {"container": asking("x", "drone", 600)["container"]}]
-    aboard.append(asking("P", "drone", 600, services=VIEWER["services"], **{"class": "passenger"}))
+def test_error_names_components_that_do_not_fit_together():
+    aboard = [navigator(PATH) | {"container": component_requesting("x", "drone", 600)["container"]}]
+    aboard.append(component_requesting("P", "drone", 600, services=VIEWER["services"], **{"class": "passenger"}))
     stock = inventory([drone("d")], hosts=[host("d", "drone", cpu=1.0)])
     with pytest.raises(Infeasible, match=r"Navigator, P do not fit together \(cpu: 1\.2 requested, 1 free\)"):
         plan(application(*aboard), stock)
@@ -59,12 +59,12 @@ def test_two_components_that_fit_one_by_one_but_not_together_are_named():
 
 @given(st.lists(st.tuples(millis, st.booleans()), min_size=1, max_size=4), st.lists(millis, min_size=1, max_size=4))
 @settings(max_examples=examples(60), deadline=None)
-def test_no_edge_node_gets_more_than_it_has_and_none_is_refused_that_has_room(wanted, rooms):
+def test_edge_nodes_are_filled_but_never_overbooked(wanted, rooms):
     statics = [(f"S{i}", milli) for i, (milli, _) in enumerate(wanted)]
     hybrids = [(f"H{i}", 200, f"S{i}") for i, (_, beside) in enumerate(wanted) if beside]
     where_to = {"locations": [{"center": at(0, 0), "radius": 50, "instances": "*"}]}
-    spec = [asking(name, "edge", milli, **where_to) for name, milli in statics]
-    spec += [asking(name, "hybrid", milli, hybridTo=[other]) for name, milli, other in hybrids]
+    spec = [component_requesting(name, "edge", milli, **where_to) for name, milli in statics]
+    spec += [component_requesting(name, "hybrid", milli, hybridTo=[other]) for name, milli, other in hybrids]
     edges = [edge(f"e{i}", (i, 0)) for i in range(len(rooms))]
     hosts = [host(f"e{i}", "edge", cpu=milli / 1000) for i, milli in enumerate(rooms)]
     result = plan(application(*spec), inventory(edges=edges, hosts=hosts))
@@ -77,7 +77,7 @@ def test_no_edge_node_gets_more_than_it_has_and_none_is_refused_that_has_room(wa
     for r in result.rejected:
         assert r.reason == "InsufficientResources"
         assert asked[r.component] > left[r.node]
-    # Each component is asked for on every node: what has room at the end had room then.
+    # Each component is tried on every node. A node with room at the end also had room at that time.
     placed = {(p.component, p.node) for p in result.placements}
     for name, milli in statics:
         assert all((name, node) in placed or milli > room for node, room in left.items())
@@ -86,16 +86,16 @@ def test_no_edge_node_gets_more_than_it_has_and_none_is_refused_that_has_room(wa
 # -- locations that compete for nodes --
 
 
-def wanting(name, *locations, milli=100):
-    """A static component with locations: middle, radius, and the number of instances."""
+def component_at(name, *locations, milli=100):
+    """Return a static component with locations, each given as (centre, radius, number of instances)."""
     spots = [
         {"center": at(*middle), "radius": radius, "instances": instances} for middle, radius, instances in locations
     ]
-    return asking(name, "edge", milli, locations=spots)
+    return component_requesting(name, "edge", milli, locations=spots)
 
 
 def hosted(app, stock):
-    """The nodes of each location of each component, or the component that has none at some location."""
+    """Return the nodes of each location of each component, or the component with a location that has no node."""
     try:
         result = plan(app, stock)
     except Infeasible as error:
@@ -107,9 +107,9 @@ def hosted(app, stock):
 
 
 def most_that_can_be_hosted(app, stock, rooms):
-    """By trying all: the most instances that all locations can have, each at least one; None if some gets none.
+    """Return the largest number of instances with at least one at each location, or None if impossible.
 
-    Instances ask for a share of the rooms that is the same for all.
+    Oracle: tries all combinations. All instances request the same resources.
     """
     slots = [(c.name, spot) for c in app.spec.components for spot in c.locations]
     inside = [
@@ -140,11 +140,11 @@ spots = st.tuples(st.tuples(st.integers(0, 4).map(lambda i: 10 * i), st.just(0))
     st.lists(st.lists(st.tuples(spots, st.integers(1, 2)), min_size=1, max_size=3), min_size=1, max_size=2), st.data()
 )
 @settings(max_examples=examples(600), deadline=None)
-def test_no_location_starves_another(wanted, data):
+def test_locations_share_nodes_for_most_instances(wanted, data):
     edges = [edge(f"e{i}", (10 * i, 0)) for i in range(5)]
     rooms = {e.name: data.draw(st.integers(0, 2)) for e in edges}
     stock = inventory(edges=edges, hosts=[host(n, "edge", cpu=room / 10) for n, room in rooms.items()])
-    app = application(*(wanting(f"S{i}", *[(*spot, k) for spot, k in some]) for i, some in enumerate(wanted)))
+    app = application(*(component_at(f"S{i}", *[(*spot, k) for spot, k in some]) for i, some in enumerate(wanted)))
     found = hosted(app, stock)
     most = most_that_can_be_hosted(app, stock, rooms)
     if most is None:
@@ -160,25 +160,27 @@ def test_no_location_starves_another(wanted, data):
         assert all(geodesic_m(spot.center, stock.edge_nodes[n].spec.location) <= spot.radius for n in nodes)
 
 
-def test_a_location_yields_the_node_that_another_one_needs():
+def test_location_yields_node_that_another_location_needs():
     edges = [edge("a", (0, 0)), edge("b", (30, 0))]
     both, only = ((0, 0), 50, 1), ((0, 0), 10, 1)
-    found = hosted(application(wanting("S", both, only)), inventory(edges=edges))
+    found = hosted(application(component_at("S", both, only)), inventory(edges=edges))
     assert found == {("S", 0): ["b"], ("S", 1): ["a"]}
-    assert hosted(application(wanting("S", both), wanting("T", only)), inventory(edges=edges))["S", 0] == ["a"]
+    assert hosted(application(component_at("S", both), component_at("T", only)), inventory(edges=edges))["S", 0] == [
+        "a"
+    ]
     small = [host(e.name, "edge", cpu=0.1) for e in edges]
-    found = hosted(application(wanting("S", both), wanting("T", only)), inventory(edges=edges, hosts=small))
+    found = hosted(application(component_at("S", both), component_at("T", only)), inventory(edges=edges, hosts=small))
     assert found == {("S", 0): ["b"], ("T", 0): ["a"]}
 
 
-def test_a_location_of_all_nodes_leaves_others_their_node():
+def test_location_with_all_nodes_yields_node_that_another_location_needs():
     edges = [edge("a", (0, 0)), edge("b", (30, 0))]
-    found = hosted(application(wanting("S", ((0, 0), 50, "*"), ((0, 0), 10, 1))), inventory(edges=edges))
+    found = hosted(application(component_at("S", ((0, 0), 50, "*"), ((0, 0), 10, 1))), inventory(edges=edges))
     assert found == {("S", 0): ["b"], ("S", 1): ["a"]}
 
 
-def test_a_further_instance_moves_nothing_that_runs():
-    app = application(wanting("S", ((0, 0), 50, 1), ((0, 0), 10, 2)))
+def test_additional_instance_moves_no_running_instance():
+    app = application(component_at("S", ((0, 0), 50, 1), ((0, 0), 10, 2)))
     few = [edge("a", (0, 0)), edge("c", (1, 0))]
     before = plan(app, inventory(edges=few))
     assert {(p.location, p.node) for p in before.placements} == {(0, "a"), (1, "c")}
@@ -187,10 +189,10 @@ def test_a_further_instance_moves_nothing_that_runs():
     assert hosted(app, stock) == {("S", 0): ["b"], ("S", 1): ["a", "c"]}
 
 
-def test_a_location_that_cannot_have_a_node_says_who_needs_them():
+def test_infeasible_location_error_names_locations_that_need_its_nodes():
     only = ((0, 0), 10, 1)
     with pytest.raises(Infeasible) as caught:
-        plan(application(wanting("S", only, only)), inventory(edges=[edge("a", (0, 0))]))
+        plan(application(component_at("S", only, only)), inventory(edges=[edge("a", (0, 0))]))
     assert caught.value.message == (
         "no node can host S at locations[1]: a hosts S for locations[0], which has no other node"
     )

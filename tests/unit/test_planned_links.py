@@ -1,4 +1,4 @@
-"""Which direct links a plan makes possible."""
+"""Direct links derived from a plan."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Body = dict[str, Any]
 
 
 def application(change: str = "{}", component: str = "ImageChecker") -> Application:
-    """The application with some fields of a component changed; None takes one away."""
+    """Return the application with changed fields of a component. A field that is set to None is removed."""
     body = copy.deepcopy(INPUT["application"])
     for part in body["spec"]["components"]:
         if part["name"] == component:
@@ -47,7 +47,7 @@ def wifi(range_m: float | None, mode: str = "adhoc", **more: Any) -> Body:
     }
 
 
-def test_each_end_limits_the_link() -> None:
+def test_link_range_is_limited_by_both_ends() -> None:
     first, second = PLANNED
     assert (first.node, first.range_m, first.bandwidth_mbps, first.pairing.network_id) == ("edge-1", 80, 12, "edge-1")
     assert (second.node, second.range_m, second.bandwidth_mbps, second.pairing.network_id) == (
@@ -60,7 +60,7 @@ def test_each_end_limits_the_link() -> None:
     assert [p.instance for p in first.instances] == ["traffic-image-checker-edge-1"]
 
 
-def test_the_interface_that_the_agent_takes_links() -> None:
+def test_link_uses_first_interface_with_device() -> None:
     two = edge(wifi(500, network="no device", device=None), wifi(50, network="first"), wifi(90, network="second"))
     (link,) = plan_links(APPLICATION, PLAN, DRONE, two)
     assert (link.range_m, link.pairing.network_id) == (50, "first")
@@ -70,12 +70,12 @@ def test_the_interface_that_the_agent_takes_links() -> None:
     (), ({"technology": "4G"},), (wifi(None),), (wifi(100, "infrastructure"),), (wifi(100, device=None),),
     (wifi(100) | {"pairing": None},), (wifi(100) | {"technology": "BLE"},),
 ])  # fmt: skip
-def test_interfaces_that_do_not_pair_make_no_link(aboard: tuple[Body, ...]) -> None:
+def test_link_is_not_planned_for_incompatible_interfaces(aboard: tuple[Body, ...]) -> None:
     assert plan_links(APPLICATION, PLAN, drone(*aboard), edge(wifi(100))) == ()
     assert plan_links(APPLICATION, PLAN, drone(wifi(100)), edge(*aboard)) == ()
 
 
-def test_nodes_that_are_gone_have_no_link() -> None:
+def test_link_is_not_planned_for_deleted_nodes() -> None:
     assert plan_links(APPLICATION, PLAN, None, EDGES) == ()
     assert [link.node for link in plan_links(APPLICATION, PLAN, DRONE, {"edge-2": EDGES["edge-2"]})] == ["edge-2"]
 
@@ -84,7 +84,7 @@ def test_nodes_that_are_gone_have_no_link() -> None:
     ("{heuristic: null}", True),
     ("{placement: cloud, hybridTo: null, heuristic: null}", False),
 ])  # fmt: skip
-def test_a_link_is_for_what_is_hybrid_and_can_be_called(change: str, linked: bool) -> None:
+def test_link_is_planned_only_for_hybrid_components_with_ports(change: str, linked: bool) -> None:
     links = plan_links(application(change), PLAN, DRONE, EDGES)
     assert [link.node for link in links] == (["edge-1", "edge-2"] if linked else [])
     assert all(link.heuristic == DEFAULT_HEURISTIC for link in links)
@@ -101,7 +101,7 @@ GROUND = {"name": "GroundViewer", "placement": "edge", "locations": [{"center": 
     ("{hybridTo: [AerialViewer]}", "{egress: null}", True),
     ("{hybridTo: [AerialViewer], container: {image: a}}", "{egress: null}", False),
 ])  # fmt: skip
-def test_a_link_is_for_what_the_drone_uses(checker: str, viewer: str, linked: bool) -> None:
+def test_link_is_planned_only_for_components_called_from_drone(checker: str, viewer: str, linked: bool) -> None:
     body = copy.deepcopy(INPUT["application"])
     parts = {part["name"]: part for part in body["spec"]["components"]}
     parts["ImageChecker"].update(yaml.safe_load(checker))
@@ -115,28 +115,28 @@ def test_a_link_is_for_what_the_drone_uses(checker: str, viewer: str, linked: bo
 # -- the path --
 
 
-def test_the_path_is_the_waypoints_of_the_driver() -> None:
+def test_link_path_is_waypoints_of_driver() -> None:
     assert [(p.lat, p.lon, p.alt) for p in PATH] == [(39.3595, 22.9295, None), (39.36, 22.93, 20), (39.361, 22.931, 30)]
 
 
-def test_where_a_driver_roams_no_path_is_known() -> None:
+def test_link_path_is_unknown_for_region_navigation() -> None:
     region = "{navigation: regionBased, region: {circle: {center: {lat: 39.36, lon: 22.93}, radius: 50}}}"
     path = "{navigation: pathBased, path: [{lat: 39.36, lon: 22.93}]}"
     roaming = application(f"{{control: partial, controlPoints: [{path}, {region}]}}", "Navigator")
     assert flown_path(roaming.spec, DEPOTS) == ()
 
 
-@pytest.mark.parametrize(("points", "told"), [(1000, 1000), (1001, 0)])
-def test_a_path_too_long_to_repeat_in_every_link_is_not_told(points: int, told: int) -> None:
+@pytest.mark.parametrize(("points", "listed"), [(1000, 1000), (1001, 0)])
+def test_link_path_is_omitted_when_too_long(points: int, listed: int) -> None:
     places = [{"lat": 39 + i * 1e-5, "lon": 22.93} for i in range(points)]
     body = copy.deepcopy(INPUT["application"])
     driver = body["spec"]["components"][0]
     driver["control"] = "partial"
     driver["controlPoints"] = [{"navigation": "pathBased", "path": half} for half in (places[:500], places[500:])]
-    assert len(flown_path(Application.from_body(body).spec, DEPOTS)) == told
+    assert len(flown_path(Application.from_body(body).spec, DEPOTS)) == listed
 
 
-def test_points_of_interest_are_flown_in_the_order_of_the_tour() -> None:
+def test_link_path_has_points_of_interest_in_tour_order() -> None:
     east = [22.9300, 22.9340, 22.9310, 22.9330]
     points = [{"lat": 39.36, "lon": lon} for lon in east]
     component = {

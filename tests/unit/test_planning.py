@@ -1,4 +1,4 @@
-"""Plans: who is chosen, who is dropped and why, and that nothing depends on order."""
+"""Plans: chosen and rejected nodes with reasons, and independence of the inventory order."""
 
 import math
 import random
@@ -130,7 +130,7 @@ def reasons(result):
     return {(r.component, r.node): r.reason for r in result.rejected}
 
 
-def test_the_fullest_drone_of_the_depot_flies():
+def test_plan_chooses_drone_of_depot_with_fullest_battery():
     fleet = [drone("d1", battery=0.8), drone("d2", battery=0.9), drone("d3", home=(5000, 0), depot="far")]
     result = plan(application(navigator(PATH)), inventory(fleet))
     assert result.drone.node == "d2"
@@ -147,14 +147,14 @@ def test_the_fullest_drone_of_the_depot_flies():
         ([drone("d", battery=0.25)], "FlightTooLong"),
     ],
 )
-def test_unsuitable_drone_is_named_with_its_reason(fleet, reason):
+def test_unsuitable_drone_is_rejected_with_reason(fleet, reason):
     with pytest.raises(Infeasible) as caught:
         plan(application(navigator(PATH)), inventory(fleet))
     assert [(r.node, r.reason) for r in caught.value.rejected] == [("d", reason)]
     assert caught.value.component == "Navigator"
 
 
-def test_a_drone_that_cannot_be_flown_is_not_said_to_fly_too_short():
+def test_drone_without_mobility_service_is_rejected_for_missing_service():
     spec = drone("d").spec.to_dict()
     camera_only = Drone.from_body(manifest("Drone", "d", spec | {"services": {"camera": {"methods": CAMERA}}}))
     camera_only = camera_only.model_copy(update={"status": drone("d").status})
@@ -170,7 +170,7 @@ def unready(node, status="False", message="no certificate"):
     return EdgeNode.from_body(manifest("EdgeNode", node.name, node.spec.to_dict(), status={"conditions": [condition]}))
 
 
-def test_edge_nodes_that_are_not_ready_get_nothing_new_and_keep_what_they_host():
+def test_unready_edge_node_keeps_instances_but_gets_no_new_ones():
     ground_viewer = component("GroundViewer", "edge", locations=[{"center": at(0, 0), "radius": 100, "instances": "*"}])
     app = application(ground_viewer)
     good, bad = edge("e1", (0, 0)), edge("e2", (10, 0))
@@ -183,12 +183,12 @@ def test_edge_nodes_that_are_not_ready_get_nothing_new_and_keep_what_they_host()
     assert nodes_of(after, "GroundViewer") == ["e1", "e2"]
 
 
-def test_no_drone_at_all_says_so():
+def test_plan_without_drones_is_infeasible():
     with pytest.raises(Infeasible, match="no Drone exists"):
         plan(application(navigator(PATH)), inventory())
 
 
-def test_drones_on_another_continent_are_not_said_to_be_missing():
+def test_plan_reports_known_drones_far_from_start():
     path = [{"lat": -33.0, "lon": 151.0, "alt": 20}]
     with pytest.raises(Infeasible, match="none of the 1 known drones is near the start"):
         plan(application(navigator(path, point={"position": path[0]})), inventory([drone("d")]))
@@ -199,20 +199,20 @@ def test_drones_on_another_continent_are_not_said_to_be_missing():
     [(name, math.nan) for name in ("safety_radius_m", "depot_radius_m", "coverage_share", "climb_speed_mps")]
     + [("safety_radius_m", math.inf), ("safety_radius_m", 0), ("cruise_speed_mps", 0), ("battery_reserve", 1.1)],
 )
-def test_settings_that_no_plan_can_be_made_with_are_refused(setting, value):
+def test_invalid_planning_settings_are_refused(setting, value):
     spelled = setting.removesuffix("_m").removesuffix("_mps").removesuffix("_share").replace("_", " ")
     with pytest.raises(InvalidObject, match=rf"^{spelled}: must be .* to .*, not {value:g}$"):
         Settings(**{setting: value})
 
 
-def test_claimed_drone_is_left_alone():
+def test_claimed_drone_is_not_chosen():
     with pytest.raises(Infeasible) as caught:
         plan(application(navigator(PATH)), inventory([drone("d")], claimed={"d": ("other", "app")}))
     assert caught.value.reason == "DroneBusy"
     assert plan(application(navigator(PATH)), inventory([drone("d")], claimed={"d": ("default", "traffic")}))
 
 
-def test_host_that_is_missing_cordoned_or_full():
+def test_drone_is_rejected_when_its_host_is_unready_cordoned_or_full():
     for bad, reason in (
         (host("d", "drone", ready=False), "NodeNotReady"),
         (host("d", "drone", schedulable=False), "NodeUnschedulable"),
@@ -223,7 +223,7 @@ def test_host_that_is_missing_cordoned_or_full():
         assert [r.reason for r in caught.value.rejected] == [reason]
 
 
-def test_a_flying_drone_is_kept_through_what_passes():
+def test_plan_keeps_drone_that_is_temporarily_unsuitable():
     app = application(navigator(PATH))
     before = plan(app, inventory([drone("d2")]))
     tired = drone("d2", battery=0.3, ready="False")
@@ -232,7 +232,7 @@ def test_a_flying_drone_is_kept_through_what_passes():
     assert plan(app, now).drone.node == "d1"
 
 
-def test_static_instances_by_distance_and_count():
+def test_static_instances_are_placed_by_distance_and_count():
     edges = [edge("e1", (50, 0)), edge("e2", (10, 0)), edge("e3", (500, 0)), edge("e4", (20, 0), camera=False)]
     viewer = component(
         "GroundViewer",
@@ -254,7 +254,7 @@ def test_static_location_without_nodes_is_infeasible():
         plan(application(viewer), inventory(edges=[edge("e1", (0, 0))]))
 
 
-def test_hybrid_serves_static_instance_on_its_own_node_or_beside():
+def test_hybrid_instance_is_placed_on_node_of_static_instance_or_linked_node():
     viewer = component("GroundViewer", "edge", locations=[{"center": at(0, 0), "radius": 5}], egress=["ImageChecker"])
     checker = component("ImageChecker", "hybrid", hybridTo=["GroundViewer"])
     edges = [edge("e1", (0, 0)), edge("e2", (60, 0)), edge("e3", (40, 0), wifi=30), edge("e4", (70, 0))]
@@ -266,7 +266,7 @@ def test_hybrid_serves_static_instance_on_its_own_node_or_beside():
     assert reasons(result)["ImageChecker", "e1"] == "InsufficientResources"
 
 
-def test_no_node_beside_leaves_the_cloud_base():
+def test_hybrid_component_has_only_cloud_base_without_linked_node():
     viewer = component("GroundViewer", "edge", locations=[{"center": at(0, 0), "radius": 5}], egress=["ImageChecker"])
     checker = component("ImageChecker", "hybrid", hybridTo=["GroundViewer"])
     checker["container"]["resources"] = {"limits": {"fractus.dev/gpu": 1}}
@@ -276,8 +276,8 @@ def test_no_node_beside_leaves_the_cloud_base():
     assert nodes_of(result, "ImageChecker") == [None]
 
 
-def test_cover_equals_plain_greedy_on_random_scenes():
-    """Oracle: sets of sample points instead of polygons."""
+def test_coverage_equals_plain_greedy_on_random_scenes():
+    """The oracle uses sets of sample points instead of polygons."""
     rng = random.Random(7)
     for _ in range(5):
         edges = [
@@ -315,7 +315,7 @@ def test_cover_equals_plain_greedy_on_random_scenes():
             assert max(len(points - covered) for points in reach.values()) <= 0.02 * len(inside)
 
 
-def test_node_that_covers_nothing_or_cannot_pair_is_dropped():
+def test_node_without_coverage_or_direct_interface_is_rejected():
     edges = [edge("near", (200, 0)), edge("far", (200, 500)), edge("wired", (150, 0), wifi=None)]
     result = plan(application(navigator(PATH), VIEWER, CHECKER), inventory([drone("d")], edges))
     assert nodes_of(result, "ImageChecker") == [None, "near"]
@@ -327,7 +327,7 @@ def test_node_that_covers_nothing_or_cannot_pair_is_dropped():
     assert (near.serves.component, near.serves.node) == ("AerialViewer", "d")
 
 
-def test_cloud_needs_a_node():
+def test_cloud_component_requires_cloud_node():
     empty = Inventory(hosts={"w": host("w", "edge")})
     with pytest.raises(Infeasible) as caught:
         plan(application(STORE), empty)
@@ -336,7 +336,7 @@ def test_cloud_needs_a_node():
 
 
 @pytest.mark.parametrize(("value", "takes"), [("true", True), ("false", False), ("", False)])
-def test_a_node_of_another_class_may_be_of_the_cloud(value, takes):
+def test_node_of_another_class_hosts_cloud_components_if_labelled(value, takes):
     both = host("w", "drone")
     both.labels["fractus.dev/cloud"] = value
     if takes:
@@ -346,7 +346,7 @@ def test_a_node_of_another_class_may_be_of_the_cloud(value, takes):
             plan(application(STORE), Inventory(hosts={"w": both}))
 
 
-def test_a_plan_books_what_it_places():
+def test_plan_books_resources_of_placed_components():
     greedy = component("GroundViewer", "edge", locations=[{"center": at(0, 0), "radius": 5}])
     greedy["container"]["resources"] = {"requests": {"cpu": "3"}}
     other = component("Other", "edge", locations=[{"center": at(0, 0), "radius": 5}])
@@ -355,7 +355,7 @@ def test_a_plan_books_what_it_places():
         plan(application(greedy, other), inventory(edges=[edge("e1", (0, 0))]))
 
 
-def test_order_of_the_inventory_does_not_matter():
+def test_plan_does_not_depend_on_inventory_order():
     edges = [edge(f"e{i}", (i * 40, (i % 3) * 20)) for i in range(9)]
     fleet = [drone(f"d{i}") for i in range(4)]
     app = application(navigator(PATH), VIEWER, CHECKER, STORE)
@@ -368,7 +368,7 @@ def test_order_of_the_inventory_does_not_matter():
         assert plan(app, inventory(f, e)) == first
 
 
-def test_replanning_moves_nothing_that_still_fits():
+def test_replanning_keeps_placements_that_still_fit():
     edges = [edge("e5", (20, 0)), edge("e6", (30, 0))]
     viewer = component("GroundViewer", "edge", locations=[{"center": at(0, 0), "radius": 100}])
     app = application(viewer)
@@ -377,7 +377,7 @@ def test_replanning_moves_nothing_that_still_fits():
     assert nodes_of(plan(app, inventory(edges=edges)), "GroundViewer") == ["e5"]
 
 
-def test_operation_area_opens_to_the_whole_depot():
+def test_operation_area_contains_whole_depot():
     result = plan(application(navigator(PATH)), inventory([drone("d")]), Settings(safety_radius_m=7))
     shape = shapely.union_all(
         [shapely.Polygon([FRAME.xy(lat, lon) for lon, lat in part[0]]) for part in result.operation_area["coordinates"]]
@@ -388,7 +388,7 @@ def test_operation_area_opens_to_the_whole_depot():
         assert not shape.covers(shapely.Point(x, y))
 
 
-def test_instance_names_are_labels_of_bounded_length():
+def test_instance_name_is_label_of_bounded_length():
     thing = application(STORE).spec.component("DataStore")
     assert instance_name("traffic", thing) == "traffic-data-store"
     long = instance_name("a" * 63, thing, "node-1")

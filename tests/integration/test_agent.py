@@ -290,7 +290,7 @@ def test_agent_keeps_grants_while_the_api_server_is_down(server: ApiServer, dron
     server.stop_apiserver()
     drone.start()
     try:
-        wait_for(lambda: "cannot be followed" in drone.log(), "an agent that noticed", timeout_s=30)
+        wait_for(lambda: "watch failed" in drone.log(), "an agent that noticed", timeout_s=30)
         assert drone.grants() == {"one", "two", "three"}
         assert drone.process is not None
         assert drone.process.poll() is None

@@ -181,7 +181,7 @@ def test_no_trouble_keeps_what_runs_from_new_certificates(
     wait_for(lambda: (world.api.get(secret) or {})["data"]["tls.crt"] != before, lambda: operator.log()[-3000:])
 
 
-def test_a_broken_policy_stays_as_granted_and_blocks_no_other(
+def test_refreshed_grant_keeps_previous_version_of_broken_policy(
     world: World, operator: OperatorProcess, namespace: str
 ) -> None:
     school = ours("Zone", "school", {"area": {"circle": {"center": at(30, 30), "radius": 5}}})

@@ -1,4 +1,4 @@
-"""Work beside the calls leaves nothing behind, also when it is cancelled before it begins."""
+"""Background tasks of a service: cancellation and errors."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fractus_services.background import Background
 from fractus_services.errors import AutopilotError
 
 
-def test_what_is_cancelled_before_it_begins_was_never_made() -> None:
+def test_background_task_cancelled_before_start_never_runs() -> None:
     begun: list[str] = []
 
     async def work(name: str) -> None:
@@ -29,7 +29,7 @@ def test_what_is_cancelled_before_it_begins_was_never_made() -> None:
     assert begun == ["once"]
 
 
-def test_an_autopilot_that_does_not_answer_is_logged_and_other_failures_are_told(
+def test_background_attempt_logs_autopilot_error_and_raises_others(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     async def fail(error: Exception) -> None:

@@ -1,4 +1,4 @@
-"""What every call must have, and how much of a service one caller may take."""
+"""Admission of calls: deadline, rate limit and number of open calls of each caller."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from google.rpc import error_details_pb2, status_pb2
 
 
 class Aborted(Exception):
-    """Stands for gRPC's end of a call."""
+    """Raised by the fake context instead of ending the call."""
 
     def __init__(self, code: grpc.StatusCode, text: str, details: status_pb2.Status) -> None:
         super().__init__(f"{code.name}: {text}")
         self.details = details
 
     def find(self, kind: Any) -> Any:
-        """The detail of a kind."""
+        """Return the first status detail of the given type, or None."""
         for detail in self.details.details:
             if detail.Is(kind.DESCRIPTOR):
                 found = kind()
@@ -63,7 +63,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> CallAdmission:
     return CallAdmission(cast("Any", None), lambda: 0.0)
 
 
-async def test_an_urgent_call_is_let_through_a_flood_and_no_flood_of_its_own(calls: CallAdmission) -> None:
+async def test_urgent_calls_have_separate_rate_limit(calls: CallAdmission) -> None:
     for _ in range(int(BURST)):
         async with calls.call(Context()):
             pass
@@ -81,7 +81,7 @@ async def test_an_urgent_call_is_let_through_a_flood_and_no_flood_of_its_own(cal
             pass
 
 
-async def test_only_so_many_calls_at_a_time(calls: CallAdmission) -> None:
+async def test_number_of_open_calls_is_limited(calls: CallAdmission) -> None:
     async with AsyncExitStack() as stack:
         for _ in range(MAX_OPEN_CALLS):
             await stack.enter_async_context(calls.call(Context(), lasting=True))
@@ -95,7 +95,7 @@ async def test_only_so_many_calls_at_a_time(calls: CallAdmission) -> None:
     assert not calls._open
 
 
-async def test_only_so_many_calls_wait_for_their_request(calls: CallAdmission) -> None:
+async def test_number_of_calls_waiting_for_request_is_limited(calls: CallAdmission) -> None:
     sent = asyncio.Event()
 
     class Slow(Context):
@@ -103,10 +103,10 @@ async def test_only_so_many_calls_wait_for_their_request(calls: CallAdmission) -
             await sent.wait()
             return b"asked"
 
-    async def answer(request: bytes, _context: Any) -> bytes:
+    async def echo(request: bytes, _context: Any) -> bytes:
         return request + b", answered"
 
-    method = calls.decoded(grpc.unary_unary_rpc_method_handler(answer, lambda body: body)).stream_unary
+    method = calls.decoded(grpc.unary_unary_rpc_method_handler(echo, lambda body: body)).stream_unary
     waiting = [asyncio.create_task(method(None, Slow())) for _ in range(MAX_OPEN_CALLS)]
     await asyncio.sleep(0)
     with pytest.raises(Aborted, match="RESOURCE_EXHAUSTED: 32 calls of this method wait") as refusal:
@@ -118,7 +118,7 @@ async def test_only_so_many_calls_wait_for_their_request(calls: CallAdmission) -
 
 
 @pytest.mark.parametrize(("urgent", "lasting"), [(True, False), (False, True)])
-async def test_a_call_needs_a_deadline(calls: CallAdmission, urgent: bool, lasting: bool) -> None:
+async def test_call_without_deadline_is_refused(calls: CallAdmission, urgent: bool, lasting: bool) -> None:
     with pytest.raises(Aborted, match="INVALID_ARGUMENT: the call has no deadline; set a timeout") as refusal:
         async with calls.call(Context(None)):
             pass
@@ -129,20 +129,20 @@ async def test_a_call_needs_a_deadline(calls: CallAdmission, urgent: bool, lasti
 
 
 @pytest.mark.parametrize("error", [ZeroDivisionError, RecursionError, MemoryError])
-async def test_whatever_breaks_refuses_and_is_told(
+async def test_unexpected_error_refuses_call_and_is_reported(
     error: Callable[[], Exception], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(admission.Callers, "of", lambda _self, _context, _urgent: Caller("a", math.inf))
-    told: list[str] = []
-    calls = CallAdmission(cast("Any", None), lambda: 0.0, failed=lambda verdict: told.append(verdict.code))
+    codes: list[str] = []
+    calls = CallAdmission(cast("Any", None), lambda: 0.0, failed=lambda verdict: codes.append(verdict.code))
     with pytest.raises(Aborted, match="INTERNAL: the service failed; nothing was done"):
         async with calls.call(Context()):
             raise error()
-    assert told == ["InternalError"]
+    assert codes == ["InternalError"]
     assert not calls._open
 
 
-def test_a_caller_without_a_grant_is_logged(caplog: pytest.LogCaptureFixture) -> None:
+def test_caller_without_grant_is_logged(caplog: pytest.LogCaptureFixture) -> None:
     calls = CallAdmission(cast("Any", SimpleNamespace(of=lambda _identity: None)), lambda: 0.0)
     with pytest.raises(PolicyDenied):
         calls.grant_of(Caller("spiffe://fractus.dev/a", math.inf))

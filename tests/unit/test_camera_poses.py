@@ -1,4 +1,4 @@
-"""Where a drone's camera was during an exposure, as its telemetry tells: no motion between two messages is left out."""
+"""Poses of a drone's camera during an exposure, from telemetry. Motion between two messages is included."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ LENS = Lens(40.0, 30.0, pitch_deg=-60.0, error_deg=0.0)
 
 
 class Drone:
-    """Telemetry as a test tells it, on a clock that the test sets."""
+    """Telemetry sent by a test, on a clock set by the test."""
 
     def __init__(self) -> None:
         self.now_s = 100.0
         self.poses = PoseHistory(lambda: self.now_s, lens=LENS)
 
-    def tell(
+    def send(
         self,
         at_s: float,
         *,
@@ -56,7 +56,7 @@ class Drone:
         message.time.FromNanoseconds(round((NOW_S + at_s - late_s) * 1e9))
         self.poses.add(to_measurement(message, at_s, NOW_S + at_s))
 
-    def way(self, begun_s: float) -> tuple[Situation, ...]:
+    def poses_since(self, begun_s: float) -> tuple[Situation, ...]:
         return self.poses.situations_since(begun_s, 1.0)
 
 
@@ -70,19 +70,19 @@ def attitude(now: Situation) -> Any:
     return now.attitude
 
 
-def test_every_pose_since_the_begin_counts_with_the_one_before_it(drone: Drone) -> None:
+def test_pose_history_returns_poses_since_begin_and_previous_one(drone: Drone) -> None:
     for i in range(10):
-        drone.tell(100.0 + i / 10, turned=(0.0, 0.0, 10.0 * i))
-    way = drone.way(100.45)
-    assert [attitude(now).yaw_deg for now in way] == [40, 50, 60, 70, 80, 90]
-    # Half of what neighbours differ by, and what an airframe turns unseen in half a tenth of a second.
-    assert attitude(way[1]).yaw_error_deg == pytest.approx(pose_history.YAW_ERROR_DEG + 5.0 + 0.05 * 60.0)
-    assert attitude(way[1]).tilt_error_deg == pytest.approx(pose_history.TILT_ERROR_DEG + 0.05 * 60.0)
+        drone.send(100.0 + i / 10, turned=(0.0, 0.0, 10.0 * i))
+    poses = drone.poses_since(100.45)
+    assert [attitude(now).yaw_deg for now in poses] == [40, 50, 60, 70, 80, 90]
+    # Half the difference to the adjacent poses, plus the largest turn of an airframe in 0.05 s.
+    assert attitude(poses[1]).yaw_error_deg == pytest.approx(pose_history.YAW_ERROR_DEG + 5.0 + 0.05 * 60.0)
+    assert attitude(poses[1]).tilt_error_deg == pytest.approx(pose_history.TILT_ERROR_DEG + 0.05 * 60.0)
     assert drone.poses.situation(1.0).attitude is not None
 
 
-def test_errors_grow_with_the_age_of_what_they_belong_to(drone: Drone) -> None:
-    drone.tell(100.0, speed=(8.0, -3.0), ages=(0.2, 0.3))
+def test_pose_errors_grow_with_measurement_age(drone: Drone) -> None:
+    drone.send(100.0, speed=(8.0, -3.0), ages=(0.2, 0.3))
     drone.now_s = 100.4
     now = drone.poses.situation(1.0)
     assert now.position_error_m == pytest.approx(1.0 + 8.0 * 0.6 + 2.5 * 0.36)
@@ -96,37 +96,37 @@ def test_errors_grow_with_the_age_of_what_they_belong_to(drone: Drone) -> None:
     assert drone.poses.situation(1.0).lat is None
 
 
-def test_a_message_that_waited_tells_where_the_drone_was_when_it_was_made(drone: Drone) -> None:
-    drone.tell(100.0, speed=(8.0, 0.0), late_s=0.4)
+def test_pose_errors_include_delay_of_telemetry(drone: Drone) -> None:
+    drone.send(100.0, speed=(8.0, 0.0), late_s=0.4)
     now = drone.poses.situation(1.0)
     assert now.position_error_m == pytest.approx(1.0 + 8.0 * 0.4 + 2.5 * 0.16, abs=1e-4)
     assert attitude(now).tilt_error_deg == pytest.approx(pose_history.TILT_ERROR_DEG + 60.0 * 0.4, abs=1e-4)
-    drone.tell(100.1, late_s=3.0)
+    drone.send(100.1, late_s=3.0)
     assert drone.poses.situation(1.0).lat is None
-    drone.tell(100.2, late_s=-3600.0)
-    assert drone.poses.situation(1.0).lat is None, "the clock was set back meanwhile: nothing tells how late it is"
+    drone.send(100.2, late_s=-3600.0)
+    assert drone.poses.situation(1.0).lat is None, "the clock was set back, so the delay is unknown"
 
 
-def test_an_age_that_is_not_told_is_not_none(drone: Drone) -> None:
-    drone.tell(100.0, ages=None)
+def test_pose_error_is_large_when_age_is_unknown(drone: Drone) -> None:
+    drone.send(100.0, ages=None)
     assert attitude(drone.poses.situation(1.0)).yaw_error_deg > pose_history.YAW_ERROR_DEG + 20.0
 
 
-def test_where_a_part_of_the_exposure_was_not_told_it_is_unknown(drone: Drone) -> None:
+def test_pose_is_unknown_when_telemetry_is_missing(drone: Drone) -> None:
     assert drone.poses.situation(1.0).lat is None
-    assert [now.lat for now in drone.way(100.0)] == [None]
-    drone.tell(100.0)
-    assert drone.way(99.9)[0].lat is None, "nothing was told when it began"
-    assert drone.way(100.0)[0].lat is not None
-    drone.tell(101.1)
-    assert drone.way(100.0)[0].lat is None, "silent for more than a second"
-    drone.tell(101.2, connected=False)
-    drone.tell(101.3)
-    assert [now.lat is None for now in drone.way(101.1)] == [False, True, False]
+    assert [now.lat for now in drone.poses_since(100.0)] == [None]
+    drone.send(100.0)
+    assert drone.poses_since(99.9)[0].lat is None, "no telemetry at the begin"
+    assert drone.poses_since(100.0)[0].lat is not None
+    drone.send(101.1)
+    assert drone.poses_since(100.0)[0].lat is None, "no telemetry for more than a second"
+    drone.send(101.2, connected=False)
+    drone.send(101.3)
+    assert [now.lat is None for now in drone.poses_since(101.1)] == [False, True, False]
     for i in range(400):
-        drone.tell(102.0 + i / 10)
+        drone.send(102.0 + i / 10)
     assert len(drone.poses) <= 302
-    assert drone.way(101.3)[0].lat is None, "longer ago than the history goes"
+    assert drone.poses_since(101.3)[0].lat is None, "older than the history"
 
 
 @settings(max_examples=examples(150), deadline=None, derandomize=True)
@@ -137,10 +137,10 @@ def test_where_a_part_of_the_exposure_was_not_told_it_is_unknown(drone: Drone) -
     ages=st.tuples(st.floats(0, 0.2), st.floats(0, 0.2)),
     share=st.floats(0, 1),
 )
-def test_whatever_is_seen_between_two_messages_is_in_the_footprint(
+def test_footprint_contains_view_between_two_messages(
     gaps: list[float], rates: tuple[float, ...], speed: tuple[float, float], ages: tuple[float, float], share: float
 ) -> None:
-    """A drone that flies and turns steadily, told of at uneven times, each measurement with an age of its own."""
+    """The drone flies and turns steadily. Telemetry arrives at uneven times, and each measurement has its own age."""
     drone = Drone()
 
     def turned(at_s: float) -> tuple[float, float, float]:
@@ -151,15 +151,15 @@ def test_whatever_is_seen_between_two_messages_is_in_the_footprint(
     for gap_s in [0.0, *gaps]:
         at_s += gap_s
         measured_s = at_s - ages[0] - 100.0
-        drone.tell(
+        drone.send(
             at_s, x=speed[0] * measured_s, alt=40.0 - speed[1] * measured_s, turned=turned(at_s - ages[1]), speed=speed,
             ages=ages,
         )  # fmt: skip
-    shown = exposure_footprint(drone.way(100.0), FRAME)
+    shown = exposure_footprint(drone.poses_since(100.0), FRAME)
     assert shown is not None
     moment_s = 100.0 + share * (at_s - 100.0)
     drone = Drone()
-    drone.tell(
+    drone.send(
         moment_s, x=speed[0] * (moment_s - 100.0), alt=40.0 - speed[1] * (moment_s - 100.0), turned=turned(moment_s)
     )  # fmt: skip
     exact = drone.poses.situation(1.0)
@@ -170,8 +170,8 @@ def test_whatever_is_seen_between_two_messages_is_in_the_footprint(
         assert shown.sight.buffer(shown.margin_m + 0.1).covers(actual.sight)
 
 
-def gimbal_told(poses: PoseHistory, at_s: float, turned: tuple[float, float, float] | None, age_s: float = 0.0) -> None:
-    """A level airframe, whose gimbal turns the camera."""
+def send_gimbal(poses: PoseHistory, at_s: float, turned: tuple[float, float, float] | None, age_s: float = 0.0) -> None:
+    """Send telemetry of a level airframe with a gimbal that turns the camera."""
     message = mobility_pb2.Telemetry(autopilot_connected=True, position_error_m=1.0, position_age_s=0.0)
     message.position.latitude_deg, message.position.longitude_deg = FRAME.latlon(0.0, 0.0)
     message.position.altitude_m = 40.0
@@ -183,20 +183,20 @@ def gimbal_told(poses: PoseHistory, at_s: float, turned: tuple[float, float, flo
     poses.add(to_measurement(message, at_s, NOW_S + at_s, gimbal=True))
 
 
-def test_a_message_from_the_future_says_nothing(drone: Drone) -> None:
-    drone.tell(0.0, late_s=-1.0)
-    drone.tell(0.1, late_s=-1.0)
-    assert all(there.lat is None and there.attitude is None for there in drone.way(0.05))
-    drone.tell(0.2, late_s=-0.01)
-    assert drone.poses.situation(1.0).lat is not None, "what rounding makes of its time"
+def test_pose_is_unknown_when_telemetry_is_from_the_future(drone: Drone) -> None:
+    drone.send(0.0, late_s=-1.0)
+    drone.send(0.1, late_s=-1.0)
+    assert all(pose.lat is None and pose.attitude is None for pose in drone.poses_since(0.05))
+    drone.send(0.2, late_s=-0.01)
+    assert drone.poses.situation(1.0).lat is not None, "a rounding error of the time is accepted"
 
 
-def test_a_clock_that_is_stepped_back_makes_no_late_message_younger() -> None:
+def test_arrival_clock_ignores_step_back_for_a_while() -> None:
     now_s, step_s = 0.0, 0.0
     arrival = ArrivalClock(lambda: NOW_S + now_s + step_s, lambda: now_s)
     assert arrival() == NOW_S
     now_s, step_s = 2.0, -0.9
-    assert arrival() == NOW_S + 2.0, "a message that was made at 1 s has waited for a second"
+    assert arrival() == NOW_S + 2.0, "a message sent at 1 s was delayed by one second"
     now_s = 2.1 + STEP_WINDOW_S
     assert arrival() == pytest.approx(NOW_S + now_s - 0.9)
     step_s = 30.0
@@ -214,10 +214,10 @@ FORWARD = Lens(40.0, 30.0, pitch_deg=0.0, error_deg=0.0)
     age_s=st.floats(0, 0.1),
     share=st.floats(0, 1),
 )
-def test_whatever_a_moving_gimbal_shows_is_in_the_footprint(
+def test_footprint_contains_view_of_moving_gimbal(
     gaps: list[float], rates: tuple[float, float], begun: tuple[float, float], age_s: float, share: float
 ) -> None:
-    """A gimbal that turns steadily, about straight down as well, where roll and yaw say little one by one."""
+    """The gimbal turns steadily, also around straight down, where only the sum of roll and yaw is meaningful."""
 
     def turned(at_s: float) -> tuple[float, float, float]:
         return 0.0, begun[0] + rates[0] * (at_s - 100.0), (begun[1] + rates[1] * (at_s - 100.0)) % 360.0
@@ -226,7 +226,7 @@ def test_whatever_a_moving_gimbal_shows_is_in_the_footprint(
     poses = PoseHistory(lambda: now_s, lens=FORWARD, gimbal=True)
     for gap_s in [0.0, *gaps]:
         now_s += gap_s
-        gimbal_told(poses, now_s, turned(now_s - age_s), age_s)
+        send_gimbal(poses, now_s, turned(now_s - age_s), age_s)
     shown = exposure_footprint(poses.situations_since(100.0, 1.0), FRAME)
     assert shown is not None
     moment_s = 100.0 + share * (now_s - 100.0)
@@ -236,10 +236,10 @@ def test_whatever_a_moving_gimbal_shows_is_in_the_footprint(
     assert shown.sight.buffer(shown.margin_m + 0.01).covers(actual.sight)
 
 
-def test_a_gimbal_that_is_not_measured_lets_the_camera_look_anywhere() -> None:
+def test_footprint_is_unbounded_when_gimbal_attitude_is_unknown() -> None:
     now_s = 100.0
     poses = PoseHistory(lambda: now_s, lens=FORWARD, gimbal=True)
-    gimbal_told(poses, 100.0, (0.0, -90.0, 0.0))
+    send_gimbal(poses, 100.0, (0.0, -90.0, 0.0))
     now_s = 100.1
     known = poses.situation(1.0)
     assert attitude(known).tilt_error_deg == pytest.approx(
@@ -248,17 +248,19 @@ def test_a_gimbal_that_is_not_measured_lets_the_camera_look_anywhere() -> None:
     assert attitude(known).yaw_error_deg == pytest.approx(
         pose_history.YAW_ERROR_DEG + 0.1 * pose_history.MAX_TURN_DEG_S
     )
-    told = []
+    situations = []
     for turned, age_s in ((None, 0.0), ((0.0, -90.0, 0.0), 1.01), ((0.0, math.nan, 0.0), 0.0)):
-        gimbal_told(poses, now_s, turned, age_s)
-        told.append(poses.situation(1.0))
-    for now in told:
+        send_gimbal(poses, now_s, turned, age_s)
+        situations.append(poses.situation(1.0))
+    for now in situations:
         view = footprint(now, FRAME)
-        assert view is None or math.isinf(view.farthest_m), "the airframe's attitude stands for none of a gimbal"
-    assert [now.attitude is None for now in told] == [True, True, False]
+        assert view is None or math.isinf(view.farthest_m), (
+            "the attitude of the airframe must not replace that of the gimbal"
+        )
+    assert [now.attitude is None for now in situations] == [True, True, False]
 
 
-def test_a_gimbals_camera_looks_where_its_attitude_points() -> None:
+def test_gimbal_camera_axis_follows_gimbal_attitude() -> None:
     camera = {"methods": ["CaptureImage"], "horizontalFieldOfView": 60, "lens": {"model": "pinhole"}}
     mounted = CameraFeatures.model_validate(camera | {"mount": {"pitch": -90, "stabilised": True, "gimbal": True}})
     lens = bounding_lens(mounted)

@@ -1,4 +1,4 @@
-"""A member that is added to a closed set is noticed wherever it must be handled."""
+"""Closed sets: a new member fails a test wherever it must be handled."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from fractus_services.mobility.rpc.proto_conversion import call_of
 Shape = Literal["round", "square"]
 
 
-def test_a_table_has_every_member_and_no_other() -> None:
+def test_exhaustive_table_has_exactly_the_members() -> None:
     assert exhaustive(Shape, {"round": 1, "square": 2})["square"] == 2
     assert exhaustive(Shape, ("square", "round")) == ("square", "round")
     for wrong in ({"round": 1}, {"round": 1, "square": 2, "flat": 3}, ("round", "square", "round")):
@@ -32,32 +32,32 @@ def rule(**spec: object) -> Rule:
 
 
 @pytest.mark.parametrize("action", get_args(FilterAction))
-def test_every_filter_is_asked_for_by_its_name(action: FilterAction) -> None:
-    asked = rule_filter(rule(type="PrivacyControl", kind="camera", action=action))
-    assert asked.action == action
-    assert combine_filters([asked]) == (Filter(action),)
+def test_rule_filter_has_name_of_action(action: FilterAction) -> None:
+    required = rule_filter(rule(type="PrivacyControl", kind="camera", action=action))
+    assert required.action == action
+    assert combine_filters([required]) == (Filter(action),)
 
 
 @pytest.mark.parametrize("action", get_args(GeofenceAction))
-def test_every_action_of_a_geofence_is_its_own(action: GeofenceAction) -> None:
+def test_geofence_policy_keeps_every_action(action: GeofenceAction) -> None:
     fence = {"type": "GeofenceControl", "kind": "exclusion", "selector": {"zones": ["z"]}}
     assert rule(**fence, action=action).spec.geofence_action == action
 
 
 @pytest.mark.parametrize("action", get_args(LimitAction))
-def test_every_action_of_a_limit_is_its_own(action: LimitAction) -> None:
+def test_limit_policy_keeps_every_action(action: LimitAction) -> None:
     assert rule(type="LimitControl", kind="speed", upperLimit=5, action=action).spec.limit_action == action
 
 
 @pytest.mark.parametrize("reference", get_args(Reference))
-def test_every_datum_has_a_height(reference: Reference) -> None:
+def test_altitude_is_converted_from_every_reference(reference: Reference) -> None:
     assert altitude_above_home_m(5.0, reference, None, True) == (None if reference == "amsl" else 5.0)
 
 
-def test_every_method_of_the_mobility_service_can_be_checked() -> None:
+def test_check_call_accepts_every_mobility_method() -> None:
     fields = {field.name for field in mobility_pb2.CheckCallRequest.DESCRIPTOR.oneofs_by_name["call"].fields}
-    asked = {call_of(mobility_pb2.CheckCallRequest(**_filled(field))).method for field in fields}
-    assert asked == METHODS_OF["mobility"]
+    methods = {call_of(mobility_pb2.CheckCallRequest(**_filled(field))).method for field in fields}
+    assert methods == METHODS_OF["mobility"]
 
 
 def _filled(field: str) -> dict[str, object]:

@@ -1,4 +1,4 @@
-"""One line in the log for each decision that is no plain permission."""
+"""Decision log: one log line for each decision except plain permissions."""
 
 from __future__ import annotations
 
@@ -44,18 +44,22 @@ def lines(caplog: pytest.LogCaptureFixture, *entries: dict[str, Any]) -> list[st
     (CHANGE | {"kind": "control", "action": "granted", "controller": "a", "reason": "control point 0", "policies": ["p"]},
      "INFO control: granted (kind=control controller=a code=- policies=p reason=control point 0)"),
 ])  # fmt: skip
-def test_what_was_decided_by_whom_and_why(caplog: pytest.LogCaptureFixture, entry: dict[str, Any], line: str) -> None:
+def test_decision_log_line_has_verdict_caller_and_reason(
+    caplog: pytest.LogCaptureFixture, entry: dict[str, Any], line: str
+) -> None:
     assert lines(caplog, entry) == [line]
 
 
 @pytest.mark.parametrize("entry", [
     CALL | {"action": "allow"}, CALL | {"kind": "check"}, {"kind": "monitor", "action": "deny"}, {"kind": "state", "lat": 1.0},
 ])  # fmt: skip
-def test_permissions_dry_runs_and_states_have_no_line(caplog: pytest.LogCaptureFixture, entry: dict[str, Any]) -> None:
+def test_decision_log_omits_permissions_dry_runs_and_states(
+    caplog: pytest.LogCaptureFixture, entry: dict[str, Any]
+) -> None:
     assert lines(caplog, entry) == []
 
 
-def test_programs_find_caller_action_policies_and_reason(caplog: pytest.LogCaptureFixture) -> None:
+def test_decision_log_json_has_fields(caplog: pytest.LogCaptureFixture) -> None:
     lines(caplog, CALL)
     assert json.loads(JsonFormatter().format(caplog.records[0]))["fields"] == {
         "action": "deny", "caller": "spiffe://fractus.dev/a", "method": "Goto", "code": "InsideExclusionZone",

@@ -1,4 +1,4 @@
-"""Grant files."""
+"""Grant files of a node's services: scanning, listeners, invalid files, and the rate limiter of callers."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def grant_files(directory: Path, refused: Any = lambda _name, _why: None) -> Gra
     return GrantFiles(directory, "drone-1", GrantVerifier(tls, tls / "seen.json"), refused=refused)
 
 
-def test_files_come_change_and_go(tmp_path: Path) -> None:
+def test_grant_files_report_added_changed_and_removed_grants(tmp_path: Path) -> None:
     seen: list[tuple[str | None, str | None]] = []
     files = grant_files(tmp_path)
     files.listen(lambda old, new: seen.append((old and old.spec.mission, new and new.spec.mission)))
@@ -102,13 +102,15 @@ async def test_grant_files_grant_nothing_while_their_directory_is_missing(tmp_pa
         await asyncio.gather(watching, return_exceptions=True)
 
 
-async def test_a_flight_is_watched_while_large_grants_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The event loop has the motion monitor and the heartbeats."""
-    begun, goes_on = threading.Event(), threading.Event()
+async def test_grant_files_do_not_block_event_loop_while_compiling(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The motion monitor and the heartbeats run on the event loop."""
+    begun, may_continue = threading.Event(), threading.Event()
 
     def slowly(*args: Any, **options: Any) -> CompiledGrant:
         begun.set()
-        assert goes_on.wait(10.0), "the event loop waits for this thread"
+        assert may_continue.wait(10.0), "the event loop waits for this thread"
         return compile_grant(*args, **options)
 
     monkeypatch.setattr(module, "compile_grant", slowly)
@@ -120,11 +122,11 @@ async def test_a_flight_is_watched_while_large_grants_are_read(tmp_path: Path, m
         async with asyncio.timeout(20.0):
             await asyncio.to_thread(begun.wait, 10.0)
             assert not files.active
-            goes_on.set()
+            may_continue.set()
             await changed.wait()
         assert len(files.active) == 1
     finally:
-        goes_on.set()
+        may_continue.set()
         watching.cancel()
         await asyncio.gather(watching, return_exceptions=True)
 
@@ -139,14 +141,14 @@ async def test_a_flight_is_watched_while_large_grants_are_read(tmp_path: Path, m
     ],
     ids=["empty", "list", "policy", "other-node", "unsigned", "crossing-area", "unknown-policy", "unknown-field"],
 )  # fmt: skip
-def test_what_is_not_understood_grants_nothing(tmp_path: Path, text: str) -> None:
+def test_grant_files_ignore_invalid_file(tmp_path: Path, text: str) -> None:
     (tmp_path / "g.json").write_text(text)
     files = grant_files(tmp_path)
     files.scan()
     assert not files.active
 
 
-def test_two_files_for_one_instance(tmp_path: Path) -> None:
+def test_grant_files_use_later_of_two_files_for_one_instance(tmp_path: Path) -> None:
     (tmp_path / "b.json").write_text(body(uid="first"))
     (tmp_path / "a.json").write_text(body(uid="second"))
     files = grant_files(tmp_path)
@@ -157,7 +159,7 @@ def test_two_files_for_one_instance(tmp_path: Path) -> None:
     assert not files.active, "the earlier one does not come back"
 
 
-def test_a_missing_directory_is_empty(tmp_path: Path) -> None:
+def test_grant_files_grant_nothing_when_directory_is_missing(tmp_path: Path) -> None:
     files = grant_files(tmp_path / "none")
     files.scan()
     assert not files.active
@@ -167,7 +169,7 @@ NESTED = b"[" * 100_000
 
 
 @pytest.mark.parametrize("odd", [NESTED, b'{"a":' * 5000 + b"1" + b"}" * 5000, b"1" * 5000, b"\0" * 50, b"\xff\xfe{"])
-def test_an_odd_file_does_not_stop_the_others(tmp_path: Path, odd: bytes) -> None:
+def test_grant_files_read_others_when_one_file_is_malformed(tmp_path: Path, odd: bytes) -> None:
     (tmp_path / "a.json").write_bytes(odd)
     (tmp_path / "b.json").write_text(body(uid="sound"))
     (tmp_path / "loop.json").symlink_to("loop.json")
@@ -176,7 +178,7 @@ def test_an_odd_file_does_not_stop_the_others(tmp_path: Path, odd: bytes) -> Non
     assert [grant.spec.mission for grant in files.active.values()] == ["sound"]
 
 
-def test_whatever_a_file_breaks_it_grants_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_grant_files_revoke_grant_when_compilation_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*_args: object, **_more: object) -> None:
         raise ZeroDivisionError
 
@@ -187,31 +189,31 @@ def test_whatever_a_file_breaks_it_grants_nothing(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr("fractus_services.grant_files.compile_grant", broken)
     (tmp_path / "a.json").write_text(body(uid="changed"))
     files.scan()
-    assert not files.active, "the grant that was there before is gone, too"
+    assert not files.active, "the previous grant must be revoked too"
 
 
-def test_a_listener_that_fails_does_not_stop_the_others(tmp_path: Path) -> None:
+def test_grant_files_call_other_listeners_when_one_fails(tmp_path: Path) -> None:
     def broken(_old: ActiveGrant | None, _new: ActiveGrant | None) -> None:
         raise ZeroDivisionError
 
-    told: list[str] = []
+    missions: list[str] = []
     files = grant_files(tmp_path)
     files.listen(broken)
-    files.listen(lambda _old, new: told.append((new.spec.mission if new else None) or ""))
+    files.listen(lambda _old, new: missions.append((new.spec.mission if new else None) or ""))
     (tmp_path / "a.json").write_text(body())
     files.scan()
-    assert told == ["u1"]
+    assert missions == ["u1"]
 
 
-def test_a_flood_runs_dry_and_fills_again() -> None:
+def test_rate_limiter_delays_burst_and_refills() -> None:
     limiter = RateLimiter(rate=10, burst=5)
     assert [limiter.take("a", 0.0) for _ in range(7)] == [0.0] * 5 + [0.1] * 2
-    assert limiter.take("b", 0.0) == 0.0, "others are not concerned"
+    assert limiter.take("b", 0.0) == 0.0, "other callers are not limited"
     assert [limiter.take("a", 0.25) for _ in range(3)] == [0.0, 0.0, pytest.approx(0.05)]
     assert [limiter.take("a", 100.0) for _ in range(6)] == [0.0] * 5 + [0.1]
 
 
-def test_those_who_ask_no_more_are_not_counted_for_ever() -> None:
+def test_rate_limiter_forgets_inactive_callers() -> None:
     limiter = RateLimiter(rate=10, burst=5)
     for n in range(2500):
         limiter.take(f"caller-{n}", n * 0.01)

@@ -1,4 +1,4 @@
-"""Signed grants: what breaks a signature and what does not, who may sign, and what a node remembers."""
+"""Signed Grants: valid and invalid signatures, signing certificates, and replay protection of a node."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def grant(body: dict[str, Any]) -> Grant:
     return Grant.from_body(body)
 
 
-def test_a_signature_holds_however_the_json_is_spelled() -> None:
+def test_signature_is_valid_for_equivalent_json() -> None:
     body = json.loads(json.dumps(signed(limits={"maxAltitude": 60, "maxSpeed": 12})))
     body["spec"]["limits"] = {"maxSpeed": 12.0, "maxAltitude": 60.0}
     body["spec"]["policies"] = body["spec"].get("policies", [])
@@ -66,7 +66,7 @@ def test_a_signature_holds_however_the_json_is_spelled() -> None:
     assert verify(grant(body), CAS) == NOW
 
 
-def test_a_signature_holds_where_a_later_release_has_more_fields_or_writes_defaults_out() -> None:
+def test_signature_is_valid_with_omitted_and_explicit_defaults() -> None:
     bare = signed()
     bare["spec"] = {key: value for key, value in bare["spec"].items() if value not in ([], None)}
     assert verify(grant(bare), CAS) == NOW
@@ -95,7 +95,7 @@ CHANGES: list[Callable[[dict[str, Any]], Any]] = [
 
 
 @pytest.mark.parametrize("change", CHANGES)
-def test_nothing_can_be_changed(change: Callable[[dict[str, Any]], Any]) -> None:
+def test_signature_is_invalid_after_any_change(change: Callable[[dict[str, Any]], Any]) -> None:
     policies = [{"name": "p", "spec": {"type": "LimitControl", "kind": "speed", "upperLimit": 5}}]
     limits = {"maxAltitude": 60, "maxSpeed": 12}
     body = json.loads(json.dumps(signed(policies=policies, limits=limits)))
@@ -122,12 +122,14 @@ def of_data(data: dict[str, str]) -> tuple[ec.EllipticCurvePrivateKey, x509.Cert
         ((SIGNER[0], CA.issue_signer(NOW)[1]), "changed after signing"),
     ],
 )
-def test_no_one_else_signs(who: tuple[ec.EllipticCurvePrivateKey, x509.Certificate], why: str) -> None:
+def test_signature_of_other_certificates_is_refused(
+    who: tuple[ec.EllipticCurvePrivateKey, x509.Certificate], why: str
+) -> None:
     with pytest.raises(BadSignature, match=why):
         verify(grant(sign(manifest(), *who, NOW)), CAS)
 
 
-def test_no_certificate_for_tls_signs_and_none_for_signing_is_for_tls() -> None:
+def test_signing_certificate_and_tls_certificates_have_separate_usages() -> None:
     signing = SIGNER[1].extensions.get_extension_for_class(x509.KeyUsage).value
     assert signing.content_commitment
     assert not signing.digital_signature
@@ -136,16 +138,16 @@ def test_no_certificate_for_tls_signs_and_none_for_signing_is_for_tls() -> None:
         assert not usage.content_commitment
 
 
-def test_the_moment_of_issue_counts_and_not_the_present_one() -> None:
-    assert verify(grant(signed(NOW)), CAS), "however old it is"
+def test_signature_is_judged_at_time_of_issue() -> None:
+    assert verify(grant(signed(NOW)), CAS), "the age does not matter"
     late = SIGNER[1].not_valid_after_utc
-    assert verify(grant(signed(late + timedelta(minutes=4))), CAS), "clocks differ"
+    assert verify(grant(signed(late + timedelta(minutes=4))), CAS), "clocks may differ by some minutes"
     for wrong in (late + timedelta(minutes=6), NOW - timedelta(hours=3)):
         with pytest.raises(BadSignature, match="certificate was not valid"):
             verify(grant(signed(wrong)), CAS)
 
 
-def test_several_authorities_while_one_takes_over() -> None:
+def test_signature_is_valid_for_each_of_several_authorities() -> None:
     both = read_authorities(OTHER_CA.certificate_pem + CA.certificate_pem)
     assert verify(grant(signed()), both) == NOW
 
@@ -153,7 +155,7 @@ def test_several_authorities_while_one_takes_over() -> None:
 # The operator
 
 
-def test_each_grant_is_issued_later_whatever_the_clock_does() -> None:
+def test_signer_issue_time_always_increases() -> None:
     clock = [NOW]
     signer = GrantSigner(CA, lambda: clock[0])
     first = grant(signer.sign(manifest()))
@@ -166,7 +168,7 @@ def test_each_grant_is_issued_later_whatever_the_clock_does() -> None:
     assert times == sorted(set(times), key=str)
 
 
-def test_the_signing_certificate_is_renewed_in_time() -> None:
+def test_signer_renews_certificate_in_time() -> None:
     clock = [NOW]
     signer = GrantSigner(CA, lambda: clock[0])
     signers = set()
@@ -179,7 +181,7 @@ def test_the_signing_certificate_is_renewed_in_time() -> None:
     assert all(verify(grant(sign(manifest(), *SIGNER, NOW)), CAS) for _ in signers)
 
 
-def test_the_operator_knows_its_own() -> None:
+def test_signer_detects_foreign_and_invalid_signatures() -> None:
     signer = GrantSigner(CA, lambda: NOW)
     body = signer.sign(manifest())
     assert signer.problem(grant(body)) is None
@@ -193,7 +195,7 @@ def test_the_operator_knows_its_own() -> None:
 
 
 class Node:
-    """The directory of a node's service, which restarts at will."""
+    """Directory and verifier of a node's service that can be restarted."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -225,10 +227,10 @@ def later(seconds: float = 1.0) -> datetime:
 
 
 @pytest.mark.parametrize("restarts", [False, True])
-def test_an_older_grant_does_not_come_back(node: Node, restarts: bool) -> None:
+def test_verifier_refuses_older_grant(node: Node, restarts: bool) -> None:
     old, new = signed(NOW), signed(later(), policies=[])
     first = node.take(old)
-    assert node.take(old) == first, "read again, it is the same"
+    assert node.take(old) == first, "the same Grant may be read again"
     digest = node.take(new)
     if restarts:
         node.restart()
@@ -240,7 +242,7 @@ def test_an_older_grant_does_not_come_back(node: Node, restarts: bool) -> None:
 
 
 @pytest.mark.parametrize("restarts", [False, True])
-def test_a_revoked_grant_does_not_come_back_and_a_later_one_does(node: Node, restarts: bool) -> None:
+def test_verifier_refuses_revoked_grant_but_accepts_later_one(node: Node, restarts: bool) -> None:
     node.verifier.revoke(IDENTITY, node.take(signed()))
     if restarts:
         node.restart()
@@ -249,14 +251,14 @@ def test_a_revoked_grant_does_not_come_back_and_a_later_one_does(node: Node, res
     assert node.take(signed(later()))
 
 
-def test_the_same_signature_under_another_uid_is_a_replay(node: Node) -> None:
+def test_verifier_refuses_replay_with_another_uid(node: Node) -> None:
     body = signed()
     node.take(body)
     with pytest.raises(BadSignature, match="not after"):
         node.take({**body, "metadata": {**body["metadata"], "uid": "u2"}})
 
 
-def test_what_was_verified_once_outlives_its_authority(node: Node) -> None:
+def test_verifier_accepts_verified_grant_after_authority_change(node: Node) -> None:
     body = signed()
     digest = node.take(body)
     node.trust(OTHER_CA)
@@ -269,7 +271,7 @@ def test_what_was_verified_once_outlives_its_authority(node: Node) -> None:
     assert node.take(sign(manifest(), *OTHER_CA.issue_signer(NOW), later(2)))
 
 
-def test_without_an_authority_nothing_is_granted(node: Node) -> None:
+def test_verifier_refuses_grants_without_authority(node: Node) -> None:
     (node.path / "ca.crt").unlink()
     node.restart()
     with pytest.raises(UnknownAuthority, match=r"ca\.crt is missing"):
@@ -280,14 +282,14 @@ def test_without_an_authority_nothing_is_granted(node: Node) -> None:
     assert node.take(signed())
 
 
-def test_a_broken_ca_file_keeps_the_one_before(node: Node) -> None:
+def test_verifier_keeps_authorities_when_ca_file_is_broken(node: Node) -> None:
     (node.path / "ca.crt").write_text("nonsense")
     assert not node.verifier.reload_authorities()
     assert node.take(signed())
 
 
 @pytest.mark.parametrize("damage", [b"", b"{", b"[]", b'{"floor": 1}', b'{"floor": "", "seen": {"a": {"b": 1}}}'])
-def test_a_damaged_memory_is_forgotten(node: Node, damage: bytes) -> None:
+def test_verifier_ignores_damaged_state_file(node: Node, damage: bytes) -> None:
     node.take(signed(later()))
     node.restart()
     (node.path / "seen.json").write_bytes(damage)
@@ -295,7 +297,7 @@ def test_a_damaged_memory_is_forgotten(node: Node, damage: bytes) -> None:
     assert node.take(signed())
 
 
-def test_a_full_disk_grants_on_and_remembers_when_there_is_room(
+def test_verifier_works_with_full_disk_and_stores_state_later(
     node: Node, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def full(_: int) -> None:
@@ -317,14 +319,14 @@ def test_a_full_disk_grants_on_and_remembers_when_there_is_room(
         node.take(body)
 
 
-def test_a_signature_that_is_taken_off_takes_the_grant_away(node: Node) -> None:
+def test_verifier_refuses_grant_after_signature_is_removed(node: Node) -> None:
     body = signed()
     node.take(body)
     with pytest.raises(BadSignature, match="is not signed"):
         node.take({**body, "metadata": {"name": "g", "uid": "u1"}})
 
 
-def test_the_memory_has_an_end_and_forgets_nothing_that_matters(node: Node, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_verifier_state_is_bounded_and_still_refuses_old_grants(node: Node, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(grant_verifier, "MAX_REMEMBERED", 3)
     for n in range(6):
         node.take(signed(later(n), instance=f"i{n}"))
@@ -334,10 +336,10 @@ def test_the_memory_has_an_end_and_forgets_nothing_that_matters(node: Node, monk
     assert node.take(signed(later(7), instance="i0"))
 
 
-# Alone
+# Standalone services without a cluster
 
 
-def test_alone(tmp_path: Path) -> None:
+def test_grants_command_creates_authority_and_signs_grant(tmp_path: Path) -> None:
     pki, to, file = tmp_path / "pki", tmp_path / "grants", tmp_path / "grant.json"
     file.write_text(json.dumps(manifest()))
     missing = CliRunner().invoke(grants, ["sign", str(file), "--tls", str(pki), "--to", str(to)])
@@ -360,7 +362,7 @@ def test_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["", "../x", "a/b", ".", "Drone"])
-def test_keys_go_nowhere_but_into_their_directory(tmp_path: Path, name: str) -> None:
+def test_standalone_pki_refuses_invalid_names(tmp_path: Path, name: str) -> None:
     made = CliRunner().invoke(grants, ["init", str(tmp_path / "pki"), "--node", name])
     assert made.exit_code == 1
     assert f"node: {name!r} is no name of a node" in made.output
@@ -369,7 +371,7 @@ def test_keys_go_nowhere_but_into_their_directory(tmp_path: Path, name: str) -> 
         StandalonePki.open(tmp_path / "pki").component(component_identity("ns", "app", "Navigator", name))
 
 
-def test_a_directory_of_keys_is_made_once(tmp_path: Path) -> None:
+def test_standalone_pki_is_created_once(tmp_path: Path) -> None:
     one = StandalonePki.create(tmp_path)
     folder = one.component(component_identity("ns", "app", "Navigator", "app-navigator"))
     assert folder.name == "ns.app-navigator"
@@ -383,7 +385,7 @@ def test_a_directory_of_keys_is_made_once(tmp_path: Path) -> None:
     assert node_identity("d") in uris.get_values_for_type(x509.UniformResourceIdentifier)
 
 
-def test_the_mission_is_signed_and_kept_while_the_grant_is() -> None:
+def test_mission_id_is_signed_and_kept_with_the_grant() -> None:
     signer = GrantSigner(CA, lambda: NOW)
     first = signer.sign(manifest())
     assert grant(first).spec.mission == "u1"
@@ -400,20 +402,20 @@ def test_the_mission_is_signed_and_kept_while_the_grant_is() -> None:
         verify(grant(forged), CAS)
 
 
-def test_no_grant_takes_the_mission_of_another_instance(node: Node) -> None:
+def test_mission_key_differs_between_instances(node: Node) -> None:
     own = signed()
     other = signed(instance="app-b", component="B", mission="u1")
     other["metadata"]["uid"] = own["metadata"]["uid"] = "u1"
     assert grant(other).spec.mission_key != grant(own).spec.mission_key
 
 
-def test_a_tour_without_an_area_is_not_signed() -> None:
+def test_tour_without_operation_area_is_not_signed() -> None:
     with pytest.raises(InvalidObject, match="a tour needs operationArea"):
         signed(operationArea=[], tour=[{"lat": 39.36, "lon": 22.95, "alt": 10}], **{"class": None})
 
 
 @pytest.mark.parametrize("who", ["driver", "passenger"])
-def test_a_drone_without_an_area_is_neither_signed_for_nor_believed(who: str) -> None:
+def test_grant_without_operation_area_is_neither_signed_nor_accepted(who: str) -> None:
     with pytest.raises(InvalidObject, match=f"a {who} needs operationArea"):
         signed(operationArea=[], **{"class": who})
     body = signed()
@@ -422,14 +424,14 @@ def test_a_drone_without_an_area_is_neither_signed_for_nor_believed(who: str) ->
         verify(grant(body), CAS)
 
 
-def test_a_zone_without_its_area_is_refused() -> None:
+def test_policy_without_zone_area_is_not_signed() -> None:
     fence = {"name": "pool", "spec": {"type": "GeofenceControl", "kind": "exclusion", "selector": {"zones": ["pool"]}}}
     for zones in ([], [{"name": "pol", "area": {"circle": {"center": {"lat": 39.36, "lon": 22.95}, "radius": 20}}}]):
         with pytest.raises(InvalidObject, match="policy pool selects pool; add the area"):
             signed(policies=[{**fence, "zones": zones}])
 
 
-def test_a_grant_for_a_node_without_a_certificate_is_not_signed(tmp_path: Path) -> None:
+def test_standalone_pki_signs_no_grant_for_node_without_certificate(tmp_path: Path) -> None:
     pki = StandalonePki.create(tmp_path / "pki")
     with pytest.raises(InvalidObject, match="drone-1 has no certificate here"):
         pki.grant(manifest(), tmp_path / "grants")

@@ -1,4 +1,4 @@
-"""Grants: which policies reach which instance, and that what cannot be resolved grants nothing."""
+"""Grants: policies of each instance, refreshes, and refusal of policies that cannot be resolved."""
 
 import dataclasses
 import gc
@@ -39,7 +39,7 @@ def compiled(*policies, zones=(), components=None):
 
 
 def comb(name, teeth, across=False, lon=None):
-    """A zone with long thin teeth, to the north or to the east."""
+    """Return a zone with long thin teeth to the north or to the east."""
     sides = [(500.0 * (((i + 1) // 2) % 2), float(i - teeth)) for i in range(2 * teeth)]
     corners = [*sides, (-1.0, float(teeth)), (-1.0, float(-teeth - 1))]
     ring = [at(*(c if across else reversed(c))) for c in corners]
@@ -48,25 +48,25 @@ def comb(name, teeth, across=False, lon=None):
     return Zone.from_body(manifest("Zone", name, {"area": {"polygon": {"exterior": ring}}}))
 
 
-def test_zones_whose_union_takes_minutes_are_not_granted():
-    """A drone's services would take as long for each grant, and read no other meanwhile."""
+def test_grant_refuses_zones_with_too_many_crossings():
+    """The union takes minutes, and a drone's services would read no other Grant during that time."""
     spiky = [comb("north", 480), comb("east", 480, across=True)]
     inside = {"type": "GeofenceControl", "kind": "inclusion", "action": "land"}
     with pytest.raises(
         InvalidObject, match=r"Policy in spec\.selector\.zones: edges of its zones cross more than 50000 times"
     ):
         compiled(policy("in", ("north", "east"), **inside), zones=spiky)
-    # What was granted stays, as with any other broken policy.
+    # The granted policy stays, as for every broken policy.
     (granted,) = compiled(policy("in", ("north",), **inside), zones=spiky)
     stock = inventory([drone("d")], zones={z.name: z for z in spiky})
     broken = dataclasses.replace(stock, policies={"in": policy("in", ("north", "east"), **inside)})
     assert refresh(granted, broken).policies == granted.policies
-    # Others are not united.
+    # Exclusion zones are not united.
     assert compiled(policy("out", ("north", "east"), **FENCE), zones=spiky)
 
 
-def test_what_was_seen_of_a_zone_goes_with_it():
-    """Each change of a zone, also of its status, is another object."""
+def test_zone_validity_cache_is_cleared_with_the_zone():
+    """Each change of a zone, even of its status, creates another object."""
     gc.collect()
     before, near = len(_SOUND), zone("near", (50, 0))
     compiled(policy("out", ("near",), **FENCE), zones=[near])
@@ -78,7 +78,7 @@ def test_what_was_seen_of_a_zone_goes_with_it():
     assert len(_SOUND) == before
 
 
-def test_crossings_of_zones_are_the_same_across_the_antimeridian():
+def test_zone_crossings_are_equal_across_the_antimeridian():
     zones = [
         tuple(sound(z) for z in (comb("north", 20, lon=lon), comb("east", 20, across=True, lon=lon)))
         for lon in (20.0, 179.9999, -180.0)
@@ -88,7 +88,7 @@ def test_crossings_of_zones_are_the_same_across_the_antimeridian():
     assert others == [pytest.approx(first, rel=0.05)] * 2
 
 
-def test_driver_and_passenger_get_their_own_grants():
+def test_driver_and_passenger_get_separate_grants():
     driver, passenger = compiled(components=(navigator(PATH), VIEWER | {"egress": []}))
     assert driver.class_ == "driver"
     assert driver.control == "full"
@@ -105,26 +105,26 @@ def test_driver_and_passenger_get_their_own_grants():
     )
 
 
-def furrows(turns, apart_m=20.0, length_m=60.0):
+def winding_path(turns, apart_m=20.0, length_m=60.0):
     return [at((i + 1) // 2 % 2 * length_m, i // 2 * apart_m, 10) for i in range(turns)]
 
 
-def test_a_path_with_many_turns_is_granted_within_a_centimetre():
-    (grant,) = compiled(components=[navigator(furrows(60))])
+def test_grant_area_of_winding_path_is_exact_to_a_centimetre():
+    (grant,) = compiled(components=[navigator(winding_path(60))])
     (area,) = grant.operation_area
     assert len(area.polygon.exterior) > 1000
-    assert _off_the_plan_m(grant, furrows(60)) < 0.011
+    assert _deviation_m(grant, winding_path(60)) < 0.011
 
 
-def test_an_outline_with_more_points_than_a_ring_takes_is_rounded_further(monkeypatch):
+def test_grant_area_is_simplified_when_ring_has_too_many_points(monkeypatch):
     monkeypatch.setattr(grant_compiler, "MAX_RING_POINTS", 150)
-    (grant,) = compiled(components=[navigator(furrows(12))])
+    (grant,) = compiled(components=[navigator(winding_path(12))])
     (area,) = grant.operation_area
     assert len(area.polygon.exterior) <= 150
-    assert 0.011 < _off_the_plan_m(grant, furrows(12)) < MAX_ROUNDING_M
+    assert 0.011 < _deviation_m(grant, winding_path(12)) < MAX_ROUNDING_M
 
 
-def test_a_path_with_too_many_meshes_is_refused_with_a_sentence(monkeypatch):
+def test_grant_refuses_path_with_too_many_holes(monkeypatch):
     monkeypatch.setattr(grant_compiler, "MAX_HOLES", 0)
     meshes = [at(0, 0, 10), at(60, 0, 10), at(60, 60, 10), at(0, 60, 10), at(0, 0, 10)]
     with pytest.raises(
@@ -133,7 +133,7 @@ def test_a_path_with_too_many_meshes_is_refused_with_a_sentence(monkeypatch):
         compiled(components=[navigator(meshes)])
 
 
-def _off_the_plan_m(grant, path):
+def _deviation_m(grant, path):
     spec = application(navigator(path)).spec
     planned = operation_area(spec, inventory([drone("d")]).depots, 7.0)
     granted = shapely.union_all([area_polygon(planned.frame, area) for area in grant.operation_area])
@@ -148,14 +148,14 @@ def guide(points, **more):
 
 
 @pytest.mark.parametrize("services", [VIEWER["services"], []])
-def test_who_has_no_driver_is_flown_a_tour(services):
+def test_grant_has_tour_without_driver(services):
     points = [at(100, 0, 10), at(300, 0, 10), at(200, 0, 10)]
     (grant,) = compiled(components=[guide(points, ordered=False) | {"services": services}])
     assert [round(FRAME.xy(p.lat, p.lon)[0]) for p in grant.tour] == [100, 200, 300]
     assert [s.service for s in grant.services] == [s["service"] for s in services]
 
 
-def test_who_comes_along_is_flown_nowhere():
+def test_grant_of_passenger_on_shared_drone_has_no_tour():
     app = application(guide([at(100, 0)]))
     flown = flight_of(application(navigator(PATH)), inventory().depots)
     flight = dataclasses.replace(flown, holder=("default", "other"))
@@ -165,14 +165,14 @@ def test_who_comes_along_is_flown_nowhere():
     assert grant.methods("camera") == {"CaptureImage"}
 
 
-def test_policies_come_with_their_zones_sorted_by_name():
+def test_grant_contains_policies_and_zones_sorted_by_name():
     (grant,) = compiled(policy("b", **ALTITUDE), policy("a", zones=["z"], **FENCE), zones=[zone("z", (100, 100))])
     assert [p.name for p in grant.policies] == ["a", "b"]
     assert [z.name for z in grant.policies[0].zones] == ["z"]
     assert grant.policies[1].zones == ()
 
 
-def test_unknown_zone_grants_nothing():
+def test_grant_is_refused_when_zone_is_unknown():
     with pytest.raises(InvalidObject, match=r"Policy a spec\.selector\.zones\[0\]: there is no Zone nowhere"):
         compiled(policy("a", zones=["nowhere"], **FENCE))
 
@@ -182,7 +182,7 @@ def stocked(*policies, zones=(), **more):
     return inventory([drone("d")], zones=named, policies={p.name: p for p in policies}, **more)
 
 
-def test_a_refresh_gives_what_a_new_grant_would():
+def test_refreshed_grant_equals_new_grant():
     policies = policy("a", zones=["z"], **FENCE), policy("b", **ALTITUDE), policy("c", zones=["far"], **FENCE)
     zones = zone("z", (100, 100)), zone("far", (80_000, 0))
     (old,) = compiled()
@@ -192,7 +192,7 @@ def test_a_refresh_gives_what_a_new_grant_would():
 
 
 @pytest.mark.parametrize("more", [{}, {"unreadable_zones": {"z": "no area"}}])
-def test_a_broken_policy_stays_as_granted_and_blocks_no_other(more):
+def test_refreshed_grant_keeps_previous_version_of_broken_policy(more):
     fence = policy("fence", zones=["z"], **FENCE)
     (old,) = compiled(fence, policy("read", **ALTITUDE), zones=[zone("z", (100, 100))])
     never = policy("never", zones=["nowhere"], **FENCE)
@@ -205,14 +205,14 @@ def test_a_broken_policy_stays_as_granted_and_blocks_no_other(more):
     assert compile_grants(app, plan(app, stock), stock, None, [old]) == (fresh,)
 
 
-def test_while_a_policy_cannot_be_read_nothing_new_is_granted():
+def test_grant_is_refused_while_policy_is_unreadable():
     stock = stocked(unreadable_policies={"odd": "spec.validFrom: no date"})
     app = application(navigator(PATH))
     with pytest.raises(InvalidObject, match=r"Policy odd: spec\.validFrom: no date"):
         compile_grants(app, plan(app, stock), stock)
 
 
-def test_a_node_without_a_description_keeps_what_held_for_it():
+def test_refreshed_grant_keeps_policies_when_node_description_is_missing():
     heavy = policy("heavy", nodes=[{"key": "interfaces", "operator": "NotIn", "values": ["x"]}], **ALTITUDE)
     (old,) = compiled(heavy)
     fresh = refresh(old, inventory([], policies={"heavy": heavy, "low": policy("low", **ALTITUDE)}))
@@ -225,7 +225,7 @@ def test_a_node_without_a_description_keeps_what_held_for_it():
         compile_grants(app, decided, gone)
 
 
-def test_zone_beyond_reach_is_left_out():
+def test_grant_omits_zones_beyond_reach():
     far = zone("far", (80_000, 0))
     (grant,) = compiled(policy("a", zones=["far"], **FENCE), zones=[far])
     assert grant.policies == ()
@@ -234,7 +234,7 @@ def test_zone_beyond_reach_is_left_out():
 @pytest.mark.parametrize(
     "there", [FENCE | {"kind": "inclusion"}, {"type": "AccessControl", "kind": "grant", "methods": ["Goto"]}]
 )
-def test_what_is_allowed_in_a_zone_beyond_reach_is_allowed_nowhere_else(there):
+def test_grant_keeps_permission_of_zone_beyond_reach(there):
     (grant,) = compiled(policy("a", zones=["far"], **there), zones=[zone("far", (80_000, 0))])
     assert [p.name for p in grant.policies] == ["a"]
     here = Situation(time_s=0.0, lat=FRAME.lat, lon=FRAME.lon, altitude_m=20.0, home=Home(FRAME.lat, FRAME.lon, 0.0))
@@ -249,7 +249,7 @@ def test_what_is_allowed_in_a_zone_beyond_reach_is_allowed_nowhere_else(there):
         {"type": "AccessControl", "kind": "denial", "methods": ["CaptureImage"]},
     ],
 )
-def test_what_a_camera_may_see_from_afar_is_granted_with_it(spec):
+def test_grant_keeps_camera_policies_of_distant_zones_in_view(spec):
     near, far = zone("near", (4000, 0)), zone("far", (80_000, 0))
     private = policy("a", zones=["near", "far"], **spec)
     policies = {"a": private, "b": policy("b", zones=["near"], **FENCE)}
@@ -259,7 +259,7 @@ def test_what_a_camera_may_see_from_afar_is_granted_with_it(spec):
     app = application(component("Watch", "edge", locations=where, services=services))
     (grant,) = compile_grants(app, plan(app, stock), stock)
     assert [[z.name for z in p.zones] for p in grant.policies] == [["near"]]
-    # Its camera is not described: it may see everything around it.
+    # The camera has no description, so it may see everything around it.
     view = Situation(time_s=0.0, lat=FRAME.lat, lon=FRAME.lon, altitude_m=5.0, home=Home(FRAME.lat, FRAME.lon, 0.0))
     assert not judge(Call("CaptureImage", CaptureArgs()), view, compile_grant(grant)).permits
 
@@ -275,7 +275,7 @@ def test_what_a_camera_may_see_from_afar_is_granted_with_it(spec):
         ({"components": ["AerialViewer"]}, False),
     ],
 )
-def test_application_selector(applications, expected):
+def test_grant_contains_policies_selected_for_application(applications, expected):
     (grant,) = compiled(policy("a", applications=applications, **ALTITUDE))
     assert bool(grant.policies) is expected
 
@@ -302,7 +302,7 @@ def test_application_selector(applications, expected):
         ("interfaces", "In", ["WiFi"], {"interfaces": [{"technology": "WiFi"}]}, True, False),
     ],
 )
-def test_node_expressions_hold_for_the_unknown_when_they_restrict(
+def test_node_selector_matches_unknown_attribute_only_for_restrictions(
     key, operator, values, attributes, restriction, permission
 ):
     expression = NodeExpression(key=key, operator=operator, values=tuple(values))
@@ -310,7 +310,7 @@ def test_node_expressions_hold_for_the_unknown_when_they_restrict(
     assert matches(expression, attributes, unknown=False) is permission
 
 
-def test_attributes_of_nodes():
+def test_node_attributes_contain_description_fields():
     attributes = node_attributes(drone("d"))
     assert attributes["name"] == "d"
     assert attributes["kind"] == "Drone"
@@ -321,7 +321,7 @@ def test_attributes_of_nodes():
     assert not {"services.camera", "camera"} & node_attributes(edge("e", (0, 0), camera=False)).keys()
 
 
-def test_every_attribute_of_a_node_is_one_that_selectors_know():
+def test_node_selector_knows_every_node_attribute():
     for node in (drone("d"), edge("e", (0, 0))):
         assert [key for key in node_attributes(node) if not is_attribute(key)] == []
     keys = "class mtom name kind depot services.camera.mount.pitch physicalFeatures.dimensions.height autonomy"
@@ -329,7 +329,7 @@ def test_every_attribute_of_a_node_is_one_that_selectors_know():
 
 
 @pytest.mark.parametrize("operator", [{"operator": "Exists"}, {"operator": "In", "values": ["x"]}])
-def test_an_exclusion_with_a_mistyped_attribute_holds_and_is_told(operator):
+def test_node_selector_with_unknown_attribute_restricts_and_is_reported(operator):
     near = zone("z", (100, 100))
     mistyped = policy("fence", zones=["z"], nodes=[{"key": "camra", **operator}], **FENCE)
     (grant,) = compiled(mistyped, zones=[near])

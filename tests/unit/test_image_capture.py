@@ -1,4 +1,4 @@
-"""The camera between judging and keeping: the drone moves, callers wait, policies change, cameras break."""
+"""Capture and retrieval of pictures when the drone moves, callers wait, policies change or cameras fail."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def world(tmp_path: Path) -> Iterator[World]:
     world.shutter.close()
 
 
-async def test_a_drone_that_flies_over_private_ground_during_the_exposure_keeps_no_picture(world: World) -> None:
+async def test_capture_is_refused_when_drone_enters_privacy_zone_during_exposure(world: World) -> None:
     world.scene.during = lambda: setattr(world.drone, "y", 0.0)
     assert await refusal(world.camera.capture(active_grant(), CaptureArgs())) == "PrivacyZone"
     world.drone.y = 80.0
@@ -43,40 +43,40 @@ async def test_a_drone_that_flies_over_private_ground_during_the_exposure_keeps_
     assert (await world.stored_images.list(active_grant()))[1] == ()
 
 
-async def test_a_drone_that_crosses_private_ground_during_the_exposure_keeps_no_picture(world: World) -> None:
+async def test_capture_is_refused_when_drone_crosses_privacy_zone_during_exposure(world: World) -> None:
     world.scene.during = lambda: setattr(world.drone, "y", -80.0)
     assert await refusal(world.camera.capture(active_grant(), CaptureArgs())) == "PrivacyZone"
 
 
-async def test_a_camera_that_looks_aside_and_back_during_the_exposure_keeps_no_picture(world: World) -> None:
-    """Narrow and oblique, 10 m up: the zone 60 m to the south is behind it at both ends of the exposure."""
+async def test_capture_is_refused_when_camera_turns_to_privacy_zone_and_back(world: World) -> None:
+    """The view is narrow and oblique. At both ends of the exposure, the zone 60 m to the south is behind the camera."""
     world.drone.lens = Lens(20.0, 20.0, pitch_deg=-15.0, stabilised=True, error_deg=0.0)
 
-    def looked(**changes: float) -> None:
+    def turn_and_back(**changes: float) -> None:
         before = {name: getattr(world.drone, name) for name in changes}
         for now in (changes, before):
             for name, value in now.items():
                 setattr(world.drone, name, value)
             world.drone.situation(NOW)
 
-    world.scene.during = lambda: looked(yaw=45.0)
+    world.scene.during = lambda: turn_and_back(yaw=45.0)
     record = await world.capture(active_grant())
     assert {round(pose.attitude.yaw_deg) for pose in record.poses if pose.attitude} == {0, 45}
-    world.scene.during = lambda: looked(yaw=180.0)
+    world.scene.during = lambda: turn_and_back(yaw=180.0)
     assert await refusal(world.camera.capture(active_grant(), CaptureArgs())) == "PrivacyZone"
-    world.scene.during = lambda: looked(y=0.0)
+    world.scene.during = lambda: turn_and_back(y=0.0)
     assert await refusal(world.camera.capture(active_grant(), CaptureArgs())) == "PrivacyZone"
     blind = policy("a", "AccessControl", "denial", [zone("z", box(-20, -20, 20, 20))], methods=["CaptureImage"])
     assert await refusal(world.camera.capture(active_grant(blind), CaptureArgs())) == "MethodDenied"
     elsewhere = policy("q", "PrivacyControl", "camera", [zone("z", box(500, 500, 510, 510))], action="refuse")
-    world.scene.during = lambda: looked(yaw=180.0)
+    world.scene.during = lambda: turn_and_back(yaw=180.0)
     record = await world.capture(active_grant(elsewhere))
     assert await refusal(world.stored_images.retrieve(active_grant(), record.name)) == "PrivacyZone"
 
 
 @pytest.mark.parametrize("model", ["pinhole", "equidistant", None])
-async def test_only_a_pinholes_view_tells_its_focal_length(tmp_path: Path, model: str | None) -> None:
-    """Of another lens only a bound of its view is known, which is wider."""
+async def test_focal_length_is_in_metadata_only_of_pinhole_camera(tmp_path: Path, model: str | None) -> None:
+    """Only a wider bound is known of the view of another lens."""
     described = {"methods": ["CaptureImage"], "horizontalFieldOfView": 60} | (
         {"lens": {"model": model}} if model else {}
     )
@@ -96,20 +96,20 @@ async def test_only_a_pinholes_view_tells_its_focal_length(tmp_path: Path, model
     world.shutter.close()
 
 
-async def test_a_camera_that_shows_what_was_is_judged_by_where_it_was(world: World) -> None:
-    def came_from_private_ground() -> None:
+async def test_delayed_picture_is_judged_by_earlier_position(world: World) -> None:
+    def cross_privacy_zone() -> None:
         for y in (0.0, 80.0):
             world.drone.y = y
             world.drone.situation(NOW)
 
-    came_from_private_ground()
+    cross_privacy_zone()
     await world.capture(active_grant())
     world.scene.latency_s = 600.0
-    came_from_private_ground()
+    cross_privacy_zone()
     assert await refusal(world.camera.capture(active_grant(), CaptureArgs())) == "PrivacyZone"
 
 
-async def test_a_zone_counts_that_was_active_when_the_camera_may_have_seen_it(world: World) -> None:
+async def test_delayed_picture_is_judged_by_zones_active_at_exposure(world: World) -> None:
     world.drone.y = 0.0
     past = {**zone("z", box(-20, -20, 20, 20)), "schedule": [{"start": "08:00", "end": "11:50"}]}
     grant = active_grant(policy("p", "PrivacyControl", "camera", [past], action="refuse"))
@@ -119,7 +119,7 @@ async def test_a_zone_counts_that_was_active_when_the_camera_may_have_seen_it(wo
     assert await refusal(world.camera.capture(grant, CaptureArgs())) == "PrivacyZone"
 
 
-async def test_those_who_wait_are_judged_and_placed_when_it_is_their_turn(world: World) -> None:
+async def test_queued_capture_is_judged_and_located_at_its_turn(world: World) -> None:
     held_up = threading.Event()
     world.scene.during = lambda: held_up.wait(10) and None
     waiting = [asyncio.create_task(world.capture(active_grant())) for _ in range(MAX_PER_OWNER)]
@@ -142,7 +142,7 @@ async def refusal_of_queue(work: Any) -> bool:
     return caught.value.verdict.code == "ShutterBusy"
 
 
-async def test_a_caller_that_hangs_up_does_not_free_the_shutter(world: World) -> None:
+async def test_cancelled_capture_keeps_shutter_until_picture_is_stored(world: World) -> None:
     held_up = threading.Event()
     world.scene.during = lambda: held_up.wait(10) and None
     task = asyncio.create_task(world.camera.capture(active_grant(), CaptureArgs()))
@@ -161,7 +161,7 @@ async def test_a_caller_that_hangs_up_does_not_free_the_shutter(world: World) ->
     raise AssertionError("the picture of the caller that hung up was not stored")
 
 
-async def test_a_grant_that_ends_while_its_caller_waits_takes_no_picture(world: World) -> None:
+async def test_capture_is_refused_when_grant_ends_in_queue(world: World) -> None:
     def gone() -> ActiveGrant:
         raise PolicyDenied("NoGrant", "gone")
 
@@ -169,7 +169,7 @@ async def test_a_grant_that_ends_while_its_caller_waits_takes_no_picture(world: 
     assert not world.scene.taken
 
 
-async def test_an_application_of_the_same_name_does_not_inherit_pictures(world: World) -> None:
+async def test_recreated_application_does_not_inherit_pictures(world: World) -> None:
     await world.capture(active_grant())
     assert len((await world.stored_images.list(active_grant()))[1]) == 1
     assert (await world.stored_images.list(active_grant(uid="u2")))[1] == ()
@@ -178,7 +178,7 @@ async def test_an_application_of_the_same_name_does_not_inherit_pictures(world: 
 # Filters
 
 
-async def test_filters_that_become_necessary_are_written_down(world: World) -> None:
+async def test_audit_contains_filters_that_become_necessary(world: World) -> None:
     def written() -> list[tuple[str, list[str], list[str]]]:
         entries = [json.loads(line) for line in (world.directory.parent / "audit.jsonl").read_text().splitlines()]
         return [(entry["method"], entry["filters"], entry["policies"]) for entry in entries]
@@ -191,7 +191,7 @@ async def test_filters_that_become_necessary_are_written_down(world: World) -> N
     await world.capture(faces)  # and too high for faces to be found.
     plain = await world.capture(free)
     world.drone.y = 80.0
-    await world.pixels(bound, record)  # It has its filters already; this one not.
+    await world.pixels(bound, record)  # This picture has its filters already, the next one does not.
     await world.pixels(bound, plain)
     await world.audit.close()
     assert written() == [
@@ -205,7 +205,7 @@ async def test_filters_that_become_necessary_are_written_down(world: World) -> N
 
 
 @pytest.mark.parametrize("action", ["black", "blurAverage", "blurMedian", "removeBackground"])
-async def test_a_filtered_picture_is_never_on_disk_without_its_filter(world: World, action: str) -> None:
+async def test_picture_is_filtered_before_it_is_stored(world: World, action: str) -> None:
     world.drone.y = 0.0
     grant = active_grant(private(action))
     verdict, record = await world.camera.capture(grant, CaptureArgs())
@@ -219,7 +219,7 @@ async def test_a_filtered_picture_is_never_on_disk_without_its_filter(world: Wor
     assert b"Camera:" not in data
 
 
-async def test_a_picture_is_judged_again_by_where_it_was_taken(world: World) -> None:
+async def test_retrieval_is_judged_by_position_of_exposure(world: World) -> None:
     free, bound = active_grant(policy("q", "PrivacyControl", "camera", [zone("far", box(500, 500, 510, 510))],
                               action="refuse")), active_grant(private("blurAverage"))  # fmt: skip
     world.drone.y = 0.0
@@ -234,8 +234,8 @@ async def test_a_picture_is_judged_again_by_where_it_was_taken(world: World) -> 
     assert grain(await world.pixels(free, record)) > 30
 
 
-async def test_a_picture_is_not_returned_that_shows_what_must_not_be_retrieved(world: World) -> None:
-    """By a denial of the method, also from elsewhere: what counts is what the picture shows, not what the camera sees by then."""
+async def test_retrieval_is_denied_when_picture_shows_denial_zone(world: World) -> None:
+    """A denial of the method applies to the content of the picture, not to the current view of the camera."""
     ground, methods = [zone("z", box(-20, -20, 20, 20))], ["RetrieveImage"]
     grant = active_grant(policy("d", "AccessControl", "denial", ground, methods=methods))
     world.drone.y = 0.0
@@ -246,7 +246,7 @@ async def test_a_picture_is_not_returned_that_shows_what_must_not_be_retrieved(w
     assert (await world.stored_images.retrieve(grant, (await world.capture(grant)).name))[0].permits
 
 
-async def test_a_denial_counts_that_held_when_the_camera_may_have_seen_its_zone(world: World) -> None:
+async def test_delayed_picture_is_judged_by_denials_active_at_exposure(world: World) -> None:
     world.drone.y = 0.0
     past = {**zone("z", box(-20, -20, 20, 20)), "schedule": [{"start": "08:00", "end": "11:50"}]}
     grant = active_grant(policy("d", "AccessControl", "denial", [past], methods=["CaptureImage"]))
@@ -255,7 +255,7 @@ async def test_a_denial_counts_that_held_when_the_camera_may_have_seen_its_zone(
     assert await refusal(world.camera.capture(grant, CaptureArgs())) == "MethodDenied"
 
 
-async def test_a_picture_is_judged_again_once_its_filters_are_applied(world: World) -> None:
+async def test_retrieval_is_judged_again_after_filters_are_applied(world: World) -> None:
     far = [zone("far", box(500, 500, 510, 510))]
     free, bound = (
         active_grant(policy("q", "PrivacyControl", "camera", far, action="refuse")),
@@ -272,13 +272,13 @@ async def test_a_picture_is_judged_again_once_its_filters_are_applied(world: Wor
     assert (caught.value.verdict.code, caught.value.verdict.policies) == ("PrivacyZone", ("p",))
 
 
-async def test_a_picture_from_elsewhere_is_judged_by_where_the_camera_is_now(world: World) -> None:
+async def test_retrieval_is_judged_by_current_position_too(world: World) -> None:
     record = await world.capture(active_grant(private("black")))
     world.drone.y = 0.0
     assert (await world.pixels(active_grant(private("black")), record)).max() == 0
 
 
-async def test_faces_are_hidden_where_they_are_large_enough_to_be_found(tmp_path: Path) -> None:
+async def test_faces_are_blurred_or_fallback_applies_when_too_small(tmp_path: Path) -> None:
     world = World(tmp_path, (1600, 1600))
     world.drone.y, world.drone.alt = 0.0, 2.0
     world.finder.boxes = [(700, 700, 100, 100)]
@@ -297,12 +297,12 @@ async def test_faces_are_hidden_where_they_are_large_enough_to_be_found(tmp_path
 
 
 @pytest.mark.parametrize(("width", "height"), [(62, 1600), (1600, 62)])
-async def test_a_part_of_the_view_that_cuts_a_face_shows_nothing_of_it(
+async def test_faces_cut_by_cropping_are_blurred(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, width: int, height: int
 ) -> None:
     world = World(tmp_path, (1600, 1600))
     world.drone.y, world.drone.alt = 0.0, 2.0
-    # The strip shows two thirds of a face that is 97 pixels wide, too little for a detector.
+    # The strip shows two thirds of a face that is 97 pixels wide. A detector does not find it.
     scene = np.full((1600, 1600, 3), 90, np.uint8)
     left, top = 776 - 225, 776 - 114
     scene[top : top + 512, left : left + 512] = skimage.data.astronaut()[..., ::-1]
@@ -324,7 +324,7 @@ async def test_a_part_of_the_view_that_cuts_a_face_shows_nothing_of_it(
     world.shutter.close()
 
 
-async def test_faces_that_were_hidden_too_softly_are_not_looked_for_again(tmp_path: Path) -> None:
+async def test_weakly_blurred_faces_get_fallback_of_stricter_policy(tmp_path: Path) -> None:
     world = World(tmp_path, (1600, 1600))
     world.drone.y, world.drone.alt = 0.0, 2.0
     world.finder.boxes = [(700, 700, 100, 100)]
@@ -342,10 +342,10 @@ async def test_faces_that_were_hidden_too_softly_are_not_looked_for_again(tmp_pa
 
 
 @pytest.mark.parametrize(("size", "shown"), [((120, 160), (120, 68)), ((400, 90), (160, 90)), ((160, 90), (160, 90))])
-async def test_no_more_is_kept_than_the_view_that_was_judged(
+async def test_stored_picture_shows_only_judged_view(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: tuple[int, int], shown: tuple[int, int]
 ) -> None:
-    """Whatever proportions the camera gives: the footprint was that of 16:9."""
+    """The footprint is that of 16:9, so other proportions of the camera are cropped."""
     world = World(tmp_path, (160, 90))
     picture = np.zeros((size[1], size[0], 3), np.uint8)
     left, top = (size[0] - shown[0]) // 2, (size[1] - shown[1]) // 2
@@ -360,14 +360,14 @@ async def test_no_more_is_kept_than_the_view_that_was_judged(
     world.shutter.close()
 
 
-async def test_without_a_lens_the_size_of_faces_is_unknown(world: World) -> None:
+async def test_face_size_is_unknown_without_lens(world: World) -> None:
     world.drone.lens = None
     verdict, _ = await world.camera.capture(active_grant(private("blurFaces")), CaptureArgs())
     assert "the size of faces is unknown" in verdict.reason
-    assert verdict.policies == ("p",), "80 m away, but who knows what the camera sees"
+    assert verdict.policies == ("p",), "80 m away, but the view of the camera is unknown"
 
 
-async def test_a_picture_that_was_enlarged_has_no_larger_faces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_enlarged_picture_does_not_enlarge_smallest_face(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     world = World(tmp_path, (1600, 1600))
     world.drone.y, world.drone.alt = 0.0, 2.0
     small = np.zeros((100, 100, 3), np.uint8)
@@ -379,7 +379,7 @@ async def test_a_picture_that_was_enlarged_has_no_larger_faces(tmp_path: Path, m
 
 
 @pytest.mark.parametrize(("width", "height"), [(15, 64), (64, 9000), (8192, 8192), (8000, 16)])
-async def test_sizes_beyond_measure_are_refused(world: World, width: int, height: int) -> None:
+async def test_capture_refuses_invalid_picture_size(world: World, width: int, height: int) -> None:
     assert await refusal(world.camera.capture(active_grant(), CaptureArgs(width, height))) == "InvalidArgument"
     assert not world.scene.taken
 
@@ -387,7 +387,7 @@ async def test_sizes_beyond_measure_are_refused(world: World, width: int, height
 # Cameras that break
 
 
-async def test_a_camera_that_hangs_is_reported_and_comes_back(tmp_path: Path) -> None:
+async def test_hanging_camera_is_reported_and_recovers(tmp_path: Path) -> None:
     scene, stuck = Scene(), threading.Event()
     scene.during = lambda: stuck.wait(20) and None
     shutter = Shutter(scene, timeout_s=0.2)
@@ -397,7 +397,7 @@ async def test_a_camera_that_hangs_is_reported_and_comes_back(tmp_path: Path) ->
     begun = time.monotonic()
     with pytest.raises(CameraFailed, match="has not responded for"):
         await shutter.expose(request)
-    assert time.monotonic() - begun < 5, "at once, not after another wait"
+    assert time.monotonic() - begun < 5, "refused at once"
     stuck.set()
     for _ in range(500):
         try:
@@ -406,11 +406,11 @@ async def test_a_camera_that_hangs_is_reported_and_comes_back(tmp_path: Path) ->
         except CameraFailed:
             await asyncio.sleep(0.01)
     else:
-        raise AssertionError("the camera does not come back")
+        raise AssertionError("the camera does not recover")
     shutter.close()
 
 
-async def test_a_driver_that_breaks_does_not_take_the_service_along(world: World) -> None:
+async def test_failed_camera_driver_is_used_again(world: World) -> None:
     def broken() -> None:
         raise CameraFailed("no light")
 
@@ -419,6 +419,3 @@ async def test_a_driver_that_breaks_does_not_take_the_service_along(world: World
         await world.capture(active_grant())
     world.scene.during = lambda: None
     await world.capture(active_grant())
-
-
-# The album

@@ -1,4 +1,4 @@
-"""What filters take away, which faces are found, what pictures tell about themselves, and where they come from."""
+"""Image processing: filters, face and motion detection, decoding, metadata and camera drivers."""
 
 from __future__ import annotations
 
@@ -61,23 +61,23 @@ def covers(boxes: list[Any], face: tuple[int, int, int, int]) -> bool:
 
 
 @pytest.mark.parametrize("blur", [blur_average, blur_median])
-def test_a_blur_leaves_sixteen_values_across_and_no_face(blur: Any, photo: Pixels, detector: CascadeDetector) -> None:
+def test_blur_leaves_16_by_16_values_and_no_face(blur: Any, photo: Pixels, detector: CascadeDetector) -> None:
     blurred = blur(photo)
     assert blurred.shape == photo.shape
     assert abs(float(blurred.mean()) - float(photo.mean())) < 12
     assert not covers(detector.detect(blurred, 48, upright=True), FACE)
-    # Structure finer than a cell is gone: what is left follows from 16x16 values.
+    # No structure finer than a cell is left: the picture follows from 16x16 values.
     few = cv2.resize(blurred[16::32, 16::32], (512, 512), interpolation=cv2.INTER_LINEAR)
     assert float(np.abs(few.astype(float) - blurred).mean()) < 6
 
 
-def test_black_is_black(photo: Pixels) -> None:
+def test_blacken_sets_all_pixels_to_black(photo: Pixels) -> None:
     assert blacken(photo).max() == 0
 
 
 @pytest.mark.parametrize("method", ["pixelate", "gaussian"])
 @pytest.mark.parametrize("width_px", [50, 97])
-def test_a_hidden_face_is_found_no_more(method: Any, width_px: int, photo: Pixels, detector: CascadeDetector) -> None:
+def test_hidden_face_is_not_detected(method: Any, width_px: int, photo: Pixels, detector: CascadeDetector) -> None:
     scale = width_px / 97
     picture = cv2.resize(photo, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     face = tuple(int(v * scale) for v in FACE)
@@ -95,31 +95,31 @@ def test_a_hidden_face_is_found_no_more(method: Any, width_px: int, photo: Pixel
 
 
 @pytest.mark.parametrize("method", ["pixelate", "gaussian"])
-def test_a_face_that_is_found_within_a_face_brings_nothing_back(method: Any, photo: Pixels) -> None:
+def test_hide_faces_reveals_nothing_when_boxes_overlap(method: Any, photo: Pixels) -> None:
     face, region = (100, 100, 98, 98), np.s_[65:233, 65:233]
     cells = cv2.resize(photo[region], (7, 7), interpolation=cv2.INTER_AREA)
     coarse = photo.copy()
     coarse[region] = cv2.resize(cells, (168, 168), interpolation=cv2.INTER_NEAREST)
     for boxes in ([face, (140, 130, 30, 30), (110, 150, 24, 24)], [(140, 130, 30, 30), face], [face, (60, 60, 40, 40)]):
         shown, nothing = (hide_faces(one, boxes, method)[region] for one in (photo, coarse))
-        # A box across the edge of the region mixes in what is beside it, before the face is hidden or after.
+        # A box across the edge of the region mixes in adjacent pixels, before or after the face is hidden.
         assert float(np.abs(shown.astype(int) - nothing).mean()) < 1, boxes
 
 
-def test_a_face_at_the_edge_keeps_no_more_colours_than_one_in_the_middle(photo: Pixels) -> None:
+def test_hide_faces_leaves_few_colours_at_picture_edge(photo: Pixels) -> None:
     hidden = hide_faces(photo, [(-60, 200, 100, 100), (472, 430, 100, 100)], "pixelate")
     assert len(np.unique(hidden[240, :75], axis=0)) <= 3
     assert len(np.unique(hidden[480, 440:], axis=0)) <= 3
     assert len(np.unique(hidden[400:, 500], axis=0)) <= 5
 
 
-def test_faces_at_the_edge_do_not_break_the_filter(photo: Pixels) -> None:
+def test_hide_faces_accepts_boxes_outside_picture(photo: Pixels) -> None:
     hidden = hide_faces(photo, [(-50, -50, 80, 80), (500, 500, 90, 90), (600, 600, 10, 10), (5, 5, 1, 1)], "pixelate")
     assert hidden.shape == photo.shape
 
 
 @pytest.mark.parametrize(("turn", "light"), [(0, 1.0), (40, 1.0), (120, 0.4), (180, 1.3), (265, 1.0)])
-def test_faces_are_found_in_every_direction(turn: int, light: float, photo: Pixels, detector: CascadeDetector) -> None:
+def test_face_detector_detects_rotated_faces(turn: int, light: float, photo: Pixels, detector: CascadeDetector) -> None:
     middle = (FACE[0] + 48.5, FACE[1] + 48.5)
     matrix = cv2.getRotationMatrix2D(middle, turn, 60 / 97)
     matrix[:, 2] += (90 - middle[0], 90 - middle[1])
@@ -127,7 +127,7 @@ def test_faces_are_found_in_every_direction(turn: int, light: float, photo: Pixe
     assert covers(detector.detect(scene, 56, upright=False), (60, 60, 60, 60))
 
 
-def test_what_moves_is_kept_and_the_rest_is_black(photo: Pixels) -> None:
+def test_remove_background_keeps_moving_objects_only(photo: Pixels) -> None:
     def frame(shift: int, car: int) -> Pixels:
         picture = np.roll(photo, shift, axis=1).copy()
         picture[350:380, car : car + 40] = (0, 0, 255)
@@ -138,7 +138,7 @@ def test_what_moves_is_kept_and_the_rest_is_black(photo: Pixels) -> None:
     assert mask is not None
     kept = remove_background(now, mask)
     assert (kept[352:378, 202:238] == (0, 0, 255)).all()
-    assert (kept.max(axis=2) > 0).mean() < 0.08, "the landscape, and where the car was, are gone"
+    assert (kept.max(axis=2) > 0).mean() < 0.08, "the landscape and the earlier place of the car must be black"
     assert kept[66:163, 177:274].max() == 0
     standing = detect_motion(frame(0, 100), frame(0, 200), frame(0, 300), fixed=True)
     assert standing is not None
@@ -147,7 +147,7 @@ def test_what_moves_is_kept_and_the_rest_is_black(photo: Pixels) -> None:
 
 
 @pytest.mark.parametrize("sway_px", [0, 2, 8, 16])
-def test_a_mast_that_sways_shows_nothing_that_stands(sway_px: int, photo: Pixels) -> None:
+def test_motion_detection_ignores_background_of_swaying_camera(sway_px: int, photo: Pixels) -> None:
     frames = []
     for i, car in enumerate((100, 200, 300)):
         picture = photo.copy()
@@ -161,7 +161,7 @@ def test_a_mast_that_sways_shows_nothing_that_stands(sway_px: int, photo: Pixels
     assert mask.mean() < 0.08
 
 
-def test_a_fixed_camera_that_sees_little_shows_what_moves(photo: Pixels) -> None:
+def test_motion_detection_detects_motion_before_plain_background(photo: Pixels) -> None:
     frames = [np.full_like(photo, 90) for _ in range(3)]
     for i, frame in enumerate(frames):
         frame[350:380, 100 * i + 100 : 100 * i + 140] = (40, 200, 40)
@@ -173,9 +173,7 @@ def test_a_fixed_camera_that_sees_little_shows_what_moves(photo: Pixels) -> None
 
 @pytest.mark.parametrize("fixed", [True, False])
 @pytest.mark.parametrize("light", [(1.0, 1.2, 1.4), (0.7, 0.85, 1.0), (1.3, 1.0, 1.3), (0.5, 1.0, 0.5)])
-def test_a_camera_that_adapts_to_light_shows_nothing_that_stands(
-    light: tuple[float, ...], fixed: bool, photo: Pixels
-) -> None:
+def test_motion_detection_ignores_changed_exposure(light: tuple[float, ...], fixed: bool, photo: Pixels) -> None:
     frames = []
     for i, (factor, car) in enumerate(zip(light, (100, 200, 300), strict=True)):
         picture = np.roll(photo, 0 if fixed else 3 * i, axis=1).copy()
@@ -187,12 +185,12 @@ def test_a_camera_that_adapts_to_light_shows_nothing_that_stands(
     assert mask.mean() < 0.08
 
 
-def test_where_light_changes_too_much_nothing_is_shown(photo: Pixels) -> None:
+def test_motion_is_unknown_when_light_changes_too_much(photo: Pixels) -> None:
     dark = cv2.convertScaleAbs(photo, alpha=0.3)
     assert detect_motion(photo, dark, photo, fixed=True) is None
 
 
-def test_where_motion_is_unknown_nothing_is_shown(photo: Pixels) -> None:
+def test_remove_background_is_black_when_motion_is_unknown(photo: Pixels) -> None:
     other = np.asarray(cv2.rotate(photo[:, ::-1], cv2.ROTATE_90_CLOCKWISE))
     noise = np.random.default_rng(3).integers(0, 256, photo.shape).astype(np.uint8)
     plain = np.full_like(photo, 90)
@@ -202,10 +200,10 @@ def test_where_motion_is_unknown_nothing_is_shown(photo: Pixels) -> None:
         assert remove_background(photo, mask).max() == 0
 
 
-# Trust
+# Reliability of face detection
 
 
-def test_the_smallest_face_follows_from_lens_distance_and_pixels() -> None:
+def test_smallest_face_depends_on_lens_distance_and_pixels() -> None:
     lens = Lens(90.0, 60.0)
     assert smallest_face_px(lens, 10.0, 2000) == pytest.approx(13.0)
     assert smallest_face_px(lens, float("inf"), 2000) == 0
@@ -225,11 +223,11 @@ def test_the_smallest_face_follows_from_lens_distance_and_pixels() -> None:
         (None, [Attitude(0, 0, 0)], False),
     ],
 )
-def test_people_stand_upright_only_where_every_pose_says_so(lens: Any, attitudes: list[Any], upright: bool) -> None:
+def test_camera_is_upright_only_if_every_pose_is(lens: Any, attitudes: list[Any], upright: bool) -> None:
     assert is_upright([Pose.from_situation(at(lens=lens, attitude=attitude)) for attitude in attitudes]) is upright
 
 
-def test_where_faces_are_not_found_reliably_the_fallback_applies(detector: CascadeDetector) -> None:
+def test_filter_fallback_applies_when_face_detection_is_unreliable(detector: CascadeDetector) -> None:
     def faces(fallback: Any) -> Filter:
         return Filter("blurFaces", fallback=fallback)
 
@@ -241,7 +239,7 @@ def test_where_faces_are_not_found_reliably_the_fallback_applies(detector: Casca
         plan_filters((faces("refuse"),), 6, detector)
 
 
-def test_a_model_that_is_none_is_refused_with_a_sentence(tmp_path: Path) -> None:
+def test_invalid_face_model_is_refused_with_reason(tmp_path: Path) -> None:
     with pytest.raises(InvalidFaceModel, match="file not found"):
         ModelDetector(tmp_path / "none.onnx")
     corrupt = tmp_path / "corrupt.onnx"
@@ -255,7 +253,7 @@ def test_a_model_that_is_none_is_refused_with_a_sentence(tmp_path: Path) -> None
 
 @given(st.integers(16, 400), st.integers(16, 400), st.sampled_from([(640, 480), (1280, 720), (100, 100), (480, 640)]))
 @settings(max_examples=examples(100, 10), deadline=None, derandomize=True)
-def test_cropping_keeps_proportions_and_shows_no_more(width: int, height: int, native: tuple[int, int]) -> None:
+def test_source_size_keeps_proportions_of_camera(width: int, height: int, native: tuple[int, int]) -> None:
     source = source_size(width, height, native)
     assert source[0] >= width
     assert source[1] >= height
@@ -263,14 +261,14 @@ def test_cropping_keeps_proportions_and_shows_no_more(width: int, height: int, n
     assert crop_and_resize(np.zeros((source[1], source[0], 3), np.uint8), width, height).shape == (height, width, 3)
 
 
-def test_the_middle_is_kept() -> None:
+def test_crop_keeps_centre_of_picture() -> None:
     picture = np.zeros((100, 300, 3), np.uint8)
     picture[:, 100:200] = 255
     assert crop_and_resize(picture, 50, 50).min() > 250
 
 
 @pytest.mark.parametrize("data", [b"", b"no picture", b"\xff\xd8\xff\xe0broken"])
-def test_what_is_no_picture_is_said_so(data: bytes) -> None:
+def test_invalid_image_data_is_refused(data: bytes) -> None:
     with pytest.raises(InvalidImage):
         decode_image(data)
 
@@ -279,7 +277,7 @@ def test_what_is_no_picture_is_said_so(data: bytes) -> None:
 @pytest.mark.parametrize(
     ("suffix", "kind"), [("png", np.uint8), ("png", np.uint16), ("tiff", np.uint8), ("bmp", np.uint8)]
 )
-def test_pictures_are_read_as_opencv_reads_them(shape: tuple[int, ...], suffix: str, kind: Any) -> None:
+def test_image_is_decoded_as_by_opencv(shape: tuple[int, ...], suffix: str, kind: Any) -> None:
     made = np.random.default_rng(3).integers(0, np.iinfo(kind).max, shape, kind)
     data = cv2.imencode(f".{suffix}", made)[1].tobytes()
     expected = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
@@ -287,7 +285,7 @@ def test_pictures_are_read_as_opencv_reads_them(shape: tuple[int, ...], suffix: 
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_pictures_are_turned_upright(photo: Pixels, orientation: int) -> None:
+def test_image_is_rotated_by_exif_orientation(photo: Pixels, orientation: int) -> None:
     exif, out = Image.Exif(), io.BytesIO()
     exif[0x0112] = orientation
     Image.fromarray(photo[:100, :60, ::-1]).save(out, "JPEG", quality=95, exif=exif)
@@ -296,20 +294,20 @@ def test_pictures_are_turned_upright(photo: Pixels, orientation: int) -> None:
     assert np.abs(decode_image(out.getvalue()).astype(int) - expected).mean() < 2
 
 
-def test_half_a_picture_is_none(photo: Pixels) -> None:
+def test_truncated_image_is_refused(photo: Pixels) -> None:
     data = encode_jpeg(photo)
     with pytest.raises(InvalidImage):
         decode_image(data[: len(data) // 2])
 
 
-def test_more_pixels_than_a_camera_has_are_not_read() -> None:
+def test_image_with_too_many_pixels_is_refused() -> None:
     out = io.BytesIO()
     Image.new("1", (10_000, 5_001)).save(out, "PNG")
     with pytest.raises(InvalidImage, match="the limit is 50000000 pixels"):
         decode_image(out.getvalue())
 
 
-def test_pictures_tell_where_they_were_taken(photo: Pixels) -> None:
+def test_image_metadata_contains_position_and_camera(photo: Pixels) -> None:
     lens = Lens(60.0, 45.0, pitch_deg=-30.0, yaw_deg=10.0, stabilised=True)
     pose = Pose.from_situation(at(30, 40, alt=12.5, lens=lens, attitude=Attitude(5, 5, 80.0)))
     data = with_metadata(encode_jpeg(photo), pose, time_s=NOW + 0.25, camera="Pi Camera ü", view_width_px=512)
@@ -340,7 +338,7 @@ def test_pictures_tell_where_they_were_taken(photo: Pixels) -> None:
         with_metadata(b"PNG", pose, time_s=NOW, camera="", view_width_px=512)
 
 
-def test_a_picture_from_nowhere_and_below_the_sea_can_be_with_metadata(photo: Pixels) -> None:
+def test_image_metadata_accepts_unknown_position_and_negative_altitude(photo: Pixels) -> None:
     for now in (at(lens=None, home=None), at(home=Home(-33.9, -70.0, -50.0), alt=1.0)):
         data = with_metadata(encode_jpeg(photo), Pose.from_situation(now), time_s=NOW, camera="", view_width_px=512)
         with Image.open(io.BytesIO(data)) as picture:
@@ -351,7 +349,7 @@ def test_a_picture_from_nowhere_and_below_the_sea_can_be_with_metadata(photo: Pi
             assert float(gps[6]) == 49.0
 
 
-def test_records_of_pictures_survive_json() -> None:
+def test_image_record_survives_json_round_trip() -> None:
     import json
 
     pose = Pose.from_situation(at(attitude=Attitude(1, 2, 3)))
@@ -374,7 +372,7 @@ def capture_request(**more: Any) -> CaptureRequest:
 @pytest.mark.parametrize(
     "connection", ["", "ftp://x/", "v4l2:", "picamera2:x", "directory:", "test:x", "http://", "http://h:x/"]
 )
-def test_what_names_no_camera_is_refused(connection: str) -> None:
+def test_invalid_camera_connection_is_refused(connection: str) -> None:
     with pytest.raises(InvalidCameraConnection):
         create_driver(connection)
 
@@ -383,11 +381,11 @@ def test_what_names_no_camera_is_refused(connection: str) -> None:
     ("connection", "latency_s"),
     [("http://h/", 2.0), ("picamera2:0", 0.3), ("v4l2:/dev/video0", 0.0), ("directory:/", 0.0), ("test:", 0.0)],
 )
-def test_cameras_tell_how_old_their_pictures_may_be(connection: str, latency_s: float) -> None:
+def test_camera_driver_has_latency(connection: str, latency_s: float) -> None:
     assert create_driver(connection).latency_s == latency_s
 
 
-def test_cameras_that_are_not_there_say_so(tmp_path: Path) -> None:
+def test_missing_camera_error_names_remedy(tmp_path: Path) -> None:
     no_camera = tmp_path / "video0"
     no_camera.write_bytes(b"no device")
     for connection, sentence in (
@@ -403,7 +401,7 @@ def test_cameras_that_are_not_there_say_so(tmp_path: Path) -> None:
         driver.close()
 
 
-def test_a_raspberry_camera_is_configured_started_and_started_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_raspberry_camera_is_configured_and_restarted(monkeypatch: pytest.MonkeyPatch) -> None:
     begun: list[Any] = []
 
     class Picamera2:
@@ -442,10 +440,10 @@ def test_a_raspberry_camera_is_configured_started_and_started_again(monkeypatch:
         create_driver("picamera2:0").capture(capture_request())
 
 
-def test_a_video_device_that_ignores_the_size_it_was_set_to_gives_no_picture_of_a_known_view(
+def test_video_device_with_unexpected_size_is_refused_when_view_is_known(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """640x480 of a sensor that was set to 64x48 may show more than its description says."""
+    """A picture of 640x480 pixels from a sensor that was set to 64x48 may show more than the described view."""
     device = SimpleNamespace(
         isOpened=lambda: True, set=lambda *_: False, grab=lambda: True, release=lambda: None,
         read=lambda: (True, np.zeros((480, 640, 3), np.uint8)),
@@ -458,13 +456,13 @@ def test_a_video_device_that_ignores_the_size_it_was_set_to_gives_no_picture_of_
     ):
         driver.capture(capture_request(lens=Lens(60.0, 45.0)))
     assert driver.capture(capture_request(lens=None)).shape == (480, 640, 3), (
-        "a camera that is not described sees everything"
+        "a camera without a description may see everything"
     )
     device.read = lambda: (True, np.zeros((48, 64, 3), np.uint8))
     assert driver.capture(capture_request(lens=Lens(60.0, 45.0))).shape == (48, 64, 3)
 
 
-def test_a_directory_gives_the_picture_that_was_taken_nearest_in_space(tmp_path: Path) -> None:
+def test_directory_driver_returns_picture_taken_nearest(tmp_path: Path) -> None:
     for name, level, place in (
         ("a", 10, at(0, 0, alt=10)),
         ("b", 100, at(50, 0, alt=10)),
@@ -476,7 +474,7 @@ def test_a_directory_gives_the_picture_that_was_taken_nearest_in_space(tmp_path:
         )
     (tmp_path / "untagged.png").write_bytes(bytes(cv2.imencode(".png", np.zeros((4, 4, 3), np.uint8))[1]))
     (tmp_path / "broken.jpg").write_bytes(b"no picture")
-    # A bitmap of 3.6 gigapixels, of which only the header is there.
+    # The header of a bitmap with 3.6 gigapixels.
     header = struct.pack("<IIIIiiHHIIiiII", 54, 0, 54, 40, 60_000, 60_000, 1, 24, *[0] * 6)
     (tmp_path / "mosaic.tif").write_bytes(b"BM" + header)
     os.mkfifo(tmp_path / "pipe.jpg")

@@ -24,7 +24,7 @@ def world(tmp_path: Path) -> Iterator[World]:
     world.shutter.close()
 
 
-async def test_the_album_forgets_what_a_crash_left_and_makes_room(tmp_path: Path) -> None:
+async def test_image_store_deletes_partial_files_and_pictures_of_deleted_owners(tmp_path: Path) -> None:
     world = World(tmp_path)
     record = await world.capture(active_grant())
     folder = next(path for path in world.directory.iterdir() if path.is_dir())
@@ -34,18 +34,18 @@ async def test_the_album_forgets_what_a_crash_left_and_makes_room(tmp_path: Path
     store = ImageStore(world.directory, 50, 10**9)
     assert [s.name for s in store.list(owner_of(active_grant()))] == [record.name]
     assert len(list(folder.glob("*.jpg*"))) == 1
-    assert store.list(owner_of(active_grant())) == (record,), "a shot survives its record"
+    assert store.list(owner_of(active_grant())) == (record,), "the picture is kept with its record"
 
     living = [owner_of(active_grant(instance="other"))]
     small = ImageStore(world.directory, 50, 10**9, 1000, lambda: living)
-    assert small.quota_problem(living[0]) == "", "pictures of those who are gone make room"
+    assert small.quota_problem(living[0]) == "", "pictures of deleted owners are removed to make room"
     assert not folder.exists()
     small.add(living[0], replace(record, name="20260101000000000-0009.jpg"), b"x" * 2000)
     assert "--keep-total-mb" in small.quota_problem(living[0])
     world.shutter.close()
 
 
-async def test_a_picture_whose_record_is_damaged_is_removed_and_never_handed_out(tmp_path: Path) -> None:
+async def test_image_store_deletes_picture_with_damaged_record(tmp_path: Path) -> None:
     world = World(tmp_path)
     owner = owner_of(active_grant())
     records = [await world.capture(active_grant()) for _ in range(5)]
@@ -69,7 +69,7 @@ async def test_a_picture_whose_record_is_damaged_is_removed_and_never_handed_out
     world.shutter.close()
 
 
-async def test_a_picture_of_an_earlier_release_has_an_unknown_place(tmp_path: Path) -> None:
+async def test_picture_of_earlier_release_has_unknown_position(tmp_path: Path) -> None:
     world = World(tmp_path)
     record = await world.capture(active_grant())
     record_path = world.store.path(owner_of(active_grant()), record.name).with_suffix(".json")
@@ -81,15 +81,15 @@ async def test_a_picture_of_an_earlier_release_has_an_unknown_place(tmp_path: Pa
     (kept,) = (await world.stored_images.list(active_grant()))[1]
     assert (kept.name, kept.poses[0].lat, kept.face_px) == (record.name, None, 0.0)
     assert await refusal(world.stored_images.retrieve(active_grant(), record.name)) == "PrivacyZone", (
-        "every policy in force holds"
+        "every active policy applies"
     )
     verdict, _, _ = await world.stored_images.retrieve(active_grant(private("black")), record.name)
     assert verdict.policies == ("p",)
     world.shutter.close()
 
 
-async def test_faces_are_not_looked_for_in_a_picture_that_may_be_a_part_of_the_view(tmp_path: Path) -> None:
-    """Releases that cropped before they looked for faces did not say so."""
+async def test_faces_are_not_detected_in_picture_that_may_be_cropped(tmp_path: Path) -> None:
+    """Earlier releases cropped pictures before face detection without a record of it."""
     world = World(tmp_path)
     record = await world.capture(active_grant())
     record_path = world.store.path(owner_of(active_grant()), record.name).with_suffix(".json")
@@ -104,7 +104,7 @@ async def test_faces_are_not_looked_for_in_a_picture_that_may_be_a_part_of_the_v
 
 
 def modes(directory: Path) -> dict[str, set[int]]:
-    """Permissions of the folders and files of an album."""
+    """Return the permissions of the folders and files of an image store."""
     found = [(path.is_dir(), stat.S_IMODE(path.stat().st_mode)) for path in directory.rglob("*")]
     return {
         "folders": {mode for is_dir, mode in found if is_dir},
@@ -112,7 +112,7 @@ def modes(directory: Path) -> dict[str, set[int]]:
     }
 
 
-async def test_only_the_service_reads_pictures(world: World) -> None:
+async def test_image_store_files_are_readable_by_owner_only(world: World) -> None:
     before = os.umask(0)
     try:
         plain = await world.capture(active_grant(private("black")))
@@ -124,7 +124,7 @@ async def test_only_the_service_reads_pictures(world: World) -> None:
     assert modes(world.directory) == {"folders": {0o700}, "files": {0o600}}
 
 
-async def test_pictures_of_an_earlier_release_are_closed_to_others(world: World) -> None:
+async def test_image_store_restricts_permissions_of_earlier_release(world: World) -> None:
     record = await world.capture(active_grant())
     for path in world.directory.rglob("*"):
         path.chmod(0o755 if path.is_dir() else 0o644)
@@ -136,11 +136,13 @@ async def test_pictures_of_an_earlier_release_are_closed_to_others(world: World)
     store = ImageStore(world.directory, 50, 10**9)
     (folder / "20260101000000000-0001.json").unlink(missing_ok=True)
     assert modes(world.directory) == {"folders": {0o700}, "files": {0o600}}
-    assert stat.S_IMODE(foreign.stat().st_mode) == 0o644, "a link leads to no other file"
+    assert stat.S_IMODE(foreign.stat().st_mode) == 0o644, "the target of a link must stay unchanged"
     assert store.find(owner_of(active_grant()), record.name) == record
 
 
-async def test_a_full_disk_is_said_and_leaves_nothing_behind(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_full_disk_is_reported_and_leaves_no_partial_picture(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def full(_file: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -155,7 +157,7 @@ async def test_a_full_disk_is_said_and_leaves_nothing_behind(world: World, monke
     await world.capture(active_grant())
 
 
-async def test_a_full_album_says_what_to_do(tmp_path: Path) -> None:
+async def test_full_image_store_error_names_remedy(tmp_path: Path) -> None:
     world = World(tmp_path, keep=1)
     await world.capture(active_grant())
     with pytest.raises(ImageStoreFull, match="DeleteImage") as caught:

@@ -1,4 +1,4 @@
-"""The DirectLinks that the operator makes of a plan, against a golden file (FRACTUS_GOLDEN=write renews it)."""
+"""DirectLinks built from a plan, compared with a golden file. Run with FRACTUS_GOLDEN=write to update it."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def target(*pods: PodView) -> object:
     return links(*pods)["edge-1"]["spec"]["services"][0].get("target")
 
 
-def test_links_are_as_the_golden_file_says() -> None:
+def test_direct_links_match_golden_file() -> None:
     found = list(links(pod("a", "10.1.0.5")).values())
     path = GOLDEN / "expected.yaml"
     if os.environ.get("FRACTUS_GOLDEN") == "write":
@@ -50,7 +50,7 @@ def test_links_are_as_the_golden_file_says() -> None:
         assert DirectLink.from_body(body).spec.to_dict() == body["spec"]
 
 
-def test_the_target_is_the_pod_that_takes_calls() -> None:
+def test_direct_link_target_is_ready_pod() -> None:
     old, new = pod("a", "10.1.0.5", terminating=True), pod("b", "10.1.0.6")
     assert target(old, new) == {"address": "10.1.0.6", "port": 8080}
     assert target(new, pod("c", "10.1.0.7", ready=False), pod("d", None)) == {"address": "10.1.0.6", "port": 8080}
@@ -62,21 +62,23 @@ def caller(*pods: PodView) -> object:
     return links(*pods)["edge-1"]["spec"]["services"][0]["callers"]
 
 
-def test_the_callers_are_the_pods_on_the_drone_that_may_call() -> None:
+def test_direct_link_callers_are_pods_on_drone_with_access() -> None:
     def viewer(name: str, ip: str | None, **state: bool) -> PodView:
         state = {"ready": False, "finished": False, "terminating": False} | state
         return PodView("city", name, "drone-1", {"fractus.dev/instance": "traffic-aerial-viewer"}, {}, ip=ip, **state)
 
     old, new = viewer("a", "10.2.0.5", terminating=True), viewer("b", "10.2.0.6")
     assert caller(viewer("a", None)) == [{"instance": "traffic-aerial-viewer"}]
-    assert caller(old, new) == [{"instance": "traffic-aerial-viewer", "address": "10.2.0.6"}], "it may call at once"
+    assert caller(old, new) == [{"instance": "traffic-aerial-viewer", "address": "10.2.0.6"}], (
+        "a new pod may call at once"
+    )
     assert caller(old, viewer("b", "10.2.0.6", finished=True)) == [
         {"instance": "traffic-aerial-viewer", "address": "10.2.0.5"}
     ]
     assert retargeted(links(old)["edge-1"]["spec"]["services"], [new])[0]["callers"] == caller(new)
 
 
-def test_what_names_no_caller_may_be_called_by_all_on_the_drone() -> None:
+def test_direct_link_has_no_callers_when_component_names_none() -> None:
     body = copy.deepcopy(INPUT["application"])
     viewer = next(c for c in body["spec"]["components"] if c["name"] == "AerialViewer")
     del viewer["egress"]
@@ -86,7 +88,7 @@ def test_what_names_no_caller_may_be_called_by_all_on_the_drone() -> None:
     assert "callers" not in first["spec"]["services"][0]
 
 
-def test_there_is_no_link_before_there_is_an_address_to_redirect() -> None:
+def test_direct_link_is_not_created_without_service_address() -> None:
     assert links(pod("a", "10.1.0.5"), cluster_ip=None) == {}
 
 
@@ -94,5 +96,5 @@ def test_there_is_no_link_before_there_is_an_address_to_redirect() -> None:
     ("city", "traffic", "drone-1", "edge-2"), ("city", "traffic", "drone-2", "edge-1"), ("city", "b", "drone-1", "edge-1"),
     ("town", "traffic", "drone-1", "edge-1"), ("city", "traffic-drone", "1", "edge-1"), ("city", "traffic", "drone-1-edge", "1"),
 ])  # fmt: skip
-def test_every_pair_of_every_application_has_a_name_of_its_own(other: tuple[str, str, str, str]) -> None:
+def test_direct_link_names_are_unique(other: tuple[str, str, str, str]) -> None:
     assert link_name("city", "traffic", "drone-1", "edge-1") != link_name(*other)

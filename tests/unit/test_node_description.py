@@ -1,4 +1,4 @@
-"""What describes a node: the agent's object, the owner's file, and neither."""
+"""Description of a node: the object from the agent, the owner's file, or neither."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def pitch(found: NodeDescription) -> float | None:
     return camera.mount.pitch
 
 
-def test_what_the_agent_hands_over_counts_before_the_file(node: Node) -> None:
+def test_node_description_prefers_object_of_agent_to_file(node: Node) -> None:
     assert pitch(node.describe()) is None
     node.write(str(drone(-10)))
     assert pitch(node.describe()) == -10
@@ -63,20 +63,20 @@ def test_what_the_agent_hands_over_counts_before_the_file(node: Node) -> None:
 @pytest.mark.parametrize(
     "content", ["", "{", "[]", "\0", '{"kind": "Zone"}', str(drone(-20)).replace("mount", "mound")]
 )
-def test_what_cannot_be_read_describes_nothing_though_there_is_a_file(node: Node, content: str) -> None:
+def test_node_description_is_empty_when_object_is_unreadable(node: Node, content: str) -> None:
     node.write(str(drone(-10)))
     node.handed.write_text(content)
     assert pitch(node.describe()) is None
 
 
-def test_what_the_agent_takes_back_describes_nothing_though_there_is_a_file(node: Node) -> None:
+def test_node_description_is_empty_when_object_is_emptied(node: Node) -> None:
     node.write(str(drone(-10)))
     node.hand_over(-20)
     NodeObjectFile(node.handed).clear("The agent cannot read the object.")
     assert pitch(node.describe()) is None
 
 
-def test_any_text_can_be_handed_over(node: Node) -> None:
+def test_node_object_file_accepts_any_text(node: Node) -> None:
     body = drone(-20)
     body["spec"]["services"]["camera"]["model"] = 'Kamera \U0001f681 é\x7f\u2028"\\'
     NodeObjectFile(node.handed).write(Drone.from_body(body))
@@ -85,20 +85,20 @@ def test_any_text_can_be_handed_over(node: Node) -> None:
     assert found.spec == Drone.from_body(body).spec
 
 
-def test_another_nodes_object_describes_nothing(node: Node) -> None:
+def test_node_description_ignores_object_of_another_node(node: Node) -> None:
     node.hand_over(-20, "drone-2")
     assert pitch(node.describe()) is None
     assert pitch(node.describe(node=None)) == -20
     assert pitch(node.describe(EdgeNode)) is None, "nor one of another kind"
 
 
-def test_a_file_that_cannot_be_read_ends_the_start(node: Node) -> None:
+def test_node_description_raises_at_start_when_file_is_unreadable(node: Node) -> None:
     node.write("kind: [")
     with pytest.raises(CannotServe, match="--description"):
         node.describe()
 
 
-async def test_each_change_is_told_once(node: Node) -> None:
+async def test_node_description_reports_each_change_once(node: Node) -> None:
     found = node.describe()
 
     async def changed() -> float | None:

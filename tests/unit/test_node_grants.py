@@ -39,7 +39,7 @@ def packed(value: Any) -> str:
 @given(
     st.dictionaries(st.text("abc", min_size=1), st.dictionaries(WORDS, VALUES, max_size=4), max_size=5), st.randoms()
 )
-def test_what_is_packed_is_unpacked_by_name(specs: dict[str, Any], random: Any) -> None:
+def test_node_grants_are_unpacked_in_name_order(specs: dict[str, Any], random: Any) -> None:
     bodies = [body(name, spec) for name, spec in specs.items()]
     text = pack(bodies)
     assert unpack(text, len(bodies)) == tuple(sorted(bodies, key=lambda each: each["metadata"]["name"]))
@@ -47,7 +47,7 @@ def test_what_is_packed_is_unpacked_by_name(specs: dict[str, Any], random: Any) 
     assert pack(bodies) == text
 
 
-def test_what_changes_with_reports_alone_is_left_out() -> None:
+def test_node_grants_omit_fields_changed_by_reports() -> None:
     signed = body("a", {"node": "drone-1"}, annotations={"fractus.dev/signature": "x"}, labels={"l": "v"})
     changed = {**signed, "status": {"phase": "Active"}}
     changed["metadata"] = {**signed["metadata"], "resourceVersion": "7", "managedFields": [{}], "finalizers": ["f"]}
@@ -55,7 +55,7 @@ def test_what_changes_with_reports_alone_is_left_out() -> None:
     assert unpack(pack([changed]), 1) == (signed,)
 
 
-def test_zones_that_grants_share_are_packed_once() -> None:
+def test_node_grants_pack_shared_zones_once() -> None:
     area = [[round(0.001 * i, 7), round(0.0013 * i * i % 7, 7)] for i in range(1_500)]
     one, many = (len(pack([body(f"g{i}", {"area": area, "n": i}) for i in range(count)])) for count in (1, 100))
     assert many < 3 * one
@@ -81,12 +81,12 @@ def test_zones_that_grants_share_are_packed_once() -> None:
         (packed([{"metadata": {"name": "a", "uid": "u"}}]), "holds 1 Grants, not the 0 of spec.count"),
     ],
 )
-def test_what_is_not_packed_is_refused(text: str, reason: str) -> None:
+def test_node_grants_refuse_invalid_packed_data(text: str, reason: str) -> None:
     with pytest.raises(InvalidObject, match=rf"^spec\.packed: {reason}.*; the operator writes it again$"):
         unpack(text, 0)
 
 
-def test_what_unpacks_to_too_much_is_refused_at_the_bound() -> None:
+def test_node_grants_refuse_oversized_data_without_unpacking_it() -> None:
     text = base64.b64encode(lzma.compress(b" " * (MAX_UNPACKED_BYTES + 1), preset=0)).decode()
     assert len(text) < 100_000
     tracemalloc.start()
@@ -100,7 +100,7 @@ def test_what_unpacks_to_too_much_is_refused_at_the_bound() -> None:
 
 @pytest.mark.parametrize("bound", ["MAX_UNPACKED_BYTES", "MAX_PACKED_BYTES"])
 @pytest.mark.parametrize("fits", [0, 1, 5, 9, 10])
-def test_of_too_many_the_oldest_are_packed(monkeypatch: pytest.MonkeyPatch, bound: str, fits: int) -> None:
+def test_node_grants_pack_oldest_when_too_many(monkeypatch: pytest.MonkeyPatch, bound: str, fits: int) -> None:
     chance = random.Random(7)
     bodies = [
         body(f"g{9 - hour}", {"noise": chance.randbytes(500).hex()}, creationTimestamp=f"2026-01-01T0{hour}:00:00Z")

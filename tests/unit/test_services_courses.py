@@ -1,4 +1,4 @@
-"""The first leg of a way, as the system flies it."""
+"""First leg of a route flown by the system."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ def unused(_motion: Any) -> Any:
     raise AssertionError("nothing is flown")
 
 
-def way(*_: Any, **__: Any) -> Iterator[None]:
-    """Begins beside the drone."""
+def route(*_: Any, **__: Any) -> Iterator[None]:
+    """Return a route with its first waypoint beside the drone."""
     yield from ()
     return ((0.2, 0.0), (100.0, 50.0))
 
 
 @pytest.mark.parametrize(("altitude_m", "waypoint"), [(5.0, (0.2, 0.0)), (30.0, (100.0, 50.0))])
-async def test_a_first_waypoint_beside_the_drone_is_left_out_only_at_its_altitude(
+async def test_first_leg_skips_waypoint_near_drone_only_at_its_altitude(
     monkeypatch: pytest.MonkeyPatch, altitude_m: float, waypoint: tuple[float, float]
 ) -> None:
-    monkeypatch.setattr(route_following, "route_steps", way)
+    monkeypatch.setattr(route_following, "route_steps", route)
     grant = compiled(operationArea=[])
     trip = route_following.SystemFlight(FlightConstraints(ActiveGrant("", "", spec(), grant), grant), "Transit", unused)
     found = await route_following.first_leg(grant.frame.latlon(100.0, 50.0), (30.0,), at(0, 0, alt=altitude_m), trip)

@@ -1,4 +1,4 @@
-"""The journal: what survives a torn file, a newer release and a hung disk."""
+"""Journal of missions: damaged files, other format versions, failed and slow disks."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from fractus_services.mobility.authority.journal import Journal, Record
 
 
 def record(**changes: Any) -> Record:
-    """A mission, and that the drone flies for it."""
+    """Return a record with one mission, which is active."""
     return Record({"k": replace(Mission("k", "id", home=(39.0, 22.0, 10.0)), **changes)}, "k")
 
 
-async def kept(directory: Path) -> Journal:
+async def saved_journal(directory: Path) -> Journal:
     journal = Journal(directory)
     await journal.save(record(points_done=1))
     await journal.save(record(points_done=2))
@@ -27,8 +27,8 @@ async def kept(directory: Path) -> Journal:
 
 
 @pytest.mark.parametrize("torn", [b"", b"{", b'{"missions": 3}', b'{"missions": [3]}', b"[]", b"[" * 90_000])
-async def test_a_torn_journal_leaves_the_copy_before_it(tmp_path: Path, torn: bytes) -> None:
-    await kept(tmp_path)
+async def test_journal_restores_previous_copy_when_file_is_damaged(tmp_path: Path, torn: bytes) -> None:
+    await saved_journal(tmp_path)
     (tmp_path / "journal.json").write_bytes(torn)
     found = Journal(tmp_path)
     assert found.record.active == "k"
@@ -36,7 +36,7 @@ async def test_a_torn_journal_leaves_the_copy_before_it(tmp_path: Path, torn: by
     assert found.record.missions["k"].home == (39.0, 22.0, 10.0)
     await found.save(found.record)
     assert json.loads((tmp_path / "journal.last.json").read_bytes())["active"] == "k", (
-        "a torn file replaces no sound one"
+        "a damaged file must not replace a valid one"
     )
 
 
@@ -49,7 +49,7 @@ async def test_a_torn_journal_leaves_the_copy_before_it(tmp_path: Path, torn: by
         ("revoked: the grant was removed", Outcome(OutcomeKind.REVOKED, "the grant was removed")),
     ],
 )
-async def test_the_first_version_is_read(tmp_path: Path, stored: str, outcome: Outcome | None) -> None:
+async def test_journal_reads_format_version_1(tmp_path: Path, stored: str, outcome: Outcome | None) -> None:
     mission = {"key": "k", "identity": "id", "outcome": stored, "points_done": 2, "waypoints": 3, "flown": True}
     body = {"version": 1, "active": "k", "missions": [{**mission, "home": [39, 22, 10]}]}
     (tmp_path / "journal.json").write_text(json.dumps(body))
@@ -58,7 +58,7 @@ async def test_the_first_version_is_read(tmp_path: Path, stored: str, outcome: O
 
 
 @pytest.mark.parametrize("odd", ["lost in space", {"kind": "lost", "reason": ""}, {"kind": "failed"}, 7, ["failed"]])
-async def test_a_mission_that_ended_in_an_unknown_way_has_ended(tmp_path: Path, odd: object) -> None:
+async def test_journal_reads_unknown_mission_outcome_as_failed(tmp_path: Path, odd: object) -> None:
     body = {"version": 3, "active": None, "missions": [{"key": "k", "identity": "id", "outcome": odd}]}
     (tmp_path / "journal.json").write_text(json.dumps(body))
     outcome = Journal(tmp_path).record.missions["k"].outcome
@@ -66,16 +66,16 @@ async def test_a_mission_that_ended_in_an_unknown_way_has_ended(tmp_path: Path, 
     assert outcome.kind is OutcomeKind.FAILED
 
 
-async def test_what_is_lost_for_good_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    await kept(tmp_path)
+async def test_journal_logs_loss_of_both_copies(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    await saved_journal(tmp_path)
     for name in ("journal.json", "journal.last.json"):
         (tmp_path / name).write_bytes(b"{")
     assert Journal(tmp_path).record == Record()
     assert "remove Grants that must not fly again" in caplog.text
 
 
-async def test_what_a_newer_release_wrote_is_left_out(tmp_path: Path) -> None:
-    await kept(tmp_path)
+async def test_journal_ignores_fields_of_newer_release(tmp_path: Path) -> None:
+    await saved_journal(tmp_path)
     path = tmp_path / "journal.json"
     stored = json.loads(path.read_bytes())
     stored["missions"][0]["novelty"] = 1
@@ -83,7 +83,7 @@ async def test_what_a_newer_release_wrote_is_left_out(tmp_path: Path) -> None:
     assert Journal(tmp_path).record.missions["k"].points_done == 2
 
 
-async def test_who_armed_is_kept(tmp_path: Path) -> None:
+async def test_journal_keeps_armed_by_others(tmp_path: Path) -> None:
     journal = Journal(tmp_path)
     await journal.save(replace(record(), armed_by_others=True))
     assert Journal(tmp_path).record.armed_by_others
@@ -91,8 +91,8 @@ async def test_who_armed_is_kept(tmp_path: Path) -> None:
     assert not Journal(tmp_path).record.armed_by_others
 
 
-async def test_a_disk_that_fails_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    journal = await kept(tmp_path)
+async def test_journal_reports_failed_disk_until_next_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    journal = await saved_journal(tmp_path)
     with monkeypatch.context() as broken:
 
         def fail(*_: object) -> None:
@@ -106,7 +106,7 @@ async def test_a_disk_that_fails_is_told(tmp_path: Path, monkeypatch: pytest.Mon
     assert journal.failure == ""
 
 
-async def test_writings_follow_each_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_journal_writes_one_record_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     journal = Journal(tmp_path)
     free, inside, most = threading.Event(), [0], [0]
     write = journal._write

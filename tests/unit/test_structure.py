@@ -17,19 +17,19 @@ SOURCE_ROOTS = ("core", "runtime", "operator", "agent", "services", "cli", "view
 
 
 def packages() -> list[str]:
-    """The packages of all rooms."""
+    """Return the names of all packages."""
     return sorted(path.parent.name for room in SOURCE_ROOTS for path in (ROOT / room).glob("*/__init__.py"))
 
 
 @cache
 def imports() -> dict[str, set[str]]:
-    """Each module and the modules that it imports, those for type checking included."""
+    """Return the imports of each module, including imports for type checking."""
     graph = grimp.build_graph(*packages(), exclude_type_checking_imports=False)
     return {module: set(graph.find_modules_directly_imported_by(module)) for module in graph.modules}
 
 
 def sources() -> Iterator[tuple[str, str]]:
-    """Path and text of each module that is written by hand."""
+    """Yield path and text of each module that is not generated."""
     for room in SOURCE_ROOTS:
         for path in sorted((ROOT / room).rglob("*.py")):
             text = path.read_text()
@@ -37,7 +37,7 @@ def sources() -> Iterator[tuple[str, str]]:
                 yield path.relative_to(ROOT).as_posix(), text
 
 
-def test_every_package_is_described_and_has_contracts() -> None:
+def test_packages_are_documented_and_have_import_contracts() -> None:
     found = {path.parent.name: path.parts[-3] for path in ROOT.glob("*/fractus*/__init__.py")}
     assert set(found.values()) == {*SOURCE_ROOTS, "proto"}
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -47,14 +47,14 @@ def test_every_package_is_described_and_has_contracts() -> None:
         assert not [package for package in found if not re.search(rf"\b{package}\b", text)], document
 
 
-def test_no_modules_import_each_other_in_a_circle() -> None:
+def test_modules_have_no_import_cycles() -> None:
     try:
         TopologicalSorter(imports()).prepare()
     except CycleError as error:
         pytest.fail(" -> ".join(reversed(error.args[1])))
 
 
-def test_every_silenced_type_error_has_a_reason() -> None:
+def test_type_ignores_have_a_reason() -> None:
     silenced = [
         (f"{path}:{number}", line)
         for path, text in sources()
@@ -94,11 +94,11 @@ def test_documents_name_files_that_exist(document: Path) -> None:
     assert [str(path) for path in named if "NNNN" not in path.name and not path.exists()] == []
 
 
-def test_no_document_installs_another_projects_distribution() -> None:
+def test_documents_install_no_foreign_distribution() -> None:
     """The name `fractus` on PyPI belongs to another project: installing it would run foreign code."""
     folders = (*SOURCE_ROOTS, "docs", "examples", "tests", "bench")
-    ours = [path for name in folders for path in (ROOT / name).rglob("*") if path.suffix in {".md", ".py"}]
-    ours += [*ROOT.glob("*.md"), ROOT / "pyproject.toml", ROOT / "Dockerfile"]
+    files = [path for name in folders for path in (ROOT / name).rglob("*") if path.suffix in {".md", ".py"}]
+    files += [*ROOT.glob("*.md"), ROOT / "pyproject.toml", ROOT / "Dockerfile"]
     foreign = re.compile(r"(pip install|uv add|uv pip install)[^\n]*(?<!/)\bfractus(?!-drones|-sim|_)\b|[\"']fractus\[")
-    assert ours
-    assert [str(path) for path in ours if path != Path(__file__) and foreign.search(path.read_text())] == []
+    assert files
+    assert [str(path) for path in files if path != Path(__file__) and foreign.search(path.read_text())] == []

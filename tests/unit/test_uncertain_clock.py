@@ -1,4 +1,4 @@
-"""Clocks that are stepped, and who stays let in meanwhile."""
+"""Steps of the clock: uncertain time, and authentication of callers during it."""
 
 from __future__ import annotations
 
@@ -24,28 +24,29 @@ _KEY = ec.generate_private_key(ec.SECP256R1())
 
 
 class Machine:
-    """A machine's clock, which may be stepped, and its steady time, which may not."""
+    """A machine with a clock that can be stepped, and a steady time that cannot."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.steady_s, self.offset_s = 50.0, BEGIN_S - 50.0
+        self.steady_s = 50.0
+        self.offset_s = BEGIN_S - 50.0
         monkeypatch.setattr(clock_module.time, "time", lambda: self.steady_s + self.offset_s)
         for module in (clock_module, auth):
             monkeypatch.setattr(module, "steady_s", lambda: self.steady_s)
-        self.told: list[tuple[float, bool]] = []
-        self.clock = Clock(lambda step_s, trusted: self.told.append((step_s, trusted)))
+        self.changes: list[tuple[float, bool]] = []
+        self.clock = Clock(lambda step_s, trusted: self.changes.append((step_s, trusted)))
         self.callers = Callers(self.clock)
 
     def caller(self, pem: bytes, urgent: bool = False) -> str:
         return self.callers.of({"x509_pem_cert": [pem]}, urgent).identity
 
-    def let_in(self, pem: bytes) -> bool:
+    def accepts(self, pem: bytes) -> bool:
         try:
             return self.caller(pem) == IDENTITY
         except NotAuthenticated:
             return False
 
     def wait(self, seconds: float) -> None:
-        """Pass time, with the clock read often, as the monitor does."""
+        """Pass time and read the clock often, like the motion monitor."""
         for _ in range(10):
             self.steady_s += seconds / 10
             self.clock()
@@ -57,7 +58,7 @@ def machine(monkeypatch: pytest.MonkeyPatch) -> Machine:
 
 
 def certificate(begin_s: float = -300.0, end_s: float = DAY_S, uris: tuple[str, ...] = (IDENTITY,)) -> bytes:
-    """A certificate that is valid from begin to end, in seconds after BEGIN_S."""
+    """Return a certificate that is valid from begin to end, in seconds after BEGIN_S."""
     begun = datetime.fromtimestamp(BEGIN_S, UTC)
     name = x509.Name([])
     builder = x509.CertificateBuilder().subject_name(name).issuer_name(name).public_key(_KEY.public_key())
@@ -71,7 +72,7 @@ def certificate(begin_s: float = -300.0, end_s: float = DAY_S, uris: tuple[str, 
 
 
 @pytest.mark.parametrize("step_s", [400 * DAY_S, -400 * DAY_S, 3600.0, -3600.0])
-def test_a_step_is_in_doubt_until_it_has_lasted(machine: Machine, step_s: float) -> None:
+def test_clock_is_uncertain_after_step_until_it_lasts(machine: Machine, step_s: float) -> None:
     machine.offset_s += step_s
     now = machine.clock()
     assert isinstance(now, UncertainTime)
@@ -80,18 +81,18 @@ def test_a_step_is_in_doubt_until_it_has_lasted(machine: Machine, step_s: float)
     assert isinstance(machine.clock(), UncertainTime)
     machine.wait(2)
     assert (machine.clock(), type(machine.clock())) == (BEGIN_S + step_s + TRUST_AFTER_S + 1, float)
-    assert machine.told == [(pytest.approx(step_s), False), (pytest.approx(step_s), True)]
+    assert machine.changes == [(pytest.approx(step_s), False), (pytest.approx(step_s), True)]
 
 
-def test_a_step_that_is_taken_back_is_over_at_once(machine: Machine) -> None:
+def test_clock_is_certain_when_step_is_reverted(machine: Machine) -> None:
     machine.offset_s += 400 * DAY_S
     machine.wait(60)
     machine.offset_s -= 400 * DAY_S
     assert (machine.clock(), type(machine.clock())) == (BEGIN_S + 60, float)
-    assert machine.told[1:] == [(0.0, True)]
+    assert machine.changes[1:] == [(0.0, True)]
 
 
-def test_each_further_step_begins_the_doubt_again(machine: Machine) -> None:
+def test_clock_uncertainty_restarts_with_each_step(machine: Machine) -> None:
     for _ in range(3):
         machine.offset_s += 3600.0
         machine.wait(TRUST_AFTER_S - 10)
@@ -100,52 +101,52 @@ def test_each_further_step_begins_the_doubt_again(machine: Machine) -> None:
     assert machine.clock() == BEGIN_S + 3 * 3600.0 + 3 * (TRUST_AFTER_S - 10) + 20
 
 
-def test_a_clock_that_is_set_right_all_the_time_is_not_in_doubt(machine: Machine) -> None:
+def test_clock_is_certain_during_small_corrections(machine: Machine) -> None:
     for slew_s in (0.5, -0.9, 0.9, 0.9, 0.9):
         machine.offset_s += slew_s
         assert type(machine.clock()) is float
-    assert machine.told == []
+    assert machine.changes == []
 
 
 @pytest.mark.parametrize("step_s", [400 * DAY_S, -400 * DAY_S, 3600.0, -3600.0])
-def test_who_was_let_in_before_a_step_stays_in_by_steady_time(machine: Machine, step_s: float) -> None:
+def test_known_caller_is_accepted_by_steady_time_after_clock_step(machine: Machine, step_s: float) -> None:
     known = certificate()
-    assert machine.let_in(known)
+    assert machine.accepts(known)
     for seconds in (1.0, TRUST_AFTER_S, 3600.0):
         machine.offset_s += step_s
         machine.wait(seconds)
-        assert machine.let_in(known)
+        assert machine.accepts(known)
         machine.offset_s -= step_s
         machine.wait(seconds)
-        assert machine.let_in(known)
+        assert machine.accepts(known)
     machine.wait(DAY_S)
     for back_s in (0.0, -400 * DAY_S, -400 * DAY_S):
         machine.offset_s += back_s
-        assert not machine.let_in(known), "no step revives it"
+        assert not machine.accepts(known), "no step makes an expired certificate valid"
         machine.wait(2 * TRUST_AFTER_S)
-        assert not machine.let_in(known)
+        assert not machine.accepts(known)
 
 
-def test_who_was_not_seen_before_a_step_is_judged_by_the_later_reading_while_it_is_in_doubt(machine: Machine) -> None:
+def test_unknown_caller_is_judged_by_later_reading_of_uncertain_clock(machine: Machine) -> None:
     fresh, expired = certificate(), certificate(-2 * DAY_S, -1.0)
     machine.offset_s -= 2 * DAY_S
-    assert machine.let_in(fresh)
-    assert not machine.let_in(expired), "a clock that is set back revives it not"
+    assert machine.accepts(fresh)
+    assert not machine.accepts(expired), "a clock that is set back does not make it valid"
     machine.offset_s += 402 * DAY_S
-    assert not machine.let_in(certificate())
-    assert not machine.let_in(fresh), "it was not remembered while the clock was in doubt"
+    assert not machine.accepts(certificate())
+    assert not machine.accepts(fresh), "callers are not remembered while the clock is uncertain"
     machine.offset_s -= 400 * DAY_S
-    assert machine.let_in(fresh), "it may be right later"
+    assert machine.accepts(fresh), "valid again when the clock is right"
 
 
 @pytest.mark.parametrize("make", [lambda: certificate(-2 * DAY_S, -1.0), lambda: certificate(3600.0)])
-def test_what_stops_a_drone_needs_no_certificate_of_this_moment(machine: Machine, make: Callable[[], bytes]) -> None:
+def test_urgent_call_accepts_expired_certificate(machine: Machine, make: Callable[[], bytes]) -> None:
     pem = make()
     assert machine.caller(pem, urgent=True) == IDENTITY
-    assert not machine.let_in(pem), "that was for this call alone"
+    assert not machine.accepts(pem), "only the urgent call is accepted"
 
 
-def test_callers_without_an_identity(machine: Machine) -> None:
+def test_caller_without_valid_identity_is_refused(machine: Machine) -> None:
     def refused(context: dict[str, Any], why: str) -> None:
         for urgent in (False, True):
             with pytest.raises(NotAuthenticated, match=why):
@@ -160,14 +161,14 @@ def test_callers_without_an_identity(machine: Machine) -> None:
         machine.caller(certificate(-DAY_S, -1.0))
     with pytest.raises(NotAuthenticated, match="not valid yet"):
         machine.caller(certificate(90.0))
-    assert machine.let_in(certificate(30.0)), "clocks may differ by that much"
+    assert machine.accepts(certificate(30.0)), "clocks may differ by that much"
 
 
-def test_only_so_many_callers_are_remembered(machine: Machine) -> None:
+def test_number_of_remembered_callers_is_limited(machine: Machine) -> None:
     known = certificate()
     for _ in range(MAX_SEEN + 5):
-        machine.let_in(known)
-        machine.let_in(certificate())
+        machine.accepts(known)
+        machine.accepts(certificate())
     assert len(machine.callers._seen) == MAX_SEEN
     machine.offset_s += 400 * DAY_S
-    assert machine.let_in(known), "it called all the time"
+    assert machine.accepts(known), "recent callers are kept"

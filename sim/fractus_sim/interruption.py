@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and SIGHUP: all of them break off what is under way, and none what must not be left half done."""
+"""Signal handling: Ctrl-C, SIGTERM and SIGHUP interrupt the current action, except in protected blocks."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def break_off_on_signals() -> None:
-    """Let SIGTERM, and SIGHUP unless it is ignored as under nohup, do what Ctrl-C does: raise KeyboardInterrupt."""
+    """Raise KeyboardInterrupt on SIGTERM, and on SIGHUP unless it is ignored (nohup)."""
     signal.signal(signal.SIGTERM, _interrupt)
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
         signal.signal(signal.SIGHUP, _interrupt)
@@ -21,15 +21,16 @@ def break_off_on_signals() -> None:
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Let these signals wait until the block is over; the last that came is then acted on.
+    """Defer these signals until the end of the block. Then handle the last signal.
 
-    For what is short or has time limits of its own. Only the main thread acts on signals, so elsewhere nothing changes.
+    Use this for actions that are short or have a timeout. It has no effect outside of the main thread, because only the
+    main thread handles signals.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     came: list[signal.Signals] = []
-    # Handlers rather than a mask: a mask would be inherited by the processes that the block starts.
+    # A signal mask would be inherited by the processes that the block starts, so handlers are used.
     before = {number: signal.getsignal(number) for number in _SIGNALS}
     for number, handler in before.items():
         if handler not in (signal.SIG_IGN, None):

@@ -32,7 +32,7 @@ def written(record: Record, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_flight_is_measured(record: Record) -> None:
+def test_flight_metrics_are_computed_from_the_record(record: Record) -> None:
     assert record.track.max_altitude_m == pytest.approx(50.0, abs=0.2)
     assert record.track.distance_m == pytest.approx(796, abs=5), "the sum of the legs, geodesic"
     assert record.takeoff_s == pytest.approx(demo_flight.TAKEOFF_S)
@@ -40,7 +40,7 @@ def test_the_flight_is_measured(record: Record) -> None:
     assert 100 < record.landing_s - record.takeoff_s < 110
 
 
-def test_what_policies_did_is_told_once_for_each_request(record: Record) -> None:
+def test_repeated_policy_decisions_are_merged(record: Record) -> None:
     told = [(j.component, j.method, j.action, j.policies[0], j.count) for j in record.judgements]
     assert told == [
         ("Navigator", "SetSpeed", "correct", "town-speed", 1),
@@ -54,14 +54,14 @@ def test_what_policies_did_is_told_once_for_each_request(record: Record) -> None
     assert (corrected.asked.alt_m, corrected.flown.alt_m) == (70.0, 50.0)
 
 
-def test_the_same_refusal_much_later_is_told_again() -> None:
+def test_repeated_denial_is_listed_again_after_a_minute() -> None:
     refused = [e for e in demo_flight.calls() if e.get("method") == "CaptureImage"]
     later = {**refused[0], "time": demo_flight.stamp(demo_flight.TAKEOFF_S + 300)}
     record = Record.of(demo_flight.content(), [*refused, later])
     assert [j.count for j in record.judgements] == [2, 1]
 
 
-def test_a_takeover_is_told_with_the_requests() -> None:
+def test_takeover_is_listed_with_the_requests() -> None:
     takeover = {
         "kind": "takeover",
         "time": demo_flight.stamp(demo_flight.TAKEOFF_S + 40),
@@ -96,12 +96,12 @@ def test_the_page_shows_corrections_refusals_placements_and_the_chain(record: Re
     assert max(map(len, page.splitlines())) < 400
 
 
-def test_a_broken_chain_is_said_loudly(record: Record) -> None:
+def test_broken_audit_chain_is_reported_prominently(record: Record) -> None:
     broken = replace(record, audit={"entries": 3, "kept": 3, "problem": "line 2 was changed after it was written"})
     assert "**broken: line 2 was changed after it was written**" in summary(broken)
 
 
-def test_direct_links_are_told_and_drawn(record: Record) -> None:
+def test_direct_links_are_listed_and_drawn(record: Record) -> None:
     assert "## Direct links" not in summary(record)
     at_s = demo_flight.TAKEOFF_S + 20.0
     changes = [
@@ -117,7 +117,7 @@ def test_direct_links_are_told_and_drawn(record: Record) -> None:
     assert [link["direct"] for link in figures(linked)["links"]] == [True, False]
 
 
-def test_the_figures_are_those_of_the_page(record: Record) -> None:
+def test_json_results_match_the_page(record: Record) -> None:
     found = figures(record)
     assert (found["corrected"], found["refused"], found["calls"]) == (2, 3, 7)
     assert found["landed"] is True
@@ -143,7 +143,7 @@ def test_geojson_is_lon_lat_and_complete(record: Record) -> None:
     assert by_kind["depot"]
 
 
-def test_every_file_is_written(written: Path) -> None:
+def test_all_report_files_are_written(written: Path) -> None:
     names = {path.name for path in written.iterdir()}
     assert names == {"summary.md", "report.json", "flight.geojson", "plan.yaml", "map.png", "altitude.png"}
     for picture in ("map.png", "altitude.png"):
@@ -153,7 +153,7 @@ def test_every_file_is_written(written: Path) -> None:
     assert DeploymentPlan.from_body(yaml.safe_load((written / "plan.yaml").read_text())).spec.placements
 
 
-def test_the_same_record_gives_the_same_files(record: Record, written: Path, tmp_path: Path) -> None:
+def test_report_is_deterministic(record: Record, written: Path, tmp_path: Path) -> None:
     write_report(record, tmp_path)
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == {p.name: p.read_bytes() for p in written.iterdir()}
 
@@ -163,7 +163,7 @@ def test_policies_for_other_drones_are_not_drawn(record: Record) -> None:
     assert "no-fly-hospital" in {p.name for p in record.policies_in_force}
 
 
-def test_a_mission_that_never_flew_is_reported_too(tmp_path: Path) -> None:
+def test_report_of_a_mission_without_flight_is_written(tmp_path: Path) -> None:
     content = demo_flight.content()
     application = {**content["objects"][0], "status": {"phase": "Failed", "message": "no drone can fly it"}}
     content["objects"] = [application, *(o for o in content["objects"][1:] if o["kind"] != "DeploymentPlan")]
@@ -177,7 +177,7 @@ def test_a_mission_that_never_flew_is_reported_too(tmp_path: Path) -> None:
     assert not (tmp_path / "plan.yaml").exists()
 
 
-def test_a_drone_still_in_the_air_has_not_landed(record: Record) -> None:
+def test_landing_time_is_none_while_in_the_air(record: Record) -> None:
     flying = replace(record, samples=record.samples[:100])
     assert flying.landing_s is None
     assert "is still in the air" in summary(flying)

@@ -44,7 +44,7 @@ def pod(name: str, ready: bool) -> dict[str, Any]:
     return {"kind": "Pod", "metadata": {"name": name}, "status": {"conditions": conditions}}
 
 
-def test_a_mission_is_told_from_apply_to_landing() -> None:
+def test_mission_progress_is_reported_from_apply_to_landing() -> None:
     said: list[str] = []
     mission = Mission("traffic-monitoring", {"applied": 100.0})
     plan = {
@@ -67,14 +67,14 @@ def test_a_mission_is_told_from_apply_to_landing() -> None:
     mission.see([application("Completed", "done"), plan, flying("inactive")], 230.0, said.append)
     assert mission.grounded
     assert mission.times == {"applied": 100.0, "planned": 101.0, "running": 104.0, "ended": 200.0, "landed": 230.0}
-    assert "planned after 1.0 s: 2 instances, drone-1 flies" in said
+    assert "plan created after 1.0 s: 2 instances, drone-1 flies" in said
     assert "all pods Running after 4.0 s" in said
     assert said.count("drone-1 is flying") == 1
     assert said[-1] == "drone-1 is on the ground"
     assert set(mission.pods) == {"a"}, "pods are remembered after the operator deleted them"
 
 
-def test_other_applications_and_their_drones_are_not_told() -> None:
+def test_mission_progress_ignores_other_applications_and_drones() -> None:
     said: list[str] = []
     mission = Mission("traffic-monitoring", {"applied": 0.0})
     other = application("Failed")
@@ -93,13 +93,13 @@ class Silent:
         return [application("Pending", "no drone is free", drone=None)]
 
 
-def test_a_mission_that_does_not_end_is_given_up(tmp_path: Path) -> None:
+def test_mission_fails_after_the_timeout(tmp_path: Path) -> None:
     mission = Mission("traffic-monitoring", {"applied": 0.0})
     with pytest.raises(DemoError, match="did not end within 5 s: no drone is free"):
         watch.follow(Silent(), mission, tmp_path / "log", timeout_s=5.0, say=print, show=print)  # type: ignore[arg-type]
 
 
-def test_the_driver_s_log_lines_are_told_whole_and_once(tmp_path: Path) -> None:
+def test_driver_log_lines_are_reported_complete_and_once(tmp_path: Path) -> None:
     log, said = tmp_path / "log", list[str]()
     log.write_bytes(b"[pod/x-navigator-1/navigator] 08:00 armed\n[pod/y/data-store] 08:00 kept 1\n[pod/x-navi")
     at = watch._tell(log, 0, said.append)
@@ -108,7 +108,7 @@ def test_the_driver_s_log_lines_are_told_whole_and_once(tmp_path: Path) -> None:
     assert said == ["navigator: 08:00 armed", "navigator: 08:01 waypoint 1/5"]
 
 
-def test_nodes_are_assigned_by_word_then_name_then_class() -> None:
+def test_nodes_are_assigned_explicitly_then_by_name_then_by_class() -> None:
     nodes = [node("kind-a", "edge"), node("kind-b"), node("kind-c", "edge"), node("kind-d", "cloud"), node("drone-1")]
     assert assign(nodes, {"edge-1": "kind-b"}) == {
         "edge-1": "kind-b",
@@ -119,16 +119,18 @@ def test_nodes_are_assigned_by_word_then_name_then_class() -> None:
     }
 
 
-def test_a_missing_node_is_named_with_the_remedy() -> None:
+def test_missing_node_is_reported_with_a_remedy() -> None:
     nodes = [node("a", "drone"), node("b", "edge"), node("c", "cloud")]
-    with pytest.raises(DemoError, match=r"stands for edge-2; name one: --assign edge-2=NODE \(nodes: a, b, c\)"):
+    with pytest.raises(
+        DemoError, match=r"can be used as edge-2; assign one with --assign edge-2=NODE \(nodes: a, b, c\)"
+    ):
         assign(nodes, {})
     with pytest.raises(DemoError, match="the cluster has no node z"):
         assign(nodes, {"edge-2": "z"})
     assert "edge-3" not in assign([*nodes, node("d", "edge")], {})
 
 
-def test_only_entries_of_this_mission_are_kept() -> None:
+def test_only_audit_entries_of_the_mission_are_kept() -> None:
     before, after = (json.dumps({"time": demo_flight.stamp(s)}).encode() for s in (99.0, 101.0))
     assert of_mission(after, 100.0)
     assert not of_mission(before, 100.0)
@@ -155,7 +157,7 @@ class Rotating:
         to.write_text(self.files[name])
 
 
-def test_audit_logs_are_fetched_whole_even_when_a_new_file_begins(tmp_path: Path) -> None:
+def test_audit_logs_are_fetched_completely_during_rotation(tmp_path: Path) -> None:
     node = Rotating()
     fetch_logs(node, "fractus-mobility-x", tmp_path / "audit")  # type: ignore[arg-type]
     found = {path.name: path.read_text() for path in (tmp_path / "audit").iterdir()}
@@ -163,7 +165,7 @@ def test_audit_logs_are_fetched_whole_even_when_a_new_file_begins(tmp_path: Path
     assert node.read.count("mobility.000000000001.jsonl") == 1, "what is closed does not change"
 
 
-def test_a_file_is_fetched_whole_or_not_at_all(tmp_path: Path) -> None:
+def test_incomplete_file_is_removed_after_a_failed_fetch(tmp_path: Path) -> None:
     kubectl = tmp_path / "kubectl"
     kubectl.write_text("#!/bin/sh\nprintf '\\377\\330half'\nif [ \"$7\" = /bad ]; then echo broken >&2; exit 1; fi\n")
     kubectl.chmod(0o755)
@@ -175,7 +177,7 @@ def test_a_file_is_fetched_whole_or_not_at_all(tmp_path: Path) -> None:
     assert to.read_bytes() == b"\xff\xd8half"
 
 
-def test_pictures_are_spread_over_the_flight() -> None:
+def test_selected_pictures_are_spread_over_the_flight() -> None:
     start_s = datetime(2026, 11, 21, 11, 0, tzinfo=UTC).timestamp()
     every = [f"202611211100{second:02d}000-0001.jpg" for second in range(0, 60, 2)]
     chosen = spread(every, start_s + 10, start_s + 50)
@@ -184,7 +186,7 @@ def test_pictures_are_spread_over_the_flight() -> None:
 
 
 @pytest.mark.parametrize("whole", [True, False])
-def test_pictures_of_the_flight_come_from_the_camera_s_recording(tmp_path: Path, whole: bool) -> None:
+def test_pictures_are_extracted_from_the_camera_recording(tmp_path: Path, whole: bool) -> None:
     record = Record.of(demo_flight.content(), demo_flight.audit())
     paths = [tmp_path / f"{service}-000001-20260601T120000Z.mcap" for service in ("camera", "mobility")]
     writer = SegmentWriter(paths[0].with_suffix(""), "drone-1")
@@ -201,19 +203,19 @@ def test_pictures_of_the_flight_come_from_the_camera_s_recording(tmp_path: Path,
     assert [path.read_bytes() for path in kept] == [b"\xff\xd825", b"\xff\xd850", b"\xff\xd880"]
 
 
-def test_a_wrong_assignment_is_refused() -> None:
+def test_invalid_node_assignment_is_rejected() -> None:
     done = CliRunner().invoke(demo, ["--cluster", "current", "--assign", "drone-7=x"])
     assert done.exit_code == 2
     assert "expected drone-1=NODE" in done.output
 
 
-def test_a_report_without_a_record_says_so(tmp_path: Path) -> None:
+def test_report_without_recorded_data_fails(tmp_path: Path) -> None:
     done = CliRunner().invoke(demo, ["--report-only", "--out", str(tmp_path)])
     assert done.exit_code == 1
-    assert "no record of a flight" in done.output
+    assert "no recorded flight" in done.output
 
 
-def test_the_simulated_hardware_stands_where_the_drone_is_kept() -> None:
+def test_simulated_hardware_is_at_the_position_of_the_drone() -> None:
     chart = ROOT / "charts" / "fractus-demo"
     home = yaml.safe_load((chart / "values.yaml").read_text())["vehicle"]["home"]
     lat, lon, _ = (float(part) for part in home.split(","))
@@ -225,7 +227,7 @@ def test_the_simulated_hardware_stands_where_the_drone_is_kept() -> None:
     assert "hostNetwork: true" in vehicle
 
 
-def test_a_change_of_path_is_told_once() -> None:
+def test_traffic_path_change_is_reported_once() -> None:
     def link(traffic: str | None, message: str) -> dict[str, Any]:
         spec = {"node": "edge-1", "application": {"namespace": "default", "name": "traffic-monitoring"}}
         status = {"traffic": traffic, "message": message} if traffic else None
@@ -241,11 +243,14 @@ def test_a_change_of_path_is_told_once() -> None:
         (2.0, "edge-1", "direct", "near"),
         (4.0, "edge-1", "cloud", "left"),
     ]
-    assert said == ["traffic goes by WiFi to edge-1: near", "traffic goes no more by WiFi to edge-1: left"]
+    assert said == [
+        "traffic moved to the direct link to edge-1: near",
+        "traffic moved from edge-1 to the cloud path: left",
+    ]
 
 
 @pytest.mark.parametrize("began", ["20260601T115955Z", "20260601T120001Z"])
-def test_the_recordings_of_the_mission_are_kept_and_the_command_that_replays_them_is_told(
+def test_mission_recordings_are_kept_and_the_replay_command_is_printed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, began: str
 ) -> None:
     assert demo_view.replay_command(tmp_path) is None
@@ -265,7 +270,7 @@ def test_the_recordings_of_the_mission_are_kept_and_the_command_that_replays_the
     assert demo_view.replay_command(tmp_path) == f"fractus view {tmp_path}/recordings/*.mcap"
 
 
-def test_a_page_that_cannot_be_served_stops_no_demo(tmp_path: Path) -> None:
+def test_demo_continues_without_live_view(tmp_path: Path) -> None:
     said, told = list[str](), threading.Event()
     (tmp_path / "config").write_text("no kubeconfig")
 
@@ -276,4 +281,4 @@ def test_a_page_that_cannot_be_served_stops_no_demo(tmp_path: Path) -> None:
     with demo_view.shown(tmp_path / "config", say):
         assert told.wait(200)
     assert len(said) == 1
-    assert said[0].startswith("no live view: fractus: the kubeconfig")
+    assert said[0].startswith("live view not available: fractus: the kubeconfig")

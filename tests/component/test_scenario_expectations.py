@@ -236,9 +236,9 @@ def test_a_program_may_ask_for_control_again_and_may_not_fly():
         assert failed == ["after that the program moves nothing"]
 
 
-def test_an_unguarded_flight_fails_what_is_expected_of_a_guarded_one():
+def test_flight_without_policies_fails_the_expectations_with_policies():
     failed = _failed(Judge(FIELD, _unguarded()).guarded())
-    for part in ("WP1, asked for", "WP6, asked for", "above 15", "WP-E1 is", "WP-E2", "no-fly", "none of them above"):
+    for part in ("WP1, requested", "WP6, requested", "above 15", "WP-E1 is", "WP-E2", "no-fly", "none of them above"):
         assert any(part in text for text in failed), part
 
 
@@ -261,9 +261,9 @@ def _changed(run: Evidence, place: str, **changes: object) -> Evidence:
         (_without(_guarded(), "revoke"), "revokes access"),
         (_without(_guarded(), "CaptureImage"), "pictures are taken"),
         (_changed(_guarded(), "WP-E1", action="allow"), "discarded"),
-        (_changed(_guarded(), "WP3", action="deny"), "goes on"),
-        (_changed(_guarded(), "WP1", flown=Place(0.0, 0.0, 17.0)), "WP1, asked for"),
-        (_changed(_guarded(), "WP6", flown=Place(0.0, 0.0, 4.2)), "WP6, asked for"),
+        (_changed(_guarded(), "WP3", action="deny"), "continues"),
+        (_changed(_guarded(), "WP1", flown=Place(0.0, 0.0, 17.0)), "WP1, requested"),
+        (_changed(_guarded(), "WP6", flown=Place(0.0, 0.0, 4.2)), "WP6, requested"),
         (replace(_guarded(), track=Track("x", _guarded().track.samples[:-40])), "lands at home"),
     ],
 )

@@ -110,7 +110,7 @@ class Kube:
 
     def kill_pod(self, pod: Object) -> None:
         """SIGKILL every process of a pod's containers, as a crash would; the sandbox stays."""
-        if not processes.tell(processes.of_pod(pod["metadata"]["uid"]), signal.SIGKILL):
+        if not processes.send_signal(processes.of_pod(pod["metadata"]["uid"]), signal.SIGKILL):
             raise CommandFailed(f"pod {pod['metadata']['name']} has no processes to kill")
 
 

@@ -81,20 +81,20 @@ def flight(*modes: tuple[float, str], end_s: float = 60) -> list[Seen]:
     ]
 
 
-def test_the_drone_alone_has_a_disk_of_its_own() -> None:
+def test_only_the_drone_has_a_separate_disk() -> None:
     spec = load_spec(ROOT / "examples" / "clusters" / "demo.yaml")
     sizes = {node.name: node.hardware.disk and node.hardware.disk.size_bytes for node in with_disk(spec).nodes}
     assert sizes == {node.name: 2**30 if node.name == "drone-1" else None for node in spec.nodes}
     assert with_disk(spec).nodes[0].hardware.vehicle == spec.nodes[0].hardware.vehicle
 
 
-def test_a_seed_repeats_its_schedule() -> None:
+def test_fault_schedule_is_identical_for_the_same_seed() -> None:
     assert schedule(7, 1800, DURATIONS) == schedule(7, 1800, DURATIONS)
     assert schedule(7, 1800, DURATIONS) != schedule(8, 1800, DURATIONS)
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_a_long_schedule_has_every_fault_within_the_run(seed: int) -> None:
+def test_long_fault_schedule_contains_every_fault_within_the_run(seed: int) -> None:
     planned = schedule(seed, 1800, DURATIONS)
     assert {each.fault for each in planned} == set(FAULTS) or len(planned) >= 8
     ends: dict[str, float] = {}
@@ -106,7 +106,7 @@ def test_a_long_schedule_has_every_fault_within_the_run(seed: int) -> None:
         ends[each.fault] = each.at_s + each.duration_s
 
 
-def test_silence_in_the_air_is_a_drone_without_authority() -> None:
+def test_authority_invariant_is_violated_by_missing_entries_in_flight() -> None:
     log = [entry(at, "state", controller="system", in_air=True) for at in range(20)]
     (found,) = without_authority(flight((0, "GUIDED")), log)
     assert found.time_s == BEGAN_S + 32
@@ -114,7 +114,7 @@ def test_silence_in_the_air_is_a_drone_without_authority() -> None:
     assert not without_authority(flight((0, "GUIDED"), end_s=25), log)
 
 
-def test_a_stepped_clock_neither_makes_nor_hides_silence() -> None:
+def test_authority_invariant_is_independent_of_clock_steps() -> None:
     started_s = BEGAN_S - 5000
     state = {"controller": "system", "in_air": True}
     ahead = [entry(at + (7200 if at > 10 else 0), "state", boot_s=5000 + at, **state) for at in range(60)]
@@ -124,13 +124,13 @@ def test_a_stepped_clock_neither_makes_nor_hides_silence() -> None:
     assert found.time_s == BEGAN_S + 32
 
 
-def test_an_entry_in_the_air_names_a_controller() -> None:
+def test_authority_invariant_is_violated_by_an_entry_without_controller() -> None:
     log = [entry(at, "state", controller="" if at == 9 else "system", in_air=True) for at in range(60)]
     (found,) = without_authority(flight((0, "GUIDED")), log)
     assert found.time_s == BEGAN_S + 9
 
 
-def test_a_drone_flies_for_one_application() -> None:
+def test_one_application_invariant_is_violated_by_two_drivers() -> None:
     one, other = grant("one"), grant("other")
     grants = {spec.mission_key: spec for spec in (one, other)}
     state = {"controller": "system", "in_air": True}
@@ -154,13 +154,13 @@ def test_a_drone_flies_for_one_application() -> None:
         (goto(1, grant("stranger")), "it had no Grant"),
     ],
 )
-def test_calls_are_judged_again(call: dict[str, Any], words: str) -> None:
+def test_grant_invariant_evaluates_permitted_calls_again(call: dict[str, Any], words: str) -> None:
     spec = grant()
     found = forbidden_calls([given(0, spec), call], {spec.mission_key: spec}, HOME)
     assert [words in each.found for each in found] == ([True] if words else [])
 
 
-def test_a_call_after_its_grant_is_forbidden() -> None:
+def test_grant_invariant_is_violated_by_a_call_after_revocation() -> None:
     spec = grant()
     log = [given(0, spec), given(1, spec, "removed"), goto(2, spec)]
     (found,) = forbidden_calls(log, {spec.mission_key: spec}, HOME)
@@ -169,7 +169,7 @@ def test_a_call_after_its_grant_is_forbidden() -> None:
     assert "never on the node" in found.found
 
 
-def test_missions_end() -> None:
+def test_mission_invariant_is_violated_by_unfinished_missions() -> None:
     ends = {
         "a": ("Completed", ""),
         "b": ("Failed", "the driver was lost"),
@@ -179,7 +179,7 @@ def test_missions_end() -> None:
     assert [each.found.split()[0] for each in not_ended(ends)] == ["c", "d"]
 
 
-def test_drones_land_at_home() -> None:
+def test_landing_invariant_is_violated_away_from_home() -> None:
     assert not landed_elsewhere(flight((0, "RTL")), HOME)
     (found,) = landed_elsewhere(flight((0, "RTL")), Home(HOME.lat + 0.001, HOME.lon, 25.0))
     assert "111 m from home" in found.found
@@ -187,10 +187,10 @@ def test_drones_land_at_home() -> None:
     assert "in the air" in found.found
 
 
-def test_nothing_is_left_over() -> None:
+def test_orphan_invariant_describes_remaining_objects() -> None:
     assert not left_over([])
     (found,) = left_over([{"kind": "Secret", "metadata": {"name": "one-navigator"}}])
-    assert "Secret/one-navigator (there)" in found.found
+    assert "Secret/one-navigator (exists)" in found.found
     ends = {
         "name": "one",
         "deletionTimestamp": "12:00",
@@ -198,10 +198,10 @@ def test_nothing_is_left_over() -> None:
         "ownerReferences": [{"kind": "D", "name": "d"}],
     }
     (found,) = left_over([{"kind": "ReplicaSet", "metadata": ends}])
-    assert "ReplicaSet/one (there; ends since 12:00; owned by D/d; held by orphan)" in found.found
+    assert "ReplicaSet/one (exists; deleted at 12:00; owned by D/d; finalizers orphan)" in found.found
 
 
-def test_a_grant_that_its_node_keeps_is_left_over(tmp_path: Path) -> None:
+def test_orphan_invariant_includes_grants_stored_on_nodes(tmp_path: Path) -> None:
     def body(application: str) -> dict[str, Any]:
         metadata = {"name": f"default.{application}-navigator", "uid": f"uid-{application}", "generation": 1}
         return Grant.model_validate({"metadata": metadata, "spec": grant(application)}).to_dict()
@@ -220,7 +220,7 @@ def test_a_grant_that_its_node_keeps_is_left_over(tmp_path: Path) -> None:
     assert [each["metadata"]["name"] for each in left] == ["default.carried-navigator", "default.stored-navigator"]
 
 
-def test_a_drained_node_is_uncordoned_though_the_api_server_refuses_at_first(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_drained_node_is_uncordoned_after_a_rejected_request(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fractus_sim.chaos.faults._RETRY_S", 0.0)
     cordoned, refusals = False, 1
 
@@ -246,7 +246,7 @@ def test_a_drained_node_is_uncordoned_though_the_api_server_refuses_at_first(mon
     assert not cordoned
 
 
-def test_a_drone_loses_its_label_once_it_is_let_and_an_edge_node_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_label_fault_waits_for_the_drone_but_not_for_an_edge_node(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fractus_sim.chaos.faults._RETRY_S", 0.0)
     labels: dict[str, str] = {}
     refusals = 0

@@ -1,1 +1,1 @@
-"""Chaos: missions on an embedded cluster while its parts fail by a seeded schedule, and what must hold throughout."""
+"""Chaos tests: missions on an embedded cluster with faults from a seeded schedule, and invariants that must hold."""

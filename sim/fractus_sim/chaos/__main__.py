@@ -1,4 +1,4 @@
-"""`python -m fractus_sim.chaos`: missions on an embedded cluster while its parts fail."""
+"""`python -m fractus_sim.chaos`: fly missions on an embedded cluster while faults are injected."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ CLUSTER = "chaos"
 DRONE = "drone-1"
 VEHICLE_PORT = 5760
 DISK = "1Gi"
-"""Recordings take half of it at most, and leave 200 MB to the audit logs, which take some megabytes in an hour."""
+"""Recordings use at most half of the disk and leave 200 MB for audit logs, which grow by a few megabytes per hour."""
 
 READY_TIMEOUT_S = 180.0
 
 
 def say(line: str) -> None:
-    """Tell what happens, a line at a time."""
+    """Print a progress line."""
     click.echo(line, err=True)
 
 
 def with_disk(spec: ClusterSpec) -> ClusterSpec:
-    """The cluster with a disk for its drone."""
+    """Return the cluster specification with a disk for the drone."""
 
     def furnished(node: NodeSpec) -> NodeSpec:
         hardware = node.hardware.model_copy(update={"disk": DiskHardware(size=DISK)})
@@ -52,11 +52,11 @@ def with_disk(spec: ClusterSpec) -> ClusterSpec:
 
 @contextmanager
 def embedded(keep: bool) -> Iterator[Stage]:
-    """A cluster of its own with Fractus and a drone that is ready; taken down at the end.
+    """Provide a separate cluster with Fractus and a ready drone. It is removed at the end unless `keep` is set.
 
     Raises:
-        ClusterError: it does not come up.
-        DemoError: Fractus does not.
+        ClusterError: The cluster did not start.
+        DemoError: Fractus did not start.
     """
     images = build_images(ROOT, targets=TARGETS, report=say)
     cluster = Cluster.load(with_disk(load_spec(ROOT / "examples" / "clusters" / "demo.yaml")), name=CLUSTER, report=say)
@@ -64,7 +64,7 @@ def embedded(keep: bool) -> Iterator[Stage]:
         cluster.up(images=images)
         kube = kube_of(cluster, say)
         stage = Stage(cluster, kube, DRONE)
-        # A run that was killed may have left it.
+        # Remove the ballast file of a run that was killed.
         (stage.state / BALLAST).unlink(missing_ok=True)
         clocks.furnish(node.own_state for node in cluster.nodes if node.spec.node_class != "cloud")
         install_fractus(kube, clocks.chart_values())
@@ -78,14 +78,22 @@ def embedded(keep: bool) -> Iterator[Stage]:
 
 
 @click.command()
-@click.option("--seeds", default=1, show_default=True, help="How many runs.")
-@click.option("--first-seed", default=1, show_default=True, help="Seed of the first; each other has the next.")
-@click.option("--minutes", default=5.0, show_default=True, help="How long faults happen in each.")
-@click.option("--fault", "kinds", multiple=True, type=click.Choice(sorted(FAULTS)), help="Only these; all by default.")
+@click.option("--seeds", default=1, show_default=True, help="Number of runs.")
+@click.option(
+    "--first-seed", default=1, show_default=True, help="Seed of the first run. Each further run uses the next seed."
+)
+@click.option("--minutes", default=5.0, show_default=True, help="Minutes of fault injection per run.")
+@click.option(
+    "--fault",
+    "kinds",
+    multiple=True,
+    type=click.Choice(sorted(FAULTS)),
+    help="Inject only this fault (repeatable). Default: all faults.",
+)
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("out/chaos"), show_default=True)
-@click.option("--keep", is_flag=True, help="Leave the cluster as it is at the end.")
+@click.option("--keep", is_flag=True, help="Do not remove the cluster at the end.")
 def chaos(*, seeds: int, first_seed: int, minutes: float, kinds: tuple[str, ...], out: Path, keep: bool) -> None:
-    """Fly missions while the cluster's parts fail by the schedule of a seed, and judge what must hold."""
+    """Fly missions while faults are injected by a seeded schedule, and check the invariants."""
     break_off_on_signals()
     out.mkdir(parents=True, exist_ok=True)
     runs: list[Run] = []
@@ -102,7 +110,7 @@ def chaos(*, seeds: int, first_seed: int, minutes: float, kinds: tuple[str, ...]
     broken = [(run.seed, each) for run in runs for each in run.broken]
     for seed, each in broken:
         click.echo(f"seed {seed}: {each.invariant}: {each.found}")
-    click.echo(f"{len(runs)} runs, {len(broken)} times an invariant was broken; report: {out}/summary.md")
+    click.echo(f"{len(runs)} runs, {len(broken)} invariant violations; report: {out}/summary.md")
     sys.exit(1 if broken else 0)
 
 

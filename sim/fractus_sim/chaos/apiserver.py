@@ -1,4 +1,4 @@
-"""An API server that is refused, silent, slow, or has too much to do."""
+"""API server faults: connections reset, no responses, slow responses, too many requests."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ RULES = (
     f"flowschemas.flowcontrol.apiserver.k8s.io/{_NAME}",
     f"prioritylevelconfigurations.flowcontrol.apiserver.k8s.io/{_NAME}",
 )
-"""The objects of `no_room`, as kubectl names them."""
+"""Objects of `no_room` in kubectl notation."""
 _ACCOUNTS = (SYSTEM, "fractus-nodes")
 _UNFINISHED = (
     "create", "--raw=/apis/authorization.k8s.io/v1/selfsubjectaccessreviews", "-f", "-",
@@ -34,7 +34,7 @@ _UNFINISHED = (
 
 
 def no_room() -> str:
-    """Manifests after which the API server has room for one request at a time of all accounts of Fractus."""
+    """Return manifests that limit all accounts of Fractus to one concurrent API request."""
     api = "flowcontrol.apiserver.k8s.io/v1"
     level = {
         "apiVersion": api, "kind": "PriorityLevelConfiguration", "metadata": {"name": _NAME},
@@ -59,10 +59,10 @@ def no_room() -> str:
 
 @contextmanager
 def occupied(kube: Kube) -> Iterator[None]:
-    """A request that no one completes takes the room of `no_room`: every other one of Fractus is answered with 429."""
+    """Occupy the request slot of `no_room`. All other requests of Fractus receive status 429."""
 
     def hold(over: threading.Event) -> None:
-        # The API server ends it after a minute, and refuses it while another one is under way.
+        # The API server ends the request after one minute, and rejects it while another request is running.
         while not over.is_set():
             with kube.follow(_UNFINISHED, subprocess.DEVNULL, subprocess.PIPE) as request:
                 while request.poll() is None and not over.wait(_POLL_S):
@@ -75,7 +75,7 @@ def occupied(kube: Kube) -> Iterator[None]:
 
 @contextmanager
 def refused(namespace: Path) -> Iterator[None]:
-    """Every connection to the API server is reset."""
+    """Reset every connection to the API server."""
     rule = f"tcp dport {API_PORT} reject with tcp reset"
     with _table(namespace, "fractus_chaos_down", f"chain c {{ type filter hook input priority -300; {rule}; }}"):
         yield
@@ -83,7 +83,7 @@ def refused(namespace: Path) -> Iterator[None]:
 
 @contextmanager
 def silenced(namespace: Path) -> Iterator[int]:
-    """The connections of now get no more answers, new ones do; yields how many they are."""
+    """Drop all responses on existing connections to the API server, but not on new ones. Yield their number."""
     peers = sorted(_peers(namespace))
     if not peers:
         yield 0
@@ -99,20 +99,20 @@ def silenced(namespace: Path) -> Iterator[int]:
 
 @contextmanager
 def slowed(pids: Callable[[], list[int]]) -> Iterator[None]:
-    """Stop the API server for two seconds again and again."""
+    """Suspend the API server for two seconds repeatedly."""
 
     def hold(over: threading.Event) -> None:
         while not over.is_set():
-            processes.tell(pids(), signal.SIGSTOP)
+            processes.send_signal(pids(), signal.SIGSTOP)
             over.wait(SLOW_S)
-            processes.tell(pids(), signal.SIGCONT)
+            processes.send_signal(pids(), signal.SIGCONT)
             over.wait(_QUICK_S)
 
     try:
         with held(hold):
             yield
     finally:
-        processes.tell(pids(), signal.SIGCONT)
+        processes.send_signal(pids(), signal.SIGCONT)
 
 
 @contextmanager
@@ -125,7 +125,7 @@ def _table(namespace: Path, name: str, content: str) -> Iterator[None]:
 
 
 def _peers(namespace: Path) -> set[str]:
-    """Established connections to the API server, as elements of a set: address . port."""
+    """Return the peers of established API server connections as nftables set elements (address . port)."""
     listed = _run(namespace, ["ss", "-Htn", "state", "established", f"( sport = :{API_PORT} )"])
     found = set()
     for line in listed.splitlines():

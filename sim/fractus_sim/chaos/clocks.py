@@ -1,4 +1,4 @@
-"""Clocks of a node's services that can be stepped, though a machine has one for all: a library that they load adds to it."""
+"""Clock faults: a preloaded library adds an offset to the clock of single services of a node."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ SERVICES = ("agent", "mobility", "camera")
 _FOLDER = "chaos"
 _SOURCE = Path(__file__).with_name("clock.c")
 _SEEN_AT = Path("/var/lib/fractus") / _FOLDER
-"""Where pods of agents and services find it."""
+"""Path of the library in pods of agents and services."""
 
 
 def chart_values() -> list[str]:
-    """Values of the chart by which agents and services load the library."""
+    """Return chart values that make agents and services load the library."""
     return [
         f"{service}.extraEnv[{at}].{key}={value}"
         for service in SERVICES
@@ -27,15 +27,15 @@ def chart_values() -> list[str]:
 
 
 def loaded(folder: Path, service: str) -> dict[str, str]:
-    """The environment of a process that loads the library in a folder, and goes by the clock of a service."""
+    """Return the environment of a process that loads the library from a folder with the clock of a service."""
     return {"LD_PRELOAD": str(folder / "clock.so"), "CLOCK_OFFSET": str(_offset(folder, service))}
 
 
 def furnish(states: Iterable[Path]) -> None:
-    """Put the library in the state directories of nodes, whose clocks then go right, also after a run that was broken off.
+    """Install the library in the state directories of nodes, and reset all clock offsets.
 
     Raises:
-        ClusterError: it cannot be built.
+        ClusterError: The library cannot be built.
     """
     for state in states:
         folder = state / _FOLDER
@@ -49,12 +49,12 @@ def furnish(states: Iterable[Path]) -> None:
 
 
 def can_step(state: Path) -> bool:
-    """Whether the services of a node load the library."""
+    """True if the services of a node load the library."""
     return all(_offset(state / _FOLDER, service).exists() for service in SERVICES)
 
 
 def step(state: Path, services: Iterable[str], offset_s: float) -> None:
-    """Set the clocks of some services of a node ahead of the machine's, in place: that also works on a full disk."""
+    """Set the clock offset of services of a node. The file is written in place, so this also works on a full disk."""
     for service in services:
         file = os.open(_offset(state / _FOLDER, service), os.O_WRONLY)
         try:

@@ -1,4 +1,4 @@
-"""The faults: each breaks something, says what, and makes it good again when it is left."""
+"""Chaos faults. Each fault is a generator that injects it, yields a description, and repairs it at exit."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from fractus_sim.demo.kube import NAMESPACE, SYSTEM, DemoError
 Breaking = Generator[str, None, None]
 
 MIN_STEP_S, MAX_STEP_S = 30.0, 26 * 3600.0
-"""Of a clock: less is what NTP does all the time, and more is longer than any certificate here is valid."""
+"""Clock offset. NTP makes smaller steps all the time, and no certificate here is valid for longer than the maximum."""
 
 BALLAST = "ballast"
-"""The file that takes a disk."""
+"""File that fills a disk."""
 
 _HEAL_TIMEOUT_S = 180.0
 _FILL_S = 0.2
@@ -39,12 +39,12 @@ _RECONCILE_S = 4.0
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """A kind of fault.
+    """A type of fault.
 
     Attributes:
-        breaks: breaks a stage, yields what it did, and heals it afterwards.
-        shortest_s: of its duration; 0 for what is over at once.
-        longest_s: the same.
+        breaks: Injects the fault, yields its description, and repairs it.
+        shortest_s: Minimum duration. 0 for instantaneous faults.
+        longest_s: Maximum duration. 0 for instantaneous faults.
     """
 
     breaks: Callable[[Stage, random.Random], Breaking]
@@ -53,25 +53,25 @@ class Fault:
 
 
 def broken(fault: Fault, stage: Stage, chance: random.Random) -> AbstractContextManager[str]:
-    """The fault as a context.
+    """Return the fault as a context manager.
 
     Raises:
-        DemoError: there is nothing to break, or the API server refuses it.
+        DemoError: The target does not exist, or the API server rejected the fault.
     """
     return contextmanager(fault.breaks)(stage, chance)
 
 
-def _tell(pids: Iterable[int], number: signal.Signals, whose: str) -> None:
-    if not processes.tell(pids, number):
-        raise DemoError(f"{whose} has no process")
+def _tell(pids: Iterable[int], number: signal.Signals, owner: str) -> None:
+    if not processes.send_signal(pids, number):
+        raise DemoError(f"{owner} has no process")
 
 
 def _kill_operator(stage: Stage, chance: random.Random) -> Breaking:
-    """SIGKILL of who leads; every other time at a random step after the next Application is there."""
+    """Kill the leading operator, half of the time shortly after an Application was applied."""
     when = "at a random moment"
     if chance.random() < 0.5 and stage.applied.wait(20.0):
         time.sleep(chance.uniform(0, _RECONCILE_S))
-        when = "while it reconciles"
+        when = "during reconciliation"
     pod = stage.leader()
     _tell(processes.of_pod(pod["metadata"]["uid"]), signal.SIGKILL, pod["metadata"]["name"])
     yield f"killed {pod['metadata']['name']} {when}"
@@ -83,7 +83,7 @@ def _kill_process(stage: Stage, chance: random.Random) -> Breaking:
         pods = stage.objects("pods", "-n", NAMESPACE, "-l", "fractus.dev/component=Navigator")
         running = [pod for pod in pods if pod["status"].get("phase") == "Running"]
         if not running:
-            raise DemoError("no driver runs")
+            raise DemoError("no driver is running")
         pod = running[0]
     else:
         pod = stage.system_pod(component, stage.drone)
@@ -104,20 +104,20 @@ def _silent_watches(stage: Stage, _chance: random.Random) -> Breaking:
 
 def _slow_api(stage: Stage, _chance: random.Random) -> Breaking:
     with apiserver.slowed(lambda: stage.program("kube-apiserver")):
-        yield f"the API server answers after {apiserver.SLOW_S:g} s"
+        yield f"the API server responds after {apiserver.SLOW_S:g} s"
 
 
 def _too_many_requests(stage: Stage, _chance: random.Random) -> Breaking:
     try:
         stage.kube.run("apply", "-f", "-", stdin=apiserver.no_room(), timeout_s=20.0)
         with apiserver.occupied(stage.kube):
-            yield "the API server answers 429 to Fractus"
+            yield "the API server rejects requests of Fractus with 429"
     finally:
         _until_done(lambda: stage.kubectl("delete", "--ignore-not-found", *apiserver.RULES))
 
 
 def _conflicts(stage: Stage, _chance: random.Random) -> Breaking:
-    """Writes all the time what others write, so that their writes meet a newer version: 409."""
+    """Annotate all objects continuously, so that other writers get conflicts (409)."""
     kinds = ",".join(
         f"{kind}.fractus.dev" for kind in ("applications", "deploymentplans", "grants", "nodegrants", "drones")
     )
@@ -130,12 +130,12 @@ def _conflicts(stage: Stage, _chance: random.Random) -> Breaking:
                 stage.kubectl("annotate", kinds, "--all", "-A", f"fractus-chaos={count}", "--overwrite")
 
     with held(write):
-        yield "every object of Fractus is written all the time"
+        yield "all objects of Fractus are updated continuously"
 
 
 def _restart_etcd(stage: Stage, _chance: random.Random) -> Breaking:
     _tell(stage.program("etcd"), signal.SIGKILL, "etcd")
-    yield "killed etcd, which starts again"
+    yield "killed etcd, which restarts"
 
 
 def _stop_kubelet(stage: Stage, chance: random.Random) -> Breaking:
@@ -144,14 +144,14 @@ def _stop_kubelet(stage: Stage, chance: random.Random) -> Breaking:
     try:
         yield f"the kubelet of {node} hangs"
     finally:
-        processes.tell(stage.program("kubelet", node), signal.SIGCONT)
+        processes.send_signal(stage.program("kubelet", node), signal.SIGCONT)
 
 
 def _power_off(stage: Stage, chance: random.Random) -> Breaking:
     node = _some_node(stage, chance)
     stage.cluster.set_power(node, on=False)
     try:
-        yield f"{node} has no power"
+        yield f"{node} is powered off"
     finally:
         stage.cluster.set_power(node, on=True)
 
@@ -169,7 +169,7 @@ def _delete_pod(stage: Stage, chance: random.Random) -> Breaking:
     pods = [*stage.objects("pods", "-n", NAMESPACE), *stage.objects("pods", "-n", SYSTEM)]
     pod = chance.choice(sorted(pods, key=lambda body: str(body["metadata"]["name"])))["metadata"]
     stage.kubectl("delete", "pod", pod["name"], "-n", pod["namespace"], "--force", "--grace-period=0", "--wait=false")
-    yield f"deleted pod {pod['name']} by force"
+    yield f"force-deleted pod {pod['name']}"
 
 
 def _drain(stage: Stage, chance: random.Random) -> Breaking:
@@ -187,29 +187,29 @@ def _drain(stage: Stage, chance: random.Random) -> Breaking:
                 timeout_s=30.0,
             )
         except DemoError as error:
-            drained = f"tried to drain ({str(error)[-120:]})"
+            drained = f"drain failed ({str(error)[-120:]}) on"
         yield f"{drained} {node}"
     finally:
-        # kubectl uncordon ends with 0 when the API server refuses it.
+        # kubectl uncordon exits with 0 even if the API server rejects the request.
         schedulable = '{"spec": {"unschedulable": null}}'
         _until_done(lambda: stage.kubectl("patch", "node", node, "--type=merge", "-p", schedulable))
 
 
 def _take_label(stage: Stage, chance: random.Random) -> Breaking:
-    """Take the class of a drone, which is refused until it has landed and has no mission, or of an edge node."""
+    """Remove the class label of the drone or of an edge node. For a drone, this is rejected until it has landed."""
     edges = [node.name for node in stage.cluster.spec.nodes if node.node_class == "edge"]
     node, node_class = (stage.drone, "drone") if chance.random() < 0.5 else (chance.choice(edges), "edge")
     try:
         _until_done(lambda: stage.kubectl("label", "node", node, f"{CLASS_LABEL}-"), _LANDING_S)
-        yield f"{node} lost its label {CLASS_LABEL}"
+        yield f"removed label {CLASS_LABEL} from {node}"
     finally:
         _until_done(lambda: stage.kubectl("label", "node", node, f"{CLASS_LABEL}={node_class}", "--overwrite"))
 
 
 def _fill_disk(stage: Stage, _chance: random.Random) -> Breaking:
-    """Take all of the disk of the drone's node, also what is freed on it meanwhile."""
+    """Fill the disk of the drone's node, including space that is freed during the fault."""
     if not stage.state.is_mount():
-        raise DemoError(f"{stage.drone} has no disk of its own")
+        raise DemoError(f"{stage.drone} has no separate disk")
     ballast = stage.state / BALLAST
     try:
         with ballast.open("wb") as file:
@@ -226,7 +226,7 @@ def _fill_disk(stage: Stage, _chance: random.Random) -> Breaking:
 
 
 def _take_all(file: IO[bytes]) -> None:
-    """Let a file take every block that its disk has left."""
+    """Allocate all free blocks of the disk to a file."""
     end, piece = os.fstat(file.fileno()).st_size, 1 << 30
     while piece:
         try:
@@ -240,30 +240,30 @@ def _take_all(file: IO[bytes]) -> None:
 
 
 def _step_clock(stage: Stage, chance: random.Random) -> Breaking:
-    """Step the clock of one service of the drone's node, or of all of them, as a node whose time server is wrong."""
+    """Step the clock of one or all services of the drone's node, as a node with a wrong time server."""
     if not clocks.can_step(stage.state):
         raise DemoError(f"clocks of {stage.drone} cannot be stepped")
     services = chance.choice([*((service,) for service in clocks.SERVICES), clocks.SERVICES])
-    # As often by minutes as by hours.
+    # Logarithmic distribution: minutes are as likely as hours.
     offset_s = chance.choice((-1, 1)) * math.exp(chance.uniform(math.log(MIN_STEP_S), math.log(MAX_STEP_S)))
     try:
         clocks.step(stage.state, services, offset_s)
-        yield f"clocks of {', '.join(services)} of {stage.drone} were stepped by {offset_s:+.0f} s"
+        yield f"stepped clocks of {', '.join(services)} on {stage.drone} by {offset_s:+.0f} s"
     finally:
         clocks.step(stage.state, services, 0.0)
 
 
 def _some_node(stage: Stage, chance: random.Random) -> str:
-    """The drone's node as often as any other."""
+    """Select a node. The drone's node is selected half of the time."""
     others = [node.name for node in stage.cluster.spec.nodes if node.name != stage.drone]
     return stage.drone if chance.random() < 0.5 else chance.choice(others)
 
 
 def _until_done(act: Callable[[], object], timeout_s: float = _HEAL_TIMEOUT_S) -> None:
-    """Try again while the API server refuses it or cannot be had, for another fault may have taken it.
+    """Retry an action while the API server rejects it or is unavailable, because another fault may be active.
 
     Raises:
-        DemoError: it could not be done in time.
+        DemoError: The action failed until the timeout.
     """
     deadline = time.monotonic() + timeout_s
     while True:

@@ -1,4 +1,4 @@
-"""What has to be done again and again as long as a fault lasts."""
+"""Background threads for actions that are repeated while a fault lasts."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ _JOIN_S = 30.0
 
 @contextmanager
 def held(hold: Callable[[threading.Event], None]) -> Iterator[None]:
-    """Run something in a thread until the block is left, of which the event tells it."""
+    """Run a function in a thread until the end of the block, which sets the event."""
     over = threading.Event()
-    # A run that is interrupted waits for no fault: its cluster is taken down.
+    # Daemon thread: an interrupted run does not wait for faults because its cluster is removed.
     holder = threading.Thread(target=hold, args=(over,), daemon=True)
     holder.start()
     try:

@@ -1,4 +1,4 @@
-"""Missions that follow one another: two Applications at a time want the one drone."""
+"""Consecutive missions of a chaos run. Two Applications at a time compete for one drone."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Say = Callable[[str], None]
 
 
 def flight(name: str, namespace: str = NAMESPACE) -> Object:
-    """The example's Navigator alone, on a short path that stays near the depot: about a minute in the air."""
+    """Return the Navigator of the example on a short path near the depot, about one minute of flight."""
     app = documents(EXAMPLE / "application.yaml")[0]
     navigator = next(each for each in app["spec"]["components"] if each["name"] == "Navigator")
     navigator["controlPoints"][0]["path"] = [
@@ -38,12 +38,12 @@ def flight(name: str, namespace: str = NAMESPACE) -> Object:
 
 @dataclass
 class Missions:
-    """The missions of one run.
+    """Missions of one run.
 
     Attributes:
-        prefix: of their names.
-        ended: phase and message of those that are over, by name.
-        present: the same of those that are not.
+        prefix: Prefix of their names.
+        ended: Phase and message of completed missions by name.
+        present: Phase and message of active missions by name.
     """
 
     stage: Stage
@@ -54,7 +54,7 @@ class Missions:
     _count: int = 0
 
     def step(self, *, more: bool) -> None:
-        """Take a look, delete what ended, and apply another mission where one is missing; the API server may be away."""
+        """Update the missions, delete ended ones and apply new ones. Errors of the API server are ignored."""
         try:
             self._look()
             while more and len(self.present) < AT_A_TIME:
@@ -63,17 +63,17 @@ class Missions:
             return
 
     def finish(self, timeout_s: float) -> None:
-        """Wait until the missions are over."""
+        """Wait until the missions have ended."""
         deadline = time.monotonic() + timeout_s
         while self.present and time.monotonic() < deadline:
             self.step(more=False)
             time.sleep(0.5)
 
     def left_over(self) -> list[Object]:
-        """Applications that are being deleted, and objects and stored Grants of those that do not exist any more.
+        """Return Applications in deletion, and remaining objects and stored Grants of deleted Applications.
 
         Raises:
-            DemoError: the API server does not answer.
+            DemoError: The API server did not respond.
         """
         applications = self.stage.objects("applications.fractus.dev", "-A")
         leaving = [body for body in applications if "deletionTimestamp" in body["metadata"]]
@@ -85,16 +85,16 @@ class Missions:
         return leaving + [body for body in found if _application(body) not in names]
 
     def _carried(self) -> list[Object]:
-        """Grants that the objects of nodes carry."""
+        """Return the Grants in NodeGrant objects."""
         specs = [body["spec"] for body in self.stage.objects("nodegrants.fractus.dev", "-A")]
         return [grant for spec in specs for grant in unpack(spec["packed"], spec["count"])]
 
     def _stored(self) -> list[Object]:
-        """Grants on the disks of nodes."""
+        """Return the Grants on the disks of nodes."""
         stored = []
         for node in self.stage.cluster.nodes:
             for path in (node.own_state / "grants").glob("*.json"):
-                with suppress(FileNotFoundError):  # it was removed meanwhile
+                with suppress(FileNotFoundError):  # # removed in the meantime
                     stored.append(json.loads(path.read_bytes()))
         return stored
 
@@ -122,7 +122,7 @@ class Missions:
 
 
 def _application(body: Object) -> str:
-    """The name of the Application that an object belongs to."""
+    """Return the name of the Application of an object."""
     label = body["metadata"].get("labels", {}).get("fractus.dev/application")
     reference = (body.get("spec") or {}).get("application") or {}
     return str(label or reference.get("name") or body["metadata"]["name"])

@@ -1,4 +1,4 @@
-"""Processes on this machine by what they belong to: the containers of a pod, or a program of the embedded cluster."""
+"""Lookup of local processes by pod, or by program of the embedded cluster."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 
 def of_pod(uid: str) -> list[int]:
-    """Processes of a pod's containers, without its pause process."""
+    """Return the processes of a pod's containers, without its pause process."""
     marks = (uid, uid.replace("-", "_"))
     return [
         pid
@@ -19,7 +19,7 @@ def of_pod(uid: str) -> list[int]:
 
 
 def of_program(name: str, namespace: Path) -> list[int]:
-    """Processes of a program in a network namespace, such as the kubelet in a node's."""
+    """Return the processes of a program in a network namespace, such as the kubelet of a node."""
     inode = namespace.stat().st_ino
     found = []
     for pid, folder, command in _all():
@@ -33,8 +33,8 @@ def of_program(name: str, namespace: Path) -> list[int]:
     return found
 
 
-def tell(pids: Iterable[int], number: signal.Signals) -> int:
-    """Send a signal; returns how many processes there were to get it."""
+def send_signal(pids: Iterable[int], number: signal.Signals) -> int:
+    """Send a signal. Return the number of processes that received it."""
     reached = 0
     for pid in pids:
         try:
@@ -46,7 +46,7 @@ def tell(pids: Iterable[int], number: signal.Signals) -> int:
 
 
 def _all() -> Iterator[tuple[int, Path, bytes]]:
-    """Each process with its folder in /proc and its program."""
+    """Yield each process with its /proc folder and its program."""
     for folder in Path("/proc").iterdir():
         if folder.name.isdigit():
             try:

@@ -1,4 +1,4 @@
-"""The page of a series of runs: whether all held, what did not, and the timeline of each."""
+"""Summary page of chaos runs: violations and timeline of each run."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from fractus_sim.report.page import clock, table
 
 
 def page(runs: Sequence[Run], run_s: float) -> str:
-    """The page, in Markdown."""
+    """Return the page in Markdown."""
     broken = sum(len(run.broken) for run in runs)
-    held = "Every invariant held." if not broken else f"Invariants were broken {broken} times."
+    held = "Every invariant held." if not broken else f"{broken} invariant violations."
     rows = [
         (
             str(run.seed), clock(run.flown_s), _missions(run), str(sum(":" in text for _, text in run.timeline)), str(run.entries),

@@ -1,4 +1,4 @@
-"""One run: missions, faults by the schedule of a seed, and what must hold, judged at the end."""
+"""One chaos run: missions, scheduled faults, and evaluation of the invariants."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ _ERRORS = (DemoError, ClusterError, subprocess.SubprocessError, OSError)
 
 @dataclass
 class Run:
-    """What happened in a run.
+    """Results of a run.
 
     Attributes:
-        timeline: seconds after its beginning, and what happened.
-        ended: phase and message of its missions.
-        broken: invariants that did not hold.
-        flown_s: how long the drone was in the air.
-        entries: of all audit logs.
+        timeline: Events with seconds since the start of the run.
+        ended: Phase and message of the missions.
+        broken: Violated invariants.
+        flown_s: Flight time, seconds.
+        entries: Number of entries in all audit logs.
     """
 
     seed: int
@@ -54,7 +54,7 @@ class Run:
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def note(self, text: str) -> None:
-        """Write a line of the timeline, and say it."""
+        """Add a line to the timeline and report it."""
         at_s = time.time() - self.began_s
         with self._lock:
             self.timeline.append((at_s, text))
@@ -63,7 +63,7 @@ class Run:
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """What a run is to do: the seed of its schedule, how long faults happen (seconds), and which."""
+    """Configuration of a run: seed of the schedule, duration of fault injection in seconds, and fault types."""
 
     seed: int
     run_s: float
@@ -71,14 +71,14 @@ class Task:
 
 
 def fly(stage: Stage, watch: Watch, task: Task, say: Callable[[str], None]) -> Run:
-    """Run the schedule of a seed and judge what came of it."""
+    """Run the schedule of a seed and evaluate the invariants."""
     run = Run(task.seed, time.time(), say)
     durations = {kind: (FAULTS[kind].shortest_s, FAULTS[kind].longest_s) for kind in task.kinds}
     planned = schedule(task.seed, task.run_s, durations)
     missions = Missions(stage, f"chaos-{task.seed}", run.note)
     chances = [random.Random(f"{task.seed}/{at}") for at in range(len(planned))]  # noqa: S311 - chosen to repeat
     threads = [
-        # A run that is interrupted waits for no fault: its cluster is taken down.
+        # # Daemon threads: an interrupted run does not wait for faults because its cluster is removed.
         threading.Thread(target=_happen, args=(stage, each, chance, run), daemon=True)
         for each, chance in zip(planned, chances, strict=True)
     ]
@@ -87,7 +87,7 @@ def fly(stage: Stage, watch: Watch, task: Task, say: Callable[[str], None]) -> R
     while time.time() < run.began_s + task.run_s or any(thread.is_alive() for thread in threads):
         missions.step(more=time.time() < run.began_s + task.run_s)
         time.sleep(_STEP_S)
-    run.note("all faults are over")
+    run.note("all faults have ended")
     missions.finish(END_TIMEOUT_S)
     run.ended = {**missions.ended, **missions.present}
     run.broken += _settle(stage, missions)
@@ -96,25 +96,27 @@ def fly(stage: Stage, watch: Watch, task: Task, say: Callable[[str], None]) -> R
 
 
 def _happen(stage: Stage, planned: Planned, chance: random.Random, run: Run) -> None:
-    """One fault, from its moment to its end."""
+    """Inject and repair one scheduled fault."""
     time.sleep(max(run.began_s + planned.at_s - time.time(), 0.0))
     begun = False
     try:
-        with broken(FAULTS[planned.fault], stage, chance) as said:
+        with broken(FAULTS[planned.fault], stage, chance) as description:
             begun = True
-            run.note(f"{planned.fault}: {said}" + (f" for {planned.duration_s:g} s" if planned.duration_s else ""))
+            run.note(
+                f"{planned.fault}: {description}" + (f" for {planned.duration_s:g} s" if planned.duration_s else "")
+            )
             time.sleep(planned.duration_s)
     except _ERRORS as error:
-        run.note(f"{planned.fault}: {'not healed' if begun else 'not done'}: {str(error)[-200:]}")
+        run.note(f"{planned.fault}: {'not repaired' if begun else 'not injected'}: {str(error)[-200:]}")
         if begun:
-            run.broken.append(Broken("all recovers", time.time(), f"{planned.fault} was not healed: {error}"))
+            run.broken.append(Broken("all recovers", time.time(), f"{planned.fault} was not repaired: {error}"))
     else:
         if planned.duration_s:
             run.note(f"{planned.fault}: over")
 
 
 def _settle(stage: Stage, missions: Missions) -> list[Broken]:
-    """Wait until nothing is left of what was deleted and all is well again; what is not is broken."""
+    """Wait until deleted objects are gone and all nodes are ready. Return what is not after the timeout."""
 
     def deleted() -> bool:
         stage.kubectl("delete", "applications.fractus.dev", "--all", "-n", NAMESPACE, "--wait=false")
@@ -128,17 +130,17 @@ def _settle(stage: Stage, missions: Missions) -> list[Broken]:
         ("every edge node is Ready", lambda: all(map(is_ready, stage.objects("edgenodes.fractus.dev")))),
     ):
         if not _awaited(holds, RECOVER_TIMEOUT_S):
-            found.append(Broken("all recovers", 0.0, f"not so after {RECOVER_TIMEOUT_S:.0f} s: {what}"))
+            found.append(Broken("all recovers", 0.0, f"after {RECOVER_TIMEOUT_S:.0f} s not true: {what}"))
     return found
 
 
 def _judge(stage: Stage, watch: Watch, run: Run) -> list[Broken]:
-    """All invariants, over what services wrote and the vehicle said since the run began."""
+    """Evaluate all invariants on audit logs and telemetry since the start of the run."""
     seen = [sample for sample in watch.seen if sample.time_s >= run.began_s]
     run.flown_s = sum(b.time_s - a.time_s for a, b in itertools.pairwise(seen) if a.flying)
     found = list(invariants.not_ended(run.ended))
     if watch.home is None or watch.failure:
-        found.append(Broken("watched", 0.0, f"the vehicle was not seen: {watch.failure or 'it has no position'}"))
+        found.append(Broken("watched", 0.0, f"no vehicle telemetry: {watch.failure or 'position unknown'}"))
     else:
         found += invariants.landed_elsewhere(seen, watch.home)
     started_s = time.time() - time.clock_gettime(time.CLOCK_BOOTTIME)
@@ -151,17 +153,17 @@ def _judge(stage: Stage, watch: Watch, run: Run) -> list[Broken]:
             if finding.problem:
                 what = f"{node.name}/{log.name}: line {finding.line} {finding.problem}"
                 found.append(Broken("one writer of each audit log", 0.0, what))
-            said = list(invariants.steadily_timed(entries(lines), started_s))
+            log_entries = list(invariants.steadily_timed(entries(lines), started_s))
             if log.stem == "mobility":
-                found += invariants.without_authority(seen, said)
-                found += invariants.in_two_applications(said, watch.grants)
+                found += invariants.without_authority(seen, log_entries)
+                found += invariants.in_two_applications(log_entries, watch.grants)
             if node.name == stage.drone:
-                found += invariants.forbidden_calls(said, watch.grants, watch.home)
+                found += invariants.forbidden_calls(log_entries, watch.grants, watch.home)
     return [each for each in found if not each.time_s or each.time_s >= run.began_s]
 
 
 def _awaited(holds: Callable[[], bool], timeout_s: float) -> bool:
-    """Whether something comes to hold in time."""
+    """Return True if the condition becomes true before the timeout."""
     deadline = time.monotonic() + timeout_s
     while time.monotonic() < deadline:
         with suppress(*_ERRORS):

@@ -1,4 +1,4 @@
-"""Which fault happens when: the same seed gives the same schedule."""
+"""Seeded schedule of faults. The same seed gives the same schedule."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 FIRST_S = 10.0
-"""The first fault meets a mission that is being deployed."""
+"""Time of the first fault. The first mission is being deployed then."""
 
 MAX_SHARE = 1 / 3
-"""Of a run: no fault lasts longer."""
+"""Maximum share of the run that a fault lasts."""
 
 OVERLAP_S = 10.0
 PAUSE_S = 25.0
@@ -18,12 +18,12 @@ PAUSE_S = 25.0
 
 @dataclass(frozen=True, slots=True)
 class Planned:
-    """One fault.
+    """A scheduled fault.
 
     Attributes:
-        at_s: seconds after the beginning of the run.
-        fault: its name.
-        duration_s: how long it lasts; 0 for one that is over at once.
+        at_s: Seconds since the start of the run.
+        fault: Name of the fault type.
+        duration_s: Duration, seconds. 0 for instantaneous faults.
     """
 
     at_s: float
@@ -32,14 +32,14 @@ class Planned:
 
 
 def schedule(seed: int, run_s: float, durations: Mapping[str, tuple[float, float]]) -> tuple[Planned, ...]:
-    """The faults of a run: each kind once in random order, then again, a little apart or one within another.
+    """Return the faults of a run: all types in random order, repeated, with pauses or overlaps.
 
-    A fault never meets itself, and all are over before the run is.
+    A fault type never overlaps itself, and all faults end before the run.
 
     Args:
-        seed: of all that is random.
-        run_s: how long the run is, seconds.
-        durations: for each fault its shortest and longest duration, seconds.
+        seed: Seed of all random values.
+        run_s: Duration of the run, seconds.
+        durations: Minimum and maximum duration of each fault type, seconds.
     """
     chance = random.Random(seed)  # noqa: S311 - chosen to repeat
     planned: list[Planned] = []

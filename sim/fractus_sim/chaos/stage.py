@@ -1,4 +1,4 @@
-"""Where a run takes place: the embedded cluster with Fractus on it, and its drone."""
+"""Environment of a chaos run: the embedded cluster with Fractus, and its drone."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ API_TIMEOUT_S = 15.0
 
 @dataclass
 class Stage:
-    """What faults act on.
+    """Targets of faults.
 
     Attributes:
-        drone: name of the node that flies.
-        applied: set when an Application was applied: the operator begins to reconcile.
+        drone: Name of the drone's node.
+        applied: Set when an Application was applied and the operator begins to reconcile.
     """
 
     cluster: Cluster
@@ -32,57 +32,57 @@ class Stage:
 
     @property
     def node(self) -> Node:
-        """The drone's node."""
+        """Node of the drone."""
         return self.cluster.node(self.drone)
 
     @property
     def state(self) -> Path:
-        """The directory on this machine that is /var/lib/fractus of the drone's node."""
+        """Local directory that is mounted as /var/lib/fractus on the drone's node."""
         return self.node.own_state
 
     @property
     def control_plane(self) -> Path:
-        """The control plane's network namespace."""
+        """Network namespace of the control plane."""
         return self.node.wiring.namespace_path()
 
     def kubectl(self, *arguments: str, timeout_s: float = API_TIMEOUT_S) -> str:
         """Run kubectl.
 
         Raises:
-            DemoError: it failed or took too long.
+            DemoError: The command failed or timed out.
         """
         return self.kube.run(f"--request-timeout={timeout_s:.0f}s", *arguments, timeout_s=timeout_s + 5)
 
     def objects(self, kinds: str, *where: str) -> list[Object]:
-        """Objects of some kinds.
+        """Return objects of the given kinds.
 
         Raises:
-            DemoError: the API server does not answer.
+            DemoError: The API server did not respond.
         """
         return list(json.loads(self.kubectl("get", kinds, "-o", "json", *(where or ("-A",))))["items"])
 
     def system_pod(self, component: str, node: str | None = None) -> Object:
-        """A running pod of Fractus.
+        """Return a running pod of Fractus.
 
         Raises:
-            DemoError: there is none.
+            DemoError: No pod is running.
         """
         for pod in self.objects("pods", "-n", SYSTEM, "-l", f"app.kubernetes.io/component={component}"):
             if pod["status"].get("phase") == "Running" and node in {None, pod["spec"].get("nodeName")}:
                 return pod
-        raise DemoError(f"no pod of {component} runs{f' on {node}' if node else ''}")
+        raise DemoError(f"no pod of {component} is running{f' on {node}' if node else ''}")
 
     def leader(self) -> Object:
-        """The operator's pod that acts.
+        """Return the pod of the leading operator.
 
         Raises:
-            DemoError: no one does.
+            DemoError: No operator holds the lease.
         """
         lease = json.loads(self.kubectl("get", "lease", "fractus-operator", "-n", SYSTEM, "-o", "json"))
         name = lease["spec"].get("holderIdentity") or "none"
         return dict(json.loads(self.kubectl("get", "pod", name, "-n", SYSTEM, "-o", "json")))
 
     def program(self, name: str, node: str | None = None) -> list[int]:
-        """Processes of a program of a node, or of the control plane."""
+        """Return the processes of a program on a node, or of the control plane."""
         namespace = self.node.wiring.namespace_path(node) if node else self.control_plane
         return processes.of_program(name, namespace)

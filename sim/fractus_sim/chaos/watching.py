@@ -1,4 +1,4 @@
-"""Stands beside the drone: hears what its vehicle says, sees which Grants lie on its disk, and changes its battery."""
+"""Observer of the drone: records telemetry, reads the Grants on its disk, and replaces its battery."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from fractus_sim.experiment.station import OBSERVER_ID, Station, TcpLink
 
 POLL_S = 0.2
 MIN_BATTERY = 0.7
-"""Share of charge below which a drone on the ground gets a full battery: a long run takes many."""
+"""Minimum charge of a drone on the ground. Below this, its battery is replaced, because a long run needs several."""
 _EVERY_BATTERY = 0xFFFF
 _CONNECT_S = 10.0
 _JOIN_S = 10.0
 
 
 class Watch:
-    """Watches until it is left.
+    """Observes the vehicle until the end of the context.
 
     Args:
-        namespace: the node's network namespace.
-        port: of its vehicle.
-        grants: where its agent keeps Grants.
+        namespace: Network namespace of the node.
+        port: Port of its vehicle.
+        grants: Directory where the agent stores Grants.
 
     Attributes:
-        seen: what the vehicle said, in order.
-        grants: all that were there, by the key that the audit log names them by.
-        home: where the vehicle stood at first.
-        failure: why it sees the vehicle no more; empty while it does.
+        seen: Telemetry samples in order.
+        grants: All Grants observed, by their key in the audit log.
+        home: Start position of the vehicle.
+        failure: Reason why the connection to the vehicle ended. Empty while connected.
     """
 
     def __init__(self, namespace: Path, port: int, grants: Path) -> None:
@@ -89,5 +89,5 @@ class Watch:
                     spec = Grant.from_body(json.loads(path.read_bytes())).spec
                     self._read[path] = changed
                     self.grants[spec.mission_key] = spec
-            except (OSError, ValueError):  # it was removed meanwhile
+            except (OSError, ValueError):  # # removed in the meantime
                 continue

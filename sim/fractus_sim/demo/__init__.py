@@ -1,1 +1,1 @@
-"""The demo: deploys the traffic monitoring example on a cluster, watches it fly, and reports what happened."""
+"""The demo: deploys the traffic monitoring example on a cluster, observes its flight, and writes a report."""

@@ -1,4 +1,4 @@
-"""`python -m fractus_sim.demo`: fly the traffic monitoring example and report."""
+"""`python -m fractus_sim.demo`: fly the traffic monitoring example and write a report."""
 
 from __future__ import annotations
 
@@ -34,23 +34,25 @@ def _assignments(_context: click.Context, _option: click.Parameter, texts: tuple
     type=click.Choice(["embedded", "current"]),
     default="embedded",
     show_default=True,
-    help="embedded: one on this machine (Linux, root). current: that of KUBECONFIG (k3s, kind), with the images loaded.",
+    help="embedded: a new cluster on this machine (Linux, root). current: the cluster of KUBECONFIG (k3s, kind) with loaded images.",
 )
 @click.option(
     "--out", type=click.Path(path_type=Path, file_okay=False), default=Path("out/demo"), show_default=True,
-    help="Folder of the report.",
+    help="Output folder of the report.",
 )  # fmt: skip
-@click.option("--keep", is_flag=True, help="Leave the cluster, Fractus and the application as they are at the end.")
+@click.option("--keep", is_flag=True, help="Do not remove cluster, Fractus and application at the end.")
 @click.option(
     "--assign", multiple=True, callback=_assignments, metavar="NAME=NODE",
-    help="With --cluster current: which node stands for drone-1, edge-1, ..., cloud-1; repeat.",
+    help="With --cluster current: node to use as drone-1, edge-1, ..., cloud-1 (repeatable).",
 )  # fmt: skip
-@click.option("--timeout", "timeout_s", default=480.0, show_default=True, help="Seconds the mission may take.")
-@click.option("--report-only", is_flag=True, help="Write the report in OUT again from what an earlier run recorded.")
+@click.option(
+    "--timeout", "timeout_s", default=480.0, show_default=True, help="Maximum duration of the mission, seconds."
+)
+@click.option("--report-only", is_flag=True, help="Only write the report in OUT again from the data of an earlier run.")
 def demo(
     *, cluster: str, out: Path, keep: bool, assign: Mapping[str, str], timeout_s: float, report_only: bool
 ) -> None:
-    """Deploy the traffic monitoring example, watch it fly, and report what happened."""
+    """Deploy the traffic monitoring example, observe its flight, and write a report."""
     console = Console()
     break_off_on_signals()
     try:

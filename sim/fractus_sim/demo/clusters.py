@@ -1,4 +1,4 @@
-"""Where the demo runs: an embedded cluster of its own, or the user's with the example's nodes assigned to its own."""
+"""Clusters for the demo: a new embedded cluster, or the user's cluster with nodes assigned to the example's nodes."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ Say = Callable[[str], None]
 
 
 def documents(path: Path) -> list[Object]:
-    """The objects of a manifest.
+    """Return the objects of a manifest.
 
     Raises:
-        DemoError: there is no such file, or it is not YAML.
+        DemoError: The file does not exist or is not YAML.
     """
     try:
         return [body for body in parse_documents(path.read_bytes(), str(path)).values if body]
@@ -41,51 +41,52 @@ def documents(path: Path) -> list[Object]:
 
 
 def surroundings() -> list[Object]:
-    """What the example flies in on an embedded cluster: depot, zones and policies."""
+    """Return depot, zones and policies of the example for an embedded cluster."""
     return [body for name in ("depot.yaml", "zones.yaml", "policies.yaml") for body in documents(EXAMPLE / name)]
 
 
 def kube_of(cluster: Cluster, report: Say) -> Kube:
-    """Kubectl and helm on an embedded cluster."""
+    """Return kubectl and helm for an embedded cluster."""
     programs = ensure_binaries(("kubectl", "helm"), report=report)
     return Kube(programs["kubectl"], programs["helm"], cluster.kubeconfig)
 
 
 def install_fractus(kube: Kube, values: Sequence[str] = ()) -> None:
-    """Install or upgrade the charts of this checkout, with values of the chart fractus (`key=value`)."""
+    """Install or upgrade the charts of this checkout, with `key=value` settings for the chart fractus."""
     for release in RELEASES:
         kube.install(release, ROOT / "charts" / release, values if release == "fractus" else ())
 
 
 class DemoCluster(Protocol):
-    """A cluster that the demo can use.
+    """A cluster for the demo.
 
     Attributes:
-        disposable: no one else uses it: pods may be restarted, and it goes away with all that is on it.
+        disposable: True if the cluster belongs to the demo, so pods may be restarted and objects remain until it is
+            removed.
     """
 
     disposable: bool
 
     def images(self) -> None:
-        """Build what the nodes will run."""
+        """Build the images of the nodes."""
 
     def up(self) -> Kube:
-        """Bring it up, with images on its nodes and nodes labelled."""
+        """Start the cluster with images on its nodes and labelled nodes."""
 
     def surroundings(self, kube: Kube) -> list[str]:
-        """Make what the example flies in: a depot, zones, policies, and nodes' descriptions and hardware where they bring none.
+        """Create depot, zones and policies, and on other clusters also node descriptions and simulated hardware.
 
         Returns:
-            The releases of charts that were not there before.
+            Releases of charts that were newly installed.
         """
 
     def down(self) -> None:
-        """Leave it as it was found."""
+        """Restore the original state of the cluster."""
 
 
 @dataclass
 class EmbeddedCluster:
-    """A cluster on this machine; taken down again unless it ran before."""
+    """A cluster on this machine. It is removed at the end unless it was already running."""
 
     say: Say
     disposable: bool = True
@@ -94,30 +95,30 @@ class EmbeddedCluster:
     _was_running: bool = False
 
     def images(self) -> None:
-        """Build the images whose content changed."""
+        """Build the images with changed content."""
         self.built = build_images(ROOT, targets=TARGETS, report=self.say)
 
     def up(self) -> Kube:
-        """Bring the cluster of examples/clusters/demo.yaml up."""
+        """Start the cluster of examples/clusters/demo.yaml."""
         self._cluster = Cluster.load(ROOT / "examples" / "clusters" / "demo.yaml", report=self.say)
         self._was_running = self._cluster.running
         self._cluster.up(images=self.built)
         return kube_of(self._cluster, self.say)
 
     def surroundings(self, kube: Kube) -> list[str]:
-        """Depot, zones and policies: vehicles stand beside the nodes, and agents register them."""
+        """Apply depot, zones and policies. Vehicles are part of the nodes, and agents register them."""
         kube.apply(surroundings())
         return []
 
     def down(self) -> None:
-        """Take the cluster down if it was brought up here."""
+        """Remove the cluster if the demo started it."""
         if self._cluster is not None and not self._was_running:
             self._cluster.down()
 
 
 @dataclass
 class CurrentCluster:
-    """The cluster of KUBECONFIG; images are there, and the example's nodes are assigned to its nodes."""
+    """The cluster of KUBECONFIG with loaded images. Its nodes are assigned to the nodes of the example."""
 
     say: Say
     given: Mapping[str, str]
@@ -125,11 +126,11 @@ class CurrentCluster:
     _assigned: Mapping[str, str] = field(default_factory=dict)
 
     def images(self) -> None:
-        """Nothing: they are loaded by the cluster's operator."""
-        self.say(f"expecting images localhost/fractus/{{{','.join((*TARGETS, 'sim'))}}}:dev on the nodes")
+        """Do nothing. The administrator of the cluster loads the images."""
+        self.say(f"using images localhost/fractus/{{{','.join((*TARGETS, 'sim'))}}}:dev on the nodes")
 
     def up(self) -> Kube:
-        """Find the cluster, assign and label its nodes."""
+        """Connect to the cluster, and assign and label its nodes."""
         found = [shutil.which(name) for name in ("kubectl", "helm")]
         if None in found:
             raise DemoError("kubectl and helm must be on the PATH for --cluster current")
@@ -139,32 +140,32 @@ class CurrentCluster:
         self._assigned = assign(nodes, self.given)
         for example, node in self._assigned.items():
             kube.run("label", "node", node, f"{CLASS_LABEL}={class_of(example)}", "--overwrite")
-            self.say(f"{example} is {node}")
+            self.say(f"node {node} is used as {example}")
         return kube
 
     def surroundings(self, kube: Kube) -> list[str]:
-        """The chart fractus-demo, with nodes as they are assigned."""
+        """Install the chart fractus-demo with the assigned nodes."""
         edges = ",".join(node for example, node in sorted(self._assigned.items()) if class_of(example) == "edge")
         named = (f"drone={self._assigned['drone-1']}", f"edgeNodes={{{edges}}}")
         return [DEMO_CHART] if kube.install(DEMO_CHART, ROOT / "charts" / DEMO_CHART, named) else []
 
     def down(self) -> None:
-        """Nothing: labels stay, for the next time."""
+        """Do nothing. Labels remain for the next run."""
 
 
 def class_of(example: str) -> str:
-    """drone, edge or cloud, from the name that a node has in the example."""
+    """Return drone, edge or cloud from the name of an example node."""
     return example.split("-", maxsplit=1)[0]
 
 
 def assign(nodes: Sequence[Object], given: Mapping[str, str]) -> dict[str, str]:
-    """Which node stands for which of the example's: drone-1, edge-1 to edge-3, cloud-1.
+    """Assign nodes of the cluster to the nodes of the example: drone-1, edge-1 to edge-3, cloud-1.
 
-    What is given comes first, then equal names, then nodes with the label of the class, by name. edge-3 may be missing:
-    it is there to be rejected.
+    Explicit assignments come first, then equal names, then nodes with the label of the class in order of their names.
+    edge-3 is optional because the example only expects its rejection.
 
     Raises:
-        DemoError: a node is missing; the message says how to name it.
+        DemoError: A node is missing. The message says how to assign it.
     """
     names = {node["metadata"]["name"]: node["metadata"].get("labels", {}).get(CLASS_LABEL) for node in nodes}
     unknown = sorted(set(given.values()) - set(names))
@@ -184,7 +185,7 @@ def assign(nodes: Sequence[Object], given: Mapping[str, str]) -> dict[str, str]:
             assigned[example] = free[0]
         elif example != "edge-3":
             raise DemoError(
-                f"no node of this cluster stands for {example}; name one: --assign {example}=NODE"
+                f"no node of this cluster can be used as {example}; assign one with --assign {example}=NODE"
                 f" (nodes: {', '.join(sorted(names))})"
             )
     return assigned

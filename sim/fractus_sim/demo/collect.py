@@ -1,4 +1,4 @@
-"""Gathers what a mission left on the cluster: objects, events, the drone's audit logs, pictures from the flight."""
+"""Collection of mission data from the cluster: objects, events, audit logs of the drone, and pictures."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ _KEPT = re.compile(rb"\[pod/[^/]+/data-store\] .* kept ")
 
 
 def collect(kube: Kube, mission: Mission, folder: Path, log: Path) -> None:
-    """Write objects.json, events.json and the audit logs into a folder; `log` is the components'.
+    """Write objects.json, events.json and the audit logs into a folder. `log` is the log of the components.
 
     Raises:
-        DemoError: the API server does not answer.
+        DemoError: The API server did not respond.
     """
     objects = [body for body in kube.objects(_KINDS) if _concerns(body, mission.application)]
     events = [
@@ -56,14 +56,14 @@ def _concerns(body: Object, application: str) -> bool:
 
 
 def _audit(kube: Kube, mission: Mission, folder: Path) -> dict[str, Any]:
-    """Fetch the drone's logs, check their chains, and count what is of this mission."""
+    """Fetch the audit logs of the drone, verify their chains, and count the entries of this mission."""
     found: dict[str, Any] = {"entries": 0, "kept": 0, "problem": ""}
     if not mission.drone:
         return {}
     try:
         fetch_logs(kube, mobility_pod(kube, mission.drone), folder / AUDIT)
     except DemoError as error:
-        return {**found, "problem": f"it could not be fetched: {error}"}
+        return {**found, "problem": f"cannot be fetched: {error}"}
 
     def counted(files: list[Path]) -> Iterator[bytes]:
         for _, _, line in lines_of(files):
@@ -79,10 +79,10 @@ def _audit(kube: Kube, mission: Mission, folder: Path) -> dict[str, Any]:
 
 
 def fetch_logs(kube: Kube, pod: str, folder: Path) -> None:
-    """Copy the audit logs of a node's services, with all their segments.
+    """Copy the audit logs of a node's services with all segments.
 
     Raises:
-        DemoError: they cannot be read.
+        DemoError: The logs cannot be read.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for _ in range(_TRIES):
@@ -93,7 +93,7 @@ def fetch_logs(kube: Kube, pod: str, folder: Path) -> None:
                 kube.fetch(pod, f"{_AUDIT}/{name}", folder / name)
         if _audit_files(kube, pod) == listed:
             return
-    raise DemoError(f"the audit log of pod {pod} begins new files faster than they can be read")
+    raise DemoError(f"the audit log of pod {pod} rotates faster than it can be copied")
 
 
 def _audit_files(kube: Kube, pod: str) -> list[str]:
@@ -102,9 +102,9 @@ def _audit_files(kube: Kube, pod: str) -> list[str]:
 
 
 def keep_pictures(recordings: Iterable[Path], record: Record, folder: Path) -> None:
-    """Keep a few of the pictures that were taken in flight, after privacy filters, from the camera service's recordings.
+    """Extract a few in-flight pictures, after privacy filters, from the recordings of the camera service.
 
-    Components delete the pictures of their albums once they have them.
+    The image stores cannot be used because components delete their pictures after retrieval.
     """
     if record.takeoff_s is None:
         return
@@ -116,8 +116,8 @@ def keep_pictures(recordings: Iterable[Path], record: Record, folder: Path) -> N
 
 
 def _pictures(recording: Path) -> Iterator[tuple[str, bytes]]:
-    """Names, by when they were taken, and contents, up to where a recording that is still written breaks off."""
-    # Whatever it is damaged by, the report goes on without the rest.
+    """Yield names (by capture time) and contents of pictures. Stop at the end of an incomplete recording."""
+    # A damaged recording must not prevent the report.
     with recording.open("rb") as file, contextlib.suppress(McapError, KeyError, RuntimeError, ValueError):
         for schema, _, message in NonSeekingReader(file).iter_messages(log_time_order=False):
             if schema is not None and schema.name == "foxglove.CompressedImage":
@@ -127,7 +127,7 @@ def _pictures(recording: Path) -> Iterator[tuple[str, bytes]]:
 
 
 def spread(names: list[str], begin_s: float, end_s: float) -> list[str]:
-    """Those pictures that were taken nearest to a quarter, half and three quarters of a time; oldest first."""
+    """Return the pictures closest to a quarter, half and three quarters of a time span, oldest first."""
     taken = {name: taken_s(name) for name in names}
     inside = [name for name in names if begin_s <= taken[name] <= end_s]
     if not inside:
@@ -141,10 +141,10 @@ def spread(names: list[str], begin_s: float, end_s: float) -> list[str]:
 
 
 def mobility_pod(kube: Kube, node: str) -> str:
-    """Name of the pod of a drone's mobility service.
+    """Return the name of the pod of a drone's mobility service.
 
     Raises:
-        DemoError: there is none.
+        DemoError: No such pod is running.
     """
     text = kube.run(
         "get", "pods", "-n", SYSTEM, "--field-selector", f"spec.nodeName={node},status.phase=Running", "-o",
@@ -153,7 +153,7 @@ def mobility_pod(kube: Kube, node: str) -> str:
     for name in text.split():
         if name.startswith("fractus-mobility"):
             return name
-    raise DemoError(f"no mobility service runs on {node}")
+    raise DemoError(f"no mobility service is running on {node}")
 
 
 def _event(event: Object) -> dict[str, Any]:

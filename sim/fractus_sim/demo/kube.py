@@ -1,4 +1,4 @@
-"""kubectl and helm on one cluster, as the demo needs them."""
+"""kubectl and helm commands for one cluster."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ NAMESPACE = "default"
 
 
 class DemoError(Exception):
-    """The demo cannot go on; the text says what to do."""
+    """The demo cannot continue. The message says what to do."""
 
 
 @dataclass(frozen=True, slots=True)
 class Kube:
-    """One cluster and the programs that speak to it; the release tool is helm."""
+    """One cluster with the programs that access it. The release tool is helm."""
 
     kubectl: Path
     release_tool: Path
     kubeconfig: Path
 
     def run(self, *arguments: str, stdin: str | None = None, timeout_s: float = 60.0) -> str:
-        """Run kubectl to its end and return its standard output.
+        """Run kubectl and return its standard output.
 
         Raises:
-            DemoError: it failed or took too long.
+            DemoError: The command failed or timed out.
         """
         return self._run(self.kubectl, arguments, stdin, timeout_s)
 
     def fetch(self, pod: str, path: str, to: Path, timeout_s: float = 120.0) -> None:
-        """Copy a file of a pod of the system, as it is now; there is no half file.
+        """Copy a file of a system pod. An incomplete copy is removed.
 
         Raises:
-            DemoError: it cannot be read, or not written here.
+            DemoError: The file cannot be read or written.
         """
         scratch = to.with_name(f".{to.name}")
         try:
@@ -54,7 +54,7 @@ class Kube:
             scratch.unlink(missing_ok=True)
 
     def objects(self, kinds: str, namespace: str = NAMESPACE) -> list[Object]:
-        """Objects of the kinds (comma-separated) in a namespace, or of the whole cluster where they have none."""
+        """Return objects of the kinds (comma-separated) in a namespace. Cluster-scoped kinds are also supported."""
         text = self.run("get", kinds, "-n", namespace, "-o", "json")
         return list(json.loads(text)["items"])
 
@@ -63,14 +63,14 @@ class Kube:
         self.run("apply", "-f", "-", stdin=yaml.safe_dump_all(objects))
 
     def delete(self, objects: Sequence[Object], timeout_s: float) -> None:
-        """Delete what manifests made, and wait until it is gone."""
+        """Delete the objects of manifests and wait until they are gone."""
         text = yaml.safe_dump_all(objects)
         self.run(
             "delete", "-f", "-", "--ignore-not-found", f"--timeout={timeout_s:.0f}s", stdin=text, timeout_s=timeout_s + 10
         )  # fmt: skip
 
     def install(self, release: str, chart: Path, values: Sequence[str] = ()) -> bool:
-        """Install or upgrade a chart with some values (`key=value`); True when it was not there before."""
+        """Install or upgrade a chart with `key=value` settings. Return True if it is a new installation."""
         listed = self._run(self.release_tool, ["list", "-n", SYSTEM, "-q", "-f", f"^{release}$"], None, 60.0)
         arguments = ["upgrade", "--install", release, str(chart), "-n", SYSTEM, "--create-namespace"]
         arguments += [f"--set={value}" for value in values]
@@ -78,13 +78,13 @@ class Kube:
         return not listed.strip()
 
     def uninstall(self, release: str) -> None:
-        """Take a release away."""
+        """Uninstall a release."""
         self._run(self.release_tool, ["uninstall", release, "-n", SYSTEM, "--ignore-not-found", "--wait"], None, 180.0)
 
     def follow(
         self, arguments: Sequence[str], out: IO[bytes] | int, stdin: int | None = None
     ) -> subprocess.Popen[bytes]:
-        """Start a kubectl that writes until it is ended."""
+        """Start a kubectl process that writes until it is ended."""
         return subprocess.Popen(
             [str(self.kubectl), *arguments], stdin=stdin, stdout=out, stderr=subprocess.DEVNULL, env=self._environment()
         )
@@ -110,7 +110,7 @@ class Kube:
                 check=False,
             )
         except subprocess.TimeoutExpired:
-            raise DemoError(f"{words}: no end after {timeout_s:.0f} s") from None
+            raise DemoError(f"{words}: timed out after {timeout_s:.0f} s") from None
         except OSError as error:
             raise DemoError(f"cannot run {program}: {error.strerror}; install it, or use --cluster embedded") from None
         if done.returncode:

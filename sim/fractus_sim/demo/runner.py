@@ -1,4 +1,4 @@
-"""The demo from an empty machine to a report, step by step."""
+"""The steps of the demo: images, cluster, installation, mission, report and clean-up."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from fractus_sim.report.summary import figures
 READY_TIMEOUT_S = 180.0
 HOME_TIMEOUT_S = 180.0
 _OWN_VALUES = {"fractus": ("camera.recordings.enabled=true",)}
-"""Of a cluster of the demo's own: its report shows pictures, and components delete theirs."""
+"""Chart values on a cluster of the demo. Recordings are needed because components delete their pictures."""
 LOGS = "components.log"
 
 
 class Teller:
-    """Says what happens: a line for what is done, a line that changes for what is under way."""
+    """Prints progress: one line per event, and a status line for the current step."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -40,18 +40,18 @@ class Teller:
         self._start = time.monotonic()
 
     def __call__(self, line: str) -> None:
-        """Say something for good."""
+        """Print a line."""
         stamp = f"[dim]{time.monotonic() - self._start:7.1f} s[/dim]"
-        with suppress(OSError):  # the terminal is gone; what is to be cleaned up still is
+        with suppress(OSError):  # # Terminal closed. The clean-up must still run.
             self._console.print(f"{stamp}  {_escaped(line)}", highlight=False, soft_wrap=True)
 
     def show(self, line: str) -> None:
-        """Say what is so at the moment."""
+        """Update the status line."""
         self._status.update(_escaped(line))
 
     @contextmanager
     def step(self, what: str) -> Iterator[None]:
-        """Announce a step, and say how long it took."""
+        """Announce a step, and print its duration at the end."""
         started = time.monotonic()
         self(f"{what} ...")
         self.show(what)
@@ -71,13 +71,13 @@ def _escaped(line: str) -> str:
 
 @dataclass
 class Demo:
-    """One run.
+    """One run of the demo.
 
     Attributes:
-        cluster: where it runs.
-        out: folder of the report.
-        keep: leave cluster, Fractus and objects as they are at the end.
-        timeout_s: how long the mission may take.
+        cluster: Cluster to use.
+        out: Output folder of the report.
+        keep: Do not remove cluster, Fractus and objects at the end.
+        timeout_s: Maximum duration of the mission.
     """
 
     cluster: DemoCluster
@@ -87,14 +87,14 @@ class Demo:
     tell: Teller
 
     def run(self) -> bool:
-        """Run all steps; what was recorded is reported, and the cluster left in order, also after a failure.
+        """Run all steps. After a failure, the report is still written and the cluster is still cleaned up.
 
         Returns:
-            Whether the mission was completed, with a request corrected and one refused, and the drone landed.
+            True if the mission completed, one request was corrected and one denied, and the drone landed.
 
         Raises:
-            DemoError: a step failed.
-            ClusterError: the embedded cluster could not be brought up.
+            DemoError: A step failed.
+            ClusterError: The embedded cluster did not start.
         """
         self.out.mkdir(parents=True, exist_ok=True)
         for stale in (PAGE, OBJECTS, "events.json", LOGS):
@@ -108,7 +108,7 @@ class Demo:
                 self.cluster.images()
             with self.tell.step("cluster"):
                 kube = self.cluster.up()
-            with self.tell.step("what an earlier run left"):
+            with self.tell.step("removing objects of an earlier run"):
                 self._remove_application(kube)
             with self.tell.step("Fractus"):
                 self._install(kube, installed)
@@ -120,10 +120,10 @@ class Demo:
 
     def _install(self, kube: Kube, installed: list[str]) -> None:
         for release in RELEASES:
-            # On another's cluster the values are theirs.
+            # The values of a foreign cluster are not changed.
             values = _OWN_VALUES.get(release, ()) if self.cluster.disposable else ()
             installed.extend([release] if kube.install(release, ROOT / "charts" / release, values) else [])
-        if self.cluster.disposable and "fractus" not in installed:  # images of the same name may have new content
+        if self.cluster.disposable and "fractus" not in installed:  # # Images with the same name may have new content.
             kube.run(
                 "delete", "pods", "-n", SYSTEM, "-l", "app.kubernetes.io/name=fractus", "--timeout=60s", timeout_s=90
             )
@@ -155,10 +155,10 @@ class Demo:
             self.tell(f"no recording of the flight: {error}")
             return
         if not recordings:
-            self.tell("no recording of the flight: the drone's services make none")
+            self.tell("no recording of the flight: the services of the drone do not record")
         elif not any((self.out / PICTURES).glob("*")):
             self.tell(
-                "no pictures of the flight: the camera service records none (chart value camera.recordings.enabled)"
+                "no pictures of the flight: the camera service does not record (chart value camera.recordings.enabled)"
             )
 
     def _clean_up(self, kube: Kube | None, installed: list[str]) -> None:
@@ -166,12 +166,12 @@ class Demo:
             try:
                 self._remove(kube, installed)
             except DemoError as error:
-                self.tell(f"not removed: {error}")
+                self.tell(f"clean-up failed: {error}")
         with uninterrupted():
             self.cluster.down()
 
     def _remove_application(self, kube: Kube) -> None:
-        """Delete the application and wait until no drone is in the air."""
+        """Delete the application and wait until all drones have landed."""
         if "applications.fractus.dev" not in kube.run("get", "crd", "-o", "name"):
             return
         kube.delete(documents(EXAMPLE / "application.yaml"), HOME_TIMEOUT_S)
@@ -197,24 +197,24 @@ def _as_promised(record: Record, tell: Teller) -> bool:
         for what, holds in (
             ("the mission is not Completed", found["phase"] == "Completed"),
             ("no request was corrected", found["corrected"] > 0),
-            ("no request was refused", found["refused"] > 0),
+            ("no request was denied", found["refused"] > 0),
             ("the drone has not landed", found["landed"]),
-            ("the audit log does not verify", found["audit"].get("problem") == ""),
+            ("the audit log is not valid", found["audit"].get("problem") == ""),
         )
         if not holds
     ]
     for what in missing:
-        tell(f"not as it should be: {what}")
+        tell(f"expectation not met: {what}")
     return not missing
 
 
 def report_again(out: Path) -> None:
-    """Write the report of an earlier run again from what it recorded.
+    """Write the report of an earlier run again from its recorded data.
 
     Raises:
-        DemoError: nothing was recorded there.
+        DemoError: The folder contains no recorded data.
     """
     try:
         write_report(Record.read(out), out)
     except (OSError, json.JSONDecodeError) as error:
-        raise DemoError(f"no record of a flight in {out}: {error}") from None
+        raise DemoError(f"no recorded flight in {out}: {error}") from None

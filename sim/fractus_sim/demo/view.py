@@ -1,4 +1,4 @@
-"""The mission on a web page: live while it flies, and from its recording afterwards."""
+"""The mission in the web view: live during the flight, and from its recording afterwards."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fractus_sim.demo.collect import mobility_pod
 from fractus_sim.demo.kube import SYSTEM, Kube
 
 RECORDINGS = "recordings"
-"""Folder of the report."""
+"""Folder of recordings in the report."""
 
 _ON_NODE = "/var/lib/fractus/recordings"
 _LIST = "import sys, pathlib as p; r = p.Path(sys.argv[1]); [print(f.stat().st_mtime, f.relative_to(r)) for f in r.glob('*/*.mcap')]"
@@ -22,7 +22,7 @@ _END_S = 10.0
 
 @contextlib.contextmanager
 def shown(kubeconfig: Path, say: Callable[[str], None]) -> Iterator[None]:
-    """Serve the page of `fractus view`, and say its address; without it the demo goes on."""
+    """Serve the page of `fractus view` and print its address. The demo continues if the page cannot be served."""
     command = [sys.executable, "-m", "fractus_cli", "view", "--kubeconfig", str(kubeconfig), "--listen", "127.0.0.1:0"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
 
@@ -30,9 +30,9 @@ def shown(kubeconfig: Path, say: Callable[[str], None]) -> Iterator[None]:
             line = process.stdout.readline().strip() if process.stdout is not None else ""
             _, found, address = line.partition("view: open ")
             if line:
-                say(f"watch it: {address}" if found else f"no live view: {line}")
+                say(f"live view: {address}" if found else f"live view not available: {line}")
 
-        # The mission does not wait for it.
+        # The mission does not wait for the page.
         telling = threading.Thread(target=tell, daemon=True)
         telling.start()
         try:
@@ -47,12 +47,13 @@ def shown(kubeconfig: Path, say: Callable[[str], None]) -> Iterator[None]:
 
 
 def fetch_recordings(kube: Kube, drone: str, since_s: float, folder: Path) -> list[Path]:
-    """Copy what the services of a drone wrote into recordings since some time (Unix seconds); none where they record nothing.
+    """Copy the recordings that the services of a drone wrote since a time (Unix seconds).
 
-    A recording of the mission may have begun before it: seconds before the motors were armed are in it, too.
+    A recording can begin before the mission, because recordings include the seconds before arming. The result is empty
+    if the services do not record.
 
     Raises:
-        DemoError: they cannot be read.
+        DemoError: The recordings cannot be read.
     """
     pod = mobility_pod(kube, drone)
     found: list[Path] = []
@@ -67,5 +68,5 @@ def fetch_recordings(kube: Kube, drone: str, since_s: float, folder: Path) -> li
 
 
 def replay_command(folder: Path) -> str | None:
-    """What shows the recordings of a report; None where there are none."""
+    """Return the command that shows the recordings of a report, or None without recordings."""
     return f"fractus view {folder / RECORDINGS}/*.mcap" if any((folder / RECORDINGS).glob("*.mcap")) else None

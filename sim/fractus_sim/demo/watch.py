@@ -1,4 +1,4 @@
-"""Follows a mission on a cluster from apply to landing, and says what changes."""
+"""Observation of a mission on a cluster from apply to landing, with a progress line for each change."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ _LOG_LINE = re.compile(rb"\[pod/(?P<pod>[^/]+)/(?P<container>[^\]]+)\] (?P<text>
 
 @dataclass
 class Mission:
-    """What was seen of a mission.
+    """Observed state of a mission.
 
     Attributes:
-        application: name of the Application.
-        times: Unix seconds of what happened: applied, planned, running, ended, landed.
-        pods: last state seen of each pod, by name.
-        links: each change of a path of traffic: when (Unix seconds), node, cloud or direct, and why.
-        phase: the Application's.
+        application: Name of the Application.
+        times: Unix seconds of events: applied, planned, running, ended, landed.
+        pods: Last observed state of each pod, by name.
+        links: Changes of the traffic path: Unix seconds, node, cloud or direct, and reason.
+        phase: Phase of the Application.
     """
 
     application: str
@@ -44,7 +44,7 @@ class Mission:
     _running: int = 0
 
     def see(self, objects: list[Object], now_s: float, say: Say) -> None:
-        """Take a look at the cluster's objects, and say what is new."""
+        """Read the objects of the cluster and report changes."""
         for body in objects:
             kind, name = body["kind"], body["metadata"]["name"]
             if kind == "Application" and name == self.application:
@@ -52,7 +52,9 @@ class Mission:
             elif kind == "DeploymentPlan" and name == self.application and "planned" not in self.times:
                 self.times["planned"] = now_s
                 placements = body["spec"].get("placements", [])
-                say(f"planned after {now_s - self.times['applied']:.1f} s: {len(placements)} instances, {_drone(body)}")
+                say(
+                    f"plan created after {now_s - self.times['applied']:.1f} s: {len(placements)} instances, {_drone(body)}"
+                )
             elif kind == "Pod" and not _ends(body):
                 self.pods[name] = body
             elif kind == "DirectLink" and body["spec"]["application"]["name"] == self.application:
@@ -63,12 +65,12 @@ class Mission:
 
     @property
     def ended(self) -> bool:
-        """Whether the Application's mission is over, also while the drone comes home."""
+        """True if the mission of the Application has ended. The drone may still be returning."""
         return self.phase in {"Returning", "Completed", "Failed", "Invalid"}
 
     @property
     def grounded(self) -> bool:
-        """Whether the drone is not in the air, as far as its agent and the operator say."""
+        """True if the drone is on the ground according to its agent and the operator."""
         return self.phase != "Returning" and (self.flight_state in GROUNDED or not self.drone)
 
     def _see_application(self, body: Object, now_s: float, say: Say) -> None:
@@ -97,8 +99,8 @@ class Mission:
         if traffic != before:
             why = status.get("message", "")
             self.links.append({"time": now_s, "node": node, "traffic": traffic, "why": why})
-            to = f"by WiFi to {node}" if traffic == "direct" else f"no more by WiFi to {node}"
-            say(f"traffic goes {to}: {why}")
+            path = f"to the direct link to {node}" if traffic == "direct" else f"from {node} to the cloud path"
+            say(f"traffic moved {path}: {why}")
 
     def _see_pods(self, now_s: float, say: Say) -> None:
         running = sum(map(is_ready, self.pods.values()))
@@ -111,18 +113,18 @@ class Mission:
 
 
 def follow(kube: Kube, mission: Mission, logs: Path, *, timeout_s: float, say: Say, show: Say) -> None:
-    """Watch until the mission is over and the drone is down.
+    """Observe the mission until it has ended and the drone has landed.
 
     Args:
-        kube: the cluster.
-        mission: what was seen; `times["applied"]` is set.
-        logs: file that gets the components' logs.
-        timeout_s: for the mission without the landing.
-        say: gets what changed, a line at a time.
-        show: gets what is so now, for a status line.
+        kube: Cluster.
+        mission: Mission to update. `times["applied"]` must be set.
+        logs: File for the logs of the components.
+        timeout_s: Maximum duration of the mission without the landing.
+        say: Called with one line per change.
+        show: Called with the current state for a status line.
 
     Raises:
-        DemoError: the time is over.
+        DemoError: The timeout expired.
     """
     deadline = mission.times["applied"] + timeout_s
     tail: subprocess.Popen[bytes] | None = None
@@ -156,10 +158,10 @@ def follow(kube: Kube, mission: Mission, logs: Path, *, timeout_s: float, say: S
 
 
 def wait_ready(kube: Kube, timeout_s: float, show: Say) -> None:
-    """Wait until some drone reports that it can fly.
+    """Wait until a drone reports that it is ready to fly.
 
     Raises:
-        DemoError: it did not in time; the message carries its condition.
+        DemoError: No drone was ready before the timeout. The message contains its condition.
     """
     deadline = time.monotonic() + timeout_s
     reason = "no Drone has registered"
@@ -176,7 +178,7 @@ def wait_ready(kube: Kube, timeout_s: float, show: Say) -> None:
 
 
 def _sick(kube: Kube) -> list[str]:
-    """Pods of the system that do not get up, with the reason."""
+    """Return the system pods that fail to start, with the reason."""
     found = []
     for pod in kube.objects("pods", SYSTEM):
         for container in pod.get("status", {}).get("containerStatuses", ()):
@@ -187,7 +189,7 @@ def _sick(kube: Kube) -> list[str]:
 
 
 def _tell(logs: Path, start: int, say: Say) -> int:
-    """Say what the driver logged since; returns where to go on."""
+    """Report new log lines of the driver. Return the offset where the next call continues."""
     with logs.open("rb") as file:
         file.seek(start)
         fresh = file.read()
@@ -200,7 +202,7 @@ def _tell(logs: Path, start: int, say: Say) -> int:
 
 
 def _ends(pod: Object) -> bool:
-    """Whether a pod's mission is over: what is reported of it is how it ran."""
+    """Return True if a pod's mission has ended, so its last running state is kept."""
     metadata = pod["metadata"]
     return "deletionTimestamp" in metadata or "fractus.dev/finished" in metadata.get("labels", {})
 

@@ -1,4 +1,4 @@
-"""From what was recorded of a flight to one page, pictures and GeoJSON; the same record gives the same files."""
+"""Reports of recorded flights: summary page, figures and GeoJSON. The output is deterministic."""
 
 from fractus_sim.report.record import Record
 from fractus_sim.report.write import write_report

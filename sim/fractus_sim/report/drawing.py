@@ -1,4 +1,4 @@
-"""What the pictures share: colours that colour-blind people tell apart (Okabe and Ito), marks, deterministic files."""
+"""Common parts of the figures: colour-blind safe colours (Okabe and Ito), marks, and deterministic files."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ TRACK_COLOURS = (BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, "#8C6D1F", "#44444
 
 
 def legend(figure: Figure, *every: Any, columns: int = 5) -> None:
-    """One legend below the picture for all axes, each label once."""
+    """Add one legend for all axes below the figure. Each label appears once."""
     entries = [entry for axes in every for entry in zip(*axes.get_legend_handles_labels(), strict=True)]
     unique = {label: handle for handle, label in entries}
     figure.legend(unique.values(), unique.keys(), loc="outside lower center", ncols=columns, fontsize=8, frameon=False)
 
 
 def canvas(width_in: float, height_in: float) -> tuple[Figure, Any]:
-    """A figure with one axes, outside pyplot's global state."""
+    """Return a figure with one axes, without pyplot's global state."""
     figure, (axes,) = panels(width_in, (height_in,))
     return figure, axes
 
 
 def panels(width_in: float, heights_in: Sequence[float], *, sharex: bool = False) -> tuple[Figure, list[Any]]:
-    """A figure with axes above each other."""
+    """Return a figure with vertically stacked axes."""
     figure = Figure(figsize=(width_in, sum(heights_in)), dpi=150, layout="constrained")
     FigureCanvasAgg(figure)
     every = figure.subplots(len(heights_in), 1, sharex=sharex, squeeze=False, height_ratios=list(heights_in))[:, 0]
@@ -44,7 +44,7 @@ def panels(width_in: float, heights_in: Sequence[float], *, sharex: bool = False
 
 
 def number(axes: Any, text: str, x: float, y: float) -> None:
-    """Write a request's number beside its mark."""
+    """Draw the number of a request next to its mark."""
     axes.annotate(
         text, (x, y), xytext=(7, 5), textcoords="offset points", fontsize=8, fontweight="bold", color=INK, zorder=9,
         bbox={"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.8},
@@ -52,5 +52,5 @@ def number(axes: Any, text: str, x: float, y: float) -> None:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a PNG without dates or versions, so that the same flight gives the same bytes."""
+    """Write a PNG without dates and versions, so that the same flight gives the same bytes."""
     figure.savefig(path, metadata={"Software": None})

@@ -1,4 +1,4 @@
-"""The flight as GeoJSON (lon, lat), for maps of others."""
+"""The flight as GeoJSON (lon, lat)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fractus_sim.report.record import Judgement, Record
 
 
 def features(record: Record) -> dict[str, Any]:
-    """A FeatureCollection: path, requests, zones, operation area, nodes, depots."""
+    """Return a FeatureCollection with path, requests, zones, operation area, nodes and depots."""
     found: list[dict[str, Any]] = []
     if record.samples:
         found.append(path(record.track))

@@ -1,4 +1,4 @@
-"""Flights seen from above: paths, zones, nodes and their reach, and what happened where."""
+"""Map of flights: paths, zones, nodes with their range, and marks of events."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def draw_map(scene: Scene) -> Figure:
 
 
 def _bounds(scene: Scene) -> Bounds:
-    """What is shown: paths, operation area, marks, and the zones that close or deny; the rest is cut off."""
+    """Return the visible extent: paths, operation area, marks and restrictive zones. Other objects are clipped."""
     shown: list[XY] = [scene.frame.xy(s.place.lat, s.place.lon) for track in scene.tracks for s in track.samples]
     shown += [mark.at for mark in scene.marks]
     if scene.area is not None and not scene.area.is_empty:
@@ -126,7 +126,7 @@ def _zones(axes: Any, scene: Scene, bounds: Bounds) -> None:
 
 
 def _zone_name(axes: Any, name: str, shape: Any, colour: str, *, beside: bool) -> None:
-    """Write a zone's name on its upper border, or beside it where the path crosses it."""
+    """Draw the name of a zone at its upper border, or next to the zone if the path crosses that position."""
     low_x, low_y, high_x, high_y = shape.bounds
     at = (high_x, (low_y + high_y) / 2) if beside else ((low_x + high_x) / 2, high_y)
     axes.annotate(
@@ -172,7 +172,7 @@ def _nodes(axes: Any, scene: Scene, bounds: Bounds) -> None:
 
 
 def _far_node(axes: Any, name: str, at: XY, bounds: tuple[float, float, float, float]) -> None:
-    """Point at a node beyond the border."""
+    """Draw a pointer to a node outside of the map."""
     middle = ((bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2)
     dx, dy = at[0] - middle[0], at[1] - middle[1]
     half = ((bounds[2] - bounds[0]) / 2, (bounds[3] - bounds[1]) / 2)
@@ -191,7 +191,7 @@ def _points(scene: Scene, track: Track) -> np.ndarray:
 
 
 def _path(axes: Any, scene: Scene, figure: Figure) -> None:
-    """The only track, coloured by altitude."""
+    """Draw a single track, coloured by altitude."""
     (track,) = scene.tracks
     if len(track.samples) < 2:
         return
@@ -209,7 +209,7 @@ def _path(axes: Any, scene: Scene, figure: Figure) -> None:
 
 
 def _paths(axes: Any, scene: Scene) -> None:
-    """Several tracks, each with its own colour and its start."""
+    """Draw several tracks, each with its own colour and start mark."""
     for index, track in enumerate(scene.tracks):
         if len(track.samples) < 2:
             continue
@@ -225,7 +225,7 @@ def _paths(axes: Any, scene: Scene) -> None:
 
 
 def _arrows(axes: Any, points: np.ndarray, colour: str = INK) -> None:
-    """Arrowheads in the direction of flight, at even distances along the path."""
+    """Draw arrowheads in flight direction at equal distances along the path."""
     steps = np.hypot(*np.diff(points, axis=0).T)
     along = np.concatenate([[0.0], np.cumsum(steps)])
     if along[-1] < 5.0:

@@ -1,4 +1,4 @@
-"""Pieces of GeoJSON (lon, lat, metres above home) that every report is made of."""
+"""GeoJSON building blocks (lon, lat, metres above home) of the reports."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ from fractus_sim.report.track import Place, Track
 
 
 def lonlat(place: Place) -> list[float]:
-    """A place as GeoJSON writes it."""
+    """Return the GeoJSON coordinates of a place."""
     return [round(place.lon, 7), round(place.lat, 7), round(place.alt_m, 2)]
 
 
 def point(coordinates: list[float]) -> dict[str, Any]:
-    """A Point."""
+    """Return a Point."""
     return {"type": "Point", "coordinates": coordinates}
 
 
 def feature(geometry: dict[str, Any], **properties: Any) -> dict[str, Any]:
-    """A Feature."""
+    """Return a Feature."""
     return {"type": "Feature", "geometry": geometry, "properties": properties}
 
 
 def path(track: Track, **properties: Any) -> dict[str, Any]:
-    """A track as a LineString Feature, with the time of each point."""
+    """Return a track as a LineString Feature with the time of each point."""
     line = {"type": "LineString", "coordinates": [lonlat(s.place) for s in track.samples]}
     times = [round(s.time_s, 3) for s in track.samples]
     return feature(line, what="path", drone=track.name, times=times, **properties)

@@ -1,4 +1,4 @@
-"""A mission on a cluster as map and profile show it."""
+"""Map and profile of a mission on a cluster."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _HOME_MODES = {"RTL": "the system flies home", "SMART_RTL": "the system flies ho
 
 
 def scene_of(record: Record) -> Scene:
-    """The mission's map."""
+    """Return the map of the mission."""
     frame = record.frame
     used = {p.node for p in record.plan.spec.placements} if record.plan else set()
     nodes = tuple(
@@ -49,7 +49,7 @@ def _links(record: Record, nodes: Mapping[str, XY]) -> Iterable[tuple[XY, XY]]:
 
 
 def profile_of(record: Record) -> Profile:
-    """The mission from the side; time runs from the takeoff."""
+    """Return the profile of the mission. Times are relative to the takeoff."""
     start_s = record.takeoff_s if record.takeoff_s is not None else record.times.get("applied", 0.0)
     return Profile(
         title=f"{record.application.name}: altitude",
@@ -80,7 +80,7 @@ def _area_shape(record: Record) -> Any:
 
 
 def _zones(record: Record) -> Iterable[DrawnZone]:
-    """Each zone with the strictest kind of policy that holds there for this drone."""
+    """Return each zone with the strictest policy that applies to this drone in it."""
     for zone in record.zones:
         kinds = {_kind(p) for p in record.policies_in_force if zone.name in p.spec.selector.zones}
         strictest = next((kind for kind in _STRICTEST if kind in kinds), None)
@@ -93,7 +93,7 @@ def _kind(policy: Policy) -> str:
 
 
 def marks_of(judgements: Sequence[Judgement], frame: LocalFrame) -> Iterable[Mark]:
-    """What policies changed, on the map."""
+    """Return map marks of calls that policies changed."""
     for index, judged in enumerate(judgements, 1):
         place = judged.asked or judged.at
         if place is None:
@@ -108,7 +108,7 @@ def marks_of(judgements: Sequence[Judgement], frame: LocalFrame) -> Iterable[Mar
 
 
 def _limits(record: Record) -> Iterable[Limit]:
-    """Altitude limits; which of them held where is in the summary."""
+    """Return the altitude limits. The summary lists where each limit applies."""
     for policy in record.policies_in_force:
         spec = policy.spec
         if spec.type != "LimitControl" or spec.kind != "altitude" or spec.altitude_reference != "home":
@@ -119,7 +119,7 @@ def _limits(record: Record) -> Iterable[Limit]:
 
 
 def _home_leg(record: Record) -> Iterable[Span]:
-    """What the system flew."""
+    """Return the time spans of flights by the system."""
     spans: list[Span] = []
     for sample in record.samples:
         if sample.mode not in _HOME_MODES or not sample.in_air:
@@ -132,7 +132,7 @@ def _home_leg(record: Record) -> Iterable[Span]:
 
 
 def requests_of(judgements: Sequence[Judgement]) -> Iterable[Request]:
-    """What policies changed, in the profile."""
+    """Return profile marks of calls that policies changed."""
     for index, judged in enumerate(judgements, 1):
         place = judged.asked or judged.at
         if place is None:
@@ -143,7 +143,7 @@ def requests_of(judgements: Sequence[Judgement]) -> Iterable[Request]:
         if judged.refused:
             yield Request("refused", str(index), judged.time_s, place.alt_m, "refused")
         else:
-            yield Request("corrected", str(index), judged.time_s, place.alt_m, "asked, and corrected", flown_m)
+            yield Request("corrected", str(index), judged.time_s, place.alt_m, "requested, and corrected", flown_m)
 
 
 def _climbs(judged: Judgement) -> bool:

@@ -1,4 +1,4 @@
-"""What the pages share: tables and times in Markdown."""
+"""Common parts of the pages: Markdown tables and time formats."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ PAGE = "summary.md"
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table in Markdown."""
+    """Return a Markdown table."""
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     lines += ["| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows]
     return "\n".join(lines)
 
 
 def clock(seconds: float | None) -> str:
-    """A duration for people."""
+    """Format a duration."""
     if seconds is None:
         return "-"
     whole = round(seconds)
@@ -24,12 +24,12 @@ def clock(seconds: float | None) -> str:
 
 
 def rounded(value: float | None) -> float | None:
-    """A figure for programs, to two places."""
+    """Round a value to two decimals."""
     return None if value is None else round(value, 2)
 
 
 def write_page(folder: Path, text: str) -> None:
-    """Write the page, whole or not at all; the last of a report, so that where there is a page there is all of it."""
+    """Write the page atomically, as the last file of a report. If the page exists, the report is complete."""
     scratch = folder / f".{PAGE}"
     try:
         scratch.write_text(text)

@@ -1,4 +1,4 @@
-"""Flights seen from the side: altitude, speed and battery over time, limits, requests, and what happened when."""
+"""Profile of flights: altitude, speed and battery over time, with limits, requests and events."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ Panel = Literal["altitude", "speed", "battery", "voltage"]
 _NAMED_TRACKS = 10
 _HEADROOM = 1.18
 _ROW_POINTS = 12
-_CHARACTER_SHARE = 0.0085  # of the axis, for a letter of the size of a fault's words
+_CHARACTER_SHARE = 0.0085  # # width of a letter of a fault label, as a share of the axis
 
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """A dashed line in a panel."""
+    """A dashed limit line in a panel."""
 
     panel: Panel
     value: float
@@ -30,7 +30,7 @@ class Limit:
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """A shaded stretch of time; `fault` draws it as something that went wrong, with its number."""
+    """A shaded time span. If `fault` is set, it is drawn as a numbered fault."""
 
     begin_s: float
     end_s: float
@@ -40,7 +40,7 @@ class Span:
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """A request that policies changed: what altitude was asked, and what was flown instead."""
+    """A request that policies changed: requested and flown altitude."""
 
     kind: Literal["refused", "corrected"]
     number: str
@@ -52,7 +52,7 @@ class Request:
 
 @dataclass(frozen=True)
 class Profile:
-    """Everything in one picture; times are on the tracks' clock, and shown since `start_s`."""
+    """Content of a profile. Times use the clock of the tracks and are shown relative to `start_s`."""
 
     title: str
     tracks: tuple[Track, ...]
@@ -73,7 +73,7 @@ _VALUES: Mapping[Panel, tuple[str, Callable[[Sample], float]]] = {
 
 
 def draw_profile(profile: Profile) -> Figure:
-    """Draw the panels above each other, on one axis of time."""
+    """Draw the panels vertically stacked with a common time axis."""
     figure, every = panels(9.0, _heights(profile), sharex=True)
     for axes, panel in zip(every, profile.panels, strict=True):
         shown = _curves(axes, profile, panel) + _limits(axes, profile, panel)
@@ -144,7 +144,7 @@ def _requests(axes: Any, profile: Profile) -> list[float]:
 
 
 def _rows(profile: Profile) -> list[tuple[Span, int]]:
-    """Spans with the row that a fault's words go to, so that those of neighbours do not overlap."""
+    """Yield spans with the row of their label, so that labels of neighbours do not overlap."""
     first, last = _time_span(profile)
     ends: list[float] = []
     placed = []

@@ -1,4 +1,4 @@
-"""What is known of one flight: the objects of the cluster, and the audit log with its flight recorder."""
+"""Data of one flight: objects of the cluster, and the audit log with its telemetry samples."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ _KINDS: tuple[type[Resource], ...] = (Application, DeploymentPlan, Depot, Drone,
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """A call that a policy corrected, refused, or answered by taking the drone.
+    """A call that a policy corrected, denied, or answered with a takeover.
 
     Attributes:
-        asked: where to, if the call was one to fly somewhere; without lat and lon of its own, where the drone was.
-        flown: where the drone was sent instead.
-        detail: the arguments in words, as asked.
-        count: how many times in a row it was asked alike.
+        asked: Requested position for calls that fly to a position. Missing lat and lon are the position of the drone.
+        flown: Position that was flown instead.
+        detail: Requested arguments as text.
+        count: Number of consecutive identical calls.
     """
 
     time_s: float
@@ -48,13 +48,13 @@ class Judgement:
 
     @property
     def refused(self) -> bool:
-        """Whether nothing of the call was carried out."""
+        """True if no part of the call was executed."""
         return self.action != "correct"
 
 
 @dataclass(frozen=True, slots=True)
 class PathChange:
-    """Traffic that took, or left, the direct link to a node; Unix seconds."""
+    """A change of traffic to or from a direct link. Times are Unix seconds."""
 
     time_s: float
     node: str
@@ -64,7 +64,7 @@ class PathChange:
 
 @dataclass(frozen=True, slots=True)
 class Pod:
-    """A pod of the application; times are Unix seconds, None while unknown."""
+    """A pod of the application. Times are Unix seconds, or None if unknown."""
 
     name: str
     component: str
@@ -76,7 +76,7 @@ class Pod:
 
 @dataclass(frozen=True)
 class Record:
-    """Everything that the report is made of; pictures are by the names of their files."""
+    """All data of the report. Pictures are listed by file name."""
 
     application: Application
     plan: DeploymentPlan | None
@@ -98,11 +98,11 @@ class Record:
 
     @classmethod
     def read(cls, folder: Path) -> Record:
-        """Read what the demo left in a folder.
+        """Read the files that the demo wrote to a folder.
 
         Raises:
-            OSError: a file is missing.
-            ValueError: a file is not what the demo writes.
+            OSError: A file is missing.
+            ValueError: The content of a file is invalid.
         """
         content = json.loads((folder / OBJECTS).read_text())
         applied_s = content.get("times", {}).get("applied", 0.0)
@@ -112,11 +112,11 @@ class Record:
 
     @classmethod
     def of(cls, content: Mapping[str, Any], audit: Iterable[Mapping[str, Any]]) -> Record:
-        """Make the record from parsed JSON.
+        """Create the record from parsed JSON.
 
         Args:
-            content: `objects` (manifests as the API server has them), `pods`, `events`, `times`, `audit`.
-            audit: entries of the drone's audit logs: calls, takeovers, and the flight recorder.
+            content: `objects` (manifests from the API server), `pods`, `events`, `times`, `audit`.
+            audit: Entries of the drone's audit logs: calls, takeovers, and telemetry samples.
         """
         found: dict[str, list[Any]] = {kind.KIND: [] for kind in _KINDS}
         parsers = {kind.KIND: kind for kind in _KINDS}
@@ -149,7 +149,7 @@ class Record:
 
     @property
     def policies_in_force(self) -> tuple[Policy, ...]:
-        """The policies that hold for some component of the application on the drone that flew."""
+        """Policies that apply to a component of the application on the drone that flew."""
         if self.drone is None:
             return self.policies
         attributes = node_attributes(self.drone)
@@ -160,27 +160,27 @@ class Record:
 
     @property
     def track(self) -> Track:
-        """The drone's flight."""
+        """Flight of the drone."""
         return Track(self.drone.name if self.drone else "no drone", self.samples)
 
     @property
     def home(self) -> Place | None:
-        """Where the drone took off."""
+        """Takeoff position."""
         return self.track.home
 
     @property
     def takeoff_s(self) -> float | None:
-        """When the drone left the ground."""
+        """Takeoff time."""
         return self.track.takeoff_s
 
     @property
     def landing_s(self) -> float | None:
-        """When it was down again; None while it flies."""
+        """Landing time. None while in flight."""
         return self.track.landing_s
 
     @property
     def frame(self) -> LocalFrame:
-        """Metres east and north of home, or else of the depot."""
+        """Local frame in metres east and north of home, or of the depot if home is unknown."""
         home = self.home
         if home is not None:
             return LocalFrame(home.lat, home.lon)
@@ -189,15 +189,15 @@ class Record:
 
 
 def of_mission(line: bytes, applied_s: float) -> bool:
-    """Whether a line of an audit log is an entry from after the application was applied."""
+    """Return True if a line of an audit log is an entry made after the application was applied."""
     try:
         return _time(json.loads(line)["time"]) >= applied_s
-    except (ValueError, KeyError, TypeError):  # being written when the log was fetched
+    except (ValueError, KeyError, TypeError):  # # incomplete last line
         return False
 
 
 def taken_s(picture: str) -> float:
-    """When a picture was taken, by the name that the camera service gave it."""
+    """Return the time of a picture from its file name."""
     return datetime.strptime(picture[:17], "%Y%m%d%H%M%S%f").replace(tzinfo=UTC).timestamp()
 
 
@@ -211,7 +211,7 @@ def _time(text: str) -> float:
 
 
 def _has_state(entry: Mapping[str, Any]) -> bool:
-    """Whether an entry tells where the drone was: the recorder's, and the note that it has landed."""
+    """Return True if an entry contains the position of the drone: telemetry samples and landing entries."""
     return entry.get("kind") == "state" or (entry.get("kind") == "control" and entry.get("action") == "landed")
 
 
@@ -227,7 +227,7 @@ def _sample(entry: Mapping[str, Any]) -> Sample:
 
 
 def _flight(samples: Iterable[Sample]) -> tuple[Sample, ...]:
-    """The samples in order, from shortly before the first takeoff to shortly after the last landing."""
+    """Return the samples in order, from shortly before the first takeoff to shortly after the last landing."""
     ordered = sorted((s for s in samples if s.place.lat or s.place.lon), key=lambda s: s.time_s)
     flying = [s.time_s for s in ordered if s.in_air]
     if not flying:
@@ -236,13 +236,13 @@ def _flight(samples: Iterable[Sample]) -> tuple[Sample, ...]:
 
 
 def judgements_of(entries: Iterable[Mapping[str, Any]]) -> tuple[Judgement, ...]:
-    """What policies changed, from entries of audit logs, in order; the same asked again soon counts as one."""
+    """Return the calls that policies changed, in order. Repetitions within a short time count as one."""
     ordered = sorted(entries, key=lambda e: str(e.get("time", "")))
     return _merged([j for e in ordered if (j := _judgement(e)) is not None])
 
 
 def _judgement(entry: Mapping[str, Any]) -> Judgement | None:
-    """What a call, the monitor or a takeover did; None for entries that changed nothing."""
+    """Return the judgement of a call, monitor or takeover entry. Return None if nothing was changed."""
     kind = entry.get("kind")
     if kind not in {"call", "monitor", "takeover"} or (kind != "takeover" and entry.get("action") not in _DECIDED):
         return None
@@ -269,7 +269,7 @@ def _component(identity: str) -> str:
 
 
 def _place(value: Mapping[str, Any] | None, base: Place | None) -> Place | None:
-    """The place that a mapping speaks of, completed by where the drone was."""
+    """Return the position of a mapping. Missing coordinates are replaced by the position of the drone."""
     value = value or {}
     lat, lon, alt = value.get("lat"), value.get("lon"), value.get("alt", value.get("altitude_m"))
     if lat is None and alt is None:
@@ -290,7 +290,7 @@ def _words(args: Mapping[str, Any]) -> str:
 
 
 def _merged(judged: Iterable[Judgement]) -> tuple[Judgement, ...]:
-    """Join what one component asked alike, with the same answer, in less than a minute, however others come between."""
+    """Merge identical calls of a component with the same verdict within one minute, also if they are interleaved."""
     kept: list[Judgement] = []
     last: dict[tuple[str, ...], tuple[int, float]] = {}
     for one in judged:

@@ -1,4 +1,4 @@
-"""What a map shows, whatever was flown: tracks, zones, nodes, and marks."""
+"""Content of a map: tracks, zones, nodes and marks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MARKS: Mapping[str, Mapping[str, Any]] = {"refused": REFUSED, "corrected": CORRE
 
 @dataclass(frozen=True, slots=True)
 class DrawnZone:
-    """A zone; `shape` is shapely's, in metres of the scene's frame."""
+    """A zone. `shape` is a shapely geometry in metres of the scene's frame."""
 
     name: str
     kind: ZoneKind
@@ -27,7 +27,7 @@ class DrawnZone:
 
 @dataclass(frozen=True, slots=True)
 class DrawnNode:
-    """An edge node and how far its WiFi reaches."""
+    """An edge node with its WiFi range."""
 
     name: str
     at: XY
@@ -37,13 +37,13 @@ class DrawnNode:
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """A numbered thing that happened.
+    """A numbered event mark.
 
     Attributes:
-        kind: how it is drawn.
-        at: where, in the scene's frame.
-        origin: where the drone was, when `at` is where it was not let go.
-        label: in the legend; the kind where there is none.
+        kind: Drawing style.
+        at: Position in the scene's frame.
+        origin: Position of the drone, if `at` is a position that was denied.
+        label: Legend text. Default: the kind.
     """
 
     kind: Literal["refused", "corrected", "fault"]
@@ -55,12 +55,12 @@ class Mark:
 
 @dataclass(frozen=True)
 class Scene:
-    """Everything on one map; metres east and north of the frame's origin.
+    """All objects of a map, in metres east and north of the frame's origin.
 
     Attributes:
-        area: shape of the operation area.
-        depots: names and places.
-        links: where the drone was when its traffic took a direct link, and where the node stands.
+        area: Shape of the operation area.
+        depots: Names and positions.
+        links: Position of the drone when its traffic moved to a direct link, and position of the node.
     """
 
     title: str

@@ -1,4 +1,4 @@
-"""The one page that tells what flew, what policies did, and where everything ran."""
+"""Summary page: flight, policy decisions, and placement of components."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _ROLES = {
 
 
 def summary(record: Record) -> str:
-    """The page, in Markdown."""
+    """Return the page in Markdown."""
     parts = [
         f"# Flight of {record.application.name}\n\n{_headline(record)}",
         _figures(record),
@@ -36,7 +36,7 @@ def summary(record: Record) -> str:
 
 
 def figures(record: Record) -> dict[str, Any]:
-    """The page's figures, for programs."""
+    """Return the results as JSON-compatible values."""
     status = record.application.status
     plan = record.plan.spec if record.plan else None
     return {
@@ -86,7 +86,7 @@ def _headline(record: Record) -> str:
         who = record.drone.name if record.drone else "The drone"
         return f"**{phase}.** {who} did not fly. {reason}".strip()
     miss = record.track.miss_m
-    end = "is still in the air" if miss is None else f"landed {miss:.1f} m from where it took off"
+    end = "is still in the air" if miss is None else f"landed {miss:.1f} m from the takeoff position"
     took = f" in {clock(flight_s)}" if flight_s is not None else ""
     corrected = sum(j.count for j in record.judgements if not j.refused)
     refused = sum(j.count for j in record.judgements if j.refused)
@@ -118,9 +118,9 @@ def _durations(record: Record) -> list[tuple[str, float]]:
 
 
 def judged(judgements: Sequence[Judgement], stamp: Callable[[float], str]) -> str:
-    """The section on what policies did; `stamp` writes a time."""
+    """Return the section about policy decisions. `stamp` formats a time."""
     if not judgements:
-        return "## What policies did\n\nEvery call was allowed as asked."
+        return "## Policy decisions\n\nEvery call was allowed unchanged."
     rows = [
         (
             str(number),
@@ -134,7 +134,7 @@ def judged(judgements: Sequence[Judgement], stamp: Callable[[float], str]) -> st
         for number, j in enumerate(judgements, 1)
     ]
     head = ("No", "At", "Component", "Asked", "Outcome", "Policies", "Reason")
-    return "## What policies did\n\n" + table(head, rows) + "\n\nNumbers are those of the drawings."
+    return "## Policy decisions\n\n" + table(head, rows) + "\n\nThe numbers match the figures."
 
 
 def _pictures(record: Record) -> str:
@@ -143,7 +143,7 @@ def _pictures(record: Record) -> str:
     shots = [(name, taken_s(name)) for name in record.pictures]
     head = [f"{_utc(at_s)}, {_height_m(record, at_s):.0f} m above home" for _, at_s in shots]
     row = [f"![from the drone]({PICTURES}/{name})" for name, _ in shots]
-    return "## What the drone's camera saw\n\n" + table(head, [row])
+    return "## Camera pictures\n\n" + table(head, [row])
 
 
 def _height_m(record: Record, at_s: float) -> float:
@@ -161,7 +161,7 @@ def _placements(record: Record) -> str:
             why += f", adds {placed.coverage:.0%} of the operation area"
         count = f" x{placed.replicas}" if placed.replicas > 1 else ""
         rows.append((placed.component, (placed.node or "any cloud node") + count, why))
-    text = "## Where it ran\n\n" + table(("Component", "Node", "Why"), rows)
+    text = "## Placement\n\n" + table(("Component", "Node", "Why"), rows)
     rejected = [(r.component, r.node, f"{r.reason}: {r.message}") for r in record.plan.spec.rejected]
     if rejected:
         text += "\n\nDropped:\n\n" + table(("Component", "Node", "Why not"), rejected)

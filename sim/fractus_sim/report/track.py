@@ -1,4 +1,4 @@
-"""What any flight leaves behind: where a drone was, how it was, and what it said."""
+"""Track of a flight: positions, state and battery over time."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from fractus_core.geo import geodesic_m
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Degrees, and metres above home."""
+    """Latitude and longitude in degrees, altitude in metres above home."""
 
     lat: float
     lon: float
@@ -18,13 +18,13 @@ class Place:
 
     @property
     def ground(self) -> Point:
-        """The same without the altitude."""
+        """Latitude and longitude without altitude."""
         return Point(lat=self.lat, lon=self.lon)
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """The drone at one moment; `battery` is a share of the full charge."""
+    """State of the drone at one time. `battery` is the share of the full charge."""
 
     time_s: float
     place: Place
@@ -37,31 +37,31 @@ class Sample:
 
 @dataclass(frozen=True)
 class Track:
-    """One drone's flight."""
+    """Flight of one drone."""
 
     name: str
     samples: tuple[Sample, ...]
 
     @property
     def takeoff_s(self) -> float | None:
-        """When it left the ground first."""
+        """First takeoff time. None if the drone never took off."""
         return next((s.time_s for s in self.samples if s.in_air), None)
 
     @property
     def landing_s(self) -> float | None:
-        """When it stood on the ground for good; None while it is in the air, or if it never was."""
+        """Final landing time. None while in the air or if the drone never took off."""
         flying = [i for i, s in enumerate(self.samples) if s.in_air]
         return self.samples[flying[-1] + 1].time_s if flying and flying[-1] + 1 < len(self.samples) else None
 
     @property
     def home(self) -> Place | None:
-        """Where it took off; None if it never did."""
+        """Takeoff position. None if the drone never took off."""
         at = next((i for i, s in enumerate(self.samples) if s.in_air), None)
         return self.samples[max(at - 1, 0)].place if at is not None else None
 
     @property
     def distance_m(self) -> float:
-        """Metres flown over the ground; steps below a quarter of a metre, noise on the spot, do not count."""
+        """Horizontal distance flown, metres. Steps below 0.25 m are ignored as position noise."""
         total, last = 0.0, None
         for sample in self.samples:
             if not sample.in_air:
@@ -76,17 +76,17 @@ class Track:
 
     @property
     def max_altitude_m(self) -> float:
-        """Highest altitude above home."""
+        """Maximum altitude above home."""
         return max((s.place.alt_m for s in self.samples), default=0.0)
 
     @property
     def max_speed_mps(self) -> float:
-        """Highest speed over ground while in the air."""
+        """Maximum ground speed in the air."""
         return max((s.speed_mps for s in self.samples if s.in_air), default=0.0)
 
     @property
     def miss_m(self) -> float | None:
-        """How far from its takeoff it landed; None while it has not."""
+        """Distance between takeoff and landing position. None before the landing."""
         if self.home is None or self.landing_s is None:
             return None
         return geodesic_m(self.home.ground, self.samples[-1].place.ground)

@@ -1,4 +1,4 @@
-"""Writes the files of a report."""
+"""Output of all files of a report."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Whole experiments of their own: what flies, what must come out, and the pictures of it."""
+"""Scenarios: complete experiments with expectations and figures."""

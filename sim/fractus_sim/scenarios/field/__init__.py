@@ -1,1 +1,1 @@
-"""The field experiment: a driver and a passenger, flown normally, against policies, and without them."""
+"""The field experiment: a driver and a passenger, flown normally, against policies, and without policies."""

@@ -1,4 +1,4 @@
-"""`make scenario-field`: flies the field experiment and leaves its pictures, table and figures."""
+"""`make scenario-field`: fly the field experiment and write figures, tables and results."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ FAILED_EXPECTATIONS = 2
     type=click.FloatRange(0.2, 8.0),
     default=3.0,
     show_default=True,
-    help="Times real time; for an autopilot that runs already: how fast that one runs.",
+    help="Factor of real time. For a running autopilot: its actual factor.",
 )
 @click.option("--run", "names", multiple=True, type=click.Choice([run.name for run in RUNS]), help="Only these runs.")
 def field(*, out: Path, autopilot: str | None, speedup: float, names: tuple[str, ...]) -> None:
-    """Fly the field experiment three times: normally, against policies, and without them.
+    """Fly the field experiment three times: normally, with violations under policies, and without policies.
 
-    Exit code: 0 if everything came out as expected, 2 if something did not, 1 if it could not be flown.
+    Exit code: 0 if all expectations hold, 2 if one does not, 1 if the experiment could not be flown.
     """
     break_off_on_signals()
     try:
@@ -56,10 +56,10 @@ def field(*, out: Path, autopilot: str | None, speedup: float, names: tuple[str,
 
 
 def experiment(out: Path, autopilot: Autopilot, names: tuple[str, ...] = ()) -> list[Check]:
-    """Fly the runs and write the report; the checks.
+    """Fly the runs, write the report, and return the checks.
 
     Raises:
-        ExperimentError: a run could not be flown.
+        ExperimentError: A run could not be flown.
     """
     ground, words = Field.read(EXAMPLE), "simulated vehicles"
     if autopilot.link is not None:

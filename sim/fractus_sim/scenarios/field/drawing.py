@@ -1,4 +1,4 @@
-"""The two pictures of the experiment: the ground with the three ways flown (as Fig. 8.10), and their altitudes (8.11)."""
+"""The two figures of the experiment: map with three flights (Fig. 8.10) and their altitudes (Fig. 8.11)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from fractus_sim.scenarios.field.evidence import Evidence
 from fractus_sim.scenarios.field.expectations import HIGHEST_M, LOWEST_M
 from fractus_sim.scenarios.field.place import NAVIGATOR, Field
 
-# Drawn in this order: the widest below, so that all three show where they lie on each other.
+# Drawing order: the widest line first, so that overlapping flights remain visible.
 _STYLES: Mapping[str, Mapping[str, Any]] = {
     "normal": {"color": BLUE, "linewidth": 5.5, "alpha": 0.45},
     "unguarded": {"color": VERMILION, "linewidth": 1.5, "linestyle": (0, (5, 2))},
@@ -28,7 +28,7 @@ _YELLOW = "#F0E442"
 
 
 def draw_ground(field: Field, area: Sequence[Any], runs: Sequence[Evidence]) -> Figure:
-    """The map, in metres east and north of home."""
+    """Draw the map, in metres east and north of home."""
     figure, axes = canvas(10.0, 6.9)
     region = max(area, key=lambda shape: shape.area, default=None)
     for shape in area:
@@ -69,7 +69,7 @@ def _fill(axes: Any, shape: Any, colour: str, alpha: float, label: str) -> None:
 
 
 def _pictures(axes: Any, field: Field, run: Evidence) -> None:
-    """Where a run took pictures, and where they were refused for what they would have shown, in the colour of its way."""
+    """Draw the positions of captured and denied pictures in the colour of the run."""
     for taken, marker, words in ((True, "*", "picture taken"), (False, "X", "picture refused")):
         at = [field.frame.xy(c.at.lat, c.at.lon) for c in run.pictures(taken=taken) if c.at is not None]
         if at:
@@ -78,7 +78,7 @@ def _pictures(axes: Any, field: Field, run: Evidence) -> None:
 
 
 def _direction(axes: Any, points: Any, colour: str) -> None:
-    """Arrowheads along a way, one every `_ARROW_M`."""
+    """Draw arrowheads along a path, one every `_ARROW_M`."""
     flown_m = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))))
     for at in np.searchsorted(flown_m, np.arange(_ARROW_M / 2, flown_m[-1], _ARROW_M)):
         axes.annotate(
@@ -121,7 +121,7 @@ def _offset(name: str) -> tuple[float, float]:
 
 
 def draw_altitudes(runs: Sequence[Evidence]) -> Figure:
-    """Altitudes above home since takeoff, with the limits and what was asked for beyond them."""
+    """Draw altitudes above home since takeoff, with limits and the requests beyond them."""
     figure, axes = canvas(10.0, 4.6)
     for limit in (LOWEST_M, HIGHEST_M):
         axes.axhline(limit, color=INK, linestyle=(0, (5, 3)), linewidth=1.0, zorder=2)
@@ -142,13 +142,13 @@ def draw_altitudes(runs: Sequence[Evidence]) -> Figure:
     axes.set_xlabel("seconds since takeoff", fontsize=9)
     axes.set_ylabel("metres above HOME", fontsize=9)
     axes.grid(color="#EEEEEE", linewidth=0.6, zorder=0)
-    axes.set_title("Altitude: what was asked for, and what was flown", fontsize=11, loc="left")
+    axes.set_title("Altitude: requested and flown", fontsize=11, loc="left")
     legend(figure, axes)
     return figure
 
 
 def _requests(axes: Any, run: Evidence) -> None:
-    """Arrows from the altitudes that were asked for to those that were flown instead."""
+    """Draw arrows from requested to flown altitudes."""
     start_s = run.track.takeoff_s or 0.0
     seen: set[float] = set()
     for call in run.gotos():
@@ -165,7 +165,7 @@ def _requests(axes: Any, run: Evidence) -> None:
         )  # fmt: skip
         axes.plot(
             at, asked, marker="o", markersize=8, color=ORANGE, markeredgecolor=INK, linestyle="none",
-            label="asked for, and corrected", zorder=7,
+            label="requested, and corrected", zorder=7,
         )  # fmt: skip
         axes.annotate(
             f"{asked:.0f} m", (at, asked), xytext=(0, 11 if asked > flown else -11), textcoords="offset points",

@@ -1,4 +1,4 @@
-"""What one run left behind, read from its logs: the link to the autopilot, and the audit logs of both services."""
+"""Evidence of one run, read from the autopilot link log and the audit logs of both services."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ SYSTEM = "system"
 
 @dataclass(frozen=True, slots=True)
 class Call:
-    """A call that was judged, or something that the system did on its own.
+    """A call with its verdict, or an action of the system.
 
     Attributes:
-        time_s: on the autopilot's clock.
-        who: the component, or `system`.
-        method: of the service; for what the system did, the takeover or the kind of control.
-        action: allow, correct, deny, or takeover (denied, and the drone taken); empty for what the system did.
-        asked: where to, for Goto.
-        flown: where to in the end.
-        at: where the drone was.
+        time_s: Time on the autopilot's clock.
+        who: Component, or `system`.
+        method: Service method. For actions of the system: takeover or type of control.
+        action: allow, correct, deny, or takeover (denied, and control revoked). Empty for actions of the system.
+        asked: Requested position of a Goto.
+        flown: Position that was flown.
+        at: Position of the drone.
     """
 
     time_s: float
@@ -48,13 +48,13 @@ class Call:
 
     @property
     def refused(self) -> bool:
-        """Whether nothing of it was carried out."""
+        """True if no part of the call was executed."""
         return self.action in ("deny", "takeover")
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """One run."""
+    """Evidence of one run."""
 
     name: str
     title: str
@@ -64,18 +64,18 @@ class Evidence:
     texts: tuple[str, ...]
 
     def gotos(self) -> list[Call]:
-        """The Goto calls, those of the system on its way among them."""
+        """Goto calls, including those of the system during transit flights."""
         return [c for c in self.calls if c.method == "Goto" and c.asked is not None]
 
     def pictures(self, *, taken: bool) -> list[Call]:
-        """The CaptureImage calls that were carried out, or refused for what they would have shown."""
+        """CaptureImage calls that were executed, or denied because of their footprint."""
         asked = [c for c in self.calls if c.method == "CaptureImage" and c.at is not None]
         if taken:
             return [c for c in asked if not c.refused]
         return [c for c in asked if c.refused and c.code != "OutsideOperationArea"]
 
     def takeover(self) -> Call | None:
-        """When the system took the drone for good."""
+        """Time when the system took control permanently."""
         return next((c for c in self.calls if c.who == SYSTEM and c.method in ("revoke", "returnToLaunch")), None)
 
 
@@ -83,8 +83,8 @@ def read_evidence(name: str, title: str, *, policies: bool, tlog: Path, audits: 
     """Read a run.
 
     Raises:
-        OSError: a log is missing.
-        ValueError: the tlog has nothing of a flight.
+        OSError: A log is missing.
+        ValueError: The tlog contains no flight.
     """
     samples, clock, texts = _flight(tlog)
     calls = [
@@ -99,20 +99,20 @@ def read_evidence(name: str, title: str, *, policies: bool, tlog: Path, audits: 
 
 
 class _Clock:
-    """From the time of day to the autopilot's clock, which a faster simulation makes run faster."""
+    """Conversion from Unix time to the autopilot's clock, which runs faster in an accelerated simulation."""
 
     def __init__(self) -> None:
         self._unix: list[float] = []
         self._boot: list[float] = []
 
     def note(self, unix_s: float, boot_s: float) -> None:
-        """Take a pair of times that belong together."""
+        """Add a pair of corresponding times."""
         if not self._unix or unix_s > self._unix[-1]:
             self._unix.append(unix_s)
             self._boot.append(boot_s)
 
     def boot_s(self, unix_s: float) -> float:
-        """The autopilot's time, between or beyond the pairs."""
+        """Return the autopilot's time by interpolation or extrapolation."""
         if len(self._unix) < 2:
             raise ValueError("the log of the link to the autopilot has no positions")
         high = min(max(bisect.bisect(self._unix, unix_s), 1), len(self._unix) - 1)
@@ -156,7 +156,7 @@ def _flight(path: Path) -> tuple[tuple[Sample, ...], _Clock, list[str]]:
             in_air = armed and (landed in FLYING_STATES if landed else height > 0.5)
             samples.append(Sample(boot_s, place, speed, mode, in_air, battery))
     if samples and not armed:
-        # The motors may have stopped after the last position that was taken.
+        # The autopilot may have disarmed after the last recorded position.
         samples[-1] = replace(samples[-1], in_air=False)
     return tuple(samples), clock, texts
 

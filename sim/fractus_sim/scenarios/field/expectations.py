@@ -1,4 +1,4 @@
-"""What must come out of each run; every check is a sentence, whether it holds, and what was seen."""
+"""Expectations for each run: description, result and observed value."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ NEAR_M = 2.0
 SAME_M = 0.5
 LOWEST_M, HIGHEST_M = 5.0, 15.0
 CRUISE_M = 10.0
-LIMIT_SLACK_M = 0.6  # between a limit and how exactly an altitude is flown and known
-CORRECTED_WITHIN_M = 1.0  # a correction may keep a margin from its limit
+LIMIT_SLACK_M = 0.6  # # tolerance of altitude control and estimation
+CORRECTED_WITHIN_M = 1.0  # # a correction may keep a margin to its limit
 LANDED_WITHIN_M = 3.0
 FEWEST_PICTURES = 4
 
@@ -36,7 +36,7 @@ class Check:
 
 
 class Judge:
-    """Looks at one run."""
+    """Evaluates the expectations on one run."""
 
     def __init__(self, field: Field, run: Evidence) -> None:
         self._field, self._run = field, run
@@ -44,7 +44,7 @@ class Judge:
         self._held = self._holds()
 
     def normal(self) -> list[Check]:
-        """The program that asks for nothing forbidden."""
+        """Return the checks of the program without violations."""
         for number in range(1, 10):
             self._reached(f"WP{number}")
         in_control = [s for s in self._run.track.samples if s.in_air and s.mode == "GUIDED"]
@@ -60,7 +60,7 @@ class Judge:
         return self._checks
 
     def guarded(self) -> list[Check]:
-        """The violating program under policies."""
+        """Return the checks of the violating program under policies."""
         for name, asked, flown in (("WP1", 20.0, HIGHEST_M), ("WP3", 20.0, HIGHEST_M), ("WP6", 4.0, LOWEST_M)):
             self._corrected(name, asked, flown)
         heights = [s.place.alt_m for s in self._run.track.samples if s.in_air and s.mode == "GUIDED"]
@@ -84,7 +84,7 @@ class Judge:
         return self._checks
 
     def unguarded(self) -> list[Check]:
-        """The violating program without policies."""
+        """Return the checks of the violating program without policies."""
         for name, alt_m in (("WP1", 20.0), ("WP3", 20.0), ("WP6", 4.0)):
             self._reached(name, alt_m)
         self._reached("WP-E1")
@@ -95,7 +95,7 @@ class Judge:
         self._landed()
         return self._checks
 
-    # -- what is looked at -------------------------------------------------------------------------------------
+    # # -- Evaluation -------------------------------------------------------------------------------------
 
     def _check(self, text: str, holds: bool, seen: str) -> None:
         self._checks.append(Check(self._run.name, text, holds, seen))
@@ -119,9 +119,9 @@ class Judge:
         flown = call.flown.alt_m if call is not None and call.flown is not None else math.nan
         inside = limit_m - flown if limit_m == HIGHEST_M else flown - limit_m
         self._check(
-            f"{name}, asked for at {asked_m:.0f} m, is flown at {limit_m:.0f} m",
+            f"{name}, requested at {asked_m:.0f} m, is flown at {limit_m:.0f} m",
             call is not None and call.action == "correct" and -0.01 <= inside <= CORRECTED_WITHIN_M,
-            f"{call.action} to {flown:.1f} m by {', '.join(call.policies)}" if call else "never asked for",
+            f"{call.action} to {flown:.1f} m by {', '.join(call.policies)}" if call else "never requested",
         )
         self._reached(name, flown if math.isfinite(flown) else limit_m)
 
@@ -130,20 +130,20 @@ class Judge:
         self._check(
             f"{name} is discarded with an error",
             bool(calls) and all(c.refused for c in calls),
-            calls[0].reason if calls else "never asked for",
+            calls[0].reason if calls else "never requested",
         )
         after = [c for c in self._gotos(then) if calls and c.time_s > calls[0].time_s and not c.refused]
-        self._check(f"and the mission goes on to {then}", bool(after), f"{len(after)} calls")
+        self._check(f"and the mission continues to {then}", bool(after), f"{len(after)} calls")
 
     def _stopped_for(self, name: str) -> None:
         calls, taken = self._gotos(name), self._run.takeover()
         self._check(
             f"{name} revokes access",
             bool(calls) and all(c.refused for c in calls) and taken is not None,
-            calls[0].reason if calls else "never asked for",
+            calls[0].reason if calls else "never requested",
         )
         since = taken.time_s if taken is not None else math.inf
-        # A program may ask for control again, as the SDK does: it is not granted, so that nothing that follows is allowed.
+        # The SDK may request control again. It is not granted, so all following calls are denied.
         later = [
             c
             for c in self._run.calls
@@ -177,13 +177,13 @@ class Judge:
         ]
 
     def _closest_to(self, zone: str) -> float:
-        """Metres between the way flown and a zone; 0 inside."""
+        """Return the distance in metres between the flown path and a zone. 0 if they intersect."""
         shape, frame = self._field.zone(zone), self._field.frame
         way = shapely.LineString([frame.xy(s.place.lat, s.place.lon) for s in self._run.track.samples])
         return float(shape.distance(way))
 
     def _inside(self, sample: Sample) -> bool:
-        """Whether a sample lies between the moments at which the program was given control and lost or returned it."""
+        """Return True if a sample is between the times when the program received and lost or released control."""
         return any(begin <= sample.time_s <= end for begin, end in self._held)
 
     def _holds(self) -> list[tuple[float, float]]:

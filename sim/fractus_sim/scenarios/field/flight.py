@@ -1,4 +1,4 @@
-"""Flies one run: vehicle, services and the example's two programs as processes, until the drone is home."""
+"""Execution of one run: vehicle, services and both example programs as processes, until the drone has landed."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ STAY_S = 2 * PERIOD_S
 FLIGHT_TIMEOUT_S = 600.0
 READY_TIMEOUT_S = 180.0
 POLL_S = 0.25
-# Of our own vehicle: as fast as the drone's description says, so that the service has nothing to correct there.
+# Speed of the simulated vehicle. It equals the maximum speed in the drone's description, so nothing is corrected.
 PARAMETERS: Mapping[str, float] = {"WPNAV_SPEED": 500.0}
 WIND = "2,240,0.5"
 
@@ -33,8 +33,8 @@ class Run:
     """One of the three flights.
 
     Attributes:
-        violates: whether the program asks for what policies forbid.
-        policies: whether there are any.
+        violates: True if the program makes requests that policies forbid.
+        policies: True if policies apply.
     """
 
     name: str
@@ -52,11 +52,11 @@ RUNS = (
 
 @dataclass(frozen=True, slots=True)
 class Autopilot:
-    """What flies.
+    """The vehicle of a run.
 
     Attributes:
-        link: of an autopilot that is there already, such as `tcp:127.0.0.1:5760`; None: a simulated one for each run.
-        speedup: times real time that it runs.
+        link: Endpoint of a running autopilot, such as `tcp:127.0.0.1:5760`. None: a simulated autopilot per run.
+        speedup: Factor of real time.
     """
 
     link: str | None
@@ -64,10 +64,10 @@ class Autopilot:
 
 
 def fly(run: Run, field: Field, autopilot: Autopilot, folder: Path, tell: Callable[[str], None]) -> Evidence:
-    """Fly one run and read what it left.
+    """Fly one run and read its evidence.
 
     Raises:
-        ExperimentError: something did not come up, or the drone did not come home in time.
+        ExperimentError: A process did not start, or the drone did not land before the timeout.
     """
     shutil.rmtree(folder, ignore_errors=True)
     manifests = field.write(folder)
@@ -88,7 +88,7 @@ def fly(run: Run, field: Field, autopilot: Autopilot, folder: Path, tell: Callab
 
 
 def _environment(run: Run, field: Field, stay_s: float) -> dict[str, str]:
-    """What the Navigator is told: the manifest's own, to hover above the stripe, and what makes it ask for too much."""
+    """Return the environment of the Navigator: manifest values, hover position above the stripe, and violations."""
     places = field.places
     above = f"6:{as_text(places[ABOVE_STRIPE])},{stay_s:.1f}"
     told = {ZIGZAG: field.environment[ZIGZAG], "DETOURS": above}
@@ -107,7 +107,7 @@ def _setup(field: Field, autopilot: Autopilot) -> DroneSetup:
         ready_after_s=FULL_START_S,
         parameters=PARAMETERS,
         description=field.drone.spec.to_dict(),
-        # A camera world follows the drone over a link of its own, which an autopilot that runs already may not have.
+        # The camera world needs a second link to the vehicle, which a running autopilot may not offer.
         camera=CameraSetup(("--seed", "3")) if simulated else CameraSetup(None),
         vehicle_arguments=("--wind", WIND),
         autopilot=autopilot.link,
@@ -115,10 +115,10 @@ def _setup(field: Field, autopilot: Autopilot) -> DroneSetup:
 
 
 def _wait_home(ground: Standalone, drone: RunningDrone, autopilot: Autopilot, tell: Callable[[str], None]) -> None:
-    """Wait until the mobility service says that the drone has landed.
+    """Wait until the mobility service reports the landing.
 
     Raises:
-        ExperimentError: it did not take off, or not come home, in time; or a process ended.
+        ExperimentError: The drone did not take off or land before the timeout, or a process ended.
     """
     began_s, said, flown = time.monotonic(), 0, False
     while True:

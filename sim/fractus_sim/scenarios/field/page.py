@@ -1,4 +1,4 @@
-"""The page and the figures that the experiment leaves."""
+"""Summary page and results of the field experiment."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from fractus_sim.scenarios.field.place import NAVIGATOR, Field
 
 
 def summary(field: Field, runs: Sequence[Evidence], checks: Sequence[Check], autopilot: str) -> str:
-    """The page, in Markdown."""
+    """Return the page in Markdown."""
     failed = [check for check in checks if not check.holds]
     held = (
         f"All {len(checks)} expectations hold." if not failed else f"{len(failed)} of {len(checks)} expectations FAIL."
@@ -24,7 +24,7 @@ def summary(field: Field, runs: Sequence[Evidence], checks: Sequence[Check], aut
         " same program with Grants that hold no policies and whose operation area covers the whole surroundings.",
         "![the ground](map.png)\n\n![altitudes](altitude.png)",
         "## The three runs\n\n" + _runs(runs),
-        "## What was asked for beyond the limits\n\n" + _violations(field, runs),
+        "## Requests beyond the limits\n\n" + _violations(field, runs),
         "## Expectations\n\n" + _checks(checks),
         "Each run's directory has its manifests, Grants, audit logs, the tlog of the autopilot's link, and pictures."
         " For programs: [report.json](report.json).",
@@ -33,7 +33,7 @@ def summary(field: Field, runs: Sequence[Evidence], checks: Sequence[Check], aut
 
 
 def figures(field: Field, runs: Sequence[Evidence], checks: Sequence[Check], autopilot: str) -> dict[str, Any]:
-    """The same for programs."""
+    """Return the results as JSON-compatible values."""
     return {
         "holds": all(check.holds for check in checks),
         "autopilot": autopilot,
@@ -105,7 +105,7 @@ def _checks(checks: Sequence[Check]) -> str:
 
 
 def _mine(run: Evidence) -> list[Call]:
-    """The program's own Gotos: those while it had control, not those of the system that drives for it."""
+    """Return the Gotos of the program while it had control, without those of the system."""
     return [c for c in run.gotos() if c.who == NAVIGATOR]
 
 

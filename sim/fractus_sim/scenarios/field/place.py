@@ -1,4 +1,4 @@
-"""Where the experiment is flown: the manifests, moved to where the drone stands, its named places, and the Grants."""
+"""Site of the experiment: manifests moved to the position of the drone, named positions, and Grants."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ EXAMPLE = Path("examples/field")
 NAVIGATOR, VIEWER = "Navigator", "AerialViewer"
 DRONE = "drone-1"
 ZIGZAG = "ZIGZAG"
-# Without policies the Grants end here, metres from home: farther than any run flies.
+# Extent of Grants without policies, metres from home. No run flies that far.
 EVERYWHERE_M = 1000.0
-# Metres east and north of home of what the violating program asks for.
+# Positions requested by the violating program, metres east and north of home.
 ASKED_OUTSIDE = {"WP-E1": (62.0, 130.0), "WP-E2": (226.0, 60.0)}
 ABOVE_STRIPE = "WP-S"
-"""Where every run hovers for longer than the time between two pictures: one of them is asked for above the stripe."""
+"""Hover position. Each run hovers longer than the picture interval, so one picture is requested above the stripe."""
 
 ALTITUDE_M = 10.0
 Place = tuple[float, float, float]
@@ -37,11 +37,11 @@ Place = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Field:
-    """The experiment on its ground.
+    """The experiment at its site.
 
     Attributes:
-        documents: the manifests as they are applied.
-        home: latitude, longitude, altitude above mean sea level of the ground.
+        documents: Manifests as applied.
+        home: Latitude, longitude, and ground altitude above mean sea level.
     """
 
     documents: tuple[Mapping[str, Any], ...]
@@ -49,10 +49,10 @@ class Field:
 
     @classmethod
     def read(cls, folder: Path, home: Place | None = None) -> Field:
-        """Read the manifests, and move them so that the depot lies at `home`.
+        """Read the manifests, and move them so that the depot is at `home`.
 
         Raises:
-            ExperimentError: a file cannot be read, or the manifests have no depot.
+            ExperimentError: A file cannot be read, or the manifests contain no depot.
         """
         documents: list[Any] = []
         for path in sorted(folder.glob("*.yaml")):
@@ -62,57 +62,57 @@ class Field:
                 raise ExperimentError(f"{path}: {error}") from None
         depot = next((d["spec"]["location"] for d in documents if d["kind"] == "Depot"), None)
         if depot is None:
-            raise ExperimentError(f"{folder} has no Depot; it says where home is")
+            raise ExperimentError(f"{folder} contains no Depot, which defines the home position; add one")
         if home is None:
             return cls(tuple(documents), (depot["lat"], depot["lon"], 25.0))
         moved = _Shift((depot["lat"], depot["lon"]), home[:2])
         return cls(tuple(moved.apply(d) for d in documents), home)
 
     def write(self, folder: Path) -> Path:
-        """Write the manifests as they are flown; the file's path."""
+        """Write the moved manifests. Return the path of the file."""
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / "manifests.yaml"
         path.write_text(dump_documents(self.documents))
         return path
 
     def objects(self, kind: str) -> list[Mapping[str, Any]]:
-        """The manifests of a kind."""
+        """Return the manifests of a kind."""
         return [d for d in self.documents if d["kind"] == kind]
 
     @cached_property
     def application(self) -> Application:
-        """The application."""
+        """Return the application."""
         return Application.from_body(self.objects("Application")[0])
 
     @cached_property
     def drone(self) -> Drone:
-        """The drone."""
+        """Return the drone."""
         return Drone.from_body(self.objects("Drone")[0])
 
     @cached_property
     def policies(self) -> tuple[Policy, ...]:
-        """The policies."""
+        """Return the policies."""
         return tuple(Policy.from_body(d) for d in self.objects("Policy"))
 
     @cached_property
     def frame(self) -> LocalFrame:
-        """Metres east and north of home."""
+        """Return the local frame in metres east and north of home."""
         return LocalFrame(self.home[0], self.home[1])
 
     def zone(self, name: str) -> Any:
-        """A zone's shape in metres."""
+        """Return the shape of a zone in metres."""
         body = next(d for d in self.objects("Zone") if d["metadata"]["name"] == name)
         return area_polygon(self.frame, Zone.from_body(body).spec.area)
 
     @cached_property
     def environment(self) -> dict[str, str]:
-        """What the Navigator's container gets."""
+        """Return the environment of the Navigator's container."""
         component = next(c for c in self.objects("Application")[0]["spec"]["components"] if c["name"] == NAVIGATOR)
         return {variable["name"]: variable["value"] for variable in component["container"]["env"]}
 
     @cached_property
     def places(self) -> dict[str, Place]:
-        """CTRL1, WP1 to WP9, CTRL2, WP-E1, WP-E2, WP-S: degrees, and metres above home."""
+        """Return CTRL1, WP1 to WP9, CTRL2, WP-E1, WP-E2 and WP-S in degrees and metres above home."""
         component = next(c for c in self.application.spec.components if c.name == NAVIGATOR)
         found: dict[str, Place] = {}
         waypoints: list[Place] = []
@@ -132,21 +132,21 @@ class Field:
         return found
 
     def _above_stripe(self, places: Mapping[str, Place]) -> Place:
-        """Where the way from WP6 to WP7 is deepest in the stripe of which no pictures are allowed."""
+        """Return the position between WP6 and WP7 that is deepest inside the stripe where pictures are forbidden."""
         way = shapely.LineString([self.frame.xy(*places[name][:2]) for name in ("WP6", "WP7")])
         middle = way.intersection(self.zone("no-photo")).centroid
         return (*self.frame.latlon(middle.x, middle.y), ALTITUDE_M)
 
     def grants(self, manifests: Path, *, policies: bool) -> list[dict[str, Any]]:
-        """The Grants that the operator would write; without policies they allow everything everywhere.
+        """Return the Grants that the operator would create. Without policies, they allow everything everywhere.
 
         Raises:
-            ExperimentError: the application cannot be planned.
+            ExperimentError: The application cannot be planned.
         """
         return [grant_manifest(spec if policies else self._unbound(spec)) for spec in granted(read([manifests]))]
 
     def operation_area(self, grants: Sequence[Mapping[str, Any]]) -> list[Any]:
-        """Shapes of the operation area that the Grants name, in metres."""
+        """Return the shapes of the operation area in the Grants, in metres."""
         spec = GrantSpec.model_validate(grants[0]["spec"])
         return [area_polygon(self.frame, area) for area in spec.operation_area]
 
@@ -159,13 +159,13 @@ class Field:
 
 @dataclass(frozen=True, slots=True)
 class _Shift:
-    """Moves positions from one home to another; distances and bearings stay what they are."""
+    """Moves positions from one home to another. Distances and bearings are preserved."""
 
     old: tuple[float, float]
     new: tuple[float, float]
 
     def apply(self, value: Any) -> Any:
-        """Move every position in a manifest: mappings with lat and lon, and texts of `lat,lon,alt`."""
+        """Move all positions in a manifest: mappings with lat and lon, and texts `lat,lon,alt`."""
         if isinstance(value, Mapping):
             moved = {key: self.apply(part) for key, part in value.items()}
             if "lat" in moved and "lon" in moved:
@@ -191,10 +191,10 @@ _PLACES = re.compile(r"(-?\d+\.\d+),\s*(-?\d+\.\d+),\s*(-?\d+(?:\.\d+)?)")
 
 
 def as_text(place: Place) -> str:
-    """A place as programs read it: `lat,lon,alt`."""
+    """Format a position as `lat,lon,alt`."""
     return f"{place[0]:.7f},{place[1]:.7f},{place[2]:g}"
 
 
 def dump(value: Any) -> str:
-    """JSON for people."""
+    """Format JSON with indentation."""
     return json.dumps(value, indent=2) + "\n"

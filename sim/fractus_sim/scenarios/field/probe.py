@@ -1,4 +1,4 @@
-"""Looks at an autopilot that is there already: who it is, where it stands, and whether it is ready to fly."""
+"""Probe of a running autopilot: identity, position, and readiness to fly."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ POLL_S = 0.05
 
 @dataclass(frozen=True, slots=True)
 class ParkedVehicle:
-    """Where an autopilot stands: latitude, longitude, and altitude above mean sea level."""
+    """Position of an autopilot: latitude, longitude, altitude above mean sea level."""
 
     system_id: int
     home: tuple[float, float, float]
 
 
 def parse_link(text: str) -> tuple[str, int]:
-    """Host and port of `tcp:HOST:PORT`.
+    """Parse `tcp:HOST:PORT`.
 
     Raises:
-        ExperimentError: the text is something else.
+        ExperimentError: The text has a different format.
     """
     try:
         return parse_address(text)
@@ -41,10 +41,11 @@ def parse_link(text: str) -> tuple[str, int]:
 
 
 def look(link: str, tell: Callable[[str], None]) -> ParkedVehicle:
-    """Wait until an ArduPilot vehicle on the ground knows where it is, and leave the link again.
+    """Wait until an ArduPilot vehicle on the ground has a position, then close the link.
 
     Raises:
-        ExperimentError: no autopilot answers, it is no ArduPilot, it flies, or it has no position in time.
+        ExperimentError: The autopilot does not respond, is not ArduPilot, is flying, or has no position before the
+            timeout.
     """
     host, port = parse_link(link)
     visitor = _Visitor(TcpLink.connect(host, port, CONNECT_S))
@@ -73,7 +74,7 @@ def look(link: str, tell: Callable[[str], None]) -> ParkedVehicle:
 
 
 class _Visitor:
-    """A short talk over one link."""
+    """A short exchange over one link."""
 
     def __init__(self, link: TcpLink) -> None:
         self.system_id = 0
@@ -81,16 +82,16 @@ class _Visitor:
         self._endpoint = Endpoint(OBSERVER_ID, STATION_COMPONENT)
 
     def ask(self, name: str) -> None:
-        """Ask for one message of a kind."""
+        """Request one message of a type."""
         values: dict[str, Value] = {"command": int(mavlink.MAV_CMD_REQUEST_MESSAGE), "param1": float(message_id(name))}
         values |= {"target_system": self.system_id, "target_component": 1}
         self._link.send(self._endpoint.encode("COMMAND_LONG", values))
 
     def wait(self, wanted: Callable[[Message], bool], timeout_s: float, missing: str, asking: str = "") -> Message:
-        """The first message that is wanted; `asking` repeats the request each second.
+        """Return the first matching message. `asking` repeats the request every second.
 
         Raises:
-            ExperimentError: it did not come in time.
+            ExperimentError: No message matched before the timeout.
         """
         deadline = time.monotonic() + timeout_s
         next_ask = time.monotonic()
@@ -105,5 +106,5 @@ class _Visitor:
         raise ExperimentError(f"{missing} from the autopilot within {timeout_s:.0f} s")
 
     def close(self) -> None:
-        """Leave the link."""
+        """Close the link."""
         self._link.close()

@@ -1,4 +1,4 @@
-"""`make scenario-links`: flies the links scenario on an embedded cluster and leaves its pictures, tables and figures."""
+"""`make scenario-links`: fly the links scenario on an embedded cluster and write figures, tables and results."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ FAILED_EXPECTATIONS = 2
     type=click.FloatRange(0.5, 1.5),
     default=1.0,
     show_default=True,
-    help="How far radios really reach, in units of what they declare.",
+    help="Actual radio range as a factor of the declared range.",
 )
-@click.option("--again", is_flag=True, help="Write the report of an earlier run again from what it left.")
+@click.option("--again", is_flag=True, help="Only write the report again from the data of an earlier run.")
 def links(*, out: Path, factor: float, again: bool) -> None:
-    """Fly past edge nodes with WiFi, and count what becomes of a picture each second.
+    """Fly past edge nodes with WiFi while one picture per second is sent, and evaluate the delivery of the pictures.
 
-    Exit code: 0 if everything came out as expected, 2 if something did not, 1 if it could not be flown.
+    Exit code: 0 if all expectations hold, 2 if one does not, 1 if the scenario could not be flown.
     """
     break_off_on_signals()
     site = read_site(factor)
@@ -55,10 +55,10 @@ def links(*, out: Path, factor: float, again: bool) -> None:
 
 
 def read_again(out: Path) -> Evidence:
-    """What an earlier run left.
+    """Read the data of an earlier run.
 
     Raises:
-        OSError: there was none.
+        OSError: There is no data.
     """
     lines = [Line(*json.loads(line)) for line in (out / LOG).read_text().splitlines()]
     track = [(at, (p[0], p[1], p[2])) for at, p in json.loads((out / "track.json").read_text())]
@@ -66,7 +66,7 @@ def read_again(out: Path) -> Evidence:
 
 
 def write(site: Site, run: Evidence, out: Path) -> list[Expectation]:
-    """Write the report; what was expected."""
+    """Write the report, and return the checks."""
     (out / PAGE).unlink(missing_ok=True)
     table = gains(site, run)
     checks = expectations(run, table)

@@ -1,4 +1,4 @@
-"""The two pictures of the scenario: the map with ranges and links (Fig. 8.13a), and bandwidth over time (Fig. 8.13b)."""
+"""The two figures of the scenario: map with ranges and links (Fig. 8.13a), and bandwidth over time (Fig. 8.13b)."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from fractus_sim.scenarios.links.place import Site
 
 
 def colours(site: Site) -> dict[str, str]:
-    """A colour for each edge node; the cloud is grey."""
+    """Assign a colour to each edge node. The cloud is grey."""
     return dict(zip(site.edges, TRACK_COLOURS, strict=False)) | {CLOUD: GREY}
 
 
 def draw_map(site: Site, run: Evidence) -> Figure:
-    """The ground: waypoints, ranges, and the flight in the colour of the node that received its pictures."""
+    """Draw the map: waypoints, ranges, and the flight in the colour of the node that received the pictures."""
     figure, axes = canvas(8.0, 8.0)
     colour = colours(site)
     used = {switch.peer for switch in run.switches if switch.redirected_s is not None}
@@ -60,7 +60,7 @@ def _received(site: Site, run: Evidence, axes: object) -> None:
 
 
 def draw_bandwidth(site: Site, run: Evidence) -> Figure:
-    """Measured bandwidth of the paths over time, and which one the pictures took."""
+    """Draw the measured bandwidth of the paths over time, and the path of the pictures."""
     figure, axes = canvas(10.0, 4.2)
     colour, begin = colours(site), run.pictures[0].sent_s if run.pictures else 0.0
     for switch in run.switches:

@@ -1,4 +1,4 @@
-"""What a run left behind: what became of each picture, of each link, and where the drone was."""
+"""Evidence of a run: delivery of each picture, state of each link, and positions of the drone."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ _DECIDED = re.compile(r"links: decided \(on=(?P<on>\S+) peer=(?P<peer>\S+)\): (?
 
 @dataclass(slots=True)
 class Picture:
-    """What became of a picture; times are Unix seconds.
+    """Delivery of a picture. Times are Unix seconds.
 
     Attributes:
-        received: when each instance took it first, by node.
-        answered_s: when its sender had the answer; None if never.
-        took_s: from sending it to the answer.
-        by: the node whose answer came.
+        received: Time of the first reception by each instance, by node.
+        answered_s: Time when the sender received the response. None if it never did.
+        took_s: Time from sending to the response.
+        by: Node that responded.
     """
 
     number: int
@@ -48,26 +48,26 @@ class Picture:
 
     @property
     def received_s(self) -> float | None:
-        """When it was received first."""
+        """Time of the first reception."""
         return min(self.received.values(), default=None)
 
 
 @dataclass(slots=True)
 class Switch:
-    """One direct link from the decision to its end; Unix seconds, None for what never happened.
+    """One direct link from the decision to its end. Times are Unix seconds, or None if the event never happened.
 
     Attributes:
-        peer: the node.
-        reason: of the decision.
-        decided_s: when the drone's agent decided to connect.
-        up_s: paired.
-        measured_s: its bandwidth measured first.
-        mbps: that.
-        spans: from when until when traffic was led to it; until None while it is.
-        first_s: the first picture that the node received.
-        left: why.
-        ended_s: the link was no more.
-        lost: it broke while it carried traffic.
+        peer: Node.
+        reason: Reason of the decision.
+        decided_s: The drone's agent decided to connect.
+        up_s: Pairing completed.
+        measured_s: First bandwidth measurement.
+        mbps: Measured bandwidth.
+        spans: Time spans with traffic on the link. The end is None while it lasts.
+        first_s: First picture that the node received.
+        left: Reason of the end.
+        ended_s: End of the link.
+        lost: True if the link was lost while it carried traffic.
     """
 
     peer: str
@@ -84,21 +84,21 @@ class Switch:
 
     @property
     def redirected_s(self) -> float | None:
-        """When traffic moved to it first."""
+        """Time when traffic first moved to the link."""
         return self.spans[0][0] if self.spans else None
 
     @property
     def back_s(self) -> float | None:
-        """When traffic moved back to the cloud for good."""
+        """Time when traffic finally moved back to the cloud."""
         return self.spans[-1][1] if self.spans else None
 
     @property
     def leads(self) -> bool:
-        """Whether traffic is led to it."""
+        """True while traffic uses the link."""
         return bool(self.spans) and self.spans[-1][1] is None
 
     def lead(self, at_s: float, *, direct: bool) -> None:
-        """Traffic goes to it, or to the cloud, from a moment on."""
+        """Move traffic to the link or back to the cloud at a time."""
         if direct and not self.leads:
             self.spans.append((at_s, None))
         elif not direct and self.leads:
@@ -107,13 +107,13 @@ class Switch:
 
 @dataclass(frozen=True)
 class Evidence:
-    """One run.
+    """Evidence of one run.
 
     Attributes:
-        pictures: by the order sent.
-        switches: by the order decided.
+        pictures: Pictures in sending order.
+        switches: Links in decision order.
         track: Unix seconds and position, in metres east and north of the start and above it.
-        cloud: the cloud node.
+        cloud: Name of the cloud node.
     """
 
     pictures: tuple[Picture, ...]
@@ -122,18 +122,21 @@ class Evidence:
 
     @property
     def longest_gap_s(self) -> float:
-        """The longest time between two receptions."""
+        """Longest time between two receptions."""
         return max(self.gap_s(abrupt=False), self.gap_s(abrupt=True))
 
     def gap_s(self, *, abrupt: bool) -> float:
-        """The longest time between two receptions while a link with traffic was lost, or at all other times."""
+        """Return the longest time between two receptions while a link with traffic was lost, or at all other times."""
         at = sorted(p.received_s for p in self.pictures if p.received_s is not None)
         lost = [s.ended_s for s in self.switches if s.lost and s.ended_s is not None]
         gaps = ((b - a, any(a - NOTICE_S <= when <= b for when in lost)) for a, b in itertools.pairwise(at))
         return max((gap for gap, at_loss in gaps if at_loss == abrupt), default=0.0)
 
     def counts(self) -> dict[str, int]:
-        """Pictures sent, received, lost, received by two instances or twice by one, and late (answered after a second)."""
+        """Return the numbers of sent, received, lost, duplicated and late pictures.
+
+        A picture is late if its response takes more than one second.
+        """
         received = [p for p in self.pictures if p.received]
         return {
             "sent": len(self.pictures),
@@ -145,7 +148,7 @@ class Evidence:
         }
 
     def by_node(self) -> dict[str, int]:
-        """How many pictures each node received first."""
+        """Return the number of pictures that each node received first."""
         first = [min(p.received, key=p.received.__getitem__) for p in self.pictures if p.received]
         return dict(sorted(Counter(first).items()))
 
@@ -187,7 +190,7 @@ def _pictures(lines: Iterable[Line]) -> list[Picture]:
 
 
 def _switches(lines: Iterable[Line]) -> list[Switch]:
-    """Links from the agent's log: decided, connecting, up, measured, and where the traffic went."""
+    """Return the links from the agent's log: decisions, connections, measurements and traffic changes."""
     found: list[Switch] = []
     for line in lines:
         if (state := _STATE.search(line.text)) is not None:
@@ -202,7 +205,7 @@ def _switches(lines: Iterable[Line]) -> list[Switch]:
 
 
 def _latest(found: Iterable[Switch], peer: str) -> Switch | None:
-    """The link to a peer that has not ended."""
+    """Return the active link to a peer."""
     return next((s for s in found if s.peer == peer and s.ended_s is None), None)
 
 
@@ -221,7 +224,7 @@ def _state(found: list[Switch], at_s: float, state: re.Match[str]) -> None:
 
 
 def _decided(found: list[Switch], at_s: float, decided: re.Match[str]) -> None:
-    """A decision on the link, or on the traffic of an application, which is named by its namespace."""
+    """Record a decision on the link, or on the traffic of an application, which is identified by its namespace."""
     on, peer, why = decided["on"], decided["peer"], decided["why"]
     if on == "link":
         if peer != "-" and _latest(found, peer) is None:
@@ -230,7 +233,7 @@ def _decided(found: list[Switch], at_s: float, decided: re.Match[str]) -> None:
     direct = _TO_LINK in why
     for own in found:
         if own.ended_s is None and own.up_s is not None and (not direct or own.peer == peer):
-            # The traffic's path may be decided on before the end of the link is told.
+            # The decision on the traffic path can be logged before the end of the link.
             own.lost |= own.leads and why.startswith(_LOST)
             own.lead(at_s, direct=direct)
             own.left = "" if direct else own.left or why

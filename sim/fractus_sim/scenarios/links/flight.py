@@ -1,4 +1,4 @@
-"""Flies the scenario once: the example's application on an embedded cluster with a radio, and what it leaves behind."""
+"""Execution of the scenario: the example's application on an embedded cluster with a simulated radio."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ Tell = Callable[[str], None]
 
 
 def fly(site: Site, out: Path, tell: Tell) -> Evidence:
-    """Bring the cluster up, fly, and read what came of it; the cluster is gone afterwards unless it ran before.
+    """Start the cluster, fly, and read the evidence. The cluster is removed at the end unless it was already running.
 
     Raises:
-        ExperimentError: something did not come up, or the mission did not end in time.
+        ExperimentError: A part did not start, or the mission did not end before the timeout.
     """
     try:
         with ExitStack() as stack:
@@ -86,7 +86,7 @@ def _mission(site: Site, cluster: Cluster, kube: Kube, out: Path, tell: Tell) ->
 
 
 def _note(kube: Kube, links: list[dict[str, Any]]) -> None:
-    """Keep what the DirectLinks say, as it was last."""
+    """Store the last state of the DirectLinks."""
     found = {body["metadata"]["name"]: body for body in kube.objects("directlinks")}
     if found:
         links[:] = [{"metadata": {"name": n}, "spec": b["spec"], "status": b.get("status")} for n, b in found.items()]

@@ -1,4 +1,4 @@
-"""The page that the scenario leaves."""
+"""Summary page of the links scenario."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from fractus_sim.scenarios.links.results import Expectation, Gain
 
 
 def summary(site: Site, run: Evidence, gains: list[Gain], checks: list[Expectation]) -> str:
-    """The page, in Markdown."""
+    """Return the page in Markdown."""
     failed = [check for check in checks if not check.holds]
     held = f"All {len(checks)} expectations hold." if not failed else f"{len(failed)} of {len(checks)} do NOT hold."
     parts = [

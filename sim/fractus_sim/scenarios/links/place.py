@@ -1,4 +1,4 @@
-"""The scene of the scenario: drone, edge nodes and waypoints, read from the example's own files."""
+"""Site of the scenario: drone, edge nodes and waypoints, read from the files of the example."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ EXAMPLE = ROOT / "examples" / "links"
 DRONE = "drone-1"
 UPLINK_MBPS, UPLINK_MS = 8.0, 60.0
 WIFI_MBPS, WIFI_MS = 12.0, 2.0
-"""What the simulated radio carries by TCP inside a station's reach."""
+"""TCP throughput of the simulated radio within the range of a station, Mbit/s."""
 
 
 @dataclass(frozen=True)
 class Site:
-    """Where everything stands, in metres east and north of the drone's home and above it.
+    """Positions of the scenario, in metres east and north of the drone's home and above it.
 
     Attributes:
-        cluster: its file, with ranges as they really are.
-        peers: edge nodes with WiFi, with their declared ranges.
-        edges: all edge nodes.
-        path: the waypoints.
-        factor: real range by declared range.
+        cluster: Cluster specification with actual ranges.
+        peers: Edge nodes with WiFi and their declared ranges.
+        edges: All edge nodes.
+        path: Waypoints.
+        factor: Actual range divided by declared range.
     """
 
     cluster: ClusterSpec
@@ -40,13 +40,13 @@ class Site:
     ground_m: float
 
     def position(self, lat: float, lon: float, alt: float) -> LocalPosition:
-        """Of degrees, and metres above mean sea level."""
+        """Return the position of degrees and metres above mean sea level."""
         east, north = self.frame.xy(lat, lon)
         return east, north, alt - self.ground_m
 
     @property
     def cloud(self) -> PathMetrics:
-        """The path over the drone's mobile uplink."""
+        """Return the path over the drone's mobile uplink."""
         return PathMetrics(UPLINK_MBPS, UPLINK_MBPS, UPLINK_MS, UPLINK_MS)
 
 
@@ -54,8 +54,8 @@ def read_site(factor: float = 1.0, folder: Path = EXAMPLE) -> Site:
     """Read the example.
 
     Args:
-        factor: how far radios really reach, in units of what they declare.
-        folder: where the example is.
+        factor: Actual radio range divided by declared range.
+        folder: Folder of the example.
     """
     spec = load_spec(folder / "cluster.yaml")
     spec = spec.model_copy(update={"nodes": tuple(_reaching(node, factor) for node in spec.nodes)})
@@ -80,7 +80,7 @@ def read_site(factor: float = 1.0, folder: Path = EXAMPLE) -> Site:
 
 
 def _reaching(node: NodeSpec, factor: float) -> NodeSpec:
-    """The node with a radio that reaches so much of what it declares."""
+    """Return the node with its radio range scaled by the factor."""
     found = node.wifi()
     if found is None:
         return node

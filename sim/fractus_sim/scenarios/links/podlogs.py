@@ -1,4 +1,4 @@
-"""Keeps what pods write, line by line with its time, also when a pod goes before its mission is reported."""
+"""Collection of container logs by line with timestamps. Lines are kept even if the pod is deleted early."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ _LINE = re.compile(r"(?P<at>\S+) (?:stdout|stderr) [FP] (?P<text>.*)")
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A line of a container.
+    """A log line of a container.
 
     Attributes:
-        at_s: Unix seconds, of the clock that all nodes share.
-        node: it ran on.
-        container: its name.
-        text: without the end of line.
+        at_s: Unix seconds. All nodes share one clock.
+        node: Node where the container ran.
+        container: Name of the container.
+        text: Line without line end.
     """
 
     at_s: float
@@ -33,11 +33,11 @@ class Line:
 
 
 class PodLogs:
-    """Follows the logs of containers on the nodes' disks, in a thread.
+    """Follows container logs on the disks of the nodes in a thread.
 
     Args:
-        nodes: directory of each node.
-        wanted: which containers, by name.
+        nodes: Directory of each node.
+        wanted: Names of the containers.
     """
 
     def __init__(self, nodes: Mapping[str, Path], wanted: Callable[[str], bool]) -> None:
@@ -50,11 +50,11 @@ class PodLogs:
         self._thread = threading.Thread(target=self._run, name="pod logs", daemon=True)
 
     def start(self) -> None:
-        """Begin to follow."""
+        """Start to follow the logs."""
         self._thread.start()
 
     def close(self) -> list[Line]:
-        """End, and return all lines in the order of their times."""
+        """Stop, and return all lines ordered by time."""
         self._over.set()
         self._thread.join()
         self.look()
@@ -63,7 +63,7 @@ class PodLogs:
         return sorted(self._lines, key=lambda line: line.at_s)
 
     def look(self) -> None:
-        """Take what is new."""
+        """Read new lines."""
         for node, directory in self._nodes.items():
             for path in sorted((directory / PODS).glob("*/*/*.log")):
                 if path not in self._open and self._wanted(path.parent.name):
@@ -79,7 +79,7 @@ class PodLogs:
 
 
 def parse(raw: bytes, node: str, container: str) -> Line | None:
-    """A line as the container runtime writes it; None for anything else."""
+    """Parse a log line of the container runtime. Return None for any other line."""
     found = _LINE.fullmatch(raw.decode("utf-8", "replace"))
     if found is None:
         return None

@@ -1,4 +1,4 @@
-"""Figures of a run: pictures, switches, and the gain over the cloud path alone beside an oracle's and the thesis' rule's."""
+"""Results of a run: pictures, switches, and the gain over the cloud path compared with other rules."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MIN_HEIGHT_M, ARRIVED_M = 15.0, 3.0
 
 @dataclass(frozen=True, slots=True)
 class Expectation:
-    """Something that must hold."""
+    """An expectation."""
 
     text: str
     holds: bool
@@ -30,7 +30,7 @@ class Expectation:
 
 @dataclass(frozen=True, slots=True)
 class Gain:
-    """Mbit that a rule carries beyond the cloud path on the flight as it was flown, and how many links it makes."""
+    """Gain of a rule over the cloud path on the recorded flight in Mbit, and number of links."""
 
     who: str
     gain_mbit: float
@@ -39,7 +39,7 @@ class Gain:
 
 
 def scene_of(site: Site, run: Evidence) -> tuple[Scene, float]:
-    """The flight as it was flown at its altitude while pictures were sent, and when it began (Unix seconds)."""
+    """Return the recorded flight while pictures were sent, and its start in Unix seconds."""
     last_s = max((p.sent_s for p in run.pictures), default=math.inf)
     flown = [(at, position) for at, position in run.track if position[2] >= MIN_HEIGHT_M and at <= last_s]
     times = np.array([at for at, _ in flown])
@@ -60,7 +60,7 @@ def scene_of(site: Site, run: Evidence) -> tuple[Scene, float]:
 
 
 def flown_gain(scene: Scene, begin_s: float, run: Evidence) -> float:
-    """Mbit beyond the cloud path: for as long as traffic was led to a peer that was really in reach."""
+    """Return the gain over the cloud path in Mbit, counting times with traffic on a peer that was actually in range."""
     peers = {peer.name: peer for peer in scene.peers}
     spans = sorted((begin, math.inf if end is None else end, s.peer) for s in run.switches for begin, end in s.spans)
     begins = [span[0] for span in spans]
@@ -74,7 +74,7 @@ def flown_gain(scene: Scene, begin_s: float, run: Evidence) -> float:
 
 
 def gains(site: Site, run: Evidence) -> list[Gain]:
-    """The flown run, beside what rules would carry on the same flight in the model."""
+    """Return the gain of the actual run, and of the modelled rules on the same flight."""
     scene, begin_s = scene_of(site, run)
     best = oracle(scene)
     rows = [("flown", flown_gain(scene, begin_s, run), sum(s.up_s is not None for s in run.switches))]
@@ -87,7 +87,7 @@ def gains(site: Site, run: Evidence) -> list[Gain]:
 
 
 def expectations(run: Evidence, table: list[Gain]) -> list[Expectation]:
-    """What the scenario must show."""
+    """Return the expectations of the scenario."""
     counts, flown = run.counts(), table[0]
     used = {s.peer for s in run.switches if s.redirected_s is not None}
     return [
@@ -102,7 +102,7 @@ def expectations(run: Evidence, table: list[Gain]) -> list[Expectation]:
 
 
 def report(site: Site, run: Evidence, table: list[Gain], checks: list[Expectation]) -> dict[str, Any]:
-    """Everything for programs."""
+    """Return the results as JSON-compatible values."""
     begin = run.pictures[0].sent_s if run.pictures else 0.0
     return {
         "holds": all(check.holds for check in checks),
@@ -115,7 +115,7 @@ def report(site: Site, run: Evidence, table: list[Gain], checks: list[Expectatio
 
 
 def _switch(switch: Switch, begin_s: float) -> dict[str, Any]:
-    """A link with its times in seconds since the first picture."""
+    """Return a link with times in seconds since the first picture."""
 
     def at(seconds: float | None) -> float | None:
         return None if seconds is None else round(seconds - begin_s, 3)

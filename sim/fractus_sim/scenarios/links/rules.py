@@ -1,4 +1,4 @@
-"""What rules for choosing a link carry on a flight: ours, the thesis', and an oracle that knows the whole flight."""
+"""Gain of link selection rules on a flight: the planner of Fractus, the thesis' rule, and an oracle."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from fractus_core.linking.range_model import with_contact, with_failure, with_lo
 
 STEP_S = 0.1
 LINK_UP_STEPS = 9
-"""0.92 s: until a link is up and measured."""
+"""0.92 s until a link is up and measured."""
 DECIDE_STEPS, BEACON_STEPS = 5, 10
 AHEAD_M = 20.0
 INGRESS = find_heuristic("max", "ingress-bandwidth")
@@ -32,16 +32,16 @@ SETTINGS = LinkSettings()
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """A flight among peers, and what paths really carry.
+    """A flight with peers, and the actual bandwidth of all paths.
 
     Attributes:
-        positions: of the drone, one every `STEP_S`.
-        waypoints: that are still to come at each step.
-        speed: along them, m/s.
-        peers: with their declared range.
-        cloud: the cloud path.
-        factor: real reach by declared reach.
-        direct_mbps: what a direct link really carries inside its reach.
+        positions: Positions of the drone, one every `STEP_S`.
+        waypoints: Remaining waypoints at each step.
+        speed: Speed along the waypoints, m/s.
+        peers: Peers with their declared range.
+        cloud: Cloud path.
+        factor: Actual range divided by declared range.
+        direct_mbps: Actual bandwidth of a direct link in range.
     """
 
     positions: Sequence[LocalPosition]
@@ -53,18 +53,18 @@ class Scene:
     direct_mbps: float = 14.7
 
     def rate(self, step: int, node: Peer) -> float:
-        """Mbit/s that the link to a peer really carries at a step."""
+        """Return the actual bandwidth of the link to a peer at a step, in Mbit/s."""
         inside = math.dist(self.positions[step], node.position) <= node.range_m * self.factor
         return self.direct_mbps if inside else 0.0
 
     @property
     def gain_mbps(self) -> float:
-        """What a direct link carries beyond the cloud path."""
+        """Return the gain of a direct link over the cloud path."""
         return self.direct_mbps - self.cloud.ingress_mbps
 
 
 def along(path: Sequence[LocalPosition], speed: float) -> tuple[list[LocalPosition], list[tuple[LocalPosition, ...]]]:
-    """Positions and coming waypoints, one every `STEP_S`, of a flight of constant speed along a path."""
+    """Return positions and remaining waypoints, one every `STEP_S`, for a constant speed along a path."""
     at, coming = path[0], list(path[1:])
     positions, waypoints = [], []
     while coming:
@@ -82,7 +82,7 @@ def along(path: Sequence[LocalPosition], speed: float) -> tuple[list[LocalPositi
 
 
 def oracle(scene: Scene) -> float:
-    """The most that any sequence of links could carry beyond the cloud path, by who knows the whole flight; Mbit."""
+    """Return the maximum gain in Mbit over the cloud path for any sequence of links, with the whole flight known."""
     n = len(scene.positions)
     up = {node.name: [scene.rate(i, node) > 0 for i in range(n)] for node in scene.peers}
     value = {"": [0.0] * (n + 1), **{name: [0.0] * (n + 1) for name in up}}
@@ -100,7 +100,7 @@ Rule = Callable[[Scene, int, LinkState, dict[str, LearnedRange]], str]
 
 
 def ours(scene: Scene, step: int, link: LinkState, ranges: dict[str, LearnedRange]) -> str:
-    """The receding-horizon plan."""
+    """Select the peer of the receding-horizon plan."""
     track = Track(scene.positions[step], scene.speed, scene.waypoints[step])
     return plan_link(
         track, scene.peers, scene.cloud, link, step * STEP_S, heuristic=INGRESS, settings=SETTINGS, ranges=ranges
@@ -108,7 +108,7 @@ def ours(scene: Scene, step: int, link: LinkState, ranges: dict[str, LearnedRang
 
 
 def thesis(scene: Scene, step: int, _link: LinkState, _reaches: dict[str, LearnedRange]) -> str:
-    """The nearest peer in declared range, where the drone flies towards its next waypoint (thesis 8.6)."""
+    """Select the nearest peer in declared range in the direction of the next waypoint (thesis 8.6)."""
     at, goal = scene.positions[step], scene.waypoints[step][0]
     share = min(AHEAD_M / max(math.dist(at, goal), 1e-9), 1.0)
     ahead = tuple(a + (b - a) * share for a, b in zip(at, goal, strict=True))
@@ -117,7 +117,7 @@ def thesis(scene: Scene, step: int, _link: LinkState, _reaches: dict[str, Learne
 
 
 def carried(scene: Scene, rule: Rule) -> tuple[float, int]:
-    """Mbit that a rule carries beyond the cloud path when it decides twice a second, and how many links it makes."""
+    """Return the gain in Mbit of a rule that decides twice a second, and its number of links."""
     link, gain, links, coming = NO_LINK, 0.0, 0, 0
     ranges: dict[str, LearnedRange] = {}
     nodes = {node.name: node for node in scene.peers}
@@ -152,7 +152,7 @@ def _learn_loss(scene: Scene, step: int, node: Peer, link: LinkState, ranges: di
 
 
 def _hear(scene: Scene, step: int, ranges: dict[str, LearnedRange]) -> None:
-    """A radio hears the beacons of the peers around it about once a second."""
+    """Interval of peer discovery. A radio receives the beacons of its neighbours about once a second."""
     for other in scene.peers:
         if scene.rate(step, other):
             distance = math.dist(scene.positions[step], other.position) / other.range_m

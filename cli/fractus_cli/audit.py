@@ -183,7 +183,7 @@ def _checkpoints(since: tuple[str, ...], ca: Path | None) -> dict[str, Checkpoin
         return {}
     # Imported here: what only verifies chains needs no cryptography.
     from cryptography import x509  # noqa: PLC0415
-    from fractus_runtime.audit_checkpoints import InvalidCheckpoint, noted, read_checkpoint  # noqa: PLC0415
+    from fractus_runtime.audit_checkpoints import InvalidCheckpoint, parse_status_checkpoint, read_checkpoint  # noqa: PLC0415
 
     known: dict[str, Checkpoint] = {}
     try:
@@ -192,7 +192,7 @@ def _checkpoints(since: tuple[str, ...], ca: Path | None) -> dict[str, Checkpoin
         raise click.ClickException(f"--ca {ca}: holds no certificate") from None
     for given in since:
         try:
-            checkpoint = noted(given) or read_checkpoint(Path(given).read_bytes(), authorities)
+            checkpoint = parse_status_checkpoint(given) or read_checkpoint(Path(given).read_bytes(), authorities)
         except (OSError, InvalidCheckpoint) as error:
             reason = error.strerror if isinstance(error, OSError) else error
             raise click.ClickException(f"--since {given}: {reason}") from None

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import click
-from fractus_runtime.audit_chain import Finding, Link, lines_of, logs, verify
+from fractus_runtime.audit_chain import Finding, Link, logs, read_lines, verify
 from fractus_services.recording.messages import component_of, parse_time_ns
 
 Entry = dict[str, Any]
@@ -43,7 +43,7 @@ def judged(name: Path, files: list[Path], since: Link | None = None) -> tuple[Fi
     begins: list[tuple[int, Path]] = [(0, files[0])]
 
     def lines() -> Iterable[bytes]:
-        for total, (path, number, line) in enumerate(lines_of(files)):
+        for total, (path, number, line) in enumerate(read_lines(files)):
             if number == 1 and total:
                 begins.append((total, path))
             yield line
@@ -81,7 +81,7 @@ def entries(found: dict[Path, list[Path]], window: Window) -> Iterator[Entry]:
 
 
 def _entries(log: str, node: str, files: Iterable[Path], window: Window) -> Iterator[Entry]:
-    for _, _, line in lines_of(files):
+    for _, _, line in read_lines(files):
         entry = _read(line)
         time_ns = parse_time_ns(entry.get("time"))
         # What began before the window counts in it, too.
@@ -106,7 +106,7 @@ def _nodes(found: dict[Path, list[Path]]) -> dict[Path, str]:
 
 def _first_started(files: Iterable[Path]) -> str:
     return next(
-        (node for _, _, line in lines_of(files) if b'"started"' in line and (node := _started(_read(line)))), ""
+        (node for _, _, line in read_lines(files) if b'"started"' in line and (node := _started(_read(line)))), ""
     )
 
 

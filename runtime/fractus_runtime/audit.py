@@ -1,4 +1,4 @@
-"""The audit log: one JSON object a line, each carrying the hash of the one before it, in segments of bounded size."""
+"""Audit log: one JSON entry per line, which contains the hash of the previous entry, in segments of bounded size."""
 
 from __future__ import annotations
 
@@ -18,33 +18,42 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from fractus_runtime.audit_chain import PRUNED, Link, canonical, digest, first_of, last_link, segment, segments
-from fractus_runtime.audit_checkpoints import signed
+from fractus_runtime.audit_chain import (
+    PRUNED,
+    Link,
+    canonical,
+    digest,
+    first_sequence,
+    last_link,
+    segment_path,
+    segments,
+)
+from fractus_runtime.audit_checkpoints import sign_checkpoint
 from fractus_runtime.files import remove_temporary, write_file
 
 log = logging.getLogger(__name__)
 
 SYNC_INTERVAL_S = 0.5
-"""Entries that record no decision wait this long for others, so that one fsync serves them all."""
+"""Maximum delay of entries that are not urgent, so that one fsync serves several entries."""
 
 MAX_SEGMENT_BYTES = 16_000_000
-"""A file of this size is closed, and the chain continues in the next one."""
+"""Size at which a file is closed. The chain continues in the next file."""
 
 MAX_SEGMENTS = 32
-"""Closed files that are kept; then the oldest is removed, and an entry records that."""
+"""Number of closed segments to keep. When the oldest is removed, an entry records the removal."""
 
 MAX_WAITING = 10_000
-"""Entries that wait in memory while the disk does not take them."""
+"""Maximum number of entries in memory while the disk cannot be written."""
 
 CHECKPOINT_INTERVAL_S = 60.0
-"""How often a checkpoint is written while there are new entries."""
+"""Interval between checkpoints while there are new entries."""
 
 HANG_TIMEOUT_S = 2.0
-"""A write that takes longer counts as failed until it returns."""
+"""Duration after which a pending write counts as a failure, until it returns."""
 
 
 def _plain(value: Any) -> Any:
-    """JSON without NaN and infinities: they become text."""
+    """Return a value for JSON, with NaN and infinities as text."""
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
     if isinstance(value, dict):
@@ -55,8 +64,8 @@ def _plain(value: Any) -> Any:
 
 
 @dataclass(frozen=True, slots=True)
-class _Waiting:
-    """An entry that is not on disk yet; it gets its place in the chain when it is written."""
+class _PendingEntry:
+    """An entry that is not on disk yet. Its sequence number and hash are computed when it is written."""
 
     time: str
     kind: str
@@ -65,21 +74,21 @@ class _Waiting:
 
 
 class AuditLog:
-    """Appends entries; a thread writes them, so that a slow disk never delays a flight.
+    """Appends entries to an audit log. A thread writes them, so that a slow disk never delays a flight.
 
-    Each has its time, and with `boot_s` the seconds since the machine started, which no step of its clock moves.
+    Each entry contains its time and, as `boot_s`, the seconds since the machine started, which clock steps do not change.
 
-    While the disk is full or does not answer, or another process writes the same log, entries wait; those beyond `MAX_WAITING` are lost, and one entry in their
-    place records how many.
+    While the disk is full or hangs, or another process writes the same log, entries are kept in memory. Entries above
+    `MAX_WAITING` are lost, and one entry records their number.
 
     Args:
-        path: the file; a chain that it holds is continued, a last line that a crash left incomplete is cut off before the
-            next entry is written, and recorded.
-        clock: Unix time in seconds.
-        segment_bytes: when the file is closed and the next one begun.
-        keep: how many closed files are kept.
-        tls: directory of the node's key and certificate, which checkpoints are signed with.
-        copied: takes each entry as it is, with time and kind, before it is in the chain; must return at once.
+        path: File of the log. An existing chain is continued. If a crash left an incomplete last line, the line is removed
+            before the next entry is written, and an entry records it.
+        clock: Returns Unix time in seconds.
+        segment_bytes: Size at which the file is closed and the next one begins.
+        keep: Number of closed segments to keep.
+        tls: Directory of the node's key and certificate, which sign checkpoints. None for a log without checkpoints.
+        on_entry: Called with each entry, including time and kind, before the entry is in the chain. Must not block.
     """
 
     def __init__(
@@ -90,9 +99,9 @@ class AuditLog:
         segment_bytes: int = MAX_SEGMENT_BYTES,
         keep: int = MAX_SEGMENTS,
         tls: Path | None = None,
-        copied: Callable[[dict[str, Any]], None] = lambda _entry: None,
+        on_entry: Callable[[dict[str, Any]], None] = lambda _entry: None,
     ) -> None:
-        self._copied = copied
+        self._on_entry = on_entry
         self._path = path
         self._clock = clock
         self._segment_bytes = segment_bytes
@@ -103,7 +112,7 @@ class AuditLog:
         self._signed = Link()
         remove_temporary(self._checkpoint)
         self._pruned: list[Path] = []
-        self._waiting: deque[_Waiting] = deque()
+        self._waiting: deque[_PendingEntry] = deque()
         self._lost = 0
         self._changed = threading.Condition()
         self._urgent = False
@@ -114,11 +123,11 @@ class AuditLog:
         path.parent.mkdir(parents=True, exist_ok=True)
         self._lock: int | None = None
         torn = 0
-        with contextlib.suppress(OSError):  # a disk that is read-only is told of when the first entry is written
+        with contextlib.suppress(OSError):  # a read-only disk is reported when the first entry is written
             whole, size = _whole_lines(path)
             torn = size - whole
             self._sound_bytes = whole if torn else None
-            path.touch(0o640)  # so that verification can tell when it is missing
+            path.touch(0o640)  # so that verification detects a missing file
         self._end = _end_of_chain(path)
         self._thread = threading.Thread(target=self._write, name="audit", daemon=True)
         self._thread.start()
@@ -127,34 +136,37 @@ class AuditLog:
 
     @property
     def failure(self) -> str:
-        """Why entries do not reach the disk; empty while they do."""
+        """Reason why entries do not reach the disk, or an empty string."""
         since_s = self._busy_since_s
         if since_s is not None and time.monotonic() - since_s > HANG_TIMEOUT_S:
-            return f"the audit log cannot be written: the disk has not answered for {time.monotonic() - since_s:.0f} s"
+            return f"the audit log cannot be written: no response of the disk for {time.monotonic() - since_s:.0f} s"
         return self._problem
 
     @property
     def head(self) -> Link:
-        """Number and hash of the last entry on disk."""
+        """Sequence number and hash of the last entry on disk."""
         return self._end
 
     @property
     def waiting(self) -> int:
-        """Entries that are not on disk yet."""
+        """Number of entries that are not on disk yet."""
         return len(self._waiting)
 
     def append(self, kind: str, content: dict[str, Any], now: bool = True) -> None:
         """Add an entry.
 
         Args:
-            kind: call, takeover, control, grant, state, ...
+            kind: Kind of the entry: call, takeover, control, grant, state, ...
             content: JSON values.
-            now: whether it must reach the disk at once.
+            now: True to write the entry to disk without waiting for further entries.
+
+        Raises:
+            TypeError: The content contains values that JSON does not have.
         """
-        entry = _Waiting(self._moment(), kind, _plain(content))
-        # Content that is not JSON fails here, in the caller, and not in the thread.
+        entry = _PendingEntry(self._moment(), kind, _plain(content))
+        # Raises in the caller instead of the thread if the content is not JSON.
         canonical(entry.content)
-        self._copied({"time": entry.time, "kind": kind, **entry.content})
+        self._on_entry({"time": entry.time, "kind": kind, **entry.content})
         with self._changed:
             if len(self._waiting) >= MAX_WAITING:
                 self._lost += 1
@@ -164,22 +176,22 @@ class AuditLog:
             self._changed.notify()
 
     def refused_grant(self, name: str, reason: str) -> None:
-        """Record that a grant file grants nothing."""
+        """Record that a Grant file was rejected."""
         self.append("grant", {"change": "refused", "name": name, "reason": reason})
 
     def clock_stepped(self, step_s: float, trusted: bool) -> None:
-        """Record a step of the clock, from which entries have their times."""
+        """Record a step of the clock that entries take their time from."""
         self.append("clock", {"step_s": round(step_s, 3), "trusted": trusted})
 
     async def close(self) -> None:
-        """Write what is left."""
+        """Write the remaining entries and stop the thread."""
         with self._changed:
             self._closing = True
             self._changed.notify()
         await asyncio.to_thread(self._thread.join, 5.0)
 
     def _write(self) -> None:
-        """The thread: write until closed; then another process may."""
+        """Run the thread: write until closed, then release the lock."""
         try:
             self._write_batches()
         finally:
@@ -187,14 +199,16 @@ class AuditLog:
                 os.close(self._lock)
 
     def _write_batches(self) -> None:
-        """Append in batches, one fsync for each."""
+        """Append entries in batches with one fsync each."""
         while True:
             with self._changed:
                 if self._changed.wait_for(lambda: self._waiting or self._closing, self._until_checkpoint_s()):
                     self._changed.wait_for(
                         lambda: self._closing or (self._urgent and not self._problem), SYNC_INTERVAL_S
                     )
-                batch, self._urgent, closing = tuple(self._waiting), False, self._closing
+                batch = tuple(self._waiting)
+                closing = self._closing
+                self._urgent = False
             written = not batch or self._flush(batch)
             if written and batch:
                 self._take_off(len(batch))
@@ -207,25 +221,26 @@ class AuditLog:
                 return
 
     def _take_off(self, written: int) -> None:
-        """Remove what is on disk from the queue, and record what was lost while it was full."""
+        """Remove written entries from the queue, and record the number of entries that were lost while it was full."""
         with self._changed:
             for _ in range(written):
                 self._waiting.popleft()
             if self._lost:
-                self._waiting.append(_Waiting(self._moment(), "lost", {"entries": self._lost}))
-                self._lost, self._urgent = 0, True
+                self._waiting.append(_PendingEntry(self._moment(), "lost", {"entries": self._lost}))
+                self._lost = 0
+                self._urgent = True
 
-    def _flush(self, batch: Iterable[_Waiting]) -> bool:
-        """Append and sync; what could not be written is tried again with the next batch."""
+    def _flush(self, batch: Iterable[_PendingEntry]) -> bool:
+        """Append entries and sync the file. Return False on failure; the entries then stay in the queue for the next attempt."""
         self._busy_since_s = time.monotonic()
         try:
             if self._lock is None:
-                self._lock, self._sound_bytes, self._end = _taken_over(self._path)
+                self._lock, self._sound_bytes, self._end = _acquire(self._path)
             data, end = _chained(batch, self._end)
             self._store(data)
         except OSError as error:
             if not self._problem:
-                log.critical("audit: cannot be written (file=%s): %s", self._path, error)
+                log.critical("audit: cannot write entries (file=%s error=%s)", self._path, error)
             self._problem = f"the audit log cannot be written: {error.strerror or error}"
             return False
         finally:
@@ -235,30 +250,30 @@ class AuditLog:
         return True
 
     def _tidy(self) -> None:
-        """Close a full file, and remove the oldest closed ones once the entry that records it is on disk."""
+        """Close a full file. Remove the oldest segments if the entry that records their removal is on disk."""
         self._busy_since_s = time.monotonic()
         try:
             while self._pruned:
                 self._pruned[0].unlink(missing_ok=True)
                 del self._pruned[0]
             if self._path.stat().st_size >= self._segment_bytes:
-                self._path.rename(segment(self._path, _first_entry(self._path)))
+                self._path.rename(segment_path(self._path, _first_entry(self._path)))
                 self._path.touch(0o640)
                 self._record_pruning()
         except (OSError, ValueError) as error:
-            log.warning("audit: cannot close a segment (file=%s): %s", self._path, error)
+            log.warning("audit: cannot close a segment (file=%s error=%s)", self._path, error)
         finally:
             self._busy_since_s = None
 
     def _until_checkpoint_s(self) -> float | None:
-        """How long to wait for an entry before those on disk are signed; None when they are, or nothing can sign them."""
+        """Return the seconds until the next checkpoint, or None if there is nothing to sign or no key."""
         if self._tls is None or self._end in (Link(), self._signed):
             return None
         due_s = self._checkpoint_due_s
         return max(due_s - time.monotonic(), 0.0) if due_s else CHECKPOINT_INTERVAL_S
 
     def _write_checkpoint(self, at_once: bool) -> None:
-        """Sign how far the log has come, now and then."""
+        """Write a signed checkpoint of the last entry on disk if one is due."""
         if self._tls is None or self._end in (Link(), self._signed):
             return
         if not at_once and time.monotonic() < self._checkpoint_due_s:
@@ -266,13 +281,13 @@ class AuditLog:
         self._checkpoint_due_s = time.monotonic() + CHECKPOINT_INTERVAL_S
         self._busy_since_s = time.monotonic()
         try:
-            content = signed(self._path.stem, self._end, self._moment(), self._tls)
+            content = sign_checkpoint(self._path.stem, self._end, self._moment(), self._tls)
             write_file(self._checkpoint, content, 0o640, durable=False)
             self._signed = self._end
         except FileNotFoundError:
             self._checkpoint_due_s = 0.0  # the node has no certificate yet
         except (OSError, ValueError, TypeError) as error:
-            log.warning("audit: cannot write a checkpoint (file=%s): %s", self._checkpoint, error)
+            log.warning("audit: cannot write a checkpoint (file=%s error=%s)", self._checkpoint, error)
         finally:
             self._busy_since_s = None
 
@@ -284,9 +299,9 @@ class AuditLog:
         end = last_link(surplus[-1])
         if end is None:
             return
-        content = {"first": first_of(surplus[0]), "last": end.sequence, "last_hash": end.hash}
+        content = {"first": first_sequence(surplus[0]), "last": end.sequence, "last_hash": end.hash}
         with self._changed:
-            self._waiting.append(_Waiting(self._moment(), PRUNED, content))
+            self._waiting.append(_PendingEntry(self._moment(), PRUNED, content))
             self._urgent = True
         self._pruned = list(surplus)
 
@@ -294,9 +309,9 @@ class AuditLog:
         return datetime.fromtimestamp(self._clock(), UTC).isoformat(timespec="milliseconds")
 
     def _store(self, data: bytes) -> None:
-        """Append bytes and wait until they are on disk, or leave the file as it was: half an entry would break the chain.
+        """Append bytes and wait until they are on disk. On failure, restore the file, because half an entry breaks the chain.
 
-        What a failed attempt, or a crash, left and could not cut off is cut off before the next.
+        If a failed attempt or a crash left bytes that could not be removed, they are removed before the next attempt.
         """
         file = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o640)
         try:
@@ -317,12 +332,12 @@ class AuditLog:
 
 
 def _end_of_chain(log_file: Path) -> Link:
-    """Where the chain on disk ends."""
+    """Return the last entry of the chain on disk."""
     for path in (log_file, *reversed(segments(log_file))):
         try:
             end = last_link(path)
         except ValueError:
-            log.critical("audit: the last entry cannot be read, a new chain begins after it (file=%s)", path)
+            log.critical("audit: cannot read the last entry, starting a new chain (file=%s)", path)
             return Link()
         if end is not None:
             return end
@@ -330,16 +345,19 @@ def _end_of_chain(log_file: Path) -> Link:
 
 
 def _first_entry(path: Path) -> int:
-    """The number of the first entry in a file."""
+    """Return the sequence number of the first entry of a file."""
     with path.open("rb") as file:
         return int(json.loads(file.readline())["seq"])
 
 
-def _taken_over(path: Path) -> tuple[int, int | None, Link]:
-    """Become a log's one writer: the lock, how much of the file is whole lines where not all is, and where its chain ends.
+def _acquire(path: Path) -> tuple[int, int | None, Link]:
+    """Become the only writer of a log.
+
+    Returns:
+        The lock, the length of the complete lines if the last line is incomplete, and the last entry.
 
     Raises:
-        OSError: another process writes the log, or there can be no lock.
+        OSError: Another process writes the log, or the lock cannot be created.
     """
     lock = _locked(path.with_name(f".{path.stem}.lock"))
     try:
@@ -351,10 +369,10 @@ def _taken_over(path: Path) -> tuple[int, int | None, Link]:
 
 
 def _locked(path: Path) -> int:
-    """A lock file, locked; the lock ends with the process.
+    """Lock a file and return its descriptor. The lock ends with the process.
 
     Raises:
-        OSError: another process holds it, or it cannot be made.
+        OSError: Another process holds the lock, or the file cannot be created.
     """
     lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o640)
     try:
@@ -362,12 +380,12 @@ def _locked(path: Path) -> int:
     except OSError as error:
         os.close(lock)
         taken = isinstance(error, BlockingIOError)
-        raise OSError(error.errno, "another process writes it") if taken else error from None
+        raise OSError(error.errno, "another process writes this log") if taken else error from None
     return lock
 
 
-def _chained(batch: Iterable[_Waiting], end: Link) -> tuple[bytes, Link]:
-    """Entries as lines that continue a chain, and its new end."""
+def _chained(batch: Iterable[_PendingEntry], end: Link) -> tuple[bytes, Link]:
+    """Return entries as lines that continue the chain, and the new last entry."""
     lines = []
     for waiting in batch:
         sequence = end.sequence + 1
@@ -380,19 +398,19 @@ def _chained(batch: Iterable[_Waiting], end: Link) -> tuple[bytes, Link]:
 
 
 def _whole_lines(path: Path) -> tuple[int, int]:
-    """How many bytes of a file are whole lines, which a crash may leave the last one not, and how many it has."""
+    """Return the length of the complete lines of a file, and its size. A crash may leave an incomplete last line."""
     try:
         size = path.stat().st_size
     except FileNotFoundError:
         return 0, 0
     with path.open("rb") as file:
-        at = size
-        while at > 0:
-            start = max(at - 65536, 0)
+        end = size
+        while end > 0:
+            start = max(end - 65536, 0)
             file.seek(start)
-            found = file.read(at - start).rfind(b"\n")
-            if found >= 0:
-                at = start + found + 1
+            newline = file.read(end - start).rfind(b"\n")
+            if newline >= 0:
+                end = start + newline + 1
                 break
-            at = start
-    return at, size
+            end = start
+    return end, size

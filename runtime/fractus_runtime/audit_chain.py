@@ -1,4 +1,4 @@
-"""The hash chain of an audit log: its entries, the segments that store them, and its verification."""
+"""Hash chain of an audit log: entries, segments, and verification."""
 
 from __future__ import annotations
 
@@ -21,84 +21,84 @@ _SEGMENT = re.compile(r"^(?P<name>.+)\.(?P<first>\d{12})$")
 
 
 def canonical(value: dict[str, Any]) -> bytes:
-    """JSON as it is hashed and written."""
+    """Return the JSON text that is hashed and written."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode()
 
 
 def digest(entry: dict[str, Any]) -> str:
-    """SHA-256 over the canonical JSON of an entry without its own hash."""
+    """Return the SHA-256 of the canonical JSON of an entry without its own hash."""
     body = {key: value for key, value in entry.items() if key != "hash"}
     return hashlib.sha256(canonical(body)).hexdigest()
 
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """An end of the chain: the next entry continues it."""
+    """Sequence number and hash of an entry, which the next entry continues."""
 
     sequence: int = 0
     hash: str = GENESIS
 
 
 def last_link(path: Path) -> Link | None:
-    """The last entry of a file, a line that a crash left incomplete aside; None when it has none.
+    """Return the last entry of a file, or None if there is no entry. An incomplete last line is skipped.
 
     Raises:
-        ValueError: the last whole line is no audit entry.
+        ValueError: The last complete line is not an audit entry.
     """
     with contextlib.suppress(FileNotFoundError), path.open("rb") as file:
         file.seek(0, os.SEEK_END)
         file.seek(max(file.tell() - _TAIL_BYTES, 0))
-        found = file.read()
-        lines = found[: found.rfind(b"\n") + 1].splitlines()
+        tail = file.read()
+        lines = tail[: tail.rfind(b"\n") + 1].splitlines()
         if lines:
             try:
                 entry = json.loads(lines[-1])
                 return Link(int(entry["seq"]), str(entry["hash"]))
             except (KeyError, TypeError, RecursionError) as error:
-                raise ValueError(f"no audit entry: {error}") from None
+                raise ValueError(f"not an audit entry: {error}") from None
     return None
 
 
-def segment(path: Path, first: int) -> Path:
-    """The name that a full log file gets; `first` is the number of its first entry."""
+def segment_path(path: Path, first: int) -> Path:
+    """Return the path of a closed segment whose first entry has the sequence number `first`."""
     return path.with_name(f"{path.stem}.{first:012d}{path.suffix}")
 
 
 def segments(path: Path) -> list[Path]:
-    """The full segments of a log, oldest first."""
-    found = path.parent.glob(f"{path.stem}.*{path.suffix}")
-    return sorted(other for other in found if other.is_file() and _of(other) == path)
+    """Return the closed segments of a log, oldest first."""
+    candidates = path.parent.glob(f"{path.stem}.*{path.suffix}")
+    return sorted(other for other in candidates if other.is_file() and _log_of(other) == path)
 
 
-def first_of(path: Path) -> int:
-    """The number of a segment's first entry, by its name."""
+def first_sequence(path: Path) -> int:
+    """Return the sequence number of the first entry of a segment, from its name."""
     match = _SEGMENT.match(path.stem)
     return int(match["first"]) if match is not None else 0
 
 
 def logs(paths: Iterable[Path]) -> dict[Path, list[Path]]:
-    """The logs that files and directories belong to, each with its files in order.
+    """Return the logs of files and directories, each with its files in order.
 
-    A log's present file stands for all of it, a segment for itself, and a directory for all of each log that it has a part or
-    a checkpoint of: a present file that is missing there is listed too.
+    The current file of a log selects the whole log, and a segment selects itself. A directory selects all logs of which it
+    contains a file or a checkpoint. The current file is listed even if it is missing.
     """
-    found: dict[Path, set[Path]] = {}
+    files_by_log: dict[Path, set[Path]] = {}
     for path in paths:
         whole = path.is_dir()
         checkpointed = (file.with_suffix(".jsonl") for file in path.glob("*.checkpoint"))
         for file in sorted({*path.glob("*.jsonl"), *checkpointed}) if whole else (path,):
-            log = _of(file)
-            found.setdefault(log, set()).update((*segments(log), log) if whole or log == file else (file,))
-    return {log: sorted(files, key=lambda file: (file == log, file)) for log, files in found.items()}
+            log = _log_of(file)
+            files_by_log.setdefault(log, set()).update((*segments(log), log) if whole or log == file else (file,))
+    return {log: sorted(files, key=lambda file: (file == log, file)) for log, files in files_by_log.items()}
 
 
-def _of(path: Path) -> Path:
+def _log_of(path: Path) -> Path:
     match = _SEGMENT.match(path.stem)
     return path.with_name(match["name"] + path.suffix) if match is not None else path
 
 
-def lines_of(files: Iterable[Path]) -> Iterator[tuple[Path, int, bytes]]:
-    """The lines of several files, each with its file and number."""
+def read_lines(files: Iterable[Path]) -> Iterator[tuple[Path, int, bytes]]:
+    """Yield the lines of several files, each with its file and line number."""
     for path in files:
         with path.open("rb") as file:
             for number, line in enumerate(file, 1):
@@ -106,7 +106,7 @@ def lines_of(files: Iterable[Path]) -> Iterator[tuple[Path, int, bytes]]:
 
 
 def entries(lines: Iterable[bytes]) -> Iterator[dict[str, Any]]:
-    """The entries of an audit log; a line that is none, of which `verify` tells, is passed over."""
+    """Yield the entries of an audit log. Lines that are not entries are skipped; `verify` reports them."""
     for line in lines:
         try:
             yield json.loads(line)
@@ -116,14 +116,14 @@ def entries(lines: Iterable[bytes]) -> Iterator[dict[str, Any]]:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """What verification found.
+    """Result of a verification.
 
     Attributes:
-        entries: how many entries are sound.
-        line: number of the first bad line; 0 when all are sound.
-        problem: what is wrong with it; empty when all are sound.
-        torn: the last line is incomplete, as after a crash or while one is being written.
-        before: how many entries before the first one were removed to free space, as a later entry records.
+        entries: Number of valid entries.
+        line: Number of the first invalid line, 0 if all lines are valid.
+        problem: Description of the problem, which follows "line N". Empty if all lines are valid.
+        torn: True if the last line is incomplete, because of a crash or because it is being written.
+        before: Number of entries before the first one that were removed to free space, according to a later entry.
     """
 
     entries: int
@@ -137,17 +137,17 @@ def verify(lines: Iterable[bytes], part: bool = False, since: Link | None = None
     """Check the chain of an audit log, line by line.
 
     Args:
-        lines: the log.
-        part: the lines are not the whole log; what comes before and after them is not judged.
-        since: an entry that the log is known to have had; all from there on must be in the lines. Without one, no entry
-            may be missing at the beginning: who removes entries can also write the entry that records it.
+        lines: Lines of the log.
+        part: True if the lines are a part of the log. Then missing entries before and after them are not detected.
+        since: An entry that the log is known to have contained. It and all later entries must exist. Without it, entries at the
+            beginning must not be missing, because an attacker who removes entries can also write the entry that records the removal.
     """
     previous, count, torn = Link(), 0, False
     begin: Link | None = None
     pruned: set[tuple[object, object]] = set()
     for number, line in enumerate(lines, 1):
         if torn:
-            return Finding(count, number - 1, "is incomplete, and others follow")
+            return Finding(count, number - 1, "is incomplete, but other lines follow")
         if not line.endswith(b"\n"):
             torn = True
             continue
@@ -162,7 +162,7 @@ def verify(lines: Iterable[bytes], part: bool = False, since: Link | None = None
         except (ValueError, KeyError, TypeError, RecursionError):
             problem = "is not an audit entry"
         if since is not None and previous.sequence == since.sequence and previous != since:
-            problem = problem or "is another entry than the checkpoint's: it and all before it were written again"
+            problem = problem or "differs from the checkpoint: this entry and all entries before it were rewritten"
         if problem:
             return Finding(count, number, problem)
         count += 1
@@ -175,27 +175,27 @@ def verify(lines: Iterable[bytes], part: bool = False, since: Link | None = None
 def _ends(
     begin: Link, end: Link, last_line: int, pruned: set[tuple[object, object]], since: Link | None
 ) -> dict[str, Any]:
-    """What is wrong with where a log begins and where it ends."""
+    """Return the line and the problem if entries are missing at the beginning or at the end of a log."""
     first = begin.sequence + 1
     if since is not None and end.sequence < since.sequence:
-        problem = f"is number {end.sequence}, the last one, and the checkpoint is number {since.sequence}: entries are missing"
+        problem = f"is the last entry, number {end.sequence}, but the checkpoint is number {since.sequence}: entries are missing"
         return {"line": last_line, "problem": problem}
     if since is not None and begin.sequence >= since.sequence and begin != since:
         return {
             "line": 1,
-            "problem": f"is number {first}, and those since the checkpoint, number {since.sequence}, are missing",
+            "problem": f"is number {first}: entries since the checkpoint, number {since.sequence}, are missing",
         }
     if begin == Link():
         return {}
     if (begin.sequence, begin.hash) not in pruned:
         return {
             "line": 1,
-            "problem": f"is number {first}, and the entries before it were removed, and no entry records that",
+            "problem": f"is number {first}: earlier entries were removed, and no entry records the removal",
         }
     if since is None:
         problem = (
-            f"is number {first}; an entry records that those before were removed to make room, which only a checkpoint from"
-            " before can prove: give it with --since"
+            f"is number {first}: an entry records that earlier entries were removed to free space, which only an earlier"
+            " checkpoint can prove; specify it with --since"
         )
         return {"line": 1, "problem": problem}
     return {}
@@ -203,9 +203,9 @@ def _ends(
 
 def _problem(entry: dict[str, Any], previous: Link, line: bytes) -> str:
     if entry["prev"] != previous.hash:
-        return "does not continue the line before it: something was removed, inserted or reordered"
+        return "does not continue the previous line: entries were removed, inserted or reordered"
     if entry["seq"] != previous.sequence + 1:
-        return f"is number {entry['seq']}, where {previous.sequence + 1} was expected"
+        return f"is number {entry['seq']}, expected {previous.sequence + 1}"
     if digest(entry) != entry["hash"] or canonical(entry) + b"\n" != line:
         return "was changed after it was written"
     return ""

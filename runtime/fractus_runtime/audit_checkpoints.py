@@ -1,4 +1,4 @@
-"""Checkpoints of an audit log: how far it had come, signed by its node, to be kept elsewhere."""
+"""Checkpoints of an audit log: its last entry, signed by the node. Copies elsewhere prove later that no entry was removed."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ from fractus_runtime.audit_chain import Link, canonical
 
 _CONTEXT = b"fractus.dev audit checkpoint 1\n"
 _NODES = node_identity("")
-_NOTED = re.compile(r"(?P<log>[^:/]+):(?P<number>\d{1,15}):(?P<hash>[0-9a-f]{64})")
+_STATUS_FORM = re.compile(r"(?P<log>[^:/]+):(?P<number>\d{1,15}):(?P<hash>[0-9a-f]{64})")
 
 
 class InvalidCheckpoint(Exception):
-    """A checkpoint proves nothing; the message says why."""
+    """The checkpoint is not valid."""
 
 
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
-    """An entry that an audit log had, and all entries before it.
+    """An entry that an audit log contained, after all entries before it.
 
     Attributes:
-        log: name of the log, without directory and extension.
-        node: identity of the node that signed it; empty where it was noted without its signature.
-        link: the entry.
-        certified: whether an authority was given that issued the node's certificate.
+        log: Name of the log, without directory and extension.
+        node: Identity of the node that signed the checkpoint. Empty if it has no signature.
+        link: The entry.
+        certified: True if the node's certificate was verified with an authority.
     """
 
     log: str
@@ -44,58 +44,58 @@ class Checkpoint:
     certified: bool
 
 
-def signed(log: str, link: Link, time: str, tls: Path) -> bytes:
-    """A checkpoint as JSON, which holds the certificate that its signature is checked by.
+def sign_checkpoint(log: str, link: Link, time: str, tls: Path) -> bytes:
+    """Return a signed checkpoint as JSON, including the certificate that verifies the signature.
 
     Args:
-        log: name of the log.
-        link: its last entry that is on disk.
-        time: now, ISO 8601.
-        tls: directory of the node's tls.key and tls.crt.
+        log: Name of the log.
+        link: Last entry of the log on disk.
+        time: Current time in ISO 8601.
+        tls: Directory of the node's tls.key and tls.crt.
 
     Raises:
-        OSError: these cannot be read.
-        ValueError: these are no key and certificate.
-        TypeError: the key is of another kind than those of nodes.
+        OSError: The key or the certificate cannot be read.
+        ValueError: The key or the certificate is malformed.
+        TypeError: The key is not an elliptic curve key.
     """
     key = serialization.load_pem_private_key((tls / "tls.key").read_bytes(), None)
     if not isinstance(key, ec.EllipticCurvePrivateKey):
-        raise TypeError(f"{tls / 'tls.key'}: is no key of an elliptic curve")
+        raise TypeError(f"{tls / 'tls.key'}: not an elliptic curve key")
     certificate = x509.load_pem_x509_certificate((tls / "tls.crt").read_bytes())
-    said = {
+    content = {
         "log": log, "seq": link.sequence, "hash": link.hash, "time": time,
         "certificate": certificate.public_bytes(serialization.Encoding.PEM).decode(),
     }  # fmt: skip
-    signature = key.sign(_CONTEXT + canonical(said), ec.ECDSA(hashes.SHA256()))
-    return canonical({**said, "signature": base64.b64encode(signature).decode()}) + b"\n"
+    signature = key.sign(_CONTEXT + canonical(content), ec.ECDSA(hashes.SHA256()))
+    return canonical({**content, "signature": base64.b64encode(signature).decode()}) + b"\n"
 
 
-def noted(text: str) -> Checkpoint | None:
-    """A checkpoint as the status of a node has it, LOG:NUMBER:HASH; None where the text is none."""
-    found = _NOTED.fullmatch(text)
-    return Checkpoint(found["log"], "", Link(int(found["number"]), found["hash"]), False) if found else None
+def parse_status_checkpoint(text: str) -> Checkpoint | None:
+    """Return a checkpoint in the form of a node's status, LOG:NUMBER:HASH, or None if the text has another form."""
+    match = _STATUS_FORM.fullmatch(text)
+    return Checkpoint(match["log"], "", Link(int(match["number"]), match["hash"]), False) if match else None
 
 
-def read_checkpoint(content: bytes, authorities: Sequence[x509.Certificate] = ()) -> Checkpoint:
-    """Check the signature of a checkpoint, and its node's certificate where authorities are given.
+def read_checkpoint(data: bytes, authorities: Sequence[x509.Certificate] = ()) -> Checkpoint:
+    """Verify the signature of a checkpoint and, if authorities are given, the certificate of its node.
 
     Raises:
-        InvalidCheckpoint: no node signed it as it stands.
+        InvalidCheckpoint: The checkpoint is malformed, or its signature or certificate is not valid.
     """
     try:
-        said = json.loads(content)
-        signature = base64.b64decode(said.pop("signature"), validate=True)
-        certificate = x509.load_pem_x509_certificate(said["certificate"].encode())
+        content = json.loads(data)
+        signature = base64.b64decode(content.pop("signature"), validate=True)
+        certificate = x509.load_pem_x509_certificate(content["certificate"].encode())
         names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
         nodes = [uri for uri in names.get_values_for_type(x509.UniformResourceIdentifier) if uri.startswith(_NODES)]
-        log, link = str(said["log"]), Link(int(said["seq"]), str(said["hash"]))
-        moment, key = datetime.fromisoformat(said["time"]), certificate.public_key()
+        log, link = str(content["log"]), Link(int(content["seq"]), str(content["hash"]))
+        moment, key = datetime.fromisoformat(content["time"]), certificate.public_key()
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError, x509.ExtensionNotFound):
-        raise InvalidCheckpoint("is no checkpoint; keep copies of the .checkpoint files beside the log") from None
+        raise InvalidCheckpoint("is not a checkpoint; use a copy of a .checkpoint file of the log") from None
     if len(nodes) != 1 or not isinstance(key, ec.EllipticCurvePublicKey):
         raise InvalidCheckpoint("is not signed by a node")
     try:
-        key.verify(signature, _CONTEXT + canonical(said), ec.ECDSA(hashes.SHA256()))
+        key.verify(signature, _CONTEXT + canonical(content), ec.ECDSA(hashes.SHA256()))
     except InvalidSignature:
         raise InvalidCheckpoint("was changed after it was signed") from None
     if authorities:
@@ -105,7 +105,7 @@ def read_checkpoint(content: bytes, authorities: Sequence[x509.Certificate] = ()
 
 def _check_issuer(certificate: x509.Certificate, moment: datetime, authorities: Sequence[x509.Certificate]) -> None:
     if not certificate.not_valid_before_utc <= moment <= certificate.not_valid_after_utc:
-        raise InvalidCheckpoint("was signed when its node's certificate was not valid")
+        raise InvalidCheckpoint("was signed outside the validity period of the node's certificate")
     for authority in authorities:
         try:
             certificate.verify_directly_issued_by(authority)

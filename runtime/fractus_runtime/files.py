@@ -1,4 +1,4 @@
-"""Writing files in one step, and waiting until they are on the disk."""
+"""Atomic and durable file replacement."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from collections.abc import Mapping
 from pathlib import Path
 
 CURRENT = "..data"
-"""Symbolic link to the directory that holds the current set of files (as kubelet does for Secret volumes)."""
+"""Symbolic link to the directory with the current set of files, as in the kubelet's Secret volumes."""
 
 
 def write_file(
     path: Path, content: bytes, mode: int = 0o600, *, former: Path | None = None, durable: bool = True
 ) -> None:
-    """Replace a file in one step and wait until it is on the disk.
+    """Replace a file atomically and wait until it is on disk.
 
-    Temporary files begin with a dot and end in .tmp; each call has its own. What a kill leaves of them, `remove_temporary`
-    removes.
+    Each call writes a temporary file whose name begins with a dot and ends in .tmp. `remove_temporary` removes temporary files
+    that a killed process left.
 
     Args:
-        path: The file; one process writes it at a time, unless it does not matter whose content stays.
-        content: What it will hold.
-        mode: Its permissions, whatever the umask.
-        former: Where the file as it was is kept, unless there was none; meanwhile the file is there, too.
-        durable: False for what can be made again: in one step, but without waiting for the disk.
+        path: File to replace. If several processes write it at the same time, the last one wins.
+        content: New content.
+        mode: Permissions, independent of the umask.
+        former: Path that keeps the previous file, if there was one. `path` exists all the time.
+        durable: False to replace atomically without waiting for the disk, for content that can be recreated.
 
     Raises:
-        OSError: the disk is full, read-only or gone; the old content is untouched.
+        OSError: The disk is full, read-only or missing. The old content is unchanged.
     """
     temporary = _temporary(path)
     try:
@@ -47,14 +47,14 @@ def write_file(
 
 
 def remove_temporary(path: Path) -> None:
-    """Remove what killed writers of a file left beside it, where that can be; only its one writer may ask for it."""
+    """Remove temporary files of killed writers of a file, as far as possible. Call it only in the only writer of the file."""
     with contextlib.suppress(OSError):
-        for left in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):
-            left.unlink(missing_ok=True)
+        for leftover in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):
+            leftover.unlink(missing_ok=True)
 
 
 def _keep(path: Path, former: Path) -> None:
-    """Give a file a second name, in one step."""
+    """Give a file a second name atomically."""
     spare = _temporary(path)
     try:
         spare.hardlink_to(path)
@@ -64,11 +64,11 @@ def _keep(path: Path, former: Path) -> None:
         path.replace(former)
         return
     spare.replace(former)
-    spare.unlink(missing_ok=True)  # where both were the same file already, nothing was renamed
+    spare.unlink(missing_ok=True)  # not renamed if both names already were the same file
 
 
 def remove_file(path: Path) -> bool:
-    """Remove a file and wait until that is on the disk; False when it was not there."""
+    """Remove a file and wait until the removal is on disk. Return False if the file did not exist."""
     try:
         path.unlink()
     except FileNotFoundError:
@@ -78,9 +78,12 @@ def remove_file(path: Path) -> bool:
 
 
 def write_set(directory: Path, files: Mapping[str, bytes], mode: int = 0o600) -> None:
-    """Replace several files that belong together in one step.
+    """Replace a set of files atomically.
 
-    Each name becomes a symbolic link through `..data`, and the swap of that one link changes all of them at once.
+    Each name is a symbolic link through `..data`. Replacing that link changes all files at once.
+
+    Raises:
+        OSError: The disk is full, read-only or missing. The old set is unchanged.
     """
     directory.mkdir(parents=True, exist_ok=True)
     fresh = directory / f"..{uuid.uuid4().hex}"
@@ -91,7 +94,7 @@ def write_set(directory: Path, files: Mapping[str, bytes], mode: int = 0o600) ->
         _sync_directory(fresh)
         _link(directory / CURRENT, fresh.name)
     except OSError:
-        # A key must not be left behind by each attempt.
+        # Failed attempts must not leave copies of a key.
         shutil.rmtree(fresh, ignore_errors=True)
         raise
     for name in files:
@@ -99,16 +102,16 @@ def write_set(directory: Path, files: Mapping[str, bytes], mode: int = 0o600) ->
         if not (directory / name).is_symlink() or str((directory / name).readlink()) != target:
             _link(directory / name, target)
     _sync_directory(directory)
-    for left in directory.glob("..*"):
-        if left.is_dir() and not left.is_symlink() and left != fresh:
-            shutil.rmtree(left, ignore_errors=True)
+    for leftover in directory.glob("..*"):
+        if leftover.is_dir() and not leftover.is_symlink() and leftover != fresh:
+            shutil.rmtree(leftover, ignore_errors=True)
 
 
 def read_set(directory: Path, names: tuple[str, ...]) -> dict[str, bytes] | None:
-    """Read files written together; None when one of them is missing."""
+    """Return the files of a set that were written together, or None if a file is missing."""
     try:
-        home = (directory / CURRENT).resolve(strict=True)
-        return {name: (home / name).read_bytes() for name in names}
+        current = (directory / CURRENT).resolve(strict=True)
+        return {name: (current / name).read_bytes() for name in names}
     except FileNotFoundError:
         return None
 

@@ -71,7 +71,7 @@ def test_decision_metrics_limit_the_number_of_policy_labels() -> None:
 
 def test_mobility_service_metrics_equal_their_documentation(tmp_path: Path) -> None:
     metrics = ServiceMetrics()
-    audit = AuditLog(tmp_path / "audit.jsonl", lambda: 1_780_000_000.0, copied=metrics.take_entry)
+    audit = AuditLog(tmp_path / "audit.jsonl", lambda: 1_780_000_000.0, on_entry=metrics.take_entry)
     grants = cast(GrantFiles, SimpleNamespace(active={"a": None, "b": None}))
     problem = [""]
     metrics.add_callback(lambda: common_metrics(lambda: 2e9, grants, audit, lambda: problem[0]))

@@ -556,7 +556,7 @@ def test_the_agent_is_told_what_is_not_recorded(tmp_path: Path, monkeypatch: pyt
 
 async def test_entries_of_the_audit_log_are_copied(tmp_path: Path) -> None:
     copied: list[dict[str, Any]] = []
-    log = AuditLog(tmp_path / "audit.jsonl", lambda: 1_780_000_000.0, copied=copied.append)
+    log = AuditLog(tmp_path / "audit.jsonl", lambda: 1_780_000_000.0, on_entry=copied.append)
     log.append("control", {"action": "takenOver"})
     await log.close()
     assert copied == [{"time": "2026-05-28T20:26:40.000+00:00", "kind": "control", "action": "takenOver"}]

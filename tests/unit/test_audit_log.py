@@ -1,4 +1,4 @@
-"""The audit log: what it writes, what survives a crash, what cannot be hidden."""
+"""Audit log: written entries, recovery after crashes, and detection of changes."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def read(path: Path) -> list[bytes]:
     return path.read_bytes().splitlines(keepends=True)
 
 
-async def test_a_sound_chain_goes_on_after_a_restart(tmp_path: Path) -> None:
+async def test_audit_chain_continues_after_a_restart(tmp_path: Path) -> None:
     path = tmp_path / "audit.jsonl"
     await written(path, 5)
     lines = await written(path, 5, 5)
@@ -46,7 +46,7 @@ async def test_a_sound_chain_goes_on_after_a_restart(tmp_path: Path) -> None:
     assert json.loads(lines[0])["value"] == "nan"
 
 
-async def test_entries_tell_how_long_lay_between_them_whatever_the_clock_does(
+async def test_audit_entries_have_the_time_since_boot_despite_clock_steps(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     steady = iter([50.0, 53.2504, 60.0])
@@ -62,7 +62,7 @@ async def test_entries_tell_how_long_lay_between_them_whatever_the_clock_does(
     assert not verify(read(tmp_path / "audit.jsonl")).problem
 
 
-async def test_two_processes_that_write_one_log_make_one_chain(tmp_path: Path) -> None:
+async def test_audit_log_of_two_writers_has_one_chain(tmp_path: Path) -> None:
     path = tmp_path / "audit.jsonl"
     first, second = (AuditLog(path, lambda: 0.0) for _ in range(2))
     for number in range(3):
@@ -83,7 +83,7 @@ async def test_two_processes_that_write_one_log_make_one_chain(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("which", ["change", "remove", "insert", "swap", "reformat", "rehash", "cut head"])
-async def test_no_entry_can_be_touched(tmp_path: Path, which: str) -> None:
+async def test_audit_verification_detects_a_changed_entry(tmp_path: Path, which: str) -> None:
     lines = await written(tmp_path / "audit.jsonl", 6)
     if which == "change":
         lines[2] = lines[2].replace(b'"n":2', b'"n":7')
@@ -107,17 +107,17 @@ async def test_no_entry_can_be_touched(tmp_path: Path, which: str) -> None:
     assert finding.line in {1, 3, 4}
 
 
-async def test_a_line_of_a_great_many_brackets_is_no_entry(tmp_path: Path) -> None:
+async def test_audit_verification_rejects_deeply_nested_json(tmp_path: Path) -> None:
     path = tmp_path / "audit.jsonl"
     lines = await written(path, 2)
     path.write_bytes(b"".join(lines) + b"[" * 200_000 + b"\n")
     finding = verify(read(path))
     assert (finding.line, finding.problem) == (3, "is not an audit entry")
-    with pytest.raises(ValueError, match="no audit entry"):
+    with pytest.raises(ValueError, match="not an audit entry"):
         last_link(path)
 
 
-async def test_a_torn_last_line_is_cut_off_and_noted(tmp_path: Path) -> None:
+async def test_audit_log_removes_an_incomplete_last_line_and_records_it(tmp_path: Path) -> None:
     path = tmp_path / "audit.jsonl"
     lines = await written(path, 4)
     path.write_bytes(b"".join(lines[:3]) + lines[3][:40])
@@ -129,7 +129,7 @@ async def test_a_torn_last_line_is_cut_off_and_noted(tmp_path: Path) -> None:
     assert json.loads(lines[4])["n"] == 4
 
 
-async def test_a_full_disk_is_told_and_nothing_is_lost_when_there_is_room_again(tmp_path: Path) -> None:
+async def test_audit_log_keeps_entries_until_a_full_disk_has_space(tmp_path: Path) -> None:
     folder = tmp_path / "log"
     path = folder / "audit.jsonl"
     log = AuditLog(path, lambda: 0.0)
@@ -152,7 +152,7 @@ async def until(condition: Callable[[], object]) -> None:
     raise AssertionError("it never happened")
 
 
-async def test_a_sync_that_fails_leaves_nothing_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_audit_log_has_no_duplicates_after_a_failed_sync(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     real, failing = os.fsync, [True]
 
     def fsync(file: int) -> None:
@@ -172,7 +172,7 @@ async def test_a_sync_that_fails_leaves_nothing_twice(tmp_path: Path, monkeypatc
     assert (finding.entries, finding.problem) == (2, "")
 
 
-async def test_what_a_failed_write_left_is_cut_off_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_audit_log_removes_the_rest_of_a_failed_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     real = {"fsync": os.fsync, "ftruncate": os.ftruncate}
     failing = [True]
 
@@ -196,7 +196,7 @@ async def test_what_a_failed_write_left_is_cut_off_later(tmp_path: Path, monkeyp
     assert (finding.entries, finding.problem) == (1, "")
 
 
-async def test_a_disk_that_hangs_is_a_failure_and_the_queue_has_an_end(
+async def test_audit_log_reports_a_hanging_disk_and_bounds_its_queue(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("fractus_runtime.audit.MAX_WAITING", 10)
@@ -212,7 +212,7 @@ async def test_a_disk_that_hangs_is_a_failure_and_the_queue_has_an_end(
     log = AuditLog(tmp_path / "audit.jsonl", lambda: 0.0)
     log.append("call", {"n": 0})
     await until(asked.is_set)
-    await until(lambda: "has not answered" in log.failure)
+    await until(lambda: "no response of the disk" in log.failure)
     for n in range(1, 25):
         log.append("call", {"n": n})
     answers.set()
@@ -227,7 +227,7 @@ async def test_a_disk_that_hangs_is_a_failure_and_the_queue_has_an_end(
     assert [(e["seq"], e["entries"]) for e in entries if e["kind"] == "lost"] == [(11, 15)]
 
 
-async def test_what_is_no_json_is_the_callers_error(tmp_path: Path) -> None:
+async def test_audit_log_rejects_content_that_is_not_json(tmp_path: Path) -> None:
     log = AuditLog(tmp_path / "audit.jsonl", lambda: 0.0)
     with pytest.raises(TypeError):
         log.append("call", {"n": object()})
@@ -236,7 +236,7 @@ async def test_what_is_no_json_is_the_callers_error(tmp_path: Path) -> None:
     assert verify(read(tmp_path / "audit.jsonl")).entries == 1
 
 
-async def test_the_command(tmp_path: Path) -> None:
+async def test_audit_verify_command_reports_a_broken_chain(tmp_path: Path) -> None:
     path = tmp_path / "audit.jsonl"
     lines = await written(path, 3)
     good = CliRunner().invoke(audit, ["verify", str(path)])

@@ -1,4 +1,4 @@
-"""The segments and checkpoints of audit logs: what they prove, and what cannot be hidden in them."""
+"""Segments and checkpoints of audit logs: rotation, pruning, and detection of changes."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from fractus_cli.audit import audit
 from fractus_core.identity.authority import Authority
 from fractus_runtime.audit import AuditLog
 from fractus_runtime.audit_chain import last_link, segments, verify
-from test_storage_audit import AUTHORITY, EPOCH, read, until, written
+from test_audit_log import AUTHORITY, EPOCH, read, until, written
 
 
 async def filled(path: Path, count: int, **bounds: Any) -> None:
-    """A log written entry by entry, so that it is closed as often as it can be."""
+    """Write entries one at a time, so that segments are closed as often as possible."""
     log = AuditLog(path, lambda: 0.0, **bounds)
     for n in range(count):
         log.append("call", {"n": n})
@@ -36,7 +36,7 @@ def verified(*paths: Path | str) -> tuple[int, str]:
     return done.exit_code, done.output.strip()
 
 
-async def test_the_chain_goes_on_through_segments_and_restarts(tmp_path: Path) -> None:
+async def test_audit_chain_continues_through_segments_and_restarts(tmp_path: Path) -> None:
     path = tmp_path / "audit.jsonl"
     await filled(path, 7, segment_bytes=600)
     assert len(segments(path)) >= 2
@@ -51,7 +51,7 @@ async def test_the_chain_goes_on_through_segments_and_restarts(tmp_path: Path) -
     assert verified(files[0])[1].endswith("what came before and after is not judged")
 
 
-async def test_a_log_that_was_just_closed_is_continued(tmp_path: Path) -> None:
+async def test_audit_chain_continues_after_a_segment_was_just_closed(tmp_path: Path) -> None:
     path = tmp_path / "audit.jsonl"
     await filled(path, 3, segment_bytes=1)
     assert path.read_bytes() == b"", "it begins at once, so that it is known when it is missing"
@@ -72,21 +72,21 @@ def node_files(directory: Path, authority: Authority) -> Path:
 
 
 async def checkpoint(path: Path, count: int, tls: Path, **bounds: int) -> Path:
-    """A copy of the checkpoint that a log ends with, after more entries."""
+    """Return a copy of the last checkpoint of a log, to which entries are then added."""
     await filled(path, count, tls=tls, **bounds)
     kept = path.parent.parent / f"kept-{len(list(path.parent.parent.iterdir()))}"
     kept.write_bytes(path.with_suffix(".checkpoint").read_bytes())
     return kept
 
 
-async def test_only_a_checkpoint_proves_that_the_oldest_segments_went_to_make_room(tmp_path: Path, tls: Path) -> None:
+async def test_pruned_segments_are_accepted_only_with_a_checkpoint(tmp_path: Path, tls: Path) -> None:
     path = tmp_path / "audit" / "audit.jsonl"
     old = await checkpoint(path, 5, tls, segment_bytes=500, keep=2)
     await filled(path, 30, segment_bytes=500, keep=2)
     recent = await checkpoint(path, 1, tls, segment_bytes=500, keep=2)
     code, said = verified(path)
     assert code == 1
-    assert "to make room, which only a checkpoint from before can prove: give it with --since" in said
+    assert "to free space, which only an earlier checkpoint can prove; specify it with --since" in said
     code, said = verified(path, "--since", recent)
     assert code == 0, said
     assert "before were removed to make room" in said
@@ -96,14 +96,14 @@ async def test_only_a_checkpoint_proves_that_the_oldest_segments_went_to_make_ro
     assert "--ca" not in verified(path, "--since", recent, "--ca", tls / "ca.crt")[1]
     code, said = verified(path, "--since", old)
     assert code == 1
-    assert "and those since the checkpoint, number 5, are missing" in said
+    assert "entries since the checkpoint, number 5, are missing" in said
     segments(path)[0].unlink()
     code, said = verified(path, "--since", recent)
     assert code == 1
-    assert "the entries before it were removed, and no entry records that" in said
+    assert "earlier entries were removed, and no entry records the removal" in said
 
 
-async def test_what_was_removed_and_recorded_by_another_is_found(tmp_path: Path, tls: Path) -> None:
+async def test_checkpoint_detects_a_forged_record_of_pruning(tmp_path: Path, tls: Path) -> None:
     path = tmp_path / "audit" / "audit.jsonl"
     kept = await checkpoint(path, 12, tls, segment_bytes=500)
     await filled(path, 6)
@@ -124,20 +124,20 @@ async def test_what_was_removed_and_recorded_by_another_is_found(tmp_path: Path,
 
 
 @pytest.mark.parametrize("which", ["end", "rewritten", "emptied", "missing", "log"])
-async def test_a_checkpoint_finds_what_the_chain_alone_does_not(tmp_path: Path, tls: Path, which: str) -> None:
+async def test_checkpoint_detects_changes_that_the_chain_does_not(tmp_path: Path, tls: Path, which: str) -> None:
     path = tmp_path / "audit" / "audit.jsonl"
     kept = await checkpoint(path, 4, tls)
     if which == "end":
         path.write_bytes(b"".join(read(path)[:3]))
-        why = "is number 3, the last one, and the checkpoint is number 4: entries are missing"
+        why = "is the last entry, number 3, but the checkpoint is number 4: entries are missing"
     elif which == "rewritten":
         path.unlink()
         await filled(path, 3)
         await filled(path, 3)
-        why = "is another entry than the checkpoint's: it and all before it were written again"
+        why = "differs from the checkpoint: this entry and all entries before it were rewritten"
     elif which == "emptied":
         path.write_bytes(b"")
-        why = "is number 0, the last one"
+        why = "is the last entry, number 0"
     elif which == "missing":
         path.rename(path.with_name("audit.000000000001.jsonl"))
         why = "audit.jsonl: is missing; the log is not complete without it"
@@ -151,7 +151,7 @@ async def test_a_checkpoint_finds_what_the_chain_alone_does_not(tmp_path: Path, 
     assert (code, why in said) == (1, True), said
 
 
-async def test_what_the_status_of_the_node_tells_is_a_checkpoint_too(tmp_path: Path, tls: Path) -> None:
+async def test_checkpoint_of_a_node_status_is_accepted(tmp_path: Path, tls: Path) -> None:
     path = tmp_path / "audit" / "audit.jsonl"
     assert read_audit_heads(path.parent) == []
     await filled(path, 4, tls=tls)
@@ -170,7 +170,7 @@ async def test_what_the_status_of_the_node_tells_is_a_checkpoint_too(tmp_path: P
     assert (code, "No such file" in said) == (1, True)
 
 
-async def test_a_log_that_is_gone_is_missed_in_its_directory(tmp_path: Path, tls: Path) -> None:
+async def test_removed_log_is_detected_by_its_checkpoint(tmp_path: Path, tls: Path) -> None:
     for name in ("camera", "mobility"):
         await filled(tmp_path / "audit" / f"{name}.jsonl", 2, tls=tls)
     assert verified(tmp_path / "audit")[0] == 0
@@ -181,7 +181,7 @@ async def test_a_log_that_is_gone_is_missed_in_its_directory(tmp_path: Path, tls
 
 
 @pytest.mark.parametrize("which", ["changed", "other", "component", "nonsense", "twice"])
-async def test_a_checkpoint_that_proves_nothing(tmp_path: Path, tls: Path, which: str) -> None:
+async def test_invalid_checkpoint_is_rejected(tmp_path: Path, tls: Path, which: str) -> None:
     path = tmp_path / "audit" / "audit.jsonl"
     kept, more = await checkpoint(path, 4, tls), list[Path]()
     if which == "changed":
@@ -198,7 +198,7 @@ async def test_a_checkpoint_that_proves_nothing(tmp_path: Path, tls: Path, which
         kept, why = await checkpoint(path, 1, tls), "is not signed by a node"
     elif which == "nonsense":
         kept.write_bytes(b"[" * 9_000)
-        why = "is no checkpoint"
+        why = "is not a checkpoint"
     else:
         more, why = [await checkpoint(path, 1, tls)], "is the second of audit.jsonl"
     options = [word for file in (kept, *more) for word in ("--since", file)]
@@ -206,7 +206,7 @@ async def test_a_checkpoint_that_proves_nothing(tmp_path: Path, tls: Path, which
     assert (code, why in said) == (1, True), said
 
 
-async def test_a_node_without_a_certificate_has_no_checkpoint_yet(
+async def test_checkpoint_is_not_written_without_a_certificate(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, tls: Path
 ) -> None:
     path = tmp_path / "audit.jsonl"
@@ -219,7 +219,7 @@ async def test_a_node_without_a_certificate_has_no_checkpoint_yet(
     assert verified(path)[0] == 0
 
 
-async def test_the_last_entries_are_signed_though_no_other_follows(
+async def test_checkpoint_covers_the_last_entries_without_further_ones(
     tmp_path: Path, tls: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("fractus_runtime.audit.CHECKPOINT_INTERVAL_S", 0.2)
@@ -236,7 +236,7 @@ async def test_the_last_entries_are_signed_though_no_other_follows(
     assert found.read_bytes() == before, "nothing new, nothing signed"
 
 
-async def test_a_certificate_that_is_missing_is_looked_for_now_and_then(
+async def test_checkpoint_retries_until_a_certificate_exists(
     tmp_path: Path, tls: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tried = []
@@ -247,7 +247,7 @@ async def test_a_certificate_that_is_missing_is_looked_for_now_and_then(
 
     with monkeypatch.context() as patched:
         patched.setattr("fractus_runtime.audit.CHECKPOINT_INTERVAL_S", 0.1)
-        patched.setattr("fractus_runtime.audit.signed", missing)
+        patched.setattr("fractus_runtime.audit.sign_checkpoint", missing)
         path = tmp_path / "audit.jsonl"
         log = AuditLog(path, lambda: 0.0, tls=tls)
         log.append("call", {"n": 0})
@@ -259,9 +259,7 @@ async def test_a_certificate_that_is_missing_is_looked_for_now_and_then(
 
 
 @pytest.mark.parametrize("torn", [b"", b'{"half an en'])
-async def test_a_disk_that_became_read_only_is_a_failure_and_no_crash(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, torn: bytes
-) -> None:
+async def test_audit_log_reports_a_read_only_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, torn: bytes) -> None:
     path = tmp_path / "audit.jsonl"
     await written(path, 2)
     path.write_bytes(path.read_bytes() + torn)
@@ -294,7 +292,7 @@ async def test_a_disk_that_became_read_only_is_a_failure_and_no_crash(
 
 
 @pytest.mark.parametrize("which", ["middle", "change", "torn"])
-async def test_segments_cannot_be_touched(tmp_path: Path, which: str) -> None:
+async def test_audit_verification_detects_changed_segments(tmp_path: Path, which: str) -> None:
     path = tmp_path / "audit.jsonl"
     await filled(path, 12, segment_bytes=500)
     second = segments(path)[1]
@@ -310,7 +308,7 @@ async def test_segments_cannot_be_touched(tmp_path: Path, which: str) -> None:
     assert f"{second}: line" in said
 
 
-async def test_several_logs_at_once(tmp_path: Path) -> None:
+async def test_audit_verify_command_checks_several_logs(tmp_path: Path) -> None:
     for name in ("mobility", "camera"):
         await filled(tmp_path / f"{name}.jsonl", 2)
     code, said = verified(tmp_path)
@@ -320,7 +318,7 @@ async def test_several_logs_at_once(tmp_path: Path) -> None:
     assert verified(tmp_path.parent / tmp_path.name)[0] == 0
 
 
-async def test_a_checkpoint_is_not_taken_for_that_of_a_log_of_the_same_name(tmp_path: Path, tls: Path) -> None:
+async def test_checkpoint_of_another_log_with_the_same_name_is_rejected(tmp_path: Path, tls: Path) -> None:
     kept = await checkpoint(tmp_path / "one" / "audit.jsonl", 3, tls)
     await filled(tmp_path / "two" / "audit.jsonl", 3)
     code, said = verified(tmp_path / "one", tmp_path / "two", "--since", kept)
@@ -331,7 +329,7 @@ async def test_a_checkpoint_is_not_taken_for_that_of_a_log_of_the_same_name(tmp_
     assert verified(tmp_path / "one", "--since", kept)[0] == 0
 
 
-async def test_a_segment_that_cannot_be_closed_costs_nothing(
+async def test_audit_log_continues_if_a_segment_cannot_be_closed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def refuse(*_: object) -> None:

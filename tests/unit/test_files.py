@@ -1,4 +1,4 @@
-"""Files that survive kills, full disks and lost power."""
+"""Atomic file replacement despite kills, full disks and power failures."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fractus_runtime.files import read_set, remove_temporary, write_file, write_
 
 
 def stopped_at(call: int, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Fail with the given step that changes names, as a kill would; returns the steps before."""
+    """Fail at the given renaming step, like a kill. Return the list of completed steps."""
     steps: list[str] = []
 
     def step(name: str, real: Callable[..., object]) -> Callable[..., object]:
@@ -28,7 +28,7 @@ def stopped_at(call: int, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return steps
 
 
-def test_a_file_is_there_at_every_moment_while_its_former_content_is_kept(tmp_path: Path) -> None:
+def test_write_file_never_leaves_the_path_without_a_file(tmp_path: Path) -> None:
     path, former = tmp_path / "a.json", tmp_path / "a.last.json"
     for call in range(10):
         for file in tmp_path.iterdir():
@@ -54,7 +54,7 @@ def test_a_file_is_there_at_every_moment_while_its_former_content_is_kept(tmp_pa
     raise AssertionError("it never came to its end")
 
 
-def test_the_former_content_is_kept_without_hard_links_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_write_file_keeps_the_previous_file_without_hard_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise PermissionError(1, "Operation not permitted")
 
@@ -65,7 +65,7 @@ def test_the_former_content_is_kept_without_hard_links_too(tmp_path: Path, monke
     assert (path.read_bytes(), former.read_bytes()) == (b"3", b"2")
 
 
-def test_only_what_was_left_of_that_file_is_removed(tmp_path: Path) -> None:
+def test_remove_temporary_removes_only_files_of_its_path(tmp_path: Path) -> None:
     others = [".b.json.1.tmp", ".a.json", "a.json", "a.json.tmp", ".aXjson.1.tmp"]
     for name in (".a.json.1.tmp", ".a.json.2.tmp", *others):
         (tmp_path / name).touch()
@@ -75,7 +75,9 @@ def test_only_what_was_left_of_that_file_is_removed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("failing", ["write", "fsync", "symlink"])
-def test_a_full_disk_leaves_no_key_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: str) -> None:
+def test_write_set_leaves_no_copy_of_a_key_on_a_full_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: str
+) -> None:
     names = ("tls.key", "tls.crt")
     write_set(tmp_path, dict.fromkeys(names, b"old"))
     before = sorted(tmp_path.rglob("*"))

@@ -115,7 +115,7 @@ async def run(settings: CameraSettings, stop: asyncio.Event) -> None:
         recorder.take_entry(entry)
         log_decision(entry)
 
-    audit = AuditLog(settings.audit, clock, tls=settings.tls, copied=on_audit_entry)
+    audit = AuditLog(settings.audit, clock, tls=settings.tls, on_entry=on_audit_entry)
     grants = GrantFiles(
         settings.grants, node, GrantVerifier(settings.tls, settings.grant_memory), refused=audit.refused_grant
     )

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 from fractus_cluster.errors import ClusterError
 from fractus_cluster.manifests import is_ready
-from fractus_runtime.audit_chain import entries, lines_of, logs, verify
+from fractus_runtime.audit_chain import entries, logs, read_lines, verify
 
 from fractus_sim.chaos import invariants
 from fractus_sim.chaos.faults import FAULTS, broken
@@ -147,7 +147,7 @@ def _judge(stage: Stage, watch: Watch, run: Run) -> list[Broken]:
     for node in stage.cluster.nodes:
         folder = node.own_state / "audit"
         for log, files in logs([folder] if folder.is_dir() else []).items():
-            lines = [line for _, _, line in lines_of(files)]
+            lines = [line for _, _, line in read_lines(files)]
             finding = verify(lines)
             run.entries += finding.entries
             if finding.problem:

@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from fractus_runtime.audit_chain import lines_of, logs, verify
+from fractus_runtime.audit_chain import logs, read_lines, verify
 from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader
 
@@ -66,7 +66,7 @@ def _audit(kube: Kube, mission: Mission, folder: Path) -> dict[str, Any]:
         return {**found, "problem": f"cannot be fetched: {error}"}
 
     def counted(files: list[Path]) -> Iterator[bytes]:
-        for _, _, line in lines_of(files):
+        for _, _, line in read_lines(files):
             found["kept"] += line.endswith(b"\n") and of_mission(line, mission.times["applied"])
             yield line
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from fractus_runtime.audit_chain import entries, lines_of, logs, verify
+from fractus_runtime.audit_chain import entries, read_lines, logs, verify
 
 from fractus_sim.experiment.findings import Findings
 
@@ -13,7 +13,7 @@ JUDGED = frozenset({"call", "monitor", "takeover"})
 
 def read_audit(path: Path, name: str, findings: Findings) -> None:
     """Verify an audit log with its segments and add its policy decisions to the findings."""
-    lines = [line for _, _, line in lines_of(logs([path])[path])]
+    lines = [line for _, _, line in read_lines(logs([path])[path])]
     finding = verify(lines)
     findings.audit_problems[name] = f"line {finding.line} {finding.problem}" if finding.problem else ""
     findings.calls += [entry for entry in entries(lines) if entry.get("kind") in JUDGED]

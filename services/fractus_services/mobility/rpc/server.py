@@ -145,7 +145,7 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
         recorder.take_entry(entry)
         log_decision(entry)
 
-    audit = AuditLog(options.audit, clock, tls=options.tls, copied=recorded)
+    audit = AuditLog(options.audit, clock, tls=options.tls, on_entry=recorded)
     verifier = GrantVerifier(options.tls, options.grant_memory)
     grants = GrantFiles(options.grants, node, verifier, options.flat_terrain, audit.refused_grant)
     found = asyncio.Event()

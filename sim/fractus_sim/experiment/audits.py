@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from fractus_runtime.audit_chain import entries, read_lines, logs, verify
+from fractus_runtime.audit_chain import entries, logs, read_lines, verify
 
 from fractus_sim.experiment.findings import Findings
 

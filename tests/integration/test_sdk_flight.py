@@ -243,7 +243,7 @@ def test_navigator_killed_at_each_stage_completes_mission(short: Stage) -> None:
         return [entry["method"] for entry in short.entries() if entry["kind"] == "call"].count(method) >= times
 
     stages: dict[str, Callable[[], bool]] = {
-        "control": lambda: "in control" in short.log("navigator"),
+        "control": lambda: "control granted" in short.log("navigator"),
         "armed": lambda: "armed; taking off" in short.log("navigator"),
         "climb": lambda: any(e["kind"] == "state" and e["alt"] > 5 for e in short.entries()),
         "first leg": lambda: begun("Goto", 1),
@@ -254,7 +254,7 @@ def test_navigator_killed_at_each_stage_completes_mission(short: Stage) -> None:
         short.wait(stage, at)
         short.kill("navigator")
     short.start_navigator()
-    short.wait("return", lambda: "the mission is over" in short.log("navigator"))
+    short.wait("return", lambda: "run: mission complete" in short.log("navigator"))
     log = short.log("navigator")
     assert log.count("waypoint 1/2 reached") == 1
     assert log.count("waypoint 2/2 reached") == 1
@@ -270,7 +270,7 @@ def test_navigator_reconnects_to_killed_service(slow: Stage) -> None:
     slow.wait("return", lambda: "control returned" in slow.log("navigator"))
     log = slow.log("navigator")
     assert "lost the connection to the mobility service" in log
-    assert log.count("in control") == 1, "the same process, under the same control"
+    assert log.count("control granted") == 1, "the same process, under the same control"
     assert "waypoint 2/2 reached" in log
 
 

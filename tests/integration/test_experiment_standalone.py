@@ -16,10 +16,11 @@ from fractus_sim.experiment.standalone_drone import DroneSetup
 from mobility_rig import HOME, grant
 from pymavlink import mavutil
 
+pytestmark = pytest.mark.slow
+
 PROGRAM = """
 import asyncio, os, pathlib, fractus
 
-pytestmark = pytest.mark.slow
 async def main():
     (task,) = fractus.control_points()
     async with fractus.mobility() as drone, drone.control():

@@ -1,4 +1,4 @@
-"""A collector of traces on real gRPC, as far as tests ask it."""
+"""OpenTelemetry collector for tests, over gRPC."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ NO_PARENT = b""
 
 @dataclass(frozen=True)
 class Seen:
-    """A span as it was exported."""
+    """An exported span."""
 
     service: str
     node: str
@@ -32,7 +32,7 @@ class Seen:
 
     @property
     def told(self) -> dict[str, Any]:
-        """Its attributes."""
+        """Attributes of the span."""
         return {one.key: value_of(one.value) for one in self.span.attributes}
 
 
@@ -45,7 +45,7 @@ def value_of(value: Any) -> Any:
 
 @dataclass
 class Collector(trace_service_pb2_grpc.TraceServiceServicer):
-    """Keeps what it is sent."""
+    """Stores received spans."""
 
     address: str = field(default_factory=lambda: f"127.0.0.1:{free_port()}")
     spans: list[Seen] = field(default_factory=list)
@@ -53,7 +53,7 @@ class Collector(trace_service_pb2_grpc.TraceServiceServicer):
 
     @property
     def environment(self) -> dict[str, str]:
-        """What has a program send its spans here, soon."""
+        """Environment of a program that exports its spans to this collector without delay."""
         return {"OTEL_EXPORTER_OTLP_ENDPOINT": f"http://{self.address}", "OTEL_BSP_SCHEDULE_DELAY": "50"}
 
     def Export(self, request: Any, context: Any) -> Any:  # noqa: N802
@@ -67,7 +67,7 @@ class Collector(trace_service_pb2_grpc.TraceServiceServicer):
         return trace_service_pb2.ExportTraceServiceResponse()
 
     def wait(self, condition: Callable[[list[Seen]], Any], timeout_s: float = 60.0) -> Any:
-        """What a condition finds in the spans, once it finds any."""
+        """Wait until a function of the spans returns a true value, and return that value."""
         deadline = time.monotonic() + timeout_s
         with self.arrived:
             while not (found := condition(self.spans)):
@@ -77,7 +77,7 @@ class Collector(trace_service_pb2_grpc.TraceServiceServicer):
             return found
 
     def one(self, name: str, kind: int = Span.SPAN_KIND_SERVER, **told: Any) -> Seen:
-        """The first span of a name and a kind that tells this; `a__b` stands for the attribute a.b."""
+        """Wait for a span with this name, kind and attributes, and return the first. `a__b` stands for the attribute a.b."""
         wanted = {key.replace("__", "."): value for key, value in told.items()}
 
         def matching(spans: list[Seen]) -> list[Seen]:
@@ -94,7 +94,7 @@ def _flat(told: dict[str, Any]) -> dict[str, Any]:
 
 @contextmanager
 def collecting() -> Iterator[Collector]:
-    """A collector that runs."""
+    """Run a collector."""
     collector = Collector()
     server = grpc.server(ThreadPoolExecutor(2))
     trace_service_pb2_grpc.add_TraceServiceServicer_to_server(collector, server)

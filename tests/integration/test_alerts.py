@@ -1,4 +1,4 @@
-"""Each alert fires when what it is about happens, and none while all is well; the rules are Prometheus' own to judge."""
+"""Alert rules, evaluated by promtool: each alert fires in its situation, and no alert fires during normal operation."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ FILES = CHARTS / "fractus" / "files"
 RULES: list[dict[str, Any]] = yaml.safe_load((FILES / "alerts.yaml").read_text())["groups"][0]["rules"]
 CACHE = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "fractus" / "promtool"
 ON = 'job="fractus-system/fractus-mobility", node="drone-1", pod="m", instance="10.0.0.1:46813"'
-"""What Prometheus adds to every sample of a service."""
+"""Labels that Prometheus adds to every sample of a service."""
 
 
 def of(name: str, labels: str = "", values: str = "0x30") -> tuple[str, str]:
-    """A series: its name with labels, and a value each 15 s in promtool's notation."""
+    """Return a series: its name with labels, and one value per 15 s in promtool's notation."""
     return f"{name}{{{ON}{', ' if labels else ''}{labels}}}", values
 
 
@@ -37,12 +37,12 @@ KNOWN = of("fractus_audit_sequence", "", "7x60")
 
 @dataclass(frozen=True)
 class Case:
-    """What happens, and when it is known.
+    """A situation that an alert is for.
 
     Attributes:
-        series: what Prometheus has scraped.
-        at: when the alert fires by then; 15 s are one sample.
-        well: the same without the trouble, where nothing fires.
+        series: Scraped series.
+        at: Time by which the alert fires. One sample takes 15 s.
+        well: Series of a similar situation in which no alert fires.
     """
 
     series: tuple[tuple[str, str], ...]
@@ -130,7 +130,7 @@ CASES = {
 
 @pytest.fixture(scope="session")
 def promtool() -> str:
-    """Prometheus' own judge of rules, out of Debian's package of it, which is not installed: that would start a server."""
+    """Return the path of promtool from Debian's package, which is unpacked but not installed, because installing it would start a server."""
     found = shutil.which("promtool") or str(CACHE / "usr/bin/promtool")
     if not Path(found).exists():
         CACHE.parent.mkdir(parents=True, exist_ok=True)
@@ -143,7 +143,7 @@ def promtool() -> str:
 
 
 def judge(promtool: str, directory: Path, tests: list[dict[str, Any]]) -> str:
-    """What promtool says of tests of the rules; empty when they pass."""
+    """Return the output of promtool for tests of the rules, or an empty string if they pass."""
     # Without annotations, which a test would have to repeat word for word.
     bare = [{key: value for key, value in rule.items() if key != "annotations"} for rule in RULES]
     (directory / "rules.yaml").write_text(yaml.safe_dump({"groups": [{"name": "fractus", "rules": bare}]}))
@@ -166,7 +166,7 @@ def asked(rows: tuple[tuple[str, str], ...], *checks: dict[str, Any]) -> dict[st
     return {"interval": "15s", "input_series": series(rows), "alert_rule_test": list(checks)}
 
 
-def test_every_alert_has_a_case_and_a_page() -> None:
+def test_alerts_have_a_case_and_a_section_in_the_docs() -> None:
     names = [rule["alert"] for rule in RULES]
     assert sorted(names) == sorted(CASES)
     page = (DOCS / "alerts.md").read_text()
@@ -176,19 +176,19 @@ def test_every_alert_has_a_case_and_a_page() -> None:
         assert rule["labels"]["severity"] in {"critical", "warning", "info"}
 
 
-def test_each_alert_fires(promtool: str, tmp_path: Path) -> None:
+def test_alerts_fire_in_their_situation(promtool: str, tmp_path: Path) -> None:
     # With which labels is its own affair, so the opposite is claimed of each, and must be wrong.
     said = judge(promtool, tmp_path, [asked(case.series, silent(alert, case.at)) for alert, case in CASES.items()])
     assert set(re.findall(r"alertname:\s*(\w+)", said)) == set(CASES), said
 
 
-def test_no_alert_fires_while_all_is_well(promtool: str, tmp_path: Path) -> None:
+def test_alerts_do_not_fire_in_normal_operation(promtool: str, tmp_path: Path) -> None:
     healthy = asked(HEALTHY, *(silent(alert, at) for alert in CASES for at in ("1m", "10m", "14m")))
     well = [asked(case.well, silent(alert, case.at)) for alert, case in CASES.items() if case.well]
     assert judge(promtool, tmp_path, [healthy, *well]) == ""
 
 
-def test_the_rules_are_what_prometheus_takes(promtool: str, tmp_path: Path) -> None:
+def test_alert_rules_are_accepted_by_promtool(promtool: str, tmp_path: Path) -> None:
     (rule,) = [body for body in render("--set", "metrics.rules.enabled=true") if body["kind"] == "PrometheusRule"]
     installed = tmp_path / "rules.yaml"
     installed.write_text(yaml.safe_dump(rule["spec"]))
@@ -196,7 +196,7 @@ def test_the_rules_are_what_prometheus_takes(promtool: str, tmp_path: Path) -> N
     assert rule["spec"] == yaml.safe_load((FILES / "alerts.yaml").read_text())
 
 
-def test_alerts_and_dashboard_ask_for_metrics_that_there_are() -> None:
+def test_alerts_and_dashboard_use_existing_metrics() -> None:
     known = set(documented())
     (found,) = [body for body in render("--set", "metrics.dashboard.enabled=true") if body["kind"] == "ConfigMap"]
     assert found["metadata"]["labels"]["grafana_dashboard"] == "1"

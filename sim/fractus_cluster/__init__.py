@@ -1,4 +1,6 @@
-"""Embedded cluster: a real Kubernetes of several nodes on one Linux machine.
+"""Embedded cluster: Kubernetes with several nodes on one Linux machine.
+
+Start a cluster, use it and remove it:
 
     cluster = Cluster.load(Path("examples/clusters/demo.yaml"))
     cluster.up()
@@ -6,5 +8,5 @@
     cluster.node("drone-1").power_off()
     cluster.down()
 
-Nothing is imported here: the nodes' own first program lives in this package too, and must start fast.
+This module imports nothing because `node_init`, which must start fast, is part of the package.
 """

@@ -1,4 +1,4 @@
-"""Which addresses a cluster gets: one free /16 of the machine, divided between nodes, pods and the host."""
+"""Address allocation of a cluster: one free /16 block, divided between nodes, pods and the host."""
 
 from __future__ import annotations
 
@@ -23,32 +23,32 @@ MAX_NODES = 100
 
 @dataclass(frozen=True, slots=True)
 class Addressing:
-    """The addresses of one cluster.
+    """Addresses of one cluster.
 
     Attributes:
-        block: All of them.
+        block: The complete block.
     """
 
     block: IPv4Network
 
     @property
     def node_network(self) -> IPv4Network:
-        """The network of the nodes' uplinks."""
+        """Network of the node uplinks."""
         return next(self.block.subnets(new_prefix=24))
 
     @property
     def pod_network(self) -> IPv4Network:
-        """The network of all pods."""
+        """Network of all pods."""
         return list(self.block.subnets(new_prefix=17))[1]
 
     @property
     def control_plane(self) -> IPv4Address:
-        """Where the API server and the cluster's DNS listen; also the nodes' router."""
+        """Address of the API server and the cluster DNS. It is also the router of the nodes."""
         return self.block.network_address + 1
 
     @property
     def host(self) -> IPv4Address:
-        """The machine's own address in the cluster's network."""
+        """Address of the machine in the cluster network."""
         return self.block.network_address + 254
 
     def node(self, index: int) -> IPv4Address:
@@ -63,7 +63,7 @@ class Addressing:
 
 
 def choose_block(taken: Iterable[IPv4Network]) -> IPv4Network:
-    """Return the first candidate block that nothing on the machine uses.
+    """Return the first candidate block that does not overlap with a used network.
 
     Args:
         taken: Networks of the machine's routes and addresses, and the blocks of other clusters.
@@ -75,7 +75,7 @@ def choose_block(taken: Iterable[IPv4Network]) -> IPv4Network:
     for candidate in _CANDIDATES:
         if not any(candidate.overlaps(network) for network in used):
             return candidate
-    # A route for all of 10.0.0.0/8 (a VPN, a cloud's network) does not forbid a more specific one in it.
+    # A route for the whole of 10.0.0.0/8 (VPN, cloud network) allows a more specific route inside it.
     narrow = [network for network in used if network.prefixlen > _BROAD]
     for candidate in _CANDIDATES:
         if not any(candidate.overlaps(network) for network in narrow):

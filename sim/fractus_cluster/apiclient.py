@@ -1,4 +1,4 @@
-"""The API server as administrator, for bringing a cluster up."""
+"""API server client with administrator rights, used to start a cluster."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _REQUEST_TIMEOUT_S = 10.0
 
 @contextmanager
 def administrating(server: str, ca: Path, credential: Credential) -> Iterator[BlockingClient]:
-    """A connection to the API server.
+    """Connect to the API server.
 
     Raises:
-        ClusterError: The API server refused a request within, or could not be reached.
+        ClusterError: The API server rejected a request or was unreachable.
     """
     try:
         access = with_certificate(server, ca, (credential.certificate, credential.key))
@@ -31,7 +31,7 @@ def administrating(server: str, ca: Path, credential: Credential) -> Iterator[Bl
 
 
 def answers_ready(host: str, port: int) -> bool:
-    """Whether a server answers `GET /ready` (over plain HTTP) with success."""
+    """Return True if a server responds to `GET /ready` (plain HTTP) with success."""
     connection = http.client.HTTPConnection(host, port, timeout=_REQUEST_TIMEOUT_S)
     try:
         connection.request("GET", "/ready")

@@ -1,4 +1,4 @@
-"""Control groups of a cluster: one branch per node, with version 1 hierarchies or the one tree of version 2."""
+"""Control groups of a cluster: one group per node, in version 1 hierarchies or the unified version 2 hierarchy."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ _NEEDED_V2 = ("cpu", "cpuset", "memory", "pids")
 _DELEGATED_V2 = (*_NEEDED_V2, "io", "hugetlb")
 _DAEMONS = "daemons"
 _WEIGHT = 20
-"""Clusters weigh as much as 20 processes beside them: they are whole machines, and what flies on them flies in real time."""
+"""CPU weight of a cluster, equal to 20 processes, because its vehicles fly in real time."""
 _ONE_V1, _ONE_V2 = 1024, 100
 _POLL_S = 0.02
 
 
 @dataclass(frozen=True, slots=True)
 class Hierarchies:
-    """Where the kernel shows its control groups.
+    """Mounted control group hierarchies.
 
     Attributes:
-        version: 1 (also for hybrid layouts, where the controllers are in version 1 hierarchies) or 2.
-        roots: Mount points; one for version 2.
+        version: 1 (also for hybrid layouts with controllers in version 1 hierarchies) or 2.
+        roots: Mount points. Version 2 has one.
     """
 
     version: int
@@ -36,13 +36,13 @@ class Hierarchies:
 
 
 def find_hierarchies(mounts: str | None = None) -> Hierarchies:
-    """Read from /proc/self/mounts which control groups there are.
+    """Read the mounted control groups from /proc/self/mounts.
 
     Args:
-        mounts: Text in the format of /proc/self/mounts; the kernel's own when None.
+        mounts: Text in the format of /proc/self/mounts. None: the kernel's own.
 
     Raises:
-        PrerequisiteError: None are mounted, or a controller that Kubernetes needs is missing.
+        PrerequisiteError: No control groups are mounted, or a required controller is missing.
     """
     text = Path("/proc/self/mounts").read_text() if mounts is None else mounts
     old: dict[Path, set[str]] = {}
@@ -57,7 +57,7 @@ def find_hierarchies(mounts: str | None = None) -> Hierarchies:
         missing = [name for name in _NEEDED_V1 if not any(name in options for options in old.values())]
         if missing:
             raise PrerequisiteError(f"the kernel's control groups lack {', '.join(missing)}; Kubernetes needs them")
-        return Hierarchies(1, (*old, *new))  # container runtimes fill the unified one of a hybrid layout too
+        return Hierarchies(1, (*old, *new))  # # container runtimes also use the unified hierarchy of a hybrid layout
     if not new:
         raise PrerequisiteError("no control groups are mounted at /sys/fs/cgroup; Kubernetes needs them")
     return Hierarchies(2, (new[0],))
@@ -65,10 +65,10 @@ def find_hierarchies(mounts: str | None = None) -> Hierarchies:
 
 @dataclass(frozen=True, slots=True)
 class Branch:
-    """One branch of the control groups: a cluster's, or below it a node's.
+    """A control group of a cluster or of one of its nodes.
 
     Attributes:
-        hierarchies: Where control groups are mounted.
+        hierarchies: Mounted hierarchies.
         path: Path below the mount points, such as `fractus-sim/demo/drone-1`.
     """
 
@@ -76,16 +76,16 @@ class Branch:
     path: str
 
     def below(self, name: str) -> Branch:
-        """Return the branch `name` inside this one."""
+        """Return the child group `name`."""
         return Branch(self.hierarchies, f"{self.path}/{name}")
 
     @property
     def directories(self) -> list[Path]:
-        """The branch's directory in each hierarchy."""
+        """Directories of the group in all hierarchies."""
         return [root / self.path for root in self.hierarchies.roots]
 
     def create(self) -> list[Path]:
-        """Make the branch where it is missing and return the files through which a process enters it."""
+        """Create the group if it is missing. Return the files that a process is added with."""
         if self.hierarchies.version == 2:
             return [self._create_v2()]
         for root in self.hierarchies.roots:
@@ -98,7 +98,7 @@ class Branch:
         return [directory / "cgroup.procs" for directory in self.directories]
 
     def _create_v2(self) -> Path:
-        # Version 2 wants processes in leaves only: daemons get a leaf of their own beside the pods' branch.
+        # Version 2 allows processes only in leaf groups, so daemons get a leaf next to the group of the pods.
         directory = self.hierarchies.roots[0]
         for part in (*Path(self.path).parts, _DAEMONS):
             _delegate(directory)
@@ -108,21 +108,21 @@ class Branch:
         return directory / "cgroup.procs"
 
     def process_ids(self) -> set[int]:
-        """Return the processes in the branch and everything below it."""
+        """Return the processes of the group and its descendants."""
         found: set[int] = set()
         for directory in self.directories:
             for folder in _walk(directory):
                 try:
                     found.update(int(word) for word in (folder / "cgroup.procs").read_text().split())
                 except (FileNotFoundError, OSError):
-                    continue  # the group went away while we looked
+                    continue  # # removed in the meantime
         return found - {0}
 
     def kill_all(self, *, timeout_s: float = 20.0) -> None:
-        """Kill every process in the branch and wait until none is left.
+        """Kill all processes of the group and wait until they have ended.
 
         Raises:
-            ClusterError: Some did not end in time.
+            ClusterError: A process did not end before the timeout.
         """
         deadline = time.monotonic() + timeout_s
         while pids := self.process_ids():
@@ -137,10 +137,10 @@ class Branch:
             time.sleep(_POLL_S)
 
     def remove(self, *, timeout_s: float = 10.0) -> None:
-        """Remove the branch and all below it; its processes must have ended.
+        """Remove the group and its descendants. Their processes must have ended.
 
         Raises:
-            ClusterError: The kernel still calls a group busy after the time limit.
+            ClusterError: The kernel reports a busy group after the timeout.
         """
         deadline = time.monotonic() + timeout_s
         for directory in self.directories:
@@ -154,21 +154,21 @@ class Branch:
 
 
 def cluster_branch(name: str) -> Branch:
-    """Return the branch of a cluster."""
+    """Return the control group of a cluster."""
     return Branch(find_hierarchies(), f"{TOP}/{name}")
 
 
 def remove_top() -> None:
-    """Remove the branch above all clusters when it is empty."""
+    """Remove the parent group of all clusters if it is empty."""
     for root in find_hierarchies().roots:
         try:
             (root / TOP).rmdir()
         except (FileNotFoundError, OSError):
-            continue  # not there, or another cluster's groups are in it
+            continue  # # missing, or used by another cluster
 
 
 def _walk(directory: Path) -> Iterator[Path]:
-    """Yield directories below and including this one, deepest first; those that vanish are skipped."""
+    """Yield the directory and its subdirectories, deepest first. Disappearing directories are skipped."""
     try:
         with os.scandir(directory) as entries:
             below = [Path(entry.path) for entry in entries if entry.is_dir(follow_symlinks=False)]

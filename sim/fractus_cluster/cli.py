@@ -52,7 +52,7 @@ def down(name: str | None, every: bool) -> None:
     # A cluster whose state directory was deleted is still in the machine's ledger.
     ours = sorted({*known_clusters(), *(held for held, at in holders().items() if at.parent == state_root())})
     if name is None and len(ours) > 1 and not every:
-        raise ClusterError(f"there are {', '.join(ours)}; name one with --name, or take all down with --all")
+        raise ClusterError(f"several clusters: {', '.join(ours)}; select one with --name, or remove all with --all")
     for each in [name] if name is not None else ours:
         Cluster.bare(each, report=print_report).down()
 
@@ -75,7 +75,7 @@ def status(name: str | None, output: str) -> None:
         )
     else:
         radio_words = {True: ", radio runs", False: ", radio dead", None: ""}[radio]
-        click.echo(f"cluster {found.name}: control plane {'runs' if found.running else 'is down'}{radio_words}")
+        click.echo(f"cluster {found.name}: control plane {'running' if found.running else 'down'}{radio_words}")
         for node in states:
             click.echo(f"  {node.name:<20} {node.node_class:<6} {node.address:<15} {_words(node)}")
     if not well:
@@ -180,7 +180,7 @@ def radio(node: str, wifi: str | None, fade: float | None, uplink: str | None, n
     found = Cluster.existing(name)
     hardware = found.node(node).spec.hardware
     if (wifi is not None or fade is not None) and hardware.wifi is None:
-        raise ClusterError(f"node {node} has no simulated WiFi; give it hardware.wifi in the cluster's file")
+        raise ClusterError(f"node {node} has no simulated WiFi; add hardware.wifi to the cluster file")
     if uplink is not None and hardware.uplink is None:
         raise ClusterError(f"node {node} has no mobile uplink; `fractus cluster link cut {node}` cuts its wire")
     if wifi is not None:
@@ -212,7 +212,7 @@ def logs(program: str, node: str | None, lines: int, name: str | None) -> None:
     file = folder / f"{program}.log"
     if not file.is_file():
         there = ", ".join(sorted(path.stem for path in folder.glob("*.log"))) if folder.is_dir() else "nothing"
-        raise ClusterError(f"there is no log {file}; name one of: {there}")
+        raise ClusterError(f"no log {file}; available: {there}")
     for line in file.read_text(errors="replace").splitlines()[-lines:]:
         click.echo(line)
 

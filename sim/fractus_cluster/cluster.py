@@ -1,4 +1,4 @@
-"""The embedded cluster itself: bringing it up, keeping it as described, taking it down."""
+"""The embedded cluster: start, update to a description, and removal."""
 
 from __future__ import annotations
 
@@ -38,22 +38,22 @@ Report = Callable[[str], None]
 
 
 def silent(_message: str) -> None:
-    """Take a line of progress and drop it."""
+    """Ignore a progress line."""
 
 
 @dataclass(frozen=True, slots=True)
 class NodeStatus:
-    """How a node is.
+    """Status of a node.
 
     Attributes:
-        name: Its name.
+        name: Name.
         node_class: drone, edge or cloud.
-        address: Its address on the cluster's network.
-        powered: Whether it runs.
-        linked: Whether its uplink is up.
-        ready: What the API server says of it; None when that cannot be asked.
-        vehicle_running: Whether its vehicle runs; None when it has none.
-        camera_running: Whether its simulated camera runs; None when it has none.
+        address: Address in the cluster network.
+        powered: True if the node is running.
+        linked: True if its uplink is up.
+        ready: Ready condition in the API server. None if the API server is unavailable.
+        vehicle_running: True if its vehicle is running. None without vehicle.
+        camera_running: True if its simulated camera is running. None without camera.
     """
 
     name: str
@@ -67,14 +67,14 @@ class NodeStatus:
 
 
 class Cluster:
-    """A cluster described by a file, whether it is up or not."""
+    """A cluster described by a file. It may be running or not."""
 
     def __init__(self, spec: ClusterSpec, *, report: Report = silent) -> None:
-        """Make a handle on a cluster; nothing happens yet.
+        """Create a cluster object. This does not start the cluster.
 
         Args:
-            spec: What it is to be.
-            report: Told about progress, a line at a time.
+            spec: Specification of the cluster.
+            report: Called with progress lines.
         """
         self.spec = spec
         self._report = report
@@ -85,12 +85,12 @@ class Cluster:
         """Return the cluster of a file.
 
         Args:
-            source: The file, or the cluster it would describe.
-            name: Its name instead of the one in the file.
-            report: Told about progress, a line at a time.
+            source: Cluster file or specification.
+            name: Overrides the name in the file.
+            report: Called with progress lines.
 
         Raises:
-            ClusterError: The file is missing or wrong.
+            ClusterError: The file is missing or invalid.
         """
         spec = source if isinstance(source, ClusterSpec) else load_spec(Path(source))
         if name is not None:
@@ -99,48 +99,48 @@ class Cluster:
 
     @classmethod
     def existing(cls, name: str | None = None, *, report: Report = silent) -> Cluster:
-        """Return a cluster that was brought up before.
+        """Return a cluster that was started before.
 
         Args:
-            name: Its name; may be left out when there is only one.
-            report: Told about progress, a line at a time.
+            name: Name. Optional if there is only one cluster.
+            report: Called with progress lines.
 
         Raises:
-            ClusterError: There is none of that name.
+            ClusterError: No cluster with this name exists.
         """
         chosen = only_cluster() if name is None else name
         spec = state_of(chosen).read_spec()
         if spec is None:
-            raise ClusterError(f"there is no cluster {chosen}; bring one up: fractus cluster up FILE")
+            raise ClusterError(f"no cluster {chosen}; start one: fractus cluster up FILE")
         return cls(spec, report=report)
 
     @classmethod
     def bare(cls, name: str, *, report: Report = silent) -> Cluster:
-        """Return a handle that can only take a cluster down, for one whose start was interrupted early."""
+        """Return an object that can only remove a cluster whose start was interrupted early."""
         spec = state_of(name).read_spec()
         return cls(spec or ClusterSpec.placeholder(name), report=report)
 
     @property
     def name(self) -> str:
-        """The cluster's name."""
+        """Name of the cluster."""
         return self.spec.name
 
     @property
     def kubeconfig(self) -> Path:
-        """The administrator's kubeconfig; there once the cluster is up."""
+        """Kubeconfig of the administrator. It exists while the cluster is up."""
         return self._state.kubeconfig
 
     @property
     def logs(self) -> Path:
-        """Logs: `control-plane/PROGRAM.log` and `NODE/PROGRAM.log`."""
+        """Folder of logs: `control-plane/PROGRAM.log` and `NODE/PROGRAM.log`."""
         return self._state.logs
 
     @property
     def nodes(self) -> list[Node]:
-        """The nodes.
+        """Nodes of the cluster.
 
         Raises:
-            ClusterError: The cluster was never up, so they have no addresses.
+            ClusterError: The cluster was never started, so its nodes have no addresses.
         """
         memory = self._memory()
         branch = cluster_branch(self.name)
@@ -152,29 +152,29 @@ class Cluster:
         ]
 
     def node(self, name: str) -> Node:
-        """Return one node.
+        """Return a node.
 
         Raises:
-            ClusterError: There is none of that name.
+            ClusterError: No node with this name exists.
         """
         for node in self.nodes:
             if node.name == name:
                 return node
         raise ClusterError(
-            f"cluster {self.name} has no node {name}; it has {', '.join(n.name for n in self.spec.nodes)}"
+            f"cluster {self.name} has no node {name}; its nodes: {', '.join(n.name for n in self.spec.nodes)}"
         )
 
     def up(self, *, images: Sequence[str] = ()) -> None:
-        """Make the cluster be as described, whatever state it is in; a no-op when it is.
+        """Start the cluster, or update it to its description. Nothing changes if it is already up to date.
 
-        Dead processes are started again, nodes switched on, links healed, dead vehicles and cameras replaced.
+        Ended processes are restarted, nodes powered on, links restored, and ended vehicles and cameras replaced.
 
         Args:
-            images: Images in the machine's store that every node gets before it starts pods.
+            images: Images in the machine's store that are delivered to every node before it starts pods.
 
         Raises:
-            PrerequisiteError: The machine lacks something.
-            ClusterError: Something did not come up; the message names the log to read.
+            PrerequisiteError: The machine lacks a requirement.
+            ClusterError: A part did not start. The message names its log.
         """
         started = time.monotonic()
         check_root()
@@ -209,10 +209,10 @@ class Cluster:
         self._report(f"cluster {self.name} is up: {len(nodes)} nodes, {time.monotonic() - started:.1f} s")
 
     def down(self) -> None:
-        """Take the cluster away with everything that it put on the machine; a no-op when there is none.
+        """Remove the cluster and all its resources on the machine. Nothing changes if it does not exist.
 
         Raises:
-            ClusterError: Something could not be removed; call it again when the cause is gone.
+            ClusterError: A resource could not be removed. Fix the cause and call this again.
         """
         check_root()
         with self._locked(remove=True):
@@ -231,7 +231,7 @@ class Cluster:
         self._report(f"cluster {self.name} is down")
 
     def status(self) -> list[NodeStatus]:
-        """Return how each node is."""
+        """Return the status of each node."""
         memory = self._memory()
         cut = network.links_cut(self._wiring(memory))
         ready = self._startup(memory).ready_nodes()
@@ -250,7 +250,7 @@ class Cluster:
         ]
 
     def set_power(self, node: str, *, on: bool) -> None:
-        """Pull a node's power or give it back; returns before its kubelet is Ready."""
+        """Power a node on or off. This does not wait until its kubelet is Ready."""
         check_root()
         with self._locked():
             chosen = self.node(node)
@@ -261,25 +261,25 @@ class Cluster:
 
     @property
     def radio(self) -> Radio:
-        """The radio of its nodes."""
+        """Simulated radio of the nodes."""
         return Radio(self.name, self._state)
 
     @property
     def running(self) -> bool:
-        """Whether the control plane's programs run."""
+        """True if the programs of the control plane are running."""
         return running(self._state.process(CONTROL_PLANE)) is not None
 
     def load_images(self, images: Sequence[str]) -> dict[str, int]:
-        """Deliver images to all nodes that are on.
+        """Deliver images to all running nodes.
 
         Args:
             images: Names in buildah's storage, or paths of OCI or Docker archives.
 
         Returns:
-            For each node, how many images were new to it.
+            Number of new images by node.
 
         Raises:
-            ClusterError: An image does not exist or a node refuses it.
+            ClusterError: An image does not exist, or a node rejected it.
         """
         store = ImageStore.default(report=self._report)
         return store.deliver(store.fetch(images), [node for node in self.nodes if node.powered])
@@ -287,10 +287,10 @@ class Cluster:
     def kubectl(
         self, *arguments: str, input_text: str | None = None, timeout_s: float = 60.0, check: bool = True
     ) -> subprocess.CompletedProcess[str]:
-        """Run kubectl against the cluster to its end and return what it wrote.
+        """Run kubectl on the cluster and return its output.
 
         Raises:
-            ClusterError: It failed (with `check`) or took too long.
+            ClusterError: The command failed (with `check`) or timed out.
         """
         program = ensure_binaries(["kubectl"], report=self._report)["kubectl"]
         environment = {**os.environ, "KUBECONFIG": str(self.kubeconfig)}
@@ -308,7 +308,7 @@ class Cluster:
     def _memory(self) -> Memory:
         memory = self._state.read_memory()
         if memory is None:
-            raise ClusterError(f"cluster {self.name} is not up; bring it up: fractus cluster up FILE")
+            raise ClusterError(f"cluster {self.name} is not running; start it: fractus cluster up FILE")
         return memory
 
     def _wiring(self, memory: Memory) -> network.Wiring:
@@ -319,5 +319,5 @@ class Cluster:
 
 
 def print_report(message: str) -> None:
-    """Write a line of progress to standard error."""
+    """Write a progress line to standard error."""
     print(message, file=sys.stderr, flush=True)

@@ -1,4 +1,4 @@
-"""Running other programs with a time limit and an error that shows what they said."""
+"""Execution of programs with a timeout and errors that contain their output."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ def run(
     env: Mapping[str, str] | None = None,
     cwd: Path | None = None,
 ) -> subprocess.CompletedProcess[str]:
-    """Run a program to its end and capture what it wrote.
+    """Run a program and capture its output.
 
     Args:
-        argv: The program and its arguments.
-        input_text: What it reads on standard input; nothing when None.
-        timeout_s: After this many seconds the program is killed and ClusterError is raised.
-        check: Raise ClusterError when the exit code is not 0.
-        env: The whole environment of the program; inherited when None.
-        cwd: Its working directory.
+        argv: Program and arguments.
+        input_text: Standard input. None: empty.
+        timeout_s: Timeout. The program is killed when it expires.
+        check: Raise ClusterError if the exit code is not 0.
+        env: Complete environment. None: inherited.
+        cwd: Working directory.
 
     Raises:
-        ClusterError: The program is missing, took too long, or (with `check`) failed.
+        ClusterError: The program is missing, timed out, or (with `check`) failed.
     """
     words = [str(word) for word in argv]
     try:

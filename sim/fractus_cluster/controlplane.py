@@ -1,4 +1,4 @@
-"""The control plane: what its programs are told, as units for the supervisor. Pure builders."""
+"""Supervisor units of the control plane. All functions are pure."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ _CLUSTER_DOMAIN = "cluster.local"
 
 @dataclass(frozen=True, slots=True)
 class ControlPlaneFiles:
-    """Where the control plane keeps its files.
+    """Directories of the control plane.
 
     Attributes:
-        directory: Its own directory: the data of etcd, configuration.
-        logs: Where its programs write their logs.
+        directory: Data of etcd and configuration.
+        logs: Logs of its programs.
     """
 
     directory: Path
@@ -86,7 +86,10 @@ def write_control_plane(
 
 
 def let_dns_start(addressing: Addressing, files: ControlPlaneFiles) -> None:
-    """Write the DNS server's configuration, once it may read Services: refused, it asks again only after half a minute."""
+    """Write the DNS server's configuration after its permission to read Services exists.
+
+    Without the permission, the server retries only after 30 s.
+    """
     if not files.corefile.exists():
         fresh = files.corefile.with_suffix(".new")
         fresh.write_text(corefile(addressing, files.kubeconfig("coredns")))

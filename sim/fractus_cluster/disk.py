@@ -1,4 +1,4 @@
-"""The disk of a node: a file system of its own, which can be full without the machine's disk being so."""
+"""Disk of a node: a separate file system that can be full while the machine's disk is not."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from fractus_cluster.commands import run
 
 
 def mount_disk(image: Path, target: Path, size_bytes: int) -> None:
-    """Mount a file as a disk, and make it where it is missing; a no-op where it is mounted.
+    """Mount an image file as a disk. Create the file if it is missing. Nothing changes if it is mounted.
 
-    Root has no blocks of its own on it: it can be filled to the last one.
+    No blocks are reserved for root, so the disk can be filled completely.
 
     Args:
-        image: The file; it keeps its size.
-        target: Where its content is; a directory that need not be there.
-        size_bytes: How large it is made.
+        image: Image file. An existing file keeps its size.
+        target: Mount point. It is created if it is missing.
+        size_bytes: Size of a new file.
 
     Raises:
-        ClusterError: The machine has no loop devices, or no room.
+        ClusterError: No loop device or no space is available.
     """
     if target.is_mount():
         return
@@ -42,5 +42,5 @@ def unmount_below(directory: Path) -> None:
     mounted = [Path(line.split(" ")[4].replace("\\040", " ")) for line in lines]
     for target in reversed(mounted):
         if target.is_relative_to(directory):
-            # Lazily: a program that still has a file of it open must not keep the rest from being taken away.
+            # Lazy unmount: a program with an open file must not prevent the removal of the other resources.
             run(["umount", "--lazy", target])

@@ -1,13 +1,13 @@
-"""What can go wrong with an embedded cluster, as one exception whose text says what to do."""
+"""Errors of the embedded cluster."""
 
 from __future__ import annotations
 
 
 class ClusterError(Exception):
-    """Something the caller can act on: what was wrong, where, and what to do about it."""
+    """An error of the embedded cluster. The message says what is wrong, where, and what to do."""
 
     exit_code = 1
-    """Of the command that it ends."""
+    """Exit code of the command."""
 
 
 class PrerequisiteError(ClusterError):

@@ -1,4 +1,4 @@
-"""What stands beside a node and keeps its own power: the simulated vehicle of a drone, a simulated camera."""
+"""Simulated hardware of a node with its own power: the vehicle of a drone and a camera."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from fractus_cluster.errors import ClusterError
 from fractus_cluster.spec import NodeSpec, Place, camera_address
 
 CAMERA_LINKS = ("tcp:127.0.0.1:5762", "tcp:127.0.0.1:5763")
-"""Where a camera follows its vehicle: a link of its own, the second if the first is the autopilot's."""
+"""Vehicle endpoint of the camera: a separate link, the second if the first is the autopilot's."""
 
 
 RADIO_LINK = "tcp:127.0.0.1:5765"
-"""Where the radio follows a vehicle that carries a station."""
+"""Vehicle endpoint of the radio, for a vehicle with a station."""
 
 
 def hardware_commands(node: NodeSpec, origin: Place | None) -> dict[str, list[str]]:
-    """Return the commands that run what stands beside a node, by the names of their logs.
+    """Return the commands of a node's simulated hardware, by log name.
 
     Args:
         node: The node.
-        origin: The middle of the landscape of the cluster's cameras.
+        origin: Centre of the landscape of the cluster's cameras.
 
     Raises:
-        ClusterError: Nothing says where its vehicle stands, or the simulator is not installed.
+        ClusterError: The position of the vehicle is not specified, or the simulator is not installed.
     """
     vehicle, camera = vehicle_command(node), camera_command(node, origin)
     found = {"vehicle": vehicle, "camera": camera}
@@ -36,10 +36,10 @@ def hardware_commands(node: NodeSpec, origin: Place | None) -> dict[str, list[st
 
 
 def vehicle_command(node: NodeSpec) -> list[str] | None:
-    """Return the command that runs a node's vehicle, or None when it has none.
+    """Return the command of a node's vehicle, or None without vehicle.
 
     Raises:
-        ClusterError: It has one, but nothing says where it stands, or the simulator is not installed.
+        ClusterError: The position of the vehicle is not specified, or the simulator is not installed.
     """
     vehicle = node.vehicle()
     if vehicle is None:
@@ -54,9 +54,9 @@ def vehicle_command(node: NodeSpec) -> list[str] | None:
 
 
 def camera_command(node: NodeSpec, origin: Place | None) -> list[str] | None:
-    """Return the command that runs a node's camera, or None when it has none.
+    """Return the command of a node's camera, or None without camera.
 
-    Lens, resolution and mount are those that the node's description tells the camera service.
+    Lens, resolution and mount are taken from the camera service in the node's description.
 
     Raises:
         ClusterError: The simulator is not installed.
@@ -91,7 +91,7 @@ def _camera_link(autopilot: str) -> str:
 
 
 def hardware_environment() -> dict[str, str]:
-    """Return the environment of what stands beside a node."""
+    """Return the environment of a node's simulated hardware."""
     return {
         "PATH": os.environ.get("PATH", "/usr/bin:/bin"),
         "HOME": "/root",
@@ -101,10 +101,10 @@ def hardware_environment() -> dict[str, str]:
 
 
 def program(name: str) -> str:
-    """Return the path of one of the simulators' programs.
+    """Return the path of a simulator program.
 
     Raises:
-        ClusterError: It is not installed.
+        ClusterError: The program is not installed.
     """
     beside = Path(sys.executable).with_name(name)
     found = str(beside) if os.access(beside, os.X_OK) else shutil.which(name)

@@ -11,7 +11,7 @@ from fractus_cluster.commands import run
 from fractus_cluster.images.build import build_images
 
 NAMESPACE = "fractus-system"
-"""The charts install nowhere else."""
+"""Namespace of the charts. They support no other namespace."""
 
 _TARGETS = ("operator", "agent", "mobility", "camera")
 _CHARTS = ("fractus-crds", "fractus")
@@ -21,15 +21,15 @@ Report = Callable[[str], None]
 
 
 def install(cluster: Cluster, source: Path, *, report: Report) -> None:
-    """Build what is stale of the images, deliver them, install or upgrade the charts, and wait for the drones.
+    """Build outdated images, deliver them, install or upgrade the charts, and wait for the drones.
 
     Args:
-        cluster: It runs.
-        source: The checkout with Dockerfile and charts.
-        report: Told about progress, a line at a time.
+        cluster: A running cluster.
+        source: Checkout with Dockerfile and charts.
+        report: Called with progress lines.
 
     Raises:
-        ClusterError: A step failed; the message says which, and what was said.
+        ClusterError: A step failed. The message contains the step and its output.
     """
     images = build_images(source, targets=_TARGETS, report=report)
     cluster.load_images(images)
@@ -42,7 +42,7 @@ def install(cluster: Cluster, source: Path, *, report: Report) -> None:
     for node in cluster.spec.nodes:
         if node.node_class != "drone":
             continue
-        # Its agent registers it first.
+        # Its agent must register it first.
         for state in ("create", "condition=Ready"):
             waiting = ("wait", f"--for={state}", f"drones.fractus.dev/{node.name}", f"--timeout={_READY_TIMEOUT_S}s")
             run([programs["kubectl"], *own, *waiting], timeout_s=_READY_TIMEOUT_S + 10)

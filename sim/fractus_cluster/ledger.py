@@ -1,4 +1,4 @@
-"""Small JSON files that remember what was built from what."""
+"""Small JSON files that record the inputs of builds."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from fractus_runtime.files import write_file
 
 
 def read_ledger(path: Path) -> dict[str, str]:
-    """What a ledger remembers; nothing when it is missing or broken, so that all is built again."""
+    """Return the content of a ledger. Return an empty mapping if it is missing or damaged, so that all is rebuilt."""
     try:
         content = json.loads(path.read_text())
     except (FileNotFoundError, json.JSONDecodeError):

@@ -1,4 +1,4 @@
-"""Locks between processes: a file that one process holds at a time, freed when that process ends."""
+"""File locks between processes. A lock is released when its process ends."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ def locked(
 ) -> Iterator[None]:
     """Hold the lock file `path` inside the block.
 
-    The lock belongs to the open file, so it is free again as soon as its holder ends, even by kill -9.
+    The lock belongs to the open file, so the kernel releases it when its holder ends, even after SIGKILL.
 
     Args:
-        path: The lock file; created when missing.
-        timeout_s: How long to wait for the present holder.
-        what: What the holder does, for messages ("another process is building binaries").
-        report: Told once when the lock is held by another process.
-        remove: Delete the file before the lock is given up.
+        path: Lock file. It is created if it is missing.
+        timeout_s: Maximum time to wait for the lock.
+        what: Activity of the holder for messages ("another process is building binaries").
+        report: Called once if another process holds the lock.
+        remove: Delete the file before the lock is released.
 
     Raises:
-        ClusterError: The lock did not become free in time.
+        ClusterError: The lock was not released before the timeout.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     handle = _acquire(path, timeout_s=timeout_s, what=what, report=report)
@@ -61,7 +61,7 @@ def _acquire(path: Path, *, timeout_s: float, what: str, report: Callable[[str],
         except BlockingIOError:
             os.close(handle)
             if time.monotonic() > deadline:
-                raise ClusterError(f"gave up after {timeout_s:.0f} s: {what} ({path} is held)") from None
+                raise ClusterError(f"timed out after {timeout_s:.0f} s: {what} ({path} is locked)") from None
             if not told:
                 report(f"waiting: {what}")
                 told = True

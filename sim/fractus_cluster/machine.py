@@ -1,4 +1,4 @@
-"""What all clusters of a machine share: claims on names and addresses, and settings to put back at the end."""
+"""Resources shared by all clusters of a machine: names, addresses, and kernel settings to restore at the end."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from fractus_cluster.errors import ClusterError
 from fractus_cluster.locking import locked
 from fractus_cluster.network import NETNS_DIRECTORY, networks_in_use
 
-# On /run, because all of it is void after a reboot, as are the settings and addresses themselves.
+# On /run, because claims, settings and addresses do not survive a reboot.
 DIRECTORY = Path("/run/fractus-sim")
 _LEDGER = DIRECTORY / "machine.json"
 _LOCK = DIRECTORY / "lock"
@@ -29,7 +29,7 @@ Report = Callable[[str], None]
 
 @dataclass(slots=True)
 class _Claim:
-    """What one cluster holds of the machine."""
+    """Claim of one cluster."""
 
     state: str
     block: str
@@ -37,7 +37,7 @@ class _Claim:
 
 @dataclass(slots=True)
 class _Ledger:
-    """All claims, and what the machine was like before the first."""
+    """All claims, and the settings of the machine before the first claim."""
 
     sysctls: dict[str, str] = field(default_factory=dict)
     controllers: list[str] = field(default_factory=list)
@@ -52,31 +52,31 @@ def cluster_lock(name: str) -> Path:
 
 
 def claim(name: str, state: Path, block: IPv4Network | None) -> IPv4Network:
-    """Claim a cluster's name and addresses, and prepare the machine when it is the first cluster.
+    """Claim a cluster's name and addresses. The first cluster also changes kernel settings.
 
     Args:
-        name: The cluster's name.
+        name: Name of the cluster.
         state: Its state directory.
-        block: The addresses it has already, or None to get some that are free.
+        block: Its existing addresses. None: allocate free addresses.
 
     Returns:
-        Its addresses.
+        Addresses of the cluster.
 
     Raises:
-        ClusterError: The name is in use by a cluster with another state directory, or the addresses are taken.
+        ClusterError: The name is used by a cluster with a different state directory, or the addresses are in use.
     """
     with locked(_LOCK, timeout_s=_LOCK_TIMEOUT_S, what="another cluster is coming up or going down"):
         ledger = _read()
         held = ledger.claims.get(name)
         if held is not None:
             if held.state != str(state):
-                raise ClusterError(f"there is a cluster {name} already, with its state in {held.state}")
+                raise ClusterError(f"cluster {name} already exists, with its state in {held.state}")
             return IPv4Network(held.block)
         others = [IPv4Network(entry.block) for entry in ledger.claims.values()]
         if block is None:
             block = choose_block([*networks_in_use(), *others])
         elif any(block.overlaps(other) for other in (*networks_in_use(), *others)):
-            raise ClusterError(f"{name}: its addresses {block} are in use by something else now; take it down first")
+            raise ClusterError(f"{name}: its addresses {block} are used by another network; remove the cluster first")
         if not ledger.claims:
             _note_machine(ledger)
         ledger.claims[name] = _Claim(str(state), str(block))
@@ -112,11 +112,11 @@ def release(name: str) -> None:
 
 
 def remove_directory() -> None:
-    """Remove the directory of claims and locks when nothing is in it any more."""
+    """Remove the directory of claims and locks if it is empty."""
     try:
         DIRECTORY.rmdir()
     except OSError:
-        return  # another cluster is in it
+        return  # # used by another cluster
 
 
 def _note_machine(ledger: _Ledger) -> None:
@@ -140,7 +140,8 @@ def _raise_sysctls(ledger: _Ledger) -> None:
 def _restore(ledger: _Ledger) -> None:
     for name, value in ledger.sysctls.items():
         path = _sysctl(name)
-        if path.read_text().strip() == str(_RAISED_SYSCTLS.get(name)):  # else it was set by another meanwhile
+        # # otherwise changed by another program in the meantime
+        if path.read_text().strip() == str(_RAISED_SYSCTLS.get(name)):
             path.write_text(value)
     # `ip netns add` mounts the directory on itself the first time.
     if NETNS_DIRECTORY.is_dir() and not any(NETNS_DIRECTORY.iterdir()):
@@ -155,7 +156,7 @@ def _restore(ledger: _Ledger) -> None:
             try:
                 control.write_text(f"-{name}")
             except OSError:
-                continue  # something else uses it by now
+                continue  # # in use by another program
 
 
 def _mounted(path: Path) -> bool:

@@ -1,4 +1,4 @@
-"""The objects that a cluster starts with: its nodes and its DNS. Pure builders of what is applied."""
+"""Initial objects of a cluster: its nodes and its DNS. All functions are pure."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DNS_USER = "fractus-sim:dns"
 
 
 def node_object(node: NodeSpec, index: int, addressing: Addressing) -> tuple[str, Json]:
-    """Return path and content of the Node, made before its kubelet starts so that its labels are there at once."""
+    """Return path and content of the Node, which is created before its kubelet so that its labels exist early."""
     pods = str(addressing.pods(index))
     labels = {
         "kubernetes.io/hostname": node.name,
@@ -43,7 +43,7 @@ def taints_patch(node: NodeSpec, present: Json) -> tuple[str, Json] | None:
         present: Its Node object.
     """
     taints = present["spec"].get("taints", [])
-    # NoExecute: kubelet heeds it too, so that naming the node in a pod does not get around it.
+    # NoExecute is also enforced by kubelet, so setting nodeName in a pod does not bypass it.
     wanted = [{"key": CLASS_LABEL, "value": node.node_class, "effect": "NoExecute"}]
     if node.node_class == "cloud":
         wanted = []
@@ -101,10 +101,10 @@ def dns_objects(listen: IPv4Address) -> list[tuple[str, Json]]:
 
 
 def extended_resources_patch(node: NodeSpec, present: Json) -> tuple[str, Json] | None:
-    """Return path and merge patch that give a node its extended resources; None when it offers them already."""
+    """Return path and merge patch for a node's extended resources, or None if the node already offers them."""
     wanted = dict(node.extended_resources)
     status = present.get("status", {})
-    # Kubelet would work out what is allocatable by itself, but only at its next heartbeat.
+    # Kubelet would update allocatable only at its next heartbeat.
     patch = {
         field: wanted
         for field in ("capacity", "allocatable")
@@ -114,11 +114,11 @@ def extended_resources_patch(node: NodeSpec, present: Json) -> tuple[str, Json] 
 
 
 def is_ready(node: Json, *, since: datetime | None = None) -> bool:
-    """Whether a Node object says that the node is Ready.
+    """Return True if a Node object is Ready.
 
     Args:
         node: The object.
-        since: Believe only what its kubelet reported at this time or later.
+        since: Ignore conditions that kubelet reported before this time.
     """
     for condition in node.get("status", {}).get("conditions", ()):
         if condition["type"] == "Ready" and condition["status"] == "True":

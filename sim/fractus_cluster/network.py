@@ -52,7 +52,7 @@ class Wiring:
 
 @dataclass(frozen=True, slots=True)
 class _Mark:
-    """A namespace that was set up completely: its identity, that of the one it is wired to, and by what."""
+    """Record of a completely configured namespace: its identity, its peer, and the code version that configured it."""
 
     inode: int
     hub: int
@@ -82,7 +82,7 @@ def networks_in_use() -> list[IPv4Network]:
 
 
 def wire_control_plane(wiring: Wiring) -> None:
-    """Set up the control plane's namespace with the bridge, and the machine's link to it; a no-op when done."""
+    """Configure the control plane's namespace with the bridge and the link of the machine. Nothing changes if done."""
     path = wiring.namespace_path()
     inode = _inode(path)
     if _read_mark(wiring, None) == _Mark(inode, 0) and inode and _link_exists(wiring.host_link):
@@ -136,7 +136,7 @@ def wire_node(wiring: Wiring, node: str, index: int, *, mobile: bool = False) ->
     _delete_link(UPLINK, wiring.namespace(node))
     _delete_link(own, wiring.namespace())
     if mobile:
-        # They stay when the radio's process ends; only then there is no carrier.
+        # The devices remain when the radio process ends, but lose their carrier.
         _ip(wiring.namespace(node), f"tuntap add dev {UPLINK} mode tap")
         _ip(wiring.namespace(), f"tuntap add dev {own} mode tap")
     else:
@@ -236,7 +236,7 @@ def _settings(namespace: Path, values: dict[str, str]) -> None:
 
 
 def _inode(path: Path) -> int:
-    """Return the identity of a network namespace, 0 when there is none behind the file."""
+    """Return the identity of a network namespace, or 0 if the file refers to none."""
     try:
         facts = path.stat()
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""A node of an embedded cluster: its files, its power, its uplink, and commands run on it."""
+"""A node of an embedded cluster: files, power, uplink and commands."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ _FOLDERS = ("etc", "etc-work", "var-lib", "var-log", "config")
 
 
 def init_command(config: Path, namespace: Path) -> list[str]:
-    """Return the command that runs the first program of a node or control plane in its own namespaces.
+    """Return the command that runs the first program of a node or control plane in new namespaces.
 
-    Its process is the parent of that program; when it is killed, everything in those namespaces ends.
+    The command is the parent of that program. When it is killed, all processes in the namespaces end.
     """
     return [
         "nsenter",
@@ -74,32 +74,32 @@ class Node:
 
     @property
     def address(self) -> IPv4Address:
-        """Its address on the cluster's network."""
+        """Address in the cluster network."""
         return self.wiring.addressing.node(self.index)
 
     @property
     def directory(self) -> Path:
-        """Its files on the machine; `var-lib/` and `etc/` below are its /var/lib and what differs in its /etc."""
+        """Files of the node. `var-lib/` and `etc/` below are its /var/lib and its changes to /etc."""
         return self.state.node(self.name)
 
     @property
     def own_state(self) -> Path:
-        """What is /var/lib/fractus on it."""
+        """Directory that is mounted as /var/lib/fractus on the node."""
         return self.directory / "var-lib" / "fractus"
 
     @property
     def powered(self) -> bool:
-        """Whether the node runs."""
+        """True if the node is running."""
         return running(self.state.process(f"node.{self.name}")) is not None
 
     @property
     def vehicle_running(self) -> bool | None:
-        """Whether the node's vehicle runs; None when it has none."""
+        """True if the node's vehicle is running. None without vehicle."""
         return None if self.spec.vehicle() is None else self._runs("vehicle")
 
     @property
     def camera_running(self) -> bool | None:
-        """Whether the node's simulated camera runs; None when it has none."""
+        """True if the node's simulated camera is running. None without camera."""
         return None if self.spec.hardware.camera is None else self._runs("camera")
 
     def _runs(self, hardware: str) -> bool:
@@ -124,7 +124,7 @@ class Node:
             children = Path(f"/proc/{record.pid}/task/{record.pid}/children").read_text().split()
             if children:
                 return int(children[0])
-        raise ClusterError(f"node {self.name} is off; give it power: fractus cluster power on {self.name}")
+        raise ClusterError(f"node {self.name} is powered off; power it on: fractus cluster power on {self.name}")
 
     def exec_command(self, argv: Sequence[str]) -> list[str]:
         """Return a command for this machine that runs `argv` on the node.
@@ -138,15 +138,15 @@ class Node:
     def exec(
         self, argv: Sequence[str], *, input_text: str | None = None, timeout_s: float = 60.0, check: bool = True
     ) -> subprocess.CompletedProcess[str]:
-        """Run a program on the node to its end, as root, and return what it wrote.
+        """Run a program on the node as root and return its output.
 
         Raises:
-            ClusterError: The node is off, or the program failed (with `check`) or took too long.
+            ClusterError: The node is powered off, or the program failed (with `check`) or timed out.
         """
         return run(self.exec_command(argv), input_text=input_text, timeout_s=timeout_s, check=check, env=ENVIRONMENT)
 
     def cut_link(self) -> None:
-        """Cut the node's uplink; the node goes on without the rest of the cluster."""
+        """Cut the node's uplink. The node keeps running."""
         network.cut_link(self.wiring, self.index)
 
     def heal_link(self) -> None:
@@ -163,10 +163,10 @@ class Node:
         self._cgroup.remove()
 
     def power_on(self) -> bool:
-        """Switch the node on with the configuration last written; a no-op when it runs.
+        """Power on the node with the last written configuration. Nothing changes if it is running.
 
         Returns:
-            Whether it was off.
+            True if the node was powered off.
         """
         if self.powered:
             return False
@@ -184,10 +184,10 @@ class Node:
         return True
 
     def start_hardware(self) -> None:
-        """Put the node's vehicle and camera in place; a no-op for what runs or the node has not.
+        """Start the node's vehicle and camera if they are configured and not running.
 
         Raises:
-            ClusterError: The simulator is not installed, or nothing says where the vehicle stands.
+            ClusterError: The simulator is not installed, or the position of the vehicle is not specified.
         """
         for name, command in hardware_commands(self.spec, self.world_origin).items():
             if self._runs(name):
@@ -271,10 +271,10 @@ class Node:
         )
 
     def write_files(self, content: dict[str, str]) -> bool:
-        """Write the node's files when they differ from those it runs with; a running node is switched off first.
+        """Write the node's files if they changed. A running node is powered off first.
 
         Returns:
-            Whether anything differed.
+            True if a file changed.
         """
         digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
         stamp = self.directory / "digest"

@@ -1,7 +1,7 @@
-"""The first program of a node: gives it its own view of the machine, then supervises its daemons.
+"""First program of a node: sets up its view of the machine, then supervises its daemons.
 
-It runs as root in fresh mount, uts, ipc and pid namespaces and in the node's network namespace, on the
-standard library alone, and changes nothing outside of them.
+It runs as root in new mount, uts, ipc and pid namespaces and in the node's network namespace. It uses only the standard
+library and changes nothing outside of these namespaces.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ _MS_BIND, _MS_REC, _MS_SHARED = 4096, 16384, 1 << 20
 _MNT_DETACH = 2
 
 RUN = Path("/run/fractus")
-"""Where a node finds its own configuration, programs and logs: config/, bin/ and logs/ below it."""
+"""Directory of a node's configuration, programs and logs: config/, bin/ and logs/ below it."""
 
 
 @dataclass(frozen=True, slots=True)
 class NodeView:
-    """What a node sees in place of the machine's own.
+    """View of the machine for a node.
 
     Attributes:
-        hostname: Its host name; None leaves the mount tree alone (a control plane needs no view of its own).
+        hostname: Host name. None leaves the mount tree unchanged (control plane).
         files: Directory with etc/, etc-work/, var-lib/, var-log/ and config/ of the node.
-        logs: Directory for its daemons' logs.
-        programs: Program name -> path on the machine.
-        sysctls: Values of machine-wide settings shown to the node, so that no daemon changes the real ones.
+        logs: Directory of its daemons' logs.
+        programs: Paths on the machine by program name.
+        sysctls: Machine-wide settings as shown to the node, so that no daemon changes the actual ones.
     """
 
     hostname: str | None
@@ -68,7 +68,7 @@ def release_namespaces() -> None:
 def prepare(view: NodeView) -> None:
     """Build the node's mount tree."""
     with ExitStack() as stack:
-        # Handles, because the paths may lie below what is about to be covered.
+        # File descriptors, because the paths may be below directories that are covered by mounts.
         source = {name: _handle(Path(view.files) / name, stack) for name in ("etc", "etc-work", "var-lib", "var-log")}
         source["config"] = _handle(Path(view.files) / "config", stack)
         source["logs"] = _handle(Path(view.logs), stack)
@@ -85,14 +85,14 @@ def prepare(view: NodeView) -> None:
         layers = f"lowerdir=/etc,upperdir={source['etc']},workdir={source['etc-work']}"
         _mount("overlay", "/etc", "overlay", 0, layers)
         _bind(source["var-log"], Path("/var/log"))
-        # With the disk that a node may have of its own.
+        # Recursive, to include the separate disk of the node.
         _mount(source["var-lib"], "/var/lib", None, _MS_BIND | _MS_REC, None)
     _settings(view.sysctls)
     _mount("none", "/", None, _MS_SHARED | _MS_REC, None)
 
 
 def _fresh_sysfs() -> None:
-    """Mount a sysfs that shows the node's own network devices, and put the control groups back into it."""
+    """Mount a sysfs with the node's network devices, and mount the control groups into it again."""
     aside = Path("/run/.cgroup")
     aside.mkdir()
     _mount("/sys/fs/cgroup", str(aside), None, _MS_BIND | _MS_REC, None)

@@ -19,7 +19,7 @@ CONTAINERD_SOCKET = "/run/containerd/containerd.sock"
 CONFIG = RUN / "config"
 
 SHOWN_SYSCTLS = {
-    # The values that kubelet wants; it finds them set and leaves the machine's own alone.
+    # Values required by kubelet. It finds them set and does not change the machine's settings.
     "vm.overcommit_memory": "1",
     "vm.panic_on_oom": "0",
     "kernel.panic": "10",
@@ -31,7 +31,7 @@ SHOWN_SYSCTLS = {
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """What the machine has to offer.
+    """Resources of the machine.
 
     Attributes:
         cpus: Number of CPUs.
@@ -55,7 +55,7 @@ def shortfalls(node: NodeSpec, machine: Machine) -> list[str]:
 
 
 def _reserved(node: NodeSpec, machine: Machine) -> dict[str, str]:
-    """Return what kubelet has to hold back so that the rest is what the node offers."""
+    """Return the resources that kubelet must reserve, so that the remainder equals the node's resources."""
     reserved: dict[str, str] = {}
     cpu, memory = node.resources.get("cpu"), node.resources.get("memory")
     if cpu and (kept := machine.cpus - parse_quantity(cpu)) > 0:
@@ -131,7 +131,7 @@ def containerd_config(*, plugin_directory: str) -> str:
     """Return containerd's configuration file.
 
     Args:
-        plugin_directory: Where the machine keeps its CNI plugins.
+        plugin_directory: Directory of the machine's CNI plugins.
     """
     return f"""\
 version = 2
@@ -209,7 +209,7 @@ def resolver_file(addressing: Addressing) -> str:
 
 
 def node_units(node: NodeSpec, *, address: str) -> list[dict[str, Any]]:
-    """Return what the node's first program has to keep running."""
+    """Return the units that the node's first program supervises."""
     logs = RUN / "logs"
     # kubelet gives up when the container runtime is not there yet.
     wait = f'i=0; while [ ! -S {CONTAINERD_SOCKET} ] && [ $i -lt 400 ]; do sleep 0.05; i=$((i+1)); done; exec "$@"'

@@ -31,12 +31,12 @@ class Credential:
 
     @property
     def complete(self) -> bool:
-        """Whether both files are there."""
+        """True if both files exist."""
         return self.certificate.is_file() and self.key.is_file()
 
 
 class Authority:
-    """The cluster's certificate authority, in a directory that it fills on demand."""
+    """Certificate authority of the cluster. Credentials are created on demand in its directory."""
 
     def __init__(self, directory: Path) -> None:
         self._directory = directory
@@ -67,13 +67,13 @@ class Authority:
         organizations: Sequence[str] = (),
         alternative_names: Sequence[AlternativeName] = (),
     ) -> Credential:
-        """Return the credential `name`, made when it is missing or was made for other names.
+        """Return the credential `name`. Create it if it is missing or was issued for other names.
 
         Args:
-            name: File name without ending.
-            common_name: The user name that Kubernetes takes from the certificate.
-            organizations: The groups that it takes from it.
-            alternative_names: DNS names and addresses; a server certificate when there are any.
+            name: File name without suffix.
+            common_name: Kubernetes user name.
+            organizations: Kubernetes groups.
+            alternative_names: DNS names and addresses. If set, a server certificate is created.
         """
         credential = Credential(self._directory / f"{name}.crt", self._directory / f"{name}.key")
         if credential.complete and _alternative_names(credential.certificate) == set(map(str, alternative_names)):
@@ -135,7 +135,7 @@ class Authority:
 
 
 def write_private(path: Path, text: str) -> None:
-    """Write a file that only its owner may read, never half written."""
+    """Write a file atomically that only its owner may read."""
     _write(path, text.encode())
 
 
@@ -188,7 +188,7 @@ def _key_bytes(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 
 def _store(credential: Credential, key: ec.EllipticCurvePrivateKey, certificate: x509.Certificate) -> None:
-    credential.certificate.unlink(missing_ok=True)  # the pair is complete when its certificate is there
+    credential.certificate.unlink(missing_ok=True)  # # written last: the pair is complete when the certificate exists
     _write(credential.key, _key_bytes(key))
     _write(credential.certificate, certificate.public_bytes(serialization.Encoding.PEM))
 

@@ -1,4 +1,4 @@
-"""Free ports of the loopback device, for programs that are told where to listen."""
+"""Allocation of free loopback ports."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import random
 import socket
 from collections import deque
 
-# Below the ports that Linux usually gives to connections and to listeners on port 0 (32768 and up), below Kubernetes'
-# NodePorts (30000 and up), above its components' (10248 to 10259) and those usual for MAVLink (14540 to 18570).
+# Below the usual range for connections and for listeners on port 0 (32768 and up) and Kubernetes NodePorts (30000 and
+# up), above the ports of Kubernetes components (10248 to 10259) and the usual MAVLink ports (14540 to 18570).
 _FIRST, _LAST = 20_000, 29_999
 _KEPT = 512
 
@@ -18,13 +18,13 @@ _reservations: deque[socket.socket] = deque()
 
 
 def free_port() -> int:
-    """Reserve a port, TCP and UDP, on which no process listens at 127.0.0.1 and which is given to no other caller.
+    """Reserve a port (TCP and UDP) of 127.0.0.1 that is free and not reserved by another caller.
 
-    The port stays reserved, also among processes, until this process ends or has asked for 512 more: a program that
-    listens there may end and start again. Elsewhere than on Linux, ports are only looked for and not reserved.
+    The port stays reserved, also for other processes, until this process ends or has reserved 512 more ports. A program
+    that listens on it may be restarted. On systems other than Linux, ports are not reserved.
 
     Raises:
-        OSError: no port is free.
+        OSError: No port is free.
     """
     count = _LAST - _FIRST + 1
     start = _chance.randrange(count)
@@ -37,12 +37,12 @@ def free_port() -> int:
             _keep(reservation)
             return port
         reservation.close()
-    message = f"none of the ports {_FIRST} to {_LAST} of 127.0.0.1 is free; end programs that listen there"
+    message = f"no free port from {_FIRST} to {_LAST} on 127.0.0.1; end programs that listen there"
     raise OSError(message)
 
 
 def _reserve(port: int) -> socket.socket | None:
-    """Take the port's name among Unix sockets: like ports, one network namespace has it once, and it needs no file."""
+    """Bind an abstract Unix socket named after the port. It is unique per network namespace and needs no file."""
     reservation = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     try:
         reservation.bind(f"\0fractus/port/{port}")
@@ -50,7 +50,7 @@ def _reserve(port: int) -> socket.socket | None:
         if error.errno == errno.EADDRINUSE:
             reservation.close()
             return None
-        # Only Linux has such names.
+        # Only Linux supports abstract Unix sockets.
     return reservation
 
 

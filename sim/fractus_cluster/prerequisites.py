@@ -1,4 +1,4 @@
-"""Whether the machine can carry a cluster: root, programs, and kernel features, each with what to do about it."""
+"""Prerequisites of a cluster on this machine: root, programs and kernel features, with remedies."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _PLUGIN_DIRECTORIES = ("/usr/lib/cni", "/opt/cni/bin", "/usr/libexec/cni")
 _PLUGINS = ("ptp", "portmap", "host-local", "loopback")
 _NAMESPACES = ("net", "mnt", "pid", "uts", "ipc")
 
-# What kube-proxy and the switching of targets ask of the kernel, tried in a network namespace of its own.
+# Kernel features of kube-proxy and the redirector, tested in a temporary network namespace.
 _FIREWALL_TRIAL = """
 table ip fractus_trial {
   map targets { type ipv4_addr . inet_proto . inet_service : verdict; }
@@ -44,7 +44,7 @@ def check_root() -> None:
     """Check that this process may create namespaces and mounts.
 
     Raises:
-        PrerequisiteError: It does not run as root, or not on Linux.
+        PrerequisiteError: The process is not root, or the system is not Linux.
     """
     if sys.platform != "linux":
         raise PrerequisiteError("the embedded cluster needs Linux; elsewhere use kind or k3s through KUBECONFIG")
@@ -56,10 +56,10 @@ def check_root() -> None:
 
 
 def check_prerequisites() -> None:
-    """Check everything that a cluster needs of the machine except its Kubernetes programs.
+    """Check all requirements on the machine except the Kubernetes programs.
 
     Raises:
-        PrerequisiteError: Something is missing; the message says what to do.
+        PrerequisiteError: A requirement is not met. The message says what to do.
     """
     check_root()
     packages = missing_packages()
@@ -74,7 +74,7 @@ def check_prerequisites() -> None:
 
 
 def missing_packages() -> list[str]:
-    """Return the Debian packages whose programs the machine lacks."""
+    """Return the Debian packages of missing programs."""
     path = os.environ.get("PATH", "") + ":/usr/sbin:/sbin"
     packages = {package for program, package in _PACKAGES.items() if shutil.which(program, path=path) is None}
     if plugin_directory() is None:
@@ -83,7 +83,7 @@ def missing_packages() -> list[str]:
 
 
 def plugin_directory() -> str | None:
-    """Return the directory with the CNI plugins that nodes use, or None."""
+    """Return the directory of the CNI plugins, or None."""
     for directory in _PLUGIN_DIRECTORIES:
         if all(os.access(f"{directory}/{plugin}", os.X_OK) for plugin in _PLUGINS):
             return directory
@@ -91,11 +91,11 @@ def plugin_directory() -> str | None:
 
 
 def machine() -> Machine:
-    """Return what the machine has to offer to nodes."""
+    """Return the resources of the machine."""
     for line in Path("/proc/meminfo").read_text().splitlines():
         if line.startswith("MemTotal:"):
             return Machine(os.cpu_count() or 1, int(line.split()[1]) * 1024)
-    raise ClusterError("/proc/meminfo does not tell the machine's memory")
+    raise ClusterError("/proc/meminfo contains no MemTotal")
 
 
 def _check_file_system(name: str, option: str) -> None:
@@ -109,7 +109,7 @@ def _check_file_system(name: str, option: str) -> None:
 
 
 def _check_network() -> None:
-    """Try the links and firewall rules that a cluster uses, in a network namespace that ends with the trial."""
+    """Create the links and firewall rules of a cluster in a temporary network namespace."""
     trials = {
         "ip link add name a type veth peer name b": "veth links (CONFIG_VETH)",
         "ip link add name c type bridge": "bridges (CONFIG_BRIDGE)",

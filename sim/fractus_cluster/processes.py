@@ -1,4 +1,4 @@
-"""Processes that outlive the command that started them, known again by pid, start time and boot."""
+"""Background processes that are identified by pid, start time and boot."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _POLL_S = 0.01
 
 @dataclass(frozen=True, slots=True)
 class ProcessRecord:
-    """A process that can be told apart from a later one with the same pid.
+    """Identity of a process that is distinct from a later process with the same pid.
 
     Attributes:
         pid: Process id in the root pid namespace.
         start_ticks: Field 22 of /proc/PID/stat: clock ticks from boot to its start.
-        boot_id: Which boot of the machine that was.
+        boot_id: Id of the boot.
     """
 
     pid: int
@@ -35,7 +35,7 @@ class ProcessRecord:
 
     @property
     def alive(self) -> bool:
-        """Whether that very process still runs (a zombie does not)."""
+        """True if this process is running. A zombie is not running."""
         if self.boot_id != boot_id():
             return False
         found = _stat(self.pid)
@@ -44,12 +44,12 @@ class ProcessRecord:
 
 @cache
 def boot_id() -> str:
-    """Return the id of the machine's present boot."""
+    """Return the id of the current boot."""
     return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
 
 
 def _stat(pid: int) -> tuple[str, int] | None:
-    """Return state letter and start time of a process, or None when there is none."""
+    """Return state letter and start time of a process, or None if it does not exist."""
     try:
         text = Path(f"/proc/{pid}/stat").read_text()
     except (FileNotFoundError, ProcessLookupError):
@@ -59,7 +59,7 @@ def _stat(pid: int) -> tuple[str, int] | None:
 
 
 def record_of(pid: int) -> ProcessRecord | None:
-    """Return the record of a running process, or None when there is none with this pid."""
+    """Return the identity of a running process, or None if no process has this pid."""
     found = _stat(pid)
     return None if found is None else ProcessRecord(pid, found[1], boot_id())
 
@@ -72,17 +72,17 @@ def spawn(
     env: Mapping[str, str],
     cwd: Path = Path("/"),
 ) -> ProcessRecord:
-    """Start a process in a session of its own that goes on when we end.
+    """Start a process in its own session. It keeps running when the current process ends.
 
     Args:
-        argv: The program and its arguments.
+        argv: Program and arguments.
         log: File that its output is appended to.
-        cgroup_files: `cgroup.procs` files the process enters before the program starts.
-        env: Its whole environment.
-        cwd: Its working directory.
+        cgroup_files: `cgroup.procs` files that the process is added to before the program starts.
+        env: Complete environment.
+        cwd: Working directory.
 
     Raises:
-        ClusterError: It could not be started.
+        ClusterError: The process could not be started.
     """
     words = [str(word) for word in argv]
     enter = 'while [ "$1" != -- ]; do echo $$ > "$1" || exit 126; shift; done; shift; exec "$@"'
@@ -100,19 +100,19 @@ def spawn(
             )
         except OSError as error:
             raise ClusterError(f"cannot start {words[0]}: {error}") from error
-    # The child is ours alone until it ends, so its pid cannot be another process's.
+    # The child is not reaped yet, so its pid cannot be reused.
     record = record_of(process.pid)
-    process.returncode = 0  # keep subprocess from waiting for it or warning about it
+    process.returncode = 0  # # prevent subprocess from waiting for the process and from warning about it
     if record is None:
         raise ClusterError(f"{words[0]} ended at once; see {log}")
     return record
 
 
 def kill(record: ProcessRecord, *, timeout_s: float = 10.0) -> None:
-    """Kill a recorded process if it still runs, and wait until it is gone.
+    """Kill a recorded process if it is running, and wait until it has ended.
 
     Raises:
-        ClusterError: It is still there after the time limit.
+        ClusterError: The process is still running after the timeout.
     """
     if record.alive:
         try:
@@ -120,7 +120,7 @@ def kill(record: ProcessRecord, *, timeout_s: float = 10.0) -> None:
         except ProcessLookupError:
             return
         try:
-            if record.alive:  # the handle now refers to what the check saw
+            if record.alive:  # # the pidfd now refers to the process that was checked
                 signal.pidfd_send_signal(handle, signal.SIGKILL)
         finally:
             os.close(handle)
@@ -133,7 +133,7 @@ def kill(record: ProcessRecord, *, timeout_s: float = 10.0) -> None:
 
 
 def reap(pid: int) -> None:
-    """Collect a child of ours that has ended; harmless for any other process."""
+    """Reap an ended child process. Other processes are not affected."""
     try:
         os.waitpid(pid, os.WNOHANG)
     except ChildProcessError:
@@ -141,13 +141,13 @@ def reap(pid: int) -> None:
 
 
 def write_record(path: Path, record: ProcessRecord) -> None:
-    """Store a record so that it is never seen half written."""
+    """Write a record atomically."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_file(path, json.dumps(asdict(record)).encode(), 0o644, durable=False)
 
 
 def read_record(path: Path) -> ProcessRecord | None:
-    """Read a stored record; None when there is none or it is of no use."""
+    """Read a record. Return None if it is missing or invalid."""
     try:
         return ProcessRecord(**json.loads(path.read_text()))
     except (FileNotFoundError, json.JSONDecodeError, TypeError):
@@ -155,16 +155,16 @@ def read_record(path: Path) -> ProcessRecord | None:
 
 
 def running(path: Path) -> ProcessRecord | None:
-    """Read the record of a process that still runs; None when it does not."""
+    """Read the record of a running process. Return None if the process is not running."""
     record = read_record(path)
     return record if record is not None and record.alive else None
 
 
 def kill_recorded(path: Path) -> None:
-    """Kill the process of a stored record, if there is one.
+    """Kill the process of a record, if there is one.
 
     Raises:
-        ClusterError: It does not end.
+        ClusterError: The process did not end.
     """
     record = read_record(path)
     if record is not None:

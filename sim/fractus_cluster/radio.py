@@ -1,6 +1,6 @@
-"""The simulated radio of a cluster: WiFi devices of its nodes on one air, and mobile uplinks in place of wires.
+"""Simulated radio of a cluster: WiFi devices of its nodes on one channel, and mobile uplinks that replace wires.
 
-The radio itself is a process of its own, which this module describes and speaks to.
+The radio runs as a separate process. This module writes its layout and controls it.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ _POLL_S = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Radio:
-    """The radio of a cluster.
+    """Radio of a cluster.
 
     Attributes:
-        cluster: Its name.
-        state: The cluster's state directory.
+        cluster: Name of the cluster.
+        state: State directory of the cluster.
     """
 
     cluster: str
@@ -43,14 +43,14 @@ class Radio:
 
     @property
     def running(self) -> bool | None:
-        """Whether it runs; None for a cluster without one."""
+        """True if the radio is running. None for a cluster without radio."""
         return None if not self._layout.exists() else running(self._record) is not None
 
     def start(self, nodes: Sequence[Node], air: AirSpec) -> None:
-        """Run it for the nodes' devices; start it again when these changed, end it when none needs it.
+        """Start the radio for the nodes' devices. Restart it if they changed, and stop it if no node needs it.
 
         Raises:
-            ClusterError: It did not start.
+            ClusterError: The radio did not start.
         """
         layout = radio_layout(nodes, air, self._control)
         if layout is not None and self.running and self._layout.read_text() == layout:
@@ -73,10 +73,10 @@ class Radio:
             time.sleep(_POLL_S)
 
     def command(self, **command: object) -> None:
-        """Change what a station or an uplink does, such as `station="drone-1", off=True`; its log says what it refuses.
+        """Change a station or an uplink, for example `station="drone-1", off=True`. Rejections are written to its log.
 
         Raises:
-            ClusterError: It does not run.
+            ClusterError: The radio is not running.
         """
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
             try:
@@ -98,12 +98,12 @@ class Radio:
 
 
 def radio_layout(nodes: Sequence[Node], air: AirSpec, control: Path) -> str | None:
-    """Return the radio's layout file, or None for a cluster without one.
+    """Return the radio's layout file, or None for a cluster without radio.
 
     Args:
-        nodes: The cluster's nodes.
-        air: What all stations share.
-        control: Path of the radio's socket for commands.
+        nodes: Nodes of the cluster.
+        air: Settings shared by all stations.
+        control: Path of the radio's control socket.
     """
     stations = [entry for node in nodes if (entry := _station(node)) is not None]
     uplinks = [entry for node in nodes if (entry := _uplink(node)) is not None]

@@ -1,4 +1,4 @@
-"""The YAML file that describes an embedded cluster, as validated values."""
+"""Data model of cluster files."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ _SUFFIXES: dict[str, Decimal | int] = {
     "Ti": 2**40,
 }
 MIN_DISK_BYTES = 16 * 2**20
-"""Of a node's own disk: what its file system itself takes, and some files."""
+"""Minimum size of a node's disk: file system overhead and some files."""
 
 _DEFAULT_CONNECTION = "tcp:127.0.0.1:5760"
 
 
 def parse_quantity(text: str) -> Decimal:
-    """Return the number that a Kubernetes quantity ("500m", "2Gi", "4") stands for.
+    """Return the value of a Kubernetes quantity ("500m", "2Gi", "4").
 
     Raises:
-        ValueError: It is not a quantity.
+        ValueError: The text is not a quantity.
     """
     match = re.fullmatch(r"([0-9.]+)([A-Za-z]*)", text.strip())
     if match is None or match[2] not in _SUFFIXES:
@@ -56,13 +56,12 @@ class _Value(BaseModel):
 
 
 class VehicleHardware(_Value):
-    """The simulated vehicle of a drone node.
+    """Simulated vehicle of a drone node.
 
     Attributes:
-        home: Where it stands; taken from `description.location` when absent.
-        listen: Address of its autopilot in the node's network namespace; taken from
-            `description.services.mobility.connection` when absent.
-        arguments: Further arguments of `fractus-vehicle`.
+        home: Start position. Default: `description.location`.
+        listen: Autopilot endpoint in the node's network namespace. Default: `description.services.mobility.connection`.
+        arguments: Additional arguments of `fractus-vehicle`.
     """
 
     home: Home | None = None
@@ -71,19 +70,19 @@ class VehicleHardware(_Value):
 
 
 class Place(_Value):
-    """A point on the ground, degrees (WGS 84)."""
+    """A position on the ground, degrees (WGS 84)."""
 
     lat: Annotated[float, Field(ge=-85, le=85)]
     lon: Annotated[float, Field(ge=-180, le=180)]
 
 
 class CameraHardware(_Value):
-    """The simulated camera of a drone or edge node; it sees what `description.services.camera` says.
+    """Simulated camera of a drone or edge node. Its properties are taken from `description.services.camera`.
 
     Attributes:
-        origin: Middle of the landscape; by default all cameras of a cluster share the place of the first.
-        seed: Of the landscape and of all that moves; cameras that share a world have the same.
-        arguments: Further arguments of `fractus-camera-world`.
+        origin: Centre of the landscape. Default: all cameras of a cluster use the position of the first.
+        seed: Seed of landscape and moving objects. Cameras with the same seed share a world.
+        arguments: Additional arguments of `fractus-camera-world`.
     """
 
     origin: Place | None = None
@@ -92,11 +91,11 @@ class CameraHardware(_Value):
 
 
 class WifiHardware(_Value):
-    """A WiFi device of a node on the cluster's simulated air.
+    """A WiFi device of a node in the simulated radio.
 
     Attributes:
-        device: Its name on the node.
-        range: How far it really reaches, metres; as far as `description.interfaces` declares when absent.
+        device: Device name on the node.
+        range: Actual range, metres. Default: the range in `description.interfaces`.
     """
 
     device: Annotated[str, Field(max_length=15)] = "wlan0"
@@ -104,11 +103,11 @@ class WifiHardware(_Value):
 
 
 class UplinkHardware(_Value):
-    """A mobile uplink in place of a wire.
+    """A mobile uplink that replaces a wire.
 
     Attributes:
-        rate: Mbit/s each way.
-        delay: Milliseconds each way.
+        rate: Mbit/s in each direction.
+        delay: Milliseconds in each direction.
     """
 
     rate: Annotated[float, Field(gt=0, le=100)] = 8.0
@@ -116,10 +115,10 @@ class UplinkHardware(_Value):
 
 
 class DiskHardware(_Value):
-    """A disk of a node's own for its /var/lib/fractus, which is otherwise on the machine's.
+    """A separate disk for a node's /var/lib/fractus. Default: the disk of the machine.
 
     Attributes:
-        size: Bytes, as a quantity; a disk that is there keeps its size.
+        size: Bytes, as a quantity. An existing disk keeps its size.
     """
 
     size: str
@@ -133,12 +132,12 @@ class DiskHardware(_Value):
 
     @property
     def size_bytes(self) -> int:
-        """Its size."""
+        """Size in bytes."""
         return int(parse_quantity(self.size))
 
 
 class Hardware(_Value):
-    """What stands beside a node and does not lose power with it."""
+    """Simulated hardware of a node that keeps its power when the node is powered off."""
 
     vehicle: VehicleHardware | None = None
     camera: CameraHardware | None = None
@@ -148,11 +147,11 @@ class Hardware(_Value):
 
 
 class AirSpec(_Value):
-    """What all WiFi devices of a cluster share.
+    """Settings shared by all WiFi devices of a cluster.
 
     Attributes:
-        fading: Shape of Nakagami fading, 0.5 or more: the smaller the softer the edge of a range; hard when absent.
-        seed: Of fading.
+        fading: Shape of Nakagami fading, at least 0.5. Smaller values give a softer range limit. Default: hard limit.
+        seed: Seed of fading.
     """
 
     fading: Annotated[float, Field(ge=0.5, le=100)] | None = None
@@ -164,12 +163,12 @@ class NodeSpec(_Value):
 
     Attributes:
         name: Name of the Kubernetes node.
-        node_class: Written `class` in the file.
-        resources: What the node offers to pods: cpu, memory, pods, and extended resources by full name.
-        labels: Further labels of the node.
-        description: The spec of the node's Drone or EdgeNode, put on it as /etc/fractus/node.yaml; when empty,
-            there is no such file and the node registers as nothing.
-        hardware: What stands beside the node.
+        node_class: Field `class` of the file.
+        resources: Resources for pods: cpu, memory, pods, and extended resources by full name.
+        labels: Additional labels of the node.
+        description: Spec of the node's Drone or EdgeNode, written to /etc/fractus/node.yaml. If empty, there is no such
+            file and the node is not registered.
+        hardware: Simulated hardware of the node.
     """
 
     name: Annotated[str, Field(pattern=DNS_LABEL, max_length=40)]
@@ -242,22 +241,22 @@ class NodeSpec(_Value):
 
     @property
     def extended_resources(self) -> dict[str, str]:
-        """The resources that are neither cpu, memory nor pods."""
+        """Extended resources: all except cpu, memory and pods."""
         return {key: amount for key, amount in self.resources.items() if "/" in key}
 
     @property
     def manifest(self) -> dict[str, Any] | None:
-        """The Drone or EdgeNode manifest of this node; None for one that the cluster file does not describe."""
+        """Drone or EdgeNode manifest of this node. None without description."""
         if self.node_class == "cloud" or not self.description:
             return None
         kind = "Drone" if self.node_class == "drone" else "EdgeNode"
         return {"apiVersion": API_VERSION, "kind": kind, "metadata": {"name": self.name}, "spec": self.description}
 
     def vehicle(self) -> tuple[Home, str, tuple[str, ...]] | None:
-        """Return home, autopilot address and further arguments of the node's vehicle; None when it has none.
+        """Return home, autopilot endpoint and additional arguments of the node's vehicle. Return None without vehicle.
 
         Raises:
-            ClusterError: The node is a drone and nothing says where its vehicle stands.
+            ClusterError: The node is a drone and the position of its vehicle is not specified.
         """
         given = self.hardware.vehicle
         connection = _dig(self.description, "services", "mobility", "connection")
@@ -274,7 +273,7 @@ class NodeSpec(_Value):
         return home, listen, given.arguments
 
     def wifi(self) -> tuple[str, float] | None:
-        """Name and range in metres of the node's device on the simulated air; None when it has none."""
+        """Name and range in metres of the node's simulated WiFi device. None without device."""
         given = self.hardware.wifi
         if given is None:
             return None
@@ -285,12 +284,12 @@ class NodeSpec(_Value):
 
     @property
     def camera_url(self) -> str:
-        """Where the node's camera service gets its pictures from."""
+        """URL of the pictures for the node's camera service."""
         url = _dig(self.description, "services", "camera", "connection")
         return url if isinstance(url, str) else "test:"
 
     def place(self) -> Home | None:
-        """Where the node is at the start; None when nothing says so."""
+        """Start position of the node. None if it is not specified."""
         given = self.hardware.vehicle
         return (given.home if given is not None else None) or self._location()
 
@@ -302,7 +301,7 @@ class NodeSpec(_Value):
 
 
 class ClusterSpec(_Value):
-    """A cluster: its name, its nodes, and the air between them."""
+    """A cluster: name, nodes, and radio settings."""
 
     name: Annotated[str, Field(pattern=DNS_LABEL, max_length=30)]
     air: AirSpec = AirSpec()
@@ -318,7 +317,7 @@ class ClusterSpec(_Value):
 
     @property
     def world_origin(self) -> Place | None:
-        """The middle of the landscape that the cameras see; None when no node has one."""
+        """Centre of the landscape of the cameras. None without cameras."""
         seeing = [node for node in self.nodes if node.hardware.camera is not None]
         given = [node.hardware.camera.origin for node in seeing if node.hardware.camera is not None]
         places = [Place(lat=home.lat, lon=home.lon) for home in (node.place() for node in seeing) if home is not None]
@@ -326,30 +325,30 @@ class ClusterSpec(_Value):
 
     @classmethod
     def placeholder(cls, name: str) -> ClusterSpec:
-        """Return a cluster of which only the name is known."""
+        """Return a cluster with only its name."""
         return cls.model_validate({"name": name, "nodes": [{"name": "unknown", "class": "cloud"}]})
 
     def to_yaml(self) -> str:
-        """Return the cluster as a file that `load_spec` reads back to an equal value."""
+        """Return the cluster as a file that `load_spec` reads back as an equal value."""
         return dump_documents([self.model_dump(mode="json", by_alias=True)])
 
 
 def parse_spec(content: object, *, source: str, found: Documents | None = None) -> ClusterSpec:
-    """Return the cluster that parsed YAML describes.
+    """Create the cluster from parsed YAML.
 
     Args:
-        content: What the YAML parser returned.
-        source: Where it came from, for messages.
-        found: What knows the lines of it.
+        content: Result of the YAML parser.
+        source: Source for messages.
+        found: Maps fields to line numbers.
 
     Raises:
-        ClusterError: A field is missing or wrong; the message names it.
+        ClusterError: A field is missing or invalid. The message names it.
     """
     try:
         return ClusterSpec.model_validate(content)
     except ValidationError as error:
         wrong = [(".".join(str(part) for part in fault["loc"]), fault["msg"]) for fault in error.errors()]
-        # A list with a bad entry counts as too short as well; the entry says it all.
+        # A list with an invalid entry is also reported as too short. Only the error of the entry is useful.
         real = [(place, text) for place, text in wrong if not any(other.startswith(f"{place}.") for other, _ in wrong)]
         faults = "; ".join(f"{place or 'file'}: {text.removeprefix('Value error, ')}" for place, text in real)
         where = found.where(content, real[0][0]) if found is not None else source
@@ -360,7 +359,7 @@ def load_spec(path: Path) -> ClusterSpec:
     """Read a cluster file.
 
     Raises:
-        ClusterError: The file is missing, not YAML, or a field is wrong.
+        ClusterError: The file is missing, is not YAML, or has an invalid field.
     """
     try:
         content, found = parse_document(path.read_bytes(), str(path))
@@ -372,7 +371,7 @@ def load_spec(path: Path) -> ClusterSpec:
 
 
 def camera_address(url: str) -> tuple[str, int] | None:
-    """Host and port of a snapshot URL that a program on the same node can serve; None for any other."""
+    """Return host and port of a snapshot URL that is served on the same node. Return None for any other URL."""
     try:
         parts = urlsplit(url)
         host, port = parts.hostname, parts.port or 80

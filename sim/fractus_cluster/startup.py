@@ -1,4 +1,4 @@
-"""The steps that bring a cluster up; each changes nothing where all is as it should be."""
+"""Steps that start a cluster. A step changes nothing if its part is up to date."""
 
 from __future__ import annotations
 
@@ -49,13 +49,13 @@ Report = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True)
 class Startup:
-    """Brings up the parts of one cluster.
+    """Starts the parts of one cluster.
 
     Attributes:
-        cluster: Its name.
-        state: Its state directory.
-        wiring: Its network.
-        authority: Its certificate authority.
+        cluster: Name.
+        state: State directory.
+        wiring: Network.
+        authority: Certificate authority.
     """
 
     cluster: str
@@ -64,7 +64,7 @@ class Startup:
     authority: Authority
 
     def start_control_plane(self, binaries: Binaries) -> None:
-        """Run etcd, the API server, its controllers, the scheduler and DNS as described; restart all when it changed."""
+        """Start etcd, the API server, controllers, scheduler and DNS. Restart all if their configuration changed."""
         wiring, files, record_path = self.wiring, self._files(), self.state.process(CONTROL_PLANE)
         network.wire_control_plane(wiring)
         units = control_plane_units(binaries, self.authority, wiring.addressing, files)
@@ -90,7 +90,7 @@ class Startup:
         write_record(record_path, record)
 
     def place_nodes(self, nodes: list[Node], binaries: Binaries, store: ImageStore, images: Sequence[Image]) -> None:
-        """Wire the nodes and write their files; new ones get their images on disk before they ever start."""
+        """Connect the nodes and write their files. New nodes get their images on disk before they start."""
         for node in nodes:
             network.wire_node(node.wiring, node.name, node.index, mobile=node.spec.hardware.uplink is not None)
             node.write_files(node.files(binaries, self.authority))
@@ -101,12 +101,12 @@ class Startup:
                 list(pool.map(template.furnish, fresh))
 
     def api(self) -> AbstractContextManager[BlockingClient]:
-        """The API server as administrator."""
+        """API server client with administrator rights."""
         server = server_url(self.wiring.addressing)
         return administrating(server, self.authority.credential.certificate, administrator(self.authority))
 
     def apply_objects(self, api: BlockingClient, nodes: list[Node]) -> None:
-        """Make the Node objects and those of DNS as described, and delete Nodes of ours that are not described."""
+        """Create or update the objects of nodes and DNS. Delete the Nodes that are not part of the description."""
         place = self.wiring.addressing
         names = {node.name for node in nodes}
         for present in api.list("/api/v1/nodes"):
@@ -114,13 +114,13 @@ class Startup:
             if name not in names and "fractus-sim" in str(present["metadata"].get("managedFields")):
                 api.call("DELETE", f"/api/v1/nodes/{name}")
         for node in nodes:
-            # Before its kubelet starts, so that no pod is there before labels and taints are.
+            # Before the kubelet starts, so that no pod is scheduled before labels and taints exist.
             _apply_node(api, node, place)
         for path, body in manifests.dns_objects(place.control_plane):
             api.apply(path, body)
 
     def write_kubeconfig(self) -> None:
-        """Write the administrator's kubeconfig where it differs."""
+        """Write the administrator's kubeconfig if it changed."""
         text = self.authority.kubeconfig(
             administrator(self.authority), server=server_url(self.wiring.addressing), cluster=f"fractus-{self.cluster}"
         )
@@ -128,7 +128,7 @@ class Startup:
             write_private(self.state.kubeconfig, text)
 
     def wait_nodes(self, api: BlockingClient, nodes: Sequence[tuple[Node, datetime | None]]) -> None:
-        """Wait until every node is Ready, by its word since the given time, and offers its extended resources."""
+        """Wait until every node is Ready in a report since the given time, and offers its extended resources."""
         deadline = time.monotonic() + _READY_TIMEOUT_S
         waiting = {node.name: (node, since) for node, since in nodes}
         while True:
@@ -155,10 +155,10 @@ class Startup:
             time.sleep(_POLL_S)
 
     def check_hardware(self, nodes: Sequence[Node]) -> None:
-        """Make sure that vehicles and cameras run.
+        """Start vehicles and cameras that are not running.
 
         Raises:
-            ClusterError: One ended at once.
+            ClusterError: A process ended immediately.
         """
         for node in nodes:
             for name, runs in (("vehicle", node.vehicle_running), ("camera", node.camera_running)):
@@ -168,14 +168,14 @@ class Startup:
                     raise ClusterError(f"the {name} of node {node.name} ended at once: {' '.join(last)} (see {log})")
 
     def let_dns_start(self) -> None:
-        """Let DNS start, which needs the objects that it answers from."""
+        """Start DNS, after the objects that it serves exist."""
         let_dns_start(self.wiring.addressing, self._files())
 
     def wait_dns(self) -> None:
-        """Wait until DNS answers.
+        """Wait until DNS responds.
 
         Raises:
-            ClusterError: It was not in time.
+            ClusterError: DNS did not respond before the timeout.
         """
         address = str(self.wiring.addressing.control_plane)
         deadline = time.monotonic() + _DNS_TIMEOUT_S
@@ -186,7 +186,7 @@ class Startup:
             time.sleep(_POLL_S)
 
     def ready_nodes(self) -> dict[str, bool] | None:
-        """Whether each node is Ready; None when the API server cannot be asked."""
+        """Return the readiness of each node, or None if the API server is unavailable."""
         if running(self.state.process(CONTROL_PLANE)) is None:
             return None
         with self.api() as api:
@@ -203,15 +203,15 @@ class Startup:
 
 
 def wiring_of(cluster: str, state: StateDirectory, memory: Memory) -> network.Wiring:
-    """The network of a cluster whose addresses are known."""
+    """Return the network of a cluster with known addresses."""
     return network.Wiring(cluster, Addressing(memory.block), state.marks)
 
 
 def claim(spec: ClusterSpec, state: StateDirectory, kubernetes: str, report: Report) -> Memory:
-    """Claim addresses, and remove the nodes that the description has no more.
+    """Claim addresses, and remove nodes that are not in the description any longer.
 
     Raises:
-        ClusterError: The cluster came up with another minor version of Kubernetes, or no addresses are free.
+        ClusterError: The cluster was started with another minor version of Kubernetes, or no addresses are free.
     """
     remembered = state.read_memory()
     if remembered is not None and remembered.kubernetes != kubernetes:
@@ -243,6 +243,6 @@ def _apply_node(api: BlockingClient, node: Node, place: Addressing) -> None:
         try:
             api.merge(*patch)
         except Conflict:
-            # The node controller has set a taint of its own meanwhile.
+            # The node controller has added its own taint in the meantime.
             if not tries_left:
                 raise

@@ -1,4 +1,4 @@
-"""The state directory of a cluster: where everything is, and what must be remembered between commands."""
+"""State directory of a cluster: paths, and data that is kept between commands."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from fractus_cluster.spec import ClusterSpec, parse_spec
 
 
 def state_root() -> Path:
-    """Return the directory of all clusters' state: FRACTUS_STATE, or below /var/lib."""
+    """Return the state directory of all clusters: FRACTUS_STATE, or below /var/lib."""
     return Path(os.environ.get("FRACTUS_STATE") or "/var/lib/fractus-sim").resolve()
 
 
 @dataclass(frozen=True, slots=True)
 class Memory:
-    """What is remembered of a cluster.
+    """Persistent data of a cluster.
 
     Attributes:
-        block: Its addresses.
-        indexes: Index of each node; a node keeps its own, so that its addresses never change.
-        kubernetes: Minor version of its programs: what a newer one has stored, an older one cannot read.
+        block: Addresses.
+        indexes: Index of each node. It is kept so that addresses do not change.
+        kubernetes: Minor version of its programs. An older version cannot read the data of a newer one.
     """
 
     block: IPv4Network
@@ -36,7 +36,7 @@ class Memory:
     kubernetes: str = DEFAULT_KUBERNETES
 
     def with_nodes(self, names: list[str]) -> Memory:
-        """Return a memory for the given nodes: those known keep their index, new ones get the lowest free one."""
+        """Return data for the given nodes. Known nodes keep their index, new nodes get the lowest free one."""
         kept = {name: index for name, index in self.indexes.items() if name in names}
         free = (index for index in range(len(names) + len(kept) + 1) if index not in kept.values())
         return replace(self, indexes={name: kept[name] if name in kept else next(free) for name in names})
@@ -55,32 +55,32 @@ class StateDirectory:
 
     @property
     def marks(self) -> Path:
-        """Records of network namespaces that are complete."""
+        """Records of completely configured network namespaces."""
         return self.path / "network"
 
     @property
     def control_plane(self) -> Path:
-        """The control plane's files."""
+        """Files of the control plane."""
         return self.path / "control-plane"
 
     @property
     def radio(self) -> Path:
-        """The radio's files: `layout.json`, and its socket `control`."""
+        """Files of the radio: `layout.json` and the socket `control`."""
         return self.path / "radio"
 
     @property
     def logs(self) -> Path:
-        """Logs, a directory each for the control plane and every node."""
+        """Logs, with one directory for the control plane and for each node."""
         return self.path / "logs"
 
     @property
     def kubeconfig(self) -> Path:
-        """The administrator's kubeconfig."""
+        """Kubeconfig of the administrator."""
         return self.path / "kubeconfig"
 
     @property
     def spec(self) -> Path:
-        """The cluster file as last brought up."""
+        """Last applied cluster file."""
         return self.path / "cluster.yaml"
 
     def node(self, name: str) -> Path:
@@ -92,7 +92,7 @@ class StateDirectory:
         return self.path / "processes" / f"{name}.json"
 
     def read_memory(self) -> Memory | None:
-        """Return what is remembered, or None for a cluster that never was."""
+        """Return the persistent data, or None if the cluster was never started."""
         try:
             content = json.loads((self.path / "memory.json").read_text())
         except FileNotFoundError:
@@ -100,12 +100,12 @@ class StateDirectory:
         return Memory(IPv4Network(content["block"]), content["indexes"], content.get("kubernetes", DEFAULT_KUBERNETES))
 
     def write_memory(self, memory: Memory) -> None:
-        """Remember."""
+        """Write the persistent data."""
         content = {"block": str(memory.block), "indexes": memory.indexes, "kubernetes": memory.kubernetes}
         self._write("memory.json", json.dumps(content))
 
     def read_spec(self) -> ClusterSpec | None:
-        """Return the cluster as last brought up, or None."""
+        """Return the last applied cluster, or None."""
         try:
             content = yaml.safe_load(self.spec.read_text())
         except FileNotFoundError:
@@ -113,7 +113,7 @@ class StateDirectory:
         return parse_spec(content, source=str(self.spec))
 
     def write_spec(self, spec: ClusterSpec) -> None:
-        """Keep the cluster file."""
+        """Write the cluster file."""
         self._write(self.spec.name, spec.to_yaml())
 
     def _write(self, name: str, text: str) -> None:
@@ -135,13 +135,13 @@ def known_clusters() -> list[str]:
 
 
 def only_cluster() -> str:
-    """Return the name of the one cluster there is.
+    """Return the name of the only cluster.
 
     Raises:
-        ClusterError: There is none, or more than one.
+        ClusterError: There is no cluster, or more than one.
     """
     names = known_clusters()
     if len(names) != 1:
         several = f"there are clusters {', '.join(names)}; name one with --name"
-        raise ClusterError(several if names else "there is no cluster; bring one up: fractus cluster up FILE")
+        raise ClusterError(several if names else "no cluster; start one: fractus cluster up FILE")
     return names[0]

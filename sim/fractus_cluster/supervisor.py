@@ -1,7 +1,7 @@
-"""The first process of a node or control plane: starts programs, restarts them, reaps orphans.
+"""First process of a node or control plane: starts and restarts programs, and reaps orphans.
 
-It runs on the standard library alone, in its own process, and is told what to run by a JSON file:
-`{"units": [{"name", "argv", "log", "env", "needs"}]}`. It never ends; killing it ends all.
+It runs as a separate process with only the standard library. A JSON file lists its programs: `{"units": [{"name",
+"argv", "log", "env", "needs"}]}`. It runs until it is killed, and killing it ends all programs.
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ ENVIRONMENT = {
     "HOME": "/root",
     "LANG": "C.UTF-8",
 }
-"""Of the daemons of nodes and control planes."""
+"""OOM score adjustment of the daemons of nodes and control planes."""
 
 _HANDLED = {signal.SIGCHLD, signal.SIGTERM}
 
 
 @dataclass(slots=True)
 class Unit:
-    """A program to keep running.
+    """A supervised program.
 
     Attributes:
-        name: Its name, for the log.
+        name: Name in the log.
         argv: Program and arguments.
         log: File that its output is appended to.
-        env: Its whole environment.
-        needs: File without which it is not started yet; empty for none.
-        oom_score_adj: How readily the kernel may kill it.
+        env: Complete environment.
+        needs: File that must exist before the program is started. Empty: none.
+        oom_score_adj: OOM score adjustment in the kernel.
     """
 
     name: str
@@ -58,7 +58,7 @@ class Unit:
     backoff_s: float = field(default=_BACKOFF_FIRST_S)
 
     def start(self, now_s: float) -> None:
-        """Start the program; a failure to do so counts as an exit."""
+        """Start the program. A failure counts as an exit."""
         self.started_s = now_s
         with Path(self.log).open("ab") as output:
             try:
@@ -82,10 +82,10 @@ class Unit:
         try:
             Path("/proc/self/oom_score_adj").write_text(str(self.oom_score_adj))
         except OSError:
-            return  # not allowed in a container: then the kernel chooses
+            return  # # not permitted in a container; the kernel's default is used
 
     def ended(self, now_s: float) -> None:
-        """Note that the program ended, and when it is to start again."""
+        """Record the end of the program and schedule its restart."""
         self.process = None
         if now_s - self.started_s > _STEADY_AFTER_S:
             self.backoff_s = _BACKOFF_FIRST_S
@@ -93,18 +93,18 @@ class Unit:
         self.backoff_s = min(2 * self.backoff_s, _MAX_BACKOFF_S)
 
     def trim_log(self) -> None:
-        """Empty a log that has grown too long; what was in it stays in one older file."""
+        """Truncate a log above the size limit. Its content is kept in one older file."""
         path = Path(self.log)
         try:
             if path.stat().st_size > _LOG_LIMIT_BYTES:
                 path.with_name(path.name + ".1").write_bytes(path.read_bytes())
-                os.truncate(path, 0)  # the program appends, so it goes on at the new end
+                os.truncate(path, 0)  # # the program appends, so it continues at the new end
         except FileNotFoundError:
             return
 
 
 def supervise(units: list[Unit]) -> None:
-    """Keep the units running until SIGTERM; reap every child that ends."""
+    """Keep the units running until SIGTERM, and reap every child that ends."""
     signal.pthread_sigmask(signal.SIG_BLOCK, _HANDLED)
     trimmed_s = time.monotonic()
     while True:
@@ -147,7 +147,7 @@ def _say(text: str) -> None:
 
 
 def read_units(path: Path) -> list[Unit]:
-    """Read the units that a JSON file lists."""
+    """Read the units of a JSON file."""
     return [Unit(**entry) for entry in json.loads(path.read_text())["units"]]
 
 

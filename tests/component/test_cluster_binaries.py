@@ -121,7 +121,7 @@ def test_other_kubernetes_is_refused(machine: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setenv("FRACTUS_KUBERNETES", chosen)
     with pytest.raises(ClusterError) as error:
         ensure_binaries(["kubelet"], report=print)
-    assert str(error.value) == f"there is no Kubernetes {chosen}; set FRACTUS_KUBERNETES to 1.35 or 1.34"
+    assert str(error.value) == f"Kubernetes {chosen} is not supported; set FRACTUS_KUBERNETES to 1.35 or 1.34"
 
 
 def test_a_cluster_keeps_its_kubernetes(tmp_path: Path) -> None:

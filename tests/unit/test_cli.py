@@ -124,7 +124,7 @@ def test_errors_of_clusters_read_like_all_others(
 ) -> None:
     monkeypatch.setenv("FRACTUS_STATE", str(tmp_path))
     assert cli.run(["cluster", "status"]) == EXIT_BAD_INPUT
-    assert capsys.readouterr().err == "fractus: there is no cluster; bring one up: fractus cluster up FILE\n"
+    assert capsys.readouterr().err == "fractus: no cluster; start one: fractus cluster up FILE\n"
 
 
 @pytest.mark.parametrize(("powered", "code"), [(True, 0), (False, 2)])

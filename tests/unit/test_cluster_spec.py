@@ -84,7 +84,7 @@ def test_refuses_with_the_field(path: str, value: object, said: str) -> None:
 def test_refuses_what_is_not_yaml(tmp_path: Path) -> None:
     file = tmp_path / "cluster.yaml"
     file.write_text("name: [")
-    with pytest.raises(ClusterError, match="is not YAML"):
+    with pytest.raises(ClusterError, match="invalid YAML"):
         load_spec(file)
     with pytest.raises(ClusterError, match="cannot read"):
         load_spec(tmp_path / "missing.yaml")

@@ -1,4 +1,4 @@
-"""The Kubernetes programs: found on the machine when their version fits, else built once from Go modules."""
+"""The Kubernetes programs: installed programs with a suitable version, or programs built once from Go modules."""
 
 from fractus_cluster.binaries.catalog import CLUSTER_PROGRAMS, DEFAULT_KUBERNETES, KUBERNETES_VERSIONS, PROGRAMS
 from fractus_cluster.binaries.provision import Binaries, cache_directory, chosen_kubernetes, ensure_binaries

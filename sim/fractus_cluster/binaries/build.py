@@ -1,4 +1,4 @@
-"""Building programs from pinned Go modules, with visible progress and nothing half done."""
+"""Build of programs from pinned Go modules with progress output."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Report = Callable[[str], None]
 
 
 def module_digest(module: Module) -> str:
-    """Return a digest of all that decides the outcome of building a module: sources, pins, link variables."""
+    """Return a digest of all inputs of a module build: sources, pins and link variables."""
     digest = hashlib.sha256()
     for entry in sorted(_sources(module).iterdir(), key=lambda item: item.name):
         digest.update(entry.name.encode() + b"\0" + entry.read_bytes() + b"\0")
@@ -35,17 +35,16 @@ def module_digest(module: Module) -> str:
 
 
 def build(programs: Sequence[Program], into: Path, *, report: Report) -> None:
-    """Build programs of one module and move each into `into` when all of them are complete.
+    """Build programs of one module, and move them to `into` when all are complete.
 
     Args:
-        programs: What to build; all of the same module.
-        into: Directory of the finished programs; an interrupted build changes none of them.
-            The caller holds a lock on it.
-        report: Told about progress, a line at a time.
+        programs: Programs to build, all of the same module.
+        into: Target directory. An interrupted build changes nothing in it. The caller must hold its lock.
+        report: Called with progress lines.
 
     Raises:
         PrerequisiteError: Go is missing or too old.
-        ClusterError: The build failed; the message ends with what the compiler said.
+        ClusterError: The build failed. The message ends with the compiler output.
     """
     module = MODULES[programs[0].module]
     check_go(module)
@@ -53,7 +52,7 @@ def build(programs: Sequence[Program], into: Path, *, report: Report) -> None:
     names = ", ".join(program.name for program in programs)
     report(f"building {names} {programs[0].version} from Go modules (once; kept in {into})")
     started = time.monotonic()
-    for left in into.glob(".building-*"):  # of a build that was killed; we hold the lock
+    for left in into.glob(".building-*"):  # # left by a killed build; the lock is held
         shutil.rmtree(left)
     with tempfile.TemporaryDirectory(prefix=".building-", dir=into) as scratch:
         source, output = Path(scratch) / "source", Path(scratch) / "bin"
@@ -100,7 +99,7 @@ def _go_build(module: Module, programs: Sequence[Program], source: Path, output:
 
 
 def _follow(process: subprocess.Popen[str], module: str, report: Report) -> list[str]:
-    """Read the compiler's lines until it ends; report now and then, return the last lines."""
+    """Read the compiler output until it ends, with progress lines. Return the last lines."""
     tail: list[str] = []
     packages = downloads = 0
     started = reported = time.monotonic()
@@ -123,10 +122,10 @@ def _follow(process: subprocess.Popen[str], module: str, report: Report) -> list
 
 
 def check_go(module: Module) -> None:
-    """Check that a Go toolchain that can build a module is on PATH, or can be fetched by the one that is.
+    """Check that PATH has a Go toolchain that can build a module, or can fetch one that can.
 
     Raises:
-        PrerequisiteError: It is missing or too old.
+        PrerequisiteError: The toolchain is missing or too old.
     """
     wanted = _go_version((_sources(module) / "go.mod").read_text(), r"^go (\d+)\.(\d+)")
     text = ".".join(map(str, wanted))
@@ -155,7 +154,7 @@ def _go_version(text: str, pattern: str) -> tuple[int, int]:
 
 
 def reported_version(path: Path, program: Program) -> str | None:
-    """Return the version that a program prints (without a leading v), or None when it prints none."""
+    """Return the version that a program prints (without a leading v), or None."""
     if not program.version_arguments:
         return None
     done = run([path, *program.version_arguments], timeout_s=60, check=False)
@@ -164,10 +163,10 @@ def reported_version(path: Path, program: Program) -> str | None:
 
 
 def check_version(path: Path, program: Program) -> None:
-    """Check that a program just built runs and says the version that was asked for.
+    """Check that a built program runs and prints the expected version.
 
     Raises:
-        ClusterError: It does not.
+        ClusterError: The program fails or prints a different version.
     """
     if program.version_arguments:
         version = reported_version(path, program)

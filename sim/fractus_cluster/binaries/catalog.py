@@ -1,4 +1,4 @@
-"""The programs a cluster runs: which Go module each comes from, and which versions are acceptable."""
+"""Catalog of the cluster's programs: Go modules and accepted versions."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 
 KUBERNETES_VERSIONS: Mapping[str, str] = MappingProxyType({"1.35": "1.35.4", "1.34": "1.34.4"})
-"""What is built of each minor version of Kubernetes that there is."""
+"""Programs that are built for each supported minor version of Kubernetes."""
 
 DEFAULT_KUBERNETES = "1.35"
 ETCD_VERSION = "3.6.13"
@@ -25,10 +25,10 @@ class Program:
     Attributes:
         name: File name of the program.
         module: Folder below `gomod/` whose go.mod and go.sum pin its sources.
-        package: What `go build` is given inside that folder.
-        version: The version that is built.
-        version_arguments: Make the program print its version; empty for one that has none to print.
-        accepts: Prefix of the versions accepted from KUBEBUILDER_ASSETS or PATH; None means never look there.
+        package: Argument of `go build` in that folder.
+        version: Version that is built.
+        version_arguments: Arguments that print the version. Empty if the program has none.
+        accepts: Version prefix accepted from KUBEBUILDER_ASSETS or PATH. None: always build.
     """
 
     name: str
@@ -41,11 +41,11 @@ class Program:
 
 @dataclass(frozen=True, slots=True)
 class Module:
-    """A Go module with everything needed to build programs from it.
+    """A Go module and its build settings.
 
     Attributes:
         name: Folder below `gomod/`.
-        link_variables: Values the linker sets; servers report their version from them.
+        link_variables: Values set by the linker. Servers report their version from them.
     """
 
     name: str
@@ -85,7 +85,7 @@ def _programs(minor: str) -> Mapping[str, Program]:
         _kubernetes(minor, "kubelet"),
         _kubernetes(minor, "kube-proxy"),
         _kubernetes(minor, "kubectl", "version", "--client"),
-        # In a module of its own: what the others share does not change with what kubeadm alone needs.
+        # Separate module, so that the dependencies of kubeadm do not affect the other programs.
         Program("kubeadm", f"kubeadm-{minor}", "k8s.io/kubernetes/cmd/kubeadm", version, ("version",)),
         Program("kind", "kind", "sigs.k8s.io/kind", KIND_VERSION),
         Program("etcd", "etcd", ".", ETCD_VERSION, accepts="3."),
@@ -108,7 +108,7 @@ def _programs(minor: str) -> Mapping[str, Program]:
 PROGRAMS: Mapping[str, Mapping[str, Program]] = MappingProxyType(
     {minor: _programs(minor) for minor in KUBERNETES_VERSIONS}
 )
-"""By minor version of Kubernetes, and by name; the names are the same for all versions."""
+"""Programs by minor version of Kubernetes and by name. All versions have the same names."""
 
 MODULES: Mapping[str, Module] = MappingProxyType(
     {
@@ -142,4 +142,4 @@ CLUSTER_PROGRAMS = (
     "pause",
     "helm",
 )
-"""What `fractus cluster up` needs; the other programs are built on request."""
+"""Programs of `fractus cluster up`. Other programs are built on request."""

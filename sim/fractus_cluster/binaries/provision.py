@@ -1,4 +1,4 @@
-"""Providing programs: KUBEBUILDER_ASSETS first, then the cache, then PATH, and at last a build."""
+"""Program lookup in KUBEBUILDER_ASSETS, the cache and PATH, and build of missing programs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Report = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True)
 class Binaries:
-    """Where each program is."""
+    """Paths of the programs."""
 
     paths: Mapping[str, Path]
 
@@ -44,12 +44,12 @@ class Binaries:
             raise ClusterError(f"{name} was not provided; run `fractus cluster binaries --with {name}`") from None
 
     def builds(self, *names: str) -> dict[str, int]:
-        """Return what changes when one of these programs is built again: when its file was written, nanoseconds."""
+        """Return the latest modification time of the programs in nanoseconds. A rebuild changes it."""
         return {name: self[name].stat().st_mtime_ns for name in names}
 
 
 def cache_directory() -> Path:
-    """Return where built programs are kept: FRACTUS_CACHE, or `fractus` in the user's cache directory."""
+    """Return the cache directory of built programs: FRACTUS_CACHE, or `fractus` in the user's cache directory."""
     chosen = os.environ.get("FRACTUS_CACHE")
     if chosen:
         return Path(chosen)
@@ -58,29 +58,29 @@ def cache_directory() -> Path:
 
 
 def chosen_kubernetes() -> str:
-    """Return the minor version of Kubernetes to run: FRACTUS_KUBERNETES, or the default.
+    """Return the minor version of Kubernetes to use: FRACTUS_KUBERNETES, or the default.
 
     Raises:
-        ClusterError: There is no such version.
+        ClusterError: The version is not supported.
     """
     chosen = os.environ.get("FRACTUS_KUBERNETES") or DEFAULT_KUBERNETES
     if chosen not in KUBERNETES_VERSIONS:
         raise ClusterError(
-            f"there is no Kubernetes {chosen}; set FRACTUS_KUBERNETES to {' or '.join(KUBERNETES_VERSIONS)}"
+            f"Kubernetes {chosen} is not supported; set FRACTUS_KUBERNETES to {' or '.join(KUBERNETES_VERSIONS)}"
         )
     return chosen
 
 
 def ensure_binaries(names: Iterable[str] = CLUSTER_PROGRAMS, *, report: Report) -> Binaries:
-    """Return paths of the named programs, building those that the machine does not have.
+    """Return the paths of programs. Missing programs are built.
 
     Args:
         names: Names from the catalog.
-        report: Told about progress, a line at a time.
+        report: Called with progress lines.
 
     Raises:
-        ClusterError: A name or the chosen version is unknown, or a build failed.
-        PrerequisiteError: Something has to be built and Go is missing or too old.
+        ClusterError: A name or the selected version is unknown, or a build failed.
+        PrerequisiteError: A build is required and Go is missing or too old.
     """
     minor = chosen_kubernetes()
     wanted = [_program(minor, name) for name in names]
@@ -132,7 +132,7 @@ def _stamp(programs: Iterable[Program], directory: Path) -> None:
 
 
 class _Versions:
-    """Versions of programs found on the machine, remembered by path, size and time so each is asked once."""
+    """Cache of program versions by path, size and modification time, so that each version is requested once."""
 
     def __init__(self, memo: Path) -> None:
         self._memo = memo

@@ -1,4 +1,4 @@
-"""Arming: one at a time, on failsafes that are known at that moment, which a link that comes back leaves as chosen."""
+"""Arming: preconditions, concurrent requests, retries, and changes of the failsafe verification meanwhile."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from virtual_time import fly
 
 
 class Slow:
-    """A fence that takes its time; tells whether the drone was armed when each raising began."""
+    """Delay raising the fence. `began_armed` records whether the drone was armed at the start of each attempt."""
 
     def __init__(self, world: World) -> None:
         self._world = world
@@ -41,7 +41,7 @@ def test_arming_happens_once_for_two_concurrent_requests(tmp_path: Path) -> None
             await first
             await end(world.service.take_off(grant, TakeoffArgs(10.0)))
             await second
-            assert slow.began_armed == [False], "nothing is prepared under a drone that flies"
+            assert slow.began_armed == [False], "no preparation while the drone flies"
             assert world.plane.commands.count(mavlink.MAV_CMD_COMPONENT_ARM_DISARM) == 1
             assert world.plane.vehicle.armed
 
@@ -66,13 +66,13 @@ def test_queued_arming_is_refused_after_driver_returns_control(tmp_path: Path) -
 
 
 FRESH = Checked("", (), Airframe(retraces=True), 8.0, remembers=True)
-"""What is verified when the link is back: the way home of this flight is not chosen in it."""
+"""Failsafe verification after a reconnect, without the return mode chosen for this flight."""
 
 
-@pytest.mark.parametrize("found", [None, FRESH])
+@pytest.mark.parametrize("verified", [None, FRESH])
 @pytest.mark.parametrize("during", ["choice", "fence", "mode"])
 def test_arming_is_refused_if_failsafe_verification_changes_meanwhile(
-    tmp_path: Path, during: str, found: Checked | None
+    tmp_path: Path, during: str, verified: Checked | None
 ) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=True) as world:
@@ -82,20 +82,20 @@ def test_arming_is_refused_if_failsafe_verification_changes_meanwhile(
             write, set_mode, raise_around = plane.vehicle_parameters.write, plane.set_mode, world.fence.raise_around
 
             async def chosen(name: str, value: float) -> float:
-                control.set_checked(found)
+                control.set_checked(verified)
                 return await write(name, value)
 
             async def raised(grant: GrantSpec, *, retraces: bool) -> None:
-                control.set_checked(found)
+                control.set_checked(verified)
                 await raise_around(grant, retraces=retraces)
 
             async def changed(mode: Any, *_: object) -> None:
                 await set_mode(mode)
-                control.set_checked(found)
+                control.set_checked(verified)
 
             if during == "choice":
                 control.dispatch(ArmingRequested(grant.key, grant.identity, (39.3604, 22.95, 10.0)))
-                control.dispatch(Airborne())  # it has landed on the way
+                control.dispatch(Airborne())  # as after a landing during the mission
                 plane.vehicle_parameters.write = chosen  # type: ignore[method-assign]
             elif during == "fence":
                 world.fence.raise_around = raised  # type: ignore[method-assign]
@@ -112,7 +112,7 @@ def test_arming_is_refused_if_failsafe_verification_changes_meanwhile(
             plane._obey = noted  # type: ignore[method-assign]
             why = await refusal(world.service.arm(grant))
             assert why.verdict.code == "FailsafesNotVerified"
-            assert control.checked is found, "what is known by then is not written over"
+            assert control.checked is verified, "the newer verification is kept"
             assert 1 not in motors
 
     fly(flight)
@@ -127,13 +127,13 @@ def test_return_mode_is_kept_after_link_reconnects_in_flight(tmp_path: Path) -> 
             grant = world.grants.put(spec())
             await world.drive(grant)
             control.dispatch(ArmingRequested(grant.key, grant.identity, (39.3604, 22.95, 10.0)))
-            control.dispatch(Airborne())  # it has landed on the way
+            control.dispatch(Airborne())  # as after a landing during the mission
             await world.service.arm(grant)
             await end(world.service.take_off(grant, TakeoffArgs(10.0)))
             assert plane.parameters["FS_GCS_ENABLE"] == 1.0
             world.observer.found()
             assert control.checked.problem
-            assert world.gate.situation().airframe.accel_mps2 == 1.0, "it brakes as it did a moment ago"
+            assert world.gate.situation().airframe.accel_mps2 == 1.0, "the known acceleration is kept"
             await world.until(lambda: control.checked is not None and not control.checked.problem, 10)
             assert plane.parameters["FS_GCS_ENABLE"] == 1.0
             assert not control.retraces
@@ -239,16 +239,16 @@ def test_arming_retries_stop_after_caller_cancels(tmp_path: Path) -> None:
 def test_waiting_driver_receives_reason_why_arming_fails(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            plane, arm, heard = world.plane, mavlink.MAV_CMD_COMPONENT_ARM_DISARM, list[str]()
+            plane, arm, reasons = world.plane, mavlink.MAV_CMD_COMPONENT_ARM_DISARM, list[str]()
             plane.refuses.add(arm)
 
             async def follow() -> None:
                 async for event in world.streams.follow(world.grants.put(partial())):
-                    heard.append(event.reason)
+                    reasons.append(event.reason)
 
             following = asyncio.ensure_future(follow())
             await asyncio.sleep(6.0)
-            assert any("COMPONENT_ARM_DISARM" in reason for reason in heard)
+            assert any("COMPONENT_ARM_DISARM" in reason for reason in reasons)
             plane.refuses.discard(arm)
             await world.until(lambda: plane.vehicle.in_air, 20)
             following.cancel()

@@ -1,4 +1,4 @@
-"""The service and a vehicle that was just switched on, in virtual time over links that lose frames."""
+"""The service with a vehicle that has just been switched on, in virtual time, on links with frame loss."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ SLOW = {"WPNAV_ACCEL": 100.0, "PSC_JERK_XY": 3.0, "WPNAV_SPEED": 600.0, "GUID_TI
 
 
 async def until(condition: Callable[[], object]) -> None:
-    while not condition():  # noqa: ASYNC110 - the simulation tells no one
+    while not condition():  # noqa: ASYNC110 - the simulation has no notification
         await asyncio.sleep(0.1)
 
 
 async def armed(sky: Sky, directory: Path) -> Checked:
-    """What the service takes the vehicle for when the motors start."""
+    """Return the verified vehicle parameters at the time of arming."""
     drone = Drone(directory, Account(0))
     turning = asyncio.ensure_future(sky.turn())
     grant = drone.grants.put(spec())
@@ -30,7 +30,7 @@ async def armed(sky: Sky, directory: Path) -> Checked:
     try:
         async with asyncio.timeout(300):
             await until(lambda: drone.state is StreamState.GRANTED)
-            assert sky.truth.home is not None, "granted before it is ready"
+            assert sky.truth.home is not None, "control was granted before the vehicle was ready"
             await drone.service.arm(grant, 120.0)
         assert drone.control.checked is not None
         return drone.control.checked

@@ -1,4 +1,4 @@
-"""An estimator that tells of no absolute position flies on by what it dead-reckons: with a GPS that has its fix all the same."""
+"""An estimator without absolute position: the vehicle dead-reckons although its GPS reports a fix."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FLOW = (
     mavlink.EKF_ATTITUDE | mavlink.EKF_VELOCITY_HORIZ | mavlink.EKF_VELOCITY_VERT
     | mavlink.EKF_POS_HORIZ_REL | mavlink.EKF_POS_VERT_ABS | mavlink.EKF_PRED_POS_HORIZ_REL
 )  # fmt: skip
-"""Of a vehicle with optical flow that takes its GPS for jammed, or whose pilot has switched to other sources: it stays in GUIDED."""
+"""EKF flags of a vehicle with optical flow that rejects its GPS, or whose pilot switched sources. It stays in GUIDED."""
 
 DRIFT_MPS = 0.3
 
@@ -50,7 +50,7 @@ def test_drone_returns_home_if_estimator_has_no_absolute_position(
             monkeypatch.setattr(Estimator, "estimate", drifting)
             monkeypatch.setattr(Estimator, "flags", FLOW)
             await asyncio.sleep(2.0)
-            assert not located(drone.control), "pictures are judged by it as well"
+            assert not located(drone.control), "camera requests must not use this position"
             await until(lambda: drone.control.state.returning or min(kept_m) <= 0.0)
             assert min(kept_m) > 1.0
 

@@ -1,4 +1,4 @@
-"""The vehicle's own fence, switched off by another station's command or by a switch of a radio: no parameter tells of either."""
+"""The vehicle fence is switched off by a command or a radio switch. No parameter changes in either case."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_vehicle_fence_is_switched_on_again_in_flight_and_before_next_arming(tmp
             async for _ in landing:
                 if sky.truth.mode == mavlink.COPTER_MODE_LAND and sky.truth.fence.enabled:
                     switch_off(mavlink.MAV_CMD_DO_FENCE_ENABLE, OFF)
-            assert not sky.truth.fence.enabled, "an autopilot may switch it off itself to land"
+            assert not sky.truth.fence.enabled, "the autopilot may switch it off for landing"
             switch_off(mavlink.MAV_CMD_DO_AUX_FUNCTION, FENCE_SWITCH, OFF)
             await asyncio.sleep(2.0)
             await drone.service.arm(grant, 120.0)

@@ -34,7 +34,7 @@ from virtual_time import fly
 WALL = (-40.0, 25.0, 40.0, 40.0)
 
 
-# The system's ways
+# Transit and return flights
 
 
 def test_transit_and_return_fly_around_exclusion_zone(tmp_path: Path) -> None:
@@ -97,12 +97,12 @@ def test_accelerating_drone_brakes_before_new_zone_without_takeover(tmp_path: Pa
             await world.up(grant)
             going = asyncio.ensure_future(refusal(world.service.goto(grant, goto(0, 90), 0)))
             await world.until(lambda: world.plane.xy[1] > 8)
-            assert math.hypot(*world.plane.velocity) < 7, "it still speeds up"
+            assert math.hypot(*world.plane.velocity) < 7, "it is still accelerating"
             world.grants.put(spec(zone("wall", "revoke", *WALL)))
             why = await going
             assert (why.verdict.code, why.verdict.action) == ("ExclusionZoneAhead", "deny")
             await asyncio.sleep(20)
-            assert world.control.authority is Authority.DRIVER, "nothing was in the zone, nor was it going to be"
+            assert world.control.authority is Authority.DRIVER, "the drone neither entered the zone nor was about to"
             assert clear_m(world, *WALL) > 5
 
     fly(flight)
@@ -138,7 +138,7 @@ def test_repeated_refused_transits_do_not_extend_driver_grace(tmp_path: Path) ->
                 assert why.verdict.code in {"NoLegalWay", "ControlLost"}
                 await asyncio.sleep(2)
             assert len(refused) > 1
-            assert refused[-1] - refused[0] < 10, "the grace of 5 s is over"
+            assert refused[-1] - refused[0] < 10, "the driver grace of 5 s has expired"
             await world.until(lambda: not world.plane.vehicle.armed)
             assert math.hypot(*world.plane.xy) < 1
 
@@ -244,7 +244,7 @@ def test_return_replans_around_zone_added_in_flight(tmp_path: Path) -> None:
     fly(flight)
 
 
-# Tours
+# POI missions
 
 
 def test_poi_mission_visits_all_points_and_returns(tmp_path: Path) -> None:
@@ -318,7 +318,7 @@ def test_poi_mission_resumes_at_next_point_after_service_restart(tmp_path: Path)
         second.grants.put(touring(tour=((0, 40), (0, 80))))
         async with second:
             await second.until(lambda: second.outcome() == "complete")
-            assert min(y for _, y, _ in second.plane.trace[flown:]) > 45, "the first point is not visited again"
+            assert min(y for _, y, _ in second.plane.trace[flown:]) > 45, "the first point is not visited twice"
             await second.until(lambda: not second.plane.vehicle.armed)
 
     fly(flight)
@@ -338,10 +338,7 @@ def test_poi_mission_waits_until_driver_returns_control(tmp_path: Path) -> None:
     fly(flight)
 
 
-# Setpoints
-
-
-# Turns, and what is not sent any more
+# Turns, stale and repeated commands
 
 
 def test_goto_brakes_first_before_sharp_turn_near_zone(tmp_path: Path) -> None:
@@ -386,7 +383,7 @@ def test_pending_command_is_dropped_after_control_is_lost(tmp_path: Path, event:
             grant = world.grants.put(spec())
             stream = await world.up(grant)
             assert world.control.effects.takeover_reason == "", "a driver has control"
-            world.plane.deaf = True  # the autopilot neither acts nor answers: commands are tried again
+            world.plane.deaf = True  # the autopilot neither acts nor acknowledges, so commands are retried
             asking = asyncio.ensure_future(refusal(world.service.set_speed(grant, SetSpeedArgs(3.0))))
             await asyncio.sleep(0.3)
             if event == "takeover":
@@ -402,12 +399,10 @@ def test_pending_command_is_dropped_after_control_is_lost(tmp_path: Path, event:
             why = await asking
             assert why.verdict.code in {"NotInControl", "ControlLost"}
             assert mavlink.MAV_CMD_DO_CHANGE_SPEED not in world.plane.commands, "the retry was dropped"
-            assert world.control.effects.takeover_reason, "the node is told why the system has control"
+            assert world.control.effects.takeover_reason, "the takeover reason is reported to the node"
             await world.until(lambda: not world.plane.vehicle.armed)
             world.control.note("landed", "the motors are stopped")
-            assert not world.control.effects.takeover_reason, (
-                "what was so in this flight is not why the system flies the next"
-            )
+            assert not world.control.effects.takeover_reason, "the reason does not carry over to the next flight"
 
     fly(flight)
 
@@ -444,7 +439,7 @@ def test_repeated_takeoff_climbs_further_or_completes_without_descending(tmp_pat
             await asyncio.wait([flying])
             stood = world.plane.xy[1]
             await end(world.service.take_off(grant, TakeoffArgs(6.0)))
-            assert abs(world.plane.height - 12.0) < 1.0, "it does not sink for a takeoff"
+            assert abs(world.plane.height - 12.0) < 1.0, "a takeoff never descends"
             with pytest.raises(Refused, match="roof"):
                 world.service.take_off(grant, TakeoffArgs(40.0))
             assert abs(world.plane.xy[1] - stood) < 1.0
@@ -492,17 +487,17 @@ def test_goto_altitude_is_converted_from_amsl_and_refused_for_unknown_terrain(tm
             there = await end(world.service.goto(grant, goto(0, 30, 28.0, reference="amsl"), 0))
             assert there.verdict.args == replace(goto(0, 30, 18.0), speed_mps=there.verdict.args.speed_mps)  # type: ignore[union-attr]
             assert world.plane.height == pytest.approx(18.0, abs=0.9)
-            why = await refusal(_begun(world, grant, goto(0, 40, 20.0, reference="terrain")))
+            why = await refusal(_goto(world, grant, goto(0, 40, 20.0, reference="terrain")))
             assert why.verdict.code == "TerrainUnknown"
 
     fly(flight)
 
 
-async def _begun(world: World, grant: ActiveGrant, args: GotoArgs) -> None:
+async def _goto(world: World, grant: ActiveGrant, args: GotoArgs) -> None:
     await end(world.service.goto(grant, args, 0))
 
 
-# Arming
+# Internal failures
 
 
 def test_flight_continues_if_journal_write_fails_in_flight(tmp_path: Path) -> None:
@@ -522,14 +517,11 @@ def test_flight_continues_if_journal_write_fails_in_flight(tmp_path: Path) -> No
     fly(flight)
 
 
-# A drone without authority
-
-
 def test_system_takes_over_armed_drone_without_authority_after_restart(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             await world.up(world.grants.put(spec()))
-        async with World(tmp_path, after=world) as second:  # it knows the armed drone, and no one that commands it
+        async with World(tmp_path, after=world) as second:  # the drone is known to be armed, without control authority
             second.grants.put(spec())
             await second.until(lambda: second.kinds("takeover"))
             assert second.kinds("takeover")[0]["code"] == "NoControlAuthority"

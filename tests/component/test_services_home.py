@@ -1,4 +1,4 @@
-"""Home under a flying drone: altitudes and ways home count from where it was fixed, also when another station moves it."""
+"""Home position in flight: altitudes and returns refer to the home fixed at arming, also if another station moves it."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ CEILING = {"name": "low", "spec": {"type": "LimitControl", "kind": "altitude", "
 
 
 def move(world: World, where: tuple[float, float, float]) -> None:
-    """What the button "set home here" of any ground station does."""
+    """Move home as a ground station does with "set home here"."""
     east, north, up = where
     lat, lon = FRAME.latlon(east, north)
     world.plane.move_home(round(lat * 1e7), round(lon * 1e7), GROUND_M + up)
 
 
-async def beat(world: World) -> None:
-    """The vehicle's heartbeats, until cancelled."""
+async def send_heartbeats(world: World) -> None:
+    """Deliver heartbeats until cancelled."""
     while True:
         world.observer.heartbeat()
         await asyncio.sleep(0.5)
@@ -48,8 +48,8 @@ async def beat(world: World) -> None:
 
 @contextlib.asynccontextmanager
 async def flying(world: World, *policies: dict[str, Any]) -> AsyncIterator[ActiveGrant]:
-    """A driver in the air, whose vehicle sends heartbeats."""
-    beating = asyncio.ensure_future(beat(world))
+    """Take off with a driver, and deliver heartbeats of the vehicle."""
+    beating = asyncio.ensure_future(send_heartbeats(world))
     grant = world.grants.put(spec(*policies))
     await world.up(grant)
     yield grant
@@ -61,7 +61,7 @@ def at_home(world: World) -> bool:
     return home is not None and abs(home.amsl_m - GROUND_M) < 0.5 and abs(home.lat - 39.36) < 1e-5
 
 
-def said(world: World) -> list[dict[str, Any]]:
+def home_moved_entries(world: World) -> list[dict[str, Any]]:
     return [entry for entry in world.kinds("control") if entry["code"] == "HomeMoved"]
 
 
@@ -72,14 +72,14 @@ def test_moved_home_is_restored_before_flight_continues(tmp_path: Path, where: t
             leg = asyncio.ensure_future(refusal(world.service.goto(grant, GotoArgs(*at(0, 90), 12.0), 0)))
             await world.until(lambda: world.plane.xy[1] > 20)
             move(world, where)
-            # Until it is set back no altitude means what it says: nothing flies by it, and no picture is judged by it.
+            # Until home is restored, altitudes are invalid: neither motions nor camera requests may use them.
             assert not located(world.control)
             with pytest.raises(Unavailable):
                 world.service.goto(grant, GotoArgs(*at(0, 90), 12.0), 0)
             assert isinstance(await leg, Unavailable)
             await world.until(lambda: at_home(world) and located(world.control), 5)
             await end(world.service.goto(grant, GotoArgs(*at(0, 90), 12.0), 0))
-            assert len(said(world)) == 1
+            assert len(home_moved_entries(world)) == 1
             assert max(height for _, _, height in world.plane.trace) < 16
             await world.control.return_control(grant)
             await world.until(lambda: not world.plane.vehicle.armed)
@@ -117,7 +117,7 @@ def test_mission_ends_if_moved_home_cannot_be_restored(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("refused", [True, False])
 def test_drone_lands_at_original_home_if_home_keeps_moving(tmp_path: Path, refused: bool) -> None:
-    """Refused by the autopilot, or moved again and again: where the path is read_known_vehicle, it leads to where the mission armed."""
+    """The restore is refused, or home is moved again every time. SmartRTL still leads to where the mission armed."""
 
     async def again_and_again(world: World) -> None:
         while True:
@@ -149,7 +149,7 @@ def test_home_moved_by_pilot_is_restored_after_handback(tmp_path: Path) -> None:
             move(world, AWAY)
             await asyncio.sleep(5.0)
             assert not at_home(world)
-            assert not located(world.control), "no picture is judged by a height above it"
+            assert not located(world.control), "heights above the moved home are invalid"
             world.plane.set_to(GUIDED)
             await world.until(lambda: at_home(world), 5)
             await world.until(lambda: not world.plane.vehicle.armed)
@@ -181,7 +181,7 @@ def test_camera_position_is_unknown_while_home_is_moved_in_pilot_flight(tmp_path
 
 
 def heartbeat(world: World, *, armed: bool) -> None:
-    """As the vehicle sends it in a pilot's mode."""
+    """Deliver a heartbeat in a pilot mode."""
     world.plane.take(
         message(
             "HEARTBEAT", type=mavlink.MAV_TYPE_QUADROTOR, autopilot=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, custom_mode=mavlink.COPTER_MODE_LOITER,
@@ -200,7 +200,7 @@ def test_pilot_flight_fixes_home_from_first_message_after_arming(tmp_path: Path)
             heartbeat(world, armed=True)
             plane.goal, plane.goal_height = (0.0, 50.0), 60.0
             await world.until(lambda: plane.vehicle.in_air)
-            assert not located(world.control), "home was not told since it armed"
+            assert not located(world.control), "no home has been reported since arming"
             move(world, (0.0, 50.0, 0.0))
             await world.until(lambda: plane.vehicle.altitude_m > 20)
             assert located(world.control)
@@ -225,7 +225,7 @@ def test_pilot_flight_after_landed_mission_uses_new_home(tmp_path: Path) -> None
             plane.goal, plane.goal_height = (0.0, 50.0), 20.0
             await world.until(lambda: plane.vehicle.altitude_m > 10)
             assert world.control.state.mission is not None
-            assert located(world.control), "the mission's home is not this flight's"
+            assert located(world.control), "the home of the mission does not apply to this flight"
             move(world, (0.0, 0.0, 0.0))
             await asyncio.sleep(1.0)
             assert not located(world.control)
@@ -234,7 +234,7 @@ def test_pilot_flight_after_landed_mission_uses_new_home(tmp_path: Path) -> None
 
 
 def test_failed_arming_does_not_fix_home(tmp_path: Path) -> None:
-    """Refused beside iron, the drone is carried to a better place, and its estimate of its height has settled meanwhile."""
+    """Arming is refused, for example because of magnetic interference. The drone is carried elsewhere and armed there."""
 
     async def flight() -> None:
         async with World(tmp_path) as world:
@@ -252,7 +252,7 @@ def test_failed_arming_does_not_fix_home(tmp_path: Path) -> None:
             east, north = FRAME.xy(home.lat, home.lon)
             assert abs(east - 30.0) < 0.5
             assert abs(north) < 0.5
-            # Once it has flown, landing on the way and arming again moves home no more.
+            # After the first flight, landing and arming again must not move home.
             await end(world.service.take_off(grant, TakeoffArgs(10.0)))
             await end(world.service.goto(grant, GotoArgs(*at(0, 40), 10.0), 0))
             await end(world.service.land(grant))
@@ -266,7 +266,7 @@ def test_failed_arming_does_not_fix_home(tmp_path: Path) -> None:
 def test_vertical_home_move_is_detected_without_home_position_message(
     up_m: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Another station on the same port has stopped the stream that tells of home, and the one message about its move is lost."""
+    """Another station stopped the HOME_POSITION stream, and the single message about the move is lost."""
 
     async def work(sky: Sky, directory: Path) -> None:
         station, parser, lost = Endpoint(255, mavlink.MAV_COMP_ID_MISSIONPLANNER), Parser(), []
@@ -274,26 +274,26 @@ def test_vertical_home_move_is_detected_without_home_position_message(
             (wire,) = sky.wires
             deliver = wire._protocol.data_received
 
-            def tell(kind: str, **values: Any) -> None:
+            def send(kind: str, **values: Any) -> None:
                 values |= {"target_system": 1, "target_component": 1}
                 sky.craft.receive(wire._channel, station.encode(kind, values))
 
             def lose_the_first(data: Any) -> None:
-                for heard in parser.feed(bytes(data)):
-                    if heard.name == "HOME_POSITION" and not lost:
-                        lost.append(heard)
+                for received in parser.feed(bytes(data)):
+                    if received.name == "HOME_POSITION" and not lost:
+                        lost.append(received)
                     else:
-                        deliver(heard.frame)
+                        deliver(received.frame)
 
             await drone.service.arm(grant, 120.0)
             await end(drone.service.take_off(grant, TakeoffArgs(15.0)))
             kind = float(mavlink.MAVLINK_MSG_ID_HOME_POSITION)
-            tell("COMMAND_LONG", command=mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, param1=kind, param2=-1.0)
+            send("COMMAND_LONG", command=mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, param1=kind, param2=-1.0)
             await asyncio.sleep(0.3)
             monkeypatch.setattr(wire._protocol, "data_received", lose_the_first)
             lat, lon = (round(degrees * 1e7) for degrees in at(0, 0))
             place = {"x": lat, "y": lon, "z": GROUND_M + up_m}
-            tell("COMMAND_INT", command=mavlink.MAV_CMD_DO_SET_HOME, frame=mavlink.MAV_FRAME_GLOBAL, **place)
+            send("COMMAND_INT", command=mavlink.MAV_CMD_DO_SET_HOME, frame=mavlink.MAV_FRAME_GLOBAL, **place)
             await until(lambda: lost, 2.0)
             with contextlib.suppress(Refused):
                 await end(drone.service.goto(grant, GotoArgs(*at(0, 20), 15.0), 0.0))
@@ -304,7 +304,7 @@ def test_vertical_home_move_is_detected_without_home_position_message(
 
 
 async def test_home_position_request_is_rate_limited_after_refusal() -> None:
-    """A refusal comes at once."""
+    """The autopilot refuses immediately. The next request must wait."""
 
     class Refusing:
         vehicle, connected, asked = Vehicle(stack=ARDUCOPTER, armed=True, heartbeat_at=10.0), True, 0

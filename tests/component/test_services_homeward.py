@@ -1,4 +1,4 @@
-"""Ways home: begun at rest, tried again when the autopilot refuses, and what stays behind after them."""
+"""Return flights: start at rest, retries after refusals, limits and new zones, and state left after the mission."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ WALL = (-40.0, 25.0, 40.0, 40.0)
 REPOSITION = 192
 
 
-async def beyond_the_wall(world: World) -> None:
-    """A driver whose way home is behind a wall gives the drone back."""
+async def return_from_behind_wall(world: World) -> None:
+    """Return control at a place from which a zone blocks the direct route home."""
     grant = world.grants.put(spec(zone("wall", "ignore", *WALL)))
     await world.up(grant)
     for x, y in ((60, 30), (60, 70), (0, 70)):
@@ -89,7 +89,7 @@ def test_return_avoids_zone_after_one_refused_command(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=True) as world:
             plane = world.plane
-            await beyond_the_wall(world)
+            await return_from_behind_wall(world)
             plane.commands.clear()
             plane.refuses.add(REPOSITION)
             await world.until(lambda: REPOSITION in plane.commands)
@@ -110,7 +110,7 @@ def test_return_is_left_to_autopilot_after_three_refused_commands(
             plane = world.plane
             plane.vehicle.path_lost = not remembers
             if remembers:
-                await beyond_the_wall(world)
+                await return_from_behind_wall(world)
             else:
                 grant = world.grants.put(spec())
                 await world.up(grant)
@@ -140,7 +140,7 @@ def test_fence_is_lowered_after_mission_ends(tmp_path: Path, how: str) -> None:
                 await world.until(lambda: world.fence.raised)
                 await asyncio.wait([arming])
                 if how == "unused":
-                    assert world.fence.raised, "while the motors run"
+                    assert world.fence.raised, "the fence stays while the motors run"
                     await world.service.disarm(grant)
                 else:
                     assert "command COMPONENT_ARM_DISARM" in str(arming.exception())
@@ -247,7 +247,7 @@ def test_internal_error_ends_mission_without_arming_again(
             await world.until(world.outcome)
             assert world.outcome().startswith("failed: the mobility service has an internal error")
             await world.until(lambda: not world.plane.vehicle.armed)
-            assert world.plane.commands.count(mavlink.MAV_CMD_COMPONENT_ARM_DISARM) == 1, "not armed again"
+            assert world.plane.commands.count(mavlink.MAV_CMD_COMPONENT_ARM_DISARM) == 1, "the drone is not armed again"
             await asyncio.sleep(20)
             assert world.plane.commands.count(mavlink.MAV_CMD_COMPONENT_ARM_DISARM) == 1
 
@@ -310,7 +310,7 @@ def test_pilot_rtl_toward_new_zone_is_reported_without_takeover(
             await world.until(lambda: not plane.vehicle.armed)
             alarms = [(entry["action"], entry["code"]) for entry in world.kinds("monitor")]
             assert {("alarm", "ExclusionZoneAhead"), ("alarm", "SpeedAboveLimit")} <= set(alarms)
-            assert len(alarms) < 10, "each is told once while it lasts"
+            assert len(alarms) < 10, "each violation is reported once"
             assert "zone wall-zone" in caplog.text
             assert mavlink.MAV_CMD_DO_SET_MODE not in plane.commands[commands:]
 
@@ -335,8 +335,8 @@ def test_restarted_service_takes_over_only_failsafe_return(tmp_path: Path, fails
             again.plane.trace.clear()
             commands = len(again.plane.commands)
             await again.until(lambda: not again.plane.vehicle.armed)
-            told = "takeBack" if failsafe else "alarm"
-            assert (told, "ExclusionZoneAhead") in [(e["action"], e["code"]) for e in again.kinds("monitor")]
+            expected_action = "takeBack" if failsafe else "alarm"
+            assert (expected_action, "ExclusionZoneAhead") in [(e["action"], e["code"]) for e in again.kinds("monitor")]
             assert (mavlink.MAV_CMD_DO_SET_MODE in again.plane.commands[commands:]) is failsafe
             assert (clear_m(again, *WALL) > 1.0) is failsafe
 
@@ -349,8 +349,13 @@ def test_return_keeps_altitude_and_speed_limits(tmp_path: Path, who: str, low: f
     async def flight() -> None:
         async with World(tmp_path) as world:
             plane = world.plane
-            here = {"type": "LimitControl", "kind": "altitude", "upperLimit": low, "selector": {"zones": ["near-zone"]}}
-            near = {"name": "near", "spec": here, "zones": [{"name": "near-zone", "area": area(-60, -30, 60, 50)}]}
+            limit = {
+                "type": "LimitControl",
+                "kind": "altitude",
+                "upperLimit": low,
+                "selector": {"zones": ["near-zone"]},
+            }
+            near = {"name": "near", "spec": limit, "zones": [{"name": "near-zone", "area": area(-60, -30, 60, 50)}]}
             limits = {"maxAltitude": 12, "maxSpeed": 3}
             grant = world.grants.put(spec(near, limits=limits))
             plane.vehicle.mode = GUIDED
@@ -410,7 +415,7 @@ def test_landing_takeover_flies_home_if_zone_is_below(tmp_path: Path, upper: flo
             if upper < 20.0:
                 await refusal_of(world, GotoArgs(*at(0, 55), 5.0))
             await world.until(lambda: not world.plane.vehicle.armed)
-            assert (math.hypot(*world.plane.xy) < 2.0) is (upper < 20.0), "inside of it, it lands at once"
+            assert (math.hypot(*world.plane.xy) < 2.0) is (upper < 20.0), "inside the zone it lands immediately"
             assert world.outcome().startswith("failed:")
 
     fly(flight)
@@ -447,7 +452,7 @@ def test_monitor_stops_failsafe_return_into_zone_after_earlier_return_was_given_
             await world.up(grant)
             for x, y in ((60, 30), (60, 70), (0, 70)):
                 await end(world.service.goto(grant, GotoArgs(*at(x, y), 10.0), 0))
-            world.monitor._return_flight.given_up = grant  # as a way home left it that its driver has stopped
+            world.monitor._return_flight.given_up = grant  # as after a return flight that its driver stopped
             await asyncio.sleep(2)
             plane.vehicle.failsafe = True
             plane.set_to(RTL)
@@ -491,26 +496,26 @@ def test_landing_does_not_violate_minimum_altitude(tmp_path: Path) -> None:
     fly(flight)
 
 
-def changes(world: World, name: str, value: float, *, told: bool = True) -> None:
-    """Another station sets a parameter; with `told` the vehicle says so to all that listen."""
+def change_parameter(world: World, name: str, value: float, *, announced: bool = True) -> None:
+    """Change a parameter as another station does. If `announced`, the vehicle broadcasts PARAM_VALUE."""
     plane = world.plane
     plane.parameters[name] = value
-    if told:
+    if announced:
         plane.take(message("PARAM_VALUE", param_id=name.encode(), param_value=value, param_count=1, param_index=65535))
 
 
-@pytest.mark.parametrize("told", [True, False])
-def test_failsafe_parameter_changed_in_flight_is_restored(tmp_path: Path, told: bool) -> None:
+@pytest.mark.parametrize("announced", [True, False])
+def test_failsafe_parameter_changed_in_flight_is_restored(tmp_path: Path, announced: bool) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             world.observer.found()
             grant = world.grants.put(spec())
             await world.until(lambda: world.control.checked is not None, 10)
             await world.up(grant)
-            changes(world, "FS_GCS_ENABLE", 0.0, told=told)
-            await world.until(lambda: world.plane.parameters["FS_GCS_ENABLE"] == 1.0, 1 if told else 12)
+            change_parameter(world, "FS_GCS_ENABLE", 0.0, announced=announced)
+            await world.until(lambda: world.plane.parameters["FS_GCS_ENABLE"] == 1.0, 1 if announced else 12)
             await world.until(lambda: any("FS_GCS_ENABLE was 0 and is 1" in str(e) for _, e in world.entries), 2)
-            assert world.control.lease is not None, "the driver keeps the drone"
+            assert world.control.lease is not None, "the driver keeps control"
 
     fly(flight)
 
@@ -523,9 +528,9 @@ def test_changed_acceleration_parameter_is_applied_in_flight(tmp_path: Path) -> 
             await world.until(lambda: world.control.checked is not None, 10)
             await world.up(grant)
             assert world.gate.situation().airframe.accel_mps2 == 2.5
-            changes(world, "WPNAV_ACCEL", 100.0)
+            change_parameter(world, "WPNAV_ACCEL", 100.0)
             assert world.gate.situation().airframe.accel_mps2 == 1.0
-            changes(world, "WPNAV_ACCEL", 50.0, told=False)
+            change_parameter(world, "WPNAV_ACCEL", 50.0, announced=False)
             await world.until(lambda: world.gate.situation().airframe.accel_mps2 == 0.5, 12)
             await world.until(lambda: any("flight parameters changed" in str(e) for _, e in world.entries), 2)
 
@@ -540,7 +545,7 @@ def test_mission_ends_if_failsafe_parameter_cannot_be_restored(tmp_path: Path) -
             await world.until(lambda: world.control.checked is not None, 10)
             await world.up(grant)
             world.plane.fixed = ("FS_GCS_ENABLE",)
-            changes(world, "FS_GCS_ENABLE", 0.0)
+            change_parameter(world, "FS_GCS_ENABLE", 0.0)
             await world.until(world.outcome, 10)
             assert "FS_GCS_ENABLE is 0 and cannot be set to 1" in world.outcome()
             await world.until(lambda: not world.plane.vehicle.armed, 120)
@@ -555,7 +560,7 @@ def test_parameter_changed_on_ground_is_verified_before_arming(tmp_path: Path) -
             grant = world.grants.put(spec())
             await world.until(lambda: world.control.checked is not None, 10)
             await world.drive(grant)
-            changes(world, "WPNAV_ACCEL", 100.0)
+            change_parameter(world, "WPNAV_ACCEL", 100.0)
             why = await refusal(world.service.arm(grant))
             assert why.verdict.code == "FailsafesNotVerified"
             await world.until(lambda: world.control.checked is not None and not world.control.checked.problem, 5)
@@ -618,6 +623,6 @@ def test_goto_stops_when_scheduled_zone_becomes_active_on_leg(tmp_path: Path, ho
             await world.until(lambda: world.gate.situation().time_s > began.timestamp() - 5.0, 30)
             stopped = await refusal(end(world.service.goto(grant, GotoArgs(*at(0, 190), 10.0), 0)))
             assert stopped.verdict.policies == ("later",)
-            assert 10.0 < world.plane.xy[1] < 80.0, "70 m before it has to"
+            assert 10.0 < world.plane.xy[1] < 80.0, "it stops long before the zone"
 
     fly(flight)

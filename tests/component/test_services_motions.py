@@ -1,4 +1,4 @@
-"""Motions that meet: one begins while another ends, and no one loses sight of the drone in between."""
+"""Motions: speeds, overlapping motions, lost commands, system flights, changed grants and link outages."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ WALL = (-40.0, 25.0, 40.0, 40.0)
 
 
 def limit(which: str, upper: float) -> dict[str, Any]:
-    """A limit of speed or altitude that corrects."""
+    """Return a speed or altitude limit with the action `enforce`."""
     return {
         "name": "limited",
         "spec": {"type": "LimitControl", "kind": which, "upperLimit": upper, "action": "enforce"},
@@ -34,7 +34,7 @@ def limit(which: str, upper: float) -> dict[str, Any]:
 
 
 async def fastest(world: World, motion: Any) -> float:
-    """How fast the drone gets in a motion."""
+    """Complete a motion and return the highest ground speed in m/s."""
     top = 0.0
     async for _ in motion:
         top = max(top, math.hypot(*world.plane.velocity))
@@ -85,20 +85,20 @@ def test_corrected_speed_holds_when_leg_is_resent(tmp_path: Path) -> None:
             await world.until(lambda: world.plane.velocity[1] > 6)
             world.grants.put(spec(limit("speed", 3.0)))
             await world.until(lambda: world.plane.speed_mps == 3.0)
-            world.plane.goal = (world.plane.xy[0], world.plane.xy[1])  # it forgets where it was told to fly
+            world.plane.goal = (world.plane.xy[0], world.plane.xy[1])  # the vehicle loses its target
             world.plane.positions = False
             stayed = world.plane.xy[1] + 10
             await world.until(lambda: world.plane.xy[1] > stayed)
             assert world.plane.velocity[1] == pytest.approx(3.0, abs=0.2)
             await flying
             grant = world.grants.put(spec())
-            assert await fastest(world, world.service.goto(grant, goto(0, 90), 0)) > 6, "where nothing limits it"
+            assert await fastest(world, world.service.goto(grant, goto(0, 90), 0)) > 6, "no limit applies"
 
     fly(flight)
 
 
 SLOW_FROM = 60.0
-"""From here on north the speed is limited."""
+"""North of this coordinate the speed is limited, in metres."""
 
 
 def slow_zone() -> dict[str, Any]:
@@ -126,7 +126,7 @@ def test_set_speed_is_limited_by_current_leg(tmp_path: Path, asked_mps: float | 
             assert await flying == pytest.approx(3.0, abs=0.2)
             assert await fastest(world, world.service.goto(grant, goto(0, 65), 0)) == pytest.approx(3.0, abs=0.2)
             await end(world.service.goto(grant, goto(0, 0), 0))
-            assert await fastest(world, world.service.goto(grant, goto(0, -120), 0)) > 10, "where nothing limits it"
+            assert await fastest(world, world.service.goto(grant, goto(0, -120), 0)) > 10, "no limit applies"
 
     fly(flight)
 
@@ -190,13 +190,13 @@ def test_return_uses_vehicle_speed_within_limits(tmp_path: Path, driven_mps: flo
                 world.grants.put(spec(wall, limit("speed", 3.0)))
             await world.control.return_control(grant)
             await world.until(lambda: world.control.motion is not None and world.control.motion.speed_mps is not None)
-            told = 3.0 if limited else 8.0
+            expected_mps = 3.0 if limited else 8.0
             assert world.gate.situation().speed_setpoint_mps == 8.0
             top = 0.0
             while world.plane.vehicle.mode == GUIDED:
                 await world.plane.update(0.1)
                 top = max(top, math.hypot(*world.plane.velocity))
-            assert top == pytest.approx(told, abs=0.5)
+            assert top == pytest.approx(expected_mps, abs=0.5)
             await world.until(lambda: not world.plane.vehicle.armed)
 
     fly(flight)
@@ -340,8 +340,8 @@ def test_goto_is_judged_again_at_current_position_after_lost_command(tmp_path: P
             begun = len(plane.commands)
             there = await end(world.service.goto(grant, goto(-60, 50), 0))
             assert there.verdict.permits
-            assert min(lost[:2]) > 5, "it flew on, unheard"
-            assert plane.commands[begun] == 84, "by then it had to stop first"
+            assert min(lost[:2]) > 5, "it flew on without a new command"
+            assert plane.commands[begun] == 84, "it has to stop first by then"
             assert (await first).verdict.code == "Replaced"
             assert clear_m(world, -200, 63, 200, 100) > 1.0
 
@@ -377,12 +377,12 @@ def test_goto_stops_and_restarts_once_after_lost_speed_command(tmp_path: Path, l
                 with pytest.raises(AutopilotError, match="does not acknowledge the speed"):
                     await flying
                 await world.until(lambda: math.hypot(*plane.velocity) < 0.2, 5)
-            assert top < 4.0, "it is not left to fly at its own speed"
+            assert top < 4.0, "it does not keep flying at its default speed"
 
     fly(flight)
 
 
-# Motions that begin while the drone comes to rest
+# Motions that begin while the drone is braking
 
 
 @pytest.mark.parametrize("target", [(0.0, 20.0), (40.0, 30.0)])
@@ -400,7 +400,7 @@ def test_permitted_goto_is_flown_while_drone_brakes_before_new_zone(
             assert (await flying).verdict.code == "ExclusionZoneAhead"
             back = goto(*target)
             await world.until(lambda: judge(Call("Goto", back), world.gate.situation(), grant.compiled).permits, 5)
-            assert world.plane.velocity[1] > 5, "it still flies toward the zone"
+            assert world.plane.velocity[1] > 5, "it is still moving toward the zone"
             await end(world.service.goto(grant, back, 0))
             assert clear_m(world, -30, 50, 30, 70) > 0.0
             codes = [note["code"] for note in world.kinds("control") if note["action"] == "brake"]
@@ -420,18 +420,18 @@ def test_altitude_correction_is_not_stopped_by_replaced_motion(tmp_path: Path) -
             assert (await flying).verdict.code == "AltitudeAboveLimit"
             begun = len(world.plane.commands)
             await world.until(lambda: world.plane.height < 16.0, 8)
-            assert 84 not in world.plane.commands[begun:], "nothing stops it on its way down"
+            assert 84 not in world.plane.commands[begun:], "the descent is not stopped"
             await world.until(lambda: world.control.motion is None, 10)
             assert world.control.state.controller == grant.identity
 
     fly(flight)
 
 
-# The system's own flying
+# System flights
 
 
-async def homeward(world: World) -> bool:
-    """A drone on its way home around a wall; whether it flies east."""
+async def start_return(world: World) -> bool:
+    """Start a return flight around a wall, and return True if it flies east."""
     grant = world.grants.put(spec(zone("wall", "ignore", *WALL)))
     await world.up(grant)
     for x, y in ((60, 30), (60, 70), (0, 70)):
@@ -444,7 +444,7 @@ async def homeward(world: World) -> bool:
 def test_return_stays_inside_shrunk_inclusion_zone(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=True) as world:
-            side = 1 if await homeward(world) else -1
+            side = 1 if await start_return(world) else -1
             edge = world.plane.xy[0] + side * 16.0
             west, east = (-200.0, edge) if side > 0 else (edge, 200.0)
             kept = zone("shrunk", "revoke", west, -200.0, east, 200.0)
@@ -464,7 +464,7 @@ def test_return_stays_inside_shrunk_inclusion_zone(tmp_path: Path) -> None:
 def test_return_brakes_if_position_is_lost(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=True) as world:
-            await homeward(world)
+            await start_return(world)
             tell, begun = world.plane._tell, world.plane.now
 
             def blind() -> None:
@@ -486,15 +486,15 @@ def test_return_brakes_if_position_is_lost(tmp_path: Path) -> None:
 
 @pytest.fixture
 def changed(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
-    """What the monitor is told at each look: whether the drone's way may have been judged by another grant."""
-    told: list[bool] = []
+    """Record the `fences_changed` argument of each monitor call."""
+    recorded: list[bool] = []
 
-    def look(*args: Any, fences_changed: bool, **more: Any) -> Any:
-        told.append(fences_changed)
+    def recording_monitor(*args: Any, fences_changed: bool, **more: Any) -> Any:
+        recorded.append(fences_changed)
         return monitor(*args, fences_changed=fences_changed, **more)
 
-    monkeypatch.setattr(monitoring, "monitor", look)
-    return told
+    monkeypatch.setattr(monitoring, "monitor", recording_monitor)
+    return recorded
 
 
 def test_monitor_flags_fences_changed_until_drone_rests(tmp_path: Path, changed: list[bool]) -> None:
@@ -504,14 +504,14 @@ def test_monitor_flags_fences_changed_until_drone_rests(tmp_path: Path, changed:
             await world.up(grant)
             going = asyncio.ensure_future(end(world.service.goto(grant, goto(0, 90), 1.0)))
             await world.until(lambda: world.plane.xy[1] > 3)
-            assert not any(changed[-20:]), "it began at rest, by the fences that still hold"
+            assert not any(changed[-20:]), "the leg began at rest under the current fences"
             grant = world.grants.put(spec(zone("far", "ignore", 60, 60, 90, 90)))
             await asyncio.sleep(0.2)
             assert changed[-1]
             await world.service.hover(grant)
             with pytest.raises(Refused):
                 await going
-            assert changed[-1], "it still flies"
+            assert changed[-1], "it is still moving"
             await world.until(lambda: math.hypot(*world.plane.velocity) < 0.01)
             await asyncio.sleep(2.0)
             await end(world.service.goto(grant, goto(0, 40), 1.0))
@@ -529,7 +529,7 @@ def test_monitor_flags_fences_changed_after_immediately_completed_goto(tmp_path:
             assert world.control.motion is None
             world.grants.put(spec(zone("far", "ignore", 60, 60, 90, 90)))
             await world.until(lambda: world.plane.xy[1] > 3)
-            assert changed[-1], "the autopilot flies there all the same"
+            assert changed[-1], "the autopilot is still flying the leg"
 
     fly(flight)
 
@@ -540,14 +540,14 @@ def test_takeoff_continues_after_lost_acknowledgement(tmp_path: Path) -> None:
             grant = world.grants.put(spec())
             await world.drive(grant)
             await world.service.arm(grant)
-            plane, obey, heard = world.plane, world.plane._obey, 0
+            plane, obey, attempts = world.plane, world.plane._obey, 0
 
             def once(outgoing: Any) -> None:
-                nonlocal heard
+                nonlocal attempts
                 if outgoing.integer("command") == mavlink.MAV_CMD_NAV_TAKEOFF:
-                    heard += 1
+                    attempts += 1
                     plane.refuses.add(mavlink.MAV_CMD_NAV_TAKEOFF)
-                    if heard == 1:
+                    if attempts == 1:
                         plane._reply = lambda _: None  # type: ignore[method-assign]
                         asyncio.get_running_loop().call_later(0.1, delattr, plane, "_reply")
                 obey(outgoing)
@@ -560,11 +560,11 @@ def test_takeoff_continues_after_lost_acknowledgement(tmp_path: Path) -> None:
     fly(flight)
 
 
-# The link is cut
+# Link outages
 
 
 async def cut(world: World, seconds: float, *, frozen: bool = False) -> None:
-    """The link is cut, or the autopilot stands still with its clock, and is heard again."""
+    """Cut the link for some seconds. If `frozen`, the vehicle and its clock stand still meanwhile."""
     plane = world.plane
     step = plane._step
     plane.deaf = True
@@ -584,7 +584,7 @@ def test_driver_keeps_control_after_short_link_outage(tmp_path: Path, seconds: f
             await world.until(lambda: world.plane.velocity[1] > 3)
             await cut(world, seconds, frozen=frozen)
             stopped = await flying
-            assert isinstance(stopped, Unavailable), "which the driver's library tries again"
+            assert isinstance(stopped, Unavailable), "the SDK retries this error"
             assert world.control.authority is Authority.DRIVER
             if seconds > 1.5:
                 with pytest.raises(Unavailable):

@@ -1,4 +1,4 @@
-"""Others on the drone's link that have heartbeats: none of them is taken for the drone's own autopilot, least of all in flight."""
+"""Foreign MAVLink components on the link of the drone are not mistaken for its autopilot."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ FLYING = heartbeat(
 )  # fmt: skip
 
 
-def heard_first(sky: Sky, *frames: bytes) -> None:
-    """Let each connection begin with these."""
+def deliver_first(sky: Sky, *frames: bytes) -> None:
+    """Deliver these frames first on each new connection."""
     connect = sky.create_connection
 
     async def create_connection(*args: Any, **kwargs: Any) -> Any:
@@ -59,7 +59,7 @@ def test_reconnected_link_ignores_heartbeats_of_foreign_components_in_flight(str
         async with ready(sky, directory) as (drone, grant):
             await drone.service.arm(grant, 120.0)
             await end(drone.service.take_off(grant, TakeoffArgs(15.0)))
-            heard_first(sky, stranger)
+            deliver_first(sky, stranger)
             (wire,) = sky.wires
             wire._protocol.connection_lost(None)
             await until(lambda: drone.autopilot._broken.is_set() or sky.wires != [wire])
@@ -126,9 +126,9 @@ def test_command_is_resent_if_acknowledgement_belongs_to_another_station(tmp_pat
     fly(work, tmp_path)
 
 
-def told_to(sky: Sky, system: int) -> list[str]:
-    """Messages to a system, as they are sent from now on."""
-    found: list[str] = []
+def messages_to(sky: Sky, system: int) -> list[str]:
+    """Return a list that collects the names of messages sent to a system from now on."""
+    names: list[str] = []
     connect = sky.create_connection
 
     async def create_connection(*args: Any, **kwargs: Any) -> Any:
@@ -136,14 +136,14 @@ def told_to(sky: Sky, system: int) -> list[str]:
         write, parser = wire.write, Parser()
 
         def noted(data: Any) -> None:
-            found.extend(sent.name for sent in parser.feed(bytes(data)) if sent.values.get("target_system") == system)
+            names.extend(sent.name for sent in parser.feed(bytes(data)) if sent.values.get("target_system") == system)
             write(data)
 
         wire.write = noted
         return wire, protocol
 
     sky.create_connection = create_connection  # type: ignore[method-assign]
-    return found
+    return names
 
 
 @pytest.mark.parametrize("stranger", [OTHER, FLYING], ids=["standing", "flying"])
@@ -164,13 +164,13 @@ def test_restarted_service_selects_known_vehicle_and_sends_nothing_to_foreign_ve
         await first.close()
         for wire in sky.wires:
             wire.close()
-        heard_first(sky, stranger)
-        told = told_to(sky, 2)
+        deliver_first(sky, stranger)
+        sent_names = messages_to(sky, 2)
         again = started()
         await until(lambda: again.autopilot.connected)
         assert again.autopilot.target == (1, 1)
         await asyncio.sleep(5.0)
-        assert not told
+        assert not sent_names
         await again.close()
         turning.cancel()
 
@@ -180,7 +180,7 @@ def test_restarted_service_selects_known_vehicle_and_sends_nothing_to_foreign_ve
 def test_unknown_armed_vehicle_receives_no_commands(tmp_path: Path) -> None:
     async def work(sky: Sky, directory: Path) -> None:
         sky.craft.receive = lambda *_: None  # type: ignore[method-assign]
-        told = told_to(sky, 2)
+        sent_names = messages_to(sky, 2)
         drone = Drone(
             directory, Account(0), known_vehicle=KnownVehicleFile(directory / "vehicle.json", "tcp:vehicle:1")
         )
@@ -188,7 +188,7 @@ def test_unknown_armed_vehicle_receives_no_commands(tmp_path: Path) -> None:
             for wire in sky.wires:
                 wire._protocol.data_received(FLYING)
             await asyncio.sleep(1.0)
-        assert not told
+        assert not sent_names
         assert not drone.autopilot.found
         assert "unknown vehicle is armed (MAVLink system 2)" in drone.control.arming_problem
         await drone.close()

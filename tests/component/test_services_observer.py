@@ -1,4 +1,4 @@
-"""What keeps the autopilot's last line as it was armed with, while the drone flies."""
+"""Supervision of failsafes, fence and RTL limits in flight."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from mobility_world import World, spec
 from virtual_time import fly
 
 
-async def heard(world: World, condition: Callable[[], object], timeout_s: float) -> None:
-    """Wait for a condition while the vehicle's heartbeats are heard."""
+async def until_with_heartbeats(world: World, condition: Callable[[], object], timeout_s: float) -> None:
+    """Wait for a condition while heartbeats of the vehicle arrive."""
 
     def beats() -> object:
         world.observer.heartbeat()
@@ -76,7 +76,7 @@ def test_drone_returns_home_if_parameters_stay_unverified(tmp_path: Path) -> Non
             await world.up(world.grants.put(spec()))
             world.plane.parameters.clear()
             silent_at = world.plane.now
-            await heard(world, lambda: taken_over(world), 2 * SETTINGS.unverified_timeout_s)
+            await until_with_heartbeats(world, lambda: taken_over(world), 2 * SETTINGS.unverified_timeout_s)
             assert world.plane.now - silent_at > SETTINGS.unverified_timeout_s
             assert "has not reported" in world.outcome()
             await world.until(lambda: not world.plane.vehicle.armed)
@@ -91,13 +91,13 @@ def test_short_parameter_outages_do_not_end_mission(tmp_path: Path) -> None:
             world.observer.found()
             await world.up(world.grants.put(spec()))
             for _ in range(3):
-                told = dict(world.plane.parameters)
+                saved = dict(world.plane.parameters)
                 world.plane.parameters.clear()
                 begun = world.plane.now
                 silent_s = 0.7 * SETTINGS.unverified_timeout_s
-                await heard(world, lambda: world.plane.now - begun > silent_s, 2 * silent_s)  # noqa: B023
-                world.plane.parameters |= told
-                await heard(world, lambda: world.observer._unverified_since is None, 60)
+                await until_with_heartbeats(world, lambda: world.plane.now - begun > silent_s, 2 * silent_s)  # noqa: B023
+                world.plane.parameters |= saved
+                await until_with_heartbeats(world, lambda: world.observer._unverified_since is None, 60)
             assert not taken_over(world)
             assert not world.outcome()
 

@@ -1,4 +1,4 @@
-"""A drone that others arm while a driver waits on the ground with it: nothing was prepared for its flight, and it is a pilot's."""
+"""A drone armed by another station while a driver waits belongs to the pilot, because its flight was not prepared."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ def test_drone_armed_by_another_station_belongs_to_pilot(mode: int, tmp_path: Pa
     async def work(sky: Sky, directory: Path) -> None:
         station = Endpoint(255, mavlink.MAV_COMP_ID_MISSIONPLANNER)
 
-        def tell(command: int, *params: float) -> None:
+        def send(command: int, *params: float) -> None:
             values = {f"param{i}": value for i, value in enumerate(params, 1)}
             values |= {"target_system": 1, "target_component": 1, "command": command}
             sky.craft.receive(sky.wires[0]._channel, station.encode("COMMAND_LONG", values))
 
         async with ready(sky, directory) as (drone, grant):
-            tell(mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, mode)
+            send(mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, mode)
             await until(lambda: drone.autopilot.vehicle.mode == ARDUCOPTER.mode(mode))
-            tell(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1)
+            send(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1)
             await until(lambda: drone.autopilot.vehicle.armed)
             await until(lambda: drone.state is StreamState.LOST)
             assert drone.control.authority is Authority.PILOT
@@ -51,7 +51,7 @@ def test_drone_armed_by_another_station_belongs_to_pilot(mode: int, tmp_path: Pa
 
 
 def test_driver_keeps_control_if_link_breaks_before_arming_is_confirmed(tmp_path: Path) -> None:
-    """The autopilot obeys, the link is cut at that moment, and the heartbeat that shows running motors comes seconds later."""
+    """The autopilot arms, the link breaks at that moment, and the armed heartbeat arrives seconds later."""
 
     async def work(sky: Sky, directory: Path) -> None:
         async with ready(sky, directory) as (drone, grant):
@@ -107,7 +107,7 @@ def test_drone_armed_by_others_stays_with_pilot_after_service_restart(mode: Flig
 
 
 def test_rearmed_motors_belong_to_pilot_after_confirmed_disarm(tmp_path: Path) -> None:
-    """The start was answered, and then the motors stopped again: no answer is missing any more."""
+    """The arm command was acknowledged and the motors stopped again, so no acknowledgement is pending."""
 
     async def work() -> None:
         async with World(tmp_path) as world:

@@ -1,4 +1,4 @@
-"""A pilot, or a failsafe, that changes the mode while the system changes it too: the system does not overrule what it hears."""
+"""A pilot changes the mode while the system changes it: the system does not overrule the pilot."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sky_drone import fly, ready, until
 
 
 def lose_mode_changes(wire: Wire, count: int, monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """Let the first changes of mode that the companion sends be lost; the times of all of them, as they are sent."""
+    """Drop the first mode commands of the companion, and return the send times of all of them."""
     write, parser, sent_at = wire.write, Parser(), []
 
     def noted(data: Any) -> None:
@@ -36,7 +36,7 @@ def lose_mode_changes(wire: Wire, count: int, monkeypatch: pytest.MonkeyPatch) -
 def test_pilot_keeps_control_when_taking_over_during_system_mode_change(
     after_s: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The first commands to land are lost: those that follow would come after the pilot's, and the system's would count."""
+    """The first mode commands are lost. Later retries must not override the mode that the pilot chose meanwhile."""
 
     async def work(sky: Sky, directory: Path) -> None:
         async with ready(sky, directory) as (drone, grant):

@@ -1,4 +1,4 @@
-"""Height and speed of the autopilot's own way home: as limits allow while a mission lasts, and as the owner chose after it."""
+"""RTL altitude and speed of the autopilot: limited during a mission, and restored to the owner's values afterwards."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ HELD = {
 
 @pytest.mark.parametrize("restarted", [False, True])
 def test_mission_parameters_are_held_during_mission_and_restored_after(tmp_path: Path, restarted: bool) -> None:
-    def found(world: World) -> dict[str, float]:
+    def current_values(world: World) -> dict[str, float]:
         return {name: world.plane.parameters[name] for name in FLOWN}
 
     async def flight() -> None:
@@ -138,22 +138,22 @@ def test_mission_parameters_are_held_during_mission_and_restored_after(tmp_path:
             world.plane.parameters |= FLOWN
             world.observer.found()
             await world.until(lambda: world.control.checked is not None and not world.control.checked.problem)
-            assert found(world) == FLOWN, "nothing flies yet"
+            assert current_values(world) == FLOWN, "unchanged before the mission"
             grant = world.grants.put(spec())
             await world.up(grant, 8.0)
-            assert found(world) == HELD
+            assert current_values(world) == HELD
             world.plane.parameters["GUID_OPTIONS"] = 16.0
-            await world.until(lambda: found(world) == HELD, 30)
+            await world.until(lambda: current_values(world) == HELD, 30)
             await end(world.service.goto(grant, goto(0, 30, 8.0), 0))
             if not restarted:
                 await world.control.return_control(grant)
                 await world.until(lambda: not world.plane.vehicle.armed)
-                await world.until(lambda: found(world) == FLOWN, 30)
+                await world.until(lambda: current_values(world) == FLOWN, 30)
         if restarted:
             async with World(tmp_path, after=world, known=False) as again:
                 again.observer.found()
                 await again.until(lambda: not again.plane.vehicle.armed)
-                await again.until(lambda: found(again) == FLOWN, 30)
+                await again.until(lambda: current_values(again) == FLOWN, 30)
 
     fly(flight)
 
@@ -203,8 +203,8 @@ def test_rtl_limits_follow_grant_changes_in_flight(tmp_path: Path) -> None:
             world.grants.put(spec(limited("altitude", 12.0, 50, 50, 60, 60), limited("speed", 3.5, 50, 50, 60, 60)))
             await world.until(lambda: held(world) == LOW, 5)
             assert world.gate.situation().airframe.return_altitude_m == 12.0
-            assert world.control.cruise_mps == 10.0, "the zone of the limits is far from where the leg leads"
-            world.plane.parameters["RTL_ALT"] = 3000.0  # by a station whose message was lost
+            assert world.control.cruise_mps == 10.0, "the zone of the limits is far from the leg"
+            world.plane.parameters["RTL_ALT"] = 3000.0  # another station, whose message was lost
             await world.until(lambda: held(world) == LOW, 15)
             world.grants.put(spec())
             await world.until(lambda: held(world) == OWNED | {"RTL_CLIMB_MIN": 0.0}, 5)
@@ -231,7 +231,7 @@ def test_arming_is_refused_if_rtl_speed_cannot_be_limited(tmp_path: Path) -> Non
 
 
 def test_saved_values_with_parameter_names_of_another_firmware_are_ignored(tmp_path: Path) -> None:
-    """Since the file was written, the vehicle got firmware that spells its parameters otherwise."""
+    """The vehicle firmware was updated after the file was written, and its parameters have other names."""
     (tmp_path / "return.json").write_text('{"RTL_ALT_M": 40.0, "WP_SPD": 10.0, "RTL_SPEED_MS": 0.0}')
 
     async def flight() -> None:

@@ -1,4 +1,4 @@
-"""Another station that commands the drone in GUIDED while its driver hovers: the monitor counts how it speeds up."""
+"""Another station commands the drone in GUIDED while its driver hovers. The monitor accounts for the acceleration."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_drone_commanded_by_another_station_stops_before_zone(action: str, tmp_p
     async def work(sky: Sky, directory: Path) -> None:
         station, oracle = Endpoint(255, mavlink.MAV_COMP_ID_MISSIONPLANNER), Oracle(sky, Account(0))
 
-        def tell(name: str, **values: float) -> None:
+        def send(name: str, **values: float) -> None:
             frame = station.encode(name, {"target_system": 1, "target_component": 1, **values})
             sky.craft.receive(sky.wires[0]._channel, frame)
 
@@ -35,16 +35,16 @@ def test_drone_commanded_by_another_station_stops_before_zone(action: str, tmp_p
             await drone.service.arm(grant, 120.0)
             async for _ in drone.service.take_off(grant, TakeoffArgs(15.0)):
                 pass
-            # Longer ago than what the grant was before may matter.
+            # Wait until the previous grant no longer affects the monitor.
             await asyncio.sleep(35.0)
             kept_m: list[float] = []
             sky.witnesses.append(lambda: kept_m.append(WALL.distance(shapely.Point(*oracle.place()[:2]))))
             lat, lon = FRAME.latlon(0.0, 90.0)
-            tell(
+            send(
                 "COMMAND_INT", command=mavlink.MAV_CMD_DO_REPOSITION, frame=mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT, param1=12.0,
                 param4=math.nan, x=round(lat * 1e7), y=round(lon * 1e7), z=15.0,
             )  # fmt: skip
-            tell(
+            send(
                 "COMMAND_LONG",
                 command=mavlink.MAV_CMD_DO_CHANGE_SPEED,
                 param1=mavlink.SPEED_TYPE_GROUNDSPEED,

@@ -1,4 +1,4 @@
-"""Setpoints of a driver: how they follow each other, and how they end."""
+"""Velocity setpoints of a driver: succession, replacement and expiry."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_goto_and_velocity_setpoint_replace_each_other(tmp_path: Path) -> None:
             assert (await flying).verdict.code == "Replaced"
             await end(world.service.goto(grant, goto(30, 30), 0))
             await asyncio.sleep(5)
-            assert math.dist(world.plane.xy, (30, 30)) < 1.5, "the watchdog of the setpoint is gone"
+            assert math.dist(world.plane.xy, (30, 30)) < 1.5, "the watchdog of the setpoint has ended"
 
     fly(flight)
 
@@ -128,7 +128,7 @@ def test_velocity_setpoint_ends_when_driver_opens_second_stream(tmp_path: Path) 
             await world.service.set_velocity(grant, VelocityArgs(4.0, 0.0, hold_s=2.0))
             await world.drive(grant)
             await asyncio.sleep(0.3)
-            assert world.plane.wanted == (0.0, 0.0, 0.0), "no one watches it but us"
+            assert world.plane.wanted == (0.0, 0.0, 0.0), "the old setpoint is stopped"
             assert world.control.motion is None
             await world.service.set_velocity(grant, VelocityArgs(0.0, 2.0, hold_s=0.5))
             assert world.plane.wanted == (2.0, 0.0, 0.0)
@@ -176,7 +176,7 @@ def test_delayed_velocity_setpoint_expires_after_hold_time(tmp_path: Path, monke
             await world.service.set_velocity(grant, VelocityArgs(0.0, 3.0, hold_s=0.5))
             assert world.plane.wanted == (3.0, 0.0, 0.0)
             await asyncio.sleep(0.7)
-            assert world.plane.wanted == (0.0, 0.0, 0.0), "it ran out"
+            assert world.plane.wanted == (0.0, 0.0, 0.0), "the setpoint expired"
 
     fly(flight)
 

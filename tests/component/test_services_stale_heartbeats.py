@@ -1,4 +1,4 @@
-"""Heartbeats from before the start that a network delivers in flight: they have no time stamp, and the drone is still its driver's."""
+"""Heartbeats from before arming that arrive in flight. They carry no timestamp, and must not end control."""
 
 from __future__ import annotations
 

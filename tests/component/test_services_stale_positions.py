@@ -1,4 +1,4 @@
-"""A position from long before that a network delivers in flight: the drone is not there, and does not land as if it were at home."""
+"""A delayed position report from home that arrives in flight must not let the drone land."""
 
 from __future__ import annotations
 

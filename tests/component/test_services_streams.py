@@ -1,4 +1,4 @@
-"""What the service does about an autopilot that restarts, or that another station tells what to send, on a link that does not break."""
+"""An autopilot that reboots, or whose telemetry streams another station stops, on an intact link."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_rebooted_autopilot_gets_failsafes_again_before_arming(tmp_path: Path) -
     async def work(sky: Sky, directory: Path) -> None:
         async with ready(sky, directory) as (drone, grant):
             await until(lambda: sky.simulation.time_s > 20.0)
-            # As a station does that resets all parameters: no message tells.
+            # Another station resets the parameters without any message to the service.
             sky.truth.params.set("SYSID_MYGCS", 255.0)
             sky.truth.params.set("FS_GCS_ENABLE", 0.0)
             before = sky.craft.vehicle

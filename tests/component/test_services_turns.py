@@ -1,4 +1,4 @@
-"""Long computations and floods of calls leave the loop to monitor, watchdog and heartbeats."""
+"""Throttling: long computations and floods of calls do not starve monitor, watchdog and heartbeats."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ WALL = (-40.0, 25.0, 40.0, 40.0)
 
 
 class Clock:
-    """Each look at it costs a millisecond."""
+    """Fake clock that advances by one millisecond with each reading."""
 
     def __init__(self) -> None:
         self.seconds = 0.0
@@ -38,7 +38,7 @@ class Clock:
 
 
 class Context:
-    """A call of one caller."""
+    """Fake gRPC context of one caller."""
 
     def __init__(self, grant: ActiveGrant) -> None:
         self.grant = grant
@@ -50,7 +50,7 @@ class Context:
         return 5.0
 
     async def write(self, message: Any) -> None:
-        """It is never read."""
+        """Discard the message."""
 
     async def abort(self, code: grpc.StatusCode, text: str, metadata: Any) -> None:
         status, why = status_pb2.Status(), error_details_pb2.ErrorInfo()
@@ -74,7 +74,7 @@ def handlers_of(world: World) -> MobilityHandlers:
 
 
 def costly(world: World, method: str, monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """Let each judgement of a method take a tenth of a second of computing; gives when they are made."""
+    """Let each policy check of a method cost 0.1 s of computing, and return the times of the checks."""
     judge, clock, at_s = world.gate.judge, Clock(), list[float]()
     monkeypatch.setattr(authorization, "time", clock)
 
@@ -106,7 +106,7 @@ async def test_long_computation_yields_to_other_tasks(monkeypatch: pytest.Monkey
     task = asyncio.ensure_future(other())
     assert await in_slices(long()) == "done"
     task.cancel()
-    assert turns > 80, "every four milliseconds"
+    assert turns > 80, "it yields every four milliseconds"
 
 
 def test_route_search_uses_fences_changed_during_search(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -125,7 +125,7 @@ def test_route_search_uses_fences_changed_during_search(tmp_path: Path, monkeypa
             monkeypatch.setattr(route_following, "in_slices", slowly)
             await world.drive(grant)
             assert searches > 2
-            assert max(abs(x) for x, _, _ in world.plane.trace) > 41, "around the wall from the first leg on"
+            assert max(abs(x) for x, _, _ in world.plane.trace) > 41, "around the wall from the first leg"
             assert not [e for e in world.kinds("control") if e["action"] == "brake"]
 
     fly(flight)
@@ -231,7 +231,7 @@ def test_throttled_call_is_replaced_by_later_call(world: Callable[[], World], mo
                 return handlers.SetVelocity(mobility_pb2.SetVelocityRequest(velocity=velocity), Context(grant))
 
             async def waiting(*calls: Any) -> list[asyncio.Future[Any]]:
-                """The calls, which came one after the other while a judgement's rest lasts."""
+                """Start calls in this order while the throttle delay of a check lasts."""
                 w.service.calls.check(Call("GetSpeed"), grant)
                 tasks = [asyncio.ensure_future(call) for call in calls]
                 await asyncio.sleep(0.02)

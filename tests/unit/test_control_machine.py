@@ -1,4 +1,4 @@
-"""The state machine of control: what holds in every state that can be reached, and after every event."""
+"""Invariants of the control state machine in every reachable state and after every event."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from dataclasses import replace
 from typing import Any, get_args
 
 from depth import DEEP
-from fractus_core.control import Authority, ControlState, Mission, Outcome, OutcomeKind
-from fractus_core.control import events as told
+from fractus_core.control import Authority, ControlState, Mission, Outcome, OutcomeKind, events
 from fractus_core.control.actions import (
     Action,
     EndStream,
@@ -40,41 +39,41 @@ FACTS = (
     GROUND, ARMED, FLYING, replace(FLYING, mode=LOITER), replace(FLYING, mode=RTL), replace(FLYING, mode=LAND),
     replace(FLYING, mode=RTL, failsafe=True), replace(FLYING, connected=False),
 )  # fmt: skip
-DRIVER, TOUR = told.GrantRef("a", commands_vehicle=True), told.GrantRef("t", commands_vehicle=True)
+DRIVER, TOUR = events.GrantRef("a", commands_vehicle=True), events.GrantRef("t", commands_vehicle=True)
 
-EVENTS: tuple[told.Event, ...] = (
-    told.StreamOpened(1, "a", "A"), told.StreamOpened(2, "b", "B"), told.StreamOpened(3, "a", "A"),
-    told.StreamClosed(1), told.StreamClosed(2), told.StreamClosed(3),
-    told.TransitRequested(1), told.TransitFailed(1, "fault"),
-    told.GrantControl(1), told.GrantControl(2), told.GrantControl(3),
-    told.ControlReturned("a", 1), told.ControlReturned("a", 9), told.ControlReturned("b", 1),
-    told.WaypointsDone("a", 1), told.CruiseSpeedSet(3.0),
-    told.MotionBegan(1, "Goto"), told.MotionBegan(2, "Land"), told.MotionFinished(1), told.MotionFailed(1),
-    told.MotionCancelled(1), told.MotionCancelled(2), told.MotionStopped("Slower", "it is too fast"),
-    told.TakeoverDemanded("hover", "X", "x"), told.TakeoverDemanded("land", "X", "x"),
-    told.TakeoverDemanded("returnToLaunch", "X", "x"), told.TakeoverDemanded("revoke", "X", "x"),
-    told.BrakeDemanded("X", "x"), told.PositionLost("x"), told.PositionFound(),
-    told.GrantChanged(None, DRIVER), told.GrantChanged(DRIVER, None), told.GrantChanged(DRIVER, DRIVER),
-    told.GrantChanged(None, TOUR), told.GrantChanged(TOUR, None),
-    *(told.VehicleObserved(facts) for facts in FACTS),
-    told.VehicleFound(), told.Heartbeat(), told.Airborne(),
-    told.ModeChangeBegan(RTL), told.ModeChangeEnded(RTL, GUIDED, done=False), told.ModeChangeEnded(RTL, GUIDED, done=True),
-    told.ArmingRequested("a", "A", (1.0, 2.0, 3.0)), told.ArmingPrepared(begins=True), told.ArmingPrepared(begins=False),
-    told.MotorStart(begins=True), told.MotorStart(begins=False),
-    told.TransitBegan(1, "a", "A"), told.TransitBegan(2, "t", "T"), told.SystemFlightBegan(3, "a"),
-    told.SystemFlightEnded(1), told.SystemFlightEnded(3),
-    told.TourBegan("t"), told.TourPointVisited("t", 1), told.TourInterrupted("t", "link"),
-    told.TourEnded("t", Outcome(OutcomeKind.COMPLETE)), told.SystemTaskEnded(0, finished=True),
-    told.SystemTaskEnded(0, finished=False), told.PassengerBoarded("t", "T"), told.Tick(),
+EVENTS: tuple[events.Event, ...] = (
+    events.StreamOpened(1, "a", "A"), events.StreamOpened(2, "b", "B"), events.StreamOpened(3, "a", "A"),
+    events.StreamClosed(1), events.StreamClosed(2), events.StreamClosed(3),
+    events.TransitRequested(1), events.TransitFailed(1, "fault"),
+    events.GrantControl(1), events.GrantControl(2), events.GrantControl(3),
+    events.ControlReturned("a", 1), events.ControlReturned("a", 9), events.ControlReturned("b", 1),
+    events.WaypointsDone("a", 1), events.CruiseSpeedSet(3.0),
+    events.MotionBegan(1, "Goto"), events.MotionBegan(2, "Land"), events.MotionFinished(1), events.MotionFailed(1),
+    events.MotionCancelled(1), events.MotionCancelled(2), events.MotionStopped("Slower", "it is too fast"),
+    events.TakeoverDemanded("hover", "X", "x"), events.TakeoverDemanded("land", "X", "x"),
+    events.TakeoverDemanded("returnToLaunch", "X", "x"), events.TakeoverDemanded("revoke", "X", "x"),
+    events.BrakeDemanded("X", "x"), events.PositionLost("x"), events.PositionFound(),
+    events.GrantChanged(None, DRIVER), events.GrantChanged(DRIVER, None), events.GrantChanged(DRIVER, DRIVER),
+    events.GrantChanged(None, TOUR), events.GrantChanged(TOUR, None),
+    *(events.VehicleObserved(facts) for facts in FACTS),
+    events.VehicleFound(), events.Heartbeat(), events.Airborne(),
+    events.ModeChangeBegan(RTL), events.ModeChangeEnded(RTL, GUIDED, done=False), events.ModeChangeEnded(RTL, GUIDED, done=True),
+    events.ArmingRequested("a", "A", (1.0, 2.0, 3.0)), events.ArmingPrepared(begins=True), events.ArmingPrepared(begins=False),
+    events.MotorStart(begins=True), events.MotorStart(begins=False),
+    events.TransitBegan(1, "a", "A"), events.TransitBegan(2, "t", "T"), events.SystemFlightBegan(3, "a"),
+    events.SystemFlightEnded(1), events.SystemFlightEnded(3),
+    events.TourBegan("t"), events.TourPointVisited("t", 1), events.TourInterrupted("t", "link"),
+    events.TourEnded("t", Outcome(OutcomeKind.COMPLETE)), events.SystemTaskEnded(0, finished=True),
+    events.SystemTaskEnded(0, finished=False), events.PassengerBoarded("t", "T"), events.Tick(),
 )  # fmt: skip
 LATE_S = 60.0
-"""Every deadline has come by then."""
+"""Time at which every deadline has expired, in seconds."""
 
-FOUND = transition(ControlState(vehicle=GROUND), told.VehicleFound(), 0.0)[0]
+FOUND = transition(ControlState(vehicle=GROUND), events.VehicleFound(), 0.0)[0]
 
 
-def settled(state: ControlState, now: float) -> ControlState:
-    """The same state as if it were now zero o'clock, and the task were the first: so that states that differ in nothing else meet."""
+def normalized(state: ControlState, now: float) -> ControlState:
+    """Normalize times, task ids and counters of a state, so that states without other differences are equal."""
     grace, motion, task = state.grace, state.motion, state.task
     return replace(
         state,
@@ -94,19 +93,19 @@ def key_of(state: ControlState) -> tuple[Any, ...]:
     return (*(getattr(state, name) for name in state.__slots__ if name != "missions"), *sorted(state.missions.items()))
 
 
-def after(state: ControlState, event: told.Event) -> tuple[ControlState, tuple[Action, ...], ControlState]:
-    """What an event makes of a state: as it is, the actions, and settled."""
-    now = LATE_S if isinstance(event, told.Tick) else 0.0
+def after(state: ControlState, event: events.Event) -> tuple[ControlState, tuple[Action, ...], ControlState]:
+    """Apply an event, check the transition, and return the new state, the actions and the normalized state."""
+    now = LATE_S if isinstance(event, events.Tick) else 0.0
     made, actions = transition(state, event, now)
     check(state, event, made, actions)
-    return made, actions, settled(made, now)
+    return made, actions, normalized(made, now)
 
 
-# What always holds
+# Invariants
 
 
 class Where(tuple[Any, ...]):
-    """A transition, written out only when something is wrong with it."""
+    """Description of a transition. It is formatted only if an assertion fails."""
 
     __slots__ = ()
 
@@ -119,79 +118,79 @@ class Where(tuple[Any, ...]):
         )
 
 
-def check(before: ControlState, event: told.Event, now: ControlState, actions: tuple[Action, ...]) -> None:
-    """Every property of a transition."""
+def check(before: ControlState, event: events.Event, now: ControlState, actions: tuple[Action, ...]) -> None:
+    """Check all invariants of a transition."""
     where = Where(before, event, now, actions)
     if now.granted:
-        assert now.authority is Authority.DRIVER, f"a lease is granted without authority{where}"
+        assert now.authority is Authority.DRIVER, f"a lease is granted without driver authority{where}"
     if now.authority is Authority.DRIVER:
         assert now.lease is not None, f"a driver commands without a lease{where}"
     if before.authority is Authority.PILOT and now.authority is not Authority.PILOT:
-        assert isinstance(event, told.Heartbeat), f"a pilot was overruled{where}"
-    if isinstance(event, told.Tick) and now.decided:
-        assert now.attended, f"an armed vehicle is left alone{where}"
-    if isinstance(event, told.TakeoverDemanded):
+        assert isinstance(event, events.Heartbeat), f"a pilot was overruled{where}"
+    if isinstance(event, events.Tick) and now.decided:
+        assert now.attended, f"an armed vehicle is unattended{where}"
+    if isinstance(event, events.TakeoverDemanded):
         assert now.authority is not Authority.DRIVER, f"a takeover left the driver in command{where}"
     check_tasks(before, event, now, actions, where)
     check_missions(before, now, actions, where)
-    check_told(before, event, now, actions, where)
+    check_notifications(before, event, now, actions, where)
 
 
 def check_tasks(
-    before: ControlState, event: told.Event, now: ControlState, actions: tuple[Action, ...], where: Where
+    before: ControlState, event: events.Event, now: ControlState, actions: tuple[Action, ...], where: Where
 ) -> None:
     started = [action.task for action in actions if isinstance(action, StartSystemTask)]
     assert len(started) <= 1, f"two tasks fly at once{where}"
     if started:
-        assert now.task == started[0], f"what was started is not what counts{where}"
+        assert now.task == started[0], f"the started task is not the current task{where}"
         assert now.authority is Authority.SYSTEM, f"the system flies without authority{where}"
     elif now.task is not None and now.task != before.task:
-        assert isinstance(event, told.TourBegan), f"a task counts that no one started{where}"
+        assert isinstance(event, events.TourBegan), f"a task became current without being started{where}"
     if now.authority is Authority.PILOT:
-        assert now.task is None, f"the system works against a pilot{where}"
+        assert now.task is None, f"a system task runs under pilot authority{where}"
 
 
 def check_missions(before: ControlState, now: ControlState, actions: tuple[Action, ...], where: Where) -> None:
     if now.lease is not None:
         mission = now.missions.get(now.lease.key)
-        assert mission is None or mission.outcome is None, f"a driver waits for a mission that is over{where}"
+        assert mission is None or mission.outcome is None, f"a lease exists for an ended mission{where}"
     for key, mission in before.missions.items():
         if mission.outcome is not None:
-            assert now.missions[key].outcome == mission.outcome, f"a mission that ended goes on{where}"
+            assert now.missions[key].outcome == mission.outcome, f"an ended mission was continued{where}"
     ended = {
         k for k, m in now.missions.items() if m.outcome and (k not in before.missions or not before.missions[k].outcome)
     }
-    assert not ended or SaveJournal() in actions, f"an end is not written down{where}"
+    assert not ended or SaveJournal() in actions, f"a mission end is not saved to the journal{where}"
     if now.grace is not None and now.grace != before.grace:
-        assert now.missions[now.grace.key].outcome is None, f"a mission that ended is waited for{where}"
+        assert now.missions[now.grace.key].outcome is None, f"a grace period is running for an ended mission{where}"
 
 
-def check_told(
-    before: ControlState, event: told.Event, now: ControlState, actions: tuple[Action, ...], where: Where
+def check_notifications(
+    before: ControlState, event: events.Event, now: ControlState, actions: tuple[Action, ...], where: Where
 ) -> None:
-    """Who loses something hears of it."""
+    """Check that streams and motions are notified of their end."""
     lease, motion = before.lease, before.motion
     if lease is not None and (now.lease is None or now.lease.lease_id != lease.lease_id):
-        heard = any(
+        notified = any(
             isinstance(action, EndStream) or (isinstance(action, SendEvent) and action.event.final)
             for action in actions
             if isinstance(action, EndStream | SendEvent) and action.lease_id == lease.lease_id
         )
-        assert heard or event == told.StreamClosed(lease.lease_id), f"a stream was not told of its end{where}"
+        assert notified or event == events.StreamClosed(lease.lease_id), f"a stream was not notified of its end{where}"
     if motion is not None and (now.motion is None or now.motion.motion_id != motion.motion_id):
         stopped = any(isinstance(action, StopMotion) and action.motion_id == motion.motion_id for action in actions)
-        over = event in {told.MotionFinished(motion.motion_id), told.MotionFailed(motion.motion_id)}
-        replaced = isinstance(event, told.MotionBegan)
+        over = event in {events.MotionFinished(motion.motion_id), events.MotionFailed(motion.motion_id)}
+        replaced = isinstance(event, events.MotionBegan)
         assert stopped or over or replaced, f"a motion was not stopped{where}"
 
 
-# Reaching every state
+# Reachable states
 
 
 def reached(depth: int, every: int = 1) -> Iterator[ControlState]:
-    """Every state that is some events away from a vehicle that was found on the ground, or in the air after a restart.
+    """Yield every state within `depth` events of a vehicle found on the ground, or in the air after a restart.
 
-    The last event happens in one of `every` states.
+    The last step expands only one of `every` states.
     """
     flying = replace(FOUND, vehicle=FLYING, armed_seen=True, missions={"a": Mission("a", "A", flown=True)}, active="a")
     frontier = [FOUND, replace(flying, grants=frozenset({"a"})), ControlState(vehicle=FLYING)]
@@ -210,7 +209,7 @@ def reached(depth: int, every: int = 1) -> Iterator[ControlState]:
 
 
 def test_control_events_are_all_covered() -> None:
-    kinds = {kind for union in get_args(told.Event) for kind in (get_args(union) or (union,))}
+    kinds = {kind for union in get_args(events.Event) for kind in (get_args(union) or (union,))}
     assert {type(event) for event in EVENTS} == kinds
 
 
@@ -219,30 +218,30 @@ def test_control_invariants_hold_in_all_states_within_few_events() -> None:
 
 
 @given(st.lists(st.tuples(st.sampled_from(EVENTS), st.sampled_from((0.0, 0.1, 1.0, LATE_S))), max_size=60))
-def test_control_invariants_hold_in_long_histories(history: list[tuple[told.Event, float]]) -> None:
+def test_control_invariants_hold_in_long_histories(history: list[tuple[events.Event, float]]) -> None:
     state, now = FOUND, 0.0
     for event, passed_s in history:
         now += passed_s
         before = state
-        if isinstance(event, told.SystemTaskEnded):
-            event = replace(event, task_id=state.last_task_id)  # noqa: PLW2901 - the one that runs
+        if isinstance(event, events.SystemTaskEnded):
+            event = replace(event, task_id=state.last_task_id)  # noqa: PLW2901 - the running task
         state, actions = transition(before, event, now)
         check(before, event, state, actions)
-        assert (state, actions) == transition(before, event, now), "the same again"
+        assert (state, actions) == transition(before, event, now), "the transition is not deterministic"
 
 
 @given(st.lists(st.sampled_from(EVENTS), max_size=40))
-def test_flying_vehicle_returns_home_without_further_events(history: list[told.Event]) -> None:
+def test_flying_vehicle_returns_home_without_further_events(history: list[events.Event]) -> None:
     state, now = FOUND, 0.0
     for event in history:
         state, _ = transition(state, event, now)
     if not (state.decided and state.vehicle.armed):
         return
-    # Nothing happens any more but time, and what the system started ends as it should.
+    # Only time passes, and started tasks end successfully.
     for _ in range(4):
         now += LATE_S
-        state, _ = transition(state, told.Tick(), now)
+        state, _ = transition(state, events.Tick(), now)
         if state.task is not None and state.task.kind is TaskKind.HOVER:
-            state, _ = transition(state, told.SystemTaskEnded(state.task.task_id, finished=True), now)
+            state, _ = transition(state, events.SystemTaskEnded(state.task.task_id, finished=True), now)
     answered = state.drives or state.authority is Authority.PILOT or state.starting_motors or state.flight is not None
     assert answered or state.returning or state.touring is not None

@@ -1,1 +1,1 @@
-"""The world below a simulated drone: a ground, what moves on it, and the picture that a camera takes of it."""
+"""Camera world: a simulated ground with moving objects, and the pictures that a camera above it takes."""

@@ -57,7 +57,12 @@ def _origin(_context: click.Context, _option: click.Parameter, text: str | None)
 
 @click.command()
 @click.option(
-    "--listen", callback=_listen, default=DEFAULT_LISTEN, show_default=True, metavar="HOST:PORT", help="Where to serve."
+    "--listen",
+    callback=_listen,
+    default=DEFAULT_LISTEN,
+    show_default=True,
+    metavar="HOST:PORT",
+    help="HOST:PORT to serve at.",
 )
 @click.option(
     "--vehicle",
@@ -70,13 +75,13 @@ def _origin(_context: click.Context, _option: click.Parameter, text: str | None)
     "--pose",
     callback=_pose,
     metavar="LAT,LON,HEIGHT[,HEADING[,PITCH[,ROLL]]]",
-    help="A camera that stays where it is, HEIGHT metres above the ground; instead of --vehicle.",
+    help="Use a fixed camera HEIGHT metres above the ground instead of --vehicle.",
 )
 @click.option(
     "--ground",
     "ground_amsl_m",
     type=float,
-    help="Altitude of the ground above mean sea level, metres; by default the vehicle's home is on it.",
+    help="Ground altitude above mean sea level, metres. Default: altitude of the vehicle's home.",
 )
 @click.option(
     "--fov", "fov_deg", type=float, default=62.2, show_default=True, help="Horizontal field of view, degrees."
@@ -85,20 +90,20 @@ def _origin(_context: click.Context, _option: click.Parameter, text: str | None)
     "--resolution", callback=_resolution, default="1920x1080", show_default=True, help="Pixels, WIDTHxHEIGHT."
 )
 @click.option(
-    "--mount-pitch", "mount_pitch_deg", type=float, default=-90.0, show_default=True, help="-90 looks down, 0 ahead."
+    "--mount-pitch", "mount_pitch_deg", type=float, default=-90.0, show_default=True, help="-90 is down, 0 is ahead."
 )
 @click.option(
     "--mount-yaw", "mount_yaw_deg", type=float, default=0.0, show_default=True, help="Clockwise from the nose."
 )
 @click.option(
-    "--stabilised/--fixed-mount", default=True, show_default=True, help="Whether a gimbal takes roll and pitch away."
+    "--stabilised/--fixed-mount", default=True, show_default=True, help="A gimbal compensates roll and pitch."
 )
 @click.option("--seed", type=int, default=7, show_default=True, help="Seed of the landscape and of all that moves.")
 @click.option(
     "--origin",
     callback=_origin,
     metavar="LAT,LON",
-    help="Middle of the landscape; cameras that share a world share it.  [default: the first position, to 0.1 degrees]",
+    help="Centre of the landscape. Cameras with the same centre share a world.  [default: the first position, to 0.1 degrees]",
 )
 @click.option(
     "--orthophoto",
@@ -132,7 +137,7 @@ def camera_world(
     crs: str | None,
     photos: Path | None,
 ) -> None:
-    """Serve what a camera above a simulated world sees: /snapshot.jpg, /truth.json, /orthophoto.png."""
+    """Serve the pictures of a camera above a simulated world: /snapshot.jpg, /truth.json, /orthophoto.png."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     from fractus_world.camera_api import CameraApi  # noqa: PLC0415 - the command line stays quick
     from fractus_world.photos import Photos  # noqa: PLC0415

@@ -1,6 +1,6 @@
-"""Photographed faces on billboards, upright beside roads or lying on the ground, for components that find or hide them.
+"""Billboards with photographed faces, upright beside roads or lying on the ground, for face detection.
 
-The photograph is scikit-image's packaged portrait of Eileen Collins, which NASA put into the public domain.
+The photograph is scikit-image's packaged portrait of Eileen Collins by NASA (public domain).
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ _FACE = (180, 72, 272, 186)
 """Left, top, right, bottom of the face in the photograph, from hairline to chin."""
 _ASPECT = (_CROP[2] - _CROP[0]) / (_CROP[3] - _CROP[1])
 _FEET_M = 1.2
-"""How far an upright billboard's lower edge is above the ground."""
+"""Height of an upright billboard's lower edge above the ground."""
 
 
 @dataclass(frozen=True, slots=True)
 class Billboard:
-    """A picture with a face.
+    """A billboard with a photographed face.
 
     Attributes:
-        id: The same in every picture.
-        x: Metres east of the world's origin, of the middle of its lower edge.
+        id: Identical in every picture.
+        x: Metres east of the world's origin, middle of the lower edge.
         y: Metres north.
-        heading_deg: Upright: the way it faces. Lying: the way the top of the picture points.
-        standing: Whether it stands.
-        height_m: Of the picture.
-        variation: Which of the variations of the photograph it shows.
+        heading_deg: Upright: direction that the front faces. Lying: direction of the top edge.
+        standing: True if the billboard is upright.
+        height_m: Height of the picture.
+        variation: Index of the variation of the photograph.
     """
 
     id: str
@@ -68,27 +68,27 @@ class Billboard:
         right = np.array([math.cos(angle), -math.sin(angle), 0.0])
         up, base = ahead, np.array([self.x, self.y, 0.02])
         if self.standing:
-            # Who looks at it sees its right on his left.
+            # A viewer in front of the billboard sees its right side on the left.
             right, up, base = -right, np.array([0.0, 0.0, 1.0]), np.array([self.x, self.y, _FEET_M])
         width = self.height_m * _ASPECT
         return np.array([base + (u - 0.5) * width * right + (1.0 - v) * self.height_m * up for u, v in shares])
 
     def faces(self, viewer: Matrix) -> bool:
-        """Whether a viewer at a point of the world's frame, shape (3,), looks at its front."""
+        """Return True if a viewer at a point of the world's frame, shape (3,), sees the front."""
         corners = self.corners()
         front = np.cross(corners[3] - corners[0], corners[1] - corners[0])
         return bool(front @ (viewer - corners[0]) > 0.0)
 
 
 class Billboards(Protocol):
-    """Tells where billboards are."""
+    """Provides the positions of billboards."""
 
     def within(self, box: Matrix) -> list[Billboard]:
         """The billboards in a box ((x0, y0), (x1, y1))."""
 
 
 class BillboardsAroundOrigin:
-    """Six billboards within a hundred metres of a world's origin; what a picture of the user's gets."""
+    """Six billboards within 100 m of a world's origin, for worlds made from a picture of the user."""
 
     def __init__(self, seed: int) -> None:
         self._boards = []
@@ -105,7 +105,7 @@ class BillboardsAroundOrigin:
 
 
 class LandscapeBillboards:
-    """Billboards beside main roads and in parks and meadows of a procedural landscape."""
+    """Billboards beside main roads, and in parks and meadows of a procedural landscape."""
 
     def __init__(self, roads: Roads, blocks: Blocks) -> None:
         self._roads = roads
@@ -132,7 +132,7 @@ class LandscapeBillboards:
         return [Billboard(f"face-lawn-{i}_{j}", x, y, 360.0 * draws[3], False, size, int(97 * draws[2]) % VARIATIONS)]
 
     def _beside(self, road: Road, step: int) -> Billboard:
-        """A billboard that those who drive on the right see ahead of them."""
+        """Return a billboard that is visible to traffic that drives on the right."""
         family = 1 if road.family == "east" else 2
         draw = unit(self._roads.seed, 74, family, road.index, step)
         x, y, dx, dy = self._roads.at(road, step + 0.3 + 0.4 * draw)
@@ -149,7 +149,7 @@ def _in(board: Billboard, box: Matrix) -> bool:
 
 
 def face_box(variation: int) -> tuple[float, float, float, float]:
-    """Where the face is in the picture of a variation: left, top, right, bottom as shares."""
+    """Return the position of the face in the picture of a variation: left, top, right, bottom as shares."""
     wide, high = _CROP[2] - _CROP[0], _CROP[3] - _CROP[1]
     left, right = (_FACE[0] - _CROP[0]) / wide, (_FACE[2] - _CROP[0]) / wide
     if variation % 2:
@@ -174,7 +174,7 @@ def _portrait(variation: int) -> Picture:
 
 @lru_cache(maxsize=8 * VARIATIONS)
 def portrait(variation: int, halvings: int) -> Picture:
-    """A variation of the photograph, made smaller by halves, for what is far away."""
+    """Return a variation of the photograph, reduced by powers of two for large distances."""
     whole = _portrait(variation)
     height, width = max(whole.shape[0] >> halvings, 2), max(whole.shape[1] >> halvings, 2)
     return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.uint8)

@@ -1,4 +1,4 @@
-"""One mesh of the road network and what lies in it: ground, buildings, trees, parked cars."""
+"""A block: one mesh of the road network with ground, buildings, trees and parked cars."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ Colour = tuple[int, int, int]
 
 @dataclass(frozen=True, slots=True)
 class Patch:
-    """A piece of ground of one kind.
+    """An area of one ground type.
 
     Attributes:
-        outline: Its corners, metres, shape (n, 2).
+        outline: Corners, metres, shape (n, 2).
         colour: Blue, green, red.
-        rough: How uneven it looks, from 0 to 255.
-        rows_deg: The way that rows of a crop lead, clockwise from north; None where nothing is sown.
+        rough: Strength of the texture, from 0 to 255.
+        rows_deg: Direction of crop rows, clockwise from north. None without crop.
     """
 
     outline: Points
@@ -33,13 +33,13 @@ class Patch:
 
 @dataclass(frozen=True, slots=True)
 class Roof:
-    """A building from above.
+    """Top view of a building.
 
     Attributes:
-        corners: Four corners; the ridge is parallel to the side from the first to the second.
-        height_m: Above the ground, for its shadow.
+        corners: Four corners. The ridge is parallel to the side from the first to the second.
+        height_m: Height above the ground, for its shadow.
         colour: Blue, green, red.
-        gabled: Whether it has a ridge.
+        gabled: True if the roof has a ridge.
     """
 
     corners: Points
@@ -50,7 +50,7 @@ class Roof:
 
 @dataclass(frozen=True, slots=True)
 class Parking:
-    """A place where a car stands."""
+    """A parking position of a car."""
 
     x: float
     y: float
@@ -62,11 +62,11 @@ class Block:
     """One mesh of the road network.
 
     Attributes:
-        kind: What it is used for.
-        outline: The middle lines of the roads around it.
-        patches: Pieces of ground, those that lie above others last.
+        kind: Land use.
+        outline: Centre lines of the surrounding roads.
+        patches: Ground areas in drawing order.
         roofs: Buildings.
-        trees: x, y, radius of the crown in metres and a number that picks its looks, shape (n, 4).
+        trees: x, y and crown radius in metres, and a number that selects the appearance, shape (n, 4).
         parked: Parked cars.
     """
 

@@ -1,4 +1,4 @@
-"""What lies between the roads of a seed: a kind for each block, laid out when it is first asked for."""
+"""Blocks between the roads of a seed. Each block is generated when it is first requested."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from fractus_world.randomness import dice, unit
 from fractus_world.roads import Road, Roads, cell
 
 _REACH = 0.5 + 0.2 + 0.1
-"""How far from its middle a block may reach, in cells: half a cell, the jitter of vertices, the curve of roads."""
+"""Maximum extent of a block from its centre, in cells: half a cell, the vertex jitter, and the curvature of roads."""
 
 
 class Blocks:
-    """The blocks of a seed; each is laid out when it is first asked for."""
+    """Blocks of a seed. Each block is generated when it is first requested."""
 
     def __init__(self, roads: Roads) -> None:
         self.roads = roads
         self.block = lru_cache(maxsize=256)(self._block)
 
     def kind(self, i: int, j: int) -> Kind:
-        """What a block is used for."""
+        """Return the land use of a block."""
         draw = unit(self.roads.seed, 11, i, j)
         if self.roads.town(i, j):
             return "houses" if draw < 0.74 or (i, j) == (0, 0) else "works" if draw < 0.88 else "park"
         return "fields" if draw < 0.66 else "wood" if draw < 0.82 else "meadow"
 
     def crop(self, i: int, j: int) -> Colour:
-        """What grows on the first of a block's fields."""
+        """Return the crop of a block's first field."""
         return CROPS[int(len(CROPS) * unit(self.roads.seed, 13, i, j))]
 
     def _block(self, i: int, j: int) -> Block:

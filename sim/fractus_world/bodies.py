@@ -49,10 +49,10 @@ class Part:
     """A convex part of a body.
 
     Attributes:
-        points: Corners: metres ahead, to the right and up, shape (n, 3).
+        points: Corners in metres ahead, to the right and up, shape (n, 3).
         colour: Blue, green, red.
         warmth: Grey value for a thermal camera.
-        detail: Left out where the body is only a few pixels long.
+        detail: True if the part is omitted when the body is only a few pixels long.
     """
 
     points: Points
@@ -71,7 +71,7 @@ def parts_of(thing: Thing) -> tuple[Part, ...]:
 
 
 def _outline(length: float, width: float, *, nose: float = 0.0, round_m: float = 0.3) -> Points:
-    """A rectangle with cut corners around the origin; `nose` moves it ahead."""
+    """Return a rectangle with cut corners around the origin. `nose` shifts it ahead."""
     a, b, c = length / 2, width / 2, round_m
     corners = [(a - c, b), (a, b - c), (a, c - b), (a - c, -b), (c - a, -b), (-a, c - b), (-a, b - c), (c - a, b)]
     return _moved(np.array(corners), nose, 0.0)

@@ -1,4 +1,4 @@
-"""The API of the simulated camera: pictures, what they show, and a map; no sockets."""
+"""HTTP API of the simulated camera without sockets: pictures, their ground truth, and a map."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ MAX_WAITING = 8
 MAX_SNAPSHOT_PX = 16_000_000
 KEPT_SNAPSHOTS = 64
 JPEG_QUALITY = 90
-_NO_POSE = "the vehicle has not told its position; is it switched on, and has it a GPS fix?"
+_NO_POSE = "the position of the vehicle is unknown; check that it is powered on and has a GPS fix"
 
 
 class RequestError(Exception):
-    """A request that gets no answer but a reason.
+    """A rejected request.
 
     Args:
         status: HTTP status.
-        reason: One sentence.
+        reason: Reason in one sentence.
     """
 
     def __init__(self, status: HTTPStatus, reason: str) -> None:
@@ -66,14 +66,14 @@ class Response:
 
 
 class CameraApi:
-    """Answers requests.
+    """Handles requests.
 
     Args:
-        world: What there is to see.
-        poses: Tells where the camera is.
-        intrinsics: The camera's own lens and resolution.
-        mount: How it sits on the airframe, unless a gimbal reports.
-        now: Unix seconds, for what moves.
+        world: World to show.
+        poses: Provides the camera position.
+        intrinsics: Lens and resolution of the camera.
+        mount: Mount on the airframe, unless a gimbal reports its attitude.
+        now: Returns Unix seconds for moving objects.
         photos: Photographs to show instead of the world.
     """
 
@@ -100,10 +100,10 @@ class CameraApi:
         self._waiting = threading.BoundedSemaphore(MAX_WAITING)
 
     def answer(self, path: str, query: dict[str, str]) -> Response:
-        """The answer to a GET request.
+        """Handle a GET request.
 
         Raises:
-            RequestError: There is no such page, a parameter is wrong, or there is nothing to show now.
+            RequestError: The page does not exist, a parameter is invalid, or no picture is available now.
         """
         pages: dict[str, Callable[[dict[str, str]], Response]] = {
             "/": self._index,
@@ -114,7 +114,7 @@ class CameraApi:
         }
         page = pages.get(path)
         if page is None:
-            raise RequestError(HTTPStatus.NOT_FOUND, f"there is no {path}; there are {', '.join(pages)}")
+            raise RequestError(HTTPStatus.NOT_FOUND, f"unknown page {path}; available: {', '.join(pages)}")
         try:
             return page(query)
         except ValueError as error:
@@ -228,7 +228,7 @@ class _RenderSlot:
 
     def __enter__(self) -> None:
         if not self._waiting.acquire(blocking=False):
-            raise RequestError(HTTPStatus.SERVICE_UNAVAILABLE, "too many pictures are being asked for; try again")
+            raise RequestError(HTTPStatus.SERVICE_UNAVAILABLE, "too many concurrent requests; try again")
         if not self._busy.acquire(timeout=RENDER_WAIT_S):
             self._waiting.release()
             raise RequestError(HTTPStatus.SERVICE_UNAVAILABLE, "the pictures before this one take too long; try again")

@@ -1,4 +1,4 @@
-"""Where the pixels of a picture lie on the earth: world files and GeoTIFF tags, in degrees, a projected system or metres around a place."""
+"""Georeferences of pictures: world files and GeoTIFF tags, in degrees, projected, or local coordinates."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _WORLD_FILES = {".png": ".pgw", ".jpg": ".jgw", ".jpeg": ".jgw", ".tif": ".tfw",
 
 
 class GeoreferenceError(ValueError):
-    """A picture that does not say where it lies."""
+    """The picture has no valid georeference."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,10 +38,10 @@ class Degrees:
 
 
 class Projected:
-    """Eastings and northings of a projected system of the EPSG registry, such as a UTM zone, by PROJ.
+    """Eastings and northings of a projected EPSG system, such as a UTM zone, computed by PROJ.
 
     Raises:
-        GeoreferenceError: There is none of that code.
+        GeoreferenceError: The code is unknown.
     """
 
     def __init__(self, code: int) -> None:
@@ -112,10 +112,10 @@ class Georeference:
 
 
 def parse_system(text: str, origin: tuple[float, float] | None) -> System:
-    """The system of an `EPSG:` code, or `local` for metres around an origin.
+    """Return the system of an `EPSG:` code, or `local` for metres around an origin.
 
     Raises:
-        GeoreferenceError: It is another, or `local` without an origin.
+        GeoreferenceError: The system is not supported, or `local` has no origin.
     """
     if text.lower() == "local":
         if origin is None:
@@ -132,28 +132,28 @@ def _system_of(code: int) -> System:
 
 
 def read_world_file(picture: Path, system: System) -> Georeference:
-    """The mapping that the world file beside a picture gives.
+    """Read the mapping of the world file next to a picture.
 
     Raises:
-        GeoreferenceError: There is none, or it is broken.
+        GeoreferenceError: The world file is missing or invalid.
     """
     names = [picture.with_suffix(suffix) for suffix in (_WORLD_FILES.get(picture.suffix.lower(), ".wld"), ".wld")]
     found = next((name for name in names if name.is_file()), None)
     if found is None:
-        raise GeoreferenceError(f"{picture}: has no world file; put {names[0].name} beside it")
+        raise GeoreferenceError(f"{picture}: no world file; store {names[0].name} in the same folder")
     try:
         a, d, b, e, c, f = (float(line) for line in found.read_text(encoding="ascii").split())
     except (ValueError, OSError) as error:
         raise GeoreferenceError(f"{found}: a world file has six lines of one number each: {error}") from error
-    # A world file tells of the middle of the first pixel.
+    # A world file refers to the centre of the first pixel.
     return _checked(np.array([[a, b, c - a / 2 - b / 2], [d, e, f - d / 2 - e / 2]]), system, str(found))
 
 
 def from_geotiff(tags: Mapping[str, Any], source: str, origin: tuple[float, float] | None) -> Georeference:
-    """The mapping that the tags of a GeoTIFF give, as tifffile reads them (`TiffFile.geotiff_metadata`).
+    """Return the mapping of GeoTIFF tags as read by tifffile (`TiffFile.geotiff_metadata`).
 
     Raises:
-        GeoreferenceError: They are missing or say what is not supported.
+        GeoreferenceError: The tags are missing or not supported.
     """
     code = tags.get("ProjectedCSTypeGeoKey") or tags.get("GeographicTypeGeoKey")
     number = getattr(code, "value", code)

@@ -1,4 +1,4 @@
-"""How blocks of each kind are laid out: fields, woods, meadows, houses with gardens, works, parks."""
+"""Layout of blocks by land use: fields, woods, meadows, houses with gardens, industry, parks."""
 
 from __future__ import annotations
 
@@ -42,15 +42,15 @@ _LAWN: Colour = (70, 116, 92)
 
 @dataclass(slots=True)
 class Site:
-    """A block being laid out.
+    """A block during its layout.
 
     Attributes:
-        block: What there is so far.
-        inside: Its ground without roads and verges.
-        roll: Its chance.
-        crop: What grows on its first field.
-        trees: As in `Block`, still a list.
-        built: Where houses stand.
+        block: Current content.
+        inside: Ground without roads and verges.
+        roll: Random source.
+        crop: Crop of the first field.
+        trees: As in `Block`, but as a list.
+        built: Areas of houses.
     """
 
     block: Block
@@ -63,14 +63,14 @@ class Site:
 
 @dataclass(frozen=True, slots=True)
 class _Frontage:
-    """A point at a road, with the directions along it and away from it into the block."""
+    """A point at a road with the directions along the road and away from it into the block."""
 
     origin: tuple[float, float]
     along: tuple[float, float]
     away: tuple[float, float]
 
     def box(self, a0: float, n0: float, a1: float, n1: float) -> shapely.Polygon:
-        """A rectangle between two distances along the road and two away from it."""
+        """Return a rectangle between two distances along the road and two distances away from it."""
         (x, y), (ax, ay), (nx, ny) = self.origin, self.along, self.away
         corners = ((a0, n0), (a1, n0), (a1, n1), (a0, n1))
         return shapely.Polygon([(x + a * ax + n * nx, y + a * ay + n * ny) for a, n in corners])
@@ -230,7 +230,7 @@ def _houses(site: Site) -> None:
 
 
 def _row(site: Site, ground: shapely.Polygon) -> list[shapely.Geometry]:
-    """Put houses around a piece of ground; returns where hedges could be."""
+    """Place houses around an area. Return possible positions of hedges."""
     hedges: list[shapely.Geometry] = []
     ring, roll = ground.exterior, site.roll
     at = roll.uniform(4.0, 12.0)

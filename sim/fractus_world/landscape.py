@@ -72,7 +72,7 @@ class Landscape:
         return np.asarray(cv2.LUT(drawing.colour, _LIGHT), np.uint8)
 
     def _from_afar(self, drawing: TileDrawing, near: list[tuple[int, int]]) -> None:
-        """Only what shows from kilometres away: what each block is used for, with straight borders."""
+        """Draw only what is visible from kilometres away: the land use of each block with straight borders."""
         vertex = self.roads.vertex
         for i, j in near:
             kind = self.blocks.kind(i, j)
@@ -100,7 +100,7 @@ class Landscape:
                 _marks(drawing, self.roads.edge(road, step), self.roads.width_m(road, step), road.main)
 
     def _carriageway(self, drawing: TileDrawing, road: Road, step: int, *, paved: bool) -> None:
-        """One piece of road: first what lies beside it, then, over the verges of its neighbours, its surface."""
+        """Draw one road segment: first its verges, then its surface over the verges of its neighbours."""
         edge, half = lengthened(self.roads.edge(road, step), 2.5), self.roads.width_m(road, step) / 2
         built_up = self.roads.built_up(road, step)
         if not paved:
@@ -195,7 +195,7 @@ def _marks(drawing: TileDrawing, edge: Points, width_m: float, main: bool) -> No
 
 
 def _stand_up(drawing: TileDrawing, blocks: list[Block]) -> None:
-    """What is higher than the ground, after its shadow."""
+    """Draw raised objects after their shadows."""
     roofs = [block.roofs[index] for block in blocks for index in drawing.within(block.roof_boxes, 10.0)]
     trees = _trees(drawing, blocks) if drawing.pixel_m <= _TREES_DOWN_TO_M else np.empty((0, 4))
     for roof in roofs:

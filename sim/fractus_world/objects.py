@@ -1,4 +1,4 @@
-"""Draws what stands and moves on the ground into a picture, and finds out what of it can be seen."""
+"""Drawing of objects on the ground, and computation of their visible parts."""
 
 from __future__ import annotations
 
@@ -55,14 +55,14 @@ class _Shape:
 
 @dataclass(frozen=True, slots=True)
 class _InSight:
-    """A thing or billboard in sight.
+    """A visible object or billboard.
 
     Attributes:
-        what: The thing or billboard.
-        away_m: From the camera; what is nearer covers what is farther.
-        shapes: Its parts as they are drawn; a billboard's one.
-        shadow: Its shadow in fixed-point pixels; None when it has none or a corner of it is out of sight.
-        points: All its corners in pixels.
+        what: The object or billboard.
+        away_m: Distance from the camera. Nearer objects cover farther ones.
+        shapes: Drawn parts. A billboard has one.
+        shadow: Shadow in fixed-point pixels. None without shadow or if one of its corners is out of sight.
+        points: All corners in pixels.
     """
 
     what: Thing | Billboard
@@ -73,14 +73,14 @@ class _InSight:
 
 
 class ObjectLayer:
-    """What stands and moves on a ground."""
+    """Objects on a ground."""
 
     def __init__(self, population: Population, gallery: Billboards) -> None:
         self._population = population
         self._gallery = gallery
 
     def in_sight(self, view: View, time_s: float, hidden: frozenset[str] = frozenset()) -> list[_InSight]:
-        """What is in sight at a time, the farthest first."""
+        """Return the visible objects at a time, the farthest first."""
         box = view.ground_within(_REACH * view.intrinsics.focal_px)
         if box is None:
             return []
@@ -92,7 +92,7 @@ class ObjectLayer:
         return sorted(in_sight, key=lambda item: (-item.away_m, item.what.id))
 
     def draw(self, picture: Picture, view: View, in_sight: list[_InSight], band: Band) -> None:
-        """Draw what is in sight."""
+        """Draw the visible objects."""
         if band == "rgb":
             for item in in_sight:
                 if item.shadow is not None:
@@ -107,7 +107,7 @@ class ObjectLayer:
     def truth(
         self, view: View, in_sight: list[_InSight], frame: LocalFrame
     ) -> tuple[tuple[Seen, ...], tuple[SeenFace, ...]]:
-        """What of each can be seen."""
+        """Return the visible share of each object."""
         lens = view.intrinsics
         labels = np.zeros((lens.height, lens.width), np.int32)
         for number, item in enumerate(in_sight, start=1):
@@ -160,7 +160,7 @@ def _thing_actors(view: View, things: list[Thing]) -> list[_InSight]:
 
 
 def _parts(thing: Thing, size_px: float) -> tuple[Part, ...]:
-    """The parts that show at a size; of what is only a few pixels long, its silhouette."""
+    """Return the parts to draw at a size. Bodies of a few pixels are drawn as a silhouette."""
     if size_px < _SILHOUETTE_PX:
         return silhouette(thing)
     parts = parts_of(thing)
@@ -231,7 +231,7 @@ def _fill(picture: Picture, shape: _Shape, band: Band) -> None:
 
 
 def _clip(low: Matrix, high: Matrix, shape: tuple[int, ...]) -> tuple[int, int, int, int] | None:
-    """The whole pixels of a picture that a box touches; None when there are none."""
+    """Return the whole pixels of a picture that a box touches, or None."""
     x0, y0 = max(math.floor(low[0]) - 1, 0), max(math.floor(low[1]) - 1, 0)
     x1, y1 = min(math.ceil(high[0]) + 1, shape[1]), min(math.ceil(high[1]) + 1, shape[0])
     return None if x0 >= x1 or y0 >= y1 else (x0, y0, x1, y1)
@@ -305,7 +305,7 @@ def _box(points: Matrix, view: View) -> Box | None:
 
 
 def _shares(view: View, hulls: Iterable[Fixed], labels: Labels, number: int) -> tuple[float, float]:
-    """Which share of some hulls is in the picture, and which is also labelled with a number."""
+    """Return the share of hulls inside the picture, and the share that is also labelled with a number."""
     pieces = list(hulls)
     points = np.vstack(pieces)[:, 0, :] / (1 << _SHIFT)
     low, high = np.floor(points.min(axis=0)) - 1, np.ceil(points.max(axis=0)) + 2

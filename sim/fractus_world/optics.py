@@ -1,8 +1,8 @@
-"""Where a camera looks: position, attitude, mount and lens, as one mapping between the ground and pixels.
+"""Camera geometry: position, attitude, mount and lens as one mapping between ground and pixels.
 
-Frames: the ground is the plane through the point below the camera, in metres east and north of it; directions are east,
-north, up. Pixel coordinates have their origin in the upper left corner of the picture, so that the middle of the first
-pixel is at (0.5, 0.5).
+Frames: the ground is the plane through the point below the camera, in metres east and north of it. Directions are east,
+north, up. Pixel coordinates have their origin in the upper left corner of the picture, so the centre of the first pixel
+is (0.5, 0.5).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Matrix = NDArray[np.float64]
 MIN_HEIGHT_M = 0.2
 MAX_PIXELS = 8192
 NEAR_M = 0.3
-"""Nothing nearer than this along the optical axis is drawn."""
+"""Near limit along the optical axis."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,12 +51,12 @@ class Intrinsics:
 
 @dataclass(frozen=True, slots=True)
 class Mount:
-    """How the camera sits on the airframe.
+    """Mount of the camera on the airframe.
 
     Attributes:
-        pitch_deg: -90 looks straight down (the top of the picture is ahead), 0 looks ahead.
+        pitch_deg: -90 is straight down (the top of the picture is ahead), 0 is ahead.
         yaw_deg: Clockwise from the airframe's nose.
-        stabilised: Whether a gimbal takes the airframe's roll and pitch away.
+        stabilised: True if a gimbal compensates roll and pitch of the airframe.
     """
 
     pitch_deg: float = -90.0
@@ -72,12 +72,12 @@ class Mount:
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Where the airframe is and how it lies in the air.
+    """Position and attitude of the airframe.
 
     Attributes:
         lat: Latitude, degrees (WGS 84).
         lon: Longitude, degrees (WGS 84).
-        height_m: Above the ground.
+        height_m: Height above the ground.
         roll_deg: Right side down is positive.
         pitch_deg: Nose up is positive.
         yaw_deg: Heading, clockwise from true north.
@@ -129,7 +129,7 @@ def camera_rotation(pose: Pose, mount: Mount) -> Matrix:
 
 
 def plane_turn(frame: LocalFrame, lat: float, lon: float) -> Matrix:
-    """What one metre east and north at a place are in metres east and north of a frame; north differs from place to place."""
+    """Return one metre east and north at a place as vectors of a frame, because north differs between places."""
     phi, origin = math.radians(lat), math.radians(frame.lat)
     apart = math.radians(lon - frame.lon)
     return np.array(
@@ -145,15 +145,15 @@ def plane_turn(frame: LocalFrame, lat: float, lon: float) -> Matrix:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """One picture's geometry.
+    """Geometry of one picture.
 
     Attributes:
-        intrinsics: The lens.
-        rotation: Camera axes to east, north, up.
-        height_m: Of the camera above the ground.
-        place: Metres east and north of the world's origin, of the point below the camera.
-        turn: What a metre east and north at the camera are in the world's frame.
-        unturn: The inverse of that.
+        intrinsics: Lens.
+        rotation: Rotation from camera axes to east, north, up.
+        height_m: Height of the camera above the ground.
+        place: Point below the camera, metres east and north of the world's origin.
+        turn: One metre east and north at the camera as vectors of the world's frame.
+        unturn: Inverse of `turn`.
     """
 
     intrinsics: Intrinsics

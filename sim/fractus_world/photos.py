@@ -37,11 +37,11 @@ class Photo:
     """A geotagged picture.
 
     Attributes:
-        path: The file.
+        path: File.
         lat: Latitude, degrees.
         lon: Longitude, degrees.
-        amsl_m: Altitude above mean sea level; 0 where the file does not tell.
-        band: What it was taken in.
+        amsl_m: Altitude above mean sea level. 0 if the file does not contain it.
+        band: Daylight or thermal.
     """
 
     path: Path
@@ -52,16 +52,16 @@ class Photo:
 
 
 class Photos:
-    """An index of geotagged pictures, of daylight and thermal ones apart.
+    """Index of geotagged pictures, separate for daylight and thermal.
 
-    A file is thermal when a folder on its path below the directory is called `ir` or `thermal`, or when its name ends in
-    `_ir`, `-ir`, `_thermal` or `_T` (as drones of DJI name them).
+    A picture is thermal if a folder in its path below the directory is named `ir` or `thermal`, or if its name ends in
+    `_ir`, `-ir`, `_thermal` or `_T` (DJI).
 
     Args:
         photos: The pictures.
 
     Raises:
-        PhotoError: There are none.
+        PhotoError: There are no pictures.
     """
 
     def __init__(self, photos: list[Photo]) -> None:
@@ -77,10 +77,10 @@ class Photos:
 
     @classmethod
     def of(cls, directory: Path) -> Photos:
-        """Index a directory and everything below it.
+        """Index a directory recursively.
 
         Raises:
-            PhotoError: It does not exist, is too large, or holds no geotagged picture.
+            PhotoError: The directory does not exist, is too large, or contains no geotagged picture.
         """
         if not directory.is_dir():
             raise PhotoError(f"{directory}: is no directory")
@@ -93,14 +93,14 @@ class Photos:
         return cls(found)
 
     def nearest(self, lat: float, lon: float, amsl_m: float, band: Band) -> tuple[Photo, float]:
-        """The picture of a band taken nearest to a place in three dimensions, and how far away, metres.
+        """Return the picture of a band that is closest to a place in three dimensions, and its distance in metres.
 
         Raises:
             PhotoError: There is no picture of the band.
         """
         tree = self._trees.get(band)
         if tree is None:
-            raise PhotoError(f"band: there is no {band} picture")
+            raise PhotoError(f"band: no {band} picture available")
         away, index = tree.query(_cartesian(lat, lon, amsl_m))
         return self._bands[band][int(index)], float(away)
 
@@ -139,10 +139,10 @@ def _angle(parts: Any, reference: Any, negative: str) -> float:
 
 
 def resized(photo: Photo, width: int, height: int) -> Picture:
-    """A photograph in a size, shape (height, width, 3); what does not fit its shape is cut off at the edges.
+    """Return a photograph in a size, shape (height, width, 3), cropped to the aspect ratio.
 
     Raises:
-        PhotoError: The file cannot be read any more.
+        PhotoError: The file cannot be read any longer.
     """
     try:
         with Image.open(photo.path) as image:

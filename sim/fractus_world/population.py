@@ -1,4 +1,4 @@
-"""Who and what is on the ground at a moment: traffic on the roads, parked cars, people. A pure function of seed and time."""
+"""Objects on the ground at a time: traffic, parked cars and people. A pure function of seed and time."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ class Thing:
     """An object on the ground.
 
     Attributes:
-        id: The same at every moment.
-        kind: Its class.
+        id: Identical at all times.
+        kind: Object class.
         x: Metres east of the world's origin.
         y: Metres north.
-        heading_deg: The way it faces, clockwise from the frame's north.
-        speed_mps: Over the ground.
-        looks: A number that picks colours.
+        heading_deg: Heading, clockwise from the frame's north.
+        speed_mps: Ground speed.
+        looks: Number that selects colours.
     """
 
     id: str
@@ -60,17 +60,17 @@ class Thing:
 
 
 class Population(Protocol):
-    """Tells what is on the ground."""
+    """Provides the objects on the ground."""
 
     def within(self, box: Matrix, time_s: float) -> list[Thing]:
-        """What stands or moves within a box ((x0, y0), (x1, y1)), metres, at a time."""
+        """Return the objects within a box ((x0, y0), (x1, y1)), metres, at a time."""
 
 
 class Unpopulated:
     """An empty world."""
 
     def within(self, box: Matrix, time_s: float) -> list[Thing]:
-        """Nothing."""
+        """Return no objects."""
         del box, time_s
         return []
 
@@ -84,7 +84,7 @@ class TownPopulation:
         self._seed = roads.seed
 
     def within(self, box: Matrix, time_s: float) -> list[Thing]:
-        """What stands or moves within a box."""
+        """Return the objects within a box."""
         things = self._traffic(box, time_s)
         (x0, y0), (x1, y1) = box
         middle = (box[0] + box[1]) / 2.0

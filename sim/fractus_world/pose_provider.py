@@ -1,4 +1,4 @@
-"""Where the camera is: at a fixed place, or on a vehicle that tells by MAVLink."""
+"""Camera position: fixed, or from the MAVLink telemetry of a vehicle."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ _STREAMS = {"GLOBAL_POSITION_INT": 20.0, "ATTITUDE": 20.0, "GIMBAL_DEVICE_ATTITU
 
 @dataclass(frozen=True, slots=True)
 class CameraPose:
-    """Where the camera is now.
+    """Current position of the camera.
 
     Attributes:
-        pose: Of the airframe.
+        pose: Pose of the airframe.
         ground_amsl_m: Altitude of the ground above mean sea level.
-        mount: What a gimbal reports; None when there is none.
+        mount: Attitude reported by a gimbal. None without gimbal.
     """
 
     pose: Pose
@@ -46,10 +46,10 @@ class CameraPose:
 
 
 class PoseProvider(Protocol):
-    """Tells where the camera is."""
+    """Provides the camera position."""
 
     def now(self) -> CameraPose | None:
-        """Where it is; None while that is unknown."""
+        """Return the position, or None if it is unknown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,11 +75,11 @@ class _Heard:
 
 
 class VehiclePose:
-    """A vehicle's position and attitude, followed in a thread of its own; the link is opened again when it breaks.
+    """Position and attitude of a vehicle, received in a thread. The link is reopened after a failure.
 
     Args:
         address: Host and port of the autopilot's TCP server.
-        ground_amsl_m: Altitude of the ground; None: the ground is as high as the vehicle's home.
+        ground_amsl_m: Altitude of the ground. None: altitude of the vehicle's home.
     """
 
     def __init__(self, address: tuple[str, int], ground_amsl_m: float | None = None) -> None:
@@ -100,7 +100,10 @@ class VehiclePose:
         self._thread.join(CONNECT_TIMEOUT_S + 2 * READ_TIMEOUT_S)
 
     def now(self) -> CameraPose | None:
-        """The last position, carried on with its speed; None when it or the attitude is more than two seconds old."""
+        """Return the last position, extrapolated with its speed.
+
+        Return None if position or attitude are older than two seconds.
+        """
         with self._lock:
             heard = replace(self._heard)
         now_s = time.monotonic()
@@ -128,7 +131,7 @@ class VehiclePose:
             wait_s = min(2 * wait_s, RETRY_S[1])
 
     def _follow(self, link: socket.socket) -> bool:
-        """Listen until the link breaks; returns whether anything was heard."""
+        """Receive until the link fails. Return True if a message was received."""
         link.settimeout(READ_TIMEOUT_S)
         endpoint = Endpoint(SYSTEM, COMPONENT)
         autopilot: tuple[int, int] | None = None
@@ -159,7 +162,7 @@ class VehiclePose:
     def _take(self, message: Message, now_s: float) -> None:
         with self._lock:
             if message.name == "GLOBAL_POSITION_INT":
-                # Zeroes are what an autopilot without a fix says.
+                # An autopilot without a fix reports zeros.
                 if message.integer("lat") != 0 or message.integer("lon") != 0:
                     self._heard.position, self._heard.position_s = message, now_s
             elif message.name == "ATTITUDE":
@@ -217,10 +220,10 @@ def _gimbal(message: Message, attitude: Message | None) -> Mount | None:
 
 
 def parse_address(text: str) -> tuple[str, int]:
-    """Host and port of `tcp:HOST:PORT`.
+    """Parse `tcp:HOST:PORT`.
 
     Raises:
-        ValueError: It is not that.
+        ValueError: The text has a different format.
     """
     kind, _, rest = text.partition(":")
     host, _, port = rest.rpartition(":")

@@ -1,4 +1,4 @@
-"""Chance that a seed decides: the same keys always give the same numbers, in whatever order they are asked for."""
+"""Seeded random numbers: the same keys always give the same numbers, independent of the order of calls."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ _MASK = (1 << 64) - 1
 
 
 def mixed(*keys: int) -> int:
-    """A 64-bit number that looks random; Steele, Lea and Flood's splitmix64 over the keys."""
+    """Return a 64-bit pseudo-random number: splitmix64 (Steele, Lea and Flood) over the keys."""
     state = 0x9E3779B97F4A7C15
     for key in keys:
         state = (state ^ (key & _MASK)) * 0xBF58476D1CE4E5B9 & _MASK
@@ -23,7 +23,7 @@ def unit(*keys: int) -> float:
 
 
 def dice(*keys: int) -> random.Random:
-    """A source of random numbers of its own."""
+    """Return a separate random number generator."""
     return random.Random(mixed(*keys))  # noqa: S311 - a landscape, not a secret
 
 

@@ -17,17 +17,17 @@ from fractus_world.tiles import TILE_PX, Picture, interpolated
 
 MAX_PIXELS = 400_000_000
 NOTHING = (112, 118, 116)
-"""Colour of what lies outside the picture: blue, green, red."""
+"""Colour outside of the picture: blue, green, red."""
 _GRID = 16
 _LEVELS = 12
 
 
 class Raster:
-    """A ground that is a picture; see `tiles.Ground`.
+    """A ground from a picture. See `tiles.Ground`.
 
     Args:
         picture: Shape (height, width, 3); blue, green, red.
-        reference: Where it lies.
+        reference: Georeference of the picture.
     """
 
     def __init__(self, picture: Picture, reference: Georeference) -> None:
@@ -46,7 +46,7 @@ class Raster:
             )
 
     def tile(self, level: int, column: int, row: int) -> Picture:
-        """Cut a tile out of the picture, as large and as turned as it lies."""
+        """Cut a tile out of the picture, with its scale and rotation."""
         grid = self._source(level, column, row) / 2.0**level
         source = self._half(level)
         low = np.floor(grid.reshape(-1, 2).min(axis=0)).astype(int) - 2
@@ -82,7 +82,7 @@ class Raster:
         while len(self._halved) <= level:
             last = self._halved[-1]
             size = (max(-(-last.shape[1] // 2), 1), max(-(-last.shape[0] // 2), 1))
-            # Of odd sizes the last row or column is repeated, so that pixels stay where they are.
+            # The last row or column is repeated for odd sizes, so that pixels keep their position.
             even = cv2.copyMakeBorder(
                 last, 0, 2 * size[1] - last.shape[0], 0, 2 * size[0] - last.shape[1], cv2.BORDER_REPLICATE
             )
@@ -95,11 +95,12 @@ def read_raster(path: Path, crs: str | None = None, origin: tuple[float, float] 
 
     Args:
         path: TIFF, PNG or JPEG.
-        crs: System of the world file: `local`, `EPSG:4326` (the default) or a projected one; a GeoTIFF says it itself.
-        origin: Latitude and longitude that `local` coordinates count from.
+        crs: System of the world file: `local`, `EPSG:4326` (default) or a projected system. A GeoTIFF contains its
+            system.
+        origin: Latitude and longitude of the origin of `local` coordinates.
 
     Raises:
-        GeoreferenceError: It cannot be read, or does not say where it lies.
+        GeoreferenceError: The file cannot be read or has no georeference.
     """
     if path.suffix.lower() in (".tif", ".tiff"):
         return _read_tiff(path, crs, origin)

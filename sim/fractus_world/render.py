@@ -1,4 +1,4 @@
-"""The ground as a camera sees it: perspective, detail that fits the distance, haze and sky."""
+"""Rendering of the ground: perspective, level of detail by distance, haze and sky."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def render_ground(view: View, store: TileStore, band: Band) -> Picture:
 
 @dataclass(frozen=True, slots=True)
 class _Cells:
-    """What changes slowly over a picture, at the corners of cells: detail, distance, elevation of the ray."""
+    """Slowly varying values at the corners of cells: level of detail, distance, elevation of the ray."""
 
     levels: NDArray[np.int64]
     haze: NDArray[np.float32]
@@ -80,7 +80,7 @@ class _Cells:
         level = np.clip(np.floor(level), 0, store.ground.levels - 1).astype(np.int64)
         level = np.where(away < FARTHEST_M, level, _NOTHING)
         corners = np.stack((level[:-1, :-1], level[1:, :-1], level[:-1, 1:], level[1:, 1:]))
-        # A cell takes the finest level of its corners, so that what is near stays sharp.
+        # A cell uses the finest level of its corners, so that near parts stay sharp.
         seen = np.where(corners == _NOTHING, 99, corners).min(axis=0)
         haze = 1.0 - np.exp(-((away / VISIBILITY_M) ** 1.2))
         elevation = np.arctan2(-down, flat)
@@ -125,8 +125,8 @@ def _warped(source: Picture, mapping: Matrix, size: tuple[int, int]) -> Picture:
 def _window(
     view: View, store: TileStore, level: int, marked: NDArray[np.bool_]
 ) -> tuple[tuple[int, int, int, int], int]:
-    """The level's pixels that the marked cells show; a coarser level where that would be too many."""
-    # The extremes of what a plane shows are at the ends of rows.
+    """Return the level's pixels for the marked cells, or a coarser level if they would be too many."""
+    # The extremes of a visible plane are at the ends of rows.
     rows = np.flatnonzero(marked.any(axis=1))
     first, last = marked[rows].argmax(axis=1), marked.shape[1] - marked[rows][:, ::-1].argmax(axis=1)
     corners = np.array([(c, r + d) for r, f, e in zip(rows, first, last, strict=True) for c in (f, e) for d in (0, 1)])
@@ -154,7 +154,7 @@ def _on_ground(view: View, corners: Matrix) -> Matrix:
 
 
 def _add_air(picture: Picture, cells: _Cells, sky: Sky) -> None:
-    """Blend haze over what is far, and the sky over what is not ground."""
+    """Blend haze over distant ground, and the sky over the remainder."""
     rows = np.flatnonzero((cells.haze > 0.01).any(axis=1))
     if len(rows) == 0:
         return

@@ -17,7 +17,7 @@ Family = Literal["east", "north"]
 
 SPACING_M = 300.0
 SHIFT_M = (-80.0, -95.0)
-"""Where the middle of block (0, 0) is, so that two main roads cross near the world's origin."""
+"""Offset of the centre of block (0, 0), so that two main roads cross near the world's origin."""
 _CROSSING = (1, 1)
 _JITTER = 0.2
 _MAIN_EVERY = 3
@@ -37,11 +37,11 @@ def cell(x: float, y: float) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class Road:
-    """One line of the network.
+    """One line of the road network.
 
     Attributes:
-        family: The way it leads, roughly.
-        index: Its number in the family; every third is a main road.
+        family: Approximate direction.
+        index: Number in the family. Every third line is a main road.
     """
 
     family: Family
@@ -49,7 +49,7 @@ class Road:
 
     @property
     def main(self) -> bool:
-        """Whether it is paved also between towns and has a marked middle."""
+        """True if the road is paved between towns and has a centre line."""
         return self.index % _MAIN_EVERY == 1
 
     def vertex(self, step: int) -> tuple[int, int]:
@@ -81,7 +81,7 @@ class Roads:
         )
 
     def built_up(self, road: Road, step: int) -> bool:
-        """Whether houses stand on either side of a road from vertex `step` to the next."""
+        """Return True if houses are on either side of a road from vertex `step` to the next."""
         i, j = road.vertex(step)
         return self.town(i, j) or (self.town(i, j - 1) if road.family == "east" else self.town(i - 1, j))
 
@@ -92,9 +92,9 @@ class Roads:
         return 6.0 if self.built_up(road, step) else 3.2
 
     def at(self, road: Road, along: float) -> tuple[float, float, float, float]:
-        """The point at a real number of vertices along a road, and the way it leads there, metres a vertex.
+        """Return the point at a fractional vertex number of a road, and its direction in metres per vertex.
 
-        A Catmull-Rom curve through the vertices, so that neighbouring pieces meet without a bend.
+        The road is a Catmull-Rom curve through its vertices, so adjacent segments meet without a bend.
         """
         step = math.floor(along)
         t = along - step
@@ -138,7 +138,7 @@ def strip(edge: Points, left_m: float, right_m: float) -> Points:
 
 
 def lengthened(edge: Points, by_m: float) -> Points:
-    """A line that goes on straight for a little at both ends, so that the pieces of a crossing meet."""
+    """Extend a line at both ends, so that the segments of a crossing meet."""
     ends = []
     for last, way in ((edge[0], edge[0] - edge[1]), (edge[-1], edge[-1] - edge[-2])):
         step = way[:2] / math.hypot(way[0], way[1]) * by_m

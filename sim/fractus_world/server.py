@@ -21,7 +21,7 @@ CLIENT_LIFE_S = 30.0
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """One request a connection, so that an idle client holds nothing."""
+    """One request per connection, so that idle clients hold no resources."""
 
     server: CameraServer
     server_version = "fractus-camera-world"
@@ -30,7 +30,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         if self._client_gone():
-            # A connection that breaks off in the middle of a request looks like its end; no one waits for the picture.
+            # A connection closed during a request looks like its end. Nobody waits for that picture.
             self.close_connection = True
             return
         parts = urlsplit(self.path)
@@ -44,7 +44,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(HTTPStatus.OK, answer)
 
     def _client_gone(self) -> bool:
-        """Whether the client has gone."""
+        """Return True if the client has disconnected."""
         self.connection.settimeout(0.0)
         try:
             return not self.connection.recv(1, socket.MSG_PEEK)
@@ -77,8 +77,8 @@ class CameraServer(ThreadingHTTPServer):
     """Serves the API to a limited number of clients, each for a limited time.
 
     Args:
-        address: Host and port to listen on; port 0 takes a free one.
-        api: Answers requests.
+        address: Host and port. Port 0 selects a free port.
+        api: Handles requests.
     """
 
     daemon_threads = True
@@ -95,11 +95,11 @@ class CameraServer(ThreadingHTTPServer):
 
     @property
     def port(self) -> int:
-        """The port it listens on."""
+        """Port of the server."""
         return int(self.server_address[1])
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Serve a client in a thread of its own, or close the connection when there are too many."""
+        """Serve a client in a thread, or close the connection if there are too many clients."""
         with self._lock:
             full = len(self._clients) >= MAX_CLIENTS
             if not full:
@@ -124,8 +124,8 @@ class CameraServer(ThreadingHTTPServer):
             try:
                 client.shutdown(socket.SHUT_RDWR)
             except OSError as error:
-                log.debug("camera world: slow client had gone (error=%s)", error)
+                log.debug("camera world: client disconnected (error=%s)", error)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Note what went wrong with one client; the others are not concerned."""
+        """Log an error of one client. Other clients are not affected."""
         log.warning("camera world: request failed (client=%s)", client_address, exc_info=True)

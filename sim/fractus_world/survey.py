@@ -1,4 +1,4 @@
-"""A map of the world's ground: a north-up picture in degrees (EPSG:4326) and the world file that goes with it."""
+"""Map of the world's ground: a north-up picture in degrees (EPSG:4326) with its world file."""
 
 from __future__ import annotations
 

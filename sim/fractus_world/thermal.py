@@ -1,4 +1,4 @@
-"""How a ground looks to a thermal camera: white is hot. A look, not radiometry."""
+"""Approximate thermal appearance of a ground: white is hot. The values are not radiometric."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A tile being painted: shapes in metres, noise that goes on from tile to tile, shadows, tree crowns."""
+"""Drawing on a tile: shapes in metres, seamless noise, shadows and tree crowns."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Points = NDArray[np.float64]
 Colour = tuple[int, int, int]
 
 SUN_SHADOW = (-0.62, 0.55)
-"""Where the shadow of something one metre high ends, metres east and north."""
+"""Shadow offset of an object of one metre height, metres east and north."""
 
 _SHIFT = 4
 _LATTICE = 256
@@ -27,16 +27,16 @@ _CROWNS = 7
 
 
 class Noise:
-    """Noise over the whole plane, the same wherever it is looked at from: octaves of random lattices that repeat."""
+    """Seamless noise over the plane: octaves of repeating random lattices."""
 
     def __init__(self, seed: int) -> None:
         random = np.random.default_rng(mixed(seed, 77))
         self._lattices = [random.standard_normal((_LATTICE, _LATTICE)).astype(np.float32) for _ in range(_OCTAVES)]
 
     def octave(self, octave: int, drawing: TileDrawing) -> NDArray[np.float32]:
-        """One octave over a square tile, standard deviation below 1."""
+        """Return one octave over a square tile, standard deviation below 1."""
         cell = _FINEST_OCTAVE_M * 2**octave
-        # What is much coarser than a pixel is worked out for every eighth one, with a rim, and enlarged.
+        # Octaves much coarser than a pixel are computed for every eighth pixel, with a margin, and enlarged.
         step = _ENLARGED if cell >= 2 * _ENLARGED * drawing.pixel_m else 1
         rim, size = (1, drawing.size // step + 2) if step > 1 else (0, drawing.size)
         scale = step * drawing.pixel_m / cell
@@ -51,7 +51,7 @@ class Noise:
         return np.asarray(drawn, np.float32)
 
     def between(self, finest_m: float, coarsest_m: float, drawing: TileDrawing) -> NDArray[np.float32]:
-        """The sum over a tile of the octaves from one size of cell to another, those below a pixel left out."""
+        """Return the sum of octaves over a tile from one cell size to another. Octaves below a pixel are omitted."""
         total = np.zeros((drawing.size, drawing.size), np.float32)
         for octave in range(_OCTAVES):
             cell = _FINEST_OCTAVE_M * 2**octave
@@ -84,13 +84,13 @@ class TileDrawing:
         return self.left_m, self.top_m - extent, self.left_m + extent, self.top_m
 
     def sees(self, points: Points, margin_m: float = 0.0) -> bool:
-        """Whether the box around points touches the tile."""
+        """Return True if the bounding box of points touches the tile."""
         west, south, east, north = self.box
         (x0, y0), (x1, y1) = points.min(axis=0)[:2], points.max(axis=0)[:2]
         return bool(x0 < east + margin_m and x1 > west - margin_m and y0 < north + margin_m and y1 > south - margin_m)
 
     def within(self, boxes: Points, margin_m: float = 0.0) -> NDArray[np.int64]:
-        """Which of some boxes (west, south, east, north), shape (n, 4), touch the tile."""
+        """Return which boxes (west, south, east, north), shape (n, 4), touch the tile."""
         west, south, east, north = self.box
         touch = (boxes[:, 0] < east + margin_m) & (boxes[:, 2] > west - margin_m)
         touch &= (boxes[:, 1] < north + margin_m) & (boxes[:, 3] > south - margin_m)
@@ -143,7 +143,7 @@ class TileDrawing:
         cv2.circle(self.shade, centre, max(radius, 8), (230,), -1, cv2.LINE_AA, _SHIFT)
 
     def cast(self, depth: float) -> None:
-        """Darken what lies in the shadows added so far; half of the light there is the sky's and bluish."""
+        """Darken the added shadows. Half of the remaining light is bluish sky light."""
         if not self.shade.any():
             return
         soft = max(int(0.25 / self.pixel_m), 0)
@@ -170,7 +170,7 @@ class TileDrawing:
 
 @lru_cache(maxsize=2048)
 def _crown(kind: int, diameter: int, shade: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """A crown, `diameter` pixels wide: its colours times its cover, and what shows through."""
+    """Return a crown of `diameter` pixels: its colours multiplied by its coverage, and its transparency."""
     colour, alpha = _drawn_crown(kind)
     colour = colour * (0.84 + 0.08 * shade)
     size = (diameter, diameter)

@@ -17,11 +17,11 @@ _MOSAIC_BYTES = 60_000_000
 
 
 class Ground(Protocol):
-    """What lies on the plane: a picture without borders, at levels of which each is half as fine as the one before.
+    """Ground as an unbounded picture with levels of detail. Each level has half the resolution of the previous one.
 
     Attributes:
         frame: Metres east and north of the world's origin.
-        finest_m: Size of a pixel of level 0 on the ground, metres.
+        finest_m: Pixel size of level 0 on the ground, metres.
         levels: Number of levels.
     """
 
@@ -30,7 +30,10 @@ class Ground(Protocol):
     levels: int
 
     def tile(self, level: int, column: int, row: int) -> Picture:
-        """One tile: blue, green, red; north is up; tile (0, 0) lies south-east of the origin, rows count southward."""
+        """Return one tile (blue, green, red), north up.
+
+        Tile (0, 0) is south-east of the origin. Rows count southward.
+        """
 
 
 def pixel_m(ground: Ground, level: int) -> float:
@@ -39,11 +42,11 @@ def pixel_m(ground: Ground, level: int) -> float:
 
 
 class TileStore:
-    """Keeps the tiles last used, and the last mosaic of each level.
+    """Cache of the last used tiles and of the last mosaic of each level.
 
     Args:
-        ground: Makes the tiles.
-        limit_bytes: What the tiles may take together.
+        ground: Creates the tiles.
+        limit_bytes: Maximum total size of the tiles.
     """
 
     def __init__(self, ground: Ground, limit_bytes: int = 70_000_000) -> None:
@@ -81,7 +84,7 @@ class TileStore:
             del self._mosaics[next(iter(self._mosaics))]
 
     def tile(self, level: int, column: int, row: int) -> Picture:
-        """One tile."""
+        """Return one tile."""
         key = (level, column, row)
         with self._lock:
             tile = self._tiles.get(key)

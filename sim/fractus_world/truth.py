@@ -1,4 +1,4 @@
-"""The ground truth of a picture: which objects and faces it shows, where, and how much of each."""
+"""Ground truth of a picture: visible objects and faces, with their positions and visible shares."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ class Seen:
     """An object in a picture.
 
     Attributes:
-        id: The same in every picture.
-        kind: Its class.
+        id: Identical in every picture.
+        kind: Object class.
         lat: Latitude, degrees.
         lon: Longitude, degrees.
         heading_deg: Clockwise from north.
-        speed_mps: Over the ground.
-        box: Around what of it is in the picture.
-        in_frame: Share of it that is in the picture, from 0 to 1.
-        visible: Share of it that is in the picture and behind nothing else, from 0 to 1.
+        speed_mps: Ground speed.
+        box: Bounding box of the part inside the picture.
+        in_frame: Share inside the picture, from 0 to 1.
+        visible: Share inside the picture that is not occluded, from 0 to 1.
     """
 
     id: str
@@ -38,7 +38,7 @@ class Seen:
     visible: float
 
     def as_json(self) -> dict[str, Any]:
-        """As the server tells it."""
+        """Return the JSON representation."""
         return {
             "id": self.id,
             "class": self.kind,
@@ -57,14 +57,14 @@ class SeenFace:
     """A photographed face in a picture.
 
     Attributes:
-        id: The same in every picture.
+        id: Identical in every picture.
         lat: Latitude, degrees.
         lon: Longitude, degrees.
-        standing: Whether its billboard stands upright; else it lies on the ground.
-        box: Around the face, as far as it is in the picture.
-        height_px: How high the whole face is, foreshortened as it is.
-        in_frame: Share of it that is in the picture.
-        visible: Share of it that is in the picture and behind nothing else; 0 from behind its billboard.
+        standing: True if the billboard is upright, False if it lies on the ground.
+        box: Bounding box of the part of the face inside the picture.
+        height_px: Height of the whole face with perspective.
+        in_frame: Share inside the picture.
+        visible: Share inside the picture that is not occluded. 0 from behind its billboard.
     """
 
     id: str
@@ -77,7 +77,7 @@ class SeenFace:
     visible: float
 
     def as_json(self) -> dict[str, Any]:
-        """As the server tells it."""
+        """Return the JSON representation."""
         return {
             "id": self.id,
             "lat": round(self.lat, 8),
@@ -92,14 +92,14 @@ class SeenFace:
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """What a picture shows."""
+    """Content of a picture."""
 
     pose: Pose
     objects: tuple[Seen, ...]
     faces: tuple[SeenFace, ...]
 
     def as_json(self) -> dict[str, Any]:
-        """As the server tells it."""
+        """Return the JSON representation."""
         pose = self.pose
         return {
             "pose": {

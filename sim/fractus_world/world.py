@@ -1,4 +1,4 @@
-"""The world as its users see it: a ground and what moves on it, from which pictures and their truth are made."""
+"""A world: a ground and moving objects, from which pictures and their ground truth are created."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ DEFAULT_MOUNT = Mount()
 
 
 class World:
-    """A ground with everything on it. Pictures depend on nothing but the arguments.
+    """A ground with objects. Pictures depend only on the arguments.
 
     Args:
-        ground: What the earth looks like from above.
-        stage: What stands and moves on it.
+        ground: Appearance of the ground from above.
+        stage: Objects on the ground.
     """
 
     def __init__(self, ground: Ground, stage: ObjectLayer) -> None:
@@ -69,15 +69,15 @@ class World:
         band: Band = "rgb",
         hidden: frozenset[str] = frozenset(),
     ) -> Picture:
-        """The picture that a camera takes.
+        """Return the picture of a camera.
 
         Args:
-            pose: Where the airframe is.
+            pose: Pose of the airframe.
             intrinsics: Lens and sensor.
-            mount: How the camera sits on the airframe.
-            time_s: Any clock's seconds; everything that moves is a function of it.
+            mount: Mount of the camera on the airframe.
+            time_s: Time in seconds on any clock. Moving objects are a function of it.
             band: Daylight or thermal.
-            hidden: Ids of objects to leave out.
+            hidden: Ids of objects to omit.
 
         Returns:
             Shape (height, width, 3); blue, green, red.
@@ -89,25 +89,25 @@ class World:
             return picture
 
     def truth(self, pose: Pose, intrinsics: Intrinsics, *, mount: Mount = DEFAULT_MOUNT, time_s: float = 0.0) -> Truth:
-        """What the picture of the same arguments shows."""
+        """Return the ground truth of the picture with the same arguments."""
         with self._lock:
             view = self.view(pose, intrinsics, mount)
             return Truth(pose, *self._objects.truth(view, self._objects.in_sight(view, time_s), self.frame))
 
     def map(self, sheet: Sheet) -> Picture:
-        """The ground on a sheet of a map, without what moves, shape (pixels, pixels, 3)."""
+        """Return the ground of a map sheet without moving objects, shape (pixels, pixels, 3)."""
         with self._lock:
             return draw_sheet(sheet, self._store, self.frame)
 
 
 class WorldAround:
-    """A world that is made around the first camera pose, unless its origin is given.
+    """A world that is created around the first camera pose unless its origin is given.
 
     Args:
-        seed: Of the landscape and of who is where.
-        origin: Latitude and longitude; None: those of the first place to a tenth of a degree, which cameras near each
-            other share.
-        world: The world itself, when it is known already.
+        seed: Seed of landscape and objects.
+        origin: Latitude and longitude. None: the first position rounded to 0.1 degrees, so that nearby cameras share
+            it.
+        world: An existing world.
     """
 
     def __init__(self, seed: int, origin: tuple[float, float] | None = None, world: World | None = None) -> None:
@@ -116,7 +116,7 @@ class WorldAround:
         self._world = world if origin is None or world is not None else World.procedural(*origin, seed)
 
     def seen_from(self, pose: Pose | None) -> World | None:
-        """The world; None as long as there is no place to make it around."""
+        """Return the world, or None if no position is known yet."""
         with self._lock:
             if self._world is None and pose is not None:
                 self._world = World.procedural(round(pose.lat, 1), round(pose.lon, 1), self._seed)

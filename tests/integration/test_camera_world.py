@@ -158,7 +158,7 @@ def test_orthophoto_and_page(served: CameraServer) -> None:
 @pytest.mark.parametrize(
     ("path", "status", "words"),
     [
-        ("/nothing", 404, "there is no /nothing"),
+        ("/nothing", 404, "unknown page /nothing"),
         ("/snapshot.jpg?width=9999", 400, "width: 9999"),
         ("/snapshot.jpg?width=8192&height=8192", 400, "more than 16,000,000 pixels"),
         ("/snapshot.jpg?width=-5", 400, "whole number"),

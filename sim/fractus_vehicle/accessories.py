@@ -33,7 +33,7 @@ SWITCH_LOW, SWITCH_HIGH = 0, 2
 FENCE_SWITCH = 11
 # Commands that fail because the simulated vehicle has no camera, mount, gripper, winch, receiver pairing or running
 # calibration.
-ABSENT = (
+ABSENT_DEVICE = (
     mavlink.MAV_CMD_DO_GRIPPER,
     mavlink.MAV_CMD_DO_MOUNT_CONFIGURE,
     mavlink.MAV_CMD_DO_MOUNT_CONTROL,
@@ -51,7 +51,7 @@ ABSENT = (
     mavlink.MAV_CMD_START_RX_PAIR,
 )
 # Commands that are accepted and have no effect.
-TAKEN = (
+WITHOUT_EFFECT = (
     mavlink.MAV_CMD_DO_DIGICAM_CONFIGURE,
     mavlink.MAV_CMD_DO_DIGICAM_CONTROL,
     mavlink.MAV_CMD_DO_SET_CAM_TRIGG_DIST,
@@ -77,7 +77,7 @@ def set_servo(v: VehicleState, channel: float, pwm_us: float) -> int:
         return mavlink.MAV_RESULT_FAILED
     number = int(channel)
     if int(v.params.get(f"SERVO{number}_FUNCTION", 0.0)) not in FREE_FUNCTIONS:
-        v.say(mavlink.MAV_SEVERITY_INFO, f"ServoRelayEvent: Channel {number} is already in use")
+        v.send_text(mavlink.MAV_SEVERITY_INFO, f"ServoRelayEvent: Channel {number} is already in use")
         return mavlink.MAV_RESULT_FAILED
     v.servos[number] = int(pwm_us) & 0xFFFF
     return mavlink.MAV_RESULT_ACCEPTED
@@ -106,13 +106,13 @@ def start_motor_test(v: VehicleState, motor: float, duration_s: float) -> int:
     The vehicle reports armed during the test, independent of the arming checks.
     """
     if not v.landed:
-        v.say(mavlink.MAV_SEVERITY_CRITICAL, "Motor Test: vehicle not landed")
+        v.send_text(mavlink.MAV_SEVERITY_CRITICAL, "Motor Test: vehicle not landed")
         return mavlink.MAV_RESULT_FAILED
     running = v.motor_test_until_s is not None
     if not (math.isfinite(motor) and math.isfinite(duration_s)) or (v.armed and not running):
         return mavlink.MAV_RESULT_FAILED
     if not running:
-        v.say(mavlink.MAV_SEVERITY_INFO, "starting motor test")
+        v.send_text(mavlink.MAV_SEVERITY_INFO, "starting motor test")
     v.motor_test_until_s = v.time_s + min(max(duration_s, 0.0), MAX_MOTOR_TEST_S)
     return mavlink.MAV_RESULT_ACCEPTED
 
@@ -121,4 +121,4 @@ def end_motor_test(v: VehicleState) -> None:
     """Stop the motor test after its duration."""
     if v.motor_test_until_s is not None and v.time_s >= v.motor_test_until_s:
         v.motor_test_until_s = None
-        v.say(mavlink.MAV_SEVERITY_INFO, "finished motor test")
+        v.send_text(mavlink.MAV_SEVERITY_INFO, "finished motor test")

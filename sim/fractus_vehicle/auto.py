@@ -79,7 +79,7 @@ class AutoFlight(Flight):
         index = v.mission.first_navigating(v.mission.current)
         if index is not None:
             v.mission.current = index
-            v.say(mavlink.MAV_SEVERITY_INFO, f"Mission: {index} {title(v.mission.items[index])}")
+            v.send_text(mavlink.MAV_SEVERITY_INFO, f"Mission: {index} {title(v.mission.items[index])}")
 
     def pause(self, v: VehicleState, *, paused: bool) -> None:
         """Handle DO_PAUSE_CONTINUE: hold the current position, or restart the current item."""
@@ -109,7 +109,7 @@ class AutoFlight(Flight):
             if item.navigates:
                 v.mission.current = index
                 self._commands.begin(v, waiting)
-                v.say(mavlink.MAV_SEVERITY_INFO, f"Mission: {index} {title(item)}")
+                v.send_text(mavlink.MAV_SEVERITY_INFO, f"Mission: {index} {title(item)}")
                 self._begin_item(v, index, item)
                 return
             waiting.append(index)
@@ -130,7 +130,7 @@ class AutoFlight(Flight):
         self._returning = self._leg = None
         track, self._track = self._track, (0.0, 0.0, 0.0)
         if item.has_place and v.altitude_base_m(item.frame) is None:
-            v.say(mavlink.MAV_SEVERITY_CRITICAL, "Failsafe: Terrain data missing")
+            v.send_text(mavlink.MAV_SEVERITY_CRITICAL, "Failsafe: Terrain data missing")
             if not self._set_mode(mavlink.COPTER_MODE_RTL):
                 self._set_mode(mavlink.COPTER_MODE_LAND)
             return
@@ -152,15 +152,15 @@ class AutoFlight(Flight):
             case mavlink.MAV_CMD_NAV_DELAY:
                 self._arrived_s = v.time_s
             case mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT:
-                here = (v.control.pos[0], v.control.pos[1], v.control.pos[2])
-                self._track = self._arrival(v, item, here, (north, east, down))
+                position = (v.control.pos[0], v.control.pos[1], v.control.pos[2])
+                self._track = self._arrival(v, item, position, (north, east, down))
                 self._leg = SplineLeg(v, (north, east, down), track, self._track)
             case mavlink.MAV_CMD_NAV_LAND:
                 v.control.go_to(north, east)
             case _:
-                here = (v.control.pos[0], v.control.pos[1], v.control.pos[2])
+                position = (v.control.pos[0], v.control.pos[1], v.control.pos[2])
                 if self._following(v, item) is not None:
-                    self._track = (north - here[0], east - here[1], down - here[2])
+                    self._track = (north - position[0], east - position[1], down - position[2])
                 self._leg = Leg(v, north, east, down)
 
     def _following(self, v: VehicleState, item: Item) -> Item | None:
@@ -205,7 +205,7 @@ class AutoFlight(Flight):
         elif self._done(v, item):
             v.item_reached = self._index
             if item.command != mavlink.MAV_CMD_NAV_TAKEOFF:
-                v.say(mavlink.MAV_SEVERITY_INFO, f"Reached command #{self._index}")
+                v.send_text(mavlink.MAV_SEVERITY_INFO, f"Reached command #{self._index}")
             self._start_from(v, v.mission.next_after(self._index))
         v.heading.step(v.est, CONTROL_STEP_S)
 

@@ -17,9 +17,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 POINTS_MAX = 500
 UPDATE_INTERVAL_S = 1.0 / 3.0
 TIMEOUT_S = 15.0
-TIDY_AFTER = 50  # new points
+CLEANUP_AFTER = 50  # new points
 LOW_SPACE = 10  # free points
-LOW_SPACE_SAID_EVERY_S = 10.0
+LOW_SPACE_TEXT_INTERVAL_S = 10.0
 PRUNE_SHARE = 0.99  # of the accuracy: segments closer than this are joined
 COMPARISONS_PER_TICK = 400  # bounds the cost of path cleanup in one control step
 
@@ -39,9 +39,9 @@ class Loop:
 class Breadcrumbs:
     """Recorded path in local metres (north, east, down), starting at home."""
 
-    def __init__(self, params: Mapping[str, float], say: Callable[[int, str], None]) -> None:
+    def __init__(self, params: Mapping[str, float], send_text: Callable[[int, str], None]) -> None:
         self._params = params
-        self._say = say
+        self._send_text = send_text
         self.active = False
         self.path: list[Point] = []
         self._limit = min(max(int(params["SRTL_POINTS"]), 0), POINTS_MAX)  # read once at startup, like ArduPilot
@@ -51,9 +51,9 @@ class Breadcrumbs:
         self._work: Iterator[None] | None = None
         self._next_s = 0.0
         self._good_s = self._saved_s = 0.0
-        self._low_said_s = -math.inf
+        self._low_space_text_s = -math.inf
 
-    def restart(self, now_s: float, here: Point | None) -> None:
+    def restart(self, now_s: float, position: Point | None) -> None:
         """Clear the path and start at the current position, if it is known (at startup and on arming)."""
         self._accuracy_m = self._params["SRTL_ACCURACY"]
         self.path.clear()
@@ -61,54 +61,54 @@ class Breadcrumbs:
         self._work = None
         if self._limit == 0 or self._accuracy_m <= 0.0:
             self.active = False
-        elif here is None:
-            self._give_up("bad position")
+        elif position is None:
+            self._deactivate("bad position")
         else:
             self.active = True
             self._good_s = self._saved_s = now_s
-            self.path.append(here)
+            self.path.append(position)
 
-    def step(self, now_s: float, here: Point | None, mode: int, *, armed: bool) -> None:
+    def step(self, now_s: float, position: Point | None, mode: int, *, armed: bool) -> None:
         """Record the position three times a second while armed, and simplify the path. SMART_RTL records nothing.
 
         Args:
             now_s: Vehicle time.
-            here: Position (north, east, down); None if unknown.
+            position: Position (north, east, down); None if unknown.
             mode: Flight mode.
             armed: True while the motors run.
         """
         if now_s >= self._next_s:
             self._next_s = now_s + UPDATE_INTERVAL_S
-            if not self.path and not armed and here is not None:
-                self.restart(now_s, here)
+            if not self.path and not armed and position is not None:
+                self.restart(now_s, position)
             if self.active and armed and mode != mavlink.COPTER_MODE_SMART_RTL:
-                self._record(now_s, here)
-                self._work = self._work or self._routine()
+                self._record(now_s, position)
+                self._work = self._work or self._routine_cleanup()
         if self._work is not None:
             try:
                 next(self._work)
             except StopIteration:
                 self._work = None
 
-    def _record(self, now_s: float, here: Point | None) -> None:
-        if here is None:
+    def _record(self, now_s: float, position: Point | None) -> None:
+        if position is None:
             if now_s - self._good_s > TIMEOUT_S:
-                self._give_up("bad position")
+                self._deactivate("bad position")
             return
         self._good_s = now_s
-        if self.add(here):
+        if self.add(position):
             self._saved_s = now_s
         elif now_s - self._saved_s > TIMEOUT_S:
-            self._give_up("buffer full")
+            self._deactivate("buffer full")
             return
-        if len(self.path) >= self._limit - LOW_SPACE + 1 and now_s - self._low_said_s > LOW_SPACE_SAID_EVERY_S:
-            self._low_said_s = now_s
-            self._say(mavlink.MAV_SEVERITY_INFO, "SmartRTL Low on space!")
+        if len(self.path) >= self._limit - LOW_SPACE + 1 and now_s - self._low_space_text_s > LOW_SPACE_TEXT_INTERVAL_S:
+            self._low_space_text_s = now_s
+            self._send_text(mavlink.MAV_SEVERITY_INFO, "SmartRTL Low on space!")
 
-    def _give_up(self, reason: str) -> None:
+    def _deactivate(self, reason: str) -> None:
         self.active = False
         self._work = None
-        self._say(mavlink.MAV_SEVERITY_WARNING, f"SmartRTL deactivated: {reason}")
+        self._send_text(mavlink.MAV_SEVERITY_WARNING, f"SmartRTL deactivated: {reason}")
 
     def add(self, point: Point) -> bool:
         """Append a point unless it is too close to the last one. Return False if the path is full."""
@@ -128,16 +128,16 @@ class Breadcrumbs:
 
     # -- simplification ----------------------------------------------------------------------------------------
 
-    def thorough(self) -> Iterator[None]:
+    def simplify_fully(self) -> Iterator[None]:
         """Simplify the whole path. Each iteration does a bounded amount of work."""
         self._work = None
         self.simplify()
         return self._prune(POINTS_MAX)
 
-    def _routine(self) -> Iterator[None] | None:
+    def _routine_cleanup(self) -> Iterator[None] | None:
         fresh = len(self.path) - self._simplified
         low = self._limit - len(self.path) <= LOW_SPACE
-        if fresh >= TIDY_AFTER or (low and fresh >= LOW_SPACE):
+        if fresh >= CLEANUP_AFTER or (low and fresh >= LOW_SPACE):
             self.simplify()
         elif low and self._pruned < len(self.path):
             return self._prune(LOW_SPACE)

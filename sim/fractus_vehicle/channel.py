@@ -13,7 +13,7 @@ OUTBOX_LIMIT = 256 * 1024
 PARAMETERS_PER_TICK = 23
 # Tolerance for rounding: sums of intervals differ slightly from multiples of the step.
 TIME_SLACK_S = 1e-6
-AT_ONCE = -1e9
+IMMEDIATELY = -1e9
 
 
 @dataclass(slots=True)
@@ -104,8 +104,8 @@ class Channel(Endpoint):
         if interval_s is None:
             self.streams.pop(name, None)
         else:
-            self.streams[name] = Stream(interval_s, AT_ONCE)
-            self.next_due_s = AT_ONCE
+            self.streams[name] = Stream(interval_s, IMMEDIATELY)
+            self.next_due_s = IMMEDIATELY
 
     def set_default(self, name: str, interval_s: float | None) -> None:
         """Set the default interval of a message and apply it."""
@@ -117,9 +117,9 @@ class Channel(Endpoint):
         self.set_interval(name, self._defaults.get(name))
 
     @property
-    def speaks_s(self) -> float:
+    def next_send_s(self) -> float:
         """Vehicle time at which the next stream message or parameter is due."""
-        return AT_ONCE if self.parameters else self.next_due_s
+        return IMMEDIATELY if self.parameters else self.next_due_s
 
     def due(self, now_s: float) -> list[str]:
         """Return the names of the messages due now.

@@ -22,7 +22,7 @@ from fractus_vehicle.copter import (
     GLOBAL_FRAMES,
     GUIDED_MODES,
     SUPPORTED_MODES,
-    TAKES_OFF,
+    TAKEOFF_MODES,
     UNAVAILABLE,
 )
 from fractus_vehicle.earth import ALTITUDE_MAX_M, valid_coordinates
@@ -33,19 +33,19 @@ from fractus_vehicle.mission_items import Item
 from fractus_vehicle.mission_orders import (
     begin_landing_sequence,
     begin_return_path,
-    choose_item,
     jump_to_tag,
     pause,
+    set_mission_current,
     start_mission,
 )
-from fractus_vehicle.orders import Order, read_order
+from fractus_vehicle.orders import Command, read_command
 from fractus_vehicle.readiness import arming_refusals, mandatory_refusals, mode_refusal
-from fractus_vehicle.requests import ANSWERS
+from fractus_vehicle.requests import REQUEST_HANDLERS
 from fractus_vehicle.state import VehicleState
 from fractus_vehicle.vehicle import Vehicle
 
 
-def _arm_disarm(vehicle: Vehicle, o: Order, _c: Channel) -> int:
+def _arm_disarm(vehicle: Vehicle, o: Command, _c: Channel) -> int:
     v = vehicle.state
     want, magic = o.params[0], o.params[1]
     if want == 1.0:
@@ -55,7 +55,7 @@ def _arm_disarm(vehicle: Vehicle, o: Order, _c: Channel) -> int:
         refusals = mandatory_refusals(v) if forced else arming_refusals(v)
         unsuited = None if forced or refusals else mode_refusal(v)
         for refusal in (*refusals, *((unsuited,) if unsuited else ())):
-            v.say(mavlink.MAV_SEVERITY_CRITICAL, f"Arm: {refusal}")
+            v.send_text(mavlink.MAV_SEVERITY_CRITICAL, f"Arm: {refusal}")
         if refusals or unsuited:
             return mavlink.MAV_RESULT_FAILED
         vehicle.arm()
@@ -68,13 +68,13 @@ def _arm_disarm(vehicle: Vehicle, o: Order, _c: Channel) -> int:
     return mavlink.MAV_RESULT_UNSUPPORTED
 
 
-def _takeoff(vehicle: Vehicle, o: Order, _c: Channel) -> int:
+def _takeoff(vehicle: Vehicle, o: Command, _c: Channel) -> int:
     v = vehicle.state
     if o.frame != mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT:
         return mavlink.MAV_RESULT_DENIED
     # ALT_HOLD can take off if the client does not require a horizontal position.
-    takes_off = v.mode in TAKES_OFF or (v.mode == mavlink.COPTER_MODE_ALT_HOLD and o.params[2] != 0.0)
-    if not v.armed or not v.landed or not takes_off or not v.altitude_m < o.z < ALTITUDE_MAX_M:
+    may_take_off = v.mode in TAKEOFF_MODES or (v.mode == mavlink.COPTER_MODE_ALT_HOLD and o.params[2] != 0.0)
+    if not v.armed or not v.landed or not may_take_off or not v.altitude_m < o.z < ALTITUDE_MAX_M:
         return mavlink.MAV_RESULT_FAILED
     origin = v.origin or v.start
     flight = vehicle.modes.flight
@@ -85,8 +85,8 @@ def _takeoff(vehicle: Vehicle, o: Order, _c: Channel) -> int:
     return mavlink.MAV_RESULT_ACCEPTED
 
 
-def _mode_command(mode: int) -> Callable[[Vehicle, Order, Channel], int]:
-    def change(vehicle: Vehicle, _o: Order, _c: Channel) -> int:
+def _mode_command(mode: int) -> Callable[[Vehicle, Command, Channel], int]:
+    def change(vehicle: Vehicle, _o: Command, _c: Channel) -> int:
         return mavlink.MAV_RESULT_ACCEPTED if vehicle.modes.change(mode) else mavlink.MAV_RESULT_FAILED
 
     return change
@@ -98,41 +98,41 @@ def set_mode_number(vehicle: Vehicle, base_mode: int, custom_mode: int) -> int:
     if not base_mode & mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
         return mavlink.MAV_RESULT_DENIED
     if custom_mode not in SUPPORTED_MODES | UNAVAILABLE.keys():
-        v.say(mavlink.MAV_SEVERITY_WARNING, f"No such mode {custom_mode}")
+        v.send_text(mavlink.MAV_SEVERITY_WARNING, f"No such mode {custom_mode}")
         return mavlink.MAV_RESULT_FAILED
     return mavlink.MAV_RESULT_ACCEPTED if vehicle.modes.change(custom_mode) else mavlink.MAV_RESULT_FAILED
 
 
-def _set_mode(vehicle: Vehicle, o: Order, _c: Channel) -> int:
+def _set_mode(vehicle: Vehicle, o: Command, _c: Channel) -> int:
     if not all(math.isfinite(value) for value in o.params[:2]):
         return mavlink.MAV_RESULT_DENIED
     return set_mode_number(vehicle, int(o.params[0]), int(o.params[1]))
 
 
-def _change_speed(vehicle: Vehicle, o: Order, _c: Channel) -> int:
+def _change_speed(vehicle: Vehicle, o: Command, _c: Channel) -> int:
     v = vehicle.state
     kind = 3 if o.params[0] > 2.9 else 2 if o.params[0] > 1.9 else 0  # thresholds of ArduPilot's comparison
-    takes = v.mode in CHANGES_SPEED and v.control.limits.change_speed(kind, o.params[1])
+    takes = v.mode in SPEED_MODES and v.control.limits.change_speed(kind, o.params[1])
     return mavlink.MAV_RESULT_ACCEPTED if takes else mavlink.MAV_RESULT_FAILED
 
 
-def _readable_place(v: VehicleState, o: Order) -> bool:
+def _has_valid_position(v: VehicleState, o: Command) -> bool:
     """Return True if the altitude and frame define a position. Report an unknown frame in a STATUSTEXT."""
     if not abs(o.z) < ALTITUDE_MAX_M:
         return False
     if o.frame not in GLOBAL_FRAMES:
-        v.say(mavlink.MAV_SEVERITY_INFO, f"Unknown mavlink coordinate frame {o.frame}")
+        v.send_text(mavlink.MAV_SEVERITY_INFO, f"Unknown mavlink coordinate frame {o.frame}")
     return v.altitude_base_m(o.frame) is not None
 
 
-def _reposition(vehicle: Vehicle, o: Order, _c: Channel) -> int:
+def _reposition(vehicle: Vehicle, o: Command, _c: Channel) -> int:
     v = vehicle.state
     switch = (
         bool(int(o.params[1]) & mavlink.MAV_DO_REPOSITION_FLAGS_CHANGE_MODE) if math.isfinite(o.params[1]) else False
     )
     if v.mode not in GUIDED_MODES and not switch:
         return mavlink.MAV_RESULT_DENIED
-    if not valid_coordinates(o.x, o.y) or not _readable_place(v, o):
+    if not valid_coordinates(o.x, o.y) or not _has_valid_position(v, o):
         return mavlink.MAV_RESULT_DENIED
     # Missing coordinates, or a missing height above home or ground, would mean the current position. ArduPilot denies
     # that.
@@ -151,21 +151,21 @@ def _reposition(vehicle: Vehicle, o: Order, _c: Channel) -> int:
     return mavlink.MAV_RESULT_ACCEPTED
 
 
-def _yaw(vehicle: Vehicle, o: Order, _c: Channel) -> int:
+def _yaw(vehicle: Vehicle, o: Command, _c: Channel) -> int:
     """Handle CONDITION_YAW. Accepted in every mode, effective in automatic modes only."""
     v = vehicle.state
     angle, rate, direction, relative = o.params
     if relative not in (0.0, 1.0) or not 0.0 <= angle <= 360.0:
         return mavlink.MAV_RESULT_FAILED
-    if v.mode in TURNS and math.isfinite(rate) and math.isfinite(direction):
+    if v.mode in HEADING_MODES and math.isfinite(rate) and math.isfinite(direction):
         v.heading.turn_to(angle, rate, int(direction), relative=relative == 1.0)
     return mavlink.MAV_RESULT_ACCEPTED
 
 
-def _roi(vehicle: Vehicle, o: Order, _c: Channel) -> int:
+def _roi(vehicle: Vehicle, o: Command, _c: Channel) -> int:
     v = vehicle.state
     if o.command != mavlink.MAV_CMD_DO_SET_ROI_NONE:
-        if not _readable_place(v, o):
+        if not _has_valid_position(v, o):
             return mavlink.MAV_RESULT_DENIED
         if not valid_coordinates(o.x, o.y):
             return mavlink.MAV_RESULT_FAILED
@@ -177,24 +177,24 @@ def _roi(vehicle: Vehicle, o: Order, _c: Channel) -> int:
     return mavlink.MAV_RESULT_ACCEPTED
 
 
-def _set_home(vehicle: Vehicle, o: Order, _c: Channel) -> int:
+def _set_home(vehicle: Vehicle, o: Command, _c: Channel) -> int:
     v = vehicle.state
     if o.params[0] == 1.0 or not o.has_place:
         return mavlink.MAV_RESULT_ACCEPTED if set_home_here(v) else mavlink.MAV_RESULT_FAILED
     if o.params[0] != 0.0:
         return mavlink.MAV_RESULT_FAILED
-    if not _readable_place(v, o):
+    if not _has_valid_position(v, o):
         return mavlink.MAV_RESULT_DENIED
     altitude = o.z + (v.altitude_base_m(o.frame) or 0.0)
     return mavlink.MAV_RESULT_ACCEPTED if set_home_at(v, o.x, o.y, altitude) else mavlink.MAV_RESULT_FAILED
 
 
-def _fence_enable(vehicle: Vehicle, o: Order, _c: Channel) -> int:
+def _fence_enable(vehicle: Vehicle, o: Command, _c: Channel) -> int:
     v = vehicle.state
     return mavlink.MAV_RESULT_ACCEPTED if switch_fence(v, o.params[0]) else mavlink.MAV_RESULT_FAILED
 
 
-def _terminate(vehicle: Vehicle, o: Order, _c: Channel) -> int:
+def _terminate(vehicle: Vehicle, o: Command, _c: Channel) -> int:
     v = vehicle.state
     if o.params[0] <= 0.5:
         return mavlink.MAV_RESULT_FAILED
@@ -202,26 +202,26 @@ def _terminate(vehicle: Vehicle, o: Order, _c: Channel) -> int:
     return mavlink.MAV_RESULT_ACCEPTED
 
 
-def _reboot(vehicle: Vehicle, o: Order, _c: Channel) -> int:
+def _reboot(vehicle: Vehicle, o: Command, _c: Channel) -> int:
     v = vehicle.state
     if v.armed:
         return mavlink.MAV_RESULT_FAILED
     if o.params[0] not in (mavlink.REBOOT_SHUTDOWN_ACTION_REBOOT, mavlink.REBOOT_SHUTDOWN_ACTION_REBOOT_TO_BOOTLOADER):
         return mavlink.MAV_RESULT_UNSUPPORTED
-    vehicle.reboot_wanted = True
+    vehicle.reboot_requested = True
     return mavlink.MAV_RESULT_ACCEPTED
 
 
-def _prearm(vehicle: Vehicle, _o: Order, _c: Channel) -> int:
+def _prearm(vehicle: Vehicle, _o: Command, _c: Channel) -> int:
     v = vehicle.state
     if v.armed:
         return mavlink.MAV_RESULT_TEMPORARILY_REJECTED
     for refusal in arming_refusals(v):
-        v.say(mavlink.MAV_SEVERITY_CRITICAL, f"PreArm: {refusal}")
+        v.send_text(mavlink.MAV_SEVERITY_CRITICAL, f"PreArm: {refusal}")
     return mavlink.MAV_RESULT_ACCEPTED
 
 
-def _calibrate(vehicle: Vehicle, o: Order, _c: Channel) -> int:
+def _calibrate(vehicle: Vehicle, o: Command, _c: Channel) -> int:
     """Handle PREFLIGHT_CALIBRATION.
 
     Accepts calibrations that need no handling by a pilot: gyroscopes, barometer, level. They have no effect because
@@ -229,31 +229,31 @@ def _calibrate(vehicle: Vehicle, o: Order, _c: Channel) -> int:
     """
     v = vehicle.state
     if v.armed or v.motor_test_until_s is not None:
-        v.say(mavlink.MAV_SEVERITY_NOTICE, "Disarm to allow calibration")
+        v.send_text(mavlink.MAV_SEVERITY_NOTICE, "Disarm to allow calibration")
         return mavlink.MAV_RESULT_FAILED
     if o.params[0] == 1.0:
         return mavlink.MAV_RESULT_ACCEPTED
     if o.params[2] == 1.0:
-        v.say(mavlink.MAV_SEVERITY_INFO, "Updating barometer calibration")
-        v.say(mavlink.MAV_SEVERITY_INFO, "Barometer calibration complete")
+        v.send_text(mavlink.MAV_SEVERITY_INFO, "Updating barometer calibration")
+        v.send_text(mavlink.MAV_SEVERITY_INFO, "Barometer calibration complete")
         return mavlink.MAV_RESULT_ACCEPTED
     if o.x == LEVEL:
-        v.say(mavlink.MAV_SEVERITY_INFO, "Trim OK: roll=0.00 pitch=0.00 yaw=0.00")
+        v.send_text(mavlink.MAV_SEVERITY_INFO, "Trim OK: roll=0.00 pitch=0.00 yaw=0.00")
         return mavlink.MAV_RESULT_ACCEPTED
     taken = o.x in (SIMPLE_ACCELEROMETER, FORCE_SAVE) or o.params[1] == FORCE_SAVE
     return mavlink.MAV_RESULT_ACCEPTED if taken else mavlink.MAV_RESULT_UNSUPPORTED
 
 
-def _storage(vehicle: Vehicle, o: Order, _c: Channel) -> int:
+def _storage(vehicle: Vehicle, o: Command, _c: Channel) -> int:
     v = vehicle.state
     if o.params[0] != 2.0 or v.armed:
         return mavlink.MAV_RESULT_DENIED
     v.params.erase()
-    v.say(mavlink.MAV_SEVERITY_WARNING, "All parameters reset, reboot board")
+    v.send_text(mavlink.MAV_SEVERITY_WARNING, "All parameters reset, reboot board")
     return mavlink.MAV_RESULT_ACCEPTED
 
 
-def _switch(vehicle: Vehicle, o: Order, _c: Channel) -> int:
+def _switch(vehicle: Vehicle, o: Command, _c: Channel) -> int:
     """Handle DO_AUX_FUNCTION: act like an RC switch. Only mode and fence functions have an effect."""
     function, position = o.params[:2]
     if not (math.isfinite(function) and math.isfinite(position)) or not SWITCH_LOW <= int(position) <= SWITCH_HIGH:
@@ -266,15 +266,15 @@ def _switch(vehicle: Vehicle, o: Order, _c: Channel) -> int:
 
 
 # Modes whose speed a client may change, and modes that control the heading.
-CHANGES_SPEED = GUIDED_MODES | {mavlink.COPTER_MODE_AUTO, mavlink.COPTER_MODE_RTL, mavlink.COPTER_MODE_SMART_RTL}
-TURNS = frozenset({mavlink.COPTER_MODE_GUIDED, mavlink.COPTER_MODE_AUTO, mavlink.COPTER_MODE_SMART_RTL})
+SPEED_MODES = GUIDED_MODES | {mavlink.COPTER_MODE_AUTO, mavlink.COPTER_MODE_RTL, mavlink.COPTER_MODE_SMART_RTL}
+HEADING_MODES = frozenset({mavlink.COPTER_MODE_GUIDED, mavlink.COPTER_MODE_AUTO, mavlink.COPTER_MODE_SMART_RTL})
 CENTIMETRE = 0.01
 # Maximum climb of a takeoff in a pilot mode.
 PILOT_TAKEOFF_MAX_M = 10.0
 # Values of the fifth parameter of PREFLIGHT_CALIBRATION (the last one also of the second).
 LEVEL, SIMPLE_ACCELEROMETER, FORCE_SAVE = 2, 4, 76
 
-HANDLERS: dict[int, Callable[[Vehicle, Order, Channel], int]] = {
+HANDLERS: dict[int, Callable[[Vehicle, Command, Channel], int]] = {
     mavlink.MAV_CMD_COMPONENT_ARM_DISARM: _arm_disarm,
     mavlink.MAV_CMD_NAV_TAKEOFF: _takeoff,
     mavlink.MAV_CMD_NAV_LAND: _mode_command(mavlink.COPTER_MODE_LAND),
@@ -290,7 +290,7 @@ HANDLERS: dict[int, Callable[[Vehicle, Order, Channel], int]] = {
     mavlink.MAV_CMD_DO_SET_HOME: _set_home,
     mavlink.MAV_CMD_DO_FENCE_ENABLE: _fence_enable,
     mavlink.MAV_CMD_MISSION_START: start_mission,
-    mavlink.MAV_CMD_DO_SET_MISSION_CURRENT: choose_item,
+    mavlink.MAV_CMD_DO_SET_MISSION_CURRENT: set_mission_current,
     mavlink.MAV_CMD_DO_JUMP_TAG: jump_to_tag,
     mavlink.MAV_CMD_DO_PAUSE_CONTINUE: pause,
     mavlink.MAV_CMD_DO_LAND_START: begin_landing_sequence,
@@ -310,8 +310,8 @@ INT_ONLY = frozenset({mavlink.MAV_CMD_DO_REPOSITION})
 
 def handle_command(vehicle: Vehicle, message: Message, channel: Channel) -> None:
     """Execute a command and send COMMAND_ACK."""
-    order = read_order(message)
-    handler, answer = HANDLERS.get(order.command), ANSWERS.get(order.command)
+    order = read_command(message)
+    handler, answer = HANDLERS.get(order.command), REQUEST_HANDLERS.get(order.command)
     if answer is not None:
         result = answer(vehicle.state, order, channel)
     elif handler is None or (order.command in INT_ONLY and not order.integer):

@@ -135,7 +135,7 @@ class Control:
         self._stopping = False
         self._braking_mps2 = 0.0
         self.thrust_share = 0.0
-        self.wanted_n = (0.0, 0.0, 0.0, 0.0)  # thrust demand of each motor
+        self.thrust_demand_n = (0.0, 0.0, 0.0, 0.0)  # thrust demand of each motor
         self.lean = (0.0, 0.0)
 
     def reset(self, est: Estimate) -> None:
@@ -218,13 +218,13 @@ class Control:
         pos, vel, acc = self.pos, self.vel, self.acc
         if self._stopping and math.hypot(vel[0], vel[1]) < STOPPED_MPS:
             self.go_to(pos[0], pos[1])
-        here = (vel[0], vel[1])
+        velocity = (vel[0], vel[1])
         bend = (acc[0], acc[1])
         if self.horizontal is Axis.POSITION:
             error = (self.target[0] - pos[0], self.target[1] - pos[1])
             acc[0], acc[1] = shape_position_xy(
                 error,
-                here,
+                velocity,
                 bend,
                 speed_max=limits.speed_mps,
                 accel_max=limits.accel_mps2,
@@ -235,7 +235,7 @@ class Control:
         elif self.horizontal is Axis.VELOCITY:
             accel = self._braking_mps2 if self._stopping else limits.accel_mps2
             acc[0], acc[1] = shape_velocity_xy(
-                self.target_velocity, here, bend, accel_max=accel, jerk_max=limits.velocity_jerk_mps3, dt=dt
+                self.target_velocity, velocity, bend, accel_max=accel, jerk_max=limits.velocity_jerk_mps3, dt=dt
             )
         vel[0] += acc[0] * dt
         vel[1] += acc[1] * dt
@@ -347,10 +347,10 @@ class Control:
         base = thrust / 4.0
         x4, y4, z4 = tau_x / 4.0, tau_y / 4.0, tau_z / 4.0
         low = 0.02 * full
-        self.wanted_n = (
+        self.thrust_demand_n = (
             clamp(base - x4 + y4 + z4, low, full),
             clamp(base + x4 - y4 + z4, low, full),
             clamp(base + x4 + y4 - z4, low, full),
             clamp(base - x4 - y4 - z4, low, full),
         )
-        return self.wanted_n
+        return self.thrust_demand_n

@@ -39,7 +39,7 @@ TRAITS = {
 SUPPORTED_MODES = frozenset(TRAITS)
 # Modes that accept targets of a companion computer, and modes in which NAV_TAKEOFF works.
 GUIDED_MODES = frozenset({mavlink.COPTER_MODE_GUIDED, mavlink.COPTER_MODE_GUIDED_NOGPS, mavlink.COPTER_MODE_AVOID_ADSB})
-TAKES_OFF = GUIDED_MODES | {mavlink.COPTER_MODE_LOITER, mavlink.COPTER_MODE_POSHOLD, mavlink.COPTER_MODE_ZIGZAG}
+TAKEOFF_MODES = GUIDED_MODES | {mavlink.COPTER_MODE_LOITER, mavlink.COPTER_MODE_POSHOLD, mavlink.COPTER_MODE_ZIGZAG}
 # Modes that exist but cannot be entered without a pilot, a sensor or a setting: STATUSTEXTs and the reason of the
 # refusal.
 UNAVAILABLE: dict[int, tuple[tuple[str, ...], str]] = {

@@ -31,21 +31,21 @@ def dispatch(vehicle: Vehicle, message: Message, channel: Channel) -> None:
         return
     if message.has("target_system") and message.integer("target_system") not in (0, v.sysid):
         return
-    if message.has("target_component") and _is_for_another(v, message.integer("target_component")):
+    if message.has("target_component") and _is_for_other_component(v, message.integer("target_component")):
         return
     handler = HANDLERS.get(message.name)
     if handler is not None:
         handler(vehicle, message, channel)
 
 
-def _is_for_another(v: VehicleState, component: int) -> bool:
+def _is_for_other_component(v: VehicleState, component: int) -> bool:
     """Return True if the addressed component is a known peer. Otherwise the autopilot handles the message itself."""
     if component in (0, v.compid):
         return False
     return any((v.sysid, component) in channel.peers for channel in v.channels)
 
 
-def _answer(name: str) -> Handler:
+def _reply_with(name: str) -> Handler:
     def answer(vehicle: Vehicle, _m: Message, c: Channel) -> None:
         send(vehicle.state, c, name)
 
@@ -61,7 +61,7 @@ def _target(take: Callable[[VehicleState, Flight, Message], None]) -> Handler:
 
 def _heartbeat(vehicle: Vehicle, m: Message, _c: Channel) -> None:
     if m.sysid == int(vehicle.state.params["SYSID_MYGCS"]):
-        vehicle.failsafes.heard_station()
+        vehicle.failsafes.record_gcs_heartbeat()
 
 
 def _set_mode(vehicle: Vehicle, m: Message, _c: Channel) -> None:
@@ -98,7 +98,7 @@ def _parameter_set(vehicle: Vehicle, m: Message, c: Channel) -> None:
     if not math.isfinite(value):
         return
     if not v.params.set(name, value) and v.params.find(name) is not None:
-        v.say(mavlink.MAV_SEVERITY_WARNING, f"Param write denied ({name})")
+        v.send_text(mavlink.MAV_SEVERITY_WARNING, f"Param write denied ({name})")
     for channel in v.channels:
         if channel is c or not channel.signed:
             send_parameter(v, channel, name, -1, UNKNOWN_U16)
@@ -175,14 +175,14 @@ def _setup_signing(vehicle: Vehicle, m: Message, _c: Channel) -> None:
     """Set the signing key, or disable signing if the key is all zeros. Refused while armed, as in ArduPilot."""
     v = vehicle.state
     if v.armed:
-        v.say(mavlink.MAV_SEVERITY_DEBUG, "ERROR: Won't setup signing when armed")
+        v.send_text(mavlink.MAV_SEVERITY_DEBUG, "ERROR: Won't setup signing when armed")
         return
     key = bytes(int(value) for value in m.array("secret_key"))
     started = m.integer("initial_timestamp")
     for channel in v.channels:
         channel.set_signing(key if any(key) else None, started)
     vehicle.signing_key = key if any(key) else None
-    v.say(mavlink.MAV_SEVERITY_INFO, "Signing key set" if any(key) else "Signing off")
+    v.send_text(mavlink.MAV_SEVERITY_INFO, "Signing key set" if any(key) else "Signing off")
 
 
 HANDLERS: dict[str, Handler] = {
@@ -196,7 +196,7 @@ HANDLERS: dict[str, Handler] = {
     "PARAM_SET": _parameter_set,
     "FILE_TRANSFER_PROTOCOL": _file_transfer,
     "TIMESYNC": _timesync,
-    "AUTOPILOT_VERSION_REQUEST": _answer("AUTOPILOT_VERSION"),
+    "AUTOPILOT_VERSION_REQUEST": _reply_with("AUTOPILOT_VERSION"),
     "SET_POSITION_TARGET_LOCAL_NED": _target(local_target),
     "SET_POSITION_TARGET_GLOBAL_INT": _target(global_target),
     "SET_ATTITUDE_TARGET": _target(attitude_target),
@@ -204,7 +204,7 @@ HANDLERS: dict[str, Handler] = {
     "RC_CHANNELS_OVERRIDE": _sticks,
     "MANUAL_CONTROL": _manual,
     # The origin comes from GPS. The reply reports its position.
-    "SET_GPS_GLOBAL_ORIGIN": _answer("GPS_GLOBAL_ORIGIN"),
+    "SET_GPS_GLOBAL_ORIGIN": _reply_with("GPS_GLOBAL_ORIGIN"),
     "SET_HOME_POSITION": _set_home,
     "SETUP_SIGNING": _setup_signing,
     **dict.fromkeys(

@@ -81,14 +81,14 @@ class Estimator:
         noise_m: float,
         rng: random.Random,
         params: Parameters,
-        say: Callable[[int, str], None],
+        send_text: Callable[[int, str], None],
     ) -> None:
         self._start = start
         self._ready_after_s = ready_after_s
         self._noise_m = noise_m
         self._rng = rng
         self._params = params
-        self._say = say
+        self._send_text = send_text
         self.gps = Gps()
         self.origin: Place | None = None
         self.position_ok = False
@@ -172,7 +172,7 @@ class Estimator:
         elif self.since_boot(FILTER_STARTED_S):
             self.gps.lose()
         self._announce(body)
-        self._judge(time_s)
+        self._update_position(time_s)
 
     def _announce(self, body: Body) -> None:
         """Send the STATUSTEXTs of the startup sequence and of the first climb."""
@@ -185,9 +185,9 @@ class Estimator:
                 self._inform(f"EKF3 IMU{unit} MAG0 in-flight yaw alignment complete")
 
     def _inform(self, text: str) -> None:
-        self._say(mavlink.MAV_SEVERITY_INFO, text)
+        self._send_text(mavlink.MAV_SEVERITY_INFO, text)
 
-    def _judge(self, time_s: float) -> None:
+    def _update_position(self, time_s: float) -> None:
         age_s = time_s - self._fix_s
         self._drift.step(GPS_INTERVAL_S, aided=self.origin is None or age_s <= 2.0 * GPS_INTERVAL_S)
         if self.origin is None and self.gps.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX and self.since_boot(ORIGIN_SET_S):

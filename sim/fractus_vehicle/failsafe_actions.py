@@ -51,7 +51,7 @@ FENCE_ACTIONS = {
 }
 
 
-def act(v: VehicleState, modes: FlightModes, action: Action) -> None:
+def execute_action(v: VehicleState, modes: FlightModes, action: Action) -> None:
     """Execute an action. If its mode is unavailable, fall back to the next best mode and finally to LAND."""
     match action:
         case Action.NONE:
@@ -64,19 +64,19 @@ def act(v: VehicleState, modes: FlightModes, action: Action) -> None:
             _return(v, modes)
         case Action.SMART_RTL:
             if not modes.change(mavlink.COPTER_MODE_SMART_RTL):
-                v.say(mavlink.MAV_SEVERITY_WARNING, "SmartRTL Unavailable, Trying RTL Mode")
+                v.send_text(mavlink.MAV_SEVERITY_WARNING, "SmartRTL Unavailable, Trying RTL Mode")
                 _return(v, modes)
         case Action.SMART_RTL_LAND:
             if not modes.change(mavlink.COPTER_MODE_SMART_RTL):
-                v.say(mavlink.MAV_SEVERITY_WARNING, "SmartRTL Unavailable, Using Land Mode")
+                v.send_text(mavlink.MAV_SEVERITY_WARNING, "SmartRTL Unavailable, Using Land Mode")
                 _land(v, modes)
         case Action.AUTO_LAND_START:
             # Landing sequences in missions are not simulated. ArduPilot falls back to RTL without one.
-            v.say(mavlink.MAV_SEVERITY_WARNING, "Trying RTL Mode")
+            v.send_text(mavlink.MAV_SEVERITY_WARNING, "Trying RTL Mode")
             _return(v, modes)
         case Action.BRAKE_LAND:
             if not modes.change(mavlink.COPTER_MODE_BRAKE):
-                v.say(mavlink.MAV_SEVERITY_WARNING, "Trying Land Mode")
+                v.send_text(mavlink.MAV_SEVERITY_WARNING, "Trying Land Mode")
                 _land(v, modes)
 
 

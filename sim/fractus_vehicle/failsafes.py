@@ -8,7 +8,7 @@ from enum import IntFlag
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.copter import mode_title
-from fractus_vehicle.failsafe_actions import FENCE_ACTIONS, GCS_ACTIONS, RADIO_ACTIONS, Action, act
+from fractus_vehicle.failsafe_actions import FENCE_ACTIONS, GCS_ACTIONS, RADIO_ACTIONS, Action, execute_action
 from fractus_vehicle.fence import NO_BREACH, breach_names
 from fractus_vehicle.modes import FlightModes
 from fractus_vehicle.state import VehicleState
@@ -58,7 +58,7 @@ class Failsafes:
         self._weak_since_s: float | None = None
         self._next_check_s = 0.0
 
-    def heard_station(self) -> None:
+    def record_gcs_heartbeat(self) -> None:
         """Record a heartbeat of the monitored ground station (SYSID_MYGCS)."""
         self._gcs_seen_s = self._state.time_s
 
@@ -87,8 +87,8 @@ class Failsafes:
         self._weak_since_s = v.time_s if self._weak_since_s is None else self._weak_since_s
         if v.time_s - self._weak_since_s >= THRUST_LOST_S:
             self._weak_since_s = None
-            hardest = max(range(len(v.body.motors)), key=lambda at: v.control.wanted_n[at])
-            v.say(mavlink.MAV_SEVERITY_EMERGENCY, f"Potential Thrust Loss ({hardest + 1})")
+            hardest = max(range(len(v.body.motors)), key=lambda at: v.control.thrust_demand_n[at])
+            v.send_text(mavlink.MAV_SEVERITY_EMERGENCY, f"Potential Thrust Loss ({hardest + 1})")
 
     def _check_crash(self, v: VehicleState) -> None:
         roll, pitch, _ = v.body.euler()
@@ -99,7 +99,7 @@ class Failsafes:
             return
         self._crash_since_s = v.time_s if self._crash_since_s is None else self._crash_since_s
         if v.time_s - self._crash_since_s >= CRASH_CONFIRMED_S:
-            v.say(
+            v.send_text(
                 mavlink.MAV_SEVERITY_EMERGENCY,
                 f"Crash: Disarming: AngErr={error_deg:.0f}>{CRASH_ANGLE_DEG:.0f}, Accel=0.0<3.0",
             )
@@ -115,7 +115,7 @@ class Failsafes:
             return
         v.failsafes.gcs = silent
         if not silent:
-            v.say(mavlink.MAV_SEVERITY_WARNING, "GCS Failsafe Cleared")
+            v.send_text(mavlink.MAV_SEVERITY_WARNING, "GCS Failsafe Cleared")
             return
         v.receiver.release()
         options = Option(int(v.params["FS_OPTIONS"]) & 31)
@@ -137,7 +137,7 @@ class Failsafes:
             return
         v.failsafes.radio = lost
         if not lost:
-            v.say(mavlink.MAV_SEVERITY_WARNING, "Radio Failsafe Cleared")
+            v.send_text(mavlink.MAV_SEVERITY_WARNING, "Radio Failsafe Cleared")
             return
         options = Option(int(v.params["FS_OPTIONS"]) & 31)
         watched = int(v.params["FS_GCS_ENABLE"]) != 0
@@ -148,27 +148,27 @@ class Failsafes:
         else:
             self._take_over(v, "Radio", RADIO_ACTIONS.get(setting, Action.LAND))
 
-    def _take_over(self, v: VehicleState, what: str, action: Action) -> None:
-        """Announce a failsafe and act, unless the vehicle is disarmed, on the ground or landing."""
+    def _take_over(self, v: VehicleState, cause: str, action: Action) -> None:
+        """Announce a failsafe and execute_action, unless the vehicle is disarmed, on the ground or landing."""
         options = Option(int(v.params["FS_OPTIONS"]) & 31)
         if not v.armed:
-            self._announce(v, what)
-        elif v.landed and not v.flying_wanted:
-            self._announce(v, what, "Disarming")
+            self._announce(v, cause)
+        elif v.landed and not v.taking_off:
+            self._announce(v, cause, "Disarming")
             v.disarm()
         elif self._modes.flight.landing and v.failsafes.battery and self._battery_action in _LAND_ACTIONS:
-            self._announce(v, f"{what} + Battery", "Continuing Landing")
-            act(v, self._modes, Action.LAND)
+            self._announce(v, f"{cause} + Battery", "Continuing Landing")
+            execute_action(v, self._modes, Action.LAND)
         elif self._modes.flight.landing and Option.LANDING in options:
-            self._announce(v, what, "Continuing Landing")
-            act(v, self._modes, Action.LAND)
+            self._announce(v, cause, "Continuing Landing")
+            execute_action(v, self._modes, Action.LAND)
         else:
-            self._announce(v, what)
-            act(v, self._modes, action)
+            self._announce(v, cause)
+            execute_action(v, self._modes, action)
 
     @staticmethod
-    def _announce(v: VehicleState, what: str, done: str = "") -> None:
-        v.say(mavlink.MAV_SEVERITY_WARNING, f"{what} Failsafe - {done}" if done else f"{what} Failsafe")
+    def _announce(v: VehicleState, cause: str, done: str = "") -> None:
+        v.send_text(mavlink.MAV_SEVERITY_WARNING, f"{cause} Failsafe - {done}" if done else f"{cause} Failsafe")
 
     def _check_battery(self, v: VehicleState) -> None:
         if not v.armed:
@@ -194,43 +194,43 @@ class Failsafes:
 
     def _battery_event(self, v: VehicleState, level: str, setting: int) -> None:
         battery = v.battery
-        v.say(
+        v.send_text(
             mavlink.MAV_SEVERITY_WARNING,
             f"Battery 1 is {level} {battery.voltage_v:.2f}V used {battery.used_mah:.0f} mAh",
         )
         action = Action(setting) if setting in set(Action) else Action.NONE
         self._battery_action = action
         landing = self._modes.flight.landing and Option.LANDING in Option(int(v.params["FS_OPTIONS"]) & 31)
-        if v.landed and not v.flying_wanted:
+        if v.landed and not v.taking_off:
             self._announce(v, "Battery", "Disarming")
             v.disarm()
         elif landing and action is not Action.NONE:
             self._announce(v, "Battery", "Continuing Landing")
-            act(v, self._modes, Action.LAND)
+            execute_action(v, self._modes, Action.LAND)
         else:
             self._announce(v, "Battery")
-            act(v, self._modes, action)
+            execute_action(v, self._modes, action)
 
     def _check_position(self, v: VehicleState) -> None:
         if v.position_ok or v.origin is None:
             if v.failsafes.ekf:
                 v.failsafes.ekf = False
-                v.say(mavlink.MAV_SEVERITY_CRITICAL, "EKF Failsafe Cleared")
+                v.send_text(mavlink.MAV_SEVERITY_CRITICAL, "EKF Failsafe Cleared")
             self._lost_since_s = None
             return
         self._lost_since_s = self._lost_since_s if self._lost_since_s is not None else v.time_s
         if v.failsafes.ekf or not v.armed or v.time_s - self._lost_since_s < POSITION_LOST_S:
             return
         v.failsafes.ekf = True
-        v.say(mavlink.MAV_SEVERITY_CRITICAL, "EKF variance")
+        v.send_text(mavlink.MAV_SEVERITY_CRITICAL, "EKF variance")
         setting = int(v.params["FS_EKF_ACTION"])
         if setting == EKF_REPORTS_ONLY or v.landed or v.mode == mavlink.COPTER_MODE_LAND:
             return
         if v.mode in (mavlink.COPTER_MODE_STABILIZE, mavlink.COPTER_MODE_ALT_HOLD) and setting != EKF_LANDS_ALWAYS:
             return
         if setting != EKF_HOLDS_ALTITUDE or v.failsafes.radio or not self._modes.change(mavlink.COPTER_MODE_ALT_HOLD):
-            act(v, self._modes, Action.LAND)
-        v.say(mavlink.MAV_SEVERITY_CRITICAL, f"EKF Failsafe: changed to {mode_title(v.mode)} Mode")
+            execute_action(v, self._modes, Action.LAND)
+        v.send_text(mavlink.MAV_SEVERITY_CRITICAL, f"EKF Failsafe: changed to {mode_title(v.mode)} Mode")
 
     def _check_fence(self, v: VehicleState) -> None:
         fence = v.fence
@@ -242,11 +242,11 @@ class Failsafes:
         before = fence.breaches
         new = fence.check(v.est.north, v.est.east, v.altitude_m, v.home_xy, v.time_s)
         if before and not fence.breaches:
-            v.say(mavlink.MAV_SEVERITY_NOTICE, "Fence breach cleared")
+            v.send_text(mavlink.MAV_SEVERITY_NOTICE, "Fence breach cleared")
         if not new:
             return
-        v.say(mavlink.MAV_SEVERITY_NOTICE, f"{breach_names(new)} breached")
+        v.send_text(mavlink.MAV_SEVERITY_NOTICE, f"{breach_names(new)} breached")
         action = FENCE_ACTIONS.get(int(v.params["FENCE_ACTION"]), Action.NONE)
         if action is not Action.NONE and v.mode != mavlink.COPTER_MODE_LAND:
             far = fence.distance_m(v.est.north, v.est.east, v.altitude_m, v.home_xy) > FENCE_GIVE_UP_M
-            act(v, self._modes, Action.LAND if far else action)
+            execute_action(v, self._modes, Action.LAND if far else action)

@@ -27,13 +27,13 @@ def _to_edge_m(north: float, east: float, a: Vertex, b: Vertex) -> float:
     return math.hypot(north - a[0] - share * run_n, east - a[1] - share * run_e)
 
 
-def _ahead_m(here: Vertex, course: Vertex, a: Vertex, b: Vertex) -> float | None:
+def _ahead_m(position: Vertex, course: Vertex, a: Vertex, b: Vertex) -> float | None:
     """Return the distance along a course to the crossing of an edge, or None if the course misses the edge."""
     run_n, run_e = b[0] - a[0], b[1] - a[1]
     turn = course[0] * run_e - course[1] * run_n
     if abs(turn) < 1e-9:
         return None
-    to_n, to_e = a[0] - here[0], a[1] - here[1]
+    to_n, to_e = a[0] - position[0], a[1] - position[1]
     ahead = (to_n * run_e - to_e * run_n) / turn
     share = (to_n * course[1] - to_e * course[0]) / turn
     return ahead if ahead >= 0.0 and 0.0 <= share <= 1.0 else None
@@ -62,10 +62,10 @@ class Polygon:
             previous = vertex
         return inside
 
-    def distance_along_m(self, here: Vertex, course: Vertex) -> float | None:
+    def distance_along_m(self, position: Vertex, course: Vertex) -> float | None:
         """Return the distance along a course to the first edge, or None."""
         edges = zip(self.vertices, (*self.vertices[1:], self.vertices[0]), strict=True)
-        return min((d for a, b in edges if (d := _ahead_m(here, course, a, b)) is not None), default=None)
+        return min((d for a, b in edges if (d := _ahead_m(position, course, a, b)) is not None), default=None)
 
     def edge_distance_m(self, north: float, east: float) -> float:
         """Return the distance to the nearest edge in metres."""
@@ -86,15 +86,15 @@ class Circle:
         """Return True if the point is inside."""
         return math.hypot(north - self.north, east - self.east) <= self.radius_m
 
-    def distance_along_m(self, here: Vertex, course: Vertex) -> float | None:
+    def distance_along_m(self, position: Vertex, course: Vertex) -> float | None:
         """Return the distance along a course to the rim, or None."""
-        north, east = here[0] - self.north, here[1] - self.east
+        north, east = position[0] - self.north, position[1] - self.east
         along = north * course[0] + east * course[1]
         square = along * along - (north * north + east * east - self.radius_m * self.radius_m)
         if square < 0.0:
             return None
-        ways = (-along - math.sqrt(square), -along + math.sqrt(square))
-        return min((way for way in ways if way >= 0.0), default=None)
+        distances = (-along - math.sqrt(square), -along + math.sqrt(square))
+        return min((distance for distance in distances if distance >= 0.0), default=None)
 
     def edge_distance_m(self, north: float, east: float) -> float:
         """Return the distance to the rim in metres."""
@@ -212,30 +212,30 @@ class Fence:
             altitude_m: Altitude above home.
             home: Home position in local metres.
         """
-        found = NO_BREACH
+        breaches = NO_BREACH
         if not self.enabled:
-            return found
+            return breaches
         if self.types & mavlink.FENCE_TYPE_ALT_MAX and altitude_m >= self.alt_max_m:
-            found |= mavlink.FENCE_TYPE_ALT_MAX
+            breaches |= mavlink.FENCE_TYPE_ALT_MAX
         if self.types & mavlink.FENCE_TYPE_ALT_MIN and altitude_m <= self.alt_min_m:
-            found |= mavlink.FENCE_TYPE_ALT_MIN
+            breaches |= mavlink.FENCE_TYPE_ALT_MIN
         if self.types & mavlink.FENCE_TYPE_CIRCLE and math.hypot(north - home[0], east - home[1]) >= self.radius_m:
-            found |= mavlink.FENCE_TYPE_CIRCLE
+            breaches |= mavlink.FENCE_TYPE_CIRCLE
         if self.types & mavlink.FENCE_TYPE_POLYGON and any(s.contains(north, east) != s.inclusion for s in self.shapes):
-            found |= mavlink.FENCE_TYPE_POLYGON
-        return found
+            breaches |= mavlink.FENCE_TYPE_POLYGON
+        return breaches
 
     def distance_m(self, north: float, east: float, altitude_m: float, home: Vertex = (0.0, 0.0)) -> float:
         """Return the distance of a point beyond the breached limits in metres, 0 inside."""
-        found = self.outside(north, east, altitude_m, home)
+        breaches = self.outside(north, east, altitude_m, home)
         beyond = [0.0]
-        if found & mavlink.FENCE_TYPE_ALT_MAX:
+        if breaches & mavlink.FENCE_TYPE_ALT_MAX:
             beyond.append(altitude_m - self.alt_max_m)
-        if found & mavlink.FENCE_TYPE_ALT_MIN:
+        if breaches & mavlink.FENCE_TYPE_ALT_MIN:
             beyond.append(self.alt_min_m - altitude_m)
-        if found & mavlink.FENCE_TYPE_CIRCLE:
+        if breaches & mavlink.FENCE_TYPE_CIRCLE:
             beyond.append(math.hypot(north - home[0], east - home[1]) - self.radius_m)
-        if found & mavlink.FENCE_TYPE_POLYGON:
+        if breaches & mavlink.FENCE_TYPE_POLYGON:
             wrong = [shape for shape in self.shapes if shape.contains(north, east) != shape.inclusion]
             beyond += [shape.edge_distance_m(north, east) for shape in wrong]
         return max(beyond)
@@ -268,9 +268,9 @@ class Fence:
 
     def check(self, north: float, east: float, altitude_m: float, home: Vertex, now_s: float) -> int:
         """Update the breaches and return the new ones."""
-        found = self.outside(north, east, altitude_m, home)
-        new = found & ~self.breaches
-        self.breaches = found
+        breaches = self.outside(north, east, altitude_m, home)
+        new = breaches & ~self.breaches
+        self.breaches = breaches
         if new:
             self.breach_count = min(self.breach_count + 1, 65535)
             self.breach_time_s = now_s

@@ -38,7 +38,7 @@ class Gimbal:
         self.yaw_deg += clamp(self.target[1] - self.yaw_deg, -most, most)
 
     @property
-    def told(self) -> tuple[float, float, float, float]:
+    def reported_quaternion(self) -> tuple[float, float, float, float]:
         """Attitude quaternion for telemetry: the measured attitude, or the target for servo gimbals."""
         angles = self.target if self.kind in SERVOS else (self.pitch_deg, self.yaw_deg)
         pitch, yaw = (math.radians(angle) / 2 for angle in angles)

@@ -34,7 +34,7 @@ class GuidedFlight(Flight):
         self.updated_s = 0.0
         self._controller = Task.VELOCITY
         self.paused = False
-        self._asked: tuple[float, float, float] | None = None
+        self._commanded_velocity: tuple[float, float, float] | None = None
         self._resume: tuple[float, float, float] | None = None
 
     def begin(self, v: VehicleState) -> None:
@@ -87,7 +87,7 @@ class GuidedFlight(Flight):
         self.updated_s = v.time_s
         velocity = _limited(v, velocity)
         control = v.control
-        self._asked = velocity if position is None else None
+        self._commanded_velocity = velocity if position is None else None
         if position is None:
             self._avoid(v)
             control.climb(velocity[2])
@@ -98,9 +98,9 @@ class GuidedFlight(Flight):
 
     def _avoid(self, v: VehicleState) -> None:
         """Fly the commanded velocity, slowed down in front of the fence."""
-        if self._asked is None:
+        if self._commanded_velocity is None:
             return
-        vn, ve, _ = self._asked
+        vn, ve, _ = self._commanded_velocity
         speed = math.hypot(vn, ve)
         braking = AVOIDANCE_OPTIMISM * (v.params["AVOID_ACCEL_MAX"] or v.control.limits.accel_mps2)
         scale = 1.0
@@ -129,7 +129,7 @@ class GuidedFlight(Flight):
     def stop(self, v: VehicleState) -> None:
         """Stop and hold."""
         self.task = Task.POSITION
-        self._asked = None
+        self._commanded_velocity = None
         v.control.hold_here()
 
     def pause(self, v: VehicleState, *, paused: bool) -> None:
@@ -152,7 +152,7 @@ class GuidedFlight(Flight):
                     v.control.pos[0], v.control.pos[1] = v.est.north, v.est.east
                     v.control.vel[0], v.control.vel[1] = v.est.vn, v.est.ve
                 self.stop(v)
-            elif self._asked is not None and self.task is Task.VELOCITY:
+            elif self._commanded_velocity is not None and self.task is Task.VELOCITY:
                 self._avoid(v)
             elif v.control.horizontal is Axis.POSITION and self.task is Task.VELOCITY:
                 vn, ve = v.control.target_velocity

@@ -11,7 +11,7 @@ from fractus_vehicle.shaping import clamp, wrap_pi
 # Below this share of the speed limit the vehicle keeps its heading instead of following the course.
 COURSE_SHARE = 0.05
 # Closer to the target angle than this, a commanded direction does not cause a full turn.
-THERE_RAD = math.radians(0.5)
+ANGLE_REACHED_RAD = math.radians(0.5)
 
 
 class Heading:
@@ -58,7 +58,7 @@ class Heading:
             self._left = -angle if direction < 0 else angle
         else:
             self._left = wrap_pi(angle - control.target_yaw)
-            if direction * self._left < 0.0 and abs(self._left) > THERE_RAD:
+            if direction * self._left < 0.0 and abs(self._left) > ANGLE_REACHED_RAD:
                 self._left += math.copysign(2.0 * math.pi, direction)
         fastest = math.radians(self._params["ATC_SLEW_YAW"] / 100.0)
         self._rate_rps = min(math.radians(rate_dps), fastest) if rate_dps > 0.0 else fastest

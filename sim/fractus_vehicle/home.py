@@ -14,7 +14,7 @@ from fractus_vehicle.telemetry import send_on_all
 def set_home(v: VehicleState, place: Place) -> None:
     """Set the home position, also in the mission, and send HOME_POSITION."""
     v.home = place
-    v.mission.with_home(place)
+    v.mission.set_home(place)
     send_on_all(v, "HOME_POSITION")
 
 
@@ -56,24 +56,24 @@ class ReturnPoint:
     base_down: float
     altitude_m: float
 
-    def distance_m(self, here: tuple[float, float]) -> float:
+    def distance_m(self, position: tuple[float, float]) -> float:
         """Return the horizontal distance in metres."""
-        return math.dist((self.north, self.east), here)
+        return math.dist((self.north, self.east), position)
 
 
 def return_point(v: VehicleState) -> ReturnPoint:
     """Return home, or the nearest rally point within RALLY_LIMIT_KM."""
     origin = v.origin or v.start
     home = v.home or origin
-    here = (v.est.north, v.est.east)
+    position = (v.est.north, v.est.east)
     at_home = ReturnPoint(*origin.vector_to(home), altitude_m=0.0)
     limit_m = v.params["RALLY_LIMIT_KM"] * 1000.0
     rallies = [_rally(v, item, origin, home) for item in v.rally.items]
-    reachable = [rally for rally in rallies if limit_m <= 0.0 or rally.distance_m(here) <= limit_m]
+    reachable = [rally for rally in rallies if limit_m <= 0.0 or rally.distance_m(position) <= limit_m]
     if not reachable:
         return at_home
-    nearest = min(reachable, key=lambda rally: rally.distance_m(here))
-    home_is_near = at_home.distance_m(here) <= nearest.distance_m(here)
+    nearest = min(reachable, key=lambda rally: rally.distance_m(position))
+    home_is_near = at_home.distance_m(position) <= nearest.distance_m(position)
     return at_home if int(v.params["RALLY_INCL_HOME"]) and home_is_near else nearest
 
 

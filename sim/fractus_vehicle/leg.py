@@ -60,9 +60,13 @@ class Leg:
         self._rest = _stopping(v)
         last = resting_place(v)
         self._start = last
-        way = (north - last[0], east - last[1], down - last[2])
-        length = math.hypot(*way)
-        self._along = (way[0] / length, way[1] / length, way[2] / length) if length > 0.0 else (0.0, 0.0, 0.0)
+        displacement = (north - last[0], east - last[1], down - last[2])
+        length = math.hypot(*displacement)
+        self._along = (
+            (displacement[0] / length, displacement[1] / length, displacement[2] / length)
+            if length > 0.0
+            else (0.0, 0.0, 0.0)
+        )
         level, rise = math.hypot(self._along[0], self._along[1]), self._along[2]
         vertical = limits.climb_mps if rise < 0.0 else limits.sink_mps
         self._speed_mps = min(
@@ -97,14 +101,14 @@ class Leg:
         change = limits.accel_mps2 / max(self._begun_mps, 0.1) * dt
         self._pace += clamp(limits.speed_mps / self._begun_mps - self._pace, -change, change)
         self._time_s += dt * self._pace
-        way, speed, accel = self._profile.at(self._time_s)
+        distance, speed, accel = self._profile.at(self._time_s)
         speed *= self._pace
         moving = self._rest[self._at] if self._at < len(self._rest) else (self._start, _STILL, _STILL)
         self._at += 1
         north, east, down = self._along
         position, velocity, acceleration = moving
         control.track(
-            (position[0] + way * north, position[1] + way * east, position[2] + way * down),
+            (position[0] + distance * north, position[1] + distance * east, position[2] + distance * down),
             (velocity[0] + speed * north, velocity[1] + speed * east, velocity[2] + speed * down),
             (acceleration[0] + accel * north, acceleration[1] + accel * east, acceleration[2] + accel * down),
         )

@@ -111,15 +111,15 @@ class Hub:
         """Stop watching a descriptor."""
         self._selector.unregister(fileno)
 
-    def at_flush(self, flush: Callable[[], None]) -> None:
+    def add_flush(self, flush: Callable[[], None]) -> None:
         """Call `flush` at each flush."""
         self._flushers.append(flush)
 
-    def not_at_flush(self, flush: Callable[[], None]) -> None:
+    def remove_flush(self, flush: Callable[[], None]) -> None:
         """Stop calling `flush`."""
         self._flushers.remove(flush)
 
-    def at_close(self, close: Callable[[], None]) -> None:
+    def add_close(self, close: Callable[[], None]) -> None:
         """Call `close` when the hub closes."""
         self._closers.append(close)
 
@@ -162,7 +162,7 @@ class _TcpServer:
             raise
         self._socket.setblocking(False)
         hub.watch(self._socket.fileno(), self._accept)
-        hub.at_close(self._close)
+        hub.add_close(self._close)
 
     def _accept(self) -> None:
         try:
@@ -192,7 +192,7 @@ class _TcpClient:
         self._channel = craft.open("tcp", port)
         self._unsent = b""
         hub.watch(connection.fileno(), self._read)
-        hub.at_flush(self._flush)
+        hub.add_flush(self._flush)
 
     def _read(self) -> None:
         for _ in range(READS_PER_POLL):
@@ -227,7 +227,7 @@ class _TcpClient:
     def close(self) -> None:
         """Close the connection and its channel."""
         self._hub.forget(self._socket.fileno())
-        self._hub.not_at_flush(self._flush)
+        self._hub.remove_flush(self._flush)
         self._craft.close(self._channel)
         self._socket.close()
         self._gone(self)
@@ -251,8 +251,8 @@ class _Udp:
             self._socket.close()
             raise
         hub.watch(self._socket.fileno(), self._read)
-        hub.at_flush(self._flush)
-        hub.at_close(self._socket.close)
+        hub.add_flush(self._flush)
+        hub.add_close(self._socket.close)
 
     def _read(self) -> None:
         for _ in range(READS_PER_POLL * 8):
@@ -308,8 +308,8 @@ class _Terminal:
         self._channel = craft.open(spec.kind, port)
         self._unsent = b""
         hub.watch(self._fd, self._read)
-        hub.at_flush(self._flush)
-        hub.at_close(self._close)
+        hub.add_flush(self._flush)
+        hub.add_close(self._close)
 
     def _read(self) -> None:
         try:

@@ -35,7 +35,7 @@ class LockstepServer:
             raise LinkError(f"lockstep {host}:{port}: {error.strerror or error}") from error
         self._listener.setblocking(False)
         hub.watch(self._listener.fileno(), self._accept)
-        hub.at_close(self._close)
+        hub.add_close(self._close)
 
     def take(self) -> int:
         """Return the number of steps requested since the last call."""

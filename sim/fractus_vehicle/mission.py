@@ -74,7 +74,9 @@ class Mission:
             item = self.items[at]
             if item.command not in (mavlink.MAV_CMD_DO_JUMP, mavlink.MAV_CMD_DO_JUMP_TAG):
                 return at
-            target = self.tagged(int(item.param1)) if item.command == mavlink.MAV_CMD_DO_JUMP_TAG else int(item.param1)
+            target = (
+                self.find_tag(int(item.param1)) if item.command == mavlink.MAV_CMD_DO_JUMP_TAG else int(item.param1)
+            )
             if target is None or not 0 < target < len(self.items):
                 return None
             done = self._jumps.get(at, 0)
@@ -85,14 +87,14 @@ class Mission:
                 at += 1
         return None
 
-    def tagged(self, tag: int) -> int | None:
+    def find_tag(self, tag: int) -> int | None:
         """Return the index of the first item with a JUMP_TAG, or None."""
         marks = (
             at for at, item in enumerate(self.items) if item.command == mavlink.MAV_CMD_JUMP_TAG and item.param1 == tag
         )
         return next(marks, None)
 
-    def with_home(self, home: Place) -> None:
+    def set_home(self, home: Place) -> None:
         """Update item 0 to the home position."""
         self.store.home = home_item(home)
         if self.items:

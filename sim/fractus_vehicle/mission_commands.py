@@ -39,7 +39,7 @@ class MissionCommands:
             item = v.mission.items[index]
             if self._begun_s is None:
                 self._begun_s = v.time_s
-                v.say(mavlink.MAV_SEVERITY_INFO, f"Mission: {index} {title(item)}")
+                v.send_text(mavlink.MAV_SEVERITY_INFO, f"Mission: {index} {title(item)}")
                 _do(v, item)
             if not _fulfilled(v, item, v.time_s - self._begun_s):
                 return

@@ -186,7 +186,7 @@ def item_from(message: Message) -> Item:
     )
 
 
-def judge(item: Item, kind: int) -> int:
+def validate_item(item: Item, kind: int) -> int:
     """Return MAV_MISSION_ACCEPTED if the item may be stored in a list of this kind, or the MAV_MISSION_RESULT error."""
     if kind == mavlink.MAV_MISSION_TYPE_FENCE:
         known = item.command in FENCE_COMMANDS
@@ -207,7 +207,7 @@ def judge(item: Item, kind: int) -> int:
     return mavlink.MAV_MISSION_ACCEPTED if item.frame in GLOBAL_FRAMES else mavlink.MAV_MISSION_UNSUPPORTED_FRAME
 
 
-def judge_numbers(message: Message) -> int:
+def validate_parameters(message: Message) -> int:
     """Return MAV_MISSION_ACCEPTED if all parameters are finite, or the error of the first invalid one."""
     may_be_nan = message.integer("command") in NAN_HEADINGS
     for at in range(1, 5):

@@ -9,14 +9,14 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from fractus_vehicle.auto import AutoFlight
 from fractus_vehicle.channel import Channel
 from fractus_vehicle.guided import GuidedFlight
-from fractus_vehicle.orders import Order
+from fractus_vehicle.orders import Command
 from fractus_vehicle.telemetry import send
 from fractus_vehicle.vehicle import Vehicle
 
 MAX_TAG = 65535
 
 
-def start_mission(vehicle: Vehicle, o: Order, _c: Channel) -> int:
+def start_mission(vehicle: Vehicle, o: Command, _c: Channel) -> int:
     """Handle MISSION_START. Only the whole mission can be started."""
     if o.params[:2] != (0.0, 0.0):
         return mavlink.MAV_RESULT_DENIED
@@ -28,7 +28,7 @@ def start_mission(vehicle: Vehicle, o: Order, _c: Channel) -> int:
     return mavlink.MAV_RESULT_ACCEPTED
 
 
-def choose_item(vehicle: Vehicle, o: Order, c: Channel) -> int:
+def set_mission_current(vehicle: Vehicle, o: Command, c: Channel) -> int:
     """Handle DO_SET_MISSION_CURRENT. Reset the mission first if the second parameter is 1."""
     v, number = vehicle.state, o.params[0]
     if not (math.isfinite(number) and 0 <= int(number) < len(v.mission.items)):
@@ -41,12 +41,12 @@ def choose_item(vehicle: Vehicle, o: Order, c: Channel) -> int:
     return mavlink.MAV_RESULT_ACCEPTED
 
 
-def jump_to_tag(vehicle: Vehicle, o: Order, c: Channel) -> int:
+def jump_to_tag(vehicle: Vehicle, o: Command, c: Channel) -> int:
     """Handle DO_JUMP_TAG."""
     v, tag = vehicle.state, o.params[0]
     if not 0.0 <= tag <= MAX_TAG:
         return mavlink.MAV_RESULT_DENIED
-    index = v.mission.tagged(int(tag))
+    index = v.mission.find_tag(int(tag))
     if index is None or not set_current(vehicle, index):
         return mavlink.MAV_RESULT_FAILED
     send(v, c, "MISSION_CURRENT")
@@ -67,32 +67,32 @@ def set_current(vehicle: Vehicle, index: int) -> bool:
     if isinstance(vehicle.modes.flight, AutoFlight) and v.armed:
         vehicle.modes.flight.jump_to(v, max(index, 1))
         return True
-    found = v.mission.first_navigating(index)
-    v.mission.current = found or 0
-    return found is not None
+    first = v.mission.first_navigating(index)
+    v.mission.current = first or 0
+    return first is not None
 
 
-def pause(vehicle: Vehicle, o: Order, _c: Channel) -> int:
+def pause(vehicle: Vehicle, o: Command, _c: Channel) -> int:
     """Handle DO_PAUSE_CONTINUE in AUTO and GUIDED modes."""
     v, flight = vehicle.state, vehicle.modes.flight
     if not math.isfinite(o.params[0]) or int(o.params[0]) not in (0, 1):
         return mavlink.MAV_RESULT_DENIED
     paused = int(o.params[0]) == 0
     if not isinstance(flight, (AutoFlight, GuidedFlight)):
-        v.say(mavlink.MAV_SEVERITY_INFO, f"Failed to {'pause' if paused else 'resume'}")
+        v.send_text(mavlink.MAV_SEVERITY_INFO, f"Failed to {'pause' if paused else 'resume'}")
         return mavlink.MAV_RESULT_FAILED
     flight.pause(v, paused=paused)
     return mavlink.MAV_RESULT_ACCEPTED
 
 
-def begin_landing_sequence(vehicle: Vehicle, _o: Order, _c: Channel) -> int:
+def begin_landing_sequence(vehicle: Vehicle, _o: Command, _c: Channel) -> int:
     """Handle DO_LAND_START. Landing sequences are not simulated."""
-    vehicle.state.say(mavlink.MAV_SEVERITY_WARNING, "Unable to start landing sequence")
-    vehicle.state.say(mavlink.MAV_SEVERITY_WARNING, "Mode change to AUTO RTL failed: No landing sequence found")
+    vehicle.state.send_text(mavlink.MAV_SEVERITY_WARNING, "Unable to start landing sequence")
+    vehicle.state.send_text(mavlink.MAV_SEVERITY_WARNING, "Mode change to AUTO RTL failed: No landing sequence found")
     return mavlink.MAV_RESULT_FAILED
 
 
-def begin_return_path(vehicle: Vehicle, _o: Order, _c: Channel) -> int:
+def begin_return_path(vehicle: Vehicle, _o: Command, _c: Channel) -> int:
     """Handle DO_RETURN_PATH_START. Return paths are not simulated."""
-    vehicle.state.say(mavlink.MAV_SEVERITY_WARNING, "Mode change to AUTO RTL failed: No return path found")
+    vehicle.state.send_text(mavlink.MAV_SEVERITY_WARNING, "Mode change to AUTO RTL failed: No return path found")
     return mavlink.MAV_RESULT_FAILED

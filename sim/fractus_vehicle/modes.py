@@ -51,7 +51,7 @@ class FlightModes:
         v = self._state
         if mode in UNAVAILABLE:
             for text in UNAVAILABLE[mode][0]:
-                v.say(mavlink.MAV_SEVERITY_WARNING, text)
+                v.send_text(mavlink.MAV_SEVERITY_WARNING, text)
             return UNAVAILABLE[mode][1]
         if v.armed and TRAITS[mode].needs_position and not v.position_ok:
             return "requires position"
@@ -75,7 +75,7 @@ class FlightModes:
         if len(v.mission.items) <= 1:
             return False
         if v.landed and not v.mission.takes_off(restart=int(v.params["MIS_RESTART"]) == 1):
-            v.say(mavlink.MAV_SEVERITY_CRITICAL, "Auto: Missing Takeoff Cmd")
+            v.send_text(mavlink.MAV_SEVERITY_CRITICAL, "Auto: Missing Takeoff Cmd")
             return False
         return True
 
@@ -85,7 +85,7 @@ class FlightModes:
             return True
         refusal = self._refusal(mode)
         if refusal is not None:
-            self._state.say(mavlink.MAV_SEVERITY_WARNING, f"Mode change to {mode_title(mode)} failed: {refusal}")
+            self._state.send_text(mavlink.MAV_SEVERITY_WARNING, f"Mode change to {mode_title(mode)} failed: {refusal}")
             return False
         self.force(mode)
         return True
@@ -104,7 +104,7 @@ class FlightModes:
         v.taking_off_until_m = None
         if v.fence.breaches:
             v.fence.recovery_until_s = v.time_s + MANUAL_RECOVERY_S
-            v.say(mavlink.MAV_SEVERITY_INFO, "Manual recovery started")
+            v.send_text(mavlink.MAV_SEVERITY_INFO, "Manual recovery started")
         self.flight.begin(v)
         send_on_all(v, "HEARTBEAT")
 

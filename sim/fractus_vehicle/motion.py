@@ -46,11 +46,11 @@ def move(v: VehicleState) -> None:
         body.step(dt, commands, air)
         v.est = v.estimator.estimate(body)
     v.battery.step(CONTROL_STEP_S, sum(body.motors) / (body.airframe.mass_kg * 9.80665))
-    if body.impacts > v.impacts_told:
-        v.impacts_told = body.impacts
-        if v.time_s - v.impact_told_s > IMPACT_TEXTS_S:
-            v.say(mavlink.MAV_SEVERITY_INFO, f"SIM Hit ground at {body.impact_mps:f} m/s")
-        v.impact_told_s = v.time_s
+    if body.impacts > v.impacts_reported:
+        v.impacts_reported = body.impacts
+        if v.time_s - v.impact_reported_s > IMPACT_TEXTS_S:
+            v.send_text(mavlink.MAV_SEVERITY_INFO, f"SIM Hit ground at {body.impact_mps:f} m/s")
+        v.impact_reported_s = v.time_s
     if v.landed and not body.on_ground:
         v.landed = False
 
@@ -58,6 +58,6 @@ def move(v: VehicleState) -> None:
 def _may_lift(v: VehicleState) -> bool:
     if not v.landed:
         return True
-    if v.flying_wanted:
+    if v.taking_off:
         return v.time_s >= v.lift_after_s
     return v.mode == mavlink.COPTER_MODE_STABILIZE and v.sticks[2] > LIFT_THROTTLE_US

@@ -90,7 +90,13 @@ def gimbal_device_attitude_status(v: VehicleState) -> Values | None:
         | mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME
     )
     unknown = {f"angular_velocity_{axis}": math.nan for axis in "xyz"}
-    return {"time_boot_ms": boot_ms(v), "flags": int(flags), "q": v.gimbal.told, "gimbal_device_id": 1, **unknown}
+    return {
+        "time_boot_ms": boot_ms(v),
+        "flags": int(flags),
+        "q": v.gimbal.reported_quaternion,
+        "gimbal_device_id": 1,
+        **unknown,
+    }
 
 
 def gimbal_manager_information(v: VehicleState) -> Values | None:

@@ -23,7 +23,7 @@ _INT32_MAX = 2147483647
 
 
 @dataclass(frozen=True, slots=True)
-class Order:
+class Command:
     """A command from either message.
 
     `x` and `y` are degrees times 1e7, or plain integers for commands without coordinates.
@@ -44,7 +44,7 @@ class Order:
         return Item(command=self.command, frame=self.frame, x=self.x, y=self.y, z=self.z)
 
 
-def read_order(message: Message) -> Order:
+def read_command(message: Message) -> Command:
     """Decode COMMAND_LONG or COMMAND_INT."""
     numbers = (
         message.real("param1"),
@@ -56,13 +56,13 @@ def read_order(message: Message) -> Order:
     if message.name == "COMMAND_INT":
         x, y, z = message.integer("x"), message.integer("y"), message.real("z")
         frame = message.integer("frame")
-        return Order(command, numbers, x, y, z, frame, x != 0 or y != 0, integer=True)
+        return Command(command, numbers, x, y, z, frame, x != 0 or y != 0, integer=True)
     scale = 1e7 if command in PLACED else 1.0
     x, y = _integer(message.real("param5") * scale), _integer(message.real("param6") * scale)
     frame = (
         mavlink.MAV_FRAME_GLOBAL if command == mavlink.MAV_CMD_DO_SET_HOME else mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT
     )
-    return Order(command, numbers, x, y, message.real("param7"), frame, x != 0 or y != 0, integer=False)
+    return Command(command, numbers, x, y, message.real("param7"), frame, x != 0 or y != 0, integer=False)
 
 
 def _integer(value: float) -> int:

@@ -56,8 +56,8 @@ def _accept(v: VehicleState, kind: int, items: list[Item]) -> int:
                 v.fence.shapes = build_shapes(_local(v, items))
             except FenceShapeError as error:
                 severity = mavlink.MAV_SEVERITY_INFO if "item count" in str(error) else mavlink.MAV_SEVERITY_WARNING
-                v.say(severity, str(error))
-                v.say(mavlink.MAV_SEVERITY_WARNING, "Fence validation failed")
+                v.send_text(severity, str(error))
+                v.send_text(mavlink.MAV_SEVERITY_WARNING, "Fence validation failed")
                 return mavlink.MAV_MISSION_ERROR
             v.params.assign("FENCE_TOTAL", len(items))
         case mavlink.MAV_MISSION_TYPE_RALLY:

@@ -31,8 +31,8 @@ class Profile:
         if left_s <= 0.0:
             return self.length_m, 0.0, 0.0
         if left_s < self._rise_s:
-            way, speed, accel = self._rise(left_s)
-            return self.length_m - way, speed, -accel
+            distance, speed, accel = self._rise(left_s)
+            return self.length_m - distance, speed, -accel
         if time_s <= self._rise_s:
             return self._rise(max(time_s, 0.0))
         return self.speed_mps * (time_s - 0.5 * self._rise_s), self.speed_mps, 0.0
@@ -47,5 +47,5 @@ class Profile:
             accel, base = jerk * bend, 0.5 * jerk * bend * bend
             return jerk * bend**3 / 6.0 + base * steady + 0.5 * accel * steady * steady, base + accel * steady, accel
         rest = self._rise_s - t
-        way = 0.5 * self.speed_mps * self._rise_s - self.speed_mps * rest + jerk * rest**3 / 6.0
-        return way, self.speed_mps - 0.5 * jerk * rest * rest, jerk * rest
+        distance = 0.5 * self.speed_mps * self._rise_s - self.speed_mps * rest + jerk * rest**3 / 6.0
+        return distance, self.speed_mps - 0.5 * jerk * rest * rest, jerk * rest

@@ -8,8 +8,8 @@ from collections.abc import Callable
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.accessories import (
-    ABSENT,
-    TAKEN,
+    ABSENT_DEVICE,
+    WITHOUT_EFFECT,
     point_gimbal,
     reset_battery,
     set_relay,
@@ -18,12 +18,12 @@ from fractus_vehicle.accessories import (
 )
 from fractus_vehicle.channel import Channel
 from fractus_vehicle.copter import VERSION_TEXT
-from fractus_vehicle.orders import Order
+from fractus_vehicle.orders import Command
 from fractus_vehicle.state import VehicleState
 from fractus_vehicle.streams import BUILDERS, SILENT
 from fractus_vehicle.telemetry import send
 
-Answer = Callable[[VehicleState, Order, Channel], int]
+RequestHandler = Callable[[VehicleState, Command, Channel], int]
 
 # Maximum message rate as a share of the main loop rate.
 MAX_LOOP_SHARE = 0.8
@@ -33,7 +33,7 @@ EKF_SOURCE_SETS = 3
 FRAMES = {0: "PLUS", 1: "X"}
 
 
-def _get_home(v: VehicleState, _o: Order, c: Channel) -> int:
+def _get_home(v: VehicleState, _o: Command, c: Channel) -> int:
     if v.home is None:
         return mavlink.MAV_RESULT_FAILED
     send(v, c, "HOME_POSITION")
@@ -54,11 +54,11 @@ def _named(v: VehicleState, number: float) -> str | None:
     """Return the name of a message id. Report an unknown id in a STATUSTEXT."""
     name = _message_name(number)
     if name is None and math.isfinite(number):
-        v.say(mavlink.MAV_SEVERITY_INFO, f"No ap_message for mavlink id ({int(number)})")
+        v.send_text(mavlink.MAV_SEVERITY_INFO, f"No ap_message for mavlink id ({int(number)})")
     return name
 
 
-def _set_interval(v: VehicleState, o: Order, c: Channel) -> int:
+def _set_interval(v: VehicleState, o: Command, c: Channel) -> int:
     interval_us = o.params[1]
     name = _named(v, o.params[0])
     # ArduPilot SITL aborts if the interval is NaN.
@@ -70,14 +70,14 @@ def _set_interval(v: VehicleState, o: Order, c: Channel) -> int:
         c.reset_interval(name)
     elif interval_us < 1e6 / (MAX_LOOP_SHARE * max(v.params["SCHED_LOOP_RATE"], 1.0)):
         text = f"Requested rate for message ID {int(o.params[0])} too fast. Increase SCHED_LOOP_RATE"
-        v.say(mavlink.MAV_SEVERITY_INFO, text)
+        v.send_text(mavlink.MAV_SEVERITY_INFO, text)
         return mavlink.MAV_RESULT_DENIED
     else:
         c.set_interval(name, min(max(int(interval_us) // 1000, MIN_INTERVAL_MS), MAX_INTERVAL_MS) / 1e3)
     return mavlink.MAV_RESULT_ACCEPTED
 
 
-def _get_interval(_v: VehicleState, o: Order, c: Channel) -> int:
+def _get_interval(_v: VehicleState, o: Command, c: Channel) -> int:
     name = _message_name(o.params[0])
     stream = c.streams.get(name) if name is not None else None
     interval = 0 if name is None else -1 if stream is None else round(stream.interval_s * 1e6)
@@ -86,7 +86,7 @@ def _get_interval(_v: VehicleState, o: Order, c: Channel) -> int:
     return mavlink.MAV_RESULT_ACCEPTED if name is not None else mavlink.MAV_RESULT_FAILED
 
 
-def _request_message(v: VehicleState, o: Order, c: Channel) -> int:
+def _request_message(v: VehicleState, o: Command, c: Channel) -> int:
     name = _message_name(o.params[0])
     if name is None:
         return mavlink.MAV_RESULT_FAILED
@@ -94,41 +94,41 @@ def _request_message(v: VehicleState, o: Order, c: Channel) -> int:
     return mavlink.MAV_RESULT_ACCEPTED
 
 
-def _capabilities(v: VehicleState, o: Order, c: Channel) -> int:
+def _capabilities(v: VehicleState, o: Command, c: Channel) -> int:
     if o.params[0] != 1.0:
         return mavlink.MAV_RESULT_FAILED
     send(v, c, "AUTOPILOT_VERSION")
     return mavlink.MAV_RESULT_ACCEPTED
 
 
-def _banner(v: VehicleState, _o: Order, _c: Channel) -> int:
+def _banner(v: VehicleState, _o: Command, _c: Channel) -> int:
     for text in (VERSION_TEXT, f"Frame: QUAD/{FRAMES.get(int(v.params['FRAME_TYPE']), 'UNSUPPORTED')}"):
-        v.say(mavlink.MAV_SEVERITY_INFO, text)
+        v.send_text(mavlink.MAV_SEVERITY_INFO, text)
     return mavlink.MAV_RESULT_ACCEPTED
 
 
-def _high_latency(v: VehicleState, o: Order, _c: Channel) -> int:
+def _high_latency(v: VehicleState, o: Command, _c: Channel) -> int:
     if o.params[0] not in (0.0, 1.0):
         return mavlink.MAV_RESULT_DENIED
-    v.say(mavlink.MAV_SEVERITY_NOTICE, f"High Latency {'enabled' if o.params[0] else 'disabled'}")
+    v.send_text(mavlink.MAV_SEVERITY_NOTICE, f"High Latency {'enabled' if o.params[0] else 'disabled'}")
     return mavlink.MAV_RESULT_ACCEPTED
 
 
-def _parachute(_v: VehicleState, o: Order, _c: Channel) -> int:
+def _parachute(_v: VehicleState, o: Command, _c: Channel) -> int:
     """Accept the defined actions, although there is no parachute."""
     return mavlink.MAV_RESULT_ACCEPTED if o.params[0] in (0.0, 1.0, 2.0) else mavlink.MAV_RESULT_FAILED
 
 
-def _ekf_sources(_v: VehicleState, o: Order, _c: Channel) -> int:
+def _ekf_sources(_v: VehicleState, o: Command, _c: Channel) -> int:
     """Accept a defined source set. All sets are equivalent."""
     return mavlink.MAV_RESULT_ACCEPTED if 1.0 <= o.params[0] < EKF_SOURCE_SETS + 1 else mavlink.MAV_RESULT_DENIED
 
 
-def _always(result: int) -> Answer:
+def _always(result: int) -> RequestHandler:
     return lambda _v, _order, _channel: result
 
 
-ANSWERS: dict[int, Answer] = {
+REQUEST_HANDLERS: dict[int, RequestHandler] = {
     mavlink.MAV_CMD_GET_HOME_POSITION: _get_home,
     mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: _set_interval,
     mavlink.MAV_CMD_GET_MESSAGE_INTERVAL: _get_interval,
@@ -146,6 +146,6 @@ ANSWERS: dict[int, Answer] = {
     mavlink.MAV_CMD_DO_REPEAT_RELAY: lambda v, o, _c: set_relay(v, o.params[0]),
     mavlink.MAV_CMD_DO_MOTOR_TEST: lambda v, o, _c: start_motor_test(v, o.params[0], o.params[3]),
     mavlink.MAV_CMD_BATTERY_RESET: lambda v, o, _c: reset_battery(v, *o.params[:2]),
-    **dict.fromkeys(ABSENT, _always(mavlink.MAV_RESULT_FAILED)),
-    **dict.fromkeys(TAKEN, _always(mavlink.MAV_RESULT_ACCEPTED)),
+    **dict.fromkeys(ABSENT_DEVICE, _always(mavlink.MAV_RESULT_FAILED)),
+    **dict.fromkeys(WITHOUT_EFFECT, _always(mavlink.MAV_RESULT_ACCEPTED)),
 }

@@ -67,7 +67,7 @@ class Craft:
     def step(self) -> None:
         """Advance by one control step."""
         self.vehicle.step()
-        if self.vehicle.reboot_wanted:
+        if self.vehicle.reboot_requested:
             self._reboot()
 
     def _reboot(self) -> None:
@@ -126,7 +126,7 @@ class Simulation:
         """Return the number of steps until a stream message is due, from 1 to `most`. STATUSTEXTs are not predicted."""
         quiet_s = min(
             (
-                channel.speaks_s - craft.vehicle.state.time_s
+                channel.next_send_s - craft.vehicle.state.time_s
                 for craft in self.crafts
                 for channel in craft.vehicle.state.channels
             ),

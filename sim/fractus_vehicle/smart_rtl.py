@@ -35,7 +35,7 @@ class SmartReturn(Flight):
 
     def __init__(self) -> None:
         self.stage = SmartStage.WAIT_FOR_PATH_CLEANUP
-        self._tidying: Iterator[None] = iter(())
+        self._cleanup: Iterator[None] = iter(())
         self._leg: Leg | None = None
         self._popped: Point | None = None
 
@@ -49,18 +49,18 @@ class SmartReturn(Flight):
         v.control.hold_here()
         v.heading.follow_course()
         v.touch_time_s = 0.0
-        self._tidying = v.breadcrumbs.thorough()
+        self._cleanup = v.breadcrumbs.simplify_fully()
 
     def end(self, v: VehicleState) -> None:
         """Put back the point that was not reached, so that the path stays complete."""
         if self.stage is SmartStage.PATH_FOLLOW and self._popped is not None and not v.breadcrumbs.add(self._popped):
-            v.say(mavlink.MAV_SEVERITY_ERROR, "SmartRTL: lost one point")
+            v.send_text(mavlink.MAV_SEVERITY_ERROR, "SmartRTL: lost one point")
 
     def step(self, v: VehicleState) -> None:
         """Fly the current stage and switch to the next one."""
         if self.stage is SmartStage.WAIT_FOR_PATH_CLEANUP:
             try:
-                next(self._tidying)
+                next(self._cleanup)
             except StopIteration:
                 self.stage = SmartStage.PATH_FOLLOW
         elif self.stage is SmartStage.PATH_FOLLOW:

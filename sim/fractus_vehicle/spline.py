@@ -45,9 +45,9 @@ class SplineLeg:
         limits, left_m = v.control.limits, 0.0
         braking = 2.0 * BRAKING_SHARE * limits.accel_mps2
         for step in range(_SAMPLES - 1, -1, -1):
-            way = math.dist(self.at(step / _SAMPLES), self.at((step + 1) / _SAMPLES))
-            allowed[step] = min(allowed[step], math.sqrt(allowed[step + 1] ** 2 + braking * way))
-            left_m += way
+            distance_m = math.dist(self.at(step / _SAMPLES), self.at((step + 1) / _SAMPLES))
+            allowed[step] = min(allowed[step], math.sqrt(allowed[step + 1] ** 2 + braking * distance_m))
+            left_m += distance_m
             if self._stops:  # the last metres approach a position: the jerk limit allows no more
                 gain = 0.5 * limits.jerk_mps3 / limits.accel_mps2
                 slower = sqrt_controller(left_m, gain, BRAKING_SHARE * limits.accel_mps2, CONTROL_STEP_S)
@@ -113,18 +113,18 @@ class SplineLeg:
         size2 = max(slope[0] ** 2 + slope[1] ** 2 + slope[2] ** 2, 1e-12)
         along = (slope[0] * bend[0] + slope[1] * bend[1] + slope[2] * bend[2]) / size2
         push, pace2 = self._accel_mps2 / math.sqrt(size2), pace * pace
-        asked = (
+        demand = (
             (bend[0] - along * slope[0]) * pace2 + push * slope[0],
             (bend[1] - along * slope[1]) * pace2 + push * slope[1],
             (bend[2] - along * slope[2]) * pace2 + push * slope[2],
         )
         # Limit the acceleration where a short tangent bends the curve more sharply than the vehicle can fly.
-        return _scaled(asked, min(1.0, most_mps2 / max(math.hypot(*asked), 1e-6)))
+        return _scaled(demand, min(1.0, most_mps2 / max(math.hypot(*demand), 1e-6)))
 
     def reached(self, v: VehicleState, radius_m: float) -> bool:
         """Return True if the curve is complete."""
-        here = (v.est.north, v.est.east, v.est.down)
-        return self._share >= 1.0 and (not self._stops or math.dist(here, self.end) <= radius_m)
+        position = (v.est.north, v.est.east, v.est.down)
+        return self._share >= 1.0 and (not self._stops or math.dist(position, self.end) <= radius_m)
 
 
 def _scaled(vector: Point, scale: float) -> Point:

@@ -93,19 +93,19 @@ class VehicleState:
             noise_m=config.position_noise_m,
             rng=self.rng,
             params=self.params,
-            say=self.say,
+            send_text=self.send_text,
         )
         self.fence = Fence()
         self.failsafes = ActiveFailsafes()
         self.mission = Mission()
         self.fence_items = ItemStore(mavlink.MAV_MISSION_TYPE_FENCE)
         self.rally = ItemStore(mavlink.MAV_MISSION_TYPE_RALLY)
-        self.breadcrumbs = Breadcrumbs(self.params, self.say)
+        self.breadcrumbs = Breadcrumbs(self.params, self.send_text)
         self.heading = Heading(self.control, self.params)
         self.gimbal = Gimbal(int(self.params["MNT1_TYPE"]))
         self.item_reached: int | None = None  # last reached mission item, reported at the end of a step
-        self.impacts_told = 0
-        self.impact_told_s = -math.inf
+        self.impacts_reported = 0
+        self.impact_reported_s = -math.inf
         self.receiver = Receiver(config.throttle_us)
         self.servos: dict[int, int] = {}
         self.motor_test_until_s: float | None = None
@@ -231,7 +231,7 @@ class VehicleState:
         return round(clamp(sum(self.body.motors) / (4.0 * self.body.airframe.full_thrust_n), 0.0, 1.0) * 100.0)
 
     @property
-    def flying_wanted(self) -> bool:
+    def taking_off(self) -> bool:
         """True during a takeoff."""
         return self.taking_off_until_m is not None
 
@@ -240,7 +240,7 @@ class VehicleState:
         """Current MAV_LANDED_STATE."""
         if self.landed:
             return mavlink.MAV_LANDED_STATE_ON_GROUND
-        if self.flying_wanted:
+        if self.taking_off:
             return mavlink.MAV_LANDED_STATE_TAKEOFF
         return (
             mavlink.MAV_LANDED_STATE_LANDING
@@ -255,7 +255,7 @@ class VehicleState:
         for channel in self.channels:
             channel.send(name, values)
 
-    def say(self, severity: int, text: str) -> None:
+    def send_text(self, severity: int, text: str) -> None:
         """Send a STATUSTEXT on every link, split into chunks if it is long."""
         data = text.encode("ascii", "replace")
         # All chunks of one text share a non-zero id.
@@ -274,7 +274,7 @@ class VehicleState:
         self.taking_off_until_m = None
         if force or self.landed:
             self.landed = self.landed or self.body.on_ground
-        self.say(mavlink.MAV_SEVERITY_INFO, "Disarming motors")
+        self.send_text(mavlink.MAV_SEVERITY_INFO, "Disarming motors")
 
     def land_complete(self) -> None:
         """Set the state to landed."""
@@ -284,7 +284,7 @@ class VehicleState:
 
     def begin_takeoff(self, down: float) -> None:
         """Spool up and climb to `down` (local)."""
-        if not self.flying_wanted:  # the motors are already running if a takeoff is repeated
+        if not self.taking_off:  # the motors are already running if a takeoff is repeated
             ready = self.armed_at_s + ARMING_DELAY_S
             spool = self.params["MOT_SPOOL_TIME"] + 0.5 * self.params["TKOFF_SLEW_TIME"]
             self.lift_after_s = max(self.time_s, ready) + spool

@@ -82,7 +82,7 @@ def global_target(v: VehicleState, flight: Flight, m: Message) -> None:
             return
         base = v.altitude_base_m(frame)
         if frame not in GLOBAL_FRAMES:
-            v.say(mavlink.MAV_SEVERITY_INFO, f"Unknown mavlink coordinate frame {frame}")
+            v.send_text(mavlink.MAV_SEVERITY_INFO, f"Unknown mavlink coordinate frame {frame}")
         if base is None:
             _stop(v, flight)
             return
@@ -97,7 +97,7 @@ def _stop(v: VehicleState, flight: Flight) -> None:
         flight.stop(v)
 
 
-def _target(v: VehicleState, flight: Flight, m: Message, asked: Setpoint) -> None:
+def _target(v: VehicleState, flight: Flight, m: Message, setpoint: Setpoint) -> None:
     """Validate the type mask and pass the target to GUIDED. Silently drop targets outside the fence."""
     if not isinstance(flight, GuidedFlight) or not v.armed:
         return
@@ -106,9 +106,9 @@ def _target(v: VehicleState, flight: Flight, m: Message, asked: Setpoint) -> Non
     if v.landed:
         return
     mask = m.integer("type_mask")
-    position = asked.position if not mask & IGNORE_POSITION else None
-    velocity = asked.velocity if not mask & IGNORE_VELOCITY else None
-    accel = asked.accel if not mask & IGNORE_ACCELERATION else None
+    position = setpoint.position if not mask & IGNORE_POSITION else None
+    velocity = setpoint.velocity if not mask & IGNORE_VELOCITY else None
+    accel = setpoint.accel if not mask & IGNORE_ACCELERATION else None
     understood = velocity is not None or (position is None) != (accel is None)
     if not understood or (mask & mavlink.POSITION_TARGET_TYPEMASK_FORCE_SET and accel is not None):
         flight.stop(v)
@@ -123,7 +123,7 @@ def _target(v: VehicleState, flight: Flight, m: Message, asked: Setpoint) -> Non
         return
     if position is not None and v.outside_fence(*position):
         return
-    _fly(v, flight, position, velocity, asked.accel)
+    _fly(v, flight, position, velocity, setpoint.accel)
     # In body frames the heading is relative to the nose.
     relative = m.name == "SET_POSITION_TARGET_LOCAL_NED" and m.integer("coordinate_frame") in _BODY_FRAMES
     _turn(v, yaw, yaw_rate, relative=relative)

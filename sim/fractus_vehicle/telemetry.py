@@ -35,10 +35,10 @@ def serve(v: VehicleState, channel: Channel) -> None:
 
 def send_parameter(v: VehicleState, channel: Channel, name: str, index: int, shown_index: int | None = None) -> None:
     """Send PARAM_VALUE by name or index, if the parameter exists."""
-    found = v.params.find(name, index)
-    if found is None:
+    entry = v.params.find(name, index)
+    if entry is None:
         return
-    shown, row, at = found
+    shown, row, at = entry
     channel.send(
         "PARAM_VALUE",
         {

@@ -9,7 +9,7 @@ from fractus_runtime.mavlink_codec import Message, Value
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.channel import Channel
-from fractus_vehicle.mission_items import Item, ItemStore, item_from, judge, judge_numbers
+from fractus_vehicle.mission_items import Item, ItemStore, item_from, validate_item, validate_parameters
 
 # Capacity of the autopilot's storage.
 MAX_ITEMS = {
@@ -20,7 +20,7 @@ MAX_ITEMS = {
 UPLOAD_TIMEOUT_S = 8.0
 RETRY_S = 1.0
 # STATUSTEXT sent when a list is stored.
-RECEIVED = {
+RECEIVED_TEXTS = {
     mavlink.MAV_MISSION_TYPE_MISSION: (mavlink.MAV_SEVERITY_INFO, "Flight plan received"),
     mavlink.MAV_MISSION_TYPE_FENCE: (mavlink.MAV_SEVERITY_DEBUG, "Fence Indexed OK"),
 }
@@ -31,7 +31,7 @@ TITLES = {
     mavlink.MAV_MISSION_TYPE_RALLY: "Rally",
 }
 # Requests refused during an upload of the same list. The older MISSION_REQUEST is still served.
-NOT_WHILE_UPLOADED = {
+REFUSED_DURING_UPLOAD = {
     "MISSION_REQUEST_LIST": mavlink.MAV_MISSION_DENIED,
     "MISSION_REQUEST_INT": mavlink.MAV_MISSION_DENIED,
     "MISSION_CLEAR_ALL": mavlink.MAV_MISSION_ERROR,
@@ -50,8 +50,8 @@ class Upload:
     last: int
     items: list[Item]
     partial: bool
-    heard_s: float
-    asked_s: float
+    received_s: float
+    requested_s: float
     old_format: bool = False
 
     def is_from(self, message: Message) -> bool:
@@ -71,12 +71,12 @@ class Transfers:
         stores: Mapping[int, ItemStore],
         replace_items: Callable[[ItemStore, list[Item]], int],
         clear: Callable[[ItemStore], int],
-        say: Callable[[int, str], None],
+        send_text: Callable[[int, str], None],
     ) -> None:
         self._stores = stores
         self._replace = replace_items
         self._clear = clear
-        self._say = say
+        self._send_text = send_text
         self.uploads: dict[int, Upload] = {}
         self.now_s = 0.0
 
@@ -90,8 +90,8 @@ class Transfers:
         kind_number = message.integer("mission_type") if message.has("mission_type") else 0
         if kind_number not in self._stores:
             self._ack(channel, message, kind_number, mavlink.MAV_MISSION_UNSUPPORTED)
-        elif kind_number in self.uploads and message.name in NOT_WHILE_UPLOADED:
-            self._ack(channel, message, kind_number, NOT_WHILE_UPLOADED[message.name])
+        elif kind_number in self.uploads and message.name in REFUSED_DURING_UPLOAD:
+            self._ack(channel, message, kind_number, REFUSED_DURING_UPLOAD[message.name])
         else:
             self._handle(channel, message, self._stores[kind_number])
 
@@ -110,16 +110,16 @@ class Transfers:
                 if 0 <= start <= end <= len(store.items):
                     self._begin(channel, message, store, range(start, end + 1))
                 else:
-                    self._say(mavlink.MAV_SEVERITY_WARNING, "Flight plan update rejected")
+                    self._send_text(mavlink.MAV_SEVERITY_WARNING, "Flight plan update rejected")
                     self._ack(channel, message, kind, mavlink.MAV_MISSION_ERROR)
             case "MISSION_ITEM" | "MISSION_ITEM_INT":
-                self._take(channel, message, store)
+                self._receive_item(channel, message, store)
             case "MISSION_REQUEST_LIST":
                 channel.send("MISSION_COUNT", _address(message, kind) | {"count": len(store.items)})
             case "MISSION_REQUEST_PARTIAL_LIST":
                 self._ack(channel, message, kind, mavlink.MAV_MISSION_UNSUPPORTED)
             case "MISSION_REQUEST" | "MISSION_REQUEST_INT":
-                self._give(channel, message, store)
+                self._send_item(channel, message, store)
             case "MISSION_CLEAR_ALL":
                 self._ack(channel, message, kind, self._clear(store))
             case _:
@@ -127,11 +127,11 @@ class Transfers:
 
     def _begin(self, channel: Channel, message: Message, store: ItemStore, wanted: range) -> None:
         """Start the upload of the item range `wanted`: a whole new list, or a part of the stored list."""
-        going_on = self.uploads.get(store.kind)
-        if going_on is not None and not going_on.is_from(message):
+        active = self.uploads.get(store.kind)
+        if active is not None and not active.is_from(message):
             self._ack(channel, message, store.kind, mavlink.MAV_MISSION_DENIED)
         elif wanted.stop > MAX_ITEMS[store.kind]:
-            self._say(mavlink.MAV_SEVERITY_WARNING, f"Only {MAX_ITEMS[store.kind]} items are supported")
+            self._send_text(mavlink.MAV_SEVERITY_WARNING, f"Only {MAX_ITEMS[store.kind]} items are supported")
             self._ack(channel, message, store.kind, mavlink.MAV_MISSION_NO_SPACE)
         elif not wanted:
             self._complete(channel, message, store, [])
@@ -146,23 +146,23 @@ class Transfers:
                 last=wanted.stop - 1,
                 items=list(store.items) if partial else [],
                 partial=partial,
-                heard_s=self.now_s,
-                asked_s=self.now_s,
+                received_s=self.now_s,
+                requested_s=self.now_s,
             )
-            self._ask(up)
+            self._request_next(up)
 
-    def _ask(self, up: Upload) -> None:
-        up.asked_s = self.now_s
+    def _request_next(self, up: Upload) -> None:
+        up.requested_s = self.now_s
         up.channel.send("MISSION_REQUEST", _address(up, up.kind) | {"seq": up.next})
 
-    def _take(self, channel: Channel, message: Message, store: ItemStore) -> None:
+    def _receive_item(self, channel: Channel, message: Message, store: ItemStore) -> None:
         up = self.uploads.get(store.kind)
         if up is None:
             self._ack(channel, message, store.kind, mavlink.MAV_MISSION_ERROR)
             return
         if message.name == "MISSION_ITEM" and not up.old_format:
             up.old_format = True
-            self._say(mavlink.MAV_SEVERITY_WARNING, "got MISSION_ITEM; GCS should send MISSION_ITEM_INT")
+            self._send_text(mavlink.MAV_SEVERITY_WARNING, "got MISSION_ITEM; GCS should send MISSION_ITEM_INT")
         seq = message.integer("seq")
         if seq != up.next or not up.is_from(message):
             # The upload continues. A repeated item gets the same error.
@@ -170,7 +170,7 @@ class Transfers:
             self._ack(channel, message, store.kind, refusal)
             return
         item = item_from(message)
-        verdict = self._judge(message, item, store, up)
+        verdict = self._validate(message, item, store, up)
         if verdict != mavlink.MAV_MISSION_ACCEPTED:
             del self.uploads[store.kind]
             self._ack(channel, message, store.kind, verdict)
@@ -181,9 +181,9 @@ class Transfers:
             # ones.
             self._replace(store, list(up.items))
         up.next += 1
-        up.heard_s = self.now_s
+        up.received_s = self.now_s
         if up.next <= up.last:
-            self._ask(up)
+            self._request_next(up)
             return
         del self.uploads[store.kind]
         self._complete(channel, message, store, up.items)
@@ -192,22 +192,22 @@ class Transfers:
         """Store a completed list and acknowledge it."""
         verdict = self._replace(store, items)
         self._ack(channel, message, store.kind, verdict)
-        if verdict == mavlink.MAV_MISSION_ACCEPTED and store.kind in RECEIVED:
-            self._say(*RECEIVED[store.kind])
+        if verdict == mavlink.MAV_MISSION_ACCEPTED and store.kind in RECEIVED_TEXTS:
+            self._send_text(*RECEIVED_TEXTS[store.kind])
 
     @staticmethod
-    def _judge(message: Message, item: Item, store: ItemStore, up: Upload) -> int:
+    def _validate(message: Message, item: Item, store: ItemStore, up: Upload) -> int:
         if store.kind == mavlink.MAV_MISSION_TYPE_MISSION:
             if message.integer("seq") == 0:
                 return mavlink.MAV_MISSION_ACCEPTED
-            verdict = judge_numbers(message)
+            verdict = validate_parameters(message)
             if verdict != mavlink.MAV_MISSION_ACCEPTED:
                 return verdict
             if item.command == mavlink.MAV_CMD_DO_JUMP and not 0 < int(item.param1) < max(len(up.items), up.last + 1):
                 return mavlink.MAV_MISSION_ERROR
-        return judge(item, store.kind)
+        return validate_item(item, store.kind)
 
-    def _give(self, channel: Channel, message: Message, store: ItemStore) -> None:
+    def _send_item(self, channel: Channel, message: Message, store: ItemStore) -> None:
         seq = message.integer("seq")
         # Item 0 of a mission is home and can be read even if the mission is empty.
         homes = [store.home] if store.home is not None and not store.items else store.items
@@ -239,9 +239,9 @@ class Transfers:
         """Repeat requests without a response, and cancel an upload after UPLOAD_TIMEOUT_S."""
         self.now_s = now_s
         for kind, up in list(self.uploads.items()):
-            if now_s - up.heard_s > UPLOAD_TIMEOUT_S:
+            if now_s - up.received_s > UPLOAD_TIMEOUT_S:
                 del self.uploads[kind]
                 self._ack(up.channel, up, up.kind, mavlink.MAV_MISSION_OPERATION_CANCELLED)
-                self._say(mavlink.MAV_SEVERITY_WARNING, f"{TITLES[kind]} upload timeout")
-            elif now_s - up.asked_s > RETRY_S:
-                self._ask(up)
+                self._send_text(mavlink.MAV_SEVERITY_WARNING, f"{TITLES[kind]} upload timeout")
+            elif now_s - up.requested_s > RETRY_S:
+                self._request_next(up)

@@ -23,8 +23,8 @@ from fractus_vehicle.transfers import Transfers
 _LANDING_MODES = frozenset({mavlink.COPTER_MODE_LAND, mavlink.COPTER_MODE_RTL, mavlink.COPTER_MODE_SMART_RTL})
 
 # Intervals at which a disarmed vehicle reports failed arming checks and the ground pressure.
-CHECKS_TOLD_S = 30.0
-PRESSURE_TOLD_S = 10.0
+CHECKS_REPORT_INTERVAL_S = 30.0
+PRESSURE_REPORT_INTERVAL_S = 10.0
 FIRST_PRESSURE_S = 1.0
 
 
@@ -39,11 +39,11 @@ class Vehicle:
             stores_of(self.state),
             lambda store, items: replace_items(self.state, store, items),
             lambda store: clear_items(self.state, store),
-            self.state.say,
+            self.state.send_text,
         )
         self.signing_key: bytes | None = None
-        self.reboot_wanted = False
-        self._next_checks_s = 0.5 * CHECKS_TOLD_S
+        self.reboot_requested = False
+        self._next_checks_s = 0.5 * CHECKS_REPORT_INTERVAL_S
         self._next_pressure_s = FIRST_PRESSURE_S
         self.state.params.watch(self._parameter_changed)
 
@@ -70,7 +70,7 @@ class Vehicle:
             set_home(v, v.place)
         v.control.reset(v.est)
         v.breadcrumbs.restart(v.time_s, v.known_position)
-        v.say(mavlink.MAV_SEVERITY_INFO, "Arming motors")
+        v.send_text(mavlink.MAV_SEVERITY_INFO, "Arming motors")
 
     def step(self) -> None:
         """Advance by one control step."""
@@ -88,7 +88,7 @@ class Vehicle:
         else:
             self.modes.flight.wait(v)
             end_motor_test(v)
-            self._tell_while_disarmed()
+            self._report_while_disarmed()
         if v.item_reached is not None:
             v.broadcast("MISSION_ITEM_REACHED", {"seq": v.item_reached})
             v.item_reached = None
@@ -99,15 +99,15 @@ class Vehicle:
         for channel in v.channels:
             serve(v, channel)
 
-    def _tell_while_disarmed(self) -> None:
+    def _report_while_disarmed(self) -> None:
         """Report failed arming checks and the ground pressure at intervals."""
         v = self.state
         if v.time_s >= self._next_checks_s:
-            self._next_checks_s += CHECKS_TOLD_S
+            self._next_checks_s += CHECKS_REPORT_INTERVAL_S
             for refusal in arming_refusals(v):
-                v.say(mavlink.MAV_SEVERITY_CRITICAL, f"PreArm: {refusal}")
+                v.send_text(mavlink.MAV_SEVERITY_CRITICAL, f"PreArm: {refusal}")
         if v.time_s >= self._next_pressure_s:
-            self._next_pressure_s = v.time_s + PRESSURE_TOLD_S
+            self._next_pressure_s = v.time_s + PRESSURE_REPORT_INTERVAL_S
             for channel in v.channels:
                 for name in ("BARO1_GND_PRESS", "BARO2_GND_PRESS"):
                     send_parameter(v, channel, name, -1, UNKNOWN_U16)
@@ -116,7 +116,7 @@ class Vehicle:
         v = self.state
         delay = v.params["DISARM_DELAY"]
         idle_s = v.time_s - v.idle_since_s
-        if not v.landed or v.flying_wanted:
+        if not v.landed or v.taking_off:
             v.idle_since_s = v.time_s
         elif (v.mode in _LANDING_MODES and idle_s > 1.0) or 0.0 < delay <= idle_s:
             v.disarm()

@@ -1,4 +1,4 @@
-"""What `fractus-vehicle` is started with: numbers, links and the file of parameters."""
+"""Command-line arguments of `fractus-vehicle`: numbers, links and the parameter file."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ from vehicle_world import CONFIG
         (["--sysid", "240", "--count", "20"], "system ids must not exceed 250"),
     ],
 )
-def test_numbers_that_make_no_sense_are_named(arguments: list[str], words: str):
+def test_invalid_option_values_are_reported(arguments: list[str], words: str):
     done = CliRunner().invoke(vehicle, arguments)
     assert done.exit_code in (1, 2)
     assert words in done.output
 
 
-def test_a_row_of_vehicles_does_not_run_out_of_ports():
+def test_formation_beyond_last_port_is_refused():
     assert LinkSpec.parse("tcp:127.0.0.1:65525").shifted(1).port == 65535
     with pytest.raises(LinkError, match="use a lower first port"):
         LinkSpec.parse("tcp:127.0.0.1:65525").shifted(2)
 
 
-def test_a_pseudoterminal_replaces_no_file(tmp_path: Path):
+def test_pseudo_terminal_does_not_replace_file(tmp_path: Path):
     kept = tmp_path / "kept"
     kept.write_text("mine")
     hub = Hub()

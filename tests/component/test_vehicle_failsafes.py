@@ -1,4 +1,4 @@
-"""The autopilot's own safety net: each fault leads to the mode and the text of a real ArduCopter."""
+"""Failsafes of the autopilot: each fault leads to the mode and STATUSTEXT of a real ArduCopter."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def _square(command: int, half_m: float, north_m: float = 0.0) -> list[dict[str,
     return [{"command": command, "param1": 4.0, "frame": 0, "x": p.lat_e7, "y": p.lon_e7} for p in places]
 
 
-def test_silent_ground_station_brings_it_home():
+def test_gcs_failsafe_returns_home_when_heartbeats_stop():
     vehicle, pilot = airborne(10.0, FS_GCS_ENABLE=1)
     pilot.go_to(30.0, 0.0, 10.0)
     pilot.fly_on(5.0)
@@ -27,7 +27,7 @@ def test_silent_ground_station_brings_it_home():
     assert distance_m(vehicle, 0.0, 0.0) < 1.0
 
 
-def test_only_the_chosen_system_counts_as_ground_station():
+def test_gcs_failsafe_monitors_only_sysid_mygcs():
     vehicle, pilot = airborne(10.0, FS_GCS_ENABLE=1, SYSID_MYGCS=255)
     other = Pilot(pilot.simulation, pilot.craft, sysid=42)
     pilot.heartbeats = False
@@ -39,21 +39,21 @@ def test_only_the_chosen_system_counts_as_ground_station():
     assert vehicle.mode == mavlink.COPTER_MODE_RTL, "clearing the failsafe does not change the mode back"
 
 
-def test_failsafe_timeout_follows_its_parameter():
+def test_gcs_failsafe_timeout_follows_parameter():
     vehicle, pilot = airborne(10.0, FS_GCS_ENABLE=5)
     assert pilot.parameter("FS_GCS_TIMEOUT", 2.0) == 2.0
     pilot.heartbeats = False
     assert pilot.wait(lambda: vehicle.mode == mavlink.COPTER_MODE_LAND, 10.0) < 2.3
 
 
-def test_without_the_failsafe_silence_changes_nothing():
+def test_disabled_gcs_failsafe_does_not_act():
     vehicle, pilot = airborne(10.0)
     pilot.heartbeats = False
     pilot.fly_on(20.0)
     assert vehicle.mode == mavlink.COPTER_MODE_GUIDED
 
 
-def test_low_and_critical_battery():
+def test_battery_failsafe_acts_on_low_and_critical_charge():
     vehicle, pilot = airborne(
         10.0, BATT_LOW_VOLT=11.5, BATT_CRT_VOLT=10.8, BATT_LOW_TIMER=3, BATT_FS_LOW_ACT=2, BATT_FS_CRT_ACT=1
     )
@@ -70,7 +70,7 @@ def test_low_and_critical_battery():
     assert pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0) == mavlink.MAV_RESULT_FAILED
 
 
-def test_lost_gps_lands_it():
+def test_gps_loss_lands_vehicle():
     vehicle, pilot = airborne(15.0)
     pilot.parameter("SIM_GPS_DISABLE", 1)
     pilot.wait(lambda: vehicle.mode == mavlink.COPTER_MODE_LAND, 15.0)
@@ -80,7 +80,7 @@ def test_lost_gps_lands_it():
     assert vehicle.body.on_ground
 
 
-def test_short_gps_loss_is_ridden_out():
+def test_short_gps_loss_causes_no_failsafe():
     vehicle, pilot = airborne(15.0)
     pilot.parameter("SIM_GPS_DISABLE", 1)
     pilot.fly_on(3.0)
@@ -90,7 +90,7 @@ def test_short_gps_loss_is_ridden_out():
     assert distance_m(vehicle, 0.0, 0.0) < 2.0
 
 
-def test_crossing_the_fence_brings_it_back():
+def test_fence_breach_returns_vehicle():
     vehicle, pilot = airborne(10.0)
     assert upload(pilot, 1, _square(mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION, 20.0)) == 0
     assert pilot.command(mavlink.MAV_CMD_DO_FENCE_ENABLE, 1) == mavlink.MAV_RESULT_ACCEPTED
@@ -110,7 +110,7 @@ def test_crossing_the_fence_brings_it_back():
     assert distance_m(vehicle, 0.0, 0.0) < 1.0
 
 
-def test_target_outside_the_fence_is_dropped_without_an_answer():
+def test_target_outside_fence_is_silently_dropped():
     vehicle, pilot = airborne(10.0)
     upload(pilot, 1, _square(mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION, 20.0))
     pilot.command(mavlink.MAV_CMD_DO_FENCE_ENABLE, 1)
@@ -129,7 +129,7 @@ def test_target_outside_the_fence_is_dropped_without_an_answer():
     assert distance_m(vehicle, 10.0, 0.0) < 0.7
 
 
-def test_the_fence_is_switched_as_a_whole_or_only_its_floor():
+def test_fence_enable_switches_whole_fence_or_minimum_altitude():
     vehicle, pilot = alone(FENCE_TYPE=12, FENCE_ENABLE=1)
     assert vehicle.fence.outside(0.0, 0.0, -20.0)
     assert pilot.command(mavlink.MAV_CMD_DO_FENCE_ENABLE, 2) == mavlink.MAV_RESULT_ACCEPTED
@@ -151,7 +151,9 @@ def test_the_fence_is_switched_as_a_whole_or_only_its_floor():
         ({"command": 5004, "param1": 5.0, "north": 30.0}, (20.0, 0.0), (30.0, 1.0)),
     ],
 )
-def test_fence_circles(item: dict[str, float], inside: tuple[float, float], outside: tuple[float, float]):
+def test_fence_circle_contains_only_allowed_points(
+    item: dict[str, float], inside: tuple[float, float], outside: tuple[float, float]
+):
     vehicle, pilot = alone(FENCE_ENABLE=1)
     place = START.offset(item.pop("north", 0.0), 0.0)
     assert upload(pilot, 1, [item | {"frame": 0, "x": place.lat_e7, "y": place.lon_e7}]) == 0
@@ -159,7 +161,7 @@ def test_fence_circles(item: dict[str, float], inside: tuple[float, float], outs
     assert vehicle.fence.outside(*outside, 10.0)
 
 
-def test_altitude_fence_and_home_circle():
+def test_altitude_fence_and_home_circle_are_breached_outside():
     vehicle, pilot = airborne(20.0, FENCE_ALT_MAX=30, FENCE_RADIUS=50, FENCE_ENABLE=1, FENCE_ACTION=4)
     pilot.go_to(0.0, 0.0, 35.0)
     pilot.go_to(55.0, 0.0, 20.0)
@@ -185,7 +187,7 @@ def test_altitude_fence_and_home_circle():
         [{"command": 16, "param1": 0.0}],
     ],
 )
-def test_bad_fences_are_refused_and_the_old_one_stays(items: list[dict[str, float]]):
+def test_invalid_fence_upload_is_refused_and_keeps_old_fence(items: list[dict[str, float]]):
     vehicle, pilot = alone()
     upload(pilot, 1, _square(mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION, 20.0))
     shapes = vehicle.fence.shapes
@@ -194,7 +196,7 @@ def test_bad_fences_are_refused_and_the_old_one_stays(items: list[dict[str, floa
     assert len(vehicle.fence_items.items) == 4
 
 
-def test_failed_motor_brings_it_down():
+def test_motor_failure_crashes_vehicle():
     vehicle, pilot = airborne(15.0)
     pilot.parameter("SIM_ENGINE_MUL", 0.0)
     pilot.parameter("SIM_ENGINE_FAIL", 1)
@@ -207,7 +209,7 @@ def _crashed(vehicle: VehicleState, pilot: Pilot) -> bool:
     return any(text.startswith("Crash: Disarming") for text in pilot.texts)
 
 
-def test_a_low_battery_forbids_arming_and_its_failsafe_stays_until_a_restart():
+def test_low_battery_prevents_arming_and_failsafe_latches_until_reboot():
     vehicle, pilot = airborne(10.0, BATT_LOW_TIMER=1, BATT_FS_LOW_ACT=1)
     pilot.parameter("SIM_BATT_VOLTAGE", 10.3)
     pilot.wait(lambda: not vehicle.armed, 60.0)
@@ -222,7 +224,7 @@ def test_a_low_battery_forbids_arming_and_its_failsafe_stays_until_a_restart():
     assert pilot.texts[-1] == "Arm: Battery failsafe"
 
 
-def test_a_change_of_mode_in_a_breach_suspends_the_fence_and_its_end_is_told():
+def test_mode_change_during_breach_suspends_fence_and_end_of_breach_is_reported():
     vehicle, pilot = airborne(10.0, FENCE_RADIUS=30, FENCE_TYPE=2, AVOID_ENABLE=0, FENCE_ENABLE=1)
     while vehicle.mode == mavlink.COPTER_MODE_GUIDED:
         pilot.send(
@@ -238,7 +240,7 @@ def test_a_change_of_mode_in_a_breach_suspends_the_fence_and_its_end_is_told():
     assert pilot.texts.count("Circle fence breached") == 1
 
 
-def test_velocities_are_slowed_before_the_fence():
+def test_velocity_is_limited_before_fence():
     vehicle, pilot = airborne(10.0, FENCE_RADIUS=30, FENCE_TYPE=2, FENCE_ENABLE=1)
     for _ in range(75):
         pilot.send(

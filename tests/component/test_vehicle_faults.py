@@ -1,4 +1,4 @@
-"""Faults injected in flight, and what a real ArduCopter shows for each: the mode and the STATUSTEXT."""
+"""Faults injected in flight, compared with the mode and STATUSTEXTs of a real ArduCopter."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ HOME = {"command": 16, "frame": 0, "x": START.lat_e7, "y": START.lon_e7, "z": 15
 
 
 def _in_order(texts: list[str], *wanted: str) -> bool:
-    """Whether the texts were said in that order (others may lie between)."""
+    """Return True if the texts were sent in this order, possibly with others in between."""
     rest = iter(texts)
     return all(any(text.startswith(want) for text in rest) for want in wanted)
 
@@ -36,7 +36,7 @@ def _in_mission(**parameters: float) -> tuple[VehicleState, Pilot]:
 @pytest.mark.parametrize(
     "mode", [mavlink.COPTER_MODE_GUIDED, mavlink.COPTER_MODE_LOITER, mavlink.COPTER_MODE_RTL, mavlink.COPTER_MODE_AUTO]
 )
-def test_gps_loss_lands_after_a_pause(mode: int):
+def test_gps_loss_lands_vehicle_after_pause(mode: int):
     vehicle, pilot = _in_mission() if mode == mavlink.COPTER_MODE_AUTO else airborne(15.0)
     if mode != mavlink.COPTER_MODE_AUTO:
         pilot.mode(mode)
@@ -55,7 +55,7 @@ def test_gps_loss_lands_after_a_pause(mode: int):
     assert not vehicle.body.crashed
 
 
-def test_gps_loss_may_hold_altitude_instead():
+def test_gps_loss_switches_to_alt_hold_if_configured():
     vehicle, pilot = airborne(15.0, FS_EKF_ACTION=2)
     pilot.parameter("SIM_GPS_DISABLE", 1)
     pilot.wait(lambda: vehicle.mode == mavlink.COPTER_MODE_ALT_HOLD, 12.0)
@@ -67,7 +67,7 @@ def test_gps_loss_may_hold_altitude_instead():
     assert pilot.mode(mavlink.COPTER_MODE_GUIDED) == mavlink.MAV_RESULT_ACCEPTED
 
 
-def test_too_few_satellites_are_no_position():
+def test_too_few_satellites_invalidate_position():
     vehicle, pilot = airborne(15.0)
     pilot.parameter("SIM_GPS_NUMSATS", 3)
     pilot.wait(lambda: vehicle.mode == mavlink.COPTER_MODE_LAND, 12.0)
@@ -84,7 +84,7 @@ def test_too_few_satellites_are_no_position():
         (7, mavlink.COPTER_MODE_BRAKE, "GCS Failsafe"),
     ],
 )
-def test_a_node_without_power_is_a_companion_that_falls_silent(setting: int, mode: int, text: str):
+def test_gcs_failsafe_action_follows_setting_when_node_loses_power(setting: int, mode: int, text: str):
     vehicle, pilot = airborne(10.0, FS_GCS_ENABLE=setting)
     pilot.go_to(40.0, 0.0, 10.0)
     pilot.heartbeats = False
@@ -105,7 +105,7 @@ def test_a_node_without_power_is_a_companion_that_falls_silent(setting: int, mod
         (0, mavlink.COPTER_MODE_LOITER, False, "GCS Failsafe"),
     ],
 )
-def test_a_lost_link_leaves_what_fs_options_says(options: int, mode: int, stays: bool, text: str):
+def test_gcs_failsafe_continues_modes_selected_by_fs_options(options: int, mode: int, stays: bool, text: str):
     vehicle, pilot = _in_mission(FS_GCS_ENABLE=1, FS_OPTIONS=options)
     pilot.mode(mode)
     pilot.heartbeats = False
@@ -117,7 +117,7 @@ def test_a_lost_link_leaves_what_fs_options_says(options: int, mode: int, stays:
 @pytest.mark.parametrize(
     ("setting", "mode"), [(1, mavlink.COPTER_MODE_RTL), (3, mavlink.COPTER_MODE_LAND), (7, mavlink.COPTER_MODE_BRAKE)]
 )
-def test_a_lost_radio(setting: int, mode: int):
+def test_radio_failsafe_action_follows_setting(setting: int, mode: int):
     vehicle, pilot = airborne(10.0, FS_THR_ENABLE=setting)
     pilot.go_to(30.0, 0.0, 10.0)
     pilot.fly_on(3.0)
@@ -132,7 +132,7 @@ def test_a_lost_radio(setting: int, mode: int):
     ("options", "watched", "text"),
     [(4, 1, "Radio Failsafe - Continuing Guided Mode"), (4, 0, "Radio Failsafe"), (0, 1, "Radio Failsafe")],
 )
-def test_guided_flight_may_go_on_without_radio_where_the_companion_is_watched(options: int, watched: int, text: str):
+def test_radio_failsafe_continues_guided_only_if_gcs_failsafe_is_enabled(options: int, watched: int, text: str):
     vehicle, pilot = airborne(10.0, FS_OPTIONS=options, FS_GCS_ENABLE=watched)
     pilot.parameter("SIM_RC_FAIL", 1)
     pilot.wait(lambda: vehicle.failsafes.radio, 3.0)
@@ -140,7 +140,7 @@ def test_guided_flight_may_go_on_without_radio_where_the_companion_is_watched(op
     assert (vehicle.mode == mavlink.COPTER_MODE_GUIDED) is text.endswith("Guided Mode")
 
 
-def test_a_lost_radio_on_the_ground_stops_the_motors_and_forbids_arming():
+def test_radio_failsafe_on_the_ground_disarms_and_prevents_arming():
     vehicle, pilot = alone()
     pilot.mode(mavlink.COPTER_MODE_GUIDED)
     pilot.wait(lambda: not arming_refusals(vehicle), 5.0)
@@ -162,7 +162,7 @@ def test_a_lost_radio_on_the_ground_stops_the_motors_and_forbids_arming():
         (7, mavlink.COPTER_MODE_BRAKE),
     ],
 )
-def test_a_battery_that_drops(setting: int, mode: int):
+def test_battery_failsafe_action_follows_setting(setting: int, mode: int):
     vehicle, pilot = airborne(10.0, BATT_LOW_VOLT=11.5, BATT_FS_LOW_ACT=setting)
     pilot.go_to(30.0, 0.0, 10.0)
     pilot.fly_on(3.0)
@@ -175,14 +175,14 @@ def test_a_battery_that_drops(setting: int, mode: int):
     )
 
 
-def test_a_terminating_battery_failsafe_stops_the_motors():
+def test_terminate_action_of_battery_failsafe_disarms():
     vehicle, pilot = airborne(10.0, BATT_CRT_VOLT=11.5, BATT_FS_CRT_ACT=5)
     pilot.parameter("SIM_BATT_VOLTAGE", 10.4)
     pilot.wait(lambda: not vehicle.armed, 15.0)
     assert _in_order(pilot.texts, "Battery 1 is critical 1", "Battery Failsafe", "Disarming motors")
 
 
-def test_a_landing_for_the_battery_is_not_undone_by_a_lost_link():
+def test_battery_landing_continues_after_gcs_failsafe():
     vehicle, pilot = airborne(25.0, BATT_CRT_VOLT=11.5, BATT_FS_CRT_ACT=1, FS_GCS_ENABLE=1, FS_OPTIONS=0)
     pilot.parameter("SIM_BATT_VOLTAGE", 10.4)
     pilot.wait(lambda: vehicle.mode == mavlink.COPTER_MODE_LAND, 15.0)
@@ -193,7 +193,7 @@ def test_a_landing_for_the_battery_is_not_undone_by_a_lost_link():
 
 
 @pytest.mark.parametrize("motor", [0, 1, 2, 3])
-def test_a_dead_motor_ends_in_a_crash_that_disarms(motor: int):
+def test_dead_motor_causes_crash_and_disarm(motor: int):
     vehicle, pilot = airborne(15.0)
     pilot.parameter("SIM_ENGINE_MUL", 0.0)
     pilot.parameter("SIM_ENGINE_FAIL", 1 << motor)
@@ -202,7 +202,7 @@ def test_a_dead_motor_ends_in_a_crash_that_disarms(motor: int):
     assert _in_order(pilot.texts, "Crash: Disarming: AngErr=", "Disarming motors")
 
 
-def test_weak_motors_are_noticed_before_the_ground_is():
+def test_thrust_loss_is_reported_before_ground_contact():
     vehicle, pilot = airborne(30.0)
     pilot.parameter("SIM_ENGINE_MUL", 0.36)
     pilot.parameter("SIM_ENGINE_FAIL", 15)
@@ -211,7 +211,7 @@ def test_weak_motors_are_noticed_before_the_ground_is():
     assert pilot.last["STATUSTEXT"].integer("severity") == mavlink.MAV_SEVERITY_EMERGENCY
 
 
-def test_a_gust_is_leaned_against_and_changes_nothing_else():
+def test_gust_is_compensated_without_mode_change():
     vehicle, pilot = airborne(15.0)
     said = len(pilot.texts)
     pilot.parameter("SIM_WIND_DIR", 0)
@@ -229,7 +229,7 @@ def test_a_gust_is_leaned_against_and_changes_nothing_else():
     assert (vehicle.mode, pilot.texts[said:]) == (mavlink.COPTER_MODE_GUIDED, [])
 
 
-def test_a_storm_carries_it_away_and_it_comes_back():
+def test_vehicle_blown_away_by_storm_returns():
     vehicle, pilot = airborne(30.0)
     pilot.parameter("SIM_WIND_SPD", 45)
     pilot.fly_on(8.0)
@@ -241,7 +241,7 @@ def test_a_storm_carries_it_away_and_it_comes_back():
     assert not vehicle.body.crashed
 
 
-def test_a_fence_that_is_far_behind_means_landing():
+def test_fence_action_is_land_far_outside_fence():
     vehicle, pilot = airborne(10.0, FENCE_RADIUS=50, FENCE_ACTION=1)
     pilot.go_to(200.0, 0.0, 10.0)
     pilot.wait(lambda: vehicle.body.north > 190.0, 60.0)

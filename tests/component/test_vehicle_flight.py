@@ -1,4 +1,4 @@
-"""How the vehicle moves, and what it grants and refuses, in lockstep."""
+"""Motion of the vehicle and preconditions of its commands, in lockstep."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def _local(pilot: Pilot, frame: int, mask: int, **values: float) -> None:
     _target(pilot, "SET_POSITION_TARGET_LOCAL_NED", coordinate_frame=frame, type_mask=mask, **values)
 
 
-def test_measured_figures_of_the_real_thing_hold_within_20_percent():
+def test_flight_performance_matches_real_vehicle_within_20_percent():
     vehicle, pilot = alone()
     climb_s = pilot.take_off(10.0)  # 95 % of 10 m
     assert 7.6 <= climb_s <= 11.4
@@ -44,7 +44,7 @@ def test_measured_figures_of_the_real_thing_hold_within_20_percent():
     assert distance_m(vehicle, 0.0, 0.0) < 1.0
 
 
-def test_motion_respects_its_limits_and_does_not_overshoot():
+def test_motion_respects_limits_without_overshoot():
     vehicle, pilot = airborne(20.0, WPNAV_SPEED=500)
     pilot.go_to(80.0, 30.0, 20.0)
     accelerations = []
@@ -64,7 +64,7 @@ def test_motion_respects_its_limits_and_does_not_overshoot():
     assert distance_m(vehicle, 80.0, 30.0) < 0.5
 
 
-def test_wind_is_held_and_gusts_do_not_carry_it_away():
+def test_position_is_held_in_wind_and_gusts():
     vehicle, pilot = airborne(15.0, SIM_WIND_SPD=8, SIM_WIND_DIR=270, SIM_WIND_TURB=2)
     pilot.fly_on(10.0)
     worst = 0.0
@@ -75,7 +75,7 @@ def test_wind_is_held_and_gusts_do_not_carry_it_away():
     assert abs(vehicle.est.roll) + abs(vehicle.est.pitch) > math.radians(3), "it must lean into the wind"
 
 
-def test_arming_waits_for_readiness_and_says_why():
+def test_arming_is_refused_with_reason_until_ready():
     vehicle, pilot = alone()
     pilot.mode(mavlink.COPTER_MODE_GUIDED)
     assert pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0) == mavlink.MAV_RESULT_FAILED
@@ -89,7 +89,7 @@ def test_arming_waits_for_readiness_and_says_why():
     assert pilot.texts[-1] == "Arm: RTL mode not armable"
 
 
-def test_idle_vehicle_disarms_by_itself():
+def test_idle_vehicle_disarms_automatically():
     vehicle, pilot = alone()
     pilot.mode(mavlink.COPTER_MODE_GUIDED)
     pilot.wait(lambda: not arming_refusals(vehicle), 5.0)
@@ -97,7 +97,7 @@ def test_idle_vehicle_disarms_by_itself():
     assert 9.0 < pilot.wait(lambda: not vehicle.armed, 15.0) < 11.0
 
 
-def test_takeoff_needs_guided_armed_and_ground():
+def test_takeoff_requires_guided_armed_and_landed():
     vehicle, pilot = alone()
     pilot.wait(lambda: vehicle.position_ok, 5.0)
     takeoff = (mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 5)
@@ -118,7 +118,7 @@ def test_takeoff_needs_guided_armed_and_ground():
     assert not vehicle.armed
 
 
-def test_a_target_during_spool_up_cancels_the_takeoff():
+def test_target_during_spool_up_cancels_takeoff():
     vehicle, pilot = alone()
     pilot.mode(mavlink.COPTER_MODE_GUIDED)
     pilot.wait(lambda: not arming_refusals(vehicle), 5.0)
@@ -144,7 +144,7 @@ def test_results_of_commands(command: int, result: int):
     assert pilot.command(command) is result
 
 
-def test_messages_for_others_are_ignored():
+def test_messages_for_other_systems_are_ignored():
     vehicle, pilot = alone()
     pilot.wait(lambda: not arming_refusals(vehicle), 5.0)
     pilot.send("COMMAND_LONG", {"target_system": 9, "target_component": 1, "command": 400, "param1": 1.0})
@@ -154,7 +154,7 @@ def test_messages_for_others_are_ignored():
 
 
 @pytest.mark.parametrize("frame", [0, 3, 5, 6, 10, 11])
-def test_global_targets_in_every_frame(frame: int):
+def test_global_target_is_flown_in_every_frame(frame: int):
     vehicle, pilot = airborne(10.0)
     place = START.offset(12.0, -9.0)
     altitude = 162.0 if frame in (0, 5) else 12.0
@@ -173,7 +173,7 @@ def test_global_targets_in_every_frame(frame: int):
 
 
 @pytest.mark.parametrize(("frame", "north", "east"), [(1, 6.0, 2.0), (7, 16.0, 2.0), (8, 8.0, 6.0), (9, 8.0, 6.0)])
-def test_local_targets_in_every_frame(frame: int, north: float, east: float):
+def test_local_target_is_flown_in_every_frame(frame: int, north: float, east: float):
     vehicle, pilot = airborne(10.0)
     pilot.go_to(10.0, 0.0, 10.0)
     pilot.command(mavlink.MAV_CMD_CONDITION_YAW, 90, 90, 1, 0)
@@ -188,7 +188,7 @@ def test_local_targets_in_every_frame(frame: int, north: float, east: float):
     assert vehicle.altitude_m == pytest.approx(10.0, abs=0.5)
 
 
-def test_velocity_targets_run_out_after_the_timeout():
+def test_velocity_target_expires_after_timeout():
     vehicle, pilot = airborne(20.0)
     for _ in range(30):
         _local(pilot, 1, 0xDC7, vx=3.0, vy=-1.0, vz=0.5)
@@ -202,7 +202,7 @@ def test_velocity_targets_run_out_after_the_timeout():
     assert math.hypot(vehicle.body.vn, vehicle.body.ve) < 0.2
 
 
-def test_yaw_targets_and_rates():
+def test_yaw_targets_and_yaw_rates_are_followed():
     vehicle, pilot = airborne(10.0)
     _local(pilot, 1, 0x9F8, x=0.0, y=0.0, z=-10.0, yaw=2.0)
     pilot.fly_on(6.0)
@@ -213,7 +213,7 @@ def test_yaw_targets_and_rates():
     assert vehicle.body.r == pytest.approx(0.5, abs=0.1)
 
 
-def test_nose_follows_the_course_and_looks_at_a_region_of_interest():
+def test_heading_follows_course_and_region_of_interest():
     vehicle, pilot = airborne(10.0)
     pilot.go_to(0.0, 60.0, 10.0)
     pilot.fly_on(6.0)
@@ -226,7 +226,7 @@ def test_nose_follows_the_course_and_looks_at_a_region_of_interest():
     assert wrap_pi(vehicle.est.yaw - bearing) == pytest.approx(0.0, abs=0.1)
 
 
-def test_reposition_switches_mode_only_when_asked():
+def test_reposition_changes_mode_only_with_flag():
     vehicle, pilot = airborne(10.0)
     assert pilot.mode(mavlink.COPTER_MODE_LOITER) == mavlink.MAV_RESULT_ACCEPTED
     place = START.offset(10.0, 5.0)
@@ -239,7 +239,7 @@ def test_reposition_switches_mode_only_when_asked():
     assert vehicle.altitude_m == pytest.approx(15.0, abs=0.4)
 
 
-def test_change_speed_holds_until_the_controller_changes():
+def test_changed_speed_is_kept_until_controller_changes():
     vehicle, pilot = airborne(10.0)
     assert pilot.command(mavlink.MAV_CMD_DO_CHANGE_SPEED, 1, 2.0) == mavlink.MAV_RESULT_ACCEPTED
     assert pilot.command(mavlink.MAV_CMD_DO_CHANGE_SPEED, 1, -1.0) == mavlink.MAV_RESULT_FAILED
@@ -260,7 +260,7 @@ def test_change_speed_holds_until_the_controller_changes():
 
 
 def _at_speed(speed_mps: float, **parameters: float) -> tuple[VehicleState, Pilot]:
-    """A vehicle that has flown north with a velocity for a while, told again four times a second."""
+    """Return a vehicle that has flown north for some seconds with a velocity target repeated at 4 Hz."""
     vehicle, pilot = airborne(10.0, **parameters)
     for _ in range(32):
         _local(pilot, 1, 0xDC7, vx=speed_mps, vy=0.0, vz=0.0)
@@ -274,7 +274,7 @@ def _until_slow(vehicle: VehicleState, pilot: Pilot, slow_mps: float = 0.5) -> f
 
 
 @pytest.mark.parametrize(("speed_mps", "real_m", "real_s"), [(6.4, 10.6, 3.75), (6.8, 12.2, 3.9)])
-def test_brake_stops_as_slowly_as_on_the_real_one(speed_mps: float, real_m: float, real_s: float):
+def test_brake_stopping_distance_matches_real_vehicle(speed_mps: float, real_m: float, real_s: float):
     vehicle, pilot = _at_speed(speed_mps)
     at = vehicle.est.north
     assert pilot.mode(mavlink.COPTER_MODE_BRAKE) == mavlink.MAV_RESULT_ACCEPTED
@@ -283,7 +283,7 @@ def test_brake_stops_as_slowly_as_on_the_real_one(speed_mps: float, real_m: floa
     assert vehicle.est.north - at == pytest.approx(real_m, rel=0.15)
 
 
-def test_a_velocity_of_zero_stops_as_on_the_real_one():
+def test_zero_velocity_stopping_distance_matches_real_vehicle():
     vehicle, pilot = _at_speed(9.5)
     at = vehicle.est.north
     _local(pilot, 1, 0xDC7, vx=0.0, vy=0.0, vz=0.0)
@@ -293,13 +293,13 @@ def test_a_velocity_of_zero_stops_as_on_the_real_one():
 
 
 @pytest.mark.parametrize(("timeout_s", "real_s"), [(3.0, 5.0), (1.0, 3.1)])
-def test_a_velocity_that_is_not_repeated_ends_as_on_the_real_one(timeout_s: float, real_s: float):
+def test_velocity_timeout_matches_real_vehicle(timeout_s: float, real_s: float):
     vehicle, pilot = _at_speed(3.0, GUID_TIMEOUT=timeout_s)
     assert 0.25 + _until_slow(vehicle, pilot, 0.1) == pytest.approx(real_s, abs=0.4)
 
 
 @pytest.mark.parametrize("mode", [mavlink.COPTER_MODE_LOITER, mavlink.COPTER_MODE_GUIDED])
-def test_stops_about_as_fast_as_the_autopilots_own_formula(mode: int):
+def test_stopping_distance_matches_ardupilot_formula(mode: int):
     vehicle, pilot = _at_speed(8.0)
     at, speed = vehicle.body.north, vehicle.body.vn
     if mode == mavlink.COPTER_MODE_GUIDED:
@@ -312,7 +312,7 @@ def test_stops_about_as_fast_as_the_autopilots_own_formula(mode: int):
     assert vehicle.altitude_m == pytest.approx(10.0, abs=0.5)
 
 
-def test_land_disarms_on_the_ground():
+def test_land_disarms_after_touchdown():
     vehicle, pilot = airborne(8.0)
     assert pilot.command(mavlink.MAV_CMD_NAV_LAND) == mavlink.MAV_RESULT_ACCEPTED
     took = pilot.wait(lambda: not vehicle.armed, 60.0)
@@ -330,7 +330,7 @@ def test_unknown_modes_are_refused():
     assert vehicle.mode == mavlink.COPTER_MODE_STABILIZE
 
 
-def test_modes_are_checked_once_the_motors_run():
+def test_mode_requirements_are_checked_only_while_armed():
     vehicle, pilot = alone()
     assert pilot.mode(mavlink.COPTER_MODE_AUTO) == mavlink.MAV_RESULT_ACCEPTED, "disarmed, every mode can be selected"
     assert pilot.mode(mavlink.COPTER_MODE_GUIDED) == mavlink.MAV_RESULT_ACCEPTED
@@ -382,28 +382,28 @@ def _fly_pattern(seed: int) -> bytes:
     return log.data
 
 
-def test_one_seed_gives_one_log():
+def test_same_seed_produces_same_log():
     first = _fly_pattern(7)
     assert len(first) > 50_000
     assert first == _fly_pattern(7)
     assert first != _fly_pattern(8)
 
 
-def test_estimate_differs_from_truth_but_little():
+def test_estimate_has_small_error():
     vehicle, pilot = airborne(10.0)
     pilot.fly_on(30.0)
     error = math.dist((vehicle.est.north, vehicle.est.east), (vehicle.body.north, vehicle.body.east))
     assert 0.0 < error < 0.5
 
 
-def test_a_battery_without_a_capacity_keeps_its_voltage():
+def test_battery_without_capacity_keeps_its_voltage():
     vehicle, pilot = airborne(10.0)
     pilot.fly_on(60.0)
     assert vehicle.battery.voltage_v == pytest.approx(12.6)
     assert vehicle.battery.percent < 100
 
 
-def test_battery_drains_and_sags():
+def test_battery_voltage_drops_with_charge_and_load():
     vehicle, pilot = airborne(10.0, SIM_BATT_CAP_AH=3.3)
     before = vehicle.battery.percent
     resting = vehicle.battery.full_v

@@ -1,4 +1,4 @@
-"""The simulated vehicle's gimbal: turns at its rate, and tells where it points."""
+"""Gimbal of the simulated vehicle: turn rate, limits and reported attitude."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ SIYI, SERVOS = 8.0, 1.0
 PITCHYAW = mavlink.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW
 
 
-def test_a_vehicle_without_a_gimbal_has_none() -> None:
+def test_vehicle_without_gimbal_sends_no_gimbal_messages() -> None:
     vehicle, pilot = alone()
     assert pilot.command(PITCHYAW, -45.0, 0.0, math.nan, math.nan) == mavlink.MAV_RESULT_FAILED
     assert gimbal_device_attitude_status(vehicle) is None
     assert gimbal_manager_information(vehicle) is None
 
 
-def test_it_turns_at_its_rate_and_tells_where_it_is() -> None:
+def test_gimbal_turns_at_its_rate_and_reports_attitude() -> None:
     vehicle, pilot = alone(MNT1_TYPE=SIYI)
     assert pilot.command(PITCHYAW, -90.0, 120.0, math.nan, math.nan) == mavlink.MAV_RESULT_ACCEPTED
     begun_s, angles = vehicle.time_s, []
@@ -41,14 +41,14 @@ def test_it_turns_at_its_rate_and_tells_where_it_is() -> None:
 
 
 @pytest.mark.parametrize("wanted", [(-120.0, 0.0, -90.0), (60.0, 0.0, 20.0)])
-def test_it_turns_as_far_as_it_can(wanted: tuple[float, float, float]) -> None:
+def test_gimbal_angles_are_limited(wanted: tuple[float, float, float]) -> None:
     vehicle, pilot = alone(MNT1_TYPE=SIYI)
     pilot.command(PITCHYAW, *wanted[:2], math.nan, math.nan)
     pilot.wait(lambda: vehicle.gimbal.pitch_deg == wanted[2], 3.0)
 
 
-def test_servos_tell_what_they_were_told() -> None:
+def test_servo_gimbal_reports_its_target() -> None:
     vehicle, pilot = alone(MNT1_TYPE=SERVOS)
     pilot.command(PITCHYAW, -90.0, 0.0, math.nan, math.nan)
     assert vehicle.gimbal.pitch_deg > -20.0
-    assert vehicle.gimbal.told[2] == pytest.approx(-math.sqrt(0.5))
+    assert vehicle.gimbal.reported_quaternion[2] == pytest.approx(-math.sqrt(0.5))

@@ -1,6 +1,6 @@
-"""What the vehicle sends in known flights, against digests: a change of structure must not change a message.
+"""Digests of all messages sent in recorded flights. Refactoring must not change a message.
 
-A change of behaviour does; then `python tests/component/test_vehicle_golden.py` prints the new digests.
+After an intended change of behaviour, `python tests/component/test_vehicle_golden.py` prints the new digests.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ FLIGHTS: tuple[tuple[Callable[[Pilot], None], int, dict[str, float], str], ...] 
 
 
 def digest(flight: Callable[[Pilot], None], seed: int, parameters: dict[str, float]) -> str:
-    """What is heard during a flight."""
+    """Fly and return the digest of all received messages."""
     pilot = pilot_of(seed, **parameters)
     flight(pilot)
-    return pilot.heard.hexdigest()[:16]
+    return pilot.digest.hexdigest()[:16]
 
 
 @pytest.mark.parametrize(
@@ -35,7 +35,7 @@ def digest(flight: Callable[[Pilot], None], seed: int, parameters: dict[str, flo
     FLIGHTS,
     ids=[f"{flight.__name__}-{seed}" for flight, seed, _, _ in FLIGHTS],
 )
-def test_flights_are_as_recorded(
+def test_golden_flight_matches_recorded_digest(
     flight: Callable[[Pilot], None], seed: int, parameters: dict[str, float], expected: str
 ):
     assert digest(flight, seed, parameters) == expected

@@ -1,4 +1,4 @@
-"""The loop that keeps a vehicle in real time: how often it wakes, and that no one on a link can tell."""
+"""Real-time loop of the vehicle: number of wake-ups, and response times that do not depend on them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ GETTING_UP_S = 0.0003
 
 
 class Clock:
-    """Time that passes only while the loop sleeps, and a little whenever it wakes."""
+    """Fake clock that advances only while the loop sleeps, and slightly at each wake-up."""
 
     def __init__(self) -> None:
         self.now_s = 1000.0
@@ -34,7 +34,7 @@ class Clock:
 
 
 class Line(Hub):
-    """One link whose far end sends bytes at given times and notes when which message reached it."""
+    """Fake link whose far end sends bytes at given times and records the arrival time of messages."""
 
     def __init__(self, clock: Clock, craft: Craft, letters: dict[float, bytes]) -> None:
         super().__init__()
@@ -46,7 +46,7 @@ class Line(Hub):
         self.flushes: list[float] = []
 
     def wait(self, timeout_s: float) -> bool:
-        """As the real one, which counts in whole milliseconds."""
+        """Round down to whole milliseconds, like the real hub."""
         end_s = self.clock.now_s + math.floor(max(timeout_s, 0.0) * 1e3) / 1e3
         first_s = min(self.letters, default=math.inf)
         self.clock.wakes += 1
@@ -88,13 +88,13 @@ def _ran(
     return line, simulation
 
 
-def test_a_quiet_vehicle_wakes_seldom_and_keeps_time(monkeypatch: pytest.MonkeyPatch):
+def test_loop_of_quiet_vehicle_wakes_rarely_and_keeps_time(monkeypatch: pytest.MonkeyPatch):
     line, simulation = _ran(monkeypatch, {})
     assert line.clock.wakes <= 2 * 10.0 / STEP_S / realtime.MAX_NAP + 20
     assert line.clock.now_s - 1000.0 == pytest.approx(simulation.time_s, abs=(realtime.MAX_NAP + 1) * STEP_S)
 
 
-def test_streams_leave_in_the_step_in_which_they_are_due(monkeypatch: pytest.MonkeyPatch):
+def test_stream_messages_are_sent_in_their_due_step(monkeypatch: pytest.MonkeyPatch):
     asks = b"".join(_command(511, number, us) for number, us in ((30, 70_000), (32, 110_000), (33, 250_000)))
     line, _ = _ran(monkeypatch, {3.0: asks})
     for name, interval_s in (("ATTITUDE", 0.07), ("LOCAL_POSITION_NED", 0.11), ("GLOBAL_POSITION_INT", 0.25)):
@@ -102,20 +102,20 @@ def test_streams_leave_in_the_step_in_which_they_are_due(monkeypatch: pytest.Mon
         assert len(left) == pytest.approx(7.0 / interval_s, abs=2)
         assert all(-1e-6 < wall_s - time_s < 0.001 for wall_s, time_s in left)
         gaps = [after[1] - before[1] for before, after in itertools.pairwise(left)]
-        # The first one is on its way with the acknowledgement, a step after what was asked is heard.
+        # The first message is sent with the acknowledgement, one step after the request was received.
         assert gaps[1:] == pytest.approx([interval_s] * (len(gaps) - 1), abs=1e-6)
 
 
 @pytest.mark.parametrize("speedup", [1.0, 5.0, 0.5])
 @pytest.mark.parametrize("at_s", [1.0, 1.0031, 1.0149, 1.0271, 1.0399])
-def test_what_arrives_is_answered_at_the_next_step(monkeypatch: pytest.MonkeyPatch, at_s: float, speedup: float):
+def test_response_is_sent_in_the_next_step(monkeypatch: pytest.MonkeyPatch, at_s: float, speedup: float):
     line, _ = _ran(monkeypatch, {at_s: _command(512, 148)}, speedup)
     (answered,) = [wall_s for wall_s, _, name in line.heard if name == "COMMAND_ACK"]
     assert 0.0 <= answered - at_s <= STEP_S / speedup + 0.0015
 
 
 @pytest.mark.parametrize("step_takes_s", [0.002, 0.0075, 0.009])
-def test_a_busy_machine_that_keeps_up_is_never_behind(monkeypatch: pytest.MonkeyPatch, step_takes_s: float):
+def test_loop_on_busy_machine_keeps_up(monkeypatch: pytest.MonkeyPatch, step_takes_s: float):
     letters = {0.007 * at: _command(512, 148) for at in range(1500)}
     line, simulation = _ran(monkeypatch, letters, step_takes_s=step_takes_s)
     gaps = [after - before for before, after in itertools.pairwise(line.flushes)]
@@ -123,7 +123,7 @@ def test_a_busy_machine_that_keeps_up_is_never_behind(monkeypatch: pytest.Monkey
     assert line.clock.now_s - 1000.0 == pytest.approx(simulation.time_s, abs=(realtime.MAX_NAP + 1) * STEP_S)
 
 
-def test_the_hub_waits_for_what_arrives_and_leaves_it():
+def test_hub_wait_leaves_data_for_poll():
     hub = Hub()
     near, far = socket.socketpair()
     heard: list[bytes] = []

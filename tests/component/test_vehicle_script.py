@@ -1,4 +1,4 @@
-"""The simulated vehicle beside the answers of a real ArduCopter 4.6.3, one script for both."""
+"""Responses of the simulated vehicle compared with a real ArduCopter 4.6.3, played from one script."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import pytest
 from vehicle_script import SimulatedLine, Step, agrees, compare, steps
 
 
-def test_every_step_is_played_or_says_why_not():
+def test_every_script_step_is_played_or_has_a_reason():
     assert len({step.name for step in steps()}) == len(steps())
     assert [step.name for step in steps() if not step.do and not step.note] == []
 
 
-def test_the_vehicle_answers_as_the_real_one():
+def test_vehicle_responses_match_real_ardupilot():
     differing: list[str] = []
 
     def report(step: Step, answer: str, verdict: str) -> None:
@@ -33,5 +33,5 @@ def test_the_vehicle_answers_as_the_real_one():
         ("s=5.0~10%", "nothing", False),
     ],
 )
-def test_tolerances_belong_to_single_numbers(real: str, ours: str, same: bool):
+def test_script_tolerances_apply_to_single_numbers(real: str, ours: str, same: bool):
     assert agrees(real, ours) is same

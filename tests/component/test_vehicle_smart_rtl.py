@@ -1,4 +1,4 @@
-"""SmartRTL: the path that is remembered, how it is tidied, and how it is flown back."""
+"""SmartRTL: recording, simplification and following of the path."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def _crumbs(points: list[Point], limit: int = 500) -> Breadcrumbs:
 
 
 def _tidy(crumbs: Breadcrumbs) -> list[Point]:
-    for _ in crumbs.thorough():
+    for _ in crumbs.simplify_fully():
         pass
     return crumbs.path
 
@@ -41,7 +41,7 @@ def _line(start: Point, end: Point, step_m: float = 2.5) -> list[Point]:
     ]
 
 
-def test_points_lie_apart_and_end_at_the_limit():
+def test_smart_rtl_points_are_spaced_and_limited():
     crumbs = _crumbs([(0.0, 0.5 * at, 0.0) for at in range(40)], limit=8)
     assert len(crumbs.path) == 8
     gaps = [math.dist(a, b) for a, b in zip(crumbs.path, crumbs.path[1:], strict=False)]
@@ -50,7 +50,7 @@ def test_points_lie_apart_and_end_at_the_limit():
     assert crumbs.add(crumbs.path[-1]), "a point that needs no room is no failure"
 
 
-def test_straight_stretches_shrink_to_their_ends_and_corners_stay():
+def test_simplification_keeps_corners_of_path():
     corners: list[Point] = [(0.0, 0.0, 0.0), (0.0, 0.0, -10.0), (60.0, 0.0, -10.0), (60.0, 40.0, -14.0)]
     points = [corners[0]]
     for a, b in itertools.pairwise(corners):
@@ -60,7 +60,7 @@ def test_straight_stretches_shrink_to_their_ends_and_corners_stay():
     assert all(math.dist(a, b) < 1.0 for a, b in zip(path, corners, strict=True))
 
 
-def test_a_loop_is_cut_where_it_closes():
+def test_loop_in_path_is_cut():
     circle: list[Point] = [(20.0 * math.sin(at / 10.0), 20.0 - 20.0 * math.cos(at / 10.0), -10.0) for at in range(63)]
     points = [
         (0.0, 0.0, 0.0),
@@ -74,7 +74,7 @@ def test_a_loop_is_cut_where_it_closes():
 
 
 @pytest.mark.parametrize("seed", range(examples(5, 2)))
-def test_tidying_never_leaves_the_flown_path_by_more_than_the_accuracy(seed: int):
+def test_simplified_path_stays_within_accuracy_of_flown_path(seed: int):
     rng = random.Random(seed)
     here, heading, points = (0.0, 0.0, 0.0), 0.0, [(0.0, 0.0, 0.0)]
     for _ in range(350):
@@ -91,7 +91,7 @@ def test_tidying_never_leaves_the_flown_path_by_more_than_the_accuracy(seed: int
             assert min(distance_to_segment(probe, *segment) for segment in segments) <= 2.0
 
 
-def test_gap_of_segments_against_sampling():
+def test_segment_gap_matches_sampling():
     rng = random.Random(4)
     for _ in range(200):
         a, b, c, d = (tuple(rng.uniform(-5.0, 5.0) for _ in range(3)) for _ in range(4))
@@ -106,7 +106,7 @@ def test_gap_of_segments_against_sampling():
 
 
 def _detour(**parameters: float) -> tuple[VehicleState, Pilot, list[Point]]:
-    """Out around a corner: north, then east; the straight way home would cut the corner."""
+    """Fly north, then east, so that the direct return would cut the corner."""
     vehicle, pilot = airborne(10.0, **parameters)
     flown: list[Point] = []
     for north, east, altitude in ((60.0, 0.0, 10.0), (60.0, 60.0, 14.0)):
@@ -120,7 +120,7 @@ def _detour(**parameters: float) -> tuple[VehicleState, Pilot, list[Point]]:
 
 
 def _farthest_from_flown(vehicle: VehicleState, pilot: Pilot, flown: list[Point]) -> float:
-    """Fly on until disarmed; the greatest distance from the way out."""
+    """Fly until disarmed and return the greatest distance from the outbound path."""
     way = [(0.0, 0.0, 0.0), *flown[::20], flown[-1]]
     worst = 0.0
     for at in range(20_000):
@@ -133,7 +133,7 @@ def _farthest_from_flown(vehicle: VehicleState, pilot: Pilot, flown: list[Point]
     raise AssertionError("not landed")
 
 
-def test_it_flies_back_along_the_path_and_lands_where_it_began():
+def test_smart_rtl_returns_along_path_and_lands_at_start():
     vehicle, pilot, flown = _detour()
     assert vehicle.breadcrumbs.active
     assert pilot.mode(mavlink.COPTER_MODE_SMART_RTL) == mavlink.MAV_RESULT_ACCEPTED
@@ -144,7 +144,7 @@ def test_it_flies_back_along_the_path_and_lands_where_it_began():
     assert pilot.texts[-1] == "Arm: SMARTRTL mode not armable"
 
 
-def test_it_waits_two_metres_above_the_start_before_it_lands():
+def test_smart_rtl_pauses_two_metres_above_start():
     vehicle, pilot, _ = _detour()
     pilot.mode(mavlink.COPTER_MODE_SMART_RTL)
     pilot.wait(lambda: pilot.craft.vehicle.modes.flight.landing, 120.0)
@@ -152,7 +152,7 @@ def test_it_waits_two_metres_above_the_start_before_it_lands():
     assert distance_m(vehicle, 0.0, 0.0) < 2.5
 
 
-def test_a_final_altitude_is_held_instead_of_landing():
+def test_smart_rtl_holds_final_altitude_instead_of_landing():
     vehicle, pilot, _ = _detour(RTL_ALT_FINAL=400)
     pilot.mode(mavlink.COPTER_MODE_SMART_RTL)
     pilot.fly_on(90.0)
@@ -162,7 +162,7 @@ def test_a_final_altitude_is_held_instead_of_landing():
 
 
 @pytest.mark.parametrize("setting", [3, 4])
-def test_a_silent_companion_is_brought_home_along_the_path(setting: int):
+def test_gcs_failsafe_can_return_by_smart_rtl(setting: int):
     vehicle, pilot, flown = _detour(FS_GCS_ENABLE=setting)
     pilot.heartbeats = False
     pilot.wait(lambda: vehicle.mode == mavlink.COPTER_MODE_SMART_RTL, 7.0)
@@ -181,7 +181,9 @@ def test_a_silent_companion_is_brought_home_along_the_path(setting: int):
         ("BATT_FS_LOW_ACT", 4, mavlink.COPTER_MODE_LAND, "SmartRTL Unavailable, Using Land Mode"),
     ],
 )
-def test_without_memory_it_falls_back_and_says_so(parameter: str, setting: int, mode: int, text: str):
+def test_failsafe_falls_back_and_reports_if_smart_rtl_is_unavailable(
+    parameter: str, setting: int, mode: int, text: str
+):
     vehicle, pilot = airborne(10.0, SRTL_POINTS=0, BATT_LOW_VOLT=11.5, **{parameter: setting})
     assert pilot.mode(mavlink.COPTER_MODE_SMART_RTL) == mavlink.MAV_RESULT_FAILED
     assert pilot.texts[-1] == "Mode change to SMARTRTL failed: init failed"
@@ -202,7 +204,7 @@ def _provoke(parameter: str, pilot: Pilot) -> None:
 @pytest.mark.parametrize(
     ("parameter", "setting"), [("FS_THR_ENABLE", 4), ("BATT_FS_LOW_ACT", 3), ("BATT_FS_LOW_ACT", 4)]
 )
-def test_other_failsafes_may_use_it_too(parameter: str, setting: int):
+def test_other_failsafes_can_use_smart_rtl(parameter: str, setting: int):
     vehicle, pilot = airborne(10.0, BATT_LOW_VOLT=11.5, **{parameter: setting})
     pilot.go_to(20.0, 0.0, 10.0)
     pilot.fly_on(5.0)
@@ -212,7 +214,7 @@ def test_other_failsafes_may_use_it_too(parameter: str, setting: int):
     assert distance_m(vehicle, 0.0, 0.0) < 1.0
 
 
-def test_a_full_memory_ends_it_for_the_flight():
+def test_smart_rtl_is_deactivated_when_path_is_full():
     vehicle, pilot = airborne(10.0, SRTL_POINTS=20)
     rng = random.Random(3)
     for at in range(14):
@@ -224,7 +226,7 @@ def test_a_full_memory_ends_it_for_the_flight():
     assert vehicle.mode == mavlink.COPTER_MODE_GUIDED
 
 
-def test_a_long_time_without_position_ends_it():
+def test_smart_rtl_is_deactivated_after_long_position_loss():
     vehicle, pilot = airborne(10.0, FS_EKF_ACTION=0)
     pilot.parameter("SIM_GPS_DISABLE", 1)
     pilot.wait(lambda: "SmartRTL deactivated: bad position" in pilot.texts, 30.0)
@@ -234,7 +236,7 @@ def test_a_long_time_without_position_ends_it():
     assert pilot.mode(mavlink.COPTER_MODE_SMART_RTL) == mavlink.MAV_RESULT_FAILED
 
 
-def test_leaving_it_midway_keeps_the_path_whole():
+def test_leaving_smart_rtl_midway_keeps_path():
     vehicle, pilot, _ = _detour()
     pilot.mode(mavlink.COPTER_MODE_SMART_RTL)
     pilot.fly_on(8.0)
@@ -247,7 +249,7 @@ def test_leaving_it_midway_keeps_the_path_whole():
     assert distance_m(vehicle, 0.0, 0.0) < 1.0
 
 
-def test_a_new_flight_begins_a_new_path():
+def test_arming_starts_a_new_smart_rtl_path():
     vehicle, pilot, _ = _detour()
     pilot.command(mavlink.MAV_CMD_NAV_LAND)
     pilot.wait(lambda: not vehicle.armed, 90.0)
@@ -258,7 +260,7 @@ def test_a_new_flight_begins_a_new_path():
     assert distance_m(vehicle, 60.0, 60.0) < 2.0
 
 
-def test_before_there_is_a_position_it_cannot_be_chosen():
+def test_smart_rtl_is_refused_without_position():
     vehicle, pilot = alone()
     assert pilot.mode(mavlink.COPTER_MODE_SMART_RTL) == mavlink.MAV_RESULT_FAILED
     pilot.wait(lambda: vehicle.position_ok, 5.0)

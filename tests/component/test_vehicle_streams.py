@@ -1,4 +1,4 @@
-"""Streams: groups, intervals, silence, and the outbox that a deaf client fills."""
+"""Telemetry streams: groups, intervals, stopping, and the send queue of a client that does not read."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vehicle_world import airborne, alone
 
 
 @pytest.mark.parametrize("interval_us", [10_000, 20_000, 30_000, 33_333, 100_000, 250_000, 1_000_000])
-def test_intervals_are_exact_in_whole_milliseconds(interval_us: int):
+def test_message_intervals_are_exact_in_whole_milliseconds(interval_us: int):
     interval_ms = interval_us // 1000
     vehicle, pilot = alone()
     assert pilot.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 30, interval_us) == mavlink.MAV_RESULT_ACCEPTED
@@ -28,7 +28,7 @@ def test_intervals_are_exact_in_whole_milliseconds(interval_us: int):
     assert vehicle.time_s >= 30.0
 
 
-def test_every_stream_at_4_hz_gives_the_measured_rate():
+def test_all_streams_at_4_hz_produce_measured_rate():
     _, pilot = airborne(5.0)
     pilot.send(
         "REQUEST_DATA_STREAM", {"target_system": 1, "target_component": 1, "req_message_rate": 4, "start_stop": 1}
@@ -37,7 +37,7 @@ def test_every_stream_at_4_hz_gives_the_measured_rate():
     assert count == pytest.approx(107.0, rel=0.2)
 
 
-def test_stopping_a_stream_and_asking_for_the_unknown():
+def test_stream_can_be_stopped_and_unknown_message_is_denied():
     _, pilot = alone()
     pilot.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 30, 100_000)
     pilot.fly_on(1.0)
@@ -51,7 +51,7 @@ def test_stopping_a_stream_and_asking_for_the_unknown():
 
 
 @pytest.mark.parametrize("name", sorted(BUILDERS))
-def test_every_message_can_be_built_in_every_phase(name: str):
+def test_every_telemetry_message_is_built_in_every_phase(name: str):
     for vehicle, pilot in (alone(), airborne(5.0, FENCE_ENABLE=1)):
         pilot.read()
         if send(vehicle, pilot.channel, name):
@@ -60,13 +60,13 @@ def test_every_message_can_be_built_in_every_phase(name: str):
             assert BUILDERS[name](vehicle) is None
 
 
-def test_groups_name_known_messages_once():
+def test_stream_groups_contain_known_messages_once():
     names = [name for number in ALL_GROUPS for name in GROUPS[number][1]]
     assert len(names) == len(set(names))
     assert set(names) <= set(BUILDERS)
 
 
-def test_default_streams_follow_their_parameters():
+def test_default_streams_follow_sr_parameters():
     vehicle, pilot = alone(SR0_POSITION=5)
     channel = pilot.craft.open("second", port=0)
     pilot.fly_on(4.0)
@@ -76,7 +76,7 @@ def test_default_streams_follow_their_parameters():
     assert vehicle.channels[0].streams.keys() == {"HEARTBEAT"}
 
 
-def test_a_deaf_client_costs_bounded_memory_and_loses_only_its_own_messages():
+def test_client_that_does_not_read_has_bounded_queue():
     vehicle, pilot = alone()
     deaf = pilot.craft.open("deaf")
     for name in BUILDERS:

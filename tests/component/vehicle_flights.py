@@ -1,4 +1,4 @@
-"""Deterministic flights of the simulated vehicle, and a digest of what it sends during them."""
+"""Deterministic flights of the simulated vehicle and digests of their messages."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ GLOBAL_RELATIVE_ALT, MISSION, FENCE, RALLY = 3, 0, 1, 2
 
 
 class RecordingPilot(Pilot):
-    """A pilot that hashes what it hears.
+    """A pilot that hashes the messages it receives.
 
-    Floats are rounded: C libraries differ in the last bit of a sine, and a digest must not.
+    Floats are rounded, because C libraries differ in the last bit of a sine.
     """
 
     def __init__(self, simulation: Simulation) -> None:
         super().__init__(simulation, simulation.crafts[0])
-        self.heard = hashlib.sha256()
+        self.digest = hashlib.sha256()
 
     def read(self) -> list[Message]:
         messages = super().read()
@@ -35,22 +35,22 @@ class RecordingPilot(Pilot):
             kind = message_class(message.name)
             lengths = dict(zip(kind.ordered_fieldnames, kind.array_lengths, strict=True))
             values = [_hashed(value, lengths[name]) for name, value in message.values.items()]
-            self.heard.update(f"{message.name}{values}".encode())
+            self.digest.update(f"{message.name}{values}".encode())
         return messages
 
 
 def _hashed(value: Value, length: int) -> Value:
-    """Return a value as the digests contain it: rounded, and text with the NULs that fill its field."""
+    """Return a value in the form used by the digests: rounded, and text padded with NULs to the field length."""
     if isinstance(value, bytes):
         return value.ljust(length, b"\0")
     return round(value, 3) + 0.0 if isinstance(value, float) else value
 
 
 def pilot_of(seed: int, **parameters: float) -> RecordingPilot:
-    """A pilot with every stream at 10 Hz."""
+    """Return a pilot that receives every stream at 10 Hz."""
     pilot = RecordingPilot(Simulation([replace(CONFIG, seed=seed, parameters=parameters)]))
     pilot.send("REQUEST_DATA_STREAM", TARGET | {"req_stream_id": 0, "req_message_rate": 10, "start_stop": 1})
-    for number in (31, 83, 85, 87, 141, 245):  # what is in no stream
+    for number in (31, 83, 85, 87, 141, 245):  # messages that belong to no stream
         pilot.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, number, 200_000)
     return pilot
 
@@ -67,7 +67,7 @@ def _sticks(pilot: Pilot, roll: int = 1500, pitch: int = 1500, throttle: int = 1
 
 
 def mission(pilot: Pilot) -> None:
-    """AUTO with curves, a circle, waits, a jump, a turned nose and the mission's own landing."""
+    """AUTO with splines, a circle, delays, a jump, a yaw command and a landing item."""
     upload(
         pilot,
         MISSION,
@@ -96,7 +96,7 @@ def mission(pilot: Pilot) -> None:
 
 
 def by_hand(pilot: Pilot) -> None:
-    """STABILIZE, ALT_HOLD, LOITER, BRAKE and LAND under the sticks of a ground station, in gusts."""
+    """STABILIZE, ALT_HOLD, LOITER, BRAKE and LAND, flown with RC overrides in gusts."""
     pilot.mode(mavlink.COPTER_MODE_LOITER)
     pilot.fly_on(3.0)
     pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0)
@@ -118,7 +118,7 @@ def by_hand(pilot: Pilot) -> None:
 
 
 def smart_return(pilot: Pilot) -> None:
-    """SMART_RTL along a path with corners and a loop, and down where it began."""
+    """SMART_RTL along a path with corners and a loop, and landing at the start."""
     pilot.parameter("RTL_ALT_FINAL", 0.0)
     pilot.take_off(8.0)
     for north, east in ((15.0, 0.0), (15.0, 15.0), (-3.0, 15.0), (-3.0, -8.0), (5.0, -8.0)):
@@ -129,7 +129,7 @@ def smart_return(pilot: Pilot) -> None:
 
 
 def breaches(pilot: Pilot) -> None:
-    """A polygon that is left with a velocity, a target outside it, the return to a rally point, and a position that is lost."""
+    """Fence breach by a velocity, a target outside the fence, return to a rally point, and position loss."""
     corners = ((-40.0, -40.0), (-40.0, 40.0), (40.0, 40.0), (40.0, -40.0))
     upload(pilot, FENCE, [_item(5001, north, east, 0.0, 4.0) for north, east in corners])
     upload(pilot, RALLY, [_item(mavlink.MAV_CMD_NAV_RALLY_POINT, 12.0, -6.0, 8.0)])
@@ -152,7 +152,7 @@ def breaches(pilot: Pilot) -> None:
 
 
 def failing(pilot: Pilot) -> None:
-    """A radio, a ground station, a battery and a motor that fail one after the other."""
+    """Consecutive failures of radio, ground station, battery and motor."""
     pilot.parameter("FS_GCS_ENABLE", 4.0)
     pilot.take_off(15.0)
     pilot.go_to(20.0, 10.0, 15.0)
@@ -219,7 +219,7 @@ _RANDOM_ORDERS: tuple[Callable[[Pilot, random.Random], object], ...] = (
 
 
 def at_random(pilot: Pilot, orders: int = 60) -> None:
-    """Whatever a seed chooses, sensible or not; takes off now and then so that it is not all refusals."""
+    """Random commands and targets from a seed, with occasional takeoffs so that not all are refused."""
     chance = random.Random(pilot.craft.config.seed)
     upload(
         pilot,

@@ -1,4 +1,4 @@
-"""A ground station in the same process: flies a vehicle in lockstep, for tests and benchmarks."""
+"""Ground station in the same process that flies a vehicle in lockstep, for tests and benchmarks."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ HEARTBEAT_INTERVAL_S = 1.0
 
 
 class PilotTimeoutError(TimeoutError):
-    """Something that was waited for did not happen within its simulated time."""
+    """An expected event did not happen within its simulated time."""
 
 
 class Pilot:
-    """One link to one vehicle; every wait advances the whole simulation."""
+    """One link to one vehicle. Each wait advances the whole simulation."""
 
     def __init__(
         self, simulation: Simulation, craft: Craft, sysid: int = 255, compid: int = mavlink.MAV_COMP_ID_MISSIONPLANNER
@@ -37,7 +37,7 @@ class Pilot:
         self.craft.receive(self.channel, self.endpoint.encode(name, values))
 
     def read(self) -> list[Message]:
-        """Take what the vehicle has sent since."""
+        """Return the messages that the vehicle has sent since the last call."""
         messages = self.endpoint.decode(self.channel.take())
         for message in messages:
             self.last[message.name] = message
@@ -46,7 +46,7 @@ class Pilot:
         return messages
 
     def step(self) -> list[Message]:
-        """Advance by one control step and read; beats the heart once a second."""
+        """Advance by one control step and receive. Send a heartbeat once a second."""
         if self.heartbeats and self.simulation.time_s >= self._next_heartbeat_s:
             self._next_heartbeat_s = self.simulation.time_s + HEARTBEAT_INTERVAL_S
             self.send(
@@ -57,10 +57,10 @@ class Pilot:
         return self.read()
 
     def wait(self, condition: Callable[[], bool], timeout_s: float) -> float:
-        """Advance until a condition holds and return the simulated seconds it took.
+        """Advance until a condition holds and return the elapsed simulated seconds.
 
         Raises:
-            PilotTimeoutError: it did not hold within `timeout_s`.
+            PilotTimeoutError: The condition did not hold within `timeout_s`.
         """
         begun = self.simulation.time_s
         while not condition():
@@ -76,10 +76,10 @@ class Pilot:
             self.step()
 
     def expect(self, name: str, timeout_s: float = 2.0) -> Message:
-        """Advance until a message of that name arrives.
+        """Advance until a message of that name arrives and return it.
 
         Raises:
-            PilotTimeoutError: none arrived within `timeout_s`.
+            PilotTimeoutError: No message arrived within `timeout_s`.
         """
         end = self.simulation.time_s + timeout_s
         found = [message for message in self.read() if message.name == name]
@@ -103,11 +103,11 @@ class Pilot:
         return self.expect("COMMAND_ACK").integer("result")
 
     def mode(self, mode: int) -> int:
-        """Ask for a mode."""
+        """Request a mode."""
         return self.command(mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, mode)
 
     def parameter(self, name: str, value: float) -> float:
-        """Set a parameter and return what the vehicle answers."""
+        """Set a parameter and return the value the vehicle reports."""
         self.send(
             "PARAM_SET",
             {
@@ -124,10 +124,10 @@ class Pilot:
                 return answer.real("param_value")
 
     def take_off(self, altitude_m: float, timeout_s: float = 90.0) -> float:
-        """Switch to GUIDED, arm, climb, and return the seconds from the takeoff command to 95 % of the altitude.
+        """Switch to GUIDED, arm and climb. Return the seconds from the takeoff command to 95 % of the altitude.
 
         Raises:
-            PilotTimeoutError: a step was refused or took too long.
+            PilotTimeoutError: A step was refused or took too long.
         """
         v = self.craft.vehicle.state
         if self.mode(mavlink.COPTER_MODE_GUIDED) != mavlink.MAV_RESULT_ACCEPTED:

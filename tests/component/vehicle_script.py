@@ -1,10 +1,10 @@
-"""One script of MAVLink exchanges, played on any autopilot, beside what a real ArduCopter 4.6.3 answered.
+"""Script of MAVLink exchanges that can be played on any autopilot, with the recorded responses of a real ArduCopter 4.6.3.
 
     python tests/component/vehicle_script.py [--autopilot tcp:HOST:PORT] [--all] [--steps FILE]
 
-The steps and the real one's answers are in `tests/golden/vehicle/arducopter-4.6.3.tsv`: name, what to do, the answer, and a
-note where the simulated vehicle is meant to differ or where the step cannot be repeated. A number `4.2~10%` holds within 10 %,
-`4.2~0.5` within 0.5. Without --autopilot the simulated vehicle is asked, cold, in simulated time.
+The steps are in `tests/golden/vehicle/arducopter-4.6.3.tsv`: name, action, recorded response, and a note if the simulated
+vehicle differs intentionally or the step cannot be repeated. The tolerance of a number `4.2~10%` is 10 %, of `4.2~0.5` it is
+0.5. Without --autopilot the script is played on the simulated vehicle after a cold start, in simulated time.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 STEPS = Path(__file__).parents[1] / "golden/vehicle/arducopter-4.6.3.tsv"
 HOME = Place.from_degrees(50.864, 4.679, 0.1)
-"""Where the real one stood."""
+"""Position of the recorded vehicle."""
 
 ELSEWHERE_M = 5_000.0
-"""Further away than any step leads."""
+"""Distance from the recorded position that no step reaches."""
 TARGET: dict[str, Value] = {"target_system": 1, "target_component": 1}
 GUIDED, RTL, BRAKE = 4, 6, 17
 KINDS = {"mission": 0, "fence": 1, "rally": 2}
 LOCAL_FRAMES, BODY_FRAMES = (1, 7, 8, 9, 12, 20, 21), (8, 9)
 TEXTS_S = 0.6
-# What an autopilot says by itself, whatever it is asked.
+# STATUSTEXTs that an autopilot sends without a request.
 SPONTANEOUS = ("EKF3", "GPS 1", "AHRS", "Field", "Barometer", "Calibrating", "RC7", "ArduPilot", "SIM ", "PreArm")
 # Lists to upload: command, frame, metres north and east (or None, or degrees), altitude, first parameters.
 Row = tuple[int, int, float | None, float, float, tuple[float, ...]]
@@ -106,11 +106,11 @@ class Line(Protocol):
         """Send a message."""
 
     def hear(self) -> list[Message]:
-        """What has come since; time goes on by a little."""
+        """Return the messages received since the last call. Time advances by a small step."""
 
 
 class SimulatedLine:
-    """The simulated vehicle, cold, in simulated time."""
+    """The simulated vehicle after a cold start, in simulated time."""
 
     def __init__(self) -> None:
         self._simulation = Simulation([VehicleConfig(start=HOME, throttle_us=1000)])
@@ -124,14 +124,14 @@ class SimulatedLine:
         self._craft.receive(self._channel, self._endpoint.encode(name, values))
 
     def hear(self) -> list[Message]:
-        """One control step."""
+        """Advance by one control step."""
         self._simulation.step()
         self.now_s = self._simulation.time_s
         return self._endpoint.decode(self._channel.take())
 
 
 class TcpLine:
-    """Any autopilot behind a TCP link, in real time."""
+    """An autopilot behind a TCP link, in real time."""
 
     def __init__(self, address: str) -> None:
         _, host, port = address.split(":")
@@ -145,7 +145,7 @@ class TcpLine:
         self._socket.sendall(self._endpoint.encode(name, values))
 
     def hear(self) -> list[Message]:
-        """Wait a little for bytes."""
+        """Wait briefly for bytes."""
         ready = select.select([self._socket], [], [], 0.02)[0]
         data = self._socket.recv(65536) if ready else b""
         if ready and not data:
@@ -165,13 +165,13 @@ class Step:
 
 
 def steps(path: Path = STEPS) -> list[Step]:
-    """The whole script."""
+    """Return all steps of the script."""
     rows = (line.split("\t") for line in path.read_text(encoding="utf-8").splitlines() if line and line[0] != "#")
     return [Step(*row) for row in rows]
 
 
 def agrees(real: str, ours: str) -> bool:
-    """Whether an answer is the real one's; numbers may have a tolerance."""
+    """Return True if a response matches the recorded one. Numbers may have a tolerance."""
     wanted, got = real.split(), ours.split()
     return len(wanted) == len(got) and all(map(_same, wanted, got))
 
@@ -190,7 +190,7 @@ def _same(wanted: str, got: str) -> bool:
 
 
 class Player:
-    """Plays steps on a line and tells what came back."""
+    """Plays steps on a connection and returns the responses."""
 
     def __init__(self, line: Line) -> None:
         self.line = line
@@ -200,7 +200,7 @@ class Player:
         self._next_beat_s = 0.0
         self._chunks = ""
 
-    # -- talking -----------------------------------------------------------------------------------------------
+    # -- communication -----------------------------------------------------------------------------------------
 
     def _hear(self) -> list[Message]:
         if self.line.now_s >= self._next_beat_s:
@@ -219,12 +219,12 @@ class Player:
         return messages
 
     def _settle(self, here: Place) -> None:
-        """Count from where the vehicle is, if that is not where the script was recorded."""
+        """Convert to an offset from the vehicle, if it is not at the recorded position."""
         if here.lat_e7 and math.hypot(*self.home.vector_to(here)[:2]) > ELSEWHERE_M:
             self.home = here
 
     def _datum_m(self, frame: int) -> float:
-        """How high above the datum of a frame home is: two count from mean sea level."""
+        """Return the height of home above the zero level of a frame. Two frames refer to mean sea level."""
         at = self.last["GLOBAL_POSITION_INT"]
         return (at.integer("alt") - at.integer("relative_alt")) / 1000.0 if frame in {0, 5} else 0.0
 
@@ -237,7 +237,7 @@ class Player:
         return next((m for m in self._stream(timeout_s) if m.name == name and fits(m)), None)
 
     def _said(self, before: int) -> str:
-        """What was said since, in answer to something."""
+        """Return the STATUSTEXTs received since the last call, except unsolicited ones."""
         for _ in self._stream(TEXTS_S):
             pass
         said = [t for t in self.texts[before:] if not t[4:].startswith(SPONTANEOUS)]
@@ -277,10 +277,10 @@ class Player:
         north, east, _ = self.home.vector_to(Place(at.integer("lat"), at.integer("lon"), 0.0))
         return north, east, at.integer("relative_alt") / 1000.0
 
-    # -- the verbs ---------------------------------------------------------------------------------------------
+    # -- step types --------------------------------------------------------------------------------------------
 
     def play(self, do: str) -> str:
-        """Do one step and tell the answer."""
+        """Execute one step and return the response."""
         verb, *words = do.split()
         method: Callable[..., str] = getattr(self, f"do_{verb}")
         return method(*words)
@@ -383,7 +383,7 @@ class Player:
         return " ".join(sorted({m.name for m in self._stream(3.0)} - ignored))
 
     def do_ready(self) -> str:
-        """Wait in a mode that flies by itself until the checks pass; tell the filter's flags before and after."""
+        """Wait in an automatic mode until the checks pass. Return the EKF flags before and after."""
         self._ordered(mavlink.MAV_CMD_DO_SET_MODE, [1.0, GUIDED])
         for number in (1, 193):
             self._ordered(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, [float(number), 250_000.0])
@@ -445,7 +445,7 @@ class Player:
         return f"{mission_result(ack.integer('type'))} mt={ack.integer('mission_type')}"
 
     def do_left(self, kind_name: str, bad: str = "") -> str:
-        """How many items are stored; after an upload that fails, where one is named."""
+        """Return the number of stored items, after a failed upload only if the step names one."""
         if bad:
             self.do_upload(kind_name, "good")
             self.do_upload(kind_name, bad)
@@ -464,7 +464,7 @@ class Player:
     # -- flying ------------------------------------------------------------------------------------------------
 
     def do_fly(self, altitude: str) -> str:
-        """Arm in GUIDED, climb, and hover there."""
+        """Arm in GUIDED, climb and hover."""
         self._ordered(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, [33.0, 100_000.0])
         self.do_ready()
         armed, up_m = self._ordered(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, [1.0]), float(altitude)
@@ -483,7 +483,7 @@ class Player:
         return math.hypot(at.integer("vx"), at.integer("vy")) / 100.0, at.integer("lat") / 1e7
 
     def do_goto(self, frame: str, north: str, east: str, up: str) -> str:
-        """A position target so far from here; the way and the highest speed within 6 s."""
+        """Send a position target at an offset. Return the distance flown and the highest speed within 6 s."""
         before, (n0, e0, u0) = len(self.texts), self._position()
         place = self.home.offset(n0 + float(north), e0 + float(east))
         alt_m = self._datum_m(int(frame)) + u0 + float(up)
@@ -499,9 +499,11 @@ class Player:
         return f"E={e1 - e0:.1f} N={n1 - n0:.1f} U={u1 - u0:.1f} vmax={peak:.1f}{said}"
 
     def do_target(self, frame: str, duration: str, *fields: str) -> str:
-        """Ask for a target five times a second; the way (F and R: ahead and to the right), highest speed and heading then.
+        """Send a target five times a second. Return the distance (F and R: forward and right), highest speed and
+        heading.
 
-        `x` is metres north of here, in a body's frame ahead; all other fields are the message's own; those not named are zero.
+        `x` is metres north of the vehicle, or ahead in body frames. All other fields are those of the message. Missing
+        fields are zero.
         """
         asked = {name: float(value) for name, _, value in (field.partition("=") for field in fields)}
         (n0, e0, u0), number, before = self._position(), int(frame), len(self.texts)
@@ -548,7 +550,7 @@ class Player:
             self.do_wait("0.2")
 
     def _stopped(self, slow_mps: float) -> tuple[float, float]:
-        """Seconds until it stands, and how far it came."""
+        """Return the seconds until the vehicle stops, and the distance."""
         begun_s, (n0, e0, _) = self.line.now_s, self._position()
         while self.line.now_s < begun_s + 15.0 and self._fast()[0] > slow_mps:
             pass
@@ -576,7 +578,7 @@ class Player:
         return f"s={0.2 + self._stopped(0.15)[0]:.1f}"
 
     def do_breach(self, speed: str) -> str:
-        """Fly north with a velocity until the fence acts; the farthest point from home, then."""
+        """Fly north with a velocity until the fence acts. Return the farthest distance from home."""
         before, farthest, end = len(self.texts), 0.0, self.line.now_s + 40.0
         while self.line.now_s < end and self._mode() == GUIDED:
             self._run(float(speed), 0.6)
@@ -586,14 +588,14 @@ class Player:
         return f"N={farthest:.0f} mode={self._mode()}{self._said(before)}"
 
     def do_home(self) -> str:
-        """RTL, and the seconds until the motors are off."""
+        """Fly RTL and return the seconds until the motors stop."""
         begun_s = self.line.now_s
         self._ordered(mavlink.MAV_CMD_DO_SET_MODE, [1.0, RTL])
         self._until("HEARTBEAT", 150.0, lambda m: not m.integer("base_mode") & 128)
         return f"s={self.line.now_s - begun_s:.0f}"
 
     def do_tour(self, last: str) -> str:
-        """Arm in GUIDED and fly the stored mission to its last item; what was reached and told, in order, repeated or not."""
+        """Arm in GUIDED and fly the stored mission to its last item. Return reached items and STATUSTEXTs in order."""
         self._ordered(mavlink.MAV_CMD_DO_SET_MODE, [1.0, GUIDED])
         self._ordered(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, [1.0])
         before, seen = len(self.texts), {"MISSION_ITEM_REACHED": [""], "MISSION_CURRENT": [""]}
@@ -608,7 +610,7 @@ class Player:
         return f"reached={','.join(seen['MISSION_ITEM_REACHED'][1:])} | {'; '.join(once)}"
 
     def do_until(self, timeout: str, *words: str) -> str:
-        """Wait for a text; the seconds it took and the mode then."""
+        """Wait for a STATUSTEXT. Return the elapsed seconds and the mode."""
         begun_s, before, wanted = self.line.now_s, len(self.texts), " ".join(words)
         while self.line.now_s < begun_s + float(timeout) and not any(wanted in t for t in self.texts[before:]):
             self._hear()
@@ -617,7 +619,7 @@ class Player:
 
 
 def compare(line: Line, report: Callable[[Step, str, str], None], script: Sequence[Step]) -> int:
-    """Play everything, report each step (with `same`, `differs`, `meant` or `not played`), and return how many differ."""
+    """Play and report all steps (`same`, `differs`, `meant` or `not played`). Return the number of differences."""
     player, wrong = Player(line), 0
     for step in script:
         if not step.do:

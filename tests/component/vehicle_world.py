@@ -1,4 +1,4 @@
-"""Vehicles in lockstep for the tests of the simulated vehicle."""
+"""Vehicles in lockstep for tests of the simulated vehicle."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ def alone(*, config: VehicleConfig = CONFIG, **parameters: float) -> tuple[Vehic
 
 
 def airborne(altitude_m: float = 10.0, **parameters: float) -> tuple[VehicleState, Pilot]:
-    """One vehicle that hovers in GUIDED."""
+    """Return one vehicle that hovers in GUIDED."""
     vehicle, pilot = alone(**parameters)
     pilot.take_off(altitude_m)
-    pilot.wait(lambda: not vehicle.flying_wanted, 20.0)
+    pilot.wait(lambda: not vehicle.taking_off, 20.0)
     return vehicle, pilot
 
 
 def distance_m(vehicle: VehicleState, north_m: float, east_m: float) -> float:
-    """True horizontal distance of a vehicle from a local point."""
+    """Return the true horizontal distance of a vehicle from a local point."""
     return math.hypot(vehicle.body.north - north_m, vehicle.body.east - east_m)
 
 

@@ -1,6 +1,6 @@
-"""Clients that no one here wrote fly the vehicle: MAVProxy, DroneKit, MAVSDK, and plans of QGroundControl.
+"""Third-party clients fly the vehicle: MAVProxy, DroneKit, MAVSDK, and plans of QGroundControl.
 
-They are development dependencies, so CI has them; FRACTUS_CLIENTS_PYTHON names another interpreter to run them in.
+The clients are development dependencies. FRACTUS_CLIENTS_PYTHON selects another interpreter with them.
 """
 
 from __future__ import annotations
@@ -39,17 +39,17 @@ def _fly(script: str, address: str, tmp_path: Path, *arguments: str) -> str:
 
 
 @pytest.mark.timeout(200)
-def test_dronekit_flies_the_classic_script(tmp_path: Path):
+def test_dronekit_client_flies_vehicle(tmp_path: Path):
     _fly("dronekit_flight.py", "tcp:127.0.0.1:{port}", tmp_path)
 
 
 @pytest.mark.timeout(200)
-def test_mavsdk_flies_with_its_plugins(tmp_path: Path):
+def test_mavsdk_client_flies_vehicle(tmp_path: Path):
     _fly("mavsdk_flight.py", "tcpout://127.0.0.1:{port}", tmp_path, "--param", "SR0_EXT_STAT=5")
 
 
 @pytest.mark.timeout(200)
-def test_mavproxy_flies_a_scripted_session(tmp_path: Path):
+def test_mavproxy_client_flies_vehicle(tmp_path: Path):
     output = _fly("mavproxy_flight.py", "tcp:127.0.0.1:{port}", tmp_path)
     assert "fence breach" not in output
 
@@ -95,7 +95,7 @@ PLAN: dict[str, Any] = {
 
 
 def _lists(plan: dict[str, Any]) -> dict[int, list[tuple[int, int, list[float], float, float, float]]]:
-    """The three item lists that QGroundControl makes of a plan: (command, frame, params, lat, lon, alt)."""
+    """Return the three item lists that QGroundControl makes of a plan: (command, frame, params, lat, lon, alt)."""
     home = plan["mission"]["plannedHomePosition"]
     mission = [(16, 0, [0.0] * 4, *home)]
     for item in plan["mission"]["items"]:
@@ -114,7 +114,7 @@ def _lists(plan: dict[str, Any]) -> dict[int, list[tuple[int, int, list[float], 
     return {0: mission, 1: fence, 2: rally}
 
 
-def test_a_plan_of_qgroundcontrol_is_uploaded_and_flown(tmp_path: Path):
+def test_qgroundcontrol_plan_is_uploaded_and_flown(tmp_path: Path):
     path = tmp_path / "survey.plan"
     path.write_text(json.dumps(PLAN))
     lists = _lists(json.loads(path.read_text()))

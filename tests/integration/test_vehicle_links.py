@@ -1,4 +1,4 @@
-"""The vehicle process behind TCP, UDP and a pseudo terminal, with clients of pymavlink, good and bad."""
+"""The vehicle process behind TCP, UDP and a pseudo terminal, with well-behaved and misbehaving clients."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from fractus_cluster.ports import free_port
 from pymavlink import mavutil
 from vehicle_process import HOME, Client, running_vehicle
 
-# What PARAM_VALUE has where it does not answer a list: a parameter by its name, or one that changed.
+# Index in a PARAM_VALUE that does not belong to a list: the response to a read by name, or a changed parameter.
 UNKNOWN_INDEX = 65535
 FAST = ("--speedup", "10", "--ready-after", "3")
 
@@ -35,7 +35,7 @@ def _resident_mb(pid: int) -> float:
     return int(text.split("VmRSS:")[1].split()[0]) / 1024
 
 
-def test_a_flight_there_and_back(fast: str):
+def test_pymavlink_client_flies_out_and_back(fast: str):
     client = Client(fast)
     heartbeat = client.wait_for("HEARTBEAT")
     assert (heartbeat.type, heartbeat.autopilot) == (2, 3)
@@ -54,7 +54,7 @@ def test_a_flight_there_and_back(fast: str):
     assert abs(place.relative_alt) < 500
 
 
-def test_silent_but_for_its_heartbeat_until_asked_and_then_exact():
+def test_vehicle_sends_only_heartbeats_until_streams_are_requested():
     port = free_port()
     with running_vehicle("--ready-after", "0.5", links=(f"tcp:127.0.0.1:{port}",)):
         client = Client(f"tcp:127.0.0.1:{port}")
@@ -80,7 +80,7 @@ def test_silent_but_for_its_heartbeat_until_asked_and_then_exact():
         assert client.command(511, 9999, 1000) == 2
 
 
-def test_acknowledgements_come_as_fast_as_the_real_ones():
+def test_acknowledgement_latency_matches_real_vehicle():
     port = free_port()
     with running_vehicle("--ready-after", "0.5", links=(f"tcp:127.0.0.1:{port}",)):
         client = Client(f"tcp:127.0.0.1:{port}")
@@ -95,7 +95,7 @@ def test_acknowledgements_come_as_fast_as_the_real_ones():
         assert 0.001 < sorted(waits)[30] < 0.012
 
 
-def test_parameters_are_listed_read_and_set(fast: str):
+def test_parameters_can_be_listed_read_and_set(fast: str):
     client = Client(fast)
     client.wait_for("HEARTBEAT")
     client.link.mav.param_request_list_send(1, 1)
@@ -116,7 +116,7 @@ def test_parameters_are_listed_read_and_set(fast: str):
     assert client.wait(lambda m: m.get_type() == "PARAM_VALUE" and m.param_id == "FS_GCS_TIMEOUT").param_value == 7.5
 
 
-def test_silent_ground_station_brings_it_home(fast: str):
+def test_gcs_failsafe_returns_home_when_heartbeats_stop(fast: str):
     client = Client(fast)
     client.take_off(10.0)
     client.link.mav.param_set_send(1, 1, b"FS_GCS_ENABLE", 1, 2)
@@ -127,7 +127,7 @@ def test_silent_ground_station_brings_it_home(fast: str):
     client.wait(lambda m: m.get_type() == "HEARTBEAT" and not m.base_mode & 128, 30.0)
 
 
-def test_three_clients_garbage_and_one_that_never_reads():
+def test_vehicle_serves_clients_despite_garbage_and_a_client_that_never_reads():
     port = free_port()
     with running_vehicle("--ready-after", "0.5", links=(f"tcp:127.0.0.1:{port}",)) as process:
         good = Client(f"tcp:127.0.0.1:{port}")
@@ -165,7 +165,7 @@ def test_three_clients_garbage_and_one_that_never_reads():
 
 
 def _noise(count: int) -> list[bytes]:
-    """Random bytes, truncated frames, and sound frames with random contents."""
+    """Random bytes, truncated frames, and valid frames with random contents."""
     rng = random.Random(11)
     writer = dialect.MAVLink(None, srcSystem=77, srcComponent=1)
     classes = [dialect.mavlink_map[number] for number in sorted(dialect.mavlink_map) if number >= 0]
@@ -191,7 +191,7 @@ def _frame(writer: dialect.MAVLink, message: type, payload: bytes) -> bytes:
     return head + payload + crc.crc.to_bytes(2, "little")
 
 
-def test_udp_in_and_out():
+def test_udp_links_work_in_both_modes():
     inward, outward = free_port(), free_port()
     server = Client(f"udpin:127.0.0.1:{outward}", sysid=254)
     with running_vehicle(*FAST, links=(f"udpin:127.0.0.1:{inward}", f"udpout:127.0.0.1:{outward}")):
@@ -206,7 +206,7 @@ def test_udp_in_and_out():
         assert server.command(520, 1) == 0
 
 
-def test_messages_for_another_system_are_passed_on(fast: str):
+def test_messages_for_another_system_are_forwarded(fast: str):
     one, two = Client(fast, sysid=255), Client(fast, sysid=42)
     one.wait_for("HEARTBEAT")
     two.wait_for("HEARTBEAT")
@@ -217,7 +217,7 @@ def test_messages_for_another_system_are_passed_on(fast: str):
     assert two.wait_for("COMMAND_LONG").command == 511
 
 
-def test_a_serial_line_is_a_link_like_any_other(tmp_path: Path):
+def test_serial_link_works_over_pseudo_terminal(tmp_path: Path):
     path = tmp_path / "ttyVehicle"
     with running_vehicle(*FAST, links=(f"pty:{path}",)):
         client = Client(str(path))
@@ -236,7 +236,7 @@ def _send_udp(port: int, frames: list[bytes]) -> None:
         for at, frame in enumerate(frames):
             sender.sendto(frame, ("127.0.0.1", port))
             if at % 100 == 0:
-                time.sleep(0.005)  # so that the kernel's buffer does not swallow them
+                time.sleep(0.005)  # prevents buffering by the kernel
 
 
 def _send_serial(path: Path, frames: list[bytes]) -> None:
@@ -252,7 +252,7 @@ def _send_serial(path: Path, frames: list[bytes]) -> None:
 
 
 @pytest.mark.parametrize("kind", ["udp", "serial"])
-def test_ten_thousand_bad_frames_on_other_links(kind: str, tmp_path: Path):
+def test_bad_frames_on_other_links_do_not_disturb_client(kind: str, tmp_path: Path):
     port, datagrams, path = free_port(), free_port(), tmp_path / "tty"
     links = (f"tcp:127.0.0.1:{port}", f"udpin:127.0.0.1:{datagrams}", f"pty:{path}")
     with running_vehicle("--ready-after", "0.5", links=links) as process:
@@ -269,7 +269,7 @@ def test_ten_thousand_bad_frames_on_other_links(kind: str, tmp_path: Path):
         assert _resident_mb(process.pid) - before_mb < 10
 
 
-def test_several_vehicles_in_one_process():
+def test_one_process_runs_several_vehicles():
     port = free_port()
     with running_vehicle(*FAST, "--count", "3", "--spacing", "20", links=(f"tcp:127.0.0.1:{port}",)):
         places = []
@@ -283,7 +283,7 @@ def test_several_vehicles_in_one_process():
 
 
 def _fly_in_lockstep(tmp_path: Path, name: str, seed: int) -> bytes:
-    """Arm, take off and go somewhere, with each message sent at a set simulated time."""
+    """Arm, take off and fly, with each message sent at a fixed simulated time."""
     port, clock_port, log = free_port(), free_port(), tmp_path / name
     options = ("--lockstep", f"127.0.0.1:{clock_port}", "--seed", str(seed), "--wind", "4,200,2", "--tlog", str(log))
     speaker = dialect.MAVLink(None, srcSystem=255, srcComponent=190)
@@ -319,7 +319,7 @@ def _fly_in_lockstep(tmp_path: Path, name: str, seed: int) -> bytes:
     return log.read_bytes()
 
 
-def test_one_seed_gives_identical_logs_in_lockstep(tmp_path: Path):
+def test_same_seed_produces_identical_logs_in_lockstep(tmp_path: Path):
     first = _fly_in_lockstep(tmp_path, "first.tlog", 3)
     assert first == _fly_in_lockstep(tmp_path, "second.tlog", 3)
     assert first != _fly_in_lockstep(tmp_path, "third.tlog", 4)
@@ -330,7 +330,7 @@ def test_one_seed_gives_identical_logs_in_lockstep(tmp_path: Path):
     assert highest == pytest.approx(10.0, abs=1.0)
 
 
-def test_bad_arguments_are_explained(tmp_path: Path):
+def test_invalid_arguments_are_explained(tmp_path: Path):
     import subprocess
     import sys
 

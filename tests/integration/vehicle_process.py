@@ -1,4 +1,4 @@
-"""`fractus-vehicle` as a process behind real links, and pymavlink clients for it."""
+"""Runs `fractus-vehicle` as a process behind real links, with pymavlink clients."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ HOME = (48.2, 16.37, 150.0)
 
 @contextlib.contextmanager
 def running_vehicle(*arguments: str, links: tuple[str, ...]) -> Iterator[subprocess.Popen[str]]:
-    """Run a vehicle until the block ends; it must end cleanly on SIGTERM."""
+    """Run a vehicle until the block ends. The process must exit cleanly on SIGTERM."""
     command = [sys.executable, "-m", "fractus_vehicle", "--home", ",".join(str(part) for part in HOME)]
     for link in links:
         command += ["--listen", link]
@@ -38,7 +38,7 @@ def running_vehicle(*arguments: str, links: tuple[str, ...]) -> Iterator[subproc
 
 
 class Client:
-    """A pymavlink client; waits are in wall-clock seconds."""
+    """A pymavlink client with waits in wall-clock seconds."""
 
     def __init__(self, address: str, sysid: int = 255, target: int = 1) -> None:
         self.link = mavutil.mavlink_connection(address, source_system=sysid, source_component=190)
@@ -49,7 +49,7 @@ class Client:
         self.link.close()
 
     def wait(self, condition: Callable[[Any], bool], timeout_s: float = 20.0) -> Any:
-        """The first message for which the condition holds."""
+        """Return the first message for which the condition holds."""
         end = time.monotonic() + timeout_s
         while time.monotonic() < end:
             message = self.link.recv_match(blocking=True, timeout=0.2)
@@ -65,7 +65,7 @@ class Client:
         raise TimeoutError(f"last texts: {self.texts[-5:]}")
 
     def wait_for(self, name: str, timeout_s: float = 10.0) -> Any:
-        """The next message of a type."""
+        """Return the next message of a type."""
         return self.wait(lambda message: message.get_type() == name, timeout_s)
 
     def beat(self) -> None:
@@ -80,7 +80,7 @@ class Client:
         return int(ack.result)
 
     def interval(self, message_id: int, rate_hz: float) -> None:
-        """Ask for a message at a rate."""
+        """Request a message at a rate."""
         assert self.command(511, message_id, 1e6 / rate_hz) == 0
 
     def take_off(self, altitude_m: float) -> None:

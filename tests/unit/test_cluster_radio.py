@@ -1,4 +1,4 @@
-"""The radio of a cluster: what the file says, and the layout that the radio's process reads."""
+"""Radio section of a cluster file, and the layout derived from it for the radio process."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def without(*path: str | int) -> dict[str, Any]:
     return content
 
 
-def test_devices_reach_as_far_as_is_declared_unless_the_hardware_says_other() -> None:
+def test_radio_range_is_declared_or_taken_from_hardware() -> None:
     found = layout(CONTENT)
     assert found is not None
     assert [(station.name, station.device, station.range_m) for station in found.stations] == [
@@ -74,7 +74,7 @@ def test_devices_reach_as_far_as_is_declared_unless_the_hardware_says_other() ->
     assert (uplink.rate_bps, uplink.delay_s) == (8e6, 0.03)
 
 
-def test_the_vehicle_listens_for_the_radio(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_vehicle_gets_link_for_radio_follower(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fractus_cluster.hardware.program", lambda name: name)
     drone = parse_spec(CONTENT, source="x").nodes[0]
     command = vehicle_command(drone)
@@ -82,7 +82,7 @@ def test_the_vehicle_listens_for_the_radio(monkeypatch: pytest.MonkeyPatch) -> N
     assert command[1:5] == ["--listen", "tcp:127.0.0.1:5760", "--listen", RADIO_LINK]
 
 
-def test_a_cluster_of_wires_has_no_radio() -> None:
+def test_wired_cluster_has_no_radio() -> None:
     content = without("nodes", 0, "hardware", "wifi")
     del content["nodes"][0]["hardware"]["uplink"], content["nodes"][1]["hardware"]
     assert layout(content) is None
@@ -96,6 +96,6 @@ def test_a_cluster_of_wires_has_no_radio() -> None:
         (json.loads(json.dumps(CONTENT).replace('"fading": 4', '"fading": 0.1')), "air.fading"),
     ],
 )
-def test_a_wrong_radio_is_refused(content: dict[str, Any], said: str) -> None:
+def test_invalid_radio_configuration_is_refused(content: dict[str, Any], said: str) -> None:
     with pytest.raises(ClusterError, match=said):
         parse_spec(content, source="x")

@@ -42,11 +42,11 @@ def configured(parameters: Parameters, *, flying: bool = False) -> Checked:
     return run(MavlinkFailsafes(parameters).configure(flying=flying))
 
 
-def test_the_companion_is_no_ground_station() -> None:
+def test_companion_is_not_a_ground_station() -> None:
     assert SYSTEM_ID not in {0, 1, 255}
 
 
-def test_the_failsafe_listens_to_the_companion_alone() -> None:
+def test_gcs_failsafe_monitors_only_the_companion() -> None:
     for name in ("SYSID_MYGCS", "MAV_GCS_SYSID"):
         vehicle = Parameters({name: 255.0, "MAV_GCS_SYSID_HI": 255.0})
         assert not configured(vehicle).problem
@@ -57,25 +57,25 @@ def test_the_failsafe_listens_to_the_companion_alone() -> None:
 @pytest.mark.parametrize(
     ("owned", "holds"), [(0.0, False), (-1.0, False), (0.8, True), (0.6, True), (1.0, True), (50.0, False)]
 )
-def test_the_estimators_failsafe_is_not_left_switched_off(owned: float, holds: bool) -> None:
+def test_ekf_failsafe_is_enabled_if_the_owner_disabled_it(owned: float, holds: bool) -> None:
     vehicle = Parameters({"SYSID_MYGCS": 244.0, "FS_EKF_THRESH": owned})
     assert not configured(vehicle).problem
     assert vehicle.values["FS_EKF_THRESH"] == (owned if holds else 0.75)
 
 
-def test_a_failsafe_that_listens_to_others_forbids_arming() -> None:
+def test_gcs_failsafe_with_another_system_prevents_arming() -> None:
     assert "SYSID_MYGCS is 255" in configured(Parameters({"SYSID_MYGCS": 255.0}, ("SYSID_MYGCS",))).problem
     assert "no SYSID_MYGCS or MAV_GCS_SYSID" in configured(Parameters({})).problem
 
 
-def test_an_airframe_that_is_not_a_number_forbids_arming() -> None:
+def test_nan_airframe_parameter_prevents_arming() -> None:
     checked = configured(Parameters({"SYSID_MYGCS": 255.0, "WPNAV_ACCEL": math.nan, "PSC_POSXY_P": math.inf}))
     assert "WPNAV_ACCEL is not a number" in checked.problem
     assert "PSC_POSXY_P is not a number" in checked.problem
     assert checked.airframe == Airframe()
 
 
-def test_legs_are_flown_with_the_owners_speed_where_the_vehicle_spells_it_so() -> None:
+def test_leg_speed_uses_parameter_name_of_the_firmware() -> None:
     for stored, expected in (({"WPNAV_SPEED": 1000.0}, 10.0), ({"WP_SPD": 7.0}, 3.0)):
         vehicle = Parameters({"SYSID_MYGCS": 255.0, "WPNAV_SPEED": 300.0})
         vehicle.vehicle_parameters.leg_speed = stored
@@ -86,7 +86,7 @@ def test_legs_are_flown_with_the_owners_speed_where_the_vehicle_spells_it_so() -
     assert configured(newer).speed_mps == 4.0
 
 
-def test_its_own_return_leads_home_at_an_altitude_above_home_and_ends_on_the_ground() -> None:
+def test_rtl_parameters_lead_home_above_home_altitude_and_land() -> None:
     owned = {"RTL_ALT_TYPE": 1.0, "RTL_ALT_FINAL": 500.0, "RALLY_LIMIT_KM": 0.5}
     vehicle = Parameters({"SYSID_MYGCS": 255.0} | owned)
     assert not configured(vehicle, flying=True).problem
@@ -100,7 +100,7 @@ def test_its_own_return_leads_home_at_an_altitude_above_home_and_ends_on_the_gro
 RETRACING = {"SYSID_MYGCS": 244.0, "SRTL_POINTS": 300.0}
 
 
-def test_a_vehicle_that_remembers_its_path_goes_back_on_it() -> None:
+def test_failsafe_uses_smart_rtl_if_path_is_recorded() -> None:
     vehicle = Parameters(RETRACING)
     checked = configured(vehicle)
     assert not checked.problem
@@ -108,14 +108,14 @@ def test_a_vehicle_that_remembers_its_path_goes_back_on_it() -> None:
     assert (vehicle.values["FS_GCS_ENABLE"], vehicle.values["BATT_FS_LOW_ACT"]) == (3.0, 3.0)
 
 
-def test_smart_return_or_landing_may_stay() -> None:
+def test_smart_rtl_or_land_action_of_owner_is_kept() -> None:
     vehicle = Parameters(RETRACING | {"FS_GCS_ENABLE": 4.0, "BATT_FS_LOW_ACT": 4.0})
     assert configured(vehicle).airframe.retraces
     assert (vehicle.values["FS_GCS_ENABLE"], vehicle.values["BATT_FS_LOW_ACT"]) == (4.0, 4.0)
 
 
 @pytest.mark.parametrize("how", [{"SRTL_POINTS": 0.0}, {"SRTL_POINTS": 50.0}])
-def test_a_short_memory_is_none(how: dict[str, float]) -> None:
+def test_smart_rtl_with_too_few_points_counts_as_unavailable(how: dict[str, float]) -> None:
     vehicle = Parameters(RETRACING | how | {"FS_GCS_ENABLE": 3.0})
     checked = configured(vehicle)
     assert not checked.problem
@@ -124,7 +124,7 @@ def test_a_short_memory_is_none(how: dict[str, float]) -> None:
 
 
 @pytest.mark.parametrize("fixed", ["FS_GCS_ENABLE", "BATT_FS_LOW_ACT"])
-def test_a_failsafe_that_stays_straight_retraces_nothing(fixed: str) -> None:
+def test_path_is_not_retraced_if_failsafe_action_is_rtl(fixed: str) -> None:
     vehicle = Parameters(RETRACING, (fixed,))
     checked = configured(vehicle)
     assert not checked.problem
@@ -132,7 +132,7 @@ def test_a_failsafe_that_stays_straight_retraces_nothing(fixed: str) -> None:
     assert vehicle.values["FS_GCS_ENABLE"] == 1.0
 
 
-def test_armed_elsewhere_it_goes_straight_and_from_home_again_on_its_path() -> None:
+def test_failsafe_uses_rtl_if_armed_away_from_home_and_smart_rtl_at_home() -> None:
     async def chosen() -> None:
         vehicle = Parameters(RETRACING)
         checked = await MavlinkFailsafes(vehicle).configure()
@@ -146,7 +146,7 @@ def test_armed_elsewhere_it_goes_straight_and_from_home_again_on_its_path() -> N
     run(chosen())
 
 
-def test_a_velocity_ends_soon_without_another() -> None:
+def test_velocity_timeout_is_short() -> None:
     vehicle = Parameters({"SYSID_MYGCS": SYSTEM_ID, "GUID_TIMEOUT": 3.0})
     assert not configured(vehicle, flying=True).problem
     assert vehicle.values["GUID_TIMEOUT"] == 1.0
@@ -157,7 +157,7 @@ def test_a_velocity_ends_soon_without_another() -> None:
 @pytest.mark.parametrize(
     ("options", "after"), [(0.0, 0.0), (4.0, 4.0), (128.0, 128.0), (16.0, 0.0), (64.0, 0.0), (36.0, 0.0)]
 )
-def test_a_vehicle_flies_and_stops_as_it_is_told(options: float, after: float) -> None:
+def test_guided_options_are_set_for_flight(options: float, after: float) -> None:
     vehicle = Parameters({"SYSID_MYGCS": SYSTEM_ID, "GUID_OPTIONS": options})
     assert not configured(vehicle, flying=True).problem
     assert vehicle.values["GUID_OPTIONS"] == after
@@ -166,7 +166,7 @@ def test_a_vehicle_flies_and_stops_as_it_is_told(options: float, after: float) -
 
 
 @pytest.mark.parametrize(("slope", "after"), [(0.0, 0.0), (0.5, 3.0), (3.0, 3.0), (8.0, 8.0)])
-def test_a_vehicle_returns_no_lower_than_ways_home_are_judged_for(slope: float, after: float) -> None:
+def test_rtl_cone_slope_is_at_least_three_unless_disabled(slope: float, after: float) -> None:
     vehicle = Parameters({"SYSID_MYGCS": SYSTEM_ID, "RTL_CONE_SLOPE": slope})
     assert not configured(vehicle, flying=True).problem
     assert vehicle.values["RTL_CONE_SLOPE"] == after
@@ -179,18 +179,18 @@ def test_a_vehicle_returns_no_lower_than_ways_home_are_judged_for(slope: float, 
         ({"ANGLE_MAX": 1000.0, "PSC_ANGLE_MAX": 30.0}, 2.5), ({"PSC_ANGLE_MAX": 3.0}, 0.1),
     ],
 )  # fmt: skip
-def test_a_vehicle_brakes_no_harder_than_it_leans_in_wind(lean: dict[str, float], accel_mps2: float) -> None:
+def test_braking_deceleration_is_limited_by_lean_angle(lean: dict[str, float], accel_mps2: float) -> None:
     checked = configured(Parameters({"SYSID_MYGCS": SYSTEM_ID, **lean}))
     assert checked.airframe.accel_mps2 == pytest.approx(accel_mps2, abs=0.01)
 
 
-def test_the_lean_is_known_by_its_name_of_release_4_7() -> None:
+def test_lean_angle_parameter_of_release_4_7_is_known() -> None:
     vehicle = Parameters({"SYSID_MYGCS": SYSTEM_ID, "ATC_ANGLE_MAX": 10.0})
     del vehicle.values["ANGLE_MAX"]
     assert configured(vehicle).airframe.accel_mps2 == pytest.approx(1.03, abs=0.01)
 
 
-def test_the_vehicles_own_fence_caps_its_way_home() -> None:
+def test_fence_ceiling_limits_return_altitude() -> None:
     fence = {"FENCE_ENABLE": 1.0, "FENCE_TYPE": 7.0, "FENCE_ALT_MAX": 40.0, "FENCE_MARGIN": 3.0}
 
     def returns_at(**changes: float) -> float:
@@ -203,7 +203,7 @@ def test_the_vehicles_own_fence_caps_its_way_home() -> None:
     assert returns_at(FENCE_ENABLE=0.0, FENCE_AUTOENABLE=1.0) == 37.0
 
 
-def test_a_fence_raised_later_caps_it_as_well() -> None:
+def test_fence_ceiling_set_later_limits_return_altitude() -> None:
     async def learnt() -> None:
         vehicle = Parameters(RETRACING | {"RTL_ALT": 5000.0})
         checked = await MavlinkFailsafes(vehicle).configure()
@@ -222,7 +222,7 @@ FENCED = {"FENCE_ENABLE": 1.0, "FENCE_TYPE": 5.0, "FENCE_ALT_MAX": 65.0}
 
 
 @pytest.mark.parametrize("lost", ["RTL_ALT", "FENCE_ENABLE"])
-def test_a_return_altitude_that_is_lost_stays_and_forbids_arming(lost: str) -> None:
+def test_lost_return_altitude_parameter_keeps_value_and_prevents_arming(lost: str) -> None:
     async def learnt() -> None:
         vehicle = Parameters(RETRACING | FENCED | {"RTL_ALT": 6000.0})
         checked = await MavlinkFailsafes(vehicle).configure()
@@ -236,7 +236,7 @@ def test_a_return_altitude_that_is_lost_stays_and_forbids_arming(lost: str) -> N
     run(learnt())
 
 
-def test_a_fence_without_its_ceiling_forbids_arming() -> None:
+def test_fence_without_known_ceiling_prevents_arming() -> None:
     vehicle = Parameters(RETRACING | FENCED)
     del vehicle.values["FENCE_ALT_MAX"]
     assert configured(vehicle).problem == "the autopilot has no FENCE_ALT_MAX"
@@ -244,7 +244,7 @@ def test_a_fence_without_its_ceiling_forbids_arming() -> None:
 
 @pytest.mark.parametrize("known", [True, False])
 @pytest.mark.parametrize("retrace", [True, False])
-def test_in_flight_the_way_home_stays_as_it_was_chosen(retrace: bool, known: bool) -> None:
+def test_return_parameters_are_not_changed_in_flight(retrace: bool, known: bool) -> None:
     async def flown() -> None:
         vehicle = Parameters(RETRACING)
         chosen = await MavlinkFailsafes(vehicle).choose_return(
@@ -260,7 +260,7 @@ def test_in_flight_the_way_home_stays_as_it_was_chosen(retrace: bool, known: boo
     run(flown())
 
 
-def test_in_flight_what_cannot_be_read_is_as_it_was() -> None:
+def test_unreadable_parameters_keep_last_value_in_flight() -> None:
     async def flown() -> None:
         moves = {"WPNAV_ACCEL": 100.0, "RTL_ALT": 6000.0, "WPNAV_SPEED": 800.0}
         vehicle = Parameters(RETRACING | moves)
@@ -277,7 +277,7 @@ def test_in_flight_what_cannot_be_read_is_as_it_was() -> None:
 
 
 @pytest.mark.parametrize(("kind", "firmware"), [(2, 12), (1, 3), (10, 3), (20, 3)])
-def test_nothing_is_set_in_a_vehicle_that_is_no_arducopter(kind: int, firmware: int) -> None:
+def test_parameters_are_set_only_in_arducopter(kind: int, firmware: int) -> None:
     vehicle = Parameters(RETRACING | {"FS_GCS_ENABLE": 0.0})
     vehicle.vehicle.take(message("HEARTBEAT", type=kind, autopilot=firmware), 1.0)
     assert configured(vehicle).problem == f"the vehicle is no ArduCopter (MAV_AUTOPILOT {firmware}, MAV_TYPE {kind})"

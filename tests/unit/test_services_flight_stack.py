@@ -10,7 +10,7 @@ from fractus_services.mobility.mavlink.mavlink_autopilot import MavlinkAutopilot
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 
-def test_each_mode_means_what_the_vehicle_does_in_it() -> None:
+def test_each_mode_maps_to_its_flight_state() -> None:
     kinds = {mode: ARDUCOPTER.mode(mode).kind for mode in enum_names("COPTER_MODE")}
     assert kinds.pop(mavlink.COPTER_MODE_GUIDED) is ModeKind.COMMANDED
     assert kinds.pop(mavlink.COPTER_MODE_LAND) is ModeKind.LANDING
@@ -20,7 +20,7 @@ def test_each_mode_means_what_the_vehicle_does_in_it() -> None:
     assert set(kinds.values()) == {ModeKind.OTHER}, "in every other mode a pilot flies"
 
 
-def test_modes_are_asked_for_by_their_numbers() -> None:
+def test_modes_are_requested_by_number() -> None:
     for mode in enum_names("COPTER_MODE"):
         assert ARDUCOPTER.mode_parameters(ARDUCOPTER.mode(mode)) == (float(mode),)
     assert ARDUCOPTER.mode(99) == FlightMode("MODE99"), "a later release's: a pilot's until it is known"
@@ -40,7 +40,7 @@ def test_modes_are_asked_for_by_their_numbers() -> None:
         ("Radio Failsafe - Continuing Auto Mode", False),
     ],
 )
-def test_texts_of_failsafes_are_told_from_others(text: str, tells: bool) -> None:
+def test_failsafe_statustexts_are_recognised(text: str, tells: bool) -> None:
     assert ARDUCOPTER.tells_failsafe(text) is tells
 
 
@@ -56,7 +56,7 @@ class TwoNumbers(ArduCopter):
         return (4.0, 6.0)
 
 
-async def test_another_firmware_needs_only_its_own_stack() -> None:
+async def test_other_firmware_needs_only_a_flight_stack() -> None:
     sent: list[Message] = []
 
     class Vehicle(MavlinkAutopilot):

@@ -81,7 +81,7 @@ def vehicle(monkeypatch: pytest.MonkeyPatch) -> Vehicle:
 LIMITS = {"limits": {"maxAltitude": 60, "maxSpeed": 12}}
 
 
-def test_bounds_lie_outside_of_what_is_granted() -> None:
+def test_fence_bounds_enclose_granted_area() -> None:
     bounds = fence_bounds(spec(area(-50, -50, 50, 50), corridor=[area(0, -120, 10, 0)], **LIMITS))
     assert bounds is not None
     assert bounds.altitude_m == 65.0
@@ -91,14 +91,14 @@ def test_bounds_lie_outside_of_what_is_granted() -> None:
     assert {i.param1 for i in bounds.items} == {float(len(bounds.items))}
 
 
-def test_areas_apart_become_one_polygon() -> None:
+def test_separate_areas_become_one_fence_polygon() -> None:
     bounds = fence_bounds(spec(area(0, 0, 50, 50), area(200, 0, 250, 50)))
     assert bounds is not None
     assert bounds.altitude_m is None
     assert outline(bounds.items).contains(shapely.box(0, 0, 250, 50))
 
 
-def test_a_round_area_has_few_vertices() -> None:
+def test_round_area_has_few_fence_vertices() -> None:
     circle = {"circle": {"center": {"lat": 39.36, "lon": 22.95}, "radius": 5000}}
     bounds = fence_bounds(spec(circle))
     assert bounds is not None
@@ -112,7 +112,7 @@ def test_a_round_area_has_few_vertices() -> None:
     st.lists(st.tuples(st.floats(-300, 300), st.floats(-300, 300), st.floats(5, 200)), min_size=1, max_size=5),
     st.sampled_from([60, 30, 15, 8, 4]),
 )
-def test_fewer_vertices_lie_further_out(circles: list[tuple[float, float, float]], vertices: int) -> None:
+def test_fence_with_fewer_vertices_lies_further_out(circles: list[tuple[float, float, float]], vertices: int) -> None:
     areas = []
     for x, y, radius in circles:
         lat, lon = FRAME.latlon(x, y)
@@ -125,7 +125,7 @@ def test_fewer_vertices_lie_further_out(circles: list[tuple[float, float, float]
     assert outline(bounds.items).contains(whole.buffer(ROOM_M - 0.5))
 
 
-async def test_a_vehicle_with_little_space_gets_fewer_vertices(
+async def test_vehicle_with_little_storage_gets_fewer_fence_vertices(
     vehicle: Vehicle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     round_area = {"circle": {"center": {"lat": 39.36, "lon": 22.95}, "radius": 300}}
@@ -149,11 +149,11 @@ async def test_a_vehicle_with_little_space_gets_fewer_vertices(
         await fence.raise_around(spec(round_area), retraces=False)
 
 
-def test_nothing_bounded_nothing_loaded() -> None:
+def test_no_fence_is_loaded_without_bounds() -> None:
     assert fence_bounds(spec()) is None
 
 
-async def test_a_fence_is_raised_and_put_back(vehicle: Vehicle, tmp_path: Path) -> None:
+async def test_mission_fence_is_enabled_and_owner_fence_restored(vehicle: Vehicle, tmp_path: Path) -> None:
     vehicle.values["FENCE_TOTAL"] = 1.0
     before = dict(vehicle.values)
     vehicle.items = (MissionItem(5003, 30.0, 1, 2),)
@@ -175,7 +175,7 @@ async def test_a_fence_is_raised_and_put_back(vehicle: Vehicle, tmp_path: Path) 
     assert not again.raised
 
 
-async def test_the_owners_own_fence_stays_in_force(vehicle: Vehicle, tmp_path: Path) -> None:
+async def test_owner_fence_stays_in_force(vehicle: Vehicle, tmp_path: Path) -> None:
     vehicle.values |= {"FENCE_ENABLE": 1.0, "FENCE_TYPE": 3.0, "FENCE_ALT_MAX": 40.0, "FENCE_OPTIONS": 3.0}
     vehicle.items = (MissionItem(5003, 30.0, 1, 2),)
     fence = MissionFence(vehicle, tmp_path)
@@ -194,7 +194,7 @@ async def test_the_owners_own_fence_stays_in_force(vehicle: Vehicle, tmp_path: P
 
 
 @pytest.mark.parametrize("action", [0.0, 4.0])
-async def test_an_owners_fence_that_brings_no_drone_down_does_so_for_the_mission(
+async def test_owner_fence_without_action_gets_action_for_the_mission(
     vehicle: Vehicle, tmp_path: Path, action: float
 ) -> None:
     vehicle.values |= {"FENCE_ENABLE": 1.0, "FENCE_ACTION": action}
@@ -205,9 +205,7 @@ async def test_an_owners_fence_that_brings_no_drone_down_does_so_for_the_mission
     assert vehicle.values["FENCE_ACTION"] == action
 
 
-def test_a_vehicle_without_fences_is_left_alone_and_one_that_is_silent_is_none(
-    vehicle: Vehicle, tmp_path: Path
-) -> None:
+def test_vehicle_without_fence_support_is_not_changed_unlike_a_silent_vehicle(vehicle: Vehicle, tmp_path: Path) -> None:
     async def raised() -> None:
         fence = MissionFence(vehicle, tmp_path)
         with pytest.raises(AutopilotError, match="FENCE_ENABLE cannot be read"):
@@ -223,7 +221,7 @@ def test_a_vehicle_without_fences_is_left_alone_and_one_that_is_silent_is_none(
         runner.run(raised())
 
 
-async def test_a_vehicle_without_item_lists_is_left_alone(
+async def test_vehicle_without_item_lists_is_not_changed(
     vehicle: Vehicle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def unsupported(*_: Any) -> tuple[MissionItem, ...]:
@@ -236,7 +234,7 @@ async def test_a_vehicle_without_item_lists_is_left_alone(
     assert not fence.raised
 
 
-async def test_what_is_read_back_must_be_what_was_sent(
+async def test_fence_read_back_must_match_sent_fence(
     vehicle: Vehicle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def forgetful(_autopilot: Any, items: Any) -> None:
@@ -248,13 +246,13 @@ async def test_what_is_read_back_must_be_what_was_sent(
         await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
 
 
-async def test_a_parameter_that_stays_as_it_is_is_told(vehicle: Vehicle, tmp_path: Path) -> None:
+async def test_fence_parameter_that_cannot_be_set_is_reported(vehicle: Vehicle, tmp_path: Path) -> None:
     vehicle.fixed = ("FENCE_TYPE",)
     with pytest.raises(AutopilotError, match="FENCE_TYPE cannot be set to 4"):
         await MissionFence(vehicle, tmp_path).raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
 
 
-async def test_nothing_is_changed_before_the_owners_fence_is_stored(vehicle: Vehicle, tmp_path: Path) -> None:
+async def test_owner_fence_is_stored_before_any_change(vehicle: Vehicle, tmp_path: Path) -> None:
     fence = MissionFence(vehicle, tmp_path / "gone")
     with pytest.raises(OSError, match="gone"):
         await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
@@ -262,7 +260,7 @@ async def test_nothing_is_changed_before_the_owners_fence_is_stored(vehicle: Veh
     assert not vehicle.items
 
 
-async def test_a_damaged_memory_of_the_owners_fence_is_no_memory(vehicle: Vehicle, tmp_path: Path) -> None:
+async def test_damaged_owner_fence_file_is_ignored(vehicle: Vehicle, tmp_path: Path) -> None:
     await asyncio.to_thread((tmp_path / "fence.json").write_text, json.dumps({"items": 3}))
     await MissionFence(vehicle, tmp_path).lower(lambda: True)
     assert not vehicle.written
@@ -271,7 +269,7 @@ async def test_a_damaged_memory_of_the_owners_fence_is_no_memory(vehicle: Vehicl
 OWNED = {"FENCE_ENABLE": 1.0, "FENCE_TYPE": 3.0, "FENCE_ALT_MAX": 40.0}
 
 
-async def test_no_fence_is_changed_while_the_motors_run(vehicle: Vehicle, tmp_path: Path) -> None:
+async def test_fence_is_not_changed_while_armed(vehicle: Vehicle, tmp_path: Path) -> None:
     vehicle.values |= OWNED
     vehicle.vehicle.armed = True
     fence = MissionFence(vehicle, tmp_path)
@@ -288,7 +286,7 @@ async def test_no_fence_is_changed_while_the_motors_run(vehicle: Vehicle, tmp_pa
     assert fence.raised
 
 
-async def test_motors_that_start_while_the_fence_is_asked_for_keep_it_on(vehicle: Vehicle, tmp_path: Path) -> None:
+async def test_fence_stays_enabled_if_vehicle_arms_during_its_request(vehicle: Vehicle, tmp_path: Path) -> None:
     vehicle.values |= OWNED
     send, asked = vehicle.send, 0
 
@@ -306,7 +304,7 @@ async def test_motors_that_start_while_the_fence_is_asked_for_keep_it_on(vehicle
 
 
 @pytest.mark.parametrize("how", ["refused", "given up"])
-async def test_a_fence_that_cannot_be_raised_leaves_the_owners(
+async def test_owner_fence_is_kept_if_mission_fence_cannot_be_enabled(
     vehicle: Vehicle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
     vehicle.values |= OWNED
@@ -328,7 +326,7 @@ async def test_a_fence_that_cannot_be_raised_leaves_the_owners(
     assert not fence.raised
 
 
-async def test_an_owners_fence_that_cannot_be_put_back_at_once_is_remembered(
+async def test_owner_fence_that_cannot_be_restored_is_kept_for_later(
     vehicle: Vehicle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     vehicle.values |= OWNED
@@ -343,9 +341,7 @@ async def test_an_owners_fence_that_cannot_be_put_back_at_once_is_remembered(
     assert fence.raised, "the supervisor puts it back later"
 
 
-async def test_in_flight_what_another_station_changes_of_the_fence_is_set_back(
-    vehicle: Vehicle, tmp_path: Path
-) -> None:
+async def test_fence_parameter_changed_by_another_station_in_flight_is_reset(vehicle: Vehicle, tmp_path: Path) -> None:
     fence = MissionFence(vehicle, tmp_path)
     await fence.raise_around(spec(area(-50, -50, 50, 50), **LIMITS), retraces=False)
     raised = dict(vehicle.values)
@@ -362,7 +358,7 @@ async def test_in_flight_what_another_station_changes_of_the_fence_is_set_back(
         await fence.hold()
 
 
-async def test_a_fence_that_another_station_replaced_is_told(vehicle: Vehicle, tmp_path: Path) -> None:
+async def test_fence_replaced_by_another_station_is_reported(vehicle: Vehicle, tmp_path: Path) -> None:
     fence = MissionFence(vehicle, tmp_path)
     await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
     vehicle.values["FENCE_TOTAL"] = 1.0
@@ -370,7 +366,7 @@ async def test_a_fence_that_another_station_replaced_is_told(vehicle: Vehicle, t
         await fence.hold()
 
 
-async def test_other_items_in_place_of_as_many_are_told(
+async def test_replaced_fence_items_of_same_count_are_reported(
     vehicle: Vehicle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fence = MissionFence(vehicle, tmp_path)
@@ -384,7 +380,7 @@ async def test_other_items_in_place_of_as_many_are_told(
         await fence.hold()
 
 
-async def test_a_fence_that_stands_is_not_loaded_again(vehicle: Vehicle, tmp_path: Path) -> None:
+async def test_loaded_fence_is_not_loaded_again(vehicle: Vehicle, tmp_path: Path) -> None:
     fence, loads = MissionFence(vehicle, tmp_path), list[int]()
 
     async def counted(_autopilot: Any, items: Any) -> None:

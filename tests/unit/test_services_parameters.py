@@ -66,7 +66,7 @@ def rounded(airframe: Airframe) -> Airframe:
 
 @pytest.mark.parametrize("release", [AS_4_6, AS_4_7, AS_4_7_0])
 @pytest.mark.parametrize(("loss", "starts"), [(0.1, examples(60)), (0.3, examples(40, 20))])
-def test_no_start_takes_a_figure_that_is_not_the_vehicles(loss: float, starts: int, release: dict[str, float]) -> None:
+def test_startup_uses_only_parameter_values_of_the_vehicle(loss: float, starts: int, release: dict[str, float]) -> None:
     verified = 0
     for seed in range(starts):
         vehicle = ParameterVehicle(release | OTHERS, loss=loss, seed=seed, delay_s=0.05)
@@ -81,7 +81,7 @@ def test_no_start_takes_a_figure_that_is_not_the_vehicles(loss: float, starts: i
 
 
 @pytest.mark.parametrize("lost", sorted({"WPNAV_ACCEL", "SRTL_POINTS", "FENCE_ALT_MAX", "RTL_ALT", "FS_GCS_ENABLE"}))
-def test_a_parameter_that_does_not_answer_forbids_arming_and_is_named(lost: str) -> None:
+def test_parameter_without_response_prevents_arming_and_is_named(lost: str) -> None:
     class Deaf(ParameterVehicle):
         def send(self, outgoing: Any) -> None:
             named = outgoing.name == "PARAM_REQUEST_READ" and outgoing.text("param_id") == lost
@@ -98,7 +98,7 @@ def test_a_parameter_that_does_not_answer_forbids_arming_and_is_named(lost: str)
         assert ("cannot be read" in problem and lost in problem) is not listing, problem
 
 
-def test_a_list_that_stays_incomplete_names_what_it_was_asked_for() -> None:
+def test_incomplete_parameter_list_names_requested_parameters() -> None:
     class Mute(ParameterVehicle):
         def take(self, incoming: Any) -> None:
             if incoming.name != "PARAM_VALUE" or incoming.text("param_id") not in {"WPNAV_ACCEL", "P0100"}:
@@ -108,7 +108,7 @@ def test_a_list_that_stays_incomplete_names_what_it_was_asked_for() -> None:
     assert "WPNAV_ACCEL or WP_ACC cannot be read" in problem
 
 
-def test_what_is_absent_is_found_out_by_the_list_and_only_once() -> None:
+def test_absent_parameter_is_detected_by_one_list_request() -> None:
     async def asked() -> None:
         vehicle = ParameterVehicle(
             {name: value for name, value in AS_4_6.items() if name != "BATT_FS_CRT_ACT"} | OTHERS
@@ -124,14 +124,14 @@ def test_what_is_absent_is_found_out_by_the_list_and_only_once() -> None:
     run(asked())
 
 
-def test_a_vehicle_that_tells_all_is_not_asked_for_its_list() -> None:
+def test_parameter_list_is_not_requested_if_all_parameters_are_reported() -> None:
     for release in (AS_4_6, AS_4_7):
         vehicle = ParameterVehicle(release | OTHERS, delay_s=0.02)
         assert not run(started(vehicle)).problem
         assert "PARAM_REQUEST_LIST" not in vehicle.asked
 
 
-def test_what_is_hidden_from_the_list_is_heard_by_name() -> None:
+def test_parameter_hidden_from_list_is_read_by_name() -> None:
     async def asked() -> None:
         values = {name: value for name, value in AS_4_6.items() if name != "FS_EKF_ACTION"} | OTHERS
         vehicle = ParameterVehicle(values, hidden=("BATT_FS_LOW_ACT", "BATT_FS_CRT_ACT"), loss=0.1, seed=3)
@@ -143,7 +143,7 @@ def test_what_is_hidden_from_the_list_is_heard_by_name() -> None:
     run(asked())
 
 
-def test_a_list_that_grows_while_it_is_read_is_read_again() -> None:
+def test_parameter_list_that_grows_while_read_is_read_again() -> None:
     class Growing(ParameterVehicle):
         def send(self, outgoing: Any) -> None:
             super().send(outgoing)
@@ -157,7 +157,7 @@ def test_a_list_that_grows_while_it_is_read_is_read_again() -> None:
     run(asked())
 
 
-def test_no_answer_is_no_refusal_and_a_late_answer_none_either() -> None:
+def test_missing_or_late_response_is_not_a_refusal() -> None:
     async def written() -> None:
         fixed = ParameterVehicle({"RTL_ALT": 1500.0}, fixed=("RTL_ALT",))
         assert await fixed.vehicle_parameters.write("RTL_ALT", 3000.0) == 1500.0
@@ -172,7 +172,7 @@ def test_no_answer_is_no_refusal_and_a_late_answer_none_either() -> None:
     run(written())
 
 
-def test_two_that_use_one_parameter_both_hear_it() -> None:
+def test_two_readers_of_one_parameter_both_receive_it() -> None:
     async def used() -> None:
         parameters = ParameterVehicle({"FENCE_TYPE": 1.0}, loss=0.2, seed=1).vehicle_parameters
         read, written = await asyncio.gather(parameters.read([("FENCE_TYPE",)]), parameters.write("FENCE_TYPE", 2.0))
@@ -182,7 +182,7 @@ def test_two_that_use_one_parameter_both_hear_it() -> None:
     run(used())
 
 
-def test_every_figure_is_asked_for() -> None:
+def test_every_vehicle_parameter_is_requested() -> None:
     class Asking(dict[str, float]):
         def __contains__(self, name: object) -> bool:
             used.add(str(name))

@@ -27,7 +27,7 @@ def fix(vehicle: Vehicle, fix_type: int, h_acc: int = 600) -> None:
 
 
 @pytest.mark.parametrize(("fix_type", "h_acc"), [(0, 0), (1, 600), (2, 600), (3, 10_001), (6, 80_000)])
-def test_without_a_good_fix_no_position_is_taken(fix_type: int, h_acc: int) -> None:
+def test_position_is_unknown_without_good_fix(fix_type: int, h_acc: int) -> None:
     vehicle = Vehicle(stack=ARDUCOPTER)
     place(vehicle, 39.0, 1.0)
     assert vehicle.lat is None
@@ -39,7 +39,7 @@ def test_without_a_good_fix_no_position_is_taken(fix_type: int, h_acc: int) -> N
 
 
 @pytest.mark.parametrize(("lat_e7", "lon_e7"), [(0, 0), (2**31 - 1, 229500000), (393600000, -(2**31)), (900000001, 0)])
-def test_what_is_no_place_is_taken_for_none(lat_e7: int, lon_e7: int) -> None:
+def test_invalid_coordinates_are_ignored(lat_e7: int, lon_e7: int) -> None:
     vehicle = Vehicle(stack=ARDUCOPTER)
     fix(vehicle, 3)
     vehicle.take(message("GLOBAL_POSITION_INT", lat=lat_e7, lon=lon_e7), 1.0)
@@ -47,7 +47,7 @@ def test_what_is_no_place_is_taken_for_none(lat_e7: int, lon_e7: int) -> None:
     assert (vehicle.lat, vehicle.home, vehicle.position_at) == (None, None, -math.inf)
 
 
-def test_an_accuracy_that_is_not_told_any_more_is_not_the_last_one() -> None:
+def test_position_accuracy_expires_when_no_longer_reported() -> None:
     vehicle = Vehicle(stack=ARDUCOPTER)
     fix(vehicle, 3, 9_000)
     assert vehicle.position_error_m == 9.0
@@ -65,7 +65,7 @@ def told(vehicle: Vehicle, now: float, missions: bool = False, heard: int = 0, w
     return telemetry_of(control, 0.0, missions=missions, not_ready_reason="", last_text=heard)
 
 
-def test_telemetry_carries_no_stale_position() -> None:
+def test_telemetry_contains_no_stale_position() -> None:
     vehicle = Vehicle(stack=ARDUCOPTER)
     fix(vehicle, 3)
     place(vehicle, 39.0, 10.0)
@@ -79,7 +79,7 @@ def test_telemetry_carries_no_stale_position() -> None:
     assert not told(Vehicle(stack=ARDUCOPTER), math.inf).HasField("position")
 
 
-def test_telemetry_tells_how_old_the_attitude_is() -> None:
+def test_telemetry_reports_age_of_attitude() -> None:
     vehicle = Vehicle(stack=ARDUCOPTER)
     vehicle.take(message("ATTITUDE", roll=0.1, pitch=0.0, yaw=1.0), 10.0)
     fresh = told(vehicle, 10.4)
@@ -90,7 +90,7 @@ def test_telemetry_tells_how_old_the_attitude_is() -> None:
 
 
 @pytest.mark.parametrize("way_s", [0.3, math.inf])
-def test_ages_count_the_way_that_messages_take(way_s: float) -> None:
+def test_telemetry_ages_include_link_latency(way_s: float) -> None:
     vehicle = Vehicle(stack=ARDUCOPTER)
     fix(vehicle, 3)
     place(vehicle, 39.0, 10.0)
@@ -106,7 +106,7 @@ def heard(name: str, boot_s: float, **values: float) -> Message:
     return message(name, **fields)
 
 
-def test_an_attitude_is_as_old_as_its_time_stamp_says() -> None:
+def test_attitude_age_follows_its_timestamp() -> None:
     async def hears() -> None:
         autopilot = MavlinkAutopilot("tcp:127.0.0.1:1", ARDUCOPTER)
         for boot_s in (100.0, 100.5):
@@ -123,14 +123,14 @@ def test_an_attitude_is_as_old_as_its_time_stamp_says() -> None:
         runner.run(hears())
 
 
-def test_missions_are_for_the_node_alone() -> None:
+def test_mission_items_are_addressed_to_the_node_only() -> None:
     ours, others = (told(Vehicle(stack=ARDUCOPTER), 0.0, missions=node) for node in (True, False))
     assert dict(ours.missions) == {"uid": MissionOutcome(kind=MissionOutcome.KIND_REVOKED, reason="why")}
     assert ours.controller_reason == "a pilot took it"
     assert (dict(others.missions), others.controller_reason) == ({}, "")
 
 
-def test_telemetry_tells_of_satellites_wind_and_new_texts() -> None:
+def test_telemetry_reports_satellites_wind_and_new_statustexts() -> None:
     vehicle = Vehicle(stack=ARDUCOPTER)
     empty = told(vehicle, 10.0)
     assert not empty.HasField("gps")

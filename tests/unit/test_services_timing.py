@@ -105,7 +105,7 @@ def wild(rng: random.Random, least: float, most: float, lost: float = 0.0) -> De
 
 
 @pytest.mark.parametrize(("up", "down"), [(0.0, 0.0), (0.15, 0.15), (0.25, 0.25), (0.5, 0.0), (0.0, 0.5)])
-def test_both_ways_are_counted_once(up: float, down: float) -> None:
+def test_latency_of_each_direction_is_counted_once(up: float, down: float) -> None:
     """Whichever way is the slower one: the bound is what it takes, and little more."""
     bench = Bench(steady(up), steady(down))
     bench.fly(30)
@@ -115,7 +115,7 @@ def test_both_ways_are_counted_once(up: float, down: float) -> None:
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_lost_late_doubled_and_overtaken_messages_leave_an_upper_bound(seed: int) -> None:
+def test_latency_is_an_upper_bound_despite_lost_late_and_duplicate_messages(seed: int) -> None:
     rng = random.Random(seed)
     least, most = rng.uniform(0, 0.2), rng.uniform(0.2, 0.4)
     bench = Bench(wild(rng, least, most, 0.1), wild(rng, least, most, 0.1), copies=2)
@@ -126,7 +126,7 @@ def test_lost_late_doubled_and_overtaken_messages_leave_an_upper_bound(seed: int
 
 
 @pytest.mark.parametrize("rate", [0.999, 1.001, 1.5, 2.0, 3.0, 5.0])
-def test_a_clock_of_another_rate_is_followed(rate: float) -> None:
+def test_clock_with_different_rate_is_tracked(rate: float) -> None:
     bench = Bench(steady(0.01), steady(0.01), clock=lambda t: rate * t + 7)
     bench.fly(15)
     bench.worst = -math.inf
@@ -136,14 +136,14 @@ def test_a_clock_of_another_rate_is_followed(rate: float) -> None:
     assert not bench.timing.problem(bench.now)
 
 
-def test_a_clock_that_runs_too_fast_is_refused() -> None:
+def test_clock_that_runs_too_fast_is_rejected() -> None:
     bench = Bench(steady(0.005), steady(0.005), clock=lambda t: 9 * t, every_s=0.01)
     bench.fly(15)
     assert "9.0 times as fast as real time" in bench.timing.problem(bench.now)
     assert f"more than {MAX_PACE:g}" in bench.timing.problem(bench.now)
 
 
-def test_a_slow_link_lets_nothing_arm_and_says_why() -> None:
+def test_slow_link_prevents_arming_with_reason() -> None:
     bench = Bench(steady(0.65), steady(0.6))
     bench.fly(15)
     assert "delays by 1.2 s there and back" in bench.timing.problem(bench.now) or "1.3 s" in bench.timing.problem(
@@ -156,7 +156,7 @@ def test_a_slow_link_lets_nothing_arm_and_says_why() -> None:
     assert math.isinf(worse.timing.latency_s(worse.now))
 
 
-def test_a_link_that_becomes_slow_is_noticed_and_forgotten_when_it_is_over() -> None:
+def test_slow_link_is_detected_and_cleared_when_fast_again() -> None:
     slow = 0.0
     bench = Bench(lambda: 0.02 + slow, steady(0.02))
     bench.fly(15)
@@ -170,7 +170,7 @@ def test_a_link_that_becomes_slow_is_noticed_and_forgotten_when_it_is_over() -> 
     assert bench.timing.delay_s < 0.1
 
 
-def test_a_link_that_gets_slow_is_noticed_before_its_first_slow_answer() -> None:
+def test_slow_link_is_detected_before_first_slow_response() -> None:
     """Positions go on coming: what the way there has got slower by, only the answers that are late can tell."""
     up_s = 0.05
     bench = Bench(lambda: up_s, steady(0.05))
@@ -184,7 +184,7 @@ def test_a_link_that_gets_slow_is_noticed_before_its_first_slow_answer() -> None
     assert bench.worst <= 0.0
 
 
-def test_many_overdue_answers_are_no_quick_link() -> None:
+def test_many_overdue_responses_do_not_count_as_fast_link() -> None:
     """Ten requests without an answer are of a vehicle that answers none, or of a link that got slow: until that is clear they count."""
     up_s = 0.05
     bench = Bench(lambda: up_s, steady(0.05))
@@ -198,7 +198,7 @@ def test_many_overdue_answers_are_no_quick_link() -> None:
     assert math.isinf(bench.timing.latency_s(bench.now)), "the slow answers are there"
 
 
-def test_a_lost_answer_makes_no_link_slower_than_can_be_flown_with() -> None:
+def test_one_lost_response_does_not_make_link_too_slow_to_fly() -> None:
     bench = Bench(steady(0.05), steady(0.05))
     bench.fly(15)
     before_s = bench.timing.latency_s(bench.now)
@@ -210,7 +210,7 @@ def test_a_lost_answer_makes_no_link_slower_than_can_be_flown_with() -> None:
     assert bench.timing.latency_s(bench.now) == pytest.approx(before_s, abs=0.05)
 
 
-def test_without_answers_nothing_is_known() -> None:
+def test_latency_is_unknown_without_responses() -> None:
     bench = Bench(steady(0.02), steady(0.02))
     assert math.isinf(bench.timing.latency_s(bench.now))
     assert "not known" in bench.timing.problem(bench.now)
@@ -220,7 +220,7 @@ def test_without_answers_nothing_is_known() -> None:
     assert math.isinf(bench.timing.latency_s(bench.now))
 
 
-def test_a_vehicle_that_answers_no_timesync_is_measured_by_acknowledgements() -> None:
+def test_latency_is_measured_by_acknowledgements_without_timesync() -> None:
     bench = Bench(steady(0.2), steady(0.1), answers=False)
     bench.fly(1.5)
     assert math.isinf(bench.timing.latency_s(bench.now))
@@ -229,7 +229,7 @@ def test_a_vehicle_that_answers_no_timesync_is_measured_by_acknowledgements() ->
     assert max(bench.told) <= REACTION_S + 0.02
 
 
-def test_replies_to_others_and_replies_again_mean_nothing() -> None:
+def test_timesync_replies_to_others_and_duplicates_are_ignored() -> None:
     timing = Timing()
     for i in range(40):
         timing.sampled(5000 + 50 * i, 1.0 + 0.05 * i)
@@ -248,7 +248,7 @@ def test_replies_to_others_and_replies_again_mean_nothing() -> None:
     assert timing.delay_s == measured
 
 
-def test_a_command_that_was_sent_again_over_a_gap_measures_no_delay() -> None:
+def test_repeated_command_after_gap_is_not_a_latency_sample() -> None:
     bench = Bench(steady(0.02), steady(0.02))
     bench.fly(10)
     sent = bench.now + 0.1
@@ -266,7 +266,7 @@ def test_a_command_that_was_sent_again_over_a_gap_measures_no_delay() -> None:
     assert math.isfinite(bench.timing.latency_s(bench.now))
 
 
-def test_a_reply_by_another_clock_than_the_positions_is_no_measurement() -> None:
+def test_timesync_reply_with_another_clock_is_ignored() -> None:
     bench = Bench(steady(0.02), steady(0.02), answers=False)
     bench.fly(3)
     number = bench.timing.request(bench.now)
@@ -275,14 +275,14 @@ def test_a_reply_by_another_clock_than_the_positions_is_no_measurement() -> None
     assert bench.timing.unanswering
 
 
-def test_the_clock_of_the_vehicle_wraps_after_49_days() -> None:
+def test_vehicle_clock_wraps_after_49_days() -> None:
     bench = Bench(steady(0.1), steady(0.1), clock=lambda t: t - 60 + 2**32 / 1e3)
     bench.fly(40)
     assert bench.worst <= -REACTION_S + 0.01
     assert max(bench.told) <= REACTION_S + 0.01
 
 
-def test_a_restart_of_the_vehicle_begins_again() -> None:
+def test_vehicle_restart_resets_timing() -> None:
     boot = 0.0
     bench = Bench(steady(0.05), steady(0.05), clock=lambda t: t - boot + 100.0)
     bench.fly(5)
@@ -303,7 +303,7 @@ def test_a_restart_of_the_vehicle_begins_again() -> None:
         ((1_000, 1_050, 1_100), [False, True, True]),
     ],
 )
-def test_an_old_position_that_comes_late_is_no_restart(stamps: tuple[int, ...], told: list[bool]) -> None:
+def test_late_old_position_is_not_a_restart(stamps: tuple[int, ...], told: list[bool]) -> None:
     timing = Timing()
     for i in range(200):
         timing.sampled(100_000 + 50 * i, 50.0 + 0.05 * i)
@@ -314,7 +314,7 @@ def test_an_old_position_that_comes_late_is_no_restart(stamps: tuple[int, ...], 
     assert restarted == told
 
 
-def test_a_restart_shows_in_replies_alone() -> None:
+def test_restart_is_detected_from_replies_alone() -> None:
     bench = Bench(steady(0.02), steady(0.02), answers=False)
     bench.fly(3)
     for seconds, restarted in (1000, False), (1001, False), (998, False), (10, True), (11, True):
@@ -326,7 +326,7 @@ def test_a_restart_shows_in_replies_alone() -> None:
     assert not bench.timing.restarted
 
 
-def test_a_vehicle_that_freezes_is_not_known_and_then_known_again() -> None:
+def test_timing_of_frozen_vehicle_is_unknown_until_it_recovers() -> None:
     frozen = 0.0
     bench = Bench(steady(0.02), steady(0.02), clock=lambda t: t - frozen)
     bench.fly(10)
@@ -343,7 +343,7 @@ def test_a_vehicle_that_freezes_is_not_known_and_then_known_again() -> None:
 
 @pytest.mark.parametrize("rate", [1.0, 3.0])
 @pytest.mark.parametrize("stall_s", [0.3, 0.8, 2.0, 3.0])
-def test_a_stalled_connection_that_hands_over_all_at_once_runs_no_faster(stall_s: float, rate: float) -> None:
+def test_burst_after_stalled_connection_does_not_speed_up_clock(stall_s: float, rate: float) -> None:
     """What TCP has kept comes late, in order, at one moment: the vehicle's clock seems to catch up."""
     until = -math.inf
     in_order = 1 - 1e-6
@@ -359,7 +359,7 @@ def test_a_stalled_connection_that_hands_over_all_at_once_runs_no_faster(stall_s
     assert bench.worst <= 0.0, "what is late counts meanwhile"
 
 
-def test_what_our_own_loop_delays_counts() -> None:
+def test_delay_of_the_own_event_loop_is_included() -> None:
     timing = Timing()
     for i in range(60):
         timing.sampled(5000 + 50 * i, 1.0 + 0.05 * i)

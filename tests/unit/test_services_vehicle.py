@@ -14,7 +14,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
     [(2, 10.0, 0.0, True), (1, 10.0, 0.2, False), (1, 10.0, 3.0, True), (1, 5.0, 1.0, True), (1, 5.0, 0.1, False),
      (3, 5.0, 0.1, True), (0, float("-inf"), 1.0, True)],
 )  # fmt: skip
-def test_in_doubt_it_flies(landed_state: int, landed_at: float, altitude_m: float, flies: bool) -> None:
+def test_vehicle_counts_as_airborne_if_landed_state_is_uncertain(
+    landed_state: int, landed_at: float, altitude_m: float, flies: bool
+) -> None:
     vehicle = Vehicle(
         stack=ARDUCOPTER, armed=True, heartbeat_at=10.0, position_at=10.0, landed_state=landed_state, landed_at=landed_at,
         altitude_m=altitude_m,
@@ -24,12 +26,12 @@ def test_in_doubt_it_flies(landed_state: int, landed_at: float, altitude_m: floa
     assert not vehicle.in_air
 
 
-def test_an_armed_vehicle_whose_place_is_unknown_flies() -> None:
+def test_armed_vehicle_without_position_counts_as_airborne() -> None:
     assert Vehicle(stack=ARDUCOPTER, armed=True, heartbeat_at=10.0).in_air
 
 
 @pytest.mark.parametrize(("vx", "forward_mps2"), [((100, 12), 2.4), ((600, -10), -2.0), ((300, 0), 0.0)])
-def test_it_tells_how_it_speeds_up(vx: tuple[int, int], forward_mps2: float) -> None:
+def test_forward_acceleration_is_derived_from_velocities(vx: tuple[int, int], forward_mps2: float) -> None:
     vehicle = Vehicle(stack=ARDUCOPTER, located=True, received_at=0.0)
     assert vehicle.forward_mps2 is None
     for i in range(12):
@@ -42,7 +44,7 @@ def test_it_tells_how_it_speeds_up(vx: tuple[int, int], forward_mps2: float) -> 
 @pytest.mark.parametrize(
     ("unplaced_s", "told", "lost"), [(11, True, False), (14, True, True), (11, False, False), (14, False, True)]
 )
-def test_a_path_is_lost_with_the_position_also_when_its_text_is(unplaced_s: int, told: bool, lost: bool) -> None:
+def test_smart_rtl_path_is_lost_with_position_even_without_statustext(unplaced_s: int, told: bool, lost: bool) -> None:
     vehicle = Vehicle(stack=ARDUCOPTER, armed=True, placed_at=0.0)
     for at in range(1, unplaced_s):
         if told:
@@ -54,7 +56,7 @@ def test_a_path_is_lost_with_the_position_also_when_its_text_is(unplaced_s: int,
     assert not vehicle.path_lost, "the next flight remembers its own"
 
 
-def test_a_vehicle_that_stands_without_a_position_loses_no_path() -> None:
+def test_landed_vehicle_without_position_keeps_smart_rtl_path() -> None:
     vehicle = Vehicle(stack=ARDUCOPTER)
     for at in range(40):
         vehicle.take(message("EKF_STATUS_REPORT", flags=BOOTED), float(at))
@@ -65,7 +67,7 @@ def test_a_vehicle_that_stands_without_a_position_loses_no_path() -> None:
 
 
 @pytest.mark.parametrize("silent", ["EKF_STATUS_REPORT", "GPS_RAW_INT"])
-def test_a_position_whose_quality_is_not_told_any_more_becomes_unknown(silent: str) -> None:
+def test_position_becomes_unknown_when_its_quality_is_no_longer_reported(silent: str) -> None:
     vehicle = Vehicle(stack=ARDUCOPTER)
     for tenth in range(300):
         now = tenth / 10
@@ -86,7 +88,7 @@ BOOTED, POSITIONED = 167, 831
 """Flags of EKF_STATUS_REPORT of a real ArduCopter, after 22 s and after 41 s."""
 
 
-def test_ready_is_what_the_arming_mode_needs() -> None:
+def test_readiness_depends_on_requirements_of_the_arming_mode() -> None:
     vehicle = Vehicle(stack=ARDUCOPTER)
     assert "SYS_STATUS" in vehicle.unready(30.0)
     vehicle.take(message("SYS_STATUS"), 30.0)
@@ -108,7 +110,7 @@ def test_ready_is_what_the_arming_mode_needs() -> None:
 
 
 @pytest.mark.parametrize("silent", ["SYS_STATUS", "EKF_STATUS_REPORT"])
-def test_what_was_told_long_ago_is_not_ready(silent: str) -> None:
+def test_stale_reports_make_vehicle_not_ready(silent: str) -> None:
     vehicle = Vehicle(stack=ARDUCOPTER)
     vehicle.take(message("HOME_POSITION", latitude=393600000, longitude=229500000), 31.0)
     for now in (31.0, 39.0):
@@ -118,13 +120,13 @@ def test_what_was_told_long_ago_is_not_ready(silent: str) -> None:
         assert (silent in vehicle.unready(now)) is (now > 31.0)
 
 
-def test_a_home_of_zeroes_is_none() -> None:
+def test_home_of_zeros_is_unknown() -> None:
     vehicle = Vehicle(stack=ARDUCOPTER)
     vehicle.take(message("HOME_POSITION"), 1.0)
     assert vehicle.home is None
 
 
-def test_it_tells_of_satellites_wind_and_what_it_says() -> None:
+def test_vehicle_reports_satellites_wind_and_statustexts() -> None:
     vehicle = Vehicle(stack=ARDUCOPTER)
     vehicle.take(message("GPS_RAW_INT", fix_type=3, satellites_visible=14), 1.0)
     assert vehicle.satellites == 14
@@ -141,7 +143,7 @@ def test_it_tells_of_satellites_wind_and_what_it_says() -> None:
 
 
 @pytest.mark.parametrize(("flags", "lost"), [(POSITIONED, False), (BOOTED, True)])
-def test_a_path_is_kept_over_a_restart_of_the_service_where_the_position_is_known(flags: int, lost: bool) -> None:
+def test_smart_rtl_path_survives_service_restart_if_position_is_known(flags: int, lost: bool) -> None:
     vehicle = Vehicle(stack=ARDUCOPTER)
     vehicle.take(message("HEARTBEAT", base_mode=mavlink.MAV_MODE_FLAG_SAFETY_ARMED), 100.0)
     vehicle.take(message("EKF_STATUS_REPORT", flags=flags), 100.5)

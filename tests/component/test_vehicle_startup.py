@@ -1,4 +1,4 @@
-"""A cold start: what the vehicle says, when it would arm in which mode, and what its status bits claim meanwhile."""
+"""Startup of the vehicle: STATUSTEXTs, arming checks by mode, and status bits."""
 
 from __future__ import annotations
 
@@ -53,20 +53,20 @@ def _refusals(pilot: Pilot) -> list[str]:
     return [text for text in pilot.texts[before:] if text.startswith("Arm: ")]
 
 
-def test_a_cold_start_says_what_a_real_one_says():
+def test_cold_start_sends_statustexts_of_real_vehicle():
     _, pilot = _cold()
     pilot.fly_on(42.0)
     assert [text for text in pilot.texts if not text.startswith("PreArm: ")] == TEXTS.splitlines()
     assert pilot.texts.count("PreArm: AHRS: waiting for home") == 1, "every 30 s, from the 15th on"
 
 
-def test_a_warm_start_says_the_same():
+def test_warm_start_sends_same_statustexts():
     _, pilot = alone(config=replace(COLD, ready_after_s=1.0))
     pilot.fly_on(1.2)
     assert pilot.texts == TEXTS.splitlines()
 
 
-def test_the_prearm_bit_is_healthy_long_before_guided_may_arm():
+def test_prearm_bit_is_healthy_before_guided_can_arm():
     vehicle, pilot = _cold()
     pilot.wait(lambda: _prearm(pilot), 60.0)
     assert vehicle.time_s == pytest.approx(22.0, abs=1.0)
@@ -80,7 +80,7 @@ def test_the_prearm_bit_is_healthy_long_before_guided_may_arm():
     assert pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0) == mavlink.MAV_RESULT_ACCEPTED
 
 
-def test_all_checks_that_fail_are_told_and_depend_on_the_mode():
+def test_all_failed_arming_checks_are_reported_per_mode():
     _, pilot = _cold()
     pilot.fly_on(3.5)
     first = ["Arm: Accels inconsistent", "Arm: EKF attitude is bad", "Arm: AHRS: not using configured AHRS type"]
@@ -95,7 +95,7 @@ def test_all_checks_that_fail_are_told_and_depend_on_the_mode():
     assert pilot.texts[before:] == ["PreArm: Accels inconsistent", "PreArm: AHRS: waiting for home"]
 
 
-def test_without_checks_or_by_force_a_position_is_still_needed():
+def test_position_is_required_without_checks_and_when_forced():
     _, pilot = _cold()
     pilot.parameter("ARMING_CHECK", 0.0)
     pilot.mode(mavlink.COPTER_MODE_GUIDED)
@@ -106,7 +106,7 @@ def test_without_checks_or_by_force_a_position_is_still_needed():
     assert pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0) == mavlink.MAV_RESULT_ACCEPTED
 
 
-def test_the_first_heartbeats_tell_of_a_start():
+def test_first_heartbeats_report_boot_state():
     _, pilot = _cold()
     beat = pilot.expect("HEARTBEAT")
     assert beat.integer("system_status") == mavlink.MAV_STATE_BOOT

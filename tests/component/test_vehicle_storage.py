@@ -1,4 +1,4 @@
-"""What the vehicle keeps: parameters on disk, and everything stored over a reboot."""
+"""Data that the vehicle stores: parameters on disk, and plans and keys across a reboot."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from vehicle_world import CONFIG, START, airborne, alone, upload
 FENCE = {"command": 5003, "param1": 80.0, "frame": 0, "x": START.lat_e7, "y": START.lon_e7}
 
 
-def test_the_table_is_sound():
+def test_parameter_table_is_consistent():
     names = [row.name for row in table()]
     assert len(names) == len(set(names)) == 1397
     assert names[0] == "FORMAT_VERSION"
     assert all(0 < len(name) <= 16 for name in names)
 
 
-def test_values_take_the_type_of_their_parameter():
+def test_parameter_values_are_converted_to_their_type():
     params = Parameters()
     assert params.set("RTL_ALT", 1234.6)
     assert params["RTL_ALT"] == 1234.0
@@ -38,7 +38,7 @@ def test_values_take_the_type_of_their_parameter():
         params.assign("NO_SUCH", 1.0)
 
 
-def test_a_value_that_is_denied_is_told_and_one_that_is_no_number_is_not_answered():
+def test_denied_parameter_write_is_reported_and_nan_is_ignored():
     vehicle, pilot = alone()
     assert pilot.parameter("MIS_TOTAL", 9.0) == 0.0
     assert pilot.texts[-1] == "Param write denied (MIS_TOTAL)"
@@ -50,7 +50,7 @@ def test_a_value_that_is_denied_is_told_and_one_that_is_no_number_is_not_answere
     assert vehicle.params["WPNAV_SPEED"] == 1000.0
 
 
-def test_changed_parameters_are_kept_on_disk(tmp_path: Path):
+def test_changed_parameters_are_stored_on_disk(tmp_path: Path):
     store = tmp_path / "vehicle.parm"
     config = replace(CONFIG, store=store)
     _, pilot = alone(config=config)
@@ -61,14 +61,14 @@ def test_changed_parameters_are_kept_on_disk(tmp_path: Path):
     assert "WPNAV_SPEED,750" in store.read_text()
 
 
-def test_later_names_of_a_parameter_are_understood():
+def test_parameter_names_of_later_releases_are_accepted():
     vehicle, pilot = alone()
     pilot.parameter("MAV_GCS_SYSID", 42)
     assert vehicle.params["SYSID_MYGCS"] == 42.0
     assert pilot.last["PARAM_VALUE"].text("param_id") == "MAV_GCS_SYSID"
 
 
-def test_a_reboot_keeps_what_is_stored_and_forgets_the_rest():
+def test_reboot_keeps_stored_data_and_resets_the_rest():
     vehicle, pilot = alone()
     pilot.parameter("WPNAV_SPEED", 750.0)
     assert upload(pilot, 1, [FENCE]) == 0
@@ -83,7 +83,7 @@ def test_a_reboot_keeps_what_is_stored_and_forgets_the_rest():
     pilot.wait(lambda: not arming_refusals(rebooted), 10.0)
 
 
-def test_erased_parameters_have_their_defaults_after_the_next_boot():
+def test_erased_parameters_are_reset_on_next_boot():
     vehicle, pilot = alone()
     pilot.parameter("WPNAV_SPEED", 750.0)
     assert pilot.command(mavlink.MAV_CMD_PREFLIGHT_STORAGE, 2) == mavlink.MAV_RESULT_ACCEPTED
@@ -96,14 +96,14 @@ def test_erased_parameters_have_their_defaults_after_the_next_boot():
     assert rebooted.params["RTL_ALT"] == 2500.0
 
 
-def test_it_does_not_reboot_in_the_air():
+def test_reboot_is_refused_in_flight():
     vehicle, pilot = airborne(5.0)
     assert pilot.command(mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, 1) == mavlink.MAV_RESULT_FAILED
     pilot.fly_on(0.1)
     assert pilot.craft.vehicle.state is vehicle
 
 
-def test_signing_shuts_out_clients_without_a_key():
+def test_signing_rejects_clients_without_key():
     _, pilot = alone()
     key = hashlib.sha256(b"secret").digest()
     target = {"target_system": 1, "target_component": 1}

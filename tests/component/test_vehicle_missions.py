@@ -44,7 +44,7 @@ MISSION = [
 ]
 
 
-def test_a_mission_is_flown_with_its_jump_and_return():
+def test_mission_with_jump_and_return_is_flown():
     vehicle, pilot = alone()
     assert upload(pilot, 0, MISSION) == mavlink.MAV_MISSION_ACCEPTED
     pilot.mode(mavlink.COPTER_MODE_GUIDED)
@@ -67,7 +67,7 @@ def test_a_mission_is_flown_with_its_jump_and_return():
     assert distance_m(vehicle, 0.0, 0.0) < 1.0
 
 
-def test_download_returns_what_was_uploaded_with_home_in_front():
+def test_mission_download_returns_uploaded_items_after_home():
     vehicle, pilot = airborne(5.0)
     assert upload(pilot, 0, MISSION) == mavlink.MAV_MISSION_ACCEPTED
     items = _download(pilot)
@@ -78,7 +78,7 @@ def test_download_returns_what_was_uploaded_with_home_in_front():
     assert vehicle.params["MIS_TOTAL"] == len(MISSION)
 
 
-def test_partial_upload_replaces_a_part():
+def test_partial_upload_replaces_part_of_mission():
     _, pilot = alone()
     upload(pilot, 0, MISSION)
     new = _waypoint(33.0, 0.0, 12.0)
@@ -94,7 +94,7 @@ def test_partial_upload_replaces_a_part():
     assert pilot.expect("MISSION_ACK").integer("type") == mavlink.MAV_MISSION_ERROR
 
 
-def test_old_float_items_are_understood():
+def test_mission_item_with_float_coordinates_is_accepted():
     vehicle, pilot = alone()
     target = {"target_system": 1, "target_component": 1}
     pilot.send("MISSION_COUNT", target | {"count": 2})
@@ -108,7 +108,7 @@ def test_old_float_items_are_understood():
     assert pilot.expect("MISSION_ITEM").real("x") == pytest.approx(48.2001, abs=1e-5)
 
 
-def test_a_stalled_upload_is_repeated_then_given_up_and_changes_nothing():
+def test_stalled_upload_is_repeated_then_cancelled_without_changes():
     vehicle, pilot = alone()
     upload(pilot, 0, MISSION)
     pilot.send("MISSION_COUNT", {"target_system": 1, "target_component": 1, "count": 3})
@@ -133,18 +133,18 @@ def test_a_stalled_upload_is_repeated_then_given_up_and_changes_nothing():
         ({"command": 177, "param1": 2, "param2": 1}, mavlink.MAV_MISSION_ERROR),
     ],
 )
-def test_bad_items_end_the_upload(item: dict[str, float], result: int):
+def test_invalid_item_aborts_upload(item: dict[str, float], result: int):
     vehicle, pilot = alone()
     assert upload(pilot, 0, [HOME, item]) == result
     assert len(vehicle.mission.items) == 1, "what had arrived is left"
 
 
-def test_a_heading_may_be_nan():
+def test_waypoint_heading_may_be_nan():
     _, pilot = alone()
     assert upload(pilot, 0, [HOME, _waypoint(5.0, 0.0, 10.0, param4=math.nan)]) == mavlink.MAV_MISSION_ACCEPTED
 
 
-def test_a_partial_upload_may_append_one_item():
+def test_partial_upload_may_append_one_item():
     vehicle, pilot = alone()
     upload(pilot, 0, MISSION)
     end = len(MISSION)
@@ -156,7 +156,7 @@ def test_a_partial_upload_may_append_one_item():
     assert [item.z for item in vehicle.mission.items[end - 1 :]] == [0.0, 3.0]
 
 
-def test_a_list_that_is_being_uploaded_is_neither_read_nor_cleared():
+def test_list_is_neither_read_nor_cleared_during_upload():
     vehicle, pilot = alone()
     upload(pilot, 0, MISSION)
     target = {"target_system": 1, "target_component": 1}
@@ -171,7 +171,7 @@ def test_a_list_that_is_being_uploaded_is_neither_read_nor_cleared():
     assert len(vehicle.mission.items) == len(MISSION)
 
 
-def test_jumps_lead_to_tags():
+def test_jump_tag_selects_tagged_item():
     vehicle, pilot = alone()
     tag = {"command": 600, "param1": 7.0}
     jump = {"command": 601, "param1": 7.0, "param2": 1.0}
@@ -182,14 +182,14 @@ def test_jumps_lead_to_tags():
     while (following := mission.next_after(at)) is not None:
         at = following
         order.append(at)
-    assert order == [1, 2, 3, 2, 3]  # a jump to a tag that is missing ends the mission
+    assert order == [1, 2, 3, 2, 3]  # a jump to a missing tag ends the mission
     assert pilot.command(mavlink.MAV_CMD_DO_JUMP_TAG, 7.0) == mavlink.MAV_RESULT_ACCEPTED
     assert mission.current == 3, "the first item after the tag that navigates"
     assert pilot.command(mavlink.MAV_CMD_DO_JUMP_TAG, 9.0) == mavlink.MAV_RESULT_FAILED
 
 
 @pytest.mark.parametrize(("times", "following"), [(-1.0, None), (1.0, 4)])
-def test_jumps_that_pass_no_waypoint_come_to_an_end(times, following):
+def test_jump_loop_without_waypoint_terminates(times, following):
     vehicle, pilot = alone()
     tag = {"command": 600, "param1": 1.0}
     jump = {"command": 601, "param1": 1.0, "param2": times}
@@ -199,13 +199,13 @@ def test_jumps_that_pass_no_waypoint_come_to_an_end(times, following):
     assert vehicle.mission.peek_after(1) == following, "nothing was counted as done"
 
 
-def test_too_many_items_are_refused():
+def test_upload_of_too_many_items_is_refused():
     _, pilot = alone()
     pilot.send("MISSION_COUNT", {"target_system": 1, "target_component": 1, "count": 5000})
     assert pilot.expect("MISSION_ACK").integer("type") == mavlink.MAV_MISSION_NO_SPACE
 
 
-def test_a_second_uploader_has_to_wait():
+def test_second_uploader_is_denied_during_upload():
     _, pilot = alone()
     other = Pilot(pilot.simulation, pilot.craft, sysid=200)
     pilot.send("MISSION_COUNT", {"target_system": 1, "target_component": 1, "count": 2})
@@ -213,7 +213,7 @@ def test_a_second_uploader_has_to_wait():
     assert other.expect("MISSION_ACK").integer("type") == mavlink.MAV_MISSION_DENIED
 
 
-def test_rtl_goes_to_the_nearest_rally_point():
+def test_rtl_returns_to_nearest_rally_point():
     vehicle, pilot = airborne(10.0)
     rally = START.offset(60.0, 10.0)
     item = {"command": 5100, "frame": 3, "x": rally.lat_e7, "y": rally.lon_e7, "z": 10.0}
@@ -225,7 +225,7 @@ def test_rtl_goes_to_the_nearest_rally_point():
     assert distance_m(vehicle, 60.0, 10.0) < 1.0
 
 
-def test_pause_and_continue_and_set_current():
+def test_mission_pause_continue_and_set_current():
     vehicle, pilot = airborne(10.0)
     upload(pilot, 0, [HOME, _waypoint(60.0, 0.0, 10.0), _waypoint(60.0, 30.0, 10.0)])
     assert pilot.mode(mavlink.COPTER_MODE_AUTO) == mavlink.MAV_RESULT_ACCEPTED
@@ -246,7 +246,7 @@ def test_pause_and_continue_and_set_current():
     assert distance_m(vehicle, 60.0, 30.0) < 3.0
 
 
-def test_land_item_lands_and_loiter_time_waits():
+def test_mission_land_item_lands_and_loiter_time_waits():
     vehicle, pilot = airborne(8.0)
     place = START.offset(15.0, 0.0)
     items = [
@@ -264,7 +264,7 @@ def test_land_item_lands_and_loiter_time_waits():
 def _fly_mission(
     items: list[dict[str, float]], **parameters: float
 ) -> tuple[VehicleState, Pilot, list[tuple[float, ...]]]:
-    """Fly a mission to its end; the way flown, with the speed."""
+    """Fly a mission to its end and return the flown path with speeds."""
     vehicle, pilot = airborne(10.0, **parameters)
     assert upload(pilot, 0, [HOME, *items]) == mavlink.MAV_MISSION_ACCEPTED
     assert pilot.mode(mavlink.COPTER_MODE_AUTO) == mavlink.MAV_RESULT_ACCEPTED
@@ -278,7 +278,7 @@ def _fly_mission(
     raise AssertionError(pilot.texts[-5:])
 
 
-def test_legs_are_straight_lines_in_space():
+def test_mission_legs_are_straight_lines():
     _, _, way = _fly_mission([_waypoint(60.0, 0.0, 30.0), _waypoint(60.0, 80.0, 12.0)])
     for north, east, altitude, *_ in way:
         if north < 55.0:
@@ -287,7 +287,7 @@ def test_legs_are_straight_lines_in_space():
             assert altitude == pytest.approx(30.0 - 18.0 * east / 80.0, abs=1.5)
 
 
-def test_splines_bend_around_their_points_without_stopping():
+def test_spline_passes_its_points_without_stopping():
     points = ((40.0, 0.0), (70.0, 40.0), (40.0, 80.0), (0.0, 80.0))
     items = [_waypoint(north, east, 10.0, command=82) for north, east in points]
     _, pilot, way = _fly_mission(items)
@@ -301,7 +301,7 @@ def test_splines_bend_around_their_points_without_stopping():
     assert "Mission: 2 SplineWP" in pilot.texts
 
 
-def test_a_return_after_a_sharp_end_of_a_spline_begins_from_there():
+def test_return_after_sharp_spline_starts_at_its_end():
     items = [_waypoint(25.0, 0.0, 12.0), _waypoint(25.0, 25.0, 12.0), _waypoint(0.0, 25.0, 12.0, command=82)]
     vehicle, _, way = _fly_mission([*items, {"command": 20}])
     assert max(math.hypot(north, east) for north, east, *_ in way) < 40.0
@@ -309,7 +309,7 @@ def test_a_return_after_a_sharp_end_of_a_spline_begins_from_there():
     assert vehicle.landed
 
 
-def test_a_stay_at_a_spline_point_stops_there():
+def test_spline_waypoint_with_delay_stops():
     items = [_waypoint(40.0, 0.0, 10.0, command=82, param1=4.0), _waypoint(40.0, 40.0, 14.0, command=82)]
     _, _, way = _fly_mission(items)
     there = [at[3] for at in way if math.dist(at[:2], (40.0, 0.0)) < 2.0]
@@ -318,7 +318,7 @@ def test_a_stay_at_a_spline_point_stops_there():
     assert way[-1][2] == pytest.approx(14.0, abs=2.1)
 
 
-def test_conditions_hold_back_what_follows_and_not_the_flight():
+def test_mission_conditions_delay_commands_without_stopping_flight():
     items = [
         _waypoint(5.0, 0.0, 10.0),
         {"command": 112, "param1": 4.0},
@@ -338,7 +338,7 @@ def test_conditions_hold_back_what_follows_and_not_the_flight():
     ]
 
 
-def test_a_part_of_a_mission_is_replaced():
+def test_write_partial_list_replaces_mission_items():
     vehicle, pilot = alone()
     upload(pilot, 0, MISSION)
     target = {"target_system": 1, "target_component": 1}
@@ -355,7 +355,7 @@ def test_a_part_of_a_mission_is_replaced():
 
 
 @pytest.mark.parametrize(("near_home", "include", "north"), [(True, 1, 0.0), (True, 0, 60.0), (False, 1, 60.0)])
-def test_home_counts_as_a_rally_point_where_it_is_included(near_home: bool, include: int, north: float):
+def test_home_is_a_rally_point_if_rally_incl_home_is_set(near_home: bool, include: int, north: float):
     vehicle, pilot = airborne(10.0, RALLY_INCL_HOME=include)
     rally = START.offset(60.0, 0.0)
     upload(pilot, 2, [{"command": 5100, "frame": 3, "x": rally.lat_e7, "y": rally.lon_e7, "z": 25.0}])
@@ -371,7 +371,7 @@ def test_home_counts_as_a_rally_point_where_it_is_included(near_home: bool, incl
         assert highest == pytest.approx(25.0, abs=0.6), "at the rally point's altitude"
 
 
-def test_a_rally_point_that_is_too_far_is_none():
+def test_rally_point_beyond_limit_is_ignored():
     vehicle, pilot = airborne(10.0, RALLY_LIMIT_KM=0.1, RALLY_INCL_HOME=0)
     rally = START.offset(400.0, 0.0)
     upload(pilot, 2, [{"command": 5100, "frame": 3, "x": rally.lat_e7, "y": rally.lon_e7, "z": 25.0}])
@@ -382,7 +382,7 @@ def test_a_rally_point_that_is_too_far_is_none():
     assert distance_m(vehicle, 0.0, 0.0) < 1.0
 
 
-def test_a_mission_tells_its_items_in_the_order_of_the_real_one():
+def test_mission_reports_items_in_order_of_real_vehicle():
     vehicle, pilot = alone()
     speed = {"command": 178, "param1": 1.0, "param2": 4.0}
     assert upload(pilot, 0, [HOME, MISSION[1], speed, _waypoint(10.0, 0.0, 10.0), {"command": 20}]) == 0
@@ -398,8 +398,8 @@ def test_a_mission_tells_its_items_in_the_order_of_the_real_one():
     assert told == [*start, "Mission: 2 ChangeSpeed", "Mission: 3 WP", "Reached command #3", "Mission: 4 RTL"]
 
 
-def test_legs_are_flown_with_the_jerk_of_waypoints():
-    """25 m from rest to rest: a real autopilot takes some 9 s, since WPNAV_JERK lets it bend so gently."""
+def test_mission_legs_use_wpnav_jerk():
+    """A leg of 25 m from rest to rest takes a real autopilot about 9 s because of the low jerk limit WPNAV_JERK."""
     profile = Profile(25.0, 10.0, 2.5, 1.0)
     assert profile.duration_s == pytest.approx(4.0 * 12.5 ** (1.0 / 3.0))
     assert profile.at(0.0) == pytest.approx((0.0, 0.0, 0.0))

@@ -1,4 +1,4 @@
-"""What the vehicle reports of itself: noise that is there and repeatable, frames it understands, logs it writes."""
+"""Sensor noise, target frames, and tlog recording of the simulated vehicle."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def _heard(pilot: Pilot, number: int, name: str, duration_s: float) -> list[Mess
     return [m for _ in range(round(duration_s * 100)) for m in pilot.step() if m.name == name]
 
 
-def test_noise_is_normal_independent_and_repeatable():
+def test_sensor_noise_is_normal_independent_and_repeatable():
     one = [gaussian(1, tick, 0) for tick in range(4000)]
     two = [gaussian(1, tick, 1) for tick in range(4000)]
     assert statistics.fmean(one) == pytest.approx(0.0, abs=0.05)
@@ -33,7 +33,7 @@ def test_noise_is_normal_independent_and_repeatable():
     assert one[7] == gaussian(1, 7, 0) != gaussian(2, 7, 0)
 
 
-def test_inertial_sensors_are_noisy_and_more_so_in_flight():
+def test_imu_noise_increases_in_flight():
     still, pilot = alone(config=replace(CONFIG, seed=5))
     pilot.fly_on(3.0)
     at_rest = [m.integer("xacc") for m in _heard(pilot, 27, "RAW_IMU", 4.0)]
@@ -46,7 +46,7 @@ def test_inertial_sensors_are_noisy_and_more_so_in_flight():
     assert still.ticks > 0
 
 
-def test_the_estimated_attitude_wanders_about_the_true_one():
+def test_estimated_attitude_drifts_around_true_attitude():
     vehicle, pilot = airborne(10.0)
     errors = []
     for _ in range(200):
@@ -72,23 +72,23 @@ def _flying_north() -> tuple[VehicleState, Pilot]:
 @pytest.mark.parametrize(
     ("frame", "mask"),
     [
-        (1, 0x9FF),  # only a yaw
-        (1, 0x5FF),  # only a yaw rate
+        (1, 0x9FF),  # yaw only
+        (1, 0x5FF),  # yaw rate only
         (1, 0xFFF),  # nothing
-        (1, 0xE00 | 0x03F),  # a force
+        (1, 0xE00 | 0x03F),  # force flag
         (1, 0xC00 | 0x038),  # position and acceleration without velocity
-        (12, 0xDC7),  # a frame that ArduCopter does not know here
-        (3, 0xDF8),  # a global frame in a local message
+        (12, 0xDC7),  # frame unsupported by ArduCopter
+        (3, 0xDF8),  # global frame in a local message
     ],
 )
-def test_a_target_that_is_not_understood_stops_the_vehicle(frame: int, mask: int):
+def test_invalid_target_stops_vehicle(frame: int, mask: int):
     vehicle, pilot = _flying_north()
     _mask(pilot, frame, mask, vx=9.0, x=500.0, yaw=1.0)
     pilot.fly_on(8.0)
     assert abs(vehicle.body.vn) < 0.2
 
 
-def test_a_force_flag_without_acceleration_is_no_matter():
+def test_force_flag_without_acceleration_is_ignored():
     vehicle, pilot = airborne(10.0)
     _mask(pilot, 1, 0xDF8 | 0x200, x=15.0, y=0.0, z=-10.0)
     pilot.fly_on(10.0)
@@ -96,7 +96,7 @@ def test_a_force_flag_without_acceleration_is_no_matter():
 
 
 @pytest.mark.parametrize(("known", "altitude_m"), [(1, 14.0), (0, 10.0)])
-def test_targets_above_terrain_need_terrain(known: int, altitude_m: float):
+def test_terrain_targets_require_terrain_data(known: int, altitude_m: float):
     vehicle, pilot = airborne(10.0, TERRAIN_ENABLE=known)
     place = START.offset(10.0, 0.0)
     pilot.send(
@@ -119,7 +119,7 @@ def test_targets_above_terrain_need_terrain(known: int, altitude_m: float):
     assert send(vehicle, pilot.channel, "TERRAIN_REPORT") is bool(known)
 
 
-def test_a_mission_above_unknown_terrain_is_given_up():
+def test_mission_above_unknown_terrain_returns():
     vehicle, pilot = airborne(10.0, TERRAIN_ENABLE=0)
     place = START.offset(60.0, 0.0)
     home = {"command": 16, "frame": 0, "x": START.lat_e7, "y": START.lon_e7, "z": 150.0}
@@ -130,7 +130,7 @@ def test_a_mission_above_unknown_terrain_is_given_up():
     assert "Failsafe: Terrain data missing" in pilot.texts
 
 
-def test_a_log_has_both_directions():
+def test_tlog_contains_both_directions():
     _, pilot = alone()
     log = io.BytesIO()
     pilot.craft.record(log)

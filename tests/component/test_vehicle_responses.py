@@ -1,4 +1,4 @@
-"""Answers of the simulated vehicle beyond the recorded script: what ArduCopter's own handlers say to other values and orders."""
+"""Responses of the simulated vehicle to values and sequences that the recorded script does not contain."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def _waypoint(north: float, **more: float) -> dict[str, float]:
         (mavlink.MAV_CMD_GET_MESSAGE_INTERVAL, (70_000,), mavlink.MAV_RESULT_FAILED),
     ],
 )
-def test_results_by_value(command: int, params: tuple[float, ...], result: int):
+def test_command_results_depend_on_parameter_values(command: int, params: tuple[float, ...], result: int):
     vehicle, pilot = alone()
     pilot.wait(lambda: vehicle.position_ok, 5.0)
     assert pilot.command(command, *params) is result
@@ -59,14 +59,14 @@ def test_results_by_value(command: int, params: tuple[float, ...], result: int):
         ),
     ],
 )
-def test_texts_by_value(command: int, params: tuple[float, ...], texts: list[str]):
+def test_statustexts_depend_on_parameter_values(command: int, params: tuple[float, ...], texts: list[str]):
     _, pilot = alone()
     pilot.texts.clear()
     pilot.command(command, *params)
     assert [text for text in pilot.texts if text in texts] == texts
 
 
-def test_an_armed_vehicle_starts_only_missions_that_take_off():
+def test_armed_vehicle_on_the_ground_starts_only_missions_with_takeoff():
     vehicle, pilot = alone()
     upload(pilot, 0, [HOME, _waypoint(20.0)])
     pilot.mode(mavlink.COPTER_MODE_GUIDED)
@@ -78,7 +78,7 @@ def test_an_armed_vehicle_starts_only_missions_that_take_off():
     assert pilot.mode(mavlink.COPTER_MODE_AUTO) == mavlink.MAV_RESULT_ACCEPTED
 
 
-def test_a_takeoff_that_is_sent_twice_climbs_as_soon():
+def test_repeated_takeoff_command_does_not_delay_climb():
     vehicle, pilot = alone()
     pilot.mode(mavlink.COPTER_MODE_GUIDED)
     pilot.wait(lambda: vehicle.position_ok, 5.0)
@@ -103,7 +103,7 @@ def test_a_takeoff_that_is_sent_twice_climbs_as_soon():
         (mavlink.COPTER_MODE_DRIFT, 0.0, mavlink.MAV_RESULT_FAILED),
     ],
 )
-def test_takeoff_by_mode(mode: int, keep_place: float, result: int):
+def test_takeoff_result_depends_on_mode(mode: int, keep_place: float, result: int):
     vehicle, pilot = alone()
     pilot.wait(lambda: vehicle.position_ok, 5.0)
     assert pilot.mode(mode) == mavlink.MAV_RESULT_ACCEPTED
@@ -111,7 +111,7 @@ def test_takeoff_by_mode(mode: int, keep_place: float, result: int):
     assert pilot.command(mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, keep_place, 0, 0, 0, 5) is result
 
 
-def test_takeoff_knows_one_frame():
+def test_takeoff_accepts_relative_altitude_frame_only():
     _, pilot = alone()
     for frame, result in (
         (0, mavlink.MAV_RESULT_DENIED),
@@ -122,7 +122,7 @@ def test_takeoff_knows_one_frame():
 
 
 @pytest.mark.parametrize(("direction", "way"), [(0, 1.0), (1, 1.0), (-1, -1.0)])
-def test_a_heading_is_turned_to_the_way_that_is_asked_for(direction: int, way: float):
+def test_condition_yaw_turns_in_requested_direction(direction: int, way: float):
     vehicle, pilot = airborne(8.0)
     assert pilot.command(mavlink.MAV_CMD_CONDITION_YAW, 90, 30, direction, 0) == mavlink.MAV_RESULT_ACCEPTED
     pilot.fly_on(2.0)
@@ -131,7 +131,7 @@ def test_a_heading_is_turned_to_the_way_that_is_asked_for(direction: int, way: f
     assert wrap_pi(vehicle.est.yaw - math.pi / 2) == pytest.approx(0.0, abs=0.05)
 
 
-def test_a_heading_in_the_bodys_frame_counts_from_the_nose():
+def test_yaw_in_body_frame_is_relative_to_the_nose():
     vehicle, pilot = airborne(8.0)
     pilot.command(mavlink.MAV_CMD_CONDITION_YAW, 90, 0, 0, 0)
     pilot.fly_on(4.0)
@@ -141,7 +141,7 @@ def test_a_heading_in_the_bodys_frame_counts_from_the_nose():
     assert wrap_pi(vehicle.est.yaw - math.pi / 2 - 0.5) == pytest.approx(0.0, abs=0.05)
 
 
-def test_reposition_needs_a_place_and_keeps_its_own_heading():
+def test_reposition_requires_position_and_ignores_yaw():
     vehicle, pilot = airborne(8.0)
     place = START.offset(0.0, 15.0)
     target = {"frame": 3, "x": place.lat_e7, "y": place.lon_e7, "z": 8.0}
@@ -152,7 +152,7 @@ def test_reposition_needs_a_place_and_keeps_its_own_heading():
     assert vehicle.est.yaw == pytest.approx(math.pi / 2, abs=0.2), "along the way it flies"
 
 
-def test_velocities_are_taken_whatever_the_frame_of_a_place_that_is_ignored():
+def test_velocity_target_is_accepted_in_any_frame_if_position_is_ignored():
     vehicle, pilot = airborne(8.0)
     for _ in range(10):
         values = {"coordinate_frame": 99, "type_mask": 0xDC7, "vx": 2.0, "lat_int": 2_000_000_000}
@@ -163,7 +163,7 @@ def test_velocities_are_taken_whatever_the_frame_of_a_place_that_is_ignored():
 
 
 @pytest.mark.parametrize("speed", [math.nan, 1001.0])
-def test_a_senseless_velocity_stops(speed: float):
+def test_implausible_velocity_stops_vehicle(speed: float):
     vehicle, pilot = airborne(8.0)
     for _ in range(10):
         pilot.send("SET_POSITION_TARGET_LOCAL_NED", HERE | {"coordinate_frame": 1, "type_mask": 0xDC7, "vx": 3.0})
@@ -173,7 +173,7 @@ def test_a_senseless_velocity_stops(speed: float):
     assert math.hypot(vehicle.body.vn, vehicle.body.ve) < 0.5
 
 
-def test_without_gps_positions_move_nothing():
+def test_position_targets_have_no_effect_in_guided_nogps():
     vehicle, pilot = airborne(8.0)
     assert pilot.mode(mavlink.COPTER_MODE_GUIDED_NOGPS) == mavlink.MAV_RESULT_ACCEPTED
     pilot.go_to(30.0, 0.0, 8.0)
@@ -181,7 +181,7 @@ def test_without_gps_positions_move_nothing():
     assert distance_m(vehicle, 0.0, 0.0) < 5.0
 
 
-def test_an_item_that_comes_twice_is_out_of_sequence_and_the_upload_goes_on():
+def test_repeated_mission_item_gets_invalid_sequence_and_upload_continues():
     vehicle, pilot = alone()
     pilot.send("MISSION_COUNT", HERE | {"count": 2})
     pilot.expect("MISSION_REQUEST")
@@ -194,7 +194,7 @@ def test_an_item_that_comes_twice_is_out_of_sequence_and_the_upload_goes_on():
     assert len(vehicle.mission.items) == 2
 
 
-def test_a_fence_may_be_uploaded_while_a_mission_is():
+def test_fence_upload_during_mission_upload_is_accepted():
     vehicle, pilot = alone()
     pilot.send("MISSION_COUNT", HERE | {"count": 2})
     assert pilot.expect("MISSION_REQUEST").integer("mission_type") == 0
@@ -207,14 +207,14 @@ def test_a_fence_may_be_uploaded_while_a_mission_is():
 
 
 @pytest.mark.parametrize(("kind", "text"), [(1, "Fence upload timeout"), (2, "Rally upload timeout")])
-def test_an_upload_that_is_given_up_is_told_by_its_kind(kind: int, text: str):
+def test_upload_timeout_text_names_the_list(kind: int, text: str):
     _, pilot = alone()
     pilot.send("MISSION_COUNT", HERE | {"count": 1, "mission_type": kind})
     pilot.fly_on(9.0)
     assert text in pilot.texts
 
 
-def test_the_current_item_is_one_that_navigates():
+def test_current_mission_item_is_a_nav_command():
     vehicle, pilot = alone()
     upload(pilot, 0, [HOME, TAKEOFF, {"command": 178, "param2": 3.0}, _waypoint(9.0), {"command": 178, "param2": 3.0}])
     for chosen, current in ((0, 1), (2, 3)):
@@ -228,7 +228,7 @@ def test_the_current_item_is_one_that_navigates():
     assert pilot.expect("MISSION_CURRENT").integer("seq") == 2, "the number that was sent is the answer"
 
 
-def test_a_mission_that_is_flown_is_not_cleared():
+def test_mission_in_flight_is_not_cleared():
     vehicle, pilot = airborne(8.0)
     upload(pilot, 0, [HOME, _waypoint(60.0), _waypoint(90.0)])
     pilot.mode(mavlink.COPTER_MODE_AUTO)
@@ -239,7 +239,7 @@ def test_a_mission_that_is_flown_is_not_cleared():
     assert len(vehicle.mission.items) == 3
 
 
-def test_items_are_judged_by_what_is_stored_of_them():
+def test_mission_items_are_validated_by_their_stored_fields():
     for item, result in (
         ({"command": 22, "frame": 99, "z": 9.0}, mavlink.MAV_MISSION_UNSUPPORTED_FRAME),
         ({"command": 20, "frame": 99, "z": math.nan}, mavlink.MAV_MISSION_ACCEPTED),
@@ -251,14 +251,14 @@ def test_items_are_judged_by_what_is_stored_of_them():
         assert upload(pilot, 0, [HOME, item]) == result, item
 
 
-def test_of_a_waypoint_only_the_delay_is_stored():
+def test_waypoint_stores_only_its_delay_parameter():
     vehicle, pilot = alone()
     upload(pilot, 0, [HOME, _waypoint(9.0, frame=2, param1=2.7, param2=5.0, param3=1.0, param4=90.0)])
     item = vehicle.mission.items[1]
     assert (item.param1, item.param2, item.param3, item.param4, item.frame) == (2.0, 0.0, 0.0, 0.0, 0)
 
 
-def test_all_streams_set_all_their_parameters():
+def test_stream_all_sets_all_sr_parameters():
     vehicle, pilot = alone()
     pilot.channel.port = 0
     pilot.send("REQUEST_DATA_STREAM", HERE | {"req_stream_id": 0, "req_message_rate": 4, "start_stop": 1})
@@ -266,7 +266,7 @@ def test_all_streams_set_all_their_parameters():
     assert {name for name, value in rates.items() if value != 4.0} == {"SR0_PARAMS"}
 
 
-def test_a_spline_stops_at_its_end():
+def test_spline_leg_stops_at_its_end():
     vehicle, pilot = airborne(10.0)
     upload(pilot, 0, [HOME, _waypoint(25.0, command=82)])
     pilot.mode(mavlink.COPTER_MODE_AUTO)
@@ -277,7 +277,7 @@ def test_a_spline_stops_at_its_end():
     assert distance_m(vehicle, 25.0, 0.0) < 0.5
 
 
-def test_what_is_asked_for_during_a_pause_waits_for_its_end():
+def test_target_during_pause_is_flown_on_resume():
     vehicle, pilot = airborne(8.0)
     assert pilot.command(mavlink.MAV_CMD_DO_PAUSE_CONTINUE, 0) == mavlink.MAV_RESULT_ACCEPTED
     pilot.go_to(15.0, 0.0, 8.0)

@@ -178,7 +178,7 @@ def test_a_silent_drone_is_in_the_air_until_someone_sees_it_on_the_ground(guarde
     status = {"flightState": "unknown", "lastFlightState": "landing", "lastSeen": seen}
     guarded.api.merge(f"{path}/status", {"status": status})
     attempt = attempts(guarded, "drone-1")["delete a pod"]
-    told = wait_for(lambda: "last heard of" in refusal(attempt) and refusal(attempt), "the silence to be known")
+    told = wait_for(lambda: "at its last report" in refusal(attempt) and refusal(attempt), "the silence to be known")
     assert line in told
     guarded.api.merge(path, {"metadata": {"annotations": {"fractus.dev/grounded": "2025-12-31T00:00:00Z"}}})
     assert refusal(attempt), "said of an earlier flight"
@@ -351,7 +351,7 @@ def test_the_operator_does_not_bring_back_what_someone_saw(control_plane: Contro
     guarded.api.merge(f"{path}/status", {"status": {"lastSeen": "2026-01-02T00:00:00Z"}})
     with control_plane.with_token(operator_token(guarded)) as client:
         for time in (seen, None):
-            assert "or when it reported" in refusal(
+            assert "report time of a drone" in refusal(
                 lambda time=time: client.merge(f"{path}/status", {"status": {"lastSeen": time}})
             )
         assert "drone-1 is in the air" in refusal(lambda: client.delete(f"{PODS}/fractus-mobility-drone-1"))

@@ -18,7 +18,7 @@ from fractus_core.policy.compiled_grant import CompiledGrant
 from fractus_core.policy.decision_types import Airframe, Call, GotoArgs, SetSpeedArgs, Situation, VelocityArgs, Verdict
 from fractus_core.policy.engine import judge
 from fractus_core.policy.monitoring import monitor
-from fractus_services.mobility.mavlink.recent_setpoints import turns
+from fractus_services.mobility.mavlink.recent_setpoints import is_turning
 from numpy.typing import NDArray
 from policy_world import HOME, METHODS, NOW, compiled, policy, ring
 
@@ -354,7 +354,7 @@ class Fleet:
         late = [told for told in self.sent[i] if told[1] >= since]
         before = [told for told in self.sent[i] if told[1] < since][-1:]
         east, north, up = (float(v) for v in self.speed[i])
-        self.sent[i] = [told for told in before if turns((north, east, -up), told[2])] + late
+        self.sent[i] = [told for told in before if is_turning((north, east, -up), told[2])] + late
         return tuple(dict.fromkeys(velocity for at, _, velocity in reversed(self.sent[i]) if at <= now))[::-1]
 
     def send(self, i: int, verdict: Verdict, *, returns: bool = False) -> None:

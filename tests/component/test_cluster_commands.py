@@ -351,6 +351,6 @@ def test_the_page_of_the_command_line_names_every_command() -> None:
     assert rows == {name: entry.summary for name, entry in main.COMMANDS.items()}
 
 
-@pytest.mark.parametrize("name", ["status", "explain", "logs", "doctor", "completion"])
+@pytest.mark.parametrize("name", ["status", "explain", "doctor", "completion"])
 def test_the_page_shows_the_help_of_commands_that_read_clusters(run: Run, name: str) -> None:
     assert run(name, "--help")[1].strip() in DOCS.read_text()

@@ -72,7 +72,7 @@ def test_a_port_where_another_listens_is_not_given(ten: range) -> None:
 
 def test_without_a_free_port_it_says_which_were_tried(ten: range) -> None:
     assert {ports.free_port() for _ in ten} == set(ten)
-    with pytest.raises(OSError, match=f"{ten[0]} to {ten[-1]} .* is free; end programs"):
+    with pytest.raises(OSError, match=f"no free port from {ten[0]} to {ten[-1]} .*; end programs"):
         ports.free_port()
 
 

@@ -345,7 +345,7 @@ async def _fly(drone: Mobility) -> fractus.Progress:
 async def test_control_is_lost_if_service_does_not_return(stage: Stage) -> None:
     stage.drone.release = asyncio.Event()
     async with stage.client(reconnect_timeout_s=0.5) as drone:
-        with pytest.raises(fractus.ControlLost, match="no answer"):
+        with pytest.raises(fractus.ControlLost, match="no response"):
             async with drone.control():
                 flight = asyncio.ensure_future(stage.drone.moving.wait())
                 await asyncio.gather(drone.goto(40.0, 22.0, 20.0), _stop(flight, stage.server))

@@ -699,7 +699,7 @@ def test_change_in_flight_waits_for_landing(world: World, operator: OperatorProc
     world.put(manifest)
     waits = wait_for(lambda: world.condition(namespace, "Updated"), "the change to wait")
     assert (waits["status"], waits["reason"]) == ("False", "WaitsForLanding")
-    assert "once drone-1 has landed" in waits["message"]
+    assert "when drone-1 has landed" in waits["message"]
     assert world.status(namespace)["phase"] == "Flying"
     world.put(ours("Policy", "low", {"type": "LimitControl", "kind": "altitude", "upperLimit": 15}))
     wait_for(

@@ -457,9 +457,9 @@ async def test_server_certificate_must_match_the_node(stage: Stage) -> None:
 @pytest.mark.parametrize(
     ("ours", "remedy"),
     [
-        (("ca.crt",), "may not know the authority of our certificate: .* FRACTUS_TLS_DIR"),
+        (("ca.crt",), "may not trust the authority of this component's certificate: .* FRACTUS_TLS_DIR"),
         ((), "another authority signed its certificate: correct FRACTUS_TLS_DIR"),
-        (("ca.crt", "tls.crt"), "tls.crt and tls.key are no pair: correct FRACTUS_TLS_DIR"),
+        (("ca.crt", "tls.crt"), "tls.crt and tls.key do not match: correct FRACTUS_TLS_DIR"),
     ],
 )
 async def test_client_with_foreign_certificate_fails_with_reason(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 
 import pytest
 from chart import path_of, render
@@ -41,33 +40,6 @@ def test_a_deployed_application_is_shown_and_explained(
     assert "Navigator: drone-1 (on the drone that flies)" in said
     assert "Policies for " in said
     assert run("explain", "nothing", "-n", namespace)[0] == 1
-
-
-def test_logs_of_a_node_that_the_api_server_cannot_reach_are_one_sentence(
-    control_plane: ControlPlane, world: World, namespace: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    world.put(traffic(namespace))
-    # Nothing listens there, as where a drone is out of reach.
-    silent = {
-        "addresses": [{"type": "InternalIP", "address": "127.0.0.1"}],
-        "daemonEndpoints": {"kubeletEndpoint": {"Port": 1}},
-    }
-    world.api.merge("/api/v1/nodes/drone-1/status", {"status": silent})
-    pods = f"/api/v1/namespaces/{namespace}/pods"
-    running = {"name": "main", "ready": True, "restartCount": 0, "image": "a", "imageID": "a", "containerID": "c://1"}
-    running |= {"state": {"running": {"startedAt": "2026-01-01T00:00:00Z"}}}
-    for component in ("Navigator", "AerialViewer"):
-        name = component.lower()
-        labels = {"fractus.dev/application": "traffic", "fractus.dev/component": component}
-        world.bound_pod(namespace, name, "drone-1", labels)
-        world.api.merge(f"{pods}/{name}/status", {"status": {"phase": "Running", "containerStatuses": [running]}})
-    code = main.run(["logs", "traffic", "-n", namespace, "--kubeconfig", str(control_plane.kubeconfig)])
-    said = capsys.readouterr()
-    assert (code, said.out) == (2, "")
-    assert re.fullmatch(
-        r"fractus: drone-1 is out of reach \(.*\); without the lines of (Navigator, AerialViewer|AerialViewer, Navigator)\n",
-        said.err,
-    )
 
 
 def test_a_cluster_without_the_charts_is_told_how_to_get_them(

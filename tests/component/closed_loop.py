@@ -43,14 +43,14 @@ PROGRAMME_S = 400.0
 """A driver that has not finished by then, as under a low limit of speed, gives up."""
 
 HOME_S = 250.0
-"""No way home takes longer, the grace time included."""
+"""Maximum duration of a return, including the grace time."""
 
 HALF_M = 130.0
 """The operation area reaches this far from home, to each side."""
 
 WATCH_S = 0.05
 HEIGHT_SLACK_M, SPEED_SLACK_MPS = 2.0, 1.0
-"""What docs/policies.md promises of heights, and docs/mobility.md of speeds; gusts add to the latter."""
+"""Tolerances stated in docs/policies.md (height) and docs/mobility.md (speed, without gusts)."""
 
 REACTION_S = 0.4
 """Until what has changed is acted on: 0.2 s is promised; a vehicle that has turned its motors needs as long again."""
@@ -66,7 +66,7 @@ JERK_MPS3 = 5.0
 
 @dataclass(frozen=True)
 class Weather:
-    """What a flight meets.
+    """Environment of a flight.
 
     Attributes:
         there_s: from the companion to the vehicle; jitter adds up to half of it.
@@ -94,7 +94,7 @@ class Weather:
 
 
 STALL_EVERY_S = (2.0, 6.0)
-"""How often a process is stalled, if any is."""
+"""Range of the interval between two stalls of a process."""
 
 TURN_S = 1e-7
 """What a turn of the loop takes: without it, who waits for the rest of a rounded period would never see its end."""
@@ -123,7 +123,7 @@ class Wire(asyncio.Transport):
             self._protocol.data_received(data)
 
     def flush(self) -> None:
-        """Send what the vehicle has said."""
+        """Send the pending messages of the vehicle."""
         for message in self._parser.feed(self._channel.take()):
             self._carry(message.frame, self._loop.weather.back_s, self._to_companion, there=False)
 
@@ -167,12 +167,12 @@ class Sky(Loop):
 
     @property
     def severed(self) -> bool:
-        """Whether the link is cut."""
+        """True while the link is cut."""
         return self.severed_at < math.inf
 
     @property
     def truth(self) -> VehicleState:
-        """What the vehicle is, not what it says."""
+        """True state of the vehicle, as opposed to its reports."""
         return self.craft.vehicle.state
 
     async def create_connection(self, factory: Any, *_: Any, **__: Any) -> Any:  # type: ignore[override]
@@ -206,7 +206,7 @@ class Sky(Loop):
         steps = round(duration_s / CONTROL_STEP_S)
         if who == "vehicle":
             await asyncio.sleep(duration_s)
-            self._go_on(steps)  # It makes up for the time that it lost.
+            self._go_on(steps)  # The vehicle catches up with the lost time.
             return
         for _ in range(steps):
             self._now += CONTROL_STEP_S
@@ -234,7 +234,7 @@ class Wall:
 
 @dataclass
 class Rules:
-    """What holds at a moment.
+    """Rules in force at a moment.
 
     Attributes:
         walls: where the drone must not be.
@@ -252,7 +252,7 @@ class Rules:
 
 @dataclass
 class Account:
-    """What became of a flight.
+    """Result of a flight.
 
     Attributes:
         seed: of it.
@@ -294,7 +294,7 @@ class Oracle:
         return math.hypot(body.vn, body.ve), -body.vd
 
     def unavoidable_m(self) -> float:
-        """How far a drone flies that is told to stop at this moment; it speeds up until then, and while that eases."""
+        """Return the stopping distance from now in metres, including acceleration until the command takes effect."""
         speed, late_s, more = self.speeds()[0], self._late_s(), self.speeding_mps2
         easing_s = more / JERK_MPS3
         surge_mps = more * (late_s + easing_s / 2)
@@ -316,7 +316,7 @@ class Oracle:
         wall.excused = near and wall.low_m - reach < height < wall.high_m + reach
 
     def reconnected(self, severed_at: float) -> None:
-        """What changed while nothing could be told to the drone holds from now on."""
+        """Apply rules changed during the link outage from now on."""
         for wall in self.rules.walls:
             if wall.since_s > severed_at - self._late_s():
                 self._excuse(wall)
@@ -327,7 +327,7 @@ class Oracle:
             self.rules.fast_since_s = self._sky.time()
 
     def _late_s(self) -> float:
-        """How long a command takes to reach the drone and to have an effect, at most."""
+        """Return the maximum time until a command takes effect."""
         weather = self._sky.weather
         # Two frames lost in a row cost as much as the jitter of a slow link.
         return REACTION_S + 1.5 * (weather.there_s + weather.back_s) + (0.4 if weather.loss else 0.0)
@@ -431,9 +431,9 @@ class Drone:
         """A driver's stream, to its end."""
         with contextlib.suppress(Refused):
             async for event in self.streams.follow(grant):
-                self.heard(event)
+                self.record(event)
 
-    def heard(self, event: ControlEvent) -> None:
+    def record(self, event: ControlEvent) -> None:
         self.state = event.state
         self._account.events.append(f"{self.autopilot.now - 1000:7.2f} stream {event.state.name} {event.reason}")
 
@@ -531,7 +531,7 @@ class Flight:
 
     @property
     def grant(self) -> ActiveGrant:
-        """The driver's, as it is now: every call is judged by what holds when it comes."""
+        """Current grant of the driver."""
         (grant,) = self.drone.grants.active.values()
         return grant
 
@@ -569,7 +569,7 @@ class Flight:
         await self._until(lambda: not self.sky.truth.armed)
 
     async def _until(self, condition: Callable[[], object]) -> None:
-        while not condition():  # noqa: ASYNC110 - the simulation tells no one
+        while not condition():  # noqa: ASYNC110 - the simulation has no notification
             await asyncio.sleep(0.2)
 
     async def _drive(self, following: asyncio.Task[None]) -> None:
@@ -609,14 +609,14 @@ class Flight:
         if kind < 0.5:
             speed = chance.choice([None, chance.uniform(1, 14)])
             leg = goto(x, y, chance.uniform(4, 40), speed_mps=speed)
-            self._tells(f"goto ({x:.0f}, {y:.0f}, {leg.alt:.0f}) at {speed}")
+            self._note_request(f"goto ({x:.0f}, {y:.0f}, {leg.alt:.0f}) at {speed}")
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(chance.uniform(3, 60) if chance.random() < 0.4 else None):
                     await self._finish(service.goto(self.grant, leg, 0.0))
         elif kind < 0.85:
             angle, speed = chance.uniform(0, 2 * math.pi), chance.uniform(0.5, 14)
             up = chance.choice([0.0, 0.0, chance.uniform(-1.5, 2.0)])
-            self._tells(f"velocity {speed:.1f} toward {math.degrees(angle):.0f} deg, up {up:.1f}")
+            self._note_request(f"velocity {speed:.1f} toward {math.degrees(angle):.0f} deg, up {up:.1f}")
             end = self.drone.autopilot.now + chance.uniform(1, 20)
             while self.drone.autopilot.now < end:
                 args = VelocityArgs(
@@ -632,7 +632,7 @@ class Flight:
         else:
             await service.set_speed(self.grant, SetSpeedArgs(chance.uniform(1, 14)))
 
-    def _tells(self, what: str) -> None:
+    def _note_request(self, what: str) -> None:
         self.account.events.append(f"{self.drone.autopilot.now - 1000:7.2f} asks {what}")
 
     async def _finish(self, motion: Any) -> None:
@@ -641,7 +641,7 @@ class Flight:
                 pass
 
     async def _trouble(self) -> None:
-        """Zones and limits that appear at any moment, also on the way home, and a link that is cut."""
+        """Add zones and limits at random times, also during the return, and cut the link."""
         chance = self.chance
         await self._until(lambda: self.account.flew)
         if self.weather.cut is not None:
@@ -669,7 +669,7 @@ class Flight:
 
 
 def weather_of(seed: int) -> Weather:
-    """What the flight of a seed meets."""
+    """Return the environment for a seed."""
     chance = random.Random(seed * 7 + 1)
     bad = chance.random() < 0.7
     cut = (chance.uniform(3, 60), chance.uniform(0.5, 8)) if chance.random() < 0.15 else None

@@ -1,4 +1,4 @@
-"""The flights that are pinned, one function each."""
+"""Courses of the golden flights, one function each."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FLIGHTS: dict[str, Course] = {}
 
 
 def course(flown: Course) -> Course:
-    """Pin a flight under its name."""
+    """Register a golden flight under its name."""
     FLIGHTS[flown.__name__] = flown
     return flown
 

@@ -1,4 +1,4 @@
-"""Flights whose course is pinned: who had the drone when, what streams were told, and what the autopilot was commanded.
+"""Golden flights: record control authority, stream events and autopilot commands.
 
 Each flight acts from outside only, through streams, calls, grants and what pilots and the autopilot do, so that the same flight
 can be flown by any version of the service. `PYTHONPATH=tests python
@@ -28,7 +28,7 @@ Trace = dict[str, list[str]]
 
 
 class Recording(list[Any]):
-    """A list that tells of what is appended."""
+    """List that calls a function for each appended item."""
 
     def __init__(self, heard: Callable[[Any], None]) -> None:
         super().__init__()
@@ -66,7 +66,7 @@ class Flight:
             obey(world.plane, mode)
 
         def heard(outgoing: Any) -> None:
-            """Do as told, and say so at once: heartbeats, as such, come too seldom to tell who started the motors."""
+            """Obey, and deliver a heartbeat at once, because regular heartbeats are too rare to attribute arming."""
             type(world.plane)._obey(world.plane, outgoing)
             self.observer.heartbeat()
 
@@ -96,12 +96,12 @@ class Flight:
     def _commanded(self, number: int) -> None:
         self._write("commands", f"command {number}")
 
-    def _told(self, name: str, what: str, text: str = "") -> None:
+    def _stream_event(self, name: str, what: str, text: str = "") -> None:
         self._write("streams", f"{name} {what}")
         self.texts.append(f"{self.world.plane.now:.1f} {name} {what} {text}")
 
     def _place(self) -> str:
-        """Where the drone is, in whole metres east, north and up of home."""
+        """Return the position in whole metres east, north and up of home."""
         plane = self.world.plane
         return str(tuple(round(metres) for metres in (*plane.xy, plane.height)))
 
@@ -128,16 +128,16 @@ class Flight:
         try:
             async for event in self.world.streams.follow(held):
                 state = event.state.name
-                self._told(name, f"{state} {event.control_point} {event.waypoints_reached}", event.reason)
+                self._stream_event(name, f"{state} {event.control_point} {event.waypoints_reached}", event.reason)
                 if state == "GRANTED":
                     granted.set()
         except asyncio.CancelledError:
-            self._told(name, "left")
+            self._stream_event(name, "left")
             raise
         except Exception as error:  # any end is part of the trace
-            self._told(name, f"refused {_code(error)}", str(error))
+            self._stream_event(name, f"refused {_code(error)}", str(error))
         else:
-            self._told(name, "ended")
+            self._stream_event(name, "ended")
 
     def call(self, name: str, work: Any) -> asyncio.Task[None]:
         """A call in the background."""
@@ -183,14 +183,14 @@ class Flight:
         self.world.plane.deaf = True
 
     def find_link(self) -> None:
-        """The link was opened again, and the vehicle is heard."""
+        """Restore the link and let the service find the vehicle."""
         plane = self.world.plane
         plane.deaf = False
         plane.vehicle.heartbeat_at = plane.now
         self.observer.found()
 
     async def restart(self) -> None:
-        """The service dies, and another begins with what the journal remembers."""
+        """Stop the service and start another one with the same journal."""
         old = self.world
         await self._stop_tasks()
         await old.__aexit__()

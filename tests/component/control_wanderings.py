@@ -1,4 +1,4 @@
-"""Flights in which anything may happen at any time, decided by a seed alone."""
+"""Random golden flights, determined by a seed."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CALLS = frozenset({"arm", "takeoff", "goto", "land", "home", "hover", "velocity"
 
 
 def wandering(seed: int) -> Course:
-    """The flight of a seed."""
+    """Return the flight of a seed."""
 
     async def course(f: Flight) -> None:
         wanderer = Wanderer(f, random.Random(seed))
@@ -37,7 +37,7 @@ def wandering(seed: int) -> Course:
 
 
 class Wanderer:
-    """Does one thing after another; what cannot be done at the moment is left out."""
+    """Performs random actions and skips those that are currently impossible."""
 
     def __init__(self, flight: Flight, dice: random.Random) -> None:
         self.dice = dice
@@ -55,7 +55,7 @@ class Wanderer:
         self._place = (0.0, 0.0)
 
     async def step(self) -> None:
-        """Whatever the dice say."""
+        """Perform one random action."""
         dice = self.dice
         self._key = dice.choice(sorted(self._specs))
         self._place = dice.uniform(-60, 60), dice.uniform(-60, 60)

@@ -1,4 +1,4 @@
-"""A mobility service and a vehicle in one loop whose time jumps: minutes of flight in a fraction of a second, always the same."""
+"""A mobility service and a simple vehicle in one event loop of virtual time, fast and deterministic."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ BRAKE, GUIDED, LAND, LOITER, RTL, SMART_RTL = (
     for name in ("BRAKE", "GUIDED", "LAND", "LOITER", "RTL", "SMART_RTL")
 )
 STEP_S = 0.1
-"""Between two positions of the vehicle, unless a test is of what happens in between."""
+"""Interval between two positions of the vehicle."""
 GROUND_M = 10.0
-"""Of the ground, above mean sea level."""
+"""Altitude of the ground above mean sea level."""
 ACCEL, CLIMB = 2.5, 2.0
 DEFAULT_MPS = 8.0
 ALL = (
@@ -49,7 +49,7 @@ ALL = (
 
 
 class Plane(MavlinkAutopilot):
-    """An autopilot of few words: it acknowledges, and moves as ArduCopter does, roughly."""
+    """Simple fake autopilot: it acknowledges commands and moves roughly as ArduCopter does."""
 
     def __init__(self, step_s: float = STEP_S) -> None:
         self.step_s = step_s
@@ -72,7 +72,7 @@ class Plane(MavlinkAutopilot):
         self.uplink_s = self.downlink_s = 0.0
         self.fixed: tuple[str, ...] = ()
         self.measured = False
-        """Whether it tells velocities often enough to know how it speeds up."""
+        """True if velocities are reported often enough to derive the acceleration."""
         self.parameters = MOVEMENT | FAILSAFES | {"WPNAV_SPEED": 100 * DEFAULT_MPS}
         vehicle = self.vehicle
         vehicle.mode, vehicle.located, vehicle.position_error_m = GUIDED, True, 0.5
@@ -155,11 +155,11 @@ class Plane(MavlinkAutopilot):
 
     @property
     def raised_m(self) -> float:
-        """How far home is above the ground that the drone took off from."""
+        """Height of home above the takeoff ground, in metres."""
         return self.home_amsl_m - GROUND_M
 
     def move_home(self, lat_e7: int, lon_e7: int, amsl_m: float) -> None:
-        """Make a place home and announce it, as any station can ask for."""
+        """Set home and announce it, as on DO_SET_HOME from any station."""
         self.home_amsl_m = amsl_m
         self._reply(
             message(
@@ -281,7 +281,7 @@ class Grants:
 
 
 class Fence:
-    """Stands for the vehicle's own fence."""
+    """Fake of the vehicle fence."""
 
     raised = False
     missing = ""
@@ -350,7 +350,7 @@ class World:
             await asyncio.gather(*tasks, return_exceptions=True)
 
     async def drive(self, grant: ActiveGrant) -> asyncio.Task[None]:
-        """A driver's stream in the background, once it has the drone."""
+        """Open a driver's stream in the background and wait until it has control or ends."""
         granted = asyncio.Event()
 
         async def follow() -> None:
@@ -369,14 +369,14 @@ class World:
         return stream
 
     async def up(self, grant: ActiveGrant, altitude_m: float = 10.0) -> asyncio.Task[None]:
-        """A driver that has armed and taken off."""
+        """Take control, arm and take off."""
         stream = await self.drive(grant)
         await self.service.arm(grant)
         await end(self.service.take_off(grant, TakeoffArgs(altitude_m)))
         return stream
 
     def outcome(self, key: str = "m1") -> str:
-        """How a mission ended, in words; empty while it goes on."""
+        """Return the outcome of a mission as text, empty while the mission continues."""
         mission = self.control.state.missions.get(key)
         return str(mission.outcome) if mission is not None and mission.outcome is not None else ""
 
@@ -390,14 +390,14 @@ class World:
 
 
 async def end(motion: Any) -> Progress:
-    """The last step of a motion that completes."""
+    """Complete a motion and return its last step."""
     steps: list[Progress] = [step async for step in motion]
     assert steps[-1].step.complete
     return steps[-1]
 
 
 async def refusal(call: Any) -> Refused:
-    """Why a call or a motion is refused."""
+    """Return the error of a call or motion that must be refused."""
     try:
         if hasattr(call, "__aiter__"):
             await end(call)
@@ -405,7 +405,7 @@ async def refusal(call: Any) -> Refused:
             await call
     except Refused as refused:
         return refused
-    raise AssertionError("it was not refused")
+    raise AssertionError("the call was not refused")
 
 
 def at(x: float, y: float) -> tuple[float, float]:
@@ -423,7 +423,7 @@ def zone(name: str, action: str, *box: float) -> dict[str, Any]:
 
 
 def spec(*policies: dict[str, Any], **changes: Any) -> GrantSpec:
-    """A driver's grant: operation area 200 m around home."""
+    """Return a driver's grant with an operation area of 200 m around home."""
     body = {
         "node": "drone-1",
         "application": {"namespace": "default", "name": "app", "uid": "u1"},

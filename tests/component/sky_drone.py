@@ -15,7 +15,7 @@ from mobility_world import spec
 
 async def until(condition: Callable[[], object], timeout_s: float = 120.0) -> None:
     async with asyncio.timeout(timeout_s):
-        while not condition():  # noqa: ASYNC110 - the simulation tells no one
+        while not condition():  # noqa: ASYNC110 - the simulation has no notification
             await asyncio.sleep(0.1)
 
 

@@ -103,7 +103,7 @@ def passenger_grant(*policies: dict[str, Any], **changes: Any) -> dict[str, Any]
 
 
 def outcomes(telemetry: pb.Telemetry) -> dict[str, str]:
-    """How missions ended, in words."""
+    """Return the outcome of each mission as text."""
     kinds = {key: pb.MissionOutcome.Kind.Name(ended.kind) for key, ended in telemetry.missions.items()}
     words = {key: kind.removeprefix("KIND_").lower() for key, kind in kinds.items()}
     reasons = {key: ended.reason for key, ended in telemetry.missions.items()}
@@ -270,7 +270,7 @@ class Rig:
         return address
 
     def start_driver(self) -> None:
-        """A driver in a process of its own, that takes off and hovers."""
+        """Start a driver process that takes off and hovers."""
         key, certificate = self.authority.issue(DRIVER)
         for name, data in (("key", key), ("crt", certificate), ("ca", self.authority.pem)):
             (self.directory / f"driver.{name}").write_bytes(data)
@@ -285,11 +285,11 @@ class Rig:
         process.wait(10)
 
     async def ended(self, name: str, timeout_s: float = 20.0) -> int:
-        """The exit status of a process that ends by itself."""
+        """Wait for a process to end and return its exit status."""
         return await asyncio.to_thread(self._processes[name].wait, timeout_s)
 
     async def until_logged(self, name: str, text: str, timeout_s: float = 20.0) -> None:
-        """Wait until a process says something."""
+        """Wait until a process logs a text."""
         async with asyncio.timeout(timeout_s):
             while text not in self.log(name):
                 assert self._processes[name].poll() is None, self.log(name)
@@ -338,7 +338,7 @@ class Rig:
         found = [json.loads(line) for line in lines if line.endswith("}")]
         return [entry for entry in found if kind is None or entry["kind"] == kind]
 
-    # What tests wait for
+    # Waiting for states
 
     async def telemetry(self) -> pb.Telemetry:
         async for message in self.stub(node_identity(NODE)).SubscribeTelemetry(

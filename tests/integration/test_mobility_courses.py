@@ -1,4 +1,4 @@
-"""What the system flies itself: around zones to control points and home, tours for passengers, setpoints that run out."""
+"""System flights around zones, POI missions of passengers, velocity setpoints, dry runs, vehicle fence and links."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ async def test_poi_mission_visits_points_of_passenger_without_driver(rig: Rig) -
     rig.start_vehicle(3.0)
     await rig.until(lambda t: t.ready, 30)
     await asyncio.sleep(0)
-    assert not (await rig.telemetry()).armed, "no one is aboard yet"
+    assert not (await rig.telemetry()).armed, "no passenger has called yet"
     stub = rig.stub(PASSENGER)
 
     async def ride() -> list[Any]:
@@ -151,7 +151,7 @@ async def test_velocity_setpoint_expires_and_is_denied_toward_zone(rig: Rig) -> 
     code, why = await denied(set_velocity(setpoint(0.0, 12.0, hold_s=2.0), timeout=5))
     assert code == grpc.StatusCode.PERMISSION_DENIED or why.action == types_pb2.Decision.ACTION_TAKEOVER
     after = xy((await rig.telemetry()).position)
-    assert math.dist(before, after) < 1.0, "nothing of it was flown"
+    assert math.dist(before, after) < 1.0, "the denied setpoint was not flown"
 
 
 async def test_check_call_returns_verdict_without_effect(rig: Rig) -> None:

@@ -1,4 +1,4 @@
-"""What becomes of a flying drone when something is lost: driver, service, grant, pilot's patience, link."""
+"""Flights that lose their driver, service, grant or authority."""
 
 from __future__ import annotations
 
@@ -221,7 +221,7 @@ async def test_pilot_mode_change_ends_control_of_driver(rig: Rig) -> None:
 
 
 async def test_suspended_driver_process_is_detected_as_lost(rig: Rig) -> None:
-    """SIGSTOP leaves the connection open: only unanswered pings tell."""
+    """SIGSTOP leaves the connection open, so only unanswered pings reveal the loss."""
     await asyncio.sleep(0)
     rig.write_grant(grant())
     rig.start_service()
@@ -266,8 +266,8 @@ def partial(**changes: Any) -> dict[str, Any]:
     return grant(control="partial", controlPoints=points, services=services, **changes)
 
 
-async def told(driver: Driver, reason: str) -> None:
-    """Wait until the transit says it is that far."""
+async def until_reason(driver: Driver, reason: str) -> None:
+    """Wait until the control stream reports a reason."""
     driver._stream = driver.stub.GetControl(pb.GetControlRequest(), wait_for_ready=True)
     async with asyncio.timeout(30):
         while (await driver._stream.read()).reason != reason:
@@ -279,7 +279,7 @@ async def test_driver_lost_during_transit_takeoff_ends_mission_and_lands(rig: Ri
     rig.start_service()
     rig.start_vehicle()
     driver = Driver(rig)
-    await told(driver, "the system takes off")
+    await until_reason(driver, "the system takes off")
     await driver.channel.close()
     await rig.until(lambda t: outcome(t) == "failed: driver lost", 20, "end of the mission")
     await rig.until(lambda t: not t.armed, 90, "landing")
@@ -290,7 +290,7 @@ async def test_grant_revoked_during_arming_prevents_takeoff(rig: Rig) -> None:
     rig.start_service()
     rig.start_vehicle(1.0)
     driver = Driver(rig)
-    await told(driver, "the system arms the drone")
+    await until_reason(driver, "the system arms the drone")
     (rig.grants / "app-navigator.json").unlink()
     state = await rig.until(lambda t: outcome(t).startswith("revoked"), 15, "revocation")
     state = await rig.until(lambda t: not t.armed, 20, "stop of the motors")

@@ -1,4 +1,4 @@
-"""Bad manifests: refused at apply, or Ready=False with a sentence that names the field; nothing is created."""
+"""Bad manifests: refused at apply, or Ready=False with a reason that names the field. No objects are created."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("make", BAD, ids=lambda make: make.__name__)
-def test_bad_manifest_is_refused_with_the_name_of_its_field(kube: Kube, make) -> None:
+def test_bad_manifest_refusal_names_field(kube: Kube, make) -> None:
     bad = make()
     kind = {"Application": "application.fractus.dev", "Zone": "zone.fractus.dev", "Policy": "policy.fractus.dev"}[
         bad["kind"]

@@ -1,4 +1,4 @@
-"""What the chart lets an agent do in the cluster, and whose certificates it gets."""
+"""Permissions of agents in the cluster, and the certificates that they can get."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ REQUESTS = "/apis/certificates.k8s.io/v1/certificatesigningrequests"
 
 OLD = {"ServiceAccount", "ClusterRole", "ClusterRoleBinding", "Role", "RoleBinding"}
 
-# -- what agents may do --
+# -- permissions of agents --
 
 
 @pytest.fixture
 def agents(control_plane: ControlPlane, world: World, chart: None) -> Iterator[dict[str, BlockingClient]]:
-    """Clients with tokens as the agents of drone-1 and edge-1 have them, bound to pods on these nodes."""
+    """Return clients with the tokens of the agents of drone-1 and edge-1, bound to pods on these nodes."""
     clients = {}
     pods = f"/api/v1/namespaces/{SYSTEM}/pods"
     for node in ("drone-1", "edge-1"):
@@ -44,7 +44,7 @@ def agents(control_plane: ControlPlane, world: World, chart: None) -> Iterator[d
                    "spec": {"expirationSeconds": 600, "boundObjectRef": bound}}  # fmt: skip
         path = f"/api/v1/namespaces/{SYSTEM}/serviceaccounts/fractus-node/token"
         clients[node] = control_plane.with_token(world.api.call("POST", path, request)["status"]["token"])
-    # The API server needs a moment to know a new admission policy: wait until it denies.
+    # The API server applies a new admission policy after a moment. Wait until it denies.
     wait_for(lambda: _denied(clients["edge-1"]), "the admission policy to be in force")
     yield clients
     for client in clients.values():
@@ -59,7 +59,7 @@ def _denied(client: BlockingClient) -> bool:
     return False
 
 
-def test_an_agent_reports_its_own_drone_only(world: World, agents: dict[str, BlockingClient]) -> None:
+def test_agent_writes_status_of_its_own_drone_only(world: World, agents: dict[str, BlockingClient]) -> None:
     state = {"status": {"flightState": "flying"}}
     agents["drone-1"].merge(f"{FRACTUS}/drones/drone-1/status", state)
     denied(
@@ -73,7 +73,7 @@ def test_an_agent_reports_its_own_drone_only(world: World, agents: dict[str, Blo
     )
 
 
-def test_an_agent_registers_its_own_node_only(world: World, agents: dict[str, BlockingClient]) -> None:
+def test_agent_registers_its_own_node_only(world: World, agents: dict[str, BlockingClient]) -> None:
     body = copy.deepcopy(world.api.get(f"{FRACTUS}/edgenodes/edge-1"))
     assert body is not None
     fresh = ours("EdgeNode", "edge-1", body["spec"])
@@ -89,9 +89,7 @@ def test_an_agent_registers_its_own_node_only(world: World, agents: dict[str, Bl
     denied(lambda: agents["edge-1"].delete(f"{FRACTUS}/edgenodes/edge-1"), "cannot delete")
 
 
-def test_an_agent_makes_its_node_nothing_else_than_its_label_says(
-    world: World, agents: dict[str, BlockingClient]
-) -> None:
+def test_agent_registers_only_the_kind_of_its_node_label(world: World, agents: dict[str, BlockingClient]) -> None:
     def refused(node: str, kind: Body, label: str) -> bool:
         path = f"{FRACTUS}/{kind['kind'].lower()}s?dryRun=All"
         try:
@@ -113,7 +111,7 @@ def _grant(world: World, node: str) -> str:
     return f"{FRACTUS}/grants/{name}"
 
 
-def test_an_agent_has_no_right_on_grants(world: World, agents: dict[str, BlockingClient]) -> None:
+def test_agent_has_no_rights_on_grants(world: World, agents: dict[str, BlockingClient]) -> None:
     mine, agent = _grant(world, "drone-1"), agents["drone-1"]
     copied = [{"op": "copy", "from": "/spec/identity", "path": "/status/phase"}]
     denied(lambda: agent.get(mine), "cannot get")
@@ -139,7 +137,7 @@ def token_path(node: str, namespace: str = NODES) -> str:
 
 @pytest.fixture
 def accounts(control_plane: ControlPlane, world: World, agents: dict[str, BlockingClient]) -> None:
-    """The accounts of drone-1 and edge-1 with their objects, made with the operator's own rights."""
+    """Create the accounts and objects of drone-1 and edge-1 with the rights of the operator."""
     operator = control_plane.with_token(operator_token(world))
     for node in agents:
         for path, body in node_objects(node).items():
@@ -148,13 +146,13 @@ def accounts(control_plane: ControlPlane, world: World, agents: dict[str, Blocki
 
 
 def node_objects(node: str) -> dict[str, Body]:
-    """What the operator makes for a node, by the path of its collection."""
+    """Return the objects that the operator creates for a node, by the path of their collection."""
     made = {kind.path(NODES): account_object(kind, node) for kind in ACCOUNT_KINDS}
     spec = {"count": 0, "packed": pack(())}
     return made | {NODE_GRANTS.path(NODES): header(NODE_GRANTS, node) | {"spec": spec}}
 
 
-def test_an_agent_reads_and_reports_on_the_one_object_of_its_node(
+def test_agent_reads_and_updates_only_node_grants_of_its_node(
     control_plane: ControlPlane, agents: dict[str, BlockingClient], accounts: None
 ) -> None:
     token = agents["drone-1"].call("POST", token_path("drone-1"), token_request())["status"]["token"]
@@ -195,7 +193,7 @@ def test_an_agent_reads_and_reports_on_the_one_object_of_its_node(
         pytest.param(token_path("fractus-operator", SYSTEM), token_request(), "cannot create", id="the operator"),
     ],
 )
-def test_an_agent_gets_no_other_token(
+def test_agent_gets_no_other_token(
     agents: dict[str, BlockingClient], accounts: None, path: str, request_: Body, words: str
 ) -> None:
     denied(lambda: agents["drone-1"].call("POST", path, request_), words)
@@ -207,7 +205,7 @@ def _rules(node: str, *more: Body, **changed: Any) -> Body:
 
 
 PODS = {"apiGroups": [""], "resources": ["pods"], "verbs": ["get"]}
-"""What the operator may itself: else the API server refuses before admission is asked."""
+"""A permission of the operator itself. Otherwise the API server refuses before admission."""
 
 
 @pytest.mark.parametrize(
@@ -242,7 +240,7 @@ PODS = {"apiGroups": [""], "resources": ["pods"], "verbs": ["get"]}
         ),
     ],
 )
-def test_who_has_the_operator_s_token_gives_no_other_rights(
+def test_operator_token_cannot_grant_other_rights(
     control_plane: ControlPlane, world: World, accounts: None, kind: Kind, body: Body, words: str
 ) -> None:
     client = control_plane.with_token(operator_token(world))
@@ -252,7 +250,7 @@ def test_who_has_the_operator_s_token_gives_no_other_rights(
         client.close()
 
 
-def test_the_operator_makes_no_account_elsewhere_and_takes_no_other_s(
+def test_operator_creates_accounts_only_in_node_namespace(
     control_plane: ControlPlane, world: World, accounts: None
 ) -> None:
     client = control_plane.with_token(operator_token(world))
@@ -267,7 +265,7 @@ def test_the_operator_makes_no_account_elsewhere_and_takes_no_other_s(
         client.close()
 
 
-def test_agents_of_the_release_before_keep_their_account_until_they_are_replaced(
+def test_agents_of_previous_release_keep_account_until_replaced(
     control_plane: ControlPlane, world: World, agents: dict[str, BlockingClient]
 ) -> None:
     connected = ("--dry-run=server", f"--kubeconfig={control_plane.kubeconfig}")
@@ -317,7 +315,7 @@ def _direct_link(world: World, drone: str, node: str) -> str:
     return f"{FRACTUS}/directlinks/{name}"
 
 
-def test_an_agent_reports_on_direct_links_of_its_node_only(world: World, agents: dict[str, BlockingClient]) -> None:
+def test_agent_writes_status_of_direct_links_of_its_node_only(world: World, agents: dict[str, BlockingClient]) -> None:
     ours, other = _direct_link(world, "drone-1", "edge-1"), _direct_link(world, "drone-2", "edge-1")
     agents["drone-1"].merge(f"{ours}/status", {"status": {"phase": "Up"}, "spec": {"range": 1000}})
     agents["edge-1"].merge(f"{ours}/status", {"status": {"switches": 1}})
@@ -333,7 +331,7 @@ def test_an_agent_reports_on_direct_links_of_its_node_only(world: World, agents:
     denied(lambda: agents["drone-1"].delete(ours), "cannot delete")
 
 
-def test_a_token_that_is_bound_to_no_node_writes_nothing(
+def test_token_without_bound_node_writes_nothing(
     control_plane: ControlPlane, world: World, agents: dict[str, BlockingClient]
 ) -> None:
     path = f"/api/v1/namespaces/{SYSTEM}/serviceaccounts/fractus-node/token"
@@ -371,7 +369,7 @@ def signing_request(node: str, names: list[x509.GeneralName] | None = None, key:
 
 
 def settled(world: World, body: Body) -> Body:
-    """The status of a request once it is signed or denied."""
+    """Wait until the request is signed or denied, and return its status."""
 
     def look() -> Body | None:
         status = (world.api.get(f"{REQUESTS}/{body['metadata']['name']}") or {}).get("status") or {}
@@ -381,7 +379,7 @@ def settled(world: World, body: Body) -> Body:
     return wait_for(look, "the request to be settled")
 
 
-def test_an_agent_gets_the_certificate_of_its_node(
+def test_agent_gets_certificate_of_its_node(
     world: World, operator: OperatorProcess, agents: dict[str, BlockingClient]
 ) -> None:
     body = signing_request("drone-1")
@@ -412,7 +410,7 @@ FOREIGN = [
 
 
 @pytest.mark.parametrize(("change", "reason"), FOREIGN)
-def test_an_agent_gets_no_other_certificate(
+def test_agent_gets_no_other_certificate(
     world: World, operator: OperatorProcess, agents: dict[str, BlockingClient], change: Body, reason: str
 ) -> None:
     body = signing_request("drone-1", **change)
@@ -422,7 +420,7 @@ def test_an_agent_gets_no_other_certificate(
     assert [(c["type"], c["reason"]) for c in status["conditions"]] == [("Denied", reason)]
 
 
-def test_no_other_gets_a_certificate_of_a_node(
+def test_node_certificate_is_refused_to_other_requesters(
     world: World, operator: OperatorProcess, agents: dict[str, BlockingClient]
 ) -> None:
     body = signing_request("drone-1")

@@ -1,4 +1,4 @@
-"""Attacks on the services of a drone, with real gRPC and real certificates: nothing unsafe happens, and the answer is clear."""
+"""Attacks on the services of a drone, with real gRPC and certificates. Each is refused safely and with a reason."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ FLOOD_PER_S = 500.0
 
 
 async def served(rig: Rig, identity: str = DRIVER) -> mobility_pb2_grpc.MobilityServiceStub:
-    """The stub of a caller who is served."""
+    """Return the stub of an accepted caller."""
     stub = rig.stub(identity)
     await stub.GetSpeed(ASK, timeout=20, wait_for_ready=True)
     return stub
@@ -72,7 +72,7 @@ async def until(condition: Callable[[], object], what: str, timeout_s: float = 1
 # Certificates
 
 
-async def test_certificates_of_others(rig: Rig) -> None:
+async def test_attack_with_foreign_certificate_is_refused(rig: Rig) -> None:
     rig.write_grant(grant())
     rig.start_service()
     stub = await served(rig)
@@ -92,12 +92,12 @@ async def test_certificates_of_others(rig: Rig) -> None:
     assert await asked(DRIVER + "/") == no_grant
     assert await asked(DRIVER.upper().replace("SPIFFE://FRACTUS.DEV", "spiffe://fractus.dev")) == no_grant
     assert await asked(node_identity("drone-2")) == no_grant
-    assert await asked(OPERATOR_IDENTITY) == no_grant, "who signs grants flies no drone"
+    assert await asked(OPERATOR_IDENTITY) == no_grant, "the operator has no Grant"
     assert (await asked("https://fractus.dev/operator"))[0] == Status.UNAUTHENTICATED, "no SPIFFE id"
     await stub.GetSpeed(ASK, timeout=5)
 
 
-async def test_the_certificate_that_signs_grants_opens_no_connection(rig: Rig) -> None:
+async def test_attack_with_grant_signing_certificate_is_refused(rig: Rig) -> None:
     rig.write_grant(grant())
     rig.start_service()
     await served(rig)
@@ -113,7 +113,7 @@ async def test_the_certificate_that_signs_grants_opens_no_connection(rig: Rig) -
     assert refusal.value.code() == Status.UNAVAILABLE
 
 
-async def test_a_stolen_certificate_is_of_no_use_once_its_instance_is_gone(rig: Rig) -> None:
+async def test_attack_with_certificate_of_removed_instance_is_refused(rig: Rig) -> None:
     path = rig.write_grant(grant())
     stale = path.read_bytes()
     rig.start_service()
@@ -148,7 +148,7 @@ time.time = _shifted
 """
 
 
-async def test_a_grant_that_is_not_signed_is_none(rig: Rig) -> None:
+async def test_attack_with_unsigned_grant_is_refused(rig: Rig) -> None:
     rig.write_grant(grant(), signed=False)
     rig.start_service()
     code, why = await denied(rig.stub(DRIVER).GetSpeed(ASK, timeout=20, wait_for_ready=True))
@@ -159,7 +159,7 @@ async def test_a_grant_that_is_not_signed_is_none(rig: Rig) -> None:
     await until(lambda: rig.entries("grant")[-1]["change"] == "added", "the grant")
 
 
-async def test_nonsense_is_counted_and_fills_no_disk(rig: Rig) -> None:
+async def test_attack_with_malformed_calls_is_limited_and_fills_no_disk(rig: Rig) -> None:
     rig.write_grant(grant())
     rig.start_service()
     await served(rig)
@@ -188,7 +188,7 @@ async def test_nonsense_is_counted_and_fills_no_disk(rig: Rig) -> None:
     assert "Traceback" not in log.read_text()
 
 
-async def test_a_step_of_the_clock_cuts_off_no_caller_and_revives_no_certificate(
+async def test_clock_step_neither_refuses_callers_nor_accepts_expired_certificates(
     rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shift = rig.directory / "shift"
@@ -205,7 +205,9 @@ async def test_a_step_of_the_clock_cuts_off_no_caller_and_revives_no_certificate
         await stub.GetSpeed(ASK, timeout=5)
         if step_s > 0:
             code, why = await denied(rig.stub(DRIVER).GetSpeed(ASK, timeout=5))
-            assert (code, why.code) == (Status.UNAUTHENTICATED, "NotAuthenticated"), "who was not known before"
+            assert (code, why.code) == (Status.UNAUTHENTICATED, "NotAuthenticated"), (
+                "callers that were unknown before the step"
+            )
             assert "expired" in why.reason
     await until(lambda: len(rig.entries("clock")) >= 3, "the steps in the audit log")
     assert [round(entry["step_s"] / 86_400, 2) for entry in rig.entries("clock")][:3] == [400.0, 0.0, -0.04]
@@ -216,11 +218,11 @@ async def test_a_step_of_the_clock_cuts_off_no_caller_and_revives_no_certificate
 
     for call in (watched, lambda: short.GetSpeed(ASK, timeout=5)):
         code, why = await denied(call())
-        assert (code, why.code) == (Status.UNAUTHENTICATED, "NotAuthenticated"), (
-            "its time is up, whatever the clock says"
-        )
+        assert (code, why.code) == (Status.UNAUTHENTICATED, "NotAuthenticated"), "expired by steady time"
     code, why = await denied(short.Hover(pb.HoverRequest(), timeout=5))
-    assert (code, why.code) == (Status.FAILED_PRECONDITION, "NotInControl"), "stopping is not refused by date"
+    assert (code, why.code) == (Status.FAILED_PRECONDITION, "NotInControl"), (
+        "stopping is accepted with an expired certificate"
+    )
     # A grant does not hang on the node's clock.
     rig.write_grant(grant(altitude_limit(5, 15)))
     await until(lambda: [e for e in rig.entries("grant") if e["change"] == "changed"], "the new grant")
@@ -229,7 +231,7 @@ async def test_a_step_of_the_clock_cuts_off_no_caller_and_revives_no_certificate
 # Methods
 
 
-async def test_no_one_calls_anothers_methods(rig: Rig) -> None:
+async def test_attack_with_methods_outside_grant_is_refused(rig: Rig) -> None:
     rig.write_grant(grant())
     rig.write_grant(passenger_grant(services=[{"service": "camera", "methods": ["ListImages"]}]))
     rig.start_service()
@@ -266,7 +268,7 @@ async def test_no_one_calls_anothers_methods(rig: Rig) -> None:
         assert (code, why.code) == (Status.PERMISSION_DENIED, "MethodNotGranted")
 
 
-async def test_what_is_no_proper_call(rig: Rig) -> None:
+async def test_attack_with_invalid_call_is_refused(rig: Rig) -> None:
     rig.write_grant(grant())
     rig.start_service()
     stub = await served(rig)
@@ -299,7 +301,7 @@ async def test_what_is_no_proper_call(rig: Rig) -> None:
 
 
 async def _flood(address: str, pem: list[bytes], until_s: float) -> None:
-    """The attacker's process: calls at a steady rate, whatever the answers; prints how they ended.
+    """Call at a steady rate regardless of responses, and print the results. Runs in the attacker's process.
 
     When a busy machine lets calls pile up, gRPC itself refuses more of a connection than it may have open: SHED.
     """
@@ -332,7 +334,7 @@ async def _flood(address: str, pem: list[bytes], until_s: float) -> None:
     print(json.dumps({"sent": sent, "ended": ended, "hints": hints, "seconds": time.monotonic() - begin}))
 
 
-async def test_a_flood_of_one_leaves_the_others_served(rig: Rig) -> None:
+async def test_attack_with_flood_of_calls_does_not_affect_others(rig: Rig) -> None:
     rig.write_grant(grant())
     rig.write_grant(passenger_grant())
     rig.start_service()
@@ -350,18 +352,18 @@ async def test_a_flood_of_one_leaves_the_others_served(rig: Rig) -> None:
         answers.append(time.monotonic() - begun)
         await asyncio.sleep(0.05)
     output, _ = await attacker.communicate()
-    told = json.loads(output)
-    print(f"flood {told}; the other's calls {len(answers)}, slowest {max(answers) * 1000:.0f} ms")
-    assert told["sent"] > FLOOD_PER_S
-    ended = told["ended"]
+    result = json.loads(output)
+    print(f"flood {result}; the other's calls {len(answers)}, slowest {max(answers) * 1000:.0f} ms")
+    assert result["sent"] > FLOOD_PER_S
+    ended = result["ended"]
     assert set(ended) <= {"OK", "RESOURCE_EXHAUSTED", "SHED"}
-    assert sum(ended.values()) == told["sent"]
-    assert 0 < ended["OK"] <= BURST + CALLS_PER_S * told["seconds"] + 1, "as many as anyone gets in this time, no more"
-    assert told["hints"] == ended["RESOURCE_EXHAUSTED"] > 0, "each that the service refuses is told when to try again"
+    assert sum(ended.values()) == result["sent"]
+    assert 0 < ended["OK"] <= BURST + CALLS_PER_S * result["seconds"] + 1, "at most the limit of each caller"
+    assert result["hints"] == ended["RESOURCE_EXHAUSTED"] > 0, "each refusal contains a retry delay"
     assert len(answers) > 10
 
 
-async def test_a_flood_of_connections_leaves_the_others_served(rig: Rig) -> None:
+async def test_attack_with_flood_of_connections_does_not_affect_others(rig: Rig) -> None:
     rig.write_grant(grant())
     rig.start_service()
     stub = await served(rig)
@@ -395,7 +397,7 @@ async def test_a_flood_of_connections_leaves_the_others_served(rig: Rig) -> None
             one.close()
 
 
-async def test_calls_whose_request_never_comes_are_counted_and_end(rig: Rig) -> None:
+async def test_attack_with_calls_without_request_is_limited(rig: Rig) -> None:
     rig.write_grant(grant())
     rig.start_service()
     stub = await served(rig)
@@ -427,7 +429,7 @@ def _closed(connection: socket.socket) -> bool:
 # In flight
 
 
-async def test_an_older_grant_in_flight_brings_the_drone_home(rig: Rig) -> None:
+async def test_attack_with_older_grant_in_flight_returns_drone(rig: Rig) -> None:
     older = rig.authority.sign(grant())
     driver = await flying(rig, altitude_limit(5, 15))
     path = rig.grants / "app-navigator.json"
@@ -442,7 +444,7 @@ async def test_an_older_grant_in_flight_brings_the_drone_home(rig: Rig) -> None:
     assert (code, why.code) == (Status.PERMISSION_DENIED, "NoGrant")
 
 
-async def test_a_full_disk_ends_no_flight_and_begins_none(rig: Rig) -> None:
+async def test_full_disk_ends_no_flight_but_prevents_arming(rig: Rig) -> None:
     driver = await flying(rig)
     before = len(rig.entries())
     full = (0, resource.RLIM_INFINITY)

@@ -1,4 +1,4 @@
-"""Bad manifests against a real API server: each is refused at apply, with a sentence that says what is wrong."""
+"""Bad manifests against a real API server: each is refused at apply with a reason."""
 
 from __future__ import annotations
 
@@ -179,7 +179,7 @@ BAD: list[tuple[str, Body, str]] = [
 
 
 @pytest.mark.parametrize(("manifest", "sentence"), [case[1:] for case in BAD], ids=[case[0] for case in BAD])
-def test_bad_manifest_is_refused_at_apply_with_its_sentence(
+def test_bad_manifest_is_refused_at_apply_with_reason(
     control_plane: ControlPlane, manifest: Body, sentence: str
 ) -> None:
     model = MODELS[manifest["kind"]]
@@ -206,14 +206,14 @@ RULES = {
 
 
 @pytest.mark.parametrize(("manifest", "sentence"), [case[1:] for case in BAD], ids=[case[0] for case in BAD])
-def test_what_the_schema_refuses_the_models_refuse_with_the_same_sentence(manifest: Body, sentence: str) -> None:
+def test_bad_manifest_is_refused_by_models_with_same_reason(manifest: Body, sentence: str) -> None:
     with pytest.raises(InvalidObject) as refused:
         MODELS[manifest["kind"]].from_body(manifest)
     if any(rule.startswith(sentence) for rule in RULES):
         assert sentence in refused.value.problem
 
 
-def test_every_rule_has_a_manifest_that_breaks_it() -> None:
+def test_every_validation_rule_has_a_bad_manifest() -> None:
     assert [rule for rule in RULES if not any(rule.startswith(sentence) for _, _, sentence in BAD)] == []
 
 
@@ -226,10 +226,10 @@ def https(control_plane: ControlPlane) -> urllib.request.OpenerDirector:
     return urllib.request.build_opener(urllib.request.HTTPSHandler(context=context))
 
 
-def test_the_api_server_judges_the_corpus_as_fractus_plan_does(
+def test_corpus_verdicts_of_api_server_equal_those_of_plan_command(
     control_plane: ControlPlane, https: urllib.request.OpenerDirector
 ) -> None:
-    """As the unit tests have it: each case is taken, or refused."""
+    """Verdicts are those of the unit tests."""
     taken = {case: all(not _refusal(control_plane, https, text) for text in case.documents) for case in CASES}
     assert [case for case, was in taken.items() if was == bool(case.refused)] == []
 
@@ -241,10 +241,10 @@ TOKENS = [
 """What plain scalars are made of; tags of others are refused by `fractus plan` alone."""
 
 
-def test_scalars_are_typed_as_the_api_server_types_them(
+def test_yaml_scalars_have_same_types_as_in_api_server(
     control_plane: ControlPlane, https: urllib.request.OpenerDirector, tmp_path: Path
 ) -> None:
-    """A number is taken for a radius and no annotation, a text the other way round."""
+    """A number is valid as a radius but not as an annotation, and a string vice versa."""
     rng = random.Random(1)
     head = "apiVersion: fractus.dev/v1alpha1\nkind: Depot\nmetadata:\n  name: x\n  annotations:\n    a: "
     taken = 0
@@ -284,8 +284,8 @@ def _refusal(control_plane: ControlPlane, https: urllib.request.OpenerDirector, 
         return str(json.loads(error.read())["message"])
 
 
-def test_unknown_fields_are_refused(control_plane: ControlPlane) -> None:
-    """As kubectl does by default: --validate=strict."""
+def test_manifest_with_unknown_field_is_refused(control_plane: ControlPlane) -> None:
+    """kubectl validates strictly by default (--validate=strict)."""
     with pytest.raises(KubeError, match="unknown field"):
         control_plane.admin.call("POST", f"{API}/zones", zone(colour="red"), params={"fieldValidation": "Strict"})
 
@@ -417,8 +417,8 @@ SHAPES = [
 
 
 @pytest.mark.parametrize("seed", range(len(GOOD)))
-def test_the_api_server_and_the_models_refuse_the_same_manifests(control_plane: ControlPlane, seed: int) -> None:
-    """Of manifests changed at random, so that both forms of every rule are evaluated over the same objects."""
+def test_api_server_and_models_refuse_same_random_manifests(control_plane: ControlPlane, seed: int) -> None:
+    """Randomly changed manifests evaluate both forms of every rule on the same objects."""
     rng, refused = random.Random(seed), 0
     model = MODELS[GOOD[seed]["kind"]]
     place = f"{API}/namespaces/default/{model.PLURAL}" if model.NAMESPACED else f"{API}/{model.PLURAL}"

@@ -1,4 +1,4 @@
-"""The camera service: pictures under policies, on edge nodes and on a drone that flies."""
+"""Camera service on edge nodes and on a flying drone: pictures under policies."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ async def retrieve(camera: Any, name: str, action: Any = types_pb2.Decision.ACTI
     return b"".join(c.data for c in chunks)
 
 
-async def test_pictures_of_an_edge_node(rig: Rig) -> None:
+async def test_edge_node_camera_captures_lists_and_deletes_pictures(rig: Rig) -> None:
     viewer = passenger_grant(services=CAMERA, operationArea=[], **{"class": None})
     rig.write_grant(viewer)
     other = grant(services=CAMERA, operationArea=[], **{"class": None})
@@ -123,7 +123,7 @@ async def test_pictures_of_an_edge_node(rig: Rig) -> None:
         assert not verify(log).problem
 
 
-async def test_the_description_that_the_agent_hands_over_is_judged_by_at_once(rig: Rig) -> None:
+async def test_camera_uses_changed_node_description_at_once(rig: Rig) -> None:
     rig.write_grant(
         passenger_grant(privacy("refuse", 40, -20, 60, 20), services=CAMERA, operationArea=[], **{"class": None})
     )
@@ -172,7 +172,7 @@ async def until_refused(call: Any) -> tuple[grpc.StatusCode, types_pb2.Decision]
     raise AssertionError("the new policy has no effect")
 
 
-async def test_policies_that_come_later_hold_for_pictures_from_before(rig: Rig) -> None:
+async def test_later_policy_applies_to_stored_pictures(rig: Rig) -> None:
     def write(*policies: dict[str, Any]) -> None:
         bound = passenger_grant(*policies, services=CAMERA, operationArea=[], **{"class": None})
         rig.write_grant(bound)
@@ -235,7 +235,7 @@ def noise_url() -> Iterator[str]:
     ("change", "code"),
     [("removed", "NoGrant"), ("refuses", "PrivacyZone"), ("filters", "PrivacyZone"), ("permits", "")],
 )
-async def test_a_grant_that_changes_ends_a_picture_under_way(rig: Rig, noise_url: str, change: str, code: str) -> None:
+async def test_changed_grant_ends_capture_in_progress(rig: Rig, noise_url: str, change: str, code: str) -> None:
     def write(*policies: dict[str, Any]) -> Path:
         return rig.write_grant(passenger_grant(*policies, services=CAMERA, operationArea=[], **{"class": None}))
 
@@ -273,7 +273,7 @@ async def test_a_grant_that_changes_ends_a_picture_under_way(rig: Rig, noise_url
     assert received < 1_000_000, "what was in buffers when the grant changed, and no more"
 
 
-async def test_an_ip_camera_that_breaks_and_comes_back(rig: Rig) -> None:
+async def test_ip_camera_is_used_again_after_failure(rig: Rig) -> None:
     viewer = passenger_grant(services=CAMERA, operationArea=[], **{"class": None})
     rig.write_grant(viewer)
     asked: list[str] = []
@@ -327,7 +327,7 @@ BILLBOARD = (39.36009591, 22.95004318)
 """A lying picture of a face in the simulated landscape."""
 
 
-async def test_a_face_in_the_simulated_world_is_hidden_and_the_rest_stays(rig: Rig) -> None:
+async def test_face_in_simulated_world_is_blurred(rig: Rig) -> None:
     port = free_port()
     rig._start(
         "world", "-m", "fractus_world", "--listen", f"127.0.0.1:{port}", "--pose", f"{BILLBOARD[0]},{BILLBOARD[1]},4",
@@ -379,15 +379,17 @@ async def test_a_face_in_the_simulated_world_is_hidden_and_the_rest_stays(rig: R
         (("--camera", "gopher://x"), "names no supported camera"),
     ],
 )
-async def test_what_cannot_work_is_refused_at_start(rig: Rig, arguments: tuple[str, ...], sentence: str) -> None:
+async def test_camera_service_refuses_invalid_arguments_at_start(
+    rig: Rig, arguments: tuple[str, ...], sentence: str
+) -> None:
     rig.start_camera(*arguments, description=EDGE)
     assert await asyncio.to_thread(rig._processes["camera"].wait, 30) == 1
-    said = rig.log("camera")
-    assert sentence in said
-    assert "Traceback" not in said
+    log = rig.log("camera")
+    assert sentence in log
+    assert "Traceback" not in log
 
 
-async def test_a_drone_takes_pictures_in_its_area_and_not_over_private_ground(rig: Rig) -> None:
+async def test_drone_camera_is_refused_over_privacy_zone(rig: Rig) -> None:
     rig.write_grant(grant())
     stripe = privacy("refuse", -50, 30, 50, 60)
     rig.write_grant(passenger_grant(stripe, services=CAMERA))

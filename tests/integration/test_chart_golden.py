@@ -1,4 +1,7 @@
-"""What the charts make, by their defaults and with everything switched on, against golden files; FRACTUS_GOLDEN=write renews them."""
+"""Rendered charts with default values and with everything enabled, compared with golden files.
+
+Run with FRACTUS_GOLDEN=write to update them.
+"""
 
 from __future__ import annotations
 
@@ -29,19 +32,19 @@ def made(chart: str, *arguments: str) -> str:
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_charts_make_what_the_golden_files_say(case: str) -> None:
+def test_rendered_chart_matches_golden_file(case: str) -> None:
     path, text = GOLDEN / f"{case}.yaml", made(*CASES[case])
     if os.environ.get("FRACTUS_GOLDEN") == "write":
         path.write_text(text)
     assert text == path.read_text()
 
 
-def test_every_golden_file_has_its_case() -> None:
+def test_chart_golden_files_have_cases() -> None:
     assert {path.stem for path in GOLDEN.glob("*.yaml")} == set(CASES)
 
 
 @pytest.mark.parametrize("chart", EVERYTHING)
-def test_everything_is_switched_on_and_set(chart: str) -> None:
+def test_chart_golden_case_sets_every_value(chart: str) -> None:
     said = yaml.safe_load(EVERYTHING[chart].read_text())
 
     def given(name: str) -> Any:
@@ -55,7 +58,7 @@ def test_everything_is_switched_on_and_set(chart: str) -> None:
             assert given(name), f"{EVERYTHING[chart]}: {name}"
 
 
-def test_the_kinds_are_the_generated_ones_and_kept() -> None:
+def test_crds_chart_renders_generated_crds_with_keep_policy() -> None:
     """The golden files of fractus-crds are crds/*.yaml."""
     for keep, kept in ((True, {"helm.sh/resource-policy": "keep"}), (False, {})):
         bodies = {
@@ -70,7 +73,7 @@ def test_the_kinds_are_the_generated_ones_and_kept() -> None:
 
 
 @pytest.mark.parametrize("chart", ["fractus", "fractus-crds", "fractus-demo"])
-def test_helm_shows_what_can_be_set(chart: str) -> None:
+def test_helm_show_readme_lists_values(chart: str) -> None:
     argv = [helm(), "show", "readme", str(CHARTS / chart)]
     shown = subprocess.run(argv, capture_output=True, text=True, timeout=60, check=True).stdout
     assert "| Value | Default | Meaning |" in shown

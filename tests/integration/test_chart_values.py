@@ -1,4 +1,4 @@
-"""Values of an older release, kept by `helm upgrade --reuse-values`: neither they nor their defaults have what a newer chart adds."""
+"""Values of an older release, kept by `helm upgrade --reuse-values`: they lack the values that a newer chart adds."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ def without(*names: str) -> list[str]:
 
 
 @pytest.mark.parametrize("name", [name for name, value in VALUES if value and isinstance(value, dict)])
-def test_a_missing_part_has_its_defaults(name: str) -> None:
+def test_chart_uses_defaults_for_missing_section(name: str) -> None:
     assert render(*without(name)) == plain()
 
 
-def test_missing_values_have_their_defaults() -> None:
+def test_chart_uses_defaults_for_missing_values() -> None:
     missing = [
         name for name, value in VALUES if not (value and isinstance(value, dict)) and not name.endswith(".enabled")
     ]
@@ -36,14 +36,14 @@ def test_missing_values_have_their_defaults() -> None:
     assert render(*EVERYTHING, *without(*missing)) == render(*EVERYTHING)
 
 
-def test_what_a_release_has_said_stays() -> None:
-    said = ["--set=operator.replicas=1", "--set=rbac.aggregate=false", "--set=host.state=/data"]
-    kept = render(*said, *without("metrics", "operator.resources", "host.config"))
-    assert kept == render(*said)
+def test_chart_keeps_values_of_older_release() -> None:
+    values = ["--set=operator.replicas=1", "--set=rbac.aggregate=false", "--set=host.state=/data"]
+    kept = render(*values, *without("metrics", "operator.resources", "host.config"))
+    assert kept == render(*values)
     assert kept != render()
 
 
-def test_a_limit_that_is_left_out_stays_out() -> None:
+def test_chart_omits_limit_set_to_null() -> None:
     agent = next(
         b
         for b in render("--set=agent.resources.limits=null")
@@ -52,12 +52,12 @@ def test_a_limit_that_is_left_out_stays_out() -> None:
     assert set(agent["spec"]["template"]["spec"]["containers"][0]["resources"]) == {"requests"}
 
 
-def test_services_get_further_variables() -> None:
-    said = [
+def test_chart_adds_environment_variables_to_service() -> None:
+    values = [
         "--set=mobility.extraEnv[0].name=OTEL_EXPORTER_OTLP_ENDPOINT",
         "--set=mobility.extraEnv[0].value=http://c:4317",
     ]
-    bodies = {b["metadata"]["name"]: b for b in render(*said) if b["kind"] == "DaemonSet"}
+    bodies = {b["metadata"]["name"]: b for b in render(*values) if b["kind"] == "DaemonSet"}
     variables = {
         name: bodies[name]["spec"]["template"]["spec"]["containers"][0]["env"]
         for name in ("fractus-mobility", "fractus-camera")
@@ -68,9 +68,9 @@ def test_services_get_further_variables() -> None:
     assert "FRACTUS_NODE" in {one["name"] for one in variables["fractus-mobility"]}
 
 
-def test_any_name_and_path_stays_text() -> None:
-    said = ["--set-string=priorityClass.name=123", "--set=host.config=/etc/a: b}", "--set=logLevel=INFO"]
-    bodies = {(body["kind"], body["metadata"]["name"]): body for body in render(*said)}
+def test_chart_quotes_names_and_paths() -> None:
+    values = ["--set-string=priorityClass.name=123", "--set=host.config=/etc/a: b}", "--set=logLevel=INFO"]
+    bodies = {(body["kind"], body["metadata"]["name"]): body for body in render(*values)}
     assert ("PriorityClass", "123") in bodies
     agent = bodies["DaemonSet", "fractus-agent"]["spec"]["template"]["spec"]
     assert agent["priorityClassName"] == "123"

@@ -1,4 +1,4 @@
-"""What the cluster's operator adds to the pods of each workload: it reaches them, beside what they need and never instead of it."""
+"""Pod settings of each workload in the chart values are added to the required settings and never replace them."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def refusal(*arguments: str, chart: str = "fractus") -> str:
 
 
 @pytest.mark.parametrize("part", [*WORKLOADS, "uninstall", "removal", "wipe"])
-def test_labels_and_annotations_reach_the_pods_beside_ours(part: str) -> None:
+def test_workload_has_additional_labels_and_annotations(part: str) -> None:
     ours = plain()[part]["metadata"]["labels"]
     assert everything()[part]["metadata"] == {
         "labels": ours | FOR_ALL["podLabels"], "annotations": FOR_ALL["podAnnotations"],
@@ -78,14 +78,14 @@ def test_labels_and_annotations_reach_the_pods_beside_ours(part: str) -> None:
 
 
 @pytest.mark.parametrize("part", WORKLOADS)
-def test_variables_and_resources_reach_the_container(part: str) -> None:
+def test_workload_has_additional_variables_and_resources(part: str) -> None:
     (before,), (container,) = (found[part]["spec"]["containers"] for found in (plain(), everything()))
     assert container.get("env") == before.get("env", []) + FOR_ALL["extraEnv"]
     assert container["resources"]["requests"] == before["resources"]["requests"] | {"cpu": "1m"}
 
 
 @pytest.mark.parametrize("part", WORKLOADS)
-def test_where_pods_run_is_what_they_need_and_what_is_asked_for(part: str) -> None:
+def test_workload_placement_combines_required_and_configured_rules(part: str) -> None:
     pod, before = everything()[part]["spec"], plain()[part]["spec"]
     assert pod["nodeSelector"] == FOR_PLACED["nodeSelector"]
     needed = before["affinity"]["nodeAffinity"][WHERE]["nodeSelectorTerms"]
@@ -103,7 +103,7 @@ def test_where_pods_run_is_what_they_need_and_what_is_asked_for(part: str) -> No
 
 
 @pytest.mark.parametrize("part", [*IN_THE_CLOUD, "uninstall", "removal"])
-def test_pods_in_the_cloud_are_spread_and_tolerate_as_asked(part: str) -> None:
+def test_cloud_workload_has_configured_spread_and_tolerations(part: str) -> None:
     pod = everything()[part]["spec"]
     assert pod["tolerations"] == FOR_THE_CLOUD["tolerations"]
     assert pod["priorityClassName"] == "ground"
@@ -115,14 +115,14 @@ def test_pods_in_the_cloud_are_spread_and_tolerate_as_asked(part: str) -> None:
     assert "app.kubernetes.io/component" in counted
 
 
-def test_a_constraint_keeps_its_own_selector() -> None:
+def test_topology_spread_constraint_keeps_its_label_selector() -> None:
     asked = FOR_THE_CLOUD["topologySpreadConstraints"][0] | {"labelSelector": {"matchLabels": {"team": "birds"}}}
     pods = templates(f"--set-json=operator.topologySpreadConstraints={json.dumps([asked])}")
     assert pods["operator"]["spec"]["topologySpreadConstraints"] == [asked]
 
 
 @pytest.mark.parametrize("part", ON_NODES)
-def test_pods_on_nodes_have_the_nodes_priority_and_tolerate_everything(part: str) -> None:
+def test_node_workload_has_node_priority_and_tolerates_all_taints(part: str) -> None:
     pod = everything()[part]["spec"]
     assert pod["priorityClassName"] == "fractus-node"
     assert pod["tolerations"] == [{"operator": "Exists"}]
@@ -130,16 +130,16 @@ def test_pods_on_nodes_have_the_nodes_priority_and_tolerate_everything(part: str
         assert name in refusal(f"--set-json={part}.{name}={value}")
 
 
-def test_operators_are_apart_where_they_can() -> None:
+def test_operator_replicas_prefer_different_nodes() -> None:
     found = plain()["operator"]["spec"]["affinity"]["podAntiAffinity"]
-    assert set(found) == {RATHER}, "an operator more beside another one is better than none"
+    assert set(found) == {RATHER}, "two replicas on one node are better than one replica"
     assert {term["podAffinityTerm"]["topologyKey"]: term["weight"] for term in found[RATHER]} == {
         "kubernetes.io/hostname": 100,
         "topology.kubernetes.io/zone": 50,
     }
 
 
-def test_the_view_runs_where_the_operator_may_unless_it_is_said_otherwise() -> None:
+def test_view_inherits_placement_of_operator_unless_configured() -> None:
     said = [
         "--set=view.enabled=true",
         "--set=operator.nodeSelector.pool=a",
@@ -163,7 +163,7 @@ RESERVED = (
 
 
 @pytest.mark.parametrize("name", RESERVED)
-def test_no_label_by_which_policies_and_selectors_go_is_replaced(name: str) -> None:
+def test_reserved_pod_label_is_refused(name: str) -> None:
     for part in ("operator", "mobility"):
         said = refusal(f"--set-json={part}.podLabels={json.dumps({name: 'x'})}", "--skip-schema-validation")
         assert f"{part}.podLabels: the label {name} is reserved" in said
@@ -171,8 +171,8 @@ def test_no_label_by_which_policies_and_selectors_go_is_replaced(name: str) -> N
 
 
 @pytest.mark.parametrize(("chart", "more"), [("fractus", ()), ("fractus-demo", (DRONE,))])
-def test_what_can_be_no_tag_is_refused(chart: str, more: tuple[str, ...]) -> None:
-    """No kubelet takes a digest in its place, and each node would wait for its services."""
+def test_invalid_image_tag_is_refused(chart: str, more: tuple[str, ...]) -> None:
+    """A kubelet accepts no digest as a tag, so every node would wait for its services."""
     for tag in (f"sha256:{64 * '0'}", f"1.0@sha256:{64 * '0'}", "-x", 129 * "x"):
         assert "image/tag" in refusal(f"--set-string=image.tag={tag}", *more, chart=chart)
     for tag in ("", "1.2.3_amd64-rc.1"):
@@ -180,12 +180,12 @@ def test_what_can_be_no_tag_is_refused(chart: str, more: tuple[str, ...]) -> Non
 
 
 @pytest.mark.parametrize("part", WORKLOADS)
-def test_no_variable_of_ours_is_replaced(part: str) -> None:
+def test_reserved_environment_variable_is_refused(part: str) -> None:
     said = refusal(f"--set={part}.extraEnv[0].name=FRACTUS_NODE", "--set=view.enabled=true")
     assert f"{part}.extraEnv: FRACTUS_NODE is reserved" in said
 
 
-def test_the_vehicle_of_the_demo_takes_them_too() -> None:
+def test_demo_vehicle_has_additional_pod_settings() -> None:
     before = templates(DRONE, chart="fractus-demo")["vehicle"]
     asked = FOR_ALL | {"priorityClassName": "fractus-node"}
     after = templates(DRONE, f"--set-json=vehicle={json.dumps(asked)}", chart="fractus-demo")["vehicle"]
@@ -199,7 +199,7 @@ def test_the_vehicle_of_the_demo_takes_them_too() -> None:
 
 
 @pytest.mark.parametrize(("said", "host"), [((), "127.0.0.1"), (("--set=metrics.nodes.address=node",), None)])
-def test_an_agent_is_ready_when_it_answers_for_its_metrics(said: tuple[str, ...], host: str | None) -> None:
+def test_agent_readiness_probe_requests_metrics(said: tuple[str, ...], host: str | None) -> None:
     (container,) = templates(*said)["agent"]["spec"]["containers"]
     asked = container["readinessProbe"]["httpGet"]
     assert (asked["path"], asked.get("host")) == ("/metrics", host)
@@ -207,21 +207,21 @@ def test_an_agent_is_ready_when_it_answers_for_its_metrics(said: tuple[str, ...]
     assert listens == f"{host or '$(FRACTUS_HOST)'}:{asked['port']}"
 
 
-def test_without_metrics_an_agent_is_ready_when_it_runs() -> None:
+def test_agent_has_no_readiness_probe_without_metrics() -> None:
     (container,) = templates("--set=metrics.nodes.enabled=false")["agent"]["spec"]["containers"]
     assert "readinessProbe" not in container
 
 
 @pytest.mark.parametrize("part", ON_NODES)
-def test_nothing_restarts_a_node_s_services_in_the_air(part: str) -> None:
+def test_node_services_have_no_liveness_probe(part: str) -> None:
     (container,) = plain()[part]["spec"]["containers"]
     assert "readinessProbe" in container
     assert not {"livenessProbe", "startupProbe"} & set(container)
 
 
-def test_what_listens_in_the_operator_s_pods_is_reached_and_nothing_else() -> None:
+def test_operator_network_policy_opens_exactly_its_ports() -> None:
     (policy,) = (b for b in render() if (b["kind"], b["metadata"]["name"]) == ("NetworkPolicy", "fractus-operator"))
-    assert policy["spec"]["policyTypes"] == ["Ingress"], "what it asks of others is left alone"
+    assert policy["spec"]["policyTypes"] == ["Ingress"], "egress is not restricted"
     pod = templates()["operator"]
     assert policy["spec"]["podSelector"]["matchLabels"].items() <= pod["metadata"]["labels"].items()
     (rule,) = policy["spec"]["ingress"]

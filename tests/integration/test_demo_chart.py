@@ -28,7 +28,7 @@ def example(name: str) -> list[dict[str, Any]]:
     return [body for body in yaml.safe_load_all((EXAMPLE / name).read_text()) if body]
 
 
-def test_the_nodes_are_those_of_the_example_under_their_own_names() -> None:
+def test_demo_chart_describes_example_nodes_by_cluster_names() -> None:
     made = objects("drone=kind-worker", "edgeNodes={kind-worker2,kind-worker3}")
     assert made["Drone", "kind-worker"]["spec"] == example("drone.yaml")[0]["spec"]
     places = example("edge-nodes.yaml")
@@ -42,7 +42,7 @@ def test_the_nodes_are_those_of_the_example_under_their_own_names() -> None:
     assert "kind-worker" in str(pod["affinity"])
 
 
-def test_a_vehicle_of_ones_own_takes_the_place_of_the_simulated_one() -> None:
+def test_demo_chart_omits_vehicle_if_disabled() -> None:
     made = objects("drone=d", "vehicle.enabled=false")
     assert "DaemonSet" not in {kind for kind, _ in made}
     assert ("Drone", "d") in made
@@ -58,7 +58,7 @@ def containers(application: dict[str, Any]) -> list[dict[str, Any]]:
     return [component["container"] for component in application["spec"]["components"]]
 
 
-def test_it_keeps_the_applications_of_the_example() -> None:
+def test_demo_chart_contains_applications_of_example() -> None:
     made = applications()
     for name in ("application.yaml", "passenger-only.yaml"):
         (body,) = example(name)
@@ -67,33 +67,33 @@ def test_it_keeps_the_applications_of_the_example() -> None:
     assert not {"Application"} & {kind for kind, _ in objects("drone=d")}
 
 
-def test_the_example_comes_from_the_registry_of_the_chart() -> None:
+def test_demo_chart_applications_use_its_registry_and_tag() -> None:
     image = "registry.example:5000/f/example-traffic-monitoring:1.2.3"
     for body in applications("image.registry=registry.example:5000/f", "image.tag=1.2.3").values():
         assert {container["image"] for container in containers(body)} == {image}
         Application.model_validate(body)
 
 
-def test_the_example_takes_resources_that_are_said() -> None:
+def test_demo_chart_applications_have_configured_resources() -> None:
     for body in applications("example.resources.requests.cpu=1m").values():
         assert all(container["resources"] == {"requests": {"cpu": "1m"}} for container in containers(body))
     assert applications("example=null") == applications(), "`helm upgrade --reuse-values` from a chart without it"
 
 
-def test_what_helm_prints_applies_an_application_that_is_kept() -> None:
+def test_demo_chart_notes_name_existing_application() -> None:
     notes = (CHARTS / "fractus-demo" / "templates" / "NOTES.txt").read_text()
     found = re.search(r"get configmap \{\{ \.Release\.Name \}\}-applications -o jsonpath='\{\.data\.([\w-]+)\}'", notes)
     assert found is not None
     assert found[1] in applications()
 
 
-def test_without_a_drone_node_it_says_what_to_label() -> None:
+def test_demo_chart_without_drone_node_fails_with_remedy() -> None:
     done = template()
     assert done.returncode != 0
     assert "no node has the label fractus.dev/class=drone; label one" in done.stderr
 
 
-def test_values_that_mean_nothing_are_refused() -> None:
+def test_demo_chart_refuses_invalid_values() -> None:
     for value, named in (
         ("vehicle.home=Leuven", "vehicle/home"),
         ("edgeNodes={a,b,c,d}", "edgeNodes"),

@@ -1,4 +1,4 @@
-"""What the services record of a real flight, as the readers of others see it."""
+"""Recordings of a real flight, read by foreign tools."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ async def completed(directory: Path) -> None:
             await asyncio.sleep(0.1)
 
 
-async def test_a_flight_and_its_pictures_are_recorded_and_a_kill_costs_little(rig: Rig) -> None:
+async def test_recording_has_flight_and_pictures_and_survives_kill(rig: Rig) -> None:
     mobility, pictures = rig.directory / "recordings" / "mobility", rig.directory / "recordings" / "camera"
     camera = [{"service": "camera", "methods": ["CaptureImage"]}]
     rig.write_grant(grant(altitude_limit(5, 15), fence("no-fly", "exclusion", "ignore", -60, -10, -40, 10)))
@@ -108,7 +108,7 @@ async def test_a_flight_and_its_pictures_are_recorded_and_a_kill_costs_little(ri
     assert component_identity("default", "app", "AerialViewer", "app-aerial-viewer") in callers
 
 
-async def test_a_recording_that_cannot_be_written_keeps_no_drone_on_the_ground(rig: Rig) -> None:
+async def test_recording_failure_does_not_prevent_flight(rig: Rig) -> None:
     (rig.directory / "file").write_text("in the way")
     rig.write_grant(grant())
     rig.start_service("--recordings", str(rig.directory / "file" / "below"))
@@ -121,7 +121,7 @@ async def test_a_recording_that_cannot_be_written_keeps_no_drone_on_the_ground(r
     await driver.stub.ReturnControl(pb.ReturnControlRequest(), timeout=10)
 
 
-async def test_the_second_service_of_a_directory_says_so_where_the_agent_looks(rig: Rig) -> None:
+async def test_recording_into_directory_of_another_service_is_reported(rig: Rig) -> None:
     shared = str(rig.directory / "shared")
     rig.write_grant(grant())
     rig.start_service("--recordings", shared)
@@ -129,24 +129,24 @@ async def test_the_second_service_of_a_directory_says_so_where_the_agent_looks(r
     driver = Driver(rig)
     await driver.up(5.0)
     rig.start_camera("--recordings", shared)
-    said = f"pictures: recording stopped: another service records into {shared}; give each its own directory with --recordings"
+    problem = f"pictures: recording stopped: another service records into {shared}; give each its own directory with --recordings"
     async with asyncio.timeout(60):
         while True:
-            if read_recording_problems(rig.directory) == [said]:
+            if read_recording_problems(rig.directory) == [problem]:
                 break
             await asyncio.sleep(0.1)
     assert not (await rig.telemetry()).recording_problem
     await driver.stub.ReturnControl(pb.ReturnControlRequest(), timeout=10)
 
 
-def test_the_chart_switches_recordings() -> None:
+def test_chart_value_enables_recordings() -> None:
     def arguments(part: str, *given: str) -> list[str]:
         (body,) = (
             b for b in chart.render(*given) if b["kind"] == "DaemonSet" and b["metadata"]["name"] == f"fractus-{part}"
         )
         (container,) = body["spec"]["template"]["spec"]["containers"]
-        told: list[str] = container["args"]
-        return told[told.index("--recordings") :] if "--recordings" in told else []
+        args: list[str] = container["args"]
+        return args[args.index("--recordings") :] if "--recordings" in args else []
 
     directory = "/var/lib/fractus/recordings"
     assert arguments("mobility") == ["--recordings", f"{directory}/mobility", "--recordings-mb", "500"]

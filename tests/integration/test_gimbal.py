@@ -1,4 +1,4 @@
-"""A camera on a gimbal: pictures are judged by where it points as it is measured, no matter who turned it."""
+"""Camera on a gimbal: pictures are judged by its measured attitude."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ async def point(driver: Driver, pitch_deg: float, yaw_deg: float = 0.0) -> pb.Po
     return await driver.stub.PointGimbal(pb.PointGimbalRequest(pitch_deg=pitch_deg, yaw_deg=yaw_deg), timeout=10)
 
 
-async def test_what_the_gimbal_shows_is_judged_by_where_it_points(stage: Stage) -> None:
+async def test_gimbal_picture_is_judged_by_measured_attitude(stage: Stage) -> None:
     driver = stage.driver
     assert (await point(driver, -90.0)).decision.action == ALLOW
     await stage.points(-90.0, 0.0)
@@ -201,7 +201,7 @@ async def test_what_the_gimbal_shows_is_judged_by_where_it_points(stage: Stage) 
     assert brightness(hidden) < 1
 
 
-async def test_what_is_no_drivers_or_no_direction_is_refused(stage: Stage) -> None:
+async def test_point_gimbal_is_refused_for_passenger_or_invalid_angle(stage: Stage) -> None:
     refused = [
         (stage.driver.stub, 45.0, grpc.StatusCode.FAILED_PRECONDITION, "AutopilotRefused"),
         (stage.driver.stub, 95.0, grpc.StatusCode.INVALID_ARGUMENT, "InvalidArgument"),
@@ -216,8 +216,8 @@ async def test_what_is_no_drivers_or_no_direction_is_refused(stage: Stage) -> No
     assert len(calls) >= len(refused), "each was judged, and the audit log has it"
 
 
-async def test_a_camera_that_is_described_as_fixed_is_not_moved(stage: Stage) -> None:
-    """Its pictures are judged by the mount that is described, from the moment on at which that is."""
+async def test_point_gimbal_is_refused_for_fixed_camera(stage: Stage) -> None:
+    """Pictures are judged by the described mount as soon as the description changes."""
     assert (await point(stage.driver, -45.0)).decision.action == ALLOW
     path = stage.rig.directory / "node.yaml"
     described = yaml.safe_load(path.read_text())

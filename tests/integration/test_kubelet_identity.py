@@ -1,4 +1,4 @@
-"""Who has a kubelet's certificate, or a component's: what Kubernetes gives a node (NodeRestriction), and nothing of Fractus beyond that."""
+"""Rights of a kubelet's or a component's certificate: those of NodeRestriction, and no access to Fractus."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def pod_on(world: World, namespace: str) -> Callable[..., Body]:
     return make
 
 
-def test_it_reads_and_writes_no_object_of_fractus(world: World, kubelet: BlockingClient, namespace: str) -> None:
+def test_kubelet_has_no_access_to_objects_of_fractus(world: World, kubelet: BlockingClient, namespace: str) -> None:
     for kind in KINDS:
         scope = f"/namespaces/{namespace}" if kind.NAMESPACED else ""
         path = f"{FRACTUS}{scope}/{kind.PLURAL}"
@@ -51,7 +51,7 @@ def test_it_reads_and_writes_no_object_of_fractus(world: World, kubelet: Blockin
     denied(lambda: kubelet.get(f"{FRACTUS}/namespaces/{NODES}/nodegrants/drone-1"), "cannot get")
 
 
-def test_it_reads_the_certificates_of_its_own_pods_only(
+def test_kubelet_reads_only_certificates_of_its_pods(
     world: World, kubelet: BlockingClient, namespace: str, pod_on: Callable[..., Body]
 ) -> None:
     secrets = f"/api/v1/namespaces/{namespace}/secrets"
@@ -66,7 +66,7 @@ def test_it_reads_the_certificates_of_its_own_pods_only(
     denied(lambda: kubelet.list(secrets), "cannot list")
 
 
-def test_it_gets_tokens_of_its_own_agent_only(
+def test_kubelet_gets_only_tokens_of_its_agent(
     world: World, kubelet: BlockingClient, pod_on: Callable[..., Body]
 ) -> None:
     def token(account: str, pod: Body, place: str = SYSTEM) -> object:
@@ -89,7 +89,7 @@ def test_it_gets_tokens_of_its_own_agent_only(
     )
 
 
-def test_it_gets_no_certificate_of_its_node(world: World, operator: OperatorProcess, kubelet: BlockingClient) -> None:
+def test_kubelet_gets_no_node_certificate(world: World, operator: OperatorProcess, kubelet: BlockingClient) -> None:
     body = signing_request("drone-1")
     kubelet.call("POST", REQUESTS, body)
     status = settled(world, body)
@@ -101,7 +101,7 @@ def test_it_gets_no_certificate_of_its_node(world: World, operator: OperatorProc
         denied(lambda part=part: kubelet.merge(f"{path}/{part}", approval), "cannot patch")
 
 
-def test_it_makes_no_pods_but_records_of_its_own_and_is_no_other_node(
+def test_kubelet_creates_only_mirror_pods_of_its_node(
     world: World, kubelet: BlockingClient, namespace: str, pod_on: Callable[..., Body]
 ) -> None:
     labels = {"fractus.dev/application": "traffic", "app.kubernetes.io/managed-by": "fractus"}
@@ -130,10 +130,10 @@ def test_it_makes_no_pods_but_records_of_its_own_and_is_no_other_node(
         )
 
 
-def test_the_certificate_of_a_component_is_no_account(
+def test_component_certificate_is_refused_by_api_server(
     control_plane: ControlPlane, world: World, tmp_path: Path
 ) -> None:
-    """Of what an application's pod has, nothing is good for the API server: it mounts no token."""
+    """The pod of an Application has no credentials for the API server, because it mounts no token."""
     now = datetime.now(UTC)
     issued = Authority.generate(now).issue_component("spiffe://fractus.dev/ns/n/app/a/component/C/instance/i", now)
     for name, value in issued.items():

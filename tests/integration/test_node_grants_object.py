@@ -1,4 +1,4 @@
-"""Each node's Grants in one object: the operator writes it and copies what is reported there, with the rights that the chart gives it."""
+"""NodeGrants object of a node: the operator writes it and copies reports from it, with the rights of the chart."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def carried(world: World, node: str) -> dict[str, Body] | None:
     )
 
 
-def test_a_node_s_object_follows_its_grants_and_its_reports_reach_them(
+def test_node_grants_object_follows_grants_and_returns_reports(
     world: World, operator: OperatorProcess, namespace: str
 ) -> None:
     wait_for(lambda: carried(world, "drone-1") == {}, "the object of a drone without Grants")

@@ -1,4 +1,4 @@
-"""The operator against a real API server: from a manifest to children, through restarts, missions and deletion."""
+"""The operator against a real API server: child objects, restarts, missions and deletion of an Application."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def events(world: World, namespace: str) -> list[str]:
     return sorted(e["reason"] for e in found if e["involvedObject"]["kind"] == "Application")
 
 
-def test_a_certificate_names_its_instance_only(world: World, operator: OperatorProcess, namespace: str) -> None:
+def test_certificate_names_only_its_instance(world: World, operator: OperatorProcess, namespace: str) -> None:
     world.put(traffic(namespace))
     world.phase(namespace, "Deploying")
     secret = world.children(namespace)["secrets/traffic-navigator-tls"]
@@ -252,7 +252,7 @@ def test_finished_pods_stay_stopped_for_their_logs(world: World, operator: Opera
     wait_for(lambda: not world.pods(namespace), "pods that are not to be kept to go")
 
 
-def test_how_long_pods_are_kept_begins_no_other_mission(
+def test_changed_ttl_of_finished_pods_starts_no_mission(
     world: World, operator: OperatorProcess, namespace: str
 ) -> None:
     manifest = traffic(namespace, "traffic", navigator())
@@ -349,7 +349,7 @@ def test_phase_follows_drone(world: World, operator: OperatorProcess, namespace:
 
 
 @pytest.mark.parametrize(("phase", "reason"), [("Failed", "MissionFailed"), ("Revoked", "MissionRevoked")])
-def test_a_failed_mission_is_reported(
+def test_failed_mission_is_reported(
     world: World, operator: OperatorProcess, namespace: str, phase: str, reason: str
 ) -> None:
     running(world, namespace)
@@ -398,7 +398,7 @@ def test_refused_pods_are_reported(world: World, operator: OperatorProcess, name
     deployed(world, namespace)
 
 
-def test_a_changed_spec_flies_again_after_completion(world: World, operator: OperatorProcess, namespace: str) -> None:
+def test_changed_spec_flies_again_after_completion(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     end_mission(world, namespace, "Complete", "done")
     world.phase(namespace, "Completed")
@@ -433,7 +433,7 @@ def test_drone_is_held_by_one_application_until_it_has_returned(
     world.phase(namespace, "Deploying", second)
 
 
-def test_without_a_drone_it_waits_for_one(world: World, operator: OperatorProcess, namespace: str) -> None:
+def test_application_waits_for_a_drone(world: World, operator: OperatorProcess, namespace: str) -> None:
     world.api.delete(f"{FRACTUS}/drones/drone-1")
     world.put(traffic(namespace))
     world.phase(namespace, "Pending")
@@ -724,7 +724,7 @@ def test_immediate_change_is_applied_in_flight(world: World, operator: OperatorP
     wait_for(lambda: driver_env(world, namespace).get("COLOUR") == "red", "the change")
 
 
-def test_a_change_that_waits_when_the_mission_ends_is_another_mission(
+def test_change_pending_at_end_of_mission_starts_another_mission(
     world: World, operator: OperatorProcess, namespace: str
 ) -> None:
     running(world, namespace)

@@ -1,4 +1,4 @@
-"""What the API server and the operator allow no one: bad manifests, foreign certificates, foreign nodes."""
+"""Admission: bad manifests, pods on foreign nodes, and attempts with the operator's token."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ BAD_APPLICATIONS: list[tuple[Callable[[Body], None], str]] = [
 
 
 @pytest.mark.parametrize(("spoil", "field"), BAD_APPLICATIONS, ids=[s.__name__.strip("_") for s, _ in BAD_APPLICATIONS])
-def test_a_bad_application_is_refused_and_nothing_is_made(
+def test_bad_application_is_refused_without_child_objects(
     world: World, operator: OperatorProcess, namespace: str, spoil: Callable[[Body], None], field: str
 ) -> None:
     manifest = traffic(namespace)
@@ -108,7 +108,7 @@ def test_a_bad_application_is_refused_and_nothing_is_made(
     assert world.children(namespace) == {}
 
 
-def test_a_crossing_zone_and_an_unknown_zone_are_not_ready(world: World, operator: OperatorProcess) -> None:
+def test_policy_with_invalid_or_unknown_zone_is_not_ready(world: World, operator: OperatorProcess) -> None:
     ring = [at(0, 0), at(50, 50), at(0, 50), at(50, 0)]
     world.put(ours("Zone", "bowtie", {"area": {"polygon": {"exterior": ring}}}))
     world.put(
@@ -141,7 +141,7 @@ def test_a_crossing_zone_and_an_unknown_zone_are_not_ready(world: World, operato
     assert "cross more than 50000 times" in crossed["message"]
 
 
-def test_a_corrected_application_is_deployed(world: World, operator: OperatorProcess, namespace: str) -> None:
+def test_corrected_application_is_deployed(world: World, operator: OperatorProcess, namespace: str) -> None:
     manifest = traffic(namespace, "traffic", navigator(), component("DataStore", "cloud"))
     manifest["spec"]["components"][0]["controlPoints"][0]["point"] = {"depot": "late"}
     world.put(manifest)
@@ -153,8 +153,8 @@ def test_a_corrected_application_is_deployed(world: World, operator: OperatorPro
 # -- what runs on drones and edge nodes --
 
 
-def test_no_pod_gets_to_a_drone_by_naming_it(world: World, chart: None, namespace: str) -> None:
-    """A kubelet heeds only taints with the effect NoExecute, and what tolerates none was not judged at all."""
+def test_pod_with_node_name_of_drone_is_refused(world: World, chart: None, namespace: str) -> None:
+    """A kubelet checks only NoExecute taints of a pod with a node name."""
     drone = "/api/v1/nodes/drone-1"
     pods = f"/api/v1/namespaces/{namespace}/pods?dryRun=All"
 
@@ -186,8 +186,8 @@ def test_no_pod_gets_to_a_drone_by_naming_it(world: World, chart: None, namespac
 # -- the operator's own permissions --
 
 
-def test_the_operator_reads_no_secret(control_plane: ControlPlane, world: World, chart: None, namespace: str) -> None:
-    """But the key of the authority; in whatever way: a patch would answer with what is there, and so would a collection's end."""
+def test_operator_reads_no_secret(control_plane: ControlPlane, world: World, chart: None, namespace: str) -> None:
+    """The key of the authority is the exception. A patch or a deletion of a collection would return the content too."""
     client = control_plane.with_token(operator_token(world))
     for place in (namespace, "kube-system", SYSTEM):
         secrets = f"/api/v1/namespaces/{place}/secrets"
@@ -208,7 +208,7 @@ def test_the_operator_reads_no_secret(control_plane: ControlPlane, world: World,
     denied(partial(client.call, "GET", "/api/v1/secrets"), 'cannot list resource "secrets"')
 
 
-def test_the_operator_writes_nothing_that_it_has_not_made(
+def test_operator_writes_only_objects_that_it_has_created(
     control_plane: ControlPlane, world: World, chart: None, namespace: str
 ) -> None:
     theirs = f"/api/v1/namespaces/{namespace}/secrets/theirs"
@@ -275,10 +275,10 @@ _MADE = {
 }
 
 
-def test_who_has_the_operator_s_token_gets_no_further(
+def test_operator_token_cannot_escalate_with_pods_or_secrets(
     control_plane: ControlPlane, world: World, chart: None, namespace: str
 ) -> None:
-    """Pods and Secrets that carry the operator's label, and would give their maker the cluster."""
+    """Pods and Secrets with the operator's label that would give their creator control of the cluster."""
     client = control_plane.with_token(operator_token(world))
     mine = {"app.kubernetes.io/managed-by": "fractus"}
 
@@ -381,10 +381,10 @@ def test_who_has_the_operator_s_token_gets_no_further(
         client.close()
 
 
-def test_who_has_the_operator_s_token_moves_no_traffic(
+def test_operator_token_cannot_redirect_foreign_traffic(
     control_plane: ControlPlane, world: World, chart: None, namespace: str
 ) -> None:
-    """Objects that carry the operator's label, and would give their maker the traffic of others."""
+    """Objects with the operator's label that would give their creator the traffic of others."""
     client = control_plane.with_token(operator_token(world))
     mine = {"app.kubernetes.io/managed-by": "fractus"}
 
@@ -450,7 +450,7 @@ def test_who_has_the_operator_s_token_moves_no_traffic(
 
 
 def _leads_no_other_s_traffic(world: World, client: BlockingClient, namespace: str) -> None:
-    """A Service's traffic goes to every EndpointSlice with its name, also to one that another client made."""
+    """The traffic of a Service goes to every EndpointSlice with its name, including those of other clients."""
     services = f"/api/v1/namespaces/{namespace}/services"
     slices = f"/apis/discovery.k8s.io/v1/namespaces/{namespace}/endpointslices"
 
@@ -496,7 +496,7 @@ def _probe_refused(client: BlockingClient) -> bool:
     return False
 
 
-def test_the_operator_does_its_work_with_the_chart_s_permissions(
+def test_operator_works_with_permissions_of_the_chart(
     control_plane: ControlPlane, world: World, chart: None, namespace: str, tmp_path: Path
 ) -> None:
     token = operator_token(world)

@@ -1,4 +1,4 @@
-"""What changes around a plan: nodes that come, go or are cordoned, shared flights, releases that serialize differently."""
+"""Changes around a plan: new, deleted and cordoned nodes, shared flights, other releases, and two operators."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ VISITS = [at(15, 15, alt=12), at(45, 45, alt=17)]
 
 
 def guest(namespace: str, name: str = "guest", points: list[Body] | None = None) -> Body:
-    """An application that only wants pictures of some places, wherever the drone that passes them belongs."""
+    """Return an application that takes pictures at some points from any drone that passes them."""
     services = [{"service": "camera", "methods": ["CaptureImage"]}]
     camera = component("Camera", "drone", **{"class": "passenger"}, services=services)
     camera["pointsOfInterest"] = {"points": points or VISITS}
@@ -26,7 +26,7 @@ def guest(namespace: str, name: str = "guest", points: list[Body] | None = None)
 
 
 def instances(world: World, namespace: str, prefix: str) -> set[str]:
-    """Names of the Deployments that begin so."""
+    """Return the names of the Deployments with a prefix."""
     names = {n.removeprefix("deployments/") for n in world.children(namespace) if n.startswith("deployments/")}
     return {name for name in names if name.startswith(prefix)}
 
@@ -39,16 +39,14 @@ def drone_of(world: World, namespace: str, name: str) -> Body:
 # -- coming along --
 
 
-def test_a_guest_comes_along_and_is_done_when_its_host_is(
-    world: World, operator: OperatorProcess, namespace: str
-) -> None:
+def test_guest_shares_flight_and_completes_with_host(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     world.put(guest(namespace))
     world.phase(namespace, "Deploying", "guest")
     assert drone_of(world, namespace, "guest")["sharedWith"] == f"{namespace}/traffic"
     (grant,) = world.grants(namespace, "guest")
     assert (grant["spec"]["node"], grant["spec"].get("tour")) == ("drone-1", None)
-    # Its grant claims nothing: the host keeps its drone, also for an operator that knows only what is written.
+    # The guest's grant claims no drone: the host keeps its drone, also after a restart of the operator.
     operator.stop()
     operator.start()
     world.drone_status("drone-1", "flying")
@@ -64,7 +62,9 @@ def test_a_guest_comes_along_and_is_done_when_its_host_is(
     assert status["message"] == f"{namespace}/traffic has flown drone-1 past all points of interest"
 
 
-def test_a_guest_whose_ride_fails_gets_another_drone(world: World, operator: OperatorProcess, namespace: str) -> None:
+def test_guest_gets_another_drone_when_shared_flight_fails(
+    world: World, operator: OperatorProcess, namespace: str
+) -> None:
     running(world, namespace)
     world.put(guest(namespace))
     world.phase(namespace, "Deploying", "guest")
@@ -81,13 +81,13 @@ def test_a_guest_whose_ride_fails_gets_another_drone(world: World, operator: Ope
     assert [(round(p["lat"], 6), p["alt"]) for p in grant["spec"]["tour"]] == [
         (round(p["lat"], 6), p["alt"]) for p in VISITS
     ]
-    # It has no driver: the node says of its own grant how the tour ended.
+    # Without a driver, the node reports the result of the tour on the guest's grant.
     report = {"status": {"phase": "Complete", "message": "all points were visited"}}
     world.api.merge(f"{FRACTUS}/grants/{namespace}.guest-camera/status", report)
     assert world.phase(namespace, "Completed", "guest")["message"] == "all points were visited"
 
 
-def test_a_guest_leaves_a_host_that_turns_elsewhere(world: World, operator: OperatorProcess, namespace: str) -> None:
+def test_guest_leaves_host_with_changed_path(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     world.put(guest(namespace))
     world.phase(namespace, "Deploying", "guest")
@@ -102,7 +102,7 @@ def test_a_guest_leaves_a_host_that_turns_elsewhere(world: World, operator: Oper
 # -- nodes that come and go --
 
 
-def test_a_node_that_goes_or_is_cordoned_is_left(world: World, operator: OperatorProcess, namespace: str) -> None:
+def test_deleted_or_cordoned_node_is_replaced(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     assert instances(world, namespace, "traffic-ground") == {
         "traffic-ground-viewer-edge-2",
@@ -128,12 +128,12 @@ def test_a_node_that_goes_or_is_cordoned_is_left(world: World, operator: Operato
     assert world.status(namespace)["drone"] == "drone-1"
 
 
-def test_a_cordoned_drone_flies_on_and_one_on_the_ground_is_replaced(
+def test_cordoned_drone_is_kept_in_flight_and_replaced_on_ground(
     world: World, operator: OperatorProcess, namespace: str
 ) -> None:
     running(world, namespace)
     world.api.merge("/api/v1/nodes/drone-1", {"spec": {"unschedulable": True}})
-    # There is no other: what runs goes on.
+    # No other drone exists, so the plan is kept.
     wait_for(lambda: world.status(namespace).get("drone") == "drone-1", "the plan to stand")
     world.drone_status("drone-1", "flying")
     world.add_drone("drone-2")
@@ -147,7 +147,7 @@ def test_a_cordoned_drone_flies_on_and_one_on_the_ground_is_replaced(
 
 
 @pytest.mark.parametrize("count", ["*", 3])
-def test_new_nodes_make_a_plan_grow(world: World, operator: OperatorProcess, namespace: str, count: Any) -> None:
+def test_new_node_scales_up_the_plan(world: World, operator: OperatorProcess, namespace: str, count: Any) -> None:
     viewer = component("GroundViewer", "edge", locations=[{"center": at(40, 30), "radius": 15, "instances": count}])
     world.put(traffic(namespace, "traffic", viewer))
     deployed(world, namespace, pods=1)
@@ -162,7 +162,7 @@ def test_new_nodes_make_a_plan_grow(world: World, operator: OperatorProcess, nam
     )
 
 
-def test_a_zone_across_the_way_is_told_before_takeoff_until_it_goes(
+def test_policy_conflict_is_reported_before_takeoff_until_policy_is_deleted(
     world: World, operator: OperatorProcess, namespace: str
 ) -> None:
     running(world, namespace)
@@ -185,13 +185,11 @@ def test_a_zone_across_the_way_is_told_before_takeoff_until_it_goes(
 # -- releases --
 
 
-def test_a_release_that_spells_grants_in_another_way_leaves_those_in_use(
-    world: World, operator: OperatorProcess, namespace: str
-) -> None:
+def test_grants_serialized_by_another_release_are_kept(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     operator.stop()
     for grant in world.grants(namespace):
-        # As a release would that writes defaults, and stamps what it wrote.
+        # Simulate a release that writes defaults and an annotation of what it applied.
         old = {"metadata": {"annotations": {"fractus.dev/applied": "of-old"}}, "spec": {"tour": [], "policies": []}}
         world.api.merge(f"{FRACTUS}/grants/{grant['metadata']['name']}", old)
     before = {g["metadata"]["name"]: g["metadata"]["resourceVersion"] for g in world.grants(namespace)}
@@ -206,7 +204,7 @@ def test_a_release_that_spells_grants_in_another_way_leaves_those_in_use(
 # -- two operators --
 
 
-def test_of_two_operators_one_acts_and_the_other_takes_over(
+def test_second_operator_takes_over_from_frozen_leader(
     control_plane: ControlPlane, world: World, namespace: str, tmp_path: Path
 ) -> None:
     brief = {"FRACTUS_LEASE": "3"}
@@ -220,7 +218,7 @@ def test_of_two_operators_one_acts_and_the_other_takes_over(
         wait_for(lambda: "waiting for the leader to end" in second.log(), second.log)
         world.put(traffic(namespace))
         world.phase(namespace, "Deploying")
-        # Frozen, as on a machine that was paused, and then thawed beside the one that acts meanwhile.
+        # Freeze the leader, as on a paused machine, and resume it while the other operator is the leader.
         first.signal(signal.SIGSTOP)
         world.add_drone("drone-2")
         world.put(traffic(namespace, "second"))
@@ -234,11 +232,11 @@ def test_of_two_operators_one_acts_and_the_other_takes_over(
         if first.running:
             first.stop(signal.SIGKILL)
         if second.running:
-            # It gives the Lease back: the next test's operator need not wait until that has run out.
+            # The operator releases the Lease, so that the next test's operator need not wait for its expiry.
             second.stop()
 
 
-def test_the_second_operator_is_healthy_and_acts_within_15_s_of_the_end_of_the_first(
+def test_second_operator_takes_over_within_15_s_of_killed_leader(
     control_plane: ControlPlane, world: World, namespace: str, tmp_path: Path
 ) -> None:
     first, second = (

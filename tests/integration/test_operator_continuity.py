@@ -1,4 +1,4 @@
-"""What stands goes on: policies reach running grants through any trouble, and drones stay with who has them."""
+"""Running Applications in trouble: policies still reach their grants, and they keep their drones."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ def _in_trouble(world: World, namespace: str, trouble: Any) -> None:
 
 
 @pytest.mark.parametrize("trouble", [_infeasible, _invalid, _foreign_deployment])
-def test_no_trouble_keeps_a_policy_from_a_grant(
+def test_policy_change_reaches_grant_of_application_in_trouble(
     world: World, operator: OperatorProcess, namespace: str, trouble: Any
 ) -> None:
     _in_trouble(world, namespace, trouble)
@@ -168,15 +168,15 @@ def _without_depot(world: World, namespace: str) -> None:
 
 
 @pytest.mark.parametrize("trouble", [_infeasible, _invalid, _without_depot])
-def test_no_trouble_keeps_what_runs_from_new_certificates(
+def test_certificate_is_renewed_for_application_in_trouble(
     world: World, operator: OperatorProcess, namespace: str, trouble: Any
 ) -> None:
-    """They last for a day, and what waits for a node or a correction may wait for longer."""
+    """Certificates last for a day, and an Application may wait longer for a node or a correction."""
     _in_trouble(world, namespace, trouble)
     deployment = f"/apis/apps/v1/namespaces/{namespace}/deployments/traffic-navigator"
     secret = f"/api/v1/namespaces/{namespace}/secrets/traffic-navigator-tls"
     before = (world.api.get(secret) or {})["data"]["tls.crt"]
-    # To the operator, one that cannot be read is as one that has expired.
+    # The operator treats an unreadable expiry as expired.
     world.api.merge(deployment, {"metadata": {"annotations": {"fractus.dev/certificate": "expired"}}})
     wait_for(lambda: (world.api.get(secret) or {})["data"]["tls.crt"] != before, lambda: operator.log()[-3000:])
 
@@ -201,7 +201,7 @@ def test_refreshed_grant_keeps_previous_version_of_broken_policy(
     world.put(ours("Policy", "slow", {"type": "LimitControl", "kind": "speed", "upperLimit": 3}))
     wait_for(lambda: granted(world, namespace) == ["fence", "odd", "slow"], "the third policy beside the broken ones")
     assert world.status(namespace)["phase"] == "Waiting"
-    # What is new is granted nothing while it is unknown for which grants that policy holds.
+    # A new Application gets no grant while the scope of the unreadable policy is unknown.
     world.add_drone("drone-2")
     world.put(traffic(namespace, "second"))
     assert "Policy odd" in reason(world, namespace, "PolicyInvalid", "second")["message"]
@@ -214,7 +214,7 @@ def test_refreshed_grant_keeps_previous_version_of_broken_policy(
 # -- who has the drone --
 
 
-def test_a_drone_on_its_way_home_is_nobodys(world: World, operator: OperatorProcess, namespace: str) -> None:
+def test_returning_drone_belongs_to_no_application(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     world.drone_status("drone-1", "flying")
     end_mission(world, namespace, "Complete", "done")
@@ -224,13 +224,15 @@ def test_a_drone_on_its_way_home_is_nobodys(world: World, operator: OperatorProc
     world.put(again)
     world.phase(namespace, "Queued")
     world.drone_status("drone-1", "inactive", ready="False")
-    # It has no claim any more: what a drone must be for a new mission is asked again.
+    # The Application has no claim any more, so the requirements of a new mission are checked again.
     reason(world, namespace, "NoDrone")
     world.drone_status("drone-1", "inactive")
     world.phase(namespace, "Deploying")
 
 
-def test_created_again_it_waits_for_the_old_ones_drone(world: World, operator: OperatorProcess, namespace: str) -> None:
+def test_recreated_application_waits_for_drone_of_deleted_one(
+    world: World, operator: OperatorProcess, namespace: str
+) -> None:
     running(world, namespace)
     world.drone_status("drone-1", "flying")
     world.api.delete(world.path(traffic(namespace)))
@@ -242,7 +244,7 @@ def test_created_again_it_waits_for_the_old_ones_drone(world: World, operator: O
     world.phase(namespace, "Deploying")
 
 
-def test_of_two_plans_with_one_drone_the_one_with_the_older_grant_stands(
+def test_plan_with_older_grant_keeps_drone_of_two_plans(
     world: World, operator: OperatorProcess, namespace: str
 ) -> None:
     running(world, namespace)
@@ -273,9 +275,7 @@ def reconciled(world: World, namespace: str) -> None:
     wait_for(lambda: (world.api.get(path) or {})["spec"]["replicas"] == 1, "the number of replicas")
 
 
-def test_trouble_with_its_node_moves_nothing_that_flies(
-    world: World, operator: OperatorProcess, namespace: str
-) -> None:
+def test_deleted_drone_in_flight_keeps_its_grants(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     world.add_drone("drone-2")
     world.drone_status("drone-1", "flying")
@@ -289,7 +289,7 @@ def test_trouble_with_its_node_moves_nothing_that_flies(
     assert world.status(namespace)["drone"] == "drone-1"
 
 
-def test_a_pod_with_our_labels_does_not_move_a_plan(world: World, operator: OperatorProcess, namespace: str) -> None:
+def test_forged_pod_does_not_change_plan(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     labels = {"fractus.dev/application": "traffic", "fractus.dev/instance": "traffic-ground-viewer-edge-2",
               "app.kubernetes.io/managed-by": "fractus"}  # fmt: skip
@@ -304,22 +304,22 @@ def test_a_pod_with_our_labels_does_not_move_a_plan(world: World, operator: Oper
     assert "deployments/traffic-ground-viewer-edge-1" not in world.children(namespace)
 
 
-def test_a_teardown_that_is_refused_is_made_again(world: World, operator: OperatorProcess, namespace: str) -> None:
+def test_refused_teardown_is_retried(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     with undeletable_secrets(world, namespace):
         world.api.delete(f"{FRACTUS}/namespaces/{namespace}/applications/traffic")
         wait_for(lambda: "failed temporarily" in operator.log(), "the teardown to fail")
-        assert not world.grants(namespace), "rights go first"
+        assert not world.grants(namespace), "grants are deleted first"
         assert world.application(namespace) is not None
     wait_for(lambda: world.application(namespace) is None, lambda: f"the end: {operator.log()[-3000:]}")
-    assert "is cancelled" not in operator.log(), "the end of what follows an application is no reason for a warning"
+    assert "is cancelled" not in operator.log(), "the end of an Application causes no warning"
 
 
 @pytest.mark.parametrize("restarted", [False, True], ids=["running", "restarted"])
-def test_deleted_while_its_mission_is_wound_up_it_leaves_no_pod(
+def test_application_deleted_at_end_of_mission_leaves_no_pods(
     world: World, operator: OperatorProcess, namespace: str, *, restarted: bool
 ) -> None:
-    """As by who deletes an application once it reads Completed: its pods have lost one owner, and have no other yet."""
+    """A user deletes the Application when it is Completed: its pods have lost one owner and have no other yet."""
     world.put(traffic(namespace, "traffic", navigator()))
     deployed(world, namespace, pods=1)
     with unstoppable_pods(world, namespace):

@@ -1,4 +1,4 @@
-"""What flies a drone stays as it is while the drone is in the air: what the API server refuses to every client."""
+"""Protection of services and nodes of a drone in flight: changes that the API server refuses to every client."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ def together(world: World) -> dict[str, Callable[[], object]]:
     }
 
 
-def test_nothing_takes_a_service_from_a_drone_in_the_air(guarded: World) -> None:
+def test_services_of_drone_in_flight_cannot_be_removed(guarded: World) -> None:
     for name, attempt in {**attempts(guarded, "drone-1"), **together(guarded)}.items():
         said = refusal(attempt)
         assert "drone-1 is in the air: wait until it has landed" in said, name
@@ -145,7 +145,7 @@ def test_nothing_takes_a_service_from_a_drone_in_the_air(guarded: World) -> None
             assert not refusal(attempt), name
 
 
-def test_what_harms_no_flight_goes_on(control_plane: ControlPlane, guarded: World) -> None:
+def test_harmless_changes_are_allowed_in_flight(control_plane: ControlPlane, guarded: World) -> None:
     api, dry = guarded.api, "?dryRun=All"
     api.merge(f"{NODE}{dry}", {"spec": {"unschedulable": True}})
     api.merge(f"{NODE}{dry}", {"metadata": {"labels": {"fractus.dev/geohash": "u1"}}})
@@ -154,7 +154,7 @@ def test_what_harms_no_flight_goes_on(control_plane: ControlPlane, guarded: Worl
     api.merge(f"{PODS}/fractus-mobility-drone-1{dry}", {"metadata": {"annotations": {"a": "b"}}})
     template = {"spec": {"template": {"metadata": {"annotations": {"a": "b"}}}}}
     api.merge(f"{DAEMON_SETS}/fractus-agent{dry}", template)
-    # A service that does not run may be replaced by one that does.
+    # A service that does not run may be replaced.
     waiting = {"name": "camera", "image": "bad", "imageID": "", "ready": False, "restartCount": 9}
     waiting["state"] = {"waiting": {"reason": "CrashLoopBackOff"}}
     kubelet = control_plane.as_user("kubelet", "system:node:drone-1", ("system:nodes",))
@@ -164,14 +164,14 @@ def test_what_harms_no_flight_goes_on(control_plane: ControlPlane, guarded: Worl
     try_delete(guarded, f"{PODS}/fractus-camera-drone-1")
 
 
-def test_on_the_ground_all_of_it_is_allowed(guarded: World) -> None:
+def test_services_of_drone_on_ground_can_be_removed(guarded: World) -> None:
     guarded.drone_status("drone-1", "inactive")
     wait_for(lambda: not refusal(attempts(guarded, "drone-1")["delete a pod"]), "the landing to be known")
     for name, attempt in {**attempts(guarded, "drone-1"), **together(guarded)}.items():
         assert not refusal(attempt), name
 
 
-def test_a_silent_drone_is_in_the_air_until_someone_sees_it_on_the_ground(guarded: World, tmp_path: Path) -> None:
+def test_stale_drone_counts_as_in_flight_until_annotated_as_grounded(guarded: World, tmp_path: Path) -> None:
     (line,) = (typed for typed in shell_lines("docs/upgrades.md") if "fractus.dev/grounded" in typed)
     path = f"{FRACTUS}/drones/drone-1"
     seen = "2026-01-01T00:00:00Z"
@@ -181,24 +181,24 @@ def test_a_silent_drone_is_in_the_air_until_someone_sees_it_on_the_ground(guarde
     told = wait_for(lambda: "at its last report" in refusal(attempt) and refusal(attempt), "the silence to be known")
     assert line in told
     guarded.api.merge(path, {"metadata": {"annotations": {"fractus.dev/grounded": "2025-12-31T00:00:00Z"}}})
-    assert refusal(attempt), "said of an earlier flight"
+    assert refusal(attempt), "the annotation refers to an earlier flight"
     Shell(tmp_path, guarded.plane).type(line)
     wait_for(lambda: not refusal(attempt), "the annotation to count")
     guarded.api.merge(f"{path}/status", {"status": {"lastSeen": "2026-01-01T00:00:05Z"}})
     wait_for(lambda: refusal(attempt), "the drone to be heard of again")
 
 
-def test_what_a_node_is_does_not_change_by_way_of_its_status(guarded: World) -> None:
+def test_node_class_cannot_be_changed_through_status(guarded: World) -> None:
     change = {"metadata": {"labels": {"fractus.dev/class": None}}}
     told = wait_for(lambda: refusal(lambda: guarded.api.merge(f"{NODE}/status?dryRun=All", change)), "the policy")
     assert "kubectl label node" in told
 
 
 @pytest.mark.parametrize("drone", ["drone-1", "drone-2"])
-def test_only_its_kubelet_says_that_a_service_has_ended(
+def test_service_pod_status_is_written_only_by_its_kubelet(
     control_plane: ControlPlane, guarded: World, drone: str
 ) -> None:
-    """Also on the ground, so that no Drone is looked at for what kubelets write all the time."""
+    """The rule also applies on the ground, so that frequent writes of kubelets need no lookup of the Drone."""
     path = f"{PODS}/fractus-mobility-{drone}/status?dryRun=All"
     failed, ended = {"status": {"phase": "Failed"}}, {"status": {"containerStatuses": []}}
     for change in (failed, ended):
@@ -209,14 +209,14 @@ def test_only_its_kubelet_says_that_a_service_has_ended(
     with control_plane.as_user(f"kubelet-{drone}", f"system:node:{drone}", ("system:nodes",)) as kubelet:
         kubelet.merge(path, failed)
         kubelet.merge(path, ended)
-    # The rights of that controller are those of its user name, by a ClusterRoleBinding of Kubernetes's own.
+    # A ClusterRoleBinding of Kubernetes gives this controller rights by its user name.
     collector = "system:serviceaccount:kube-system:pod-garbage-collector"
     with control_plane.as_user("collector", collector, ()) as client:
         client.merge(path, failed)
         assert "only the kubelet of the node" in refusal(lambda: client.merge(path, ended))
 
 
-def test_the_kinds_stay_while_the_chart_needs_them(guarded: World) -> None:
+def test_crds_cannot_be_deleted_while_chart_is_installed(guarded: World) -> None:
     kinds = "/apis/apiextensions.k8s.io/v1/customresourcedefinitions"
     for path in (f"{kinds}/drones.fractus.dev", f"{kinds}/zones.fractus.dev", kinds):
         assert "uninstall that first (helm -n fractus-system uninstall fractus)" in refusal(
@@ -224,7 +224,7 @@ def test_the_kinds_stay_while_the_chart_needs_them(guarded: World) -> None:
         )
 
 
-def test_a_drone_with_a_mission_may_have_taken_off(guarded: World) -> None:
+def test_services_of_drone_with_mission_cannot_be_removed(guarded: World) -> None:
     guarded.drone_status("drone-1", "inactive")
     attempt = attempts(guarded, "drone-1")["delete a pod"]
     wait_for(lambda: not refusal(attempt), "the landing to be known")
@@ -240,7 +240,7 @@ def test_a_drone_with_a_mission_may_have_taken_off(guarded: World) -> None:
     wait_for(lambda: not refusal(attempt), "the annotation to count")
 
 
-def test_a_drone_that_was_never_heard_of_can_be_set_up(guarded: World) -> None:
+def test_services_of_drone_without_reports_can_be_replaced(guarded: World) -> None:
     guarded.api.merge(
         f"{FRACTUS}/drones/drone-1/status", {"status": {"flightState": "unknown", "lastFlightState": None}}
     )
@@ -284,7 +284,7 @@ def release(world: World, number: int, revision: str) -> None:
     world.api.apply(path, body)
 
 
-def test_services_are_replaced_on_the_ground_drone_by_drone(guarded: World, permitted: OperatorProcess) -> None:
+def test_services_are_replaced_on_ground_one_drone_at_a_time(guarded: World, permitted: OperatorProcess) -> None:
     release(guarded, 1, "old")
     release(guarded, 2, "new")
 
@@ -309,7 +309,7 @@ def test_services_are_replaced_on_the_ground_drone_by_drone(guarded: World, perm
     wait_for(lambda: alive() == {"fractus-mobility-drone-2"}, permitted.log)
 
 
-def test_a_drone_that_is_not_heard_of_any_more_is_unknown(guarded: World, permitted: OperatorProcess) -> None:
+def test_stale_drone_has_unknown_state(guarded: World, permitted: OperatorProcess) -> None:
     path = f"{FRACTUS}/drones/drone-1"
     guarded.api.merge(f"{path}/status", {"status": {"lastSeen": "2026-01-01T00:00:00Z", "controller": "system"}})
     wait_for(lambda: condition(guarded, "drone-1", "Ready").get("status") == "Unknown", permitted.log)
@@ -326,7 +326,7 @@ def test_a_drone_that_is_not_heard_of_any_more_is_unknown(guarded: World, permit
     assert "drone-1" in refusal(attempts(guarded, "drone-1")["delete a pod"])
 
 
-def test_the_operator_does_not_say_that_a_drone_has_landed(control_plane: ControlPlane, guarded: World) -> None:
+def test_operator_cannot_report_landing(control_plane: ControlPlane, guarded: World) -> None:
     with control_plane.with_token(operator_token(guarded)) as client:
         path = f"{FRACTUS}/drones/drone-1"
         for lie in ({"flightState": "inactive"}, {"flightState": "unknown", "lastFlightState": "inactive"}):
@@ -335,7 +335,7 @@ def test_the_operator_does_not_say_that_a_drone_has_landed(control_plane: Contro
             assert "may not change the flight state" in refusal(
                 lambda body=body: client.call("PUT", f"{path}/status", body)
             )
-        # What it may say of one that is silent is no step to another lie.
+        # The permitted report of a stale drone must not enable another false report.
         client.merge(f"{path}/status", {"status": {"flightState": "unknown", "lastFlightState": "flying"}})
         for last in ("unknown", "inactive", None):
             assert "may not change the flight state" in refusal(
@@ -344,8 +344,8 @@ def test_the_operator_does_not_say_that_a_drone_has_landed(control_plane: Contro
         assert "fractus-flight-pods" in refusal(lambda: client.delete(f"{PODS}/fractus-mobility-drone-1"))
 
 
-def test_the_operator_does_not_bring_back_what_someone_saw(control_plane: ControlPlane, guarded: World) -> None:
-    """That the drone stood there when it was last heard of, before this flight; the annotation that says so stays."""
+def test_operator_cannot_reset_time_of_last_report(control_plane: ControlPlane, guarded: World) -> None:
+    """The grounded annotation refers to the last report before this flight and must not become valid again."""
     path, seen = f"{FRACTUS}/drones/drone-1", "2026-01-01T00:00:00Z"
     guarded.api.merge(path, {"metadata": {"annotations": {"fractus.dev/grounded": seen}}})
     guarded.api.merge(f"{path}/status", {"status": {"lastSeen": "2026-01-02T00:00:00Z"}})
@@ -357,7 +357,7 @@ def test_the_operator_does_not_bring_back_what_someone_saw(control_plane: Contro
         assert "drone-1 is in the air" in refusal(lambda: client.delete(f"{PODS}/fractus-mobility-drone-1"))
 
 
-def test_whether_a_drone_has_a_mission_is_said(guarded: World, permitted: OperatorProcess, namespace: str) -> None:
+def test_on_mission_condition_follows_mission(guarded: World, permitted: OperatorProcess, namespace: str) -> None:
     path = f"{FRACTUS}/drones/drone-2"
     guarded.api.merge(f"{path}/status", {"status": {"lastSeen": "2026-01-01T00:00:00Z"}})
     guarded.put(traffic(namespace))
@@ -373,9 +373,7 @@ def test_whether_a_drone_has_a_mission_is_said(guarded: World, permitted: Operat
     wait_for(reported, permitted.log)
 
 
-def test_who_sees_a_drone_on_the_ground_frees_it_for_the_operator_and_leaves_a_record(
-    guarded: World, permitted: OperatorProcess
-) -> None:
+def test_grounded_annotation_allows_replacement_and_is_recorded(guarded: World, permitted: OperatorProcess) -> None:
     seen = "2026-01-01T00:00:00Z"
     path = f"{FRACTUS}/drones/drone-1"
     release(guarded, 1, "old")

@@ -1,4 +1,4 @@
-"""DirectLinks on a real API server: made of a plan, following pods and nodes, gone with the application."""
+"""DirectLinks on a real API server: created from a plan, updated with pods and nodes, deleted with the Application."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def addresses(world: World, namespace: str) -> dict[str, Any]:
     return {node: pod["status"]["podIP"] for node, pod in checkers(world, namespace).items()}
 
 
-def test_links_lead_to_the_pods_that_the_drone_can_use(world: World, operator: OperatorProcess, namespace: str) -> None:
+def test_direct_links_target_pods_usable_by_drone(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     found = world.links(namespace)
     assert found, "no links"
@@ -69,7 +69,7 @@ def base_addresses(world: World, namespace: str) -> list[str]:
 
 
 @pytest.mark.parametrize("change", ["none", "waits for the landing", "cannot be planned"])
-def test_links_and_the_cloud_path_follow_their_pods(
+def test_direct_links_and_cloud_path_follow_restarted_pods(
     world: World, operator: OperatorProcess, namespace: str, change: str
 ) -> None:
     running(world, namespace)
@@ -97,14 +97,14 @@ def test_links_and_the_cloud_path_follow_their_pods(
     wait_for(lambda: base_addresses(world, namespace) == ["10.1.9.8"], "the cloud path to follow")
 
 
-def test_what_agents_report_moves_nothing(world: World, operator: OperatorProcess, namespace: str) -> None:
+def test_direct_link_status_survives_operator_restart(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     link = next(iter(world.links(namespace).values()))
     path = f"{FRACTUS}/directlinks/{link['metadata']['name']}"
     reported = world.api.merge(f"{path}/status", {"status": {"phase": "Up", "traffic": "direct", "switches": 3}})
     operator.stop()
     operator.start()
-    # The new operator has looked at everything once it has made this again.
+    # The new operator has processed all objects when it has created this Service again.
     service = f"/api/v1/namespaces/{namespace}/services/traffic-data-store"
     world.api.delete(service)
     wait_for(lambda: world.api.get(service), "the Service to be made again")
@@ -112,7 +112,7 @@ def test_what_agents_report_moves_nothing(world: World, operator: OperatorProces
     assert world.api.get(path) == reported
 
 
-def test_events_tell_what_becomes_of_a_link(world: World, operator: OperatorProcess, namespace: str) -> None:
+def test_direct_link_transitions_have_events(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     path = f"{FRACTUS}/directlinks/{next(iter(world.links(namespace).values()))['metadata']['name']}"
     direct = {"phase": "Up", "traffic": "direct", "switches": 1, "message": "it is faster"}
@@ -124,7 +124,7 @@ def test_events_tell_what_becomes_of_a_link(world: World, operator: OperatorProc
     assert events(world, namespace).count("LinkUp") == 1
 
 
-def test_links_of_another_release_are_corrected(world: World, operator: OperatorProcess, namespace: str) -> None:
+def test_direct_links_of_another_release_are_corrected(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     operator.stop()
     node, link = next(iter(world.links(namespace).items()))
@@ -142,7 +142,7 @@ def test_links_of_another_release_are_corrected(world: World, operator: Operator
     wait_for(lambda: "long-ago" not in world.links(namespace), "the link that no plan knows to go")
 
 
-def test_links_follow_the_drone_and_end_with_the_mission(
+def test_direct_links_follow_drone_and_end_with_mission(
     world: World, operator: OperatorProcess, namespace: str
 ) -> None:
     running(world, namespace)
@@ -163,13 +163,13 @@ def test_links_follow_the_drone_and_end_with_the_mission(
     wait_for(lambda: not world.links(namespace), "the links to go")
 
 
-def test_links_go_with_the_application(world: World, operator: OperatorProcess, namespace: str) -> None:
+def test_direct_links_are_deleted_with_application(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     world.api.delete(world.path(traffic(namespace)))
     wait_for(lambda: gone(world, namespace), lambda: f"everything to go; {world.children(namespace).keys()}")
 
 
-def test_links_without_an_application_go(world: World, operator: OperatorProcess, namespace: str) -> None:
+def test_direct_links_without_application_are_deleted(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     operator.stop()
     path = world.path(traffic(namespace))
@@ -180,7 +180,9 @@ def test_links_without_an_application_go(world: World, operator: OperatorProcess
     wait_for(lambda: not world.links(namespace), "the links to go")
 
 
-def test_two_applications_on_one_drone_have_links_each(world: World, operator: OperatorProcess, namespace: str) -> None:
+def test_direct_links_of_two_applications_on_one_drone_are_separate(
+    world: World, operator: OperatorProcess, namespace: str
+) -> None:
     running(world, namespace)
     services = [{"service": "camera", "methods": ["CaptureImage"]}]
     camera = component("Camera", "drone", **{"class": "passenger"}, services=services, egress=["Sorter"])
@@ -191,7 +193,7 @@ def test_two_applications_on_one_drone_have_links_each(world: World, operator: O
     deployed(world, namespace, "guest", 1)
     guests, hosts = world.links(namespace, "guest"), world.links(namespace)
     assert {body["spec"]["drone"] for body in [*guests.values(), *hosts.values()]} == {"drone-1"}
-    # The host flies: its way is what both can tell.
+    # The host flies, so both have the path of the host.
     assert next(iter(guests.values()))["spec"]["path"] == next(iter(hosts.values()))["spec"]["path"]
     world.api.delete(f"{FRACTUS}/namespaces/{namespace}/applications/guest")
     wait_for(lambda: not world.links(namespace, "guest"), "the guest's links to go")

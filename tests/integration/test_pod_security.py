@@ -1,4 +1,4 @@
-"""A namespace that enforces Pod Security: helm refuses to install where no pod of a node service would be admitted."""
+"""Pod Security: helm refuses to install into a namespace that would not admit the pods of node services."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def rendered(chart: str, control_plane: ControlPlane, *more: str) -> subprocess.
 
 
 @pytest.mark.parametrize("chart", CHART)
-def test_a_namespace_that_refuses_the_pods_is_refused(
+def test_chart_is_refused_in_namespace_with_restrictive_pod_security(
     control_plane: ControlPlane, world: World, namespace: str, chart: str
 ) -> None:
     for level in ("baseline", "restricted"):
@@ -43,7 +43,7 @@ def test_a_namespace_that_refuses_the_pods_is_refused(
 
 
 @pytest.mark.parametrize("chart", CHART)
-def test_a_namespace_that_admits_them_is_taken(
+def test_chart_is_accepted_in_namespace_with_privileged_pod_security(
     control_plane: ControlPlane, world: World, namespace: str, chart: str
 ) -> None:
     for level in ("privileged", None):

@@ -1,4 +1,4 @@
-"""The simulated radio's devices: real IP traffic between network namespaces, by range, faults and uplink."""
+"""Devices of the simulated radio: real IP traffic between network namespaces, with range, faults and uplink."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def air(tmp_path: Path) -> Iterator[Air]:
     found.close()
 
 
-def test_nodes_talk_while_they_are_in_reach(air: Air) -> None:
+def test_simulated_radio_connects_nodes_within_range(air: Air) -> None:
     assert len(air.ping("10.77.0")) == 3
     air.command(station="b", position=[81.0, 0.0, 0.0])
     assert not air.ping("10.77.0", 1)
@@ -119,21 +119,21 @@ def test_nodes_talk_while_they_are_in_reach(air: Air) -> None:
 
 
 @pytest.mark.parametrize("fault", [{"off": True}, {"silent": True}, {"loss_db": 90}, {"network": "other"}])
-def test_faults_are_injected_and_end(air: Air, fault: dict[str, object]) -> None:
+def test_simulated_radio_faults_start_and_end(air: Air, fault: dict[str, object]) -> None:
     air.command(station="b", **fault)
     assert not air.ping("10.77.0", 1)
     air.command(station="b", off=False, silent=False, loss_db=0, network="net")
     assert air.ping("10.77.0", 2)
 
 
-def test_the_uplink_delays(air: Air) -> None:
+def test_simulated_uplink_has_delay(air: Air) -> None:
     found = air.ping("10.78.0", 5)
     assert min(found) >= 120.0
     air.command(uplink="a", off=True)
     assert not air.ping("10.78.0", 1)
 
 
-def test_bad_commands_change_nothing(air: Air) -> None:
+def test_simulated_radio_refuses_bad_command_without_effect(air: Air) -> None:
     for command, what in (
         ({"station": "c"}, "unknown station c"),
         ({"station": "a", "speed": 3}, "unknown attribute speed"),

@@ -1,4 +1,4 @@
-"""The operator where etcd is restored from an older backup: what it watches goes back to versions that were there before."""
+"""The operator while etcd is restored from an older backup: resource versions go back."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def plane(tmp_path: Path) -> Iterator[ControlPlane]:
         plane.stop()
 
 
-def test_an_operator_that_outlives_a_restore_starts_again(plane: ControlPlane, tmp_path: Path) -> None:
+def test_operator_restarts_after_etcd_restore(plane: ControlPlane, tmp_path: Path) -> None:
     world, backup = World(plane), tmp_path / "backup"
     world.furnish()
     operator = OperatorProcess(plane.kubeconfig, tmp_path / "operator.log")
@@ -45,11 +45,11 @@ def test_an_operator_that_outlives_a_restore_starts_again(plane: ControlPlane, t
             start()
             wait_for(lambda: not operator.running, operator.log)
             assert "as after a restore" in operator.log()
-            # As its kubelet does.
+            # The kubelet restarts the operator.
             operator.start()
             world.put(traffic(after, "second"))
             wait_for(lambda: world.status(after, "second").get("phase"), operator.log)
-            # It came back with the backup, and is followed again.
+            # The Application was restored from the backup and is reconciled again.
             wait_for(lambda: world.status(before).get("drone") == "drone-1" and world.grants(before), operator.log)
     finally:
         if operator.running:

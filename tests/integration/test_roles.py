@@ -1,4 +1,4 @@
-"""The chart's roles, as a real API server takes them: who may read and write each kind, alone and by the built-in roles."""
+"""Roles of the chart on a real API server: read and write access to each kind, alone and aggregated."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def allowed(world: World, role: str) -> set[tuple[str, str]]:
     return found
 
 
-def test_each_kind_has_its_roles() -> None:
+def test_every_kind_has_viewer_editor_and_admin_roles() -> None:
     every = {f"fractus-{kind}-viewer" for kind in KINDS}
     assert set(chart_roles()) == every | {
         f"fractus-{kind}-{role}" for kind in set(KINDS) - WRITTEN_BY_THE_OPERATOR for role in ("editor", "admin")
@@ -98,7 +98,7 @@ def test_each_kind_has_its_roles() -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_role_reaches_its_kind_and_no_other(roles: World, kind: str) -> None:
+def test_role_permits_only_its_kind(roles: World, kind: str) -> None:
     assert allowed(roles, f"fractus-{kind}-viewer") == {(verb, kind) for verb in READ}
     if kind not in WRITTEN_BY_THE_OPERATOR:
         more = ALL if kind == "application" else ()
@@ -106,7 +106,7 @@ def test_a_role_reaches_its_kind_and_no_other(roles: World, kind: str) -> None:
         assert allowed(roles, f"fractus-{kind}-admin") == {(verb, kind) for verb in (*READ, *WRITE, *ALL)}
 
 
-def test_the_built_in_roles_read_all_and_write_applications(roles: World) -> None:
+def test_builtin_roles_read_all_kinds_and_write_applications(roles: World) -> None:
     read = {(verb, kind) for verb in READ for kind in KINDS}
     write = {(verb, "application") for verb in (*WRITE, *ALL)}
     assert allowed(roles, "view") == read
@@ -118,13 +118,13 @@ def test_the_built_in_roles_read_all_and_write_applications(roles: World) -> Non
 PAGE = "docs/roles.md"
 
 
-def test_the_page_tells_of_each_kind() -> None:
+def test_roles_page_lists_every_kind() -> None:
     rows = re.findall(r"^\| (`\w+`.*?) \| yes \| (yes|no).*? \|", (ROOT / PAGE).read_text(), re.MULTILINE)
-    told = {kind: writes == "yes" for kinds, writes in rows for kind in re.findall(r"`(\w+)`", kinds)}
-    assert told == {kind: kind not in WRITTEN_BY_THE_OPERATOR for kind in KINDS}
+    documented = {kind: writes == "yes" for kinds, writes in rows for kind in re.findall(r"`(\w+)`", kinds)}
+    assert documented == {kind: kind not in WRITTEN_BY_THE_OPERATOR for kind in KINDS}
 
 
-def test_an_authority_writes_zones_and_policies_by_the_commands_of_the_page(roles: World, tmp_path: Path) -> None:
+def test_documented_commands_permit_zones_and_policies(roles: World, tmp_path: Path) -> None:
     shell = Shell(tmp_path, roles.plane)
     lines = shell_lines(PAGE)
     for line in lines:
@@ -138,7 +138,7 @@ def test_an_authority_writes_zones_and_policies_by_the_commands_of_the_page(role
             shell.type(f"kubectl delete clusterrolebinding {line.split()[3]}")
 
 
-def test_without_aggregation_the_roles_are_there_to_be_bound() -> None:
+def test_roles_are_not_aggregated_if_disabled() -> None:
     found = {body["metadata"]["name"]: body for body in render("--set=rbac.aggregate=false")}
     for name, role in chart_roles().items():
         assert found[name]["rules"] == role["rules"]

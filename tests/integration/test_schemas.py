@@ -42,7 +42,7 @@ def made(what: str) -> tuple[Body, ...]:
 
 @pytest.mark.parametrize("version", VERSIONS)
 @pytest.mark.parametrize("what", ["fractus", "fractus with everything", "fractus-crds", "fractus-demo", "operator"])
-def test_kubernetes_knows_every_field(what: str, version: str) -> None:
+def test_rendered_objects_match_kubernetes_schemas(what: str, version: str) -> None:
     wrong, asked = [], 0
     for body in made(what):
         name = f"{body['kind']} {body['metadata']['name']}"
@@ -57,12 +57,12 @@ def test_kubernetes_knows_every_field(what: str, version: str) -> None:
     assert asked
 
 
-def test_every_chart_is_asked_about() -> None:
+def test_schema_tests_include_every_chart() -> None:
     assert {path.name for path in CHARTS.iterdir()} == {"fractus", "fractus-crds", "fractus-demo"}
 
 
 @pytest.mark.parametrize("version", VERSIONS)
-def test_what_is_misspelled_or_of_another_type_is_found(version: str) -> None:
+def test_schema_validation_detects_unknown_field_and_wrong_type(version: str) -> None:
     deployment = next(body for body in made("fractus") if body["kind"] == "Deployment")
     misspelled, of_another_type = copy.deepcopy(deployment), copy.deepcopy(deployment)
     misspelled["spec"]["template"]["spec"]["containers"][0]["readynessProbe"] = {}

@@ -1,4 +1,4 @@
-"""Two processes of one service on one node: only one at a time writes to the autopilot, the state and the audit log."""
+"""Two processes of one service on a node: only one writes to the autopilot, the state and the audit log."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ async def flying(rig: Rig, speedup: float) -> None:
     await Driver(rig).up()
 
 
-async def test_a_second_service_waits_until_the_first_is_dead_and_takes_its_drone(rig: Rig) -> None:
+async def test_second_service_takes_over_drone_after_first_dies(rig: Rig) -> None:
     await flying(rig, speedup=1.0)
     assert speaks_to_autopilot(rig, "service")
     rig.start_service("--driver-grace", "1", name="second")
@@ -63,16 +63,16 @@ async def test_a_second_service_waits_until_the_first_is_dead_and_takes_its_dron
     assert sound(rig.audit)
 
 
-async def test_a_second_service_gives_up_with_one_sentence(rig: Rig) -> None:
+async def test_second_service_exits_after_lock_timeout(rig: Rig) -> None:
     rig.start_service()
     await rig.until_logged("service", "mobility: serving")
     rig.start_service("--lock-timeout", "1", name="second")
     assert await rig.ended("second") == 1
-    said = rig.log("second").splitlines()
-    assert said[-1].startswith(
+    lines = rig.log("second").splitlines()
+    assert lines[-1].startswith(
         f"Error: {rig.directory / 'state' / 'mobility.lock'} is still held by pid {rig.pid('service')} on "
     )
-    assert said[-1].endswith("end that process, and restart")
+    assert lines[-1].endswith("end that process, and restart")
     assert "Traceback" not in rig.log("second")
     rig.start_service("--lock-timeout", "1", "--state", str(rig.directory / "other"), name="third")
     assert await rig.ended("third") == 1
@@ -80,7 +80,7 @@ async def test_a_second_service_gives_up_with_one_sentence(rig: Rig) -> None:
     rig.start_service(name="fourth")
     await rig.until_logged("fourth", "waiting for")
     rig.kill("fourth", signal.SIGTERM)
-    assert rig.log("fourth").count("\n") == 1, "who waits ends at once"
+    assert rig.log("fourth").count("\n") == 1, "a waiting service ends at once"
     assert len(rig.entries("started")) == 1
 
 
@@ -95,7 +95,7 @@ def _state_gone(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize("lose", [_lock_file_replaced, _state_gone])
-async def test_a_service_whose_lock_is_lost_falls_silent(rig: Rig, lose: Callable[[Rig], None]) -> None:
+async def test_service_stops_sending_when_lock_is_lost(rig: Rig, lose: Callable[[Rig], None]) -> None:
     await flying(rig, speedup=2.0)
     entries = len(rig.entries())
     lose(rig)
@@ -110,7 +110,7 @@ async def test_a_service_whose_lock_is_lost_falls_silent(rig: Rig, lose: Callabl
     assert sound(rig.audit)
 
 
-async def test_a_second_camera_service_waits_too(rig: Rig) -> None:
+async def test_second_camera_service_waits_for_first(rig: Rig) -> None:
     rig.write_grant(passenger_grant(services=CAMERA, operationArea=[], **{"class": None}))
     first = rig.start_camera(description=EDGE)
     await capture(stub(rig, first), width=64, height=64)

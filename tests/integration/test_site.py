@@ -1,4 +1,4 @@
-"""The documentation as a site: no link leads nowhere, no page is left out, and the reference has all there is."""
+"""Documentation site: links resolve, every page is included, and the reference is complete."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def text(site: Path, page: str) -> str:
     return re.sub(r"<[^>]+>", "", (site / page).read_text())
 
 
-def test_the_reference_has_all_kinds_calls_values_and_commands(site: Path) -> None:
+def test_site_reference_has_kinds_calls_values_and_commands(site: Path) -> None:
     kinds = text(site, "reference/kinds.html")
     for path in (ROOT / "crds").glob("*.yaml"):
         assert yaml.safe_load(path.read_text())["spec"]["names"]["kind"] + ".spec" in kinds
@@ -43,7 +43,7 @@ def test_the_reference_has_all_kinds_calls_values_and_commands(site: Path) -> No
     assert "fractus audit export" in text(site, "reference/commands.html")
 
 
-def test_nothing_is_loaded_from_elsewhere(site: Path) -> None:
+def test_site_loads_no_external_resources(site: Path) -> None:
     for page in ("index.html", "safety-case.html", "reference/sdk.html"):
         loaded = re.findall(r'<(?:script|link|img)[^>]+(?:src|href)="([^"]+)"', (site / page).read_text())
         assert loaded

@@ -1,4 +1,4 @@
-"""helm uninstall: what its hooks are, when they wipe nodes, and what they remove on a real API server, with the account they have."""
+"""Hooks of helm uninstall: conditions for wiping nodes, and removed objects on a real API server with their account."""
 
 from __future__ import annotations
 
@@ -39,17 +39,17 @@ def hooks(*arguments: str) -> list[Body]:
     return sorted(found, key=lambda body: int(body["metadata"]["annotations"]["helm.sh/hook-weight"]))
 
 
-def test_nodes_are_wiped_only_where_it_is_asked_for_and_only_by_an_uninstall() -> None:
+def test_uninstall_wipes_nodes_only_if_enabled() -> None:
     plain, asked, made = render(), render(*WIPE), hooks(*WIPE)
     assert not [body for body in plain if "wipe" in str(body)]
     same = [body for body in plain if not is_hook(body)]
-    assert [body for body in asked if not is_hook(body)] == same, "the switch changes nothing that runs"
+    assert [body for body in asked if not is_hook(body)] == same, "the value must not change running workloads"
     assert [body["kind"] for body in made][-2:] == ["DaemonSet", "Job"]
     for body in made:
         assert body["metadata"]["annotations"]["helm.sh/hook-delete-policy"] == "before-hook-creation,hook-succeeded"
 
 
-def test_the_wiping_pod_reaches_the_nodes_data_and_no_more() -> None:
+def test_wipe_pod_has_access_only_to_state_of_node() -> None:
     (body,) = (body for body in hooks(*WIPE, "--set=host.state=/data/fractus") if body["kind"] == "DaemonSet")
     pod = body["spec"]["template"]["spec"]
     sets = {b["metadata"]["name"]: b["spec"]["template"] for b in render() if b["kind"] == "DaemonSet"}
@@ -75,7 +75,7 @@ def test_the_wiping_pod_reaches_the_nodes_data_and_no_more() -> None:
         *("/home/fractus", "/home/fractus/data", "/root/fractus", "/var/lib/fractusd-shared", "/data/my-fractus"),
     ],
 )
-def test_a_directory_that_is_not_plainly_ours_is_not_wiped(path: str) -> None:
+def test_wipe_is_refused_for_ambiguous_directory(path: str) -> None:
     with pytest.raises(subprocess.CalledProcessError) as refused:
         render(*WIPE, f"--set=host.state={path}")
     assert "host" in refused.value.stderr
@@ -83,7 +83,7 @@ def test_a_directory_that_is_not_plainly_ours_is_not_wiped(path: str) -> None:
 
 
 @pytest.mark.parametrize("path", ["/var/lib/fractus", "/data/fractus/", "/opt/fractus/state"])
-def test_a_directory_of_ours_is(path: str) -> None:
+def test_wipe_is_accepted_for_directory_of_fractus(path: str) -> None:
     assert render(*WIPE, f"--set=host.state={path}")
 
 
@@ -95,7 +95,7 @@ def test_a_directory_of_ours_is(path: str) -> None:
         ("/data/fractus/", "/data//x/../fractus/./etc/"),
     ],
 )
-def test_descriptions_of_nodes_are_not_wiped(state: str, config: str) -> None:
+def test_wipe_is_refused_if_directory_contains_node_descriptions(state: str, config: str) -> None:
     set_ = (f"--set=host.state={state}", f"--set=host.config={config}")
     assert render(*set_)
     with pytest.raises(subprocess.CalledProcessError) as refused:
@@ -104,13 +104,13 @@ def test_descriptions_of_nodes_are_not_wiped(state: str, config: str) -> None:
     assert render(*WIPE, "--set=host.state=/data/fractus", "--set=host.config=/data/fractus-config")
 
 
-def test_what_renders_without_a_cluster_wipes_nothing() -> None:
-    """Such as Argo CD, which says of all that it is an installation: a value that is left there refuses no change of others."""
+def test_wipe_is_not_rendered_without_cluster() -> None:
+    """Argo CD renders everything as an installation. A remaining wipe value must not refuse other changes."""
     assert render(WIPES) == render()
 
 
-def test_an_installation_cannot_be_told_to_wipe(world: World) -> None:
-    """`helm install --atomic` that fails uninstalls, on nodes that may have been there before."""
+def test_wipe_is_refused_at_installation(world: World) -> None:
+    """A failed `helm install --atomic` uninstalls, possibly on nodes with existing data."""
     with pytest.raises(subprocess.CalledProcessError) as refused:
         render(*on(world, WIPES))
     assert "set it with an upgrade just before uninstalling" in refused.value.stderr
@@ -122,8 +122,8 @@ def on(world: World, *arguments: str) -> tuple[str, ...]:
 
 
 @pytest.mark.parametrize("how", [(), ("--is-upgrade",)])
-def test_a_wiping_that_was_left_is_not_installed_beside(world: World, how: tuple[str, ...]) -> None:
-    """It keeps agents off its nodes, or wipes a node that is in use."""
+def test_chart_is_refused_while_wipe_daemon_set_remains(world: World, how: tuple[str, ...]) -> None:
+    """A remaining wipe DaemonSet keeps agents off its nodes, or wipes a node in use."""
     assert render(*on(world, *how))
     (body,) = (body for body in hooks(*WIPE) if body["kind"] == "DaemonSet")
     world.api.apply(path_of(body), body)
@@ -135,8 +135,8 @@ def test_a_wiping_that_was_left_is_not_installed_beside(world: World, how: tuple
     assert f"kubectl -n {SYSTEM} delete daemonset fractus-wipe" in refused.value.stderr
 
 
-def test_an_authority_that_was_there_before_stays(world: World, left: list[str], tmp_path: Path) -> None:
-    """One that was restored from a backup: an installation that fails, and is undone, has not made it."""
+def test_failed_installation_keeps_existing_authority(world: World, left: list[str], tmp_path: Path) -> None:
+    """The authority was restored from a backup. A failed installation that is rolled back has not created it."""
     upgraded = hooks(*on(world, "--is-upgrade"))
     made = hooks(*on(world))
     assert "keep" not in str(upgraded)
@@ -212,7 +212,7 @@ def remove(world: World, tmp_path: Path, made: list[Body] | None = None) -> subp
     )  # fmt: skip
 
 
-def test_what_the_operator_made_is_removed_and_nothing_else(world: World, left: list[str], tmp_path: Path) -> None:
+def test_uninstall_removes_only_objects_of_operator(world: World, left: list[str], tmp_path: Path) -> None:
     for again in (False, True):
         done = remove(world, tmp_path)
         assert done.returncode == 0, (again, done.stderr)
@@ -225,7 +225,7 @@ def test_what_the_operator_made_is_removed_and_nothing_else(world: World, left: 
     assert world.api.get(f"{REQUESTS}/theirs")
 
 
-def test_what_is_refused_is_told(world: World, left: list[str], tmp_path: Path) -> None:
+def test_uninstall_reports_refused_deletions(world: World, left: list[str], tmp_path: Path) -> None:
     role = next(path_of(body) for body in hooks() if body["kind"] == "Role")
     world.api.delete(role)
     done = remove(world, tmp_path)
@@ -235,8 +235,10 @@ def test_what_is_refused_is_told(world: World, left: list[str], tmp_path: Path) 
     assert [path for path in left if world.api.get(path)] == [path for path in left if SYSTEM in path]
 
 
-def test_an_installed_system_stays_as_it_is(world: World, left: list[str], tmp_path: Path) -> None:
-    """Tools that render the chart and know no hooks make the Job along with what it would remove."""
+def test_uninstall_job_removes_nothing_while_operator_is_installed(
+    world: World, left: list[str], tmp_path: Path
+) -> None:
+    """Tools without hook support create the Job together with the objects that it would remove."""
     (operator,) = (body for body in render() if body["kind"] == "Deployment" and "operator" in body["metadata"]["name"])
     world.api.apply(path_of(operator), operator)
     try:

@@ -47,10 +47,10 @@ def without_kind(world: World) -> Iterator[None]:
         wait_for(lambda: is_served(world) and is_stored(world), "the kind to be back")
 
 
-def test_an_operator_leaves_the_lease_to_the_release_before(
+def test_operator_with_missing_kind_leaves_lease_to_previous_release(
     control_plane: ControlPlane, world: World, tmp_path: Path
 ) -> None:
-    """It could decide nothing, and a healthy one would have that end which can."""
+    """The operator cannot work without the kind, and must not replace the operator that can."""
     process = OperatorProcess(control_plane.kubeconfig, tmp_path / "operator.log")
 
     def healthy() -> bool:
@@ -74,7 +74,7 @@ def test_an_operator_leaves_the_lease_to_the_release_before(
 
 
 @pytest.mark.parametrize("how", [(), ("--is-upgrade",)])
-def test_the_chart_is_refused(world: World, how: tuple[str, ...]) -> None:
+def test_chart_is_refused_when_kind_is_missing(world: World, how: tuple[str, ...]) -> None:
     assert render(*on(world, *how))
     with without_kind(world), pytest.raises(subprocess.CalledProcessError) as refused:
         render(*on(world, *how))

@@ -1,4 +1,4 @@
-"""The `fractus` command, and those of its commands that need no cluster: they answer as the operator would."""
+"""The `fractus` command, its commands that read a cluster, and its commands that work offline on manifests and files."""
 
 EXIT_OK = 0
 EXIT_BAD_INPUT = 1

@@ -1,4 +1,4 @@
-"""Reads audit logs: whether their chains are sound, and what their entries say."""
+"""Read audit logs: verify their chains and iterate over their entries."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from fractus_services.recording.messages import component_of, parse_time_ns
 Entry = dict[str, Any]
 
 
-def found_logs(paths: Iterable[Path]) -> dict[Path, list[Path]]:
-    """The logs in some directories and files, each with its files in order.
+def find_logs(paths: Iterable[Path]) -> dict[Path, list[Path]]:
+    """Return the logs in directories and files, each with its segments in order.
 
     Raises:
-        click.ClickException: there is none.
+        click.ClickException: There are no logs.
     """
     paths = tuple(paths)
     found = logs(paths)
     if not found:
-        raise click.ClickException(f"{', '.join(map(str, paths))}: there is no audit log (*.jsonl)")
+        raise click.ClickException(f"{', '.join(map(str, paths))}: no audit log (*.jsonl) found")
     return found
 
 
-def judged(name: Path, files: list[Path], since: Link | None = None) -> tuple[Finding, str]:
-    """What verification finds in a log, and the problem with the file and line that it is in; empty when it is sound.
+def verify_log(name: Path, files: list[Path], since: Link | None = None) -> tuple[Finding, str]:
+    """Verify a log. Return the finding, and the problem with its file and line (empty if the log is sound).
 
     Args:
-        name: the log.
-        files: those of its files that are judged.
-        since: see `verify`.
+        name: The log.
+        files: Its segments to verify.
+        since: Link that the log must contain, see `verify`.
 
     Raises:
-        click.ClickException: a file is missing.
+        click.ClickException: A segment is missing.
     """
     begins: list[tuple[int, Path]] = [(0, files[0])]
 
@@ -51,7 +51,7 @@ def judged(name: Path, files: list[Path], since: Link | None = None) -> tuple[Fi
     try:
         finding = verify(lines(), name not in files, since)
     except FileNotFoundError as error:
-        raise click.ClickException(f"{error.filename}: is missing; the log is not complete without it") from None
+        raise click.ClickException(f"{error.filename}: segment is missing; the log is incomplete without it") from None
     if not finding.problem:
         return finding, ""
     before, path = next(begin for begin in reversed(begins) if begin[0] < max(finding.line, 1))
@@ -60,7 +60,7 @@ def judged(name: Path, files: list[Path], since: Link | None = None) -> tuple[Fi
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """From when to when; Unix nanoseconds, open where they are None."""
+    """Time window in Unix nanoseconds. None is unbounded."""
 
     begin_ns: int | None = None
     end_ns: int | None = None
@@ -70,10 +70,9 @@ class Window:
 
 
 def entries(found: dict[Path, list[Path]], window: Window) -> Iterator[Entry]:
-    """The entries of several logs in the order of their times.
+    """Iterate over the entries of several logs in time order.
 
-    Each has `log`, the name of its log, `time_ns`, and `node`, whose log it is. Lines that are no entries are left out: `judged`
-    tells of them.
+    Adds `log` (name of the log), `node` and `time_ns` to each entry. Skips lines that are not entries; `verify_log` reports them.
     """
     nodes = _nodes(found)
     each = (_entries(name.stem, nodes[name], files, window) for name, files in found.items())
@@ -84,14 +83,14 @@ def _entries(log: str, node: str, files: Iterable[Path], window: Window) -> Iter
     for _, _, line in read_lines(files):
         entry = _read(line)
         time_ns = parse_time_ns(entry.get("time"))
-        # What began before the window counts in it, too.
+        # The service may have started before the window.
         node = _started(entry) or node
         if time_ns is not None and time_ns in window:
             yield entry | {"log": log, "node": node, "time_ns": time_ns}
 
 
 def _nodes(found: dict[Path, list[Path]]) -> dict[Path, str]:
-    """Whose each log is: what a service said when it started, there or in a log beside it; else the directory's name."""
+    """Return the node of each log: from its `started` entry, else from another log in the directory, else the directory name."""
     said = {name: _first_started(files) for name, files in found.items()}
     beside: dict[Path, set[str]] = {}
     for name, node in said.items():
@@ -115,7 +114,7 @@ def _started(entry: Entry) -> str:
 
 
 def _read(line: bytes) -> Entry:
-    """An entry; an empty one where the line is none."""
+    """Parse an entry. Return an empty one if the line is invalid."""
     try:
         entry = json.loads(line)
     except (ValueError, RecursionError):
@@ -123,14 +122,14 @@ def _read(line: bytes) -> Entry:
     return entry if isinstance(entry, dict) else {}
 
 
-def decided(entry: Entry) -> bool:
-    """Whether an entry tells of a policy that changed something, or of a change of control."""
+def is_decision(entry: Entry) -> bool:
+    """Return True if an entry records a policy decision other than permission, or a change of control."""
     kind = entry.get("kind")
     if kind in {"call", "check"}:
         return entry.get("action") in {"correct", "deny", "takeover"}
     return kind in {"monitor", "takeover", "control"}
 
 
-def who(entry: Entry) -> str:
-    """Who an entry is about: the component that called, or what else acted."""
+def actor(entry: Entry) -> str:
+    """Return the component that an entry is about, or else the controller."""
     return component_of(entry) or str(entry.get("controller") or "system")

@@ -1,10 +1,10 @@
-"""`fractus doctor`: what a cluster lacks to fly, and how to fix it."""
+"""`fractus doctor`: find problems of a cluster and print their remedies."""
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Literal
@@ -16,20 +16,20 @@ from fractus_core.api.crd import crd
 from fractus_core.api.names import CLASS_LABEL as CLASS
 from fractus_core.api.names import CLOUD_LABEL
 
-from fractus_cli.output import output_option, printable
-from fractus_cli.reading import (
+from fractus_cli.cluster_reader import (
     EXIT_PROBLEM,
     GROUP,
     SYSTEM,
     Body,
-    Cluster,
-    cluster,
+    ClusterReader,
     conditions_of,
     kubeconfig_option,
+    open_cluster,
 )
+from fractus_cli.output import output_option, printable
 
 MIN_VERSION = (1, 32)
-"""The oldest Kubernetes that the charts take."""
+"""Minimum Kubernetes version of the charts."""
 SERVICES = ("fractus-agent", "fractus-mobility", "fractus-camera")
 POLICIES = (
     "fractus-agent",
@@ -57,13 +57,13 @@ _ADMISSION = "/apis/admissionregistration.k8s.io/v1"
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """What was found of one thing.
+    """Result of a check.
 
     Attributes:
-        level: error: Fractus does not work without it; warning: it works, but not as it should.
-        check: which check found it.
-        message: one sentence.
-        remedy: what to do; empty where nothing is wrong.
+        level: error: Fractus does not work until it is fixed; warning: Fractus works with restrictions.
+        check: Name of the check.
+        message: One sentence.
+        remedy: Command or action that fixes the problem. Empty if there is no problem.
     """
 
     level: Literal["ok", "warning", "error"]
@@ -76,12 +76,12 @@ class Finding:
 @output_option
 @kubeconfig_option
 def doctor(output: str, config: str | None) -> int:
-    """Check a cluster: its version, kinds, charts, images, nodes and certificates; say what is missing and how to fix it.
+    """Check version, CRDs, charts, images, nodes and certificates of a cluster, and print a remedy for each problem.
 
-    Exits with 2 where something is missing that Fractus does not work without.
+    The exit code is 2 if there is an error, which prevents Fractus from working.
     """
-    with cluster(config) as found:
-        findings = list(examine(found, datetime.now(UTC)))
+    with open_cluster(config) as cluster:
+        findings = list(examine(cluster, datetime.now(UTC)))
     if output == "json":
         click.echo(json.dumps([asdict(finding) for finding in findings]))
     else:
@@ -92,109 +92,109 @@ def doctor(output: str, config: str | None) -> int:
     return EXIT_PROBLEM if any(finding.level == "error" for finding in findings) else 0
 
 
-def examine(found: Cluster, now: datetime) -> Iterator[Finding]:
-    """All findings of a cluster, in the order in which they are to be fixed.
+def examine(cluster: ClusterReader, now: datetime) -> Iterator[Finding]:
+    """Run all checks on a cluster, in the order in which problems must be fixed.
 
     Raises:
-        KubeError: the API server refused something, or could not be reached.
+        KubeError: The API server rejected a request or is unreachable.
     """
-    checks: Sequence[Callable[[], Iterator[Finding]]] = (
-        lambda: _version(found.get("/version") or {}),
-        lambda: _kinds(found),
-        lambda: _operator(found),
-        lambda: _services(found),
-        lambda: _admission(found),
-        lambda: _strangers(found),
-        lambda: _pods(found.list(f"/api/v1/namespaces/{SYSTEM}/pods")),
-        lambda: _authority(found.get(f"/api/v1/namespaces/{SYSTEM}/configmaps/fractus-ca"), now),
-        lambda: _nodes(found),
-        lambda: _rules(found),
-    )
-    for check in checks:
-        yield from check()
+    yield from _version(cluster.get("/version") or {})
+    yield from _kinds(cluster)
+    yield from _operator(cluster)
+    yield from _services(cluster)
+    yield from _admission(cluster)
+    yield from _foreign_pods(cluster)
+    yield from _pods(cluster.list(f"/api/v1/namespaces/{SYSTEM}/pods"))
+    yield from _authority(cluster.get(f"/api/v1/namespaces/{SYSTEM}/configmaps/fractus-ca"), now)
+    yield from _nodes(cluster)
+    yield from _policies(cluster)
 
 
 def _version(version: Body) -> Iterator[Finding]:
     numbers = (int(re.sub(r"\D.*", "", str(version.get(part) or "0")) or 0) for part in ("major", "minor"))
     if tuple(numbers) < MIN_VERSION:
         needed = ".".join(map(str, MIN_VERSION))
-        message = f"{version.get('gitVersion')} lacks selectable fields of kinds and node names in tokens"
+        message = f"{version.get('gitVersion')} does not support selectable CRD fields and node names in tokens"
         yield Finding("error", "version", message, f"upgrade Kubernetes to {needed} or newer")
     else:
         yield Finding("ok", "version", f"Kubernetes {version.get('gitVersion')}")
 
 
-def _kinds(found: Cluster) -> Iterator[Finding]:
-    bodies = found.list("/apis/apiextensions.k8s.io/v1/customresourcedefinitions")
+def _kinds(cluster: ClusterReader) -> Iterator[Finding]:
+    bodies = cluster.list("/apis/apiextensions.k8s.io/v1/customresourcedefinitions")
     known = {body["metadata"]["name"]: conditions_of(body).get("Established", {}).get("status") for body in bodies}
     missing = [f"{k.PLURAL}.fractus.dev" for k in KINDS if known.get(f"{k.PLURAL}.fractus.dev") != "True"]
     if missing:
-        yield Finding("error", "kinds", f"{', '.join(missing)}: not there", _CRDS)
+        yield Finding("error", "kinds", f"{', '.join(missing)}: not installed", _CRDS)
     schemas = {body["metadata"]["name"]: _schema(body) for body in bodies}
     lacking = [
         f"{kind.KIND} has no {field}"
         for kind in KINDS
         if f"{kind.PLURAL}.fractus.dev" not in missing
-        for field in _lacking(_schema(crd(kind)), schemas[f"{kind.PLURAL}.fractus.dev"])
+        for field in _missing_fields(_schema(crd(kind)), schemas[f"{kind.PLURAL}.fractus.dev"])
     ]
     if lacking:
         more = f" and {len(lacking) - _LISTED} more" if len(lacking) > _LISTED else ""
-        yield Finding("error", "kinds", f"of another release: {', '.join(lacking[:_LISTED])}{more}", _CRDS)
+        yield Finding("error", "kinds", f"CRDs of another release: {', '.join(lacking[:_LISTED])}{more}", _CRDS)
     elif not missing:
-        yield Finding("ok", "kinds", f"all {len(KINDS)} are there")
+        yield Finding("ok", "kinds", f"all {len(KINDS)} kinds are installed")
 
 
 def _schema(definition: Body) -> Body:
-    """What the served version of a kind consists of."""
+    """Return the schema of the served version of a kind."""
     version: Body = next((v for v in definition["spec"]["versions"] if v.get("served")), {})
-    found: Body = (version.get("schema") or {}).get("openAPIV3Schema") or {}
-    return found
+    schema: Body = (version.get("schema") or {}).get("openAPIV3Schema") or {}
+    return schema
 
 
-def _lacking(ours: Body, theirs: Body, above: str = "") -> Iterator[str]:
-    """The fields of a schema that another one does not have: the API server would drop them."""
-    for name, field in (ours.get("properties") or {}).items():
-        known = (theirs.get("properties") or {}).get(name)
+def _missing_fields(expected: Body, installed: Body, prefix: str = "") -> Iterator[str]:
+    """Return the fields that are missing in the installed schema. The API server would drop them."""
+    for name, field in (expected.get("properties") or {}).items():
+        known = (installed.get("properties") or {}).get(name)
         if known is None:
-            yield f"{above}{name}"
+            yield f"{prefix}{name}"
         else:
-            yield from _lacking(field, known, f"{above}{name}.")
-    if isinstance(ours.get("items"), dict):
-        yield from _lacking(ours["items"], theirs.get("items") or {}, above)
+            yield from _missing_fields(field, known, f"{prefix}{name}.")
+    if isinstance(expected.get("items"), dict):
+        yield from _missing_fields(expected["items"], installed.get("items") or {}, prefix)
 
 
-def _operator(found: Cluster) -> Iterator[Finding]:
-    deployment = found.get(f"{_APPS}/deployments/fractus-operator")
+def _operator(cluster: ClusterReader) -> Iterator[Finding]:
+    deployment = cluster.get(f"{_APPS}/deployments/fractus-operator")
     if deployment is None:
-        yield Finding("error", "operator", "the chart fractus is not installed", _HELM)
+        yield Finding("error", "operator", "chart fractus is not installed", _HELM)
         return
-    ready, wanted = (deployment.get("status") or {}).get("readyReplicas", 0), deployment["spec"].get("replicas", 1)
-    lease = found.get(f"/apis/coordination.k8s.io/v1/namespaces/{SYSTEM}/leases/fractus-operator") or {}
+    ready = (deployment.get("status") or {}).get("readyReplicas", 0)
+    wanted = deployment["spec"].get("replicas", 1)
+    lease = cluster.get(f"/apis/coordination.k8s.io/v1/namespaces/{SYSTEM}/leases/fractus-operator") or {}
     leader = (lease.get("spec") or {}).get("holderIdentity")
     logs = f"kubectl -n {SYSTEM} logs deployment/fractus-operator"
     failed = conditions_of(deployment).get("ReplicaFailure", {})
     if failed.get("status") == "True" and failed.get("reason") == "FailedCreate":
-        yield Finding("error", "operator", f"its pods cannot be made: {failed.get('message')}", _cure(failed))
+        yield Finding("error", "operator", f"pods cannot be created: {failed.get('message')}", _creation_remedy(failed))
     elif not ready or not leader:
         yield Finding("error", "operator", f"{ready} of {wanted} ready, leader: {leader or 'none'}", logs)
     elif ready < wanted:
-        yield Finding("warning", "operator", f"{ready} of {wanted} ready, {leader} leads", logs)
+        yield Finding("warning", "operator", f"{ready} of {wanted} ready, leader: {leader}", logs)
     else:
-        yield Finding("ok", "operator", f"{ready} of {wanted} ready, {leader} leads")
+        yield Finding("ok", "operator", f"{ready} of {wanted} ready, leader: {leader}")
 
 
-def _services(found: Cluster) -> Iterator[Finding]:
+def _services(cluster: ClusterReader) -> Iterator[Finding]:
     for name in SERVICES:
-        body = found.get(f"{_APPS}/daemonsets/{name}")
+        body = cluster.get(f"{_APPS}/daemonsets/{name}")
         if body is None:
-            yield Finding("warning", "services", f"{name} is not installed", f"{_HELM} (its values enable it)")
+            yield Finding(
+                "warning", "services", f"{name} is not installed", f"{_HELM} (with the values that enable it)"
+            )
             continue
         status = body.get("status") or {}
-        ready, wanted = status.get("numberReady", 0), status.get("desiredNumberScheduled", 0)
+        ready = status.get("numberReady", 0)
+        wanted = status.get("desiredNumberScheduled", 0)
         if status.get("currentNumberScheduled", 0) < wanted:
-            failed = _not_made(found, name)
-            message = f"pods of {name} cannot be made: {failed.get('message', 'nothing says why')}"
-            yield Finding("error", "services", message, _cure(failed))
+            failed = _creation_failure(cluster, name)
+            message = f"pods of {name} cannot be created: {failed.get('message', 'reason unknown')}"
+            yield Finding("error", "services", message, _creation_remedy(failed))
         elif ready < wanted:
             remedy = f"kubectl -n {SYSTEM} describe pods -l app.kubernetes.io/component={name.removeprefix('fractus-')}"
             yield Finding("warning", "services", f"{name} is ready on {ready} of {wanted} nodes", remedy)
@@ -202,23 +202,23 @@ def _services(found: Cluster) -> Iterator[Finding]:
             yield Finding("ok", "services", f"{name} is ready on all {wanted} nodes")
 
 
-def _not_made(found: Cluster, daemon_set: str) -> Body:
-    """The last event that says why a DaemonSet's pods are not made; empty where none does."""
+def _creation_failure(cluster: ClusterReader, daemon_set: str) -> Body:
+    """Return the latest FailedCreate event of a DaemonSet, or an empty object."""
     selector = f"reason=FailedCreate,involvedObject.kind=DaemonSet,involvedObject.name={daemon_set}"
-    events = found.list(f"/api/v1/namespaces/{SYSTEM}/events", fieldSelector=selector)
+    events = cluster.list(f"/api/v1/namespaces/{SYSTEM}/events", fieldSelector=selector)
     return max(events, key=lambda event: str(event.get("lastTimestamp") or ""), default={})
 
 
-def _cure(failed: Body) -> str:
-    """What to do where the API server refuses pods of the system."""
+def _creation_remedy(failed: Body) -> str:
+    """Return the remedy if the API server rejects pods of the system."""
     if "PodSecurity" in str(failed.get("message")):
         return f"kubectl label namespace {SYSTEM} pod-security.kubernetes.io/enforce=privileged --overwrite"
-    return f"kubectl -n {SYSTEM} get events --field-selector reason=FailedCreate; see its ResourceQuota and LimitRange, too"
+    return f"kubectl -n {SYSTEM} get events --field-selector reason=FailedCreate; also check its ResourceQuota and LimitRange"
 
 
-def _admission(found: Cluster) -> Iterator[Finding]:
-    policies = found.list(f"{_ADMISSION}/validatingadmissionpolicies")
-    bindings = found.list(f"{_ADMISSION}/validatingadmissionpolicybindings")
+def _admission(cluster: ClusterReader) -> Iterator[Finding]:
+    policies = cluster.list(f"{_ADMISSION}/validatingadmissionpolicies")
+    bindings = cluster.list(f"{_ADMISSION}/validatingadmissionpolicybindings")
     denied = {b["spec"]["policyName"] for b in bindings if "Deny" in (b["spec"].get("validationActions") or ())}
     missing = set(POLICIES) - denied.intersection(body["metadata"]["name"] for body in policies)
     if missing:
@@ -227,29 +227,31 @@ def _admission(found: Cluster) -> Iterator[Finding]:
         yield Finding("ok", "admission", f"all {len(POLICIES)} policies are in force")
 
 
-def _strangers(found: Cluster) -> Iterator[Finding]:
-    """Pods such as those of a network plugin, that were there before the policies that keep them off drones and edge nodes."""
-    judged = found.get(f"{_ADMISSION}/validatingadmissionpolicies/fractus-pods") or {}
-    selector = ((judged.get("spec") or {}).get("matchConstraints") or {}).get("namespaceSelector") or {}
+def _foreign_pods(cluster: ClusterReader) -> Iterator[Finding]:
+    """Find pods (for example of a network plugin) on drones and edge nodes that the admission policies reject if they are recreated."""
+    policy = cluster.get(f"{_ADMISSION}/validatingadmissionpolicies/fractus-pods") or {}
+    selector = ((policy.get("spec") or {}).get("matchConstraints") or {}).get("namespaceSelector") or {}
     exempt = [name for e in selector.get("matchExpressions") or () for name in e.get("values") or ()]
-    nodes = found.list("/api/v1/nodes", labelSelector=f"{CLASS} in (drone, edge)")
+    nodes = cluster.list("/api/v1/nodes", labelSelector=f"{CLASS} in (drone, edge)")
     guarded = {node["metadata"]["name"] for node in nodes}
-    pods = found.list("/api/v1/pods", fieldSelector="spec.hostNetwork=true") if exempt and guarded else ()
+    pods = cluster.list("/api/v1/pods", fieldSelector="spec.hostNetwork=true") if exempt and guarded else ()
     refused = {
         pod["metadata"]["namespace"]: f"{pod['metadata']['name']} on {pod['spec']['nodeName']}"
         for pod in pods
-        if pod["spec"].get("nodeName") in guarded and pod["metadata"]["namespace"] not in exempt and _is_judged(pod)
+        if pod["spec"].get("nodeName") in guarded
+        and pod["metadata"]["namespace"] not in exempt
+        and _is_subject_to_policy(pod)
     }
-    # The value replaces the one before: each remedy is that for all.
+    # Setting the value replaces the previous one, so each remedy lists all namespaces.
     listed = ",".join(n for n in (*exempt, *sorted(refused)) if n != SYSTEM)
-    remedy = f"where they are the cluster's own: {_HELM} --reuse-values --set 'admission.exemptNamespaces={{{listed}}}'"
+    remedy = f"if they belong to the cluster: {_HELM} --reuse-values --set 'admission.exemptNamespaces={{{listed}}}'"
     for namespace, name in sorted(refused.items()):
-        message = f"{namespace}: pods in the node's network, such as {name}, are refused when they are made again"
+        message = f"{namespace}: pods in the host network, such as {name}, will be rejected when they are recreated"
         yield Finding("warning", "admission", message, remedy)
 
 
-def _is_judged(pod: Body) -> bool:
-    """Whether the policy `fractus-pods` judges such a pod when it is made again: one that tolerates the taint, by no kubelet."""
+def _is_subject_to_policy(pod: Body) -> bool:
+    """Return True if policy `fractus-pods` applies to a recreated pod: not a mirror pod, and it tolerates the taint."""
     ended = (pod.get("status") or {}).get("phase") in {"Succeeded", "Failed"}
     mirror = "kubernetes.io/config.mirror" in (pod["metadata"].get("annotations") or {})
     tolerates = any(t.get("key", "") in {"", CLASS} for t in pod["spec"].get("tolerations") or ())
@@ -260,132 +262,135 @@ def _pods(pods: Sequence[Body]) -> Iterator[Finding]:
     for pod in pods:
         scheduled = conditions_of(pod).get("PodScheduled", {})
         if scheduled.get("status") == "False":
-            message = f"{pod['metadata']['name']} has no node: {scheduled.get('message', '')}".rstrip(": ")
-            yield Finding("error", "pods", message, _places(pod))
-        name, containers = pod["metadata"]["name"], (pod.get("status") or {}).get("containerStatuses") or ()
-        waiting = [c["state"]["waiting"] for c in containers if "waiting" in (c.get("state") or {})]
-        for why in waiting:
-            reason = why.get("reason", "")
-            image = "Image" in reason
-            remedy = "check image.registry, image.tag and imagePullSecrets of the chart" if image else ""
-            remedy = remedy or f"kubectl -n {SYSTEM} logs {name} --previous"
-            if reason != "ContainerCreating":
-                where = (pod.get("spec") or {}).get("nodeName", "no node")
-                message = f"{name} on {where}: {reason}: {why.get('message', '')}".rstrip(": ")
-                yield Finding("error", "images" if image else "pods", message, remedy)
+            message = f"{pod['metadata']['name']} is not scheduled: {scheduled.get('message', '')}".rstrip(": ")
+            yield Finding("error", "pods", message, _scheduling_remedy(pod))
+        name = pod["metadata"]["name"]
+        node = (pod.get("spec") or {}).get("nodeName", "no node")
+        for container in (pod.get("status") or {}).get("containerStatuses") or ():
+            waiting = (container.get("state") or {}).get("waiting")
+            if waiting is None or waiting.get("reason") == "ContainerCreating":
+                continue
+            reason = waiting.get("reason", "")
+            message = f"{name} on {node}: {reason}: {waiting.get('message', '')}".rstrip(": ")
+            if "Image" in reason:
+                remedy = "check image.registry, image.tag and imagePullSecrets of the chart"
+                yield Finding("error", "images", message, remedy)
+            else:
+                yield Finding("error", "pods", message, f"kubectl -n {SYSTEM} logs {name} --previous")
 
 
-def _places(pod: Body) -> str:
-    """What to do for a pod that no node takes."""
+def _scheduling_remedy(pod: Body) -> str:
+    """Return the remedy for a pod that cannot be scheduled."""
     if (pod["metadata"].get("labels") or {}).get("app.kubernetes.io/component") not in {"operator", "view"}:
         return f"kubectl -n {SYSTEM} describe pod {pod['metadata']['name']}"
     return (
-        f"it needs a node that is neither a drone nor an edge node, or has {CLOUD_LABEL}=true; where that has taints, set"
+        f"add a node that is neither a drone nor an edge node, or label a node {CLOUD_LABEL}=true; if that node has taints, set"
         " operator.tolerations of the chart"
     )
 
 
-def _authority(secret: Body | None, now: datetime) -> Iterator[Finding]:
-    text = ((secret or {}).get("data") or {}).get("ca.crt", "")
+def _authority(config_map: Body | None, now: datetime) -> Iterator[Finding]:
+    text = ((config_map or {}).get("data") or {}).get("ca.crt", "")
     if not text:
-        message, remedy = "there is no authority yet", "the operator makes it when it starts: see the check operator"
-        yield Finding("error", "certificates", message, remedy)
+        remedy = "the operator creates it when it starts: see the check operator"
+        yield Finding("error", "certificates", "there is no certificate authority yet", remedy)
         return
     try:
         ends = min(c.not_valid_after_utc for c in x509.load_pem_x509_certificates(text.encode()))
     except ValueError as error:
         remedy = f"kubectl -n {SYSTEM} get configmap fractus-ca -o yaml"
-        yield Finding("error", "certificates", f"the authority cannot be read: {error}", remedy)
+        yield Finding("error", "certificates", f"the certificate authority cannot be read: {error}", remedy)
         return
     if ends - now < EXPIRY:
         level: Literal["warning", "error"] = "error" if ends < now else "warning"
-        remedy = "delete the Secret fractus-ca while nothing flies; the operator makes another authority"
-        yield Finding(level, "certificates", f"the authority expires at {ends:%Y-%m-%d}", remedy)
+        remedy = "delete the Secret fractus-ca while no drone flies; the operator creates a new certificate authority"
+        yield Finding(level, "certificates", f"the certificate authority expires at {ends:%Y-%m-%d}", remedy)
     else:
-        yield Finding("ok", "certificates", f"the authority is valid until {ends:%Y-%m-%d}")
+        yield Finding("ok", "certificates", f"the certificate authority is valid until {ends:%Y-%m-%d}")
 
 
-def _nodes(found: Cluster) -> Iterator[Finding]:
+def _nodes(cluster: ClusterReader) -> Iterator[Finding]:
     described = {
-        "drone": {body["metadata"]["name"]: body for body in found.list(f"{GROUP}/drones")},
-        "edge": {body["metadata"]["name"]: body for body in found.list(f"{GROUP}/edgenodes")},
+        "drone": {body["metadata"]["name"]: body for body in cluster.list(f"{GROUP}/drones")},
+        "edge": {body["metadata"]["name"]: body for body in cluster.list(f"{GROUP}/edgenodes")},
     }
     classes: set[str] = set()
-    nodes = found.list("/api/v1/nodes")
+    nodes = cluster.list("/api/v1/nodes")
     names = {node["metadata"]["name"] for node in nodes}
-    for of_class, bodies in described.items():
+    for node_class, bodies in described.items():
         for name in sorted(set(bodies) - names):
-            kind = "drone" if of_class == "drone" else "edgenode"
-            message = f"there is no node of the name of {kind} {name}: it was renamed or removed"
-            yield Finding("warning", "nodes", message, f"where it does not come back: kubectl delete {kind} {name}")
+            kind = "drone" if node_class == "drone" else "edgenode"
+            message = f"{kind} {name} has no node: the node was renamed or removed"
+            yield Finding("warning", "nodes", message, f"if the node does not return: kubectl delete {kind} {name}")
     for node in nodes:
         name, labels = node["metadata"]["name"], node["metadata"].get("labels") or {}
-        of_class = labels.get(CLASS, "")
-        classes |= {of_class, "cloud"} if labels.get(CLOUD_LABEL) == "true" else {of_class}
-        if of_class not in {"", "drone", "edge", "cloud"}:
+        node_class = labels.get(CLASS, "")
+        classes |= {node_class, "cloud"} if labels.get(CLOUD_LABEL) == "true" else {node_class}
+        if node_class not in {"", "drone", "edge", "cloud"}:
             remedy = f"kubectl label node {name} {CLASS}=drone --overwrite (or edge, or cloud)"
-            yield Finding("error", "nodes", f"{name}: the class {of_class} means nothing", remedy)
-        elif of_class in described:
-            yield from _node(node, of_class, described[of_class].get(name))
-    for of_class in ("drone", "cloud"):
-        if of_class not in classes:
-            remedy = f"kubectl label node NODE {CLASS}={of_class}"
-            level: Literal["warning", "error"] = "error" if of_class == "drone" else "warning"
-            yield Finding(level, "nodes", f"no node has the label {CLASS}={of_class}", remedy)
+            yield Finding("error", "nodes", f"{name}: unknown node class {node_class}", remedy)
+        elif node_class in described:
+            yield from _node(node, node_class, described[node_class].get(name))
+    for node_class in ("drone", "cloud"):
+        if node_class not in classes:
+            remedy = f"kubectl label node NODE {CLASS}={node_class}"
+            level: Literal["warning", "error"] = "error" if node_class == "drone" else "warning"
+            yield Finding(level, "nodes", f"no node has the label {CLASS}={node_class}", remedy)
 
 
-def _node(node: Body, of_class: str, body: Body | None) -> Iterator[Finding]:
-    """The findings of one drone or edge node."""
-    name, before = node["metadata"]["name"], []
+def _node(node: Body, node_class: str, body: Body | None) -> Iterator[Finding]:
+    """Check one drone or edge node."""
+    name = node["metadata"]["name"]
+    findings: list[Finding] = []
     if conditions_of(node).get("Ready", {}).get("status") != "True":
-        before.append(Finding("warning", "nodes", f"{name} is out of reach", "check its power, link and kubelet"))
+        findings.append(
+            Finding("warning", "nodes", f"{name} is not ready", "check its power, network link and kubelet")
+        )
     addresses = (node.get("status") or {}).get("addresses") or ()
     address = next((str(a.get("address")) for a in addresses if a.get("type") == "InternalIP"), "")
     if ":" in address:
-        message = f"{name} has the address {address} first, and its services listen on IPv4"
-        before.append(
+        message = f"{name} has {address} as first address, but its services listen on IPv4"
+        findings.append(
             Finding("error", "nodes", message, "give the node an IPv4 address first (--node-ip of its kubelet)")
         )
     effects = {t["effect"] for t in (node.get("spec") or {}).get("taints") or () if t["key"] == CLASS}
     if (node["metadata"].get("labels") or {}).get(CLOUD_LABEL) == "true":
         if effects:
-            message = f"{name} has the label {CLOUD_LABEL}, but its taint {CLASS} keeps the cloud's pods away"
-            before.append(Finding("warning", "nodes", message, f"kubectl taint node {name} {CLASS}-"))
-        elif of_class == "drone":
-            message = f"{name} is of the cloud, too: any pod there can reach its autopilot"
-            before.append(
-                Finding("warning", "nodes", message, "only for a simulated drone; else give it a node of its own")
+            message = f"{name} has the label {CLOUD_LABEL}, but its taint {CLASS} keeps cloud pods away"
+            findings.append(Finding("warning", "nodes", message, f"kubectl taint node {name} {CLASS}-"))
+        elif node_class == "drone":
+            message = f"{name} is also a cloud node: any pod on it can reach the autopilot"
+            findings.append(
+                Finding("warning", "nodes", message, "use a separate cloud node, except for a simulated drone")
             )
     elif "NoExecute" not in effects:
-        remedy = f"kubectl taint node {name} {CLASS}={of_class}:NoExecute"
+        remedy = f"kubectl taint node {name} {CLASS}={node_class}:NoExecute"
         message = (
-            f"{name} has no taint {CLASS} with the effect NoExecute: other pods may run there, also with its network"
+            f"{name} has no taint {CLASS} with the effect NoExecute: other pods may run on it, also in the host network"
         )
-        before.append(Finding("warning", "nodes", message, remedy))
+        findings.append(Finding("warning", "nodes", message, remedy))
     if body is None:
-        kind = "Drone" if of_class == "drone" else "EdgeNode"
-        remedy = (
-            f"put its description on the node as /etc/fractus/node.yaml, and see kubectl -n {SYSTEM} logs of its agent"
-        )
-        before.append(Finding("error", "nodes", f"{name} has no {kind}: its agent has not registered it", remedy))
+        kind = "Drone" if node_class == "drone" else "EdgeNode"
+        remedy = f"store its description on the node as /etc/fractus/node.yaml, and check the log of its agent (kubectl -n {SYSTEM} logs)"
+        findings.append(Finding("error", "nodes", f"{name} has no {kind}: its agent has not registered it", remedy))
     else:
         for type_, condition in sorted(conditions_of(body).items()):
-            # Services that wait for a landing, and missions, are as they should be.
+            # Services that wait for a landing and missions are not problems.
             if condition["status"] != "True" and type_ not in {"ServicesCurrent", "OnMission"}:
                 message = f"{name}: {type_}: {condition['reason']}: {condition.get('message', '')}".rstrip(": ")
-                remedy = f"kubectl describe {'drone' if of_class == 'drone' else 'edgenode'} {name}"
-                before.append(Finding("error" if type_ == "Ready" else "warning", "hardware", message, remedy))
-    yield from before or [Finding("ok", "nodes", f"{name} is a {of_class} node, described and ready")]
+                remedy = f"kubectl describe {'drone' if node_class == 'drone' else 'edgenode'} {name}"
+                findings.append(Finding("error" if type_ == "Ready" else "warning", "hardware", message, remedy))
+    yield from findings or [Finding("ok", "nodes", f"{name} is a {node_class} node, registered and ready")]
 
 
-def _rules(found: Cluster) -> Iterator[Finding]:
+def _policies(cluster: ClusterReader) -> Iterator[Finding]:
     for plural in ("zones", "policies"):
-        for body in found.list(f"{GROUP}/{plural}"):
+        for body in cluster.list(f"{GROUP}/{plural}"):
             ready = conditions_of(body).get("Ready", {})
             if ready.get("status") == "False":
                 name = f"{plural}/{body['metadata']['name']}"
                 yield Finding(
                     "error", "policies", f"{name}: {ready.get('message')}", f"correct it: kubectl edit {name}"
                 )
-    if not found.list(f"{GROUP}/depots"):
-        yield Finding("warning", "depots", "there is none", "apply a Depot: drones start from it (examples)")
+    if not cluster.list(f"{GROUP}/depots"):
+        yield Finding("warning", "depots", "there is no Depot", "apply a Depot, from which drones start (see examples)")

@@ -1,4 +1,4 @@
-"""`fractus explain`: why an application is where it is, why it is not elsewhere, and what policies did."""
+"""`fractus explain`: reasons for the placement of an Application, rejected nodes, and effects of policies."""
 
 from __future__ import annotations
 
@@ -8,48 +8,58 @@ from typing import Any
 
 import click
 
+from fractus_cli.cluster_reader import (
+    EXIT_PROBLEM,
+    GROUP,
+    Body,
+    ClusterReader,
+    get_application,
+    kubeconfig_option,
+    open_cluster,
+)
 from fractus_cli.output import output_option, printable
-from fractus_cli.reading import EXIT_PROBLEM, GROUP, Body, Cluster, application, cluster, kubeconfig_option
 
 _LISTED = 5
 
 
 @click.command()
 @click.argument("name", metavar="APPLICATION")
-@click.option("-n", "--namespace", default="default", show_default=True, help="Of the application.")
-@click.option("--all", "everything", is_flag=True, help="List every rejected node and event, not the first five.")
+@click.option("-n", "--namespace", default="default", show_default=True, help="Namespace of the Application.")
+@click.option("--all", "everything", is_flag=True, help="List all rejected nodes and events instead of five.")
 @output_option
 @kubeconfig_option
 def explain(name: str, namespace: str, everything: bool, output: str, config: str | None) -> int:
-    """Say why APPLICATION runs where it runs, why not elsewhere, and which policy did what.
+    """Explain where APPLICATION runs, why other nodes were rejected, and what policies changed.
 
-    Exits with 2 where it has no plan, or where policies do not let its mission be flown as planned.
+    The exit code is 2 if there is no plan, or if policies forbid the mission as planned.
     """
-    with cluster(config) as found:
-        seen = look(found, namespace, name)
-    shown = map(printable, lines(seen, None if everything else _LISTED))
-    click.echo(json.dumps(seen) if output == "json" else "\n".join(shown))
-    conflict = (seen["drone"] or {}).get("policyConflict")
-    return EXIT_PROBLEM if not seen["placements"] or conflict else 0
+    with open_cluster(config) as cluster:
+        summary = collect(cluster, namespace, name)
+    if output == "json":
+        click.echo(json.dumps(summary))
+    else:
+        click.echo("\n".join(map(printable, lines(summary, None if everything else _LISTED))))
+    conflict = (summary["drone"] or {}).get("policyConflict")
+    return EXIT_PROBLEM if not summary["placements"] or conflict else 0
 
 
-def look(found: Cluster, namespace: str, name: str) -> dict[str, Any]:
-    """What is known of an application: its status, its plan, the policies of its grants, and its events.
+def collect(cluster: ClusterReader, namespace: str, name: str) -> dict[str, Any]:
+    """Return status, plan, granted policies and events of an Application.
 
     Raises:
-        ClickException: there is no such application.
+        ClickException: The Application does not exist.
     """
     scope = f"{GROUP}/namespaces/{namespace}"
-    body = application(found, namespace, name)
-    plans = [p for p in found.list(f"{scope}/deploymentplans") if p["spec"]["application"] == name]
+    body = get_application(cluster, namespace, name)
+    plans = [p for p in cluster.list(f"{scope}/deploymentplans") if p["spec"]["application"] == name]
     plan: Body = plans[0]["spec"] if plans else {}
-    listed = found.list_permitted(f"{GROUP}/grants")
+    listed = cluster.list_permitted(f"{GROUP}/grants")
     grants = [
         grant["spec"]
         for grant in listed or ()
         if (grant["spec"]["application"]["namespace"], grant["spec"]["application"]["name"]) == (namespace, name)
     ]
-    events = found.list(
+    events = cluster.list(
         f"/api/v1/namespaces/{namespace}/events",
         fieldSelector=f"involvedObject.kind=Application,involvedObject.name={name}",
     )
@@ -58,7 +68,7 @@ def look(found: Cluster, namespace: str, name: str) -> dict[str, Any]:
         "namespace": namespace,
         "name": name,
         "phase": status.get("phase", "Pending"),
-        "message": status.get("message", "the operator has not seen it yet"),
+        "message": status.get("message", "not processed by the operator yet"),
         "conditions": list(status.get("conditions") or ()),
         "drone": plan.get("drone"),
         "placements": list(plan.get("placements") or ()),
@@ -79,42 +89,44 @@ def look(found: Cluster, namespace: str, name: str) -> dict[str, Any]:
     }
 
 
-def lines(seen: dict[str, Any], most: int | None) -> Iterator[str]:
-    """The same for people.
+def lines(summary: dict[str, Any], limit: int | None) -> Iterator[str]:
+    """Format a summary as text.
 
     Args:
-        seen: As `look` gave it.
-        most: How many rejected nodes of a component, and events, are listed; None: all.
+        summary: Result of `collect`.
+        limit: Maximum number of rejected nodes of each component and of events, or None for all.
     """
-    yield f"{seen['namespace']}/{seen['name']}: {seen['phase']}: {seen['message']}"
-    for c in seen["conditions"]:
+    yield f"{summary['namespace']}/{summary['name']}: {summary['phase']}: {summary['message']}"
+    for c in summary["conditions"]:
         yield f"  {c['type']}={c['status']} {c['reason']}: {c.get('message', '')}".rstrip(": ")
-    if not seen["placements"]:
+    if not summary["placements"]:
         yield "There is no plan."
-    if seen["drone"]:
-        yield from _drone(seen["drone"])
-    for placed in seen["placements"]:
+    if summary["drone"]:
+        yield from _drone(summary["drone"])
+    for placed in summary["placements"]:
         yield from _placement(placed)
-    yield from _rejections(seen, most)
-    yield from _policies(seen["policies"])
-    if seen["forbidden"]:
-        yield f"You may not list {' and '.join(seen['forbidden'])} of this cluster: which policies hold is in them."
-    if seen["events"]:
-        yield "Events, the newest first:"
-        for event in seen["events"][:most]:
+    yield from _rejections(summary, limit)
+    yield from _policies(summary["policies"])
+    if summary["forbidden"]:
+        yield f"You are not permitted to list {' and '.join(summary['forbidden'])} of this cluster, so the applied policies are unknown."
+    if summary["events"]:
+        yield "Events, newest first:"
+        for event in summary["events"][:limit]:
             yield f"  {event['lastTimestamp']} {event['type']} {event['reason']}: {event['message']}"
 
 
 def _drone(drone: Body) -> Iterator[str]:
-    shared = f", which {drone['sharedWith']} flies" if drone.get("sharedWith") else ""
+    shared = f", flown by {drone['sharedWith']}" if drone.get("sharedWith") else ""
     others = ", ".join(f"{a['node']} ({a['score']:.3g})" for a in drone.get("alternatives") or ())
     score = f" (score {drone['score']:.3g})" if drone.get("score") is not None else ""
-    yield f"Drone: {drone['node']}{score}{shared}" + (f"; next best: {others}" if others else "; no other could fly it")
+    yield f"Drone: {drone['node']}{score}{shared}" + (
+        f"; next best: {others}" if others else "; no other drone is suitable"
+    )
     mission = drone.get("mission")
     if mission:
         yield (
-            f"  {mission['distance']:.0f} m in {mission['duration']:.1f} min; it can fly {mission['available']:.1f} min with its"
-            " reserve kept"
+            f"  {mission['distance']:.0f} m in {mission['duration']:.1f} min; available without the reserve: {mission['available']:.1f}"
+            " min"
         )
     for leg in drone.get("legality") or ():
         to = f"{leg['end']['lat']:.6f}, {leg['end']['lon']:.6f}"
@@ -127,29 +139,29 @@ def _drone(drone: Body) -> Iterator[str]:
 
 
 def _placement(placed: Body) -> Iterator[str]:
-    why = {
-        "drone": "on the drone that flies",
+    reason = {
+        "drone": "on the selected drone",
         "static": f"for location {placed.get('location', 0)}",
-        "hybrid-edge": "covers a part of the operation area",
-        "hybrid-drone": "on the drone, beside what it serves",
+        "hybrid-edge": "covers part of the operation area",
+        "hybrid-drone": "on the drone, next to the component that it serves",
         "cloud": "any cloud node",
     }.get(placed["role"], placed["role"])
     coverage = f", {placed['coverage']:.0%} of it" if placed.get("coverage") else ""
-    yield f"{placed['component']}: {placed.get('node') or 'cloud'} ({why}{coverage})"
+    yield f"{placed['component']}: {placed.get('node') or 'cloud'} ({reason}{coverage})"
 
 
-def _rejections(seen: dict[str, Any], most: int | None) -> Iterator[str]:
+def _rejections(summary: dict[str, Any], limit: int | None) -> Iterator[str]:
     by_component: dict[str, list[Body]] = {}
-    for rejected in seen["rejected"]:
+    for rejected in summary["rejected"]:
         by_component.setdefault(rejected["component"], []).append(rejected)
     for component, rejections in by_component.items():
-        yield f"Not for {component}:"
-        for rejected in rejections[:most]:
+        yield f"Rejected for {component}:"
+        for rejected in rejections[:limit]:
             yield f"  {rejected['node']}: {rejected['reason']}: {rejected['message']}"
-        if most is not None and len(rejections) > most:
-            yield f"  and {len(rejections) - most} more (--all)"
-    if seen["rejectedOmitted"]:
-        yield f"{seen['rejectedOmitted']} more rejected nodes are not in the plan: most of them too far away"
+        if limit is not None and len(rejections) > limit:
+            yield f"  and {len(rejections) - limit} more (--all)"
+    if summary["rejectedOmitted"]:
+        yield f"{summary['rejectedOmitted']} more rejected nodes are not listed in the plan, most because of distance"
 
 
 def _policies(policies: dict[str, Sequence[Body]]) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""Audit logs in the formats of others: GeoJSON, KML, CSV and MCAP."""
+"""Export audit logs as GeoJSON, KML, CSV and MCAP."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from fractus_services.recording.map_features import Feature, to_feature
 from fractus_services.recording.messages import audit_records, component_of, finite_number, location, sentence, zones
 from fractus_services.recording.segment_writer import McapWriter
 
-from fractus_cli.audit_logs import Entry, decided, who
+from fractus_cli.audit_logs import Entry, actor, is_decision
 
 GAP_NS = 10_000_000_000
-"""A path ends where the flight recorder, which writes twice a second while the motors run, is silent for longer."""
+"""A longer gap between state entries ends a path. The flight recorder writes two entries per second while the motors run."""
 
 _COLUMNS = (
     "time", "node", "log", "kind", "lat", "lon", "alt_m", "amsl_m", "speed_mps", "battery", "mode", "controller", "component",
@@ -30,24 +30,24 @@ _COLUMNS = (
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """What is drawn besides the flight, with a feature for each: `kind` of its properties says what it is."""
+    """Zones and areas to export with the flight. The property `kind` of a feature is its type."""
 
     areas: Sequence[tuple[Zone, str, str]] = ()
-    """A shape, its kind, and the component that it is for."""
+    """Shapes, each with its kind and its component (empty for none)."""
 
     def features(self) -> list[Feature]:
-        """As GeoJSON."""
+        """Return GeoJSON features."""
         return [to_feature(zone, kind, **({"component": owner} if owner else {})) for zone, kind, owner in self.areas]
 
 
 @dataclass(frozen=True, slots=True)
 class Export:
-    """What is written.
+    """Data to export.
 
     Attributes:
-        entries: in the order of their times, as `audit_logs.entries` gives them.
-        places: zones and areas.
-        problems: why the entries prove nothing; empty when the chains are sound.
+        entries: Entries in time order, see `audit_logs.entries`.
+        places: Zones and areas.
+        problems: Problems of the hash chains. Empty if they are sound.
     """
 
     entries: Iterable[Entry]
@@ -57,7 +57,7 @@ class Export:
 
 @dataclass(slots=True)
 class _Path:
-    """One flight of a drone: from the motors' start to their stop."""
+    """Path of one flight, from motor start to motor stop."""
 
     node: str
     times: list[int] = field(default_factory=list)
@@ -65,8 +65,8 @@ class _Path:
 
 
 @dataclass(slots=True)
-class _Flown:
-    """The paths of a drone and what was decided on them, with where it was: lon, lat, metres above sea level."""
+class _DroneFlights:
+    """Paths and decisions of a drone, with positions as longitude, latitude and metres above mean sea level."""
 
     paths: list[_Path] = field(default_factory=list)
     decisions: list[tuple[Entry, tuple[float, float, float] | None]] = field(default_factory=list)
@@ -74,7 +74,7 @@ class _Flown:
     home_m: float = 0.0
 
     def add(self, entry: Entry) -> None:
-        """Take the drone's next entry."""
+        """Process the next entry of the drone."""
         lat, lon, alt = (
             finite_number(entry.get("lat")),
             finite_number(entry.get("lon")),
@@ -90,24 +90,24 @@ class _Flown:
                 self.paths.append(_Path(entry["node"]))
             self.paths[-1].times.append(entry["time_ns"])
             self.paths[-1].points.append(self.last)
-        elif decided(entry):
-            # The monitor's entries do not say where: the recorder does, twice a second.
+        elif is_decision(entry):
+            # Entries of the monitor have no position, so use the last recorded one.
             at = (lon, lat, self.home_m + alt) if lat is not None and lon is not None else self.last
             self.decisions.append((entry, at))
 
 
-def _flown(entries: Iterable[Entry]) -> dict[str, _Flown]:
-    """What each node did, by its name; nodes that neither flew nor decided are left out."""
-    flown: dict[str, _Flown] = {}
+def _flights_by_node(entries: Iterable[Entry]) -> dict[str, _DroneFlights]:
+    """Return paths and decisions by node. Nodes without either are omitted."""
+    flown: dict[str, _DroneFlights] = {}
     for entry in entries:
-        flown.setdefault(entry["node"], _Flown()).add(entry)
+        flown.setdefault(entry["node"], _DroneFlights()).add(entry)
     return {node: one for node, one in sorted(flown.items()) if one.paths or one.decisions}
 
 
 def write_geojson(export: Export, out: IO[bytes]) -> None:
-    """A FeatureCollection (RFC 7946): paths, decisions and areas; heights are metres above sea level."""
+    """Write a FeatureCollection (RFC 7946) with paths, decisions and areas. Altitudes are metres above mean sea level."""
     features: list[Feature] = []
-    flown = _flown(export.entries)
+    flown = _flights_by_node(export.entries)
     for path in (path for one in flown.values() for path in one.paths):
         spots = [list(point) for point in path.points]
         line = len(spots) > 1
@@ -119,32 +119,32 @@ def write_geojson(export: Export, out: IO[bytes]) -> None:
         })  # fmt: skip
     for entry, at in (decision for one in flown.values() for decision in one.decisions):
         geometry = {"type": "Point", "coordinates": list(at)} if at is not None else None
-        features.append({"type": "Feature", "properties": _told(entry), "geometry": geometry})
+        features.append({"type": "Feature", "properties": _decision_properties(entry), "geometry": geometry})
     features += export.places.features()
     whole: dict[str, Any] = {"type": "FeatureCollection", "verified": not export.problems, "features": features}
     out.write(json.dumps(whole, ensure_ascii=False, indent=1).encode() + b"\n")
 
 
-def _told(entry: Entry) -> dict[str, Any]:
-    told = {key: entry[key] for key in ("action", "code", "reason", "policies", "method", "mode") if entry.get(key)}
+def _decision_properties(entry: Entry) -> dict[str, Any]:
+    optional = {key: entry[key] for key in ("action", "code", "reason", "policies", "method", "mode") if entry.get(key)}
     return {
         "kind": entry["kind"],
         "node": entry["node"],
         "time": _iso(entry["time_ns"]),
-        "component": who(entry),
-    } | told
+        "component": actor(entry),
+    } | optional
 
 
 def write_kml(export: Export, out: IO[bytes]) -> None:
-    """A document (OGC 07-147r2): a folder for each drone, with a line for each flight and a point for each decision; and the areas."""
-    flown = _flown(export.entries)
+    """Write a KML document (OGC 07-147r2): a folder for each drone with flight lines and decision points, and the areas."""
+    flown = _flights_by_node(export.entries)
     marks = [f"<description>{escape(one)}</description>\n" for one in (" ".join(export.problems),) if one]
     marks += [_folder(node, one) for node, one in flown.items()]
     marks += [zone_placemark(zone, []) for zone, _, _ in export.places.areas]
     out.write(kml_document(marks).encode())
 
 
-def _folder(node: str, flown: _Flown) -> str:
+def _folder(node: str, flown: _DroneFlights) -> str:
     points = (_point(entry, at) for entry, at in flown.decisions if at is not None)
     return f"<Folder><name>{escape(node)}</name>\n{''.join((*map(_line, flown.paths), *points))}</Folder>\n"
 
@@ -173,7 +173,7 @@ def _spot(point: tuple[float, float, float]) -> str:
 
 
 def write_csv(export: Export, out: IO[bytes]) -> None:
-    """A row for each entry (RFC 4180), with the number and the hash that it has in its log."""
+    """Write one row for each entry (RFC 4180), with its sequence number and hash."""
     text = io.TextIOWrapper(out, encoding="utf-8", newline="", write_through=True)
     writer = csv.DictWriter(text, _COLUMNS, extrasaction="ignore")
     writer.writeheader()
@@ -181,8 +181,8 @@ def write_csv(export: Export, out: IO[bytes]) -> None:
         policies = entry.get("policies")
         renamed = {"alt_m": entry.get("alt"), "amsl_m": entry.get("amsl"), "speed_mps": entry.get("speed")}
         names = " ".join(map(str, policies)) if isinstance(policies, list) else ""
-        told = {"component": component_of(entry), "policies": names, "time": _iso(entry["time_ns"])}
-        writer.writerow({key: value for key, value in (entry | renamed | told).items() if _plain(value)})
+        added = {"component": component_of(entry), "policies": names, "time": _iso(entry["time_ns"])}
+        writer.writerow({key: value for key, value in (entry | renamed | added).items() if _plain(value)})
     text.detach()
 
 
@@ -191,8 +191,8 @@ def _plain(value: object) -> bool:
 
 
 def write_mcap(export: Export, out: IO[bytes]) -> None:
-    """A file for Foxglove: location, state, decisions and log of each node, and the areas as GeoJSON."""
-    # The writer asks how far it is, which a pipe cannot say.
+    """Write a file for Foxglove: location, state, decisions and log of each node, and the areas as GeoJSON."""
+    # The writer needs the file position, which a pipe does not have.
     file = McapWriter(cast(IO[bytes], _Counted(out)))
     file.add_metadata("audit", {"verified": "no" if export.problems else "yes", "problems": "\n".join(export.problems)})
     features = export.places.features()
@@ -210,7 +210,7 @@ def write_mcap(export: Export, out: IO[bytes]) -> None:
 
 
 class _Counted:
-    """A file that is only written to, from its beginning to its end."""
+    """Sequentially written file that counts its bytes."""
 
     def __init__(self, out: IO[bytes]) -> None:
         self._out = out

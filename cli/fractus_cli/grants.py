@@ -1,4 +1,4 @@
-"""`fractus grants`: keys, certificates and signed Grants for services that run without Kubernetes."""
+"""`fractus grants`: keys, certificates and signed Grants for services without Kubernetes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import click
 from fractus_core.api import Grant, InvalidObject
 from fractus_core.identity.authority import BrokenAuthority
 
-from fractus_cli.manifests import BadManifest, documents
+from fractus_cli.manifests import BadManifest, read_documents
 from fractus_cli.standalone import StandalonePki
 
 _DIRECTORY = click.Path(file_okay=False, path_type=Path)
@@ -18,15 +18,23 @@ _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 
 @click.group()
 def grants() -> None:
-    """Sign Grants, and make the certificates of nodes and components, without Kubernetes."""
+    """Sign Grants and issue certificates of nodes and components, without Kubernetes."""
 
 
 @grants.command()
 @click.argument("directory", type=_DIRECTORY)
-@click.option("--node", "nodes", multiple=True, required=True, help="A node whose services need a certificate.")
-@click.option("--days", type=click.IntRange(1, 3650), default=365, show_default=True, help="Life of the certificates.")
+@click.option(
+    "--node",
+    "nodes",
+    multiple=True,
+    required=True,
+    help="Name of a node whose services need a certificate. May be repeated.",
+)
+@click.option(
+    "--days", type=click.IntRange(1, 3650), default=365, show_default=True, help="Validity of the certificates in days."
+)
 def init(directory: Path, nodes: tuple[str, ...], days: int) -> None:
-    """Make a certificate authority in DIRECTORY, once, and the certificates of nodes."""
+    """Create a certificate authority in DIRECTORY unless it exists, and issue certificates of nodes."""
     try:
         pki = StandalonePki.create(directory, life=timedelta(days=days))
         for node in nodes:
@@ -37,21 +45,25 @@ def init(directory: Path, nodes: tuple[str, ...], days: int) -> None:
 
 @grants.command()
 @click.argument("files", type=_FILE, nargs=-1, required=True)
-@click.option("--tls", type=_DIRECTORY, required=True, help="The directory of `fractus grants init`.")
-@click.option("--to", type=_DIRECTORY, required=True, help="Where the signed Grants go: the services' --grants.")
-@click.option("--days", type=click.IntRange(1, 3650), default=365, show_default=True, help="Life of the certificates.")
+@click.option("--tls", type=_DIRECTORY, required=True, help="Directory created by `fractus grants init`.")
+@click.option(
+    "--to", type=_DIRECTORY, required=True, help="Directory for the signed Grants (--grants of the services)."
+)
+@click.option(
+    "--days", type=click.IntRange(1, 3650), default=365, show_default=True, help="Validity of the certificates in days."
+)
 def sign(files: tuple[Path, ...], tls: Path, to: Path, days: int) -> None:
-    """Sign the Grants in FILES (YAML or JSON), and make a certificate for the component of each.
+    """Sign the Grants in FILES (YAML or JSON), and issue a certificate for the component of each Grant.
 
-    A Grant that replaces another takes effect at once, also in flight. One that was removed counts for nothing any more;
-    sign its manifest again to bring it back.
+    A Grant that replaces another one takes effect immediately, also in flight. A Grant whose file was removed stays
+    revoked. To grant it again, sign its manifest again.
     """
     try:
         pki = StandalonePki.open(tls, life=timedelta(days=days))
         for file in files:
-            manifests = list(documents(file))
+            manifests = list(read_documents(file))
             if not manifests:
-                raise BadManifest(f"{file}: holds no Grant")
+                raise BadManifest(f"{file}: contains no Grant")
             for manifest in manifests:
                 try:
                     identity = Grant.from_body(manifest.body).spec.identity

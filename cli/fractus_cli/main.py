@@ -1,4 +1,4 @@
-"""The `fractus` command: lists its subcommands without importing them, and imports the one that is called."""
+"""The `fractus` command. Lists its subcommands without importing them, and imports only the subcommand that is called."""
 
 from __future__ import annotations
 
@@ -22,34 +22,34 @@ _MARKERS = {
     "sim": "matplotlib",
     "view": "aiohttp",
 }
-"""A module that tells whether an extra is installed: looking for it takes a millisecond, importing a command a second."""
+"""A module of each extra. Finding it takes a millisecond; importing a command to see if it works takes a second."""
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """Where a command is, and what the list of commands says of it.
+    """Location and summary of a subcommand.
 
-    Named by strings, because an import of every command would take seconds, and fail where an extra is missing.
+    The location is a string, because importing every command would take seconds and fail if an extra is missing.
 
     Attributes:
-        place: MODULE:ATTRIBUTE.
-        summary: its line in `fractus --help`.
-        extra: the extra of fractus-drones that the command needs; "sim" for the distribution fractus-sim; empty for the base.
+        location: MODULE:ATTRIBUTE.
+        summary: Its line in `fractus --help`.
+        extra: The extra of fractus-drones that the command needs; "sim" for the distribution fractus-sim; empty for the base.
     """
 
-    place: str
+    location: str
     summary: str
     extra: str = ""
 
     @property
     def installed(self) -> bool:
-        """Whether the command can probably be imported."""
-        modules = [self.place.partition(":")[0].partition(".")[0], *filter(None, [_MARKERS.get(self.extra)])]
+        """True if the module of the command and a module of its extra are installed."""
+        modules = [self.location.partition(":")[0].partition(".")[0], *filter(None, [_MARKERS.get(self.extra)])]
         return all(importlib.util.find_spec(module) for module in modules)
 
     @property
     def requirement(self) -> str:
-        """The distribution, with its extra, that provides the command, as pip takes it."""
+        """Requirement for pip that provides the command."""
         if self.extra == "sim":
             return "fractus-sim"
         return f"fractus-drones[{self.extra}]" if self.extra else "fractus-drones"
@@ -57,39 +57,39 @@ class Entry:
 
 COMMANDS: dict[str, Entry] = {
     "audit": Entry("fractus_cli.audit:audit", "Check, show and export audit logs of a node's services and agent.", "services"),
-    "camera": Entry("fractus_services.commands:camera", "The camera service of a node.", "services"),
-    "camera-world": Entry("fractus_world.__main__:camera_world", "Serve what a camera above a simulated world sees.", "sim"),
-    "cluster": Entry("fractus_cluster.cli:cluster", "Run a real Kubernetes of several nodes on this machine.", "sim"),
-    "completion": Entry("fractus_cli.completion:completion", "Print what a shell sources to complete commands."),
-    "doctor": Entry("fractus_cli.doctor:doctor", "Check a cluster, and say what it lacks to fly.", "operator"),
+    "camera": Entry("fractus_services.commands:camera", "Run the camera service of a node.", "services"),
+    "camera-world": Entry("fractus_world.__main__:camera_world", "Serve images of a camera above a simulated world.", "sim"),
+    "cluster": Entry("fractus_cluster.cli:cluster", "Run a multi-node Kubernetes cluster on this machine.", "sim"),
+    "completion": Entry("fractus_cli.completion:completion", "Print the completion script of a shell."),
+    "doctor": Entry("fractus_cli.doctor:doctor", "Check a cluster and print a remedy for each problem.", "operator"),
     "experiment": Entry("fractus_sim.experiment.cli:experiment", "Run experiments with faults, checks and a report.", "sim"),
-    "explain": Entry("fractus_cli.explain:explain", "Say why an Application runs where it runs.", "kube"),
+    "explain": Entry("fractus_cli.explain:explain", "Explain the plan of an Application.", "kube"),
     "grants": Entry("fractus_cli.grants:grants", "Sign Grants and make certificates, without Kubernetes.", "operator"),
     "images": Entry("fractus_cluster.images.cli:images", "Build the container images of Fractus with buildah.", "sim"),
-    "mobility": Entry("fractus_services.commands:mobility", "The mobility service of a drone.", "services"),
-    "plan": Entry("fractus_cli.plan:plan", "Plan the Applications in some manifests, without a cluster.", "geometry"),
-    "policy": Entry("fractus_cli.policy:policy", "Ask the policy engine, without a cluster.", "geometry"),
+    "mobility": Entry("fractus_services.commands:mobility", "Run the mobility service of a drone.", "services"),
+    "plan": Entry("fractus_cli.plan:plan", "Plan Applications from manifests, without a cluster.", "geometry"),
+    "policy": Entry("fractus_cli.policy:policy", "Judge a call with the policy engine, without a cluster.", "geometry"),
     "status": Entry("fractus_cli.status:status", "Show the drones and applications of a cluster.", "kube"),
     "telemetry": Entry("fractus_cli.telemetry:telemetry", "Print the state of a drone until interrupted."),
     "vehicle": Entry("fractus_vehicle.__main__:vehicle", "Simulate ArduCopter-compatible vehicles.", "sim"),
-    "view": Entry("fractus_view.command:view", "Show flights on a web page, as they happen or from recordings.", "view"),
-    "zones": Entry("fractus_cli.zones:zones", "Read and write Zones in other formats.", "geometry"),
+    "view": Entry("fractus_view.command:view", "Show live or recorded flights on a web page.", "view"),
+    "zones": Entry("fractus_cli.zones:zones", "Import and export Zones in other formats.", "geometry"),
 }  # fmt: skip
 
 
 class LazyGroup(click.Group):
-    """A group that imports a command when it is called, and lists those whose extra is installed."""
+    """Group that imports a command when it is called, and lists the commands whose extra is installed."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Names of all commands."""
+        """Return the names of all commands."""
         return sorted(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Import one command; None when there is none of that name."""
+        """Import a command. Return None if the name is unknown."""
         entry = COMMANDS.get(cmd_name)
         if entry is None:
             return None
-        module, _, attribute = entry.place.partition(":")
+        module, _, attribute = entry.location.partition(":")
         try:
             command: click.Command = getattr(importlib.import_module(module), attribute)
         except ImportError as error:
@@ -104,13 +104,13 @@ class LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Find the command; the error for a mistyped one names the nearest."""
+        """Find the command. If it is unknown, the error suggests the closest name."""
         try:
             return super().resolve_command(ctx, args)
         except click.UsageError:
             near = difflib.get_close_matches(args[0], COMMANDS, n=1)
             hint = f"did you mean {near[0]}?" if near else "see `fractus --help`"
-            raise click.UsageError(f"there is no command {args[0]}; {hint}") from None
+            raise click.UsageError(f"unknown command {args[0]}; {hint}") from None
 
 
 def _missing(name: str, entry: Entry, error: ImportError) -> click.Command:
@@ -130,45 +130,45 @@ def _missing(name: str, entry: Entry, error: ImportError) -> click.Command:
 @click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="fractus-drones", prog_name="fractus", message="%(prog)s %(version)s")
 def fractus() -> None:
-    """Run, check and watch Fractus: drones, edge and cloud under stakeholders' policies."""
+    """Plan, run, check and watch applications on drones, edge nodes and the cloud."""
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
-    """Run the command and return its exit code: 0, 1 for bad input, 2 for what cannot be done as asked.
+    """Run the command and return its exit code: 0 for success, 1 for bad input, 2 for an infeasible request or failed check.
 
-    A command refuses by raising: `click.ClickException`, or any exception with an integer `exit_code`; its text is the
-    one line that the user sees.
+    A command fails by raising `click.ClickException`, or any exception with an optional integer `exit_code`. The text of
+    the exception is printed as one line.
     """
     try:
         outcome = fractus.main(
             args=list(arguments) if arguments is not None else None, prog_name="fractus", standalone_mode=False
         )
-    except Exception as error:  # the outermost edge of the program: one line instead of a traceback
-        return _explain(error)
+    except Exception as error:  # print one line instead of a traceback
+        return _report(error)
     except KeyboardInterrupt:
-        return _complain("interrupted", EXIT_INTERRUPTED)
+        return _print_error("interrupted", EXIT_INTERRUPTED)
     return outcome if isinstance(outcome, int) else EXIT_OK
 
 
-def _explain(error: Exception) -> int:
+def _report(error: Exception) -> int:
     while isinstance(error, ExceptionGroup):
-        error = error.exceptions[0]  # what failed first is the cause; the others were cancelled by it
+        error = error.exceptions[0]  # the first failure is the cause; it cancelled the other tasks
     match error:
         case click.exceptions.NoArgsIsHelpError():
             click.echo(error.format_message())
             return EXIT_OK
         case click.UsageError():
-            where = f" (see `{error.ctx.command_path} --help`)" if error.ctx is not None else ""
-            return _complain(error.format_message() + where, EXIT_BAD_INPUT)
+            hint = f" (see `{error.ctx.command_path} --help`)" if error.ctx is not None else ""
+            return _print_error(error.format_message() + hint, EXIT_BAD_INPUT)
         case click.ClickException():
-            return _complain(error.format_message(), error.exit_code)
+            return _print_error(error.format_message(), error.exit_code)
         case click.Abort():
-            return _complain("interrupted", EXIT_INTERRUPTED)
+            return _print_error("interrupted", EXIT_INTERRUPTED)
         case BrokenPipeError():
             sys.stderr.close()
             return EXIT_OK
     code = getattr(error, "exit_code", EXIT_BAD_INPUT)
-    return _complain(_sentence(error), code if isinstance(code, int) else EXIT_BAD_INPUT)
+    return _print_error(_sentence(error), code if isinstance(code, int) else EXIT_BAD_INPUT)
 
 
 def _sentence(error: Exception) -> str:
@@ -177,7 +177,7 @@ def _sentence(error: Exception) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-def _complain(message: str, code: int) -> int:
+def _print_error(message: str, code: int) -> int:
     click.echo(printable(f"fractus: {' '.join(message.split())}"), err=True)
     return code
 

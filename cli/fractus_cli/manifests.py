@@ -1,4 +1,4 @@
-"""Manifests of any mix of kinds, from files and directories, as an inventory and the applications to plan."""
+"""Read manifests of any kinds from files and directories, and provide the inventory and Applications for planning."""
 
 from __future__ import annotations
 
@@ -47,11 +47,11 @@ _METADATA = frozenset(
         "deletionGracePeriodSeconds",
     }
 )  # fmt: skip
-"""The fields of ObjectMeta."""
+"""Fields of ObjectMeta."""
 
 
 class BadManifest(Exception):
-    """A manifest cannot be used; one sentence that names the file, the line, the object and the field."""
+    """A manifest is invalid. The message names file, line, object and field."""
 
     def __init__(self, sentence: str) -> None:
         super().__init__(printable(sentence))
@@ -59,18 +59,18 @@ class BadManifest(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Manifest:
-    """An object as a file has it."""
+    """Object in a file."""
 
     file: pathlib.Path
     body: dict[str, Any]
     _documents: Documents
 
     def bad(self, problem: InvalidObject, *, described: str = "") -> BadManifest:
-        """That something is wrong with it, and where.
+        """Return the error for a problem, with its file and line.
 
         Args:
-            problem: what, and the field.
-            described: how the object is called in the sentence; by default by its kind and name.
+            problem: Problem and field.
+            described: Description of the object in the message. Default: kind and name.
         """
         metadata = self.body.get("metadata")
         name = metadata.get("name", "") if isinstance(metadata, dict) else ""
@@ -78,13 +78,13 @@ class Manifest:
         return BadManifest(f"{self.where(problem.field)}: {about}: {problem}")
 
     def where(self, path: str = "") -> str:
-        """FILE:LINE of a field."""
+        """Return FILE:LINE of a field."""
         return self._documents.where(self.body, path)
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
-    """An object and the manifest it was read from."""
+class LoadedObject:
+    """Object and the manifest from which it was read."""
 
     manifest: Manifest
     resource: Resource | Host
@@ -92,23 +92,23 @@ class Found:
 
 @dataclass
 class Manifests:
-    """Everything that was read, by kind and (namespace, name)."""
+    """All objects by kind, namespace and name."""
 
-    found: dict[tuple[str, str, str], Found] = field(default_factory=dict)
+    objects: dict[tuple[str, str, str], LoadedObject] = field(default_factory=dict)
 
     def of(self, kind: type[R]) -> dict[str, R]:
-        """The objects of a cluster-scoped kind by name."""
-        return {f.resource.name: f.resource for f in self.found.values() if isinstance(f.resource, kind)}
+        """Return the objects of a cluster-scoped kind by name."""
+        return {f.resource.name: f.resource for f in self.objects.values() if isinstance(f.resource, kind)}
 
     def applications(self) -> list[Application]:
-        """The applications to plan: those with a driver first, for passengers may come along; else by name."""
-        every = [f.resource for f in self.found.values() if isinstance(f.resource, Application)]
+        """Return the Applications in planning order: first those with a driver (passengers may share its drone), then by name."""
+        every = [f.resource for f in self.objects.values() if isinstance(f.resource, Application)]
         return sorted(every, key=lambda a: (a.spec.driver is None, a.key))
 
     def previous(self, application: Application) -> DeploymentPlan | None:
-        """The plan that is in force for an application, if its manifest is among those read."""
+        """Return the current plan of an Application if the manifests contain it."""
         namespace, name = application.key
-        plans = [f.resource for f in self.found.values() if isinstance(f.resource, DeploymentPlan)]
+        plans = [f.resource for f in self.objects.values() if isinstance(f.resource, DeploymentPlan)]
         return next(
             (
                 p
@@ -119,23 +119,24 @@ class Manifests:
         )
 
     def bad(self, application: Application, problem: InvalidObject) -> BadManifest:
-        """That something is wrong with an application, and where."""
-        return self.found[(Application.KIND, *application.key)].manifest.bad(problem)
+        """Return the error for a problem of an Application, with its file and line."""
+        return self.objects[(Application.KIND, *application.key)].manifest.bad(problem)
 
     def inventory(self) -> Inventory:
-        """What applications can be planned on.
+        """Return the inventory for planning.
 
-        Drones that do not say how they are count as Ready and full. Without any Node object every drone and edge node
-        has a host of unlimited resources, and there is a cloud.
+        Drones without a reported status are assumed to be Ready and fully charged. If there is no Node object, each drone
+        and edge node has a host with unlimited resources, and there is a cloud host.
         """
-        hosts = {f.resource.name: f.resource for f in self.found.values() if isinstance(f.resource, Host)}
-        drones, edge_nodes = self.of(Drone), self.of(EdgeNode)
+        hosts = {f.resource.name: f.resource for f in self.objects.values() if isinstance(f.resource, Host)}
+        drones = self.of(Drone)
+        edge_nodes = self.of(EdgeNode)
         if not hosts:
             classes = {**dict.fromkeys(drones, "drone"), **dict.fromkeys(edge_nodes, "edge"), _ASSUMED_CLOUD: "cloud"}
             hosts = {name: Host(name, {CLASS_LABEL: c}, Unlimited()) for name, c in classes.items()}
         return Inventory(
             hosts=hosts,
-            drones={name: _reported(drone) for name, drone in drones.items()},
+            drones={name: _assume_ready(drone) for name, drone in drones.items()},
             edge_nodes=edge_nodes,
             depots=self.of(Depot),
             zones=self.of(Zone),
@@ -144,37 +145,38 @@ class Manifests:
 
 
 class Unlimited(Mapping[str, float]):
-    """Resources of a host without a description: as much as is asked for."""
+    """Unlimited resources, for a host without a Node object."""
 
     def __getitem__(self, resource: str) -> float:
-        """Without end."""
+        """Return infinity."""
         return math.inf
 
     def __iter__(self) -> Iterator[str]:
-        """No resource is named."""
+        """Contain no named resource."""
         return iter(())
 
     def __len__(self) -> int:
-        """No resource is named."""
+        """Contain no named resource."""
         return 0
 
 
 def read_manifests(paths: Iterable[pathlib.Path], kinds: Iterable[type[Resource]] = _READ) -> Manifests:
-    """Read files, and the .yaml, .yml and .json files in directories and below.
+    """Read files, and the .yaml, .yml and .json files in directories, recursively.
 
     Args:
-        paths: of files and directories.
-        kinds: what is read; others are passed over.
+        paths: Files and directories.
+        kinds: Kinds to read. Other kinds are skipped.
 
     Raises:
-        BadManifest: a file cannot be read or parsed, an object breaks the rules of its kind, or is there twice.
+        BadManifest: A file cannot be read or parsed, or an object is invalid or a duplicate.
     """
-    manifests, read = Manifests(), {kind.KIND: kind for kind in kinds}
+    manifests = Manifests()
+    read = {kind.KIND: kind for kind in kinds}
     for file, strict in _files(paths):
-        for manifest in documents(file, strict=strict):
+        for manifest in read_documents(file, strict=strict):
             resource = _resource(manifest, read)
             if resource is not None:
-                _add(manifests, Found(manifest, resource))
+                _add(manifests, LoadedObject(manifest, resource))
     _check(manifests)
     return manifests
 
@@ -184,43 +186,43 @@ def _files(paths: Iterable[pathlib.Path]) -> Iterator[tuple[pathlib.Path, bool]]
         if path.is_dir():
             inside = sorted(p for p in path.rglob("*") if p.suffix in _SUFFIXES and p.is_file())
             if not inside:
-                raise BadManifest(f"{path}: the directory has no .yaml, .yml or .json file")
+                raise BadManifest(f"{path}: the directory contains no .yaml, .yml or .json file")
             yield from ((p, False) for p in inside)
         else:
             yield path, True
 
 
-def documents(file: pathlib.Path, *, strict: bool = True) -> Iterator[Manifest]:
-    """The objects of a file, also those in Lists.
+def read_documents(file: pathlib.Path, *, strict: bool = True) -> Iterator[Manifest]:
+    """Return the objects of a file, including the items of Lists.
 
     Args:
-        file: YAML or JSON.
-        strict: whether what is no Kubernetes object is an error, rather than passed over.
+        file: YAML or JSON file.
+        strict: True to reject documents that are not Kubernetes objects. False to skip them.
 
     Raises:
-        BadManifest: the file cannot be read or parsed, or, if strict, holds something else.
+        BadManifest: The file cannot be read or parsed, or, if strict, contains a document that is not a Kubernetes object.
     """
     try:
-        found = parse_documents(read_file(file), str(file), is_json=file.suffix == ".json")
+        parsed = parse_documents(read_file(file), str(file), is_json=file.suffix == ".json")
     except BadDocument as error:
         raise BadManifest(str(error)) from None
-    for body in found.values:
+    for body in parsed.values:
         if not isinstance(body, dict) or not isinstance(body.get("kind"), str):
             if strict:
-                raise BadManifest(f"{found.where(body)}: a document has no kind; it is no Kubernetes object")
+                raise BadManifest(f"{parsed.where(body)}: the document has no kind, so it is not a Kubernetes object")
             continue
         items = body.get("items")
         if body["kind"].endswith("List") and isinstance(items, list):
-            yield from (Manifest(file, item, found) for item in items if isinstance(item, dict))
+            yield from (Manifest(file, item, parsed) for item in items if isinstance(item, dict))
         else:
-            yield Manifest(file, body, found)
+            yield Manifest(file, body, parsed)
 
 
 def read_file(file: pathlib.Path) -> bytes:
-    """The content of a file, as far as it may be long: also of a device or pipe that never ends.
+    """Return the content of a file. The size limit also applies to devices and pipes without an end.
 
     Raises:
-        BadManifest: it cannot be read, or is too long.
+        BadManifest: The file cannot be read or is too large.
     """
     try:
         with file.open("rb") as opened:
@@ -228,7 +230,7 @@ def read_file(file: pathlib.Path) -> bytes:
     except OSError as error:
         raise BadManifest(f"{file}: {error.strerror}") from None
     if len(content) > MAX_BYTES:
-        raise BadManifest(f"{file}: it has more than {MAX_BYTES // 2**20} MiB; split it")
+        raise BadManifest(f"{file}: larger than {MAX_BYTES // 2**20} MiB; split it")
     return content
 
 
@@ -236,7 +238,7 @@ def _resource(manifest: Manifest, kinds: Mapping[str, type[Resource]]) -> Resour
     body = manifest.body
     kind = body.get("kind")
     try:
-        if not _is_ours(body, kinds):
+        if not _is_read(body, kinds):
             return None
         metadata = body.get("metadata")
         if not isinstance(metadata, dict) or not isinstance(metadata.get("name"), str):
@@ -249,13 +251,14 @@ def _resource(manifest: Manifest, kinds: Mapping[str, type[Resource]]) -> Resour
         raise manifest.bad(error) from None
 
 
-def _is_ours(body: Mapping[str, Any], kinds: Collection[str]) -> bool:
-    """Whether this is an object that is read, rather than one of another project or of another use.
+def _is_read(body: Mapping[str, Any], kinds: Collection[str]) -> bool:
+    """Return True if the object is read, False if it is of another project or of no use here.
 
     Raises:
-        InvalidObject: it says that it is one of Fractus' kinds, and there is no such kind.
+        InvalidObject: The object claims to be of a Fractus kind that does not exist.
     """
-    kind, version = str(body.get("kind")), body.get("apiVersion")
+    kind = str(body.get("kind"))
+    version = body.get("apiVersion")
     if version is None and kind in _EVERY:
         raise InvalidObject("apiVersion", f"is missing; write {API_VERSION}")
     group, _, _ = str(version).rpartition("/")
@@ -269,12 +272,14 @@ def _is_ours(body: Mapping[str, Any], kinds: Collection[str]) -> bool:
 
 
 def _host(document: dict[str, Any]) -> Host:
-    """A Node as a host; one without allocatable resources has as much as anyone asks for.
+    """Convert a Node to a host. Without allocatable resources the host has unlimited resources.
 
     Raises:
-        InvalidObject: a quantity is none, or a field has the wrong type.
+        InvalidObject: A quantity is invalid or a field has the wrong type.
     """
-    metadata, spec, status = document["metadata"], _part(document, "spec"), _part(document, "status")
+    metadata = document["metadata"]
+    spec = _part(document, "spec")
+    status = _part(document, "status")
     labels = _part(metadata, "labels", "metadata.labels")
     described = _part(status, "allocatable", "status.allocatable") or _part(status, "capacity", "status.capacity")
     conditions = status.get("conditions") or ()
@@ -306,35 +311,35 @@ def _part(document: dict[str, Any], key: str, name: str = "") -> dict[str, Any]:
     return part or {}
 
 
-def _add(manifests: Manifests, found: Found) -> None:
-    resource = found.resource
+def _add(manifests: Manifests, loaded: LoadedObject) -> None:
+    resource = loaded.resource
     kind = "Node" if isinstance(resource, Host) else resource.kind
     namespace = ""
     if isinstance(resource, Resource) and resource.NAMESPACED:
         namespace = resource.metadata.namespace or "default"
     key = (kind, namespace, resource.name)
-    if key in manifests.found:
-        there = manifests.found[key].manifest.where("metadata.name")
-        raise found.manifest.bad(InvalidObject("metadata.name", f"{there} has it too; remove one of them"))
-    manifests.found[key] = found
+    if key in manifests.objects:
+        first = manifests.objects[key].manifest.where("metadata.name")
+        raise loaded.manifest.bad(InvalidObject("metadata.name", f"duplicate of {first}; remove one of them"))
+    manifests.objects[key] = loaded
 
 
 def _check(manifests: Manifests) -> None:
-    """Refuse zones and policies that no schema can refuse."""
+    """Check rules of Zones and Policies that the schema cannot express."""
     zones = manifests.of(Zone)
-    for found in manifests.found.values():
-        resource = found.resource
+    for loaded in manifests.objects.values():
+        resource = loaded.resource
         try:
             if isinstance(resource, Zone):
                 check_zone(resource)
             elif isinstance(resource, Policy):
                 check_policy(resource, zones)
         except InvalidObject as error:
-            raise found.manifest.bad(error) from None
+            raise loaded.manifest.bad(error) from None
 
 
-def _reported(drone: Drone) -> Drone:
-    """The drone as it stands ready, unless its manifest says how it is."""
+def _assume_ready(drone: Drone) -> Drone:
+    """Add a Ready condition unless the manifest has one."""
     status = drone.status or DroneStatus()
     if any(c.type == "Ready" for c in status.conditions):
         return drone

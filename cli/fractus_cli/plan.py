@@ -1,4 +1,4 @@
-"""`fractus plan`: what the operator would decide, from manifests alone."""
+"""`fractus plan`: plan Applications from manifests, with the planner of the operator."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ from fractus_core.planning.plugins import GROUP as PLUGINS
 from fractus_core.planning.plugins import UnknownPlugin, load_plugin
 
 from fractus_cli import EXIT_INFEASIBLE
-from fractus_cli.calls import parse_time
+from fractus_cli.call_arguments import parse_time
 from fractus_cli.manifests import BadManifest, read_manifests
+from fractus_cli.offline_planner import PlanResult, plan_all
 from fractus_cli.plan_map import plan_map
 from fractus_cli.plan_table import infeasible_table, plan_table
-from fractus_cli.planning import Decided, plan_all
 
 _DEFAULTS = Settings()
 
 INFEASIBLE_ANNOTATION = f"{GROUP}/infeasible"
-"""On what is printed of an application that no plan fits: REASON: MESSAGE."""
+"""Annotation of an infeasible Application in YAML and JSON output. Its value is REASON: MESSAGE."""
 
 
 _PATH = click.Path(exists=True, path_type=pathlib.Path)
 _SHARE = click.FloatRange(0, 1)
 _POSITIVE = click.FloatRange(min=0, min_open=True)
 _TUNING: dict[str, tuple[str, click.FloatRange, str]] = {
-    "--safety-radius": ("safety_radius_m", _POSITIVE, "How far paths are dilated, in metres."),
-    "--depot-radius": ("depot_radius_m", click.FloatRange(min=0), "How far a depot may be from an open or partial start, in metres."),
-    "--coverage": ("coverage_share", _SHARE, "Share of the operation area to reach with direct links."),
+    "--safety-radius": ("safety_radius_m", _POSITIVE, "Distance by which paths are widened to the operation area, in metres."),
+    "--depot-radius": ("depot_radius_m", click.FloatRange(min=0), "Maximum distance of a depot from an open or partial start, in metres."),
+    "--coverage": ("coverage_share", _SHARE, "Share of the operation area that direct links must cover."),
     "--cruise-speed": ("cruise_speed_mps", _POSITIVE, "Ground speed assumed for flight times, in m/s."),
-    "--battery-reserve": ("battery_reserve", _SHARE, "Share of a full charge to be left after landing."),
+    "--battery-reserve": ("battery_reserve", _SHARE, "Share of a full charge that must remain after landing."),
 }  # fmt: skip
-"""Which option sets what of the planning, and within which bounds."""
+"""Planning options: setting, bounds and help text."""
 
 
 def _tunable(command: Callable[..., None]) -> Callable[..., None]:
@@ -52,58 +52,64 @@ def _tunable(command: Callable[..., None]) -> Callable[..., None]:
 @click.command()
 @click.option(
     "-f", "--filename", "paths", type=_PATH, multiple=True, required=True,
-    help="A file of manifests, or a directory of them; may be repeated.",
+    help="File or directory of manifests. May be repeated.",
 )  # fmt: skip
 @click.argument("more", type=_PATH, nargs=-1)
-@click.option("-o", "--output", type=click.Choice(["table", "yaml", "json", "geojson"]), default="table")
+@click.option(
+    "-o", "--output", type=click.Choice(["table", "yaml", "json", "geojson"]), default="table", help="Output format."
+)
 @_tunable
 @click.option(
     "--policy-conflicts", type=click.Choice(["warn", "forbid"]), default="warn", show_default=True,
-    help="What becomes of a mission whose way policies do not let be flown, where no drone has another one.",
+    help="Warn about a mission whose route policies forbid for every drone, or treat it as infeasible.",
 )  # fmt: skip
 @click.option(
-    "--time", "time_s", callback=parse_time, metavar="RFC3339", help="When it begins, with its zone; else now."
+    "--time", "time_s", callback=parse_time, metavar="RFC3339", help="Start time with time zone.  [default: now]"
 )
-@click.option("--flat-terrain", is_flag=True, help="Take the ground for as high as home everywhere.")
-@click.option("--ranking", help=f"Name of a plug-in (entry point group {PLUGINS}) that scores drones.")
-@click.option("--covering", help=f"Name of a plug-in (entry point group {PLUGINS}) that chooses nodes along the way.")
+@click.option("--flat-terrain", is_flag=True, help="Assume that the ground is level with home everywhere.")
+@click.option("--ranking", help=f"Plug-in (entry point group {PLUGINS}) that scores drones.")
+@click.option("--covering", help=f"Plug-in (entry point group {PLUGINS}) that selects nodes along the route.")
 @click.pass_context
 def plan(
     context: click.Context, /, paths: Sequence[pathlib.Path], more: Sequence[pathlib.Path], *, output: str,
     ranking: str | None, covering: str | None, **tuned: Any,
 ) -> None:  # fmt: skip
-    """Plan the Applications in some manifests, without a cluster.
+    """Plan Applications from manifests, without a cluster.
 
-    Reads Applications, Drones, EdgeNodes, Depots, Zones, Policies, DeploymentPlans (in force: what still fits stays)
-    and Nodes, in any mix, and passes over all other kinds. Prints the DeploymentPlans that the operator would write.
+    Reads Applications, Drones, EdgeNodes, Depots, Zones, Policies, Nodes and DeploymentPlans in any combination, and
+    ignores all other kinds. Prints the DeploymentPlans that the operator would create. A DeploymentPlan in the input is
+    treated as the current plan: placements that are still feasible are kept.
 
-    Nodes give resources (status.allocatable), readiness and, by the label fractus.dev/class=cloud or fractus.dev/cloud=true,
-    the cloud. Without any Node object, every Drone and EdgeNode has a Node of unlimited resources, and there is a cloud.
-    A Drone whose manifest has no Ready condition counts as Ready, and as full if it has no battery status.
+    Nodes define resources (status.allocatable) and readiness. Nodes with the label fractus.dev/class=cloud or
+    fractus.dev/cloud=true form the cloud. If there is no Node object, each Drone and EdgeNode has a Node with unlimited
+    resources, and there is a cloud. A Drone without a Ready condition is assumed to be Ready, and fully charged if it has
+    no battery status.
 
-    Several Applications are planned one after the other, those with a driver first, then by name; each takes its drone
+    Applications are planned one after the other: first those with a driver, then by name. Each of them claims its drone
     and its resources.
 
-    Exit code: 0 if all are feasible, 2 if one is not, 1 if the input is bad. In yaml and json, what is infeasible has the
-    annotation fractus.dev/infeasible, no placements, and the nodes that were rejected; the operator writes no such plan.
+    The route of each drone is judged by the Policies and Zones that apply at --time and at the end of the mission. The plan
+    lists the legs that are denied, corrected or replaced by a detour.
 
-    The way of each drone is judged by the policies and zones among the manifests, as they hold at --time and when the
-    mission ends: the plan says which legs they deny, correct or lead around.
+    Exit code: 0 if all Applications are feasible, 2 if one is infeasible, 1 for bad input. In yaml and json, an infeasible
+    Application has the annotation fractus.dev/infeasible, no placements, and the rejected nodes. The operator creates no
+    such plan.
     """
     try:
         manifests = read_manifests([*paths, *more])
-        score, cover = _plugin(ranking, "--ranking"), _plugin(covering, "--covering")
+        score = _plugin(ranking, "--ranking")
+        cover = _plugin(covering, "--covering")
         tuned["time_s"] = time.time() if tuned["time_s"] is None else tuned["time_s"]
         settings = Settings(**tuned, score_drone=score, cover=cover)
-        decided = plan_all(manifests, settings)
+        results = plan_all(manifests, settings)
     except BadManifest as error:
         raise click.ClickException(str(error)) from None
-    text = _FORMATS[output](decided) if output in _FORMATS else _as_geojson(decided, manifests.inventory(), settings)
+    text = _FORMATS[output](results) if output in _FORMATS else _as_geojson(results, manifests.inventory(), settings)
     click.echo(text, nl=False)
-    for answer in decided:
-        if answer.refusal is not None and output != "table":
-            click.echo(f"{'/'.join(answer.application.key)}: {answer.refusal.reason}: {answer.refusal}", err=True)
-    if any(answer.refusal is not None for answer in decided):
+    for result in results:
+        if result.refusal is not None and output != "table":
+            click.echo(f"{'/'.join(result.application.key)}: {result.refusal.reason}: {result.refusal}", err=True)
+    if any(result.refusal is not None for result in results):
         context.exit(EXIT_INFEASIBLE)
 
 
@@ -117,54 +123,55 @@ def _plugin(name: str | None, option: str) -> Any:
 # -- output --
 
 
-def _bodies(decided: Sequence[Decided]) -> list[dict[str, Any]]:
-    """The DeploymentPlans that the operator would write; where there is no plan, why not."""
+def _bodies(results: Sequence[PlanResult]) -> list[dict[str, Any]]:
+    """Return the DeploymentPlans that the operator would create, or the reason why an Application is infeasible."""
     bodies = []
-    for answer in decided:
-        namespace, name = answer.application.key
+    for result in results:
+        namespace, name = result.application.key
         metadata: dict[str, Any] = {"name": name, "namespace": namespace}
-        if answer.refusal is not None:
-            why = f"{answer.refusal.reason}: {answer.refusal.message}"
-            metadata["annotations"] = {INFEASIBLE_ANNOTATION: why}
-        spec = (answer.plan or _without_placements(answer)).to_dict()
+        if result.refusal is not None:
+            reason = f"{result.refusal.reason}: {result.refusal.message}"
+            metadata["annotations"] = {INFEASIBLE_ANNOTATION: reason}
+        spec = (result.plan or _without_placements(result)).to_dict()
         bodies.append({"apiVersion": API_VERSION, "kind": DeploymentPlan.KIND, "metadata": metadata, "spec": spec})
     return bodies
 
 
-def _without_placements(answer: Decided) -> DeploymentPlanSpec:
-    """What yaml and json say of an application that is infeasible."""
-    rejected, far = (answer.refusal.rejected, answer.refusal.omitted) if answer.refusal is not None else ((), 0)
-    omitted = max(len(rejected) - _DEFAULTS.rejections_listed, 0) + far
+def _without_placements(result: PlanResult) -> DeploymentPlanSpec:
+    """Return the plan of an infeasible Application for YAML and JSON output."""
+    rejected = result.refusal.rejected if result.refusal is not None else ()
+    omitted = result.refusal.omitted if result.refusal is not None else 0
+    omitted += max(len(rejected) - _DEFAULTS.rejections_listed, 0)
     return DeploymentPlanSpec(
-        application=answer.application.name,
+        application=result.application.name,
         rejected=rejected[: _DEFAULTS.rejections_listed],
         rejected_omitted=omitted or None,
     )
 
 
-def _as_yaml(decided: Sequence[Decided]) -> str:
-    return dump_documents(_bodies(decided))
+def _as_yaml(results: Sequence[PlanResult]) -> str:
+    return dump_documents(_bodies(results))
 
 
-def _as_json(decided: Sequence[Decided]) -> str:
-    bodies = _bodies(decided)
+def _as_json(results: Sequence[PlanResult]) -> str:
+    bodies = _bodies(results)
     whole = bodies[0] if len(bodies) == 1 else {"apiVersion": "v1", "kind": "List", "items": bodies}
     return json.dumps(whole, indent=2) + "\n"
 
 
-def _as_geojson(decided: Sequence[Decided], stock: Inventory, settings: Settings) -> str:
-    features = [f for a in decided if a.plan is not None for f in plan_map(a.application, a.plan, stock, settings)]
+def _as_geojson(results: Sequence[PlanResult], inventory: Inventory, settings: Settings) -> str:
+    features = [f for a in results if a.plan is not None for f in plan_map(a.application, a.plan, inventory, settings)]
     return json.dumps({"type": "FeatureCollection", "features": features}, indent=1) + "\n"
 
 
-def _as_table(decided: Sequence[Decided]) -> str:
+def _as_table(results: Sequence[PlanResult]) -> str:
     parts = []
-    for answer in decided:
-        if answer.plan is not None:
-            parts.append(plan_table(answer.application, answer.plan, answer.links))
-        elif answer.refusal is not None:
-            parts.append(infeasible_table(answer.application, answer.refusal))
+    for result in results:
+        if result.plan is not None:
+            parts.append(plan_table(result.application, result.plan, result.links))
+        elif result.refusal is not None:
+            parts.append(infeasible_table(result.application, result.refusal))
     return "\n".join(parts)
 
 
-_FORMATS: dict[str, Callable[[Sequence[Decided]], str]] = {"table": _as_table, "yaml": _as_yaml, "json": _as_json}
+_FORMATS: dict[str, Callable[[Sequence[PlanResult]], str]] = {"table": _as_table, "yaml": _as_yaml, "json": _as_json}

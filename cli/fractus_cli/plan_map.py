@@ -1,4 +1,4 @@
-"""A plan as GeoJSON features, coloured for map viewers that follow simplestyle."""
+"""Plans as GeoJSON features with simplestyle colours for map viewers."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ Feature = dict[str, Any]
 
 
 def plan_map(
-    application: Application, plan: DeploymentPlanSpec, stock: Inventory, settings: Settings
+    application: Application, plan: DeploymentPlanSpec, inventory: Inventory, settings: Settings
 ) -> Iterator[Feature]:
-    """The operation area with a part for each control point, the way, the legs the system flies, and the nodes."""
+    """Return features for the operation area, the part of each control point, the route, transit legs, and nodes."""
     name = "/".join(application.key)
-    area = operation_area(application.spec, stock.depots, settings.safety_radius_m)
+    area = operation_area(application.spec, inventory.depots, settings.safety_radius_m)
     if plan.operation_area is not None:
         style = {"fill": "#9467bd", "fill-opacity": 0.25, "stroke": "#9467bd"}
         yield _feature(plan.operation_area, name, "operationArea", style)
@@ -45,18 +45,18 @@ def plan_map(
     for leg in plan.drone.transit if plan.drone is not None else ():
         yield _feature(line_geojson((leg.start, leg.end)), name, "transit", {"stroke": "#7f7f7f"})
     for node, instances in _by_node(plan.placements).items():
-        place = _place(node, stock)
+        place = _place(node, inventory)
         if place is not None:
             components = ", ".join(f"{p.component} ({p.role})" for p in instances)
             colour = next((c for role, c in _COLOURS.items() if any(p.role == role for p in instances)), "#7f7f7f")
             shape = {"type": "Point", "coordinates": [place.lon, place.lat]}
-            more = {"marker-color": colour, "node": node, "instances": [p.instance for p in instances]}
-            yield _feature(shape, name, components, more)
+            properties = {"marker-color": colour, "node": node, "instances": [p.instance for p in instances]}
+            yield _feature(shape, name, components, properties)
 
 
-def _feature(geometry: Mapping[str, Any], application: str, title: str, more: Mapping[str, Any]) -> Feature:
-    properties = {"application": application, "title": title, **more}
-    return {"type": "Feature", "properties": properties, "geometry": dict(geometry)}
+def _feature(geometry: Mapping[str, Any], application: str, title: str, properties: Mapping[str, Any]) -> Feature:
+    whole = {"application": application, "title": title, **properties}
+    return {"type": "Feature", "properties": whole, "geometry": dict(geometry)}
 
 
 def _by_node(placements: Sequence[PlannedInstance]) -> dict[str, list[PlannedInstance]]:
@@ -67,8 +67,8 @@ def _by_node(placements: Sequence[PlannedInstance]) -> dict[str, list[PlannedIns
     return nodes
 
 
-def _place(node: str, stock: Inventory) -> Point | None:
-    located = stock.located()
+def _place(node: str, inventory: Inventory) -> Point | None:
+    located = inventory.located()
     for index in (located.edge_nodes, located.stands):
         if node in index:
             return index.position(node)

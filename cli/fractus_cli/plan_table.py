@@ -1,4 +1,4 @@
-"""A plan as text for people."""
+"""Plans as text tables."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ _LISTED = 20
 
 
 def plan_table(application: Application, plan: DeploymentPlanSpec, links: Sequence[PlannedLink] = ()) -> str:
-    """Which instance goes where, which direct links its drone may have, and which nodes were rejected."""
+    """Format the placements, possible direct links and rejected nodes of a plan."""
     lines = [f"{'/'.join(application.key)}: feasible"]
     if plan.drone is not None:
         lines += [_drone(plan.drone), *_legality(plan.drone)]
     lines += ["", *_columns(("COMPONENT", "INSTANCE", "NODE", "ROLE", "SERVES", "ADDS"), map(_row, plan.placements))]
     covered = sum(p.coverage or 0.0 for p in plan.placements if p.role == "hybrid-drone")
     if covered:
-        lines.append(f"hybrid instances along the way add direct links over {covered:.1%} of the operation area")
+        lines.append(f"hybrid instances along the route add direct links over {covered:.1%} of the operation area")
     if links:
         lines += ["", *_columns(("DIRECT LINK TO", "BY", "NETWORK", "RANGE", "BANDWIDTH", "FOR"), map(_link, links))]
     return "\n".join([*lines, *_rejections(plan.rejected, plan.rejected_omitted or 0), ""])
 
 
 def infeasible_table(application: Application, refusal: Infeasible) -> str:
-    """Why there is no plan."""
+    """Format the reason why an Application is infeasible."""
     lines = [f"{'/'.join(application.key)}: infeasible ({refusal.reason})", refusal.message]
     return "\n".join([*lines, *_rejections(refusal.rejected, refusal.omitted), ""])
 
@@ -36,20 +36,20 @@ def infeasible_table(application: Application, refusal: Infeasible) -> str:
 def _drone(choice: DroneChoice) -> str:
     text = f"drone {choice.node}"
     if choice.shared_with is not None:
-        text += f" comes along with {choice.shared_with}"
+        text += f" is shared with {choice.shared_with}"
     if choice.mission is not None:
         mission = choice.mission
-        text += f" flies {mission.distance:.0f} m in {mission.duration:.1f} min of the {mission.available:.1f} it has"
+        text += f" flies {mission.distance:.0f} m in {mission.duration:.1f} of {mission.available:.1f} available min"
     if choice.transit:
         legs = len(choice.transit)
-        text += f"; the system flies {legs} leg{'s' if legs > 1 else ''} of it"
+        text += f"; {legs} transit leg{'s' if legs > 1 else ''} flown by the system"
     if choice.alternatives:
-        text += f"; then {', '.join(a.node for a in choice.alternatives[:3])}"
+        text += f"; next best: {', '.join(a.node for a in choice.alternatives[:3])}"
     return text
 
 
 def _legality(choice: DroneChoice) -> list[str]:
-    """The conflict with policies, and the legs that they change."""
+    """Format the policy conflict and the legs that policies change."""
     lines = [f"policy conflict: {choice.policy_conflict}"] if choice.policy_conflict is not None else []
     if choice.legality:
         rows = [
@@ -71,8 +71,8 @@ def _row(placed: PlannedInstance) -> tuple[str, ...]:
 
 def _link(link: PlannedLink) -> tuple[str, ...]:
     used = ", ".join(placed.component for placed in link.instances)
-    reach, bandwidth = f"{link.range_m:g} m", f"{link.bandwidth_mbps:g} Mbit/s"
-    return (link.node, link.technology, link.pairing.network_id, reach, bandwidth, used)
+    bandwidth = f"{link.bandwidth_mbps:g} Mbit/s"
+    return (link.node, link.technology, link.pairing.network_id, f"{link.range_m:g} m", bandwidth, used)
 
 
 def _rejections(rejected: Sequence[Rejection], omitted: int) -> list[str]:
@@ -83,8 +83,9 @@ def _rejections(rejected: Sequence[Rejection], omitted: int) -> list[str]:
     hidden = len(rejected) - len(rows) + omitted
     if hidden:
         counts = Counter(r.reason for r in rejected[_LISTED:])
-        why = ", ".join(f"{count} {reason}" for reason, count in sorted(counts.items()))
-        lines.append(f"and {hidden} more{f' ({why})' if why else ''}; see -o yaml")
+        by_reason = ", ".join(f"{count} {reason}" for reason, count in sorted(counts.items()))
+        listed = f" ({by_reason})" if by_reason else ""
+        lines.append(f"and {hidden} more{listed}; see -o yaml")
     return lines
 
 

@@ -1,4 +1,4 @@
-"""`fractus policy`: what the policy engine would say, from manifests alone."""
+"""`fractus policy`: judge a call with the policy engine, from manifests."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from fractus_core.policy.decision_types import Airframe, Attitude, Call, Home, S
 from fractus_core.policy.engine import judge
 from fractus_core.policy.lenses import bounding_lens
 
-from fractus_cli.calls import figures, parse_call, parse_time
+from fractus_cli.call_arguments import parse_call, parse_numbers, parse_time
 from fractus_cli.manifests import BadManifest, Manifests, read_manifests
+from fractus_cli.offline_planner import plan_all
 from fractus_cli.output import output_option
-from fractus_cli.planning import plan_all
 
 R = TypeVar("R", bound=Resource)
 
@@ -34,107 +34,123 @@ IN_AIR_M = 0.5
 
 @click.group()
 def policy() -> None:
-    """Ask the policy engine."""
+    """Judge calls with the policy engine."""
 
 
 @policy.command()
 @click.option(
     "--policies", "paths", type=click.Path(exists=True, path_type=pathlib.Path), multiple=True, required=True,
-    help="A file or a directory of Policies and their Zones; may be repeated.",
+    help="File or directory of Policies and their Zones. May be repeated.",
 )  # fmt: skip
 @click.option(
-    "--drone", "drone_file", type=click.Path(exists=True, path_type=pathlib.Path), required=True, help="The Drone."
+    "--drone",
+    "drone_file",
+    type=click.Path(exists=True, path_type=pathlib.Path),
+    required=True,
+    help="Manifest of the Drone.",
 )
 @click.option(
     "--application", "application_file", type=click.Path(exists=True, path_type=pathlib.Path),
-    help="The Application whose component asks; without it, a caller that may do everything asks.",
+    help="Manifest of the Application that makes the call. Without it, the caller has a Grant for all methods.",
 )  # fmt: skip
-@click.option("--component", help="The component that asks; needed with --application.")
-@click.option("--method", required=True, help="Goto, Takeoff, SetSpeed, SetVelocity, Land, Arm, CaptureImage, ...")
+@click.option("--component", help="Component that makes the call. Required with --application.")
 @click.option(
-    "--args", "arguments", default="{}", help='Its arguments, such as {"lat": 39.36, "lon": 22.95, "alt": 10}.'
+    "--method", required=True, help="Called method: Goto, Takeoff, SetSpeed, SetVelocity, Land, Arm, CaptureImage, ..."
+)
+@click.option(
+    "--args",
+    "arguments",
+    default="{}",
+    help='Arguments of the method, such as {"lat": 39.36, "lon": 22.95, "alt": 10}.',
 )
 @click.option(
     "--at",
     "at",
-    callback=figures("lat", "lon", "alt"),
+    callback=parse_numbers("lat", "lon", "alt"),
     metavar="lat,lon,alt",
     required=True,
-    help="The drone: degrees, metres above home.",
+    help="Position of the drone: degrees, metres above home.",
 )
 @click.option(
     "--velocity",
-    callback=figures("n", "e", "d"),
+    callback=parse_numbers("n", "e", "d"),
     metavar="n,e,d",
     default="0,0,0",
-    help="Its velocity north, east, down in m/s.",
+    help="Velocity of the drone north, east and down in m/s.",
 )
 @click.option(
-    "--home", callback=figures("lat", "lon", "alt"), metavar="lat,lon,alt",
-    help="Where it took off: degrees, metres above mean sea level. Else that of its manifest, else below --at at sea level.",
+    "--home", callback=parse_numbers("lat", "lon", "alt"), metavar="lat,lon,alt",
+    help="Take-off position: degrees, metres above mean sea level.  [default: home of the Drone, else --at at sea level]",
 )  # fmt: skip
-@click.option("--time", "time_s", callback=parse_time, metavar="RFC3339", help="When, with its zone; else now.")
+@click.option(
+    "--time", "time_s", callback=parse_time, metavar="RFC3339", help="Time of the call with time zone.  [default: now]"
+)
 @click.option(
     "--way-home", type=click.Choice(["straight", "retraced"]), default="straight", show_default=True,
-    help="How the autopilot's failsafe flies home: straight (RTL), or back as it came (SmartRTL).",
+    help="Return flight of the autopilot's failsafe: straight (RTL), or along the path flown (SmartRTL).",
 )  # fmt: skip
-@click.option("--flat-terrain", is_flag=True, help="Take the ground for as high as home everywhere.")
+@click.option("--flat-terrain", is_flag=True, help="Assume that the ground is level with home everywhere.")
 @output_option
-def check(paths: Sequence[pathlib.Path], drone_file: pathlib.Path, output: str, **asked: Any) -> None:
-    """What would become of a call, and why: the same engine and the same answer as in flight.
+def check(paths: Sequence[pathlib.Path], drone_file: pathlib.Path, output: str, **options: Any) -> None:
+    """Print the verdict on a call and its reason, from the same engine as in flight.
 
-    The drone stands when --at is below half a metre and flies otherwise; its motion is that of ArduCopter's usual
-    parameters, its position errors those that the mobility service assumes, and its camera is level.
+    The drone is on the ground if the altitude in --at is at most 0.5 m, and flies otherwise. It has the motion limits of
+    ArduCopter's default parameters, the default position error of the mobility service, and a level camera.
 
-    With --application the grant is the one that the operator would write, with its operation area and corridor. Without,
-    every method is granted everywhere, and policies for particular applications do not hold.
+    With --application, the Grant is the one that the operator would create, with its operation area and corridor. Without
+    it, all methods are granted everywhere, and policies that select applications do not apply.
 
-    Exit code: 0 with an answer, whatever it is; 1 if the input is bad.
+    Exit code: 0 for any verdict, 1 for bad input.
     """
     try:
-        question = _question(paths, drone_file, asked)
+        question = _question(paths, drone_file, options)
     except (BadManifest, InvalidObject) as error:
         raise click.ClickException(str(error)) from None
-    compiled = compile_grant(question.grant, flat_terrain=bool(asked["flat_terrain"]))
+    compiled = compile_grant(question.grant, flat_terrain=bool(options["flat_terrain"]))
     click.echo(_FORMATS[output](judge(question.call, question.now, compiled)), nl=False)
 
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """A call, who asks it, and in what situation."""
+    """Call, situation of the drone, and Grant of the caller."""
 
     call: Call
     now: Situation
     grant: GrantSpec
 
 
-def _question(paths: Sequence[pathlib.Path], drone_file: pathlib.Path, asked: Mapping[str, Any]) -> Question:
-    call = parse_call(asked["method"], asked["arguments"])
-    application, component = asked["application_file"], asked["component"]
+def _question(paths: Sequence[pathlib.Path], drone_file: pathlib.Path, options: Mapping[str, Any]) -> Question:
+    call = parse_call(options["method"], options["arguments"])
+    application = options["application_file"]
+    component = options["component"]
     if (application is None) != (component is None):
-        raise BadManifest("give --application and --component together, or neither")
+        raise BadManifest("specify --application and --component together")
     files = {path.resolve(): path for path in (*paths, drone_file, application) if path is not None}.values()
-    manifests = read_manifests(_apart(list(files)))
+    manifests = read_manifests(_without_nested(list(files)))
     if not manifests.of(Policy):
-        click.echo("note: --policies has no Policy, so nothing but the drone's own limits is judged", err=True)
+        click.echo("note: --policies has no Policy; only the limits of the drone apply", err=True)
     drone = _drone(manifests, drone_file)
-    grant = _anything(manifests, drone) if application is None else _granted(manifests, drone, application, component)
-    return Question(call, _situation(drone, asked), grant)
+    grant = (
+        _unrestricted_grant(manifests, drone)
+        if application is None
+        else _planned_grant(manifests, drone, application, component)
+    )
+    return Question(call, _situation(drone, options), grant)
 
 
-def _apart(paths: list[pathlib.Path]) -> list[pathlib.Path]:
-    """The paths that lie in none of the others, for no object may be read twice."""
+def _without_nested(paths: list[pathlib.Path]) -> list[pathlib.Path]:
+    """Return the paths that are not inside another one, because each object must be read only once."""
     directories = [path.resolve() for path in paths if path.is_dir()]
     return [p for p in paths if not any(d in p.resolve().parents for d in directories)]
 
 
 def _from(manifests: Manifests, path: pathlib.Path, kind: type[R]) -> list[R]:
-    """The objects of a kind that were read from a file, or from below a directory."""
+    """Return the objects of a kind that were read from a file or directory."""
     inside = path.resolve()
     return [
-        found.resource
-        for found in manifests.found.values()
-        if isinstance(found.resource, kind) and found.manifest.file.resolve().is_relative_to(inside)
+        loaded.resource
+        for loaded in manifests.objects.values()
+        if isinstance(loaded.resource, kind) and loaded.manifest.file.resolve().is_relative_to(inside)
     ]
 
 
@@ -142,42 +158,40 @@ def _drone(manifests: Manifests, file: pathlib.Path) -> Drone:
     drones = _from(manifests, file, Drone)
     if len(drones) != 1:
         names = ", ".join(sorted(drone.name for drone in drones)) or "none"
-        raise BadManifest(f"{file}: --drone takes a manifest of one Drone, not of {len(drones)} ({names})")
+        raise BadManifest(f"{file}: --drone must contain exactly one Drone, not {len(drones)} ({names})")
     return drones[0]
 
 
-def _granted(manifests: Manifests, drone: Drone, file: pathlib.Path, component: str) -> GrantSpec:
-    """The grant that the operator would write for a component.
+def _planned_grant(manifests: Manifests, drone: Drone, file: pathlib.Path, component: str) -> GrantSpec:
+    """Return the Grant that the operator would create for a component.
 
     Raises:
-        BadManifest: there is no such component, or no plan puts it on the drone.
+        BadManifest: The component does not exist, or there is no plan that places it on the drone.
     """
     applications = _from(manifests, file, Application)
     if len(applications) != 1:
-        raise BadManifest(f"{file}: --application takes a manifest of one Application, not of {len(applications)}")
+        raise BadManifest(f"{file}: --application must contain exactly one Application, not {len(applications)}")
     application = applications[0]
-    # No other application is to be planned, and on no other drone.
-    for key, found in list(manifests.found.items()):
-        if isinstance(found.resource, Application | Drone) and found.resource not in (application, drone):
-            del manifests.found[key]
+    # Plan only this application, and only on this drone.
+    for key, loaded in list(manifests.objects.items()):
+        if isinstance(loaded.resource, Application | Drone) and loaded.resource not in (application, drone):
+            del manifests.objects[key]
     known = [c.name for c in application.spec.components]
     if component not in known:
         raise BadManifest(f"Application {application.name} has no component {component} (it has {', '.join(known)})")
     settings = Settings()
-    answer = plan_all(manifests, settings)[0]
-    if answer.plan is None:
-        raise BadManifest(f"Application {application.name} cannot be planned: {answer.refusal}")
+    result = plan_all(manifests, settings)[0]
+    if result.plan is None:
+        raise BadManifest(f"Application {application.name} cannot be planned: {result.refusal}")
     inventory = manifests.inventory()
-    for grant in compile_grants(application, answer.plan, inventory, settings):
+    for grant in compile_grants(application, result.plan, inventory, settings):
         if grant.component == component and grant.node == drone.name:
             return grant
-    raise BadManifest(
-        f"component {component} is not granted anything on {drone.name}: give it services, and a placement on the drone"
-    )
+    raise BadManifest(f"component {component} has no Grant on {drone.name}; add services and a placement on the drone")
 
 
-def _anything(manifests: Manifests, drone: Drone) -> GrantSpec:
-    """A grant of everything, under the policies that hold for every flight of the drone."""
+def _unrestricted_grant(manifests: Manifests, drone: Drone) -> GrantSpec:
+    """Return a Grant for all methods, limited by the policies that apply to all flights of the drone."""
     features = drone.spec.services.mobility
     depots = manifests.inventory().depots
     depot = depots.get(drone.spec.depot or "")
@@ -200,10 +214,10 @@ def _anything(manifests: Manifests, drone: Drone) -> GrantSpec:
     return refresh(grant, manifests.inventory())
 
 
-def _situation(drone: Drone, asked: Mapping[str, Any]) -> Situation:
-    lat, lon, alt = asked["at"]
-    north, east, down = asked["velocity"]
-    time_s = asked["time_s"] if asked["time_s"] is not None else datetime.now(tz=UTC).timestamp()
+def _situation(drone: Drone, options: Mapping[str, Any]) -> Situation:
+    lat, lon, alt = options["at"]
+    north, east, down = options["velocity"]
+    time_s = options["time_s"] if options["time_s"] is not None else datetime.now(tz=UTC).timestamp()
     flying = alt > IN_AIR_M
     camera = drone.spec.services.camera
     moved = camera is not None and camera.mount is not None and camera.mount.gimbal
@@ -215,22 +229,22 @@ def _situation(drone: Drone, asked: Mapping[str, Any]) -> Situation:
         north_mps=north,
         east_mps=east,
         down_mps=down,
-        home=_home(drone, asked),
+        home=_home(drone, options),
         armed=flying,
         in_air=flying,
-        airframe=Airframe(retraces=asked["way_home"] == "retraced"),
-        # Where a gimbal points is measured in flight; before, it may be anywhere.
+        airframe=Airframe(retraces=options["way_home"] == "retraced"),
+        # The attitude of a gimbal is unknown here, because it is measured in flight.
         attitude=None if moved else Attitude(0.0, 0.0, math.degrees(math.atan2(east, north))),
         lens=bounding_lens(camera),
     )
 
 
-def _home(drone: Drone, asked: Mapping[str, Any]) -> Home:
-    if asked["home"] is not None:
-        return Home(*asked["home"])
+def _home(drone: Drone, options: Mapping[str, Any]) -> Home:
+    if options["home"] is not None:
+        return Home(*options["home"])
     stated = drone.spec.home
     if stated is None:
-        return Home(asked["at"][0], asked["at"][1], 0.0)
+        return Home(options["at"][0], options["at"][1], 0.0)
     known = stated.alt is not None and stated.altitude_reference == "amsl"
     return Home(stated.lat, stated.lon, stated.alt if known and stated.alt is not None else 0.0)
 
@@ -238,7 +252,7 @@ def _home(drone: Drone, asked: Mapping[str, Any]) -> Home:
 # -- output --
 
 
-def _spelled(verdict: Verdict) -> dict[str, Any] | None:
+def _arguments_of(verdict: Verdict) -> dict[str, Any] | None:
     if verdict.args is None or not verdict.permits:
         return None
     return {name: value for name, value in asdict(verdict.args).items() if value is not None}
@@ -248,7 +262,7 @@ def _as_json(verdict: Verdict) -> str:
     whole = {
         "action": verdict.action,
         "takeover": verdict.takeover,
-        "args": _spelled(verdict),
+        "args": _arguments_of(verdict),
         "reason": verdict.reason,
         "policies": list(verdict.policies),
         "code": verdict.code,
@@ -259,7 +273,7 @@ def _as_json(verdict: Verdict) -> str:
 
 
 def _as_text(verdict: Verdict) -> str:
-    args = (_spelled(verdict) or {}).items()
+    args = (_arguments_of(verdict) or {}).items()
     lines = {
         "action:   ": verdict.action,
         "takeover: ": verdict.takeover,
@@ -269,7 +283,7 @@ def _as_text(verdict: Verdict) -> str:
         "reason:   ": verdict.reason + (f" ({verdict.code})" if verdict.reason and verdict.code else ""),
         "policies: ": ", ".join(verdict.policies),
         "filters:  ": ", ".join(f.action for f in verdict.filters),
-        "first:    ": "the drone is brought to a stop" if verdict.brake_first else "",
+        "first:    ": "the drone is stopped before the call is executed" if verdict.brake_first else "",
     }
     return "".join(f"{title}{text}\n" for title, text in lines.items() if text)
 

@@ -28,13 +28,13 @@ def _now() -> datetime:
 
 
 class StandalonePki:
-    """A certificate authority in a directory, and what it issues.
+    """Certificate authority in a directory. Issues certificates of nodes and components, and signs Grants.
 
     Args:
-        directory: The directory, as above.
-        authority: Its authority.
-        clock: The present time.
-        life: How long the certificates of nodes and components are valid.
+        directory: Directory with the layout above.
+        authority: Certificate authority of the directory.
+        clock: Returns the current time.
+        life: Validity of the certificates of nodes and components.
     """
 
     def __init__(
@@ -48,10 +48,10 @@ class StandalonePki:
 
     @classmethod
     def create(cls, directory: Path, clock: Callable[[], datetime] = _now, life: timedelta = LIFE) -> Self:
-        """Make the authority of a directory, once; later calls open it.
+        """Open a directory. Create its certificate authority if there is none.
 
         Raises:
-            BrokenAuthority: its files are damaged.
+            BrokenAuthority: The files of the authority are damaged.
         """
         if not (directory / "authority").is_dir():
             _write(directory / "authority", Authority.generate(clock()).to_data())
@@ -59,42 +59,44 @@ class StandalonePki:
 
     @classmethod
     def open(cls, directory: Path, clock: Callable[[], datetime] = _now, life: timedelta = LIFE) -> Self:
-        """Open the directory.
+        """Open a directory.
 
         Raises:
-            BrokenAuthority: it has no authority, or a damaged one.
+            BrokenAuthority: The authority is missing or damaged.
         """
         folder = directory / "authority"
         data = _read(folder)
         if not data:
-            raise BrokenAuthority(f"{folder}: there is no authority; make one with: fractus grants init {directory}")
+            raise BrokenAuthority(
+                f"{folder}: no certificate authority; create it with: fractus grants init {directory}"
+            )
         try:
             return cls(directory, Authority.from_data(data), clock, life)
         except BrokenAuthority:
             raise BrokenAuthority(f"{folder}: tls.key and tls.crt are damaged or do not belong together") from None
 
     def node(self, name: str) -> Path:
-        """The directory with the certificate of a node's services, made again.
+        """Issue a new certificate for the services of a node. Return its directory.
 
         Raises:
-            InvalidObject: the name is none that a node can have.
+            InvalidObject: The name is not a valid node name.
         """
         if not is_subdomain(name):
-            raise InvalidObject("node", f"{name!r} is no name of a node; use lower-case letters, digits, - and .")
+            raise InvalidObject("node", f"{name!r} is not a valid node name; use lower-case letters, digits, - and .")
         return _write(self._directory / "nodes" / name, self._authority.issue_node(name, self._clock(), self._life))
 
     def component(self, identity: str) -> Path:
-        """The directory with the certificate of a component instance; made again when it is due for renewal.
+        """Return the directory with the certificate of a component instance. Renew the certificate if it is due.
 
         Args:
-            identity: Its SPIFFE id; `GrantSpec.identity` of its grant.
+            identity: SPIFFE id of the instance: `GrantSpec.identity` of its Grant.
 
         Raises:
-            InvalidObject: its parts are no names.
+            InvalidObject: The identity is invalid.
         """
         found = ComponentIdentity.parse(identity)
         if found is None or not is_subdomain(found.namespace) or not is_subdomain(found.instance):
-            raise InvalidObject("spec.instance", f"{identity} does not name an instance of a component")
+            raise InvalidObject("spec.instance", f"{identity} is not the identity of a component instance")
         folder = self._directory / "components" / f"{found.namespace}.{found.instance}"
         now = self._clock()
         if self._authority.is_current(_read(folder), identity, now):
@@ -106,39 +108,39 @@ class StandalonePki:
 
         Args:
             manifest: The Grant.
-            replaces: One that this one is to count before.
+            replaces: Older Grant that this one must take precedence over.
 
         Raises:
-            InvalidObject: the manifest is no Grant.
+            InvalidObject: The manifest is not a Grant.
         """
         return self._signer.sign(manifest, replaces or Grant.from_body(manifest))
 
     def grant(self, manifest: dict[str, Any], grants: Path) -> Path:
-        """Sign a Grant and put it, in one step, where the services of its node look for it.
+        """Sign a Grant and store it atomically in the directory that the services of its node read.
 
         Args:
             manifest: The Grant.
-            grants: The services' --grants.
+            grants: Directory (--grants of the services).
 
         Raises:
-            InvalidObject: the manifest is no Grant, bounds no drone, or is for a node without a certificate.
+            InvalidObject: The manifest is not a Grant, does not limit the drone, or its node has no certificate.
         """
-        wanted = Grant.from_body(manifest)
-        name = wanted.name
-        if not (self._directory / "nodes" / wanted.spec.node / "tls.crt").is_file():
+        parsed = Grant.from_body(manifest)
+        name = parsed.name
+        if not (self._directory / "nodes" / parsed.spec.node / "tls.crt").is_file():
             raise InvalidObject(
-                "spec.node", f"{wanted.spec.node} has no certificate here; make one with: fractus grants init --node"
+                "spec.node", f"{parsed.spec.node} has no certificate here; issue it with: fractus grants init --node"
             )
         if "/" in name or name.startswith("."):
-            raise InvalidObject("metadata.name", f"{name!r} is no name of a file")
+            raise InvalidObject("metadata.name", f"{name!r} is not a valid file name")
         path = grants / f"{name}.json"
-        signed = self.sign(manifest, _present(path))
+        signed = self.sign(manifest, _stored(path))
         grants.mkdir(parents=True, exist_ok=True)
         write_file(path, json.dumps(signed, indent=1).encode() + b"\n", 0o640)
         return path
 
 
-def _present(path: Path) -> Grant | None:
+def _stored(path: Path) -> Grant | None:
     try:
         return Grant.from_body(json.loads(path.read_bytes()))
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""`fractus status`: the fleet and the applications of a cluster."""
+"""`fractus status`: drones, edge nodes and Applications of a cluster."""
 
 from __future__ import annotations
 
@@ -9,46 +9,47 @@ from typing import Any
 
 import click
 
+from fractus_cli.cluster_reader import GROUP, Body, ClusterReader, conditions_of, kubeconfig_option, open_cluster, table
 from fractus_cli.output import output_option, printable
-from fractus_cli.reading import GROUP, Body, Cluster, cluster, conditions_of, kubeconfig_option, table
 
 PERIOD_S = 2.0
 
 
 @click.command()
-@click.option("-n", "--namespace", default="", help="Only the applications of this namespace.")
-@click.option("-w", "--watch", is_flag=True, help="Print it again every two seconds until interrupted.")
+@click.option("-n", "--namespace", default="", help="Only Applications of this namespace.")
+@click.option("-w", "--watch", is_flag=True, help="Repeat every two seconds until interrupted.")
 @output_option
 @kubeconfig_option
 def status(namespace: str, watch: bool, output: str, config: str | None) -> None:
-    """Show the drones, edge nodes and applications of a cluster.
+    """Show the drones, edge nodes and Applications of a cluster.
 
-    Who has rights in one namespace only sees its applications (--namespace).
+    With permissions in a single namespace, use --namespace. Only the Applications are shown then.
     """
-    with cluster(config) as found:
+    with open_cluster(config) as cluster:
         while True:
-            seen = look(found, namespace)
+            summary = collect(cluster, namespace)
             if watch and output == "text":
                 click.clear()
-            click.echo(json.dumps(seen) if output == "json" else "\n".join(map(printable, lines(seen))))
+            click.echo(json.dumps(summary) if output == "json" else "\n".join(map(printable, lines(summary))))
             if not watch:
                 return
             time.sleep(PERIOD_S)
 
 
-def look(found: Cluster, namespace: str) -> dict[str, Any]:
-    """What is shown of a cluster: drones, edge nodes and applications, each by name, and what the user may not list.
+def collect(cluster: ClusterReader, namespace: str) -> dict[str, Any]:
+    """Return drones, edge nodes and Applications by name, and the names of collections that the user is not permitted to list.
 
     Raises:
-        ClickException: the user may not list these Applications.
+        ClickException: The user is not permitted to list these Applications.
     """
     scope = f"/namespaces/{namespace}" if namespace else ""
-    applications = found.list_permitted(f"{GROUP}{scope}/applications")
+    applications = cluster.list_permitted(f"{GROUP}{scope}/applications")
     if applications is None:
-        remedy = "check your permissions there" if namespace else "give one with --namespace"
-        raise click.ClickException(f"you may not list the Applications of {namespace or 'all namespaces'}; {remedy}")
-    drones = found.list_permitted(f"{GROUP}/drones")
-    edge_nodes = found.list_permitted(f"{GROUP}/edgenodes")
+        scope_name = f"namespace {namespace}" if namespace else "all namespaces"
+        remedy = "check your permissions there" if namespace else "specify a namespace with --namespace"
+        raise click.ClickException(f"not permitted to list the Applications of {scope_name}; {remedy}")
+    drones = cluster.list_permitted(f"{GROUP}/drones")
+    edge_nodes = cluster.list_permitted(f"{GROUP}/edgenodes")
     return {
         "drones": [_drone(body) for body in _by_name(drones or ())],
         "edgeNodes": [_node(body) for body in _by_name(edge_nodes or ())],
@@ -57,19 +58,20 @@ def look(found: Cluster, namespace: str) -> dict[str, Any]:
     }
 
 
-def lines(seen: dict[str, Any]) -> list[str]:
-    """The same for people."""
+def lines(summary: dict[str, Any]) -> list[str]:
+    """Format a summary as text."""
     drones = [
         (d["name"], d["state"], d["controller"], d["battery"], d["ready"], d["services"], d["lastSeen"], d["message"])
-        for d in seen["drones"]
+        for d in summary["drones"]
     ]
-    edges = [(e["name"], e["ready"], e["services"], e["lastSeen"], e["message"]) for e in seen["edgeNodes"]]
+    edges = [(e["name"], e["ready"], e["services"], e["lastSeen"], e["message"]) for e in summary["edgeNodes"]]
     applications = [
-        (f"{a['namespace']}/{a['name']}", a["phase"], a["drone"], a["pods"], a["message"]) for a in seen["applications"]
+        (f"{a['namespace']}/{a['name']}", a["phase"], a["drone"], a["pods"], a["message"])
+        for a in summary["applications"]
     ]
     shown = table(("APPLICATION", "PHASE", "DRONE", "PODS", "MESSAGE"), applications)
-    if seen["forbidden"]:
-        return [*shown, "", f"You may not list {' and '.join(seen['forbidden'])} of this cluster."]
+    if summary["forbidden"]:
+        return [*shown, "", f"You are not permitted to list {' and '.join(summary['forbidden'])} of this cluster."]
     return [
         *table(("DRONE", "STATE", "CONTROLLER", "BATTERY", "READY", "SERVICES", "LAST SEEN", "MESSAGE"), drones),
         "",
@@ -85,7 +87,8 @@ def _by_name(bodies: Sequence[Body]) -> list[Body]:
 
 def _node(body: Body) -> dict[str, Any]:
     conditions = conditions_of(body)
-    ready, current = conditions.get("Ready", {}), conditions.get("ServicesCurrent", {})
+    ready = conditions.get("Ready", {})
+    current = conditions.get("ServicesCurrent", {})
     return {
         "name": body["metadata"]["name"],
         "ready": ready.get("status", "Unknown"),
@@ -97,26 +100,26 @@ def _node(body: Body) -> dict[str, Any]:
 
 
 def _drone(body: Body) -> dict[str, Any]:
-    known = body.get("status") or {}
-    remaining = (known.get("battery") or {}).get("remaining")
+    status = body.get("status") or {}
+    remaining = (status.get("battery") or {}).get("remaining")
     return {
         **_node(body),
-        "state": known.get("flightState", "unknown"),
-        "lastState": known.get("lastFlightState"),
-        "controller": known.get("controller"),
+        "state": status.get("flightState", "unknown"),
+        "lastState": status.get("lastFlightState"),
+        "controller": status.get("controller"),
         "battery": f"{remaining:.0%}" if remaining is not None else None,
-        "position": known.get("position"),
+        "position": status.get("position"),
         "onMission": conditions_of(body).get("OnMission", {}).get("status", "False"),
     }
 
 
 def _application(body: Body) -> dict[str, Any]:
-    known = body.get("status") or {}
+    status = body.get("status") or {}
     return {
         "namespace": body["metadata"]["namespace"],
         "name": body["metadata"]["name"],
-        "phase": known.get("phase", "Pending"),
-        "drone": known.get("drone"),
-        "pods": known.get("pods"),
-        "message": known.get("message", "the operator has not seen it yet"),
+        "phase": status.get("phase", "Pending"),
+        "drone": status.get("drone"),
+        "pods": status.get("pods"),
+        "message": status.get("message", "not processed by the operator yet"),
     }

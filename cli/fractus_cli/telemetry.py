@@ -1,4 +1,4 @@
-"""`fractus telemetry`: a drone's state, line by line, for people, pipes and recorders."""
+"""`fractus telemetry`: state of a drone, one line per sample."""
 
 from __future__ import annotations
 
@@ -20,23 +20,29 @@ from fractus_cli.output import output_option
 
 
 @click.command()
-@click.option("--node", envvar="FRACTUS_NODE", required=True, help="Name of the drone's node.")
-@click.option("--address", envvar="FRACTUS_MOBILITY_ADDRESS", default=f"127.0.0.1:{MOBILITY_PORT}", show_default=True)
+@click.option("--node", envvar="FRACTUS_NODE", required=True, help="Name of the node of the drone.")
+@click.option(
+    "--address",
+    envvar="FRACTUS_MOBILITY_ADDRESS",
+    default=f"127.0.0.1:{MOBILITY_PORT}",
+    show_default=True,
+    help="Address of the mobility service.",
+)
 @click.option(
     "--tls",
     envvar="FRACTUS_TLS_DIR",
     default=DEFAULT_TLS_DIR,
     show_default=True,
     type=click.Path(path_type=Path, file_okay=False),
-    help="Folder with tls.crt, tls.key and ca.crt of the caller.",
+    help="Directory with tls.crt, tls.key and ca.crt of the caller.",
 )
-@click.option("--interval", "interval_s", default=1.0, show_default=True, help="Seconds between lines, 0.05 at least.")
+@click.option("--interval", "interval_s", default=1.0, show_default=True, help="Seconds between lines, at least 0.05.")
 @click.option("--count", type=click.IntRange(min=1), help="Stop after this many lines.")
 @output_option
 def telemetry(*, node: str, address: str, tls: Path, interval_s: float, count: int | None, output: str) -> None:
-    """Print the state of the drone of a node until interrupted.
+    """Print the state of a drone until interrupted.
 
-    Needs the certificate of a component that may call GetPosition, or the node's own.
+    Requires the certificate of the node, or of a component that may call GetPosition.
     """
     endpoint = Endpoint.on_node(node, address, tls)
     asyncio.run(_follow(endpoint, interval_s, count, output))
@@ -66,5 +72,5 @@ def _line(sample: Telemetry) -> str:
         speed = f"{math.hypot(sample.velocity.north, sample.velocity.east):4.1f} m/s"
     return (
         f"{sample.time:%H:%M:%S}  {sample.flight_state:<9}  {sample.mode:<9}  {sample.position or 'position unknown'}  {speed}"
-        f"  battery {sample.battery_remaining:.0%}  by {sample.controller or 'no one'}"
+        f"  battery {sample.battery_remaining:.0%}  controller {sample.controller or 'none'}"
     )

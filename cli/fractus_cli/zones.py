@@ -1,4 +1,4 @@
-"""`fractus zones`: Zones from and to the formats of others."""
+"""`fractus zones`: import Zones from other formats and export Zones to other formats."""
 
 from __future__ import annotations
 
@@ -31,25 +31,25 @@ _WRITERS: dict[str, Callable[[Iterable[Zone]], formats.Exported]] = {
 
 @click.group()
 def zones() -> None:
-    """Read and write zones in the formats of others."""
+    """Import and export Zones in other formats."""
 
 
 @zones.command("import")
 @click.argument("file", type=click.Path(exists=True, dir_okay=False, path_type=pathlib.Path))
-@click.option("--from", "source", type=click.Choice(sorted(_READERS)), required=True, help="The format of the file.")
-@click.option("--prefix", default="", help="Put before the name of every zone.")
-@click.option("--leave-out", "without", multiple=True, metavar="NAME", help="A feature to leave out; may be repeated.")
-@click.option("--drop", multiple=True, metavar="PROPERTY", help="A property to ignore; may be repeated.")
+@click.option("--from", "source", type=click.Choice(sorted(_READERS)), required=True, help="Format of the file.")
+@click.option("--prefix", default="", help="Prefix for the names of all Zones.")
+@click.option("--leave-out", "without", multiple=True, metavar="NAME", help="Feature to skip. May be repeated.")
+@click.option("--drop", multiple=True, metavar="PROPERTY", help="Property to ignore. May be repeated.")
 def import_(file: pathlib.Path, source: str, prefix: str, without: tuple[str, ...], drop: tuple[str, ...]) -> None:
     """Print a Zone manifest for each zone in a file.
 
-    What a Zone cannot keep exactly (where, how high and when it counts) is refused, feature by feature: correct it, or
-    leave it out. What means nothing for that, and does not map, is listed on standard error. Properties whose names seem
-    to say how high or when a zone counts are refused until they are dropped (geojson, kml).
+    A feature is rejected if a Zone cannot represent its area, altitudes or schedule exactly. Correct it, or skip it with
+    --leave-out. Other properties that cannot be converted are listed on standard error. A property whose name suggests an
+    altitude or a schedule is rejected unless it is ignored with --drop (geojson, kml).
     """
     read = _READERS[source]
     if drop and source not in _DROPPING:
-        raise click.ClickException(f"--drop is for --from {' and '.join(_DROPPING)}")
+        raise click.ClickException(f"--drop requires --from {' or '.join(_DROPPING)}")
     if drop:
         read = functools.partial(_DROPPING[source], drop=drop)
     try:
@@ -65,18 +65,18 @@ def import_(file: pathlib.Path, source: str, prefix: str, without: tuple[str, ..
         raise click.ClickException(f"{file}: not a UTF-8 text file") from None
     except formats.InexactFeatures as error:
         *most, last = (f"{_where(file, content, one)}: {one}" for one in error.every)
-        _tell(most)
+        _print_notes(most)
         raise click.ClickException(last) from None
     except InvalidObject as error:
         raise click.ClickException(f"{file}: {error}") from None
-    _tell(found.notes)
+    _print_notes(found.notes)
     if not named:
-        raise click.ClickException(f"{file}: there is no zone in the file")
+        raise click.ClickException(f"{file}: the file contains no zone")
     click.echo(dump_documents(map(_manifest, named)), nl=False)
 
 
 def _where(file: pathlib.Path, content: bytes, problem: InvalidObject) -> str:
-    """The line of a field, in formats that are JSON."""
+    """Return the location of a field, with its line for JSON formats."""
     try:
         found = parse_documents(content, str(file), is_json=True)
     except BadDocument:
@@ -86,24 +86,24 @@ def _where(file: pathlib.Path, content: bytes, problem: InvalidObject) -> str:
 
 @zones.command("export")
 @click.argument("paths", type=click.Path(exists=True, path_type=pathlib.Path), nargs=-1, required=True)
-@click.option("--to", "target", type=click.Choice(sorted(_READERS)), required=True, help="The format to print.")
-@click.option("--inclusion", is_flag=True, help="For qgc-plan: fences to stay in, instead of out of.")
+@click.option("--to", "target", type=click.Choice(sorted(_READERS)), required=True, help="Output format.")
+@click.option("--inclusion", is_flag=True, help="For qgc-plan: write inclusion fences instead of exclusion fences.")
 def export(paths: tuple[pathlib.Path, ...], target: str, inclusion: bool) -> None:
-    """Print the Zones of some manifests in another format; what does not map is listed on standard error."""
+    """Print the Zones of manifests in another format. Properties that cannot be converted are listed on standard error."""
     if inclusion and target != "qgc-plan":
-        raise click.ClickException("--inclusion is for --to qgc-plan")
+        raise click.ClickException("--inclusion requires --to qgc-plan")
     try:
         every = sorted(read_manifests(paths).of(Zone).values(), key=lambda zone: zone.name)
     except BadManifest as error:
         raise click.ClickException(str(error)) from None
     if not every:
-        raise click.ClickException("there is no Zone in the manifests")
+        raise click.ClickException("the manifests contain no Zone")
     write = _WRITERS.get(target)
     try:
         found = write(every) if write is not None else formats.write_qgc_plan(every, inclusion=inclusion)
     except InvalidObject as error:
         raise click.ClickException(str(error)) from None
-    _tell(found.notes)
+    _print_notes(found.notes)
     click.echo(found.text, nl=False)
 
 
@@ -119,6 +119,6 @@ def _manifest(zone: Zone) -> dict[str, object]:
     return {"apiVersion": body["apiVersion"], "kind": body["kind"], "metadata": {"name": zone.name}, "spec": spec}
 
 
-def _tell(notes: Iterable[str]) -> None:
+def _print_notes(notes: Iterable[str]) -> None:
     for note in notes:
         click.echo(printable(note), err=True)

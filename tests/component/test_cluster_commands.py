@@ -1,4 +1,4 @@
-"""`fractus status`, `explain` and `doctor`: what they say of a cluster, and their exit codes."""
+"""Output and exit codes of `fractus status`, `explain`, `doctor` and `completion`."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from cluster_shown import condition, show
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
+from fake_cluster_reader import condition, show
 from fractus_cli import doctor, explain, main, status
 from fractus_core.api import KINDS
 from fractus_core.api.crd import crd
@@ -30,8 +30,8 @@ Body = dict[str, Any]
 def run(capsys: pytest.CaptureFixture[str]) -> Run:
     def call(*arguments: str) -> tuple[int, str]:
         code = main.run(arguments)
-        said = capsys.readouterr()
-        return code, said.out + said.err
+        output = capsys.readouterr()
+        return code, output.out + output.err
 
     return call
 
@@ -61,7 +61,7 @@ APPLICATION = named(
 )
 
 
-def test_status_shows_the_fleet_and_the_applications(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_status_shows_drones_edge_nodes_and_applications(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     edge = named("edge-1", spec={}, status={"conditions": [condition("Ready", "Unknown", "AgentSilent", "gone")]})
     objects = {
         f"{V1}/drones": [DRONE],
@@ -70,18 +70,18 @@ def test_status_shows_the_fleet_and_the_applications(run: Run, monkeypatch: pyte
         f"{V1}/namespaces/other/applications": [],
     }
     show(monkeypatch, status, objects)
-    code, said = run("status")
+    code, output = run("status")
     assert code == 0
-    assert re.search(r"drone-1 +flying +- +62% +True +InTheAir +2026-01-01T00:00:00Z", said)
-    assert re.search(r"edge-1 +Unknown +Current +- +gone", said)
-    assert re.search(r"default/traffic +Flying +drone-1 +3/3 +drone-1 flies", said)
-    assert re.search(r"default/new +Pending .*the operator has not seen it yet", said)
-    code, said = run("status", "-n", "other", "-o", "json")
-    seen = json.loads(said)
+    assert re.search(r"drone-1 +flying +- +62% +True +InTheAir +2026-01-01T00:00:00Z", output)
+    assert re.search(r"edge-1 +Unknown +Current +- +gone", output)
+    assert re.search(r"default/traffic +Flying +drone-1 +3/3 +drone-1 flies", output)
+    assert re.search(r"default/new +Pending .*not processed by the operator yet", output)
+    code, output = run("status", "-n", "other", "-o", "json")
+    seen = json.loads(output)
     assert (seen["drones"][0]["onMission"], seen["applications"]) == ("True", [])
 
 
-def test_status_goes_on_until_it_is_interrupted(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_status_watch_repeats_until_interrupted(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     show(monkeypatch, status, {})
     pauses: list[float] = []
 
@@ -91,9 +91,9 @@ def test_status_goes_on_until_it_is_interrupted(run: Run, monkeypatch: pytest.Mo
             raise KeyboardInterrupt
 
     monkeypatch.setattr(status.time, "sleep", pause)
-    code, said = run("status", "--watch")
+    code, output = run("status", "--watch")
     assert code == 130
-    assert said.count("APPLICATION") == 3
+    assert output.count("APPLICATION") == 3
 
 
 PLAN: Body = {
@@ -141,48 +141,48 @@ def explained(monkeypatch: pytest.MonkeyPatch) -> Body:
     return objects
 
 
-def test_explain_says_why_here_why_not_there_and_which_policy_did_what(run: Run, explained: Body) -> None:
-    code, said = run("explain", "traffic")
+def test_explain_prints_placements_rejected_nodes_and_policies(run: Run, explained: Body) -> None:
+    code, output = run("explain", "traffic")
     assert code == 0
     for sentence in (
         "default/traffic: Flying: drone-1 flies",
         "Drone: drone-1 (score 12.5); next best: drone-2 (3.25)",
-        "420 m in 6.2 min; it can fly 18.0 min",
+        "420 m in 6.2 min; available without the reserve: 18.0 min",
         "leg to 39.500000, 22.500000: Detour by school: the system flies a detour of 80 m",
         "Viewer: edge-1 (for location 1)",
         "Store: cloud (any cloud node)",
-        "Not for Navigator:",
+        "Rejected for Navigator:",
         "drone-3: FlightTooLong: needs 9 min",
         "and 2 more (--all)",
         "40 more rejected nodes",
         "Policies for navigator-x: school (GeofenceControl in yard)",
         "Normal Planned: drone-1 flies",
     ):
-        assert sentence in said
-    assert "drone-9" not in said
+        assert sentence in output
+    assert "drone-9" not in output
     assert "drone-9" in run("explain", "traffic", "--all")[1]
     assert json.loads(run("explain", "traffic", "-o", "json")[1])["rejected"] == PLAN["rejected"]
 
 
-def test_explain_fails_where_there_is_no_plan_or_a_conflict(run: Run, explained: Body) -> None:
+def test_explain_exits_with_2_without_plan_or_with_policy_conflict(run: Run, explained: Body) -> None:
     assert run("explain", "other")[0] == 1
     plans = explained[f"{V1}/namespaces/default/deploymentplans"]
     conflict = {**PLAN, "drone": {**PLAN["drone"], "policyConflict": "the leg is denied"}}
     plans[:] = [named("traffic", "default", spec=conflict)]
-    code, said = run("explain", "traffic")
+    code, output = run("explain", "traffic")
     assert code == 2
-    assert "Conflict: the leg is denied" in said
+    assert "Conflict: the leg is denied" in output
     plans.clear()
-    code, said = run("explain", "traffic")
+    code, output = run("explain", "traffic")
     assert code == 2
-    assert "There is no plan." in said
+    assert "There is no plan." in output
 
 
-def test_explain_names_the_nearest_application(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_explain_suggests_closest_application_for_unknown_name(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     show(monkeypatch, explain, {f"{V1}/namespaces/default/applications": [APPLICATION]})
     assert run("explain", "trafic") == (
         1,
-        "fractus: there is no Application default/trafic; did you mean traffic?\n",
+        "fractus: Application default/trafic not found; did you mean traffic?\n",
     )
 
 
@@ -199,16 +199,16 @@ def authority(days: float) -> Body:
     return {"data": {"ca.crt": pem.decode()}}
 
 
-def node(name: str, of_class: str, *, tainted: bool = True, ready: str = "True", cloud: bool = False) -> Body:
+def node(name: str, node_class: str, *, tainted: bool = True, ready: str = "True", cloud: bool = False) -> Body:
     taints = [{"key": "fractus.dev/class", "effect": "NoExecute"}] if tainted else []
     body = named(name, spec={"taints": taints}, status={"conditions": [condition("Ready", ready)]})
-    body["metadata"]["labels"] = {"fractus.dev/class": of_class} | ({"fractus.dev/cloud": "true"} if cloud else {})
+    body["metadata"]["labels"] = {"fractus.dev/class": node_class} | ({"fractus.dev/cloud": "true"} if cloud else {})
     return body
 
 
 @pytest.fixture
 def healthy(monkeypatch: pytest.MonkeyPatch) -> Body:
-    """A cluster that lacks nothing."""
+    """Cluster without problems."""
     system = "/apis/apps/v1/namespaces/fractus-system"
     kinds = [crd(kind) | {"status": {"conditions": [condition("Established", "True")]}} for kind in KINDS]
     policies = [named(name) for name in doctor.POLICIES]
@@ -238,19 +238,19 @@ def healthy(monkeypatch: pytest.MonkeyPatch) -> Body:
     return objects
 
 
-def test_doctor_finds_nothing_in_a_cluster_that_lacks_nothing(run: Run, healthy: Body) -> None:
-    code, said = run("doctor")
-    assert code == 0, said
-    assert {line.split()[0] for line in said.splitlines()} == {"ok"}
+def test_doctor_reports_only_ok_for_healthy_cluster(run: Run, healthy: Body) -> None:
+    code, output = run("doctor")
+    assert code == 0, output
+    assert {line.split()[0] for line in output.splitlines()} == {"ok"}
 
 
-def test_doctor_finds_nothing_in_a_cluster_of_one_node(run: Run, healthy: Body) -> None:
+def test_doctor_warns_about_single_node_that_is_drone_and_cloud(run: Run, healthy: Body) -> None:
     healthy["/api/v1/nodes"] = [node("drone-1", "drone", tainted=False, cloud=True)]
     healthy[f"{V1}/edgenodes"] = []
-    code, said = run("doctor", "-o", "json")
-    assert code == 0, said
-    (warned,) = [found["message"] for found in json.loads(said) if found["level"] != "ok"]
-    assert warned == "drone-1 is of the cloud, too: any pod there can reach its autopilot"
+    code, output = run("doctor", "-o", "json")
+    assert code == 0, output
+    (warned,) = [found["message"] for found in json.loads(output) if found["level"] != "ok"]
+    assert warned == "drone-1 is also a cloud node: any pod on it can reach the autopilot"
 
 
 SYSTEM_APPS = "/apis/apps/v1/namespaces/fractus-system"
@@ -264,7 +264,7 @@ UNREGISTERED = [node("drone-1", "drone"), node("drone-9", "drone"), node("cloud-
 MISTYPED = [*UNREGISTERED[::2], node("b", "boat")]
 AUTHORITY = "/api/v1/namespaces/fractus-system/configmaps/fractus-ca"
 ADMISSION = "/apis/admissionregistration.k8s.io/v1"
-LACKS: list[tuple[str, Any, str, str]] = [
+PROBLEMS: list[tuple[str, Any, str, str]] = [
     ("/version", {"major": "1", "minor": "31"}, "error", "upgrade Kubernetes to 1.32"),
     ("/apis/apiextensions.k8s.io/v1/customresourcedefinitions", [], "error", "--install fractus-crds"),
     (f"{SYSTEM_APPS}/deployments/fractus-operator", None, "error", "--install fractus "),
@@ -279,9 +279,9 @@ LACKS: list[tuple[str, Any, str, str]] = [
     (f"{ADMISSION}/validatingadmissionpolicies", [], "error", "fractus-flight-pods"),
     (f"{ADMISSION}/validatingadmissionpolicybindings", [], "error", "fractus-flight-pods"),
     ("/api/v1/namespaces/fractus-system/pods", [WAITING], "error", "imagePullSecrets"),
-    (AUTHORITY, None, "error", "there is no authority yet"),
-    (AUTHORITY, authority(10), "warning", "the authority expires"),
-    (AUTHORITY, authority(-1), "error", "the authority expires"),
+    (AUTHORITY, None, "error", "there is no certificate authority yet"),
+    (AUTHORITY, authority(10), "warning", "the certificate authority expires"),
+    (AUTHORITY, authority(-1), "error", "the certificate authority expires"),
     (AUTHORITY, {"data": {"ca.crt": base64.b64encode(b"x").decode()}}, "error", "cannot be read"),
     ("/api/v1/nodes", UNREGISTERED, "error", "drone-9 has no Drone"),
     ("/api/v1/nodes", MISTYPED, "error", "kubectl label node b fractus.dev/class=drone --overwrite"),
@@ -303,7 +303,7 @@ LACKS: list[tuple[str, Any, str, str]] = [
         "/api/v1/nodes",
         [node("drone-1", "drone", ready="Unknown"), node("c", "cloud")],
         "warning",
-        "drone-1 is out of reach",
+        "drone-1 is not ready",
     ),
     (f"{V1}/drones", [SILENT], "error", "drone-1: Ready: AgentSilent: last heard of"),
     (
@@ -316,18 +316,20 @@ LACKS: list[tuple[str, Any, str, str]] = [
 ]
 
 
-@pytest.mark.parametrize(("path", "found", "level", "words"), LACKS, ids=[f"{n}-{x[3]}" for n, x in enumerate(LACKS)])
-def test_doctor_says_what_is_missing_and_the_remedy(
+@pytest.mark.parametrize(
+    ("path", "found", "level", "words"), PROBLEMS, ids=[f"{n}-{x[3]}" for n, x in enumerate(PROBLEMS)]
+)
+def test_doctor_reports_problem_with_remedy(
     run: Run, healthy: Body, path: str, found: Any, level: str, words: str
 ) -> None:
     healthy[path] = found
-    code, said = run("doctor", "-o", "json")
+    code, output = run("doctor", "-o", "json")
     assert code == (2 if level == "error" else 0)
-    assert any(f["level"] == level and words in f["message"] + f["remedy"] for f in json.loads(said)), said
-    assert all(f["remedy"] for f in json.loads(said) if f["level"] != "ok"), "each has its remedy"
+    assert any(f["level"] == level and words in f["message"] + f["remedy"] for f in json.loads(output)), output
+    assert all(f["remedy"] for f in json.loads(output) if f["level"] != "ok"), "every problem has a remedy"
 
 
-def test_the_policies_that_doctor_asks_for_are_those_of_the_chart() -> None:
+def test_doctor_checks_all_admission_policies_of_the_chart() -> None:
     charts = DOCS.parents[1] / "charts" / "fractus" / "templates"
     text = "".join(file.read_text() for file in charts.glob("*.yaml"))
     assert set(re.findall(r"kind: ValidatingAdmissionPolicy\nmetadata:\n  name: ([\w-]+)", text)) == set(
@@ -339,18 +341,18 @@ def test_the_policies_that_doctor_asks_for_are_those_of_the_chart() -> None:
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_shells_complete_commands(run: Run, shell: str) -> None:
-    code, said = run("completion", shell)
+def test_completion_prints_script_for_shell(run: Run, shell: str) -> None:
+    code, output = run("completion", shell)
     assert code == 0
-    assert "_FRACTUS_COMPLETE" in said
+    assert "_FRACTUS_COMPLETE" in output
 
 
-def test_the_page_of_the_command_line_names_every_command() -> None:
+def test_cli_page_lists_every_command_with_its_summary() -> None:
     text = DOCS.read_text()
     rows = dict(re.findall(r"^\| `fractus ([\w-]+)` \| (.*?) \|", text, re.MULTILINE))
     assert rows == {name: entry.summary for name, entry in main.COMMANDS.items()}
 
 
 @pytest.mark.parametrize("name", ["status", "explain", "doctor", "completion"])
-def test_the_page_shows_the_help_of_commands_that_read_clusters(run: Run, name: str) -> None:
+def test_cli_page_quotes_help_of_commands_that_read_clusters(run: Run, name: str) -> None:
     assert run(name, "--help")[1].strip() in DOCS.read_text()

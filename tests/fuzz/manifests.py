@@ -19,9 +19,11 @@ from typing import Any
 
 import atheris
 
-with atheris.instrument_imports(include=["fractus_core", "fractus_cli.manifests", "fractus_cli.planning", "yaml"]):
+with atheris.instrument_imports(
+    include=["fractus_core", "fractus_cli.manifests", "fractus_cli.offline_planner", "yaml"]
+):
     from fractus_cli.manifests import BadManifest, read_manifests
-    from fractus_cli.planning import plan_all
+    from fractus_cli.offline_planner import plan_all
     from fractus_core.api.grants import GrantSpec
     from fractus_core.api.nodes import Drone, EdgeNode, InvalidDescription, parse_description
     from fractus_core.documents import dump_documents, parse_documents

@@ -8,12 +8,12 @@ import pytest
 from chart import path_of, render
 from control_plane import ControlPlane, wait_for
 from fractus_cli import main
-from fractus_cli.reading import GROUP, SYSTEM
+from fractus_cli.cluster_reader import GROUP, SYSTEM
 from fractus_runtime.kubernetes import KubeError
 from operator_world import OperatorProcess, World, traffic
 
 
-def test_a_deployed_application_is_shown_and_explained(
+def test_status_and_explain_show_deployed_application(
     control_plane: ControlPlane,
     world: World,
     operator: OperatorProcess,
@@ -28,21 +28,23 @@ def test_a_deployed_application_is_shown_and_explained(
     world.put(traffic(namespace))
     world.phase(namespace, "Deploying")
     wait_for(lambda: len(world.grants(namespace)) >= 3, "the grants")
-    code, said = run("status", "-n", namespace, "-o", "json")
-    seen = json.loads(said)
+    code, output = run("status", "-n", namespace, "-o", "json")
+    summary = json.loads(output)
     assert code == 0
-    assert [(a["name"], a["phase"], a["drone"]) for a in seen["applications"]] == [("traffic", "Deploying", "drone-1")]
-    assert [d["state"] for d in seen["drones"]] == ["inactive"]
+    assert [(a["name"], a["phase"], a["drone"]) for a in summary["applications"]] == [
+        ("traffic", "Deploying", "drone-1")
+    ]
+    assert [d["state"] for d in summary["drones"]] == ["inactive"]
     assert "drone-1" in run("status")[1]
-    code, said = run("explain", "traffic", "-n", namespace)
+    code, output = run("explain", "traffic", "-n", namespace)
     assert code == 0
-    assert "Drone: drone-1" in said
-    assert "Navigator: drone-1 (on the drone that flies)" in said
-    assert "Policies for " in said
+    assert "Drone: drone-1" in output
+    assert "Navigator: drone-1 (on the selected drone)" in output
+    assert "Policies for " in output
     assert run("explain", "nothing", "-n", namespace)[0] == 1
 
 
-def test_a_cluster_without_the_charts_is_told_how_to_get_them(
+def test_doctor_prints_install_commands_for_cluster_without_charts(
     control_plane: ControlPlane, world: World, capsys: pytest.CaptureFixture[str]
 ) -> None:
     code = main.run(["doctor", "-o", "json", "--kubeconfig", str(control_plane.kubeconfig)])
@@ -54,10 +56,10 @@ def test_a_cluster_without_the_charts_is_told_how_to_get_them(
     assert any("has no taint fractus.dev/class" in f["message"] for f in findings.values())
 
 
-def test_pods_that_a_policy_would_not_let_be_made_again_are_told(
+def test_doctor_warns_about_pods_that_admission_would_reject_on_recreation(
     control_plane: ControlPlane, world: World, namespace: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Such as those of a network plugin that was there before Fractus; and why pods of services cannot be made."""
+    """Example: a network plugin that was installed before Fractus."""
     bare: dict[str, object] = {"nodeName": "drone-1", "hostNetwork": True, "tolerations": [{"operator": "Exists"}]}
     bare |= {"containers": [{"name": "cni", "image": "registry.test/cni:1"}]}
     plugin = {"apiVersion": "v1", "kind": "Pod", "metadata": {"name": "cni", "namespace": namespace}, "spec": bare}
@@ -67,16 +69,16 @@ def test_pods_that_a_policy_would_not_let_be_made_again_are_told(
         if (body["kind"], body["metadata"]["name"]) == ("ValidatingAdmissionPolicy", "fractus-pods")
     )
 
-    def made() -> bool:
+    def pod_created() -> bool:
         try:
             world.api.apply(f"/api/v1/namespaces/{namespace}/pods/cni", plugin)
         except KubeError as error:
-            # The API server goes by the policy of an earlier test for a moment after that is deleted.
+            # The API server enforces the deleted policy of an earlier test for a moment.
             assert "fractus-pod" in str(error), error
             return False
         return True
 
-    wait_for(made, "a pod on a node that no policy protects")
+    wait_for(pod_created, "a pod on a node without an admission policy")
     world.api.apply(path_of(guard), guard)
     try:
         main.run(["doctor", "-o", "json", "--kubeconfig", str(control_plane.kubeconfig)])
@@ -89,19 +91,19 @@ def test_pods_that_a_policy_would_not_let_be_made_again_are_told(
     assert f"admission.exemptNamespaces={{kube-system,{namespace}}}" in found[0]["remedy"]
 
 
-def test_the_account_of_helm_test_may_read_what_doctor_reads(
+def test_helm_test_account_has_exactly_the_permissions_of_doctor(
     control_plane: ControlPlane, world: World, chart: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The chart's pod runs it; more than that its account may not."""
+    """The test pod of the chart runs `fractus doctor`. Its account may not read Secrets or Grants."""
     account = f"system:serviceaccount:{SYSTEM}:fractus-test"
     kubeconfig = control_plane.write_kubeconfig("fractus-test", account, ("system:authenticated",))
 
     def examined() -> bool:
         code = main.run(["doctor", "-o", "json", "--kubeconfig", str(kubeconfig)])
-        said = capsys.readouterr()
-        # The authorizer hears of roles by a watch.
-        assert not said.err or "Forbidden" in said.err, said.err
-        return code == 2 and "operator" in {finding["check"] for finding in json.loads(said.out)}
+        captured = capsys.readouterr()
+        # The authorizer receives roles through a watch, with a delay.
+        assert not captured.err or "Forbidden" in captured.err, captured.err
+        return code == 2 and "operator" in {finding["check"] for finding in json.loads(captured.out)}
 
     wait_for(examined, "doctor by the chart's account")
     (pod,) = (body for body in render() if body["kind"] == "Pod")

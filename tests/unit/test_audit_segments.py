@@ -48,7 +48,7 @@ async def test_audit_chain_continues_through_segments_and_restarts(tmp_path: Pat
     code, said = verified(tmp_path)
     assert code == 0
     assert "11 entries, chain sound" in said
-    assert verified(files[0])[1].endswith("what came before and after is not judged")
+    assert verified(files[0])[1].endswith("earlier and later entries were not verified")
 
 
 async def test_audit_chain_continues_after_a_segment_was_just_closed(tmp_path: Path) -> None:
@@ -89,9 +89,9 @@ async def test_pruned_segments_are_accepted_only_with_a_checkpoint(tmp_path: Pat
     assert "to free space, which only an earlier checkpoint can prove; specify it with --since" in said
     code, said = verified(path, "--since", recent)
     assert code == 0, said
-    assert "before were removed to make room" in said
+    assert "entries were removed to free space" in said
     assert re.search(
-        r"all since number \d+ are there, as signed by spiffe://fractus.dev/node/drone-1, whose cert", said
+        r"complete since entry \d+ \(checkpoint signed by spiffe://fractus.dev/node/drone-1; its cert", said
     )
     assert "--ca" not in verified(path, "--since", recent, "--ca", tls / "ca.crt")[1]
     code, said = verified(path, "--since", old)
@@ -140,11 +140,11 @@ async def test_checkpoint_detects_changes_that_the_chain_does_not(tmp_path: Path
         why = "is the last entry, number 0"
     elif which == "missing":
         path.rename(path.with_name("audit.000000000001.jsonl"))
-        why = "audit.jsonl: is missing; the log is not complete without it"
+        why = "audit.jsonl: segment is missing; the log is incomplete without it"
     else:
         path.rename(path.with_name("other.jsonl"))
         path.with_suffix(".checkpoint").unlink()
-        why = "--since: the checkpoint is of audit.jsonl; give that log, or its directory"
+        why = "--since: the checkpoint belongs to audit.jsonl; give that log, or its directory"
     if which not in {"missing", "log"}:
         assert verified(path.parent)[0] == 0
     code, said = verified(path.parent, "--since", kept)
@@ -161,7 +161,7 @@ async def test_checkpoint_of_a_node_status_is_accepted(tmp_path: Path, tls: Path
     (path.parent / "other.checkpoint").write_text(json.dumps({"log": "a b", "seq": 1, "hash": "0" * 64}))
     assert read_audit_heads(path.parent) == [head]
     code, said = verified(path, "--since", head)
-    assert (code, "all since number 4 are there" in said, "signed" in said) == (0, True, False)
+    assert (code, "complete since entry 4" in said, "signed" in said) == (0, True, False)
     path.write_bytes(b"".join(read(path)[:3]))
     code, said = verified(path, "--since", head)
     assert code == 1
@@ -177,7 +177,7 @@ async def test_removed_log_is_detected_by_its_checkpoint(tmp_path: Path, tls: Pa
     (tmp_path / "audit" / "camera.jsonl").unlink()
     code, said = verified(tmp_path / "audit")
     assert code == 1
-    assert "camera.jsonl: is missing" in said
+    assert "camera.jsonl: segment is missing" in said
 
 
 @pytest.mark.parametrize("which", ["changed", "other", "component", "nonsense", "twice"])
@@ -200,7 +200,7 @@ async def test_invalid_checkpoint_is_rejected(tmp_path: Path, tls: Path, which: 
         kept.write_bytes(b"[" * 9_000)
         why = "is not a checkpoint"
     else:
-        more, why = [await checkpoint(path, 1, tls)], "is the second of audit.jsonl"
+        more, why = [await checkpoint(path, 1, tls)], "second checkpoint of audit.jsonl"
     options = [word for file in (kept, *more) for word in ("--since", file)]
     code, said = verified(path, *options, "--ca", tls / "ca.crt")
     assert (code, why in said) == (1, True), said
@@ -323,7 +323,7 @@ async def test_checkpoint_of_another_log_with_the_same_name_is_rejected(tmp_path
     await filled(tmp_path / "two" / "audit.jsonl", 3)
     code, said = verified(tmp_path / "one", tmp_path / "two", "--since", kept)
     assert code == 1
-    assert "--since: the checkpoint is of audit.jsonl, and there are several" in said
+    assert "--since: several logs match the checkpoint of audit.jsonl" in said
     assert str(tmp_path / "two" / "audit.jsonl") in said
     assert verified(tmp_path / "one", tmp_path / "two")[0] == 0
     assert verified(tmp_path / "one", "--since", kept)[0] == 0

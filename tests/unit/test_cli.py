@@ -1,4 +1,4 @@
-"""The `fractus` command: what it finds, what it says when something is wrong, and its exit codes."""
+"""The `fractus` command: subcommands, error messages and exit codes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Infeasible(Exception):
 @click.command()
 @click.argument("how")
 def probe(how: str) -> None:
-    """Do what the test says."""
+    """Fail in a given way, or print HOW."""
     if how == "infeasible":
         raise Infeasible("no drone can fly\nso far")
     if how == "bug":
@@ -44,7 +44,7 @@ def probe(how: str) -> None:
 @pytest.fixture
 def commands(monkeypatch: pytest.MonkeyPatch) -> None:
     entries = {
-        "probe": cli.Entry(f"{__name__}:probe", "Do what the test says."),
+        "probe": cli.Entry(f"{__name__}:probe", "Fail in a given way."),
         "cluster": cli.Entry("no_such_package.cli:cluster", "A cluster.", "sim"),
     }
     monkeypatch.setattr(cli, "COMMANDS", entries)
@@ -54,14 +54,14 @@ def commands(monkeypatch: pytest.MonkeyPatch) -> None:
 def fractus(commands: None, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
     def call(*arguments: str) -> tuple[int, str, str]:
         code = cli.run(arguments)
-        said = capsys.readouterr()
-        return code, said.out, said.err
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
 
     return call
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "said"),
+    ("arguments", "code", "message"),
     [
         (["probe", "infeasible"], 2, "fractus: no drone can fly so far\n"),
         (["probe", "bug"], 1, "fractus: something broke\n"),
@@ -71,21 +71,21 @@ def fractus(commands: None, capsys: pytest.CaptureFixture[str]) -> Callable[...,
         (["probe", "escape"], 1, "fractus: there is no zone \\x1b[2J\\u202etown\n"),
         (["probe", "stop"], 130, "\nfractus: interrupted\n"),
         (["probe"], 1, "fractus: Missing argument 'HOW'. (see `fractus probe --help`)\n"),
-        (["prob"], 1, "fractus: there is no command prob; did you mean probe?\n"),
-        (["xyz"], 1, "fractus: there is no command xyz; see `fractus --help`\n"),
+        (["prob"], 1, "fractus: unknown command prob; did you mean probe?\n"),
+        (["xyz"], 1, "fractus: unknown command xyz; see `fractus --help`\n"),
     ],
 )
-def test_what_goes_wrong_is_one_line_and_an_exit_code(
-    fractus: Callable[..., tuple[int, str, str]], arguments: list[str], code: int, said: str
+def test_failure_prints_one_line_and_returns_exit_code(
+    fractus: Callable[..., tuple[int, str, str]], arguments: list[str], code: int, message: str
 ) -> None:
-    assert fractus(*arguments) == (code, "", said)
+    assert fractus(*arguments) == (code, "", message)
 
 
-def test_a_command_runs(fractus: Callable[..., tuple[int, str, str]]) -> None:
+def test_command_runs_and_returns_0(fractus: Callable[..., tuple[int, str, str]]) -> None:
     assert fractus("probe", "well") == (0, "well\n", "")
 
 
-def test_a_command_whose_extra_is_missing_is_hidden_and_says_what_to_install(
+def test_command_without_its_extra_is_hidden_and_names_the_requirement(
     fractus: Callable[..., tuple[int, str, str]],
 ) -> None:
     code, out, _ = fractus("--help")
@@ -97,7 +97,7 @@ def test_a_command_whose_extra_is_missing_is_hidden_and_says_what_to_install(
     assert "pip install 'fractus-sim'" in err
 
 
-def test_version_and_bare_command(fractus: Callable[..., tuple[int, str, str]]) -> None:
+def test_version_and_help_without_command_return_0(fractus: Callable[..., tuple[int, str, str]]) -> None:
     code, out, _ = fractus("--version")
     assert (code, out) == (0, f"fractus {importlib.metadata.version('fractus-drones')}\n")
     code, out, _ = fractus()
@@ -106,20 +106,20 @@ def test_version_and_bare_command(fractus: Callable[..., tuple[int, str, str]]) 
 
 
 @pytest.mark.parametrize("name", sorted(cli.COMMANDS))
-def test_the_list_names_commands_that_are_there(name: str) -> None:
+def test_listed_command_exists(name: str) -> None:
     entry = cli.COMMANDS[name]
     assert entry.installed
-    module, _, attribute = entry.place.partition(":")
+    module, _, attribute = entry.location.partition(":")
     package, *below = module.split(".")
     spec = importlib.util.find_spec(package)
     assert spec is not None
     assert spec.submodule_search_locations is not None
-    # Looked for in the source: to import every command takes seconds.
+    # Search the source, because importing every command takes seconds.
     source = Path(spec.submodule_search_locations[0], *below).with_suffix(".py")
     assert f"\ndef {attribute}(" in source.read_text()
 
 
-def test_errors_of_clusters_read_like_all_others(
+def test_cluster_error_is_printed_as_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("FRACTUS_STATE", str(tmp_path))
@@ -128,16 +128,16 @@ def test_errors_of_clusters_read_like_all_others(
 
 
 @pytest.mark.parametrize(("powered", "code"), [(True, 0), (False, 2)])
-def test_the_status_of_a_cluster_is_for_programs_too(
+def test_cluster_status_prints_json_and_exit_code(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], powered: bool, code: int
 ) -> None:
     node = NodeStatus("drone-1", "drone", "10.0.0.2", powered, True, True, None, True)
     shown = SimpleNamespace(name="demo", running=True, radio=SimpleNamespace(running=None), status=lambda: [node])
     monkeypatch.setattr(Cluster, "existing", lambda _name: shown)
     assert run_to_end(["cluster", "status", "-o", "json"]) == code
-    told = json.loads(capsys.readouterr().out)
-    assert (told["well"], told["radio"], told["nodes"][0]["name"]) == (powered, None, "drone-1")
-    assert told["nodes"][0]["vehicle_running"] is None
+    status = json.loads(capsys.readouterr().out)
+    assert (status["well"], status["radio"], status["nodes"][0]["name"]) == (powered, None, "drone-1")
+    assert status["nodes"][0]["vehicle_running"] is None
     assert run_to_end(["cluster", "status"]) == code
     assert "drone-1" in capsys.readouterr().out
 
@@ -149,12 +149,14 @@ def run_to_end(arguments: list[str]) -> int:
         return int(ended.code or 0)
 
 
-def test_a_link_of_no_kind_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unknown_autopilot_link_type_is_reported_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     for name in ("grants", "tls", "state"):
         (tmp_path / name).mkdir()
     given = [f"--{name}={tmp_path / name}" for name in ("grants", "tls", "state")]
     argv = ["mobility", "serve", *given, f"--audit={tmp_path}/audit.jsonl", f"--description={tmp_path}/none.yaml"]
     assert cli.run([*argv, f"--node-object={tmp_path}/none.json", "--autopilot", "bluetooth:x"]) == EXIT_BAD_INPUT
-    said = capsys.readouterr().err.splitlines()
-    assert "bluetooth" in said[-1] and said[-1].startswith("fractus: ")
-    assert not any("Traceback" in line for line in said)
+    lines = capsys.readouterr().err.splitlines()
+    assert "bluetooth" in lines[-1] and lines[-1].startswith("fractus: ")
+    assert not any("Traceback" in line for line in lines)

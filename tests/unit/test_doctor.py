@@ -1,4 +1,4 @@
-"""`fractus doctor`: what is found where one thing is missing, and what it says to do."""
+"""`fractus doctor`: findings and remedies for each problem of a cluster."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Body = dict[str, Any]
 
 
 class Cluster:
-    """A cluster in which all is as it should be, by path; tests take something away."""
+    """Fake of a healthy cluster: objects and lists by path. Tests change it to create a problem."""
 
     def __init__(self) -> None:
         ready = {"readyReplicas": 2, "conditions": [{"type": "ReplicaFailure", "status": "False", "reason": "x"}]}
@@ -87,7 +87,7 @@ def findings(cluster: Any) -> list[Finding]:
     return list(examine(cluster, NOW))
 
 
-def test_a_cluster_that_lacks_nothing_is_fine() -> None:
+def test_doctor_reports_only_ok_for_healthy_cluster_objects() -> None:
     assert {finding.level for finding in findings(Cluster())} == {"ok"}
 
 
@@ -118,7 +118,7 @@ def refused_operator(cluster: Cluster) -> None:
     cluster.objects[OPERATOR]["status"] = {"conditions": [failed]}
 
 
-def stranger(cluster: Cluster) -> None:
+def foreign_pods(cluster: Cluster) -> None:
     everywhere: Body = {"hostNetwork": True, "tolerations": [{"operator": "Exists"}]}
     mirror = pod("static-drone-1", "mirrors", nodeName="drone-1", **everywhere)
     mirror["metadata"]["annotations"] = {"kubernetes.io/config.mirror": "5d8f"}
@@ -141,11 +141,11 @@ def older_kinds(cluster: Cluster) -> None:
     del schema["spec"]["properties"]["interfaces"]["items"]["properties"]["range"]
 
 
-def renamed(cluster: Cluster) -> None:
+def renamed_node(cluster: Cluster) -> None:
     cluster.lists["/apis/fractus.dev/v1alpha1/drones"].append({"metadata": {"name": "drone-0"}, "status": {}})
 
 
-def ipv6(cluster: Cluster) -> None:
+def ipv6_first(cluster: Cluster) -> None:
     kinds = (("Hostname", "drone-1"), ("InternalIP", "fd00::7"), ("InternalIP", "10.0.0.7"))
     addresses = [{"type": type_, "address": address} for type_, address in kinds]
     node = cluster.lists["/api/v1/nodes"][0]
@@ -153,25 +153,25 @@ def ipv6(cluster: Cluster) -> None:
 
 
 def weakly_tainted(cluster: Cluster) -> None:
-    """Who names the node in a pod passes by the scheduler, and kubelets look at NoExecute only."""
+    """Replace the taint by NoSchedule, which pods with a node name bypass because kubelets check NoExecute only."""
     cluster.lists["/api/v1/nodes"][0]["spec"] = {"taints": [{"key": "fractus.dev/class", "effect": "NoSchedule"}]}
 
 
-def audited(cluster: Cluster) -> None:
+def audit_only_binding(cluster: Cluster) -> None:
     cluster.lists[BINDINGS][0]["spec"]["validationActions"] = ["Audit"]
 
 
-def test_one_command_lets_the_pods_of_all_namespaces_be_made() -> None:
+def test_doctor_remedy_exempts_all_namespaces_with_foreign_pods() -> None:
     cluster = Cluster()
-    stranger(cluster)
+    foreign_pods(cluster)
     plugin = cluster.lists["/api/v1/pods"][0]
     cluster.lists["/api/v1/pods"].append(plugin | {"metadata": {"name": "cni", "namespace": "cilium"}})
     remedies = {finding.remedy for finding in findings(cluster) if finding.level != "ok"}
-    assert len(remedies) == 1, "the second of two would undo the first"
+    assert len(remedies) == 1, "a second remedy would undo the first"
     assert "exemptNamespaces={kube-system,cilium,kube-flannel}" in remedies.pop()
 
 
-def test_an_operator_whose_pods_cannot_be_deleted_is_well() -> None:
+def test_doctor_ignores_failed_deletion_of_operator_pods() -> None:
     cluster = Cluster()
     failed = {"type": "ReplicaFailure", "status": "True", "reason": "FailedDelete", "message": "no"}
     cluster.objects[OPERATOR]["status"]["conditions"] = [failed]
@@ -179,24 +179,24 @@ def test_an_operator_whose_pods_cannot_be_deleted_is_well() -> None:
 
 
 @pytest.mark.parametrize(
-    ("takes", "level", "check", "message", "remedy"),
+    ("break_cluster", "level", "check", "message", "remedy"),
     [
-        (unscheduled, "error", "pods", "fractus-operator-1 has no node: 0/2 nodes", "fractus.dev/cloud=true"),
+        (unscheduled, "error", "pods", "fractus-operator-1 is not scheduled: 0/2 nodes", "fractus.dev/cloud=true"),
         (refused_service, "error", "services", "violates PodSecurity", "pod-security.kubernetes.io/enforce=privileged"),
-        (refused_operator, "error", "operator", "cannot be made: exceeded quota", "ResourceQuota"),
-        (stranger, "warning", "admission", "kube-flannel: pods in the node's", "exemptNamespaces={kube-system,kube-flannel}"),
+        (refused_operator, "error", "operator", "cannot be created: exceeded quota", "ResourceQuota"),
+        (foreign_pods, "warning", "admission", "kube-flannel: pods in the host network", "exemptNamespaces={kube-system,kube-flannel}"),
         (older_kinds, "error", "kinds", "Drone has no spec.interfaces.range", "helm upgrade --install fractus-crds"),
-        (renamed, "warning", "nodes", "no node of the name of drone drone-0", "kubectl delete drone drone-0"),
-        (ipv6, "error", "nodes", "drone-1 has the address fd00::7 first", "--node-ip"),
+        (renamed_node, "warning", "nodes", "drone drone-0 has no node", "kubectl delete drone drone-0"),
+        (ipv6_first, "error", "nodes", "drone-1 has fd00::7 as first address", "--node-ip"),
         (weakly_tainted, "warning", "nodes", "drone-1 has no taint fractus.dev/class with the effect NoExecute", "=drone:NoExecute"),
-        (audited, "error", "admission", f"{POLICIES[0]}: not in force", "helm upgrade --install fractus "),
+        (audit_only_binding, "error", "admission", f"{POLICIES[0]}: not in force", "helm upgrade --install fractus "),
     ],
 )  # fmt: skip
-def test_what_is_missing_is_found_with_what_to_do(
-    takes: Callable[[Cluster], None], level: str, check: str, message: str, remedy: str
+def test_doctor_finds_problem_and_prints_remedy(
+    break_cluster: Callable[[Cluster], None], level: str, check: str, message: str, remedy: str
 ) -> None:
     cluster = Cluster()
-    takes(cluster)
+    break_cluster(cluster)
     found = [finding for finding in findings(cluster) if finding.level != "ok"]
     assert [(f.level, f.check) for f in found] == [(level, check)]
     assert message in found[0].message

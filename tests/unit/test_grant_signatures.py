@@ -365,7 +365,7 @@ def test_grants_command_creates_authority_and_signs_grant(tmp_path: Path) -> Non
 def test_standalone_pki_refuses_invalid_names(tmp_path: Path, name: str) -> None:
     made = CliRunner().invoke(grants, ["init", str(tmp_path / "pki"), "--node", name])
     assert made.exit_code == 1
-    assert f"node: {name!r} is no name of a node" in made.output
+    assert f"node: {name!r} is not a valid node name" in made.output
     assert not (tmp_path / "pki" / "nodes").exists()
     with pytest.raises(InvalidObject, match=r"spec\.instance"):
         StandalonePki.open(tmp_path / "pki").component(component_identity("ns", "app", "Navigator", name))

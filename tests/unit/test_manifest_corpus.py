@@ -15,7 +15,7 @@ def test_corpus_manifest_is_accepted_or_refused_with_line(case, tmp_path):
     file = tmp_path / "m.yaml"
     file.write_text(case.text)
     if not case.refused:
-        assert read_manifests([file]).found
+        assert read_manifests([file]).objects
         return
     with pytest.raises(BadManifest) as refused:
         read_manifests([file])

@@ -229,8 +229,8 @@ BOW_TIE = [{"lat": 0, "lon": 0}, {"lat": 1e-3, "lon": 1e-3}, {"lat": 0, "lon": 1
 @pytest.mark.parametrize(
     ("objects", "sentence"),
     [
-        ([DEPOT], "there is no Application in the manifests"),
-        ([{"replicas": 1}], "a document has no kind"),
+        ([DEPOT], "the manifests contain no Application"),
+        ([{"replicas": 1}], "the document has no kind"),
         ([{"kind": "Drone", "metadata": {}}], "Drone: apiVersion: is missing; write fractus.dev/v1alpha1"),
         (
             [{"apiVersion": "fractus.dev/v1alpha1", "kind": "Drone"}],
@@ -268,12 +268,12 @@ def test_bad_input_exits_1_with_one_sentence_that_names_file_object_and_field(ru
     assert result.stdout == ""
     assert sentence in result.stderr
     assert len(result.stderr.strip().splitlines()) == 1
-    assert sentence.startswith("there is no App") or re.search(r"all\.yaml:[0-9]+: ", result.stderr)
+    assert sentence.startswith("the manifests contain no App") or re.search(r"all\.yaml:[0-9]+: ", result.stderr)
 
 
 def test_a_kind_of_another_project_is_passed_over(run):
     foreign = {"apiVersion": "argoproj.io/v1alpha1", "kind": "Application", "metadata": {"name": "a"}, "spec": {}}
-    assert "there is no Application in the manifests" in run([foreign]).stderr
+    assert "the manifests contain no Application" in run([foreign]).stderr
 
 
 def test_broken_yaml_and_json_name_the_line(tmp_path):

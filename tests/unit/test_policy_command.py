@@ -110,15 +110,15 @@ def test_text() -> None:
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        (("--method", "Fly", "--at", HERE), "there is no method Fly"),
+        (("--method", "Fly", "--at", HERE), "unknown method Fly"),
         (("--method", "Goto", "--at", HERE), "Goto needs lat and lon"),
-        (("--method", "Goto", "--args", "{", "--at", HERE), "no JSON"),
+        (("--method", "Goto", "--args", "{", "--at", HERE), "invalid JSON"),
         (("--method", "Goto", "--args", "[1]", "--at", HERE), "JSON object"),
         (("--method", "Goto", "--args", '{"lat": "x", "lon": 1}', "--at", HERE), "lat must be a number"),
         (("--method", "Goto", "--args", '{"lat": 1, "lon": 1, "up": 1}', "--at", HERE), "Goto has no up"),
         (("--method", "Land", "--args", '{"lat": 1}', "--at", HERE), "takes no arguments"),
-        (("--method", "Land", "--at", "1,2"), "3 numbers"),
-        (("--method", "Land", "--at", "nan,2,3"), "3 numbers"),
+        (("--method", "Land", "--at", "1,2"), "3 comma-separated numbers"),
+        (("--method", "Land", "--at", "nan,2,3"), "3 comma-separated numbers"),
         (("--method", "Land", "--at", "91,2,3"), "lat must be"),
         (("--method", "Land", "--at", "1,2,1e300"), "alt must be"),
         (("--method", "Land", "--at", HERE, "--velocity", "1e300,0,0"), "n must be"),
@@ -128,7 +128,7 @@ def test_text() -> None:
         (("--method", "Goto", "--args", '{"lat": 1, "lon": 1, "reference": []}', "--at", HERE), "reference must be"),
         (("--method", "Goto", "--args", "[" * 100_000, "--at", HERE), "nested too deeply"),
         (("--method", "CaptureImage", "--args", '{"width": NaN}', "--at", HERE), "whole number"),
-        (("--method", "Land", "--at", HERE, "--time", "2026-01-01T00:00:00"), "no time with its zone"),
+        (("--method", "Land", "--at", HERE, "--time", "2026-01-01T00:00:00"), "not a time with a time zone"),
         (("--method", "Land", "--at", HERE, "--component", "Navigator"), "together"),
         (("--method", "Land", "--at", HERE, "--application", DRONE, "--component", "X"), "one Application"),
         (

@@ -305,7 +305,7 @@ def test_import_rejects_unknown_properties_to_drop(tmp_path):
     source = tmp_path / "a.json"
     source.write_text("{}")
     refused = CliRunner().invoke(command, ["import", str(source), "--from", "ed269", "--drop", "ceiling"])
-    assert "--drop is for --from geojson and kml" in refused.stderr
+    assert "--drop requires --from geojson or kml" in refused.stderr
 
 
 def test_import_limits_the_points_of_a_file(monkeypatch):

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from fractus_cli.manifests import BadManifest, Manifests, read_manifests
-from fractus_cli.planning import plan_all
+from fractus_cli.offline_planner import plan_all
 from fractus_core.api import API_VERSION, Drone
 from fractus_core.api.grants import GrantSpec
 from fractus_core.planning import Settings

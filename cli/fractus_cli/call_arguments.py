@@ -1,4 +1,4 @@
-"""What `fractus policy` is asked: a call with its arguments, places, velocities and times, as a command line spells them."""
+"""Parse calls, positions, velocities and times from the command line."""
 
 from __future__ import annotations
 
@@ -27,7 +27,9 @@ from fractus_cli.manifests import BadManifest
 
 METHODS: tuple[str, ...] = get_args(Method)
 
-_TAKES: dict[str, type[GotoArgs | TakeoffArgs | SetSpeedArgs | VelocityArgs | PointGimbalArgs | CaptureArgs]] = {
+_ARGUMENT_TYPES: dict[
+    str, type[GotoArgs | TakeoffArgs | SetSpeedArgs | VelocityArgs | PointGimbalArgs | CaptureArgs]
+] = {
     "Goto": GotoArgs,
     "Takeoff": TakeoffArgs,
     "SetSpeed": SetSpeedArgs,
@@ -55,33 +57,33 @@ _BOUNDS: dict[str, tuple[float, float, str]] = {
 
 
 Parser = Callable[[click.Context, click.Parameter, str | None], Any]
-"""The callback of an option: turns its text into a value."""
+"""Callback that converts the text of an option to a value."""
 
 
-def figures(*names: str) -> Parser:
-    """The parser of numbers with commas between them; by their names it knows their bounds."""
+def parse_numbers(*names: str) -> Parser:
+    """Return a parser of comma-separated numbers. The names define their bounds."""
 
     def parse(context: click.Context, option: click.Parameter, text: str | None) -> tuple[float, ...] | None:
         del context, option
         if text is None:
             return None
         try:
-            found = tuple(float(part) for part in text.split(","))
+            numbers = tuple(float(part) for part in text.split(","))
         except ValueError:
-            found = ()
-        if len(found) != len(names) or not all(math.isfinite(figure) for figure in found):
-            raise click.BadParameter(f"{text!r} is not {','.join(names)}: {len(names)} numbers with commas")
-        for name, figure in zip(names, found, strict=True):
+            numbers = ()
+        if len(numbers) != len(names) or not all(math.isfinite(number) for number in numbers):
+            raise click.BadParameter(f"{text!r} is not {','.join(names)} ({len(names)} comma-separated numbers)")
+        for name, number in zip(names, numbers, strict=True):
             lower, upper, unit = _BOUNDS[name]
-            if not lower <= figure <= upper:
-                raise click.BadParameter(f"{name} must be {lower:g} to {upper:g} {unit}, not {figure:g}")
-        return found
+            if not lower <= number <= upper:
+                raise click.BadParameter(f"{name} must be {lower:g} to {upper:g} {unit}, not {number:g}")
+        return numbers
 
     return parse
 
 
 def parse_time(context: click.Context, option: click.Parameter, text: str | None) -> float | None:
-    """A moment as RFC 3339 spells it, as seconds since 1970 UTC."""
+    """Parse an RFC 3339 time to Unix time in seconds."""
     del context, option
     if text is None:
         return None
@@ -90,63 +92,64 @@ def parse_time(context: click.Context, option: click.Parameter, text: str | None
     except ValueError:
         moment = None
     if moment is None or moment.tzinfo is None:
-        raise click.BadParameter(f"{text!r} is no time with its zone, such as 2026-06-01T12:00:00Z")
+        raise click.BadParameter(f"{text!r} is not a time with a time zone, such as 2026-06-01T12:00:00Z")
     return moment.timestamp()
 
 
 def parse_call(method: str, text: str) -> Call:
-    """The call of a method with arguments as JSON.
+    """Parse a call: a method and its arguments as JSON.
 
     Raises:
-        BadManifest: there is no such method, or an argument is missing, unknown or no number.
+        BadManifest: The method is unknown, or an argument is missing, unknown or invalid.
     """
     if method not in METHODS:
-        raise BadManifest(f"--method: there is no method {method} (there are {', '.join(sorted(METHODS))})")
+        raise BadManifest(f"--method: unknown method {method}; use one of: {', '.join(sorted(METHODS))}")
     try:
-        given = json.loads(
-            text, parse_int=float, object_pairs_hook=_once
-        )  # an integer of any length is a number out of range
+        # Integers are parsed as floats, so that a very long integer is a number out of range.
+        given = json.loads(text, parse_int=float, object_pairs_hook=_reject_duplicates)
     except json.JSONDecodeError as error:
-        raise BadManifest(f"--args: this is no JSON: {error.msg} at character {error.pos + 1}") from None
+        raise BadManifest(f"--args: invalid JSON: {error.msg} at character {error.pos + 1}") from None
     except RecursionError:
-        raise BadManifest("--args: this JSON is nested too deeply; give an object of numbers") from None
+        raise BadManifest("--args: the JSON is nested too deeply; use an object with numbers") from None
     if not isinstance(given, dict):
-        raise BadManifest('--args: give a JSON object, such as {"lat": 39.36, "lon": 22.95, "alt": 10}')
-    takes = _TAKES.get(method)
-    if takes is None:
+        raise BadManifest('--args: use a JSON object, such as {"lat": 39.36, "lon": 22.95, "alt": 10}')
+    argument_type = _ARGUMENT_TYPES.get(method)
+    if argument_type is None:
         if given:
             raise BadManifest(f"--args: {method} takes no arguments")
         return Call(method)
-    spelled = {_plain(f.name): f.name for f in fields(takes)} | {f.name: f.name for f in fields(takes)}
-    if takes is GotoArgs:
-        spelled |= {"altitude": "alt", "altitudeReference": "reference"}
-    found: dict[str, Any] = {}
+    names = {_plain(f.name): f.name for f in fields(argument_type)} | {f.name: f.name for f in fields(argument_type)}
+    if argument_type is GotoArgs:
+        names |= {"altitude": "alt", "altitudeReference": "reference"}
+    arguments: dict[str, Any] = {}
     for name, value in given.items():
-        field = spelled.get(name)
+        field = names.get(name)
         if field is None:
-            raise BadManifest(f"--args: {method} has no {name} (it takes {', '.join(f.name for f in fields(takes))})")
-        if field in found:
-            raise BadManifest(f"--args: {name} is there twice under two names; give it once")
+            raise BadManifest(
+                f"--args: {method} has no {name} (it takes {', '.join(f.name for f in fields(argument_type))})"
+            )
+        if field in arguments:
+            raise BadManifest(f"--args: {name} is specified twice under two names; specify it once")
         if value is not None:
-            found[field] = _value(name, field, value)
-    missing = sorted(_NEEDED.get(method, frozenset()) - set(found))
+            arguments[field] = _value(name, field, value)
+    missing = sorted(_NEEDED.get(method, frozenset()) - set(arguments))
     if missing:
         raise BadManifest(f"--args: {method} needs {' and '.join(missing)}")
-    args: Args = takes(**found)
+    args: Args = argument_type(**arguments)
     return Call(method, args)
 
 
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
+def _reject_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    arguments: dict[str, Any] = {}
     for name, value in pairs:
-        if name in found:
-            raise BadManifest(f"--args: {name} is given twice; give it once")
-        found[name] = value
-    return found
+        if name in arguments:
+            raise BadManifest(f"--args: {name} is specified twice; specify it once")
+        arguments[name] = value
+    return arguments
 
 
 def _plain(name: str) -> str:
-    """An argument's name without its unit: speed for speed_mps."""
+    """Return the name of an argument without its unit, for example speed for speed_mps."""
     return re.sub(r"_(mps|m|deg|s)$", "", name)
 
 

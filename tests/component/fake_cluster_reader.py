@@ -1,4 +1,4 @@
-"""A cluster for commands that read one, from a dict of objects by path."""
+"""Fake cluster for commands that read a cluster, built from a dict of objects by path."""
 
 from __future__ import annotations
 
@@ -11,34 +11,34 @@ import pytest
 Body = dict[str, Any]
 
 
-class Shown:
-    """Stands for `fractus_cli.reading.Cluster`."""
+class FakeClusterReader:
+    """Fake of `fractus_cli.cluster_reader.ClusterReader`."""
 
     def __init__(self, objects: Mapping[str, Any]) -> None:
         self.objects = objects
 
     def get(self, path: str) -> Body | None:
-        found = self.objects.get(path)
-        assert not isinstance(found, list)
-        return found
+        body = self.objects.get(path)
+        assert not isinstance(body, list)
+        return body
 
     def list(self, path: str, **selectors: str) -> Sequence[Body]:
-        found = self.objects.get(path, [])
-        assert isinstance(found, list)
-        return found
+        bodies = self.objects.get(path, [])
+        assert isinstance(bodies, list)
+        return bodies
 
     def list_permitted(self, path: str) -> Sequence[Body]:
         return self.list(path)
 
 
 def show(monkeypatch: pytest.MonkeyPatch, module: Any, objects: Mapping[str, Any]) -> None:
-    """Let a command's module find these objects."""
+    """Make the module of a command read these objects."""
 
     @contextmanager
-    def cluster(_: str | None) -> Iterator[Shown]:
-        yield Shown(objects)
+    def open_cluster(_: str | None) -> Iterator[FakeClusterReader]:
+        yield FakeClusterReader(objects)
 
-    monkeypatch.setattr(module, "cluster", cluster)
+    monkeypatch.setattr(module, "open_cluster", open_cluster)
 
 
 def condition(type_: str, status: str, reason: str = "Because", message: str = "") -> Body:

@@ -1,4 +1,4 @@
-"""Reads a cluster for commands: what is in it, as the API server gives it."""
+"""Read-only access of commands to a cluster, with errors that contain a remedy."""
 
 from __future__ import annotations
 
@@ -22,29 +22,29 @@ kubeconfig_option = click.option(
     "--kubeconfig",
     "config",
     type=click.Path(exists=True, dir_okay=False),
-    help="Which cluster; else KUBECONFIG, then ~/.kube/config.",
+    help="Kubeconfig of the cluster.  [default: KUBECONFIG, then ~/.kube/config]",
 )
 
 
-class Cluster:
-    """A cluster that is only read."""
+class ClusterReader:
+    """Read-only view of a cluster."""
 
     def __init__(self, client: BlockingClient) -> None:
         self._client = client
 
     def get(self, path: str) -> Body | None:
-        """An object; None where there is none.
+        """Return an object, or None if it does not exist.
 
         Raises:
-            KubeError: the API server refused it, or could not be reached.
+            KubeError: The API server rejected the request or is unreachable.
         """
         return self._client.get(path)
 
     def list(self, path: str, **selectors: str) -> Sequence[Body]:
-        """A collection; empty where there is no such kind.
+        """Return a collection. It is empty if the kind does not exist.
 
         Raises:
-            KubeError: the API server refused it, or could not be reached.
+            KubeError: The API server rejected the request or is unreachable.
         """
         try:
             return self._client.list(path, **selectors)
@@ -52,10 +52,10 @@ class Cluster:
             return ()
 
     def list_permitted(self, path: str) -> Sequence[Body] | None:
-        """A collection; None where the user may not list it, as those of no namespace with rights in one only.
+        """Return a collection, or None if the user is not permitted to list it (for example with rights in one namespace only).
 
         Raises:
-            KubeError: the API server could not be reached, or failed.
+            KubeError: The API server failed or is unreachable.
         """
         try:
             return self.list(path)
@@ -66,67 +66,67 @@ class Cluster:
 
 
 @contextmanager
-def cluster(config: str | None) -> Iterator[Cluster]:
-    """Open the cluster of a kubeconfig, or the one that kubectl would take.
+def open_cluster(config: str | None) -> Iterator[ClusterReader]:
+    """Open the cluster of a kubeconfig, or the default cluster of kubectl.
 
     Raises:
-        Unconfigured: there are no credentials.
-        ClickException: the API server refused what the command asked for, or could not be reached.
+        Unconfigured: There are no credentials.
+        ClickException: The API server rejected a request or is unreachable.
     """
-    with refusals_explained(), BlockingClient(asyncio.run(access_to(config)), "fractus", trust_env=True) as client:
-        yield Cluster(client)
+    with kube_errors_explained(), BlockingClient(asyncio.run(access_to(config)), "fractus", trust_env=True) as client:
+        yield ClusterReader(client)
 
 
 async def access_to(config: str | None) -> Access:
-    """Access to the cluster of a kubeconfig, or the one that kubectl would take.
+    """Return access to the cluster of a kubeconfig, or to the default cluster of kubectl.
 
     Raises:
-        Unconfigured: there are no credentials.
+        Unconfigured: There are no credentials.
     """
     return await (kubeconfig(config) if config is not None else from_environment())
 
 
 @contextmanager
-def refusals_explained() -> Iterator[None]:
-    """Refusals and silence of the API server as the one line that the user sees.
+def kube_errors_explained() -> Iterator[None]:
+    """Convert errors of the API server to errors with a remedy.
 
     Raises:
-        ClickException: the API server refused what the command asked for, or could not be reached.
+        ClickException: The API server rejected a request or is unreachable.
     """
     try:
         yield
     except (KubeError, ExceptionGroup) as error:
         first: Exception = error
         while isinstance(first, ExceptionGroup):
-            first = first.exceptions[0]  # what failed first is the cause; the others were cancelled by it
+            first = first.exceptions[0]  # the first failure is the cause; it cancelled the other tasks
         if not isinstance(first, KubeError):
             raise
         remedy = "check your permissions" if first.status else "check the cluster and --kubeconfig"
         raise click.ClickException(f"{first}; {remedy}") from first
 
 
-def application(found: Cluster, namespace: str, name: str) -> Body:
-    """An Application.
+def get_application(cluster: ClusterReader, namespace: str, name: str) -> Body:
+    """Return an Application.
 
     Raises:
-        ClickException: there is none of that name; it names the nearest.
+        ClickException: The Application does not exist. The message suggests the closest name.
     """
-    body = found.get(f"{GROUP}/namespaces/{namespace}/applications/{name}")
+    body = cluster.get(f"{GROUP}/namespaces/{namespace}/applications/{name}")
     if body is not None:
         return body
-    there = [b["metadata"]["name"] for b in found.list_permitted(f"{GROUP}/namespaces/{namespace}/applications") or ()]
-    near = difflib.get_close_matches(name, there, n=1)
-    hint = f"did you mean {near[0]}?" if near else "see fractus status"
-    raise click.ClickException(f"there is no Application {namespace}/{name}; {hint}")
+    bodies = cluster.list_permitted(f"{GROUP}/namespaces/{namespace}/applications") or ()
+    near = difflib.get_close_matches(name, [b["metadata"]["name"] for b in bodies], n=1)
+    hint = f"did you mean {near[0]}?" if near else "`fractus status` lists Applications"
+    raise click.ClickException(f"Application {namespace}/{name} not found; {hint}")
 
 
 def conditions_of(body: Body) -> dict[str, Body]:
-    """The conditions of an object by type."""
+    """Return the conditions of an object by type."""
     return {c["type"]: c for c in (body.get("status") or {}).get("conditions") or ()}
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> list[str]:
-    """Lines of a table whose columns are as wide as they need to be."""
+    """Format a table, with columns as wide as their longest cell."""
     cells = [[str(cell) if cell not in {None, ""} else "-" for cell in row] for row in (head, *rows)]
     widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in cells]

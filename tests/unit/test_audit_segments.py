@@ -144,7 +144,7 @@ async def test_checkpoint_detects_changes_that_the_chain_does_not(tmp_path: Path
     else:
         path.rename(path.with_name("other.jsonl"))
         path.with_suffix(".checkpoint").unlink()
-        why = "--since: the checkpoint belongs to audit.jsonl; give that log, or its directory"
+        why = "--since: the checkpoint belongs to audit.jsonl; add that log or its directory to PATHS"
     if which not in {"missing", "log"}:
         assert verified(path.parent)[0] == 0
     code, said = verified(path.parent, "--since", kept)

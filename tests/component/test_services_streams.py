@@ -27,7 +27,7 @@ def test_rebooted_autopilot_gets_failsafes_again_before_arming(tmp_path: Path) -
             sky.truth.params.set("SYSID_MYGCS", 255.0)
             sky.truth.params.set("FS_GCS_ENABLE", 0.0)
             before = sky.craft.vehicle
-            before.reboot_wanted = True
+            before.reboot_requested = True
             await until(lambda: sky.craft.vehicle is not before)
             await until(lambda: drone.autopilot.vehicle.unready(drone.autopilot.now))
             await drone.service.arm(grant, 120.0)

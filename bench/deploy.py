@@ -222,7 +222,7 @@ class Bound:
 
 @dataclass
 class Measured:
-    """What was seen at one number of nodes."""
+    """Measurements for one cluster size."""
 
     nodes: int
     first_plan_s: float = 0.0

@@ -233,7 +233,7 @@ class Node:
         wait_for(lambda: self._processes.check() or said in self._processes.log(by), what, 150.0)
 
     def _surroundings(self) -> None:
-        """The drone's hardware, and MAVProxy."""
+        """Start the simulated vehicle, its camera and MAVProxy."""
         home = ",".join(str(value) for value in HOME)
         listens = [word for link in self._links for word in ("--listen", link)]
         self._processes.start("vehicle", sys.executable, "-m", "fractus_vehicle", *listens, "--home", home)

@@ -598,7 +598,7 @@ class Bench:
                 self.found.refused[f"{code} {named(event)}"] += 1
 
     def _rest(self) -> None:
-        """Look at what goes on while nothing changes."""
+        """Count the API requests of an idle cluster."""
         self.found.warnings, _ = self._warnings(0)
         time.sleep(SETTLE_S)
         read, since = self._log.stat().st_size, datetime.now(UTC)

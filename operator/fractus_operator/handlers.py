@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import dataclasses
 import os
+import ssl
 from collections.abc import Callable
 from typing import Any, Protocol, cast
 
@@ -54,7 +55,8 @@ def _register(registry: kopf.OperatorRegistry, applications: Controller, oldest_
     @kopf.on.login(registry=registry, retries=3)
     def login(**kwargs: Any) -> kopf.ConnectionInfo | None:
         """Return the credentials that the store uses. kopf calls it again when they expire."""
-        return _with_address(kopf.login_with_service_account(**kwargs)) or kopf.login_with_kubeconfig(**kwargs)
+        info = _with_address(kopf.login_with_service_account(**kwargs)) or kopf.login_with_kubeconfig(**kwargs)
+        return Connection(**{f.name: getattr(info, f.name) for f in dataclasses.fields(info)}) if info else None
 
     @kopf.on.probe(registry=registry, id="oldest_contact_s")
     async def probe_watches(**_: object) -> float:
@@ -88,6 +90,19 @@ def _register(registry: kopf.OperatorRegistry, applications: Controller, oldest_
             await applications.teardown((namespace or "", name), uid)
         except KubeError as error:
             raise kopf.TemporaryError(str(error), delay=_RETRY_S) from error
+
+
+class Connection(kopf.ConnectionInfo):
+    """Credentials of kopf that accept API server certificates without an authority key identifier.
+
+    Python 3.13 refuses such certificates by default. kubectl and `fractus_runtime.kubernetes` accept them.
+    """
+
+    def as_ssl_context(self) -> ssl.SSLContext:
+        """Return the TLS context of kopf without strict verification of X.509 extensions."""
+        context: ssl.SSLContext = super().as_ssl_context()
+        context.verify_flags &= ~ssl.VERIFY_X509_STRICT
+        return context
 
 
 def _with_address(info: kopf.ConnectionInfo | None) -> kopf.ConnectionInfo | None:

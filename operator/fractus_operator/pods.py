@@ -131,7 +131,7 @@ def parse_pod(body: Body) -> PodView:
 
 
 def _stops(spec: Body, status: Body) -> bool:
-    """Return True if a pod has ended or is being stopped. The label alone must not hide a running pod."""
+    """Return True if a pod has ended or is being stopped. The label alone is not sufficient, because a labelled pod may still run."""
     return status.get("phase") in _ENDED or spec.get("activeDeadlineSeconds") == FINISHED_DEADLINE_S
 
 

@@ -34,6 +34,8 @@ RETRY_S = 1.0
 MAX_RETRY_S = 60.0
 ACCEPT_RETRY_S = 0.1
 """Delay after a failed accept, for example if no file descriptor is free."""
+ACCEPT_INTERVAL_S = 0.05
+"""Seconds between two accepted connections, which limits responses to 20 per second."""
 
 T = TypeVar("T")
 
@@ -185,6 +187,8 @@ async def _accept(server: socket.socket, collect: Callable[[], Iterable[Metric]]
                 await asyncio.sleep(ACCEPT_RETRY_S)
             else:
                 responses.create_task(_respond(connection, collect)).add_done_callback(lambda _: slots.release())
+                # The port may be reachable for every pod, and the flight shares this event loop.
+                await asyncio.sleep(ACCEPT_INTERVAL_S)
 
 
 async def _respond(connection: socket.socket, collect: Callable[[], Iterable[Metric]]) -> None:

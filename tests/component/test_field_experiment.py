@@ -1,4 +1,4 @@
-"""The field experiment's design: what must come out of it does not hang on the moment at which a picture is taken."""
+"""Expected results of the field experiment do not depend on the time at which pictures are taken."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ from fractus_agent.redirector.connections import PodNamespaces
 from fractus_agent.redirector.netlink import NetlinkError
 from fractus_agent.redirector.nft_maps import Endpoint
 from fractus_agent.redirector.redirector import Redirector
-from fractus_agent.settings import MAX_DRAIN_S, BadSetting, Settings
+from fractus_agent.settings import DEFAULT_DRAIN_S, MAX_DRAIN_S, BadSetting, Settings
 from fractus_core.api.direct_links import DirectLink, LinkedService
 from fractus_core.linking import HeuristicRegistry, PathMetrics, UnknownHeuristic
 
@@ -47,11 +47,16 @@ class FakeCollaborator:
         return
 
 
-def drone_controller() -> DroneLinkController:
+def drone_controller(drain_s: float = DEFAULT_DRAIN_S) -> DroneLinkController:
     return DroneLinkController(
         "d1", Path(), cast(Redirector, FakeCollaborator()), cloud=lambda: PATH, telemetry=lambda: None, report=lambda _: None,
-        record=lambda *_: None,
+        record=lambda *_: None, drain_s=drain_s,
     )  # fmt: skip
+
+
+@pytest.mark.parametrize(("drain_s", "leave_s"), [(0.5, 2.0), (1.5, 2.0), (10.0, 10.5)])
+def test_traffic_leaves_a_link_early_enough_for_the_drain(drain_s: float, leave_s: float) -> None:
+    assert drone_controller(drain_s)._settings.drain_s == leave_s
 
 
 def test_beacons_of_unknown_nodes_are_ignored() -> None:

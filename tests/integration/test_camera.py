@@ -197,7 +197,7 @@ async def test_later_policy_applies_to_stored_pictures(rig: Rig) -> None:
     assert len(blurred) == chunks[0].image.size_bytes < len(plain)
     assert not chunks[0].image.HasField("position")
     assert b"Exif" not in blurred
-    # A picture of a fixed camera needs what the place of the camera needs now.
+    # A stored picture of a fixed camera is judged by the policies that currently apply at the camera's position.
     logged = f"policy: filters required (action=correct caller={PASSENGER} method=RetrieveImage filters=blurAverage policies=privacy"
     await rig.until_logged("camera", logged)
     again = await capture(camera)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import ssl
 from types import SimpleNamespace
 from typing import Any
 
 import kopf
 import pytest
-from fractus_operator.handlers import InMemoryProgress
+from fractus_operator.handlers import Connection, InMemoryProgress
 from kopf._core.actions.execution import Outcome
 from kopf._core.actions.progression import State
 
@@ -54,3 +55,18 @@ async def test_unchanged_progress_is_not_stored_again() -> None:
         body=body(), patch=again, storage=progress
     )
     assert not again
+
+
+def test_kopf_accepts_api_servers_without_authority_key_identifier(monkeypatch: pytest.MonkeyPatch) -> None:
+    default_context = ssl.create_default_context
+
+    def strict_context(*args: Any, **kwargs: Any) -> ssl.SSLContext:
+        """Create a context with the defaults of Python 3.13."""
+        context = default_context(*args, **kwargs)
+        context.verify_flags |= ssl.VERIFY_X509_STRICT
+        return context
+
+    monkeypatch.setattr(ssl, "create_default_context", strict_context)
+    context = Connection(server="https://127.0.0.1:6443").as_ssl_context()
+    assert not context.verify_flags & ssl.VERIFY_X509_STRICT
+    assert context.verify_mode is ssl.CERT_REQUIRED

@@ -171,7 +171,7 @@ def test_slow_link_is_detected_and_cleared_when_fast_again() -> None:
 
 
 def test_slow_link_is_detected_before_first_slow_response() -> None:
-    """Positions go on coming: what the way there has got slower by, only the answers that are late can tell."""
+    """Positions still arrive on time. Only overdue responses show that the uplink became slower."""
     up_s = 0.05
     bench = Bench(lambda: up_s, steady(0.05))
     bench.fly(15)

@@ -135,7 +135,8 @@ class Acceptor:
                 self._sessions[session.peer] = _this_task()
             await session.send({"accepted": not reason, "reason": reason})
         except (LinkLost, PairingFailed, OSError, TimeoutError) as error:
-            log.warning("links: pairing failed (error=%s)", error)
+            # Every radio in range can cause this line.
+            log.warning("links: pairing failed (error=%s)", error, extra={"limit_by": "pairing"})
             reason = str(error) or "timeout"
         except BaseException:
             if session is not None:

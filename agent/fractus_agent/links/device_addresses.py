@@ -11,6 +11,7 @@ import errno
 import hashlib
 import socket
 from ipaddress import IPv4Address, IPv4Network
+from typing import Any
 
 from pyroute2 import AsyncIPRoute, NetlinkError
 
@@ -78,9 +79,11 @@ class DeviceAddresses:
             index = await self._index(route)
             link = (await route.link("get", index=index))[0]
             if not link["flags"] & _IFF_UP:
-                alias = (link.get("ifalias") or "").removesuffix(RAISED) + RAISED
+                alias = _alias(link).removesuffix(RAISED) + RAISED
                 # If the owner's alias leaves no room for the suffix, the device stays up in the end.
-                mark = {"ifalias": alias} if len(alias.encode()) <= _MAX_ALIAS_BYTES else {}
+                mark = (
+                    {"ifalias": alias} if len(alias.encode()) < _MAX_ALIAS_BYTES else {}
+                )  # pyroute2 appends a NUL byte
                 await route.link("set", index=index, state="up", **mark)
             # Other addresses go first, because deleting a primary address deletes the secondary ones with it.
             for other in await _addresses(route, index):
@@ -109,7 +112,7 @@ class DeviceAddresses:
             for address in await _addresses(route, index):
                 if address in LINK_LOCAL:
                     await _delete_address(route, index, address)
-            alias = (await route.link("get", index=index))[0].get("ifalias") or ""
+            alias = _alias((await route.link("get", index=index))[0])
             if alias.endswith(RAISED):
                 await route.link("set", index=index, state="down", ifalias=alias.removesuffix(RAISED))
 
@@ -131,3 +134,9 @@ async def _delete_address(route: AsyncIPRoute, index: int, address: IPv4Address)
     except NetlinkError as error:
         if error.code != errno.EADDRNOTAVAIL:  # another program has deleted it
             raise
+
+
+def _alias(link: Any) -> str:
+    """Return the alias of a device. An alias that is not UTF-8 counts as empty and is replaced."""
+    alias = link.get("ifalias")
+    return alias if isinstance(alias, str) else ""

@@ -40,7 +40,8 @@ from fractus_agent.links.pairing import LinkLost, Session
 from fractus_agent.links.traffic_rates import CONFIRMING_SHARE, MAX_CONFIRMATIONS, WINDOW_S, TrafficRates
 from fractus_agent.redirector.netlink import NetlinkError
 from fractus_agent.redirector.nft_maps import Endpoint, RedirectFailed
-from fractus_agent.redirector.redirector import Redirector
+from fractus_agent.redirector.redirector import QUIET_TIMEOUT_S, Redirector
+from fractus_agent.settings import DEFAULT_DRAIN_S
 
 log = logging.getLogger(__name__)
 
@@ -49,9 +50,8 @@ PROBE_INTERVAL_S = 3.0
 """Seconds between two bandwidth measurements of a link that is up."""
 PROBE_SAMPLES = 3
 """The best of this many measurements counts, because a probe that competes with traffic measures only the rest."""
-LEAVE_S = 2.0
-"""Time before the drone leaves a link's range at which its traffic moves back, in seconds: the default drain and the wait
-for a quiet moment."""
+MIN_LEAVE_S = 2.0
+"""Shortest time before the predicted end of a link's range at which traffic moves back to the cloud path, in seconds."""
 SHUTDOWN_DRAIN_S = 2.0
 """Time for connections to finish if the agent ends, or if no link is planned any more, in seconds."""
 DEFAULT_LATENCY_MS = 5.0
@@ -69,6 +69,7 @@ class DroneLinkController:
         telemetry: Returns the latest telemetry of the drone, None if unavailable.
         report: Called with the state of the links after each decision.
         record: Writes an audit record.
+        drain_s: Time for which connections stay on a path that their service has left, in seconds.
     """
 
     def __init__(
@@ -81,13 +82,15 @@ class DroneLinkController:
         telemetry: Callable[[], TelemetrySample | None],
         report: Callable[[DroneLinkReport], None],
         record: AuditRecorder,
+        drain_s: float = DEFAULT_DRAIN_S,
     ) -> None:
         self._redirector = redirector
         self._cloud = cloud
         self._telemetry = telemetry
         self._report = report
         self._record = record
-        self._settings = LinkSettings(drain_s=LEAVE_S)
+        # Old connections must have ended before the link breaks.
+        self._settings = LinkSettings(drain_s=max(MIN_LEAVE_S, drain_s + QUIET_TIMEOUT_S))
         self._connector = Connector(node, tls, self._run_session, self._on_link_change)
         self._range_model = RangeModel(self._settings)
         self._links: tuple[DirectLink, ...] = ()

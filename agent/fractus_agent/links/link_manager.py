@@ -126,7 +126,7 @@ class LinkManager:
         self._on_change()
 
     def _report_interface(self) -> None:
-        """Report status that does not come from decisions: of the edge node, and of an unusable interface."""
+        """Report the conditions that no link controller sets: those of an edge node and of an unusable interface."""
         links = self._direct_links.links
         if self._end == "node":
             drones = self._edge_controller.drones if self._edge_controller is not None else frozenset()
@@ -254,6 +254,7 @@ class LinkManager:
                         telemetry=self._telemetry,
                         report=self._on_drone_report,
                         record=record,
+                        drain_s=self._drain_s,
                     )
                     self._drone_controller = drone
                     drone.set_links(self._direct_links.links)

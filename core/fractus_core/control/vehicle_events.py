@@ -215,7 +215,7 @@ def _on_foreign_mode(update: StateUpdate) -> None:
         update.set(unconfirmed=None)
         if vehicle.mode.comes_down and state.authority is Authority.SYSTEM and not state.returning:
             update.follow_descent(_descent(vehicle.mode))  # the task that requested it has ended
-        return  # the system's own change, whose answers were lost
+        return  # the system requested this mode itself, but the acknowledgements were lost
     # A failsafe stays reported for the rest of the flight: a pilot may choose the mode long after it.
     begins = vehicle.failsafe and not state.failsafe_seen
     text = vehicle.failsafe_text if update.now - vehicle.failsafe_text_at < FAILSAFE_TEXT_S else ""

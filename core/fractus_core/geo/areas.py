@@ -225,7 +225,7 @@ def _turns(ring: Sequence[tuple[float, float]]) -> bool:
 
 
 def _beside_pole(rings: Iterable[Sequence[tuple[float, float]]]) -> BaseGeometry:
-    """Return the area enclosed by rings on a map of degrees, in which a pole is a line that no edge can pass."""
+    """Return the area enclosed by rings in the longitude/latitude plane. A pole is a line in this plane that no edge crosses."""
     exterior, *holes = rings
     # A hole may lie a whole turn from the start of the exterior.
     turned = (_closed(_shifted(hole, shift)) for hole in holes for shift in (-360.0, 0.0, 360.0))

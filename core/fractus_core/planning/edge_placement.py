@@ -43,7 +43,7 @@ class Location:
 
 
 def find_static(builder: PlanBuilder, component: Component) -> list[Location]:
-    """Return the locations of a component with their edge nodes, and reject the nearest nodes outside."""
+    """Return each location of a component with its edge nodes. Record the nearest nodes outside all locations as rejected."""
     located, known = builder.located.edge_nodes, builder.inventory.edge_nodes
     before = {(p.location, p.node) for p in builder.previous_placements if p.component == component.name}
     found = []

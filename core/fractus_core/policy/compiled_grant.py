@@ -64,7 +64,7 @@ class PolicyZone:
     schedule: tuple[ActiveTime, ...] = ()
 
     def in_force(self, time_s: float) -> bool:
-        """Return True if the policy may be in its validity window and the zone active at a time."""
+        """Return True if the policy is valid and its zone active at a time. With an uncertain clock: if both are possible."""
         if not self.rule.in_force(time_s):
             return False
         return active_at(self.schedule, time_s) or (

@@ -1,4 +1,4 @@
-"""Local processes with log files that end with the experiment."""
+"""Local processes, each with a log file. They are stopped at the end of the experiment."""
 
 from __future__ import annotations
 

@@ -182,7 +182,7 @@ class MissionFence:
             await self._restore(owned)
 
     async def hold(self) -> tuple[str, ...]:
-        """Restore what another station changed of the raised fence, and return the changes as sentences.
+        """Revert changes that another station made to the raised fence. Return a description of each change.
 
         Raises:
             AutopilotError: The fence cannot be restored, or the vehicle has other fence items.

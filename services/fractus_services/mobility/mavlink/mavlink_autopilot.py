@@ -245,7 +245,7 @@ class MavlinkAutopilot(Link):
             try:
                 await self.command(mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude_m, permit=permit, attempts=1)
             except AutopilotError as error:
-                # The acknowledgement was lost: a vehicle that takes off already refuses to take off again.
+                # A refusal may mean that only the acknowledgement was lost: a vehicle that is taking off refuses a second takeoff command.
                 if attempt and not error.link and await self._starts_to_fly():
                     return
                 if not error.link or attempt + 1 == ATTEMPTS:

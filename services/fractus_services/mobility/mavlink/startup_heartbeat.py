@@ -25,7 +25,7 @@ from fractus_services.mobility.mavlink.vehicle_identification import Source, rea
 log = logging.getLogger(__name__)
 
 TIMEOUT_S = 15.0
-"""Longest start with heartbeats. After that, the drone returns by its failsafe."""
+"""Longest time for which heartbeats are sent during the start. After that, the autopilot's failsafe brings the drone home."""
 
 RETRY_S = 1.0
 """Interval of reconnections and of messages to a silent autopilot."""

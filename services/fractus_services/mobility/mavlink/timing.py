@@ -225,7 +225,7 @@ class Timing:
         return now - self._heard_at
 
     def latency_s(self, now: float) -> float:
-        """Return the seconds of the vehicle's clock from its last position to the effect of a command sent now; infinite if unknown."""
+        """Return the total latency by the vehicle's clock, in seconds: from its last reported position until a command sent now takes effect. Infinite if unknown."""
         if now - self._heard_at > STALE_S or self.delay_s > MAX_DELAY_S:
             return math.inf
         age_s = self._present(now) - self._sampled

@@ -69,7 +69,7 @@ E2E_WORKERS = $(if $(filter current,$(FRACTUS_E2E_CLUSTER)),0,2)
 test: packages env lint ## The gate for every change: lint, types, unit, component and integration tests, attacks, kills, and a mission on an embedded cluster (20 min)
 	$(RUN) fractus cluster binaries
 	$(PYTEST) $(UNIT) -m "not slow" tests/component tests/unit
-	$(PYTEST) -n 4 $(GROUPS) -m "not slow" tests/integration
+	$(PYTEST) -n 3 $(GROUPS) -m "not slow" tests/integration
 	$(E2E_IMAGES)
 	$(PYTEST) -n $(E2E_WORKERS) $(GROUPS) -m "not slow" tests/e2e
 

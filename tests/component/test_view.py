@@ -101,7 +101,7 @@ def test_damage_is_told_and_what_was_before_it_stays(recording: Path) -> None:
     (problem,) = of(Problem, events)
     assert "damaged" in problem.text
     recording.write_bytes(b"no recording at all")
-    with pytest.raises(Damaged, match="no MCAP"):
+    with pytest.raises(Damaged, match="not an MCAP"):
         list(Tail(recording).read())
 
 
@@ -435,7 +435,7 @@ def test_the_command_says_what_is_wrong(tmp_path: Path, recording: Path, monkeyp
         ([str(recording), "--recordings", str(tmp_path)], "one of them"),
         ([str(recording), "--context", "k3s"], "one of them"),
         ([str(recording), "--token-file", str(tmp_path / "short")], "has no token: write 16"),
-        ([str(tmp_path / "text.mcap")], "is no MCAP file"),
+        ([str(tmp_path / "text.mcap")], "is not an MCAP file"),
         ([str(recording), "--listen", "8650"], "is not HOST:PORT"),
         ([str(recording), "--listen", "203.0.113.1:8650"], "choose another with --listen"),
     ):

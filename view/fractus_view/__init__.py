@@ -1,1 +1,1 @@
-"""The live view: one web page of flights, from recordings or a cluster, served by a small server that only reads."""
+"""Live view: a web page of flights from recordings or a cluster, served by a read-only server."""

@@ -1,4 +1,4 @@
-"""What a cluster says of its flights now: watches its objects, and says when they are not heard of any more."""
+"""Live flights of a cluster: watches its objects, and reports when their state is stale."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ from fractus_view.events import Applications, Areas, Contact, Event, Gone, Links
 from fractus_view.hub import Hub
 
 GATHER_S = 0.2
-"""How long changes are gathered before they are told."""
+"""Seconds for which changes are collected before they are published."""
 
 CONTACT_S = 1.0
-"""How often the API server is asked whether it is there."""
+"""Seconds between two connectivity checks of the API server."""
 
 ANSWER_S = 3.0
-"""An API server that takes longer is not there."""
+"""An API server that needs more seconds to respond counts as unreachable."""
 
 GRACE_S = 2.0
-"""For so long nothing is said: watches end and begin again all the time."""
+"""Seconds after which a silent watch is reported. Watches end and restart regularly."""
 
 T = TypeVar("T", bound=api.Resource)
 
 KINDS: tuple[type[api.Resource], ...] = (
     api.Drone, api.EdgeNode, api.Depot, api.Zone, api.Policy, api.Application, api.DeploymentPlan, api.DirectLink,
 )  # fmt: skip
-"""What is read."""
+"""Kinds that are watched."""
 
 
 class Cluster:
-    """The flights of a cluster; of it nothing is changed.
+    """Source of a cluster's flights. It only reads.
 
     Args:
         client: of the API server.
@@ -60,16 +60,16 @@ class Cluster:
         }
 
     def picture(self, id_: str) -> bytes | None:
-        """None: a cluster keeps no pictures."""
+        """Return None, because a cluster stores no pictures."""
         del id_
         return None
 
     def stream(self, last_id: str) -> AsyncIterator[bytes]:
-        """What holds, then what happens."""
+        """Yield the current state, then changes."""
         return self._hub.stream(last_id)
 
     async def check(self) -> None:
-        """Ask for everything once.
+        """List all objects once.
 
         Raises:
             KubeError: the API server cannot be reached, has not our kinds, or refuses them.
@@ -100,7 +100,7 @@ class Cluster:
             "kind",
         )
 
-    # What is so
+    # Current state
 
     def _informer(self, model: type[T], namespace: str) -> Informer[T]:
         def parse(body: Body) -> T:
@@ -163,10 +163,10 @@ class Cluster:
     def _all(self, model: type[T]) -> Iterator[T]:
         return self._informers[model].values()
 
-    # Whether it is so now
+    # Staleness
 
     async def _keep_contact(self) -> None:
-        """Ask the API server all the time: a watch that hears nothing looks like one where nothing happens."""
+        """Check the API server continuously, because a broken watch looks like a watch without changes."""
         while True:
             problem = await self._problem()
             now_ms = self._now_ms()
@@ -178,7 +178,7 @@ class Cluster:
             await asyncio.sleep(CONTACT_S)
 
     async def _problem(self) -> str | None:
-        """Why what is known may not be so any more; None: it is."""
+        """Return the reason why the state may be stale, or None."""
         unheard = [each for each in self._informers.values() if not (each.watching and each.synced.is_set())]
         try:
             await self._ask((unheard or list(self._informers.values()))[0].kind)

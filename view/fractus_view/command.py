@@ -25,7 +25,7 @@ from fractus_view.sources import Following, Replay, Source
 DEFAULT_LISTEN = "127.0.0.1:8650"
 MIN_TOKEN = 16
 TOKEN_PERIOD_S = 1.0
-"""How often a token's file is read again."""
+"""Seconds after which the token file is read again."""
 
 _REMEDIES = {
     0: "check the cluster and --context, or give recordings to replay",
@@ -35,7 +35,7 @@ _REMEDIES = {
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """Where to serve, by which further names, and to who knows the token in a file; None: a new one.
+    """Parse the options of the server: address, additional host names, and token file (None creates a token).
 
     Attributes:
         metrics: where Prometheus is answered; empty: nowhere.
@@ -137,21 +137,21 @@ def _token(path: Path) -> str:
 
 
 async def _follow_token(path: Path, shown: View) -> None:
-    """Take what the file holds now: who knows an earlier token may look no more."""
+    """Use the current token of the file. Earlier tokens become invalid."""
     told, failed = "", False
     while True:
         await asyncio.sleep(TOKEN_PERIOD_S)
         try:
             shown.token, problem, failed = _token(path), "", False
         except click.ClickException as error:
-            # A file that is just being written is empty for a moment.
+            # A file is empty for a moment while it is written.
             problem, failed = error.message if failed else told, True
             if problem:
-                # None that anyone knows.
+                # A random token that nobody knows.
                 shown.token = secrets.token_urlsafe(32)
         if problem != told:
             said = f"view: no one may look: {problem}" if problem else f"view: {path} has a token again"
-            with suppress(OSError):  # Who reads what it says may be gone.
+            with suppress(OSError):  # The reader of standard output may have ended.
                 click.echo(said, err=True)
         told = problem
 
@@ -160,7 +160,9 @@ def _replay(recordings: tuple[Path, ...]) -> Source:
     for path in recordings:
         with path.open("rb") as file:
             if file.read(len(MAGIC)) != MAGIC:
-                raise click.ClickException(f"{path} is no MCAP file; give one that a service wrote with --recordings")
+                raise click.ClickException(
+                    f"{path} is not an MCAP file; give a file that a service wrote with --recordings"
+                )
     return Replay(recordings)
 
 
@@ -202,7 +204,7 @@ async def _serve(source: Source, where: Site, metrics: Callable[[], Iterable[Met
             ) from error
         bound = runner.addresses[0][1]
         name = f"[{host}]" if ":" in host else host
-        # A token that was given is known already, and logs are read by more people.
+        # The user knows a given token, and more people can read logs.
         said = f"?token={served.token}" if given is None else "?token=..."
         click.echo(f"view: open http://{name}:{bound}/{said}")
         if not _loopback(host):

@@ -1,4 +1,4 @@
-"""What the page is told: one value for each thing that happened, and how it is written on the wire."""
+"""Events for the page, and their encoding."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 
 @dataclass(frozen=True, slots=True)
 class Fix:
-    """Where a drone was.
+    """Position of a drone.
 
     Attributes:
         drone: its node.
@@ -33,7 +33,7 @@ class Fix:
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """What a drone did: altitude above home, speed over ground, share of the battery that is left, and who flies.
+    """State of a drone: altitude above home, ground speed, remaining battery (0 to 1), and control authority.
 
     Attributes:
         seen_ms: when the drone itself said so; None: then.
@@ -52,7 +52,7 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class Gone:
-    """A drone is no more: all that was told of it is void."""
+    """A drone was removed. Its earlier events are void."""
 
     drone: str
     time_ms: int
@@ -60,7 +60,7 @@ class Gone:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What was decided on a call, or on the flight itself, with the policies that decided it."""
+    """Verdict on a call or on the flight, with the policies that decided."""
 
     drone: str
     time_ms: int
@@ -77,7 +77,7 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """A line of a log; levels as in foxglove.Log, from 1 (debug) to 5 (fatal)."""
+    """Log line. Levels are those of foxglove.Log, from 1 (debug) to 5 (fatal)."""
 
     drone: str
     time_ms: int
@@ -87,7 +87,7 @@ class Note:
 
 @dataclass(frozen=True, slots=True)
 class Areas:
-    """Zones, areas, planned paths and places of one origin: all that hold from now on, as GeoJSON features.
+    """Zones, areas, planned paths and places of one origin as GeoJSON features. They replace the earlier ones.
 
     Each has `kind` (zone, operationArea, corridor, path, depot or edgeNode) and `name` among its properties, and maybe
     `altitude`, a `component` or an `application` that it is of, and a `state`.
@@ -100,7 +100,7 @@ class Areas:
 
 @dataclass(frozen=True, slots=True)
 class Application:
-    """Where an application stands; `reason` is for programs, `text` for people."""
+    """State of an application. `reason` is for programs, `text` for people."""
 
     name: str
     drone: str
@@ -111,7 +111,7 @@ class Application:
 
 @dataclass(frozen=True, slots=True)
 class Applications:
-    """All applications that there are from now on."""
+    """All current applications."""
 
     time_ms: int
     applications: Sequence[Application]
@@ -119,12 +119,12 @@ class Applications:
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """A direct link that a drone may have with a node.
+    """Possible direct link between a drone and a node.
 
     Attributes:
-        lat: degrees, of the node.
-        lon: degrees, of the node.
-        traffic: the path that it takes now, cloud or direct; empty where that is not known.
+        lat: Latitude of the node in degrees.
+        lon: Longitude of the node in degrees.
+        traffic: Current path, `cloud` or `direct`; empty if unknown.
     """
 
     name: str
@@ -140,7 +140,7 @@ class Link:
 
 @dataclass(frozen=True, slots=True)
 class Links:
-    """All direct links that there may be from now on."""
+    """All currently possible direct links."""
 
     time_ms: int
     links: Sequence[Link]
@@ -148,7 +148,7 @@ class Links:
 
 @dataclass(frozen=True, slots=True)
 class Policy:
-    """What a policy says, in a phrase, and where; no zones: everywhere."""
+    """Summary of a policy and its zones. Without zones, the policy applies everywhere."""
 
     name: str
     text: str
@@ -157,7 +157,7 @@ class Policy:
 
 @dataclass(frozen=True, slots=True)
 class Policies:
-    """All policies that hold from now on."""
+    """All current policies."""
 
     time_ms: int
     policies: Sequence[Policy]
@@ -165,11 +165,11 @@ class Policies:
 
 @dataclass(frozen=True, slots=True)
 class Contact:
-    """Whether what is shown is so now. It is told every second or so, whether anything happens or not.
+    """Staleness of the shown state. Sent about once per second, even without changes.
 
     Attributes:
-        stale_since_ms: since when nothing is heard of where all this comes from; None: it is heard.
-        text: why, in one sentence.
+        stale_since_ms: Time since which the source has sent nothing; None if the state is current.
+        text: Reason in one sentence.
     """
 
     time_ms: int
@@ -179,7 +179,7 @@ class Contact:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A picture after privacy filters; `id` names it to the server."""
+    """Picture after privacy filters. The page requests it by `id`."""
 
     drone: str
     time_ms: int
@@ -188,7 +188,7 @@ class Picture:
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """Something that the user of the page should know of what they see, in one sentence."""
+    """Problem with the shown data, in one sentence."""
 
     time_ms: int
     text: str
@@ -197,21 +197,21 @@ class Problem:
 Event = Fix | State | Gone | Verdict | Note | Areas | Applications | Links | Policies | Contact | Picture | Problem
 
 RESET = '{"type":"reset"}'
-"""What was told before is void: all that holds follows."""
+"""Earlier events are void. The complete current state follows."""
 
 LIVE = '{"type":"live"}'
-"""Everything up to now was told; what follows happens now."""
+"""The current state is complete. Later events happen now."""
 
 END = '{"type":"end"}'
-"""A recording has no more."""
+"""The recording has ended."""
 
 
 def encode(event: Event) -> str:
-    """As an object of JSON, with the name of its type."""
+    """Return the event as a JSON object with the name of its type."""
     content = {"type": type(event).__name__.lower(), **asdict(event)}
     return json.dumps(content, separators=(",", ":"), allow_nan=False)
 
 
 def message(id_: str, encoded: Iterable[str]) -> bytes:
-    """Encoded events as one message of an event stream, which a client that comes back names as the last it heard."""
+    """Return encoded events as one message of the event stream. A client that reconnects sends its id."""
     return f"id: {id_}\ndata: [{','.join(encoded)}]\n\n".encode()

@@ -1,4 +1,4 @@
-"""What is known now, and what changed lately, for any number of pages: their number and speed cost no memory."""
+"""Current state and recent changes for any number of pages. Memory does not depend on their number or speed."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ from fractus_view.events import (
 )
 
 RECENT = 4_000
-"""Events that are kept for pages: one that falls behind by more, or comes back later, gets what is known by then."""
+"""Number of stored events. A page that is further behind receives the current state."""
 
 TRAIL = 600
-"""Positions of a drone's path that a new page gets."""
+"""Number of positions of a drone's path for a new page."""
 
 _KEPT = {Verdict: 300, Note: 200, Picture: 60, Problem: 10}
-"""How many of those that happen, rather than hold, a new page gets."""
+"""Number of past verdicts, notes and pictures for a new page."""
 
 _BATCH = 500
 
 
 class Trail:
-    """A drone's path in a bounded number of positions: the longer it is, the fewer for each minute."""
+    """Path of a drone with a bounded number of positions: a longer path has fewer positions per minute."""
 
     def __init__(self) -> None:
         self._fixes: list[Fix] = []
@@ -48,7 +48,7 @@ class Trail:
         self._last: Fix | None = None
 
     def add(self, fix: Fix) -> None:
-        """Take the newest position."""
+        """Append a position."""
         if not self._fixes or fix.time_ms - self._fixes[-1].time_ms >= self._spacing_ms:
             self._fixes.append(fix)
         self._last = fix
@@ -57,14 +57,14 @@ class Trail:
             self._spacing_ms *= 2
 
     def __iter__(self) -> Iterator[Fix]:
-        """Oldest first, the newest always among them."""
+        """Return the positions, oldest first, always including the newest."""
         yield from self._fixes
         if self._last is not None and self._last is not self._fixes[-1]:
             yield self._last
 
 
 class Hub:
-    """Takes events from one source, and gives them to pages.
+    """Distributes events of one source to pages.
 
     All pages read the same short memory of events, each from where it is. One that is slower than the source finds its
     place forgotten, and starts over with what is known: nothing is queued for anyone.
@@ -80,7 +80,7 @@ class Hub:
         self._news = asyncio.Event()
 
     def publish(self, events: Iterable[Event]) -> None:
-        """Tell all pages."""
+        """Publish events to all pages."""
         for event in events:
             self._remember(event)
             self._recent.append(encode(event))
@@ -105,7 +105,7 @@ class Hub:
                 self._happened[type(event)].append(event)
 
     def snapshot(self) -> Iterator[Event]:
-        """What a page needs that knows nothing."""
+        """Return the events for a new page."""
         yield from self._holding.values()
         for trail in self._trails.values():
             yield from trail
@@ -113,7 +113,7 @@ class Hub:
             yield from happened
 
     async def stream(self, last_id: str) -> AsyncIterator[bytes]:
-        """Messages of an event stream, for as long as they are read.
+        """Yield messages of the event stream while the client reads them.
 
         Args:
             last_id: of the last message that the page heard; empty if none.
@@ -138,7 +138,7 @@ class Hub:
         return f"{self._epoch}-{place}"
 
     def _place(self, last_id: str) -> int | None:
-        """Where a page was; None where it knows nothing of this hub."""
+        """Return the position of a page in the event stream; None if it has none in this hub."""
         epoch, _, place = last_id.partition("-")
         if epoch != self._epoch or not place.isdecimal() or int(place) > self._count:
             return None

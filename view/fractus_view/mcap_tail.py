@@ -1,4 +1,4 @@
-"""Reads MCAP files of JSON messages from the front, also while they are written."""
+"""Sequential reader of MCAP files with JSON messages, also while they are written."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from mcap.stream_reader import breakup_chunk
 
 MAGIC = b"\x89MCAP0\r\n"
 MAX_RECORD_BYTES = 100_000_000
-"""No record of ours is longer: a length beyond that is damage."""
+"""Maximum length of a record. A larger value means a damaged file."""
 
 _HEAD = struct.Struct("<BQ")
 
 
 class Damaged(ValueError):
-    """A file is no MCAP file, or not any more from some point on."""
+    """The file is not an MCAP file, or is damaged from some point on."""
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where a message is in its file: the record that it is in, and how many messages of that record come before it."""
+    """Position of a message: its record in the file, and the number of earlier messages in this record."""
 
     offset: int
     index: int
@@ -36,7 +36,7 @@ class Place:
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """One message; times are Unix milliseconds."""
+    """One message. Times are in Unix milliseconds."""
 
     topic: str
     schema: str
@@ -46,7 +46,7 @@ class Told:
 
 
 class Tail:
-    """The messages of one file in the order in which they were written.
+    """Reader of one file's messages in the order of writing.
 
     Args:
         path: the file; what was read of it is not read again.
@@ -63,7 +63,7 @@ class Tail:
         self._channels: dict[int, tuple[str, str]] = {}
 
     def read(self) -> Iterator[Told]:
-        """What is complete in the file by now, and was not read yet.
+        """Yield the complete messages that were not read yet.
 
         Raises:
             Damaged: the file cannot be read further, now or later.
@@ -76,7 +76,7 @@ class Tail:
                 if found is None:
                     return
                 opcode, body, self._offset = found
-                # Behind this is only the index.
+                # Only the index follows.
                 self.finished = opcode == Opcode.DATA_END
                 yield from self._messages(opcode, body, place)
 
@@ -94,7 +94,7 @@ class Tail:
 
 
 def message_at(path: Path, place: Place) -> dict[str, Any] | None:
-    """The content of one message; None where there is none.
+    """Return the content of one message, or None.
 
     Raises:
         Damaged: the file cannot be read there.
@@ -110,11 +110,11 @@ def message_at(path: Path, place: Place) -> dict[str, Any] | None:
 
 
 def _record(file: IO[bytes], offset: int) -> tuple[int, bytes, int] | None:
-    """Opcode and content of the record at a place, and where the next one begins; None while it is not complete."""
+    """Return opcode and content of the record at a position, and the position of the next one; None if it is incomplete."""
     if offset == 0:
         start = file.read(len(MAGIC))
         if start != MAGIC[: len(start)]:
-            raise Damaged(f"{file.name} is no MCAP file")
+            raise Damaged(f"{file.name} is not an MCAP file")
         offset = len(MAGIC)
     file.seek(offset)
     head = file.read(_HEAD.size)
@@ -128,7 +128,7 @@ def _record(file: IO[bytes], offset: int) -> tuple[int, bytes, int] | None:
 
 
 def _inside(opcode: int, body: bytes, path: Path) -> list[Any]:
-    """The records that a record holds: those of a chunk, itself, or none that matters here."""
+    """Return the records inside a chunk, or the record itself; empty for records without messages."""
     stream = ReadDataStream(BytesIO(body))
     try:
         match opcode:
@@ -141,7 +141,7 @@ def _inside(opcode: int, body: bytes, path: Path) -> list[Any]:
             case Opcode.MESSAGE:
                 return [Message.read(stream, len(body))]
     except Exception as error:
-        # The libraries that unpack a chunk raise what they like.
+        # The decompression libraries raise various exceptions.
         raise Damaged(f"{path} is damaged: {error}") from error
     return []
 

@@ -1,4 +1,4 @@
-"""Objects of a cluster as what the page shows of them."""
+"""Conversion of cluster objects to events."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from fractus_view.events import Application, Fix, Link, Policy, State
 from fractus_view.translation import who
 
 OVER = frozenset({"Completed", "Failed", "Invalid"})
-"""Phases of applications whose plan says nothing of what comes."""
+"""Phases in which an application's plan is no longer relevant."""
 
 _PHASES = {
     "inactive": "on the ground",
@@ -33,7 +33,7 @@ Feature = dict[str, Any]
 
 
 def fix(drone: api.Drone, now_ms: int) -> Fix | None:
-    """Where a drone is, as far as it said."""
+    """Return the reported position of a drone."""
     place = drone.status.position if drone.status is not None else None
     if place is None:
         return None
@@ -43,7 +43,7 @@ def fix(drone: api.Drone, now_ms: int) -> Fix | None:
 
 
 def state(drone: api.Drone, now_ms: int) -> State:
-    """What a drone does, as far as it said."""
+    """Return the reported state of a drone."""
     said = drone.status or api.nodes.DroneStatus()
     phase = _PHASES.get(said.flight_state)
     if phase is None:
@@ -64,7 +64,7 @@ def state(drone: api.Drone, now_ms: int) -> State:
 
 
 def application(given: api.Application) -> Application:
-    """Where an application stands."""
+    """Return the state of an application."""
     said = given.status
     ready = _condition(said.conditions if said is not None else (), "Ready")
     return Application(
@@ -77,7 +77,7 @@ def application(given: api.Application) -> Application:
 
 
 def link(given: api.DirectLink) -> Link:
-    """A direct link, and how it stands."""
+    """Return a direct link and its state."""
     spec, said = given.spec, given.status
     return Link(
         name=given.name,
@@ -93,7 +93,7 @@ def link(given: api.DirectLink) -> Link:
 
 
 def policy(given: api.Policy) -> Policy:
-    """What a policy says; one that is not ready says why instead."""
+    """Return the summary of a policy, or the reason why it is not ready."""
     ready = _condition(given.status.conditions if given.status is not None else (), "Ready")
     text = _phrase(given.spec)
     if ready is not None and ready.status == "False":
@@ -117,12 +117,12 @@ def _phrase(spec: PolicySpec) -> str:
 
 
 def zones(given: Iterable[api.Zone]) -> list[Feature]:
-    """Zones by name."""
+    """Return the zones by name."""
     return [_placed(zone, "zone") for zone in sorted(given, key=lambda zone: zone.name)]
 
 
 def places(edge_nodes: Iterable[api.EdgeNode], depots: Iterable[api.Depot]) -> list[Feature]:
-    """Depots as discs, edge nodes as points."""
+    """Return depots as circles and edge nodes as points."""
     found = [_placed(_disc(depot), "depot") for depot in sorted(depots, key=lambda depot: depot.name)]
     for node in sorted(edge_nodes, key=lambda node: node.name):
         ready = _condition(node.status.conditions if node.status is not None else (), "Ready")
@@ -137,7 +137,7 @@ def places(edge_nodes: Iterable[api.EdgeNode], depots: Iterable[api.Depot]) -> l
 def intentions(
     applications: Iterable[api.Application], plans: Mapping[tuple[str, str], api.DeploymentPlan]
 ) -> list[Feature]:
-    """Where applications that are not over may fly, and the paths that they mean to.
+    """Return operation areas and planned paths of applications that have not ended.
 
     Args:
         applications: all that are known.

@@ -1,4 +1,4 @@
-"""The web server of the view: it answers GET and HEAD, to who has the token."""
+"""Web server of the view. It responds to GET and HEAD requests with the token."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from fractus_view.sources import Source
 log = logging.getLogger(__name__)
 
 PAGE = Path(__file__).parent / "page"
-"""What `make view` builds of `view/web`."""
+"""Page built from `view/web` by `make view`."""
 
 HEADERS = {
     "Content-Security-Policy": (
@@ -33,25 +33,25 @@ HEADERS = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
 }
-"""Of every answer: the page loads nothing from elsewhere, and no other page shows or reads it."""
+"""Headers of every response: the page loads nothing from other servers, and other pages can neither embed nor read it."""
 
 WRITE_TIMEOUT_S = 30.0
-"""A page that takes nothing for so long is gone, or as good as gone."""
+"""Seconds after which a page that reads nothing is disconnected."""
 
 ALIVE_S = 15.0
-"""A comment is sent when nothing happens for so long, so that a connection that broke is noticed."""
+"""Seconds without events after which a comment is sent to detect broken connections."""
 
 MAX_STREAMS = 64
 
 HEALTH = "/healthz"
-"""The one path that needs no token."""
+"""The only path that needs no token."""
 
 _Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
 @dataclass
 class View:
-    """What is served.
+    """Configuration of the server.
 
     Attributes:
         source: of the events and pictures.
@@ -76,7 +76,7 @@ class View:
     _running: asyncio.Task[None] | None = None
 
     def application(self) -> web.Application:
-        """For aiohttp to run.
+        """Return the aiohttp application.
 
         Raises:
             OSError: the page was not built.
@@ -101,7 +101,7 @@ class View:
         self._answers.labels(str(response.status)).inc()
 
     async def _run(self, _application: web.Application) -> AsyncIterator[None]:
-        """Keep the source current while the server runs; without it the page would silently stand still."""
+        """Run the source while the server runs. If it fails, the server stops, because the page would silently stand still."""
         self._running = task = asyncio.create_task(self.source.run())
         task.add_done_callback(_ended)
         yield
@@ -109,7 +109,7 @@ class View:
         await asyncio.gather(task, return_exceptions=True)
 
     async def _health(self, _request: web.Request) -> web.Response:
-        """For who restarts a server that shows nothing new any more; it says nothing of what is shown."""
+        """Health check for restarts. It contains no data of flights."""
         task = self._running
         ended = task is None or (task.done() and (task.cancelled() or task.exception() is not None))
         return web.Response(status=503 if ended else 200, text="nothing new is shown any more\n" if ended else "ok\n")
@@ -123,7 +123,7 @@ class View:
 
     @web.middleware
     async def _only_our_name(self, request: web.Request, handler: _Handler) -> web.StreamResponse:
-        """A foreign name that leads here is how a web site would read the page from a user's browser (DNS rebinding)."""
+        """Refuse foreign host names, which a web site could use to read the page through a user's browser (DNS rebinding)."""
         if not _ours(request.headers.get(hdrs.HOST, ""), self.names):
             return web.Response(
                 status=421, text="call this server by its address, by localhost, or as --listen or --hostname says\n"
@@ -134,7 +134,7 @@ class View:
     async def _only_with_token(self, request: web.Request, handler: _Handler) -> web.StreamResponse:
         given = request.query.get("token")
         if request.path == "/" and given is not None and self._right(given):
-            # From here on the token is in no address, which histories and logs keep.
+            # Redirect, so that the address in histories and logs does not contain the token.
             response = web.Response(status=303, headers={hdrs.LOCATION: "/"})
             response.set_cookie(
                 _cookie(request), self.token, httponly=True, secure=_by_tls(request), samesite="Strict", path="/"
@@ -171,7 +171,7 @@ class View:
             await response.prepare(request)
             await self._send(request, response)
         except (ConnectionError, TimeoutError):
-            # It is gone, or too slow: it comes back and says what it heard last.
+            # The client is gone or too slow. It reconnects with its last event id.
             if request.transport is not None:
                 request.transport.abort()
         finally:
@@ -197,22 +197,22 @@ class View:
 
 def _ended(task: asyncio.Task[None]) -> None:
     if not task.cancelled() and task.exception() is not None:
-        log.error("view: nothing new is shown any more; start it again", exc_info=task.exception())
+        log.error("view: source failed, restart the view", exc_info=task.exception())
 
 
 def _cookie(request: web.Request) -> str:
-    """Its name has the port, for browsers give cookies to all servers of a host."""
+    """Return the name of the cookie. It contains the port, because browsers send cookies to all servers of a host."""
     _, _, port = request.headers.get(hdrs.HOST, "").rpartition(":")
     return f"fractus-view-{port if port.isdecimal() else 80}"
 
 
 def _by_tls(request: web.Request) -> bool:
-    """Whether the browser speaks TLS with who stands before this server; who says so wrongly spoils its own cookie."""
+    """Return True if the browser uses TLS to the proxy. A client that sets the header wrongly only breaks its own cookie."""
     return request.secure or request.headers.get("X-Forwarded-Proto", "").lower() == "https"
 
 
 def _ours(host: str, names: frozenset[str]) -> bool:
-    """Whether a Host header has an address, localhost, or one of some names."""
+    """Return True if a Host header contains an IP address, localhost or a permitted name."""
     name = host.rpartition(":")[0] if host.rpartition(":")[2].isdecimal() else host
     name = name.removeprefix("[").removesuffix("]").lower()
     if name in names | {"localhost"}:
@@ -239,7 +239,7 @@ def _static(name: str, data: bytes) -> _Handler:
         if name.endswith((".js", ".mjs"))
         else mimetypes.guess_type(name)[0] or "application/octet-stream"
     )
-    # A name below assets has a digest of its content in it.
+    # File names in assets contain a digest of the content.
     kept = "private, max-age=31536000, immutable" if name.startswith("assets/") else "no-store"
 
     async def answer(_request: web.Request) -> web.Response:

@@ -1,4 +1,4 @@
-"""Where events come from: recordings that are complete, or those that services write now."""
+"""Sources of events: complete recordings, or recordings that services write now."""
 
 from __future__ import annotations
 
@@ -21,38 +21,38 @@ from fractus_view.translation import Translation
 log = logging.getLogger(__name__)
 
 POLL_S = 0.5
-"""How often a directory is looked at; services write to it every 3 s."""
+"""Seconds between two scans of the directory. Services write every 3 s."""
 
 CURRENT_S = 60.0
-"""A file that nothing was written to for longer is of an earlier flight."""
+"""A file without writes for more seconds belongs to an earlier flight."""
 
 _BATCH = 1_000
 
 
 class Source(Protocol):
-    """Gives what the page shows."""
+    """Source of the page's events."""
 
     def stream(self, last_id: str) -> AsyncIterator[bytes]:
-        """Messages of an event stream, from the one after `last_id` where that is possible."""
+        """Yield messages of the event stream, after `last_id` if possible."""
         ...
 
     def picture(self, id_: str) -> bytes | None:
-        """A picture (JPEG) by its id; None where there is none. It may read a file."""
+        """Return a picture (JPEG) by its id, or None. The method may read a file."""
         ...
 
     async def run(self) -> None:
-        """Keep it current until cancelled."""
+        """Update the source until cancelled."""
         ...
 
 
 class Files:
-    """The files that pictures are in, by number."""
+    """Files with pictures, by number."""
 
     def __init__(self, paths: Sequence[Path] = ()) -> None:
         self.paths = list(paths)
 
     def picture(self, id_: str) -> bytes | None:
-        """A picture by the id that `Translation` gave it; None where it is gone or never was."""
+        """Return a picture by the id that `Translation` assigned, or None if it does not exist."""
         parts = id_.split("-")
         if len(parts) != 3 or not all(part.isascii() and part.isdecimal() and len(part) < 16 for part in parts):
             return None
@@ -65,7 +65,7 @@ class Files:
 
 
 class Replay:
-    """Recordings that are complete: each page gets all that they say, in the order of time, as fast as it reads.
+    """Complete recordings. Each page receives all events in chronological order.
 
     Args:
         paths: MCAP files, of one or more drones and services.
@@ -75,14 +75,14 @@ class Replay:
         self._files = Files(paths)
 
     def picture(self, id_: str) -> bytes | None:
-        """A picture of the recordings."""
+        """Return a picture of the recordings."""
         return self._files.picture(id_)
 
     async def run(self) -> None:
-        """Nothing changes."""
+        """Do nothing, because recordings do not change."""
 
     async def stream(self, last_id: str) -> AsyncIterator[bytes]:
-        """All events, with a number for each, and the end."""
+        """Yield all events with numbers, and the end."""
         told = int(last_id) if last_id.isascii() and last_id.isdecimal() and len(last_id) < 16 else 0
         events = itertools.islice(self.events(), told, None)
         first = [] if told else [RESET]
@@ -93,13 +93,13 @@ class Replay:
         yield message(str(told), [*first, END])
 
     def events(self) -> Iterator[Event]:
-        """Of all files, merged."""
+        """Yield the events of all files, merged by time."""
         found = (_events(Tail(path), Translation(number)) for number, path in enumerate(self._files.paths))
         return heapq.merge(*found, key=lambda event: event.time_ms)
 
 
 def _events(tail: Tail, translation: Translation) -> Iterator[Event]:
-    """What is in a file by now; that it is damaged is told like all the rest, once."""
+    """Yield the events of a file, and one `Problem` if it is damaged."""
     last_ms = 0
     try:
         for told in tail.read():
@@ -107,11 +107,11 @@ def _events(tail: Tail, translation: Translation) -> Iterator[Event]:
             yield from translation.events(told)
     except (Damaged, OSError) as error:
         tail.finished = True
-        yield Problem(last_ms, f"a recording cannot be read further: {error}")
+        yield Problem(last_ms, f"a recording is damaged and cannot be read further: {error}")
 
 
 class Following:
-    """Recordings that services write now, below one directory.
+    """Recordings below one directory that services write now.
 
     Args:
         directory: looked through with all directories in it.
@@ -125,15 +125,15 @@ class Following:
         self._problem = ""
 
     def picture(self, id_: str) -> bytes | None:
-        """A picture of the recordings, while its file is there."""
+        """Return a picture of the recordings while its file exists."""
         return self._files.picture(id_)
 
     def stream(self, last_id: str) -> AsyncIterator[bytes]:
-        """What is known, then what happens."""
+        """Yield the current state, then changes."""
         return self._hub.stream(last_id)
 
     async def run(self) -> None:
-        """Read on as files grow."""
+        """Read files as they grow."""
         while True:
             events = await asyncio.to_thread(self._read)
             if events:
@@ -157,7 +157,7 @@ class Following:
         return sorted(events, key=lambda event: event.time_ms)
 
     def _look(self) -> None:
-        """Open the files that are new, and leave those that are gone."""
+        """Open new files, and close removed ones."""
         written = dict(_written(self._directory))
         for path in self._open.keys() - written.keys():
             del self._open[path]
@@ -168,9 +168,9 @@ class Following:
 
 
 def _written(directory: Path) -> Iterator[tuple[Path, float]]:
-    """The recordings in a directory, and when something was last written to each."""
+    """Return the recordings in a directory with their modification times."""
     directory.stat()
     for path in directory.rglob("*.mcap"):
-        # The oldest are removed at any time.
+        # Services may remove the oldest files at any time.
         with contextlib.suppress(FileNotFoundError):
             yield path, path.stat().st_mtime

@@ -1,4 +1,4 @@
-"""Messages of recordings as events of the page."""
+"""Conversion of recorded messages to events."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from fractus_view.events import Areas, Event, Fix, Note, Picture, State, Verdict
 from fractus_view.mcap_tail import Told
 
 PERIOD_MS = 200
-"""Positions are recorded at 20 Hz and told at 5 Hz: between two of them the page draws a line."""
+"""Milliseconds between two published positions. They are recorded at 20 Hz and published at 5 Hz; the page draws lines between them."""
 
 STILL_MS = 1_000
-"""And at 1 Hz while they do not change."""
+"""Milliseconds between two published positions that do not change."""
 
 
 JUDGED = frozenset({"call", "monitor", "takeover"})
-"""Kinds of audit entries that are verdicts; what else happened is a line of the log."""
+"""Kinds of audit entries that are verdicts. Other entries become log lines."""
 
 
 class Translation:
-    """Of the messages of one file.
+    """Converter of one file's messages.
 
     Args:
         file: how the server knows the file that pictures are in.
@@ -34,7 +34,7 @@ class Translation:
         self._last: dict[str, Fix] = {}
 
     def events(self, told: Told) -> Iterator[Event]:
-        """What a message says; nothing if it is of no interest or has not the shape that its schema asks for."""
+        """Return the events of a message; empty if it is irrelevant or does not match its schema."""
         _, node, topic = told.topic.split("/") if told.topic.count("/") == 2 else ("", "", "")
         content, time_ms = told.content, told.time_ms
         match told.schema, topic:
@@ -110,7 +110,7 @@ def _areas(node: str, time_ms: int, content: Mapping[str, Any]) -> Iterator[Area
 
 
 def who(identity: object) -> str:
-    """Who an identity stands for, in a word: the component, or the last part."""
+    """Return a short name of an identity: the component, or the last part."""
     text = _text(identity)
     _, found, rest = text.partition("/component/")
     return rest.partition("/")[0] if found else text.rpartition("/")[2]
@@ -121,7 +121,7 @@ def _text(given: object) -> str:
 
 
 def _number(given: object) -> float | None:
-    """A finite number; None for anything else."""
+    """Return a finite number, or None for other values."""
     if isinstance(given, int | float) and not isinstance(given, bool) and math.isfinite(given):
         return float(given)
     return None

@@ -139,7 +139,10 @@ def server_span(
 
 @contextmanager
 def child_span(name: str) -> Iterator[Span]:
-    """Open a span below the span of the call."""
+    """Open a span below the span of the call. Without a call, for example in the motion monitor, nothing is traced."""
+    if not trace.get_current_span().get_span_context().is_valid:
+        yield trace.INVALID_SPAN
+        return
     span = _start_span(name, None, SpanKind.INTERNAL, {})
     try:
         yield span

@@ -7,6 +7,7 @@ import contextlib
 import json
 import logging
 import threading
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,8 @@ log = logging.getLogger(__name__)
 
 RESCAN_INTERVAL_S = 0.25
 """Interval at which the directory is scanned. It bounds the time until a removed Grant is revoked, on any file system."""
+SETTLE_S = 0.05
+"""Delay between the detection of a changed file and its reading."""
 _Stamp = tuple[int, int, int]
 
 
@@ -141,6 +144,10 @@ class GrantFiles:
         authorities_changed = self._verifier.reload_authorities()
         if stamps == self._stamps and not authorities_changed:
             return False
+        if self._stamps and stamps != self._stamps:
+            # A file that is copied in place is incomplete for a moment.
+            time.sleep(SETTLE_S)
+            stamps, complete = self._list()
         before = dict(self._loaded)
         for path in self._stamps.keys() - stamps.keys():
             self._loaded.pop(path, None)
@@ -168,15 +175,24 @@ class GrantFiles:
                     continue
                 except OSError as error:
                     complete = False
-                    log.critical("grants: cannot read file, it grants nothing (file=%s error=%s)", path, error)
+                    log.critical(
+                        "grants: cannot read file, it grants nothing (file=%s error=%s)",
+                        path,
+                        error,
+                        extra={"limit_by": str(path)},
+                    )
                     continue
                 stamps[path] = (stat.st_mtime_ns, stat.st_size, stat.st_ino)
+            complete = complete and self._directory.is_dir()
         except OSError as error:
             complete = False
             log.critical(
-                "grants: cannot read directory, nothing is granted (directory=%s error=%s)", self._directory, error
+                "grants: cannot read directory, nothing is granted (directory=%s error=%s)",
+                self._directory,
+                error,
+                extra={"limit_by": str(self._directory)},
             )
-        return stamps, complete and self._directory.is_dir()
+        return stamps, complete
 
     def _load(self, path: Path) -> ActiveGrant | None:
         """Return the Grant of a file. Revoke the previous Grant of the file if it is no longer valid."""

@@ -218,3 +218,12 @@ def test_rate_limiter_forgets_inactive_callers() -> None:
     for n in range(2500):
         limiter.take(f"caller-{n}", n * 0.01)
     assert len(limiter._buckets) < 1100
+
+
+def test_directory_error_during_scan_keeps_service_running_and_grants_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = grant_files(tmp_path)
+    monkeypatch.setattr("pathlib.Path.is_dir", lambda _path: (_ for _ in ()).throw(OSError(5, "Input/output error")))
+    files.scan()
+    assert not files.active

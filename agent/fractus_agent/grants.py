@@ -167,7 +167,7 @@ class GrantSynchronizer:
     """Mirrors the node's Grants to disk, and reports their phases.
 
     A file is removed only if the operator's complete list does not contain its Grant, or if the operator did not sign
-    the Grant. While the API server is unreachable, all files stay, so that a flight goes on.
+    the Grant. While the API server is unreachable, all files stay, so that a flight continues.
 
     Args:
         store: The node's objects at the API server.

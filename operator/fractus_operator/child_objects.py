@@ -145,7 +145,7 @@ class ChildObjects:
         except KubeError as error:
             if error.status not in _INADMISSIBLE:
                 raise
-            # The present content is not admitted any more, so that it must be replaced first.
+            # Admission would refuse the current content, so it must be replaced first.
             await self._store.apply(kind, desired)
             await self._store.take_ownership(kind, key_of(desired))
         self._record(kind, desired, await self._store.apply(kind, desired))
@@ -248,7 +248,7 @@ class ChildObjects:
             await self._delete(kinds.GRANT, grant)
 
     async def _delete(self, kind: Kind, body: Body, *, orphan: bool = False) -> bool:
-        """Delete a child object. Return True if it does not exist any more."""
+        """Delete a child object. Return True if it is gone."""
         if "deletionTimestamp" in body["metadata"]:
             return False
         logger.info("child objects: deleting (kind=%s name=%s)", kind.name, body["metadata"]["name"])

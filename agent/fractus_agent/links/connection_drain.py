@@ -1,4 +1,4 @@
-"""Planned switches in progress: old connections finish on their path in the background, while decisions go on."""
+"""Planned switches in progress: old connections finish on their path in the background while decisions continue."""
 
 from __future__ import annotations
 

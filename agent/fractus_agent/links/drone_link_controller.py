@@ -53,7 +53,7 @@ PROBE_SAMPLES = 3
 MIN_LEAVE_S = 2.0
 """Shortest time before the predicted end of a link's range at which traffic moves back to the cloud path, in seconds."""
 SHUTDOWN_DRAIN_S = 2.0
-"""Time for connections to finish if the agent ends, or if no link is planned any more, in seconds."""
+"""Seconds for which connections may finish if the agent ends or no link is planned."""
 DEFAULT_LATENCY_MS = 5.0
 """Expected latency of a link before its first measurement, in milliseconds."""
 

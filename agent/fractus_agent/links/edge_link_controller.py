@@ -105,7 +105,7 @@ class EdgeLinkController:
         """Redirect the drone's calls while its session lasts, and send it the routes.
 
         Raises:
-            LinkLost: No DirectLink names the drone any more, and its grace time is over.
+            LinkLost: The DirectLink of the drone was deleted, and the grace period has ended.
         """
         sent: dict[str, int] | None = None
         self._record("drone", {"drone": session.peer, "linked": True})

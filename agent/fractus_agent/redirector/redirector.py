@@ -143,7 +143,7 @@ class Redirector:
         for service in sorted(wanted):
             # A service keeps its number, because its connections carry it as their mark.
             numbers[service] = self._numbers.get(service) or self._new_number(numbers)
-        # Connections of removed services on the cloud path go on.
+        # Connections of removed services on the cloud path stay open.
         removed = self._redirects.keys() - wanted
         ended = self._left_paths({service: self._numbers[service] for service in removed})
         redirects = {virtual: target for virtual, target in self._redirects.items() if virtual in numbers}

@@ -54,7 +54,7 @@ class NodeObjectFile:
         self._set_condition(problem)
 
     def clear(self, problem: str = "") -> None:
-        """Empty the file, because its content is not valid any more.
+        """Empty the file, because its content is outdated.
 
         The file is not removed: without it the services would use the owner's description, which may be older and
         describe a camera with a smaller footprint.

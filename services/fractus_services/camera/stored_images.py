@@ -101,7 +101,7 @@ class StoredImages:
             record: Record that `retrieve` returned, with all filters that were applied.
 
         Raises:
-            Refused: The image may not be returned any more, or requires more filters than were applied.
+            Refused: Current policies forbid the image, or require more filters than were applied.
         """
         if owner_of(grant) != owner:
             raise PolicyDenied(

@@ -38,7 +38,9 @@ def main() -> int:
     parser.add_argument("--json", type=Path, help="write the claims to a file")
     options = parser.parse_args()
     seeds = range(options.seed, options.seed + (20 if options.quick else options.flights))
-    wrong, flew, deepest_m = 0, 0, 0.0
+    wrong = 0
+    flew = 0
+    deepest_m = 0.0
     with ProcessPoolExecutor(max_workers=os.cpu_count()) as pool:
         for done, account in enumerate(pool.map(fly, seeds), start=1):
             flew += account.flew

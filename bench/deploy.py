@@ -81,7 +81,8 @@ def path_of(body: Body, namespace: str = "default") -> str:
 
 def elsewhere(rng: random.Random, depot: Body) -> Body:
     """A place 5 to 100 km from the example's."""
-    bearing, distance_m = rng.uniform(0, 2 * math.pi), math.sqrt(rng.uniform(5e3**2, 1e5**2))
+    bearing = rng.uniform(0, 2 * math.pi)
+    distance_m = math.sqrt(rng.uniform(5e3**2, 1e5**2))
     lat = depot["lat"] + distance_m * math.cos(bearing) / 111_000
     lon = depot["lon"] + distance_m * math.sin(bearing) / (111_000 * math.cos(math.radians(lat)))
     return {"lat": round(lat, 6), "lon": round(lon, 6)}
@@ -93,7 +94,8 @@ class Scene:
     def __init__(self, api: Api) -> None:
         self._api = api
         self._rng = random.Random(SEED)
-        self._drone, (self._depot,) = documents("drone.yaml")[0], documents("depot.yaml")
+        self._drone = documents("drone.yaml")[0]
+        (self._depot,) = documents("depot.yaml")
         self._edges = documents("edge-nodes.yaml")
         self.nodes = 0
         for name in (SYSTEM, NODES, "plain"):
@@ -390,8 +392,10 @@ class Bench:
 
     def _at_once(self, found: Measured) -> None:
         """Fifty applications at once: who ends bound, who waits, and whether anything was lost or made twice."""
-        namespace, names = self._namespace(), [f"app-{i:02d}" for i in range(AT_ONCE)]
-        cpu, began = self.operator.cpu_s(), time.monotonic()
+        namespace = self._namespace()
+        names = [f"app-{i:02d}" for i in range(AT_ONCE)]
+        cpu = self.operator.cpu_s()
+        began = time.monotonic()
         with ThreadPoolExecutor(8) as pool:
             for _ in pool.map(
                 lambda n: self._api.apply(path_of(application(n, namespace), namespace), application(n, namespace)),
@@ -495,7 +499,8 @@ def table(rows: Iterable[Measured]) -> Iterator[str]:
 def claims(rows: list[Measured]) -> list[dict[str, object]]:
     """What must hold at the largest number of nodes, and whether it does."""
     last = rows[-1]
-    bound, plain = statistics.median(last.fractus_s), statistics.median(last.plain_s)
+    bound = statistics.median(last.fractus_s)
+    plain = statistics.median(last.plain_s)
     faults = [f"{r.nodes} nodes: {fault}" for r in rows for fault in r.faults]
     for fault in faults:
         print(f"FAULT {fault}")

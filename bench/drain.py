@@ -58,7 +58,8 @@ async def measure(switches: int) -> list[dict[str, object]]:
         for rate in RATES:
             ours, calls_s = await lost(world, redirector, rate, switches, planned=True)
             theirs, _ = await lost(world, redirector, rate, max(switches // 4, 4), planned=False)
-            a_switch, at_once = ours / switches, theirs / max(switches // 4, 4)
+            a_switch = ours / switches
+            at_once = theirs / max(switches // 4, 4)
             holds = a_switch == 0 if rate <= SAFE_RATE else a_switch <= 1
             target = "none" if rate <= SAFE_RATE else "at most one"
             name = f"calls lost in a planned switch, {rate} calls/s"

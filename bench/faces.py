@@ -144,7 +144,8 @@ def hundred(width_px: float, quick: bool) -> Iterator[Scene]:
 
 
 def recall_table(quick: bool) -> dict[tuple[str, int], Tally]:
-    detector, tallies = CascadeDetector(), {}
+    detector = CascadeDetector()
+    tallies = {}
     print(f"{'faces':<12}{'width px':>9}{'scenes':>8}{'ours':>8}{'hidden':>8}{'tutorial':>10}")
     for name, series in (("astronaut", astronauts), ("hundred", hundred)):
         for width in (24, DEFAULT_MIN_PX) if quick else (16, 24, 32, 40, DEFAULT_MIN_PX, 64, 96):
@@ -192,7 +193,8 @@ def claims(tallies: dict[tuple[str, int], Tally]) -> list[dict[str, object]]:
         trusted = [tally for (series, width), tally in tallies.items() if series == name and width >= DEFAULT_MIN_PX]
         whole = Tally(*(sum(getattr(t, field) for t in trusted) for field in ("scenes", "ours", "theirs", "hidden")))
         for field, what in (("ours", "found"), ("hidden", "hidden")):
-            ours, theirs = whole.share(field), whole.share("theirs")
+            ours = whole.share(field)
+            theirs = whole.share("theirs")
             made.append(
                 {
                     "name": f"{name}: faces {what} from {DEFAULT_MIN_PX} px on, every direction and light", "ours": round(ours, 4),

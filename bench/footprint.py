@@ -196,14 +196,18 @@ class Node:
     """
 
     def __init__(self, folder: Path, server: ApiServer, images: Images, processes: Processes) -> None:
-        self._folder, self._server, self._images, self._processes = folder, server, images, processes
+        self._folder = folder
+        self._server = server
+        self._images = images
+        self._processes = processes
         self._ports = {name: free_port() for name in ("mobility", "camera", "world", "scene")}
         self._links = [f"tcp:127.0.0.1:{free_port()}" for _ in range(3)]
         self.pids: dict[str, int] = {}
 
     def start(self) -> None:
         """Bring everything up, and into the air."""
-        etc, state = self._folder / "etc", self._folder / "state"
+        etc = self._folder / "etc"
+        state = self._folder / "state"
         for folder in (etc, state):
             folder.mkdir()
         pki = StandalonePki.create(self._folder / "pki")

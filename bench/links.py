@@ -23,7 +23,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "integration"))
 from linked_world import linked_world, until
 
 TICKS = os.sysconf("SC_CLK_TCK")
-MEMORY_LIMIT_MB, PROCESSOR_LIMIT = 60.0, 1.0
+MEMORY_LIMIT_MB = 60.0
+PROCESSOR_LIMIT = 1.0
 RADIO_LIBRARIES = {"pyroute2", "nl80211", "iw", "wpa_supplicant", "dbus", "scapy"}
 """Which no agent is to load on a node without a radio: they take a fifth of its memory."""
 
@@ -61,7 +62,8 @@ def main() -> None:
     options = parser.parse_args()
     seconds = 8.0 if options.quick else 30.0
     with tempfile.TemporaryDirectory() as folder, linked_world(Path(folder)) as world:
-        edge, drone = world.edge("e1", 20.0), world.drone()
+        edge = world.edge("e1", 20.0)
+        drone = world.drone()
         link = world.link(drone, edge)
         world.serve()
         for agent in (edge, drone):
@@ -74,7 +76,8 @@ def main() -> None:
         client = world.client(drone, 1_000_000, 0.1)
         until(lambda: client.by == "e1", "an answer over the link", world)
         time.sleep(5.0)
-        busy, busy_edge = share(drone.pid, seconds), share(edge.pid, seconds)
+        busy = share(drone.pid, seconds)
+        busy_edge = share(edge.pid, seconds)
         memory = private_mb(drone.pid)
         drone.stop()
         loaded = {module.partition(".")[0] for module in (drone.folder / "modules.txt").read_text().split()}

@@ -118,7 +118,8 @@ class Site:
     def nodes(self) -> Iterator[tuple[str, str, Body]]:
         """Class, name and spec of its nodes: one drone or two, the example's edge nodes, and others about."""
         rng = random.Random(SEED + self.number)
-        drone, edges = documents("drone.yaml")[0]["spec"], documents("edge-nodes.yaml")
+        drone = documents("drone.yaml")[0]["spec"]
+        edges = documents("edge-nodes.yaml")
         drones = 2 - self.number % 2
         for i in range(NODES_PER_SITE):
             name = f"site-{self.number}-{i}"
@@ -252,7 +253,8 @@ class Seen:
         """Whether an application as it was applied has a plan, or was told why it has none yet."""
         metadata = body["metadata"]
         key = (metadata["namespace"], metadata["name"])
-        plan, present = self.plans.get(key), self.applications.get(key)
+        plan = self.plans.get(key)
+        present = self.applications.get(key)
         if plan is not None and self._says(plan, metadata):
             return True
         if present is None or present["metadata"]["uid"] != metadata["uid"]:
@@ -420,7 +422,8 @@ class Load:
         found = [f"{name} was lost" for namespace, name in there.keys() - self._seen.applications.keys()]
         for key, body in self._seen.applications.items():
             status = body.get("status") or {}
-            phase, message = status.get("phase"), status.get("message")
+            phase = status.get("phase")
+            message = status.get("message")
             planned = key in self._seen.plans and phase in {"Waiting", "Running"}
             refused = phase == "Queued" and any(c["reason"] == "DroneBusy" for c in status["conditions"])
             if key not in there or not (planned or refused) or not self._seen.answered(body):
@@ -507,7 +510,8 @@ class Bench:
         wait_until(self._kinds_served, "the kinds to be served", timeout_s=60)
         self._scene = Scene(self._api, nodes, applications)
         self._log = directory / "operator.log"
-        kubeconfig, settings = cluster.kubeconfig_of(USER), {"FRACTUS_LOG_FORMAT": "json"}
+        kubeconfig = cluster.kubeconfig_of(USER)
+        settings = {"FRACTUS_LOG_FORMAT": "json"}
         self._operator = Operator(kubeconfig, self._log, settings)
         self._requests = Requests(cluster.audit_log)
         self._seen = Seen(self._api)
@@ -533,7 +537,8 @@ class Bench:
 
     def measure(self, duration_s: float, period_s: float) -> Measured:
         """Create all, change for some time, let it come to rest, look."""
-        found, load = self.found, self._load
+        found = self.found
+        load = self._load
         self._operator.start()
         began = time.monotonic()
         load.create_all()
@@ -544,7 +549,9 @@ class Bench:
         wait_until(self._nodes_furnished, "nodes to have their objects", timeout_s=600, pause_s=1.0)
         self._alone()
         load.done.clear()
-        began, cpu, since = time.monotonic(), self._operator.cpu_s(), datetime.now(UTC)
+        began = time.monotonic()
+        cpu = self._operator.cpu_s()
+        since = datetime.now(UTC)
         stop = threading.Event()
         sampling = threading.Thread(target=self._sample, args=(stop,))
         sampling.start()
@@ -555,7 +562,8 @@ class Bench:
         found.cpu = (self._operator.cpu_s() - cpu) / found.duration_s
         found.converged_s = self._converge()
         self._count(since, datetime.now(UTC))
-        found.changes, found.answers = load.changes, dict(load.done)
+        found.changes = load.changes
+        found.answers = dict(load.done)
         self._rest()
         found.faults = load.faults
         found.lasting += load.differences()
@@ -578,7 +586,8 @@ class Bench:
     def _alone(self) -> None:
         """Count what one change costs, each alone."""
         # The whole example, where there is a drone for each, so that no other application takes what a deletion leaves.
-        load, slots = self._load, self._scene.slots[:: 2 * len(_MIX)][:ALONE]
+        load = self._load
+        slots = self._scene.slots[:: 2 * len(_MIX)][:ALONE]
         for change in (load.path, load.limit, load.label, load.policy, load.delete, load.create):
             since = datetime.now(UTC)
             for slot in slots:
@@ -601,7 +610,8 @@ class Bench:
         """Count the API requests of an idle cluster."""
         self.found.warnings, _ = self._warnings(0)
         time.sleep(SETTLE_S)
-        read, since = self._log.stat().st_size, datetime.now(UTC)
+        read = self._log.stat().st_size
+        since = datetime.now(UTC)
         time.sleep(QUIET_S)
         events = self._requests.between(since, datetime.now(UTC))
         self.found.at_rest = collections.Counter(named(event) for event in events if not is_upkeep(event))

@@ -22,7 +22,8 @@ from fractus_cluster.pki import Authority, Credential, write_private
 from fractus_cluster.ports import free_port
 
 PROGRAMS = ("etcd", "kube-apiserver", "kube-controller-manager", "kube-scheduler", "kwok")
-NODE_LABEL, NODE_VALUE = "type", "kwok"
+NODE_LABEL = "type"
+NODE_VALUE = "kwok"
 
 _START_TIMEOUT_S = 60.0
 _STOP_TIMEOUT_S = 10.0
@@ -144,7 +145,8 @@ class LoopbackCluster:
             self._processes.append(process)
 
     def _etcd(self) -> list[str]:
-        self._etcd_url, peer = f"http://127.0.0.1:{free_port()}", f"http://127.0.0.1:{free_port()}"
+        self._etcd_url = f"http://127.0.0.1:{free_port()}"
+        peer = f"http://127.0.0.1:{free_port()}"
         return [
             f"--data-dir={self._directory / 'etcd'}",
             f"--listen-client-urls={self._etcd_url}",

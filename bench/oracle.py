@@ -26,8 +26,10 @@ from homeward_flights import WaysHome
 from parameter_faults import parameter_faults
 from policy_flights import Tally, flights
 
-DRONES, REQUESTS = 500, 3
-WATCH_EVERY, WATCHED = 8, 12
+DRONES = 500
+REQUESTS = 3
+WATCH_EVERY = 8
+WATCHED = 12
 HOME_EVERY = 8
 VEHICLES = 100
 
@@ -40,7 +42,10 @@ def main() -> int:
     parser.add_argument("--json", type=Path, help="write the claims to a file, after every batch")
     options = parser.parse_args()
     cases = 3000 if options.quick else options.cases
-    whole, vehicles, seed, begun = Tally(), 0, options.seed, time.monotonic()
+    whole = Tally()
+    vehicles = 0
+    seed = options.seed
+    begun = time.monotonic()
     while whole.asked < cases:
         ways_home = WaysHome(seed, HOME_EVERY)
         found = flights(seed, DRONES, requests=REQUESTS, watch_every=WATCH_EVERY, watched=WATCHED, returns=ways_home)

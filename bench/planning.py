@@ -139,7 +139,8 @@ def inventory(nodes: int, candidates: int) -> Inventory:
 
 def _outside(rng: random.Random, nodes: int) -> tuple[float, float]:
     """Somewhere in a land that grows with the number of nodes, but not near the streets."""
-    bearing, reach = rng.uniform(0, 2 * math.pi), 50.0 * math.sqrt(nodes)
+    bearing = rng.uniform(0, 2 * math.pi)
+    reach = 50.0 * math.sqrt(nodes)
     distance = math.sqrt(rng.uniform(CLEAR_M**2, (CLEAR_M + reach) ** 2))
     return distance * math.cos(bearing), distance * math.sin(bearing)
 
@@ -326,7 +327,8 @@ def repeated(make: Callable[[], Generator[str, None, object]], times: int) -> tu
 
 def measure(nodes: int, candidates: int, times: int, application: Application) -> tuple[Measured, Measured, bool]:
     """Ours, the linear method, and whether they made the same plan."""
-    stock, settings = inventory(nodes, candidates), Settings()
+    stock = inventory(nodes, candidates)
+    settings = Settings()
     stock.located()
     plan, total, phases = repeated(lambda: plan_in_steps(application, stock, settings), times)
     ours = Measured(nodes, candidates, total, phases)

@@ -26,13 +26,16 @@ def main() -> int:
     parser.add_argument("--json", type=Path, help="write the claims to a file")
     options = parser.parse_args()
     cases = 1000 if options.quick else options.cases
-    wrong, undecided, begun = 0, 0, time.monotonic()
+    wrong = 0
+    undecided = 0
+    begun = time.monotonic()
     for number in range(cases):
         seed = options.seed + number
         try:
             found = deviation(seed)
         except Undecided:
-            undecided, found = undecided + 1, None
+            undecided = undecided + 1
+            found = None
         if found is not None:
             wrong += 1
             print(f"\nWRONG seed {seed}: {found}", flush=True)

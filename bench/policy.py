@@ -64,7 +64,8 @@ def access_policies(count: int, rng: random.Random) -> list[dict[str, Any]]:
     """Return denials in scattered areas, none of which contains home."""
     found = []
     for i in range(count):
-        angle, away = rng.uniform(0, 2 * math.pi), rng.uniform(200, 4000)
+        angle = rng.uniform(0, 2 * math.pi)
+        away = rng.uniform(200, 4000)
         zone = {"name": f"z{i}", "area": square(away * math.cos(angle), away * math.sin(angle), rng.uniform(20, 90))}
         spec = {"type": "AccessControl", "kind": "denial", "methods": ["Hover"], "selector": {"zones": [f"z{i}"]}}
         found.append({"name": f"p{i}", "spec": spec, "zones": [zone]})
@@ -86,7 +87,8 @@ def fences(count: int, rng: random.Random) -> list[dict[str, Any]]:
     zones = []
     side = math.ceil(math.sqrt(count))
     for i in range(count):
-        x, y = (i % side - side / 2 + 0.5) * 90, (i // side - side / 2 + 0.5) * 90
+        x = (i % side - side / 2 + 0.5) * 90
+        y = (i // side - side / 2 + 0.5) * 90
         if math.hypot(x, y) < 300:
             x += 20_000
         zones.append({"name": f"z{i}", "area": square(x, y, rng.uniform(10, 40))})
@@ -185,7 +187,8 @@ class Case:
 def cases() -> list[Case]:
     """Return the cases to measure."""
     rng = random.Random(8)
-    goto, velocity = Call("Goto", GotoArgs(*FRAME.latlon(60, 80), 20)), Call("SetVelocity", VelocityArgs(3.0, 4.0))
+    goto = Call("Goto", GotoArgs(*FRAME.latlon(60, 80), 20))
+    velocity = Call("SetVelocity", VelocityArgs(3.0, 4.0))
     return [
         Case("100 AccessControl policies", access_policies(100, rng), Call("Hover"), 25.0, 100.0),
         Case("Goto, one geofence and one limit", fence_and_limit(), goto, 200.0),

@@ -23,9 +23,12 @@ from fractus_radio.medium import Medium, Station
 from fractus_radio.propagation import Propagation
 
 MODULES = ("core", "internet", "mobility", "network", "propagation", "wifi")
-POWER_DBM, EXPONENT, FADING = 16.02, 3.0, 1.5
+POWER_DBM = 16.02
+EXPONENT = 3.0
+FADING = 1.5
 HEADERS_BYTES = 8 + 20 + 14
-TOLERANCE, SLACK_MBPS = 0.15, 0.15
+TOLERANCE = 0.15
+SLACK_MBPS = 0.15
 """A row holds within this share of ns-3's figure, or this many Mbit/s: at the soft edge next to nothing arrives."""
 
 
@@ -48,7 +51,8 @@ class Scene:
     both: bool = False
 
 
-HARD, SOFT = Propagation(POWER_DBM, EXPONENT), Propagation(POWER_DBM, EXPONENT, FADING)
+HARD = Propagation(POWER_DBM, EXPONENT)
+SOFT = Propagation(POWER_DBM, EXPONENT, FADING)
 DECLARED = Propagation.reaching(80.0)
 SCENES = (
     Scene("10 m", 10, HARD, 14.67),
@@ -70,14 +74,16 @@ SCENES = (
 
 def ours(scene: Scene, seconds: float) -> float:
     """Mbit/s of payload that arrive in the model of `fractus_radio`."""
-    medium, addresses = Medium(scene.propagation, 1), {"a": b"\x02aaaaa", "b": b"\x02bbbbb"}
+    medium = Medium(scene.propagation, 1)
+    addresses = {"a": b"\x02aaaaa", "b": b"\x02bbbbb"}
     for name, east in (("a", 0.0), ("b", scene.distance_m)):
         medium.add(name, Station((east, 0.0, 0.0), addresses[name], "net"))
     frames = {
         name: addresses[other] + addresses[name] + b"\x08\x00" + bytes(scene.size + HEADERS_BYTES - 14)
         for name, other in (("a", "b"), ("b", "a"))
     }
-    now_s, arrived = 0.0, 0
+    now_s = 0.0
+    arrived = 0
     while now_s < seconds:
         for name in ("a", "b") if scene.both else ("a",):
             while len(medium.stations[name].queue) < 10:
@@ -126,7 +132,8 @@ def main() -> None:
     options = parser.parse_args()
     seconds = 3.0 if options.quick else 10.0
     with ExitStack() as stack:
-        program, why = None, "not with --quick"
+        program = None
+        why = "not with --quick"
         if not options.quick:
             program, why = compiled(Path(stack.enter_context(tempfile.TemporaryDirectory())))
         if program is None:

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from fractus_runtime.mavlink_codec import Endpoint
     from fractus_services.recording.recorder import FlightWriter
 
-MAX_CPU, MAX_MB = 2.0, 16.0
+MAX_CPU = 2.0
+MAX_MB = 16.0
 """Percent of a core and megabytes that recording may add."""
 
 RATES = {
@@ -74,7 +75,9 @@ def main() -> int:
     from fractus_services.mobility.rpc import server as _server  # noqa: F401, PLC0415
     from fractus_services.recording.segment_directory import SegmentDirectory  # noqa: PLC0415
 
-    vehicle, companion, before_mb = Endpoint(1, 1), Endpoint(244, 191), resident_mb()
+    vehicle = Endpoint(1, 1)
+    companion = Endpoint(244, 191)
+    before_mb = resident_mb()
     from fractus_services.recording.recorder import FlightWriter  # noqa: PLC0415
 
     with tempfile.TemporaryDirectory() as directory:

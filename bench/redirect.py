@@ -121,7 +121,8 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="fewer switches of the comparator")
     parser.add_argument("--json", type=Path, help="write the claims to this file")
     options = parser.parse_args()
-    switches, few = 1000, 2 if options.quick else 5
+    switches = 1000
+    few = 2 if options.quick else 5
     claims = []
     sides = [Side(f"fxbench{os.getpid()}{end}") for end in ("c", "s")]
     try:
@@ -133,7 +134,8 @@ def main() -> None:
             for count in SIZES:
                 mine = ours_ms(sides, count, switches)
                 thesis = theirs_ms(sides, count, few if count <= 16 else 1)
-                middle, slow = statistics.median(mine), statistics.median(thesis)
+                middle = statistics.median(mine)
+                slow = statistics.median(thesis)
                 fast = middle < 2.0 if count == 64 else slow >= 100 * middle if count == 16 else middle < slow
                 target = {64: "p50 under 2 ms", 16: "100 times faster"}.get(count, "faster")
                 claims.append(claim(f"switch of {count} services, p50{beside}", middle, slow, target, fast))

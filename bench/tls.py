@@ -146,13 +146,15 @@ class Side:
         for name, (width, height) in SIZES.items():
             request = camera_pb2.CaptureImageRequest(width=width, height=height)
             reply = await stub.CaptureImage(request, timeout=60, wait_for_ready=True)
-            self.names[name], sizes[name] = reply.image.name, reply.image.size_bytes
+            self.names[name] = reply.image.name
+            sizes[name] = reply.image.size_bytes
         return sizes
 
     async def fetch(self, size: str, channel: Any = None) -> float:
         """Fetch a picture; seconds."""
         stub = camera_pb2_grpc.CameraServiceStub(channel or self._channel)
-        begun, count = time.perf_counter(), 0
+        begun = time.perf_counter()
+        count = 0
         request = camera_pb2.RetrieveImageRequest(name=self.names[size])
         async for chunk in stub.RetrieveImage(request, timeout=60):
             count += len(chunk.data)

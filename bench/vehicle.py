@@ -78,7 +78,8 @@ def motion() -> list[Claim]:
     climb_s = pilot.take_off(10.0)
     pilot.fly_on(6.0)
     pilot.go_to(50.0, 0.0, 10.0)
-    peak, begun = 0.0, simulation.time_s
+    peak = 0.0
+    begun = simulation.time_s
     while math.hypot(vehicle.body.north - 50.0, vehicle.body.east) > 1.0:
         pilot.step()
         peak = max(peak, math.hypot(vehicle.body.vn, vehicle.body.ve))
@@ -99,7 +100,8 @@ def memory_and_start() -> list[Claim]:
     simulation = Simulation([VehicleConfig(start=START)])
     pilot = Pilot(simulation, simulation.crafts[0])
     pilot.send("PARAM_REQUEST_LIST", {"target_system": 1, "target_component": 1})
-    begun, listed = simulation.time_s, 0
+    begun = simulation.time_s
+    listed = 0
     count = len(simulation.crafts[0].vehicle.state.params)
     while listed < count:
         listed += sum(message.name == "PARAM_VALUE" for message in pilot.step())
@@ -192,7 +194,8 @@ class Link:
 
     def read(self, duration_s: float, until: str = "") -> int:
         """Read for a time, or until a message of that name; returns how many came."""
-        count, end = 0, time.monotonic() + duration_s
+        count = 0
+        end = time.monotonic() + duration_s
         while time.monotonic() < end:
             if not select.select([self.socket], [], [], max(0.0, end - time.monotonic()))[0]:
                 break

@@ -73,7 +73,8 @@ class Fleet:
         for number in range(self.count):
             angle = now_ms / 5_000 + number
             radius = 0.001 + 0.008 * number / self.count
-            lat, lon = 39.36 + radius * math.cos(angle), 22.95 + radius * math.sin(angle)
+            lat = 39.36 + radius * math.cos(angle)
+            lon = 22.95 + radius * math.sin(angle)
             heading = math.degrees(angle + math.pi / 2) % 360
             found.append(Fix(f"drone-{number}", now_ms, lat, lon, 30.0, round(heading, 1)))
             found.append(State(f"drone-{number}", now_ms, 20.0, 5.0, 0.7, "GUIDED", "Navigator", "in the air"))
@@ -117,7 +118,8 @@ async def measure(browser: Browser, count: int, seconds: float) -> dict[str, flo
     assert await page.locator("#drones li").count() == count
     # The page's policy lets no script in but its own: the debugger's protocol does.
     rules = (await Axe().run(page)).response
-    kept, broken = len(rules["passes"]), len(rules["violations"])
+    kept = len(rules["passes"])
+    broken = len(rules["violations"])
     await context.close()
     await runner.cleanup()
     frames = sorted(b - a for a, b in itertools.pairwise(times))
@@ -133,7 +135,8 @@ async def run(seconds: float) -> tuple[dict[str, float], dict[str, float]]:
         browser = await playwright.chromium.launch(executable_path=shutil.which("chromium"), args=ARGUMENTS)
         # The first page of a browser pays for its start.
         await measure(browser, 1, 3.0)
-        one, many = await measure(browser, 1, seconds), await measure(browser, 100, seconds)
+        one = await measure(browser, 1, seconds)
+        many = await measure(browser, 100, seconds)
         for count, found in ((1, one), (100, many)):
             again = [await measure(browser, count, 0.5) for _ in range(LOADS - 1)]
             found["map_ms"] = statistics.median([found["map_ms"], *(other["map_ms"] for other in again)])
@@ -156,7 +159,8 @@ def main() -> int:
             f"{count:>6}  {found['map_ms']:>7.0f}  {found['p50']:>9.1f}  {found['p95']:>7.1f}  {found['fps']:>8.1f}"
             f"  {found['work_ms']:>17.2f}"
         )
-    ratio, reached = many["p95"] / one["p95"], min(one["accessibility"], many["accessibility"])
+    ratio = many["p95"] / one["p95"]
+    reached = min(one["accessibility"], many["accessibility"])
     claims = [
         {
             "name": "first map on loopback", "ours": one["map_ms"], "theirs": MAX_MAP_MS, "unit": "ms",

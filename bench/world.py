@@ -26,7 +26,8 @@ from fractus_world.tiles import TILE_PX, TileStore
 from fractus_world.world import World
 
 LENS = Intrinsics(1920, 1080, 62.2)
-LAT, LON = 50.8637, 4.6785
+LAT = 50.8637
+LON = 4.6785
 LIMIT_MS = 40.0
 
 
@@ -75,7 +76,8 @@ def naive(view: View, store: TileStore, level: int = 0) -> np.ndarray:
     u, v = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
     ground = np.stack((u, v, np.ones_like(u)), axis=-1) @ view.ground_matrix().T
     metres = store.ground.finest_m * 2**level
-    x, y = ground[..., 0] / ground[..., 2] / metres, -ground[..., 1] / ground[..., 2] / metres
+    x = ground[..., 0] / ground[..., 2] / metres
+    y = -ground[..., 1] / ground[..., 2] / metres
     window = (int(x.min()), int(y.min()), int(x.max()) + 2, int(y.max()) + 2)
     picture, left, top = store.mosaic(level, window)
     return picture[(np.floor(y).astype(int) - top), (np.floor(x).astype(int) - left)]
@@ -162,8 +164,10 @@ def memory() -> Claim:
 
 def likeness(world: World) -> Claim:
     """How far a slanted picture is from one of sixteen times as many rays; the naive one flickers."""
-    small, large = Intrinsics(480, 270, 62.2), Intrinsics(1920, 1080, 62.2)
-    at, mount = pose(world, 0.0, 0.0, 120.0), Mount(-50.0)
+    small = Intrinsics(480, 270, 62.2)
+    large = Intrinsics(1920, 1080, 62.2)
+    at = pose(world, 0.0, 0.0, 120.0)
+    mount = Mount(-50.0)
     store = TileStore(world.ground, 600_000_000)
     fine = render_ground(world.view(at, large, mount), store, "rgb")
     reference = cv2.resize(fine, (small.width, small.height), interpolation=cv2.INTER_AREA).astype(float)
@@ -172,7 +176,8 @@ def likeness(world: World) -> Claim:
         return float(np.sqrt(np.mean((picture.astype(float) - reference) ** 2)))
 
     view = world.view(at, small, mount)
-    ours, theirs = error(render_ground(view, store, "rgb")), error(naive(view, store, 1))
+    ours = error(render_ground(view, store, "rgb"))
+    theirs = error(naive(view, store, 1))
     return Claim("grey levels off a 16-fold oversampled picture", ours, theirs, "rms", "< naive", ours < theirs)
 
 

@@ -58,7 +58,10 @@ def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: 
     folder = posixpath.dirname(source or "docs/" + page.file.src_uri)
 
     def led(found: re.Match[str]) -> str:
-        mark, text, target, anchor = found.group(1), found.group(2), found.group(3), found.group(4) or ""
+        mark = found.group(1)
+        text = found.group(2)
+        target = found.group(3)
+        anchor = found.group(4) or ""
         if "://" in target or target.startswith(("mailto:", "/")):
             return found.group()
         path = posixpath.normpath(posixpath.join(folder, target))
@@ -86,7 +89,8 @@ def kinds() -> Iterator[str]:
     yield "All are of the group `fractus.dev`, version `v1alpha1`; `kubectl explain KIND.spec` says the same."
     for path in sorted((ROOT / "crds").glob("*.yaml")):
         body = yaml.safe_load(path.read_text())["spec"]
-        names, schema = body["names"], body["versions"][0]["schema"]["openAPIV3Schema"]
+        names = body["names"]
+        schema = body["versions"][0]["schema"]["openAPIV3Schema"]
         short = ", ".join(f"`{name}`" for name in names.get("shortNames", ()))
         yield f"## {names['kind']}"
         yield f"{schema.get('description', '')} {body['scope']}; `kubectl get {names['plural']}`, short {short}."
@@ -104,9 +108,12 @@ def kinds() -> Iterator[str]:
 def _fields(schema: dict[str, Any], above: str) -> Iterator[str]:
     required = set(schema.get("required", ()))
     for name, field in schema.get("properties", {}).items():
-        path, inner, kind = f"{above}{name}", field, field.get("type", "any")
+        path = f"{above}{name}"
+        inner = field
+        kind = field.get("type", "any")
         if kind == "array":
-            inner, path = field["items"], f"{path}[]"
+            inner = field["items"]
+            path = f"{path}[]"
             kind = f"list of {inner.get('type', 'any')}"
         bounds = [
             f"{field[key]} {word}" for key, word in (("minimum", "or more"), ("maximum", "at most")) if key in field

@@ -68,7 +68,9 @@ def objects() -> tuple[dict[str, Any], ...]:
         )
         for name in names
     }
-    edges, zones, policies = documents("edge-nodes.yaml"), documents("zones.yaml"), documents("policies.yaml")
+    edges = documents("edge-nodes.yaml")
+    zones = documents("zones.yaml")
+    policies = documents("policies.yaml")
     (depot,) = documents("depot.yaml")
     spec = plan(
         Application.from_body(application),
@@ -117,7 +119,8 @@ def states() -> list[dict[str, Any]]:
     path = documents("application.yaml")[0]["spec"]["components"][0]["controlPoints"][0]["path"]
     stops = [(*HOME, 0.0), (*HOME, 20.0), *((w["lat"], w["lon"], min(w["alt"], 50.0)) for w in path)]
     stops += [(*HOME, 25.0), (*HOME, 0.0)]
-    lines, now = [_line(TAKEOFF_S - 2, *HOME, 0.0, "GUIDED", flying=False)], TAKEOFF_S
+    lines = [_line(TAKEOFF_S - 2, *HOME, 0.0, "GUIDED", flying=False)]
+    now = TAKEOFF_S
     for i, (start, end) in enumerate(itertools.pairwise(stops)):
         over_m = math.dist(_metres(start), _metres(end))
         steps = max(int(2 * max(over_m / 9.0, abs(end[2] - start[2]) / 2.5)), 2)

@@ -84,8 +84,10 @@ class ParameterVehicle(MavlinkAutopilot):
         super().__init__("tcp:nowhere:1", ARDUCOPTER)
         self.target = (1, 1)
         self.values = dict(values)
-        self.fixed, self.hidden = fixed, hidden
-        self.loss, self.delay_s = loss, delay_s
+        self.fixed = fixed
+        self.hidden = hidden
+        self.loss = loss
+        self.delay_s = delay_s
         self.asked: list[str] = []
         self._random = random.Random(seed)
 

@@ -114,7 +114,8 @@ def grant_report(grant: Grant, missions: Mapping[str, Outcome], problem: str | N
     """
     phase, message = mission_outcome(grant, missions) or ("Active", "")
     if problem is not None:
-        phase, message = "Pending", problem
+        phase = "Pending"
+        message = problem
     return _report(grant.metadata.model_dump(by_alias=True), phase, message)
 
 
@@ -250,7 +251,8 @@ class GrantSynchronizer:
                 self._remove(gone)
             for body in grant_list.grants:
                 # Skip unchanged Grants, because parsing, verifying and storing one takes about 15 ms.
-                name, digest = body["metadata"]["name"], _digest(json.dumps(body, sort_keys=True).encode())
+                name = body["metadata"]["name"]
+                digest = _digest(json.dumps(body, sort_keys=True).encode())
                 if name not in self._grants or self._digests.get(name) != (digest, self._stored_digest(name)):
                     self._put(body)
                     self._digests[name] = digest, self._stored_digest(name)

@@ -13,7 +13,8 @@ from fractus_agent.store import Backoff, KubeError
 
 LOG = logging.getLogger(__name__)
 
-FIRST_RETRY_S, MAX_RETRY_S = 0.5, 15.0
+FIRST_RETRY_S = 0.5
+MAX_RETRY_S = 15.0
 WATCHDOG_INTERVAL_S = 10.0
 WATCHDOG_TIMEOUT_S = 60.0
 

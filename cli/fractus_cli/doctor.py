@@ -323,7 +323,8 @@ def _nodes(cluster: ClusterReader) -> Iterator[Finding]:
             message = f"{kind} {name} has no node: the node was renamed or removed"
             yield Finding("warning", "nodes", message, f"if the node does not return: kubectl delete {kind} {name}")
     for node in nodes:
-        name, labels = node["metadata"]["name"], node["metadata"].get("labels") or {}
+        name = node["metadata"]["name"]
+        labels = node["metadata"].get("labels") or {}
         node_class = labels.get(CLASS, "")
         classes |= {node_class, "cloud"} if labels.get(CLOUD_LABEL) == "true" else {node_class}
         if node_class not in {"", "drone", "edge", "cloud"}:

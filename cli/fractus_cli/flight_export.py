@@ -75,11 +75,9 @@ class _DroneFlights:
 
     def add(self, entry: Entry) -> None:
         """Process the next entry of the drone."""
-        lat, lon, alt = (
-            finite_number(entry.get("lat")),
-            finite_number(entry.get("lon")),
-            finite_number(entry.get("alt")) or 0.0,
-        )
+        lat = finite_number(entry.get("lat"))
+        lon = finite_number(entry.get("lon"))
+        alt = finite_number(entry.get("alt")) or 0.0
         if entry.get("kind") == "state":
             if lat is None or lon is None:
                 return
@@ -150,7 +148,8 @@ def _folder(node: str, flown: _DroneFlights) -> str:
 
 
 def _line(path: _Path) -> str:
-    begin, end = _iso(path.times[0]), _iso(path.times[-1])
+    begin = _iso(path.times[0])
+    end = _iso(path.times[-1])
     return (
         f"<Placemark><name>flight {begin}</name><TimeSpan><begin>{begin}</begin><end>{end}</end></TimeSpan>"
         f"<LineString><altitudeMode>absolute</altitudeMode><coordinates>{' '.join(map(_spot, path.points))}</coordinates>"
@@ -197,7 +196,8 @@ def write_mcap(export: Export, out: IO[bytes]) -> None:
     file.add_metadata("audit", {"verified": "no" if export.problems else "yes", "problems": "\n".join(export.problems)})
     features = export.places.features()
     for entry in export.entries:
-        time_ns, node = entry["time_ns"], entry["node"]
+        time_ns = entry["time_ns"]
+        node = entry["node"]
         records = list(audit_records(entry, node))
         if entry.get("kind") == "state":
             records += _located(entry, node)
@@ -228,7 +228,9 @@ class _Counted:
 
 
 def _located(entry: Entry, node: str) -> Iterator[Any]:
-    lat, lon, amsl = finite_number(entry.get("lat")), finite_number(entry.get("lon")), finite_number(entry.get("amsl"))
+    lat = finite_number(entry.get("lat"))
+    lon = finite_number(entry.get("lon"))
+    amsl = finite_number(entry.get("amsl"))
     if lat is not None and lon is not None:
         yield location(entry["time_ns"], node, lat, lon, amsl if amsl is not None else 0.0)
 

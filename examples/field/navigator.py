@@ -14,7 +14,8 @@ log = logging.getLogger("navigator")
 
 async def fly(drone: fractus.Mobility, control: fractus.Control) -> None:
     """Visit the remaining waypoints of a control point, and the detours between them."""
-    altitudes, detours = _altitudes(), _detours()
+    altitudes = _altitudes()
+    detours = _detours()
     tasks = [task.path or _positions(os.environ["ZIGZAG"]) for task in fractus.control_points()]
     first = 1 + sum(len(task) for task in tasks[: control.control_point])
     async for waypoint in control.remaining(tasks[control.control_point]):
@@ -56,7 +57,8 @@ def _detours() -> dict[int, tuple[fractus.Position, float]]:
     found = {}
     for pair in filter(str.strip, os.environ.get("DETOURS", "").split(";")):
         number, place = pair.split(":")
-        where, stay = place.split(",")[:3], place.split(",")[3:]
+        where = place.split(",")[:3]
+        stay = place.split(",")[3:]
         found[int(number)] = _position(",".join(where)), float(stay[0]) if stay else 0.0
     return found
 

@@ -25,7 +25,8 @@ log = logging.getLogger("viewer")
 
 async def watch() -> None:
     """Take and send pictures until SIGTERM, without waiting for earlier ones."""
-    over, sending = asyncio.Event(), set[asyncio.Task[None]]()
+    over = asyncio.Event()
+    sending = set[asyncio.Task[None]]()
     loop = asyncio.get_running_loop()
     loop.add_signal_handler(signal.SIGTERM, over.set)
     begun = loop.time()

@@ -19,7 +19,8 @@ async def watch(interval_s: float) -> None:
     """Take, retrieve and send pictures until SIGTERM. A failure is logged, and the next picture is taken."""
     stop = asyncio.Event()
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, stop.set)
-    number, said = 0, ""
+    number = 0
+    said = ""
     async with fractus.camera(reconnect_timeout_s=1.0) as camera, fractus.requester("ImageChecker") as checker:
         while not stop.is_set():
             number += 1

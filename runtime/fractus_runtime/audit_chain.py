@@ -142,7 +142,9 @@ def verify(lines: Iterable[bytes], part: bool = False, since: Link | None = None
         since: An entry that the log is known to have contained. It and all later entries must exist. Without it, entries at the
             beginning must not be missing, because an attacker who removes entries can also write the entry that records the removal.
     """
-    previous, count, torn = Link(), 0, False
+    previous = Link()
+    count = 0
+    torn = False
     begin: Link | None = None
     pruned: set[tuple[object, object]] = set()
     for number, line in enumerate(lines, 1):

@@ -88,8 +88,10 @@ def read_checkpoint(data: bytes, authorities: Sequence[x509.Certificate] = ()) -
         certificate = x509.load_pem_x509_certificate(content["certificate"].encode())
         names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
         nodes = [uri for uri in names.get_values_for_type(x509.UniformResourceIdentifier) if uri.startswith(_NODES)]
-        log, link = str(content["log"]), Link(int(content["seq"]), str(content["hash"]))
-        moment, key = datetime.fromisoformat(content["time"]), certificate.public_key()
+        log = str(content["log"])
+        link = Link(int(content["seq"]), str(content["hash"]))
+        moment = datetime.fromisoformat(content["time"])
+        key = certificate.public_key()
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError, x509.ExtensionNotFound):
         raise InvalidCheckpoint("is not a checkpoint; use a copy of a .checkpoint file of the log") from None
     if len(nodes) != 1 or not isinstance(key, ec.EllipticCurvePublicKey):

@@ -133,7 +133,8 @@ class Mobility(ServiceClient):
         """
         request = velocity_request(Velocity(north_mps, east_mps, down_mps), yaw_deg, hold_s)
         reply = await self._call("SetVelocity", request)
-        decision, velocity = Decision.from_proto(reply.decision), Velocity.from_proto(reply.velocity)
+        decision = Decision.from_proto(reply.decision)
+        velocity = Velocity.from_proto(reply.velocity)
         return self._judged(VelocityResult(decision=decision, velocity=velocity))
 
     async def point_gimbal(self, pitch_deg: float, yaw_deg: float = 0.0) -> Result:

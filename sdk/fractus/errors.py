@@ -215,7 +215,8 @@ def translate(error: Any, what: str, address: str) -> FractusError:
         what: Name of the method.
         address: Address of the service.
     """
-    code, text = error.code(), error.details() or ""
+    code = error.code()
+    text = error.details() or ""
     decision = decision_of(error)
     if code in {grpc.StatusCode.PERMISSION_DENIED, grpc.StatusCode.FAILED_PRECONDITION}:
         return _refusal(code, text, what, decision)

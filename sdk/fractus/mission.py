@@ -248,7 +248,8 @@ def _simple(items: Sequence[Any]) -> Iterator[Any]:
 def _waypoints(items: Iterator[Any], path: str) -> Iterator[Waypoint]:
     speed_mps: float | None = None
     for number, item in enumerate(items, start=1):
-        command, params = item["command"], item["params"]
+        command = item["command"]
+        params = item["params"]
         if command == _NAV_WAYPOINT:
             if item["frame"] not in _REFERENCES:
                 raise InvalidRequest(

@@ -98,7 +98,8 @@ def _signature(name: str, function: Any) -> str:
 
 def _text(kind: Any) -> Iterator[str]:
     """A docstring as Markdown: its sections as lists."""
-    section, entries = "", list[str]()
+    section = ""
+    entries = list[str]()
     for block in (inspect.getdoc(kind) or "").split("\n\n"):
         paragraph = list[str]()
         for line in block.splitlines():
@@ -117,7 +118,8 @@ def _text(kind: Any) -> Iterator[str]:
         if section:
             joined = " ".join(entries) if section == "Returns" else "\n".join(entries)
             yield f"{section}: {joined}" if section == "Returns" else f"{section}:\n\n{joined}"
-            section, entries = "", []
+            section = ""
+            entries = []
 
 
 if __name__ == "__main__":

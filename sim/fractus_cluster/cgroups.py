@@ -18,7 +18,8 @@ _DELEGATED_V2 = (*_NEEDED_V2, "io", "hugetlb")
 _DAEMONS = "daemons"
 _WEIGHT = 20
 """CPU weight of a cluster, equal to 20 processes, because its vehicles fly in real time."""
-_ONE_V1, _ONE_V2 = 1024, 100
+_ONE_V1 = 1024
+_ONE_V2 = 100
 _POLL_S = 0.02
 
 
@@ -91,7 +92,8 @@ class Branch:
         for root in self.hierarchies.roots:
             directory = root
             for part in Path(self.path).parts:
-                above, directory = directory, directory / part
+                above = directory
+                directory = directory / part
                 directory.mkdir(exist_ok=True)
                 _fill_cpuset(above, directory)
             _weigh(root / TOP)

@@ -66,7 +66,8 @@ def status(name: str | None, output: str) -> None:
     Exits with 2 unless all are well.
     """
     found = Cluster.existing(name)
-    states, radio = found.status(), found.radio.running
+    states = found.status()
+    radio = found.radio.running
     well = found.running and radio is not False and all(map(_well, states))
     if output == "json":
         nodes = [asdict(node) for node in states]

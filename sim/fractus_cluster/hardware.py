@@ -30,7 +30,8 @@ def hardware_commands(node: NodeSpec, origin: Place | None) -> dict[str, list[st
     Raises:
         ClusterError: The position of the vehicle is not specified, or the simulator is not installed.
     """
-    vehicle, camera = vehicle_command(node), camera_command(node, origin)
+    vehicle = vehicle_command(node)
+    camera = camera_command(node, origin)
     found = {"vehicle": vehicle, "camera": camera}
     return {name: command for name, command in found.items() if command is not None}
 
@@ -61,7 +62,8 @@ def camera_command(node: NodeSpec, origin: Place | None) -> list[str] | None:
     Raises:
         ClusterError: The simulator is not installed.
     """
-    camera, address = node.hardware.camera, camera_address(node.camera_url)
+    camera = node.hardware.camera
+    address = camera_address(node.camera_url)
     if camera is None or address is None:
         return None
     services = NodeServices.model_validate(node.description["services"])
@@ -78,7 +80,8 @@ def camera_command(node: NodeSpec, origin: Place | None) -> list[str] | None:
     command += ["--stabilised" if mount.stabilised or mount.gimbal else "--fixed-mount"]
     if features.horizontal_field_of_view is not None:
         command += ["--fov", str(features.horizontal_field_of_view)]
-    place, vehicle = node.place(), node.vehicle()
+    place = node.place()
+    vehicle = node.vehicle()
     if vehicle is not None:
         command += ["--vehicle", _camera_link(vehicle[1])]
     elif place is not None:

@@ -123,7 +123,8 @@ def wire_node(wiring: Wiring, node: str, index: int, *, mobile: bool = False) ->
         index: Its place in the addressing.
         mobile: Whether the radio carries the uplink, between a device at each end, instead of a wire.
     """
-    path, hub = wiring.namespace_path(node), _inode(wiring.namespace_path())
+    path = wiring.namespace_path(node)
+    hub = _inode(wiring.namespace_path())
     inode = _inode(path)
     if inode and _read_mark(wiring, node) == _Mark(inode, hub, mobile):
         heal_link(wiring, index)

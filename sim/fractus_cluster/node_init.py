@@ -18,8 +18,12 @@ from pathlib import Path
 from fractus_cluster.supervisor import Unit, supervise
 
 _LIBC = ctypes.CDLL(None, use_errno=True)
-_MS_NOSUID, _MS_NODEV, _MS_NOEXEC = 2, 4, 8
-_MS_BIND, _MS_REC, _MS_SHARED = 4096, 16384, 1 << 20
+_MS_NOSUID = 2
+_MS_NODEV = 4
+_MS_NOEXEC = 8
+_MS_BIND = 4096
+_MS_REC = 16384
+_MS_SHARED = 1 << 20
 _MNT_DETACH = 2
 
 RUN = Path("/run/fractus")

@@ -45,7 +45,8 @@ class Machine:
 def shortfalls(node: NodeSpec, machine: Machine) -> list[str]:
     """Return a sentence for each resource of which the node is to offer more than the machine has."""
     said = []
-    cpu, memory = node.resources.get("cpu"), node.resources.get("memory")
+    cpu = node.resources.get("cpu")
+    memory = node.resources.get("memory")
     if cpu and parse_quantity(cpu) > machine.cpus:
         said.append(f"node {node.name} offers {machine.cpus} CPUs, not {cpu}: the machine has no more")
     if memory and parse_quantity(memory) > machine.memory_bytes:
@@ -57,7 +58,8 @@ def shortfalls(node: NodeSpec, machine: Machine) -> list[str]:
 def _reserved(node: NodeSpec, machine: Machine) -> dict[str, str]:
     """Return the resources that kubelet must reserve, so that the remainder equals the node's resources."""
     reserved: dict[str, str] = {}
-    cpu, memory = node.resources.get("cpu"), node.resources.get("memory")
+    cpu = node.resources.get("cpu")
+    memory = node.resources.get("memory")
     if cpu and (kept := machine.cpus - parse_quantity(cpu)) > 0:
         reserved["cpu"] = f"{int(kept * 1000)}m"
     if memory and (left := Decimal(machine.memory_bytes) - parse_quantity(memory)) > 0:

@@ -10,7 +10,8 @@ from collections import deque
 
 # Below the usual range for connections and for listeners on port 0 (32768 and up) and Kubernetes NodePorts (30000 and
 # up), above the ports of Kubernetes components (10248 to 10259) and the usual MAVLink ports (14540 to 18570).
-_FIRST, _LAST = 20_000, 29_999
+_FIRST = 20_000
+_LAST = 29_999
 _KEPT = 512
 
 _chance = random.SystemRandom()

@@ -116,7 +116,8 @@ def radio_layout(nodes: Sequence[Node], air: AirSpec, control: Path) -> str | No
 
 
 def _station(node: Node) -> dict[str, Any] | None:
-    interface, place = node.spec.wifi(), node.spec.place()
+    interface = node.spec.wifi()
+    place = node.spec.place()
     if interface is None or place is None:
         return None
     return {

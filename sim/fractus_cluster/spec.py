@@ -374,7 +374,8 @@ def camera_address(url: str) -> tuple[str, int] | None:
     """Return host and port of a snapshot URL that is served on the same node. Return None for any other URL."""
     try:
         parts = urlsplit(url)
-        host, port = parts.hostname, parts.port or 80
+        host = parts.hostname
+        port = parts.port or 80
     except ValueError:
         return None
     local = parts.scheme == "http" and host in ("127.0.0.1", "localhost", "::1") and parts.path == "/snapshot.jpg"

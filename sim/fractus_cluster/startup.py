@@ -65,7 +65,9 @@ class Startup:
 
     def start_control_plane(self, binaries: Binaries) -> None:
         """Start etcd, the API server, controllers, scheduler and DNS. Restart all if their configuration changed."""
-        wiring, files, record_path = self.wiring, self._files(), self.state.process(CONTROL_PLANE)
+        wiring = self.wiring
+        files = self._files()
+        record_path = self.state.process(CONTROL_PLANE)
         network.wire_control_plane(wiring)
         units = control_plane_units(binaries, self.authority, wiring.addressing, files)
         view: dict[str, object] = {"hostname": None, "files": "", "logs": "", "programs": {}, "sysctls": {}}

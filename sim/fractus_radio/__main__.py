@@ -21,7 +21,8 @@ from fractus_radio.radio import Radio
 from fractus_radio.taps import Tap
 from fractus_radio.uplink import Uplink
 
-REAL_TIME_PRIORITY, HIGHEST = 10, -20
+REAL_TIME_PRIORITY = 10
+HIGHEST = -20
 
 
 class Frame:
@@ -46,7 +47,8 @@ def make_radio(layout: Layout) -> tuple[Radio, list[Follower]]:
     """
     range_m = max((entry.range_m for entry in layout.stations), default=1.0)
     radio = Radio(Medium(Propagation.reaching(range_m, fading=layout.fading), layout.seed), layout.control)
-    frame, followers = Frame(layout.origin), []
+    frame = Frame(layout.origin)
+    followers = []
     for entry in layout.stations:
         at = frame.position(entry.place.lat, entry.place.lon, entry.place.alt)
         station = Station(at, entry.address, reach=entry.range_m / range_m)

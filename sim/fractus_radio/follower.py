@@ -15,9 +15,11 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 log = logging.getLogger(__name__)
 
-SYSTEM, COMPONENT = 246, 25
+SYSTEM = 246
+COMPONENT = 25
 RATE_HZ = 10.0
-CONNECT_TIMEOUT_S, READ_TIMEOUT_S = 5.0, 1.0
+CONNECT_TIMEOUT_S = 5.0
+READ_TIMEOUT_S = 1.0
 SILENCE_S = 5.0
 REQUEST_INTERVAL_S = 5.0
 RETRY_S = 1.0
@@ -86,7 +88,8 @@ class Follower:
                 link.sendall(_encode_request(endpoint, autopilot))
 
     def _handle_position(self, message: Message) -> None:
-        lat, lon = message.integer("lat"), message.integer("lon")
+        lat = message.integer("lat")
+        lon = message.integer("lon")
         if lat or lon:  # an autopilot without a fix reports zeros
             self._on_position(lat / 1e7, lon / 1e7, message.integer("alt") / 1000.0)
 

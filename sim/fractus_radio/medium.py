@@ -21,7 +21,8 @@ HEADER_BYTES = 76
 FIXED_S = 269e-6
 """DIFS, mean first back-off, preambles, SIFS and ACK. Matches ns-3 within 2 us from 40 to 1400 bytes."""
 SLOT_S = 20e-6
-FIRST_WINDOW, MAX_WINDOW = 16, 1024
+FIRST_WINDOW = 16
+MAX_WINDOW = 1024
 ATTEMPTS = 7
 QUEUE_FRAMES = 100
 
@@ -127,7 +128,8 @@ class Medium:
     def advance(self, now_s: float) -> Iterator[Arrival]:
         """Return the arrivals up to `now_s`."""
         while self._sending is not None and self._free_s <= now_s:
-            attempt, self._sending = self._sending, None
+            attempt = self._sending
+            self._sending = None
             yield from self._end(attempt)
             if self._sending is None:
                 self._begin(self._free_s)
@@ -139,11 +141,13 @@ class Medium:
             self._order.rotate(-1)
             if self.stations[name].queue:
                 frame = self.stations[name].queue.popleft()
-                self._sending, self._free_s = Attempt(name, frame), at_s + airtime_s(len(frame))
+                self._sending = Attempt(name, frame)
+                self._free_s = at_s + airtime_s(len(frame))
                 return
 
     def _end(self, attempt: Attempt) -> Iterator[Arrival]:
-        name, frame = attempt.station, attempt.frame
+        name = attempt.station
+        frame = attempt.frame
         if frame[0] & GROUP_BIT:  # broadcasts are neither acknowledged nor retried
             yield from (Arrival(other, frame) for other in self.stations if other != name and self._hears(name, other))
             return
@@ -159,7 +163,8 @@ class Medium:
             self._free_s += airtime_s(len(frame), attempt.number + 1)
 
     def _hears(self, sender: str, receiver: str) -> bool:
-        a, b = self.stations[sender], self.stations[receiver]
+        a = self.stations[sender]
+        b = self.stations[receiver]
         if a.off or b.off or a.network != b.network:
             return False
         return self._propagation.receives(_distance_m(a, b), self._chance, loss_db=a.loss_db + b.loss_db)

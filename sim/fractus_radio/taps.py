@@ -11,7 +11,9 @@ from pathlib import Path
 from fractus_agent.redirector.netlink import in_namespace
 
 TUN = Path("/dev/net/tun")
-TUNSETIFF, IFF_TAP, IFF_NO_PI = 0x400454CA, 0x0002, 0x1000
+TUNSETIFF = 0x400454CA
+IFF_TAP = 0x0002
+IFF_NO_PI = 0x1000
 MAX_NAME = 15
 FRAME_BYTES = 2048
 

@@ -44,14 +44,17 @@ def run(simulation: Simulation, hub: Hub, speedup: float, stop: _Stop, until_s: 
     message is due (at most `MAX_NAP` steps) or a message arrives, and then runs the missed steps together. A received
     message takes effect in the step in which it arrived. The response is sent in the next step.
     """
-    wall_0, time_0 = time.monotonic(), simulation.time_s
-    woken, nap = False, 1
+    wall_0 = time.monotonic()
+    time_0 = simulation.time_s
+    woken = False
+    nap = 1
     while not stop.wanted and (until_s is None or simulation.time_s < until_s):
         if speedup > 0.0:
             behind = time_0 + (time.monotonic() - wall_0) * speedup - simulation.time_s
             steps = min(int(behind / CONTROL_STEP_S + 1e-6), MAX_BATCH)
             if behind > MAX_LAG_S * max(speedup, 1.0):
-                wall_0, time_0 = time.monotonic(), simulation.time_s
+                wall_0 = time.monotonic()
+                time_0 = simulation.time_s
         else:
             steps = 1
         for _ in range(steps - 1):
@@ -229,7 +232,8 @@ def vehicle(
         epoch_us=REPEATABLE_EPOCH_US if lockstep else int(time.time() * 1e6),
     )
     with contextlib.ExitStack() as stack:
-        hub, opened = Hub(), list[tuple[int, str]]()
+        hub = Hub()
+        opened = list[tuple[int, str]]()
         stack.callback(hub.close)
         try:
             simulation = Simulation(formation(config, count, spacing))

@@ -8,7 +8,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.state import VehicleState
 
-RELAYS, SERVOS = 6, 32
+RELAYS = 6
+SERVOS = 32
 RELAY_FUNCTION = 1
 # SERVOn_FUNCTION values of outputs that commands may set. Other values assign the output to a motor or another device.
 FREE_FUNCTIONS = frozenset({0, 1})
@@ -29,7 +30,8 @@ SWITCHED_MODES = {
     72: mavlink.COPTER_MODE_CIRCLE,
     73: mavlink.COPTER_MODE_DRIFT,
 }
-SWITCH_LOW, SWITCH_HIGH = 0, 2
+SWITCH_LOW = 0
+SWITCH_HIGH = 2
 FENCE_SWITCH = 11
 # Commands that fail because the simulated vehicle has no camera, mount, gripper, winch, receiver pairing or running
 # calibration.

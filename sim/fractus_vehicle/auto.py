@@ -124,11 +124,13 @@ class AutoFlight(Flight):
             v.control.hold_here()
 
     def _begin_item(self, v: VehicleState, index: int, item: Item) -> None:
-        self._item, self._index = item, index
+        self._item = item
+        self._index = index
         self._arrived_s = None
         self._landing = False
         self._returning = self._leg = None
-        track, self._track = self._track, (0.0, 0.0, 0.0)
+        track = self._track
+        self._track = (0.0, 0.0, 0.0)
         if item.has_place and v.altitude_base_m(item.frame) is None:
             v.send_text(mavlink.MAV_SEVERITY_CRITICAL, "Failsafe: Terrain data missing")
             if not self._set_mode(mavlink.COPTER_MODE_RTL):

@@ -161,7 +161,9 @@ class Body:
     def _translate(self, dt: float, lift: float, air: tuple[float, float, float]) -> None:
         frame = self.airframe
         w, x, y, z = self.quaternion
-        rn, re, rd = self.vn - air[0], self.ve - air[1], self.vd - air[2]
+        rn = self.vn - air[0]
+        re = self.ve - air[1]
+        rd = self.vd - air[2]
         drag = frame.drag_linear + frame.drag_quadratic * math.sqrt(rn * rn + re * re + rd * rd)
         fn = -lift * 2.0 * (x * z + w * y) - drag * rn
         fe = -lift * 2.0 * (y * z - w * x) - drag * re
@@ -198,7 +200,8 @@ class Body:
         """Roll the crashed vehicle onto its side."""
         half = CRASHED_ROLL_RAD / 2.0
         w, x, y, z = self.quaternion
-        c, s = math.cos(half), math.sin(half)
+        c = math.cos(half)
+        s = math.sin(half)
         self.quaternion = (w * c - x * s, x * c + w * s, y * c + z * s, z * c - y * s)
 
     def _rest(self, dt: float) -> None:
@@ -209,17 +212,23 @@ class Body:
         if abs(x) + abs(y) < 1e-6:
             return
         keep = math.exp(-dt / 0.1)
-        x, y = x * keep, y * keep
+        x = x * keep
+        y = y * keep
         size = math.sqrt(w * w + x * x + y * y + z * z) or 1.0
         self.quaternion = (w / size, x / size, y / size, z / size)
 
     def _rotate(self, dt: float, tx: float, ty: float, tz: float) -> None:
-        ixy, iz = self._ixy, self._iz
-        p, q, r = self.p, self.q, self.r
+        ixy = self._ixy
+        iz = self._iz
+        p = self.p
+        q = self.q
+        r = self.r
         p += dt * (tx - (iz - ixy) * q * r) / ixy
         q += dt * (ty - (ixy - iz) * p * r) / ixy
         r += dt * tz / iz
-        self.p, self.q, self.r = p, q, r
+        self.p = p
+        self.q = q
+        self.r = r
         w, x, y, z = self.quaternion
         h = 0.5 * dt
         nw = w - h * (p * x + q * y + r * z)

@@ -165,7 +165,8 @@ class Breadcrumbs:
     def _prune(self, enough: int) -> Iterator[None]:
         """Cut loops that end in new points, newest first, until `enough` points are removed."""
         loops: list[Loop] = []
-        count, done = 0, len(self.path)
+        count = 0
+        done = len(self.path)
         for last in range(done - 1, max(self._pruned, 3) - 1, -1):
             for first in range(1, last - 1):
                 count += 1
@@ -202,8 +203,12 @@ def _with_loop(loops: list[Loop], new: Loop) -> list[Loop]:
 
 def distance_to_segment(point: Point, start: Point, end: Point) -> float:
     """Return the distance of a point from a line segment in space, in metres."""
-    dx, dy, dz = end[0] - start[0], end[1] - start[1], end[2] - start[2]
-    px, py, pz = point[0] - start[0], point[1] - start[1], point[2] - start[2]
+    dx = end[0] - start[0]
+    dy = end[1] - start[1]
+    dz = end[2] - start[2]
+    px = point[0] - start[0]
+    py = point[1] - start[1]
+    pz = point[2] - start[2]
     length2 = dx * dx + dy * dy + dz * dz
     share = 0.0 if length2 == 0.0 else min(1.0, max(0.0, (px * dx + py * dy + pz * dz) / length2))
     return math.hypot(px - share * dx, py - share * dy, pz - share * dz)
@@ -214,11 +219,20 @@ def segment_gap(a: Point, b: Point, c: Point, d: Point) -> tuple[float, Point]:
 
     Algorithm: Ericson, "Real-Time Collision Detection", section 5.1.9.
     """
-    ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-    vx, vy, vz = d[0] - c[0], d[1] - c[1], d[2] - c[2]
-    wx, wy, wz = a[0] - c[0], a[1] - c[1], a[2] - c[2]
-    uu, vv = ux * ux + uy * uy + uz * uz, vx * vx + vy * vy + vz * vz
-    uv, uw, vw = ux * vx + uy * vy + uz * vz, ux * wx + uy * wy + uz * wz, vx * wx + vy * wy + vz * wz
+    ux = b[0] - a[0]
+    uy = b[1] - a[1]
+    uz = b[2] - a[2]
+    vx = d[0] - c[0]
+    vy = d[1] - c[1]
+    vz = d[2] - c[2]
+    wx = a[0] - c[0]
+    wy = a[1] - c[1]
+    wz = a[2] - c[2]
+    uu = ux * ux + uy * uy + uz * uz
+    vv = vx * vx + vy * vy + vz * vz
+    uv = ux * vx + uy * vy + uz * vz
+    uw = ux * wx + uy * wy + uz * wz
+    vw = vx * wx + vy * wy + vz * wz
     slant = uu * vv - uv * uv
     s = min(1.0, max(0.0, (uv * vw - uw * vv) / slant)) if slant > 1e-12 else 0.0
     t = (uv * s + vw) / vv if vv > 0.0 else 0.0

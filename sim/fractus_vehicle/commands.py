@@ -47,7 +47,8 @@ from fractus_vehicle.vehicle import Vehicle
 
 def _arm_disarm(vehicle: Vehicle, o: Command, _c: Channel) -> int:
     v = vehicle.state
-    want, magic = o.params[0], o.params[1]
+    want = o.params[0]
+    magic = o.params[1]
     if want == 1.0:
         if v.armed:
             return mavlink.MAV_RESULT_ACCEPTED
@@ -272,7 +273,9 @@ CENTIMETRE = 0.01
 # Maximum climb of a takeoff in a pilot mode.
 PILOT_TAKEOFF_MAX_M = 10.0
 # Values of the fifth parameter of PREFLIGHT_CALIBRATION (the last one also of the second).
-LEVEL, SIMPLE_ACCELEROMETER, FORCE_SAVE = 2, 4, 76
+LEVEL = 2
+SIMPLE_ACCELEROMETER = 4
+FORCE_SAVE = 76
 
 HANDLERS: dict[int, Callable[[Vehicle, Command, Channel], int]] = {
     mavlink.MAV_CMD_COMPONENT_ARM_DISARM: _arm_disarm,
@@ -311,7 +314,8 @@ INT_ONLY = frozenset({mavlink.MAV_CMD_DO_REPOSITION})
 def handle_command(vehicle: Vehicle, message: Message, channel: Channel) -> None:
     """Execute a command and send COMMAND_ACK."""
     order = read_command(message)
-    handler, answer = HANDLERS.get(order.command), REQUEST_HANDLERS.get(order.command)
+    handler = HANDLERS.get(order.command)
+    answer = REQUEST_HANDLERS.get(order.command)
     if answer is not None:
         result = answer(vehicle.state, order, channel)
     elif handler is None or (order.command in INT_ONLY and not order.integer):

@@ -163,7 +163,8 @@ class Control:
 
     def stop(self, accel_mps2: float | None = None) -> None:
         """Brake with the maximum acceleration, or with `accel_mps2`, then hold the position reached."""
-        vn, ve = self.vel[0], self.vel[1]
+        vn = self.vel[0]
+        ve = self.vel[1]
         speed = math.hypot(vn, ve)
         self._braking_mps2 = accel_mps2 or self.limits.accel_mps2
         reach = speed / (2.0 * self._braking_mps2)
@@ -198,7 +199,9 @@ class Control:
         """Set the current point of an externally shaped trajectory."""
         self.horizontal = self.vertical = Axis.PATH
         self._stopping = False
-        self.pos[:], self.vel[:], self.acc[:] = position, velocity, acceleration
+        self.pos[:] = position
+        self.vel[:] = velocity
+        self.acc[:] = acceleration
 
     def climb(self, vd: float) -> None:
         """Track a vertical speed (positive down)."""
@@ -214,8 +217,11 @@ class Control:
         return self._mix(thrust, est, thrust_full_n)
 
     def _follow_xy(self, dt: float, est: Estimate) -> tuple[float, float]:
-        limits, gains = self.limits, self.gains
-        pos, vel, acc = self.pos, self.vel, self.acc
+        limits = self.limits
+        gains = self.gains
+        pos = self.pos
+        vel = self.vel
+        acc = self.acc
         if self._stopping and math.hypot(vel[0], vel[1]) < STOPPED_MPS:
             self.go_to(pos[0], pos[1])
         velocity = (vel[0], vel[1])
@@ -241,7 +247,8 @@ class Control:
         vel[1] += acc[1] * dt
         pos[0] += vel[0] * dt
         pos[1] += vel[1] * dt
-        error_n, error_e = pos[0] - est.north, pos[1] - est.east
+        error_n = pos[0] - est.north
+        error_e = pos[1] - est.east
         distance = math.hypot(error_n, error_e)
         if distance > 4.0:
             # After a gust or motor failure the trajectory waits for the vehicle instead of running ahead.
@@ -261,10 +268,13 @@ class Control:
         )
 
     def _follow_z(self, dt: float, est: Estimate) -> float:
-        limits, gains = self.limits, self.gains
+        limits = self.limits
+        gains = self.gains
         if self.throttle is not None:
             return 0.0
-        pos, vel, acc = self.pos, self.vel, self.acc
+        pos = self.pos
+        vel = self.vel
+        acc = self.acc
         if self.vertical is Axis.POSITION:
             acc[2] = shape_position(
                 self.target_down - pos[2],
@@ -309,7 +319,8 @@ class Control:
             level = math.hypot(an, ae)
             reach = GRAVITY * math.tan(self.limits.tilt_max_rad)
             if level > reach:
-                an, ae = an * reach / level, ae * reach / level
+                an = an * reach / level
+                ae = ae * reach / level
             forward = an * math.cos(yaw) + ae * math.sin(yaw)
             right = ae * math.cos(yaw) - an * math.sin(yaw)
             pitch = math.atan2(-forward, GRAVITY)
@@ -321,13 +332,20 @@ class Control:
         return self.airframe.mass_kg * vertical / max(tilt, 0.5)
 
     def _mix(self, thrust: float, est: Estimate, full: float) -> tuple[float, float, float, float]:
-        gains, frame = self.gains, self.airframe
+        gains = self.gains
+        frame = self.airframe
         roll, pitch = self.lean
         # Direction of the demanded body down axis in the world frame, then in the body frame. Thrust direction and
         # heading are controlled separately, so that a yaw turn does not bend the flight path.
-        cr, sr, cp, sp = math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch)
-        cy, sy = math.cos(self.yaw_setpoint), math.sin(self.yaw_setpoint)
-        dn, de, dd = cr * sp * cy + sr * sy, cr * sp * sy - sr * cy, cr * cp
+        cr = math.cos(roll)
+        sr = math.sin(roll)
+        cp = math.cos(pitch)
+        sp = math.sin(pitch)
+        cy = math.cos(self.yaw_setpoint)
+        sy = math.sin(self.yaw_setpoint)
+        dn = cr * sp * cy + sr * sy
+        de = cr * sp * sy - sr * cy
+        dd = cr * cp
         w, x, y, z = est.quaternion
         ax = (1.0 - 2.0 * (y * y + z * z)) * dn + 2.0 * (x * y + w * z) * de + 2.0 * (x * z - w * y) * dd
         ay = 2.0 * (x * y - w * z) * dn + (1.0 - 2.0 * (x * x + z * z)) * de + 2.0 * (y * z + w * x) * dd
@@ -345,7 +363,9 @@ class Control:
         tau_z = clamp(tau_z, -limit, limit)
         self.thrust_share = thrust / (4.0 * full)
         base = thrust / 4.0
-        x4, y4, z4 = tau_x / 4.0, tau_y / 4.0, tau_z / 4.0
+        x4 = tau_x / 4.0
+        y4 = tau_y / 4.0
+        z4 = tau_z / 4.0
         low = 0.02 * full
         self.thrust_demand_n = (
             clamp(base - x4 + y4 + z4, low, full),

@@ -94,7 +94,8 @@ def _parameter_read(vehicle: Vehicle, m: Message, c: Channel) -> None:
 
 def _parameter_set(vehicle: Vehicle, m: Message, c: Channel) -> None:
     v = vehicle.state
-    name, value = m.text("param_id"), m.real("param_value")
+    name = m.text("param_id")
+    value = m.real("param_value")
     if not math.isfinite(value):
         return
     if not v.params.set(name, value) and v.params.find(name) is not None:

@@ -66,7 +66,9 @@ _FLAGS_READY = (
 def _tilted(q: tuple[float, float, float, float], tilt: list[float]) -> tuple[float, float, float, float]:
     """Rotate an attitude by small angles about the body axes, accurate to second order."""
     w, x, y, z = q
-    a, b, c = 0.5 * tilt[0], 0.5 * tilt[1], 0.5 * tilt[2]
+    a = 0.5 * tilt[0]
+    b = 0.5 * tilt[1]
+    c = 0.5 * tilt[2]
     return (w - x * a - y * b - z * c, x + w * a + y * c - z * b, y + w * b + z * a - x * c, z + w * c + x * b - y * a)
 
 

@@ -21,7 +21,9 @@ CRASH_CONFIRMED_S = 2.0
 # Beyond this distance outside the fence, the autopilot only lands.
 FENCE_GIVE_UP_M = 100.0
 # FS_EKF_ACTION
-EKF_REPORTS_ONLY, EKF_HOLDS_ALTITUDE, EKF_LANDS_ALWAYS = 0, 2, 3
+EKF_REPORTS_ONLY = 0
+EKF_HOLDS_ALTITUDE = 2
+EKF_LANDS_ALWAYS = 3
 # Full throttle for THRUST_LOST_S, level and still sinking: potential thrust loss of a motor.
 THRUST_LOST_S = 1.0
 THRUST_LOST_SHARE = 0.9
@@ -174,7 +176,8 @@ class Failsafes:
         if not v.armed:
             self._low_since_s = self._critical_since_s = None
             return
-        p, battery = v.params, v.battery
+        p = v.params
+        battery = v.battery
         left = battery.capacity_mah - battery.used_mah
         timer = p["BATT_LOW_TIMER"]
         critical = 0.0 < battery.voltage_v < p["BATT_CRT_VOLT"]

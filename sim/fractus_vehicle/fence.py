@@ -20,7 +20,8 @@ Vertex = tuple[float, float]
 
 
 def _to_edge_m(north: float, east: float, a: Vertex, b: Vertex) -> float:
-    run_n, run_e = b[0] - a[0], b[1] - a[1]
+    run_n = b[0] - a[0]
+    run_e = b[1] - a[1]
     length2 = run_n * run_n + run_e * run_e
     share = 0.0 if length2 == 0.0 else ((north - a[0]) * run_n + (east - a[1]) * run_e) / length2
     share = min(1.0, max(0.0, share))
@@ -29,11 +30,13 @@ def _to_edge_m(north: float, east: float, a: Vertex, b: Vertex) -> float:
 
 def _ahead_m(position: Vertex, course: Vertex, a: Vertex, b: Vertex) -> float | None:
     """Return the distance along a course to the crossing of an edge, or None if the course misses the edge."""
-    run_n, run_e = b[0] - a[0], b[1] - a[1]
+    run_n = b[0] - a[0]
+    run_e = b[1] - a[1]
     turn = course[0] * run_e - course[1] * run_n
     if abs(turn) < 1e-9:
         return None
-    to_n, to_e = a[0] - position[0], a[1] - position[1]
+    to_n = a[0] - position[0]
+    to_e = a[1] - position[1]
     ahead = (to_n * run_e - to_e * run_n) / turn
     share = (to_n * course[1] - to_e * course[0]) / turn
     return ahead if ahead >= 0.0 and 0.0 <= share <= 1.0 else None
@@ -88,7 +91,8 @@ class Circle:
 
     def distance_along_m(self, position: Vertex, course: Vertex) -> float | None:
         """Return the distance along a course to the rim, or None."""
-        north, east = position[0] - self.north, position[1] - self.east
+        north = position[0] - self.north
+        east = position[1] - self.east
         along = north * course[0] + east * course[1]
         square = along * along - (north * north + east * east - self.radius_m * self.radius_m)
         if square < 0.0:

@@ -9,7 +9,9 @@ from fractus_vehicle.shaping import clamp
 
 TURN_DEG_S = 60.0
 # Angle limits: ArduPilot's defaults of MNT1_PITCH_MIN, MNT1_PITCH_MAX and so on.
-PITCH_DEG, YAW_DEG, ROLL_DEG = (-90.0, 20.0), (-180.0, 180.0), (-30.0, 30.0)
+PITCH_DEG = (-90.0, 20.0)
+YAW_DEG = (-180.0, 180.0)
+ROLL_DEG = (-30.0, 30.0)
 # MNT1_TYPE values without feedback (servo and brushless PWM). They report their target as the measured attitude.
 SERVOS = frozenset({1, 7})
 
@@ -42,5 +44,8 @@ class Gimbal:
         """Attitude quaternion for telemetry: the measured attitude, or the target for servo gimbals."""
         angles = self.target if self.kind in SERVOS else (self.pitch_deg, self.yaw_deg)
         pitch, yaw = (math.radians(angle) / 2 for angle in angles)
-        cp, sp, cy, sy = math.cos(pitch), math.sin(pitch), math.cos(yaw), math.sin(yaw)
+        cp = math.cos(pitch)
+        sp = math.sin(pitch)
+        cy = math.cos(yaw)
+        sy = math.sin(yaw)
         return cp * cy, -sp * sy, sp * cy, cp * sy

@@ -137,7 +137,8 @@ class GuidedFlight(Flight):
         if paused and not self.paused:
             self._resume = (*v.control.target, v.control.target_down) if self.task is Task.POSITION else None
             self.stop(v)
-        before, self.paused = self.paused, paused
+        before = self.paused
+        self.paused = paused
         if before and not paused and self._resume is not None:
             self.go_to(v, *self._resume)
 
@@ -149,8 +150,10 @@ class GuidedFlight(Flight):
         elif self.task in (Task.VELOCITY, Task.ATTITUDE):
             if v.time_s - self.updated_s > v.params["GUID_TIMEOUT"]:
                 if self.task is Task.ATTITUDE:
-                    v.control.pos[0], v.control.pos[1] = v.est.north, v.est.east
-                    v.control.vel[0], v.control.vel[1] = v.est.vn, v.est.ve
+                    v.control.pos[0] = v.est.north
+                    v.control.pos[1] = v.est.east
+                    v.control.vel[0] = v.est.vn
+                    v.control.vel[1] = v.est.ve
                 self.stop(v)
             elif self._commanded_velocity is not None and self.task is Task.VELOCITY:
                 self._avoid(v)

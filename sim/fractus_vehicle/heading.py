@@ -52,7 +52,8 @@ class Heading:
             direction: -1 left, 1 right, 0 the shorter way.
             relative: Measure the angle from the current heading.
         """
-        control, angle = self._control, math.radians(angle_deg)
+        control = self._control
+        angle = math.radians(angle_deg)
         control.target_yaw = control.yaw_setpoint
         if relative:
             self._left = -angle if direction < 0 else angle
@@ -63,7 +64,8 @@ class Heading:
         fastest = math.radians(self._params["ATC_SLEW_YAW"] / 100.0)
         self._rate_rps = min(math.radians(rate_dps), fastest) if rate_dps > 0.0 else fastest
         control.yaw_rate = None
-        self._roi, self._fixed = None, True
+        self._roi = None
+        self._fixed = True
 
     @property
     def turned(self) -> bool:
@@ -78,7 +80,8 @@ class Heading:
             self._left -= step
             control.target_yaw = wrap_pi(control.target_yaw + step)
         elif self._roi is not None:
-            dn, de = self._roi[0] - est.north, self._roi[1] - est.east
+            dn = self._roi[0] - est.north
+            de = self._roi[1] - est.east
             if math.hypot(dn, de) > 1.0:
                 control.target_yaw = math.atan2(de, dn)
         elif not self._fixed and int(self._params["WP_YAW_BEHAVIOR"]) in (1, 2, 3):

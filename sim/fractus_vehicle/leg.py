@@ -20,8 +20,12 @@ Vector = tuple[float, float, float]
 
 def _stopping(v: VehicleState) -> list[tuple[Vector, Vector, Vector]]:
     """Compute how the current motion comes to rest: position, velocity and acceleration in each control step."""
-    control, limits, dt = v.control, v.control.limits, CONTROL_STEP_S
-    pos, vel, acc = list(control.pos), list(control.vel), list(control.acc)
+    control = v.control
+    limits = v.control.limits
+    dt = CONTROL_STEP_S
+    pos = list(control.pos)
+    vel = list(control.vel)
+    acc = list(control.acc)
     rest: list[tuple[Vector, Vector, Vector]] = []
     while math.hypot(*vel) > RESTING_MPS and len(rest) < STOP_STEPS:
         acc[0], acc[1] = shape_velocity_xy(
@@ -55,7 +59,8 @@ class Leg:
     """
 
     def __init__(self, v: VehicleState, north: float, east: float, down: float) -> None:
-        control, limits = v.control, v.control.limits
+        control = v.control
+        limits = v.control.limits
         self.end = (north, east, down)
         self._rest = _stopping(v)
         last = resting_place(v)
@@ -67,7 +72,8 @@ class Leg:
             if length > 0.0
             else (0.0, 0.0, 0.0)
         )
-        level, rise = math.hypot(self._along[0], self._along[1]), self._along[2]
+        level = math.hypot(self._along[0], self._along[1])
+        rise = self._along[2]
         vertical = limits.climb_mps if rise < 0.0 else limits.sink_mps
         self._speed_mps = min(
             limits.speed_mps / level if level > 0.0 else math.inf, vertical / abs(rise) if rise else math.inf
@@ -77,13 +83,16 @@ class Leg:
             limits.accel_z_mps2 / abs(rise) if rise else math.inf,
         )
         jerk = max(v.params["WPNAV_JERK"], 0.1)
-        speed, accel = min(self._speed_mps, 1e3), min(accel, 1e3)
+        speed = min(self._speed_mps, 1e3)
+        accel = min(accel, 1e3)
         self._profile = Profile(length, speed, accel, jerk)
         self._begun_mps = limits.speed_mps
         self._pace = 1.0
         self._time_s = 0.0
         self._at = 0
-        control.target, control.target_down, control.target_velocity = (north, east), down, (0.0, 0.0)
+        control.target = (north, east)
+        control.target_down = down
+        control.target_velocity = (0.0, 0.0)
 
     @property
     def finished(self) -> bool:
@@ -92,7 +101,9 @@ class Leg:
 
     def step(self, v: VehicleState) -> None:
         """Advance the trajectory by one control step. Apply a changed speed limit with the acceleration of legs."""
-        control, limits, dt = v.control, v.control.limits, CONTROL_STEP_S
+        control = v.control
+        limits = v.control.limits
+        dt = CONTROL_STEP_S
         if self.finished:
             if control.horizontal is Axis.PATH:
                 control.track(self.end, _STILL, _STILL)

@@ -149,7 +149,9 @@ class Hub:
 
 class _TcpServer:
     def __init__(self, hub: Hub, spec: LinkSpec, craft: Craft, port: int) -> None:
-        self._hub, self._craft, self._port = hub, craft, port
+        self._hub = hub
+        self._craft = craft
+        self._port = port
         self._clients: set[_TcpClient] = set()
         family = socket.AF_INET6 if ":" in spec.host else socket.AF_INET
         self._socket = socket.socket(family, socket.SOCK_STREAM)
@@ -187,7 +189,9 @@ class _TcpClient:
     ) -> None:
         connection.setblocking(False)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._hub, self._socket, self._craft = hub, connection, craft
+        self._hub = hub
+        self._socket = connection
+        self._craft = craft
         self._gone = gone
         self._channel = craft.open("tcp", port)
         self._unsent = b""
@@ -235,7 +239,9 @@ class _TcpClient:
 
 class _Udp:
     def __init__(self, hub: Hub, spec: LinkSpec, craft: Craft, port: int) -> None:
-        self._hub, self._craft, self._port = hub, craft, port
+        self._hub = hub
+        self._craft = craft
+        self._port = port
         family = socket.AF_INET6 if ":" in spec.host else socket.AF_INET
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setblocking(False)

@@ -39,7 +39,8 @@ class LockstepServer:
 
     def take(self) -> int:
         """Return the number of steps requested since the last call."""
-        wanted, self._wanted = self._wanted, 0
+        wanted = self._wanted
+        self._wanted = 0
         return wanted
 
     def answer(self, ticks: int) -> None:
@@ -58,7 +59,8 @@ class LockstepServer:
             return
         self._drop()
         driver.settimeout(1.0)
-        self._driver, self._input = driver, b""
+        self._driver = driver
+        self._input = b""
         self._hub.watch(driver.fileno(), self._read)
 
     def _read(self) -> None:

@@ -80,7 +80,8 @@ class Acro(Stabilize):
         super().step(v)
         turn = math.radians(v.params["ACRO_RP_RATE"]) * CONTROL_STEP_S
         lean = v.control.limits.tilt_max_rad
-        right, forward = stick_rate(v.sticks[0]), stick_rate(v.sticks[1])
+        right = stick_rate(v.sticks[0])
+        forward = stick_rate(v.sticks[1])
         v.control.attitude = (
             clamp(roll + right * turn, -lean, lean) if right else 0.0,
             clamp(pitch + forward * turn, -lean, lean) if forward else 0.0,
@@ -118,7 +119,8 @@ class Loiter(Flight):
 
     def step(self, v: VehicleState) -> None:
         """Follow the sticks."""
-        forward, right = -stick_rate(v.sticks[1]), stick_rate(v.sticks[0])
+        forward = -stick_rate(v.sticks[1])
+        right = stick_rate(v.sticks[0])
         if forward or right:
             speed = v.params["LOIT_SPEED"] / 100.0
             yaw = v.est.yaw
@@ -145,7 +147,8 @@ class Circle(Flight):
     def begin(self, v: VehicleState) -> None:
         """Set the centre CIRCLE_RADIUS ahead of the stopping position."""
         v.control.hold_here()
-        radius, yaw = v.params["CIRCLE_RADIUS"] / 100.0, v.est.yaw
+        radius = v.params["CIRCLE_RADIUS"] / 100.0
+        yaw = v.est.yaw
         north, east = v.control.target
         self._centre = (north + radius * math.cos(yaw), east + radius * math.sin(yaw))
         self._angle = yaw + math.pi

@@ -164,11 +164,14 @@ def _parameters(message: Message, command: int) -> tuple[float, float, float, fl
 def item_from(message: Message) -> Item:
     """Decode MISSION_ITEM_INT, or MISSION_ITEM with coordinates in floating-point degrees."""
     frame = message.integer("frame")
-    x, y = message.real("x"), message.real("y")
+    x = message.real("x")
+    y = message.real("y")
     scale = 1e7 if frame in GLOBAL_FRAMES else 1e4
     if message.name == "MISSION_ITEM":
-        x, y = (x * scale if math.isfinite(x) else 0.0), (y * scale if math.isfinite(y) else 0.0)
-    command, z = message.integer("command"), message.real("z")
+        x = x * scale if math.isfinite(x) else 0.0
+        y = y * scale if math.isfinite(y) else 0.0
+    command = message.integer("command")
+    z = message.real("z")
     param1, param2, param3, param4 = _parameters(message, command)
     return Item(
         command=command,

@@ -30,7 +30,8 @@ def start_mission(vehicle: Vehicle, o: Command, _c: Channel) -> int:
 
 def set_mission_current(vehicle: Vehicle, o: Command, c: Channel) -> int:
     """Handle DO_SET_MISSION_CURRENT. Reset the mission first if the second parameter is 1."""
-    v, number = vehicle.state, o.params[0]
+    v = vehicle.state
+    number = o.params[0]
     if not (math.isfinite(number) and 0 <= int(number) < len(v.mission.items)):
         return mavlink.MAV_RESULT_DENIED
     if o.params[1] == 1.0:
@@ -43,7 +44,8 @@ def set_mission_current(vehicle: Vehicle, o: Command, c: Channel) -> int:
 
 def jump_to_tag(vehicle: Vehicle, o: Command, c: Channel) -> int:
     """Handle DO_JUMP_TAG."""
-    v, tag = vehicle.state, o.params[0]
+    v = vehicle.state
+    tag = o.params[0]
     if not 0.0 <= tag <= MAX_TAG:
         return mavlink.MAV_RESULT_DENIED
     index = v.mission.find_tag(int(tag))
@@ -74,7 +76,8 @@ def set_current(vehicle: Vehicle, index: int) -> bool:
 
 def pause(vehicle: Vehicle, o: Command, _c: Channel) -> int:
     """Handle DO_PAUSE_CONTINUE in AUTO and GUIDED modes."""
-    v, flight = vehicle.state, vehicle.modes.flight
+    v = vehicle.state
+    flight = vehicle.modes.flight
     if not math.isfinite(o.params[0]) or int(o.params[0]) not in (0, 1):
         return mavlink.MAV_RESULT_DENIED
     paused = int(o.params[0]) == 0

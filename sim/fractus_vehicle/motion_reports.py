@@ -68,9 +68,12 @@ def attitude_target(v: VehicleState) -> Values:
     """Build ATTITUDE_TARGET."""
     roll, pitch = v.control.lean
     yaw = v.control.yaw_setpoint
-    cr, sr = math.cos(roll / 2), math.sin(roll / 2)
-    cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
-    cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
+    cr = math.cos(roll / 2)
+    sr = math.sin(roll / 2)
+    cp = math.cos(pitch / 2)
+    sp = math.sin(pitch / 2)
+    cy = math.cos(yaw / 2)
+    sy = math.sin(yaw / 2)
     q = (
         cr * cp * cy + sr * sp * sy,
         sr * cp * cy - cr * sp * sy,
@@ -127,7 +130,8 @@ def vfr_hud(v: VehicleState) -> Values:
 def nav_controller_output(v: VehicleState) -> Values:
     """Build NAV_CONTROLLER_OUTPUT."""
     c = v.control
-    dn, de = c.target[0] - v.est.north, c.target[1] - v.est.east
+    dn = c.target[0] - v.est.north
+    de = c.target[1] - v.est.east
     distance = math.hypot(dn, de) if c.horizontal is Axis.POSITION and not v.landed else 0.0
     bearing = round(math.degrees(math.atan2(de, dn))) if distance > 0.1 else 0
     return {
@@ -270,7 +274,8 @@ def sim_state(v: VehicleState) -> Values:
 
 def high_latency2(v: VehicleState) -> Values:
     """Build HIGH_LATENCY2."""
-    place, speed = v.place, math.hypot(v.est.vn, v.est.ve)
+    place = v.place
+    speed = math.hypot(v.est.vn, v.est.ve)
     return {
         "timestamp": boot_ms(v),
         "type": mavlink.MAV_TYPE_QUADROTOR,

@@ -7,8 +7,10 @@ import struct
 import zlib
 
 # Noise of ArduPilot's simulated sensors: at rest, and added at full throttle.
-ACCEL_MPS2, ACCEL_THROTTLE_MPS2 = 0.05, 0.25
-GYRO_RPS, GYRO_THROTTLE_RPS = 0.002, 0.007
+ACCEL_MPS2 = 0.05
+ACCEL_THROTTLE_MPS2 = 0.25
+GYRO_RPS = 0.002
+GYRO_THROTTLE_RPS = 0.007
 MAG_MGAUSS = 1.0
 
 

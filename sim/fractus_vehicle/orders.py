@@ -54,11 +54,14 @@ def read_command(message: Message) -> Command:
     )
     command = message.integer("command")
     if message.name == "COMMAND_INT":
-        x, y, z = message.integer("x"), message.integer("y"), message.real("z")
+        x = message.integer("x")
+        y = message.integer("y")
+        z = message.real("z")
         frame = message.integer("frame")
         return Command(command, numbers, x, y, z, frame, x != 0 or y != 0, integer=True)
     scale = 1e7 if command in PLACED else 1.0
-    x, y = _integer(message.real("param5") * scale), _integer(message.real("param6") * scale)
+    x = _integer(message.real("param5") * scale)
+    y = _integer(message.real("param6") * scale)
     frame = (
         mavlink.MAV_FRAME_GLOBAL if command == mavlink.MAV_CMD_DO_SET_HOME else mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT
     )

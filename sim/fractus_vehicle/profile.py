@@ -39,12 +39,14 @@ class Profile:
 
     def _rise(self, t: float) -> tuple[float, float, float]:
         """Return distance, speed and acceleration while accelerating: jerk, constant acceleration, opposite jerk."""
-        jerk, bend = self._jerk, self._bend_s
+        jerk = self._jerk
+        bend = self._bend_s
         if t <= bend:
             return jerk * t**3 / 6.0, 0.5 * jerk * t * t, jerk * t
         if t <= self._rise_s - bend:
             steady = t - bend
-            accel, base = jerk * bend, 0.5 * jerk * bend * bend
+            accel = jerk * bend
+            base = 0.5 * jerk * bend * bend
             return jerk * bend**3 / 6.0 + base * steady + 0.5 * accel * steady * steady, base + accel * steady, accel
         rest = self._rise_s - t
         distance = 0.5 * self.speed_mps * self._rise_s - self.speed_mps * rest + jerk * rest**3 / 6.0

@@ -95,7 +95,9 @@ def _fence_needs_position(v: VehicleState) -> bool:
 
 
 def _battery_refusals(v: VehicleState) -> Iterator[str]:
-    volts, left_mah, p = v.battery.voltage_v, v.battery.capacity_mah - v.battery.used_mah, v.params
+    volts = v.battery.voltage_v
+    left_mah = v.battery.capacity_mah - v.battery.used_mah
+    p = v.params
     if _checks(v, Check.BATTERY):
         if 0.0 < volts < p["BATT_ARM_VOLT"]:
             yield "Battery 1 below minimum arming voltage"

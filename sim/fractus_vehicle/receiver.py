@@ -5,7 +5,8 @@ from __future__ import annotations
 from fractus_vehicle.shaping import clamp
 
 STICKS_CENTRED = (1500,) * 4 + (1800,) + (1000,) * 3 + (0,) * 10
-RELEASED, UNCHANGED = 0, 65535
+RELEASED = 0
+UNCHANGED = 65535
 
 
 class Receiver:

@@ -28,7 +28,8 @@ RequestHandler = Callable[[VehicleState, Command, Channel], int]
 # Maximum message rate as a share of the main loop rate.
 MAX_LOOP_SHARE = 0.8
 # Intervals are stored in whole milliseconds. Intervals below one control step have no effect.
-MIN_INTERVAL_MS, MAX_INTERVAL_MS = 10, 60_000
+MIN_INTERVAL_MS = 10
+MAX_INTERVAL_MS = 60_000
 EKF_SOURCE_SETS = 3
 FRAMES = {0: "PLUS", 1: "X"}
 

@@ -40,7 +40,8 @@ class ReturnToLaunch(Flight):
         """Choose the destination and altitude, and begin to climb."""
         p = v.params
         point = return_point(v)
-        self._target, base_down = (point.north, point.east), point.base_down
+        self._target = (point.north, point.east)
+        base_down = point.base_down
         distance = point.distance_m((v.est.north, v.est.east))
         height = base_down - v.est.down
         least = max(height + p["RTL_CLIMB_MIN"] / 100.0, 2.0)
@@ -89,5 +90,6 @@ class ReturnToLaunch(Flight):
             self._leg = Leg(v, *self._target, self._down)
 
     def _arrived(self, v: VehicleState) -> bool:
-        leg, radius_m = self._leg, max(v.params["WPNAV_RADIUS"] / 100.0, 0.5)
+        leg = self._leg
+        radius_m = max(v.params["WPNAV_RADIUS"] / 100.0, 0.5)
         return leg is not None and leg.finished and leg.reached(v, radius_m)

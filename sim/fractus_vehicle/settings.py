@@ -31,7 +31,8 @@ def leg_speeds_mps(params: Parameters) -> tuple[float, float, float]:
 
 def set_limits(params: Parameters, control: Control) -> None:
     """Set motion limits and gains of the controllers."""
-    limits, gains = control.limits, control.gains
+    limits = control.limits
+    gains = control.gains
     limits.speed_mps, limits.climb_mps, limits.sink_mps = leg_speeds_mps(params)
     limits.accel_mps2 = max(params["WPNAV_ACCEL"] / 100.0, 0.5)
     limits.accel_z_mps2 = max(params["WPNAV_ACCEL_Z"] / 100.0, 0.5)
@@ -53,7 +54,8 @@ def set_fence(params: Parameters, fence: Fence, changed: str = "FENCE_ENABLE") -
     if changed == "FENCE_ENABLE":
         fence.enabled = int(params["FENCE_ENABLE"]) != 0
     fence.types = int(params["FENCE_TYPE"])
-    fence.alt_max_m, fence.alt_min_m = params["FENCE_ALT_MAX"], params["FENCE_ALT_MIN"]
+    fence.alt_max_m = params["FENCE_ALT_MAX"]
+    fence.alt_min_m = params["FENCE_ALT_MIN"]
     fence.radius_m = params["FENCE_RADIUS"]
     fence.margin_m = max(params["FENCE_MARGIN"], 0.0)
     fence.avoid = bool(int(params["AVOID_ENABLE"]) & AVOID_FENCE)

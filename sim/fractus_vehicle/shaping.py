@@ -79,13 +79,16 @@ def shape_velocity_xy(
     dt: float,
 ) -> tuple[float, float]:
     """`shape_velocity` for the horizontal plane. The limits apply to the length of the vector."""
-    error_n, error_e = target[0] - velocity[0], target[1] - velocity[1]
+    error_n = target[0] - velocity[0]
+    error_e = target[1] - velocity[1]
     size = math.hypot(error_n, error_e)
     thrust_demand_n = wanted_e = 0.0
     if size > 1e-9:
         scale = min(sqrt_controller(size, jerk_max / accel_max, jerk_max, dt), accel_max) / size
-        thrust_demand_n, wanted_e = error_n * scale, error_e * scale
-    delta_n, delta_e = thrust_demand_n - acceleration[0], wanted_e - acceleration[1]
+        thrust_demand_n = error_n * scale
+        wanted_e = error_e * scale
+    delta_n = thrust_demand_n - acceleration[0]
+    delta_e = wanted_e - acceleration[1]
     size = math.hypot(delta_n, delta_e)
     step = jerk_max * dt
     scale = step / size if size > step else 1.0

@@ -72,7 +72,8 @@ class Craft:
 
     def _reboot(self) -> None:
         """Restart the vehicle at its position. Keep parameters, plans and the signing key."""
-        old, key = self.vehicle.state, self.vehicle.signing_key
+        old = self.vehicle.state
+        key = self.vehicle.signing_key
         place = replace(old.true_place, alt_m=self.config.start.alt_m)
         heading_deg = math.degrees(old.body.euler()[2]) % 360.0
         self.vehicle = Vehicle(

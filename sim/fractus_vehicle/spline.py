@@ -20,7 +20,8 @@ class SplineLeg:
     """Curve from the current trajectory to a local point, with given directions at both ends."""
 
     def __init__(self, v: VehicleState, end: Point, leave: Point, arrive: Point) -> None:
-        pos, vel = v.control.pos, v.control.vel
+        pos = v.control.pos
+        vel = v.control.vel
         self.end = end
         self._stops = not any(arrive)
         start = (pos[0], pos[1], pos[2])
@@ -28,7 +29,8 @@ class SplineLeg:
         self._speed_mps = math.hypot(vel[0], vel[1], vel[2]) if any(leave) else 0.0
         leave = leave if any(leave) else _scaled(straight, AT_REST)
         arrive = _scaled(straight, AT_REST) if self._stops else arrive
-        size, room = math.hypot(*leave) + math.hypot(*arrive), 4.0 * math.dist(start, end)
+        size = math.hypot(*leave) + math.hypot(*arrive)
+        room = 4.0 * math.dist(start, end)
         scale = room / size if size > room else 1.0
         self._curve = tuple(
             (a, la, -3.0 * a - 2.0 * la + 3.0 * b - lb, 2.0 * a + la - 2.0 * b + lb)
@@ -42,7 +44,8 @@ class SplineLeg:
         """Return the maximum speed at each sample that allows braking for bends, climbs and the end."""
         allowed = [self._local_limit(v, step / _SAMPLES) for step in range(_SAMPLES + 1)]
         allowed[-1] = 0.0 if self._stops else allowed[-1]
-        limits, left_m = v.control.limits, 0.0
+        limits = v.control.limits
+        left_m = 0.0
         braking = 2.0 * BRAKING_SHARE * limits.accel_mps2
         for step in range(_SAMPLES - 1, -1, -1):
             distance_m = math.dist(self.at(step / _SAMPLES), self.at((step + 1) / _SAMPLES))
@@ -65,8 +68,10 @@ class SplineLeg:
         return (dx, dy, dz), (ddx, ddy, ddz)
 
     def _local_limit(self, v: VehicleState, share: float) -> float:
-        limits, (slope, bend) = v.control.limits, self._slopes(share)
-        size, level = max(math.hypot(*slope), 1e-6), max(math.hypot(slope[0], slope[1]), 1e-6)
+        limits = v.control.limits
+        slope, bend = self._slopes(share)
+        size = max(math.hypot(*slope), 1e-6)
+        level = max(math.hypot(slope[0], slope[1]), 1e-6)
         wanted = limits.speed_mps * size / level
         if slope[2]:
             wanted = min(wanted, (limits.climb_mps if slope[2] < 0.0 else limits.sink_mps) * size / abs(slope[2]))
@@ -75,7 +80,8 @@ class SplineLeg:
 
     def step(self, v: VehicleState) -> None:
         """Advance the trajectory along the curve by one control step."""
-        control, dt = v.control, CONTROL_STEP_S
+        control = v.control
+        dt = CONTROL_STEP_S
         if self._share >= 1.0:
             if control.horizontal is Axis.PATH:
                 if self._stops:
@@ -101,7 +107,8 @@ class SplineLeg:
         slope, bend = self._slopes(self._share)
         pace = self._speed_mps / max(math.hypot(*slope), 1e-6)
         self._share = min(1.0, self._share + pace * dt)
-        control.target, control.target_down = self.end[:2], self.end[2]
+        control.target = self.end[:2]
+        control.target_down = self.end[2]
         control.track(
             self.at(self._share),
             (slope[0] * pace, slope[1] * pace, slope[2] * pace),
@@ -112,7 +119,8 @@ class SplineLeg:
         """Return the acceleration that keeps the vehicle on the curve and changes its speed."""
         size2 = max(slope[0] ** 2 + slope[1] ** 2 + slope[2] ** 2, 1e-12)
         along = (slope[0] * bend[0] + slope[1] * bend[1] + slope[2] * bend[2]) / size2
-        push, pace2 = self._accel_mps2 / math.sqrt(size2), pace * pace
+        push = self._accel_mps2 / math.sqrt(size2)
+        pace2 = pace * pace
         demand = (
             (bend[0] - along * slope[0]) * pace2 + push * slope[0],
             (bend[1] - along * slope[1]) * pace2 + push * slope[1],

@@ -41,7 +41,8 @@ def _vector(m: Message, x: str, y: str, z: str) -> Vector:
 
 
 def _rotated(v: VehicleState, vector: Vector) -> Vector:
-    cosine, sine = math.cos(v.est.yaw), math.sin(v.est.yaw)
+    cosine = math.cos(v.est.yaw)
+    sine = math.sin(v.est.yaw)
     return (vector[0] * cosine - vector[1] * sine, vector[0] * sine + vector[1] * cosine, vector[2])
 
 
@@ -59,10 +60,13 @@ def local_target(v: VehicleState, flight: Flight, m: Message) -> None:
     if frame not in _LOCAL_FRAMES:
         _stop(v, flight)
         return
-    position, velocity = _vector(m, "x", "y", "z"), _vector(m, "vx", "vy", "vz")
+    position = _vector(m, "x", "y", "z")
+    velocity = _vector(m, "vx", "vy", "vz")
     accel = _vector(m, "afx", "afy", "afz")
     if frame in _BODY_FRAMES:
-        position, velocity, accel = _rotated(v, position), _rotated(v, velocity), _rotated(v, accel)
+        position = _rotated(v, position)
+        velocity = _rotated(v, velocity)
+        accel = _rotated(v, accel)
     if frame in _OFFSET_FRAMES:
         e = v.est
         position = (position[0] + e.north, position[1] + e.east, position[2] + e.down)
@@ -72,8 +76,11 @@ def local_target(v: VehicleState, flight: Flight, m: Message) -> None:
 def global_target(v: VehicleState, flight: Flight, m: Message) -> None:
     """Handle SET_POSITION_TARGET_GLOBAL_INT."""
     frame = m.integer("coordinate_frame")
-    lat, lon, alt = m.integer("lat_int"), m.integer("lon_int"), m.real("alt")
-    origin, position = v.origin, (0.0, 0.0, 0.0)
+    lat = m.integer("lat_int")
+    lon = m.integer("lon_int")
+    alt = m.real("alt")
+    origin = v.origin
+    position = (0.0, 0.0, 0.0)
     if origin is None or not isinstance(flight, GuidedFlight):
         return
     if not m.integer("type_mask") & IGNORE_POSITION:  # without a position, frame and coordinates are ignored

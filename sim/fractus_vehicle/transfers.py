@@ -105,7 +105,8 @@ class Transfers:
             case "MISSION_COUNT":
                 self._begin(channel, message, store, range(message.integer("count")))
             case "MISSION_WRITE_PARTIAL_LIST":
-                start, end = message.integer("start_index"), message.integer("end_index")
+                start = message.integer("start_index")
+                end = message.integer("end_index")
                 # A write may append one item.
                 if 0 <= start <= end <= len(store.items):
                     self._begin(channel, message, store, range(start, end + 1))

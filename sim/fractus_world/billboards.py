@@ -66,10 +66,13 @@ class Billboard:
         angle = math.radians(self.heading_deg)
         ahead = np.array([math.sin(angle), math.cos(angle), 0.0])
         right = np.array([math.cos(angle), -math.sin(angle), 0.0])
-        up, base = ahead, np.array([self.x, self.y, 0.02])
+        up = ahead
+        base = np.array([self.x, self.y, 0.02])
         if self.standing:
             # A viewer in front of the billboard sees its right side on the left.
-            right, up, base = -right, np.array([0.0, 0.0, 1.0]), np.array([self.x, self.y, _FEET_M])
+            right = -right
+            up = np.array([0.0, 0.0, 1.0])
+            base = np.array([self.x, self.y, _FEET_M])
         width = self.height_m * _ASPECT
         return np.array([base + (u - 0.5) * width * right + (1.0 - v) * self.height_m * up for u, v in shares])
 
@@ -93,8 +96,10 @@ class BillboardsAroundOrigin:
     def __init__(self, seed: int) -> None:
         self._boards = []
         for n in range(6):
-            bearing, away = 2 * math.pi * (n / 6 + 0.1 * unit(seed, 71, n)), 14.0 + 14.0 * n
-            x, y = away * math.sin(bearing), away * math.cos(bearing)
+            bearing = 2 * math.pi * (n / 6 + 0.1 * unit(seed, 71, n))
+            away = 14.0 + 14.0 * n
+            x = away * math.sin(bearing)
+            y = away * math.cos(bearing)
             heading = math.degrees(bearing) + 180.0 if n % 2 else 360.0 * unit(seed, 72, n)
             size = (4.8, 3.2, 6.4)[n % 3]
             self._boards.append(Billboard(f"face-{n}", x, y, heading, n % 2 == 1, size, n % VARIATIONS))
@@ -150,8 +155,10 @@ def _in(board: Billboard, box: Matrix) -> bool:
 
 def face_box(variation: int) -> tuple[float, float, float, float]:
     """Return the position of the face in the picture of a variation: left, top, right, bottom as shares."""
-    wide, high = _CROP[2] - _CROP[0], _CROP[3] - _CROP[1]
-    left, right = (_FACE[0] - _CROP[0]) / wide, (_FACE[2] - _CROP[0]) / wide
+    wide = _CROP[2] - _CROP[0]
+    high = _CROP[3] - _CROP[1]
+    left = (_FACE[0] - _CROP[0]) / wide
+    right = (_FACE[2] - _CROP[0]) / wide
     if variation % 2:
         left, right = 1.0 - right, 1.0 - left
     return left, (_FACE[1] - _CROP[1]) / high, right, (_FACE[3] - _CROP[1]) / high
@@ -176,5 +183,6 @@ def _portrait(variation: int) -> Picture:
 def portrait(variation: int, halvings: int) -> Picture:
     """Return a variation of the photograph, reduced by powers of two for large distances."""
     whole = _portrait(variation)
-    height, width = max(whole.shape[0] >> halvings, 2), max(whole.shape[1] >> halvings, 2)
+    height = max(whole.shape[0] >> halvings, 2)
+    width = max(whole.shape[1] >> halvings, 2)
     return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.uint8)

@@ -52,6 +52,7 @@ class Blocks:
 
     def near(self, x0: float, y0: float, x1: float, y1: float) -> list[tuple[int, int]]:
         """The blocks that may reach into a box."""
-        (west, south), (east, north) = cell(x0, y0), cell(x1, y1)
+        west, south = cell(x0, y0)
+        east, north = cell(x1, y1)
         columns = range(math.ceil(west - _REACH), math.floor(east + _REACH) + 1)
         return [(i, j) for j in range(math.ceil(south - _REACH), math.floor(north + _REACH) + 1) for i in columns]

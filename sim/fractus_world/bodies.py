@@ -72,7 +72,9 @@ def parts_of(thing: Thing) -> tuple[Part, ...]:
 
 def _outline(length: float, width: float, *, nose: float = 0.0, round_m: float = 0.3) -> Points:
     """Return a rectangle with cut corners around the origin. `nose` shifts it ahead."""
-    a, b, c = length / 2, width / 2, round_m
+    a = length / 2
+    b = width / 2
+    c = round_m
     corners = [(a - c, b), (a, b - c), (a, c - b), (a - c, -b), (c - a, -b), (-a, c - b), (-a, b - c), (c - a, b)]
     return _moved(np.array(corners), nose, 0.0)
 
@@ -106,8 +108,10 @@ def _lights(ahead: float, width: float, height: float) -> tuple[Part, ...]:
 
 @lru_cache(maxsize=64)
 def _car(paint: Colour, moving: bool) -> tuple[Part, ...]:
-    base, belt = _outline(4.4, 1.78, round_m=0.38), _outline(4.5, 1.85, round_m=0.42)
-    cabin, roof = _outline(2.75, 1.62, nose=-0.3, round_m=0.25), _outline(1.65, 1.36, nose=-0.42, round_m=0.2)
+    base = _outline(4.4, 1.78, round_m=0.38)
+    belt = _outline(4.5, 1.85, round_m=0.42)
+    cabin = _outline(2.75, 1.62, nose=-0.3, round_m=0.25)
+    roof = _outline(1.65, 1.36, nose=-0.42, round_m=0.2)
     pillars = _outline(2.0, 1.46, nose=-0.4, round_m=0.1)
     bonnet = _outline(1.0, 1.3, nose=1.55, round_m=0.2)
     return (
@@ -123,7 +127,8 @@ def _car(paint: Colour, moving: bool) -> tuple[Part, ...]:
 
 @lru_cache(maxsize=64)
 def _van(paint: Colour, moving: bool) -> tuple[Part, ...]:
-    base, roof = _outline(5.6, 2.05, round_m=0.3), _outline(4.3, 1.86, nose=-0.55, round_m=0.2)
+    base = _outline(5.6, 2.05, round_m=0.3)
+    roof = _outline(4.3, 1.86, nose=-0.55, round_m=0.2)
     screen = _outline(0.75, 1.7, nose=1.75, round_m=0.12)
     bonnet = _outline(0.8, 1.5, nose=2.3, round_m=0.2)
     return (
@@ -144,7 +149,8 @@ def _van(paint: Colour, moving: bool) -> tuple[Part, ...]:
 
 @lru_cache(maxsize=64)
 def _truck(paint: Colour, moving: bool) -> tuple[Part, ...]:
-    cab, box = _outline(2.2, 2.45, nose=4.1, round_m=0.25), _outline(7.8, 2.5, nose=-1.3, round_m=0.05)
+    cab = _outline(2.2, 2.45, nose=4.1, round_m=0.25)
+    box = _outline(7.8, 2.5, nose=-1.3, round_m=0.05)
     load: Colour = (206, 208, 206)
     return (
         Part(_prism(_outline(10.4, 2.2), 0.4, _outline(10.4, 2.2), 1.0), (54, 54, 56), 140),
@@ -160,7 +166,8 @@ def _truck(paint: Colour, moving: bool) -> tuple[Part, ...]:
 
 @lru_cache(maxsize=64)
 def _bus(paint: Colour, moving: bool) -> tuple[Part, ...]:
-    base, roof = _outline(12.0, 2.55, round_m=0.35), _outline(11.7, 2.35, round_m=0.35)
+    base = _outline(12.0, 2.55, round_m=0.35)
+    roof = _outline(11.7, 2.35, round_m=0.35)
     return (
         Part(_prism(base, 0.3, base, 1.2), _shaded(paint, 0.55), 140),
         Part(_prism(base, 1.2, roof, 2.6), _GLASS, 130),
@@ -173,13 +180,16 @@ def _bus(paint: Colour, moving: bool) -> tuple[Part, ...]:
 
 @lru_cache(maxsize=4096)
 def _person(looks: int, stride: int) -> tuple[Part, ...]:
-    shirt, hair = CLOTHES[looks % len(CLOTHES)], _HAIR[looks // 8 % len(_HAIR)]
+    shirt = CLOTHES[looks % len(CLOTHES)]
+    hair = _HAIR[looks // 8 % len(_HAIR)]
     trousers = _TROUSERS[looks // 40 % len(_TROUSERS)]
     step = 0.07 * stride
     foot = _outline(0.28, 0.11, round_m=0.05)
-    hips, chest = _outline(0.24, 0.36, round_m=0.1), _outline(0.27, 0.5, round_m=0.11)
+    hips = _outline(0.24, 0.36, round_m=0.1)
+    chest = _outline(0.27, 0.5, round_m=0.11)
     head = _outline(0.22, 0.18, round_m=0.07)
-    left, right = _moved(foot, step, -0.1), _moved(foot, -step, 0.1)
+    left = _moved(foot, step, -0.1)
+    right = _moved(foot, -step, 0.1)
     return (
         Part(np.vstack((_at(left, 0.0), _at(_moved(hips, 0.0, -0.02), 0.9))), _shaded(trousers, 0.8), 214),
         Part(np.vstack((_at(right, 0.0), _at(hips, 0.9))), trousers, 220),
@@ -215,7 +225,8 @@ def silhouette(thing: Thing) -> tuple[Part, ...]:
 @lru_cache(maxsize=128)
 def _far_vehicle(size_m: tuple[float, float, float], paint: Colour) -> tuple[Part, ...]:
     length, width, height = size_m
-    base, roof = _outline(length, width, round_m=0.4), _outline(0.6 * length, 0.8 * width, round_m=0.2)
+    base = _outline(length, width, round_m=0.4)
+    roof = _outline(0.6 * length, 0.8 * width, round_m=0.2)
     low = 0.6 * height
     return (
         Part(_prism(base, 0.2, base, low), _shaded(paint, 0.62), 140),

@@ -166,7 +166,8 @@ class CameraApi:
         return world
 
     def _noted(self, camera_pose: CameraPose, lens: Intrinsics, time_s: float, band: Band) -> Snapshot:
-        pose, mount = camera_pose.pose, camera_pose.mount or self._mount
+        pose = camera_pose.pose
+        mount = camera_pose.mount or self._mount
         amsl_m = camera_pose.ground_amsl_m + pose.height_m
         with self._lock:
             self._count += 1
@@ -224,7 +225,8 @@ class _RenderSlot:
     """The right to render: one at a time, few wait, and none for long."""
 
     def __init__(self, waiting: threading.BoundedSemaphore, busy: threading.Lock) -> None:
-        self._waiting, self._busy = waiting, busy
+        self._waiting = waiting
+        self._busy = busy
 
     def __enter__(self) -> None:
         if not self._waiting.acquire(blocking=False):

@@ -168,11 +168,13 @@ def from_geotiff(tags: Mapping[str, Any], source: str, origin: tuple[float, floa
         whole = np.asarray(matrix, np.float64).reshape(4, 4)
         affine = whole[:2][:, [0, 1, 3]]
     else:
-        scale, tie = tags.get("ModelPixelScale"), tags.get("ModelTiepoint")
+        scale = tags.get("ModelPixelScale")
+        tie = tags.get("ModelTiepoint")
         if scale is None or tie is None:
             raise GeoreferenceError(f"{source}: no GeoTIFF tags (ModelPixelScale and ModelTiepoint); add a world file")
         tie = np.asarray(tie, np.float64).ravel()
-        east, north = float(scale[0]), -float(scale[1])
+        east = float(scale[0])
+        north = -float(scale[1])
         affine = np.array([[east, 0.0, tie[3] - east * tie[0]], [0.0, north, tie[4] - north * tie[1]]])
     affine = affine.copy()
     affine[:, 2] -= shift * (affine[:, 0] + affine[:, 1])

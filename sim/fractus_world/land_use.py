@@ -71,14 +71,18 @@ class _Frontage:
 
     def box(self, a0: float, n0: float, a1: float, n1: float) -> shapely.Polygon:
         """Return a rectangle between two distances along the road and two distances away from it."""
-        (x, y), (ax, ay), (nx, ny) = self.origin, self.along, self.away
+        x, y = self.origin
+        ax, ay = self.along
+        nx, ny = self.away
         corners = ((a0, n0), (a1, n0), (a1, n1), (a0, n1))
         return shapely.Polygon([(x + a * ax + n * nx, y + a * ay + n * ny) for a, n in corners])
 
 
 def _fields(site: Site) -> None:
     """Strips of crops side by side, and a hedge here and there."""
-    block, inside, roll = site.block, site.inside, site.roll
+    block = site.block
+    inside = site.inside
+    roll = site.roll
     sides = inside.minimum_rotated_rectangle.exterior.coords
     heading = math.degrees(math.atan2(sides[1][0] - sides[0][0], sides[1][1] - sides[0][1]))
     heading += 90.0 * (roll.random() < 0.5)
@@ -112,13 +116,17 @@ def _hedge(site: Site, line: shapely.Geometry, radius_m: tuple[float, float], ga
 
 
 def _meadow(site: Site) -> None:
-    block, inside, roll = site.block, site.inside, site.roll
+    block = site.block
+    inside = site.inside
+    roll = site.roll
     block.patches.append(Patch(_corners(inside), _tinted((78, 130, 112), roll, 8), 130))
     _scatter(site, inside, roll.randint(8, 40), (1.5, 5.0))
 
 
 def _wood(site: Site) -> None:
-    block, inside, roll = site.block, site.inside, site.roll
+    block = site.block
+    inside = site.inside
+    roll = site.roll
     block.patches.append(Patch(_corners(inside), (40, 64, 50), 160))
     west, south, east, north = inside.bounds
     step = 5.2
@@ -132,7 +140,9 @@ def _wood(site: Site) -> None:
 
 def _park(site: Site) -> None:
     """Lawn, a pitch, a pond, paths and trees."""
-    block, inside, roll = site.block, site.inside, site.roll
+    block = site.block
+    inside = site.inside
+    roll = site.roll
     block.patches.append(Patch(_corners(inside), _LAWN, 90))
     middle = inside.centroid
     pond = shapely.Point(middle.x + roll.uniform(40, 60), middle.y + roll.uniform(-50, 50)).buffer(roll.uniform(14, 24))
@@ -159,7 +169,9 @@ def _park(site: Site) -> None:
 
 def _works(site: Site) -> None:
     """Halls on a paved yard with a car park."""
-    block, inside, roll = site.block, site.inside, site.roll
+    block = site.block
+    inside = site.inside
+    roll = site.roll
     block.patches.append(Patch(_corners(inside), _tinted(_PAVEMENT, roll, 6), 50))
     sides = inside.minimum_rotated_rectangle.exterior.coords
     turn = math.degrees(math.atan2(sides[1][1] - sides[0][1], sides[1][0] - sides[0][0])) % 90.0
@@ -167,8 +179,10 @@ def _works(site: Site) -> None:
     west, south, east, north = level.bounds
     taken = shapely.Polygon()
     for _ in range(12):
-        w, d = roll.uniform(28, 80), roll.uniform(24, 50)
-        x, y = roll.uniform(west, east - w), roll.uniform(south + 50, north - d)
+        w = roll.uniform(28, 80)
+        d = roll.uniform(24, 50)
+        x = roll.uniform(west, east - w)
+        y = roll.uniform(south + 50, north - d)
         hall = shapely.box(x, y, x + w, y + d)
         if level.contains(hall.buffer(4)) and not hall.buffer(9).intersects(taken):
             taken = taken.union(hall)
@@ -182,7 +196,9 @@ def _works(site: Site) -> None:
 
 
 def _car_park(site: Site, level: shapely.Polygon, taken: shapely.Geometry, turn: float) -> None:
-    block, roll, origin = site.block, site.roll, site.inside.centroid
+    block = site.block
+    roll = site.roll
+    origin = site.inside.centroid
     west, south, east, _ = level.bounds
     for row in range(4):
         y = south + 16.0 + 8.5 * row
@@ -200,7 +216,9 @@ def _car_park(site: Site, level: shapely.Polygon, taken: shapely.Geometry, turn:
 
 def _houses(site: Site) -> None:
     """Rows of houses along the roads around and along streets between them, each with a drive and a garden behind."""
-    block, inside, roll = site.block, site.inside, site.roll
+    block = site.block
+    inside = site.inside
+    roll = site.roll
     block.patches.append(Patch(_corners(inside), _tinted(_LAWN, roll, 6), 110))
     whole = shapely.Polygon(block.outline)
     sides = inside.minimum_rotated_rectangle.exterior.coords
@@ -232,14 +250,16 @@ def _houses(site: Site) -> None:
 def _row(site: Site, ground: shapely.Polygon) -> list[shapely.Geometry]:
     """Place houses around an area. Return possible positions of hedges."""
     hedges: list[shapely.Geometry] = []
-    ring, roll = ground.exterior, site.roll
+    ring = ground.exterior
+    roll = site.roll
     at = roll.uniform(4.0, 12.0)
     while at < ring.length - 10.0:
         lot = roll.uniform(17.0, 25.0)
         _house(site, ground, _frontage(ring, at + lot / 2), lot)
         if roll.random() < 0.4:
             front = _frontage(ring, at)
-            (x, y), (nx, ny) = front.origin, front.away
+            x, y = front.origin
+            nx, ny = front.away
             hedge = shapely.LineString([(x + nx * 3, y + ny * 3), (x + nx * 26, y + ny * 26)])
             hedges.append(hedge.intersection(ground))
         at += lot
@@ -248,16 +268,21 @@ def _row(site: Site, ground: shapely.Polygon) -> list[shapely.Geometry]:
 
 def _frontage(line: shapely.LinearRing, at_m: float) -> _Frontage:
     """The point so far along a ring that runs counter-clockwise or clockwise; `away` leads inside."""
-    here, ahead = line.interpolate(at_m - 1.0), line.interpolate(at_m + 1.0)
+    here = line.interpolate(at_m - 1.0)
+    ahead = line.interpolate(at_m + 1.0)
     length = max(math.hypot(ahead.x - here.x, ahead.y - here.y), 1e-6)
-    ax, ay = (ahead.x - here.x) / length, (ahead.y - here.y) / length
+    ax = (ahead.x - here.x) / length
+    ay = (ahead.y - here.y) / length
     side = 1.0 if line.is_ccw else -1.0
     return _Frontage((here.x, here.y), (ax, ay), (-ay * side, ax * side))
 
 
 def _house(site: Site, ground: shapely.Polygon, front: _Frontage, lot: float) -> None:
-    block, roll = site.block, site.roll
-    wide, deep, back = roll.uniform(9.0, min(lot - 6.0, 14.0)), roll.uniform(8.0, 11.0), roll.uniform(5.0, 9.0)
+    block = site.block
+    roll = site.roll
+    wide = roll.uniform(9.0, min(lot - 6.0, 14.0))
+    deep = roll.uniform(8.0, 11.0)
+    back = roll.uniform(5.0, 9.0)
     house = front.box(-wide / 2, back, wide / 2, back + deep)
     room = house.buffer(3.0, quad_segs=1)
     if not ground.contains(house) or any(room.intersects(other) for other in site.built):
@@ -277,7 +302,9 @@ def _house(site: Site, ground: shapely.Polygon, front: _Frontage, lot: float) ->
 
 
 def _garden(site: Site, front: _Frontage, wide: float, behind: float) -> None:
-    block, roll, inside = site.block, site.roll, site.inside
+    block = site.block
+    roll = site.roll
+    inside = site.inside
     terrace = front.box(-wide / 4, behind, wide / 4, behind + 3.2)
     if inside.contains(terrace):
         block.patches.append(Patch(_corners(terrace), _tinted((150, 160, 172), roll, 10), 40))
@@ -298,8 +325,10 @@ def _scatter(site: Site, area: shapely.Geometry, count: int, radius_m: tuple[flo
     west, south, east, north = area.bounds
     shapely.prepare(area)
     for _ in range(count):
-        x, y = roll.uniform(west, east), roll.uniform(south, north)
-        radius, looks = radius_m[0] + (radius_m[1] - radius_m[0]) * roll.random() ** 2, roll.random()
+        x = roll.uniform(west, east)
+        y = roll.uniform(south, north)
+        radius = radius_m[0] + (radius_m[1] - radius_m[0]) * roll.random() ** 2
+        looks = roll.random()
         if shapely.contains_xy(area, x, y):
             site.trees.append((x, y, radius, looks))
 

@@ -34,10 +34,13 @@ _AFAR: dict[Kind, Colour] = {
     "meadow": (78, 130, 112),
 }
 _SHADOW_DEPTH = 0.56
-_EARTHY, _LEAFY = np.array([0.86, 1.0, 0.98], np.float32), np.array([0.8, 1.0, 1.0], np.float32)
+_EARTHY = np.array([0.86, 1.0, 0.98], np.float32)
+_LEAFY = np.array([0.8, 1.0, 1.0], np.float32)
 _LIGHT = np.clip(np.outer(np.arange(256), [0.97, 1.0, 1.03]), 0, 255).astype(np.uint8).reshape(256, 1, 3)
 """The colour of an afternoon."""
-_DASH_M, _DASH_EVERY_M, _JUNCTION_M = 3.0, 9.0, 11.0
+_DASH_M = 3.0
+_DASH_EVERY_M = 9.0
+_JUNCTION_M = 11.0
 
 
 class Landscape:
@@ -101,7 +104,8 @@ class Landscape:
 
     def _carriageway(self, drawing: TileDrawing, road: Road, step: int, *, paved: bool) -> None:
         """Draw one road segment: first its verges, then its surface over the verges of its neighbours."""
-        edge, half = lengthened(self.roads.edge(road, step), 2.5), self.roads.width_m(road, step) / 2
+        edge = lengthened(self.roads.edge(road, step), 2.5)
+        half = self.roads.width_m(road, step) / 2
         built_up = self.roads.built_up(road, step)
         if not paved:
             if built_up:
@@ -140,10 +144,14 @@ def _patches(drawing: TileDrawing, block: Block) -> None:
 def _rows(drawing: TileDrawing, patch: Patch, heading_deg: float) -> None:
     """Rows of a crop, swaths, and the tramlines that a tractor leaves every 18 m."""
     mask = drawing.mask(patch.outline)
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    rows = np.flatnonzero(mask.any(axis=1))
+    columns = np.flatnonzero(mask.any(axis=0))
     if len(rows) == 0:
         return
-    y0, y1, x0, x1 = int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1
+    y0 = int(rows[0])
+    y1 = int(rows[-1]) + 1
+    x0 = int(columns[0])
+    x1 = int(columns[-1]) + 1
     across = math.radians(heading_deg + 90.0)
     east = (drawing.left_m + (np.arange(x0, x1) + 0.5) * drawing.pixel_m) * math.sin(across)
     north = (drawing.top_m - (np.arange(y0, y1) + 0.5) * drawing.pixel_m) * math.cos(across)
@@ -216,7 +224,8 @@ def _trees(drawing: TileDrawing, blocks: list[Block]) -> Points:
     if not found:
         return np.empty((0, 4))
     trees = np.vstack(found)
-    x, y = trees[:, 0], trees[:, 1]
+    x = trees[:, 0]
+    y = trees[:, 1]
     keep = (x > west - margin) & (x < east + margin) & (y > south - margin) & (y < north + margin)
     keep &= trees[:, 2] > 1.1 * drawing.pixel_m
     return np.asarray(trees[keep])
@@ -234,7 +243,8 @@ def _roof(drawing: TileDrawing, roof: Roof) -> None:
             drawing.fill(box + np.array(SUN_SHADOW) * 0.8, _lit(roof.colour, 0.62))
             drawing.fill(box, (178, 178, 176))
         return
-    start, end = (a + d) / 2, (b + c) / 2
+    start = (a + d) / 2
+    end = (b + c) / 2
     for near, far in ((a, b), (d, c)):
         outward = (near + far) / 2 - (start + end) / 2
         facing = float(outward @ np.array(SUN_SHADOW)) / float(np.linalg.norm(outward))

@@ -113,7 +113,8 @@ class ObjectLayer:
         for number, item in enumerate(in_sight, start=1):
             for shape in item.shapes:
                 cv2.fillConvexPoly(labels, shape.hull, (number,), cv2.LINE_8, _SHIFT)
-        objects, faces = [], []
+        objects = []
+        faces = []
         for number, item in enumerate(in_sight, start=1):
             if isinstance(item.what, Billboard):
                 face = _seen_face(view, item.what, labels, number, frame)
@@ -145,11 +146,13 @@ def _thing_actors(view: View, things: list[Thing]) -> list[_InSight]:
     shade, shade_depth = view.project(fallen)
     starts = np.concatenate(([0], np.cumsum(counts)[:-1]))
     near = np.minimum.reduceat(depth, starts) < NEAR_M
-    low, high = np.minimum.reduceat(pixels, starts), np.maximum.reduceat(pixels, starts)
+    low = np.minimum.reduceat(pixels, starts)
+    high = np.maximum.reduceat(pixels, starts)
     lens = view.intrinsics
     outside = (high <= 0).any(axis=1) | (low[:, 0] >= lens.width) | (low[:, 1] >= lens.height)
     shadeless = (np.minimum.reduceat(shade_depth, starts) < NEAR_M) | (sizes < _SHADELESS_PX)
-    fixed, fixed_shade = _fixed(pixels), _fixed(shade)
+    fixed = _fixed(pixels)
+    fixed_shade = _fixed(shade)
     in_sight = []
     for k in np.flatnonzero(~near & ~outside & (sizes >= _TINY_PX)):
         span = np.s_[starts[k] : starts[k] + counts[k]]
@@ -170,14 +173,16 @@ def _parts(thing: Thing, size_px: float) -> tuple[Part, ...]:
 def _placed(things: list[Thing], corners: Matrix, counts: NDArray[np.int64]) -> Matrix:
     """Corners of bodies in the world's frame, shape (n, 3)."""
     angles = np.radians([thing.heading_deg for thing in things])
-    sines, cosines = np.repeat(np.sin(angles), counts), np.repeat(np.cos(angles), counts)
+    sines = np.repeat(np.sin(angles), counts)
+    cosines = np.repeat(np.cos(angles), counts)
     x = np.repeat([thing.x for thing in things], counts) + corners[:, 0] * sines + corners[:, 1] * cosines
     y = np.repeat([thing.y for thing in things], counts) + corners[:, 0] * cosines - corners[:, 1] * sines
     return np.column_stack((x, y, corners[:, 2]))
 
 
 def _shapes(fixed: Fixed, parts: tuple[Part, ...]) -> tuple[_Shape, ...]:
-    shapes, start = [], 0
+    shapes = []
+    start = 0
     for part in parts:
         hull = np.asarray(cv2.convexHull(fixed[start : start + len(part.points)]), np.int32)
         shapes.append(_Shape(hull, part.colour, part.warmth))
@@ -202,7 +207,8 @@ def _board_actor(view: View, board: Billboard) -> _InSight | None:
 
 
 def _outside(view: View, pixels: Matrix) -> bool:
-    low, high = pixels.min(axis=0), pixels.max(axis=0)
+    low = pixels.min(axis=0)
+    high = pixels.max(axis=0)
     lens = view.intrinsics
     return bool(high[0] <= 0 or high[1] <= 0 or low[0] >= lens.width or low[1] >= lens.height)
 
@@ -232,8 +238,10 @@ def _fill(picture: Picture, shape: _Shape, band: Band) -> None:
 
 def _clip(low: Matrix, high: Matrix, shape: tuple[int, ...]) -> tuple[int, int, int, int] | None:
     """Return the whole pixels of a picture that a box touches, or None."""
-    x0, y0 = max(math.floor(low[0]) - 1, 0), max(math.floor(low[1]) - 1, 0)
-    x1, y1 = min(math.ceil(high[0]) + 1, shape[1]), min(math.ceil(high[1]) + 1, shape[0])
+    x0 = max(math.floor(low[0]) - 1, 0)
+    y0 = max(math.floor(low[1]) - 1, 0)
+    x1 = min(math.ceil(high[0]) + 1, shape[1])
+    y1 = min(math.ceil(high[1]) + 1, shape[0])
     return None if x0 >= x1 or y0 >= y1 else (x0, y0, x1, y1)
 
 
@@ -298,9 +306,12 @@ def _draw_posts(picture: Picture, view: View, board: Billboard, band: Band) -> N
 
 def _box(points: Matrix, view: View) -> Box | None:
     lens = view.intrinsics
-    low, high = points.min(axis=0), points.max(axis=0)
-    left, top = max(float(low[0]), 0.0), max(float(low[1]), 0.0)
-    right, bottom = min(float(high[0]), float(lens.width)), min(float(high[1]), float(lens.height))
+    low = points.min(axis=0)
+    high = points.max(axis=0)
+    left = max(float(low[0]), 0.0)
+    top = max(float(low[1]), 0.0)
+    right = min(float(high[0]), float(lens.width))
+    bottom = min(float(high[1]), float(lens.height))
     return None if left >= right or top >= bottom else (left, top, right, bottom)
 
 
@@ -308,15 +319,19 @@ def _shares(view: View, hulls: Iterable[Fixed], labels: Labels, number: int) -> 
     """Return the share of hulls inside the picture, and the share that is also labelled with a number."""
     pieces = list(hulls)
     points = np.vstack(pieces)[:, 0, :] / (1 << _SHIFT)
-    low, high = np.floor(points.min(axis=0)) - 1, np.ceil(points.max(axis=0)) + 2
+    low = np.floor(points.min(axis=0)) - 1
+    high = np.ceil(points.max(axis=0)) + 2
     limit = 4.0 * max(view.intrinsics.width, view.intrinsics.height)
-    low, high = np.maximum(low, -limit).astype(int), np.minimum(high, limit).astype(int)
+    low = np.maximum(low, -limit).astype(int)
+    high = np.minimum(high, limit).astype(int)
     whole = np.zeros((int(high[1] - low[1]), int(high[0] - low[0])), np.uint8)
     for piece in pieces:
         cv2.fillConvexPoly(whole, piece - (low << _SHIFT).astype(np.int32), (1,), cv2.LINE_8, _SHIFT)
     total = int(np.count_nonzero(whole))
-    x0, y0 = max(int(low[0]), 0), max(int(low[1]), 0)
-    x1, y1 = min(int(high[0]), labels.shape[1]), min(int(high[1]), labels.shape[0])
+    x0 = max(int(low[0]), 0)
+    y0 = max(int(low[1]), 0)
+    x1 = min(int(high[0]), labels.shape[1])
+    y1 = min(int(high[1]), labels.shape[0])
     if total == 0 or x0 >= x1 or y0 >= y1:
         return 0.0, 0.0
     inside = whole[y0 - low[1] : y1 - low[1], x0 - low[0] : x1 - low[0]] > 0

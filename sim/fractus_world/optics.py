@@ -101,17 +101,20 @@ class Pose:
 
 
 def _about_x(angle_deg: float) -> Matrix:
-    c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
+    c = math.cos(math.radians(angle_deg))
+    s = math.sin(math.radians(angle_deg))
     return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
 
 
 def _about_y(angle_deg: float) -> Matrix:
-    c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
+    c = math.cos(math.radians(angle_deg))
+    s = math.sin(math.radians(angle_deg))
     return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
 
 
 def _about_z(angle_deg: float) -> Matrix:
-    c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
+    c = math.cos(math.radians(angle_deg))
+    s = math.sin(math.radians(angle_deg))
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
@@ -130,7 +133,8 @@ def camera_rotation(pose: Pose, mount: Mount) -> Matrix:
 
 def plane_turn(frame: LocalFrame, lat: float, lon: float) -> Matrix:
     """Return one metre east and north at a place as vectors of a frame, because north differs between places."""
-    phi, origin = math.radians(lat), math.radians(frame.lat)
+    phi = math.radians(lat)
+    origin = math.radians(frame.lat)
     apart = math.radians(lon - frame.lon)
     return np.array(
         [

@@ -107,7 +107,8 @@ class Photos:
 
 def _cartesian(lat: float, lon: float, amsl_m: float) -> tuple[float, float, float]:
     """Earth-centred coordinates, so that distances are metres wherever the pictures are."""
-    phi, lam = math.radians(lat), math.radians(lon)
+    phi = math.radians(lat)
+    lam = math.radians(lon)
     n = _A / math.sqrt(1 - _E2 * math.sin(phi) ** 2)
     flat = (n + amsl_m) * math.cos(phi)
     return flat * math.cos(lam), flat * math.sin(lam), (n * (1 - _E2) + amsl_m) * math.sin(phi)
@@ -120,7 +121,8 @@ def _read(path: Path, directory: Path) -> Photo | None:
     except (OSError, UnidentifiedImageError, SyntaxError, ValueError, Image.DecompressionBombError):
         return None  # not a picture: the directory may hold anything
     try:
-        lat, lon = _angle(gps[_LAT], gps[_LAT_REF], "S"), _angle(gps[_LON], gps[_LON_REF], "W")
+        lat = _angle(gps[_LAT], gps[_LAT_REF], "S")
+        lon = _angle(gps[_LON], gps[_LON_REF], "W")
         amsl_m = float(gps.get(_ALT, 0.0)) * (-1.0 if gps.get(_ALT_REF) in (1, b"\x01") else 1.0)
     except (KeyError, TypeError, ValueError, ZeroDivisionError):
         return None
@@ -153,8 +155,10 @@ def resized(photo: Photo, width: int, height: int) -> Picture:
     except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
         raise PhotoError(f"{photo.path}: cannot be read: {error}") from error
     scale = max(width / pixels.shape[1], height / pixels.shape[0])
-    w, h = round(width / scale), round(height / scale)
-    x, y = (pixels.shape[1] - w) // 2, (pixels.shape[0] - h) // 2
+    w = round(width / scale)
+    h = round(height / scale)
+    x = (pixels.shape[1] - w) // 2
+    y = (pixels.shape[0] - h) // 2
     part = np.ascontiguousarray(pixels[y : y + h, x : x + w])
     way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     return np.asarray(cv2.resize(part, (width, height), interpolation=way), np.uint8)

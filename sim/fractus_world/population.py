@@ -98,7 +98,8 @@ class TownPopulation:
 
     def _traffic(self, box: Matrix, time_s: float) -> list[Thing]:
         things: list[Thing] = []
-        low, high = np.array(cell(*box[0])) + 0.5, np.array(cell(*box[1])) + 0.5
+        low = np.array(cell(*box[0])) + 0.5
+        high = np.array(cell(*box[1])) + 0.5
         for family, across, along in (("east", 1, 0), ("north", 0, 1)):
             for index in range(math.floor(low[across] - 0.5), math.ceil(high[across] + 0.5) + 1):
                 road = Road("east" if family == "east" else "north", index)
@@ -112,7 +113,8 @@ class TownPopulation:
         key = (self._seed, 31, family, road.index, way)
         gap = _GAP_M[road.main] / SPACING_M
         rate = way * _SPEED_MPS[road.main] * (0.85 + 0.3 * unit(*key)) / SPACING_M
-        first, last = math.floor((span[0] - rate * time_s) / gap) - 1, math.ceil((span[1] - rate * time_s) / gap)
+        first = math.floor((span[0] - rate * time_s) / gap) - 1
+        last = math.ceil((span[1] - rate * time_s) / gap)
         things = []
         for slot in range(first, last + 1):
             along = (slot + 0.65 * unit(*key, slot)) * gap + rate * time_s
@@ -120,7 +122,8 @@ class TownPopulation:
                 continue
             x, y, dx, dy = self._roads.along(road, along)
             length = math.hypot(dx, dy)
-            ux, uy = way * dx / length, way * dy / length
+            ux = way * dx / length
+            uy = way * dy / length
             offset = _LANE_M[road.main]
             looks = mixed(*key, slot, 5)
             things.append(
@@ -174,8 +177,10 @@ class TownPopulation:
         x, y = centre(i + 0.5 * (draws[0] - 0.5), j + 0.5 * (draws[1] - 0.5))
         reach = 6.0 + 22.0 * draws[2]
         rate = WALK_MPS * (0.6 + 0.4 * draws[3]) / reach / 1.3
-        east, north = rate * time_s + 2 * math.pi * draws[4], 0.61 * rate * time_s + 2 * math.pi * draws[5]
-        vx, vy = reach * rate * math.cos(east), 0.61 * reach * rate * math.cos(north)
+        east = rate * time_s + 2 * math.pi * draws[4]
+        north = 0.61 * rate * time_s + 2 * math.pi * draws[5]
+        vx = reach * rate * math.cos(east)
+        vy = 0.61 * reach * rate * math.cos(north)
         place = (x + reach * math.sin(east), y + reach * math.sin(north))
         heading = math.degrees(math.atan2(vx, vy))
         return Thing(

@@ -25,7 +25,8 @@ SILENCE_S = 5.0
 """A link that brings nothing for so long is opened again."""
 RETRY_S = (0.2, 3.0)
 ASK_EVERY_S = 5.0
-SYSTEM, COMPONENT = 242, mavlink.MAV_COMP_ID_CAMERA
+SYSTEM = 242
+COMPONENT = mavlink.MAV_COMP_ID_CAMERA
 """MAVLink ids of a camera; no heartbeats are sent, so that none can hold off an autopilot's failsafe."""
 _STREAMS = {"GLOBAL_POSITION_INT": 20.0, "ATTITUDE": 20.0, "GIMBAL_DEVICE_ATTITUDE_STATUS": 10.0}
 
@@ -164,11 +165,14 @@ class VehiclePose:
             if message.name == "GLOBAL_POSITION_INT":
                 # An autopilot without a fix reports zeros.
                 if message.integer("lat") != 0 or message.integer("lon") != 0:
-                    self._heard.position, self._heard.position_s = message, now_s
+                    self._heard.position = message
+                    self._heard.position_s = now_s
             elif message.name == "ATTITUDE":
-                self._heard.attitude, self._heard.attitude_s = message, now_s
+                self._heard.attitude = message
+                self._heard.attitude_s = now_s
             elif message.name == "GIMBAL_DEVICE_ATTITUDE_STATUS":
-                self._heard.mount, self._heard.mount_s = _gimbal(message, self._heard.attitude), now_s
+                self._heard.mount = _gimbal(message, self._heard.attitude)
+                self._heard.mount_s = now_s
 
 
 def _ask(link: socket.socket, endpoint: Endpoint, autopilot: tuple[int, int]) -> None:
@@ -185,7 +189,8 @@ def _ask(link: socket.socket, endpoint: Endpoint, autopilot: tuple[int, int]) ->
 
 
 def _pose(position: Message, attitude: Message, age_s: float, ground_amsl_m: float) -> Pose:
-    north, east = position.real("vx") / 100.0 * age_s, position.real("vy") / 100.0 * age_s
+    north = position.real("vx") / 100.0 * age_s
+    east = position.real("vy") / 100.0 * age_s
     lat = position.real("lat") * 1e-7
     shrink = max(math.cos(math.radians(lat)), 0.01)
     lon = position.real("lon") * 1e-7 + math.degrees(east / 6_378_137.0) / shrink
@@ -209,10 +214,8 @@ def _gimbal(message: Message, attitude: Message | None) -> Mount | None:
     pitch = math.degrees(math.asin(min(max(2 * (w * y - z * x) / norm**2, -1.0), 1.0)))
     yaw = math.degrees(math.atan2(2 * (w * z + x * y), norm**2 - 2 * (y * y + z * z)))
     flags = message.integer("flags")
-    lock, vehicle = (
-        flags & mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK,
-        flags & mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME,
-    )
+    lock = flags & mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK
+    vehicle = flags & mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME
     earth = flags & mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME or (lock and not vehicle)
     if earth and attitude is not None:
         yaw -= math.degrees(attitude.real("yaw"))

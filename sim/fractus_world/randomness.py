@@ -29,9 +29,12 @@ def dice(*keys: int) -> random.Random:
 
 def smooth(seed: int, x: float, y: float) -> float:
     """Value noise from 0 to 1 over a lattice of unit cells."""
-    i, j = int(x // 1), int(y // 1)
-    a, b = x - i, y - j
-    a, b = a * a * (3 - 2 * a), b * b * (3 - 2 * b)
+    i = int(x // 1)
+    j = int(y // 1)
+    a = x - i
+    b = y - j
+    a = a * a * (3 - 2 * a)
+    b = b * b * (3 - 2 * b)
     low = unit(seed, i, j) * (1 - a) + unit(seed, i + 1, j) * a
     high = unit(seed, i, j + 1) * (1 - a) + unit(seed, i + 1, j + 1) * a
     return low * (1 - b) + high * b

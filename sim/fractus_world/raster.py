@@ -51,7 +51,8 @@ class Raster:
         source = self._half(level)
         low = np.floor(grid.reshape(-1, 2).min(axis=0)).astype(int) - 2
         high = np.ceil(grid.reshape(-1, 2).max(axis=0)).astype(int) + 3
-        low, high = np.maximum(low, 0), np.minimum(high, [source.shape[1], source.shape[0]])
+        low = np.maximum(low, 0)
+        high = np.minimum(high, [source.shape[1], source.shape[0]])
         blank = np.empty((TILE_PX, TILE_PX, 3), np.uint8)
         blank[:] = NOTHING
         if bool((low >= high).any()):

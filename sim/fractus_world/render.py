@@ -45,7 +45,8 @@ def render_ground(view: View, store: TileStore, band: Band) -> Picture:
     picture = np.empty((lens.height, lens.width, 3), np.uint8)
     beyond = np.flatnonzero((cells.levels == _NOTHING).any(axis=1))
     if len(beyond):
-        first, last = int(beyond[0]) * CELL_PX, (int(beyond[-1]) + 1) * CELL_PX
+        first = int(beyond[0]) * CELL_PX
+        last = (int(beyond[-1]) + 1) * CELL_PX
         cv2.rectangle(picture, (0, first), (lens.width, last), SKIES[band].horizon, -1)
     for level in np.unique(cells.levels):
         if level != _NOTHING:
@@ -67,11 +68,13 @@ class _Cells:
     @classmethod
     def of(cls, view: View, store: TileStore) -> _Cells:
         lens = view.intrinsics
-        columns, rows = -(-lens.width // CELL_PX), -(-lens.height // CELL_PX)
+        columns = -(-lens.width // CELL_PX)
+        rows = -(-lens.height // CELL_PX)
         u, v = np.meshgrid(np.arange(columns + 1) * CELL_PX, np.arange(rows + 1) * CELL_PX)
         pixels = np.stack((u, v), axis=-1).astype(np.float64)
         rays = view.rays(pixels)
-        down, flat = -rays[..., 2], np.hypot(rays[..., 0], rays[..., 1])
+        down = -rays[..., 2]
+        flat = np.hypot(rays[..., 0], rays[..., 1])
         away = view.height_m * np.sqrt(flat**2 + down**2) / np.maximum(down, 1e-9)
         away = np.where(down > 1e-9, np.minimum(away, 1e7), 1e7)
         # A pixel is h / f / down wide and h / f / down^2 long; the mean leans to its length, so that nothing flickers.
@@ -92,8 +95,10 @@ class _Cells:
 def _draw_level(picture: Picture, view: View, store: TileStore, level: int, cells: _Cells) -> None:
     """Draw all cells of one level."""
     marked = cells.levels == level
-    rows, columns = np.flatnonzero(marked.any(axis=1)), np.flatnonzero(marked.any(axis=0))
-    left, top = int(columns[0]) * CELL_PX, int(rows[0]) * CELL_PX
+    rows = np.flatnonzero(marked.any(axis=1))
+    columns = np.flatnonzero(marked.any(axis=0))
+    left = int(columns[0]) * CELL_PX
+    top = int(rows[0]) * CELL_PX
     right = min((int(columns[-1]) + 1) * CELL_PX, view.intrinsics.width)
     bottom = min((int(rows[-1]) + 1) * CELL_PX, view.intrinsics.height)
     window, level = _window(view, store, level, marked)
@@ -113,7 +118,8 @@ def _draw_level(picture: Picture, view: View, store: TileStore, level: int, cell
 
 
 def _warped(source: Picture, mapping: Matrix, size: tuple[int, int]) -> Picture:
-    flags, border = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, cv2.BORDER_REPLICATE
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    border = cv2.BORDER_REPLICATE
     if float(np.abs(mapping[2, :2]).max()) * max(size) < 1e-9 * abs(float(mapping[2, 2])):
         # Looking straight down: no perspective, and half the work.
         drawn = cv2.warpAffine(source, mapping[:2] / mapping[2, 2], size, flags=flags, borderMode=border)
@@ -128,15 +134,18 @@ def _window(
     """Return the level's pixels for the marked cells, or a coarser level if they would be too many."""
     # The extremes of a visible plane are at the ends of rows.
     rows = np.flatnonzero(marked.any(axis=1))
-    first, last = marked[rows].argmax(axis=1), marked.shape[1] - marked[rows][:, ::-1].argmax(axis=1)
+    first = marked[rows].argmax(axis=1)
+    last = marked.shape[1] - marked[rows][:, ::-1].argmax(axis=1)
     corners = np.array([(c, r + d) for r, f, e in zip(rows, first, last, strict=True) for c in (f, e) for d in (0, 1)])
     corners = np.minimum(corners * float(CELL_PX), [view.intrinsics.width, view.intrinsics.height])
     most = _SPARE_PX + 3 * view.intrinsics.width * view.intrinsics.height
     ground = _on_ground(view, corners)
     while True:
         metres = pixel_m(store.ground, level)
-        west, north = math.floor(ground[:, 0].min() / metres) - 1, math.floor(-ground[:, 1].max() / metres) - 1
-        east, south = math.ceil(ground[:, 0].max() / metres) + 2, math.ceil(-ground[:, 1].min() / metres) + 2
+        west = math.floor(ground[:, 0].min() / metres) - 1
+        north = math.floor(-ground[:, 1].max() / metres) - 1
+        east = math.ceil(ground[:, 0].max() / metres) + 2
+        south = math.ceil(-ground[:, 1].min() / metres) + 2
         area = (east - west + TILE_PX) * (south - north + TILE_PX)
         if area <= most or level >= store.ground.levels - 1:
             return (west, north, east, south), level
@@ -158,14 +167,17 @@ def _add_air(picture: Picture, cells: _Cells, sky: Sky) -> None:
     rows = np.flatnonzero((cells.haze > 0.01).any(axis=1))
     if len(rows) == 0:
         return
-    first, last = max(int(rows[0]) - 1, 0), min(int(rows[-1]) + 1, cells.rows)
+    first = max(int(rows[0]) - 1, 0)
+    last = min(int(rows[-1]) + 1, cells.rows)
     height, width = picture.shape[:2]
-    top, bottom = first * CELL_PX, min(last * CELL_PX, height)
+    top = first * CELL_PX
+    bottom = min(last * CELL_PX, height)
     if bottom <= top:
         return
     weight = _enlarged(cells.haze[first : last + 1])[: bottom - top, :width]
     up = np.clip(cells.elevation[first : last + 1] / math.radians(40.0), 0.0, 1.0) ** 0.6
-    near, far = np.array(sky.horizon), np.array(sky.zenith)
+    near = np.array(sky.horizon)
+    far = np.array(sky.zenith)
     colours = np.round(near + (far - near) * up[..., None]).astype(np.uint8)
     air = _enlarged(colours)[: bottom - top, :width]
     cv2.blendLinear(picture[top:bottom], air, 1.0 - weight, weight, dst=picture[top:bottom])

@@ -71,11 +71,13 @@ class Roads:
         x, y = centre(i - 0.5, j - 0.5)
         if (i, j) == _CROSSING:
             return x, y
-        dx, dy = unit(self.seed, 1, i, j) - 0.5, unit(self.seed, 2, i, j) - 0.5
+        dx = unit(self.seed, 1, i, j) - 0.5
+        dy = unit(self.seed, 2, i, j) - 0.5
         return x + 2 * _JITTER * dx * SPACING_M, y + 2 * _JITTER * dy * SPACING_M
 
     def _town(self, i: int, j: int) -> bool:
-        x, y = i * SPACING_M, j * SPACING_M
+        x = i * SPACING_M
+        y = j * SPACING_M
         return (
             smooth(self.seed + 3, x / 1500.0, y / 1500.0) + 0.6 * math.exp(-(x * x + y * y) / TOWN_RADIUS_M**2) > 0.62
         )
@@ -99,9 +101,12 @@ class Roads:
         step = math.floor(along)
         t = along - step
         p = [self.vertex(*road.vertex(step + k)) for k in (-1, 0, 1, 2)]
-        place, way = [], []
+        place = []
+        way = []
         for a, b, c, d in zip(*p, strict=True):
-            k1, k2, k3 = (c - a) / 2, a - 2.5 * b + 2 * c - d / 2, (d - a) / 2 + 1.5 * (b - c)
+            k1 = (c - a) / 2
+            k2 = a - 2.5 * b + 2 * c - d / 2
+            k3 = (d - a) / 2 + 1.5 * (b - c)
             place.append(b + t * (k1 + t * (k2 + t * k3)))
             way.append(k1 + t * (2 * k2 + t * 3 * k3))
         return place[0], place[1], way[0], way[1]
@@ -113,7 +118,8 @@ class Roads:
         k = min(int(share), EDGE_POINTS - 2)
         (ax, ay), (bx, by) = self._points(road, step)[k : k + 2]
         share -= k
-        dx, dy = bx - ax, by - ay
+        dx = bx - ax
+        dy = by - ay
         return ax + share * dx, ay + share * dy, dx * (EDGE_POINTS - 1), dy * (EDGE_POINTS - 1)
 
     def _edge(self, road: Road, step: int) -> Points:
@@ -127,8 +133,10 @@ class Roads:
 
     def outline(self, i: int, j: int) -> Points:
         """The middle lines of the four roads around block (i, j), counter-clockwise, shape (n, 2)."""
-        south, east = self.edge(Road("east", j), i), self.edge(Road("north", i + 1), j)
-        north, west = self.edge(Road("east", j + 1), i), self.edge(Road("north", i), j)
+        south = self.edge(Road("east", j), i)
+        east = self.edge(Road("north", i + 1), j)
+        north = self.edge(Road("east", j + 1), i)
+        west = self.edge(Road("north", i), j)
         return np.vstack((south[:-1, :2], east[:-1, :2], north[:0:-1, :2], west[:0:-1, :2]))
 
 

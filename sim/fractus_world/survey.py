@@ -65,7 +65,8 @@ def draw_sheet(sheet: Sheet, store: TileStore, frame: LocalFrame) -> Picture:
     level = min(level, store.ground.levels - 1)
     metres = pixel_m(store.ground, level)
     source = ground * [1 / metres, -1 / metres]
-    low, high = np.floor(source.min(axis=0)).astype(int) - 1, np.ceil(source.max(axis=0)).astype(int) + 2
+    low = np.floor(source.min(axis=0)).astype(int) - 1
+    high = np.ceil(source.max(axis=0)).astype(int) + 2
     picture, left, top = store.mosaic(level, (int(low[0]), int(low[1]), int(high[0]), int(high[1])))
     maps = [
         interpolated((source[:, axis] - origin - 0.5).reshape(count, count), np.arange(sheet.pixels) / _GRID_PX)

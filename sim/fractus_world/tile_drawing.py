@@ -40,7 +40,8 @@ class Noise:
         step = _ENLARGED if cell >= 2 * _ENLARGED * drawing.pixel_m else 1
         rim, size = (1, drawing.size // step + 2) if step > 1 else (0, drawing.size)
         scale = step * drawing.pixel_m / cell
-        x, y = (drawing.left_m / cell) % _LATTICE, (-drawing.top_m / cell) % _LATTICE
+        x = (drawing.left_m / cell) % _LATTICE
+        y = (-drawing.top_m / cell) % _LATTICE
         matrix = np.array([[scale, 0.0, x + (0.5 - rim) * scale], [0.0, scale, y + (0.5 - rim) * scale]])
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         lattice = self._lattices[octave]
@@ -71,7 +72,10 @@ class TileDrawing:
     """
 
     def __init__(self, left_m: float, top_m: float, pixel_m: float, size: int, ground: Colour) -> None:
-        self.left_m, self.top_m, self.pixel_m, self.size = left_m, top_m, pixel_m, size
+        self.left_m = left_m
+        self.top_m = top_m
+        self.pixel_m = pixel_m
+        self.size = size
         self.colour = np.empty((size, size, 3), np.uint8)
         self.colour[:] = ground
         self.rough = np.full((size, size), 110, np.uint8)
@@ -86,7 +90,8 @@ class TileDrawing:
     def sees(self, points: Points, margin_m: float = 0.0) -> bool:
         """Return True if the bounding box of points touches the tile."""
         west, south, east, north = self.box
-        (x0, y0), (x1, y1) = points.min(axis=0)[:2], points.max(axis=0)[:2]
+        (x0, y0) = points.min(axis=0)[:2]
+        (x1, y1) = points.max(axis=0)[:2]
         return bool(x0 < east + margin_m and x1 > west - margin_m and y0 < north + margin_m and y1 > south - margin_m)
 
     def within(self, boxes: Points, margin_m: float = 0.0) -> NDArray[np.int64]:
@@ -160,7 +165,10 @@ class TileDrawing:
         colour, cover = _crown(int(looks * 997) % _CROWNS, diameter, int(looks * 7919) % 5)
         column = round((x - self.left_m) / self.pixel_m - diameter / 2)
         row = round((self.top_m - y) / self.pixel_m - diameter / 2)
-        x0, y0, x1, y1 = max(column, 0), max(row, 0), min(column + diameter, self.size), min(row + diameter, self.size)
+        x0 = max(column, 0)
+        y0 = max(row, 0)
+        x1 = min(column + diameter, self.size)
+        y1 = min(row + diameter, self.size)
         if x0 >= x1 or y0 >= y1:
             return
         part = self.colour[y0:y1, x0:x1]
@@ -201,7 +209,8 @@ def _drawn_crown(kind: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     alpha = np.zeros((_CROWN_PX, _CROWN_PX), np.uint8)
     clusters = []
     for _ in range(420):
-        bearing, away = random.uniform(0, 2 * math.pi), math.sqrt(random.uniform(0, 1)) * 0.86
+        bearing = random.uniform(0, 2 * math.pi)
+        away = math.sqrt(random.uniform(0, 1)) * 0.86
         bulge = 1 + 0.12 * math.sin(3 * bearing + kind) + 0.07 * math.sin(5 * bearing + 2 * kind)
         clusters.append(
             (away * bulge * math.cos(bearing), away * bulge * math.sin(bearing), random.uniform(0.05, 0.14))

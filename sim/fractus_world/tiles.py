@@ -63,8 +63,10 @@ class TileStore:
         Returns:
             The picture, and the level's pixel coordinates of its upper left corner.
         """
-        left, top = window[0] // TILE_PX, window[1] // TILE_PX
-        right, bottom = -(-window[2] // TILE_PX), -(-window[3] // TILE_PX)
+        left = window[0] // TILE_PX
+        top = window[1] // TILE_PX
+        right = -(-window[2] // TILE_PX)
+        bottom = -(-window[3] // TILE_PX)
         wanted = (left, top, right, bottom)
         known = self._mosaics.get(level)
         if known is not None and _covers(known[0], wanted):
@@ -72,7 +74,8 @@ class TileStore:
         picture = np.empty(((bottom - top) * TILE_PX, (right - left) * TILE_PX, 3), np.uint8)
         for row in range(top, bottom):
             for column in range(left, right):
-                y, x = (row - top) * TILE_PX, (column - left) * TILE_PX
+                y = (row - top) * TILE_PX
+                x = (column - left) * TILE_PX
                 picture[y : y + TILE_PX, x : x + TILE_PX] = self.tile(level, column, row)
         self._keep(level, wanted, picture)
         return picture, left * TILE_PX, top * TILE_PX

@@ -49,13 +49,15 @@ HALF_M = 130.0
 """The operation area reaches this far from home, to each side."""
 
 WATCH_S = 0.05
-HEIGHT_SLACK_M, SPEED_SLACK_MPS = 2.0, 1.0
+HEIGHT_SLACK_M = 2.0
+SPEED_SLACK_MPS = 1.0
 """Tolerances stated in docs/policies.md (height) and docs/mobility.md (speed, without gusts)."""
 
 REACTION_S = 0.4
 """Until what has changed is acted on: 0.2 s is promised; a vehicle that has turned its motors needs as long again."""
 
-BRAKING_SHARE, MAX_BRAKING_MPS2 = 0.64, 1.6
+BRAKING_SHARE = 0.64
+MAX_BRAKING_MPS2 = 1.6
 """ArduCopter's BRAKE from 6.4 m/s takes 10.6 m, from 9.6 m/s 19.6 m with WPNAV_ACCEL 250: the mean of it, with some wind from
 behind; a vehicle that accelerates less brakes less."""
 
@@ -105,7 +107,8 @@ class Wire(asyncio.Transport):
 
     def __init__(self, loop: Sky, protocol: asyncio.Protocol) -> None:
         super().__init__()
-        self._loop, self._protocol = loop, protocol
+        self._loop = loop
+        self._protocol = protocol
         self._channel = loop.craft.open("companion")
         self._parser = Parser()
         self._arrivals = {True: 0.0, False: 0.0}
@@ -275,7 +278,8 @@ class Oracle:
     """Watches the true position."""
 
     def __init__(self, sky: Sky, account: Account) -> None:
-        self._sky, self._account = sky, account
+        self._sky = sky
+        self._account = account
         self.rules = Rules()
         self.arena = shapely.box(-HALF_M, -HALF_M, HALF_M, HALF_M)
         self._said: set[str] = set()
@@ -295,11 +299,14 @@ class Oracle:
 
     def unavoidable_m(self) -> float:
         """Return the stopping distance from now in metres, including acceleration until the command takes effect."""
-        speed, late_s, more = self.speeds()[0], self._late_s(), self.speeding_mps2
+        speed = self.speeds()[0]
+        late_s = self._late_s()
+        more = self.speeding_mps2
         easing_s = more / JERK_MPS3
         surge_mps = more * (late_s + easing_s / 2)
         accel_mps2 = self._sky.truth.params["WPNAV_ACCEL"] / 100.0
-        run_m, speed = (speed + surge_mps / 2) * (late_s + easing_s), speed + surge_mps
+        run_m = (speed + surge_mps / 2) * (late_s + easing_s)
+        speed = speed + surge_mps
         return run_m + speed * speed / (2 * min(BRAKING_SHARE * accel_mps2, MAX_BRAKING_MPS2)) + 1.0
 
     def appears(self, wall: Wall) -> None:
@@ -338,8 +345,10 @@ class Oracle:
             await asyncio.sleep(WATCH_S)
 
     def _look(self) -> None:
-        truth, speed_mps = self._sky.truth, self.speeds()[0]
-        self.speeding_mps2, self._speed_mps = max((speed_mps - self._speed_mps) / WATCH_S, 0.0), speed_mps
+        truth = self._sky.truth
+        speed_mps = self.speeds()[0]
+        self.speeding_mps2 = max((speed_mps - self._speed_mps) / WATCH_S, 0.0)
+        self._speed_mps = speed_mps
         x, y, height = self.place()
         if height < 0.7 or not truth.armed:
             return
@@ -405,7 +414,9 @@ class Drone:
             clock=lambda: 1_790_000_000.0 + self.autopilot.now, grace_s=grace_s, boarding_s=0.0, state=ControlState(),
         )  # fmt: skip
         parts = self.parts
-        self.control, self.service, self.streams = parts.control, parts.service, parts.streams
+        self.control = parts.control
+        self.service = parts.service
+        self.streams = parts.streams
         work = (self.autopilot.run(), parts.monitor.run(), parts.poi_missions.run())
         self.tasks = [asyncio.ensure_future(part) for part in work]
         self.state = StreamState.WAITING
@@ -446,7 +457,8 @@ class Flight:
 
     def __init__(self, seed: int, directory: Path, weather: Weather, sky: Sky) -> None:
         self.chance = random.Random(seed)
-        self.weather, self.sky = weather, sky
+        self.weather = weather
+        self.sky = sky
         self.account = Account(seed)
         self.oracle = Oracle(sky, self.account)
         self.drone = Drone(directory, self.account)
@@ -457,23 +469,28 @@ class Flight:
         """A box that leaves home, and ways around it, alone."""
         chance = self.chance
         while True:
-            x, y = chance.uniform(-100, 100), chance.uniform(-100, 100)
-            wide, high = chance.uniform(6, 35), chance.uniform(6, 35)
+            x = chance.uniform(-100, 100)
+            y = chance.uniform(-100, 100)
+            wide = chance.uniform(6, 35)
+            high = chance.uniform(6, 35)
             box = x - wide, y - high, x + wide, y + high
             if shapely.box(*box).distance(shapely.Point(0, 0)) > 18.0 and max(map(abs, box)) < HALF_M - 12.0:
                 return box
 
     def _box_ahead(self) -> tuple[float, float, float, float]:
         """A box in the way of a drone that can still stop before it: on its course, or between it and home."""
-        chance, body = self.chance, self.sky.truth.body
+        chance = self.chance
+        body = self.sky.truth.body
         x, y, _ = self.oracle.place()
         speed, _ = self.oracle.speeds()
         east, north = (body.ve / speed, body.vn / speed) if speed > 1.0 else (-x, -y)
         length = math.hypot(east, north) or 1.0
-        wide, high = chance.uniform(4, 20), chance.uniform(4, 20)
+        wide = chance.uniform(4, 20)
+        high = chance.uniform(4, 20)
         away = self.oracle.unavoidable_m() + chance.uniform(0.5, 20)
         for _ in range(100):
-            cx, cy = x + east / length * away, y + north / length * away
+            cx = x + east / length * away
+            cy = y + north / length * away
             box = cx - wide, cy - high, cx + wide, cy + high
             if shapely.box(*box).distance(shapely.Point(x, y)) > self.oracle.unavoidable_m():
                 home_m = shapely.box(*box).distance(shapely.Point(0, 0))
@@ -483,13 +500,15 @@ class Flight:
 
     def add_zone(self, *, ahead: bool = False) -> None:
         """One more zone, now."""
-        chance, box = self.chance, self._box_ahead() if ahead else self._box()
+        chance = self.chance
+        box = self._box_ahead() if ahead else self._box()
         if any(wall.box.distance(shapely.box(*box)) < 25.0 for wall in self.oracle.rules.walls):
             return
         action = chance.choice(["ignore", "adjust", "hover", "returnToLaunch", "land"])
         name = f"z{len(self.policies)}"
         policy = zone(name, action, *box)
-        low, high = -math.inf, math.inf
+        low = -math.inf
+        high = math.inf
         if chance.random() < 0.25:
             low, high = chance.choice([(-5.0, 14.0), (18.0, 60.0)])
             policy["zones"][0]["altitude"] = {"lower": low, "upper": high, "reference": "home"}
@@ -501,10 +520,14 @@ class Flight:
 
     def add_zone_overhead(self) -> None:
         """A zone above the drone, now, that it can still stop below."""
-        chance, (x, y, height), (_, climb) = self.chance, self.oracle.place(), self.oracle.speeds()
-        half_m, low = chance.uniform(15, 60), height + 4.0 + 2.0 * abs(climb) + chance.uniform(0.5, 6)
+        chance = self.chance
+        x, y, height = self.oracle.place()
+        _, climb = self.oracle.speeds()
+        half_m = chance.uniform(15, 60)
+        low = height + 4.0 + 2.0 * abs(climb) + chance.uniform(0.5, 6)
         box = x - half_m, y - half_m, x + half_m, y + half_m
-        action, name = chance.choice(["ignore", "adjust", "hover"]), f"z{len(self.policies)}"
+        action = chance.choice(["ignore", "adjust", "hover"])
+        name = f"z{len(self.policies)}"
         policy = zone(name, action, *box)
         policy["zones"][0]["altitude"] = {"lower": low, "upper": 60.0, "reference": "home"}
         self.policies.append(policy)
@@ -513,16 +536,19 @@ class Flight:
 
     def add_limit(self) -> None:
         """A limit of height or of speed, now."""
-        chance, rules = self.chance, self.oracle.rules
+        chance = self.chance
+        rules = self.oracle.rules
         name = f"l{len(self.policies)}"
         kind = chance.choice(["altitude", "speed"])
         value = round(chance.uniform(9, 25) if kind == "altitude" else chance.uniform(2.5, 7), 1)
         spec = {"type": "LimitControl", "kind": kind, "upperLimit": value}
         self.policies.append({"name": name, "spec": spec})
         if kind == "altitude" and value < rules.ceiling_m:
-            rules.ceiling_m, rules.high_since_s = value, self.sky.time()
+            rules.ceiling_m = value
+            rules.high_since_s = self.sky.time()
         elif kind == "speed" and value < rules.top_mps:
-            rules.top_mps, rules.fast_since_s = value, self.sky.time()
+            rules.top_mps = value
+            rules.fast_since_s = self.sky.time()
         self.account.events.append(f"{self.sky.time() - 1000:7.2f} limit {kind} {value}")
 
     def spec(self) -> GrantSpec:
@@ -536,7 +562,8 @@ class Flight:
         return grant
 
     async def fly(self) -> Account:
-        chance, drone = self.chance, self.drone
+        chance = self.chance
+        drone = self.drone
         for _ in range(chance.randrange(4)):
             self.add_zone()
         for _ in range(chance.randrange(3)):
@@ -574,7 +601,8 @@ class Flight:
 
     async def _drive(self, following: asyncio.Task[None]) -> None:
         """The driver's programme: it tries what comes to its mind, and gives up when the drone is not its own."""
-        drone, chance = self.drone, self.chance
+        drone = self.drone
+        chance = self.chance
         try:
             async with asyncio.timeout(90):
                 await self._until(lambda: drone.state is StreamState.GRANTED and drone.autopilot.vehicle.ready)
@@ -603,9 +631,11 @@ class Flight:
                     await self._finish(drone.service.return_to_launch(self.grant))
 
     async def _leg(self) -> None:
-        chance, service = self.chance, self.drone.service
+        chance = self.chance
+        service = self.drone.service
         kind = chance.random()
-        x, y = chance.uniform(-1, 1) * (HALF_M + 5), chance.uniform(-1, 1) * (HALF_M + 5)
+        x = chance.uniform(-1, 1) * (HALF_M + 5)
+        y = chance.uniform(-1, 1) * (HALF_M + 5)
         if kind < 0.5:
             speed = chance.choice([None, chance.uniform(1, 14)])
             leg = goto(x, y, chance.uniform(4, 40), speed_mps=speed)
@@ -614,7 +644,8 @@ class Flight:
                 async with asyncio.timeout(chance.uniform(3, 60) if chance.random() < 0.4 else None):
                     await self._finish(service.goto(self.grant, leg, 0.0))
         elif kind < 0.85:
-            angle, speed = chance.uniform(0, 2 * math.pi), chance.uniform(0.5, 14)
+            angle = chance.uniform(0, 2 * math.pi)
+            speed = chance.uniform(0.5, 14)
             up = chance.choice([0.0, 0.0, chance.uniform(-1.5, 2.0)])
             self._note_request(f"velocity {speed:.1f} toward {math.degrees(angle):.0f} deg, up {up:.1f}")
             end = self.drone.autopilot.now + chance.uniform(1, 20)
@@ -663,7 +694,8 @@ class Flight:
         self.sky.call_later(self.weather.cut[1], self._reconnect)
 
     def _reconnect(self) -> None:
-        severed_at, self.sky.severed_at = self.sky.severed_at, math.inf
+        severed_at = self.sky.severed_at
+        self.sky.severed_at = math.inf
         self.oracle.reconnected(severed_at)
         self.account.events.append(f"{self.sky.time() - 1000:7.2f} link back")
 

@@ -540,7 +540,9 @@ def restarted_in(mode: FlightMode, removed: bool = False) -> Callable[[Flight], 
 @course
 async def found_armed_without_a_mission(f: Flight) -> None:
     plane = f.world.plane
-    plane.vehicle.armed, plane.height, plane.xy = True, 12.0, [10.0, 30.0]
+    plane.vehicle.armed = True
+    plane.height = 12.0
+    plane.xy = [10.0, 30.0]
     plane.set_to(GUIDED)
     await f.restart()
     await f.landed()

@@ -86,7 +86,8 @@ class Flight:
     def _audited(self, entry: tuple[str, dict[str, Any]]) -> None:
         kind, content = entry
         if kind in {"control", "takeover"}:
-            plane, where = self.world.plane, self._place()
+            plane = self.world.plane
+            where = self._place()
             who = str(content["controller"]).rpartition("/")[2]
             self._write("authority", f"{kind} {content['action']} by {who} {content['code'] or '-'} at {where}")
             self.texts.append(f"{plane.now:.1f} {kind} {content['reason']}")
@@ -175,8 +176,10 @@ class Flight:
 
     def failsafe(self, mode: FlightMode) -> None:
         """The autopilot's own failsafe acts."""
-        vehicle, plane = self.world.plane.vehicle, self.world.plane
-        vehicle.failsafe_text, vehicle.failsafe_text_at = "Battery Failsafe", plane.now
+        vehicle = self.world.plane.vehicle
+        plane = self.world.plane
+        vehicle.failsafe_text = "Battery Failsafe"
+        vehicle.failsafe_text_at = plane.now
         plane.set_to(mode)
 
     def lose_link(self) -> None:
@@ -195,7 +198,8 @@ class Flight:
         await self._stop_tasks()
         await old.__aexit__()
         self.world = self._wired(World(self._directory, **self._options, after=old, known=False))
-        grants, self._grants = self._grants, []
+        grants = self._grants
+        self._grants = []
         for grant, key in grants:
             self.put(grant, key)
         self.observer.found()

@@ -68,7 +68,9 @@ class Wanderer:
             getattr(self, what)()
 
     def _call(self, what: str) -> None:
-        mine, (x, y), service = self._grants.get(self._key), self._place, self._flight.world.service
+        mine = self._grants.get(self._key)
+        x, y = self._place
+        service = self._flight.world.service
         if mine is None:
             return
         work: dict[str, Callable[[], Any]] = {
@@ -108,7 +110,8 @@ class Wanderer:
         self._grants[self._key] = self._flight.put(self._specs[self._key], self._key)
 
     def remove(self) -> None:
-        grants, mine = self._flight.world.grants, self._grants.get(self._key)
+        grants = self._flight.world.grants
+        mine = self._grants.get(self._key)
         if mine is not None and grants.of(mine.identity) is mine:
             grants.remove(self._grants.pop(self._key))
 

@@ -102,7 +102,8 @@ class _Away:
     """Drones on their ways home."""
 
     def __init__(self, fleet: Fleet, pardoned: Flags) -> None:
-        self.fleet, self.pardoned = fleet, pardoned | excused(fleet)
+        self.fleet = fleet
+        self.pardoned = pardoned | excused(fleet)
         self.count = len(fleet.scenes)
         self.alone = np.zeros(self.count, dtype=bool)
         self.wrong: list[tuple[int, str]] = []
@@ -131,10 +132,12 @@ class _Away:
 
     def start_alone(self, i: int) -> None:
         """Begin the autopilot's own return: a climb, then straight."""
-        fleet, bounds = self.fleet, return_bounds(self.fleet.situation(i, told=True), self.fleet.scenes[i].grant)
+        fleet = self.fleet
+        bounds = return_bounds(self.fleet.situation(i, told=True), self.fleet.scenes[i].grant)
         owned = {"RTL_ALT": 100.0 * fleet.airframes[i].return_altitude_m, "RTL_SPEED": 0.0, "WPNAV_SPEED": 1000.0}
         values = ARDUCOPTER.return_values(owned, bounds)
-        fleet.place[i], fleet.settled[i] = fleet.seen[i], fleet._wind()[i]
+        fleet.place[i] = fleet.seen[i]
+        fleet.settled[i] = fleet._wind()[i]
         fleet.goal[i] = fleet.place[i]
         fleet.goal[i, 2] = max(fleet.place[i, 2], values["RTL_ALT"] / 100)
         fleet.cruise[i] = (values["RTL_SPEED"] or values["WPNAV_SPEED"]) / 100
@@ -143,7 +146,8 @@ class _Away:
 
     def _decide(self) -> None:
         fleet = self.fleet
-        speeds, expected = np.linalg.norm(fleet.speed, axis=1), {i for _, i, _ in fleet.mail}
+        speeds = np.linalg.norm(fleet.speed, axis=1)
+        expected = {i for _, i, _ in fleet.mail}
         for i in np.flatnonzero(~self._home).tolist():
             leg = self._legs[i]
             if self.alone[i]:
@@ -151,7 +155,8 @@ class _Away:
             elif i in expected:
                 continue
             elif leg is not None:
-                east, north = (leg.lon - HOME.lon) * EAST_M, (leg.lat - HOME.lat) * NORTH_M
+                east = (leg.lon - HOME.lon) * EAST_M
+                north = (leg.lat - HOME.lat) * NORTH_M
                 x, y, z = fleet.seen[i]
                 if (
                     math.hypot(x - east, y - north) <= self._reached[i]
@@ -172,7 +177,9 @@ class _Away:
         if found is None:
             self._home[i] = self.pardoned[i] = True
             return
-        self._legs[i], self._reached[i], self._begun[i] = found.args, found.reached_m, True
+        self._legs[i] = found.args
+        self._reached[i] = found.reached_m
+        self._begun[i] = True
         self._tops[i] = found.args.speed_mps
         self.fleet.send(i, Verdict("allow", found.args))
 

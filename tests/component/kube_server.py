@@ -55,11 +55,14 @@ class Server:
     def __init__(
         self, answers: bytes | Callable[[Request], bytes], *, closes: bool = False, delay_s: float = 0.0
     ) -> None:
-        self._answers, self._closes, self._delay_s = answers, closes, delay_s
+        self._answers = answers
+        self._closes = closes
+        self._delay_s = delay_s
         self.requests: list[Request] = []
         self.connections = 0
         self.url = ""
-        self.heard, self.gone = asyncio.Event(), asyncio.Event()
+        self.heard = asyncio.Event()
+        self.gone = asyncio.Event()
 
     async def __call__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.connections += 1

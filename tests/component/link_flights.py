@@ -90,7 +90,9 @@ class Flown:
 async def straight(flown: Flown) -> None:
     """As fast as it goes, again and again after each refusal."""
     chance = flown.chance
-    speed, hold_s, every_s = chance.uniform(6, 12), chance.choice([0.5, 1.0, 2.0]), chance.choice([0.05, 0.1, 0.2])
+    speed = chance.uniform(6, 12)
+    hold_s = chance.choice([0.5, 1.0, 2.0])
+    every_s = chance.choice([0.05, 0.1, 0.2])
     for _ in range(int(14 / every_s)):
         await flown.fly(speed, chance.uniform(-0.5, 0.5), hold_s)
         await asyncio.sleep(every_s)

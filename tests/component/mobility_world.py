@@ -40,7 +40,8 @@ STEP_S = 0.1
 """Interval between two positions of the vehicle."""
 GROUND_M = 10.0
 """Altitude of the ground above mean sea level."""
-ACCEL, CLIMB = 2.5, 2.0
+ACCEL = 2.5
+CLIMB = 2.0
 DEFAULT_MPS = 8.0
 ALL = (
     "Arm", "Disarm", "Takeoff", "Land", "SetSpeed", "GetSpeed", "SetVelocity", "Goto", "Hover", "GetPosition",
@@ -56,8 +57,10 @@ class Plane(MavlinkAutopilot):
         self.on_parameter: Callable[[str], None] = lambda _name: None
         super().__init__("tcp:nowhere:1", ARDUCOPTER, on_parameter=lambda name: self.on_parameter(name))  # noqa: PLW0108
         self.target = (1, 1)
-        self.xy, self.velocity = [0.0, 0.0], [0.0, 0.0]
-        self.height, self.climb = 0.0, 0.0
+        self.xy = [0.0, 0.0]
+        self.velocity = [0.0, 0.0]
+        self.height = 0.0
+        self.climb = 0.0
         self.speed_mps = DEFAULT_MPS
         self.positions = False
         self.goal: tuple[float, float] | None = None
@@ -75,8 +78,12 @@ class Plane(MavlinkAutopilot):
         """True if velocities are reported often enough to derive the acceleration."""
         self.parameters = MOVEMENT | FAILSAFES | {"WPNAV_SPEED": 100 * DEFAULT_MPS}
         vehicle = self.vehicle
-        vehicle.mode, vehicle.located, vehicle.position_error_m = GUIDED, True, 0.5
-        vehicle.ready, vehicle.estimated, vehicle.received_at = True, True, math.inf
+        vehicle.mode = GUIDED
+        vehicle.located = True
+        vehicle.position_error_m = 0.5
+        vehicle.ready = True
+        vehicle.estimated = True
+        vehicle.received_at = math.inf
         vehicle.home = Home(39.36, 22.95, GROUND_M)
         self.home_amsl_m = GROUND_M
 
@@ -105,7 +112,8 @@ class Plane(MavlinkAutopilot):
     def _hear(self, outgoing: Message) -> None:
         for answer in told(self.parameters, outgoing, self.fixed):
             self._reply(answer)
-        kind, command = outgoing.name, outgoing.values.get("command", 0)
+        kind = outgoing.name
+        command = outgoing.values.get("command", 0)
         if kind in {"COMMAND_LONG", "COMMAND_INT"}:
             self.commands.append(command)
             refused = command in self.refuses
@@ -123,10 +131,8 @@ class Plane(MavlinkAutopilot):
         elif kind == "SET_POSITION_TARGET_LOCAL_NED" and self.vehicle.mode == GUIDED and self.height > 0.2:
             self.commands.append(84)
             self.positions = False
-            self.wanted, self.wanted_until = (
-                (outgoing.real("vy"), outgoing.real("vx"), -outgoing.real("vz")),
-                self.now + 3.0,
-            )
+            self.wanted = (outgoing.real("vy"), outgoing.real("vx"), -outgoing.real("vz"))
+            self.wanted_until = self.now + 3.0
             self.goal = None
 
     def _obey(self, outgoing: Message) -> None:
@@ -136,18 +142,18 @@ class Plane(MavlinkAutopilot):
         elif number == mavlink.MAV_CMD_COMPONENT_ARM_DISARM:
             self.vehicle.armed = outgoing.real("param1") == 1
         elif number == mavlink.MAV_CMD_NAV_TAKEOFF:
-            self.goal, self.goal_height, self.wanted = (
-                (self.xy[0], self.xy[1]),
-                outgoing.real("param7") + self.raised_m,
-                None,
-            )
+            self.goal = (self.xy[0], self.xy[1])
+            self.goal_height = outgoing.real("param7") + self.raised_m
+            self.wanted = None
         elif number == mavlink.MAV_CMD_DO_CHANGE_SPEED:
             self.speed_mps = outgoing.real("param2")
         elif number == mavlink.MAV_CMD_DO_REPOSITION:
             if not self.positions:
-                self.positions, self.speed_mps = True, DEFAULT_MPS  # its position controller begins again
+                self.positions = True
+                self.speed_mps = DEFAULT_MPS  # its position controller begins again
             self.goal = FRAME.xy(outgoing.integer("x") / 1e7, outgoing.integer("y") / 1e7)
-            self.goal_height, self.wanted = outgoing.real("z") + self.raised_m, None
+            self.goal_height = outgoing.real("z") + self.raised_m
+            self.wanted = None
         elif number == mavlink.MAV_CMD_CONDITION_YAW:
             self.heading = outgoing.real("param1")
         elif number == mavlink.MAV_CMD_DO_SET_HOME:
@@ -198,7 +204,8 @@ class Plane(MavlinkAutopilot):
             self.trace.append((self.xy[0], self.xy[1], self.height))
         if self.vehicle.mode in {LAND, RTL, SMART_RTL} and self.height <= 0.0:
             self.vehicle.armed = False
-            self.velocity, self.climb = [0.0, 0.0], 0.0
+            self.velocity = [0.0, 0.0]
+            self.climb = 0.0
 
     def _command(self) -> tuple[float, float, float]:  # noqa: PLR0911 - one line a mode
         mode = self.vehicle.mode
@@ -222,7 +229,8 @@ class Plane(MavlinkAutopilot):
         return (*self._toward(self.goal), max(-CLIMB, min(CLIMB, rise)))
 
     def _toward(self, goal: tuple[float, float]) -> tuple[float, float]:
-        x, y = goal[0] - self.xy[0], goal[1] - self.xy[1]
+        x = goal[0] - self.xy[0]
+        y = goal[1] - self.xy[1]
         away = math.hypot(x, y)
         if away < 0.05:
             return 0.0, 0.0
@@ -230,7 +238,8 @@ class Plane(MavlinkAutopilot):
         return x / away * speed, y / away * speed
 
     def _tell(self) -> None:
-        place, height = FRAME.latlon(self.xy[0], self.xy[1]), self.height
+        place = FRAME.latlon(self.xy[0], self.xy[1])
+        height = self.height
         state = (*place, height - self.raised_m, height + GROUND_M, self.heading, *self.velocity, -self.climb)
         self._after(self.downlink_s, self._show, round(self.now * 1e3), *state)
 
@@ -329,10 +338,14 @@ class World:
             audit=self.audit, clock=lambda: 1_790_000_000.0 + self.plane.now, grace_s=grace_s, boarding_s=boarding_s,  # type: ignore[arg-type]
             state=ControlState(decided=known, armed_seen=facts.armed if known else None, expected_mode=GUIDED),
         )  # fmt: skip
-        self.control, self.gate, self.service, self.streams = parts.control, parts.gate, parts.service, parts.streams
-        self.tours, self.monitor, self.supervisor, self.observer = (
-            parts.poi_missions, parts.monitor, parts.supervisor, parts.observer,
-        )  # fmt: skip
+        self.control = parts.control
+        self.gate = parts.gate
+        self.service = parts.service
+        self.streams = parts.streams
+        self.tours = parts.poi_missions
+        self.monitor = parts.monitor
+        self.supervisor = parts.supervisor
+        self.observer = parts.observer  # fmt: skip
         self.control.set_checked(Checked("", (), Airframe(retraces=retraces), 8.0, retraces))
         self.plane.on_parameter = self.observer.parameter
         self._tasks = [asyncio.ensure_future(part) for part in (self.plane.run(), self.monitor.run(), self.tours.run())]

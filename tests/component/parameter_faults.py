@@ -72,7 +72,9 @@ def parameter_faults(seed: int, count: int) -> list[str]:
 
 async def _wrong(rng: random.Random) -> str:
     """What is wrong with what the service makes of one vehicle."""
-    values, lost, expected = dict(OTHERS), set(), {}
+    values = dict(OTHERS)
+    lost = set()
+    expected = {}
     known = True
     for figure, (older, newer, least) in NEEDED.items():
         name, scale = rng.choice((older, newer))

@@ -28,11 +28,16 @@ from fractus_core.planning.coverage import Samples
 NOW_S = 1_780_000_000.0
 FLOWN_M = 10.0
 """The altitude of all waypoints."""
-SAFETY_M, NEAR_M, RESERVE, CRUISE_MPS, CLIMB_MPS = 7.0, 800.0, 0.2, 5.0, 1.5
+SAFETY_M = 7.0
+NEAR_M = 800.0
+RESERVE = 0.2
+CRUISE_MPS = 5.0
+CLIMB_MPS = 1.5
 MARGIN_M = 2.5
 """What a leg from standstill keeps from zones: position error and deviation of the autopilot."""
 STEP_M = 3.0
-CPU, ROOMS = 0.1, (0.05, 0.1, 0.2, 0.2, 4.0, 4.0)
+CPU = 0.1
+ROOMS = (0.05, 0.1, 0.2, 0.2, 4.0, 4.0)
 OTHER = ("default", "other")
 
 
@@ -78,7 +83,8 @@ class Maker:
             for i in range(rng.randint(1, 3))
         }
         path = [self.somewhere(250) for _ in range(rng.randint(1, 4))]
-        drones, edges = self.drones(), self.edges()
+        drones = self.drones()
+        edges = self.edges()
         components = self.aboard(path)
         components += self.on_the_ground([c["name"] for c in components if c["name"] == "Viewer"])
         application = Application.from_body(body("Application", "app", {"components": components}))
@@ -125,12 +131,14 @@ class Maker:
         return [{"technology": "4G"}, *wifi]
 
     def drones(self) -> list[Drone]:
-        rng, found = self.rng, []
+        rng = self.rng
+        found = []
         for i in range(rng.randint(1, 6)):
             depot = rng.choice([*self.depots, "depot-0", "depot-0", None])
             home = self.at(*self.somewhere(rng.choice([30, 300, 900]))) if depot is None or rng.random() < 0.2 else None
             if rng.random() < 0.03:
-                depot, home = None, None
+                depot = None
+                home = None
             mobility = {
                 "maxAltitude": rng.choice([8, *[80] * 9]),
                 "maxFlightTime": rng.choice([4, 15, 30, 30, 60]),
@@ -188,7 +196,8 @@ class Maker:
         return [driver, *([viewer] if rng.random() < 0.5 else [])]
 
     def on_the_ground(self, viewers: list[str]) -> list[dict[str, Any]]:
-        rng, found = self.rng, []
+        rng = self.rng
+        found = []
         for i in range(rng.choice([0, 0, 1, 1, 2])):
             locations = [
                 {
@@ -238,7 +247,8 @@ class Maker:
 
     def flights(self, path: Sequence[tuple[float, float]], drones: list[Drone]) -> dict[str, Flight]:
         """What drones of another application fly: along this one's points, against their order, past some, or elsewhere."""
-        rng, found = self.rng, {}
+        rng = self.rng
+        found = {}
         for drone in rng.sample(drones, rng.randint(0, min(2, len(drones)))):
             way = list(path)
             match rng.choice(["along", "against", "past", "elsewhere"]):
@@ -337,7 +347,8 @@ class Oracle:
         return drone.spec.home or (depot.spec.location if depot is not None else None)
 
     def stands_right(self, drone: Drone) -> bool:
-        home, driver = self.home(drone), self.spec.driver
+        home = self.home(drone)
+        driver = self.spec.driver
         if home is None:
             return False
         first = driver.control_points[0] if driver is not None else None
@@ -372,7 +383,9 @@ class Oracle:
 
     def rules(self, drone: Drone, *, used: bool) -> Iterator[tuple[str, bool]]:
         """The rules in their order, each with whether a drone fails it."""
-        services, mobility, status = drone.spec.services, drone.spec.services.mobility, drone.status
+        services = drone.spec.services
+        mobility = drone.spec.services.mobility
+        status = drone.status
         assert status is not None
         aboard = list(self.spec.on("drone"))
         for request in (request for one in aboard for request in one.services):
@@ -404,7 +417,8 @@ class Oracle:
         return (distance_m / speed + 2 * height_m / CLIMB_MPS) / 60
 
     def available_min(self, drone: Drone) -> float:
-        mobility, status = drone.spec.services.mobility, drone.status
+        mobility = drone.spec.services.mobility
+        status = drone.status
         assert mobility is not None
         assert status is not None
         assert status.battery is not None
@@ -417,7 +431,8 @@ class Oracle:
         for a, b in itertools.pairwise(xy):
             count = max(int(math.dist(a, b) / 0.25), 1)
             places += [np.array(a) + (np.array(b) - np.array(a)) * k / count for k in range(1, count + 1)]
-        way, at = np.array(places), 0
+        way = np.array(places)
+        at = 0
         for point in self.route():
             away = np.hypot(*(way - np.array(self.scene.xy(point))).T)
             if np.abs(away[at:].min() - SAFETY_M) < 0.3:
@@ -449,7 +464,9 @@ class Oracle:
         asked_min = self.flight_min(drone, self.asked_m(drone), CRUISE_MPS, FLOWN_M)
         policies = list(self.holding(drone, asked_min))
         circles = [self.scene.zones[z] for p in policies for z in p.spec.selector.zones]
-        speed, height, changed = CRUISE_MPS, FLOWN_M, False
+        speed = CRUISE_MPS
+        height = FLOWN_M
+        changed = False
         for policy in policies:
             spec = policy.spec
             if spec.kind == "speed" and spec.upper_limit is not None:
@@ -514,7 +531,8 @@ class Oracle:
         if _blocked([b, b], circles):
             return False
         west, south, east, north = hull.bounds
-        columns, rows = int((east - west) / STEP_M) + 1, int((north - south) / STEP_M) + 1
+        columns = int((east - west) / STEP_M) + 1
+        rows = int((north - south) / STEP_M) + 1
         x, y = np.meshgrid(west + STEP_M * np.arange(columns), south + STEP_M * np.arange(rows), indexing="ij")
         inner = hull.buffer(-margin_m)
         free = shapely.contains_xy(inner, x, y) if not inner.is_empty else np.zeros_like(x, dtype=bool)
@@ -529,7 +547,8 @@ class Oracle:
             if goal[i, j]:
                 return True
             for di, dj in itertools.product((-1, 0, 1), repeat=2):
-                k, m = i + di, j + dj
+                k = i + di
+                m = j + dj
                 if 0 <= k < columns and 0 <= m < rows and free[k, m] and not seen[k, m]:
                     seen[k, m] = True
                     pending.append((k, m))
@@ -601,7 +620,9 @@ class Oracle:
 
     def greedy(self, wanted: Any, inside: Any, rooms: dict[str, int]) -> dict[tuple[str, int], list[str]]:
         """The nearest nodes, location by location, as the thesis has it."""
-        left, used, found = dict(rooms), set(), {}
+        left = dict(rooms)
+        used = set()
+        found = {}
         for name, i, count in wanted:
             chosen = [n for n in inside[name, i] if left[n] > 0 and (name, n) not in used][:count]
             found[name, i] = chosen
@@ -631,7 +652,8 @@ class Oracle:
         placed.append((role, name))
 
     def place_beside(self, static: str, placed: list[tuple[str, str]]) -> None:
-        edges, here = self.stock.edge_nodes, self.stock.edge_nodes[static]
+        edges = self.stock.edge_nodes
+        here = self.stock.edge_nodes[static]
         around = []
         for n in edges:
             reach = self.reach_m(here, edges[n])
@@ -730,7 +752,8 @@ def deviation(seed: int) -> str | None:
 
 def _compare_drone(oracle: Oracle, found: DeploymentPlanSpec | None, problem: Infeasible | None) -> bool:
     """Compare the drone, and why others do not fly; whether there is one."""
-    reason, spec = problem.reason if problem is not None else "", oracle.spec
+    reason = problem.reason if problem is not None else ""
+    spec = oracle.spec
     flies = oracle.expected_drone()
     assert (flies is None) == (reason in {"NoDrone", "DroneBusy", "PolicyConflict"}), (
         f"{flies}, but {reason or 'a plan'}"

@@ -27,17 +27,24 @@ Flags = NDArray[np.bool_]
 
 STEP_S = 0.05
 STANDING_MPS = 0.02
-ZONES, CORNERS = 7, 8
-ACCELS, CLIMB_ACCELS, JERKS, GAIN = (1.0, 2.5, 2.5, 3.5), (1.0, 1.0, 2.0), (3.0, 5.0, 5.0, 8.0), 1.0
+ZONES = 7
+CORNERS = 8
+ACCELS = (1.0, 2.5, 2.5, 3.5)
+CLIMB_ACCELS = (1.0, 1.0, 2.0)
+JERKS = (3.0, 5.0, 5.0, 8.0)
+GAIN = 1.0
 """Values of WPNAV_ACCEL, WPNAV_ACCEL_Z and PSC_JERK_XY, in metres."""
 CHANGED = 0.04
 """Fraction of vehicles whose parameters change between two requests."""
 RETURNS_M = (3.0, 15.0, 15.0, 40.0)
 """Values of RTL_ALT in metres."""
-UP_MPS, DOWN_MPS = 2.5, 1.5
+UP_MPS = 2.5
+DOWN_MPS = 1.5
 RATIO = 4.0
 """ArduPilot's CONTROL_TIME_CONSTANT_RATIO: it plans to brake with three quarters of its acceleration."""
-POSITION_ERROR_M, HEIGHT_ERROR_M, TRACKING_M = 1.5, 1.0, 1.0
+POSITION_ERROR_M = 1.5
+HEIGHT_ERROR_M = 1.0
+TRACKING_M = 1.0
 LATENCY_S = (0.05, 0.8)
 """Round-trip delay of the link of up to half a second, plus the reaction time of the autopilot."""
 COURSE_S = 0.3
@@ -47,9 +54,12 @@ RESEND_S = 0.2
 STILL = (0.0, 0.0, 0.0)
 HOURS = 12
 """Hour of the day of all flights."""
-NORTH_M, EAST_M = 110_998.6, math.cos(math.radians(HOME.lat)) * 111_457.6
+NORTH_M = 110_998.6
+EAST_M = math.cos(math.radians(HOME.lat)) * 111_457.6
 """Metres per degree at home (WGS 84), accurate to centimetres over this scene."""
-EXCLUSION, INCLUSION, LIMIT = 1, 2, 3
+EXCLUSION = 1
+INCLUSION = 2
+LIMIT = 3
 SERVICES = [{"service": "mobility", "methods": [*METHODS, "SetVelocity"]}]
 METHOD_OF: dict[type, Method] = {GotoArgs: "Goto", VelocityArgs: "SetVelocity", SetSpeedArgs: "SetSpeed"}
 _CIRCLE = np.array([(math.cos(a), math.sin(a)) for a in np.arange(16) * math.pi / 8])
@@ -111,8 +121,10 @@ def scene(rng: np.random.Generator) -> Scene:
         zone, active = _zone(rng, slot, rings, bands, rng.uniform(8, 25), rng.uniform(-60, 60, 2), banded=False)
         low, high = sorted(rng.uniform(3, 50, 2))
         policies.append(policy("zoned", "LimitControl", "altitude", [zone], lowerLimit=low, upperLimit=high))
-        kinds[slot], bands[slot] = (LIMIT if active else 0), (low, high)
-    heights, top = (-np.inf, 120.0), 15.0
+        kinds[slot] = LIMIT if active else 0
+        bands[slot] = (low, high)
+    heights = (-np.inf, 120.0)
+    top = 15.0
     if rng.random() < 0.5:
         heights = (float(rng.uniform(2, 10)), float(rng.uniform(12, 60)))
         action = str(rng.choice(["enforce", "enforce", "refuse"]))
@@ -140,7 +152,8 @@ def _zone(
     turn = rng.uniform(0, 2 * math.pi) + 2 * math.pi * np.arange(count) / count
     radii = size * rng.uniform(0.45, 1.0, count)
     corners = middle + np.column_stack((np.cos(turn), np.sin(turn))) * radii[:, None]
-    rings[slot, :count], rings[slot, count:] = corners, corners[-1]
+    rings[slot, :count] = corners
+    rings[slot, count:] = corners[-1]
     zone: dict[str, Any] = {"name": f"z{slot}", "area": ring([tuple(c) for c in corners.tolist()])}
     if banded and rng.random() < 0.35:
         low, high = sorted(rng.uniform(0, 70, 2))
@@ -168,7 +181,8 @@ class Walls:
     @classmethod
     def of(cls, rings: Floats) -> Walls:
         """Return the edges of rings, shape (n, z, c, 2)."""
-        x, y = rings[..., 0], rings[..., 1]
+        x = rings[..., 0]
+        y = rings[..., 1]
         rise = np.roll(y, -1, axis=2) - y
         slope = (np.roll(x, -1, axis=2) - x) / np.where(rise == 0, 1.0, rise)
         return cls(y, np.roll(y, -1, axis=2), x - slope * y, slope)
@@ -179,7 +193,8 @@ class Walls:
 
     def around(self, points: Floats) -> Flags:
         """Return which rings contain points of shape (n, 2), by rays to the east: shape (n, z)."""
-        x, y = points[:, None, None, 0], points[:, None, None, 1]
+        x = points[:, None, None, 0]
+        y = points[:, None, None, 1]
         hits = ((self.y0 > y) != (self.y1 > y)) & (x < self.x0 + self.slope * y)
         odd: Flags = np.logical_xor.reduce(hits, axis=2)
         return odd
@@ -205,11 +220,13 @@ class Fleet:
 
     def __post_init__(self) -> None:
         """Place each drone somewhere, with some velocity, wind and errors."""
-        rng, count = self.rng, len(self.scenes)
+        rng = self.rng
+        count = len(self.scenes)
         (other,) = rng.spawn(1)
         self.airframes = [s.airframe(other) for s in self.scenes]
         self.place = np.column_stack((rng.uniform(-80, 80, (count, 2)), rng.uniform(3, 45, count)))
-        angle, fast = rng.uniform(0, 2 * math.pi, count), rng.uniform(0, 8, count) * (rng.random(count) < 0.7)
+        angle = rng.uniform(0, 2 * math.pi, count)
+        fast = rng.uniform(0, 8, count) * (rng.random(count) < 0.7)
         climb = rng.uniform(-1.5, 2.0, count) * (rng.random(count) < 0.4)
         self.speed = np.column_stack((fast * np.cos(angle), fast * np.sin(angle), climb))
         self.accel = np.zeros((count, 3))
@@ -257,7 +274,8 @@ class Fleet:
     def part(self, who: NDArray[np.int64]) -> Fleet:
         """Return some of the drones in their present state, on independent flights."""
         found = Fleet(np.random.default_rng(0), [self.scenes[i] for i in who])
-        found.rng, found.time_s = self.rng, self.time_s
+        found.rng = self.rng
+        found.time_s = self.time_s
         found.airframes = [self.airframes[i] for i in who]
         for name in _ROWS:
             setattr(found, name, getattr(self, name)[who].copy())
@@ -339,7 +357,8 @@ class Fleet:
         x, y, z = self.seen[i]
         drift = self.gust[i] * self.beat[i] * math.cos(self.beat[i] * self.time_s + self.phase[i])
         east, north, up = (float(v) for v in self.speed[i] + drift)
-        ground, tends = math.hypot(east, north), float(np.linalg.norm(self.wanted[i, :2]))
+        ground = math.hypot(east, north)
+        tends = float(np.linalg.norm(self.wanted[i, :2]))
         forward = float(self.accel[i, 0] * east + self.accel[i, 1] * north) / max(ground, 0.05) if told else None
         return Situation(
             time_s=NOW, lat=float(HOME.lat + y / NORTH_M), lon=float(HOME.lon + x / EAST_M), altitude_m=float(z), north_mps=north, east_mps=east,
@@ -350,7 +369,8 @@ class Fleet:
 
     def _pending(self, i: int) -> tuple[tuple[float, float, float], ...]:
         """Return the setpoints that the state of a drone may not show yet."""
-        now, since = self.time_s, self.time_s - float(self.latency[i]) - COURSE_S
+        now = self.time_s
+        since = self.time_s - float(self.latency[i]) - COURSE_S
         late = [told for told in self.sent[i] if told[1] >= since]
         before = [told for told in self.sent[i] if told[1] < since][-1:]
         east, north, up = (float(v) for v in self.speed[i])
@@ -364,15 +384,19 @@ class Fleet:
             returns: True if the engine has verified the return from the end of a leg.
         """
         self.surely_returns[i] = returns or (self.surely_returns[i] and isinstance(verdict.args, SetSpeedArgs))
-        args, velocity, hold_s = verdict.args, STILL, 0.0
+        args = verdict.args
+        velocity = STILL
+        hold_s = 0.0
         if isinstance(args, SetSpeedArgs):
             self.mail.append((self.time_s + self.rng.uniform(0, float(self.latency[i])), i, verdict))
             return
         if isinstance(args, VelocityArgs) and not verdict.brake_first:
-            velocity, hold_s = (args.north_mps, args.east_mps, args.down_mps), args.hold_s
+            velocity = (args.north_mps, args.east_mps, args.down_mps)
+            hold_s = args.hold_s
         elif isinstance(args, GotoArgs) and not verdict.brake_first:
             x, y, z = self.seen[i]
-            east, north = (args.lon - HOME.lon) * EAST_M - x, (args.lat - HOME.lat) * NORTH_M - y
+            east = (args.lon - HOME.lon) * EAST_M - x
+            north = (args.lat - HOME.lat) * NORTH_M - y
             cruise = (args.speed_mps or float(self.setpoint[i])) / max(math.hypot(east, north), 1e-6)
             rise = (args.alt or z) - z
             velocity = (float(north * cruise), float(east * cruise), math.copysign(UP_MPS, -rise))
@@ -413,7 +437,8 @@ class Fleet:
 
         Exclusion zones and limits count one by one, inclusion zones together in slot 0 of a second block.
         """
-        true, fast = self.true, np.abs(self.speed).max(axis=1) > STANDING_MPS
+        true = self.true
+        fast = np.abs(self.speed).max(axis=1) > STANDING_MPS
         if fast.mean() > 0.5:
             return trespasses(true[:, :2], true[:, 2], self.walls, self.kinds, self.bands)
         # A stationary drone sways slowly and is observed twice a second.
@@ -450,7 +475,8 @@ def _root(error: Floats, gain: Floats, limit: Floats) -> Floats:
 
 def _disc(rng: np.random.Generator, count: int, radius: float) -> Floats:
     """Return points of a disc, half of them on its rim."""
-    angle, far = rng.uniform(0, 2 * math.pi, count), np.sqrt(np.minimum(rng.uniform(0, 2, count), 1.0)) * radius
+    angle = rng.uniform(0, 2 * math.pi, count)
+    far = np.sqrt(np.minimum(rng.uniform(0, 2, count), 1.0)) * radius
     return np.column_stack((far * np.cos(angle), far * np.sin(angle)))
 
 
@@ -505,7 +531,8 @@ def flights(
     """
     rng = np.random.default_rng(seed)
     scenes = [s for s in (scene(rng) for _ in range(math.ceil(count / shared))) for _ in range(shared)][:count]
-    fleet, tally = Fleet(rng, scenes), Tally()
+    fleet = Fleet(rng, scenes)
+    tally = Tally()
     pardoned = excused(fleet)
     told: list[str] = [""] * count
     (other,) = rng.spawn(1)
@@ -562,7 +589,8 @@ def _change(fleet: Fleet, tally: Tally, told: list[str], pardoned: Flags, rng: n
     for i in who:
         other = fleet.scenes[i].airframe(rng)
         fleet.airframes[i] = replace(other, retraces=fleet.airframes[i].retraces)
-        told[i], fleet.arrives[i] = "", False
+        told[i] = ""
+        fleet.arrives[i] = False
     fleet.learn()
     if len(who):
         pardoned[who] |= excused(fleet.part(who))
@@ -628,7 +656,8 @@ def _flies_faster(fleet: Fleet, i: int, verdict: Verdict, now: Situation) -> boo
 
     The service keeps its speed then.
     """
-    leg, args = fleet.legs[i], verdict.args
+    leg = fleet.legs[i]
+    args = verdict.args
     if leg is None or not isinstance(args, SetSpeedArgs) or args.speed_mps <= float(fleet.setpoint[i]):
         return False
     faster = replace(leg, speed_mps=args.speed_mps)
@@ -650,7 +679,8 @@ def _again(rng: np.random.Generator, last: Call | None) -> Call | None:
     """Repeat the request of half of the drivers that use velocities, with the same or a slightly higher speed."""
     if last is None or not isinstance(last.args, VelocityArgs) or rng.random() < 0.5:
         return None
-    args, faster = last.args, float(rng.choice([1.0, 1.3]))
+    args = last.args
+    faster = float(rng.choice([1.0, 1.3]))
     return Call("SetVelocity", replace(args, north_mps=args.north_mps * faster, east_mps=args.east_mps * faster))
 
 
@@ -698,7 +728,9 @@ def excused(fleet: Fleet) -> Flags:
     from there. `fleet` is not changed.
     """
     trial = fleet.part(np.arange(len(fleet.scenes)))
-    trial.held[:], trial.wanted, trial.until = True, trial.speed.copy(), fleet.time_s + fleet.latency
+    trial.held[:] = True
+    trial.wanted = trial.speed.copy()
+    trial.until = fleet.time_s + fleet.latency
     found = np.zeros((len(fleet.scenes), ZONES + 1), dtype=bool)
     for n in range(int(SLOWEST_STOP_S / STEP_S)):
         if n % 4 == 0:

@@ -66,7 +66,8 @@ def clocked(tmp_path: Path) -> Iterator[dict[str, Clocked]]:
 
 
 def test_a_service_is_stepped_and_no_other(clocked: dict[str, Clocked], tmp_path: Path) -> None:
-    agent, mobility = clocked["agent"], clocked["mobility"]
+    agent = clocked["agent"]
+    mobility = clocked["mobility"]
     assert agent.is_ahead(0)
     assert mobility.is_ahead(0)
     for offset_s in (DAY_S, -DAY_S, -30.5, 0.0):

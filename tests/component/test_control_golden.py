@@ -38,7 +38,8 @@ def selected_flights() -> list[str]:
         return list(courses())
     traces: dict[str, Trace] = {path.stem: json.loads(path.read_text()) for path in sorted(GOLDEN.glob("*.json"))}
     shows = {name: features(trace) for name, trace in traces.items()}
-    missing, names = set().union(*shows.values()), list[str]()
+    missing = set().union(*shows.values())
+    names = list[str]()
     while missing:
         names.append(max(shows, key=lambda name: len(shows[name] & missing) / (1 + len(traces[name]["path"]))))
         missing -= shows[names[-1]]

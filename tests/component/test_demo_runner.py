@@ -100,7 +100,8 @@ def test_mission_fails_after_the_timeout(tmp_path: Path) -> None:
 
 
 def test_driver_log_lines_are_reported_complete_and_once(tmp_path: Path) -> None:
-    log, said = tmp_path / "log", list[str]()
+    log = tmp_path / "log"
+    said = list[str]()
     log.write_bytes(b"[pod/x-navigator-1/navigator] 08:00 armed\n[pod/y/data-store] 08:00 kept 1\n[pod/x-navi")
     at = watch._tell(log, 0, said.append)
     log.write_bytes(log.read_bytes() + b"gator-1/navigator] 08:01 waypoint 1/5\n")
@@ -169,7 +170,8 @@ def test_incomplete_file_is_removed_after_a_failed_fetch(tmp_path: Path) -> None
     kubectl = tmp_path / "kubectl"
     kubectl.write_text("#!/bin/sh\nprintf '\\377\\330half'\nif [ \"$7\" = /bad ]; then echo broken >&2; exit 1; fi\n")
     kubectl.chmod(0o755)
-    kube, to = Kube(kubectl, kubectl, tmp_path), tmp_path / "out.jpg"
+    kube = Kube(kubectl, kubectl, tmp_path)
+    to = tmp_path / "out.jpg"
     with pytest.raises(DemoError, match="broken"):
         kube.fetch("pod", "/bad", to)
     assert [path.name for path in tmp_path.iterdir()] == ["kubectl"]
@@ -271,7 +273,8 @@ def test_mission_recordings_are_kept_and_the_replay_command_is_printed(
 
 
 def test_demo_continues_without_live_view(tmp_path: Path) -> None:
-    said, told = list[str](), threading.Event()
+    said = list[str]()
+    told = threading.Event()
     (tmp_path / "config").write_text("no kubeconfig")
 
     def say(line: str) -> None:

@@ -50,7 +50,8 @@ def problems(arguments: str) -> list[str]:
         found = command.get_command(context, name)
         if found is None:
             return [f"no command {name}"]
-        command, context = found, click.Context(found, parent=context)
+        command = found
+        context = click.Context(found, parent=context)
     if "--" in words:
         words = words[: words.index("--")]
     known = {name for parameter in command.params for name in (*parameter.opts, *parameter.secondary_opts)}

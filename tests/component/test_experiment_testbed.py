@@ -68,7 +68,9 @@ def testbed(experiment: Experiment, tmp_path: Path) -> Empty:
 
 @pytest.mark.parametrize("error", [full(), KeyboardInterrupt()], ids=["disk full", "Ctrl-C"])
 def test_testbed_closes_remaining_resources_after_a_close_error(testbed: Empty, error: BaseException) -> None:
-    first, last, order = testbed.keep(Thing()), Thing(error), list[str]()
+    first = testbed.keep(Thing())
+    last = Thing(error)
+    order = list[str]()
     testbed.at_end(lambda: order.append("done"))
     testbed.keep(last)
     with pytest.raises(type(error)):

@@ -68,7 +68,8 @@ async def test_a_request_arrives_as_it_is_and_connections_are_kept() -> None:
 
 async def test_a_connection_whose_other_side_is_gone_is_found_dead(monkeypatch: pytest.MonkeyPatch) -> None:
     """A watch sends nothing: only keepalives of TCP notice that a cable was pulled."""
-    made, real = list[socket.socket](), connection._socket
+    made = list[socket.socket]()
+    real = connection._socket
     monkeypatch.setattr(connection, "_socket", lambda address: made.append(real(address)) or made[-1])
     async with client_of(Server(answer({}))) as client:
         await client.request("GET", "/apis/one")
@@ -264,7 +265,8 @@ async def test_a_write_to_an_api_server_that_stalls_ends_before_another_may_act(
     async with client_of(server, may_write_s=lambda: left_s) as client:
         with pytest.raises(KubeError, match=r"no response in 0\.0 s"):
             await client.create(ZONE, ZONE.header("a"))
-        left_s, before = 0.0, len(server.requests)
+        left_s = 0.0
+        before = len(server.requests)
         with pytest.raises(KubeError, match="another operator may act"):
             await client.create(ZONE, ZONE.header("a"))
     assert len(server.requests) == before
@@ -421,7 +423,8 @@ async def test_a_proxy_of_the_environment_is_used_where_it_is_trusted(
     for name in ("http_proxy", "https_proxy", "all_proxy", "no_proxy"):
         monkeypatch.delenv(name, raising=False)
         monkeypatch.delenv(name.upper(), raising=False)
-    proxy, server = Server(answer({"from": "proxy"})), Server(answer({"from": "server"}))
+    proxy = Server(answer({"from": "proxy"}))
+    server = Server(answer({"from": "server"}))
     async with listening(proxy), client_of(server, trust_env=trust_env) as client:
         monkeypatch.setenv("http_proxy", proxy.url)
         assert await client.request("GET", "/x") == {"from": "proxy" if trust_env else "server"}

@@ -13,7 +13,8 @@ from mobility_world import GUIDED, LAND, LOITER, RTL, Plane, World, spec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from virtual_time import fly
 
-MODE, SPEED = mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_CMD_DO_CHANGE_SPEED
+MODE = mavlink.MAV_CMD_DO_SET_MODE
+SPEED = mavlink.MAV_CMD_DO_CHANGE_SPEED
 
 
 def slow(plane: Plane, each_way_s: float) -> None:
@@ -97,7 +98,8 @@ def test_a_change_of_mode_waits_for_none_that_is_not_answered(tmp_path: Path, mo
             plane = world.plane
             heard: list[tuple[float, float]] = []
             await measured(plane, 1.0)
-            hear, lost = plane._hear, [LOITER, RTL]
+            hear = plane._hear
+            lost = [LOITER, RTL]
 
             def listen(outgoing: Message) -> None:
                 if outgoing.values.get("command") == MODE:
@@ -126,7 +128,8 @@ def test_a_slow_link_brings_the_drone_down(tmp_path: Path) -> None:
 
     async def flight() -> None:
         async with World(tmp_path) as world:
-            grant, plane = world.grants.put(spec()), world.plane
+            grant = world.grants.put(spec())
+            plane = world.plane
             await world.up(grant)
             slow(plane, 1.5)
             await asyncio.sleep(5.0)

@@ -37,7 +37,8 @@ def flown_at_once(wind_mps: float, error_m: float) -> Attempt:
     return attempt(as_fast_as_let, 7, weather(0.0, wind_mps, error_m=error_m))
 
 
-CALM, WINDY = (0.0, 0.5), (6.0, 5.0)
+CALM = (0.0, 0.5)
+WINDY = (6.0, 5.0)
 """Wind in m/s, and how far from the truth a position is, in metres."""
 
 
@@ -59,7 +60,8 @@ def test_velocities_keep_their_distance(delay_s: float, air: tuple[float, float]
 
 def test_a_delay_that_is_not_measured_costs_the_distance(monkeypatch: pytest.MonkeyPatch) -> None:
     """So would a figure that is taken for granted, which the cells above must notice."""
-    first, measured = flown_at_once(0.0, 0.5), Timing.latency_s
+    first = flown_at_once(0.0, 0.5)
+    measured = Timing.latency_s
     monkeypatch.setattr(Timing, "latency_s", lambda self, now: min(measured(self, now), 0.3))
     assert attempt(as_fast_as_let, 7, weather(0.5, error_m=0.5)).kept_m < first.kept_m - COSTS_M
 
@@ -99,7 +101,10 @@ AHEAD_M = {0.0: (12.0, 31.0), 0.1: (13.0, 32.0), 0.25: (13.0, 33.0), 0.5: (15.0,
 """How far ahead a zone may appear by the delay, at 5 and at 10 m/s: the last columns of the table."""
 
 
-SLOW, FAST, AHEAD, BEHIND = (5.0, 0.5), (10.0, 0.5), (10.0, 5.0), (10.0, -5.0)
+SLOW = (5.0, 0.5)
+FAST = (10.0, 0.5)
+AHEAD = (10.0, 5.0)
+BEHIND = (10.0, -5.0)
 """Speed in m/s, and how far ahead of where it believes to be the drone is, in metres."""
 
 

@@ -24,8 +24,14 @@ def test_monitor_never_stops_permitted_flights(speed_mps: float) -> None:
     fleet = Fleet(rng, [scene(rng)])
     fleet.airframes = [Airframe()]
     fleet.learn()
-    fleet.place[:], fleet.speed[:], fleet.gust[:], fleet.error[:] = [0, 0, 10], 0.0, 0.0, 0.0
-    fleet.goal[:], fleet.cruise[:], fleet.setpoint[:], fleet.held[:] = [0, 47.4, 10], speed_mps, speed_mps, False
+    fleet.place[:] = [0, 0, 10]
+    fleet.speed[:] = 0.0
+    fleet.gust[:] = 0.0
+    fleet.error[:] = 0.0
+    fleet.goal[:] = [0, 47.4, 10]
+    fleet.cruise[:] = speed_mps
+    fleet.setpoint[:] = speed_mps
+    fleet.held[:] = False
     for _ in range(int(60 / STEP_S)):
         fleet.step()
         x, y, z = fleet.place[0]
@@ -44,8 +50,14 @@ def test_monitor_stops_accelerating_drone_before_new_zone(appears_s: float) -> N
     fleet = Fleet(rng, [scene(rng)])
     fleet.airframes = [Airframe()]
     fleet.learn()
-    fleet.place[:], fleet.speed[:], fleet.gust[:], fleet.error[:] = [0, 0, 10], 0.0, 0.0, 0.0
-    fleet.goal[:], fleet.cruise[:], fleet.setpoint[:], fleet.held[:] = [0, 300, 10], 12.0, 12.0, False
+    fleet.place[:] = [0, 0, 10]
+    fleet.speed[:] = 0.0
+    fleet.gust[:] = 0.0
+    fleet.error[:] = 0.0
+    fleet.goal[:] = [0, 300, 10]
+    fleet.cruise[:] = 12.0
+    fleet.setpoint[:] = 12.0
+    fleet.held[:] = False
     while fleet.time_s < appears_s:
         fleet.step()
     assert fleet.accel[0, 1] > 0.8 * fleet.accels[0]
@@ -68,7 +80,9 @@ def test_monitor_stops_accelerating_drone_before_new_zone(appears_s: float) -> N
     for _ in range(int(now.latency_s / STEP_S)):
         fleet.step()
     # The service commands a zero velocity.
-    fleet.held[:], fleet.wanted[:], fleet.until[:] = True, 0.0, math.inf
+    fleet.held[:] = True
+    fleet.wanted[:] = 0.0
+    fleet.until[:] = math.inf
     for _ in range(int(20 / STEP_S)):
         fleet.step()
     rest_m = wall_m - fleet.place[0, 1]

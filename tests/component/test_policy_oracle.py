@@ -35,7 +35,8 @@ _cases = settings(max_examples=examples(600), deadline=None, derandomize=True)
 
 
 def flat(lat: float, lon: float) -> tuple[float, float]:
-    north_scale, east_scale = 110_998.0, math.cos(math.radians(HOME.lat)) * 111_458.0
+    north_scale = 110_998.0
+    east_scale = math.cos(math.radians(HOME.lat)) * 111_458.0
     return (lon - HOME.lon) * east_scale, (lat - HOME.lat) * north_scale
 
 
@@ -52,26 +53,33 @@ def fly(
     start: tuple[float, float], velocity: tuple[float, float], to: tuple[float, float], cruise: float, latency: float
 ) -> list[tuple[float, float]]:
     """Return positions of a drone that receives its target after a latency and then turns to it, braking in time."""
-    (x, y), (vx, vy) = start, velocity
-    track, t = [start], 0.0
+    x, y = start
+    vx, vy = velocity
+    track = [start]
+    t = 0.0
     while t < 120:
         t += STEP_S
         ax = ay = 0.0
         if t > latency:
-            dx, dy = to[0] - x, to[1] - y
+            dx = to[0] - x
+            dy = to[1] - y
             away = math.hypot(dx, dy)
             linear = ACCEL_MPS2
             wanted = away if away < linear else math.sqrt(2 * ACCEL_MPS2 * (away - linear / 2))
             wanted = min(wanted, cruise)
             wx, wy = (dx / away * wanted, dy / away * wanted) if away > 1e-6 else (0.0, 0.0)
-            ex, ey = (wx - vx) / STEP_S, (wy - vy) / STEP_S
+            ex = (wx - vx) / STEP_S
+            ey = (wy - vy) / STEP_S
             size = math.hypot(ex, ey)
             scale = min(1.0, ACCEL_MPS2 / size) if size > 0 else 0.0
-            ax, ay = ex * scale, ey * scale
+            ax = ex * scale
+            ay = ey * scale
             if away < 0.05 and math.hypot(vx, vy) < 0.05:
                 break
-        vx, vy = vx + ax * STEP_S, vy + ay * STEP_S
-        x, y = x + vx * STEP_S, y + vy * STEP_S
+        vx = vx + ax * STEP_S
+        vy = vy + ay * STEP_S
+        x = x + vx * STEP_S
+        y = y + vy * STEP_S
         track.append((x, y))
     return track
 
@@ -90,7 +98,8 @@ def brake(start: tuple[float, float], velocity: tuple[float, float], latency: fl
 @st.composite
 def polygons(draw: st.DrawFn) -> Corners:
     """Draw a star-shaped polygon, convex or not."""
-    cx, cy = draw(st.floats(-120, 120)), draw(st.floats(-120, 120))
+    cx = draw(st.floats(-120, 120))
+    cy = draw(st.floats(-120, 120))
     count = draw(st.integers(3, 8))
     radii = draw(st.lists(st.floats(5, 45), min_size=count, max_size=count))
     turn = draw(st.floats(0, 6))
@@ -270,7 +279,9 @@ def test_oracle_excuses_drones_that_start_beyond_an_altitude_limit() -> None:
     limits[0] = 21, 40
     scene = Scene(compiled(), rings, np.array([LIMIT] + [0] * (ZONES - 1)), limits, (-np.inf, 120.0), 15.0)
     fleet = Fleet(np.random.default_rng(1), [scene] * 4)
-    fleet.place[:], fleet.speed[:], fleet.gust[:] = (0, 0, 19), 0, 0
+    fleet.place[:] = (0, 0, 19)
+    fleet.speed[:] = 0
+    fleet.gust[:] = 0
     fleet.place[1:, 2] = 21.5, 39.5, 42
     assert excused(fleet)[:, 0].tolist() == [True, False, False, True]
 

@@ -102,9 +102,11 @@ def made_whole(writer: FlightWriter, path: Path) -> None:
 
 def fly(writer: FlightWriter, begin_s: int, seconds: int, vehicle: Vehicle | None = None) -> None:
     """A minute on the ground, some seconds with the motors on, a minute on the ground."""
-    vehicle, companion = vehicle or Vehicle(), Endpoint(244, 191)
+    vehicle = vehicle or Vehicle()
+    companion = Endpoint(244, 191)
     for second in range(begin_s - 60, begin_s + seconds + 60):
-        armed, now = begin_s <= second < begin_s + seconds, T0 + second * S
+        armed = begin_s <= second < begin_s + seconds
+        now = T0 + second * S
         Steady.now_s += 1.0
         writer.received(now, vehicle.heartbeat(armed))
         writer.received(now + 1000, vehicle.position(39.0 + second * 1e-5, 22.0, 100.0 + second) + vehicle.attitude())
@@ -139,9 +141,11 @@ def mcap(path: Path) -> dict[str, list[tuple[int, Any]]]:
 
 
 def test_a_flight_is_recorded_with_a_little_before_and_after(tmp_path: Path) -> None:
-    writer, vehicle = writer_in(tmp_path / "r"), Vehicle()
+    writer = writer_in(tmp_path / "r")
+    vehicle = Vehicle()
     fly(writer, 100, 30, vehicle)
-    ((frames,), (messages,)) = files(tmp_path / "r", ".tlog"), files(tmp_path / "r", ".mcap")
+    (frames,) = files(tmp_path / "r", ".tlog")
+    (messages,) = files(tmp_path / "r", ".mcap")
     assert frames.stem == messages.stem == "000001-20260528T202809Z"
     kinds = Counter(message.get_type() for message in tlog(frames))
     assert kinds["HEARTBEAT"] == kinds["GLOBAL_POSITION_INT"] == kinds["ATTITUDE"]
@@ -173,7 +177,8 @@ def test_each_flight_has_files_of_its_own_and_the_ground_has_none(tmp_path: Path
 
 
 def test_ground_stations_tools_read_the_tlog(tmp_path: Path) -> None:
-    writer, vehicle = writer_in(tmp_path), Vehicle()
+    writer = writer_in(tmp_path)
+    vehicle = Vehicle()
     fly(writer, 100, 5, vehicle)
     program = Path(sys.executable).with_name("mavlogdump.py")
     (path,) = files(tmp_path, ".tlog")
@@ -201,7 +206,8 @@ def test_frames_beyond_the_dialect_are_in_the_tlog(tmp_path: Path) -> None:
 def test_decisions_texts_and_zones_are_in_the_mcap(tmp_path: Path) -> None:
     import yaml
 
-    writer, vehicle = writer_in(tmp_path), Vehicle()
+    writer = writer_in(tmp_path)
+    vehicle = Vehicle()
     spec = Grant.from_body(yaml.safe_load(GRANT)).spec
     writer.grants(T0, [spec])
     writer.received(T0, vehicle.heartbeat(True))
@@ -233,9 +239,12 @@ def test_decisions_texts_and_zones_are_in_the_mcap(tmp_path: Path) -> None:
 
 
 def test_the_oldest_make_room_and_no_other_user_reads_them(tmp_path: Path) -> None:
-    directory, limit_mb = tmp_path / "deep" / "r", 1.5
-    writer, vehicle = writer_in(directory, limit_mb), Vehicle()
-    seen, said = set[int](), vehicle.heartbeat(True) + vehicle.position(39.0, 22.0, 100.0)
+    directory = tmp_path / "deep" / "r"
+    limit_mb = 1.5
+    writer = writer_in(directory, limit_mb)
+    vehicle = Vehicle()
+    seen = set[int]()
+    said = vehicle.heartbeat(True) + vehicle.position(39.0, 22.0, 100.0)
     for second in range(3000):
         now = T0 + second * S
         for _ in range(5):
@@ -258,14 +267,16 @@ def test_the_oldest_make_room_and_no_other_user_reads_them(tmp_path: Path) -> No
 
 
 def test_what_a_crash_leaves_can_be_read_and_is_completed(tmp_path: Path) -> None:
-    writer, vehicle = writer_in(tmp_path), Vehicle()
+    writer = writer_in(tmp_path)
+    vehicle = Vehicle()
     for second in range(20):
         writer.received(T0 + second * S, vehicle.heartbeat(True) + vehicle.position(39.0, 22.0, 100.0))
     tape = writer._segment
     assert tape is not None
     tape.flush()
     writer.received(T0 + 20 * S, vehicle.position(39.0, 22.0, 100.0))
-    ((frames,), (messages,)) = files(tmp_path, ".tlog"), files(tmp_path, ".mcap")
+    (frames,) = files(tmp_path, ".tlog")
+    (messages,) = files(tmp_path, ".mcap")
     whole = messages.read_bytes()
     read = []
     with pytest.raises(Exception, match=r".*"), messages.open("rb") as file:
@@ -291,7 +302,8 @@ def test_what_a_crash_leaves_can_be_read_and_is_completed(tmp_path: Path) -> Non
 
 def crashed(directory: Path, seconds: int = 200) -> Path:
     """A directory in which a process was killed in flight; the file that has no index."""
-    writer, vehicle = writer_in(directory), Vehicle()
+    writer = writer_in(directory)
+    vehicle = Vehicle()
     for second in range(seconds):
         writer.received(T0 + second * S, vehicle.heartbeat(True) + vehicle.position(39.0, 22.0, 100.0))
     writer.flush()
@@ -303,7 +315,8 @@ def test_nothing_is_completed_while_a_drone_flies(tmp_path: Path, monkeypatch: p
     broken = crashed(tmp_path)
     left = broken.read_bytes()
     monkeypatch.setattr(recorder, "INDEX_SLICE_S", 0.0001)
-    writer, vehicle = writer_in(tmp_path), Vehicle()
+    writer = writer_in(tmp_path)
+    vehicle = Vehicle()
     for second in range(100):
         Steady.now_s += 0.25
         writer.received(T0 + (300 + second) * S, vehicle.heartbeat(True))
@@ -333,7 +346,8 @@ def test_a_file_that_made_room_meanwhile_does_not_come_back(tmp_path: Path) -> N
 
 
 def test_what_a_crash_left_half_made_is_removed_and_nothing_else(tmp_path: Path) -> None:
-    orphan, foreign = tmp_path / "000007-20260601T120000Z.part", tmp_path / "download.part"
+    orphan = tmp_path / "000007-20260601T120000Z.part"
+    foreign = tmp_path / "download.part"
     orphan.write_bytes(b"x")
     foreign.write_bytes(b"x")
     writer_in(tmp_path)
@@ -384,7 +398,8 @@ def test_only_a_directory_that_it_makes_gets_its_mode(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("step_s", [-3600, 3600])
 def test_the_wall_clock_does_not_say_when_a_flight_ends(tmp_path: Path, step_s: int) -> None:
-    writer, vehicle = writer_in(tmp_path), Vehicle()
+    writer = writer_in(tmp_path)
+    vehicle = Vehicle()
     for second in range(60):
         Steady.now_s += 1.0
         now = T0 + second * S + (step_s * S if second >= 15 else 0)
@@ -395,7 +410,8 @@ def test_the_wall_clock_does_not_say_when_a_flight_ends(tmp_path: Path, step_s: 
 
 
 def test_a_clock_that_is_set_back_lets_nothing_grow(tmp_path: Path) -> None:
-    writer, vehicle = writer_in(tmp_path), Vehicle()
+    writer = writer_in(tmp_path)
+    vehicle = Vehicle()
     for second in range(3000):
         Steady.now_s = float(second)
         writer.received(T0 - second * S, vehicle.heartbeat(False))
@@ -452,7 +468,8 @@ def test_a_full_disk_stops_the_recording_and_it_goes_on_when_there_is_room(
             raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(os, "fdatasync", sync)
-    vehicle, taken = Vehicle(), Recorder(SegmentDirectory(tmp_path, 4_000_000, reserve_bytes=0), "drone-1")
+    vehicle = Vehicle()
+    taken = Recorder(SegmentDirectory(tmp_path, 4_000_000, reserve_bytes=0), "drone-1")
 
     def flies() -> None:
         taken.take_received(vehicle.heartbeat(True) + vehicle.position(39.0, 22.0, 100.0))
@@ -485,7 +502,8 @@ def test_one_line_tells_that_a_disk_has_no_room(tmp_path: Path, caplog: pytest.L
     tried = len(caplog.records)
     taken = Recorder(SegmentDirectory(tmp_path / "r", 4_000_000, reserve_bytes=2**62), "drone-1")
     until(lambda: taken.problem)
-    vehicle, deadline = Vehicle(), time.monotonic() + 0.3
+    vehicle = Vehicle()
+    deadline = time.monotonic() + 0.3
     while time.monotonic() < deadline:  # a dozen of attempts
         taken.take_received(vehicle.heartbeat(True))
         time.sleep(0.01)
@@ -499,7 +517,8 @@ def test_one_line_tells_that_a_disk_has_no_room(tmp_path: Path, caplog: pytest.L
 def test_a_disk_that_hangs_delays_no_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    hangs, monotonic = threading.Event(), time.monotonic
+    hangs = threading.Event()
+    monotonic = time.monotonic
     monkeypatch.setattr(recorder, "POLL_INTERVAL_S", 0.005)
     monkeypatch.setattr(FlightWriter, "received", lambda _self, _now, _data: hangs.wait(60))
     taken = Recorder(SegmentDirectory(tmp_path, 4_000_000, reserve_bytes=0), "drone-1", max_waiting=50)

@@ -42,7 +42,8 @@ def test_the_ground_moves_with_home_and_keeps_its_shape():
 
 def test_grants_hold_the_policies_or_none(tmp_path: Path):
     manifests = FIELD.write(tmp_path)
-    bound, free = FIELD.grants(manifests, policies=True), FIELD.grants(manifests, policies=False)
+    bound = FIELD.grants(manifests, policies=True)
+    free = FIELD.grants(manifests, policies=False)
     assert {g["spec"]["component"] for g in bound} == {"Navigator", "AerialViewer"}
     for grant in bound:
         assert [p["name"] for p in grant["spec"]["policies"]] == [
@@ -96,7 +97,9 @@ def test_logs_are_read_on_the_clock_of_the_autopilot(tmp_path: Path):
 
 def _samples(stops: list[tuple[float, float, float, str]]) -> tuple[Sample, ...]:
     """A flight at 5 m/s through (east, north, altitude, mode), from the ground and back to it."""
-    samples, time_s, at = [], 0.0, (0.0, 0.0, 0.0)
+    samples = []
+    time_s = 0.0
+    at = (0.0, 0.0, 0.0)
     for east, north, alt, mode in [*stops, (0.0, 0.0, 15.0, "RTL"), (0.0, 0.0, 0.0, "RTL")]:
         steps = max(1, round(math.dist(at, (east, north, alt)) / 1.0))
         for step in range(1, steps + 1):
@@ -140,7 +143,8 @@ def _system(time_s: float, what: str, code: str = "") -> Call:
 def _pictures(samples: tuple[Sample, ...]) -> list[Call]:
     """One at each of five waypoints, and one refused over the stripe."""
     found = [_picture(samples, _when(samples, name), "allow") for name in ("WP1", "WP2", "WP3", "WP4", "WP5")]
-    stripe, frame = FIELD.zone("no-photo"), FIELD.frame
+    stripe = FIELD.zone("no-photo")
+    frame = FIELD.frame
     middle = stripe.centroid
     over = min(samples, key=lambda s: math.dist(frame.xy(s.place.lat, s.place.lon), (middle.x, middle.y)))
     return [*found, _picture(samples, over.time_s, "deny")]

@@ -134,7 +134,8 @@ def test_gaps_at_a_loss_are_told_apart(site: Site) -> None:
     run = run_of(site, *picture(41, 42.0, "cloud-1"))
     assert (run.gap_s(abrupt=False), run.gap_s(abrupt=True)) == (pytest.approx(3.0), 0.0)
     (switch,) = run.switches
-    switch.lost, switch.ended_s = True, BEGIN_S + 40.5
+    switch.lost = True
+    switch.ended_s = BEGIN_S + 40.5
     assert (run.gap_s(abrupt=False), run.gap_s(abrupt=True)) == (pytest.approx(1.0), pytest.approx(3.0))
 
 

@@ -54,7 +54,8 @@ async def test_request_returns_response() -> None:
 
 
 async def test_requester_reconnects_before_the_next_request() -> None:
-    worker, opened = Worker(), list[asyncio.StreamWriter]()
+    worker = Worker()
+    opened = list[asyncio.StreamWriter]()
 
     async with worker.serving() as responder:
 
@@ -93,7 +94,8 @@ async def test_repeated_request_returns_first_response() -> None:
 
 
 async def test_request_id_is_scoped_to_its_method() -> None:
-    answers, worker = Answers(), Worker()
+    answers = Answers()
+    worker = Worker()
     for method in ("work", "play"):
         await answers.once(Request("r1", method, b"this"), worker.work)
     assert worker.done == ["r1", "r1"]

@@ -76,10 +76,13 @@ def test_arming_is_refused_if_failsafe_verification_changes_meanwhile(
 ) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=True) as world:
-            control, plane = world.control, world.plane
+            control = world.control
+            plane = world.plane
             grant = world.grants.put(spec())
             await world.drive(grant)
-            write, set_mode, raise_around = plane.vehicle_parameters.write, plane.set_mode, world.fence.raise_around
+            write = plane.vehicle_parameters.write
+            set_mode = plane.set_mode
+            raise_around = world.fence.raise_around
 
             async def chosen(name: str, value: float) -> float:
                 control.set_checked(verified)
@@ -102,7 +105,8 @@ def test_arming_is_refused_if_failsafe_verification_changes_meanwhile(
             else:
                 plane.set_to(BRAKE)
                 plane.set_mode = changed  # type: ignore[method-assign]
-            obey, motors = plane._obey, list[float]()
+            obey = plane._obey
+            motors = list[float]()
 
             def noted(outgoing: Any) -> None:
                 if outgoing.integer("command") == mavlink.MAV_CMD_COMPONENT_ARM_DISARM:
@@ -121,7 +125,8 @@ def test_arming_is_refused_if_failsafe_verification_changes_meanwhile(
 def test_return_mode_is_kept_after_link_reconnects_in_flight(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=True) as world:
-            control, plane = world.control, world.plane
+            control = world.control
+            plane = world.plane
             plane.parameters |= {"SRTL_POINTS": 300.0, "SYSID_MYGCS": 244.0, "WPNAV_ACCEL": 100.0}
             control.set_checked(Checked("", (), Airframe(retraces=True, accel_mps2=1.0), 8.0, remembers=True))
             grant = world.grants.put(spec())
@@ -202,7 +207,8 @@ def test_arming_is_retried_until_caller_deadline(tmp_path: Path) -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
             await world.drive(grant)
-            plane, arm = world.plane, mavlink.MAV_CMD_COMPONENT_ARM_DISARM
+            plane = world.plane
+            arm = mavlink.MAV_CMD_COMPONENT_ARM_DISARM
             plane.refuses.add(arm)
             begun = plane.now
             with pytest.raises(AutopilotError, match="failed"):
@@ -221,7 +227,8 @@ def test_arming_retries_stop_after_caller_cancels(tmp_path: Path) -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
             await world.drive(grant)
-            plane, arm = world.plane, mavlink.MAV_CMD_COMPONENT_ARM_DISARM
+            plane = world.plane
+            arm = mavlink.MAV_CMD_COMPONENT_ARM_DISARM
             plane.refuses.add(arm)
             call = asyncio.ensure_future(world.service.arm(grant, 60.0))
             await asyncio.sleep(5.0)
@@ -239,7 +246,9 @@ def test_arming_retries_stop_after_caller_cancels(tmp_path: Path) -> None:
 def test_waiting_driver_receives_reason_why_arming_fails(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            plane, arm, reasons = world.plane, mavlink.MAV_CMD_COMPONENT_ARM_DISARM, list[str]()
+            plane = world.plane
+            arm = mavlink.MAV_CMD_COMPONENT_ARM_DISARM
+            reasons = list[str]()
             plane.refuses.add(arm)
 
             async def follow() -> None:

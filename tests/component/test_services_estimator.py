@@ -41,7 +41,8 @@ def test_drone_returns_home_if_estimator_has_no_absolute_position(
                 pass
             kept_m: list[float] = []
             sky.witnesses.append(lambda: kept_m.append(WALL.distance(shapely.Point(*oracle.place()[:2]))))
-            since_s, estimate = sky.time(), Estimator.estimate
+            since_s = sky.time()
+            estimate = Estimator.estimate
 
             def drifting(self: Estimator, body: Body) -> Estimate:
                 known = estimate(self, body)

@@ -11,7 +11,8 @@ from fractus_runtime.mavlink_codec import Endpoint
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sky_drone import fly, ready, until
 
-FENCE_SWITCH, OFF = 11.0, 0.0
+FENCE_SWITCH = 11.0
+OFF = 0.0
 
 
 def test_vehicle_fence_is_switched_on_again_in_flight_and_before_next_arming(tmp_path: Path) -> None:

@@ -165,7 +165,9 @@ def test_camera_position_is_unknown_while_home_is_moved_in_pilot_flight(tmp_path
             plane = world.plane
             move(world, (3.0, 0.0, 0.5))
             plane.set_to(LOITER)
-            plane.vehicle.armed, plane.goal, plane.goal_height = True, (0.0, 0.0), 60.0
+            plane.vehicle.armed = True
+            plane.goal = (0.0, 0.0)
+            plane.goal_height = 60.0
             world.observer.heartbeat()
             await world.until(lambda: plane.vehicle.altitude_m > 50)
             assert world.control.state.controller == "pilot"
@@ -198,7 +200,8 @@ def test_pilot_flight_fixes_home_from_first_message_after_arming(tmp_path: Path)
             move(world, (0.0, 0.0, 0.0))
             plane.xy[:] = [0.0, 50.0]
             heartbeat(world, armed=True)
-            plane.goal, plane.goal_height = (0.0, 50.0), 60.0
+            plane.goal = (0.0, 50.0)
+            plane.goal_height = 60.0
             await world.until(lambda: plane.vehicle.in_air)
             assert not located(world.control), "no home has been reported since arming"
             move(world, (0.0, 50.0, 0.0))
@@ -222,7 +225,8 @@ def test_pilot_flight_after_landed_mission_uses_new_home(tmp_path: Path) -> None
             heartbeat(world, armed=True)
             move(world, (0.0, 50.0, 0.0))
             assert (world.control.authority, world.control.state.armed_by_others) == (Authority.PILOT, True)
-            plane.goal, plane.goal_height = (0.0, 50.0), 20.0
+            plane.goal = (0.0, 50.0)
+            plane.goal_height = 20.0
             await world.until(lambda: plane.vehicle.altitude_m > 10)
             assert world.control.state.mission is not None
             assert located(world.control), "the home of the mission does not apply to this flight"
@@ -238,7 +242,8 @@ def test_failed_arming_does_not_fix_home(tmp_path: Path) -> None:
 
     async def flight() -> None:
         async with World(tmp_path) as world:
-            plane, grant = world.plane, world.grants.put(spec())
+            plane = world.plane
+            grant = world.grants.put(spec())
             await world.drive(grant)
             plane.refuses.add(mavlink.MAV_CMD_COMPONENT_ARM_DISARM)
             with pytest.raises(AutopilotError):
@@ -269,7 +274,9 @@ def test_vertical_home_move_is_detected_without_home_position_message(
     """Another station stopped the HOME_POSITION stream, and the single message about the move is lost."""
 
     async def work(sky: Sky, directory: Path) -> None:
-        station, parser, lost = Endpoint(255, mavlink.MAV_COMP_ID_MISSIONPLANNER), Parser(), []
+        station = Endpoint(255, mavlink.MAV_COMP_ID_MISSIONPLANNER)
+        parser = Parser()
+        lost = []
         async with ready(sky, directory) as (drone, grant):
             (wire,) = sky.wires
             deliver = wire._protocol.data_received
@@ -307,7 +314,9 @@ async def test_home_position_request_is_rate_limited_after_refusal() -> None:
     """The autopilot refuses immediately. The next request must wait."""
 
     class Refusing:
-        vehicle, connected, asked = Vehicle(stack=ARDUCOPTER, armed=True, heartbeat_at=10.0), True, 0
+        vehicle = Vehicle(stack=ARDUCOPTER, armed=True, heartbeat_at=10.0)
+        connected = True
+        asked = 0
 
         async def request_home(self) -> None:
             self.asked += 1

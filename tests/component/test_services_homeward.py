@@ -194,7 +194,8 @@ def test_return_altitude_is_capped_below_fence(tmp_path: Path) -> None:
 def test_failsafe_setup_is_retried_after_missing_parameter(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            control, plane = world.control, world.plane
+            control = world.control
+            plane = world.plane
             grant = world.grants.put(spec())
             plane.parameters |= {"SYSID_MYGCS": 244.0}
             lost = plane.parameters.pop("FS_GCS_ENABLE")
@@ -213,9 +214,11 @@ def test_failsafe_setup_is_retried_after_missing_parameter(tmp_path: Path) -> No
 def test_failsafe_setup_is_retried_after_exception(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
-            control, plane = world.control, world.plane
+            control = world.control
+            plane = world.plane
             plane.parameters |= {"SYSID_MYGCS": 244.0}
-            read, broken = plane.vehicle_parameters.read, [KeyError("FENCE_ENABLE"), KeyError("FENCE_ENABLE")]
+            read = plane.vehicle_parameters.read
+            broken = [KeyError("FENCE_ENABLE"), KeyError("FENCE_ENABLE")]
 
             async def breaking(wanted: Any) -> dict[str, float]:
                 if broken:

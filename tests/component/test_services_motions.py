@@ -328,7 +328,8 @@ def test_goto_is_judged_again_at_current_position_after_lost_command(tmp_path: P
             await world.up(grant)
             first = asyncio.ensure_future(refusal(world.service.goto(grant, goto(0, 56), 0)))
             await world.until(lambda: plane.velocity[1] > 5 and plane.xy[1] > 22)
-            send, lost = plane.send, []
+            send = plane.send
+            lost = []
 
             def lossy(outgoing: Any) -> None:
                 if outgoing.name == "COMMAND_INT" and len(lost) < 3:
@@ -355,7 +356,9 @@ def test_goto_stops_and_restarts_once_after_lost_speed_command(tmp_path: Path, l
             plane = world.plane
             grant = world.grants.put(spec(limit("speed", 2.0)))
             await world.up(grant)
-            send, left, top = plane.send, lost, 0.0
+            send = plane.send
+            left = lost
+            top = 0.0
 
             def lossy(outgoing: Any) -> None:
                 nonlocal left, top
@@ -465,7 +468,8 @@ def test_return_brakes_if_position_is_lost(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=True) as world:
             await start_return(world)
-            tell, begun = world.plane._tell, world.plane.now
+            tell = world.plane._tell
+            begun = world.plane.now
 
             def blind() -> None:
                 tell()
@@ -540,7 +544,9 @@ def test_takeoff_continues_after_lost_acknowledgement(tmp_path: Path) -> None:
             grant = world.grants.put(spec())
             await world.drive(grant)
             await world.service.arm(grant)
-            plane, obey, attempts = world.plane, world.plane._obey, 0
+            plane = world.plane
+            obey = world.plane._obey
+            attempts = 0
 
             def once(outgoing: Any) -> None:
                 nonlocal attempts
@@ -571,7 +577,8 @@ async def cut(world: World, seconds: float, *, frozen: bool = False) -> None:
     if frozen:
         plane._step = lambda: None  # type: ignore[method-assign]
     await asyncio.sleep(seconds)
-    plane._step, plane.deaf = step, False  # type: ignore[method-assign]
+    plane._step = step
+    plane.deaf = False  # type: ignore[method-assign]
 
 
 @pytest.mark.parametrize(("seconds", "frozen"), [(1.5, False), (3.0, False), (4.5, False), (5.0, True)])

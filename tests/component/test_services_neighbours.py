@@ -100,7 +100,9 @@ def test_command_is_resent_if_acknowledgement_belongs_to_another_station(tmp_pat
     async def work(sky: Sky, directory: Path) -> None:
         async with ready(sky, directory) as (drone, _):
             (wire,) = sky.wires
-            write, parser, arrived = wire.write, Parser(), []
+            write = wire.write
+            parser = Parser()
+            arrived = []
             theirs = {
                 "target_system": 1,
                 "target_component": 1,
@@ -133,7 +135,8 @@ def messages_to(sky: Sky, system: int) -> list[str]:
 
     async def create_connection(*args: Any, **kwargs: Any) -> Any:
         wire, protocol = await connect(*args, **kwargs)
-        write, parser = wire.write, Parser()
+        write = wire.write
+        parser = Parser()
 
         def noted(data: Any) -> None:
             names.extend(sent.name for sent in parser.feed(bytes(data)) if sent.values.get("target_system") == system)

@@ -18,7 +18,9 @@ from sky_drone import fly, ready, until
 
 def lose_mode_changes(wire: Wire, count: int, monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """Drop the first mode commands of the companion, and return the send times of all of them."""
-    write, parser, sent_at = wire.write, Parser(), []
+    write = wire.write
+    parser = Parser()
+    sent_at = []
 
     def noted(data: Any) -> None:
         for sent in parser.feed(bytes(data)):

@@ -31,7 +31,8 @@ def held(world: World) -> dict[str, float]:
 def test_return_bounds_use_strictest_limit_between_home_and_operation_area() -> None:
     everywhere = compiled(altitude(upperLimit=30), speed(upperLimit=10))
     assert return_bounds(at(), everywhere) == ReturnBounds(30.0, 10.0)
-    near, far = box(20, 20, 40, 40), box(5000, 5000, 5100, 5100)
+    near = box(20, 20, 40, 40)
+    far = box(5000, 5000, 5100, 5100)
     zoned = compiled(
         altitude("near", [zone("a", near)], upperLimit=30),
         altitude("far", [zone("b", far)], upperLimit=3),

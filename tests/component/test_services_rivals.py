@@ -24,7 +24,8 @@ KEPT_M = 1.0
 @pytest.mark.parametrize("action", ["ignore", "returnToLaunch"])
 def test_drone_commanded_by_another_station_stops_before_zone(action: str, tmp_path: Path) -> None:
     async def work(sky: Sky, directory: Path) -> None:
-        station, oracle = Endpoint(255, mavlink.MAV_COMP_ID_MISSIONPLANNER), Oracle(sky, Account(0))
+        station = Endpoint(255, mavlink.MAV_COMP_ID_MISSIONPLANNER)
+        oracle = Oracle(sky, Account(0))
 
         def send(name: str, **values: float) -> None:
             frame = station.encode(name, {"target_system": 1, "target_component": 1, **values})

@@ -23,7 +23,9 @@ def test_stale_disarmed_heartbeats_in_flight_do_not_end_control(
     async def work(sky: Sky, directory: Path) -> None:
         async with ready(sky, directory) as (drone, grant):
             (wire,) = sky.wires
-            deliver, parser, kept = wire._protocol.data_received, Parser(), []
+            deliver = wire._protocol.data_received
+            parser = Parser()
+            kept = []
 
             def keep(data: Any) -> None:
                 kept.extend(m.frame for m in parser.feed(bytes(data)) if m.name == "HEARTBEAT" and not sky.truth.armed)

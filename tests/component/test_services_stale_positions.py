@@ -23,7 +23,9 @@ def test_stale_home_position_does_not_land_returning_drone(tmp_path: Path, monke
 
         async with ready(sky, directory) as (drone, grant):
             (wire,) = sky.wires
-            deliver, parser, kept = wire._protocol.data_received, Parser(), []
+            deliver = wire._protocol.data_received
+            parser = Parser()
+            kept = []
 
             def keep(data: Any) -> None:
                 kept.extend(m.frame for m in parser.feed(bytes(data)) if m.name == "GLOBAL_POSITION_INT")

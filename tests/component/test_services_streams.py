@@ -65,7 +65,9 @@ def test_lost_stream_request_is_repeated_despite_duplicate_acknowledgement(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def work(sky: Sky, directory: Path) -> None:
-        connect, wanted, lost = sky.create_connection, float(message_id(kind)), []
+        connect = sky.create_connection
+        wanted = float(message_id(kind))
+        lost = []
         answer = {
             "command": mavlink.MAV_CMD_SET_MESSAGE_INTERVAL,
             "result": mavlink.MAV_RESULT_ACCEPTED,
@@ -75,7 +77,8 @@ def test_lost_stream_request_is_repeated_despite_duplicate_acknowledgement(
 
         async def create_connection(*args: Any, **kwargs: Any) -> Any:
             wire, protocol = await connect(*args, **kwargs)
-            write, parser = wire.write, Parser()
+            write = wire.write
+            parser = Parser()
 
             def lose_the_first(data: Any) -> None:
                 for sent in parser.feed(bytes(data)):

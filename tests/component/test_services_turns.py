@@ -53,7 +53,8 @@ class Context:
         """Discard the message."""
 
     async def abort(self, code: grpc.StatusCode, text: str, metadata: Any) -> None:
-        status, why = status_pb2.Status(), error_details_pb2.ErrorInfo()
+        status = status_pb2.Status()
+        why = error_details_pb2.ErrorInfo()
         status.ParseFromString(dict(metadata)["grpc-status-details-bin"])
         for detail in status.details:
             if detail.Is(why.DESCRIPTOR):
@@ -75,7 +76,9 @@ def handlers_of(world: World) -> MobilityHandlers:
 
 def costly(world: World, method: str, monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """Let each policy check of a method cost 0.1 s of computing, and return the times of the checks."""
-    judge, clock, at_s = world.gate.judge, Clock(), list[float]()
+    judge = world.gate.judge
+    clock = Clock()
+    at_s = list[float]()
     monkeypatch.setattr(authorization, "time", clock)
 
     def slow(call: Call, *args: Any, **options: Any) -> Verdict:
@@ -224,7 +227,8 @@ def test_throttled_call_is_replaced_by_later_call(world: Callable[[], World], mo
             handlers = handlers_of(w)
             costly(w, "GetSpeed", monkeypatch)
             place = dict(zip(("latitude_deg", "longitude_deg", "altitude_m"), (*at(0, 90), 10.0), strict=True))
-            goto, hover = mobility_pb2.GotoRequest(target=place), mobility_pb2.HoverRequest()
+            goto = mobility_pb2.GotoRequest(target=place)
+            hover = mobility_pb2.HoverRequest()
 
             def setpoint(east_mps: float) -> Any:
                 velocity = {"east_mps": east_mps}

@@ -301,7 +301,8 @@ def test_velocity_timeout_matches_real_vehicle(timeout_s: float, real_s: float):
 @pytest.mark.parametrize("mode", [mavlink.COPTER_MODE_LOITER, mavlink.COPTER_MODE_GUIDED])
 def test_stopping_distance_matches_ardupilot_formula(mode: int):
     vehicle, pilot = _at_speed(8.0)
-    at, speed = vehicle.body.north, vehicle.body.vn
+    at = vehicle.body.north
+    speed = vehicle.body.vn
     if mode == mavlink.COPTER_MODE_GUIDED:
         _local(pilot, 1, 0xFFF)
     else:

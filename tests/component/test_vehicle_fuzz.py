@@ -78,7 +78,8 @@ def _restart(vehicle: VehicleState, pilot: Pilot, rng: random.Random) -> None:
     if not vehicle.armed:
         pilot.craft.vehicle.arm()
     pilot.craft.vehicle.modes.force(rng.choice(sorted(SUPPORTED_MODES)))
-    vehicle.body.on_ground, vehicle.landed = False, False
+    vehicle.body.on_ground = False
+    vehicle.landed = False
     vehicle.body.down = min(vehicle.body.down, -5.0)
     pilot.fly_on(0.5)
 

@@ -11,7 +11,8 @@ from fractus_vehicle.motion_reports import gimbal_device_attitude_status, gimbal
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from vehicle_world import alone
 
-SIYI, SERVOS = 8.0, 1.0
+SIYI = 8.0
+SERVOS = 1.0
 PITCHYAW = mavlink.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW
 
 
@@ -25,7 +26,8 @@ def test_vehicle_without_gimbal_sends_no_gimbal_messages() -> None:
 def test_gimbal_turns_at_its_rate_and_reports_attitude() -> None:
     vehicle, pilot = alone(MNT1_TYPE=SIYI)
     assert pilot.command(PITCHYAW, -90.0, 120.0, math.nan, math.nan) == mavlink.MAV_RESULT_ACCEPTED
-    begun_s, angles = vehicle.time_s, []
+    begun_s = vehicle.time_s
+    angles = []
 
     def turned() -> bool:
         report = gimbal_device_attitude_status(vehicle)

@@ -178,7 +178,9 @@ def test_jump_tag_selects_tagged_item():
     lost = {"command": 601, "param1": 8.0, "param2": -1.0}
     points = [_waypoint(north, 0.0, 10.0) for north in (1.0, 2.0, 3.0)]
     assert upload(pilot, 0, [HOME, points[0], tag, points[1], jump, lost, points[2]]) == mavlink.MAV_MISSION_ACCEPTED
-    mission, at, order = vehicle.mission, 0, []
+    mission = vehicle.mission
+    at = 0
+    order = []
     while (following := mission.next_after(at)) is not None:
         at = following
         order.append(at)

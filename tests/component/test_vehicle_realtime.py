@@ -38,7 +38,8 @@ class Line(Hub):
 
     def __init__(self, clock: Clock, craft: Craft, letters: dict[float, bytes]) -> None:
         super().__init__()
-        self.clock, self.craft = clock, craft
+        self.clock = clock
+        self.craft = craft
         self.letters = {clock.now_s + at_s: data for at_s, data in letters.items()}
         self.channel: Channel = craft.open("line")
         self.parser = Parser()

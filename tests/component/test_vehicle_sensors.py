@@ -136,9 +136,12 @@ def test_tlog_contains_both_directions():
     pilot.craft.record(log)
     pilot.send("COMMAND_LONG", {"target_system": 1, "target_component": 1, "command": 520, "param1": 1.0})
     pilot.fly_on(2.0)
-    entries, data, at = [], log.getvalue(), 0
+    entries = []
+    data = log.getvalue()
+    at = 0
     while at < len(data):
-        time_us, length = struct.unpack(">Q", data[at : at + 8])[0], data[at + 9] + 12
+        time_us = struct.unpack(">Q", data[at : at + 8])[0]
+        length = data[at + 9] + 12
         message = Parser().feed(data[at + 8 : at + 8 + length])[0]
         entries.append((time_us, message.sysid, message.name))
         at += 8 + length

@@ -76,7 +76,9 @@ def test_loop_in_path_is_cut():
 @pytest.mark.parametrize("seed", range(examples(5, 2)))
 def test_simplified_path_stays_within_accuracy_of_flown_path(seed: int):
     rng = random.Random(seed)
-    here, heading, points = (0.0, 0.0, 0.0), 0.0, [(0.0, 0.0, 0.0)]
+    here = (0.0, 0.0, 0.0)
+    heading = 0.0
+    points = [(0.0, 0.0, 0.0)]
     for _ in range(350):
         heading += rng.gauss(0.0, 0.5)
         here = (here[0] + 2.1 * math.cos(heading), here[1] + 2.1 * math.sin(heading), here[2] - rng.uniform(-0.4, 0.45))

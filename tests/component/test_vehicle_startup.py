@@ -11,7 +11,8 @@ from vehicle_pilot import Pilot
 from vehicle_world import START, alone
 
 COLD = VehicleConfig(start=replace(START, alt_m=0.1))
-WITHOUT_POSITION, WITH_POSITION = 167, 831
+WITHOUT_POSITION = 167
+WITH_POSITION = 831
 TEXTS = """Calibrating barometer
 Barometer 1 calibration complete
 Barometer 2 calibration complete

@@ -79,10 +79,12 @@ def of(kind: type, events: Iterable[Event]) -> list[Any]:
 
 
 def test_a_file_that_grows_says_the_same_as_the_whole_of_it(recording: Path, tmp_path: Path) -> None:
-    data, growing = recording.read_bytes(), tmp_path / "growing.mcap"
+    data = recording.read_bytes()
+    growing = tmp_path / "growing.mcap"
     whole = list(Tail(recording).read())
     assert len(whole) == len(records())
-    tail, found = Tail(growing), []
+    tail = Tail(growing)
+    found = []
     with growing.open("wb") as file:
         for start in range(0, len(data), 997):
             file.write(data[start : start + 997])
@@ -230,7 +232,8 @@ async def test_a_directory_is_followed_while_services_write_to_it(tmp_path: Path
     task = asyncio.create_task(following.run())
     buffer = io.BytesIO()
     write(buffer, records())
-    data, path = buffer.getvalue(), tmp_path / "mobility" / "000001-20260528T202640Z.mcap"
+    data = buffer.getvalue()
+    path = tmp_path / "mobility" / "000001-20260528T202640Z.mcap"
     try:
         async with asyncio.timeout(20), aclosing(following.stream("")) as stream:
             await anext(stream)
@@ -393,7 +396,8 @@ async def test_every_answer_keeps_the_page_to_itself(served: tuple[str, View]) -
 
 
 async def test_requests_and_open_pages_are_counted_for_prometheus(recording: Path) -> None:
-    port, metrics = free_port(), free_port()
+    port = free_port()
+    metrics = free_port()
     site = Site("127.0.0.1", port, (), None, f"127.0.0.1:{metrics}")
     task = asyncio.create_task(command._serve(Following(recording.parent), site))
     try:

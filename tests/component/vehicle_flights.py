@@ -16,7 +16,10 @@ from vehicle_pilot import Pilot, PilotTimeoutError
 from vehicle_world import CONFIG, START, upload
 
 TARGET = {"target_system": 1, "target_component": 1}
-GLOBAL_RELATIVE_ALT, MISSION, FENCE, RALLY = 3, 0, 1, 2
+GLOBAL_RELATIVE_ALT = 3
+MISSION = 0
+FENCE = 1
+RALLY = 2
 
 
 class RecordingPilot(Pilot):

@@ -33,9 +33,12 @@ HOME = Place.from_degrees(50.864, 4.679, 0.1)
 ELSEWHERE_M = 5_000.0
 """Distance from the recorded position that no step reaches."""
 TARGET: dict[str, Value] = {"target_system": 1, "target_component": 1}
-GUIDED, RTL, BRAKE = 4, 6, 17
+GUIDED = 4
+RTL = 6
+BRAKE = 17
 KINDS = {"mission": 0, "fence": 1, "rally": 2}
-LOCAL_FRAMES, BODY_FRAMES = (1, 7, 8, 9, 12, 20, 21), (8, 9)
+LOCAL_FRAMES = (1, 7, 8, 9, 12, 20, 21)
+BODY_FRAMES = (8, 9)
 TEXTS_S = 0.6
 # STATUSTEXTs that an autopilot sends without a request.
 SPONTANEOUS = ("EKF3", "GPS 1", "AHRS", "Field", "Barometer", "Calibrating", "RC7", "ArduPilot", "SIM ", "PreArm")
@@ -172,7 +175,8 @@ def steps(path: Path = STEPS) -> list[Step]:
 
 def agrees(real: str, ours: str) -> bool:
     """Return True if a response matches the recorded one. Numbers may have a tolerance."""
-    wanted, got = real.split(), ours.split()
+    wanted = real.split()
+    got = ours.split()
     return len(wanted) == len(got) and all(map(_same, wanted, got))
 
 
@@ -267,7 +271,8 @@ class Player:
         if message is None:
             return "no reply"
         value = message.real("param_value")
-        index, kind = message.integer("param_index"), message.integer("param_type")
+        index = message.integer("param_index")
+        kind = message.integer("param_type")
         return f"PARAM_VALUE {message.text('param_id')} idx={index} type={kind} val={value:g}"
 
     def _position(self) -> tuple[float, float, float]:
@@ -314,7 +319,8 @@ class Player:
         return f"{result} | {'; '.join(t for t in self.texts[before:] if t[4:].startswith('PreArm'))}"
 
     def do_int(self, command: str, frame: str, north: str, east: str, alt: str, *params: str) -> str:
-        before, place = len(self.texts), self.home.offset(float(north), float(east))
+        before = len(self.texts)
+        place = self.home.offset(float(north), float(east))
         values: dict[str, Value] = {f"param{at}": float(p) for at, p in enumerate(params, start=1)}
         where: dict[str, Value] = {"x": place.lat_e7, "y": place.lon_e7, "z": float(alt), "frame": int(frame)}
         self.line.send("COMMAND_INT", values | where | TARGET | {"command": int(command)})
@@ -326,7 +332,8 @@ class Player:
 
     def do_arm(self, number: str) -> str:
         self._ordered(mavlink.MAV_CMD_DO_SET_MODE, [1.0, float(number)])
-        mode, answer = self._mode(), self._ordered(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, [1.0])
+        mode = self._mode()
+        answer = self._ordered(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, [1.0])
         if answer.startswith("ACCEPTED"):
             self._ordered(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, [0.0])
         return f"mode={mode} {answer}"
@@ -371,7 +378,8 @@ class Player:
 
     def do_rate(self, number: str, interval_us: str) -> str:
         result = self._ordered(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, [float(number), float(interval_us)])
-        layout, duration_s = mavlink.mavlink_map.get(int(number)), 3.0
+        layout = mavlink.mavlink_map.get(int(number))
+        duration_s = 3.0
         assert layout is not None
         count = sum(message.name == layout.msgname for message in self._stream(duration_s))
         return f"{result.split(' ')[0]} hz={count / duration_s:.1f}"
@@ -403,20 +411,26 @@ class Player:
     def _item(self, kind: int, seq: int, row: Row) -> dict[str, Value]:
         command, frame, north, east, alt, params = row
         if north is None:
-            x, y = 0, 0
+            x = 0
+            y = 0
         elif math.isinf(north):
-            x, y = 2_000_000_000, self.home.lon_e7
+            x = 2_000_000_000
+            y = self.home.lon_e7
         else:
             place = self.home.offset(north, east)
-            x, y = place.lat_e7, place.lon_e7
+            x = place.lat_e7
+            y = place.lon_e7
         values: dict[str, Value] = {f"param{at}": float(p) for at, p in enumerate(params, start=1)}
         where: dict[str, Value] = {"seq": seq, "frame": frame, "command": command, "x": x, "y": y, "z": alt}
         return values | where | TARGET | {"autocontinue": 1, "mission_type": kind}
 
     def do_upload(self, kind_name: str, name: str, old: str = "") -> str:
-        before, kind, rows = len(self.texts), KINDS[kind_name], LISTS[name]
+        before = len(self.texts)
+        kind = KINDS[kind_name]
+        rows = LISTS[name]
         self.line.send("MISSION_COUNT", TARGET | {"count": len(rows), "mission_type": kind})
-        asked, end = 0, self.line.now_s + 6.0
+        asked = 0
+        end = self.line.now_s + 6.0
         while self.line.now_s < end:
             for message in self._hear():
                 if message.name in ("MISSION_REQUEST", "MISSION_REQUEST_INT"):
@@ -467,7 +481,8 @@ class Player:
         """Arm in GUIDED, climb and hover."""
         self._ordered(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, [33.0, 100_000.0])
         self.do_ready()
-        armed, up_m = self._ordered(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, [1.0]), float(altitude)
+        armed = self._ordered(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, [1.0])
+        up_m = float(altitude)
         begun_s = self.line.now_s
         taken = self._ordered(mavlink.MAV_CMD_NAV_TAKEOFF, [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, up_m])
         while self.line.now_s < begun_s + 40.0 and self._position()[2] < up_m - 0.5:
@@ -484,14 +499,16 @@ class Player:
 
     def do_goto(self, frame: str, north: str, east: str, up: str) -> str:
         """Send a position target at an offset. Return the distance flown and the highest speed within 6 s."""
-        before, (n0, e0, u0) = len(self.texts), self._position()
+        before = len(self.texts)
+        (n0, e0, u0) = self._position()
         place = self.home.offset(n0 + float(north), e0 + float(east))
         alt_m = self._datum_m(int(frame)) + u0 + float(up)
         values: dict[str, Value] = {"coordinate_frame": int(frame), "type_mask": 0xDF8, "alt": alt_m}
         self.line.send(
             "SET_POSITION_TARGET_GLOBAL_INT", TARGET | values | {"lat_int": place.lat_e7, "lon_int": place.lon_e7}
         )
-        peak, end = 0.0, self.line.now_s + 6.0
+        peak = 0.0
+        end = self.line.now_s + 6.0
         while self.line.now_s < end:
             peak = max(peak, self._fast()[0])
         n1, e1, u1 = self._position()
@@ -506,7 +523,9 @@ class Player:
         fields are zero.
         """
         asked = {name: float(value) for name, _, value in (field.partition("=") for field in fields)}
-        (n0, e0, u0), number, before = self._position(), int(frame), len(self.texts)
+        (n0, e0, u0) = self._position()
+        number = int(frame)
+        before = len(self.texts)
         heading = math.radians(self.last["GLOBAL_POSITION_INT"].integer("hdg") / 100.0)
         x = asked.pop("x", 0.0)
         values: dict[str, Value] = TARGET | {"coordinate_frame": number, **asked}
@@ -515,10 +534,13 @@ class Player:
             name = "SET_POSITION_TARGET_LOCAL_NED"
             values |= {"x": x + n0, "y": e0, "z": -u0} if number == 1 else {"x": x}
         else:
-            place, name = self.home.offset(n0 + x, e0), "SET_POSITION_TARGET_GLOBAL_INT"
+            place = self.home.offset(n0 + x, e0)
+            name = "SET_POSITION_TARGET_GLOBAL_INT"
             values |= {"lat_int": place.lat_e7, "lon_int": place.lon_e7, "alt": self._datum_m(number) + u0}
             values |= {"lat_int": int(asked["lat_int"])} if "lat_int" in asked else {}
-        peak, end, once = 0.0, self.line.now_s + float(duration), "x" in {f.partition("=")[0] for f in fields}
+        peak = 0.0
+        end = self.line.now_s + float(duration)
+        once = "x" in {f.partition("=")[0] for f in fields}
         self.line.send(name, values)
         while self.line.now_s < end:
             again = min(self.line.now_s + 0.2, end)
@@ -529,7 +551,8 @@ class Player:
         n1, e1, u1 = self._position()
         faces = self.last["GLOBAL_POSITION_INT"].integer("hdg") / 100.0
         turned = (faces - math.degrees(heading) + 180.0) % 360.0 - 180.0
-        north, east = n1 - n0, e1 - e0
+        north = n1 - n0
+        east = e1 - e0
         ahead = north * math.cos(heading) + east * math.sin(heading)
         right = east * math.cos(heading) - north * math.sin(heading)
         way = f"F={ahead:.1f} R={right:.1f}" if number in BODY_FRAMES else f"E={east:.1f} N={north:.1f}"
@@ -551,7 +574,8 @@ class Player:
 
     def _stopped(self, slow_mps: float) -> tuple[float, float]:
         """Return the seconds until the vehicle stops, and the distance."""
-        begun_s, (n0, e0, _) = self.line.now_s, self._position()
+        begun_s = self.line.now_s
+        (n0, e0, _) = self._position()
         while self.line.now_s < begun_s + 15.0 and self._fast()[0] > slow_mps:
             pass
         stood_s = self.line.now_s - begun_s
@@ -579,7 +603,9 @@ class Player:
 
     def do_breach(self, speed: str) -> str:
         """Fly north with a velocity until the fence acts. Return the farthest distance from home."""
-        before, farthest, end = len(self.texts), 0.0, self.line.now_s + 40.0
+        before = len(self.texts)
+        farthest = 0.0
+        end = self.line.now_s + 40.0
         while self.line.now_s < end and self._mode() == GUIDED:
             self._run(float(speed), 0.6)
             farthest = max(farthest, self._position()[0])
@@ -598,7 +624,8 @@ class Player:
         """Arm in GUIDED and fly the stored mission to its last item. Return reached items and STATUSTEXTs in order."""
         self._ordered(mavlink.MAV_CMD_DO_SET_MODE, [1.0, GUIDED])
         self._ordered(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, [1.0])
-        before, seen = len(self.texts), {"MISSION_ITEM_REACHED": [""], "MISSION_CURRENT": [""]}
+        before = len(self.texts)
+        seen = {"MISSION_ITEM_REACHED": [""], "MISSION_CURRENT": [""]}
         self._ordered(mavlink.MAV_CMD_MISSION_START, [])
         for message in self._stream(150.0):
             if message.name in seen and seen[message.name][-1] != str(message.integer("seq")):
@@ -611,7 +638,9 @@ class Player:
 
     def do_until(self, timeout: str, *words: str) -> str:
         """Wait for a STATUSTEXT. Return the elapsed seconds and the mode."""
-        begun_s, before, wanted = self.line.now_s, len(self.texts), " ".join(words)
+        begun_s = self.line.now_s
+        before = len(self.texts)
+        wanted = " ".join(words)
         while self.line.now_s < begun_s + float(timeout) and not any(wanted in t for t in self.texts[before:]):
             self._hear()
         waited_s = self.line.now_s - begun_s
@@ -620,7 +649,8 @@ class Player:
 
 def compare(line: Line, report: Callable[[Step, str, str], None], script: Sequence[Step]) -> int:
     """Play and report all steps (`same`, `differs`, `meant` or `not played`). Return the number of differences."""
-    player, wrong = Player(line), 0
+    player = Player(line)
+    wrong = 0
     for step in script:
         if not step.do:
             report(step, "", "not played")
@@ -644,7 +674,9 @@ def main() -> None:
     options = parser.parse_args()
     line: Line = TcpLine(options.autopilot) if options.autopilot else SimulatedLine()
 
-    script, begun_s, played = steps(options.steps), time.monotonic(), 0
+    script = steps(options.steps)
+    begun_s = time.monotonic()
+    played = 0
 
     def report(step: Step, answer: str, verdict: str) -> None:
         nonlocal played

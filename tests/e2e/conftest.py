@@ -83,7 +83,9 @@ def kube(cluster: Cluster | None) -> Kube:
     """The cluster with Fractus installed by its charts, and its drone ready to fly."""
     if cluster is not None:
         programs = ensure_binaries(("kubectl", "helm"), report=say)
-        kubectl, helm, kubeconfig = programs["kubectl"], programs["helm"], cluster.kubeconfig
+        kubectl = programs["kubectl"]
+        helm = programs["helm"]
+        kubeconfig = cluster.kubeconfig
     else:
         kubectl, helm = (pathlib.Path(shutil.which(name) or name) for name in ("kubectl", "helm"))
         kubeconfig = pathlib.Path(os.environ.get("KUBECONFIG", "~/.kube/config")).expanduser()

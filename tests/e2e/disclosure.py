@@ -35,7 +35,8 @@ def readable(kube: Kube) -> dict[str, str]:
     """Return the logs of all pods of Fractus and its applications, Events, and all objects except Secrets."""
     found: dict[str, str] = {}
     for pod in (*kube.all("pods", SYSTEM), *kube.all("pods", None, "fractus.dev/application")):
-        namespace, name = pod["metadata"]["namespace"], pod["metadata"]["name"]
+        namespace = pod["metadata"]["namespace"]
+        name = pod["metadata"]["name"]
         found[f"log of {name}"] = kube.must("logs", "-n", namespace, name, "--all-containers")
         if any(status["restartCount"] for status in pod["status"].get("containerStatuses") or ()):
             found[f"log of {name} before"] = kube.run("logs", "-n", namespace, name, "--all-containers", "-p").stdout

@@ -78,7 +78,8 @@ class Kube:
             try:
                 found = condition()
             except CommandFailed as error:
-                found, last = None, error
+                found = None
+                last = error
             if found:
                 return found
             time.sleep(poll_s)

@@ -173,7 +173,8 @@ def test_nodes_are_as_described(small: Cluster) -> None:
 def test_services_and_names_work_across_nodes(small: Cluster) -> None:
     found = pods(small)
     for node, other in (("drone-1", "edge-1"), ("edge-1", "drone-1")):
-        name, address = found[node]["metadata"]["name"], found[other]["status"]["podIP"]
+        name = found[node]["metadata"]["name"]
+        address = found[other]["status"]["podIP"]
         fetched = small.kubectl("exec", name, "--", *FETCH, f"http://{address}:8080/hostname")
         assert fetched.stdout.strip() == found[other]["metadata"]["name"]
         small.kubectl("exec", name, "--", *FETCH, "http://web.default.svc.cluster.local/hostname")
@@ -242,7 +243,8 @@ def test_cut_link_loses_contact_and_nothing_else(healthy: Cluster) -> None:
 
 
 def test_documented_commands_of_the_embedded_cluster_work(healthy: Cluster) -> None:
-    drone, edge = healthy.node("drone-1"), healthy.node("edge-1")
+    drone = healthy.node("drone-1")
+    edge = healthy.node("edge-1")
     typed_words = [shlex.split(line, comments=True) for line in shell_lines("docs/embedded-cluster.md")]
     lines = {words[2]: words for words in typed_words if len(words) > 3}
 

@@ -29,7 +29,8 @@ def test_killed_part_does_not_leave_the_drone_unsupervised_in_flight(grounded: K
     kube.wait("the first waypoint is near", in_midleg(kube, entries), timeout_s=60)
     selector, namespace, node = PARTS[part]
     pod = leader(kube) if part == "operator" else kube.pod(selector, namespace, node)
-    name, before = pod["metadata"]["name"], restarts(pod)
+    name = pod["metadata"]["name"]
+    before = restarts(pod)
     kube.kill_pod(pod)
     kube.wait(f"{part} runs again", lambda: restarts(kube.get("pod", name, namespace)) > before, timeout_s=60)
     kube.wait("the mission is over", lambda: phase(kube, application) in {"Completed", "Failed"}, timeout_s=240)

@@ -166,7 +166,8 @@ READ_METRICS = "import os, urllib.request as u; print(u.urlopen(f'http://{os.env
 def test_every_workload_serves_metrics(kube: Kube) -> None:
     checked = set()
     for pod in kube.all("pods", SYSTEM):
-        name, (container,) = pod["metadata"]["name"], pod["spec"]["containers"]
+        name = pod["metadata"]["name"]
+        (container,) = pod["spec"]["containers"]
         ports = {port["name"]: port["containerPort"] for port in container.get("ports", ())}
         if pod["status"]["phase"] != "Running":
             continue

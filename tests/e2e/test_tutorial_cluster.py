@@ -16,7 +16,8 @@ import pytest
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "tutorial.md").read_text()
 NAME = "tutorial-e2e"
-BEGINS, ENDS = "## 6. ", "## When it does not fly"
+BEGINS = "## 6. "
+ENDS = "## When it does not fly"
 TIMEOUT_S = 1500
 pytestmark = [
     pytest.mark.slow,
@@ -71,7 +72,8 @@ def checkout(tmp_path: Path) -> Iterator[Path]:
 
 @pytest.mark.timeout(TIMEOUT_S + 250)
 def test_application_of_the_tutorial_flies_on_a_cluster(checkout: Path) -> None:
-    begin, end = PAGE.index(BEGINS), PAGE.index(ENDS)
+    begin = PAGE.index(BEGINS)
+    end = PAGE.index(ENDS)
     page = PAGE[begin:end]
     (checkout / "patrol.py").write_text(files(PAGE[:begin])["patrol.py"])
     written = files(page)

@@ -45,7 +45,8 @@ OTHERS = FOLDER / "other.jpg"
 METHODS = camera_pb2.DESCRIPTOR.services_by_name["CameraService"].methods
 TYPES = {method.name: getattr(camera_pb2, method.input_type.name) for method in METHODS}
 NAMES = sorted(TYPES)
-FIRST, SECOND = active_grant(), active_grant(private("blurFaces"), uid="u2", instance="app-viewer")
+FIRST = active_grant()
+SECOND = active_grant(private("blurFaces"), uid="u2", instance="app-viewer")
 PLACES_M = [80.0, 0.0, 21.0]
 """North of home; the private zone reaches 20 m."""
 PATHS = ["../../other.jpg", "../other.json", "/etc/passwd", "20260601120000000-0000.jpg/..", "a" * 20_000, "\0", ".jpg"]
@@ -73,7 +74,9 @@ class Service:
     """A camera service with two components, on a drone at a position that the fuzzer sets."""
 
     def __init__(self) -> None:
-        self.drone, self.shutter, self.grants = Drone(), Shutter(), Grants()
+        self.drone = Drone()
+        self.shutter = Shutter()
+        self.grants = Grants()
         self.names: dict[str, list[str]] = {}
         for grant in (FIRST, SECOND):
             self.grants.active[grant.identity] = grant
@@ -110,7 +113,8 @@ async def calls(given: atheris.FuzzedDataProvider) -> None:
         if not given.remaining_bytes():
             break
         if not running:
-            service.drone.y, service.shutter.broken = given.PickValueInList(PLACES_M), not given.ConsumeIntInRange(0, 9)
+            service.drone.y = given.PickValueInList(PLACES_M)
+            service.shutter.broken = not given.ConsumeIntInRange(0, 9)
         which = given.ConsumeIntInRange(0, 3 * len(chains) - 1)
         chain = chains[which if which < len(chains) else which % 2]
         name = given.PickValueInList(NAMES)

@@ -32,7 +32,8 @@ with atheris.instrument_imports(
     from fractus_core.policy.compiled_grant import compile_grant
 
 FOLDER = Path(tempfile.mkdtemp())
-YAML, JSON = FOLDER / "manifest.yaml", FOLDER / "manifest.json"
+YAML = FOLDER / "manifest.yaml"
+JSON = FOLDER / "manifest.json"
 EXAMPLES = Path(__file__).parents[2] / "examples" / "traffic-monitoring"
 KINDS = {"Application", "Depot", "Drone", "EdgeNode", "Policy", "Zone"}
 OBJECTS = [
@@ -72,7 +73,8 @@ def move(inside: Any, lat: float, lon: float) -> None:
     if isinstance(inside, dict) and {"lat", "lon"} <= inside.keys():
         narrower = math.cos(math.radians(HOME_DEG[0])) / math.cos(math.radians(lat))
         east = (inside["lon"] - HOME_DEG[1]) * narrower + lon
-        inside["lat"], inside["lon"] = inside["lat"] - HOME_DEG[0] + lat, (east + 180.0) % 360.0 - 180.0
+        inside["lat"] = inside["lat"] - HOME_DEG[0] + lat
+        inside["lon"] = (east + 180.0) % 360.0 - 180.0
 
 
 def changed(given: atheris.FuzzedDataProvider) -> list[Any]:

@@ -60,7 +60,8 @@ def check_unsigned(frame: bytes, kind: MessageClass) -> None:
 def parsed(data: bytes) -> list[Message]:
     """Return the messages of a stream, which must not depend on the way it is cut."""
     half = len(data) // 2
-    outcomes, reported = [], []
+    outcomes = []
+    reported = []
     for cuts in ([data[i : i + 1] for i in range(len(data))], [data[:half], data[half:]], [data]):
         unknown: list[bytes] = []
         parser = Parser(unknown=unknown.append)

@@ -33,7 +33,8 @@ from wire import DEADLINES_S, STRANGE, Context, Registry, called, certificate, r
 FOLDER = Path(tempfile.mkdtemp())
 NODE = "drone-1"
 WALL = (-40.0, 25.0, 40.0, 40.0)
-AREA_M, NEAR_M = 200.0, 2.0
+AREA_M = 200.0
+NEAR_M = 2.0
 METHODS = (
     "Arm", "Disarm", "Takeoff", "Land", "SetSpeed", "GetSpeed", "SetVelocity", "Goto", "Hover", "GetPosition",
     "ReturnToLaunch", "PointGimbal",

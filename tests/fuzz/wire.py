@@ -103,7 +103,8 @@ class Context:
     """gRPC context of a call that checks the replies of the service."""
 
     def __init__(self, chain: tuple[bytes, ...], remaining_s: float | None) -> None:
-        self._chain, self._remaining_s = chain, remaining_s
+        self._chain = chain
+        self._remaining_s = remaining_s
         self.code: grpc.StatusCode | None = None
         self.written: list[Any] = []
         self.body: Any = grpc.aio.EOF

@@ -64,7 +64,8 @@ def opened(browser: Browser, address: str, **how: str) -> Iterator[Page]:
     """The page, without an error on its console, and without a request to anything else."""
     context = browser.new_context(viewport={"width": 1280, "height": 800}, **how)  # type: ignore[arg-type]
     context.set_default_timeout(TIMEOUT_MS)
-    page, wrong = context.new_page(), list[str]()
+    page = context.new_page()
+    wrong = list[str]()
     page.on("console", lambda said: wrong.append(said.text) if said.type == "error" else None)
     page.on("pageerror", lambda error: wrong.append(str(error)))
 

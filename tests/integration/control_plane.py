@@ -100,7 +100,8 @@ class ControlPlane:
 
     def start(self, kinds: bool = True) -> None:
         """Start the control plane. Install the CRDs if `kinds` is set."""
-        client, peer = free_port(), free_port()
+        client = free_port()
+        peer = free_port()
         accounts = self.authority.service_account_key()
         serving = self.authority.issue(
             "server",

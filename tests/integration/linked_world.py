@@ -37,15 +37,14 @@ TIMEOUT_S = 40.0
 PROGRAM = Path(__file__).with_name("linked_agent.py")
 ORIGIN = (39.36, 22.94)
 _FRAME = FlatFrame(*ORIGIN)
-_PER_EAST, _PER_NORTH = (
-    _FRAME.from_degrees(ORIGIN[0], ORIGIN[1] + 1, 0)[0],
-    _FRAME.from_degrees(ORIGIN[0] + 1, ORIGIN[1], 0)[1],
-)
+_PER_EAST = _FRAME.from_degrees(ORIGIN[0], ORIGIN[1] + 1, 0)[0]
+_PER_NORTH = _FRAME.from_degrees(ORIGIN[0] + 1, ORIGIN[1], 0)[1]
 
 
 def place(east: float, north: float, up: float = 0.0) -> dict[str, Any]:
     """Return a position of a manifest."""
-    lat, lon = ORIGIN[0] + north / _PER_NORTH, ORIGIN[1] + east / _PER_EAST
+    lat = ORIGIN[0] + north / _PER_NORTH
+    lon = ORIGIN[1] + east / _PER_EAST
     return {"lat": lat, "lon": lon, "alt": up, "altitudeReference": "home"}
 
 
@@ -80,7 +79,10 @@ class Agent:
     """Node in a network namespace, with a radio, an uplink to the cloud, a pod, and a link manager."""
 
     def __init__(self, world: World, name: str, kind: str, at: tuple[float, float]) -> None:
-        self.world, self.name, self.kind, self.at = world, name, kind, at
+        self.world = world
+        self.name = name
+        self.kind = kind
+        self.at = at
         self.number = len(world.agents) + 1
         self.pod = f"10.88.{self.number}.2"
         self.folder = world.directory / name
@@ -103,7 +105,8 @@ class Agent:
 
     def add_pod(self) -> None:
         """Create the namespace of its pod, as the container runtime does."""
-        name, net = f"{self.name}p", f"10.88.{self.number}"
+        name = f"{self.name}p"
+        net = f"10.88.{self.number}"
         self.world.namespace(name)
         (self.pods / "pod").unlink(missing_ok=True)
         (self.pods / "pod").symlink_to(self.world.path(name))

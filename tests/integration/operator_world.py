@@ -27,7 +27,8 @@ NODE_OBJECTS = (
     f"/api/v1/namespaces/{NODES}/serviceaccounts",
 )
 """Collections of the objects that the operator keeps for each node."""
-LAT, LON = 39.3606, 22.9307
+LAT = 39.3606
+LON = 22.9307
 MOBILITY = [
     "Arm",
     "Disarm",

@@ -202,7 +202,8 @@ class Pictures(camera_pb2_grpc.CameraServiceServicer):
     async def RetrieveImage(self, request, context):  # noqa: N802
         if request.name != "1.jpg":
             await context.abort(grpc.StatusCode.NOT_FOUND, f"there is no picture {request.name}")
-        size, chunk = len(self.picture), 256 * 1024
+        size = len(self.picture)
+        chunk = 256 * 1024
         for start in range(0, size - (chunk if self.cut else 0), chunk):
             yield camera_pb2.ImageChunk(
                 image=camera_pb2.ImageInfo(size_bytes=size), data=self.picture[start : start + chunk]
@@ -217,7 +218,9 @@ class Server:
     """A gRPC server that can be stopped and started on the same port, as a service that restarts."""
 
     def __init__(self, drone: Drone, pictures: Pictures, tls: Path) -> None:
-        self._drone, self._pictures, self._tls = drone, pictures, tls
+        self._drone = drone
+        self._pictures = pictures
+        self._tls = tls
         self._server: grpc.aio.Server | None = None
         self.port = 0
 

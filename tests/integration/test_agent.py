@@ -70,12 +70,17 @@ class Node:
     """A node: its files, its agent process, its mobility service."""
 
     def __init__(self, server: ApiServer, authority: TestAuthority, directory: Path, name: str, kind: str) -> None:
-        self.server, self.authority, self.name, self.directory = server, authority, name, directory
-        self.state, self.description = directory / "state", directory / "node.yaml"
+        self.server = server
+        self.authority = authority
+        self.name = name
+        self.directory = directory
+        self.state = directory / "state"
+        self.description = directory / "node.yaml"
         self.plural = {"Drone": "drones", "EdgeNode": "edgenodes"}[kind]
         self.class_ = {"Drone": "drone", "EdgeNode": "edge"}[kind]
         self.mobility = Mobility()
-        self.port, self.metrics = free_port(), free_port()
+        self.port = free_port()
+        self.metrics = free_port()
         self.process: subprocess.Popen[bytes] | None = None
         self._grpc: grpc.Server | None = None
         labels = {"fractus.dev/class": self.class_}

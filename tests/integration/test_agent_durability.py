@@ -61,7 +61,8 @@ def die_everywhere(action: Callable[[], object], check: Callable[[bool], None]) 
 
 def test_killed_write_file_leaves_the_old_or_the_new_file(tmp_path: Path) -> None:
     file = tmp_path / "g.json"
-    old, new = b'{"version": 1}', b'{"version": 2, "long": "' + b"x" * 5000 + b'"}'
+    old = b'{"version": 1}'
+    new = b'{"version": 2, "long": "' + b"x" * 5000 + b'"}'
     write_file(file, old)
 
     def check(done: bool) -> None:

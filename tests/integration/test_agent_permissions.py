@@ -98,7 +98,8 @@ def test_agent_registers_only_the_kind_of_its_node_label(world: World, agents: d
             return error.status == 403 and f"has the label fractus.dev/class={label}; its agent" in str(error)
         return False
 
-    drone, edge = ours("Drone", "edge-1", {"services": {}}), ours("EdgeNode", "drone-1", {"location": at(0, 0)})
+    drone = ours("Drone", "edge-1", {"services": {}})
+    edge = ours("EdgeNode", "drone-1", {"location": at(0, 0)})
     wait_for(lambda: refused("edge-1", drone, "edge"), "the refusal of a drone")
     wait_for(lambda: refused("drone-1", edge, "drone"), "the refusal of an edge node")
     world.api.call("POST", f"{FRACTUS}/drones?dryRun=All", drone)
@@ -112,7 +113,8 @@ def _grant(world: World, node: str) -> str:
 
 
 def test_agent_has_no_rights_on_grants(world: World, agents: dict[str, BlockingClient]) -> None:
-    mine, agent = _grant(world, "drone-1"), agents["drone-1"]
+    mine = _grant(world, "drone-1")
+    agent = agents["drone-1"]
     copied = [{"op": "copy", "from": "/spec/identity", "path": "/status/phase"}]
     denied(lambda: agent.get(mine), "cannot get")
     denied(lambda: agent.list(f"{FRACTUS}/grants", fieldSelector="spec.node=drone-1"), "cannot list")
@@ -292,7 +294,9 @@ def test_agents_of_previous_release_keep_account_until_replaced(
     request = token_request(boundObjectRef=bound, expirationSeconds=600)
     path = f"/api/v1/namespaces/{SYSTEM}/serviceaccounts/fractus-agent/token"
     agent = control_plane.with_token(world.api.call("POST", path, request)["status"]["token"])
-    mine, other, status = _grant(world, "edge-2"), _grant(world, "drone-1"), {"status": {"phase": "Complete"}}
+    mine = _grant(world, "edge-2")
+    other = _grant(world, "drone-1")
+    status = {"status": {"phase": "Complete"}}
     wait_for(lambda: agent.get(mine), "the right to read Grants")
     agent.merge(f"{mine}/status", status)
     denied(lambda: agent.merge(f"{other}/status", status), "only on Grants of edge-2")
@@ -316,7 +320,8 @@ def _direct_link(world: World, drone: str, node: str) -> str:
 
 
 def test_agent_writes_status_of_direct_links_of_its_node_only(world: World, agents: dict[str, BlockingClient]) -> None:
-    ours, other = _direct_link(world, "drone-1", "edge-1"), _direct_link(world, "drone-2", "edge-1")
+    ours = _direct_link(world, "drone-1", "edge-1")
+    other = _direct_link(world, "drone-2", "edge-1")
     agents["drone-1"].merge(f"{ours}/status", {"status": {"phase": "Up"}, "spec": {"range": 1000}})
     agents["edge-1"].merge(f"{ours}/status", {"status": {"switches": 1}})
     agents["edge-1"].merge(f"{other}/status", {"status": {"phase": "Idle"}})

@@ -138,7 +138,8 @@ async def test_expired_resource_version_leads_to_a_new_list(server: ApiServer) -
         with pytest.raises(Expired):
             await until(watched._watch(links, old), Deleted)
 
-        real, used = watched._list, []
+        real = watched._list
+        used = []
 
         async def stale_at_first(*of: Any) -> tuple[tuple[dict[str, Any], ...], str]:
             objects, version = await real(*of)

@@ -165,7 +165,8 @@ async def test_attack_with_malformed_calls_is_limited_and_fills_no_disk(rig: Rig
     await served(rig)
     log = rig.directory / "service.log"
     begun = log.stat().st_size
-    channel, codes = rig.channel(DRIVER), Counter[Status]()
+    channel = rig.channel(DRIVER)
+    codes = Counter[Status]()
     await mobility_pb2_grpc.MobilityServiceStub(channel).GetSpeed(ASK, timeout=5, wait_for_ready=True)
     for method, kind in (("SetSpeed", channel.unary_unary), ("Goto", channel.unary_stream)):
         for _ in range(300):
@@ -175,7 +176,8 @@ async def test_attack_with_malformed_calls_is_limited_and_fills_no_disk(rig: Rig
     assert codes.keys() == {Status.INVALID_ARGUMENT, Status.RESOURCE_EXHAUSTED}
     host, port = rig.address.split(":")
     stranger = ssl.create_default_context()
-    stranger.check_hostname, stranger.verify_mode = False, ssl.CERT_NONE
+    stranger.check_hostname = False
+    stranger.verify_mode = ssl.CERT_NONE
     stranger.set_alpn_protocols(["h2"])
     for _ in range(200):
         for context in (stranger, None):
@@ -198,7 +200,8 @@ async def test_clock_step_neither_refuses_callers_nor_accepts_expired_certificat
     rig.write_grant(grant())
     rig.start_service()
     await served(rig)
-    stub, short = rig.stub(DRIVER, seconds=600.0), rig.stub(DRIVER, seconds=5.0)
+    stub = rig.stub(DRIVER, seconds=600.0)
+    short = rig.stub(DRIVER, seconds=5.0)
     await short.GetSpeed(ASK, timeout=5)
     for step_s in (0, 400 * 86_400, 0, -3600, -400 * 86_400):
         shift.write_text(str(step_s))
@@ -324,7 +327,9 @@ async def _flood(address: str, pem: list[bytes], until_s: float) -> None:
     credentials = grpc.ssl_channel_credentials(ca, key, certificate)
     async with grpc.aio.secure_channel(address, credentials, options) as channel:
         stub = mobility_pb2_grpc.MobilityServiceStub(channel)
-        begin, sent, calls = time.monotonic(), 0, set()
+        begin = time.monotonic()
+        sent = 0
+        calls = set()
         while (now := time.monotonic()) < begin + until_s:
             while sent < (now - begin) * FLOOD_PER_S:
                 calls.add(asyncio.create_task(one(stub)))
@@ -373,7 +378,8 @@ async def test_attack_with_flood_of_connections_does_not_affect_others(rig: Rig)
     for name, data in (("key", key), ("crt", certificate)):
         (rig.directory / f"stranger.{name}").write_bytes(data)
     wrong = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    wrong.check_hostname, wrong.verify_mode = False, ssl.CERT_NONE
+    wrong.check_hostname = False
+    wrong.verify_mode = ssl.CERT_NONE
     wrong.load_cert_chain(rig.directory / "stranger.crt", rig.directory / "stranger.key")
     silent: list[socket.socket] = []
     try:

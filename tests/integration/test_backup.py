@@ -83,11 +83,14 @@ def test_backup_is_restored_into_another_cluster_and_uninstalled(
     no_school = {"type": "GeofenceControl", "kind": "exclusion", "selector": {"zones": ["school"]}}
     world.put(ours("Policy", "no-school", no_school))
     (folder / "application.yaml").write_text(json.dumps(traffic(namespace)))
-    lost, shell = Shell(folder, world.plane), Shell(folder, found.plane)
+    lost = Shell(folder, world.plane)
+    shell = Shell(folder, found.plane)
     lost.type("kubectl apply -f application.yaml")
     world.phase(namespace, "Deploying")
     operator.stop(signal.SIGKILL)
-    before, may, signed_by = written(world), granted(world, namespace), authority(world)
+    before = written(world)
+    may = granted(world, namespace)
+    signed_by = authority(world)
     for line in BACK_UP:
         lost.type(line)
 

@@ -419,7 +419,8 @@ SHAPES = [
 @pytest.mark.parametrize("seed", range(len(GOOD)))
 def test_api_server_and_models_refuse_same_random_manifests(control_plane: ControlPlane, seed: int) -> None:
     """Randomly changed manifests evaluate both forms of every rule on the same objects."""
-    rng, refused = random.Random(seed), 0
+    rng = random.Random(seed)
+    refused = 0
     model = MODELS[GOOD[seed]["kind"]]
     place = f"{API}/namespaces/default/{model.PLURAL}" if model.NAMESPACED else f"{API}/{model.PLURAL}"
     for manifest in [GOOD[seed], *(mutated(rng, GOOD[seed]) for _ in range(150))]:

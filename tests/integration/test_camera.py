@@ -360,10 +360,11 @@ async def test_face_in_simulated_world_is_blurred(rig: Rig) -> None:
         data = await retrieve(camera, taken.image.name, taken.decision.action)
         return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE).astype(float)
 
-    plain, hidden = await picture(DRIVER), await picture(PASSENGER)
+    plain = await picture(DRIVER)
+    hidden = await picture(PASSENGER)
     url = f"http://127.0.0.1:{port}/truth.json"
     truth = json.loads(await asyncio.to_thread(lambda: urllib.request.urlopen(url, timeout=10).read()))
-    (left, top, right, bottom) = (int(v) for v in next(f for f in truth["faces"] if f["visible"] > 0.7)["box"])
+    left, top, right, bottom = (int(v) for v in next(f for f in truth["faces"] if f["visible"] > 0.7)["box"])
     face = np.s_[max(top, 0) : bottom, max(left, 0) : right]
     fine = [np.abs(np.diff(p[face], axis=1)) for p in (plain, hidden)]
     assert (fine[1] > 4).mean() < 0.35 * (fine[0] > 4).mean()

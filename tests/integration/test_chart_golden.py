@@ -33,7 +33,8 @@ def made(chart: str, *arguments: str) -> str:
 
 @pytest.mark.parametrize("case", CASES)
 def test_rendered_chart_matches_golden_file(case: str) -> None:
-    path, text = GOLDEN / f"{case}.yaml", made(*CASES[case])
+    path = GOLDEN / f"{case}.yaml"
+    text = made(*CASES[case])
     if os.environ.get("FRACTUS_GOLDEN") == "write":
         path.write_text(text)
     assert text == path.read_text()

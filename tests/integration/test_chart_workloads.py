@@ -12,10 +12,12 @@ from chart import render
 
 Body = dict[str, Any]
 
-ON_NODES, IN_THE_CLOUD = ("agent", "mobility", "camera"), ("operator", "view")
+ON_NODES = ("agent", "mobility", "camera")
+IN_THE_CLOUD = ("operator", "view")
 WORKLOADS = (*ON_NODES, *IN_THE_CLOUD)
 DRONE = "--set=drone=d"
-WHERE, RATHER = "requiredDuringSchedulingIgnoredDuringExecution", "preferredDuringSchedulingIgnoredDuringExecution"
+WHERE = "requiredDuringSchedulingIgnoredDuringExecution"
+RATHER = "preferredDuringSchedulingIgnoredDuringExecution"
 
 SSD = {"key": "disk", "operator": "In", "values": ["ssd"]}
 BIG = {"key": "memory", "operator": "Exists"}
@@ -86,7 +88,8 @@ def test_workload_has_additional_variables_and_resources(part: str) -> None:
 
 @pytest.mark.parametrize("part", WORKLOADS)
 def test_workload_placement_combines_required_and_configured_rules(part: str) -> None:
-    pod, before = everything()[part]["spec"], plain()[part]["spec"]
+    pod = everything()[part]["spec"]
+    before = plain()[part]["spec"]
     assert pod["nodeSelector"] == FOR_PLACED["nodeSelector"]
     needed = before["affinity"]["nodeAffinity"][WHERE]["nodeSelectorTerms"]
     assert [term["matchExpressions"][0]["key"].partition("/")[0] for term in needed] == ["fractus.dev"] * len(needed)

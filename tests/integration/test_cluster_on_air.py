@@ -75,7 +75,8 @@ class Site:
         self.radio = Radio(NAME, self.state)
         network.wire_control_plane(self.wiring)
         self.wire()
-        self._over, self._echoes = threading.Event(), list[threading.Thread]()
+        self._over = threading.Event()
+        self._echoes = list[threading.Thread]()
         for node in (None, "edge-1"):
             self.echo(node)
 

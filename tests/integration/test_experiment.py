@@ -244,8 +244,10 @@ def gone(mark: Path) -> bool:
 
 
 def test_running_autopilot_is_flown_and_faulted_over_tcp(tmp_path: Path) -> None:
-    processes, port = Processes(tmp_path), free_port()
-    link, home = f"tcp:127.0.0.1:{port}", "50.8637,4.6785,25"
+    processes = Processes(tmp_path)
+    port = free_port()
+    link = f"tcp:127.0.0.1:{port}"
+    home = "50.8637,4.6785,25"
     arguments = ["--listen", link, "--home", home, "--speedup", "5", "--ready-after", "2"]
     processes.start("sitl", [sys.executable, "-m", "fractus_vehicle", *arguments], dict(os.environ))
     try:

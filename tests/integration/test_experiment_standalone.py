@@ -43,7 +43,8 @@ except fractus.FractusError as lost:  # the autopilot may have gone home before 
 
 def said(ground: Standalone, words: str, count: int) -> None:
     """Wait until the program has said something that often."""
-    log, deadline = ground.processes.log("pilot"), time.monotonic() + 60
+    log = ground.processes.log("pilot")
+    deadline = time.monotonic() + 60
     while log.read_text().count(words) < count:
         assert time.monotonic() < deadline, log.read_text()
         time.sleep(0.1)

@@ -68,7 +68,8 @@ async def completed(directory: Path) -> None:
 
 
 async def test_recording_has_flight_and_pictures_and_survives_kill(rig: Rig) -> None:
-    mobility, pictures = rig.directory / "recordings" / "mobility", rig.directory / "recordings" / "camera"
+    mobility = rig.directory / "recordings" / "mobility"
+    pictures = rig.directory / "recordings" / "camera"
     camera = [{"service": "camera", "methods": ["CaptureImage"]}]
     rig.write_grant(grant(altitude_limit(5, 15), fence("no-fly", "exclusion", "ignore", -60, -10, -40, 10)))
     rig.write_grant(passenger_grant(services=camera))

@@ -23,10 +23,13 @@ from mobility_rig import HOME, NODE, PASSENGER, Driver, Rig, area, denied, grant
 from PIL import Image
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-SIYI, SERVOS = 8, 1
+SIYI = 8
+SERVOS = 1
 METHODS = ["CaptureImage", "RetrieveImage", "DeleteImage"]
-ALLOW, CORRECT = types_pb2.Decision.ACTION_ALLOW, types_pb2.Decision.ACTION_CORRECT
-GPS, DIRECTION = 0x8825, 17
+ALLOW = types_pb2.Decision.ACTION_ALLOW
+CORRECT = types_pb2.Decision.ACTION_CORRECT
+GPS = 0x8825
+DIRECTION = 17
 NORTH = {
     "name": "north",
     "spec": {"type": "PrivacyControl", "kind": "camera", "action": "black", "selector": {"zones": ["yard"]}},
@@ -41,7 +44,8 @@ class Station:
     """A ground station on a link of its own, which the service does not hear."""
 
     def __init__(self, port: int) -> None:
-        self._link, self._endpoint = socket.create_connection(("127.0.0.1", port), timeout=10), Endpoint(255, 190)
+        self._link = socket.create_connection(("127.0.0.1", port), timeout=10)
+        self._endpoint = Endpoint(255, 190)
 
     def _send(self, name: str, **values: Any) -> None:
         self._link.sendall(self._endpoint.encode(name, {"target_system": 1, "target_component": 1, **values}))
@@ -62,7 +66,10 @@ class Stage:
     """A drone in flight with a camera on a gimbal, and a passenger that takes pictures north of which people live."""
 
     def __init__(self, rig: Rig, station: Station, driver: Driver, camera: Any) -> None:
-        self.rig, self.station, self.driver, self.camera = rig, station, driver, camera
+        self.rig = rig
+        self.station = station
+        self.driver = driver
+        self.camera = camera
 
     async def taken(self) -> tuple[Any, bytes]:
         """The decision on a picture, and the picture; waits for the camera and for a position."""
@@ -131,7 +138,8 @@ async def stage(tmp_path: Path) -> AsyncIterator[Stage]:
         "connection": f"http://127.0.0.1:{ports[2]}/snapshot.jpg", "resolution": "320x240", "methods": METHODS,
         "horizontalFieldOfView": 30, "lens": {"model": "pinhole"}, "mount": {"gimbal": True},
     }  # fmt: skip
-    metadata, spec = {"name": NODE}, {"services": {"camera": camera}}
+    metadata = {"name": NODE}
+    spec = {"services": {"camera": camera}}
     described = yaml.safe_dump(
         {"apiVersion": "fractus.dev/v1alpha1", "kind": "Drone", "metadata": metadata, "spec": spec}
     )
@@ -139,7 +147,8 @@ async def stage(tmp_path: Path) -> AsyncIterator[Stage]:
     rig.start_service("--description", str(rig.directory / "node.yaml"))
     links = [part for port in ports[:2] for part in ("--listen", f"tcp:127.0.0.1:{port}")]
     rig.start_vehicle(1.0, *links, "--param", f"MNT1_TYPE={SIYI}")
-    driver, station = Driver(rig), None
+    driver = Driver(rig)
+    station = None
     try:
         await take_off(driver)
         station = Station(ports[1])

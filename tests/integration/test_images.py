@@ -77,7 +77,8 @@ def test_image_has_only_locked_distributions(image: tuple[str, str]) -> None:
 def test_equal_sources_give_equal_layers(tmp_path: Path) -> None:
     checkout = tmp_path / "elsewhere"
     for line in (ROOT / ".dockerignore").read_text().splitlines():
-        here, there = ROOT / line.removeprefix("!"), checkout / line.removeprefix("!")
+        here = ROOT / line.removeprefix("!")
+        there = checkout / line.removeprefix("!")
         if line.startswith("!") and here.is_dir():
             shutil.copytree(here, there, ignore=shutil.ignore_patterns("node_modules"))
         elif line.startswith("!"):

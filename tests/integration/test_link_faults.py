@@ -20,7 +20,8 @@ def world(tmp_path: Path) -> Iterator[World]:
 
 @pytest.mark.parametrize("left", ["nothing", "half"])
 def test_nodes_recover_after_power_loss_during_a_link(world: World, left: str) -> None:
-    edge, drone = world.edge("e1", 20.0), world.drone()
+    edge = world.edge("e1", 20.0)
+    drone = world.drone()
     before = world.states()
     flying(world, edge)
     client = world.client(drone, 100_000, 0.1)
@@ -85,7 +86,9 @@ asyncio.run(main())
 
 @pytest.mark.parametrize("fault", ["silent", "no routes", "no probes"])
 def test_peer_that_stops_after_pairing_is_left(world: World, fault: str) -> None:
-    bad, other, drone = world.edge("e1", 5.0), world.edge("e2", 30.0), world.drone()
+    bad = world.edge("e1", 5.0)
+    other = world.edge("e2", 30.0)
+    drone = world.drone()
     before = {name: state for name, state in world.states().items() if name != "e1"}
     # The bad one promises more, and so it is asked first.
     links = [world.link(drone, bad, bandwidth=13.0), world.link(drone, other)]
@@ -120,12 +123,15 @@ while True:  # "that address is here"
 
 
 def test_node_with_the_address_of_the_peer_gets_no_traffic(world: World) -> None:
-    edge, drone, stranger = world.edge("e1", 20.0), world.drone(), world.edge("e9", 5.0)
+    edge = world.edge("e1", 20.0)
+    drone = world.drone()
+    stranger = world.edge("e9", 5.0)
     before = {name: state for name, state in world.states().items() if name != "e9"}
     flying(world, edge)
     client = world.client(drone, 100_000, 0.05)
     until(lambda: client.by == "e1", "an answer over the link", world)
-    address, port = str(link_address("e1")), int(next(iter(edge.redirects())).split(" . ")[2])
+    address = str(link_address("e1"))
+    port = int(next(iter(edge.redirects())).split(" . ")[2])
     # It takes calls where the edge node does, and pairs with the certificate that it has.
     stranger.join(address)
     stranger.plan(world.link(drone, edge))
@@ -148,7 +154,8 @@ def test_node_with_the_address_of_the_peer_gets_no_traffic(world: World) -> None
 
 @pytest.mark.parametrize("loss", ["planned", "abrupt"])
 def test_long_stream_is_reopened_without_lost_or_repeated_replies(world: World, loss: str) -> None:
-    edge, drone = world.edge("e1", 20.0), world.drone()
+    edge = world.edge("e1", 20.0)
+    drone = world.drone()
     before = world.states()
     flying(world, edge)
     stream = Client(world.python("d1p", STREAM, f"{VIP.address}:{VIP.port}"))

@@ -81,10 +81,12 @@ def test_traffic_returns_to_the_cloud_within_a_second_after_link_loss(world: Wor
     until(lambda: client.by == "e1", "a reply over the link", world)
     who = [answer[1] for answer in client.answers]
     assert "FAILED" not in who, "the planned switch to the link loses no call"
-    switched, gaps = [], []
+    switched = []
+    gaps = []
     # The loss is detected after 0.6 s, and the switch takes a millisecond. Several losses, because the machine may be busy.
     while len(gaps) < 5 and not (gaps and min(switched) < 1.0 and min(gaps) < 1.0):
-        begun, lost_at = len(client.answers) - 1, time.time()
+        begun = len(client.answers) - 1
+        lost_at = time.time()
         world.command(station="d1", off=True)
         until(lambda: client.by == "cloud", "a reply of the cloud", world)
         assert not drone.redirects()
@@ -172,7 +174,9 @@ def test_link_is_restored_after_the_edge_agent_is_killed(world: World) -> None:
 
 
 def test_second_drone_waits_for_a_busy_edge_node(world: World) -> None:
-    edge, first, second = world.edge("e1", 20.0), world.drone("d1"), world.drone("d2")
+    edge = world.edge("e1", 20.0)
+    first = world.drone("d1")
+    second = world.drone("d2")
     before = world.states()
     links = [world.link(first, edge), world.link(second, edge)]
     world.serve()
@@ -197,7 +201,8 @@ def test_second_drone_waits_for_a_busy_edge_node(world: World) -> None:
 
 @pytest.mark.parametrize("fault", ["silent", "impostor"])
 def test_peer_that_does_not_pair_costs_no_calls(world: World, fault: str) -> None:
-    edge, other = world.edge("e1", 5.0), world.edge("e2", 30.0)
+    edge = world.edge("e1", 5.0)
+    other = world.edge("e2", 30.0)
     if fault == "impostor":
         edge.certify("e2")
     drone = world.drone()
@@ -266,7 +271,8 @@ while True:
 
 
 def test_a_hundred_changes_in_a_minute_end_in_the_last_state(world: World) -> None:
-    edge, drone = world.edge("e1", 20.0), world.drone()
+    edge = world.edge("e1", 20.0)
+    drone = world.drone()
     before = world.states()
     flying(world, edge)
     client = world.client(drone, 100_000, 0.05)
@@ -328,7 +334,8 @@ def test_unreachable_cloud_path_is_left_even_if_it_was_better(world: World) -> N
 
 
 def test_agent_killed_during_a_switch_recovers(world: World) -> None:
-    edge, drone = world.edge("e1", 20.0), world.drone()
+    edge = world.edge("e1", 20.0)
+    drone = world.drone()
     before = world.states()
     flying(world, edge)
     world.python("d1p", STREAM, f"{VIP.address}:{VIP.port}")  # never idle, so that a switch takes all its time

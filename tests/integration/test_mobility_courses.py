@@ -262,7 +262,8 @@ async def test_arming_is_refused_if_owner_fence_cannot_be_saved(rig: Rig) -> Non
 
 @pytest.mark.parametrize("kind", ["serial", "udpin", "udpout"])
 async def test_mavlink_connection_reaches_autopilot(rig: Rig, kind: str) -> None:
-    port, pty = free_port(), rig.directory / "pty"
+    port = free_port()
+    pty = rig.directory / "pty"
     ours, theirs = {
         "serial": (f"serial:{pty}:115200", f"pty:{pty}"),
         "udpin": (f"udpin:127.0.0.1:{port}", f"udpout:127.0.0.1:{port}"),

@@ -239,7 +239,8 @@ def test_operator_writes_only_objects_that_it_has_created(
             lambda: client.call("PATCH", f"{pods}/ours", other, content_type=change), "but not change their containers"
         )
         client.merge(f"{pods}/ours", {"spec": {"activeDeadlineSeconds": 1}})
-        node, labels = "/api/v1/nodes/edge-1", "may write only the location labels of nodes"
+        node = "/api/v1/nodes/edge-1"
+        labels = "may write only the location labels of nodes"
         denied(lambda: client.merge(node, {"spec": {"unschedulable": True}}), labels)
         denied(lambda: client.merge(node, {"metadata": {"labels": {"fractus.dev/class": "cloud"}}}), labels)
         denied(lambda: client.merge(node, {"metadata": {"labels": {"kubernetes.io/os": "x"}}}), labels)

@@ -65,7 +65,8 @@ def refusing(
         unless: A CEL expression that is true of what it is to let through.
         probe: A dry run that it is to refuse.
     """
-    root, name = "/apis/admissionregistration.k8s.io/v1", f"refuse-{operation.lower()}-{resource}"
+    root = "/apis/admissionregistration.k8s.io/v1"
+    name = f"refuse-{operation.lower()}-{resource}"
     rule = {"apiGroups": [""], "apiVersions": ["v1"], "resources": [resource], "operations": [operation]}
     place = {"namespaceSelector": {"matchLabels": {"kubernetes.io/metadata.name": namespace}}}
     objects = {

@@ -77,7 +77,8 @@ class FaultPoints:
 
     async def _forward(self, session: aiohttp.ClientSession, request: web.Request) -> web.StreamResponse:
         kept = {name: value for name, value in request.headers.items() if name.lower() in {"accept", "content-type"}}
-        body, timeout = await request.read(), aiohttp.ClientTimeout(total=None)
+        body = await request.read()
+        timeout = aiohttp.ClientTimeout(total=None)
         url = f"{self._server}{request.raw_path}"
         async with session.request(request.method, url, data=body or None, headers=kept, timeout=timeout) as answer:
             step = _step(request)
@@ -109,7 +110,8 @@ def _step(request: web.Request) -> str | None:
 @contextmanager
 def killed_at_each_step(plane: ControlPlane, folder: Path) -> Iterator[tuple[OperatorProcess, FaultPoints]]:
     """An operator that is started again each time that it was killed."""
-    port, kubeconfig = free_port(), folder / "points.kubeconfig"
+    port = free_port()
+    kubeconfig = folder / "points.kubeconfig"
     cluster = {"name": "points", "cluster": {"server": f"http://127.0.0.1:{port}"}}
     context = {"name": "points", "context": {"cluster": "points", "user": "points"}}
     users = [{"name": "points", "user": {}}]

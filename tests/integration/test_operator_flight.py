@@ -86,7 +86,9 @@ def evict(world: World, pod: str) -> object:
 
 def attempts(world: World, drone: str) -> dict[str, Callable[[], object]]:
     """What would take a service from a drone, or end it; none is carried out."""
-    api, pod, node = world.api, f"{PODS}/fractus-mobility-{drone}", f"/api/v1/nodes/{drone}"
+    api = world.api
+    pod = f"{PODS}/fractus-mobility-{drone}"
+    node = f"/api/v1/nodes/{drone}"
     dry = "?dryRun=All"
     # With the service's processes in sight, which it may end.
     debugger = {"name": "debugger", "image": "tools:1", "targetContainerName": "mobility"}
@@ -115,7 +117,8 @@ def attempts(world: World, drone: str) -> dict[str, Callable[[], object]]:
 
 def together(world: World) -> dict[str, Callable[[], object]]:
     """What would take services from all drones."""
-    api, dry = world.api, "?dryRun=All"
+    api = world.api
+    dry = "?dryRun=All"
     camera = f"{DAEMON_SETS}/fractus-camera{dry}"
 
     def pods(**spec: object) -> Body:
@@ -146,7 +149,8 @@ def test_services_of_drone_in_flight_cannot_be_removed(guarded: World) -> None:
 
 
 def test_harmless_changes_are_allowed_in_flight(control_plane: ControlPlane, guarded: World) -> None:
-    api, dry = guarded.api, "?dryRun=All"
+    api = guarded.api
+    dry = "?dryRun=All"
     api.merge(f"{NODE}{dry}", {"spec": {"unschedulable": True}})
     api.merge(f"{NODE}{dry}", {"metadata": {"labels": {"fractus.dev/geohash": "u1"}}})
     unreachable = [{"key": "node.kubernetes.io/unreachable", "effect": "NoExecute"}]
@@ -200,7 +204,8 @@ def test_service_pod_status_is_written_only_by_its_kubelet(
 ) -> None:
     """The rule also applies on the ground, so that frequent writes of kubelets need no lookup of the Drone."""
     path = f"{PODS}/fractus-mobility-{drone}/status?dryRun=All"
-    failed, ended = {"status": {"phase": "Failed"}}, {"status": {"containerStatuses": []}}
+    failed = {"status": {"phase": "Failed"}}
+    ended = {"status": {"containerStatuses": []}}
     for change in (failed, ended):
         assert "only the kubelet of the node" in refusal(lambda change=change: guarded.api.merge(path, change))
     hidden = {"metadata": {"labels": {"app.kubernetes.io/component": "x"}}}
@@ -346,7 +351,8 @@ def test_operator_cannot_report_landing(control_plane: ControlPlane, guarded: Wo
 
 def test_operator_cannot_reset_time_of_last_report(control_plane: ControlPlane, guarded: World) -> None:
     """The grounded annotation refers to the last report before this flight and must not become valid again."""
-    path, seen = f"{FRACTUS}/drones/drone-1", "2026-01-01T00:00:00Z"
+    path = f"{FRACTUS}/drones/drone-1"
+    seen = "2026-01-01T00:00:00Z"
     guarded.api.merge(path, {"metadata": {"annotations": {"fractus.dev/grounded": seen}}})
     guarded.api.merge(f"{path}/status", {"status": {"lastSeen": "2026-01-02T00:00:00Z"}})
     with control_plane.with_token(operator_token(guarded)) as client:

@@ -191,7 +191,8 @@ def test_direct_links_of_two_applications_on_one_drone_are_separate(
     world.put(ours("Application", "guest", {"components": [camera, sorter]}, namespace))
     wait_for(lambda: world.links(namespace, "guest"), lambda: f"links; {world.status(namespace, 'guest')}")
     deployed(world, namespace, "guest", 1)
-    guests, hosts = world.links(namespace, "guest"), world.links(namespace)
+    guests = world.links(namespace, "guest")
+    hosts = world.links(namespace)
     assert {body["spec"]["drone"] for body in [*guests.values(), *hosts.values()]} == {"drone-1"}
     # The host flies, so both have the path of the host.
     assert next(iter(guests.values()))["spec"]["path"] == next(iter(hosts.values()))["spec"]["path"]

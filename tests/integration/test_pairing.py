@@ -145,7 +145,8 @@ def air(tmp_path: Path) -> Iterator[Air]:
 
 
 def test_two_nodes_discover_each_other_pair_and_disconnect(air: Air) -> None:
-    edge, drone = air.node("e1"), air.node("d1")
+    edge = air.node("e1")
+    drone = air.node("d1")
     edge.expect("heard d1")
     drone.expect("heard e1")
     drone.tell("want e1")
@@ -159,7 +160,9 @@ def test_two_nodes_discover_each_other_pair_and_disconnect(air: Air) -> None:
 
 
 def test_drone_changes_its_peer_and_has_one_link_at_a_time(air: Air) -> None:
-    first, second, drone = air.node("e1"), air.node("e2"), air.node("d1")
+    first = air.node("e1")
+    second = air.node("e2")
+    drone = air.node("d1")
     drone.tell("want e1")
     drone.expect("link up e1")
     drone.tell("want e2")
@@ -170,7 +173,8 @@ def test_drone_changes_its_peer_and_has_one_link_at_a_time(air: Air) -> None:
 
 
 def test_both_ends_detect_the_loss_of_the_link(air: Air) -> None:
-    edge, drone = air.node("e1"), air.node("d1")
+    edge = air.node("e1")
+    drone = air.node("d1")
     drone.tell("want e1")
     drone.expect("link up e1")
     edge.expect("accepted d1")
@@ -217,7 +221,8 @@ def test_node_without_the_peers_certificate_is_not_linked(air: Air, fault: str) 
 
 
 def test_edge_node_refuses_a_drone_without_direct_link(air: Air) -> None:
-    edge, drone = air.node("e1"), air.node("d1")
+    edge = air.node("e1")
+    drone = air.node("d1")
     edge.tell("refuse no DirectLink names d1")
     drone.tell("want e1")
     assert "no_DirectLink_names_d1" in drone.expect("link none -")
@@ -225,7 +230,8 @@ def test_edge_node_refuses_a_drone_without_direct_link(air: Air) -> None:
 
 def test_second_drone_is_refused_while_the_first_is_linked(air: Air) -> None:
     edge = air.node("e1", max_peers=1)
-    first, second = air.node("d1"), air.node("d2")
+    first = air.node("d1")
+    second = air.node("d2")
     first.tell("want e1")
     first.expect("link up e1")
     edge.expect("accepted d1")
@@ -238,7 +244,8 @@ def test_second_drone_is_refused_while_the_first_is_linked(air: Air) -> None:
 
 
 def test_link_is_restored_after_the_peer_restarts(air: Air) -> None:
-    edge, drone = air.node("e1"), air.node("d1")
+    edge = air.node("e1")
+    drone = air.node("d1")
     drone.tell("want e1")
     drone.expect("link up e1")
     drone.kill()

@@ -21,7 +21,8 @@ from redirect_rig import DIRECT, DRONE, POD, VIP, Rig, rig, run
 
 pytestmark = pytest.mark.root
 
-TO_EDGE, TO_CLOUD = {VIP: DIRECT}, {VIP: None}
+TO_EDGE = {VIP: DIRECT}
+TO_CLOUD = {VIP: None}
 
 
 @pytest.fixture

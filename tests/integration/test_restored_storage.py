@@ -23,7 +23,8 @@ def plane(tmp_path: Path) -> Iterator[ControlPlane]:
 
 
 def test_operator_restarts_after_etcd_restore(plane: ControlPlane, tmp_path: Path) -> None:
-    world, backup = World(plane), tmp_path / "backup"
+    world = World(plane)
+    backup = tmp_path / "backup"
     world.furnish()
     operator = OperatorProcess(plane.kubeconfig, tmp_path / "operator.log")
     operator.start()

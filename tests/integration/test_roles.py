@@ -24,7 +24,9 @@ KINDS = {names["singular"]: names["plural"] for names in NAMES}
 WRITTEN_BY_THE_OPERATOR = {"deploymentplan", "grant", "nodegrants", "directlink"}
 WRITTEN_BY_AUTHORITIES = set(KINDS) - WRITTEN_BY_THE_OPERATOR - {"application"}
 
-READ, WRITE, ALL = ("get", "list", "watch"), ("create", "update", "patch", "delete"), ("deletecollection",)
+READ = ("get", "list", "watch")
+WRITE = ("create", "update", "patch", "delete")
+ALL = ("deletecollection",)
 
 
 @cache

@@ -43,7 +43,8 @@ def made(what: str) -> tuple[Body, ...]:
 @pytest.mark.parametrize("version", VERSIONS)
 @pytest.mark.parametrize("what", ["fractus", "fractus with everything", "fractus-crds", "fractus-demo", "operator"])
 def test_rendered_objects_match_kubernetes_schemas(what: str, version: str) -> None:
-    wrong, asked = [], 0
+    wrong = []
+    asked = 0
     for body in made(what):
         name = f"{body['kind']} {body['metadata']['name']}"
         try:
@@ -64,7 +65,8 @@ def test_schema_tests_include_every_chart() -> None:
 @pytest.mark.parametrize("version", VERSIONS)
 def test_schema_validation_detects_unknown_field_and_wrong_type(version: str) -> None:
     deployment = next(body for body in made("fractus") if body["kind"] == "Deployment")
-    misspelled, of_another_type = copy.deepcopy(deployment), copy.deepcopy(deployment)
+    misspelled = copy.deepcopy(deployment)
+    of_another_type = copy.deepcopy(deployment)
     misspelled["spec"]["template"]["spec"]["containers"][0]["readynessProbe"] = {}
     of_another_type["spec"]["replicas"] = "two"
     for body, named in ((misspelled, "readynessProbe"), (of_another_type, "two")):

@@ -44,7 +44,8 @@ class Stage:
 async def stage(tmp_path: Path) -> AsyncIterator[Stage]:
     authority = Authority()
     server_tls = authority.issue(tmp_path / "server", [x509.DNSName("drone-1.node.fractus.dev")])
-    drone, pictures = Drone(), Pictures()
+    drone = Drone()
+    pictures = Pictures()
     server = Server(drone, pictures, server_tls)
     await server.start()
     endpoint = fractus.Endpoint(f"127.0.0.1:{server.port}", "drone-1.node.fractus.dev", tmp_path / "client")
@@ -208,7 +209,8 @@ async def test_interrupted_program_restarts_a_limited_number_of_times(
     assert len(stage.drone.targets) == 3
     assert stage.drone.calls.count("GetControl") == 1
 
-    stage.drone.interruptions, stage.drone.waypoints_reached = 1000, 0
+    stage.drone.interruptions = 1000
+    stage.drone.waypoints_reached = 0
     async with stage.client() as drone:
         with pytest.raises(fractus.Interrupted, match="a zone appeared ahead"):
             await runner.fly(visit, drone)
@@ -281,7 +283,8 @@ async def test_turn_changes_heading_at_current_position(stage: Stage) -> None:
 
 async def test_camera_every_takes_pictures_repeatedly(stage: Stage) -> None:
     async with Camera(stage.endpoint) as camera, contextlib.aclosing(camera.every(0.0)) as pictures:
-        first, second = await anext(pictures), await anext(pictures)
+        first = await anext(pictures)
+        second = await anext(pictures)
         assert not stage.pictures.kept
     assert [(p.info.name, p.data) for p in (first, second)] == [("1.jpg", stage.pictures.picture)] * 2
 

@@ -14,7 +14,9 @@ from test_mobility_sdk import endpoint
 
 pytestmark = pytest.mark.timeout(300)
 
-MIDDLE, RADIUS_M, ALTITUDE_M = FRAME.latlon(30.0, 0.0), 20.0, 12.0
+MIDDLE = FRAME.latlon(30.0, 0.0)
+RADIUS_M = 20.0
+ALTITUDE_M = 12.0
 
 
 def saved_plan(path: Path) -> Path:
@@ -24,7 +26,8 @@ def saved_plan(path: Path) -> Path:
         return {"type": "SimpleItem", "command": command, "frame": frame, "params": list(params)}
 
     spots = [item(16, stay, 0, 0, None, *FRAME.latlon(x, 20.0), ALTITUDE_M) for x, stay in ((0.0, 0.0), (30.0, 1.0))]
-    speed, home = item(178, 1, 6.0, -1, 0, 0, 0, 0, frame=2), item(20, 0, 0, 0, 0, 0, 0, 0, frame=2)
+    speed = item(178, 1, 6.0, -1, 0, 0, 0, 0, frame=2)
+    home = item(20, 0, 0, 0, 0, 0, 0, 0, frame=2)
     items = [item(22, 0, 0, 0, None, *FRAME.latlon(0.0, 0.0), ALTITUDE_M), speed, *spots, home]
     path.write_text(json.dumps({"fileType": "Plan", "mission": {"items": items}}))
     return path

@@ -21,8 +21,11 @@ from mobility_rig import DRIVER, FRAME, HOME, NODE, Rig, altitude_limit, area, f
 from opentelemetry.proto.trace.v1.trace_pb2 import Span, Status
 
 pytestmark = pytest.mark.timeout(240)
-CLIENT, SERVER, INTERNAL = Span.SPAN_KIND_CLIENT, Span.SPAN_KIND_SERVER, Span.SPAN_KIND_INTERNAL
-MOBILITY, CAMERA = "fractus.v1.MobilityService", "fractus.v1.CameraService"
+CLIENT = Span.SPAN_KIND_CLIENT
+SERVER = Span.SPAN_KIND_SERVER
+INTERNAL = Span.SPAN_KIND_INTERNAL
+MOBILITY = "fractus.v1.MobilityService"
+CAMERA = "fractus.v1.CameraService"
 EDGE = f"""
 apiVersion: fractus.dev/v1alpha1
 kind: EdgeNode
@@ -111,14 +114,16 @@ async def test_corrected_goto_is_one_trace_from_the_sdk_to_the_autopilot(rig: Ri
     cancelled = {"rpc.grpc.status_code": 1}  # the SDK cancels the stream of a completed motion
     assert client.told == method | cancelled
     assert client.span.status.code == Status.STATUS_CODE_UNSET
-    code, policies = goto.decision.code, list(goto.decision.policies)
+    code = goto.decision.code
+    policies = list(goto.decision.policies)
     assert call.told | cancelled == client.told | {
         "fractus.caller": DRIVER, "fractus.verdict.action": "correct", "fractus.verdict.code": code,
         "fractus.verdict.policies": policies,
     }  # fmt: skip
     assert (call.service, call.node) == ("fractus-mobility", NODE)
     found = parts(collector, call, "policy.judge", "autopilot.DO_REPOSITION")
-    judged, flown = found["policy.judge"][0], found["autopilot.DO_REPOSITION"][0]
+    judged = found["policy.judge"][0]
+    flown = found["autopilot.DO_REPOSITION"][0]
     assert {s.span.trace_id for s in (client, call, judged, flown)} == {client.span.trace_id}
     assert judged.told["fractus.verdict.code"] == code
     assert judged.span.end_time_unix_nano <= flown.span.start_time_unix_nano

@@ -44,7 +44,8 @@ def running(folder: Path, *arguments: str) -> Iterator[None]:
 
 
 def test_program_of_the_tutorial_flies_its_mission(tmp_path: Path) -> None:
-    vehicle_port, service_port = str(free_port()), str(free_port())
+    vehicle_port = str(free_port())
+    service_port = str(free_port())
     init, sign, vehicle, mobility, *_ = commands({"5760": vehicle_port})
     (tmp_path / "patrol.py").write_text(shown_file(PAGE_NAME, "patrol.py"))
     (tmp_path / "patrol.yaml").write_text(shown_file(PAGE_NAME, "patrol.yaml"))

@@ -24,7 +24,8 @@ pytestmark = pytest.mark.slow
 Body = dict[str, Any]
 WIPES = "--set=uninstall.wipeNodes=true"
 WIPE = (WIPES, "--is-upgrade")
-CORE, LEASES = f"/api/v1/namespaces/{SYSTEM}", f"/apis/coordination.k8s.io/v1/namespaces/{SYSTEM}/leases"
+CORE = f"/api/v1/namespaces/{SYSTEM}"
+LEASES = f"/apis/coordination.k8s.io/v1/namespaces/{SYSTEM}/leases"
 REQUESTS = "/apis/certificates.k8s.io/v1/certificatesigningrequests"
 
 
@@ -40,7 +41,9 @@ def hooks(*arguments: str) -> list[Body]:
 
 
 def test_uninstall_wipes_nodes_only_if_enabled() -> None:
-    plain, asked, made = render(), render(*WIPE), hooks(*WIPE)
+    plain = render()
+    asked = render(*WIPE)
+    made = hooks(*WIPE)
     assert not [body for body in plain if "wipe" in str(body)]
     same = [body for body in plain if not is_hook(body)]
     assert [body for body in asked if not is_hook(body)] == same, "the value must not change running workloads"

@@ -55,7 +55,8 @@ def test_mavproxy_client_flies_vehicle(tmp_path: Path):
 
 
 def _item(command: int, north: float, east: float, alt: float, frame: int = 3) -> dict[str, Any]:
-    lat, lon = HOME[0] + north / 111_319, HOME[1] + east / 74_000
+    lat = HOME[0] + north / 111_319
+    lon = HOME[1] + east / 74_000
     return {
         "type": "SimpleItem",
         "autoContinue": True,

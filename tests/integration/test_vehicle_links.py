@@ -192,7 +192,8 @@ def _frame(writer: dialect.MAVLink, message: type, payload: bytes) -> bytes:
 
 
 def test_udp_links_work_in_both_modes():
-    inward, outward = free_port(), free_port()
+    inward = free_port()
+    outward = free_port()
     server = Client(f"udpin:127.0.0.1:{outward}", sysid=254)
     with running_vehicle(*FAST, links=(f"udpin:127.0.0.1:{inward}", f"udpout:127.0.0.1:{outward}")):
         client = Client(f"udpout:127.0.0.1:{inward}")
@@ -207,7 +208,8 @@ def test_udp_links_work_in_both_modes():
 
 
 def test_messages_for_another_system_are_forwarded(fast: str):
-    one, two = Client(fast, sysid=255), Client(fast, sysid=42)
+    one = Client(fast, sysid=255)
+    two = Client(fast, sysid=42)
     one.wait_for("HEARTBEAT")
     two.wait_for("HEARTBEAT")
     two.beat()
@@ -253,7 +255,9 @@ def _send_serial(path: Path, frames: list[bytes]) -> None:
 
 @pytest.mark.parametrize("kind", ["udp", "serial"])
 def test_bad_frames_on_other_links_do_not_disturb_client(kind: str, tmp_path: Path):
-    port, datagrams, path = free_port(), free_port(), tmp_path / "tty"
+    port = free_port()
+    datagrams = free_port()
+    path = tmp_path / "tty"
     links = (f"tcp:127.0.0.1:{port}", f"udpin:127.0.0.1:{datagrams}", f"pty:{path}")
     with running_vehicle("--ready-after", "0.5", links=links) as process:
         good = Client(f"tcp:127.0.0.1:{port}")
@@ -284,7 +288,9 @@ def test_one_process_runs_several_vehicles():
 
 def _fly_in_lockstep(tmp_path: Path, name: str, seed: int) -> bytes:
     """Arm, take off and fly, with each message sent at a fixed simulated time."""
-    port, clock_port, log = free_port(), free_port(), tmp_path / name
+    port = free_port()
+    clock_port = free_port()
+    log = tmp_path / name
     options = ("--lockstep", f"127.0.0.1:{clock_port}", "--seed", str(seed), "--wind", "4,200,2", "--tlog", str(log))
     speaker = dialect.MAVLink(None, srcSystem=255, srcComponent=190)
     with running_vehicle("--ready-after", "2", *options, links=(f"tcp:127.0.0.1:{port}",)):

@@ -39,7 +39,8 @@ def test_it_is_only_there_when_asked_for_and_may_write_nothing() -> None:
     (volume,) = pod["volumes"]
     assert volume["secret"]["secretName"] == "fractus-view"
     assert all(container[probe]["httpGet"]["path"] == "/healthz" for probe in ("readinessProbe", "livenessProbe"))
-    open_, (served,) = found["NetworkPolicy"]["spec"]["ingress"][0]["ports"], found["Service"]["spec"]["ports"]
+    open_ = found["NetworkPolicy"]["spec"]["ingress"][0]["ports"]
+    (served,) = found["Service"]["spec"]["ports"]
     assert [port["port"] for port in open_] == [port["name"] for port in container["ports"]] == ["http", "metrics"]
     assert served["targetPort"] == "http", "what needs no token is not behind the Service"
     assert f"--metrics=:{container['ports'][1]['containerPort']}" in container["args"]

@@ -22,7 +22,8 @@ from mobility_rig import PASSENGER, Driver, Rig, altitude_limit, fence, grant, p
 from PIL import Image
 from playwright.sync_api import Browser, Page, Playwright, expect, sync_playwright
 
-FLOWN, ZONE = (11, 87, 184), (194, 24, 43)
+FLOWN = (11, 87, 184)
+ZONE = (194, 24, 43)
 """Colours of the page in light."""
 
 pytestmark = [
@@ -224,7 +225,8 @@ def test_without_webgl_the_lists_say_it_all(playwright: Playwright, address: str
 
 def refusal_at(data: bytes) -> int:
     """Where the part of a recording begins that has the first refusal: how far into it depends on the machine's load."""
-    file, begins = io.BytesIO(data), 0
+    file = io.BytesIO(data)
+    begins = 0
     for record in StreamReader(file, emit_chunks=True).records:
         if isinstance(record, Chunk) and any(
             isinstance(each, Message) and b'"deny"' in each.data for each in breakup_chunk(record)
@@ -236,7 +238,8 @@ def refusal_at(data: bytes) -> int:
 
 def test_what_is_recorded_now_is_shown_live(browser: Browser, recordings: Path, tmp_path: Path) -> None:
     (source,) = (recordings / "mobility").glob("*.mcap")
-    data, growing = source.read_bytes(), tmp_path / source.name
+    data = source.read_bytes()
+    growing = tmp_path / source.name
     begins = refusal_at(data)
     growing.write_bytes(data[:begins])
     with serving("--recordings", tmp_path) as address, opened(browser, address) as page:

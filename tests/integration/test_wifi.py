@@ -37,7 +37,8 @@ def device() -> Iterator[str]:
 @pytest.fixture
 def sockets(device: str, tmp_path: Path) -> Iterator[Path]:
     """Start wpa_supplicant with a network of the owner, and return the directory of its control sockets."""
-    directory, configuration = tmp_path / "wpa", tmp_path / "wpa.conf"
+    directory = tmp_path / "wpa"
+    configuration = tmp_path / "wpa.conf"
     configuration.write_text(
         f'ctrl_interface={directory}\nap_scan=0\nnetwork={{\n ssid="owner"\n key_mgmt=NONE\n disabled=1\n}}\n'
     )

@@ -90,7 +90,9 @@ def test_pose_is_what_the_autopilot_says(autopilot: Autopilot, follower: Vehicle
 
 def test_streams_are_asked_for_and_no_heartbeat_is_sent(autopilot: Autopilot, follower: VehiclePose) -> None:
     autopilot.fly()
-    parser, asked, end = Parser(), {}, time.monotonic() + TIMEOUT_S
+    parser = Parser()
+    asked = {}
+    end = time.monotonic() + TIMEOUT_S
     while len(asked) < 3 and time.monotonic() < end:
         assert autopilot.link is not None
         for message in parser.feed(autopilot.link.recv(4096)):
@@ -114,7 +116,8 @@ def test_gimbal_overrides_the_mount(autopilot: Autopilot, follower: VehiclePose,
     """Its yaw is the airframe's, or north's: MAVLink tells by flags."""
     autopilot.fly(yaw_deg=80.0)
     known(follower)
-    half_pitch, half_yaw = math.radians(-40.0) / 2, math.radians(30.0) / 2
+    half_pitch = math.radians(-40.0) / 2
+    half_yaw = math.radians(30.0) / 2
     q = (
         math.cos(half_yaw) * math.cos(half_pitch),
         -math.sin(half_yaw) * math.sin(half_pitch),

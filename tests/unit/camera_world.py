@@ -39,7 +39,10 @@ class Drone:
     """A pose provider that a test moves; it remembers what it told."""
 
     def __init__(self) -> None:
-        self.x, self.y, self.alt, self.yaw = 0.0, 80.0, 10.0, 0.0
+        self.x = 0.0
+        self.y = 80.0
+        self.alt = 10.0
+        self.yaw = 0.0
         self.lens: Lens | None = SEEING
         self.told: list[tuple[float, Situation]] = []
 
@@ -110,7 +113,9 @@ class World:
         self, directory: Path, resolution: tuple[int, int] = (64, 64), keep: int = 50, pinhole: bool = False
     ) -> None:
         self.directory = directory / "images"
-        self.drone, self.scene, self.finder = Drone(), Scene(), Finder()
+        self.drone = Drone()
+        self.scene = Scene()
+        self.finder = Finder()
         self.shutter = Shutter(self.scene, timeout_s=5.0)
         self.audit = AuditLog(directory / "audit.jsonl", lambda: NOW)
         self.store = ImageStore(self.directory, keep, 10**9)

@@ -450,7 +450,8 @@ def test_mission_outcome_gives_phase_and_reason() -> None:
 
 
 def test_reported_final_phase_is_kept() -> None:
-    grant, ended = Grant.from_body(manifest(metadata={"generation": 2})), report("Complete", "done")
+    grant = Grant.from_body(manifest(metadata={"generation": 2}))
+    ended = report("Complete", "done")
     now = grant_report(grant, {KEY: FAILED}, None)
     assert keep_final_phase(now, ended) == ended.model_copy(update={"observed_generation": 2})
     assert keep_final_phase(grant_report(grant, {}, "disk full"), ended).phase == "Complete"

@@ -15,7 +15,8 @@ from fractus_agent.wipe import main, wipe
 @pytest.fixture
 def state(tmp_path: Path) -> Path:
     """Create a state directory with symbolic links to files of another program."""
-    state, other = tmp_path / "fractus", tmp_path / "other"
+    state = tmp_path / "fractus"
+    other = tmp_path / "other"
     for folder in (state / "tls", state / "camera" / "albums", other):
         folder.mkdir(parents=True)
     for path in (state / "tls" / "tls.key", state / "camera" / "albums" / "1.jpg", state / ".hidden", other / "kept"):

@@ -42,7 +42,8 @@ def entries() -> list[dict[str, Any]]:
 @pytest.fixture
 async def log(tmp_path: Path, entries: list[dict[str, Any]]) -> Path:
     """An audit log of a flight, written by the one writer."""
-    path, now = tmp_path / "audit" / "mobility.jsonl", 0.0
+    path = tmp_path / "audit" / "mobility.jsonl"
+    now = 0.0
     writer = AuditLog(path, lambda: now)
     for entry in entries:
         now = datetime.fromisoformat(entry["time"]).timestamp()
@@ -208,7 +209,8 @@ def test_show_tells_what_was_decided(log: Path) -> None:
 @pytest.fixture
 async def fleet(tmp_path: Path, log: Path, entries: list[dict[str, Any]]) -> list[Path]:
     """The directories of two drones that flew at the same time, the second one a little to the north."""
-    other, now = tmp_path / "other" / "mobility.jsonl", 0.0
+    other = tmp_path / "other" / "mobility.jsonl"
+    now = 0.0
     writer = AuditLog(other, lambda: now)
     for entry in entries:
         now = datetime.fromisoformat(entry["time"]).timestamp()

@@ -153,7 +153,8 @@ async def until(condition: Callable[[], object]) -> None:
 
 
 async def test_audit_log_has_no_duplicates_after_a_failed_sync(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real, failing = os.fsync, [True]
+    real = os.fsync
+    failing = [True]
 
     def fsync(file: int) -> None:
         if failing:
@@ -201,7 +202,9 @@ async def test_audit_log_reports_a_hanging_disk_and_bounds_its_queue(
 ) -> None:
     monkeypatch.setattr("fractus_runtime.audit.MAX_WAITING", 10)
     monkeypatch.setattr("fractus_runtime.audit.HANG_TIMEOUT_S", 0.02)
-    real, answers, asked = os.fsync, threading.Event(), threading.Event()
+    real = os.fsync
+    answers = threading.Event()
+    asked = threading.Event()
 
     def fsync(file: int) -> None:
         asked.set()

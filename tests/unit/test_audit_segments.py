@@ -183,7 +183,8 @@ async def test_removed_log_is_detected_by_its_checkpoint(tmp_path: Path, tls: Pa
 @pytest.mark.parametrize("which", ["changed", "other", "component", "nonsense", "twice"])
 async def test_invalid_checkpoint_is_rejected(tmp_path: Path, tls: Path, which: str) -> None:
     path = tmp_path / "audit" / "audit.jsonl"
-    kept, more = await checkpoint(path, 4, tls), list[Path]()
+    kept = await checkpoint(path, 4, tls)
+    more = list[Path]()
     if which == "changed":
         kept.write_bytes(kept.read_bytes().replace(b'"seq":4', b'"seq":3'))
         why = "was changed after it was signed"
@@ -195,12 +196,14 @@ async def test_invalid_checkpoint_is_rejected(tmp_path: Path, tls: Path, which: 
         issued = AUTHORITY.issue_component("spiffe://fractus.dev/ns/a/app/b/component/c/instance/d", EPOCH)
         for name, content in issued.items():
             (tls / name).write_bytes(base64.b64decode(content))
-        kept, why = await checkpoint(path, 1, tls), "is not signed by a node"
+        kept = await checkpoint(path, 1, tls)
+        why = "is not signed by a node"
     elif which == "nonsense":
         kept.write_bytes(b"[" * 9_000)
         why = "is not a checkpoint"
     else:
-        more, why = [await checkpoint(path, 1, tls)], "second checkpoint of audit.jsonl"
+        more = [await checkpoint(path, 1, tls)]
+        why = "second checkpoint of audit.jsonl"
     options = [word for file in (kept, *more) for word in ("--since", file)]
     code, said = verified(path, *options, "--ca", tls / "ca.crt")
     assert (code, why in said) == (1, True), said

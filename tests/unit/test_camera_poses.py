@@ -47,10 +47,14 @@ class Drone:
         self.now_s = at_s
         lat, lon = FRAME.latlon(x, 0.0)
         message = mobility_pb2.Telemetry(autopilot_connected=connected, position_error_m=1.0)
-        message.position.latitude_deg, message.position.longitude_deg, message.position.altitude_m = lat, lon, alt
+        message.position.latitude_deg = lat
+        message.position.longitude_deg = lon
+        message.position.altitude_m = alt
         message.velocity.east_mps, message.velocity.down_mps = speed
         message.attitude.roll_deg, message.attitude.pitch_deg, message.attitude.yaw_deg = turned
-        message.home.latitude_deg, message.home.longitude_deg, message.home.altitude_m = HOME.lat, HOME.lon, 100.0
+        message.home.latitude_deg = HOME.lat
+        message.home.longitude_deg = HOME.lon
+        message.home.altitude_m = 100.0
         if ages is not None:
             message.position_age_s, message.attitude_age_s = ages
         message.time.FromNanoseconds(round((NOW_S + at_s - late_s) * 1e9))
@@ -175,8 +179,11 @@ def send_gimbal(poses: PoseHistory, at_s: float, turned: tuple[float, float, flo
     message = mobility_pb2.Telemetry(autopilot_connected=True, position_error_m=1.0, position_age_s=0.0)
     message.position.latitude_deg, message.position.longitude_deg = FRAME.latlon(0.0, 0.0)
     message.position.altitude_m = 40.0
-    message.home.latitude_deg, message.home.longitude_deg, message.home.altitude_m = HOME.lat, HOME.lon, 100.0
-    message.attitude.yaw_deg, message.attitude_age_s = 0.0, 0.0
+    message.home.latitude_deg = HOME.lat
+    message.home.longitude_deg = HOME.lon
+    message.home.altitude_m = 100.0
+    message.attitude.yaw_deg = 0.0
+    message.attitude_age_s = 0.0
     if turned is not None:
         message.gimbal.roll_deg, message.gimbal.pitch_deg, message.gimbal.yaw_deg = turned
         message.gimbal_age_s = age_s
@@ -192,10 +199,12 @@ def test_pose_is_unknown_when_telemetry_is_from_the_future(drone: Drone) -> None
 
 
 def test_arrival_clock_ignores_step_back_for_a_while() -> None:
-    now_s, step_s = 0.0, 0.0
+    now_s = 0.0
+    step_s = 0.0
     arrival = ArrivalClock(lambda: NOW_S + now_s + step_s, lambda: now_s)
     assert arrival() == NOW_S
-    now_s, step_s = 2.0, -0.9
+    now_s = 2.0
+    step_s = -0.9
     assert arrival() == NOW_S + 2.0, "a message sent at 1 s was delayed by one second"
     now_s = 2.1 + STEP_WINDOW_S
     assert arrival() == pytest.approx(NOW_S + now_s - 0.9)

@@ -131,7 +131,8 @@ def test_authority_invariant_is_violated_by_an_entry_without_controller() -> Non
 
 
 def test_one_application_invariant_is_violated_by_two_drivers() -> None:
-    one, other = grant("one"), grant("other")
+    one = grant("one")
+    other = grant("other")
     grants = {spec.mission_key: spec for spec in (one, other)}
     state = {"controller": "system", "in_air": True}
     both = [given(0, one), given(1, other), entry(2, "state", **state)]
@@ -222,7 +223,8 @@ def test_orphan_invariant_includes_grants_stored_on_nodes(tmp_path: Path) -> Non
 
 def test_drained_node_is_uncordoned_after_a_rejected_request(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fractus_sim.chaos.faults._RETRY_S", 0.0)
-    cordoned, refusals = False, 1
+    cordoned = False
+    refusals = 1
 
     def kubectl(command: str, *arguments: str, **_: object) -> str:
         """As kubectl does: of these, only patch tells by its exit code that it was refused."""

@@ -23,7 +23,8 @@ networks = st.builds(
 @given(st.lists(networks, max_size=30))
 def test_chosen_block_touches_nothing(taken: list[IPv4Network]) -> None:
     block = choose_block(taken)
-    first, last = int(block.network_address), int(block.broadcast_address)
+    first = int(block.network_address)
+    last = int(block.broadcast_address)
     for network in taken:  # without `overlaps`, which the code under test uses
         assert last < int(network.network_address) or int(network.broadcast_address) < first
 

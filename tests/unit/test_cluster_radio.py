@@ -45,7 +45,8 @@ CONTENT: dict[str, Any] = {
 def layout(content: dict[str, Any]) -> Layout | None:
     spec: ClusterSpec = parse_spec(content, source="x")
     wiring = Wiring("radio", Addressing(IPv4Network("10.200.0.0/16")), Path("/none"))
-    state, branch = state_of("radio"), cluster_branch("radio")
+    state = state_of("radio")
+    branch = cluster_branch("radio")
     nodes = [Node(node, index, wiring, state, branch) for index, node in enumerate(spec.nodes)]
     text = radio_layout(nodes, spec.air, Path("/none/control"))
     return None if text is None else Layout.model_validate_json(text)

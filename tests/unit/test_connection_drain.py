@@ -42,7 +42,8 @@ class FakeRedirector:
 
 
 async def test_link_is_in_use_until_its_connections_are_drained() -> None:
-    redirector, ended = FakeRedirector(), asyncio.Event()
+    redirector = FakeRedirector()
+    ended = asyncio.Event()
     drain = ConnectionDrain(cast(Redirector, redirector), ended.set)
     await drain.begin({LOADER: DIRECT})
     assert redirector.redirects == {LOADER: DIRECT}, "new connections take the link at once"
@@ -70,7 +71,8 @@ async def test_connections_on_a_lost_path_are_cut() -> None:
 
 @pytest.mark.parametrize("refuses", ["at once", "in the end"])
 async def test_switch_refused_by_the_kernel_is_reported(refuses: str, caplog: pytest.LogCaptureFixture) -> None:
-    redirector, ended = FakeRedirector(), asyncio.Event()
+    redirector = FakeRedirector()
+    ended = asyncio.Event()
     redirector.refuses = refuses
     drain = ConnectionDrain(cast(Redirector, redirector), ended.set)
     if refuses == "at once":

@@ -39,7 +39,8 @@ FACTS = (
     GROUND, ARMED, FLYING, replace(FLYING, mode=LOITER), replace(FLYING, mode=RTL), replace(FLYING, mode=LAND),
     replace(FLYING, mode=RTL, failsafe=True), replace(FLYING, connected=False),
 )  # fmt: skip
-DRIVER, TOUR = events.GrantRef("a", commands_vehicle=True), events.GrantRef("t", commands_vehicle=True)
+DRIVER = events.GrantRef("a", commands_vehicle=True)
+TOUR = events.GrantRef("t", commands_vehicle=True)
 
 EVENTS: tuple[events.Event, ...] = (
     events.StreamOpened(1, "a", "A"), events.StreamOpened(2, "b", "B"), events.StreamOpened(3, "a", "A"),
@@ -74,7 +75,9 @@ FOUND = transition(ControlState(vehicle=GROUND), events.VehicleFound(), 0.0)[0]
 
 def normalized(state: ControlState, now: float) -> ControlState:
     """Normalize times, task ids and counters of a state, so that states without other differences are equal."""
-    grace, motion, task = state.grace, state.motion, state.task
+    grace = state.grace
+    motion = state.motion
+    task = state.task
     return replace(
         state,
         grace=replace(grace, until=grace.until - now) if grace is not None else None,
@@ -169,7 +172,8 @@ def check_notifications(
     before: ControlState, event: events.Event, now: ControlState, actions: tuple[Action, ...], where: Where
 ) -> None:
     """Check that streams and motions are notified of their end."""
-    lease, motion = before.lease, before.motion
+    lease = before.lease
+    motion = before.motion
     if lease is not None and (now.lease is None or now.lease.lease_id != lease.lease_id):
         notified = any(
             isinstance(action, EndStream) or (isinstance(action, SendEvent) and action.event.final)
@@ -219,7 +223,8 @@ def test_control_invariants_hold_in_all_states_within_few_events() -> None:
 
 @given(st.lists(st.tuples(st.sampled_from(EVENTS), st.sampled_from((0.0, 0.1, 1.0, LATE_S))), max_size=60))
 def test_control_invariants_hold_in_long_histories(history: list[tuple[events.Event, float]]) -> None:
-    state, now = FOUND, 0.0
+    state = FOUND
+    now = 0.0
     for event, passed_s in history:
         now += passed_s
         before = state
@@ -232,7 +237,8 @@ def test_control_invariants_hold_in_long_histories(history: list[tuple[events.Ev
 
 @given(st.lists(st.sampled_from(EVENTS), max_size=40))
 def test_flying_vehicle_returns_home_without_further_events(history: list[events.Event]) -> None:
-    state, now = FOUND, 0.0
+    state = FOUND
+    now = 0.0
     for event in history:
         state, _ = transition(state, event, now)
     if not (state.decided and state.vehicle.armed):

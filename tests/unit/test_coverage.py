@@ -53,7 +53,9 @@ def plain_greedy(points, discs, share, unfit):
         name: {i for i, p in enumerate(points) if (p[0] - x) ** 2 + (p[1] - y) ** 2 <= r * r}
         for name, (x, y, r) in discs.items()
     }
-    covered, picks, left = set(), [], list(discs)
+    covered = set()
+    picks = []
+    left = list(discs)
     while left and len(covered) < share * len(points):
         gains = [len(reached[name] - covered) for name in left]
         best = max(gains)
@@ -93,7 +95,8 @@ def test_lazy_greedy_coverage_equals_plain_greedy_for_more_than_one_batch():
     scene = CoverScene(samples, names, xy, np.full(len(xy), 60.0), 0.95)
     found = [(p.name, round(p.share * len(samples))) for p in greedy_cover(scene, lambda _: True)]
     reached = np.hypot(*(samples.xy()[None] - xy[:, None]).transpose(2, 0, 1)) <= 60.0
-    covered, wanted = np.zeros(len(samples), dtype=bool), []
+    covered = np.zeros(len(samples), dtype=bool)
+    wanted = []
     while covered.sum() < 0.95 * len(samples):
         gains = (reached & ~covered).sum(axis=1)
         best = int(np.argmax(gains))

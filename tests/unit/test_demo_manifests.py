@@ -103,7 +103,8 @@ def test_the_drone_s_camera_sees_the_simulated_world(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(hardware.shutil, "which", lambda name: f"/bin/{name}")
     spec = load_spec(ROOT / "examples" / "clusters" / "demo.yaml")
     commands = {node.name: hardware_commands(node, spec.world_origin) for node in spec.nodes}
-    vehicle, camera = commands["drone-1"]["vehicle"], commands["drone-1"]["camera"]
+    vehicle = commands["drone-1"]["vehicle"]
+    camera = commands["drone-1"]["camera"]
     options = dict(itertools.pairwise(camera))
     assert options["--listen"] == "127.0.0.1:8090"
     assert options["--vehicle"] in vehicle

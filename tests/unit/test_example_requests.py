@@ -39,7 +39,8 @@ def programs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict[str, Any]:
 
 
 async def test_repeated_picture_counts_once_across_instances(programs: dict[str, Any]) -> None:
-    check, pictures = programs["image_checker"].check, programs["pictures"]
+    check = programs["image_checker"].check
+    pictures = programs["pictures"]
     body = pictures.pack("picture-1", "viewer-1", pictures.render(160, 120, 1))
     for _ in range(2):  # instances, each of which knows nothing of the other
         responder = Responder({"check": check}, 0)
@@ -97,7 +98,8 @@ async def test_links_example_leaves_no_pictures_on_the_node(monkeypatch: pytest.
     monkeypatch.setattr(sys, "path", [str(EXAMPLES / "links"), *sys.path])
     monkeypatch.delitem(sys.modules, "aerial_viewer", raising=False)
     monkeypatch.delitem(os.environ, "PICTURE_BYTES", raising=False)
-    look, camera = importlib.import_module("aerial_viewer").look, FullCamera()
+    look = importlib.import_module("aerial_viewer").look
+    camera = FullCamera()
     with pytest.raises(fractus.PolicyDenied):
         await look(camera)
     assert await look(camera) == b"picture-2"

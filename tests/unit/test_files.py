@@ -29,7 +29,8 @@ def stopped_at(call: int, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def test_write_file_never_leaves_the_path_without_a_file(tmp_path: Path) -> None:
-    path, former = tmp_path / "a.json", tmp_path / "a.last.json"
+    path = tmp_path / "a.json"
+    former = tmp_path / "a.last.json"
     for call in range(10):
         for file in tmp_path.iterdir():
             file.unlink()
@@ -59,7 +60,8 @@ def test_write_file_keeps_the_previous_file_without_hard_links(tmp_path: Path, m
         raise PermissionError(1, "Operation not permitted")
 
     monkeypatch.setattr(module.Path, "hardlink_to", refuse)
-    path, former = tmp_path / "a", tmp_path / "b"
+    path = tmp_path / "a"
+    former = tmp_path / "b"
     for content in (b"1", b"2", b"3"):
         write_file(path, content, former=former)
     assert (path.read_bytes(), former.read_bytes()) == (b"3", b"2")

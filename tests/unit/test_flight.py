@@ -57,7 +57,8 @@ def test_first_missed_equals_walk_along_path(leg, offsets, ordered):
     points = [
         (steps[int(t * (len(steps) - 1))][0] + dx, steps[int(t * (len(steps) - 1))][1] + dy) for t, dx, dy in offsets
     ]
-    sure, possible = visits(leg, points, 6.8, ordered), visits(leg, points, 7.2, ordered)
+    sure = visits(leg, points, 6.8, ordered)
+    possible = visits(leg, points, 7.2, ordered)
     missed = first_missed([place(*p) for p in points], flight(leg), 7.0, ordered=ordered)
     if sure:
         assert missed is None

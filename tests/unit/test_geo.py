@@ -28,7 +28,8 @@ longitudes = st.floats(-180, 180)
 @given(latitudes, longitudes, st.floats(0, 2 * math.pi), st.floats(1, 50_000))
 def test_local_frame_distances_match_geodesic_distances(lat, lon, bearing, distance):
     frame = LocalFrame(lat, lon)
-    x, y = distance * math.sin(bearing), distance * math.cos(bearing)
+    x = distance * math.sin(bearing)
+    y = distance * math.cos(bearing)
     there_lat, there_lon = frame.latlon(x, y)
     geodesic = geodesic_m(Point(lat=lat, lon=lon), Point(lat=there_lat, lon=there_lon))
     assert geodesic == pytest.approx(distance, rel=1e-3)
@@ -141,7 +142,8 @@ def test_geojson_of_circles_at_the_poles_covers_the_same_area(pole, off, lon, ra
     ]
     assert all(part.is_valid for part in drawn)
     for bearing, share in places:
-        x, y = share * radius * math.sin(bearing), share * radius * math.cos(bearing)
+        x = share * radius * math.sin(bearing)
+        y = share * radius * math.cos(bearing)
         there_lat, there_lon = frame.latlon(x, y)
         assert any(part.covers(shapely.Point(there_lon, there_lat)) for part in drawn) == (share < 1)
 

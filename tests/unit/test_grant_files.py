@@ -106,7 +106,8 @@ async def test_grant_files_do_not_block_event_loop_while_compiling(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The motion monitor and the heartbeats run on the event loop."""
-    begun, may_continue = threading.Event(), threading.Event()
+    begun = threading.Event()
+    may_continue = threading.Event()
 
     def slowly(*args: Any, **options: Any) -> CompiledGrant:
         begun.set()
@@ -114,7 +115,8 @@ async def test_grant_files_do_not_block_event_loop_while_compiling(
         return compile_grant(*args, **options)
 
     monkeypatch.setattr(module, "compile_grant", slowly)
-    files, changed = grant_files(tmp_path), asyncio.Event()
+    files = grant_files(tmp_path)
+    changed = asyncio.Event()
     files.listen(lambda _old, _new: changed.set())
     watching = asyncio.ensure_future(files.run())
     try:

@@ -228,7 +228,8 @@ def later(seconds: float = 1.0) -> datetime:
 
 @pytest.mark.parametrize("restarts", [False, True])
 def test_verifier_refuses_older_grant(node: Node, restarts: bool) -> None:
-    old, new = signed(NOW), signed(later(), policies=[])
+    old = signed(NOW)
+    new = signed(later(), policies=[])
     first = node.take(old)
     assert node.take(old) == first, "the same Grant may be read again"
     digest = node.take(new)
@@ -340,7 +341,9 @@ def test_verifier_state_is_bounded_and_still_refuses_old_grants(node: Node, monk
 
 
 def test_grants_command_creates_authority_and_signs_grant(tmp_path: Path) -> None:
-    pki, to, file = tmp_path / "pki", tmp_path / "grants", tmp_path / "grant.json"
+    pki = tmp_path / "pki"
+    to = tmp_path / "grants"
+    file = tmp_path / "grant.json"
     file.write_text(json.dumps(manifest()))
     missing = CliRunner().invoke(grants, ["sign", str(file), "--tls", str(pki), "--to", str(to)])
     assert missing.exit_code == 1

@@ -68,7 +68,8 @@ def test_grant_refuses_zones_with_too_many_crossings():
 def test_zone_validity_cache_is_cleared_with_the_zone():
     """Each change of a zone, even of its status, creates another object."""
     gc.collect()
-    before, near = len(_SOUND), zone("near", (50, 0))
+    before = len(_SOUND)
+    near = zone("near", (50, 0))
     compiled(policy("out", ("near",), **FENCE), zones=[near])
     compiled(policy("out", ("near",), **FENCE), zones=[near])
     assert len(_SOUND) == before + 1
@@ -217,7 +218,8 @@ def test_refreshed_grant_keeps_policies_when_node_description_is_missing():
     (old,) = compiled(heavy)
     fresh = refresh(old, inventory([], policies={"heavy": heavy, "low": policy("low", **ALTITUDE)}))
     assert [p.name for p in fresh.policies] == ["heavy", "low"]
-    stock, app = inventory([drone("d")]), application(navigator(PATH))
+    stock = inventory([drone("d")])
+    app = application(navigator(PATH))
     decided = plan(app, stock)
     gone = inventory([], policies={"heavy": heavy, "low": policy("low", **ALTITUDE)})
     assert compile_grants(app, decided, gone, None, [old]) == (fresh,)
@@ -250,7 +252,8 @@ def test_grant_keeps_permission_of_zone_beyond_reach(there):
     ],
 )
 def test_grant_keeps_camera_policies_of_distant_zones_in_view(spec):
-    near, far = zone("near", (4000, 0)), zone("far", (80_000, 0))
+    near = zone("near", (4000, 0))
+    far = zone("far", (80_000, 0))
     private = policy("a", zones=["near", "far"], **spec)
     policies = {"a": private, "b": policy("b", zones=["near"], **FENCE)}
     stock = inventory(edges=[edge("e", (0, 0))], zones={z.name: z for z in (near, far)}, policies=policies)

@@ -184,7 +184,9 @@ async def test_audit_contains_filters_that_become_necessary(world: World) -> Non
         return [(entry["method"], entry["filters"], entry["policies"]) for entry in entries]
 
     far = policy("q", "PrivacyControl", "camera", [zone("far", box(500, 500, 510, 510))], action="refuse")
-    free, bound, faces = active_grant(far), active_grant(private("black")), active_grant(private("blurFaces"))
+    free = active_grant(far)
+    bound = active_grant(private("black"))
+    faces = active_grant(private("blurFaces"))
     world.scene.during = lambda: setattr(world.drone, "y", 0.0)
     record = await world.capture(bound)  # The drone came over the zone during the exposure,
     await world.capture(bound)  # was there from the beginning,
@@ -220,8 +222,10 @@ async def test_picture_is_filtered_before_it_is_stored(world: World, action: str
 
 
 async def test_retrieval_is_judged_by_position_of_exposure(world: World) -> None:
-    free, bound = active_grant(policy("q", "PrivacyControl", "camera", [zone("far", box(500, 500, 510, 510))],
-                              action="refuse")), active_grant(private("blurAverage"))  # fmt: skip
+    free = active_grant(
+        policy("q", "PrivacyControl", "camera", [zone("far", box(500, 500, 510, 510))], action="refuse")
+    )
+    bound = active_grant(private("blurAverage"))  # fmt: skip
     world.drone.y = 0.0
     record = await world.capture(free)
     assert grain(world.stored(free, record)) > 30
@@ -236,7 +240,8 @@ async def test_retrieval_is_judged_by_position_of_exposure(world: World) -> None
 
 async def test_retrieval_is_denied_when_picture_shows_denial_zone(world: World) -> None:
     """A denial of the method applies to the content of the picture, not to the current view of the camera."""
-    ground, methods = [zone("z", box(-20, -20, 20, 20))], ["RetrieveImage"]
+    ground = [zone("z", box(-20, -20, 20, 20))]
+    methods = ["RetrieveImage"]
     grant = active_grant(policy("d", "AccessControl", "denial", ground, methods=methods))
     world.drone.y = 0.0
     record = await world.capture(grant)
@@ -257,10 +262,8 @@ async def test_delayed_picture_is_judged_by_denials_active_at_exposure(world: Wo
 
 async def test_retrieval_is_judged_again_after_filters_are_applied(world: World) -> None:
     far = [zone("far", box(500, 500, 510, 510))]
-    free, bound = (
-        active_grant(policy("q", "PrivacyControl", "camera", far, action="refuse")),
-        active_grant(private("blurAverage")),
-    )
+    free = active_grant(policy("q", "PrivacyControl", "camera", far, action="refuse"))
+    bound = active_grant(private("blurAverage"))
     world.drone.y = 0.0
     record = await world.capture(free)
     _, shown, _ = await world.stored_images.retrieve(bound, record.name, lambda: bound)
@@ -280,7 +283,8 @@ async def test_retrieval_is_judged_by_current_position_too(world: World) -> None
 
 async def test_faces_are_blurred_or_fallback_applies_when_too_small(tmp_path: Path) -> None:
     world = World(tmp_path, (1600, 1600))
-    world.drone.y, world.drone.alt = 0.0, 2.0
+    world.drone.y = 0.0
+    world.drone.alt = 2.0
     world.finder.boxes = [(700, 700, 100, 100)]
     grant = active_grant(private("blurFaces"))
     kept = world.stored(grant, await world.capture(grant))
@@ -301,16 +305,19 @@ async def test_faces_cut_by_cropping_are_blurred(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, width: int, height: int
 ) -> None:
     world = World(tmp_path, (1600, 1600))
-    world.drone.y, world.drone.alt = 0.0, 2.0
+    world.drone.y = 0.0
+    world.drone.alt = 2.0
     # The strip shows two thirds of a face that is 97 pixels wide. A detector does not find it.
     scene = np.full((1600, 1600, 3), 90, np.uint8)
-    left, top = 776 - 225, 776 - 114
+    left = 776 - 225
+    top = 776 - 114
     scene[top : top + 512, left : left + 512] = skimage.data.astronaut()[..., ::-1]
     face = np.s_[776 - 38 : 776 + 38, 776 - 38 : 776 + 38]
     shown = np.s_[(1600 - height) // 2 : (1600 + height) // 2, (1600 - width) // 2 : (1600 + width) // 2]
     monkeypatch.setattr(world.scene, "capture", lambda _request: scene)
     monkeypatch.setattr(world.finder, "detect", CascadeDetector().detect)
-    grant, later = active_grant(private("blurFaces")), active_grant(private("blurFaces"), uid="u2")
+    grant = active_grant(private("blurFaces"))
+    later = active_grant(private("blurFaces"), uid="u2")
     picture = np.zeros_like(scene)
     picture[shown] = world.stored(grant, await world.capture(grant, width=width, height=height))
     before = np.zeros_like(scene)
@@ -326,7 +333,8 @@ async def test_faces_cut_by_cropping_are_blurred(
 
 async def test_weakly_blurred_faces_get_fallback_of_stricter_policy(tmp_path: Path) -> None:
     world = World(tmp_path, (1600, 1600))
-    world.drone.y, world.drone.alt = 0.0, 2.0
+    world.drone.y = 0.0
+    world.drone.alt = 2.0
     world.finder.boxes = [(700, 700, 100, 100)]
     soft = active_grant(private("blurFaces", faces="gaussian"))
     record = await world.capture(soft)
@@ -348,7 +356,8 @@ async def test_stored_picture_shows_only_judged_view(
     """The footprint is that of 16:9, so other proportions of the camera are cropped."""
     world = World(tmp_path, (160, 90))
     picture = np.zeros((size[1], size[0], 3), np.uint8)
-    left, top = (size[0] - shown[0]) // 2, (size[1] - shown[1]) // 2
+    left = (size[0] - shown[0]) // 2
+    top = (size[1] - shown[1]) // 2
     picture[top : top + shown[1], left : left + shown[0]] = 200
     monkeypatch.setattr(world.scene, "capture", lambda _request: picture)
     for asked in ({"width": 64, "height": 64}, {"width": 64, "height": 36}, {"width": 90, "height": 160}):
@@ -369,7 +378,8 @@ async def test_face_size_is_unknown_without_lens(world: World) -> None:
 
 async def test_enlarged_picture_does_not_enlarge_smallest_face(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     world = World(tmp_path, (1600, 1600))
-    world.drone.y, world.drone.alt = 0.0, 2.0
+    world.drone.y = 0.0
+    world.drone.alt = 2.0
     small = np.zeros((100, 100, 3), np.uint8)
     monkeypatch.setattr(world.scene, "capture", lambda _request: small)
     verdict, record = await world.camera.capture(active_grant(private("blurFaces")), CaptureArgs())
@@ -388,7 +398,8 @@ async def test_capture_refuses_invalid_picture_size(world: World, width: int, he
 
 
 async def test_hanging_camera_is_reported_and_recovers(tmp_path: Path) -> None:
-    scene, stuck = Scene(), threading.Event()
+    scene = Scene()
+    stuck = threading.Event()
     scene.during = lambda: stuck.wait(20) and None
     shutter = Shutter(scene, timeout_s=0.2)
     request = CaptureRequest(8, 8, (8, 8), "RGB", at())

@@ -53,7 +53,8 @@ def detector() -> CascadeDetector:
 
 
 def covers(boxes: list[Any], face: tuple[int, int, int, int]) -> bool:
-    x, y = face[0] + face[2] / 2, face[1] + face[3] / 2
+    x = face[0] + face[2] / 2
+    y = face[1] + face[3] / 2
     return any(left <= x <= left + w and top <= y <= top + h and w < 2.5 * face[2] for left, top, w, h in boxes)
 
 
@@ -96,7 +97,8 @@ def test_hidden_face_is_not_detected(method: Any, width_px: int, photo: Pixels, 
 
 @pytest.mark.parametrize("method", ["pixelate", "gaussian"])
 def test_hide_faces_reveals_nothing_when_boxes_overlap(method: Any, photo: Pixels) -> None:
-    face, region = (100, 100, 98, 98), np.s_[65:233, 65:233]
+    face = (100, 100, 98, 98)
+    region = np.s_[65:233, 65:233]
     cells = cv2.resize(photo[region], (7, 7), interpolation=cv2.INTER_AREA)
     coarse = photo.copy()
     coarse[region] = cv2.resize(cells, (168, 168), interpolation=cv2.INTER_NEAREST)
@@ -286,7 +288,8 @@ def test_image_is_decoded_as_by_opencv(shape: tuple[int, ...], suffix: str, kind
 
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_image_is_rotated_by_exif_orientation(photo: Pixels, orientation: int) -> None:
-    exif, out = Image.Exif(), io.BytesIO()
+    exif = Image.Exif()
+    out = io.BytesIO()
     exif[0x0112] = orientation
     Image.fromarray(photo[:100, :60, ::-1]).save(out, "JPEG", quality=95, exif=exif)
     expected = cv2.imdecode(np.frombuffer(out.getvalue(), np.uint8), cv2.IMREAD_COLOR)
@@ -314,7 +317,8 @@ def test_image_metadata_contains_position_and_camera(photo: Pixels) -> None:
     with Image.open(io.BytesIO(data)) as picture:
         assert np.asarray(picture).shape == photo.shape
         exif = picture.getexif()
-        gps, more = exif.get_ifd(0x8825), exif.get_ifd(0x8769)
+        gps = exif.get_ifd(0x8825)
+        more = exif.get_ifd(0x8769)
         lat = sum(float(v) / 60**i for i, v in enumerate(gps[2]))
         lon = sum(float(v) / 60**i for i, v in enumerate(gps[4]))
         assert (lat, lon) == pytest.approx((pose.lat, pose.lon), abs=1e-9)

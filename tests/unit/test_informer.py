@@ -232,7 +232,9 @@ def test_paths_of_objects() -> None:
 
 
 async def test_informer_reports_open_watch() -> None:
-    ended, is_open, listed_again = asyncio.Event(), asyncio.Event(), asyncio.Event()
+    ended = asyncio.Event()
+    is_open = asyncio.Event()
+    listed_again = asyncio.Event()
 
     class Watched(Script):
         async def watch(self, kind: Any, *, opened: Any, **_: Any) -> AsyncIterator[tuple[str, Body]]:

@@ -27,7 +27,8 @@ async def bearer(access: Access) -> str | None:
 
 
 async def test_token_is_requested_before_first_request_and_reused() -> None:
-    tokens, base = Tokens(), Configuration(host="https://api", cert_file="crt", key_file="key")
+    tokens = Tokens()
+    base = Configuration(host="https://api", cert_file="crt", key_file="key")
     base.api_key["BearerToken"] = "Bearer of the pod"
     access = with_tokens(base, tokens, 3600.0)
     assert tokens.given == 0

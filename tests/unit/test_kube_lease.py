@@ -88,7 +88,8 @@ async def step(*leases: Lease) -> None:
         if task.done():
             task.result()
         # Ended as a killed process is: nothing is given back.
-        one_give_back, one._give_back = one._give_back, _nothing  # type: ignore[method-assign]
+        one_give_back = one._give_back
+        one._give_back = _nothing  # type: ignore[method-assign]
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
         one._give_back = one_give_back  # type: ignore[method-assign]
@@ -99,8 +100,10 @@ async def _nothing() -> None:
 
 
 async def test_second_candidate_waits_for_lease_duration() -> None:
-    shelf, clock = Shelf(), Clock()
-    first, second = lease(shelf, clock, "first"), lease(shelf, clock, "second")
+    shelf = Shelf()
+    clock = Clock()
+    first = lease(shelf, clock, "first")
+    second = lease(shelf, clock, "second")
     await step(first, second)
     assert first.left_s > 0
     assert second.left_s == 0
@@ -117,8 +120,10 @@ async def test_second_candidate_waits_for_lease_duration() -> None:
 
 
 async def test_renewed_lease_keeps_others_out() -> None:
-    shelf, clock = Shelf(), Clock()
-    first, second = lease(shelf, clock, "first"), lease(shelf, clock, "second")
+    shelf = Shelf()
+    clock = Clock()
+    first = lease(shelf, clock, "first")
+    second = lease(shelf, clock, "second")
     for _ in range(20):
         await step(first, second)
         assert first.left_s > 0.5 * DURATION_S
@@ -127,8 +132,10 @@ async def test_renewed_lease_keeps_others_out() -> None:
 
 
 async def test_frozen_holder_loses_lease() -> None:
-    shelf, clock = Shelf(), Clock()
-    first, second = lease(shelf, clock, "first"), lease(shelf, clock, "second")
+    shelf = Shelf()
+    clock = Clock()
+    first = lease(shelf, clock, "first")
+    second = lease(shelf, clock, "second")
     await step(first, second)
     clock.now += DURATION_S + 1
     await step(second)
@@ -139,13 +146,16 @@ async def test_frozen_holder_loses_lease() -> None:
 
 async def test_restored_lease_is_lost() -> None:
     """As after the restore of a backup: its watches would wait for versions that are yet to come."""
-    shelf, clock = Shelf(), Clock()
+    shelf = Shelf()
+    clock = Clock()
     only = lease(shelf, clock, "only")
     await step(only)
-    backup, writes = copy.deepcopy(shelf.body), shelf.writes
+    backup = copy.deepcopy(shelf.body)
+    writes = shelf.writes
     for _ in range(3):
         await step(only)
-    shelf.body, shelf.writes = backup, writes
+    shelf.body = backup
+    shelf.writes = writes
     with pytest.raises(LostLease, match="went back from 4 to 1, as after a restore"):
         await step(only)
     again = lease(shelf, clock, "again")
@@ -156,7 +166,8 @@ async def test_restored_lease_is_lost() -> None:
 
 
 async def test_lease_ends_while_api_server_is_unreachable() -> None:
-    shelf, clock = Shelf(), Clock()
+    shelf = Shelf()
+    clock = Clock()
     only = lease(shelf, clock, "only")
     await step(only)
     shelf.reachable = False
@@ -169,7 +180,8 @@ async def test_lease_ends_while_api_server_is_unreachable() -> None:
 
 
 async def test_restarted_holder_continues_at_once() -> None:
-    shelf, clock = Shelf(), Clock()
+    shelf = Shelf()
+    clock = Clock()
     await step(lease(shelf, clock, "pod"))
     again = lease(shelf, clock, "pod")
     await step(again)
@@ -177,8 +189,10 @@ async def test_restarted_holder_continues_at_once() -> None:
 
 
 async def test_released_lease_is_free_at_once() -> None:
-    shelf, clock = Shelf(), Clock()
-    first, second = lease(shelf, clock, "first"), lease(shelf, clock, "second")
+    shelf = Shelf()
+    clock = Clock()
+    first = lease(shelf, clock, "first")
+    second = lease(shelf, clock, "second")
     task = asyncio.create_task(first.run())
     await asyncio.wait_for(first.held(), 5.0)
     task.cancel()
@@ -189,7 +203,8 @@ async def test_released_lease_is_free_at_once() -> None:
 
 
 async def test_one_of_two_concurrent_candidates_gets_lease() -> None:
-    shelf, clock = Shelf(), Clock()
+    shelf = Shelf()
+    clock = Clock()
     racers = [lease(shelf, clock, f"r{i}") for i in range(5)]
     tasks: list[asyncio.Task[Any]] = [asyncio.create_task(racer.run()) for racer in racers]
     for _ in range(20):
@@ -213,7 +228,8 @@ async def test_stalled_renewal_leaves_time_for_retry() -> None:
 
 @pytest.mark.parametrize("failure", [KubeError(500, "InternalError", "not now"), TimeoutError()])
 async def test_failed_renewal_leaves_time_for_retry(monkeypatch: pytest.MonkeyPatch, failure: Exception) -> None:
-    shelf, clock = Shelf(), Clock()
+    shelf = Shelf()
+    clock = Clock()
     pauses: list[float] = []
     done = asyncio.Event()
     failing = False
@@ -245,8 +261,10 @@ async def test_failed_renewal_leaves_time_for_retry(monkeypatch: pytest.MonkeyPa
 
 
 async def test_renewal_without_response_is_released() -> None:
-    shelf, clock = Shelf(), Clock()
-    first, second = lease(shelf, clock, "first"), lease(shelf, clock, "second")
+    shelf = Shelf()
+    clock = Clock()
+    first = lease(shelf, clock, "first")
+    second = lease(shelf, clock, "second")
     await step(first)
     clock.now += DURATION_S
     assert first.left_s == 0

@@ -51,7 +51,8 @@ def test_direct_links_match_golden_file() -> None:
 
 
 def test_direct_link_target_is_ready_pod() -> None:
-    old, new = pod("a", "10.1.0.5", terminating=True), pod("b", "10.1.0.6")
+    old = pod("a", "10.1.0.5", terminating=True)
+    new = pod("b", "10.1.0.6")
     assert target(old, new) == {"address": "10.1.0.6", "port": 8080}
     assert target(new, pod("c", "10.1.0.7", ready=False), pod("d", None)) == {"address": "10.1.0.6", "port": 8080}
     assert target(old) is None
@@ -67,7 +68,8 @@ def test_direct_link_callers_are_pods_on_drone_with_access() -> None:
         state = {"ready": False, "finished": False, "terminating": False} | state
         return PodView("city", name, "drone-1", {"fractus.dev/instance": "traffic-aerial-viewer"}, {}, ip=ip, **state)
 
-    old, new = viewer("a", "10.2.0.5", terminating=True), viewer("b", "10.2.0.6")
+    old = viewer("a", "10.2.0.5", terminating=True)
+    new = viewer("b", "10.2.0.6")
     assert caller(viewer("a", None)) == [{"instance": "traffic-aerial-viewer"}]
     assert caller(old, new) == [{"instance": "traffic-aerial-viewer", "address": "10.2.0.6"}], (
         "a new pod may call at once"

@@ -25,7 +25,8 @@ from fractus_core.linking.range_model import RangeModel, next_attempt_s
 CLOUD = PathMetrics(8.0, 8.0, 60.0, 60.0)
 WIFI = PathMetrics(12.0, 12.0, 5.0, 5.0, direct=True)
 SETTINGS = LinkSettings()
-VIP, OTHER_VIP = Endpoint(IPv4Address("10.96.0.5"), 80), Endpoint(IPv4Address("10.96.0.6"), 80)
+VIP = Endpoint(IPv4Address("10.96.0.5"), 80)
+OTHER_VIP = Endpoint(IPv4Address("10.96.0.6"), 80)
 ROUTE = Endpoint(IPv4Address("169.254.7.7"), 30_000)
 NEAR = Peer("e1", (10.0, 0.0, 0.0), 80.0, WIFI)
 NOW_S = 1000.0
@@ -89,7 +90,8 @@ def test_traffic_leaves_the_link_before_its_range_ends() -> None:
 
 
 def test_traffic_moves_back_before_another_peer_is_linked() -> None:
-    far, better = replace(NEAR, position=(-75.0, 0.0, 0.0)), Peer("e2", (60.0, 0.0, 0.0), 80.0, WIFI)
+    far = replace(NEAR, position=(-75.0, 0.0, 0.0))
+    better = Peer("e2", (60.0, 0.0, 0.0), 80.0, WIFI)
     flight = Track((3.0, 0.0, 0.0), 3.0, ((300.0, 0.0, 0.0),))
     ranges = IN_CONTACT | {"e2": LearnedRange(last_beacon_s=NOW_S)}
     found = actions(replace(DIRECT, track=flight, traffic=(replace(TRAFFIC, peers=(far, better)),), ranges=ranges))
@@ -197,7 +199,8 @@ def test_range_model_forgets_peers_that_are_not_planned() -> None:
 
 
 def test_loss_well_inside_the_range_does_not_shorten_it() -> None:
-    near, far = range_model(10.0), range_model(64.0)
+    near = range_model(10.0)
+    far = range_model(64.0)
     near.on_link_lost("e1", NOW_S)
     assert (near.ranges["e1"].range_factor, near.ranges["e1"].failures) == (1.0, 1)
     far.on_link_lost("e1", NOW_S)
@@ -217,7 +220,8 @@ def test_range_is_restored_by_a_beacon_from_where_the_link_broke() -> None:
 
 
 def test_rate_is_learned_only_well_inside_the_range() -> None:
-    inside, edge = range_model(10.0), range_model(79.0)
+    inside = range_model(10.0)
+    edge = range_model(79.0)
     for found in (inside, edge):
         found.on_measurement("e1", replace(WIFI, ingress_mbps=6.0))
     assert inside.ranges["e1"].rate_factor < 1.0

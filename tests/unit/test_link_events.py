@@ -25,7 +25,8 @@ def reasons(told: LinkReport, now: LinkReport) -> list[str]:
     return [reason for reason, _ in link_changes(told, now)]
 
 
-UP, DIRECT = report("Up"), report("Up", "direct", 1, "it is faster")
+UP = report("Up")
+DIRECT = report("Up", "direct", 1, "it is faster")
 
 
 def test_link_events_are_in_order() -> None:

@@ -165,7 +165,8 @@ def test_peer_that_failed_to_pair_is_retried_after_the_back_off() -> None:
 
 def test_back_off_of_unresponsive_peer_is_short_only_without_another_link() -> None:
     learned = functools.reduce(with_failure, [100.0] * 9, LearnedRange())
-    at, both = Track((0.0, 0.0, 0.0)), [peer("e1", 0.0), peer("e2", 78.0)]
+    at = Track((0.0, 0.0, 0.0))
+    both = [peer("e1", 0.0), peer("e2", 78.0)]
     assert decide(at, both[:1], ranges={"e1": learned}, now_s=103.9).peer == ""
     assert decide(at, both[:1], ranges={"e1": learned}, now_s=104.0).peer == "e1"
     up = LinkState(LinkPhase.UP, "e2", 40.0)
@@ -219,7 +220,8 @@ def test_path_choice_takes_the_better_path_with_hysteresis() -> None:
 
 
 def test_traffic_leaves_the_link_before_its_range_ends() -> None:
-    up, node = LinkState(LinkPhase.UP, "e1", 0.0), peer("e1", 0.0)
+    up = LinkState(LinkPhase.UP, "e1", 0.0)
+    node = peer("e1", 0.0)
     outbound = Track((75.0, 0.0, 0.0), 6.0, ((400.0, 0.0, 0.0),))
     assert leaves_range(outbound, node, LearnedRange(), up, SETTINGS)
     assert not leaves_range(outbound, node, LearnedRange(range_factor=1.3), up, SETTINGS)

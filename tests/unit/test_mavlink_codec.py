@@ -94,7 +94,8 @@ def test_trailing_zeros_are_cut_and_restored() -> None:
 @pytest.mark.parametrize("seed", [1, 2])
 def test_every_message_of_the_dialect_survives_encoding_and_decoding(seed: int) -> None:
     rng = random.Random(seed)
-    sender, parser = Endpoint(7, 8), Parser()
+    sender = Endpoint(7, 8)
+    parser = Parser()
     for kind in MESSAGE_CLASSES:
         values = random_values(kind, rng)
         (received,) = parser.feed(sender.encode(kind.msgname, values))

@@ -49,7 +49,8 @@ class Keeper(MavlinkAutopilot):
         if self.result:
             return message("MISSION_ACK", type=self.result, mission_type=mavlink.MAV_MISSION_TYPE_FENCE)
         if kind == "MISSION_COUNT":
-            self.items, self.wanted = [], outgoing.integer("count")
+            self.items = []
+            self.wanted = outgoing.integer("count")
         elif kind == "MISSION_ITEM_INT" and outgoing.integer("seq") == len(self.items):
             self.items.append(outgoing)
         elif kind == "MISSION_REQUEST_LIST":

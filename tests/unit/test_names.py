@@ -26,7 +26,8 @@ def divisions(tokens):
     """Return all divisions of words into application, component and optional node, joined by hyphens or dots."""
     found = []
     for i, j in itertools.combinations(range(1, len(tokens) + 1), 2):
-        component, node = "-".join(tokens[i:j]), tokens[j:]
+        component = "-".join(tokens[i:j])
+        node = tokens[j:]
         if not component[0].isalpha():
             continue
         found += [(mark.join(tokens[:i]), component, inner.join(node) or None) for mark in "-." for inner in "-."]

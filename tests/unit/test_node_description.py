@@ -25,7 +25,8 @@ class Node:
     """The files of a node."""
 
     def __init__(self, directory: Path) -> None:
-        self.handed, self.file = directory / "node.json", directory / "node.yaml"
+        self.handed = directory / "node.json"
+        self.file = directory / "node.yaml"
 
     def hand_over(self, pitch: float, name: str = "drone-1") -> None:
         NodeObjectFile(self.handed).write(Drone.from_body(drone(pitch, name)))

@@ -172,7 +172,8 @@ class EventsOfTheCluster(RuleBasedStateMachine):
         return next(r for r in self.cache.informers() if r.kind == kind)
 
     def take(self, kind: Kind, type_: str, body: Body) -> None:
-        key, informer = key_of(body), self.informer(kind)
+        key = key_of(body)
+        informer = self.informer(kind)
         known = informer.get(key) is not None
         informer._take(type_, copy.deepcopy(body))
         # An object deleted before the last response is present again, and its plan stays.
@@ -181,7 +182,8 @@ class EventsOfTheCluster(RuleBasedStateMachine):
 
     @rule(kind=st.sampled_from(KINDS), again=st.booleans())
     def hear(self, kind: Kind, again: bool) -> None:
-        heard, self.unheard[kind] = self.unheard[kind], []
+        heard = self.unheard[kind]
+        self.unheard[kind] = []
         for type_, body in heard:
             for _ in range(1 + again):
                 self.take(kind, type_, body)

@@ -377,7 +377,8 @@ def test_pod_requests_include_sidecars_and_overhead() -> None:
     def asked(**spec: Any) -> float:
         return parse_pod({"metadata": {"name": "p", "namespace": "ns"}, "spec": spec}).requests["cpu"]
 
-    proxy, main = asks("200m", restartPolicy="Always"), asks("300m")
+    proxy = asks("200m", restartPolicy="Always")
+    main = asks("300m")
     assert asked(containers=[main], initContainers=[proxy]) == pytest.approx(0.5)
     assert asked(containers=[main], initContainers=[proxy, asks("400m")]) == pytest.approx(0.6)
     assert asked(containers=[main], initContainers=[asks("400m"), proxy]) == pytest.approx(0.5)

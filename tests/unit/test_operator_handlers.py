@@ -30,7 +30,8 @@ def test_annotations_neither_skip_nor_delay_teardown(noted: str) -> None:
 
 
 def test_failed_teardown_is_retried() -> None:
-    progress, patch = InMemoryProgress("kopf.fractus.dev"), kopf.Patch()
+    progress = InMemoryProgress("kopf.fractus.dev")
+    patch = kopf.Patch()
     record: Any = {"started": "2026-01-01T00:00:00+00:00", "delayed": "2026-01-01T00:00:05+00:00", "retries": 1}
     progress.store(key=TEARDOWN, record=record, body=body(), patch=patch)
     assert json.loads(patch["metadata"]["annotations"][NOTE]) == record, "whose change wakes kopf"
@@ -44,7 +45,8 @@ def test_failed_teardown_is_retried() -> None:
 
 async def test_unchanged_progress_is_not_stored_again() -> None:
     """Else kopf waits for the event of a patch that changes nothing, and never tries again."""
-    progress, patch = InMemoryProgress("kopf.fractus.dev"), kopf.Patch()
+    progress = InMemoryProgress("kopf.fractus.dev")
+    patch = kopf.Patch()
     handler: Any = SimpleNamespace(id=TEARDOWN)
     failed = Outcome(final=False, delay=5.0, exception=kopf.TemporaryError("later"))
     state = State.from_scratch().with_purpose("delete").with_handlers([handler]).with_outcomes({TEARDOWN: failed})

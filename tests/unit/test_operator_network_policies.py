@@ -40,7 +40,8 @@ def may_call(application: Application, sender: Body | str, instance: str) -> boo
     return not policies or any(selects(peer["podSelector"], sender) for peer in rules if "podSelector" in peer)
 
 
-BASE, EDGE = "traffic-image-checker", "traffic-image-checker-edge-1"
+BASE = "traffic-image-checker"
+EDGE = "traffic-image-checker-edge-1"
 
 
 def test_network_policy_allows_only_callers_to_cloud_base() -> None:

@@ -47,7 +47,8 @@ class Cluster:
         self.looks = 0
         self.deleted: list[str] = []
         self.labels: list[str] = []
-        self.fails, self.refuses = fails, refuses
+        self.fails = fails
+        self.refuses = refuses
 
     async def get(self, kind: Any, name: str, namespace: str) -> Any:
         assert (kind.name, name, namespace) == ("Deployment", "fractus-operator", "fractus-system")

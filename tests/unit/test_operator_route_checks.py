@@ -65,7 +65,8 @@ class Scene:
 
 
 async def test_route_check_runs_in_a_thread_and_is_cached(check: FakeCheck) -> None:
-    scene, present = Scene(), plan()
+    scene = Scene()
+    present = plan()
     assert scene.lookup(present) is present
     assert scene.lookup(present) is present
     check.go.set()
@@ -82,7 +83,8 @@ async def test_route_check_runs_in_a_thread_and_is_cached(check: FakeCheck) -> N
 
 
 async def test_route_check_of_other_rules_is_not_used(check: FakeCheck) -> None:
-    scene, present = Scene(), plan()
+    scene = Scene()
+    present = plan()
     check.go.set()
     scene.lookup(present, rules=1)
     async with asyncio.timeout(20.0):
@@ -92,7 +94,9 @@ async def test_route_check_of_other_rules_is_not_used(check: FakeCheck) -> None:
 
 
 async def test_route_check_does_not_replace_newer_plan(check: FakeCheck) -> None:
-    scene, present, newer = Scene(), plan(), plan()
+    scene = Scene()
+    present = plan()
+    newer = plan()
     scene.lookup(present)
     await scene.until(lambda: bool(check.plans))
     scene.checks.put(KEY, newer, 1)
@@ -128,7 +132,9 @@ async def test_failed_route_check_is_counted_and_cached(
         raise KeyError("a zone that is none")
 
     monkeypatch.setattr(route_check_cache, "with_legality", broken)
-    scene, present, before = Scene(), plan(), count()
+    scene = Scene()
+    present = plan()
+    before = count()
     for failures in (1, 1, 2):
         scene.now += timedelta(minutes=2) if failures == 2 else timedelta()
         assert scene.lookup(present) is present

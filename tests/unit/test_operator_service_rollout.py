@@ -105,7 +105,8 @@ def test_one_of_twenty_nodes_is_replaced_at_a_time_in_large_fleet() -> None:
 
 def test_latest_revision_has_highest_number() -> None:
     services = NodeServices("fractus-system")
-    old, new = pod(revision="old"), pod(revision="new")
+    old = pod(revision="old")
+    new = pod(revision="new")
     for one in (old, new):
         services.pod_changed((one.namespace, one.name), None, one)
     assert services.is_current(old), "no revision is known yet"
@@ -176,7 +177,8 @@ def test_clock_of_node_does_not_affect_staleness(jump: str) -> None:
 
 
 def test_report_timeout_depends_on_report_period() -> None:
-    silence, standing = StaleNodeDetector(), drone(at(0), "inactive")
+    silence = StaleNodeDetector()
+    standing = drone(at(0), "inactive")
     spec = {"location": {"lat": 1, "lon": 2}}
     body = {"apiVersion": V1, "kind": "EdgeNode", "metadata": {"name": "e"}, "spec": spec}
     edge = EdgeNode.from_body({**body, "status": {"lastSeen": at(0)}})
@@ -193,8 +195,10 @@ def test_node_without_report_is_not_stale() -> None:
 
 
 def test_api_server_outage_makes_no_node_stale() -> None:
-    now_s, hears = [0.0], [True]
-    clock, silence = ObservationClock(lambda: now_s[0], lambda: hears[0]), StaleNodeDetector()
+    now_s = [0.0]
+    hears = [True]
+    clock = ObservationClock(lambda: now_s[0], lambda: hears[0])
+    silence = StaleNodeDetector()
 
     def silent_after(seconds: int) -> bool:
         found = False
@@ -318,7 +322,8 @@ async def test_missing_successor_pod_stops_rollout(cache: ClusterCache) -> None:
 
 
 async def test_node_that_is_never_ready_does_not_stop_rollout(cache: ClusterCache) -> None:
-    api, now_s = Api(), [0.0]
+    api = Api()
+    now_s = [0.0]
     rollout = ServiceRollout(api, cache, reported(cache, api), lambda: now_s[0])
     await rollout.step()
     removed(cache, pod("d1", "old"))
@@ -360,7 +365,8 @@ async def test_refused_deletion_does_not_stop_rollout(cache: ClusterCache) -> No
 
 @pytest.mark.parametrize("seen", [None, "2026-01-01T00:00:00z", "yesterday"])
 async def test_report_times_are_parsed(cache: ClusterCache, seen: str | None) -> None:
-    api, now_s = Api(), [0.0]
+    api = Api()
+    now_s = [0.0]
     watch = NodeLivenessController(cache, reported(cache, api), lambda: now_s[0])
     await watch.step()
     api.objects["d1"]["status"] = {"lastSeen": seen} if seen else {}

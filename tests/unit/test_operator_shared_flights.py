@@ -98,7 +98,8 @@ def grant(name: str, uid: str, created: str) -> Grant:
 
 def test_guest_claims_no_drone() -> None:
     plans = {("default", "guest"): OwnedPlan("g", RIDE), ("default", "traffic"): OwnedPlan("t", OWN)}
-    old, new = grant("guest", "g", "2026-01-01T00:00:00Z"), grant("traffic", "t", "2026-01-02T00:00:00Z")
+    old = grant("guest", "g", "2026-01-01T00:00:00Z")
+    new = grant("traffic", "t", "2026-01-02T00:00:00Z")
     assert claims(plans, [old, new])["d"].uid == "t"
     # Without any plan it is not known which application shared the flight.
     assert claims({}, [old, new])["d"].uid == "g"
@@ -110,7 +111,8 @@ def test_remaining_grant_of_guest_claims_no_drone(left_by: str | None) -> None:
     if left_by is not None:
         # It has its own drone now, and its Grant on the previous drone is not deleted yet.
         plans["default", "guest"] = OwnedPlan("g", OWN.model_copy(update={"drone": DroneChoice(node="e")}))
-    left, flown_by = grant("guest", "g", "2026-01-01T00:00:00Z"), grant("traffic", "t", "2026-01-02T00:00:00Z")
+    left = grant("guest", "g", "2026-01-01T00:00:00Z")
+    flown_by = grant("traffic", "t", "2026-01-02T00:00:00Z")
     for grants in ([left, flown_by], [flown_by, left]):
         assert claims(plans, grants)["d"].uid == "t"
     # A plan alone is no claim where another application may still fly by a grant.
@@ -119,7 +121,8 @@ def test_remaining_grant_of_guest_claims_no_drone(left_by: str | None) -> None:
 
 def test_older_grant_decides_between_two_claims() -> None:
     plans = {("default", "a"): OwnedPlan("a", OWN), ("default", "traffic"): OwnedPlan("t", OWN)}
-    old, new = grant("traffic", "t", "2026-01-01T00:00:00Z"), grant("a", "a", "2026-01-02T00:00:00Z")
+    old = grant("traffic", "t", "2026-01-01T00:00:00Z")
+    new = grant("a", "a", "2026-01-02T00:00:00Z")
     assert claims(plans, [old, new])["d"].uid == "t"
     assert claims(plans, [])["d"].uid == "a"
 
@@ -135,7 +138,8 @@ def pod(name: str, node: str | None, cpu: float, **more: Any) -> PodView:
 
 def test_bookings_follow_pods() -> None:
     rng = random.Random(4)
-    bookings, pods = Bookings(), {}
+    bookings = Bookings()
+    pods = {}
     for _ in range(300):
         name = f"p{rng.randrange(20)}"
         new = pod(name, rng.choice([None, "a", "b"]), rng.choice([0.25, 0.5]), finished=rng.random() < 0.2)
@@ -148,7 +152,8 @@ def test_bookings_follow_pods() -> None:
 
 
 def test_planned_instance_is_booked_once_and_own_pods_are_free() -> None:
-    bookings, mine = Bookings(), pod("mine", "a", 1.0, app="me")
+    bookings = Bookings()
+    mine = pod("mine", "a", 1.0, app="me")
     for each in (mine, pod("theirs", "a", 2.0, app="them"), pod("bare", "a", 4.0)):
         bookings.pod_changed(None, each)
     bookings.plan_changed(("ns", "me"), [PlannedRequest("mine-2", "b", {"cpu": 8.0})])

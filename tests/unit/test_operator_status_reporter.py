@@ -44,7 +44,8 @@ class Statuses:
 
 def new() -> tuple[Statuses, ClusterCache, StatusReporter, Submitted]:
     """An application without a status."""
-    api, cache = Statuses(), ClusterCache(cast(Store, None))
+    api = Statuses()
+    cache = ClusterCache(cast(Store, None))
     submitted = parse_application({k: v for k, v in INPUT["application"].items() if k != "status"})
     cache.applications.record_write(submitted.key, submitted.body)
     return api, cache, StatusReporter(cast(Any, api), cache.applications, lambda: NOW), submitted

@@ -158,7 +158,8 @@ def test_application_is_validated_again_when_it_or_rules_change() -> None:
         body["metadata"] |= {"namespace": "ns", "uid": uid, "generation": generation}
         return Application.from_body(body)
 
-    memory, known = _ApplicationState(), inventory()
+    memory = _ApplicationState()
+    known = inventory()
     lacking = replace(known, depots={})
     memory.check(applied(1, "a"), known, 1)
     memory.check(applied(1, "a"), lacking, 1)
@@ -197,7 +198,8 @@ async def test_infeasible_application_wakes_when_capacity_is_released(monkeypatc
 
 
 APPLICATION = {"apiVersion": V1, "kind": "Application", "spec": {}}
-HOST, SHARING = ("ns", "host"), ("ns", "sharing")
+HOST = ("ns", "host")
+SHARING = ("ns", "sharing")
 
 
 def plan_body(node: str, version: int) -> dict[str, Any]:

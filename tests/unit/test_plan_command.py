@@ -159,7 +159,8 @@ def test_passengers_come_along_with_a_driver_of_the_same_manifests(run):
 
 
 def test_nodes_give_resources_and_readiness(run):
-    cloud, flying = node("c", "cloud"), node("d1", "drone")
+    cloud = node("c", "cloud")
+    flying = node("d1", "drone")
     result = run([*SCENE, TRAFFIC, cloud, flying, node("e1", "edge", cpu="50m")], "-o", "yaml")
     plan = DeploymentPlan.from_body(yaml.safe_load(result.stdout)).spec
     assert nodes_of(plan, "ImageChecker") == [None]
@@ -277,7 +278,8 @@ def test_a_kind_of_another_project_is_passed_over(run):
 
 
 def test_broken_yaml_and_json_name_the_line(tmp_path):
-    bad_yaml, bad_json = tmp_path / "bad.yaml", tmp_path / "bad.json"
+    bad_yaml = tmp_path / "bad.yaml"
+    bad_json = tmp_path / "bad.json"
     bad_yaml.write_text("kind: Drone\n  metadata: [")
     bad_json.write_text('{\n"kind": }')
     for file, line in ((bad_yaml, 2), (bad_json, 2)):
@@ -296,7 +298,8 @@ def test_unknown_plug_in_is_named(run):
 
 def test_plug_ins_are_entry_points(run, monkeypatch):
     class Entry:
-        name, value = "last", "module:last"
+        name = "last"
+        value = "module:last"
 
         def load(self):
             return lambda facts: facts.drone.name == "d2"

@@ -207,7 +207,8 @@ def test_legality_uses_every_zone_near_path():
     rng = random.Random(5)
 
     def area():
-        x, y = rng.uniform(-3000, 3000), rng.uniform(-3000, 3000)
+        x = rng.uniform(-3000, 3000)
+        y = rng.uniform(-3000, 3000)
         size = rng.choice([5, 300, 3000, 30_000])
         if rng.random() < 0.5:
             return {"circle": {"center": at(x, y), "radius": size}}

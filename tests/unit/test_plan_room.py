@@ -162,7 +162,8 @@ def test_locations_share_nodes_for_most_instances(wanted, data):
 
 def test_location_yields_node_that_another_location_needs():
     edges = [edge("a", (0, 0)), edge("b", (30, 0))]
-    both, only = ((0, 0), 50, 1), ((0, 0), 10, 1)
+    both = ((0, 0), 50, 1)
+    only = ((0, 0), 10, 1)
     found = hosted(application(component_at("S", both, only)), inventory(edges=edges))
     assert found == {("S", 0): ["b"], ("S", 1): ["a"]}
     assert hosted(application(component_at("S", both), component_at("T", only)), inventory(edges=edges))["S", 0] == [

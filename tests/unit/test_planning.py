@@ -9,7 +9,8 @@ from fractus_core.api import Application, Depot, Drone, EdgeNode, InvalidObject
 from fractus_core.geo import LocalFrame
 from fractus_core.planning import Host, Infeasible, Inventory, Settings, instance_name, plan
 
-LAT, LON = 39.3606, 22.9307
+LAT = 39.3606
+LON = 22.9307
 FRAME = LocalFrame(LAT, LON)
 ALL = ["Arm", "Disarm", "Takeoff", "Land", "SetSpeed", "GetSpeed", "Goto", "Hover", "GetPosition", "ReturnToLaunch"]
 CAMERA = ["CaptureImage", "RetrieveImage", "ListImages"]
@@ -173,7 +174,8 @@ def unready(node, status="False", message="no certificate"):
 def test_unready_edge_node_keeps_instances_but_gets_no_new_ones():
     ground_viewer = component("GroundViewer", "edge", locations=[{"center": at(0, 0), "radius": 100, "instances": "*"}])
     app = application(ground_viewer)
-    good, bad = edge("e1", (0, 0)), edge("e2", (10, 0))
+    good = edge("e1", (0, 0))
+    bad = edge("e2", (10, 0))
     result = plan(app, inventory(edges=[good, unready(bad)]))
     assert nodes_of(result, "GroundViewer") == ["e1"]
     assert [(r.node, r.reason, r.message) for r in result.rejected] == [("e2", "EdgeNodeNotReady", "no certificate")]
@@ -362,7 +364,8 @@ def test_plan_does_not_depend_on_inventory_order():
     first = plan(app, inventory(fleet, edges))
     for seed in range(5):
         shuffled = random.Random(seed)
-        f, e = fleet[:], edges[:]
+        f = fleet[:]
+        e = edges[:]
         shuffled.shuffle(f)
         shuffled.shuffle(e)
         assert plan(app, inventory(f, e)) == first

@@ -140,10 +140,15 @@ def test_goto_of_accelerating_drone_needs_more_room() -> None:
     assert slowing < known - 2
     assert unknown == measured > steady + 3
     # Computed in steps: latency, end of the acceleration by the jerk limit, then ArduPilot's stopping distance.
-    x, v, a, t = 0.0, 4.0, 2.5, 0.0
+    x = 0.0
+    v = 4.0
+    a = 2.5
+    t = 0.0
     while t < 0.3 or a > 0:
         a = a if t < 0.3 else max(a - 5.0 * 1e-4, 0.0)
-        x, v, t = x + v * 1e-4, v + a * 1e-4, t + 1e-4
+        x = x + v * 1e-4
+        v = v + a * 1e-4
+        t = t + 1e-4
     x += v * 0.25 + 1.25 + v * v / 5
     assert unknown == pytest.approx(x, abs=0.05)
 

@@ -82,13 +82,15 @@ def test_times_homes_and_ways_home(tmp_path: pathlib.Path) -> None:
             body["spec"] |= {"altitudeReference": "amsl", "upperLimit": 115, "lowerLimit": 105}
     file.write_text(yaml.safe_dump_all(bodies))
     paths = {"policies": str(tmp_path / "field"), "drone": str(tmp_path / "field" / "place.yaml")}
-    home, near = ("--home", "39.37,22.93,100"), "39.370701,22.932303,10"
+    home = ("--home", "39.37,22.93,100")
+    near = "39.370701,22.932303,10"
     before = ask("Goto", INSIDE, "--time", "2026-06-01T11:59:59Z", *home, at=near, **paths)
     after = ask("Goto", INSIDE, "--time", "2026-06-01T14:00:00+02:00", *home, at=near, **paths)
     assert (before["action"], after["action"]) == ("takeover", "allow")
     assert ask("Goto", {**FREE, "alt": 20}, *home, **paths)["args"]["alt"] == 15.0
     behind = {"lat": 39.37055, "lon": 22.93315}
-    spot, early = "39.37000,22.93315,10", ("--time", "2026-06-01T11:00:00Z", *home)
+    spot = "39.37000,22.93315,10"
+    early = ("--time", "2026-06-01T11:00:00Z", *home)
     assert ask("Goto", behind, *early, at=spot, **paths)["code"] == "WayHomeBlocked"
     assert ask("Goto", behind, *early, "--way-home", "retraced", at=spot, **paths)["action"] == "allow"
 
@@ -157,7 +159,8 @@ def test_an_argument_out_of_range_is_an_answer() -> None:
 def test_a_drone_in_a_file_with_policies_whose_zones_are_in_another(tmp_path: pathlib.Path) -> None:
     bodies = list(yaml.safe_load_all((FIELD / "place.yaml").read_text()))
     policies = list(yaml.safe_load_all((FIELD / "policies.yaml").read_text()))
-    zones, others = tmp_path / "zones.yaml", tmp_path / "others.yaml"
+    zones = tmp_path / "zones.yaml"
+    others = tmp_path / "others.yaml"
     zones.write_text(yaml.safe_dump_all(b for b in bodies if b["kind"] == "Zone"))
     others.write_text(yaml.safe_dump_all([*(b for b in bodies if b["kind"] != "Zone"), *policies]))
     answer = ask("Goto", INSIDE, at="39.370701,22.932303,10", policies=str(zones), drone=str(others))

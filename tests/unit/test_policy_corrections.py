@@ -68,7 +68,8 @@ def test_altitude_correction_into_slower_zone_also_corrects_speed() -> None:
 
 def test_takeoff_correction_complies_with_limits_of_entered_zone() -> None:
     high = zone("high", EVERYWHERE, lower=20, upper=60)
-    climb, ground = Call("Takeoff", TakeoffArgs(5)), at(alt=0.0, in_air=False)
+    climb = Call("Takeoff", TakeoffArgs(5))
+    ground = at(alt=0.0, in_air=False)
     taller = ask(compiled(altitude(lowerLimit=30), altitude("tall", [high], lowerLimit=40)), climb, ground)
     assert (taller.action, taller.args) == ("correct", TakeoffArgs(40))
     assert taller.policies == ("altitudes", "tall")
@@ -80,7 +81,8 @@ def test_takeoff_correction_complies_with_limits_of_entered_zone() -> None:
 
 def test_corrections_through_stacked_zones_settle_or_are_denied() -> None:
     floors = [altitude(f"f{n}", [zone(f"z{n}", EVERYWHERE, lower=n * 10, upper=n * 10 + 5)], lowerLimit=n * 10 + 10) for n in range(1, 11)]  # fmt: skip
-    climb, ground = Call("Takeoff", TakeoffArgs(5)), at(alt=0.0, in_air=False)
+    climb = Call("Takeoff", TakeoffArgs(5))
+    ground = at(alt=0.0, in_air=False)
     short = ask(compiled(altitude(lowerLimit=10), *floors[:4]), climb, ground)
     assert (short.action, short.args) == ("correct", TakeoffArgs(50))
     endless = ask(compiled(altitude(lowerLimit=10), *floors), climb, ground)
@@ -177,8 +179,10 @@ class World:
 
     def _zone(self, name: str, size: float) -> tuple[dict[str, Any], Corners, tuple[float, float]]:
         draw = self.draw
-        x, y = draw.uniform(-60, 60), draw.uniform(-60, 60)
-        count, turn = draw.randint(3, 7), draw.uniform(0, 6)
+        x = draw.uniform(-60, 60)
+        y = draw.uniform(-60, 60)
+        count = draw.randint(3, 7)
+        turn = draw.uniform(0, 6)
         angles = [turn + 2 * math.pi * n / count for n in range(count)]
         radii = [size * draw.uniform(0.5, 1) for _ in angles]
         corners = [(x + r * math.cos(a), y + r * math.sin(a)) for a, r in zip(angles, radii, strict=True)]
@@ -198,7 +202,9 @@ class World:
         }
 
     def _limit(self, name: str, kind: str, low: float, high: float) -> None:
-        zones, corners, band = [], [], (-math.inf, math.inf)
+        zones = []
+        corners = []
+        band = (-math.inf, math.inf)
         if self.draw.random() < 0.7:
             area, corners, band = self._zone(f"{name}-z", 100)
             zones = [area]
@@ -230,7 +236,9 @@ class World:
         """Return a request in some situation."""
         draw = self.draw
         method = draw.choice(("Goto", "Goto", "Goto", "Takeoff", "SetSpeed", "SetVelocity"))
-        x, y, alt = draw.uniform(-80, 80), draw.uniform(-80, 80), draw.uniform(3, 90)
+        x = draw.uniform(-80, 80)
+        y = draw.uniform(-80, 80)
+        alt = draw.uniform(3, 90)
         motion: dict[str, float] = {}
         if draw.random() < 0.4:
             motion = {
@@ -267,7 +275,8 @@ class Motion:
 def motion(args: Args, now: Situation) -> Motion:
     assert now.lat is not None
     assert now.lon is not None
-    (x, y), here = FRAME.xy(now.lat, now.lon), now.altitude_m
+    x, y = FRAME.xy(now.lat, now.lon)
+    here = now.altitude_m
     match args:
         case GotoArgs(lat, lon, alt, _, _, speed_mps):
             to = FRAME.xy(lat, lon)
@@ -298,7 +307,8 @@ def broken(rules: list[Plain], args: Args, now: Situation) -> Iterator[str]:
 
 
 def _breaks(rule: Plain, done: Motion, along: list[bool]) -> bool:
-    end, fast = done.heights[1], done.fast
+    end = done.heights[1]
+    fast = done.fast
     met = any(along) and rule.meets(min(done.heights), max(done.heights))
     match rule.kind:
         case "speed" if fast is not None:

@@ -214,7 +214,8 @@ def test_judge_handles_thousands_of_policies_at_one_place() -> None:
 
 def test_altitude_bands_of_every_datum_are_respected() -> None:
     amsl = compiled(exclusion(box(50, -20, 80, 20), lower=90, upper=115, reference="amsl"), services=SERVICES)
-    low, high = at(40, 0, alt=10), at(40, 0, alt=30)
+    low = at(40, 0, alt=10)
+    high = at(40, 0, alt=30)
     push = Call("SetVelocity", VelocityArgs(0, 9, hold_s=2))
     assert ask(amsl, push, low).action == "deny", "home lies at 100 m"
     assert ask(amsl, push, high).action == "allow"

@@ -33,7 +33,8 @@ from policy_world import (
     zone,
 )
 
-NAN, INF = math.nan, math.inf
+NAN = math.nan
+INF = math.inf
 
 
 def test_plain_request_is_allowed_unchanged() -> None:
@@ -163,7 +164,8 @@ def test_motion_is_denied_when_position_is_unknown() -> None:
 
 def test_altitude_is_corrected_to_enforced_limit() -> None:
     grant = compiled(altitude(upperLimit=15, lowerLimit=5, action="enforce"))
-    high, low = ask(grant, goto(10, 10, 20)), ask(grant, goto(10, 10, 4))
+    high = ask(grant, goto(10, 10, 20))
+    low = ask(grant, goto(10, 10, 4))
     assert (high.action, high.code, high.args.alt, high.policies) == (
         "correct",
         "AltitudeAboveLimit",
@@ -269,7 +271,8 @@ def test_zone_applies_only_while_its_schedule_is_active() -> None:
         scheduled = {**zone("z", box(*area)), "schedule": [{"start": "22:00", "end": "06:00"}]}
         return policy("night", "GeofenceControl", kind, [scheduled])
 
-    noon, midnight = at(), at(time_s=NOW + 12 * 3600)
+    noon = at()
+    midnight = at(time_s=NOW + 12 * 3600)
     shut = compiled(at_night("exclusion", 50, -20, 80, 20))
     assert ask(shut, goto(60, 0), noon).action == "allow"
     assert ask(shut, goto(60, 0), midnight).code == "InsideExclusionZone"

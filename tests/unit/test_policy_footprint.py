@@ -22,11 +22,13 @@ _cases = settings(max_examples=examples(400), deadline=None, derandomize=True)
 
 
 def rotation(axis: int, degrees: float) -> np.ndarray:
-    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    c = math.cos(math.radians(degrees))
+    s = math.sin(math.radians(degrees))
     matrix = np.eye(3)
     i, j = ((1, 2), (2, 0), (0, 1))[axis]
     matrix[i, i] = matrix[j, j] = c
-    matrix[i, j], matrix[j, i] = -s, s
+    matrix[i, j] = -s
+    matrix[j, i] = s
     return matrix
 
 
@@ -77,10 +79,12 @@ def test_footprint_contains_everything_a_picture_may_show(
     assume(direction[2] > 1e-6 and above_m >= 0)
     for ground_m in (0.0, -errors[2]):
         reach = (above_m - ground_m) / direction[2]
-        north, east = direction[0] * reach, direction[1] * reach
+        north = direction[0] * reach
+        east = direction[1] * reach
         if math.hypot(north, east) > MAX_SIGHT_M:
             continue
-        x, y = (errors[0] * turn[0] * 0.7, errors[0] * turn[1] * 0.7)
+        x = errors[0] * turn[0] * 0.7
+        y = errors[0] * turn[1] * 0.7
         shown = view(now)
         point = shapely.Point(x + east, y + north)
         assert shown.sight.dwithin(point, shown.margin_m + 1e-6)
@@ -154,7 +158,8 @@ def test_footprint_shows_zones_with_altitude_bands() -> None:
 def test_footprint_of_exposure_covers_the_motion_between_its_ends() -> None:
     private = policy("p", "PrivacyControl", "camera", [zone("z", box(40, -5, 45, 5))], action="refuse")
     grant = compiled(private)
-    now, later = at(0, 0, alt=10), at(100, 0, alt=10)
+    now = at(0, 0, alt=10)
+    later = at(100, 0, alt=10)
     assert judge_privacy(now, grant).action == judge_privacy(later, grant).action == "allow"
     assert judge_privacy(replace(later, exposure=(now, later)), grant).code == "PrivacyZone"
     assert judge_privacy(replace(later, exposure=(now, Situation(time_s=NOW))), grant).code == "PrivacyZone", (
@@ -187,7 +192,8 @@ def test_combined_filters_satisfy_each_filter(required: list[Filter], more: list
 
 
 def test_combined_filters_use_stricter_face_method() -> None:
-    soft, hard = Filter("blurFaces", "gaussian", "refuse"), Filter("blurFaces", "pixelate", "black")
+    soft = Filter("blurFaces", "gaussian", "refuse")
+    hard = Filter("blurFaces", "pixelate", "black")
     assert combine_filters([soft, hard]) == (Filter("blurFaces", "pixelate", "refuse"),)
     assert combine_filters([soft]) == (soft,)
     assert remaining_filters([hard], [soft]) == (hard,), "a soft blur does not satisfy pixelation"

@@ -71,7 +71,8 @@ def test_goto_from_home_may_leave_operation_area_into_corridor() -> None:
 def test_partial_control_driver_may_fly_where_system_can_return_around_zone() -> None:
     fields = {"operationArea": [box(50, -20, 150, 20)], "corridor": [box(-30, -60, 150, 60)], "control": "partial"}
     retracing = at(60, 0, airframe=Airframe(retraces=True))
-    beside, across = exclusion(box(20, -10, 40, 10)), exclusion(box(20, -70, 40, 70))
+    beside = exclusion(box(20, -10, 40, 10))
+    across = exclusion(box(20, -70, 40, 70))
     assert ask(compiled(beside, **fields), goto(100, 0), retracing).action == "allow"
     assert ask(compiled(across, **fields), goto(100, 0), retracing).code == "WayHomeBlocked"
     assert ask(compiled(beside, **fields), goto(100, 0), at(60, 0)).code == "WayHomeBlocked", "it flies home straight"
@@ -79,7 +80,9 @@ def test_partial_control_driver_may_fly_where_system_can_return_around_zone() ->
 
 def test_goto_into_through_or_near_exclusion_zone_is_denied() -> None:
     grant = compiled(exclusion(box(50, -20, 80, 20)))
-    inside, through, near = ask(grant, goto(60, 0)), ask(grant, goto(150, 0)), ask(grant, goto(48, 0))
+    inside = ask(grant, goto(60, 0))
+    through = ask(grant, goto(150, 0))
+    near = ask(grant, goto(48, 0))
     assert (inside.action, inside.code) == ("deny", "InsideExclusionZone")
     assert "10.0 m inside" in inside.reason
     assert through.code == "LegThroughExclusionZone"

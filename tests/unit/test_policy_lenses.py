@@ -96,7 +96,8 @@ def test_bounding_lens_covers_every_zone_a_picture_shows(
     # Focal length at which the sides of the picture are at that angle.
     side = projected(model, np.array([[math.tan(half), 0.0, 1.0]]), 1.0, (0.0, 0.0), k)[0][0]
     assume(side > 0.01)
-    focal, centre = _WIDTH / 2 / side, (_WIDTH / 2, height / 2)
+    focal = _WIDTH / 2 / side
+    centre = (_WIDTH / 2, height / 2)
     lens = bounding_lens(described(model, half, height, k, told=told))
     assert lens is not None
     exact = Lens(lens.horizontal_deg, lens.vertical_deg, error_deg=0.0)
@@ -105,8 +106,10 @@ def test_bounding_lens_covers_every_zone_a_picture_shows(
     assert shown is not None
     # Points of the ground, nearer ones more often, and their positions in the picture.
     rng = np.random.default_rng(seed)
-    reach, bearing = alt * 10 ** rng.uniform(-2, 1.7, _POINTS), rng.uniform(0, 2 * math.pi, _POINTS)
-    north, east = reach * np.cos(bearing), reach * np.sin(bearing)
+    reach = alt * 10 ** rng.uniform(-2, 1.7, _POINTS)
+    bearing = rng.uniform(0, 2 * math.pi, _POINTS)
+    north = reach * np.cos(bearing)
+    east = reach * np.sin(bearing)
     world = np.stack([north, east, np.full(_POINTS, alt)], axis=1)
     turned = rotation(2, turn[2]) @ rotation(1, turn[1]) @ rotation(0, turn[0]) @ rotation(1, -90)
     ahead, right, down = (world @ turned).T

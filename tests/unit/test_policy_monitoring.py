@@ -81,7 +81,8 @@ def test_monitor_stops_drone_leaving_operation_area_or_inclusion_zone() -> None:
 
 
 def test_monitor_stops_system_flight_only_when_it_makes_things_worse() -> None:
-    kept, out = compiled(inclusion(box(-50, -50, 50, 50), "land")), compiled(exclusion(WALL, "revoke"))
+    kept = compiled(inclusion(box(-50, -50, 50, 50), "land"))
+    out = compiled(exclusion(WALL, "revoke"))
     for state, grant, code in (
         (at(0, 45, north_mps=6), kept, "InclusionBorderAhead"),
         (at(0, 60, north_mps=6), kept, "OutsideInclusionZone"),
@@ -98,7 +99,8 @@ def test_monitor_stops_system_flight_only_when_it_makes_things_worse() -> None:
 
 
 def test_monitor_detects_zone_ahead_while_leaving_another() -> None:
-    around, ahead = exclusion(box(-50, -50, 50, 10), "revoke", "around"), exclusion(WALL, "ignore", "ahead")
+    around = exclusion(box(-50, -50, 50, 10), "revoke", "around")
+    ahead = exclusion(WALL, "ignore", "ahead")
     verdict = monitor(at(0, 8, north_mps=12), compiled(around, ahead), system_flies=True)
     assert verdict is None
     verdict = monitor(at(0, 9.5, north_mps=16), compiled(around, ahead), system_flies=True)
@@ -108,7 +110,8 @@ def test_monitor_detects_zone_ahead_while_leaving_another() -> None:
 
 @pytest.mark.parametrize("forward_mps2", [None, 0.0, -2.5])
 def test_drone_flying_into_zone_brakes_before_a_new_command(forward_mps2: float | None) -> None:
-    grant, back = compiled(exclusion(WALL)), goto(0, 0)
+    grant = compiled(exclusion(WALL))
+    back = goto(0, 0)
     heading = replace(at(0, 29, north_mps=7.5), forward_mps2=forward_mps2)
     verdict = judge(back, heading, grant)
     assert (verdict.permits, verdict.brake_first) == (True, True)
@@ -150,7 +153,8 @@ def test_monitor_takes_over_when_position_is_unknown() -> None:
 
 def test_monitor_takeover_of_fast_drone_brakes_first() -> None:
     grant = compiled(exclusion(WALL, "returnToLaunch"))
-    fast, slow = monitor(at(0, 40, north_mps=8), grant), monitor(at(0, 70), grant)
+    fast = monitor(at(0, 40, north_mps=8), grant)
+    slow = monitor(at(0, 70), grant)
     assert fast is not None
     assert slow is not None
     assert (fast.brake_first, slow.brake_first) == (True, False)
@@ -209,7 +213,9 @@ def test_monitor_permits_climb_to_allowed_altitude_despite_link_latency() -> Non
 
 def test_monitor_stops_leg_crossing_new_zone_at_once() -> None:
     """The stop is not delayed to the last possible moment, because the link may be cut by then."""
-    leg, climbing, short = goto(180, 0, 12.0).args, goto(180, 0, 30.0).args, goto(60, 0, 12.0).args
+    leg = goto(180, 0, 12.0).args
+    climbing = goto(180, 0, 30.0).args
+    short = goto(60, 0, 12.0).args
     assert isinstance(leg, GotoArgs)
     assert isinstance(climbing, GotoArgs)
     assert isinstance(short, GotoArgs)
@@ -228,7 +234,9 @@ def test_monitor_stops_leg_crossing_new_zone_at_once() -> None:
 
 
 def test_monitor_permits_climb_ended_by_velocity_despite_link_latency() -> None:
-    grant, up, level = compiled(altitude(upperLimit=16)), (0.0, 0.0, -2.6), (1.0, 0.0, 0.0)
+    grant = compiled(altitude(upperLimit=16))
+    up = (0.0, 0.0, -2.6)
+    level = (1.0, 0.0, 0.0)
     climbing = at(0, 0, 12.5, down_mps=-2.6, latency_s=0.77)
     assert monitor(replace(climbing, pending=(up, level)), grant) is None
     assert correction(monitor(replace(climbing, pending=(level, up)), grant)) == "AltitudeAboveLimit"
@@ -253,7 +261,8 @@ AROUND = box(-50, -50, 50, 50)
 def test_monitor_stops_drone_below_and_above_altitude_band(
     action: str, above: bool, climb_mps: float, grant: Any
 ) -> None:
-    grant, up = grant(action), 1 if above else -1
+    grant = grant(action)
+    up = 1 if above else -1
     stopped = []
     for step in range(200):
         height = 15 - up * (10 - step * 0.1)

@@ -27,27 +27,36 @@ def flown(rng: random.Random, now: Situation, pending: list[Velocity], asked: Ve
         (0.0, 0.0),
     ]
     moments.append(rng.choice([asked.hold_s, asked.hold_s + now.latency_s]))
-    x, y, vx, vy, time_s = 0.0, 0.0, now.east_mps, now.north_mps, 0.0
+    x = 0.0
+    y = 0.0
+    vx = now.east_mps
+    vy = now.north_mps
+    time_s = 0.0
     places = []
     while time_s < moments[-1] or math.hypot(vx, vy) > 0.05:
         tx, ty = wanted[sum(moment <= time_s for moment in moments)]
         change = math.hypot(tx - vx, ty - vy)
         share = min(now.airframe.accel_mps2 * STEP_S / change, 1.0) if change else 0.0
-        vx, vy = vx + (tx - vx) * share, vy + (ty - vy) * share
-        x, y, time_s = x + vx * STEP_S, y + vy * STEP_S, time_s + STEP_S
+        vx = vx + (tx - vx) * share
+        vy = vy + (ty - vy) * share
+        x = x + vx * STEP_S
+        y = y + vy * STEP_S
+        time_s = time_s + STEP_S
         places.append((x, y))
     return places
 
 
 def direction(rng: random.Random, fast: float) -> Velocity:
-    angle, speed = rng.uniform(0, 2 * math.pi), rng.choice([0.0, fast, rng.uniform(0, fast)])
+    angle = rng.uniform(0, 2 * math.pi)
+    speed = rng.choice([0.0, fast, rng.uniform(0, fast)])
     return speed * math.cos(angle), speed * math.sin(angle)
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_velocity_leg_contains_the_flown_path_with_pending_setpoints(seed: int) -> None:
     rng = random.Random(seed)
-    furthest_m, missed_m = 0.0, 0.0
+    furthest_m = 0.0
+    missed_m = 0.0
     for _ in range(150):
         north, east = direction(rng, 9.0)
         pending = [direction(rng, 12.0) for _ in range(rng.choice([1, 1, 2, 3, 7]))]

@@ -149,7 +149,8 @@ def _shortest(zones: list[Corners], start: tuple[float, float], to: tuple[float,
     walls = shapely.union_all([shapely.Polygon(z).buffer(2.5 + CLEARANCES_M[0], quad_segs=4) for z in zones])
     nodes = [start, to, *map(tuple, shapely.get_coordinates(walls.buffer(0.01)))]
     inner = walls.buffer(-1e-3)
-    costs, done = {0: 0.0}, set()
+    costs = {0: 0.0}
+    done = set()
     while True:
         at_ = min((n for n in costs if n not in done), key=costs.__getitem__)
         if at_ == 1:
@@ -168,7 +169,9 @@ def test_route_is_not_much_longer_than_the_shortest(seed: int) -> None:
     draw = random.Random(seed)
     zones: list[Corners] = []
     for x, y in itertools.product(range(20, 90, 34), repeat=2):
-        count, turn, radius = draw.randint(3, 5), draw.uniform(0, 6), draw.uniform(8, 14)
+        count = draw.randint(3, 5)
+        turn = draw.uniform(0, 6)
+        radius = draw.uniform(8, 14)
         angles = [turn + 2 * math.pi * i / count for i in range(count)]
         zones.append([(x + radius * math.cos(a), y + radius * math.sin(a)) for a in angles])
     grant = free(*(exclusion(ring(z), name=f"z{i}") for i, z in enumerate(zones)))
@@ -184,7 +187,9 @@ def test_route_search_handles_a_thousand_zones() -> None:
     zones = []
     for i, (x, y) in enumerate(itertools.product(range(-960, 961, 60), repeat=2)):
         if math.hypot(x, y) > 40:
-            cx, cy, half = x + draw.uniform(-12, 12), y + draw.uniform(-12, 12), draw.uniform(8, 18)
+            cx = x + draw.uniform(-12, 12)
+            cy = y + draw.uniform(-12, 12)
+            half = draw.uniform(8, 18)
             zones.append(zone(f"z{i}", box(cx - half, cy - half, cx + half, cy + half)))
     many = policy("many", "GeofenceControl", "exclusion", zones[:1000])
     grant = free({**many, "zones": zones})

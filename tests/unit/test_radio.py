@@ -10,11 +10,14 @@ from fractus_radio.medium import ATTEMPTS, QUEUE_FRAMES, Medium, Station, airtim
 from fractus_radio.propagation import Propagation
 from fractus_radio.uplink import Uplink
 
-NS3_POWER_DBM, NS3_EXPONENT = 16.02, 3.0
+NS3_POWER_DBM = 16.02
+NS3_EXPONENT = 3.0
 UDP_BYTES = 1400
 FRAME_BYTES = UDP_BYTES + 8 + 20 + 14
 
-A, B, C = b"\x02aaaaa", b"\x02bbbbb", b"\x02ccccc"
+A = b"\x02aaaaa"
+B = b"\x02bbbbb"
+C = b"\x02ccccc"
 
 
 def frame(to: bytes, size: int = FRAME_BYTES) -> bytes:
@@ -30,7 +33,8 @@ def pair(distance_m: float, propagation: Propagation, seed: int = 1) -> Medium:
 
 def udp_mbps(medium: Medium, seconds: float = 2.0) -> float:
     """Payload that arrives while the sender's queue is never empty."""
-    now, arrived = 0.0, 0
+    now = 0.0
+    arrived = 0
     while now < seconds:
         while len(medium.stations["a"].queue) < 10:
             medium.offer("a", frame(B), now)
@@ -71,7 +75,8 @@ def test_small_frames_take_mostly_overhead(size: int) -> None:
 
 def test_both_directions_share_the_air() -> None:
     medium = pair(10, Propagation.reaching(100))
-    now, arrived = 0.0, {"a": 0, "b": 0}
+    now = 0.0
+    arrived = {"a": 0, "b": 0}
     while now < 2.0:
         for name, to in (("a", B), ("b", A)):
             while len(medium.stations[name].queue) < 10:
@@ -86,7 +91,8 @@ def test_both_directions_share_the_air() -> None:
 def test_frames_arrive_in_order_and_once() -> None:
     medium = pair(60, Propagation(NS3_POWER_DBM, NS3_EXPONENT, 1.5), seed=5)
     sent = [frame(B, 100)[:-4] + n.to_bytes(4, "big") for n in range(400)]
-    found, now = [], 0.0
+    found = []
+    now = 0.0
     for one in sent:
         medium.offer("a", one, now)
         while medium.next_s < math.inf:
@@ -142,7 +148,8 @@ def test_the_uplink_has_a_rate_a_delay_and_a_queue() -> None:
     assert not list(uplink.advance(0.0609))
     assert list(uplink.advance(0.0611)) == [b"x" * 1000]
     rng = random.Random(2)
-    now, arrived = 1.0, 0
+    now = 1.0
+    arrived = 0
     while now < 3.0:
         uplink.offer(b"x" * 1500, now)
         now += rng.uniform(0.0005, 0.0015)  # 12 Mbit/s offered

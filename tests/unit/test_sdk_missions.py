@@ -98,7 +98,8 @@ class Remembered:
 
 
 async def test_second_mission_at_control_point_is_refused() -> None:
-    control, flown = cast(fractus.Control, Remembered()), list[fractus.Position]()
+    control = cast(fractus.Control, Remembered())
+    flown = list[fractus.Position]()
     first, second, third = (fractus.Position(lat, 22.0) for lat in (39.0, 39.1, 39.2))
 
     async def goto(waypoint: fractus.Waypoint) -> None:

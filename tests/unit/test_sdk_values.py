@@ -22,7 +22,8 @@ def test_telemetry_position_is_none_if_unknown() -> None:
 async def test_watch_yields_changes_once_and_all_texts() -> None:
     def sample(satellites: int, *texts: str) -> Telemetry:
         message = mobility_pb2.Telemetry(not_ready_reason="it has no home yet")
-        message.gps.fix_type, message.gps.satellites = 3, satellites
+        message.gps.fix_type = 3
+        message.gps.satellites = satellites
         for text in texts:
             message.texts.add(severity=2, text=text)
         return Telemetry.from_proto(message)

@@ -17,8 +17,11 @@ from fractus_services.mobility.mavlink.acknowledgements import (
 from fractus_services.mobility.mavlink.timing import Timing
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-SPEED, MODE = mavlink.MAV_CMD_DO_CHANGE_SPEED, mavlink.MAV_CMD_DO_SET_MODE
-ACCEPTED, DENIED, IN_PROGRESS = mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_DENIED, mavlink.MAV_RESULT_IN_PROGRESS
+SPEED = mavlink.MAV_CMD_DO_CHANGE_SPEED
+MODE = mavlink.MAV_CMD_DO_SET_MODE
+ACCEPTED = mavlink.MAV_RESULT_ACCEPTED
+DENIED = mavlink.MAV_RESULT_DENIED
+IN_PROGRESS = mavlink.MAV_RESULT_IN_PROGRESS
 
 
 def ack(result: int = ACCEPTED, command: int = SPEED, target: int = 245) -> Message:
@@ -60,7 +63,9 @@ def test_transmission_is_lost_after_the_longest_measured_delay(way_s: float, tim
 
 
 async def test_second_acknowledgement_of_a_repeated_command_does_not_deny_the_next_one() -> None:
-    acks, first, later = link(), Answer(), Answer()
+    acks = link()
+    first = Answer()
+    later = Answer()
     acks.sent(SPEED, first, 0.0)
     acks.sent(SPEED, first, 0.7)
     acks.take(ack(), 1.0)
@@ -73,7 +78,9 @@ async def test_second_acknowledgement_of_a_repeated_command_does_not_deny_the_ne
 
 
 async def test_earlier_acceptance_does_not_accept_a_denied_command() -> None:
-    acks, first, later = link(), Answer(), Answer()
+    acks = link()
+    first = Answer()
+    later = Answer()
     for at in (0.0, 0.7):
         acks.sent(SPEED, first, at)
     acks.take(ack(), 1.0)
@@ -85,7 +92,9 @@ async def test_earlier_acceptance_does_not_accept_a_denied_command() -> None:
 
 @pytest.mark.parametrize("way_s", [0.05, 0.5, 1.0, 2.0])
 async def test_lost_transmission_does_not_consume_the_next_acknowledgement(way_s: float) -> None:
-    acks, first, later = link(way_s), Answer(), Answer()
+    acks = link(way_s)
+    first = Answer()
+    later = Answer()
     again = acks.timeout_s
     acks.sent(SPEED, first, 0.0)
     acks.sent(SPEED, first, again)
@@ -97,7 +106,9 @@ async def test_lost_transmission_does_not_consume_the_next_acknowledgement(way_s
 
 
 async def test_acknowledgement_of_an_abandoned_command_is_not_assigned_to_the_next() -> None:
-    acks, first, later = link(), Answer(), Answer()
+    acks = link()
+    first = Answer()
+    later = Answer()
     acks.sent(SPEED, first, 0.0)
     first.cancel()
     acks.sent(SPEED, later, 0.1)
@@ -108,7 +119,8 @@ async def test_acknowledgement_of_an_abandoned_command_is_not_assigned_to_the_ne
 
 
 async def test_acknowledgements_are_assigned_while_the_link_becomes_slow() -> None:
-    acks, answer = link(0.02), Answer()
+    acks = link(0.02)
+    answer = Answer()
     for at in (0.0, 0.7):
         acks.sent(SPEED, answer, at)
     acks.take(ack(), 2.0)
@@ -116,7 +128,9 @@ async def test_acknowledgements_are_assigned_while_the_link_becomes_slow() -> No
 
 
 async def test_missing_acknowledgements_may_still_arrive() -> None:
-    timing, first, later = measured(0.02, lambda now: now), Answer(), Answer()
+    timing = measured(0.02, lambda now: now)
+    first = Answer()
+    later = Answer()
     acks = Acknowledgements(245, timing)
     acks.sent(SPEED, first, 0.1)
     first.cancel()
@@ -126,7 +140,9 @@ async def test_missing_acknowledgements_may_still_arrive() -> None:
 
 
 async def test_late_acknowledgements_are_expected_while_the_delay_is_unknown() -> None:
-    acks, first, later = link(math.inf), Answer(), Answer()
+    acks = link(math.inf)
+    first = Answer()
+    later = Answer()
     for at in (0.0, 0.7, 1.4):
         acks.sent(SPEED, first, at)
     acks.take(ack(), 2.0)
@@ -139,7 +155,9 @@ async def test_late_acknowledgements_are_expected_while_the_delay_is_unknown() -
 
 
 async def test_in_progress_keeps_the_transmission_open() -> None:
-    acks, first, later = link(), Answer(), Answer()
+    acks = link()
+    first = Answer()
+    later = Answer()
     acks.sent(SPEED, first, 0.0)
     acks.take(ack(IN_PROGRESS), 1.0)
     assert not first.done()
@@ -150,7 +168,8 @@ async def test_in_progress_keeps_the_transmission_open() -> None:
 
 
 async def test_acknowledgements_for_other_systems_and_commands_are_ignored() -> None:
-    acks, answer = link(), Answer()
+    acks = link()
+    answer = Answer()
     acks.sent(SPEED, answer, 0.0)
     acks.take(ack(DENIED, target=255), 0.5)
     acks.take(ack(DENIED, MODE), 0.6)
@@ -160,7 +179,11 @@ async def test_acknowledgements_for_other_systems_and_commands_are_ignored() -> 
 
 
 async def test_duplicate_frame_is_ignored() -> None:
-    autopilot, parser, acks, first, later = Endpoint(1, 1), Parser(), link(0.05), Answer(), Answer()
+    autopilot = Endpoint(1, 1)
+    parser = Parser()
+    acks = link(0.05)
+    first = Answer()
+    later = Answer()
 
     def heard(result: int) -> Message:
         (incoming,) = parser.feed(autopilot.encode("COMMAND_ACK", ack(result).values))
@@ -177,7 +200,9 @@ async def test_duplicate_frame_is_ignored() -> None:
 
 
 async def test_transmissions_are_dropped_when_the_connection_breaks(caplog: pytest.LogCaptureFixture) -> None:
-    acks, before, after = link(), Answer(), Answer()
+    acks = link()
+    before = Answer()
+    after = Answer()
     acks.sent(SPEED, before, 0.0)
     acks.forget()
     assert not acks.overtaken(SPEED, before)
@@ -198,7 +223,9 @@ async def test_number_of_open_transmissions_is_limited() -> None:
 
 
 async def test_later_command_overtakes_an_unanswered_one() -> None:
-    acks, first, later = link(), Answer(), Answer()
+    acks = link()
+    first = Answer()
+    later = Answer()
     acks.sent(MODE, first, 0.0)
     assert not acks.overtaken(MODE, first)
     acks.sent(MODE, later, 0.1)

@@ -26,7 +26,8 @@ def link(monkeypatch: pytest.MonkeyPatch) -> tuple[MavlinkAutopilot, list[Any]]:
 
 async def test_command_is_not_repeated_after_a_later_command(link: tuple[MavlinkAutopilot, list[Any]]) -> None:
     autopilot, sent = link
-    autopilot.target, autopilot.vehicle.heartbeat_at = (1, 1), asyncio.get_running_loop().time()
+    autopilot.target = (1, 1)
+    autopilot.vehicle.heartbeat_at = asyncio.get_running_loop().time()
 
     def permit() -> None:
         if sent:
@@ -38,7 +39,8 @@ async def test_command_is_not_repeated_after_a_later_command(link: tuple[Mavlink
 
 
 async def test_no_heartbeat_is_sent_while_the_companion_does_not_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    duty, sent = False, list[Any]()
+    duty = False
+    sent = list[Any]()
     autopilot = MavlinkAutopilot("tcp:127.0.0.1:1", ARDUCOPTER, alive=lambda: duty)
     monkeypatch.setattr(autopilot, "send", sent.append)
     autopilot.send_heartbeat()

@@ -67,7 +67,8 @@ async def test_other_firmware_needs_only_a_flight_stack() -> None:
 
     stack = TwoNumbers()
     vehicle = Vehicle("tcp:nowhere:1", stack)
-    vehicle.target, vehicle.vehicle.heartbeat_at = (1, 1), vehicle.now
+    vehicle.target = (1, 1)
+    vehicle.vehicle.heartbeat_at = vehicle.now
     await vehicle.set_mode(stack.land)
     assert vehicle.vehicle.mode == stack.land
     (order,) = sent

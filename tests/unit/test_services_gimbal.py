@@ -21,9 +21,11 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 CAMERA = Lens(1.0, 1.0, pitch_deg=0.0)
 KEPT = mavlink.GIMBAL_DEVICE_FLAGS_ROLL_LOCK | mavlink.GIMBAL_DEVICE_FLAGS_PITCH_LOCK
-ARDUPILOT_4_4, ARDUPILOT_4_6 = KEPT, KEPT | mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME
+ARDUPILOT_4_4 = KEPT
+ARDUPILOT_4_6 = KEPT | mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME
 NORTH = KEPT | mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME
-SIYI, SERVO = 8.0, 1.0
+SIYI = 8.0
+SERVO = 1.0
 
 
 def quaternion(roll_deg: float, pitch_deg: float, yaw_deg: float) -> tuple[float, ...]:
@@ -147,7 +149,8 @@ class Commanded:
     def __init__(self, error: AutopilotError | None = None, limits: dict[str, float] | None = None) -> None:
         self.vehicle = vehicle()
         self.sent: list[tuple[float, ...]] = []
-        self._error, self._limits = error, limits
+        self._error = error
+        self._limits = limits
 
     async def command(self, command: int, *params: float, permit: Permit = always, attempts: int = 4) -> None:
         del attempts

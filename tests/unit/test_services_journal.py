@@ -108,7 +108,9 @@ async def test_journal_reports_failed_disk_until_next_write(tmp_path: Path, monk
 
 async def test_journal_writes_one_record_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     journal = Journal(tmp_path)
-    free, inside, most = threading.Event(), [0], [0]
+    free = threading.Event()
+    inside = [0]
+    most = [0]
     write = journal._write
 
     def slow(data: bytes) -> None:

@@ -129,7 +129,8 @@ async def test_vehicle_with_little_storage_gets_fewer_fence_vertices(
     vehicle: Vehicle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     round_area = {"circle": {"center": {"lat": 39.36, "lon": 22.95}, "radius": 300}}
-    sent, room = list[int](), 12
+    sent = list[int]()
+    room = 12
 
     async def little(_autopilot: Any, items: Any) -> None:
         sent.append(len(items))
@@ -288,7 +289,8 @@ async def test_fence_is_not_changed_while_armed(vehicle: Vehicle, tmp_path: Path
 
 async def test_fence_stays_enabled_if_vehicle_arms_during_its_request(vehicle: Vehicle, tmp_path: Path) -> None:
     vehicle.values |= OWNED
-    send, asked = vehicle.send, 0
+    send = vehicle.send
+    asked = 0
 
     def heard(outgoing: Message) -> None:
         nonlocal asked
@@ -353,7 +355,8 @@ async def test_fence_parameter_changed_by_another_station_in_flight_is_reset(veh
         "FENCE_ALT_MAX was 900 and is 65", "FENCE_ACTION was 0 and is 1", "FENCE_ENABLE was 0 and is 1",
     )  # fmt: skip
     assert vehicle.values == raised
-    vehicle.values["FENCE_ACTION"], vehicle.fixed = 0.0, ("FENCE_ACTION",)
+    vehicle.values["FENCE_ACTION"] = 0.0
+    vehicle.fixed = ("FENCE_ACTION",)
     with pytest.raises(AutopilotError, match="FENCE_ACTION cannot be set to 1; it remains 0"):
         await fence.hold()
 
@@ -381,13 +384,15 @@ async def test_replaced_fence_items_of_same_count_are_reported(
 
 
 async def test_loaded_fence_is_not_loaded_again(vehicle: Vehicle, tmp_path: Path) -> None:
-    fence, loads = MissionFence(vehicle, tmp_path), list[int]()
+    fence = MissionFence(vehicle, tmp_path)
+    loads = list[int]()
 
     async def counted(_autopilot: Any, items: Any) -> None:
         loads.append(len(items))
 
     await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
-    upload, module.upload = module.upload, counted  # type: ignore[assignment]
+    upload = module.upload
+    module.upload = counted  # type: ignore[assignment]
     try:
         vehicle.values["FENCE_ACTION"] = 0.0
         await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)

@@ -112,7 +112,8 @@ def test_attitude_age_follows_its_timestamp() -> None:
         for boot_s in (100.0, 100.5):
             autopilot.take(heard("GLOBAL_POSITION_INT", boot_s))
             await asyncio.sleep(0.5)
-        vehicle, now = autopilot.vehicle, autopilot.now
+        vehicle = autopilot.vehicle
+        now = autopilot.now
         autopilot.take(heard("ATTITUDE", 100.6, yaw=0.5))  # it waited on its way for 0.4 s
         assert vehicle.attitude_at == pytest.approx(now - 0.4, abs=1e-3)
         autopilot.take(heard("ATTITUDE", 100.2, yaw=2.0))  # and this one was overtaken

@@ -75,7 +75,8 @@ class Bench:
             self._told_at = stamp
 
     def _probe(self) -> None:
-        number, sent = self.timing.request(self.now), self.now
+        number = self.timing.request(self.now)
+        sent = self.now
         if number is not None and self.answers:
             up = self.up()
             tc1 = round(self.clock(self.now + min(up, 1e6)) * 1e9)
@@ -117,7 +118,8 @@ def test_latency_of_each_direction_is_counted_once(up: float, down: float) -> No
 @pytest.mark.parametrize("seed", range(12))
 def test_latency_is_an_upper_bound_despite_lost_late_and_duplicate_messages(seed: int) -> None:
     rng = random.Random(seed)
-    least, most = rng.uniform(0, 0.2), rng.uniform(0.2, 0.4)
+    least = rng.uniform(0, 0.2)
+    most = rng.uniform(0.2, 0.4)
     bench = Bench(wild(rng, least, most, 0.1), wild(rng, least, most, 0.1), copies=2)
     bench.fly(15)
     bench.worst = -math.inf
@@ -175,7 +177,8 @@ def test_slow_link_is_detected_before_first_slow_response() -> None:
     up_s = 0.05
     bench = Bench(lambda: up_s, steady(0.05))
     bench.fly(15)
-    before_s, up_s = bench.timing.latency_s(bench.now), 1.0
+    before_s = bench.timing.latency_s(bench.now)
+    up_s = 1.0
     bench.fly(0.9)
     assert bench.timing.delay_s < 0.2, "no slow answer has come yet"
     assert bench.timing.latency_s(bench.now) >= before_s + 0.6

@@ -13,7 +13,8 @@ from fractus_services.mobility.mavlink import transport
 from fractus_services.mobility.mavlink.transport import BadUrl, open_link
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-AUTOPILOT, STRANGER = ("127.0.0.1", 14550), ("127.0.0.1", 40000)
+AUTOPILOT = ("127.0.0.1", 14550)
+STRANGER = ("127.0.0.1", 40000)
 
 
 def heartbeat(autopilot: int = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA) -> bytes:
@@ -33,7 +34,8 @@ class Socket:
 
 def link(connected: bool) -> tuple[Any, Socket, list[bytes]]:
     heard: list[bytes] = []
-    made, socket = transport._Datagrams(heard.append, lambda _error: None, connected), Socket()
+    made = transport._Datagrams(heard.append, lambda _error: None, connected)
+    socket = Socket()
     made.connection_made(socket)  # type: ignore[arg-type]
     return made, socket, heard
 

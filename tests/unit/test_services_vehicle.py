@@ -84,7 +84,8 @@ def test_position_becomes_unknown_when_its_quality_is_no_longer_reported(silent:
 
 
 HEALTHY = {"onboard_control_sensors_present": 1 << 28, "onboard_control_sensors_health": 1 << 28}
-BOOTED, POSITIONED = 167, 831
+BOOTED = 167
+POSITIONED = 831
 """Flags of EKF_STATUS_REPORT of a real ArduCopter, after 22 s and after 41 s."""
 
 

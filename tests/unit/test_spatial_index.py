@@ -48,7 +48,8 @@ def test_within_equals_brute_force_anywhere_on_earth(centre, radius, spread):
 @settings(max_examples=examples(60), deadline=None)
 def test_within_equals_brute_force_for_huge_radii(centre, others, radius):
     points = {f"n{i}": p for i, p in enumerate(others)}
-    result, expected = index_of(points).within(centre, radius), brute_force(points, centre, radius)
+    result = index_of(points).within(centre, radius)
+    expected = brute_force(points, centre, radius)
     assert [n for n, _ in result] == [n for n, _ in expected]
     assert [d for _, d in result] == pytest.approx([d for _, d in expected], abs=1e-4)
 
@@ -76,7 +77,8 @@ operations = st.lists(
 @given(places, operations)
 @settings(deadline=None)
 def test_index_after_updates_equals_a_new_index(centre, changes):
-    index, points = SpatialIndex(), {}
+    index = SpatialIndex()
+    points = {}
     for name, target in changes:
         if target is None:
             index.remove(name)

@@ -8,7 +8,8 @@ import pytest
 from fractus_agent.links.traffic_rates import WINDOWS, ServiceRate, TrafficRates
 from fractus_agent.redirector.nft_maps import Endpoint
 
-A, B = Endpoint(IPv4Address("10.96.0.5"), 80), Endpoint(IPv4Address("10.96.0.6"), 80)
+A = Endpoint(IPv4Address("10.96.0.5"), 80)
+B = Endpoint(IPv4Address("10.96.0.6"), 80)
 MBIT = 125_000
 
 

@@ -128,7 +128,8 @@ def test_known_caller_is_accepted_by_steady_time_after_clock_step(machine: Machi
 
 
 def test_unknown_caller_is_judged_by_later_reading_of_uncertain_clock(machine: Machine) -> None:
-    fresh, expired = certificate(), certificate(-2 * DAY_S, -1.0)
+    fresh = certificate()
+    expired = certificate(-2 * DAY_S, -1.0)
     machine.offset_s -= 2 * DAY_S
     assert machine.accepts(fresh)
     assert not machine.accepts(expired), "a clock that is set back does not make it valid"

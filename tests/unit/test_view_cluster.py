@@ -174,7 +174,8 @@ async def test_the_view_tells_prometheus_what_is_documented(monkeypatch: pytest.
 async def test_all_that_a_cluster_knows_of_flights_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     async with watched(ApiServer(*ALL), Clock(), monkeypatch) as cluster:
         events = await until(cluster, lambda event: event["type"] == "policies")
-    state, fix = last(events, "state"), last(events, "fix")
+    state = last(events, "state")
+    fix = last(events, "fix")
     assert (state["drone"], state["phase"], state["controller"]) == ("drone-1", "in the air", "Navigator")
     assert (state["altitude_m"], state["battery"], state["seen_ms"]) == (12.5, 0.5, NOW_MS - 1_000)
     assert (fix["lat"], fix["lon"], fix["amsl_m"]) == (39.36, 22.93, None)
@@ -216,7 +217,8 @@ async def test_what_changes_is_told_and_what_is_deleted_is_gone(monkeypatch: pyt
 
 
 async def test_a_lost_api_server_is_told_with_since_when_and_why(monkeypatch: pytest.MonkeyPatch) -> None:
-    server, clock = ApiServer(*ALL), Clock()
+    server = ApiServer(*ALL)
+    clock = Clock()
     async with watched(server, clock, monkeypatch) as cluster:
         await until(cluster, lambda event: event["type"] == "contact" and event["stale_since_ms"] is None)
         server.cut()

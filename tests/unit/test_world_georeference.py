@@ -87,7 +87,8 @@ def test_png_with_world_file_in_degrees(tmp_path: Path, lat: float, lon: float) 
 
 def test_geotiff_in_utm(tmp_path: Path) -> None:
     picture, marks = marked()
-    corner, size = (533_000.0, 5_640_000.0), 0.5
+    corner = (533_000.0, 5_640_000.0)
+    size = 0.5
     keys = (1, 1, 0, 3, 1024, 0, 1, 1, 1025, 0, 1, 1, 3072, 0, 1, 32631)
     tags = [
         (33550, "d", 3, (size, size, 0.0), True),

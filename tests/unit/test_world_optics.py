@@ -12,12 +12,14 @@ from fractus_world.optics import Intrinsics, Mount, Pose, View
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-A, E2 = 6_378_137.0, (2 - 1 / 298.257223563) / 298.257223563
+A = 6_378_137.0
+E2 = (2 - 1 / 298.257223563) / 298.257223563
 LENS = Intrinsics(1920, 1080, 62.2)
 
 
 def ecef(lat: float, lon: float, height_m: float) -> np.ndarray:
-    phi, lam = math.radians(lat), math.radians(lon)
+    phi = math.radians(lat)
+    lam = math.radians(lon)
     n = A / math.sqrt(1 - E2 * math.sin(phi) ** 2)
     return np.array(
         [
@@ -30,7 +32,8 @@ def ecef(lat: float, lon: float, height_m: float) -> np.ndarray:
 
 def oracle(pose: Pose, mount: Mount, lat: float, lon: float) -> np.ndarray:
     """The pixel of a place on the ellipsoid, by vectors: nothing of it is shared with the code under test."""
-    phi, lam = math.radians(pose.lat), math.radians(pose.lon)
+    phi = math.radians(pose.lat)
+    lam = math.radians(pose.lon)
     east = np.array([-math.sin(lam), math.cos(lam), 0.0])
     north = np.array([-math.sin(phi) * math.cos(lam), -math.sin(phi) * math.sin(lam), math.cos(phi)])
     up = np.cross(east, north)
@@ -40,7 +43,8 @@ def oracle(pose: Pose, mount: Mount, lat: float, lon: float) -> np.ndarray:
     level = math.cos(yaw) * east - math.sin(yaw) * north
     right = math.cos(roll) * level - math.sin(roll) * np.cross(level, ahead)
     below = np.cross(ahead, right)
-    turn, tilt = math.radians(mount.yaw_deg), math.radians(mount.pitch_deg)
+    turn = math.radians(mount.yaw_deg)
+    tilt = math.radians(mount.pitch_deg)
     forward = math.cos(turn) * ahead + math.sin(turn) * right
     side = math.cos(turn) * right - math.sin(turn) * ahead
     optical = math.cos(tilt) * forward - math.sin(tilt) * below

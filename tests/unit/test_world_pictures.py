@@ -15,7 +15,8 @@ from fractus_world.population import Thing
 from fractus_world.truth import Seen, SeenFace, Truth
 from fractus_world.world import World, WorldAround
 
-LAT, LON = 50.8637, 4.6785
+LAT = 50.8637
+LON = 4.6785
 LENS = Intrinsics(640, 360, 62.2)
 SMALL = Intrinsics(160, 90, 62.2)
 TIME_S = 1_795_000_000.0
@@ -46,7 +47,8 @@ def test_same_seed_pose_and_time_give_the_same_bytes(world: World) -> None:
 
 def test_time_moves_the_traffic_and_nothing_else(world: World) -> None:
     pose = above(world, *CROSSING, 150.0)
-    then, now = world.truth(pose, LENS, time_s=TIME_S), world.truth(pose, LENS, time_s=TIME_S + 2.0)
+    then = world.truth(pose, LENS, time_s=TIME_S)
+    now = world.truth(pose, LENS, time_s=TIME_S + 2.0)
     places = {seen.id: (seen.lat, seen.lon) for seen in then.objects}
     moved = [seen for seen in now.objects if seen.id in places]
     assert any(seen.speed_mps > 5 for seen in moved)
@@ -78,7 +80,8 @@ def difference(world: World, pose: Pose, mount: Mount, name: str) -> tuple[int, 
     with_it = world.render(pose, LENS, band="ir", **arguments)
     without = world.render(pose, LENS, band="ir", hidden=frozenset({name}), **arguments)
     changed = np.abs(with_it.astype(int) - without.astype(int)).max(axis=2) > 12
-    rows, columns = np.flatnonzero(changed.any(axis=1)), np.flatnonzero(changed.any(axis=0))
+    rows = np.flatnonzero(changed.any(axis=1))
+    columns = np.flatnonzero(changed.any(axis=0))
     return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
 
 
@@ -168,7 +171,8 @@ def test_every_variation_shows_its_face_where_it_says() -> None:
         assert found, f"no face in variation {variation}"
         left, top, right, bottom = face_box(variation)
         height, width = picture.shape[:2]
-        x, y = found[0]["c"] + found[0]["width"] / 2, found[0]["r"] + found[0]["height"] / 2
+        x = found[0]["c"] + found[0]["width"] / 2
+        y = found[0]["r"] + found[0]["height"] / 2
         assert left * width < x < right * width
         assert top * height < y < bottom * height
 
@@ -214,9 +218,11 @@ def test_shape_of_every_kind_fits_its_size() -> None:
 
 
 def test_cameras_near_each_other_share_a_world() -> None:
-    one, other = WorldAround(7), WorldAround(7)
+    one = WorldAround(7)
+    other = WorldAround(7)
     assert one.seen_from(None) is None
-    first, second = one.seen_from(Pose(50.86, 4.67, 10.0)), other.seen_from(Pose(50.87, 4.66, 3.0))
+    first = one.seen_from(Pose(50.86, 4.67, 10.0))
+    second = other.seen_from(Pose(50.87, 4.66, 3.0))
     assert first is not None
     assert second is not None
     assert (first.frame.lat, first.frame.lon) == (second.frame.lat, second.frame.lon)
@@ -225,7 +231,8 @@ def test_cameras_near_each_other_share_a_world() -> None:
 def test_tiles_of_a_level_meet_without_a_seam(world: World) -> None:
     """The last column of a tile and the first of its neighbour differ no more than columns within a tile do."""
     ground = world.ground
-    left, right = ground.tile(2, 0, -1).astype(int), ground.tile(2, 1, -1).astype(int)
+    left = ground.tile(2, 0, -1).astype(int)
+    right = ground.tile(2, 1, -1).astype(int)
     across = np.abs(left[:, -1] - right[:, 0]).mean()
     within = np.abs(left[:, -2] - left[:, -1]).mean()
     assert across < 2.0 * within + 1.0

@@ -123,8 +123,10 @@ class Cluster:
             await informer.synced.wait()
         self._changed = set(KINDS)
         while True:
-            changed, self._changed = self._changed, set()
-            drones, self._drones = self._drones, set()
+            changed = self._changed
+            self._changed = set()
+            drones = self._drones
+            self._drones = set()
             if changed:
                 self._hub.publish(self._events(changed, drones))
             await asyncio.sleep(GATHER_S)

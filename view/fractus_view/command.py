@@ -138,14 +138,18 @@ def _token(path: Path) -> str:
 
 async def _follow_token(path: Path, shown: View) -> None:
     """Use the current token of the file. Earlier tokens become invalid."""
-    told, failed = "", False
+    told = ""
+    failed = False
     while True:
         await asyncio.sleep(TOKEN_PERIOD_S)
         try:
-            shown.token, problem, failed = _token(path), "", False
+            shown.token = _token(path)
+            problem = ""
+            failed = False
         except click.ClickException as error:
             # A file is empty for a moment while it is written.
-            problem, failed = error.message if failed else told, True
+            problem = error.message if failed else told
+            failed = True
             if problem:
                 # A random token that nobody knows.
                 shown.token = secrets.token_urlsafe(32)
@@ -191,7 +195,8 @@ async def _serve(source: Source, where: Site, metrics: Callable[[], Iterable[Met
     given = where.token_file
     if given is not None:
         served.token = _token(given)
-    host, port = where.host, where.port
+    host = where.host
+    port = where.port
     runner = web.AppRunner(served.application(), access_log=None, handle_signals=False, shutdown_timeout=1.0)
     await runner.setup()
     try:

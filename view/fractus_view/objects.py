@@ -78,7 +78,8 @@ def application(given: api.Application) -> Application:
 
 def link(given: api.DirectLink) -> Link:
     """Return a direct link and its state."""
-    spec, said = given.spec, given.status
+    spec = given.spec
+    said = given.status
     return Link(
         name=given.name,
         drone=spec.drone,

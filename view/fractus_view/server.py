@@ -165,7 +165,8 @@ class View:
             return web.Response(headers=head)
         if len(self._streams) >= MAX_STREAMS:
             return web.Response(status=503, text=f"{MAX_STREAMS} pages look already: close one\n")
-        response, place = web.StreamResponse(headers=head), object()
+        response = web.StreamResponse(headers=head)
+        place = object()
         self._streams.add(place)
         try:
             await response.prepare(request)

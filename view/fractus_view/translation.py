@@ -36,7 +36,8 @@ class Translation:
     def events(self, told: Told) -> Iterator[Event]:
         """Return the events of a message; empty if it is irrelevant or does not match its schema."""
         _, node, topic = told.topic.split("/") if told.topic.count("/") == 2 else ("", "", "")
-        content, time_ms = told.content, told.time_ms
+        content = told.content
+        time_ms = told.time_ms
         match told.schema, topic:
             case "foxglove.LocationFix", _:
                 yield from self._fix(node, time_ms, content)
@@ -57,7 +58,8 @@ class Translation:
                 yield Note(node, time_ms, level if isinstance(level, int) else 2, _text(content.get("message")))
 
     def _fix(self, node: str, time_ms: int, content: Mapping[str, Any]) -> Iterator[Fix]:
-        lat, lon = _number(content.get("latitude")), _number(content.get("longitude"))
+        lat = _number(content.get("latitude"))
+        lon = _number(content.get("longitude"))
         if lat is None or lon is None or not (-90 <= lat <= 90 and -180 <= lon <= 180):
             return
         fix = Fix(node, time_ms, lat, lon, _number(content.get("altitude")), self._heading.get(node))

@@ -13,7 +13,8 @@ from fractus_core.linking import PathMetrics
 
 log = logging.getLogger(__name__)
 
-PROBE_S, PROBE_TIMEOUT_S = 1.0, 2.0
+PROBE_S = 1.0
+PROBE_TIMEOUT_S = 2.0
 """Interval and timeout of probes, in seconds. A probe takes one round trip, or more after packet loss."""
 SILENT_S = 4.0
 """Time without a response after which the path counts as unreachable, in seconds."""

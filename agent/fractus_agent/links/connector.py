@@ -75,7 +75,8 @@ class Connector:
 
     async def close(self, reason: str = "the agent ends") -> None:
         """End the current link, if any."""
-        task, self._task = self._task, None
+        task = self._task
+        self._task = None
         if task is not None:
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)

@@ -22,7 +22,8 @@ log = logging.getLogger(__name__)
 
 MAX_DRONES = 1
 """Limit of linked drones, because the declared bandwidth of a link is for one drone."""
-FIRST_PORT, LAST_PORT = 30_000, 39_999
+FIRST_PORT = 30_000
+LAST_PORT = 39_999
 """Ports on the link address that are translated to pods. Nothing listens on them."""
 LISTEN_RETRY_S = 1.0
 REMOVAL_GRACE_S = 3.0

@@ -20,7 +20,8 @@ from fractus_agent.redirector.nft_maps import Endpoint
 from fractus_agent.store import LinkEnd, Object, Store
 from fractus_agent.supervisor import repeat
 
-URGENT_INTERVAL_S, VALUES_INTERVAL_S = 1.0, 15.0
+URGENT_INTERVAL_S = 1.0
+VALUES_INTERVAL_S = 15.0
 """Seconds between writes of one status: after a decision, and if only measured values have changed."""
 
 _PHASES = {LinkPhase.NONE: "Idle", LinkPhase.CONNECTING: "Connecting", LinkPhase.UP: "Up"}

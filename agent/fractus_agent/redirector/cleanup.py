@@ -14,7 +14,8 @@ from fractus_agent.redirector.connections import Conntrack
 from fractus_agent.redirector.netlink import NETLINK_NETFILTER, Netlink, attributes
 from fractus_agent.redirector.nft_maps import TABLE
 
-_LIST_TABLES, _NAME = 10 << 8 | 1, 1
+_LIST_TABLES = 10 << 8 | 1
+_NAME = 1
 
 
 def table_exists() -> bool:

@@ -32,7 +32,8 @@ from fractus_agent.redirector.nft_maps import MARK_BASE, MARK_MASK, Endpoint
 
 log = logging.getLogger(__name__)
 
-_BY_FAMILY, _DESTROY = 20, 21
+_BY_FAMILY = 20
+_DESTROY = 21
 _TCP_INFO = 2
 _REQUEST = struct.Struct("=BBBxI")
 _ID = struct.Struct(">HH16s16s")
@@ -44,7 +45,9 @@ _INFO = struct.Struct("=24xI16x4I")
 received."""
 
 _MAPPED = b"\0" * 10 + b"\xff\xff"
-TCP_ESTABLISHED, TCP_SYN_SENT, TCP_CLOSE_WAIT = 1, 2, 8
+TCP_ESTABLISHED = 1
+TCP_SYN_SENT = 2
+TCP_CLOSE_WAIT = 8
 _OPEN = frozenset({TCP_ESTABLISHED, TCP_SYN_SENT, TCP_CLOSE_WAIT})
 _STATES = sum(1 << state for state in _OPEN)
 
@@ -54,7 +57,8 @@ QUIET_MS = 2 * JIFFY_MS
 """Time without data in either direction after which a connection counts as quiet, in milliseconds."""
 
 _CONNTRACK_DELETE = 1 << 8 | 2
-_CONNTRACK_MARK, _CONNTRACK_MARK_MASK = 8, 21
+_CONNTRACK_MARK = 8
+_CONNTRACK_MARK_MASK = 21
 ALL_BITS = 0xFFFFFFFF
 
 

@@ -28,21 +28,37 @@ from fractus_agent.redirector.netlink import (
 )
 
 TABLE = "fractus"
-TARGETS, MARKS, PEERS = "targets", "marks", "peers"
-SENT, RECEIVED = "sent", "received"
-GUARDED, CALLERS = "guarded", "callers"
+TARGETS = "targets"
+MARKS = "marks"
+PEERS = "peers"
+SENT = "sent"
+RECEIVED = "received"
+GUARDED = "guarded"
+CALLERS = "callers"
 
-MARK_MASK, MARK_BASE = 0xFFF00000, 0xF6A00000
+MARK_MASK = 0xFFF00000
+MARK_BASE = 0xF6A00000
 """Connection mark of redirected connections. The lower bits number the period of a service on one path."""
 
 MAX_NUMBER = 0xFFFFF
 
 _SUBSYSTEM = 10 << 8
-_NEW_ELEMENTS, _GET_ELEMENTS, _DELETE_ELEMENTS = _SUBSYSTEM | 12, _SUBSYSTEM | 13, _SUBSYSTEM | 14
-_BEGIN, _END = 0x10, 0x11
-_LIST_TABLE, _LIST_SET, _LIST_ELEMENTS, _LIST_ELEMENT = 1, 2, 3, 1
-_ELEMENT_KEY, _ELEMENT_DATA, _ELEMENT_TIMEOUT, _ELEMENT_EXPRESSION = 1, 2, 4, 7
-_DATA_VALUE, _EXPRESSION_DATA, _COUNTER_BYTES = 1, 2, 1
+_NEW_ELEMENTS = _SUBSYSTEM | 12
+_GET_ELEMENTS = _SUBSYSTEM | 13
+_DELETE_ELEMENTS = _SUBSYSTEM | 14
+_BEGIN = 0x10
+_END = 0x11
+_LIST_TABLE = 1
+_LIST_SET = 2
+_LIST_ELEMENTS = 3
+_LIST_ELEMENT = 1
+_ELEMENT_KEY = 1
+_ELEMENT_DATA = 2
+_ELEMENT_TIMEOUT = 4
+_ELEMENT_EXPRESSION = 7
+_DATA_VALUE = 1
+_EXPRESSION_DATA = 2
+_COUNTER_BYTES = 1
 
 _MARK = struct.Struct("=HHHHI")
 """Connection mark as the data of an element."""

@@ -36,7 +36,8 @@ REFRESH_S = 1.5
 
 QUIET_TIMEOUT_S = 0.5
 """Time to wait for a quiet moment of a connection at the end of the drain, in seconds."""
-DRAIN_POLL_S, QUIET_POLL_S = 0.02, 0.002
+DRAIN_POLL_S = 0.02
+QUIET_POLL_S = 0.002
 
 
 @dataclass(frozen=True, slots=True)

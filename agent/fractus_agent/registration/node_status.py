@@ -223,7 +223,8 @@ def _has_changed(old: Object, new: Object) -> bool:
     charge = [(status.get("battery") or {}).get("remaining", 0.0) for status in (old, new)]
     if abs(charge[0] - charge[1]) >= 0.01:
         return True
-    before, after = old.get("position"), new.get("position")
+    before = old.get("position")
+    after = new.get("position")
     if before is None or after is None:
         return before is not after
     north_m = (after["lat"] - before["lat"]) * _DEGREE_M

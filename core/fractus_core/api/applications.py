@@ -101,8 +101,12 @@ class ApplicationSpec(Model):
         flown = self.driver is not None or self.points_of_interest is not None
         return f"components[{aboard[0]}].pointsOfInterest" if aboard and not flown else None
 
-    _known_ingress, _known_egress, _known_hybrid = _known("ingress"), _known("egress"), _known("hybridTo")
-    _other_ingress, _other_egress, _other_hybrid = _other("ingress"), _other("egress"), _other("hybridTo")
+    _known_ingress = _known("ingress")
+    _known_egress = _known("egress")
+    _known_hybrid = _known("hybridTo")
+    _other_ingress = _other("ingress")
+    _other_egress = _other("egress")
+    _other_hybrid = _other("hybridTo")
 
     _hybrid_hosts = _each(
         "hybridTo",

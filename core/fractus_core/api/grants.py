@@ -281,7 +281,8 @@ def pack_oldest(bodies: Sequence[Mapping[str, Any]]) -> tuple[str, int]:
     too_many = count + 1
     while True:
         try:
-            packed, fit = pack(oldest[:count]), count
+            packed = pack(oldest[:count])
+            fit = count
         except InvalidObject:
             too_many = count
         if too_many - fit <= 1:

@@ -200,8 +200,12 @@ class Resource(Model):
         written_by_operator: bool = False,
     ) -> None:
         super().__init_subclass__()
-        cls.KIND, cls.PLURAL, cls.SHORT, cls.NAMESPACED = cls.__name__, plural, short, namespaced
-        cls.SELECTABLE, cls.WRITTEN_BY_OPERATOR = selectable, written_by_operator
+        cls.KIND = cls.__name__
+        cls.PLURAL = plural
+        cls.SHORT = short
+        cls.NAMESPACED = namespaced
+        cls.SELECTABLE = selectable
+        cls.WRITTEN_BY_OPERATOR = written_by_operator
 
     @classmethod
     def from_body(cls, body: Any) -> Self:
@@ -231,7 +235,8 @@ class Resource(Model):
         return self.metadata.name
 
 
-_WHOLE, _LARGEST = 2**63, 10**300
+_WHOLE = 2**63
+_LARGEST = 10**300
 
 
 def _plain(value: Any, *, nulls: bool = False) -> Any:
@@ -307,7 +312,8 @@ _SENTENCES = {
 
 
 def _problem(finding: ErrorDetails) -> str:
-    kind, limits = finding["type"], finding.get("ctx", {})
+    kind = finding["type"]
+    limits = finding.get("ctx", {})
     if kind == "string_pattern_mismatch":
         return f"must be {SHAPES.get(limits['pattern'], 'of the form ' + limits['pattern'])}"
     if kind in {"too_long", "too_short"} and limits.get("field_type") == "Tuple":

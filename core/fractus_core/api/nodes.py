@@ -23,7 +23,9 @@ GROUNDED: frozenset[FlightState] = frozenset({"inactive", "charging"})
 BANDWIDTH_MBPS: dict[Technology, float] = {"Ethernet": 100.0, "4G": 8.0, "5G": 50.0, "WiFi": 12.0, "BLE": 0.7}
 """Default usable bandwidth of an interface at good reception, in Mbit/s."""
 
-FLIGHT_REPORT_S, DRONE_REPORT_S, EDGE_REPORT_S = 5.0, 30.0, 60.0
+FLIGHT_REPORT_S = 5.0
+DRONE_REPORT_S = 30.0
+EDGE_REPORT_S = 60.0
 """Maximum interval between two status reports of an agent, in seconds: airborne drone, grounded drone, edge node."""
 
 

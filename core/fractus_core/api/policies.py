@@ -259,7 +259,9 @@ class PolicySpec(Validity):
         " limits above terrain require an upperLimit above 0 m",
     )
     def _limits_keepable(self) -> Violation:
-        speed, lower, upper = self.kind == "speed", self.lower_limit, self.upper_limit
+        speed = self.kind == "speed"
+        lower = self.lower_limit
+        upper = self.upper_limit
         if self.type != "LimitControl":
             return None
         if upper is not None and upper <= 0 and (speed or self.altitude_reference == "terrain"):
@@ -305,7 +307,8 @@ class PolicySpec(Validity):
         "lowerLimit must not be above upperLimit",
     )
     def _limits_ordered(self) -> Violation:
-        lower, upper = self.lower_limit, self.upper_limit
+        lower = self.lower_limit
+        upper = self.upper_limit
         return "lowerLimit" if lower is not None and upper is not None and lower > upper else None
 
     @rule(

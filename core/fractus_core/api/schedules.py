@@ -70,7 +70,8 @@ class ActiveTime(Validity):
         begin_s, end_s = self.window_s
         if not begin_s <= time_s < end_s:
             return False
-        start, end = _clock_s(self.start or "00:00"), _clock_s(self.end or "00:00")
+        start = _clock_s(self.start or "00:00")
+        end = _clock_s(self.end or "00:00")
         length = end - start if end > start else _DAY_S + end - start
         today = time_s // _DAY_S
         # An active time that started yesterday may last until today.

@@ -369,7 +369,8 @@ class ControlState:
     @property
     def in_transit(self) -> bool:
         """True if the system flies a transit for a waiting driver. The grace of the driver does not expire meanwhile."""
-        lease, flight = self.lease, self.flight
+        lease = self.lease
+        flight = self.flight
         return lease is not None and flight is not None and not lease.granted and lease.key == flight.key
 
     @property

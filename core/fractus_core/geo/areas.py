@@ -141,7 +141,8 @@ def area_center(area: Area) -> Point:
 def center_of(points: Iterable[Point]) -> Point:
     """Return the center of points on the sphere. It is also correct across the antimeridian and near the poles."""
     rad = np.radians([(p.lat, p.lon) for p in points])
-    lat, lon = rad[:, 0], rad[:, 1]
+    lat = rad[:, 0]
+    lon = rad[:, 1]
     vector = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)]).mean(axis=1)
     if np.linalg.norm(vector) < 1e-9:
         return Point(lat=float(np.degrees(lat[0])), lon=float(np.degrees(lon[0])))

@@ -39,7 +39,8 @@ def distance_m(a: Point, b: Point) -> float:
     The error is below a micrometre up to 50 km. The distance is computed from the chord, bent by the ellipsoid's
     curvature along it. Beyond 200 km the function calls `geodesic_m`.
     """
-    (ax, ay, az), (bx, by, bz) = ecef(a.lat, a.lon), ecef(b.lat, b.lon)
+    ax, ay, az = ecef(a.lat, a.lon)
+    bx, by, bz = ecef(b.lat, b.lon)
     across = (bx - ax) ** 2 + (by - ay) ** 2
     up = (bz - az) ** 2
     chord = math.sqrt(across + up)
@@ -47,7 +48,8 @@ def distance_m(a: Point, b: Point) -> float:
         return geodesic_m(a, b)
     if chord < 1e-9:
         return chord
-    equator, pole = SEMI_MAJOR_AXIS_M**-2, (SEMI_MAJOR_AXIS_M * (1 - FLATTENING)) ** -2
+    equator = SEMI_MAJOR_AXIS_M**-2
+    pole = (SEMI_MAJOR_AXIS_M * (1 - FLATTENING)) ** -2
     middle = ((ax + bx) ** 2 + (ay + by) ** 2) / 4
     height = (az + bz) ** 2 / 4
     depth = middle * equator + height * pole
@@ -64,7 +66,8 @@ def ecef(lat: Metres, lon: Metres, of: ModuleType = math) -> tuple[Metres, Metre
         lon: Degrees east.
         of: Module with the functions to use: `math` for one point, `numpy` for arrays.
     """
-    phi, lam = of.radians(lat), of.radians(lon)
+    phi = of.radians(lat)
+    lam = of.radians(lon)
     sin_phi = of.sin(phi)
     n = SEMI_MAJOR_AXIS_M / of.sqrt(1 - _E2 * sin_phi * sin_phi)
     ground = n * of.cos(phi)
@@ -84,7 +87,8 @@ class LocalFrame:
     def __init__(self, lat: float, lon: float) -> None:
         self.lat = lat
         self.lon = lon
-        phi, lam = math.radians(lat), math.radians(lon)
+        phi = math.radians(lat)
+        lam = math.radians(lon)
         self._sin_lat = math.sin(phi)
         self._cos_lat = math.cos(phi)
         self._sin_lon = math.sin(lam)
@@ -100,8 +104,10 @@ class LocalFrame:
     def xy(self, lat: float, lon: float) -> tuple[float, float]:
         """Return metres east and north of the origin, of a point on the ellipsoid in degrees."""
         # This repeats `ecef` inline, because every judgement calls it several times.
-        phi, lam = math.radians(lat), math.radians(lon)
-        sin_phi, cos_phi = math.sin(phi), math.cos(phi)
+        phi = math.radians(lat)
+        lam = math.radians(lon)
+        sin_phi = math.sin(phi)
+        cos_phi = math.cos(phi)
         n = SEMI_MAJOR_AXIS_M / math.sqrt(1 - _E2 * sin_phi * sin_phi)
         dx = n * cos_phi * math.cos(lam) - self._origin[0]
         dy = n * cos_phi * math.sin(lam) - self._origin[1]
@@ -113,7 +119,9 @@ class LocalFrame:
     def xy_array(self, lats: Coordinates, lons: Coordinates) -> Coordinates:
         """Return metres east and north, shape (n, 2), of points on the ellipsoid in degrees, shapes (n,)."""
         x, y, z = ecef(lats, lons, np)
-        dx, dy, dz = x - self._origin[0], y - self._origin[1], z - self._origin[2]
+        dx = x - self._origin[0]
+        dy = y - self._origin[1]
+        dz = z - self._origin[2]
         east = -self._sin_lon * dx + self._cos_lon * dy
         north = -self._sin_lat * (self._cos_lon * dx + self._sin_lon * dy) + self._cos_lat * dz
         return np.column_stack((east, north))
@@ -130,7 +138,9 @@ class LocalFrame:
         if not root >= 0:
             raise self._hidden(x, y)
         up = -over / (slope + math.sqrt(root))
-        p, q, z = p + up * u, q + up * v, z + up * w
+        p = p + up * u
+        q = q + up * v
+        z = z + up * w
         return math.degrees(math.atan2(z, (1 - _E2) * math.hypot(p, q))), math.degrees(math.atan2(q, p))
 
     def latlon_array(self, xy: Coordinates) -> tuple[Coordinates, Coordinates]:
@@ -139,7 +149,8 @@ class LocalFrame:
         Raises:
             ValueError: A point lies beyond the horizon of the frame.
         """
-        x, y = xy[:, 0], xy[:, 1]
+        x = xy[:, 0]
+        y = xy[:, 1]
         u, v, w = self._up
         with np.errstate(invalid="ignore", over="ignore"):
             p, q, z = self._plane(x, y)
@@ -148,7 +159,9 @@ class LocalFrame:
         if len(hidden):
             raise self._hidden(float(x[hidden[0]]), float(y[hidden[0]]))
         up = -over / (slope + np.sqrt(root))
-        p, q, z = p + up * u, q + up * v, z + up * w
+        p = p + up * u
+        q = q + up * v
+        z = z + up * w
         return np.degrees(np.arctan2(z, (1 - _E2) * np.hypot(p, q))), np.degrees(np.arctan2(q, p))
 
     def _above(self, p: Metres, q: Metres, z: Metres) -> tuple[Metres, Metres, Metres]:

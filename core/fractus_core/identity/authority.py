@@ -202,7 +202,8 @@ class Authority:
 
 def renewal_time(certificate: x509.Certificate) -> datetime:
     """Return the time at which a certificate is due for renewal: after two thirds of its validity."""
-    start, end = certificate.not_valid_before_utc, certificate.not_valid_after_utc
+    start = certificate.not_valid_before_utc
+    end = certificate.not_valid_after_utc
     return start + (end - start) * _RENEW_AFTER
 
 

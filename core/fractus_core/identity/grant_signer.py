@@ -55,7 +55,8 @@ class GrantSigner:
 
     def problem(self, grant: Grant) -> str | None:
         """Return why a Grant is invalid, or None if the operator of this system signed it."""
-        annotations, metadata = grant.metadata.annotations, grant.metadata
+        annotations = grant.metadata.annotations
+        metadata = grant.metadata
         fingerprint = (
             metadata.uid,
             metadata.generation,

@@ -14,7 +14,8 @@ from dataclasses import dataclass, field, replace
 from fractus_core.linking.prediction import bandwidth_share, expected_metrics
 from fractus_core.linking.values import LearnedRange, LinkSettings, LocalPosition, PathMetrics, Peer
 
-MIN_FACTOR, MAX_FACTOR = 0.2, 2.0
+MIN_FACTOR = 0.2
+MAX_FACTOR = 2.0
 RATE_SMOOTHING = 0.3
 """Weight of a new bandwidth measurement."""
 RANGE_MARGIN = 1.02
@@ -22,7 +23,8 @@ RANGE_MARGIN = 1.02
 RECOVERY_SHARE = 0.98
 """If a beacon arrives from this share of the distance at which a link broke, the link broke for another reason."""
 
-FIRST_RETRY_S, MAX_RETRY_S = 1.0, 60.0
+FIRST_RETRY_S = 1.0
+MAX_RETRY_S = 60.0
 """First and longest delay before another attempt to connect to a peer. The delay doubles with each failure."""
 MAX_IDLE_RETRY_S = 4.0
 """Longest delay while there is no link: an attempt costs nothing then."""

@@ -144,7 +144,8 @@ def direct_reach_m(interfaces: Iterable[Interface], peer_interfaces: Iterable[In
 
     The interfaces for direct links must have the same technology and pairing mode. The smaller range applies.
     """
-    a, b = direct_interface(interfaces), direct_interface(peer_interfaces)
+    a = direct_interface(interfaces)
+    b = direct_interface(peer_interfaces)
     if a is None or b is None or a.technology != b.technology:
         return None
     if a.range is None or b.range is None or a.pairing is None or b.pairing is None or a.pairing.mode != b.pairing.mode:

@@ -44,7 +44,8 @@ class Samples:
     __slots__ = ("_columns", "_first", "_keys", "_ranks", "_rows", "spacing_m")
 
     def __init__(self, shape: BaseGeometry) -> None:
-        area, outline = float(shape.area), float(shape.length)
+        area = float(shape.area)
+        outline = float(shape.length)
         width = 2 * area / outline
         finest = max(math.sqrt(area / _MAX_SAMPLES), outline / _MAX_CROSSINGS)
         self.spacing_m = max(finest, min(math.sqrt(area / SAMPLES), width / _ACROSS))
@@ -80,13 +81,18 @@ class Samples:
         lowest = np.maximum(np.ceil(turned[:, 1] - reach).astype(np.int64), self._first[0])
         highest = np.minimum(np.floor(turned[:, 1] + reach).astype(np.int64), self._first[0] + self._rows - 1)
         node, row = _ranges(lowest, highest + 1)
-        x, y, r = turned[node, 0], turned[node, 1], reach[node]
+        x = turned[node, 0]
+        y = turned[node, 1]
+        r = reach[node]
         half = np.sqrt(np.maximum(r * r - (row - y) ** 2, 0.0))
         left = np.clip(np.ceil(x - half) - self._first[1], 0, self._columns).astype(np.int64)
         right = np.clip(np.floor(x + half) - self._first[1] + 1, 0, self._columns).astype(np.int64)
         base = (row - self._first[0]) * self._columns
         some = right > left
-        node, base, left, right = node[some], base[some], left[some], right[some]
+        node = node[some]
+        base = base[some]
+        left = left[some]
+        right = right[some]
         return node, self._rank(base + left), self._rank(base + right)
 
     def _rank(self, keys: _Integers) -> _Integers:
@@ -261,14 +267,17 @@ def _lattice(shape: BaseGeometry, spacing_m: float) -> tuple[_Integers, _Integer
     )
     turned = _turned(coordinates, -_TILT_RAD) / spacing_m - 0.5
     joined = ring[1:] == ring[:-1]
-    a, b = turned[:-1][joined], turned[1:][joined]
+    a = turned[:-1][joined]
+    b = turned[1:][joined]
     upwards = (a[:, 1] <= b[:, 1])[:, None]
-    low, high = np.where(upwards, a, b), np.where(upwards, b, a)
+    low = np.where(upwards, a, b)
+    high = np.where(upwards, b, a)
     edge, row = _ranges(np.ceil(low[:, 1]).astype(np.int64), np.ceil(high[:, 1]).astype(np.int64))
     rise = (row - low[edge, 1]) / (high[edge, 1] - low[edge, 1])
     crossing = low[edge, 0] + rise * (high[edge, 0] - low[edge, 0])
     order = np.lexsort((crossing, row))
-    row, crossing = row[order], crossing[order]
+    row = row[order]
+    crossing = crossing[order]
     run, column = _ranges(np.ceil(crossing[0::2]).astype(np.int64), np.ceil(crossing[1::2]).astype(np.int64))
     if len(column) == 0:
         inside = _turned(shapely.get_coordinates(shape.representative_point()), -_TILT_RAD) / spacing_m
@@ -286,5 +295,6 @@ def _ranges(starts: _Integers, ends: _Integers) -> tuple[_Integers, _Integers]:
 
 
 def _turned(xy: _Floats, angle_rad: float) -> _Floats:
-    cos, sin = math.cos(angle_rad), math.sin(angle_rad)
+    cos = math.cos(angle_rad)
+    sin = math.sin(angle_rad)
     return np.column_stack((cos * xy[:, 0] - sin * xy[:, 1], sin * xy[:, 0] + cos * xy[:, 1]))

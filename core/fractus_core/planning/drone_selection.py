@@ -159,7 +159,8 @@ def _legal_first(
 
 def _standing(builder: PlanBuilder, area: OperationArea, leader: Component, flying: Sequence[str]) -> list[str]:
     """Return the drones parked in range of the start, and reject the nearest ones out of range."""
-    located, settings = builder.located, builder.settings
+    located = builder.located
+    settings = builder.settings
     first = leader.control_points[0] if leader.control_points else None
     start = start_of(first, builder.inventory.depots) if first is not None else None
     named = first.point.depot if first is not None and first.point is not None else None
@@ -167,9 +168,11 @@ def _standing(builder: PlanBuilder, area: OperationArea, leader: Component, flyi
     inside = builder.inventory.depots[named].spec.radius if named is not None else settings.safety_radius_m
     kept = located.kept_in(named) if named is not None else frozenset()
     if start is None or leader.control == "partial":
-        limit, reason = max(settings.depot_radius_m, inside), "TooFar"
+        limit = max(settings.depot_radius_m, inside)
+        reason = "TooFar"
     else:
-        limit, reason = inside, "TooFar" if named is None else "OtherDepot"
+        limit = inside
+        reason = "TooFar" if named is None else "OtherDepot"
         if named is None:
             kept = frozenset().union(*(located.kept_in(name) for name in _depots_around(builder, centre)))
     wanted = f"not in {named}" if reason == "OtherDepot" else f"more than {limit:.0f} m"

@@ -44,7 +44,8 @@ class Location:
 
 def find_static(builder: PlanBuilder, component: Component) -> list[Location]:
     """Return each location of a component with its edge nodes. Record the nearest nodes outside all locations as rejected."""
-    located, known = builder.located.edge_nodes, builder.inventory.edge_nodes
+    located = builder.located.edge_nodes
+    known = builder.inventory.edge_nodes
     before = {(p.location, p.node) for p in builder.previous_placements if p.component == component.name}
     found = []
     for i, spot in enumerate(component.locations):
@@ -191,7 +192,8 @@ def _reject_unsuitable(builder: PlanBuilder, locations: Iterable[Location]) -> N
 
 def _no_node(builder: PlanBuilder, starved: Location, locations: Iterable[Location]) -> Exception:
     """Return the error for a location without any node."""
-    component, spot = starved.component, starved.spot
+    component = starved.component
+    spot = starved.spot
     for other in locations:
         for name in other.hosts:
             if other.component is component and name in starved.nodes:

@@ -392,7 +392,8 @@ _SOUND: dict[int, SoundZone] = {}
 
 
 def _looked_at(zone: Zone) -> SoundZone:
-    name, spec = zone.name, zone.spec
+    name = zone.name
+    spec = zone.spec
     try:
         frame = LocalFrame.at(area_center(spec.area))
         outline = area_polygon(frame, spec.area)

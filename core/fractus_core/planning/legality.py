@@ -122,11 +122,14 @@ class RouteJudge:
             drone: Drone that flies.
             mission: Estimated flight, or None if the application shares the flight of another one.
         """
-        home, leader = home_of(drone, self._inventory.depots), self._application.spec.leader
-        mobility, time_s = drone.spec.services.mobility, self._settings.time_s
+        home = home_of(drone, self._inventory.depots)
+        leader = self._application.spec.leader
+        mobility = drone.spec.services.mobility
+        time_s = self._settings.time_s
         if time_s is None or home is None or mobility is None or leader is None or mission is None:
             return None
-        owner, attributes = application_reference(self._application), node_attributes(drone)
+        owner = application_reference(self._application)
+        attributes = node_attributes(drone)
         held = tuple(
             p.name for p in self._inventory.policies.values() if policy_applies(p.spec, owner, leader.name, attributes)
         )
@@ -294,7 +297,8 @@ class _Flight:
         return permitted
 
     def _arrive(self, flown: GotoArgs) -> None:
-        now, frame = self.now, self.grant.frame
+        now = self.now
+        frame = self.grant.frame
         height = None
         if flown.alt is not None:
             height = altitude_above_home_m(flown.alt, flown.reference, now.home, self.grant.flat_terrain)

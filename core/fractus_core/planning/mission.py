@@ -59,7 +59,8 @@ class MissionEstimator:
         approach, distance = self._distances(home)
         top, climb = self._climb(drone)
         mobility = drone.spec.services.mobility
-        speed, available = self._settings.cruise_speed_mps, 0.0
+        speed = self._settings.cruise_speed_mps
+        available = 0.0
         if mobility is not None:
             speed = min(speed, mobility.max_speed)
             available = remaining_minutes(drone) - self._settings.battery_reserve * mobility.max_flight_time
@@ -141,7 +142,8 @@ def mission_legs(
     spec: ApplicationSpec, area: OperationArea, home: Position, depots: Mapping[str, Depot]
 ) -> Iterator[MissionLeg]:
     """Return the legs of a mission from the parking position of the drone and back, in order."""
-    driver, at = spec.driver, home
+    driver = spec.driver
+    at = home
     if driver is None:
         for place in area.route:
             yield MissionLeg(at, place, "system")
@@ -250,7 +252,8 @@ def first_missed(points: Sequence[Position], flight: Flight, radius_m: float, *,
     for i, point in enumerate(points):
         passages = _passages(starts, ends, _spot(frame, point, point.alt), radius_m)
         index = np.arange(len(passages))
-        begin, end = index + passages[:, 0], index + passages[:, 1]
+        begin = index + passages[:, 0]
+        end = index + passages[:, 1]
         open_ = np.isfinite(passages[:, 0]) & (end >= at)
         if not open_.any():
             return i
@@ -270,7 +273,8 @@ def _spot(frame: LocalFrame, place: Position, alt: float | None) -> list[float]:
 
 def _segments(frame: LocalFrame, flight: Flight) -> tuple[_Spots, _Spots]:
     """Return starts and ends of the remaining segments: x, y, altitude (NaN if unknown), datum; shape (n, 4)."""
-    starts, ends = [], []
+    starts = []
+    ends = []
     passed = flight.reached
     for leg in flight.legs:
         spots = []
@@ -290,7 +294,8 @@ def _passages(starts: _Spots, ends: _Spots, spot: Sequence[float], radius_m: flo
     """Return the interval (0 to 1) in which each segment is within a radius of a spot, or inf; shape (n, 2)."""
     along = ends[:, :2] - starts[:, :2]
     offset = starts[:, :2] - np.array(spot[:2])
-    a, b = (along**2).sum(axis=1), (along * offset).sum(axis=1)
+    a = (along**2).sum(axis=1)
+    b = (along * offset).sum(axis=1)
     c = (offset**2).sum(axis=1) - radius_m**2
     span = np.where(a > 0, b * b - a * c, -c)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -298,13 +303,15 @@ def _passages(starts: _Spots, ends: _Spots, spot: Sequence[float], radius_m: flo
         low = np.where(a > 0, (-b - root) / a, 0.0)
         high = np.where(a > 0, (-b + root) / a, 1.0)
         rise = ends[:, 2] - starts[:, 2]
-        below, above = spot[2] - radius_m - starts[:, 2], spot[2] + radius_m - starts[:, 2]
+        below = spot[2] - radius_m - starts[:, 2]
+        above = spot[2] + radius_m - starts[:, 2]
         at = np.sort(np.column_stack((below / rise, above / rise)), axis=1)
         level = np.where((below <= 0) & (above >= 0), 0.0, np.inf)
     known = ~np.isnan(rise) & ~math.isnan(spot[2]) & (starts[:, 3] == spot[3]) & (ends[:, 3] == spot[3])
     sloped = known & (rise != 0)
     low = np.maximum(low, np.where(sloped, at[:, 0], np.where(known, level, 0.0)))
     high = np.minimum(high, np.where(sloped, at[:, 1], 1.0))
-    low, high = np.maximum(low, 0.0), np.minimum(high, 1.0)
+    low = np.maximum(low, 0.0)
+    high = np.minimum(high, 1.0)
     never = ~(span >= 0) | ~(low <= high)
     return np.where(never[:, None], np.inf, np.column_stack((low, high)))

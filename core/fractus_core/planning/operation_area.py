@@ -108,7 +108,8 @@ def check_crossings(spec: ApplicationSpec, route: Sequence[Position]) -> None:
     if not route:
         return
     frame = LocalFrame.at(center_of(route))
-    driver, poi = spec.driver, spec.points_of_interest
+    driver = spec.driver
+    poi = spec.points_of_interest
     rings: list[Sequence[Point]] = []
     if driver is not None:
         ways: list[Sequence[Point]] = [point.path for point in driver.control_points if point.path is not None]
@@ -118,7 +119,8 @@ def check_crossings(spec: ApplicationSpec, route: Sequence[Position]) -> None:
         rings = [ring for area in areas if area is not None for ring in (area.exterior, *area.holes)]
         field = f"components[{spec.components.index(driver)}].controlPoints"
     elif poi is not None and poi.service_access == "path":
-        ways, field = [route], "components"
+        ways = [route]
+        field = "components"
     else:
         return
     lines = [np.asarray(points_xy(frame, way)) for way in (*ways, *((*ring, ring[0]) for ring in rings))]
@@ -270,8 +272,10 @@ def _untangled(tour: list[int], distance: NDArray[np.float64]) -> list[int]:
         improved = False
         for i in range(len(order) - 2):
             # Reverse order[i+1..j]: the edges (i, i+1) and (j, j+1) become (i, j) and (i+1, j+1); the end is open.
-            a, b = order[i], order[i + 1]
-            ends, after = order[i + 2 :], order[i + 3 :]
+            a = order[i]
+            b = order[i + 1]
+            ends = order[i + 2 :]
+            after = order[i + 3 :]
             change = distance[a, ends] - distance[a, b]
             change[:-1] += distance[b, after] - distance[ends[:-1], after]
             j = int(np.argmin(change))

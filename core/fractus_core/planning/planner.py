@@ -83,7 +83,8 @@ def plan_in_steps(
 
 
 def _plan_once(builder: PlanBuilder) -> Generator[str, None, DeploymentPlanSpec]:
-    application, inventory = builder.application, builder.inventory
+    application = builder.application
+    inventory = builder.inventory
     area = operation_area(builder.spec, inventory.depots, builder.settings.safety_radius_m)
     yield "area"
     choice: DroneChoice | None = None

@@ -67,7 +67,8 @@ class Footprint:
         if self._at is None or not (upper_m < self._lowest_m or lower_m > 0.0):
             return True
         # All rays are straight and lead down, so the view at a depth is the view at depth 1, enlarged.
-        far, near = self._highest_m - max(lower_m, 0.0), max(self._lowest_m - upper_m, 0.0)
+        far = self._highest_m - max(lower_m, 0.0)
+        near = max(self._lowest_m - upper_m, 0.0)
         if far < 0.0:
             return False
         x, y = self._at
@@ -166,15 +167,24 @@ def _widened(lens: Lens, error_deg: float) -> tuple[float, float] | None:
 
 def camera_axes(lens: Lens, attitude: Attitude) -> tuple[Vector, Vector, Vector]:
     """Return the viewing direction, and the right and up directions of pictures, as north, east, down."""
-    pitch, yaw = math.radians(lens.pitch_deg), math.radians(lens.yaw_deg)
-    cp, sp, cy, sy = math.cos(pitch), math.sin(pitch), math.cos(yaw), math.sin(yaw)
+    pitch = math.radians(lens.pitch_deg)
+    yaw = math.radians(lens.yaw_deg)
+    cp = math.cos(pitch)
+    sp = math.sin(pitch)
+    cy = math.cos(yaw)
+    sy = math.sin(yaw)
     mounted = ((cp * cy, cp * sy, -sp), (-sy, cy, 0.0), (sp * cy, sp * sy, cp))
     roll = pitch = 0.0
     if not lens.stabilised:
-        roll, pitch = math.radians(attitude.roll_deg), math.radians(attitude.pitch_deg)
-    cr, sr, cp, sp = math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch)
+        roll = math.radians(attitude.roll_deg)
+        pitch = math.radians(attitude.pitch_deg)
+    cr = math.cos(roll)
+    sr = math.sin(roll)
+    cp = math.cos(pitch)
+    sp = math.sin(pitch)
     yaw = math.radians(attitude.yaw_deg)
-    cy, sy = math.cos(yaw), math.sin(yaw)
+    cy = math.cos(yaw)
+    sy = math.sin(yaw)
 
     def turned(vector: Vector) -> Vector:
         x, y, z = vector
@@ -196,12 +206,14 @@ def _sector(position: XY, now: Situation, axis: Vector, corners: list[Vector], e
     """Return everything within sight between the left and right sides of a picture that shows the horizon."""
     ahead = math.atan2(axis[1], axis[0])
     turns = [math.remainder(math.atan2(east, north) - ahead, 2 * math.pi) for north, east, _ in corners]
-    left, right = min(turns) - math.radians(error_deg), max(turns) + math.radians(error_deg)
+    left = min(turns) - math.radians(error_deg)
+    right = max(turns) + math.radians(error_deg)
     if right - left >= math.radians(175):
         return _everything(position, now)
     steps = math.ceil((right - left) / math.radians(_ARC_DEG))
     step = (right - left) / steps
-    reach_m, (x, y) = MAX_SIGHT_M / math.cos(step / 2), position
+    reach_m = MAX_SIGHT_M / math.cos(step / 2)
+    x, y = position
     bearings = [ahead + left + i * step for i in range(steps + 1)]
     points = [position, *((x + reach_m * math.sin(b), y + reach_m * math.cos(b)) for b in bearings)]
     return Footprint(_hull(points), now.position_error_m, math.inf, math.inf)
@@ -215,7 +227,8 @@ def _turned(corners: list[XY], error_deg: float) -> list[XY]:
         reach = max(math.hypot(e, n) for e, n in corners)
         return [(reach * e, reach * n) for e, n in _CIRCLE]
     turn = math.radians(error_deg)
-    c, s = math.cos(turn), math.sin(turn)
+    c = math.cos(turn)
+    s = math.sin(turn)
     # The ends of each corner's arc, and the intersection of the tangents there.
     return [
         point

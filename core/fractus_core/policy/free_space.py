@@ -63,7 +63,8 @@ class FreeSpace:
         air = AirVolume(line, self.margin_m, self.lower_m - slack, self.upper_m + slack)
         obstacles: list[PolicyZone | int] = list(self.grant.exclusions.near(air, self.now, flat))
         if self.grant.altitude_limits.zones:
-            low, high = self.lower_m, self.upper_m
+            low = self.lower_m
+            high = self.upper_m
             limiting = self.grant.altitude_limits.near(air, self.now, flat)
             obstacles += [zone for zone in limiting if limit_forbids_altitudes(zone, low, high, self.now, flat)]
         for i, (shape, border) in enumerate(self.required_areas):
@@ -142,8 +143,10 @@ def _corners(shape: BaseGeometry, turning: float) -> Floats:
         whole = shapely.orient_polygons(part)
         for ring in (whole.exterior, *whole.interiors):
             points = shapely.get_coordinates(ring)[:-1]
-            before, after = np.roll(points, 1, axis=0), np.roll(points, -1, axis=0)
-            there, away = points - before, after - points
+            before = np.roll(points, 1, axis=0)
+            after = np.roll(points, -1, axis=0)
+            there = points - before
+            away = after - points
             turn = there[:, 0] * away[:, 1] - there[:, 1] * away[:, 0]
             corners.append(np.hstack((points, before, after))[turn * turning > 0])
     return np.vstack(corners)

@@ -381,10 +381,12 @@ def _only_gains_distance(
     """
     if keeps(leg.line):
         return True
-    (x, y), (tx, ty) = leg.stop, leg.target
+    x, y = leg.stop
+    tx, ty = leg.target
     if keeps(shapely.points(leg.stop)) or not keeps(shapely.points(leg.target)):
         return False
-    low, high = 0.0, 1.0
+    low = 0.0
+    high = 1.0
     for _ in range(BISECTION_STEPS):
         share = (low + high) / 2
         keeps_rest = keeps(shapely.linestrings(((x + (tx - x) * share, y + (ty - y) * share), (tx, ty))))

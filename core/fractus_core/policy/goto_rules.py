@@ -261,12 +261,14 @@ def check_return(target: XY, altitude_m: float, now: Situation, grant: CompiledG
 def _last_legal_point(leg: Leg, breaches: list[Breach]) -> XY | None:
     """Return the farthest point of a leg that no breached fence forbids, or None if the leg to it is too short."""
     length_m = math.dist(leg.stop, leg.target)
-    (x, y), (tx, ty) = leg.stop, leg.target
+    x, y = leg.stop
+    tx, ty = leg.target
 
     def along(share: float) -> XY:
         return x + (tx - x) * share, y + (ty - y) * share
 
-    low, high = 0.0, 1.0
+    low = 0.0
+    high = 1.0
     for _ in range(BISECTION_STEPS):
         share = (low + high) / 2
         part = shapely.linestrings((leg.stop, along(share)))

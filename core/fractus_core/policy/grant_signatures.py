@@ -156,6 +156,7 @@ def _issuer(certificate: x509.Certificate, authorities: Sequence[x509.Certificat
 
 def _check_time(issued_at: datetime, *certificates: x509.Certificate) -> None:
     for certificate in certificates:
-        begin, end = certificate.not_valid_before_utc, certificate.not_valid_after_utc
+        begin = certificate.not_valid_before_utc
+        end = certificate.not_valid_after_utc
         if not begin - MAX_CLOCK_SKEW <= issued_at <= end + MAX_CLOCK_SKEW:
             raise BadSignature(f"it was issued at {issued_at:%F %T}, when its certificate was not valid")

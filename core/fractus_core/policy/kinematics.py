@@ -195,10 +195,12 @@ def turn_point(situation: Situation, position: XY, target: XY) -> XY:
     if speed < STATIONARY_MPS:
         return stop
     reaction = motion_before_reaction(situation)
-    east, north = situation.east_mps / speed * reaction.speed_mps, situation.north_mps / speed * reaction.speed_mps
+    east = situation.east_mps / speed * reaction.speed_mps
+    north = situation.north_mps / speed * reaction.speed_mps
     change = reaction.speed_mps
     for origin in (position, stop):
-        dx, dy = target[0] - origin[0], target[1] - origin[1]
+        dx = target[0] - origin[0]
+        dy = target[1] - origin[1]
         distance = math.hypot(dx, dy)
         cruise = (
             min(situation.speed_setpoint_mps, math.sqrt(2 * airframe.accel_mps2 * distance)) if distance > 0 else 0.0
@@ -311,7 +313,8 @@ class Leg:
         """Farthest point of an overshoot. A drone that turns on its way swings past the target."""
         if self.follows_velocity:
             return self.target
-        (tx, ty), (x, y) = self.turn, self.target
+        tx, ty = self.turn
+        x, y = self.target
         along = math.hypot(x - tx, y - ty)
         over = OVERSHOOT_SHARE * math.hypot(self.stop[0] - self.start[0], self.stop[1] - self.start[1])
         if over == 0 or along < 1e-6:
@@ -395,13 +398,16 @@ def _displacements(
         vx, vy = (p + (w - p) * done for p, w in zip(present, target_velocity, strict=True))
         half = turning_s / 2
         points.append((present[0] * half, present[1] * half))
-        x, y = (present[0] + vx) * half, (present[1] + vy) * half
+        x = (present[0] + vx) * half
+        y = (present[1] + vy) * half
         speed = math.hypot(vx, vy)
         if share == 1.0:
             points.append((x, y))
-            x, y = x + vx * (lasting_s - turning_s), y + vy * (lasting_s - turning_s)
+            x = x + vx * (lasting_s - turning_s)
+            y = y + vy * (lasting_s - turning_s)
         if speed > 0:
             run = accel / (2 * airframe.jerk_mps3) + stopping_distance_m(speed, accel, gain) / speed
-            x, y = x + vx * run, y + vy * run
+            x = x + vx * run
+            y = y + vy * run
         points.append((x, y))
     return points

@@ -183,7 +183,8 @@ def clamp(quantity: str, unit: str, value: float, bounds: list[Bound]) -> Correc
     problem = check_contradiction(quantity, unit, bounds)
     if problem is not None:
         return problem
-    highest, lowest = _highest(bounds), _lowest(bounds)
+    highest = _highest(bounds)
+    lowest = _lowest(bounds)
     corrected_value = min(max(value, lowest), highest)
     word = "above" if above else "below"
     return Correction(
@@ -201,7 +202,8 @@ def is_achievable(quantity: str, limit: float | None) -> bool:
 
 def check_contradiction(quantity: str, unit: str, bounds: list[Bound]) -> Verdict | None:
     """Return the denial of every value if limits contradict each other, or None."""
-    highest, lowest = _highest(bounds), _lowest(bounds)
+    highest = _highest(bounds)
+    lowest = _lowest(bounds)
     if lowest <= highest + ROUNDING_SLACK:
         return None
     high = [b for b in bounds if b.upper == highest]
@@ -247,7 +249,8 @@ def check_altitude_on_entry(
         bounds: Altitude limits along the leg.
         slack_m: Permitted deviation from the limits.
     """
-    low, high = min(heights_m), max(heights_m)
+    low = min(heights_m)
+    high = max(heights_m)
     for bound in bounds:
         if bound.shape is None or bound.shape.intersects(start):
             continue

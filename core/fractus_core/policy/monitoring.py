@@ -83,7 +83,8 @@ def monitor(
         return None
     if not now.is_plausible and not math.isfinite(now.time_s):
         raise ValueError("the time is not a number")
-    lat, lon = now.lat, now.lon
+    lat = now.lat
+    lon = now.lon
     if lat is None or lon is None or not now.is_plausible:
         return Verdict("takeover", None, "PositionUnknown", "the drone's position is unknown", (), "hover")
     start = grant.frame.xy(lat, lon)
@@ -370,8 +371,10 @@ def _check_altitude(
     bounds, unknown = altitude_bounds(grant, now, AirVolume(shapely.points(start), 0.0, now.altitude_m, now.altitude_m))
     slack = now.altitude_error_m + now.airframe.tracking_m
     sinks_back = sinks_back and now.down_mps > SINKING_MPS
-    over, under = strictest_bound(bounds, above=True), strictest_bound(bounds, above=False)
-    high, low = max(now.altitude_m, rest_m), min(now.altitude_m, rest_m)
+    over = strictest_bound(bounds, above=True)
+    under = strictest_bound(bounds, above=False)
+    high = max(now.altitude_m, rest_m)
+    low = min(now.altitude_m, rest_m)
     if over is not None and over.upper is not None and high > over.upper + share * slack and not sinks_back:
         reason = f"the drone climbs to {high:.1f} m, above the limit of {over.upper:.1f} m"
         return _altitude_correction(_LimitViolation(over, over.upper, "AltitudeAboveLimit", reason), now, grant, stop)

@@ -102,7 +102,8 @@ def rules_in_view(index: PolicyIndex, now: Situation, grant: CompiledGrant) -> l
     if not index.zones:
         return by_priority(rules)
     position = shapely.Point(grant.frame.xy(now.lat, now.lon))
-    lower_m, upper_m = now.altitude_m - now.altitude_error_m, now.altitude_m + now.altitude_error_m
+    lower_m = now.altitude_m - now.altitude_error_m
+    upper_m = now.altitude_m + now.altitude_error_m
     for zone in index.near(AirVolume(position, now.position_error_m, lower_m, upper_m), now, grant.flat_terrain):
         rules[zone.rule.name] = zone.rule
     air = AirVolume(view.sight, view.margin_m, -math.inf, view.upper_m)

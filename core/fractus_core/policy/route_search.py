@@ -147,7 +147,10 @@ def _length_m(start: XY, route: tuple[XY, ...]) -> float:
 
 def _intersection(before: XY, first: XY, second: XY, after: XY) -> XY | None:
     """Return the intersection of two legs when both are extended. None if it is far away or behind."""
-    ux, uy, vx, vy = first[0] - before[0], first[1] - before[1], second[0] - after[0], second[1] - after[1]
+    ux = first[0] - before[0]
+    uy = first[1] - before[1]
+    vx = second[0] - after[0]
+    vy = second[1] - after[1]
     across = ux * vy - uy * vx
     if abs(across) < 1e-9:
         return None
@@ -207,7 +210,8 @@ class _Search:
             _, end, begin, cost = heapq.heappop(self._heap)
             if cost >= self._cost[end] - 1e-9 or not self._open(begin, end):
                 continue
-            self._cost[end], self._parent[end] = cost, begin
+            self._cost[end] = cost
+            self._parent[end] = begin
             if end == _TARGET:
                 return self._way()
             self._expand(end)
@@ -254,7 +258,8 @@ class _Search:
 
     def _push(self, begins: list[int], first: int) -> None:
         """Queue the tangents from some nodes to all nodes from a number on."""
-        froms, tos = self._nodes[begins], self._nodes[first:]
+        froms = self._nodes[begins]
+        tos = self._nodes[first:]
         along = tos[None, :, :2] - froms[:, None, :2]
         away = np.hypot(along[..., 0], along[..., 1])
         cost = self._cost[begins][:, None] + away
@@ -320,7 +325,8 @@ class _Search:
 
 def _tangent(along: Floats, corners: Floats) -> NDArray[np.bool_]:
     """Return True for lines through corners that leave both neighbours of the corner on one side. Shapes broadcast."""
-    before, after = corners[..., 2:4] - corners[..., :2], corners[..., 4:] - corners[..., :2]
+    before = corners[..., 2:4] - corners[..., :2]
+    after = corners[..., 4:] - corners[..., :2]
     left = along[..., 0] * before[..., 1] - along[..., 1] * before[..., 0]
     right = along[..., 0] * after[..., 1] - along[..., 1] * after[..., 0]
     tangent: NDArray[np.bool_] = left * right >= -_ROUNDING

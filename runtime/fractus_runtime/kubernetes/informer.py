@@ -198,7 +198,8 @@ class Informer(Generic[T]):
 
     def _take(self, type_: str, body: Body) -> None:
         key = key_of(body)
-        version, own_write = _version(body), self._own_writes.get(key, 0)
+        version = _version(body)
+        own_write = self._own_writes.get(key, 0)
         if version < own_write or (own_write and version == own_write and type_ != "DELETED"):
             return
         self._own_writes.pop(key, None)

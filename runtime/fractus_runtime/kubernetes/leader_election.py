@@ -151,11 +151,13 @@ class Lease:
     def _expired(self, body: Body) -> bool:
         """Return True if this process has observed no change of the Lease of another process for its duration."""
         spec = body.get("spec") or {}
-        now, state = self._time(), (spec.get("holderIdentity"), spec.get("renewTime"))
+        now = self._time()
+        state = (spec.get("holderIdentity"), spec.get("renewTime"))
         if state != self._seen:
             if self._seen[:1] != state[:1]:
                 logger.info("lease: waiting for the leader to end (leader=%s)", spec.get("holderIdentity"))
-            self._seen, self._seen_at = state, now
+            self._seen = state
+            self._seen_at = now
         return now - self._seen_at > max(self._duration_s, float(spec.get("leaseDurationSeconds") or 0))
 
     def _wanted(self, body: Body, *, free: bool = False) -> Body:

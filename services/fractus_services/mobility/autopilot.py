@@ -26,7 +26,8 @@ BEING_SET = "they are being set"
 """Problem of failsafes that are not read back yet."""
 
 LANDED_MAX_AGE_S = 2.0
-SURELY_M, UNTOLD_M = 1.5, 0.5
+SURELY_M = 1.5
+UNTOLD_M = 0.5
 """Altitude above which a drone flies although it reports ON_GROUND, and altitude above which it flies if it reports nothing."""
 _IN_AIR = frozenset(
     {mavlink.MAV_LANDED_STATE_IN_AIR, mavlink.MAV_LANDED_STATE_TAKEOFF, mavlink.MAV_LANDED_STATE_LANDING}
@@ -177,7 +178,8 @@ class VehicleState:
         """Acceleration along the course; None while too few velocities are known."""
         if len(self.courses) < 2:
             return None
-        (begun, north, east), (now, *_) = self.courses[0], self.courses[-1]
+        begun, north, east = self.courses[0]
+        (now, *_) = self.courses[-1]
         if now - begun < COURSE_S / 3:
             return None
         along = (self.north_mps - north) * self.north_mps + (self.east_mps - east) * self.east_mps

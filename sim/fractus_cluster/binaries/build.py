@@ -55,7 +55,8 @@ def build(programs: Sequence[Program], into: Path, *, report: Report) -> None:
     for left in into.glob(".building-*"):  # # left by a killed build; the lock is held
         shutil.rmtree(left)
     with tempfile.TemporaryDirectory(prefix=".building-", dir=into) as scratch:
-        source, output = Path(scratch) / "source", Path(scratch) / "bin"
+        source = Path(scratch) / "source"
+        output = Path(scratch) / "bin"
         output.mkdir()
         with resources.as_file(_sources(module)) as folder:
             shutil.copytree(folder, source)

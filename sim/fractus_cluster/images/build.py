@@ -120,7 +120,8 @@ def build_images(
         if stale:
             ensure_base(report=report)
             _build_stale(source, stale, tag, report)
-            before, present = present, image_ids()
+            before = present
+            present = image_ids()
             _remove_replaced(before[name] for name in names if name in before and before[name] != present[name])
             built.update({name: f"{digests[name]} {present[name]}" for name in names})
             write_ledger(ledger, built)

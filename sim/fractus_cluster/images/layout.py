@@ -193,7 +193,8 @@ def _layer_with(program: Path) -> bytes:
 
 def _add_bytes(archive: tarfile.TarFile, name: str, content: bytes, *, mode: int = 0o644) -> None:
     member = tarfile.TarInfo(name)
-    member.size, member.mode = len(content), mode
+    member.size = len(content)
+    member.mode = mode
     archive.addfile(member, io.BytesIO(content))
 
 

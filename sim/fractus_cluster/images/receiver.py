@@ -137,7 +137,8 @@ class _Handler(BaseHTTPRequestHandler):
     def do_PUT(self) -> None:
         """Complete an upload, or receive a manifest."""
         address = urlsplit(self.path)
-        upload, manifest = _UPLOAD.match(address.path), _MANIFEST.match(address.path)
+        upload = _UPLOAD.match(address.path)
+        manifest = _MANIFEST.match(address.path)
         if upload is not None:
             file = self._upload_file(upload[1])
             with file.open("ab") as out:

@@ -117,7 +117,9 @@ def _copy_storage(source: Path, target: Path) -> None:
 @contextmanager
 def _daemon(scratch: Path) -> Iterator[list[str]]:
     """Run a container daemon on `scratch/root`, and yield the beginning of its client's command line."""
-    socket, config, log = scratch / "s", scratch / "config.toml", scratch / "log"
+    socket = scratch / "s"
+    config = scratch / "config.toml"
+    log = scratch / "log"
     config.write_text(_CONFIG.format(root=scratch / "root", state=scratch / "state", socket=socket))
     with log.open("wb") as output:
         daemon = subprocess.Popen(

@@ -24,7 +24,8 @@ from fractus_sim.demo.kube import NAMESPACE, SYSTEM, DemoError
 
 Breaking = Generator[str, None, None]
 
-MIN_STEP_S, MAX_STEP_S = 30.0, 26 * 3600.0
+MIN_STEP_S = 30.0
+MAX_STEP_S = 26 * 3600.0
 """Clock offset. NTP makes smaller steps all the time, and no certificate here is valid for longer than the maximum."""
 
 BALLAST = "ballast"
@@ -227,7 +228,8 @@ def _fill_disk(stage: Stage, _chance: random.Random) -> Breaking:
 
 def _take_all(file: IO[bytes]) -> None:
     """Allocate all free blocks of the disk to a file."""
-    end, piece = os.fstat(file.fileno()).st_size, 1 << 30
+    end = os.fstat(file.fileno()).st_size
+    piece = 1 << 30
     while piece:
         try:
             os.posix_fallocate(file.fileno(), end, piece)

@@ -109,7 +109,8 @@ def keep_pictures(recordings: Iterable[Path], record: Record, folder: Path) -> N
     if record.takeoff_s is None:
         return
     taken = {name: jpeg for path in recordings if path.name.startswith("camera-") for name, jpeg in _pictures(path)}
-    begin_s, end_s = record.samples[0].time_s, record.samples[-1].time_s
+    begin_s = record.samples[0].time_s
+    end_s = record.samples[-1].time_s
     (folder / PICTURES).mkdir(parents=True, exist_ok=True)
     for name in spread(list(taken), begin_s, end_s):
         (folder / PICTURES / name).write_bytes(taken[name])

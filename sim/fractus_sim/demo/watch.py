@@ -46,7 +46,8 @@ class Mission:
     def see(self, objects: list[Object], now_s: float, say: Say) -> None:
         """Read the objects of the cluster and report changes."""
         for body in objects:
-            kind, name = body["kind"], body["metadata"]["name"]
+            kind = body["kind"]
+            name = body["metadata"]["name"]
             if kind == "Application" and name == self.application:
                 self._see_application(body, now_s, say)
             elif kind == "DeploymentPlan" and name == self.application and "planned" not in self.times:
@@ -75,11 +76,13 @@ class Mission:
 
     def _see_application(self, body: Object, now_s: float, say: Say) -> None:
         status = body.get("status") or {}
-        phase, message = status.get("phase", ""), status.get("message", "")
+        phase = status.get("phase", "")
+        message = status.get("message", "")
         self.drone = status.get("drone") or self.drone
         if (phase, message) != (self.phase, self.message):
             say(f"application {phase or 'new'}{': ' + message if message else ''}")
-        self.phase, self.message = phase, message
+        self.phase = phase
+        self.message = message
         if self.ended and "ended" not in self.times:
             self.times["ended"] = now_s
 
@@ -93,7 +96,8 @@ class Mission:
         say(f"{self.drone} is {_words(state)}")
 
     def _see_link(self, body: Object, now_s: float, say: Say) -> None:
-        node, status = body["spec"]["node"], body.get("status") or {}
+        node = body["spec"]["node"]
+        status = body.get("status") or {}
         traffic = status.get("traffic") or "cloud"
         before = next((change["traffic"] for change in reversed(self.links) if change["node"] == node), "cloud")
         if traffic != before:

@@ -157,7 +157,8 @@ class ClusterTestbed(Testbed):
             except DemoError:
                 continue
             for body in found:
-                name, phase = body["metadata"]["name"], (body.get("status") or {}).get("phase", "")
+                name = body["metadata"]["name"]
+                phase = (body.get("status") or {}).get("phase", "")
                 if phase and self._phase.get(name) != phase:
                     self._phase[name] = phase
                     self.findings.phases.setdefault(name, []).append(phase)
@@ -205,7 +206,8 @@ def _prepared(node: NodeSpec, setup: VehicleSetup, experiment: Experiment) -> No
     if found is None:
         return node
     home, _, arguments = found
-    wind, entry = experiment.wind, setup.entry
+    wind = experiment.wind
+    entry = setup.entry
     given = [
         "--seed", str(experiment.seed), "--sysid", str(setup.system_id), "--ready-after", f"{entry.ready_after:g}", "--throttle", "1500",
         "--wind", f"{wind.speed},{wind.direction},{wind.turbulence}",

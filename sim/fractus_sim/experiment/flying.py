@@ -130,7 +130,8 @@ def _take_off(station: Station, altitude_m: float) -> Flight:
 
 def _go(station: Station, step: Goto, speed_mps: float | None) -> Flight:
     target = _point(station, step)
-    lat, lon = target.lat_e7, target.lon_e7
+    lat = target.lat_e7
+    lon = target.lon_e7
     remind_s = station.now_s
     while True:
         if station.now_s >= remind_s:
@@ -150,7 +151,8 @@ def _go(station: Station, step: Goto, speed_mps: float | None) -> Flight:
 
 
 def _hold(station: Station, seconds: float) -> Flight:
-    mode, end = station.state.mode, station.now_s + seconds
+    mode = station.state.mode
+    end = station.now_s + seconds
     while station.now_s < end:
         yield
         if station.state.mode != mode:

@@ -51,7 +51,9 @@ class Injector:
     def __init__(self, faults: Sequence[Fault], testbed: Testbed, tell: Callable[[str], None]) -> None:
         self.occurrences: list[Occurrence] = []
         self.takeoffs_s: dict[str, float] = {}
-        self._testbed, self._observers, self._tell = testbed, testbed.observers, tell
+        self._testbed = testbed
+        self._observers = testbed.observers
+        self._tell = tell
         self._now_s = 0.0
         self._running = [self._prepare(fault, vehicle) for fault in faults for vehicle in self._victims(fault)]
 

@@ -105,14 +105,16 @@ def _reached(check: kinds.Reached, flight: Flight, _evidence: Evidence) -> tuple
         target = Place.from_degrees(check.lat, check.lon, 0.0)
     else:
         target = Place.from_degrees(home.lat, home.lon, 0.0).offset(check.north or 0.0, check.east or 0.0)
-    best_m, best_s = math.inf, 0.0
+    best_m = math.inf
+    best_s = 0.0
     for sample in flight.samples:
         if check.within is not None and sample.time_s > check.within:
             break
         north, east, _ = Place.from_degrees(sample.place.lat, sample.place.lon, 0.0).vector_to(target)
         off_m = math.hypot(north, east, 0.0 if check.alt is None else sample.place.alt_m - check.alt)
         if off_m < best_m:
-            best_m, best_s = off_m, sample.time_s
+            best_m = off_m
+            best_s = sample.time_s
     return best_m <= check.tolerance, f"closest {best_m:.1f} m, at {best_s:.1f} s"
 
 
@@ -143,7 +145,8 @@ def _altitude(check: kinds.AltitudeBand, flight: Flight, _evidence: Evidence) ->
     heights = [s.place.alt_m for s in flight.samples if s.in_air]
     if not heights:
         return False, "never took off"
-    holds, found = True, []
+    holds = True
+    found = []
     if check.max is not None:
         found.append(f"maximum {max(heights):.1f} m")
         holds = max(heights) <= check.max
@@ -211,13 +214,17 @@ def _task(_check: kinds.TaskDone, flight: Flight, _evidence: Evidence) -> tuple[
 
 def _separation(check: kinds.Separation, evidence: Evidence) -> tuple[bool, str]:
     names = check.vehicles or tuple(evidence.flights)
-    nearest_m, who, when_s = math.inf, "", 0.0
+    nearest_m = math.inf
+    who = ""
+    when_s = 0.0
     for one, other in itertools.combinations(names, 2):
         for a, b in _pairs(evidence.flights[one].samples, evidence.flights[other].samples):
             start = Place.from_degrees(a.place.lat, a.place.lon, a.place.alt_m)
             off_m = math.hypot(*start.vector_to(Place.from_degrees(b.place.lat, b.place.lon, b.place.alt_m)))
             if off_m < nearest_m:
-                nearest_m, who, when_s = off_m, f"{one} and {other}", a.time_s
+                nearest_m = off_m
+                who = f"{one} and {other}"
+                when_s = a.time_s
     if not who:
         return True, "no two vehicles were in the air at the same time"
     return nearest_m >= check.min, f"closest {nearest_m:.1f} m, {who} at {when_s:.1f} s"

@@ -101,7 +101,8 @@ class LinkTap:
             client.close()
             return
         near, far = (_End(one, Framer(self._log)) for one in (client, server))
-        near.other, far.other = far, near
+        near.other = far
+        far.other = near
         for end in (near, far):
             end.socket.setblocking(False)
             end.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

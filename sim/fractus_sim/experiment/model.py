@@ -316,7 +316,8 @@ def _check_faults(experiment: Experiment) -> None:
 
 def _check_checks(experiment: Experiment) -> None:
     names = {name for entry in experiment.vehicles for name in entry.names()}
-    zones, programs = {zone.name for zone in experiment.zones}, {program.name for program in experiment.programs}
+    zones = {zone.name for zone in experiment.zones}
+    programs = {program.name for program in experiment.programs}
     kinds = {fault.fault for fault in experiment.faults}
     for index, check in enumerate(experiment.checks):
         where = f"checks[{index}]"

@@ -44,7 +44,8 @@ class Reaper:
         """Kill the process groups that are still held."""
         if self._guard is None:
             return
-        guard, self._guard = self._guard, None
+        guard = self._guard
+        self._guard = None
         os.close(self._pipe)
         try:
             guard.wait(_CLOSE_S)

@@ -12,7 +12,10 @@ from fractus_services.recording.segment_writer import McapWriter
 from fractus_sim.experiment.station import Station
 from fractus_sim.report.track import Place, Sample, Track
 
-_NUMBER, _TEXT, _FLAG, _INTEGER = {"type": "number"}, {"type": "string"}, {"type": "boolean"}, {"type": "integer"}
+_NUMBER = {"type": "number"}
+_TEXT = {"type": "string"}
+_FLAG = {"type": "boolean"}
+_INTEGER = {"type": "integer"}
 _SCHEMAS = dict(
     (
         schema(
@@ -81,7 +84,8 @@ class Recorder:
 
     def take(self, station: Station, messages: list[Message], now_s: float, unix_us: int) -> None:
         """Record messages in order."""
-        state, flight = station.state, self.flight
+        state = station.state
+        flight = self.flight
         for message in messages:
             if message.name == "GLOBAL_POSITION_INT" and (state.lat or state.lon):
                 place = Place(state.lat, state.lon, state.alt_m)
@@ -105,7 +109,8 @@ class Recorder:
                     flight.modes.append((now_s, state.mode))
 
     def _position(self, station: Station, now_s: float, unix_us: int) -> None:
-        state, time_ns = station.state, unix_us * 1000
+        state = station.state
+        time_ns = unix_us * 1000
         self._write(location(time_ns, self.flight.name, state.lat, state.lon, state.amsl_m))
         content = {
             "time_s": round(now_s, 3), "mode": state.mode, "armed": state.armed, "in_air": state.flying,

@@ -172,12 +172,15 @@ def _run_session(session: _Session) -> str:
     Raises:
         ExperimentError: The experiment could not be set up.
     """
-    testbed, experiment, progress = session.testbed, session.experiment, session.progress
+    testbed = session.testbed
+    experiment = session.experiment
+    progress = session.progress
     testbed.set_up()
     for name, endpoint in testbed.endpoints.items():
         progress.tell(f"{name}: connect QGroundControl, Mission Planner or MAVProxy to {endpoint}")
     _wait_ready(session)
-    session.start, session.begun = session.moment, True
+    session.start = session.moment
+    session.begun = True
     session.injector = Injector(experiment.faults, testbed, lambda text: _tell_fault(session, text))
     for setup in experiment.setups():
         if setup.entry.task:
@@ -242,7 +245,8 @@ def _tell_fault(session: _Session, text: str) -> None:
 
 
 def _outcome(session: _Session, out: Path, problem: str, wall_s: float) -> Outcome:
-    findings, experiment = session.testbed.findings, session.experiment
+    findings = session.testbed.findings
+    experiment = session.experiment
     evidence = Evidence(
         session.flights,
         session.injector.occurrences,

@@ -133,7 +133,9 @@ class ServiceTestbed(Testbed):
             raise ExperimentError(f"the manifests contain no Drone {setup.name}; add one")
         if setup.home is None:
             raise ExperimentError(f"{setup.name} has no start position; set `home`")
-        entry, wind, world = setup.entry, self.experiment.wind, self.experiment.world
+        entry = setup.entry
+        wind = self.experiment.wind
+        world = self.experiment.world
         camera = CameraSetup(("--seed", str(world.seed), *world.arguments)) if entry.camera else None
         return DroneSetup(
             setup.name,

@@ -185,7 +185,9 @@ class Station:
         self.acks: dict[int, int] = {}
         self.parameters: dict[str, float] = {}
         self.inbox: list[Message] = []
-        self._link, self._system_id, self._log = link, system_id, log
+        self._link = link
+        self._system_id = system_id
+        self._log = log
         self._beats = beats
         self._endpoint = Endpoint(own_id, STATION_COMPONENT, saturate=True)
         self._unix_us = 0
@@ -198,7 +200,8 @@ class Station:
         Raises:
             ExperimentError: The link was closed.
         """
-        self.now_s, self._unix_us = now_s, unix_us
+        self.now_s = now_s
+        self._unix_us = unix_us
         data = self._link.receive()
         messages = [] if self.cut else self._endpoint.decode(data)
         self.inbox = [m for m in messages if m.sysid == self._system_id and m.compid == mavlink.MAV_COMP_ID_AUTOPILOT1]
@@ -273,9 +276,12 @@ def _heartbeat(station: Station, message: Message) -> None:
 
 def _position(station: Station, message: Message) -> None:
     state = station.state
-    state.lat, state.lon = message.integer("lat") / 1e7, message.integer("lon") / 1e7
-    state.alt_m, state.amsl_m = message.integer("relative_alt") / 1000.0, message.integer("alt") / 1000.0
-    north, east = message.integer("vx") / 100.0, message.integer("vy") / 100.0
+    state.lat = message.integer("lat") / 1e7
+    state.lon = message.integer("lon") / 1e7
+    state.alt_m = message.integer("relative_alt") / 1000.0
+    state.amsl_m = message.integer("alt") / 1000.0
+    north = message.integer("vx") / 100.0
+    east = message.integer("vy") / 100.0
     state.speed_mps = (north * north + east * east) ** 0.5
     state.climb_mps = -message.integer("vz") / 100.0
     state.heading_deg = message.integer("hdg") / 100.0

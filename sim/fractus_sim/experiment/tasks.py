@@ -22,7 +22,8 @@ class Place(Model):
 
     @model_validator(mode="after")
     def _one_way(self) -> Self:
-        degrees, metres = {self.lat is None, self.lon is None}, {self.north is None, self.east is None}
+        degrees = {self.lat is None, self.lon is None}
+        metres = {self.north is None, self.east is None}
         if len(degrees) == 2 or len(metres) == 2 or degrees == metres:
             raise InvalidObject("", "give lat and lon, or north and east")
         return self

@@ -43,7 +43,10 @@ class Testbed(ABC):
     """
 
     def __init__(self, experiment: Experiment, folder: Path, base: Path, tell: Callable[[str], None]) -> None:
-        self.experiment, self.folder, self.base, self.tell = experiment, folder, base, tell
+        self.experiment = experiment
+        self.folder = folder
+        self.base = base
+        self.tell = tell
         self.observers: dict[str, Station] = {}
         self.pilots: dict[str, Station] = {}
         self.endpoints: dict[str, str] = {}

@@ -165,7 +165,9 @@ class VehicleTestbed(Testbed):
         return f"tcp:127.0.0.1:{port}"
 
     def _config(self, setup: VehicleSetup) -> VehicleConfig:
-        home, wind, entry = setup.home, self.experiment.wind, setup.entry
+        home = setup.home
+        wind = self.experiment.wind
+        entry = setup.entry
         if home is None:
             raise ExperimentError(f"{setup.name} has no start position; set `home`")
         blow = {"SIM_WIND_SPD": wind.speed, "SIM_WIND_DIR": wind.direction, "SIM_WIND_TURB": wind.turbulence}

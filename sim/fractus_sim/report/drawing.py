@@ -9,8 +9,14 @@ from typing import Any
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-BLUE, ORANGE, GREEN, VERMILION = "#0072B2", "#E69F00", "#009E73", "#D55E00"
-PURPLE, SKY, INK, GREY = "#CC79A7", "#56B4E9", "#222222", "#6B6B6B"
+BLUE = "#0072B2"
+ORANGE = "#E69F00"
+GREEN = "#009E73"
+VERMILION = "#D55E00"
+PURPLE = "#CC79A7"
+SKY = "#56B4E9"
+INK = "#222222"
+GREY = "#6B6B6B"
 
 CORRECTED = {"marker": "^", "markersize": 10, "color": ORANGE, "markeredgecolor": INK, "linestyle": "none"}
 REFUSED = {"marker": "X", "markersize": 10, "color": VERMILION, "markeredgecolor": INK, "linestyle": "none"}

@@ -83,9 +83,11 @@ def _bounds(scene: Scene) -> Bounds:
             shown += _corners(zone.shape)
     low_x, low_y, high_x, high_y = shapely.MultiPoint(shown or [(0.0, 0.0)]).bounds
     margin_m = min(_MARGIN_M, max(_MARGIN_SHARE * max(high_x - low_x, high_y - low_y), 5.0))
-    half_x, half_y = (high_x - low_x) / 2 + margin_m, (high_y - low_y) / 2 + margin_m
+    half_x = (high_x - low_x) / 2 + margin_m
+    half_y = (high_y - low_y) / 2 + margin_m
     half_x, half_y = max(half_x, half_y * _ASPECT), max(half_y, half_x / _ASPECT)
-    x, y = (low_x + high_x) / 2, (low_y + high_y) / 2
+    x = (low_x + high_x) / 2
+    y = (low_y + high_y) / 2
     return x - half_x, y - half_y, x + half_x, y + half_y
 
 
@@ -174,7 +176,8 @@ def _nodes(axes: Any, scene: Scene, bounds: Bounds) -> None:
 def _far_node(axes: Any, name: str, at: XY, bounds: tuple[float, float, float, float]) -> None:
     """Draw a pointer to a node outside of the map."""
     middle = ((bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2)
-    dx, dy = at[0] - middle[0], at[1] - middle[1]
+    dx = at[0] - middle[0]
+    dy = at[1] - middle[1]
     half = ((bounds[2] - bounds[0]) / 2, (bounds[3] - bounds[1]) / 2)
     share = min(half[0] / abs(dx) if dx else math.inf, half[1] / abs(dy) if dy else math.inf)
     tip = (middle[0] + dx * share * 0.99, middle[1] + dy * share * 0.99)

@@ -161,7 +161,8 @@ def _rows(profile: Profile) -> list[tuple[Span, int]]:
 
 def _spans(axes: Any, profile: Profile, *, top: bool) -> None:
     for span, row in _rows(profile):
-        begin, end = span.begin_s - profile.start_s, span.end_s - profile.start_s
+        begin = span.begin_s - profile.start_s
+        end = span.end_s - profile.start_s
         if span.fault:
             axes.axvspan(begin, end, color=PURPLE, alpha=0.11, linewidth=0, zorder=0.6)
             axes.axvline(begin, color=PURPLE, linewidth=1.2, zorder=2)

@@ -17,7 +17,9 @@ from fractus_core.policy.selectors import node_attributes, policy_selects
 
 from fractus_sim.report.track import Place, Sample, Track
 
-OBJECTS, AUDIT, PICTURES = "objects.json", "audit", "pictures"
+OBJECTS = "objects.json"
+AUDIT = "audit"
+PICTURES = "pictures"
 _DECIDED = {"correct", "deny", "takeover"}
 _KINDS: tuple[type[Resource], ...] = (Application, DeploymentPlan, Depot, Drone, EdgeNode, Policy, Zone)
 
@@ -271,7 +273,9 @@ def _component(identity: str) -> str:
 def _place(value: Mapping[str, Any] | None, base: Place | None) -> Place | None:
     """Return the position of a mapping. Missing coordinates are replaced by the position of the drone."""
     value = value or {}
-    lat, lon, alt = value.get("lat"), value.get("lon"), value.get("alt", value.get("altitude_m"))
+    lat = value.get("lat")
+    lon = value.get("lon")
+    alt = value.get("alt", value.get("altitude_m"))
     if lat is None and alt is None:
         return None
     if lat is None or lon is None:
@@ -283,7 +287,8 @@ _UNITS = {"speed_mps": "{:.1f} m/s", "altitude_m": "{:.0f} m", "alt": "{:.0f} m"
 
 
 def _words(args: Mapping[str, Any]) -> str:
-    lat, lon = args.get("lat"), args.get("lon")
+    lat = args.get("lat")
+    lon = args.get("lon")
     where = [f"{lat:.6f}, {lon:.6f}"] if isinstance(lat, float) and isinstance(lon, float) else []
     figures = [shape.format(args[key]) for key, shape in _UNITS.items() if isinstance(args.get(key), int | float)]
     return ", ".join([*where, *figures])
@@ -306,7 +311,8 @@ def _merged(judged: Iterable[Judgement]) -> tuple[Judgement, ...]:
 
 
 def _pod(body: Mapping[str, Any]) -> Pod:
-    metadata, status = body["metadata"], body.get("status", {})
+    metadata = body["metadata"]
+    status = body.get("status", {})
     labels = metadata.get("labels", {})
     ready = [c for c in status.get("conditions", ()) if c["type"] == "Ready" and c["status"] == "True"]
     starts = [

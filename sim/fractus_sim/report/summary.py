@@ -186,7 +186,8 @@ def _pods(record: Record) -> str:
 def _audit(record: Record) -> str:
     if not record.audit:
         return "## Audit log\n\nNone was collected."
-    entries, problem = record.audit.get("entries", 0), record.audit.get("problem")
+    entries = record.audit.get("entries", 0)
+    problem = record.audit.get("problem")
     verdict = f"**broken: {problem}**" if problem else "the chain is sound"
     return (
         f"## Audit log\n\n{entries} entries on the drone, {record.audit.get('kept', 0)} of this mission; {verdict}."

@@ -62,7 +62,8 @@ class Track:
     @property
     def distance_m(self) -> float:
         """Horizontal distance flown, metres. Steps below 0.25 m are ignored as position noise."""
-        total, last = 0.0, None
+        total = 0.0
+        last = None
         for sample in self.samples:
             if not sample.in_air:
                 continue
@@ -71,7 +72,8 @@ class Track:
                 continue
             step = geodesic_m(last.ground, sample.place.ground)
             if step >= 0.25:
-                total, last = total + step, sample.place
+                total = total + step
+                last = sample.place
         return total
 
     @property

@@ -161,7 +161,8 @@ def _daily(day: dict[str, Any], field: str) -> dict[str, Any]:
     if unknown:
         raise InvalidObject(f"{field}.day", f"{unknown[0]!r:.40} is not MON to SUN or ANY; name the days of the week")
     days = [] if "ANY" in named else [list(_DAYS.values()).index(_DAYS[name]) for name in named]
-    start, end = day.get("startTime"), day.get("endTime")
+    start = day.get("startTime")
+    end = day.get("endTime")
     times: dict[str, Any] = {}
     if start or end:
         begin_min = _minutes(start, f"{field}.startTime")
@@ -261,7 +262,8 @@ def _applicability(schedule: Iterable[ActiveTime]) -> list[dict[str, Any]]:
             period["endDateTime"] = time.valid_until.isoformat()
         if time.days or time.start:
             day = [names[d] for d in time.days] or ["ANY"]
-            start, end = time.start or "00:00", time.end or "00:00"
+            start = time.start or "00:00"
+            end = time.end or "00:00"
             period["schedule"] = [{"day": day, "startTime": f"{start}Z", "endTime": f"{end}Z"}]
         periods.append(period)
     return periods or [{"permanent": "YES"}]

@@ -33,7 +33,8 @@ class HttpSnapshot:
     def __init__(self, url: str) -> None:
         parts = urllib.parse.urlsplit(url)
         try:
-            host, port = parts.hostname, parts.port
+            host = parts.hostname
+            port = parts.port
         except ValueError as error:
             raise InvalidCameraConnection(f"{parts.scheme}: URL of the camera: {error}") from None
         if parts.scheme not in {"http", "https"} or not host:

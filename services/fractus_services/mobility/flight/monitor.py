@@ -116,7 +116,8 @@ class MotionMonitor:
         lasting = control.autopilot.now - self._alarm_at > SETTINGS.correction_timeout_s
         fresh = verdict.code != self._alarm or (lasting and acts)
         if fresh:
-            self._alarm, self._alarm_at = verdict.code, control.autopilot.now
+            self._alarm = verdict.code
+            self._alarm_at = control.autopilot.now
             policies = ",".join(verdict.policies) or "-"
             log.warning(
                 "monitor: alarm raised (code=%s mode=%s policies=%s reason=%s)",
@@ -258,7 +259,8 @@ class MotionMonitor:
     def _permits(self) -> Permits:
         """Return permits for a correction that hold while lease, authority and motion do not change."""
         control = self._control
-        lease, authority = control.lease, control.authority
+        lease = control.lease
+        authority = control.authority
 
         def permit(motion: Motion | None) -> Permit:
             def check() -> None:

@@ -46,13 +46,19 @@ positions as in a mission: at WPNAV_SPEED regardless of the commanded speed, and
 _STEERED = frozenset(float(options) for options in range(256) if not options & _UNSTEERED)
 
 # Values of FS_GCS_ENABLE and FENCE_ACTION: RTL, and SmartRTL. BATT_FS_LOW_ACT uses other numbers.
-_RETURN, _RETRACE = 1.0, 3.0
+_RETURN = 1.0
+_RETRACE = 3.0
 
 _COMES_DOWN = frozenset({1.0, 2.0, 3.0, 5.0})
 """Values of FENCE_ACTION that bring the drone down. Others only report, or hover until the battery is low."""
 
-ENABLE, TYPE, ALTITUDE, ACTION, OPTIONS = "FENCE_ENABLE", "FENCE_TYPE", "FENCE_ALT_MAX", "FENCE_ACTION", "FENCE_OPTIONS"
-AUTOENABLE, MARGIN = "FENCE_AUTOENABLE", "FENCE_MARGIN"
+ENABLE = "FENCE_ENABLE"
+TYPE = "FENCE_TYPE"
+ALTITUDE = "FENCE_ALT_MAX"
+ACTION = "FENCE_ACTION"
+OPTIONS = "FENCE_OPTIONS"
+AUTOENABLE = "FENCE_AUTOENABLE"
+MARGIN = "FENCE_MARGIN"
 _UNION = 2
 """Bit of FENCE_OPTIONS: being inside of one polygon is sufficient."""
 _DEFAULT_FENCES = float(mavlink.FENCE_TYPE_ALT_MAX | mavlink.FENCE_TYPE_CIRCLE | mavlink.FENCE_TYPE_POLYGON)

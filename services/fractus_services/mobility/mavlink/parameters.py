@@ -82,17 +82,23 @@ class Parameters:
 
     def take(self, told: Message) -> None:
         """Process a PARAM_VALUE: an answer, or a report that another station changed a parameter."""
-        name, value = told.text("param_id"), told.real("param_value")
-        index, size = told.integer("param_index"), told.integer("param_count")
+        name = told.text("param_id")
+        value = told.real("param_value")
+        index = told.integer("param_index")
+        size = told.integer("param_count")
         self._number += 1
-        before, self.told[name], self._heard[name] = self.told.get(name), value, self._number
+        before = self.told.get(name)
+        self.told[name] = value
+        self._heard[name] = self._number
         self._absent.discard(name)
         # Answers to requests by name have index 65535. Indices of the list count until an enabled feature changes its length.
         if index < size:
             if size != self._size:
-                self._size, self._list = size, {}
+                self._size = size
+                self._list = {}
             self._list[index] = name
-        news, self._news = self._news, asyncio.Event()
+        news = self._news
+        self._news = asyncio.Event()
         news.set()
         if before is not None and not same(before, value) and not same(self._written.get(name, math.nan), value):
             self._on_change(name)
@@ -108,7 +114,8 @@ class Parameters:
             ParameterLost: The value or the existence of a parameter is unknown.
             AutopilotError: The vehicle is not connected.
         """
-        begun, asked = self._number, tuple(wanted)
+        begun = self._number
+        asked = tuple(wanted)
         wanted = [names for names in asked if not self._absent.issuperset(names)]
         # An absent parameter may exist by now: it is requested, but not waited for.
         for name in self._absent.intersection(name for names in asked for name in names):
@@ -140,7 +147,8 @@ class Parameters:
         """
         async with self._locks.setdefault(name, asyncio.Lock()):
             self._written[name] = value
-            heard, others = self._number, 0
+            heard = self._number
+            others = 0
             for _ in range(ATTEMPTS):
                 self._link.send(
                     message(
@@ -155,7 +163,8 @@ class Parameters:
                     if same(self.told[name], value):
                         return value
                     # The first differing value may be a late answer to an earlier request.
-                    heard, others = self._heard[name], others + 1
+                    heard = self._heard[name]
+                    others = others + 1
                 if others > 1:
                     break
             del self._written[name]

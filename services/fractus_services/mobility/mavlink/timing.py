@@ -37,7 +37,8 @@ RATE_S = (1.0, 10.0)
 REACTION_S = 0.25
 """Additional delay: the autopilot's loops, the time to tilt, and one lost or overtaken command that is sent again."""
 
-MAX_ARMING_DELAY_S, MAX_DELAY_S = 1.2, 1.8
+MAX_ARMING_DELAY_S = 1.2
+MAX_DELAY_S = 1.8
 """A round-trip delay above the first forbids arming. Above the second, a flying drone hovers."""
 
 MAX_PACE = 6.0
@@ -95,7 +96,8 @@ class Timing:
             if later_s <= 0.0:
                 # A position from long ago may be delivered very late and must be ignored. After a restart of the vehicle, further
                 # positions continue from it.
-                begun_ms, self._begun_ms = self._begun_ms, boot_ms
+                begun_ms = self._begun_ms
+                self._begun_ms = boot_ms
                 if begun_ms is None or not 0 < boot_ms - begun_ms < OVERTAKEN_S * 1e3:
                     return None
                 self.reset()
@@ -110,7 +112,8 @@ class Timing:
             self._resumed_at = now
             self._history.clear()
             self._compared_from = now + ENVELOPE_S if self._samples else now
-        self._sampled, self._boot_ms = (self._sampled + self._since(boot_ms) if self._samples else 0.0), boot_ms
+        self._sampled = self._sampled + self._since(boot_ms) if self._samples else 0.0
+        self._boot_ms = boot_ms
         self._arrived_at = now
         while self._samples and self._at(self._samples[-1], now) <= self._sampled:
             self._samples.pop()

@@ -19,7 +19,8 @@ _UNKNOWN_U16 = 0xFFFF
 
 _POSITIONED = mavlink.EKF_POS_HORIZ_ABS | mavlink.EKF_PRED_POS_HORIZ_ABS
 
-MIN_ERROR_M, MAX_ERROR_M = 0.5, 10.0
+MIN_ERROR_M = 0.5
+MAX_ERROR_M = 10.0
 """Range of the position error: smaller reported errors are raised to the first, and larger ones give no position."""
 
 STATUS_MAX_AGE_S = 10.0
@@ -110,7 +111,8 @@ def _position(vehicle: Vehicle, message: Message, now: float) -> None:
     if place is None:
         return
     vehicle.lat, vehicle.lon = place
-    vehicle.altitude_m, vehicle.amsl_m = message.integer("relative_alt") / 1e3, message.integer("alt") / 1e3
+    vehicle.altitude_m = message.integer("relative_alt") / 1e3
+    vehicle.amsl_m = message.integer("alt") / 1e3
     vehicle.north_mps, vehicle.east_mps, vehicle.down_mps = (message.integer(name) / 100 for name in ("vx", "vy", "vz"))
     told_s = message.integer("time_boot_ms") / 1e3
     vehicle.courses.append((told_s, vehicle.north_mps, vehicle.east_mps))
@@ -127,7 +129,9 @@ def _attitude(vehicle: Vehicle, message: Message, now: float) -> None:
     angles = [math.degrees(message.real(name)) for name in ("roll", "pitch", "yaw")]
     # An attitude that was overtaken by a later one is outdated.
     if all(map(math.isfinite, angles)) and now >= vehicle.attitude_at:
-        vehicle.roll_deg, vehicle.pitch_deg, vehicle.heading_deg = angles[0], angles[1], angles[2] % 360.0
+        vehicle.roll_deg = angles[0]
+        vehicle.pitch_deg = angles[1]
+        vehicle.heading_deg = angles[2] % 360.0
         vehicle.attitude_at = now
 
 
@@ -167,12 +171,14 @@ def _home(vehicle: Vehicle, message: Message, _now: float) -> None:
 
 
 def _landed(vehicle: Vehicle, message: Message, now: float) -> None:
-    vehicle.landed_state, vehicle.landed_at = message.integer("landed_state"), now
+    vehicle.landed_state = message.integer("landed_state")
+    vehicle.landed_at = now
 
 
 def _status(vehicle: Vehicle, message: Message, now: float) -> None:
     # -1 and 0xFFFF: not measured.
-    percent, millivolts = message.integer("battery_remaining"), message.integer("voltage_battery")
+    percent = message.integer("battery_remaining")
+    millivolts = message.integer("voltage_battery")
     centiamperes = message.integer("current_battery")
     vehicle.battery_remaining = percent / 100 if percent >= 0 else math.nan
     vehicle.battery_v = millivolts / 1e3 if millivolts != _UNKNOWN_U16 else math.nan
@@ -200,7 +206,8 @@ def _estimator(vehicle: Vehicle, message: Message, now: float) -> None:
 
 def _gps(vehicle: Vehicle, message: Message, now: float) -> None:
     vehicle.received_at = now
-    vehicle.fix_type, accuracy_mm = message.integer("fix_type"), message.integer("h_acc")
+    vehicle.fix_type = message.integer("fix_type")
+    accuracy_mm = message.integer("h_acc")
     satellites = message.integer("satellites_visible")
     vehicle.satellites = satellites if satellites != _UNKNOWN_U8 else 0
     error = accuracy_mm / 1e3 if accuracy_mm else DEFAULT_ERROR_M
@@ -218,13 +225,17 @@ def _text(vehicle: Vehicle, message: Message, now: float) -> None:
     if vehicle.stack.tells_path_lost(text):
         vehicle.path_lost = True
     if vehicle.stack.tells_failsafe(text):
-        vehicle.failsafe_text, vehicle.failsafe_text_at = text, now
+        vehicle.failsafe_text = text
+        vehicle.failsafe_text_at = now
 
 
 def _wind(vehicle: Vehicle, message: Message, now: float) -> None:
-    from_deg, speed_mps = message.real("direction"), message.real("speed")
+    from_deg = message.real("direction")
+    speed_mps = message.real("speed")
     if math.isfinite(from_deg) and math.isfinite(speed_mps):
-        vehicle.wind_from_deg, vehicle.wind_mps, vehicle.wind_at = from_deg % 360.0, speed_mps, now
+        vehicle.wind_from_deg = from_deg % 360.0
+        vehicle.wind_mps = speed_mps
+        vehicle.wind_at = now
 
 
 _HANDLERS = {

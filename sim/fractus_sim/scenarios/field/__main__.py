@@ -61,7 +61,8 @@ def experiment(out: Path, autopilot: Autopilot, names: tuple[str, ...] = ()) -> 
     Raises:
         ExperimentError: A run could not be flown.
     """
-    ground, words = Field.read(EXAMPLE), "simulated vehicles"
+    ground = Field.read(EXAMPLE)
+    words = "simulated vehicles"
     if autopilot.link is not None:
         standing = look(autopilot.link, _tell)
         ground = Field.read(EXAMPLE, standing.home)

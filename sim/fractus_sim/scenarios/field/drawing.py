@@ -73,7 +73,8 @@ def _pictures(axes: Any, field: Field, run: Evidence) -> None:
     for taken, marker, words in ((True, "*", "picture taken"), (False, "X", "picture refused")):
         at = [field.frame.xy(c.at.lat, c.at.lon) for c in run.pictures(taken=taken) if c.at is not None]
         if at:
-            colour, label = _STYLES[run.name]["color"], f"{words}, {run.title}"
+            colour = _STYLES[run.name]["color"]
+            label = f"{words}, {run.title}"
             axes.plot(*np.array(at).T, color=colour, marker=marker, label=label, zorder=7, **_PICTURE)
 
 
@@ -132,7 +133,8 @@ def draw_altitudes(runs: Sequence[Evidence]) -> Figure:
     for run in sorted(runs, key=lambda r: list(_STYLES).index(r.name)):
         start_s = run.track.takeoff_s or 0.0
         shown = [s for s in run.track.samples if s.time_s >= start_s - 2.0]
-        times, heights = [s.time_s - start_s for s in shown], [s.place.alt_m for s in shown]
+        times = [s.time_s - start_s for s in shown]
+        heights = [s.place.alt_m for s in shown]
         axes.plot(times, heights, label=run.title, zorder=4, **_STYLES[run.name])
     for run in runs:
         if run.name == "guarded":
@@ -154,7 +156,8 @@ def _requests(axes: Any, run: Evidence) -> None:
     for call in run.gotos():
         if call.who != NAVIGATOR or call.asked is None or call.flown is None:
             continue
-        asked, flown = call.asked.alt_m, call.flown.alt_m
+        asked = call.asked.alt_m
+        flown = call.flown.alt_m
         if abs(asked - flown) < 0.1 or round(call.time_s) in seen:
             continue
         seen.add(round(call.time_s))

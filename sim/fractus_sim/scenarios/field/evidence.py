@@ -116,7 +116,8 @@ class _Clock:
         if len(self._unix) < 2:
             raise ValueError("the log of the link to the autopilot has no positions")
         high = min(max(bisect.bisect(self._unix, unix_s), 1), len(self._unix) - 1)
-        first, last = self._unix[high - 1], self._unix[high]
+        first = self._unix[high - 1]
+        last = self._unix[high]
         share = (unix_s - first) / (last - first)
         return self._boot[high - 1] + share * (self._boot[high] - self._boot[high - 1])
 
@@ -130,8 +131,13 @@ def _frames(path: Path) -> Iterator[tuple[float, Message]]:
 
 
 def _flight(path: Path) -> tuple[tuple[Sample, ...], _Clock, list[str]]:
-    clock, samples, texts = _Clock(), list[Sample](), list[str]()
-    mode, armed, landed, battery = "", False, 0, 1.0
+    clock = _Clock()
+    samples = list[Sample]()
+    texts = list[str]()
+    mode = ""
+    armed = False
+    landed = 0
+    battery = 1.0
     for unix_s, message in _frames(path):
         if message.compid != mavlink.MAV_COMP_ID_AUTOPILOT1:
             continue

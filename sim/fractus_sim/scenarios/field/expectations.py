@@ -17,7 +17,8 @@ from fractus_sim.scenarios.field.place import Place as Spot
 
 NEAR_M = 2.0
 SAME_M = 0.5
-LOWEST_M, HIGHEST_M = 5.0, 15.0
+LOWEST_M = 5.0
+HIGHEST_M = 15.0
 CRUISE_M = 10.0
 LIMIT_SLACK_M = 0.6  # # tolerance of altitude control and estimation
 CORRECTED_WITHIN_M = 1.0  # # a correction may keep a margin to its limit
@@ -39,7 +40,8 @@ class Judge:
     """Evaluates the expectations on one run."""
 
     def __init__(self, field: Field, run: Evidence) -> None:
-        self._field, self._run = field, run
+        self._field = field
+        self._run = run
         self._checks: list[Check] = []
         self._held = self._holds()
 
@@ -136,7 +138,8 @@ class Judge:
         self._check(f"and the mission continues to {then}", bool(after), f"{len(after)} calls")
 
     def _stopped_for(self, name: str) -> None:
-        calls, taken = self._gotos(name), self._run.takeover()
+        calls = self._gotos(name)
+        taken = self._run.takeover()
         self._check(
             f"{name} revokes access",
             bool(calls) and all(c.refused for c in calls) and taken is not None,
@@ -152,7 +155,8 @@ class Judge:
         self._check("after that the program moves nothing", taken is not None and not later, f"{len(later)} calls")
 
     def _pictures(self) -> None:
-        taken, refused = self._run.pictures(taken=True), self._run.pictures(taken=False)
+        taken = self._run.pictures(taken=True)
+        refused = self._run.pictures(taken=False)
         above = self._above_stripe(taken=True)
         self._check("pictures are taken", len(taken) >= FEWEST_PICTURES, f"{len(taken)}")
         self._check("none of them above the no-photo stripe", not above, f"{len(above)} above it")
@@ -178,7 +182,8 @@ class Judge:
 
     def _closest_to(self, zone: str) -> float:
         """Return the distance in metres between the flown path and a zone. 0 if they intersect."""
-        shape, frame = self._field.zone(zone), self._field.frame
+        shape = self._field.zone(zone)
+        frame = self._field.frame
         way = shapely.LineString([frame.xy(s.place.lat, s.place.lon) for s in self._run.track.samples])
         return float(shape.distance(way))
 

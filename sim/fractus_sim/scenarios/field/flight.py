@@ -120,7 +120,9 @@ def _wait_home(ground: Standalone, drone: RunningDrone, autopilot: Autopilot, te
     Raises:
         ExperimentError: The drone did not take off or land before the timeout, or a process ended.
     """
-    began_s, said, flown = time.monotonic(), 0, False
+    began_s = time.monotonic()
+    said = 0
+    flown = False
     while True:
         log = list(entries(drone.audit.read_bytes().splitlines() if drone.audit.exists() else ()))
         control = [e for e in log if e.get("kind") in ("control", "takeover")]

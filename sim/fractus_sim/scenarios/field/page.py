@@ -123,5 +123,6 @@ def _name(field: Field, call: Call) -> str:
 
 
 def _flight_s(run: Evidence) -> float | None:
-    begin, end = run.track.takeoff_s, run.track.landing_s
+    begin = run.track.takeoff_s
+    end = run.track.landing_s
     return None if begin is None or end is None else end - begin

@@ -21,7 +21,8 @@ from fractus_sim.experiment.errors import ExperimentError
 from fractus_sim.experiment.services import grant_manifest, granted, read
 
 EXAMPLE = Path("examples/field")
-NAVIGATOR, VIEWER = "Navigator", "AerialViewer"
+NAVIGATOR = "Navigator"
+VIEWER = "AerialViewer"
 DRONE = "drone-1"
 ZIGZAG = "ZIGZAG"
 # Extent of Grants without policies, metres from home. No run flies that far.

@@ -54,7 +54,8 @@ def _received(site: Site, run: Evidence, axes: object) -> None:
     colour = colours(site)
     for node in sorted({p.by for p in run.pictures if p.by}):
         at = [p.sent_s for p in run.pictures if p.by == node]
-        x, y = np.interp(at, times, east), np.interp(at, times, north)
+        x = np.interp(at, times, east)
+        y = np.interp(at, times, north)
         name = node if node in site.edges else CLOUD
         axes.plot(x, y, ".", color=colour[name], markersize=8, label=name, zorder=5)  # type: ignore[attr-defined]  # axes
 
@@ -62,7 +63,8 @@ def _received(site: Site, run: Evidence, axes: object) -> None:
 def draw_bandwidth(site: Site, run: Evidence) -> Figure:
     """Draw the measured bandwidth of the paths over time, and the path of the pictures."""
     figure, axes = canvas(10.0, 4.2)
-    colour, begin = colours(site), run.pictures[0].sent_s if run.pictures else 0.0
+    colour = colours(site)
+    begin = run.pictures[0].sent_s if run.pictures else 0.0
     for switch in run.switches:
         for first, last in switch.spans:
             end = max(p.sent_s for p in run.pictures) if last is None else last

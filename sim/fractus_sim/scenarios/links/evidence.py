@@ -14,7 +14,9 @@ from fractus_core.linking import LocalPosition
 
 from fractus_sim.scenarios.links.podlogs import Line
 
-VIEWER, CHECKER, AGENT = "aerial-viewer", "image-checker", "agent"
+VIEWER = "aerial-viewer"
+CHECKER = "image-checker"
+AGENT = "agent"
 CLOUD = "cloud"
 LATE_S = 1.0
 NOTICE_S = 1.0
@@ -178,7 +180,9 @@ def _pictures(lines: Iterable[Line]) -> list[Picture]:
             found[said["picture"]] = Picture(said["picture"], said["at"], said["bytes"])
         elif said.get("event") == "answered" and said["picture"] in found:
             picture = found[said["picture"]]
-            picture.answered_s, picture.took_s, picture.by = said["at"], said["took_s"], said["by"]
+            picture.answered_s = said["at"]
+            picture.took_s = said["took_s"]
+            picture.by = said["by"]
         elif said.get("event") == "received":
             received.append((line, said))
     for line, said in received:
@@ -198,7 +202,8 @@ def _switches(lines: Iterable[Line]) -> list[Switch]:
         elif (measured := _MEASURED.search(line.text)) is not None:
             last = _latest(found, measured["peer"])
             if last is not None and last.measured_s is None:
-                last.measured_s, last.mbps = line.at_s, float(measured["mbps"])
+                last.measured_s = line.at_s
+                last.mbps = float(measured["mbps"])
         elif (decided := _DECIDED.search(line.text)) is not None:
             _decided(found, line.at_s, decided)
     return found
@@ -210,7 +215,8 @@ def _latest(found: Iterable[Switch], peer: str) -> Switch | None:
 
 
 def _state(found: list[Switch], at_s: float, state: re.Match[str]) -> None:
-    phase, peer = state["phase"], state["peer"]
+    phase = state["phase"]
+    peer = state["peer"]
     own = _latest(found, peer)
     if own is None:
         if phase == "connecting":
@@ -218,14 +224,17 @@ def _state(found: list[Switch], at_s: float, state: re.Match[str]) -> None:
     elif phase == "up":
         own.up_s = at_s
     elif phase == "none":
-        own.ended_s, own.left = at_s, own.left or state["reason"]
+        own.ended_s = at_s
+        own.left = own.left or state["reason"]
         own.lost |= own.leads and "wanted" not in state["reason"]
         own.lead(at_s, direct=False)
 
 
 def _decided(found: list[Switch], at_s: float, decided: re.Match[str]) -> None:
     """Record a decision on the link, or on the traffic of an application, which is identified by its namespace."""
-    on, peer, why = decided["on"], decided["peer"], decided["why"]
+    on = decided["on"]
+    peer = decided["peer"]
+    why = decided["why"]
     if on == "link":
         if peer != "-" and _latest(found, peer) is None:
             found.append(Switch(peer, at_s, why))

@@ -26,8 +26,10 @@ from fractus_sim.scenarios.links.place import DRONE, EXAMPLE, Site
 from fractus_sim.scenarios.links.podlogs import PodLogs
 
 TARGETS = ("operator", "agent", "mobility", "camera", "example-links")
-READY_S, MISSION_S = 240.0, 600.0
-LOG, OBJECTS = "lines.jsonl", "links.json"
+READY_S = 240.0
+MISSION_S = 600.0
+LOG = "lines.jsonl"
+OBJECTS = "links.json"
 _KEPT = frozenset({VIEWER, CHECKER, AGENT, "navigator"})
 Tell = Callable[[str], None]
 

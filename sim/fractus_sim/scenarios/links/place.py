@@ -14,8 +14,10 @@ from fractus_sim.demo.clusters import ROOT, documents
 
 EXAMPLE = ROOT / "examples" / "links"
 DRONE = "drone-1"
-UPLINK_MBPS, UPLINK_MS = 8.0, 60.0
-WIFI_MBPS, WIFI_MS = 12.0, 2.0
+UPLINK_MBPS = 8.0
+UPLINK_MS = 60.0
+WIFI_MBPS = 12.0
+WIFI_MS = 2.0
 """TCP throughput of the simulated radio within the range of a station, Mbit/s."""
 
 
@@ -63,7 +65,8 @@ def read_site(factor: float = 1.0, folder: Path = EXAMPLE) -> Site:
     home = drone.place()
     assert home is not None
     frame = LocalFrame(home.lat, home.lon)
-    edges, peers = {}, []
+    edges = {}
+    peers = []
     for node in spec.nodes:
         place = node.place()
         if node.node_class != "edge" or place is None:

@@ -14,9 +14,11 @@ from fractus_sim.scenarios.links.evidence import Evidence, Switch
 from fractus_sim.scenarios.links.place import Site
 from fractus_sim.scenarios.links.rules import STEP_S, Scene, carried, oracle, ours, thesis
 
-PLANNED_GAP_S, ABRUPT_GAP_S = 1.5, 2.5
+PLANNED_GAP_S = 1.5
+ABRUPT_GAP_S = 2.5
 SHARE = 0.95
-MIN_HEIGHT_M, ARRIVED_M = 15.0, 3.0
+MIN_HEIGHT_M = 15.0
+ARRIVED_M = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +49,8 @@ def scene_of(site: Site, run: Evidence) -> tuple[Scene, float]:
     places = np.array([position for _, position in flown])
     columns = [np.interp(grid, times, places[:, axis]) for axis in range(3)]
     positions: list[LocalPosition] = [(float(x), float(y), float(z)) for x, y, z in zip(*columns, strict=True)]
-    coming, waypoints = list(site.path[1:]), []
+    coming = list(site.path[1:])
+    waypoints = []
     for position in positions:
         if len(coming) > 1 and math.dist(position, coming[0]) <= ARRIVED_M:
             coming.pop(0)
@@ -88,7 +91,8 @@ def gains(site: Site, run: Evidence) -> list[Gain]:
 
 def expectations(run: Evidence, table: list[Gain]) -> list[Expectation]:
     """Return the expectations of the scenario."""
-    counts, flown = run.counts(), table[0]
+    counts = run.counts()
+    flown = table[0]
     used = {s.peer for s in run.switches if s.redirected_s is not None}
     return [
         Expectation("no picture is lost", counts["lost"] == 0 and counts["sent"] > 0, f"{counts['lost']} of {counts['sent']}"),

@@ -24,7 +24,8 @@ from fractus_core.linking.range_model import with_contact, with_failure, with_lo
 STEP_S = 0.1
 LINK_UP_STEPS = 9
 """0.92 s until a link is up and measured."""
-DECIDE_STEPS, BEACON_STEPS = 5, 10
+DECIDE_STEPS = 5
+BEACON_STEPS = 10
 AHEAD_M = 20.0
 INGRESS = find_heuristic("max", "ingress-bandwidth")
 SETTINGS = LinkSettings()
@@ -65,8 +66,10 @@ class Scene:
 
 def along(path: Sequence[LocalPosition], speed: float) -> tuple[list[LocalPosition], list[tuple[LocalPosition, ...]]]:
     """Return positions and remaining waypoints, one every `STEP_S`, for a constant speed along a path."""
-    at, coming = path[0], list(path[1:])
-    positions, waypoints = [], []
+    at = path[0]
+    coming = list(path[1:])
+    positions = []
+    waypoints = []
     while coming:
         positions.append(at)
         waypoints.append(tuple(coming))
@@ -74,10 +77,12 @@ def along(path: Sequence[LocalPosition], speed: float) -> tuple[list[LocalPositi
         while coming and left > 0:
             away = math.dist(at, coming[0])
             if away <= left:
-                at, left = coming.pop(0), left - away
+                at = coming.pop(0)
+                left = left - away
             else:
                 x, y, z = (a + (b - a) * left / away for a, b in zip(at, coming[0], strict=True))
-                at, left = (x, y, z), 0.0
+                at = (x, y, z)
+                left = 0.0
     return positions, waypoints
 
 
@@ -109,7 +114,8 @@ def ours(scene: Scene, step: int, link: LinkState, ranges: dict[str, LearnedRang
 
 def thesis(scene: Scene, step: int, _link: LinkState, _reaches: dict[str, LearnedRange]) -> str:
     """Select the nearest peer in declared range in the direction of the next waypoint (thesis 8.6)."""
-    at, goal = scene.positions[step], scene.waypoints[step][0]
+    at = scene.positions[step]
+    goal = scene.waypoints[step][0]
     share = min(AHEAD_M / max(math.dist(at, goal), 1e-9), 1.0)
     ahead = tuple(a + (b - a) * share for a, b in zip(at, goal, strict=True))
     near = [node for node in scene.peers if math.dist(at, node.position) <= node.range_m]
@@ -118,7 +124,10 @@ def thesis(scene: Scene, step: int, _link: LinkState, _reaches: dict[str, Learne
 
 def carried(scene: Scene, rule: Rule) -> tuple[float, int]:
     """Return the gain in Mbit of a rule that decides twice a second, and its number of links."""
-    link, gain, links, coming = NO_LINK, 0.0, 0, 0
+    link = NO_LINK
+    gain = 0.0
+    links = 0
+    coming = 0
     ranges: dict[str, LearnedRange] = {}
     nodes = {node.name: node for node in scene.peers}
     for step in range(len(scene.positions)):
@@ -139,7 +148,8 @@ def carried(scene: Scene, rule: Rule) -> tuple[float, int]:
             wanted = rule(scene, step, link, ranges)
             if wanted != link.peer:
                 link = LinkState(LinkPhase.CONNECTING, wanted, now_s) if wanted else NO_LINK
-                coming, links = LINK_UP_STEPS, links + bool(wanted)
+                coming = LINK_UP_STEPS
+                links = links + bool(wanted)
     return gain, links
 
 

@@ -78,10 +78,12 @@ def main() -> int:
     vehicle = Endpoint(1, 1)
     companion = Endpoint(244, 191)
     before_mb = resident_mb()
+    from fractus_services.recording.mavlink_messages import MavlinkDecoder  # noqa: PLC0415
     from fractus_services.recording.recorder import FlightWriter  # noqa: PLC0415
 
     with tempfile.TemporaryDirectory() as directory:
-        writer = FlightWriter(SegmentDirectory(Path(directory), 500_000_000, reserve_bytes=0), "drone-1")
+        segments = SegmentDirectory(Path(directory), 500_000_000, reserve_bytes=0)
+        writer = FlightWriter(segments, "drone-1", MavlinkDecoder("drone-1"))
         writer.begin()
         begun_s = time.process_time()
         record(writer, seconds, vehicle, companion)

@@ -29,6 +29,7 @@ from fractus_proto.v1.mobility_pb2 import Telemetry
 from fractus_runtime.audit import AuditLog
 from fractus_runtime.mavlink_codec import Endpoint, Parser
 from fractus_services.recording import recorder
+from fractus_services.recording.mavlink_messages import MavlinkDecoder
 from fractus_services.recording.recorder import FlightWriter, Recorder
 from fractus_services.recording.segment_directory import MIN_SEGMENT_BYTES, SegmentDirectory, segments_in
 from fractus_services.recording.segment_writer import rebuild_index
@@ -90,7 +91,8 @@ def writer_in(directory: Path, megabytes: float = 4.0, *, always: bool = False) 
     while opened:
         opened.pop().segments.unlock()
     segments = SegmentDirectory(directory, int(megabytes * 1e6), reserve_bytes=0)
-    opened.append(FlightWriter(segments, "drone-1", always=always, steady=lambda: Steady.now_s))
+    decoder = None if always else MavlinkDecoder("drone-1")
+    opened.append(FlightWriter(segments, "drone-1", decoder, steady=lambda: Steady.now_s))
     opened[-1].begin()
     return opened[-1]
 
@@ -377,7 +379,7 @@ def test_a_directory_has_one_writer(tmp_path: Path) -> None:
         OSError, match=r"another service records into .*; give each its own directory with --recordings"
     ):
         second.prepare()
-    taken = Recorder(second, "drone-1")
+    taken = Recorder(second, "drone-1", MavlinkDecoder("drone-1"))
     until(lambda: taken.problem)
     assert f"another service records into {tmp_path}" in taken.problem
     asyncio.run(taken.close())
@@ -469,7 +471,7 @@ def test_a_full_disk_stops_the_recording_and_it_goes_on_when_there_is_room(
 
     monkeypatch.setattr(os, "fdatasync", sync)
     vehicle = Vehicle()
-    taken = Recorder(SegmentDirectory(tmp_path, 4_000_000, reserve_bytes=0), "drone-1")
+    taken = Recorder(SegmentDirectory(tmp_path, 4_000_000, reserve_bytes=0), "drone-1", MavlinkDecoder("drone-1"))
 
     def flies() -> None:
         taken.take_received(vehicle.heartbeat(True) + vehicle.position(39.0, 22.0, 100.0))
@@ -500,7 +502,9 @@ def test_a_full_disk_stops_the_recording_and_it_goes_on_when_there_is_room(
 @pytest.mark.usefixtures("quick")
 def test_one_line_tells_that_a_disk_has_no_room(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     tried = len(caplog.records)
-    taken = Recorder(SegmentDirectory(tmp_path / "r", 4_000_000, reserve_bytes=2**62), "drone-1")
+    taken = Recorder(
+        SegmentDirectory(tmp_path / "r", 4_000_000, reserve_bytes=2**62), "drone-1", MavlinkDecoder("drone-1")
+    )
     until(lambda: taken.problem)
     vehicle = Vehicle()
     deadline = time.monotonic() + 0.3
@@ -521,7 +525,9 @@ def test_a_disk_that_hangs_delays_no_one(
     monotonic = time.monotonic
     monkeypatch.setattr(recorder, "POLL_INTERVAL_S", 0.005)
     monkeypatch.setattr(FlightWriter, "received", lambda _self, _now, _data: hangs.wait(60))
-    taken = Recorder(SegmentDirectory(tmp_path, 4_000_000, reserve_bytes=0), "drone-1", max_waiting=50)
+    taken = Recorder(
+        SegmentDirectory(tmp_path, 4_000_000, reserve_bytes=0), "drone-1", MavlinkDecoder("drone-1"), max_waiting=50
+    )
     taken.take_received(b"")
     until(lambda: taken._busy_since_s is not None and taken._waiting.empty())
     for _ in range(500):
@@ -544,7 +550,7 @@ def test_an_error_of_ours_is_a_problem_and_no_crash(tmp_path: Path, monkeypatch:
         raise ZeroDivisionError("oops")
 
     monkeypatch.setattr(FlightWriter, "sent", broken)
-    taken = Recorder(SegmentDirectory(tmp_path, 4_000_000, reserve_bytes=0), "drone-1")
+    taken = Recorder(SegmentDirectory(tmp_path, 4_000_000, reserve_bytes=0), "drone-1", MavlinkDecoder("drone-1"))
     taken.take_sent(b"x")
     until(lambda: taken.problem == "recording stopped: ZeroDivisionError: oops")
     taken.take_entry({})
@@ -566,7 +572,12 @@ def test_the_agent_is_told_what_is_not_recorded(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(SegmentDirectory, "check_space", check)
     Recorder(None, "drone-1", problem_file=state / "recording.problem")
     assert read_recording_problems(tmp_path) == []
-    taken = Recorder(SegmentDirectory(tmp_path / "r", 4_000_000), "drone-1", problem_file=state / "recording.problem")
+    taken = Recorder(
+        SegmentDirectory(tmp_path / "r", 4_000_000),
+        "drone-1",
+        MavlinkDecoder("drone-1"),
+        problem_file=state / "recording.problem",
+    )
     until(lambda: read_recording_problems(tmp_path) == ["camera: recording stopped: no room"])
     full.clear()
     until(lambda: read_recording_problems(tmp_path) == [])

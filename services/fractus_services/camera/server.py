@@ -96,15 +96,15 @@ async def run(settings: CameraSettings, stop: asyncio.Event) -> None:
     Raises:
         CannotServe: A setting is wrong. It may be within an ExceptionGroup.
     """
-    # The audit log reads the clock, so it is looked up when the clock is stepped.
+    # The audit log needs the clock, which reports its steps to the audit log.
     clock = Clock(lambda step_s, trusted: audit.clock_stepped(step_s, trusted))  # noqa: PLW0108
     description = NodeDescription(settings.node, settings.node_object, settings.description, Drone, EdgeNode)
-    node = settings.node or (description.value.name if description.value is not None else socket.gethostname())
+    name = description.value.name if description.value is not None else socket.gethostname()
+    node = settings.node or name
     tls = TlsFiles(settings.tls)
     recorder = Recorder(
         segments_in(settings.recordings, settings.recordings_mb),
         node,
-        always=True,
         max_waiting=settings.max_unrecorded_images,
         problem_file=settings.recording_problem,
     )

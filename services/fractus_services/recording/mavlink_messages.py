@@ -1,20 +1,45 @@
-"""Converts MAVLink messages of the autopilot to records."""
+"""Decodes the MAVLink stream of the autopilot for the recorder."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
 
-from fractus_runtime.mavlink_codec import Message
+from fractus_runtime.mavlink_codec import Message, Parser
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_services.recording.messages import DEBUG, ERROR, FATAL, INFO, WARNING, Record, attitude, location, text
+from fractus_services.recording.recorder import AutopilotFrame
 
 _LEVELS = (FATAL, FATAL, FATAL, ERROR, WARNING, INFO, INFO, DEBUG)
 """Levels of foxglove.Log by MAV_SEVERITY."""
 
 
-def to_records(message: Message, time_ns: int, node: str) -> Iterable[Record]:
+class MavlinkDecoder:
+    """`AutopilotDecoder` of a MAVLink link.
+
+    Args:
+        node: Name of the node, which is the first part of each topic.
+    """
+
+    def __init__(self, node: str) -> None:
+        self._node = node
+        self._unknown: list[bytes] = []
+        self._parser = Parser(unknown=self._unknown.append)
+
+    def decode(self, data: bytes, time_ns: int) -> list[AutopilotFrame]:
+        """See `AutopilotDecoder`. Frames of unknown messages are included, because a ground station may know them."""
+        messages = self._parser.feed(data)
+        frames = [AutopilotFrame(frame) for frame in self._unknown]
+        self._unknown.clear()
+        frames += [
+            AutopilotFrame(message.frame, tuple(_to_records(message, time_ns, self._node)), _is_armed(message))
+            for message in messages
+        ]
+        return frames
+
+
+def _to_records(message: Message, time_ns: int, node: str) -> Iterable[Record]:
     """Yield the position, attitude or text of a message. Other messages are in the tlog only."""
     match message.name:
         case "GLOBAL_POSITION_INT":
@@ -31,8 +56,8 @@ def to_records(message: Message, time_ns: int, node: str) -> Iterable[Record]:
             yield text(time_ns, "log", node, level, message.text("text"))
 
 
-def is_armed(message: Message) -> bool | None:
-    """Return True if an autopilot's HEARTBEAT reports armed motors, and None for all other messages."""
+def _is_armed(message: Message) -> bool:
+    """Return True if the message is an autopilot's HEARTBEAT that reports armed motors."""
     if message.name != "HEARTBEAT" or message.integer("autopilot") == mavlink.MAV_AUTOPILOT_INVALID:
-        return None
+        return False
     return bool(message.integer("base_mode") & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)

@@ -9,18 +9,16 @@ import queue
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from fractus_core.api.grants import GrantSpec
 from fractus_runtime.files import write_file
-from fractus_runtime.mavlink_codec import Parser
 
 from fractus_services.recording import messages
 from fractus_services.recording.map_features import grant_features
-from fractus_services.recording.mavlink_messages import is_armed, to_records
 from fractus_services.recording.messages import Record
 from fractus_services.recording.segment_directory import SegmentDirectory
 from fractus_services.recording.segment_writer import SegmentWriter, rebuild_index
@@ -57,6 +55,33 @@ MAX_WAITING = 5_000
 
 
 @dataclass(frozen=True, slots=True)
+class AutopilotFrame:
+    """A frame received from the autopilot.
+
+    Attributes:
+        data: Bytes of the frame.
+        records: Records of the contents of the frame.
+        armed: True if the frame reports that the motors are armed.
+    """
+
+    data: bytes
+    records: Sequence[Record] = ()
+    armed: bool = False
+
+
+class AutopilotDecoder(Protocol):
+    """Decodes the byte stream of the autopilot link."""
+
+    def decode(self, data: bytes, time_ns: int) -> Iterable[AutopilotFrame]:
+        """Add received bytes, and return the frames that they complete.
+
+        Args:
+            data: Bytes received from the autopilot.
+            time_ns: Time of arrival in Unix nanoseconds, for the records.
+        """
+
+
+@dataclass(frozen=True, slots=True)
 class _Pending:
     """A message that is written if the drone flies now or soon."""
 
@@ -72,7 +97,7 @@ class FlightWriter:
     Args:
         segments: Directory of the segments.
         node: Name of the node, which is the first part of each topic.
-        always: True to record all the time, for a service without a link to the autopilot.
+        decoder: Decoder of the autopilot link. A service without this link has no decoder, and records all the time.
         steady: Returns seconds of a clock that is never stepped. The system clock may be set in flight.
 
     Attributes:
@@ -83,16 +108,15 @@ class FlightWriter:
         self,
         segments: SegmentDirectory,
         node: str,
+        decoder: AutopilotDecoder | None = None,
         *,
-        always: bool = False,
         steady: Callable[[], float] = time.monotonic,
     ) -> None:
         self.segments = segments
         self._node = node
-        self._always = always
-        self._parser = Parser(unknown=self._write_unknown)
+        self._decoder = decoder
+        self._always = decoder is None
         self._steady = steady
-        self._now_ns = 0
         self._armed_s: float | None = None
         self._pending: deque[_Pending] = deque(maxlen=MAX_BEFORE)
         self._map: Record | None = None
@@ -112,12 +136,13 @@ class FlightWriter:
         self._indexing = _rebuild_indexes([path for paths in self.segments.by_number().values() for path in paths])
 
     def received(self, time_ns: int, data: bytes) -> None:
-        """Record bytes received from the autopilot."""
-        self._now_ns = time_ns
-        for message in self._parser.feed(data):
-            if is_armed(message):
+        """Record bytes received from the autopilot. Without a decoder there is no autopilot link, and nothing is recorded."""
+        if self._decoder is None:
+            return
+        for frame in self._decoder.decode(data, time_ns):
+            if frame.armed:
                 self._armed_s = self._steady()
-            self._write(time_ns, message.frame, tuple(to_records(message, time_ns, self._node)))
+            self._write(time_ns, frame.data, frame.records)
 
     def sent(self, time_ns: int, frame: bytes) -> None:
         """Record a frame sent to the autopilot."""
@@ -210,10 +235,6 @@ class FlightWriter:
         while time.monotonic() < until_s and next(self._indexing, self) is not self:
             pass
 
-    def _write_unknown(self, frame: bytes) -> None:
-        """Record a frame of an unknown MAVLink message, because a ground station may know it."""
-        self._write(self._now_ns, frame, ())
-
     def _write(self, time_ns: int, frame: bytes, records: Sequence[Record]) -> None:
         """Write a message, or keep it for `BEFORE_S` seconds if the drone does not fly."""
         if self.paused:
@@ -259,7 +280,7 @@ class Recorder:
     Args:
         segments: Directory of the segments, or None to record nothing.
         node: Name of the node, which is the first part of each topic.
-        always: See `FlightWriter`.
+        decoder: See `FlightWriter`.
         max_waiting: Size of the queue. Messages beyond it are lost.
         problem_file: File that contains `problem` while there is one. The agent reads it. None writes no file.
         clock: Returns Unix nanoseconds.
@@ -269,8 +290,8 @@ class Recorder:
         self,
         segments: SegmentDirectory | None,
         node: str,
+        decoder: AutopilotDecoder | None = None,
         *,
-        always: bool = False,
         max_waiting: int = MAX_WAITING,
         problem_file: Path | None = None,
         clock: Callable[[], int] = time.time_ns,
@@ -289,7 +310,7 @@ class Recorder:
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
         if segments is not None:
-            writer = FlightWriter(segments, node, always=always)
+            writer = FlightWriter(segments, node, decoder)
             self._thread = threading.Thread(target=self._run, args=(writer,), name="recorder", daemon=True)
             self._thread.start()
 

@@ -33,6 +33,7 @@ from fractus_services.mobility.rpc.flight_metrics import flight_metrics
 from fractus_services.mobility.rpc.handlers import MobilityHandlers
 from fractus_services.node_description import NodeDescription
 from fractus_services.options import CannotServe, MobilityOptions
+from fractus_services.recording.mavlink_messages import MavlinkDecoder
 from fractus_services.recording.recorder import Recorder
 from fractus_services.recording.segment_directory import segments_in
 
@@ -137,7 +138,7 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
     node = options.node or name
     url = options.autopilot or _link(description)
     tls = TlsFiles(options.tls)
-    recorder = Recorder(segments_in(options.recordings, options.recordings_mb), node)
+    recorder = Recorder(segments_in(options.recordings, options.recordings_mb), node, MavlinkDecoder(node))
     metrics = ServiceMetrics()
 
     def recorded(entry: dict[str, Any]) -> None:

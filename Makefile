@@ -128,11 +128,10 @@ format: env ## Format the code
 	$(RUN) ruff format
 
 .PHONY: generate
-generate: env ## Generate the CRDs, the stubs of the .proto files, the SDK's reference, the chart's defaults and the charts' README.md
+generate: env ## Generate the CRDs, the stubs of the .proto files, the chart's defaults and the charts' README.md
 	$(RUN) python -m fractus_core.api.crd crds
 	$(RUN) python -m grpc_tools.protoc -Iproto --python_out=proto --pyi_out=proto --grpc_python_out=proto \
 		proto/fractus_proto/v1/*.proto
-	$(RUN) python -m fractus.reference docs/reference/sdk.md
 	cp charts/fractus/values.yaml charts/fractus/files/values.yaml
 	$(RUN) python docs/pages.py
 

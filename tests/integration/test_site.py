@@ -43,6 +43,12 @@ def test_site_reference_has_kinds_calls_values_and_commands(site: Path) -> None:
     assert "fractus audit export" in text(site, "reference/commands.html")
 
 
+def test_site_reference_has_methods_fields_and_errors_of_the_sdk(site: Path) -> None:
+    page = set(re.findall(r"[\w.]+", text(site, "reference/sdk.html")))
+    assert {"fractus.Mobility", "goto", "remaining", "waypoints_reached", "status_texts", "radius_m"} <= page
+    assert {"fractus.MissionEnded", "fractus.sync"} <= page
+
+
 def test_site_loads_no_external_resources(site: Path) -> None:
     for page in ("index.html", "safety-case.html", "reference/sdk.html"):
         loaded = re.findall(r'<(?:script|link|img)[^>]+(?:src|href)="([^"]+)"', (site / page).read_text())

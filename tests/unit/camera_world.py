@@ -1,4 +1,4 @@
-"""A camera service with a drone and a scene that do what a test says."""
+"""Camera service for tests with a scripted drone, camera and face detector."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def private(action: str = "refuse", name: str = "p", **fields: Any) -> dict[str,
 
 
 class Drone:
-    """A pose provider that a test moves; it remembers what it told."""
+    """Pose provider with a pose set by the test. It records each situation that it returned."""
 
     def __init__(self) -> None:
         self.x = 0.0
@@ -44,22 +44,22 @@ class Drone:
         self.alt = 10.0
         self.yaw = 0.0
         self.lens: Lens | None = SEEING
-        self.told: list[tuple[float, Situation]] = []
+        self.recorded: list[tuple[float, Situation]] = []
 
     def situation(self, time_s: float) -> Situation:
         now = at(
             self.x, self.y, alt=self.alt, time_s=time_s, lens=self.lens, attitude=Attitude(0, 0, self.yaw, 0, 0)
         )  # fmt: skip
-        self.told.append((time.monotonic(), now))
+        self.recorded.append((time.monotonic(), now))
         return now
 
     def situations_since(self, begun_s: float, time_s: float) -> tuple[Situation, ...]:
         self.situation(time_s)
-        return tuple(one for told_at, one in self.told if told_at >= begun_s)
+        return tuple(situation for recorded_s, situation in self.recorded if recorded_s >= begun_s)
 
 
 class Scene:
-    """A camera that shows noise, and lets a test act during the exposure."""
+    """Camera that returns noise and calls a function of the test during the exposure."""
 
     def __init__(self) -> None:
         self.latency_s = 0.0
@@ -82,7 +82,7 @@ class Scene:
 
 
 class Finder:
-    """A detector that finds what a test says."""
+    """Face detector that returns the boxes set by the test."""
 
     name = "test"
     min_px = 40.0
@@ -107,7 +107,7 @@ def active_grant(*policies: dict[str, Any], uid: str = "u1", instance: str = "ap
 
 
 class World:
-    """A camera service with what it needs."""
+    """Camera service with its collaborators."""
 
     def __init__(
         self, directory: Path, resolution: tuple[int, int] = (64, 64), keep: int = 50, pinhole: bool = False
@@ -153,5 +153,5 @@ async def refusal(work: Any) -> str:
 
 
 def grain(picture: Pixels) -> float:
-    """How much neighbouring pixels differ."""
+    """Return the mean difference of neighbouring pixels."""
     return float(np.abs(np.diff(picture.astype(float), axis=1)).mean())

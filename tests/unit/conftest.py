@@ -1,4 +1,4 @@
-"""Unit tests are of one room's logic: they start no process and open no connection. What does is in tests/component."""
+"""Unit tests start no process and open no connection. Tests that do are component tests."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ from collections.abc import Iterator
 
 import pytest
 
-BEYOND = {"subprocess.Popen", "os.fork", "os.posix_spawn", "socket.bind", "socket.connect"}
-"""Python's audit events of what leaves the process."""
-seen: list[str] = []
+EXTERNAL = {"subprocess.Popen", "os.fork", "os.posix_spawn", "socket.bind", "socket.connect"}
+"""Audit events of Python for processes and connections."""
+external_events: list[str] = []
 
 
-def _hear(event: str, args: tuple[object, ...]) -> None:
-    # A thread that a component test left behind in this process may still be at work.
-    if event in BEYOND and threading.current_thread() is threading.main_thread():
-        seen.append(f"{event}{args[:2]}")
+def _record_external_event(event: str, args: tuple[object, ...]) -> None:
+    # A thread of an earlier component test in this process may still be running.
+    if event in EXTERNAL and threading.current_thread() is threading.main_thread():
+        external_events.append(f"{event}{args[:2]}")
 
 
-sys.addaudithook(_hear)
+sys.addaudithook(_record_external_event)
 
 
 @pytest.fixture(autouse=True)
 def _within_the_process() -> Iterator[None]:
-    seen.clear()
+    external_events.clear()
     yield
-    assert not seen, "a component test: move it to tests/component"
+    assert not external_events, "the test starts a process or opens a connection: move it to tests/component"

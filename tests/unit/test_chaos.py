@@ -1,4 +1,4 @@
-"""What a chaos run judges by: schedules that repeat, and invariants that notice what breaks them."""
+"""Fault schedules, invariants and faults of chaos runs."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ BEGAN_S = 1_800_000_000.0
 
 
 def grant(application: str = "one", **more: Any) -> GrantSpec:
-    """The Grant of a Navigator, within 200 m of home and 50 m above it."""
+    """Return a Grant of a Navigator, limited to 200 m around home and 50 m above home."""
     area = [{"circle": {"center": {"lat": HOME.lat, "lon": HOME.lon}, "radius": 200}}]
     return GrantSpec.model_validate(
         {
@@ -63,7 +63,7 @@ def entry(at_s: float, kind: str, **more: Any) -> dict[str, Any]:
     return {"time": time, "kind": kind, **more}
 
 
-def given(at_s: float, spec: GrantSpec, change: str = "added") -> dict[str, Any]:
+def grant_entry(at_s: float, spec: GrantSpec, change: str = "added") -> dict[str, Any]:
     return entry(at_s, "grant", change=change, identity=spec.identity, key=spec.mission_key)
 
 
@@ -74,7 +74,7 @@ def goto(at_s: float, spec: GrantSpec, north_m: float = 50, alt: float = 12, **m
 
 
 def flight(*modes: tuple[float, str], end_s: float = 60) -> list[Seen]:
-    """A drone in the air above home, seen every second."""
+    """Return observations, one each second, of a drone in the air above home. Modes are (start, mode)."""
     return [
         Seen(BEGAN_S + at, HOME.lat, HOME.lon, at < end_s, [mode for since, mode in modes if since <= at][-1])
         for at in range(round(end_s) + 2)
@@ -96,20 +96,20 @@ def test_fault_schedule_is_identical_for_the_same_seed() -> None:
 @pytest.mark.parametrize("seed", range(20))
 def test_long_fault_schedule_contains_every_fault_within_the_run(seed: int) -> None:
     planned = schedule(seed, 1800, DURATIONS)
-    assert {each.fault for each in planned} == set(FAULTS) or len(planned) >= 8
+    assert {item.fault for item in planned} == set(FAULTS) or len(planned) >= 8
     ends: dict[str, float] = {}
-    for each in planned:
-        shortest, longest = DURATIONS[each.fault]
-        assert shortest <= each.duration_s <= max(shortest, longest)
-        assert each.at_s + each.duration_s <= 1800
-        assert each.at_s >= ends.get(each.fault, 0)
-        ends[each.fault] = each.at_s + each.duration_s
+    for item in planned:
+        shortest, longest = DURATIONS[item.fault]
+        assert shortest <= item.duration_s <= max(shortest, longest)
+        assert item.at_s + item.duration_s <= 1800
+        assert item.at_s >= ends.get(item.fault, 0)
+        ends[item.fault] = item.at_s + item.duration_s
 
 
 def test_authority_invariant_is_violated_by_missing_entries_in_flight() -> None:
     log = [entry(at, "state", controller="system", in_air=True) for at in range(20)]
-    (found,) = without_authority(flight((0, "GUIDED")), log)
-    assert found.time_s == BEGAN_S + 32
+    (violation,) = without_authority(flight((0, "GUIDED")), log)
+    assert violation.time_s == BEGAN_S + 32
     assert not without_authority(flight((0, "GUIDED"), (30, "RTL")), log)
     assert not without_authority(flight((0, "GUIDED"), end_s=25), log)
 
@@ -120,27 +120,32 @@ def test_authority_invariant_is_independent_of_clock_steps() -> None:
     ahead = [entry(at + (7200 if at > 10 else 0), "state", boot_s=5000 + at, **state) for at in range(60)]
     assert not without_authority(flight((0, "GUIDED")), steadily_timed(ahead, started_s))
     hidden = [entry(at * 3, "state", boot_s=5000 + at, **state) for at in range(20)]
-    (found,) = without_authority(flight((0, "GUIDED")), steadily_timed(hidden, started_s))
-    assert found.time_s == BEGAN_S + 32
+    (violation,) = without_authority(flight((0, "GUIDED")), steadily_timed(hidden, started_s))
+    assert violation.time_s == BEGAN_S + 32
 
 
 def test_authority_invariant_is_violated_by_an_entry_without_controller() -> None:
     log = [entry(at, "state", controller="" if at == 9 else "system", in_air=True) for at in range(60)]
-    (found,) = without_authority(flight((0, "GUIDED")), log)
-    assert found.time_s == BEGAN_S + 9
+    (violation,) = without_authority(flight((0, "GUIDED")), log)
+    assert violation.time_s == BEGAN_S + 9
 
 
 def test_one_application_invariant_is_violated_by_two_drivers() -> None:
-    one = grant("one")
-    other = grant("other")
-    grants = {spec.mission_key: spec for spec in (one, other)}
+    first = grant("one")
+    second = grant("other")
+    grants = {spec.mission_key: spec for spec in (first, second)}
     state = {"controller": "system", "in_air": True}
-    both = [given(0, one), given(1, other), entry(2, "state", **state)]
-    (found,) = in_two_applications(both, grants)
-    assert "one, other" in found.found
-    in_turn = [given(0, one), given(1, one, "removed"), given(2, other), entry(3, "state", **state)]
+    both = [grant_entry(0, first), grant_entry(1, second), entry(2, "state", **state)]
+    (violation,) = in_two_applications(both, grants)
+    assert "one, other" in violation.found
+    in_turn = [
+        grant_entry(0, first),
+        grant_entry(1, first, "removed"),
+        grant_entry(2, second),
+        entry(3, "state", **state),
+    ]
     assert not in_two_applications(in_turn, grants)
-    restarted = [given(0, one), entry(1, "started"), given(2, other), entry(3, "state", **state)]
+    restarted = [grant_entry(0, first), entry(1, "started"), grant_entry(2, second), entry(3, "state", **state)]
     assert not in_two_applications(restarted, grants)
 
 
@@ -157,17 +162,17 @@ def test_one_application_invariant_is_violated_by_two_drivers() -> None:
 )
 def test_grant_invariant_evaluates_permitted_calls_again(call: dict[str, Any], words: str) -> None:
     spec = grant()
-    found = forbidden_calls([given(0, spec), call], {spec.mission_key: spec}, HOME)
-    assert [words in each.found for each in found] == ([True] if words else [])
+    violations = forbidden_calls([grant_entry(0, spec), call], {spec.mission_key: spec}, HOME)
+    assert [words in item.found for item in violations] == ([True] if words else [])
 
 
 def test_grant_invariant_is_violated_by_a_call_after_revocation() -> None:
     spec = grant()
-    log = [given(0, spec), given(1, spec, "removed"), goto(2, spec)]
-    (found,) = forbidden_calls(log, {spec.mission_key: spec}, HOME)
-    assert "it had no Grant" in found.found
-    (found,) = forbidden_calls([given(0, spec), goto(2, spec)], {}, HOME)
-    assert "never on the node" in found.found
+    log = [grant_entry(0, spec), grant_entry(1, spec, "removed"), goto(2, spec)]
+    (violation,) = forbidden_calls(log, {spec.mission_key: spec}, HOME)
+    assert "it had no Grant" in violation.found
+    (violation,) = forbidden_calls([grant_entry(0, spec), goto(2, spec)], {}, HOME)
+    assert "never on the node" in violation.found
 
 
 def test_mission_invariant_is_violated_by_unfinished_missions() -> None:
@@ -177,29 +182,29 @@ def test_mission_invariant_is_violated_by_unfinished_missions() -> None:
         "c": ("Failed", ""),
         "d": ("Flying", "leg 2"),
     }
-    assert [each.found.split()[0] for each in not_ended(ends)] == ["c", "d"]
+    assert [item.found.split()[0] for item in not_ended(ends)] == ["c", "d"]
 
 
 def test_landing_invariant_is_violated_away_from_home() -> None:
     assert not landed_elsewhere(flight((0, "RTL")), HOME)
-    (found,) = landed_elsewhere(flight((0, "RTL")), Home(HOME.lat + 0.001, HOME.lon, 25.0))
-    assert "111 m from home" in found.found
-    (found,) = landed_elsewhere(flight((0, "RTL"))[:30], HOME)
-    assert "in the air" in found.found
+    (violation,) = landed_elsewhere(flight((0, "RTL")), Home(HOME.lat + 0.001, HOME.lon, 25.0))
+    assert "111 m from home" in violation.found
+    (violation,) = landed_elsewhere(flight((0, "RTL"))[:30], HOME)
+    assert "in the air" in violation.found
 
 
 def test_orphan_invariant_describes_remaining_objects() -> None:
     assert not left_over([])
-    (found,) = left_over([{"kind": "Secret", "metadata": {"name": "one-navigator"}}])
-    assert "Secret/one-navigator (exists)" in found.found
+    (violation,) = left_over([{"kind": "Secret", "metadata": {"name": "one-navigator"}}])
+    assert "Secret/one-navigator (exists)" in violation.found
     ends = {
         "name": "one",
         "deletionTimestamp": "12:00",
         "finalizers": ["orphan"],
         "ownerReferences": [{"kind": "D", "name": "d"}],
     }
-    (found,) = left_over([{"kind": "ReplicaSet", "metadata": ends}])
-    assert "ReplicaSet/one (exists; deleted at 12:00; owned by D/d; finalizers orphan)" in found.found
+    (violation,) = left_over([{"kind": "ReplicaSet", "metadata": ends}])
+    assert "ReplicaSet/one (exists; deleted at 12:00; owned by D/d; finalizers orphan)" in violation.found
 
 
 def test_orphan_invariant_includes_grants_stored_on_nodes(tmp_path: Path) -> None:
@@ -218,7 +223,7 @@ def test_orphan_invariant_includes_grants_stored_on_nodes(tmp_path: Path) -> Non
     cluster = SimpleNamespace(nodes=[SimpleNamespace(own_state=tmp_path)])
     stage = cast("Stage", SimpleNamespace(objects=lambda kinds, *_: objects.get(kinds, []), cluster=cluster))
     left = Missions(stage, "chaos", print).left_over()
-    assert [each["metadata"]["name"] for each in left] == ["default.carried-navigator", "default.stored-navigator"]
+    assert [item["metadata"]["name"] for item in left] == ["default.carried-navigator", "default.stored-navigator"]
 
 
 def test_drained_node_is_uncordoned_after_a_rejected_request(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -227,7 +232,7 @@ def test_drained_node_is_uncordoned_after_a_rejected_request(monkeypatch: pytest
     refusals = 1
 
     def kubectl(command: str, *arguments: str, **_: object) -> str:
-        """As kubectl does: of these, only patch tells by its exit code that it was refused."""
+        """Imitate kubectl. Among these commands only `patch` fails when the API server rejects the request."""
         nonlocal cordoned, refusals
         if command == "drain":
             cordoned = True
@@ -267,12 +272,12 @@ def test_label_fault_waits_for_the_drone_but_not_for_an_edge_node(monkeypatch: p
     nodes = [SimpleNamespace(name=name, node_class=name.split("-")[0]) for name in ("drone-1", "edge-1", "cloud-1")]
     cluster = SimpleNamespace(spec=SimpleNamespace(nodes=nodes))
     stage = cast("Stage", SimpleNamespace(kubectl=kubectl, drone="drone-1", cluster=cluster))
-    whole = {"drone-1": "drone", "edge-1": "edge"}
-    lost = set()
+    complete = {"drone-1": "drone", "edge-1": "edge"}
+    removed = set()
     for seed in range(8):
-        labels.update(whole)
+        labels.update(complete)
         with broken(FAULTS["label-removal"], stage, Random(seed)):
-            lost |= whole.keys() - labels.keys()
-        assert labels == whole
-    assert lost == {"drone-1", "edge-1"}
+            removed |= complete.keys() - labels.keys()
+        assert labels == complete
+    assert removed == {"drone-1", "edge-1"}
     assert refusals == 3

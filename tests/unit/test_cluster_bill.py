@@ -1,4 +1,4 @@
-"""Bill of materials of an image, from its root file system."""
+"""Bill of materials generated from the root file system of an image."""
 
 import json
 from pathlib import Path
@@ -19,7 +19,7 @@ NETBASE = "Package: netbase\nArchitecture: all\nVersion: 6.4\n"
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """The root file system of a small image."""
+    """Root file system of a small image."""
     (tmp_path / "var/lib/dpkg").mkdir(parents=True)
     (tmp_path / "var/lib/dpkg/status").write_text(f"{LIBGCC}\n{NETBASE}\n")
     (tmp_path / "usr/lib").mkdir(parents=True)
@@ -31,17 +31,17 @@ def root(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_bill_has_package_urls_as_advisories_use_them(root: Path) -> None:
+def test_bill_has_package_urls_in_the_format_of_advisories(root: Path) -> None:
     bill = json.loads(bill_of_materials("localhost/fractus/agent:dev", root))
     assert (bill["bomFormat"], bill["specVersion"]) == ("CycloneDX", "1.5")
     assert bill["metadata"]["component"]["name"] == "localhost/fractus/agent:dev"
-    assert {each["purl"] for each in bill["components"]} == {
+    assert {component["purl"] for component in bill["components"]} == {
         "pkg:deb/debian/libgcc-s1@1%3A12.2.0-14%2Bdeb12u1?arch=arm64&distro=debian-12&upstream=gcc-12",
         "pkg:deb/debian/netbase@6.4?arch=all&distro=debian-12",
         "pkg:pypi/typing-extensions@4.16.0",
         "pkg:pypi/grpcio@1.85.1",
     }
-    assert {(each["name"], each["version"]) for each in bill["components"]} >= {
+    assert {(component["name"], component["version"]) for component in bill["components"]} >= {
         ("libgcc-s1", "1:12.2.0-14+deb12u1"),
         ("typing-extensions", "4.16.0"),
     }

@@ -1,4 +1,4 @@
-"""What the daemons of a cluster are told."""
+"""Configuration of the kubelet, network plug-in, DNS server and control groups of a cluster."""
 
 from __future__ import annotations
 
@@ -19,66 +19,66 @@ from fractus_cluster.network import host_link
 from fractus_cluster.nodeconfig import Machine, cni_config, kubelet_config, node_units, shortfalls
 from fractus_cluster.spec import NodeSpec
 
-PLACE = Addressing(IPv4Network("10.200.0.0/16"))
+ADDRESSING = Addressing(IPv4Network("10.200.0.0/16"))
 MACHINE = Machine(cpus=4, memory_bytes=16 * 2**30)
 
 
 def node(**resources: str) -> NodeSpec:
-    """A node that offers these resources; `gpu` stands for fractus.dev/gpu."""
+    """Return a node with the given resources. `gpu` stands for fractus.dev/gpu."""
     named = {"fractus.dev/gpu" if key == "gpu" else key: value for key, value in resources.items()}
     return NodeSpec.model_validate({"name": "n", "class": "edge", "resources": named, "labels": {"zone": "z"}})
 
 
 def kubelet(spec: NodeSpec, version: int = 1) -> Any:
-    """The parsed configuration of the node's kubelet."""
+    """Return the parsed configuration of the node's kubelet."""
     return yaml.safe_load(kubelet_config(spec, cgroup_root="a/b", cgroup_version=version, machine=MACHINE))
 
 
-def test_kubelet_holds_back_what_the_node_does_not_offer() -> None:
+def test_kubelet_reserves_resources_that_the_node_does_not_offer() -> None:
     assert kubelet(node(cpu="1500m", memory="4Gi"))["systemReserved"] == {"cpu": "2500m", "memory": str(12 * 2**30)}
 
 
-def test_kubelet_holds_nothing_back_when_all_is_offered() -> None:
+def test_kubelet_reserves_nothing_when_node_offers_all_resources() -> None:
     assert kubelet(node())["systemReserved"] == {}
     assert kubelet(node(cpu="8", memory="64Gi"))["systemReserved"] == {}
 
 
-def test_more_than_the_machine_has_is_said() -> None:
+def test_resources_beyond_the_machine_are_reported() -> None:
     assert shortfalls(node(cpu="4", memory="16Gi"), MACHINE) == []
     cpu, memory = shortfalls(node(cpu="8", memory="64Gi"), MACHINE)
     assert "4 CPUs, not 8" in cpu
     assert "16384Mi of memory, not 64Gi" in memory
 
 
-def test_kubelet_accepts_old_control_groups_only_where_there_are_some() -> None:
+def test_kubelet_accepts_cgroup_v1_only_on_machines_with_cgroup_v1() -> None:
     assert kubelet(node(), 1)["failCgroupV1"] is False
     assert "failCgroupV1" not in kubelet(node(), 2)
 
 
-def test_maximum_of_pods() -> None:
+def test_kubelet_limits_number_of_pods() -> None:
     assert kubelet(node(pods="7"))["maxPods"] == 7
     assert kubelet(node())["maxPods"] == 110
 
 
-def test_each_node_hands_out_addresses_of_its_own() -> None:
-    subnets = [json.loads(cni_config(i, PLACE))["plugins"][0]["ipam"]["ranges"][0][0]["subnet"] for i in range(3)]
-    assert subnets == [str(PLACE.pods(i)) for i in range(3)]
+def test_nodes_assign_pod_addresses_from_separate_networks() -> None:
+    subnets = [json.loads(cni_config(i, ADDRESSING))["plugins"][0]["ipam"]["ranges"][0][0]["subnet"] for i in range(3)]
+    assert subnets == [str(ADDRESSING.pods(i)) for i in range(3)]
     assert len(set(subnets)) == 3
 
 
-def test_node_object_says_class_and_pod_network() -> None:
-    path, body = node_object(node(), 2, PLACE)
+def test_node_object_has_class_and_pod_network() -> None:
+    path, body = node_object(node(), 2, ADDRESSING)
     assert path == "/api/v1/nodes/n"
     assert body["metadata"]["labels"]["fractus.dev/class"] == "edge"
     assert body["metadata"]["labels"]["zone"] == "z"
-    assert body["spec"]["podCIDR"] == str(PLACE.pods(2))
+    assert body["spec"]["podCIDR"] == str(ADDRESSING.pods(2))
 
 
-def test_drones_and_edge_nodes_are_tainted_and_other_taints_stay() -> None:
-    ours = {"key": "fractus.dev/class", "value": "edge", "effect": "NoExecute"}
-    other = {"key": "node.kubernetes.io/unschedulable", "effect": "NoSchedule"}
+def test_drones_and_edge_nodes_are_tainted_and_keep_other_taints() -> None:
+    class_taint = {"key": "fractus.dev/class", "value": "edge", "effect": "NoExecute"}
+    other_taint = {"key": "node.kubernetes.io/unschedulable", "effect": "NoSchedule"}
 
-    def patched(spec: NodeSpec, *taints: dict[str, str]) -> Any:
+    def patched_taints(spec: NodeSpec, *taints: dict[str, str]) -> Any:
         patch = taints_patch(spec, {"metadata": {"resourceVersion": "7"}, "spec": {"taints": list(taints)}})
         if patch is None:
             return None
@@ -86,47 +86,47 @@ def test_drones_and_edge_nodes_are_tainted_and_other_taints_stay() -> None:
         assert patch[1]["metadata"] == {"resourceVersion": "7"}
         return patch[1]["spec"]["taints"]
 
-    assert patched(node()) == [ours]
-    assert patched(node(), other) == [other, ours]
-    assert patched(node(), {**ours, "value": "drone"}, other) == [other, ours]
-    assert patched(node(), ours, other) is None
+    assert patched_taints(node()) == [class_taint]
+    assert patched_taints(node(), other_taint) == [other_taint, class_taint]
+    assert patched_taints(node(), {**class_taint, "value": "drone"}, other_taint) == [other_taint, class_taint]
+    assert patched_taints(node(), class_taint, other_taint) is None
     cloud = NodeSpec.model_validate({"name": "n", "class": "cloud"})
-    assert patched(cloud, other) is None
-    assert patched(cloud, ours, other) == [other]
+    assert patched_taints(cloud, other_taint) is None
+    assert patched_taints(cloud, class_taint, other_taint) == [other_taint]
 
 
 def test_extended_resources_are_patched_only_when_missing() -> None:
     spec = node(gpu="1", cpu="1")
-    has = {"fractus.dev/gpu": "1"}
+    amounts = {"fractus.dev/gpu": "1"}
     path, patch = extended_resources_patch(spec, {"status": {"capacity": {"cpu": "4"}}}) or pytest.fail("no patch")
     assert path == "/api/v1/nodes/n/status"
-    assert patch == {"status": {"capacity": has, "allocatable": has}}
-    half = extended_resources_patch(spec, {"status": {"capacity": has}}) or pytest.fail("no patch")
-    assert half[1] == {"status": {"allocatable": has}}
-    assert extended_resources_patch(spec, {"status": {"capacity": has, "allocatable": has}}) is None
+    assert patch == {"status": {"capacity": amounts, "allocatable": amounts}}
+    partial = extended_resources_patch(spec, {"status": {"capacity": amounts}}) or pytest.fail("no patch")
+    assert partial[1] == {"status": {"allocatable": amounts}}
+    assert extended_resources_patch(spec, {"status": {"capacity": amounts, "allocatable": amounts}}) is None
     assert extended_resources_patch(node(), {}) is None
 
 
-def test_ready_is_believed_only_since() -> None:
-    said = datetime(2026, 1, 1, tzinfo=UTC)
+def test_node_is_ready_only_with_heartbeat_after_given_time() -> None:
+    heartbeat_time = datetime(2026, 1, 1, tzinfo=UTC)
     condition = {"type": "Ready", "status": "True", "lastHeartbeatTime": "2026-01-01T00:00:00Z"}
     body = {"status": {"conditions": [condition]}}
     assert is_ready(body)
-    assert is_ready(body, since=said)
-    assert not is_ready(body, since=said + timedelta(seconds=1))
+    assert is_ready(body, since=heartbeat_time)
+    assert not is_ready(body, since=heartbeat_time + timedelta(seconds=1))
     assert not is_ready({"status": {"conditions": [{**condition, "status": "Unknown"}]}})
     assert not is_ready({})
 
 
-def test_dns_is_at_its_well_known_address() -> None:
-    objects = {body["kind"]: body for _, body in dns_objects(PLACE.control_plane)}
+def test_dns_service_has_well_known_address() -> None:
+    objects = {body["kind"]: body for _, body in dns_objects(ADDRESSING.control_plane)}
     assert objects["Service"]["spec"]["clusterIP"] == "10.96.0.10"
     assert "selector" not in objects["Service"]["spec"]
-    assert objects["EndpointSlice"]["endpoints"][0]["addresses"] == [str(PLACE.control_plane)]
-    assert f"bind {PLACE.control_plane}" in corefile(PLACE, Path("/kubeconfig"))
+    assert objects["EndpointSlice"]["endpoints"][0]["addresses"] == [str(ADDRESSING.control_plane)]
+    assert f"bind {ADDRESSING.control_plane}" in corefile(ADDRESSING, Path("/kubeconfig"))
 
 
-def test_units_name_logs_and_programs() -> None:
+def test_node_units_have_programs_and_log_files() -> None:
     units = {unit["name"]: unit for unit in node_units(node(), address="10.200.0.10")}
     assert set(units) == {"containerd", "kubelet", "kube-proxy"}
     assert "--node-ip=10.200.0.10" in units["kubelet"]["argv"]
@@ -134,7 +134,7 @@ def test_units_name_logs_and_programs() -> None:
 
 
 @pytest.mark.parametrize("name", ["a", "demo", "a-very-long-name-of-a-cluster-x"])
-def test_link_names_fit_the_kernel(name: str) -> None:
+def test_link_names_fit_the_kernel_limit(name: str) -> None:
     assert len(host_link(name)) <= 15
     assert host_link(name) != host_link(name + "2")
 
@@ -146,19 +146,19 @@ V1 = "".join(
 UNIFIED = "cgroup2 /sys/fs/cgroup/unified cgroup2 rw,relatime 0 0\n"
 
 
-def test_hierarchies_of_version_1_and_hybrid() -> None:
+def test_cgroup_hierarchies_of_version_1_and_hybrid_are_found() -> None:
     assert find_hierarchies(V1).version == 1
     hybrid = find_hierarchies(V1 + UNIFIED)
     assert hybrid.version == 1
     assert Path("/sys/fs/cgroup/unified") in hybrid.roots
 
 
-def test_hierarchies_of_version_2() -> None:
-    found = find_hierarchies("cgroup2 /sys/fs/cgroup cgroup2 rw,nsdelegate 0 0\nproc /proc proc rw 0 0\n")
-    assert (found.version, found.roots) == (2, (Path("/sys/fs/cgroup"),))
+def test_cgroup_hierarchy_of_version_2_is_found() -> None:
+    hierarchies = find_hierarchies("cgroup2 /sys/fs/cgroup cgroup2 rw,nsdelegate 0 0\nproc /proc proc rw 0 0\n")
+    assert (hierarchies.version, hierarchies.roots) == (2, (Path("/sys/fs/cgroup"),))
 
 
-def test_clusters_weigh_more_than_one_process(tmp_path: Path) -> None:
+def test_cluster_cgroup_has_more_cpu_shares_than_a_process(tmp_path: Path) -> None:
     shares = tmp_path / TOP / "cpu.shares"
     shares.parent.mkdir()
     shares.write_text("1024")
@@ -166,7 +166,7 @@ def test_clusters_weigh_more_than_one_process(tmp_path: Path) -> None:
     assert int(shares.read_text()) >= 10 * 1024
 
 
-def test_missing_control_groups_are_named() -> None:
+def test_error_names_missing_cgroup_controller() -> None:
     with pytest.raises(PrerequisiteError, match="memory"):
         find_hierarchies(V1.replace("memory", "misc"))
     with pytest.raises(PrerequisiteError, match="no control groups"):

@@ -1,4 +1,4 @@
-"""Images: layouts, archives without known layers, and detection of changed sources."""
+"""Image layouts, archives without known layers, and detection of changed sources."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ NAME = "localhost/test/tool:1"
 
 @pytest.fixture
 def layout(tmp_path: Path) -> Layout:
-    """A layout with one image."""
+    """Layout with one image."""
     program = tmp_path / "tool"
     program.write_bytes(b"\x7fELF tool")
-    made = Layout(tmp_path / "layout")
-    made.add_program(NAME, program)
-    return made
+    image_layout = Layout(tmp_path / "layout")
+    image_layout.add_program(NAME, program)
+    return image_layout
 
 
 def archive_of(layout: Layout, without: set[str]) -> tarfile.TarFile:
@@ -37,7 +37,7 @@ def archive_of(layout: Layout, without: set[str]) -> tarfile.TarFile:
     return tarfile.open(fileobj=out)
 
 
-def test_image_of_a_program_has_it_as_its_entry_point(layout: Layout) -> None:
+def test_program_is_entry_point_of_its_image(layout: Layout) -> None:
     layer, config, manifest = layout.digests(layout.image(NAME))
     with tarfile.open(layout.blob(layer)) as files:
         assert [(member.name, member.mode) for member in files] == [("tool", 0o755)]
@@ -47,7 +47,7 @@ def test_image_of_a_program_has_it_as_its_entry_point(layout: Layout) -> None:
     assert json.loads(layout.blob(manifest).read_text())["config"]["digest"] == config
 
 
-def test_same_program_is_the_same_image(layout: Layout, tmp_path: Path) -> None:
+def test_same_program_gives_the_same_image(layout: Layout, tmp_path: Path) -> None:
     before = layout.image(NAME)
     assert layout.add_program(NAME, tmp_path / "tool") == before
     assert len(layout.images()) == 1
@@ -92,18 +92,18 @@ def test_every_target_is_in_the_dockerfile() -> None:
 def test_release_builds_on_a_base_digest_that_its_images_name() -> None:
     workflow = yaml.safe_load((ROOT / ".github/workflows/release.yaml").read_text())
     scripts = [step["run"] for job in workflow["jobs"].values() for step in job["steps"] if "run" in step]
-    (told,) = [n for n, script in enumerate(scripts) if "imagetools inspect" in script]
-    (built,) = [n for n, script in enumerate(scripts) if script.startswith("make dist")]
-    assert told < built
+    (inspect_step,) = [n for n, script in enumerate(scripts) if "imagetools inspect" in script]
+    (build_step,) = [n for n, script in enumerate(scripts) if script.startswith("make dist")]
+    assert inspect_step < build_step
     makefile = (ROOT / "Makefile").read_text()
     assert '$(if $(BASE),--build-arg "BASE=$(BASE)")' in makefile
     assert '--output "type=oci,rewrite-timestamp=true,' in makefile
-    assert 'echo "SOURCE_DATE_EPOCH=' in scripts[told]
+    assert 'echo "SOURCE_DATE_EPOCH=' in scripts[inspect_step]
     dockerfile = (ROOT / "Dockerfile").read_text()
     assert "FROM ${BASE} AS base\nARG BASE\nLABEL org.opencontainers.image.base.name=${BASE}\n" in dockerfile
     (base,) = re.findall(r"^ARG BASE=(.+)$", dockerfile, re.MULTILINE)
-    assert f"imagetools inspect {base} " in scripts[told]
-    assert f'echo "BASE={base}@$digest" >> "$GITHUB_ENV"' in scripts[told]
+    assert f"imagetools inspect {base} " in scripts[inspect_step]
+    assert f'echo "BASE={base}@$digest" >> "$GITHUB_ENV"' in scripts[inspect_step]
 
 
 def test_actions_of_workflows_with_write_permission_are_pinned_to_commits() -> None:
@@ -125,12 +125,12 @@ def test_every_image_of_the_examples_can_be_built() -> None:
 
 @pytest.fixture
 def checkout(tmp_path: Path) -> Path:
-    """A small checkout with sources of images."""
+    """Small checkout with sources of images."""
     for name in ("Dockerfile", ".dockerignore", "pyproject.toml", "uv.lock", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, tmp_path / name)
-    for room in ("core", "runtime", "operator", "agent", "services", "sdk", "proto", "sim"):
-        (tmp_path / room).mkdir()
-        (tmp_path / room / "module.py").write_text(f"ROOM = {room!r}\n")
+    for folder in ("core", "runtime", "operator", "agent", "services", "sdk", "proto", "sim"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "module.py").write_text(f"ROOM = {folder!r}\n")
     (tmp_path / "examples" / "traffic-monitoring").mkdir(parents=True)
     return tmp_path
 
@@ -153,7 +153,7 @@ def test_changed_file_makes_its_images_stale(checkout: Path, changed: str, stale
     assert {target for target in TARGETS if source_digest(checkout, target) != before[target]} == stale
 
 
-def test_source_is_found_from_below(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_source_is_found_from_a_subfolder(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     assert find_source(checkout / "core") == checkout
     with pytest.raises(ClusterError, match="--source"):
         find_source(tmp_path_factory.mktemp("elsewhere"))

@@ -1,4 +1,4 @@
-"""Radio section of a cluster file, and the layout derived from it for the radio process."""
+"""Radio section of a cluster file, and the layout of the radio process derived from it."""
 
 from __future__ import annotations
 
@@ -54,23 +54,23 @@ def layout(content: dict[str, Any]) -> Layout | None:
 
 def without(*path: str | int) -> dict[str, Any]:
     content = copy.deepcopy(CONTENT)
-    place: Any = content
+    parent: Any = content
     for part in path[:-1]:
-        place = place[part]
-    del place[path[-1]]
+        parent = parent[part]
+    del parent[path[-1]]
     return content
 
 
 def test_radio_range_is_declared_or_taken_from_hardware() -> None:
-    found = layout(CONTENT)
-    assert found is not None
-    assert [(station.name, station.device, station.range_m) for station in found.stations] == [
+    radio = layout(CONTENT)
+    assert radio is not None
+    assert [(station.name, station.device, station.range_m) for station in radio.stations] == [
         ("drone-1", "wlan0", 120.0),
         ("edge-1", "wlan0", 96.0),
     ]
-    assert [station.vehicle for station in found.stations] == [RADIO_LINK, None]
-    assert (found.fading, found.seed, found.origin.lat) == (4.0, 3, 50.0)
-    (uplink,) = found.uplinks
+    assert [station.vehicle for station in radio.stations] == [RADIO_LINK, None]
+    assert (radio.fading, radio.seed, radio.origin.lat) == (4.0, 3, 50.0)
+    (uplink,) = radio.uplinks
     assert (uplink.near.device, uplink.far.device) == ("eth0", "node0")
     assert (uplink.rate_bps, uplink.delay_s) == (8e6, 0.03)
 
@@ -90,13 +90,13 @@ def test_wired_cluster_has_no_radio() -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "message"),
     [
         (without("nodes", 0, "description", "interfaces"), "hardware.wifi reaches nowhere"),
         (without("nodes", 1, "description", "location"), "needs a vehicle or description.location"),
         (json.loads(json.dumps(CONTENT).replace('"fading": 4', '"fading": 0.1')), "air.fading"),
     ],
 )
-def test_invalid_radio_configuration_is_refused(content: dict[str, Any], said: str) -> None:
-    with pytest.raises(ClusterError, match=said):
+def test_invalid_radio_configuration_is_refused(content: dict[str, Any], message: str) -> None:
+    with pytest.raises(ClusterError, match=message):
         parse_spec(content, source="x")

@@ -1,4 +1,4 @@
-"""The cluster file: what it accepts, what it refuses and with which words."""
+"""Parsing and validation of cluster files, and their error messages."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from fractus_cluster.spec import ClusterSpec, load_spec, parse_quantity, parse_s
 
 DEMO = Path(__file__).parents[2] / "examples" / "clusters" / "demo.yaml"
 
-GOOD: dict[str, Any] = {
+VALID: dict[str, Any] = {
     "name": "small",
     "nodes": [
         {
@@ -29,17 +29,17 @@ GOOD: dict[str, Any] = {
 
 
 def changed(path: str, value: object) -> dict[str, Any]:
-    """The good cluster with one field set; the path's parts are keys and indexes."""
-    content = copy.deepcopy(GOOD)
+    """Return the valid cluster with one field changed. The path consists of keys and indexes."""
+    content = copy.deepcopy(VALID)
     *parents, last = path.split(".")
-    place: Any = content
+    parent: Any = content
     for part in parents:
-        place = place[int(part)] if isinstance(place, list) else place[part]
-    place[last] = value
+        parent = parent[int(part)] if isinstance(parent, list) else parent[part]
+    parent[last] = value
     return content
 
 
-def test_demo_file_is_good() -> None:
+def test_demo_cluster_file_is_valid() -> None:
     spec = load_spec(DEMO)
     classes = [node.node_class for node in spec.nodes]
     assert classes.count("drone") == 1
@@ -48,13 +48,13 @@ def test_demo_file_is_good() -> None:
     assert spec.nodes[classes.index("drone")].vehicle() is not None
 
 
-def test_reads_back_what_it_writes() -> None:
+def test_cluster_spec_survives_yaml_round_trip() -> None:
     spec = load_spec(DEMO)
     assert parse_spec(yaml.safe_load(spec.to_yaml()), source="copy") == spec
 
 
 @pytest.mark.parametrize(
-    ("path", "value", "said"),
+    ("path", "value", "message"),
     [
         ("name", "Demo", "name"),
         ("nodes.0.hardware.disk", {"size": "1Mi"}, "16Mi at least"),
@@ -73,15 +73,15 @@ def test_reads_back_what_it_writes() -> None:
         ("nodes.0.description", {"colour": "red"}, "node drone-1: description"),
     ],
 )
-def test_refuses_with_the_field(path: str, value: object, said: str) -> None:
-    with pytest.raises(ClusterError) as refusal:
+def test_invalid_cluster_file_error_names_field(path: str, value: object, message: str) -> None:
+    with pytest.raises(ClusterError) as error:
         parse_spec(changed(path, value), source="cluster.yaml")
-    assert said in str(refusal.value)
-    assert str(refusal.value).startswith("cluster.yaml: ")
-    assert "after validation, not 0" not in str(refusal.value) or value == []
+    assert message in str(error.value)
+    assert str(error.value).startswith("cluster.yaml: ")
+    assert "after validation, not 0" not in str(error.value) or value == []
 
 
-def test_refuses_what_is_not_yaml(tmp_path: Path) -> None:
+def test_unreadable_cluster_file_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "cluster.yaml"
     file.write_text("name: [")
     with pytest.raises(ClusterError, match="invalid YAML"):
@@ -93,24 +93,24 @@ def test_refuses_what_is_not_yaml(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "number"), [("2", 2), ("500m", Decimal("0.5")), ("4Gi", 4 * 2**30), ("1.5k", 1500), ("3M", 3_000_000)]
 )
-def test_quantities(text: str, number: Decimal | int) -> None:
+def test_quantity_is_parsed(text: str, number: Decimal | int) -> None:
     assert parse_quantity(text) == number
 
 
 @pytest.mark.parametrize("text", ["", "Gi", "-1", "1 GB", "1..2", "1Xi"])
-def test_refuses_quantities(text: str) -> None:
+def test_invalid_quantity_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="is not a quantity"):
         parse_quantity(text)
 
 
-def test_vehicle_stands_where_the_hardware_says() -> None:
-    home, listen, arguments = parse_spec(GOOD, source="x").nodes[0].vehicle() or pytest.fail("no vehicle")
+def test_vehicle_has_home_of_the_hardware_section() -> None:
+    home, listen, arguments = parse_spec(VALID, source="x").nodes[0].vehicle() or pytest.fail("no vehicle")
     assert (home.lat, home.lon, home.alt) == (50.0, 4.0, 25.0)
     assert listen == "tcp:127.0.0.1:5760"
     assert arguments == ()
 
 
-def test_vehicle_needs_a_place() -> None:
+def test_vehicle_without_home_is_refused() -> None:
     spec = parse_spec(changed("nodes.0.hardware", {"vehicle": {}}), source="x")
     with pytest.raises(ClusterError, match=r"hardware\.vehicle\.home"):
         spec.nodes[0].vehicle()
@@ -120,19 +120,19 @@ def test_drone_without_hardware_has_no_vehicle() -> None:
     assert parse_spec(changed("nodes.0.hardware", {}), source="x").nodes[0].vehicle() is None
 
 
-def test_extended_resources_are_those_with_a_domain() -> None:
-    assert parse_spec(GOOD, source="x").nodes[0].extended_resources == {"fractus.dev/gpu": "2"}
+def test_resources_with_a_domain_are_extended_resources() -> None:
+    assert parse_spec(VALID, source="x").nodes[0].extended_resources == {"fractus.dev/gpu": "2"}
 
 
-def test_node_manifest_carries_the_description() -> None:
+def test_node_manifest_contains_the_description() -> None:
     spec = load_spec(DEMO)
     edge = next(node for node in spec.nodes if node.node_class == "edge")
     assert edge.manifest is not None
     assert edge.manifest["kind"] == "EdgeNode"
     assert edge.manifest["metadata"] == {"name": edge.name}
     assert edge.manifest["spec"] == edge.description
-    assert parse_spec(GOOD, source="x").nodes[0].manifest is None
+    assert parse_spec(VALID, source="x").nodes[0].manifest is None
 
 
-def test_placeholder_is_valid() -> None:
+def test_placeholder_cluster_spec_is_valid() -> None:
     assert ClusterSpec.placeholder("gone").name == "gone"

@@ -1,4 +1,4 @@
-"""The example's manifests: valid, in agreement with each other, and planned the way the demo tells."""
+"""The example's manifests are valid, consistent, and planned as the demo shows."""
 
 from __future__ import annotations
 
@@ -66,17 +66,17 @@ def inventory() -> Inventory:
 
 @pytest.fixture(scope="module")
 def application() -> Application:
-    (found,) = load("application.yaml")
-    assert isinstance(found, Application)
-    return found
+    (submitted,) = load("application.yaml")
+    assert isinstance(submitted, Application)
+    return submitted
 
 
 @pytest.mark.parametrize("path", sorted(EXAMPLE.glob("*.yaml")), ids=lambda path: path.name)
-def test_every_manifest_is_valid(path: Path) -> None:
+def test_example_manifest_is_valid(path: Path) -> None:
     assert load(path.name)
 
 
-def test_the_objects_agree_with_each_other(inventory: Inventory, application: Application) -> None:
+def test_example_objects_reference_existing_objects(inventory: Inventory, application: Application) -> None:
     (passenger,) = load("passenger-only.yaml")
     assert isinstance(passenger, Application)
     check_application(application, inventory.depots)
@@ -87,19 +87,19 @@ def test_the_objects_agree_with_each_other(inventory: Inventory, application: Ap
         check_policy(policy, inventory.zones)
 
 
-def test_the_cluster_s_nodes_are_those_of_the_manifests() -> None:
+def test_demo_cluster_nodes_match_the_manifests() -> None:
     spec = load_spec(ROOT / "examples" / "clusters" / "demo.yaml")
     described = {n.name: BY_KIND[n.manifest["kind"]].from_body(n.manifest) for n in spec.nodes if n.manifest}
     drone = described["drone-1"].to_dict()["spec"]
     camera = drone["services"]["camera"]
     assert camera["connection"] == "http://127.0.0.1:8090/snapshot.jpg"
-    camera["connection"] = "test:"  # clusters of others have no simulated camera
+    camera["connection"] = "test:"  # the manifest is also for clusters without a simulated camera
     assert {k: v.to_dict()["spec"] for k, v in described.items()} | {"drone-1": drone} == {
         k: v.to_dict()["spec"] for k, v in {**named("drone.yaml"), **named("edge-nodes.yaml")}.items()
     }
 
 
-def test_the_drone_s_camera_sees_the_simulated_world(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_demo_camera_command_matches_the_drone_manifest(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hardware.shutil, "which", lambda name: f"/bin/{name}")
     spec = load_spec(ROOT / "examples" / "clusters" / "demo.yaml")
     commands = {node.name: hardware_commands(node, spec.world_origin) for node in spec.nodes}
@@ -108,13 +108,13 @@ def test_the_drone_s_camera_sees_the_simulated_world(monkeypatch: pytest.MonkeyP
     options = dict(itertools.pairwise(camera))
     assert options["--listen"] == "127.0.0.1:8090"
     assert options["--vehicle"] in vehicle
-    told = named("drone.yaml")["drone-1"].spec.services.camera
-    assert float(options["--fov"]) == told.horizontal_field_of_view
-    assert (options["--resolution"], float(options["--mount-pitch"])) == (told.resolution, told.mount.pitch)
+    described = named("drone.yaml")["drone-1"].spec.services.camera
+    assert float(options["--fov"]) == described.horizontal_field_of_view
+    assert (options["--resolution"], float(options["--mount-pitch"])) == (described.resolution, described.mount.pitch)
     assert not any(commands[name] for name in commands if name != "drone-1")
 
 
-def test_the_plan_uses_what_is_near_and_says_why_edge_3_is_not(inventory: Inventory, application: Application) -> None:
+def test_demo_plan_uses_near_edge_nodes_and_rejects_edge_3(inventory: Inventory, application: Application) -> None:
     spec = plan(application, inventory)
     on = {name: {p.node for p in spec.placements if p.component == name} for name in ("GroundViewer", "ImageChecker")}
     assert spec.drone is not None
@@ -127,17 +127,15 @@ def test_the_plan_uses_what_is_near_and_says_why_edge_3_is_not(inventory: Invent
     }
 
 
-def test_the_passenger_s_application_is_planned(inventory: Inventory) -> None:
+def test_passenger_only_application_is_planned(inventory: Inventory) -> None:
     (passenger,) = load("passenger-only.yaml")
     assert isinstance(passenger, Application)
     spec = plan(passenger, inventory)
     assert spec.drone is not None
 
 
-def test_the_flight_is_legal_but_for_what_the_demo_wants_to_show(
-    inventory: Inventory, application: Application
-) -> None:
-    """Each leg is judged from the rest at the waypoint before it."""
+def test_demo_flight_is_legal_except_for_the_shown_violations(inventory: Inventory, application: Application) -> None:
+    """Each leg is judged for a drone that hovers at the previous waypoint."""
     grants = compile_grants(application, plan(application, inventory), inventory)
     grant = compile_grant(next(g for g in grants if g.component == "Navigator"))
     depot = inventory.depots["depot-1"].spec.location
@@ -149,11 +147,11 @@ def test_the_flight_is_legal_but_for_what_the_demo_wants_to_show(
     verdicts = []
     altitude = path[0].alt or 0.0
     for start, target in legs:
-        at = Situation(
+        situation = Situation(
             time_s=1.8e9, lat=start[0], lon=start[1], altitude_m=altitude, home=home, armed=True, in_air=True,
             speed_setpoint_mps=10.0,
         )  # fmt: skip
-        verdict = judge(Call("Goto", GotoArgs(*target)), at, grant)
+        verdict = judge(Call("Goto", GotoArgs(*target)), situation, grant)
         assert isinstance(verdict.args, GotoArgs), verdict
         altitude = verdict.args.alt or 0.0
         verdicts.append((verdict.action, altitude))
@@ -170,23 +168,23 @@ def test_the_flight_is_legal_but_for_what_the_demo_wants_to_show(
     assert (speed.action, speed.policies) == ("correct", ("town-speed",))
 
 
-def test_the_navigator_reads_its_path_from_the_environment(application: Application) -> None:
+def test_navigator_path_is_read_from_the_environment(application: Application) -> None:
     driver = application.spec.driver
     assert driver is not None
     (point,) = control_points({"FRACTUS_CONTROL_POINTS": json.dumps([p.to_dict() for p in driver.control_points])})
     assert [p.alt for p in point.path] == [20, 20, 70, 40, 25]
 
 
-def test_the_flight_takes_about_two_minutes(inventory: Inventory, application: Application) -> None:
+def test_demo_flight_is_600_to_1000_m_long(inventory: Inventory, application: Application) -> None:
     driver = application.spec.driver
     assert driver is not None
     depot = inventory.depots["depot-1"].spec.location
-    way = [depot, *(driver.control_points[0].path or ()), depot]
-    length_m = sum(geodesic_m(a, b) for a, b in itertools.pairwise(way))
+    points = [depot, *(driver.control_points[0].path or ()), depot]
+    length_m = sum(geodesic_m(a, b) for a, b in itertools.pairwise(points))
     assert 600 < length_m < 1000
 
 
-def test_zones_and_policies_are_of_their_kinds() -> None:
+def test_manifest_files_contain_only_their_kinds() -> None:
     assert all(isinstance(z, Zone) for z in load("zones.yaml"))
     assert {type(p) for p in load("policies.yaml")} == {Policy}
     assert {type(d) for d in load("depot.yaml")} == {Depot}

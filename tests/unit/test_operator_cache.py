@@ -31,8 +31,8 @@ FIRST = "2026-01-01T00:00:00Z"
 
 
 def labels(key: Key, **more: str) -> dict[str, str]:
-    made = {"app.kubernetes.io/managed-by": "fractus", "fractus.dev/application": key[1]}
-    return made | {"fractus.dev/namespace": key[0]} | {f"fractus.dev/{name}": value for name, value in more.items()}
+    common = {"app.kubernetes.io/managed-by": "fractus", "fractus.dev/application": key[1]}
+    return common | {"fractus.dev/namespace": key[0]} | {f"fractus.dev/{name}": value for name, value in more.items()}
 
 
 def plan_spec(node: str, host: Key | None, generation: int, placed_on: str) -> dict[str, Any]:
@@ -62,26 +62,26 @@ class EventsOfTheCluster(RuleBasedStateMachine):
         self.woken: set[Key] = set()
         self.cache.plans._wake = self.woken.add
         self.version = 0
-        self.there: dict[Kind, dict[Key, Body]] = {kind: {} for kind in KINDS}
-        self.unheard: dict[Kind, list[tuple[str, Body]]] = {kind: [] for kind in KINDS}
+        self.stored: dict[Kind, dict[Key, Body]] = {kind: {} for kind in KINDS}
+        self.pending: dict[Kind, list[tuple[str, Body]]] = {kind: [] for kind in KINDS}
         self.decided: dict[Key, OwnedPlan] = {}
-        self.last: dict[str, Claim] = {}
+        self.last_claims: dict[str, Claim] = {}
 
     # -- at the API server --
 
     def put(self, kind: Kind, body: Body) -> None:
         self.version += 1
         body["metadata"]["resourceVersion"] = str(self.version)
-        self.there[kind][key_of(body)] = body
-        self.unheard[kind].append(("MODIFIED", body))
+        self.stored[kind][key_of(body)] = body
+        self.pending[kind].append(("MODIFIED", body))
 
     def remove(self, kind: Kind, key: Key) -> None:
-        body = self.there[kind].pop(key, None)
+        body = self.stored[kind].pop(key, None)
         if body is not None:
             self.version += 1
             body = copy.deepcopy(body)
             body["metadata"]["resourceVersion"] = str(self.version)
-            self.unheard[kind].append(("DELETED", body))
+            self.pending[kind].append(("DELETED", body))
 
     @rule(
         key=APPLICATIONS,
@@ -151,11 +151,11 @@ class EventsOfTheCluster(RuleBasedStateMachine):
         node=st.none() | st.sampled_from(NODES),
         cpu=st.integers(1, 3),
         ended=st.booleans(),
-        ours=st.booleans(),
+        managed=st.booleans(),
     )
-    def pod(self, name: str, key: Key, node: str | None, cpu: int, ended: bool, ours: bool) -> None:
+    def pod(self, name: str, key: Key, node: str | None, cpu: int, ended: bool, managed: bool) -> None:
         container = {"resources": {"requests": {"cpu": str(cpu)}}}
-        metadata = {"namespace": key[0], "name": name, "labels": labels(key, instance="c-1") if ours else {}}
+        metadata = {"namespace": key[0], "name": name, "labels": labels(key, instance="c-1") if managed else {}}
         status = {"phase": "Succeeded" if ended else "Running"}
         self.put(
             kinds.POD, {"metadata": metadata, "spec": {"nodeName": node, "containers": [container]}, "status": status}
@@ -163,15 +163,15 @@ class EventsOfTheCluster(RuleBasedStateMachine):
 
     @rule(kind=st.sampled_from(KINDS), choice=st.randoms(use_true_random=False))
     def delete(self, kind: Kind, choice: Any) -> None:
-        if self.there[kind]:
-            self.remove(kind, choice.choice(sorted(self.there[kind])))
+        if self.stored[kind]:
+            self.remove(kind, choice.choice(sorted(self.stored[kind])))
 
     # -- received events --
 
     def informer(self, kind: Kind) -> Informer[Any]:
         return next(r for r in self.cache.informers() if r.kind == kind)
 
-    def take(self, kind: Kind, type_: str, body: Body) -> None:
+    def receive(self, kind: Kind, type_: str, body: Body) -> None:
         key = key_of(body)
         informer = self.informer(kind)
         known = informer.get(key) is not None
@@ -181,34 +181,34 @@ class EventsOfTheCluster(RuleBasedStateMachine):
             self.decided.pop(key, None)
 
     @rule(kind=st.sampled_from(KINDS), again=st.booleans())
-    def hear(self, kind: Kind, again: bool) -> None:
-        heard = self.unheard[kind]
-        self.unheard[kind] = []
-        for type_, body in heard:
+    def deliver_events(self, kind: Kind, again: bool) -> None:
+        events = self.pending[kind]
+        self.pending[kind] = []
+        for type_, body in events:
             for _ in range(1 + again):
-                self.take(kind, type_, body)
+                self.receive(kind, type_, body)
 
-    @precondition(lambda self: any(self.unheard.values()))
+    @precondition(lambda self: any(self.pending.values()))
     @rule(kind=st.sampled_from(KINDS))
-    def hear_one(self, kind: Kind) -> None:
-        if self.unheard[kind]:
-            self.take(kind, *self.unheard[kind].pop(0))
+    def deliver_one_event(self, kind: Kind) -> None:
+        if self.pending[kind]:
+            self.receive(kind, *self.pending[kind].pop(0))
 
     @rule(kind=st.sampled_from(KINDS))
-    def answer(self, kind: Kind) -> None:
+    def return_write(self, kind: Kind) -> None:
         """A write of the operator returns before the watch reports it."""
-        if self.unheard[kind] and self.unheard[kind][-1][0] != "DELETED":
-            body = copy.deepcopy(self.unheard[kind][-1][1])
+        if self.pending[kind] and self.pending[kind][-1][0] != "DELETED":
+            body = copy.deepcopy(self.pending[kind][-1][1])
             self.informer(kind).record_write(key_of(body), body)
 
     @rule(kind=st.sampled_from(KINDS))
     def list_again(self, kind: Kind) -> None:
         """An object that was deleted meanwhile is only missing in the list."""
-        self.unheard[kind] = []
-        for body in self.there[kind].values():
-            self.take(kind, "MODIFIED", body)
+        self.pending[kind] = []
+        for body in self.stored[kind].values():
+            self.receive(kind, "MODIFIED", body)
         informer = self.informer(kind)
-        for key in {key for key, _ in informer.items()} - self.there[kind].keys():
+        for key in {key for key, _ in informer.items()} - self.stored[kind].keys():
             informer._drop(key)
             if kind is kinds.APPLICATION:
                 self.decided.pop(key, None)
@@ -216,37 +216,37 @@ class EventsOfTheCluster(RuleBasedStateMachine):
     # -- invariants --
 
     def plans(self) -> dict[Key, OwnedPlan]:
-        """The plans made last."""
+        """Return the latest plan of each application."""
         stored = {key: parse_plan(body) for key, body in self.cache.children[kinds.DEPLOYMENT_PLAN].items()}
         return {key: plan for key, plan in stored.items() if plan is not None} | self.decided
 
     def active(self) -> dict[Key, OwnedPlan]:
-        found = {}
+        active = {}
         for key, plan in self.plans().items():
             submitted = self.cache.applications.get(key)
             if submitted is not None and submitted.uid == plan.uid:
                 returning = submitted.settled_generation
                 if returning is None or (plan.spec.application_generation or 0) > returning:
-                    found[key] = plan
-        return found
+                    active[key] = plan
+        return active
 
-    def booked(self, node: str, own: Key) -> float:
+    def booked(self, node: str, application: Key) -> float:
         pods = [p for p in self.cache.pods.values() if p.node == node and not p.finished]
-        of_others = [p for p in pods if (p.namespace, p.application) != own]
+        other_pods = [p for p in pods if (p.namespace, p.application) != application]
         bound = {(p.namespace, p.instance) for p in pods if p.application is not None}
-        return sum(p.requests["cpu"] for p in of_others) + sum(self.unbound(node, own, bound))
+        return sum(p.requests["cpu"] for p in other_pods) + sum(self.unbound(node, application, bound))
 
-    def unbound(self, node: str, own: Key, bound: Iterable[tuple[str, str | None]]) -> Iterator[float]:
+    def unbound(self, node: str, application: Key, bound: Iterable[tuple[str, str | None]]) -> Iterator[float]:
         for key, plan in self.active().items():
             submitted = self.cache.applications.get(key)
             assert submitted is not None
             assert submitted.application is not None
             for placed in plan.spec.placements:
-                if key != own and placed.node == node and (key[0], placed.instance) not in bound:
+                if key != application and placed.node == node and (key[0], placed.instance) not in bound:
                     yield requests(submitted.application.spec.components[0])["cpu"]
 
     @invariant()
-    def plans_in_force_are_those_of_missions_that_are_not_over(self) -> None:
+    def active_plans_are_those_of_unfinished_missions(self) -> None:
         plans = self.active()
         for key in [("ns", "a"), ("ns", "b"), ("ms", "a")]:
             assert self.cache.plans.active(key) == plans.get(key)
@@ -255,25 +255,25 @@ class EventsOfTheCluster(RuleBasedStateMachine):
             assert set(self.cache.fleet.applications_on(node)) == on
 
     @invariant()
-    def each_drone_has_the_application_that_all_plans_and_grants_give_it(self) -> None:
+    def claims_follow_from_plans_and_grants(self) -> None:
         plans = self.active()
         held = claims(plans, self.cache._known_grants.values())
         for drone in self.cache.drones.values():
             if drone is not None and drone.in_air and drone.name not in held:
-                last = self.last.get(drone.name) or self.cache.fleet._claim_from_status(drone.name)
+                last = self.last_claims.get(drone.name) or self.cache.fleet._claim_from_status(drone.name)
                 held[drone.name] = replace(last, returning=True)
-        self.last.update(held)
+        self.last_claims.update(held)
         assert dict(self.cache.fleet.claims()) == held
-        heard = {
+        grants = {
             (b["spec"]["application"]["uid"], b["spec"]["node"]) for b in self.cache.children[kinds.GRANT].values()
         }
         drones = [(plan.uid, plan.spec.drone) for plan in plans.values() if plan.spec.drone is not None]
         sharing = {(uid, drone.node) for uid, drone in drones if drone.shared_with is not None}
-        assert {node for _, node in heard - sharing} <= set(held), (
-            "a drone with the grant of one that shares no flight is not free"
+        assert {node for _, node in grants - sharing} <= set(held), (
+            "the drone of a Grant is claimed unless the application shares the flight"
         )
         owners = {(claim.uid, node) for node, claim in held.items() if not claim.returning}
-        own = {
+        flown_by = {
             plan.spec.drone.node
             for plan in plans.values()
             if plan.spec.drone is not None
@@ -281,19 +281,21 @@ class EventsOfTheCluster(RuleBasedStateMachine):
             and (plan.uid, plan.spec.drone.node) in owners
             and self.cache.drone(plan.spec.drone.node) is not None
         }
-        assert {flown.drone.name for flown in self.cache.fleet.active_missions()} == own
+        assert {flown.drone.name for flown in self.cache.fleet.active_missions()} == flown_by
         flying = {key for key, plan in plans.items() if self.cache.fleet.drone_in_flight(plan.spec) is not None}
         assert set(self.cache.fleet.applications_in_flight()) == flying
 
     @invariant()
-    def each_node_has_booked_on_it_what_runs_or_is_planned_there(self) -> None:
+    def bookings_follow_from_pods_and_plans(self) -> None:
         for name in NODES:
-            for own in [("ns", "a"), ("ns", "z")]:
-                found = self.cache._bookings.on(name, own, [p for p in self.cache.pods_of(own) if p.node == name])
-                assert found.get("cpu", 0.0) == pytest.approx(self.booked(name, own))
+            for application in [("ns", "a"), ("ns", "z")]:
+                booked = self.cache._bookings.on(
+                    name, application, [p for p in self.cache.pods_of(application) if p.node == name]
+                )
+                assert booked.get("cpu", 0.0) == pytest.approx(self.booked(name, application))
 
     @invariant()
-    def who_shares_a_flight_is_woken_by_its_host(self) -> None:
+    def wake_guests_wakes_applications_that_share_the_flight(self) -> None:
         for host in [("ns", "a"), ("ns", "b"), ("ms", "a")]:
             self.woken.clear()
             self.cache.plans.wake_guests(host)

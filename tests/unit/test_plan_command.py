@@ -1,4 +1,4 @@
-"""`fractus plan`: what it prints, how it exits, and the sentence for what it cannot read."""
+"""Output, exit codes and input errors of `fractus plan`."""
 
 import importlib.metadata
 import json
@@ -73,7 +73,7 @@ def run(tmp_path):
     return invoke
 
 
-def test_table_says_who_goes_where(run):
+def test_plan_table_lists_placements(run):
     result = run([*SCENE, TRAFFIC])
     assert result.exit_code == 0, result.output
     lines = result.output.splitlines()
@@ -83,23 +83,23 @@ def test_table_says_who_goes_where(run):
     assert any("any cloud node, 3 replicas" in line for line in lines)
 
 
-def test_table_says_which_direct_links_there_may_be(run):
+def test_plan_table_lists_possible_direct_links(run):
     lines = run([*SCENE, TRAFFIC]).output.splitlines()
     title = next(i for i, line in enumerate(lines) if line.startswith("DIRECT LINK TO"))
     assert lines[title + 1].split() == ["e1", "WiFi", "e1", "80", "m", "12", "Mbit/s", "ImageChecker"]
 
 
-@pytest.mark.parametrize(("output", "read"), [("yaml", yaml.safe_load), ("json", json.loads)])
-def test_the_plan_is_the_one_that_the_operator_would_write(run, tmp_path, output, read):
+@pytest.mark.parametrize(("output", "parse"), [("yaml", yaml.safe_load), ("json", json.loads)])
+def test_printed_plan_equals_the_plan_of_the_operator(run, tmp_path, output, parse):
     result = run([*SCENE, TRAFFIC], "-o", output)
     assert result.exit_code == 0
-    printed = DeploymentPlan.from_body(read(result.stdout))
+    printed = DeploymentPlan.from_body(parse(result.stdout))
     manifests = read_manifests([tmp_path / "all.yaml"])
     assert printed.spec == decide(manifests.applications()[0], manifests.inventory())
     assert (printed.name, printed.metadata.namespace) == ("traffic", "default")
 
 
-def test_geojson_has_area_way_and_nodes(run):
+def test_plan_geojson_has_area_route_and_nodes(run):
     result = run([*SCENE, TRAFFIC], "-o", "geojson")
     collection = json.loads(result.stdout)
     assert collection["type"] == "FeatureCollection"
@@ -111,7 +111,7 @@ def test_geojson_has_area_way_and_nodes(run):
     assert points["e1"]["geometry"]["coordinates"] == pytest.approx([at(150, 0)["lon"], at(150, 0)["lat"]])
 
 
-def test_infeasible_exits_2_with_the_reasons(run):
+def test_infeasible_plan_exits_with_2_and_reasons(run):
     result = run([DEPOT, spec_only(edge("e1", (150, 0))), TRAFFIC])
     assert result.exit_code == 2
     assert "default/traffic: infeasible (NoDrone)" in result.output
@@ -126,14 +126,14 @@ def test_infeasible_exits_2_with_the_reasons(run):
     assert "the mission takes" in result.stderr
 
 
-def test_an_infeasible_plan_lists_no_more_nodes_than_any_other(run, monkeypatch):
+def test_infeasible_plan_limits_listed_nodes(run, monkeypatch):
     monkeypatch.setattr(command, "_DEFAULTS", Settings(rejections_listed=1))
     drones = [spec_only(drone(f"d{i}", minutes=2)) for i in range(3)]
     spec = json.loads(run([DEPOT, *drones, TRAFFIC], "-o", "json").stdout)["spec"]
     assert (len(spec["rejected"]), spec["rejectedOmitted"]) == (1, 2)
 
 
-def test_two_applications_never_get_one_drone(run):
+def test_applications_never_get_the_same_drone(run):
     result = run(
         [
             DEPOT,
@@ -147,18 +147,20 @@ def test_two_applications_never_get_one_drone(run):
     assert "default/b: infeasible (DroneBusy)" in result.output
 
 
-def test_passengers_come_along_with_a_driver_of_the_same_manifests(run):
+def test_passenger_shares_drone_of_driver_in_the_same_manifests(run):
     guest = named(application(VIEWER | {"egress": [], "pointsOfInterest": {"points": VISITS}}), "a-guest")
     result = run([DEPOT, spec_only(drone("d1")), guest, named(application(navigator(PATH)), "host")], "-o", "json")
     assert result.exit_code == 0, result.output
     plans = {p["metadata"]["name"]: p["spec"] for p in json.loads(result.stdout)["items"]}
     assert plans["a-guest"]["drone"]["sharedWith"] == "default/host"
-    against = named(application(VIEWER | {"egress": [], "pointsOfInterest": {"points": VISITS[::-1]}}), "a-guest")
-    result = run([DEPOT, spec_only(drone("d1")), against, named(application(navigator(PATH)), "host")])
+    reversed_guest = named(
+        application(VIEWER | {"egress": [], "pointsOfInterest": {"points": VISITS[::-1]}}), "a-guest"
+    )
+    result = run([DEPOT, spec_only(drone("d1")), reversed_guest, named(application(navigator(PATH)), "host")])
     assert "default/a-guest: infeasible (DroneBusy)" in result.output
 
 
-def test_nodes_give_resources_and_readiness(run):
+def test_node_objects_determine_resources_and_readiness(run):
     cloud = node("c", "cloud")
     flying = node("d1", "drone")
     result = run([*SCENE, TRAFFIC, cloud, flying, node("e1", "edge", cpu="50m")], "-o", "yaml")
@@ -171,7 +173,7 @@ def test_nodes_give_resources_and_readiness(run):
     assert "d1 is cordoned" in result.output
 
 
-def test_bookings_of_one_application_are_seen_by_the_next(run):
+def test_bookings_of_one_application_reduce_room_for_the_next(run):
     big = component("Big", "edge", locations=[{"center": at(150, 0), "radius": 10}])
     big["container"]["resources"] = {"requests": {"cpu": "3"}}
     result = run([SCENE[3], node("e1", "edge"), *(named(application(big), n) for n in ("one", "two"))])
@@ -180,23 +182,23 @@ def test_bookings_of_one_application_are_seen_by_the_next(run):
     assert "cpu: 3 requested, 1 free" in result.output
 
 
-def test_a_plan_in_force_is_kept(run, tmp_path):
+def test_active_plan_is_kept(run, tmp_path):
     first = run([*SCENE[:2], TRAFFIC], "-o", "yaml").stdout.replace("d1", "d2")
     result = run([*SCENE, TRAFFIC, yaml.safe_load(first)], "-o", "yaml")
     assert DeploymentPlan.from_body(yaml.safe_load(result.stdout)).spec.drone.node == "d2"
 
 
-def test_a_plan_in_force_keeps_its_drone_from_the_others(run):
-    mine = yaml.safe_load(
+def test_active_plan_claims_its_drone(run):
+    active_plan = yaml.safe_load(
         run([DEPOT, spec_only(drone("d1")), named(application(navigator(PATH)), "z")], "-o", "yaml").stdout
     )
     apps = [named(application(navigator(PATH)), name) for name in "az"]
-    result = run([DEPOT, spec_only(drone("d1")), spec_only(drone("d2", battery=0.5)), *apps, mine], "-o", "json")
+    result = run([DEPOT, spec_only(drone("d1")), spec_only(drone("d2", battery=0.5)), *apps, active_plan], "-o", "json")
     plans = {p["metadata"]["name"]: p["spec"] for p in json.loads(result.stdout)["items"]}
     assert {name: spec["drone"]["node"] for name, spec in plans.items()} == {"a": "d2", "z": "d1"}
 
 
-def test_the_example_is_feasible():
+def test_plan_of_the_example_is_feasible():
     result = CliRunner().invoke(
         command.plan,
         [
@@ -212,7 +214,7 @@ def test_the_example_is_feasible():
     assert "drone drone-1 flies" in result.output
 
 
-def test_other_kinds_and_other_files_of_a_directory_are_passed_over(tmp_path):
+def test_other_kinds_and_files_of_a_directory_are_ignored(tmp_path):
     (tmp_path / "deep").mkdir()
     write(
         tmp_path / "deep" / "scene.yml", [*SCENE, {"apiVersion": "v1", "kind": "ConfigMap", "metadata": {"name": "x"}}]
@@ -263,7 +265,7 @@ BOW_TIE = [{"lat": 0, "lon": 0}, {"lat": 1e-3, "lon": 1e-3}, {"lat": 0, "lon": 1
         ),
     ],
 )
-def test_bad_input_exits_1_with_one_sentence_that_names_file_object_and_field(run, objects, sentence):
+def test_invalid_manifest_exits_with_1_and_names_file_object_and_field(run, objects, sentence):
     result = run(objects)
     assert result.exit_code == 1
     assert result.stdout == ""
@@ -272,12 +274,12 @@ def test_bad_input_exits_1_with_one_sentence_that_names_file_object_and_field(ru
     assert sentence.startswith("the manifests contain no App") or re.search(r"all\.yaml:[0-9]+: ", result.stderr)
 
 
-def test_a_kind_of_another_project_is_passed_over(run):
+def test_kind_of_another_api_group_is_ignored(run):
     foreign = {"apiVersion": "argoproj.io/v1alpha1", "kind": "Application", "metadata": {"name": "a"}, "spec": {}}
     assert "the manifests contain no Application" in run([foreign]).stderr
 
 
-def test_broken_yaml_and_json_name_the_line(tmp_path):
+def test_syntax_error_names_the_line(tmp_path):
     bad_yaml = tmp_path / "bad.yaml"
     bad_json = tmp_path / "bad.json"
     bad_yaml.write_text("kind: Drone\n  metadata: [")
@@ -290,13 +292,13 @@ def test_broken_yaml_and_json_name_the_line(tmp_path):
     assert result.exit_code == 1
 
 
-def test_unknown_plug_in_is_named(run):
+def test_unknown_plugin_is_named(run):
     result = run([*SCENE, TRAFFIC], "--ranking", "best")
     assert result.exit_code == 1
     assert "--ranking: plug-in best is not installed" in result.stderr
 
 
-def test_plug_ins_are_entry_points(run, monkeypatch):
+def test_plugins_are_found_by_entry_point(run, monkeypatch):
     class Entry:
         name = "last"
         value = "module:last"
@@ -317,12 +319,14 @@ FENCE = manifest(
 SQUARE = manifest("Zone", "square", {"area": {"circle": {"center": at(200, 0), "radius": 20}}})
 
 
-def test_a_conflict_with_policies_is_told_or_forbidden(run):
-    told = run([TRAFFIC, *SCENE, FENCE, SQUARE])
-    assert told.exit_code == 0
+def test_policy_conflict_is_reported_or_forbidden(run):
+    reported = run([TRAFFIC, *SCENE, FENCE, SQUARE])
+    assert reported.exit_code == 0
     end = at(300, 0)
-    assert f"policy conflict: policies do not allow the leg to {end['lat']:.6f}, {end['lon']:.6f}" in told.stdout
-    assert re.search(r"driver +Denied +LegThroughExclusionZone +the leg crosses zone square for 40.0 m", told.stdout)
+    assert f"policy conflict: policies do not allow the leg to {end['lat']:.6f}, {end['lon']:.6f}" in reported.stdout
+    assert re.search(
+        r"driver +Denied +LegThroughExclusionZone +the leg crosses zone square for 40.0 m", reported.stdout
+    )
     written = yaml.safe_load(run([TRAFFIC, *SCENE, FENCE, SQUARE], "-o", "yaml").stdout)
     assert written["spec"]["drone"]["legality"][0]["policies"] == ["keep-out"]
     assert DeploymentPlan.from_body(written).spec.drone.policy_conflict is not None
@@ -331,8 +335,8 @@ def test_a_conflict_with_policies_is_told_or_forbidden(run):
     assert "infeasible (PolicyConflict)" in forbidden.stdout
 
 
-def test_policies_are_judged_at_the_time_given(run):
+def test_policies_are_judged_at_the_specified_time(run):
     past = FENCE | {"spec": FENCE["spec"] | {"validUntil": "2026-01-01T00:00:00Z"}}
     for time, conflict in (("2025-06-01T12:00:00Z", True), ("2026-06-01T12:00:00Z", False)):
-        told = run([TRAFFIC, *SCENE, past, SQUARE], "--time", time)
-        assert ("policy conflict" in told.stdout) == conflict
+        result = run([TRAFFIC, *SCENE, past, SQUARE], "--time", time)
+        assert ("policy conflict" in result.stdout) == conflict

@@ -1,4 +1,4 @@
-"""The simulated radio against ns-3's 802.11g: rates over distance, half duplex, faults; and the mobile uplink."""
+"""The simulated radio compared with 802.11g of ns-3: rates over distance, half duplex and faults. Also the mobile uplink."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def pair(distance_m: float, propagation: Propagation, seed: int = 1) -> Medium:
 
 
 def udp_mbps(medium: Medium, seconds: float = 2.0) -> float:
-    """Payload that arrives while the sender's queue is never empty."""
+    """Return the received payload in Mbit/s while the sender's queue is never empty."""
     now = 0.0
     arrived = 0
     while now < seconds:
@@ -50,30 +50,30 @@ def udp_mbps(medium: Medium, seconds: float = 2.0) -> float:
         (10, 1.5, 14.65, 0.03), (30, 1.5, 11.3, 0.12), (90, 1.5, 0.0, 0.0),
     ],
 )  # fmt: skip
-def test_rates_are_those_of_ns3(distance_m: float, fading: float | None, ns3_mbps: float, tolerance: float) -> None:
+def test_radio_rate_matches_ns3(distance_m: float, fading: float | None, ns3_mbps: float, tolerance: float) -> None:
     propagation = Propagation(NS3_POWER_DBM, NS3_EXPONENT, fading)
     assert udp_mbps(pair(distance_m, propagation)) == pytest.approx(ns3_mbps, rel=tolerance, abs=0.02)
 
 
 @pytest.mark.parametrize(("distance_m", "ns3_mbps"), [(50, 0.96), (60, 0.35), (70, 0.10)])
-def test_the_soft_edge_fades_like_ns3(distance_m: float, ns3_mbps: float) -> None:
-    found = udp_mbps(pair(distance_m, Propagation(NS3_POWER_DBM, NS3_EXPONENT, 1.5)), 10.0)
-    assert found == pytest.approx(ns3_mbps, rel=0.25, abs=0.1)
+def test_radio_rate_at_the_range_limit_fades_as_in_ns3(distance_m: float, ns3_mbps: float) -> None:
+    rate_mbps = udp_mbps(pair(distance_m, Propagation(NS3_POWER_DBM, NS3_EXPONENT, 1.5)), 10.0)
+    assert rate_mbps == pytest.approx(ns3_mbps, rel=0.25, abs=0.1)
 
 
 @pytest.mark.parametrize("range_m", [80.0, 100.0, 120.0])
-def test_a_declared_range_is_the_edge(range_m: float) -> None:
+def test_radio_link_ends_at_the_declared_range(range_m: float) -> None:
     propagation = Propagation.reaching(range_m)
     assert udp_mbps(pair(range_m - 0.5, propagation), 0.5) > 14
     assert udp_mbps(pair(range_m + 0.5, propagation), 0.5) == 0
 
 
 @pytest.mark.parametrize("size", [40, 200, 800, 1400])
-def test_small_frames_take_mostly_overhead(size: int) -> None:
+def test_airtime_includes_overhead_of_each_frame(size: int) -> None:
     assert airtime_s(size + 14) == pytest.approx((size + 76) * 8 / 24e6 + 269e-6)
 
 
-def test_both_directions_share_the_air() -> None:
+def test_both_directions_share_the_channel() -> None:
     medium = pair(10, Propagation.reaching(100))
     now = 0.0
     arrived = {"a": 0, "b": 0}
@@ -88,22 +88,22 @@ def test_both_directions_share_the_air() -> None:
     assert sum(arrived.values()) * UDP_BYTES * 8 / 2.0 / 1e6 == pytest.approx(14.68, rel=0.02)
 
 
-def test_frames_arrive_in_order_and_once() -> None:
+def test_frames_arrive_once_and_in_order() -> None:
     medium = pair(60, Propagation(NS3_POWER_DBM, NS3_EXPONENT, 1.5), seed=5)
     sent = [frame(B, 100)[:-4] + n.to_bytes(4, "big") for n in range(400)]
-    found = []
+    received = []
     now = 0.0
-    for one in sent:
-        medium.offer("a", one, now)
+    for data in sent:
+        medium.offer("a", data, now)
         while medium.next_s < math.inf:
             now = medium.next_s
-            found += [arrival.frame for arrival in medium.advance(now)]
-    assert len(found) == len(set(found))
-    assert found == sorted(found)
-    assert len(found) < len(sent)  # after the last attempt a frame is given up
+            received += [arrival.frame for arrival in medium.advance(now)]
+    assert len(received) == len(set(received))
+    assert received == sorted(received)
+    assert len(received) < len(sent)  # a frame is dropped after its last attempt
 
 
-def test_only_stations_of_a_network_in_reach_hear_each_other() -> None:
+def test_only_stations_of_one_network_in_range_receive_frames() -> None:
     medium = pair(10, Propagation.reaching(100))
     medium.add("c", Station((20.0, 0.0, 0.0), C, "other"))
     medium.add("d", Station((200.0, 0.0, 0.0), b"\x02ddddd", "net"))
@@ -113,7 +113,7 @@ def test_only_stations_of_a_network_in_reach_hear_each_other() -> None:
 
 
 @pytest.mark.parametrize("fault", [{"off": True}, {"silent": True}, {"loss_db": 60.0}])
-def test_faults_silence_a_station(fault: dict[str, object]) -> None:
+def test_faulty_station_sends_no_frames(fault: dict[str, object]) -> None:
     medium = pair(10, Propagation.reaching(100))
     for name, value in fault.items():
         setattr(medium.stations["b"], name, value)
@@ -121,14 +121,14 @@ def test_faults_silence_a_station(fault: dict[str, object]) -> None:
     assert not list(medium.advance(1.0))
 
 
-def test_a_full_queue_drops() -> None:
+def test_full_radio_queue_drops_frames() -> None:
     medium = pair(10, Propagation.reaching(100))
     for _ in range(QUEUE_FRAMES + 11):
         medium.offer("a", frame(B), 0.0)
-    assert medium.stations["a"].dropped == 10  # one is in the air
+    assert medium.stations["a"].dropped == 10  # one frame is being sent
 
 
-def test_out_of_reach_attempts_end() -> None:
+def test_sending_out_of_range_ends_after_the_last_attempt() -> None:
     medium = pair(200, Propagation.reaching(100))
     medium.offer("a", frame(B), 0.0)
     assert not list(medium.advance(10.0))
@@ -136,12 +136,12 @@ def test_out_of_reach_attempts_end() -> None:
     assert sum(airtime_s(FRAME_BYTES, n) for n in range(ATTEMPTS)) < 0.1
 
 
-def test_the_same_seed_gives_the_same_air() -> None:
-    found = [udp_mbps(pair(40, Propagation(NS3_POWER_DBM, NS3_EXPONENT, 1.5), seed=9), 0.5) for _ in range(2)]
-    assert found[0] == found[1]
+def test_radio_is_deterministic_for_a_seed() -> None:
+    rates = [udp_mbps(pair(40, Propagation(NS3_POWER_DBM, NS3_EXPONENT, 1.5), seed=9), 0.5) for _ in range(2)]
+    assert rates[0] == rates[1]
 
 
-def test_the_uplink_has_a_rate_a_delay_and_a_queue() -> None:
+def test_uplink_has_rate_delay_and_queue() -> None:
     uplink = Uplink()
     uplink.offer(b"x" * 1000, 0.0)
     assert uplink.next_s == pytest.approx(0.061)
@@ -153,12 +153,12 @@ def test_the_uplink_has_a_rate_a_delay_and_a_queue() -> None:
     while now < 3.0:
         uplink.offer(b"x" * 1500, now)
         now += rng.uniform(0.0005, 0.0015)  # 12 Mbit/s offered
-        arrived += sum(len(one) for one in uplink.advance(now))
+        arrived += sum(len(packet) for packet in uplink.advance(now))
     assert arrived * 8 / 2.0 == pytest.approx(8e6, rel=0.06)
     assert uplink.dropped > 0
 
 
-def test_an_uplink_that_is_cut_carries_nothing() -> None:
+def test_disabled_uplink_drops_packets() -> None:
     uplink = Uplink()
     uplink.offer(b"x", 0.0)
     uplink.off = True

@@ -1,4 +1,4 @@
-"""What the live view tells of a cluster, and that it tells when it does not hear of it any more."""
+"""Events that the live view derives from the objects of a cluster, and loss of contact to its API server."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from scraping import assert_documented, values
 NOW_MS = 1_780_000_000_000
 
 
-def ours(kind: str, name: str, spec: Body, status: Body | None = None, namespace: str = "") -> Body:
+def resource(kind: str, name: str, spec: Body, status: Body | None = None, namespace: str = "") -> Body:
     metadata = {"name": name, "resourceVersion": "1"} | ({"namespace": namespace} if namespace else {})
     body: Body = {"apiVersion": api.API_VERSION, "kind": kind, "metadata": metadata, "spec": spec}
     return body | ({"status": status} if status is not None else {})
@@ -34,20 +34,20 @@ def ready(status: str, reason: str = "Because", message: str = "") -> Body:
     return {"type": "Ready", "status": status, "reason": reason, "message": message, "lastTransitionTime": when}
 
 
-DRONE = ours(
+DRONE = resource(
     "Drone", "drone-1", {},
     {
         "flightState": "flying", "position": {"lat": 39.36, "lon": 22.93, "alt": 12.5}, "battery": {"remaining": 0.5},
         "controller": "spiffe://fractus.dev/ns/d/app/traffic/component/Navigator/instance/n", "lastSeen": "2026-05-28T20:26:39Z",
     },
 )  # fmt: skip
-EDGE = ours("EdgeNode", "edge-1", {"location": {"lat": 39.361, "lon": 22.931}}, {"conditions": [ready("True")]})
-DEPOT = ours("Depot", "base", {"location": {"lat": 39.36, "lon": 22.93}, "radius": 30})
-ZONE = ours(
+EDGE = resource("EdgeNode", "edge-1", {"location": {"lat": 39.361, "lon": 22.931}}, {"conditions": [ready("True")]})
+DEPOT = resource("Depot", "base", {"location": {"lat": 39.36, "lon": 22.93}, "radius": 30})
+ZONE = resource(
     "Zone", "school",
     {"area": {"circle": {"center": {"lat": 39.36, "lon": 22.932}, "radius": 50}}, "altitude": {"lower": 0, "upper": 30}},
 )  # fmt: skip
-POLICY = ours(
+POLICY = resource(
     "Policy", "town-altitude",
     {"type": "LimitControl", "kind": "altitude", "upperLimit": 50, "lowerLimit": 5, "selector": {"zones": ["town"]}},
 )  # fmt: skip
@@ -57,7 +57,7 @@ NAVIGATOR = {
     "services": [{"service": "mobility", "methods": ["Arm", "Takeoff", "Goto", "Land"]}],
     "controlPoints": [{"navigation": "pathBased", "path": [{"lat": 39.36, "lon": 22.93, "alt": 10}, {"lat": 39.361, "lon": 22.931, "alt": 20}]}],
 }  # fmt: skip
-APPLICATION = ours(
+APPLICATION = resource(
     "Application", "traffic", {"components": [NAVIGATOR]},
     {"phase": "Flying", "drone": "drone-1", "message": "drone-1 flies", "conditions": [ready("True", "Deployed")]}, "demo",
 )  # fmt: skip
@@ -65,7 +65,7 @@ AREA = {
     "type": "MultiPolygon",
     "coordinates": [[[[22.93, 39.36], [22.94, 39.36], [22.94, 39.37], [22.93, 39.36]]]],
 }
-PLAN = ours(
+PLAN = resource(
     "DeploymentPlan", "traffic",
     {
         "application": "traffic", "operationArea": AREA,
@@ -73,7 +73,7 @@ PLAN = ours(
     },
     None, "demo",
 )  # fmt: skip
-LINK = ours(
+LINK = resource(
     "DirectLink", "traffic-edge-1",
     {
         "drone": "drone-1", "node": "edge-1", "application": {"namespace": "demo", "name": "traffic", "uid": "u"},
@@ -86,12 +86,12 @@ ALL = (DRONE, EDGE, DEPOT, ZONE, POLICY, APPLICATION, PLAN, LINK)
 
 
 class ApiServer:
-    """Stands for `fractus_runtime.kubernetes.Client`: lists what it holds, tells of changes, and is out of reach when told so."""
+    """Fake `fractus_runtime.kubernetes.Client` that lists bodies, reports changes and can become unreachable."""
 
     def __init__(self, *bodies: Body) -> None:
         self.bodies = list(bodies)
         self.refusal: KubeError | None = None
-        self._news: dict[str, asyncio.Queue[tuple[str, Body] | None]] = {}
+        self._events: dict[str, asyncio.Queue[tuple[str, Body] | None]] = {}
 
     async def request(self, method: str, path: str, **_: Any) -> Body:
         assert method == "GET"
@@ -107,23 +107,23 @@ class ApiServer:
     async def watch(self, kind: Kind, *, opened: Any, **_: Any) -> AsyncIterator[tuple[str, Body]]:
         await self.request("GET", kind.path())
         opened()
-        news = self._news[kind.name] = asyncio.Queue()
-        while (found := await news.get()) is not None:
-            yield found
+        events = self._events[kind.name] = asyncio.Queue()
+        while (event := await events.get()) is not None:
+            yield event
 
-    async def tell(self, type_: str, body: Body) -> None:
+    async def send_event(self, type_: str, body: Body) -> None:
         body = json.loads(json.dumps(body))
         body["metadata"]["resourceVersion"] = "2"
-        self._news[body["kind"]].put_nowait((type_, body))
+        self._events[body["kind"]].put_nowait((type_, body))
 
-    def cut(self) -> None:
+    def disconnect(self) -> None:
         self.refusal = KubeError(0, "Unreachable", "connection refused")
-        for news in self._news.values():
-            news.put_nowait(None)
+        for events in self._events.values():
+            events.put_nowait(None)
 
 
 class Clock:
-    """One second passes between two looks at the contact."""
+    """Clock that a test sets."""
 
     now_ms = NOW_MS
 
@@ -145,14 +145,14 @@ async def watched(server: ApiServer, clock: Clock, monkeypatch: pytest.MonkeyPat
         await asyncio.gather(task, return_exceptions=True)
 
 
-async def until(cluster: Cluster, wanted: Any) -> list[dict[str, Any]]:
-    """The events from one that is wanted on are of no interest: those up to it."""
-    found: list[dict[str, Any]] = []
+async def until(cluster: Cluster, condition: Any) -> list[dict[str, Any]]:
+    """Return the events up to the first batch with an event that fulfils the condition."""
+    events: list[dict[str, Any]] = []
     async with aclosing(cluster.stream("")) as stream:
         async for message in stream:
-            found += json.loads(message.decode().split("\n")[1].removeprefix("data: "))
-            if any(wanted(event) for event in found):
-                return found
+            events += json.loads(message.decode().split("\n")[1].removeprefix("data: "))
+            if any(condition(event) for event in events):
+                return events
     raise AssertionError
 
 
@@ -160,18 +160,18 @@ def last(events: list[dict[str, Any]], type_: str) -> dict[str, Any]:
     return [event for event in events if event["type"] == type_][-1]
 
 
-async def test_the_view_tells_prometheus_what_is_documented(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_view_metrics_equal_their_documentation(monkeypatch: pytest.MonkeyPatch) -> None:
     async with watched(ApiServer(*ALL), Clock(), monkeypatch) as cluster:
         await until(cluster, lambda event: event["type"] == "policies")
         text = metrics_text([*View(cluster, frozenset()).metrics(), *cluster.metrics()]).decode()
     assert_documented(text, "View")
-    seen = values(text)
-    assert all(seen["fractus_view_watch_open", kind.PLURAL] == 1 for kind in KINDS)
-    assert all(0 <= seen["fractus_view_watch_age_seconds", kind.PLURAL] < 20 for kind in KINDS)
-    assert seen["fractus_view_pages",] == 0
+    samples = values(text)
+    assert all(samples["fractus_view_watch_open", kind.PLURAL] == 1 for kind in KINDS)
+    assert all(0 <= samples["fractus_view_watch_age_seconds", kind.PLURAL] < 20 for kind in KINDS)
+    assert samples["fractus_view_pages",] == 0
 
 
-async def test_all_that_a_cluster_knows_of_flights_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_view_reports_drones_areas_applications_links_and_policies(monkeypatch: pytest.MonkeyPatch) -> None:
     async with watched(ApiServer(*ALL), Clock(), monkeypatch) as cluster:
         events = await until(cluster, lambda event: event["type"] == "policies")
     state = last(events, "state")
@@ -199,54 +199,56 @@ async def test_all_that_a_cluster_knows_of_flights_is_told(monkeypatch: pytest.M
     ]
 
 
-async def test_what_changes_is_told_and_what_is_deleted_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_view_reports_changed_and_deleted_objects(monkeypatch: pytest.MonkeyPatch) -> None:
     server = ApiServer(*ALL)
     async with watched(server, Clock(), monkeypatch) as cluster:
         await until(cluster, lambda event: event["type"] == "policies")
-        await server.tell("MODIFIED", APPLICATION | {"status": {"phase": "Completed"}})
-        await server.tell("DELETED", DRONE)
+        await server.send_event("MODIFIED", APPLICATION | {"status": {"phase": "Completed"}})
+        await server.send_event("DELETED", DRONE)
         events = await until(cluster, lambda event: event["type"] == "gone")
         assert last(events, "gone")["drone"] == "drone-1"
-        over = await until(
+        completed = await until(
             cluster, lambda e: e["type"] == "applications" and e["applications"][0]["phase"] == "Completed"
         )
-        plans = [event for event in over if event["type"] == "areas" and event["origin"] == "plans"]
-        assert plans[-1]["features"] == [], "what is over means to fly nowhere"
-        new = await until(cluster, lambda event: event["type"] == "live")
-    assert not [event for event in new if event["type"] in {"state", "fix"}], "a new page hears of no drone"
+        plans = [event for event in completed if event["type"] == "areas" and event["origin"] == "plans"]
+        assert plans[-1]["features"] == [], "a completed application has no planned route"
+        new_page = await until(cluster, lambda event: event["type"] == "live")
+    assert not [event for event in new_page if event["type"] in {"state", "fix"}], (
+        "a new page receives no event of the deleted drone"
+    )
 
 
-async def test_a_lost_api_server_is_told_with_since_when_and_why(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_lost_api_server_is_reported_with_time_and_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     server = ApiServer(*ALL)
     clock = Clock()
     async with watched(server, clock, monkeypatch) as cluster:
         await until(cluster, lambda event: event["type"] == "contact" and event["stale_since_ms"] is None)
-        server.cut()
+        server.disconnect()
         clock.now_ms += 1_500
         await asyncio.sleep(0.1)
-        quiet = last(await until(cluster, lambda event: event["type"] == "live"), "contact")
-        assert quiet["time_ms"] == NOW_MS, "watches end and begin again all the time"
+        contact = last(await until(cluster, lambda event: event["type"] == "live"), "contact")
+        assert contact["time_ms"] == NOW_MS, "a short interruption of a watch is normal"
         clock.now_ms += 1_500
         stale = await until(cluster, lambda event: event["type"] == "contact" and event["stale_since_ms"] is not None)
         assert last(stale, "contact")["stale_since_ms"] == NOW_MS
         assert last(stale, "contact")["text"] == "connection refused"
         server.refusal = None
-        back = await until(
+        recovered = await until(
             cluster, lambda e: e["type"] == "contact" and e["time_ms"] > NOW_MS and e["stale_since_ms"] is None
         )
-        assert last(back, "contact")["text"] == ""
+        assert last(recovered, "contact")["text"] == ""
 
 
-async def test_it_is_not_current_while_one_kind_is_not_watched(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Blind(ApiServer):
-        async def watch(self, kind: Kind, **how: Any) -> AsyncIterator[tuple[str, Body]]:
+async def test_view_is_stale_while_one_kind_is_not_watched(monkeypatch: pytest.MonkeyPatch) -> None:
+    class WithoutZoneWatch(ApiServer):
+        async def watch(self, kind: Kind, **options: Any) -> AsyncIterator[tuple[str, Body]]:
             if kind.name == "Zone":
                 raise KubeError(500, "InternalError", "no watch")
-            async for found in super().watch(kind, **how):
-                yield found
+            async for event in super().watch(kind, **options):
+                yield event
 
     clock = Clock()
-    async with watched(Blind(*ALL), clock, monkeypatch) as cluster:
+    async with watched(WithoutZoneWatch(*ALL), clock, monkeypatch) as cluster:
         clock.now_ms += 5_000
         events = await until(cluster, lambda event: event["type"] == "contact")
     assert (last(events, "contact")["stale_since_ms"], last(events, "contact")["text"]) == (
@@ -255,22 +257,22 @@ async def test_it_is_not_current_while_one_kind_is_not_watched(monkeypatch: pyte
     )
 
 
-async def test_an_object_that_cannot_be_read_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    odd = ours("Zone", "odd", {"area": {"square": 1}})
-    async with watched(ApiServer(*ALL, odd), Clock(), monkeypatch) as cluster:
+async def test_invalid_object_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    invalid = resource("Zone", "odd", {"area": {"square": 1}})
+    async with watched(ApiServer(*ALL, invalid), Clock(), monkeypatch) as cluster:
         events = await until(cluster, lambda event: event["type"] == "problem")
     assert "a Zone cannot be read" in last(events, "problem")["text"]
 
 
-def test_a_drone_that_is_not_heard_of_does_not_fly_for_all_that_is_shown() -> None:
+def test_silent_drone_is_not_shown_as_flying() -> None:
     silent = {"flightState": "unknown", "lastFlightState": "flying", "position": {"lat": 1, "lon": 2, "alt": 3}}
-    shown = objects.state(api.Drone.from_body(ours("Drone", "a", {}, silent)), NOW_MS)
+    shown = objects.state(api.Drone.from_body(resource("Drone", "a", {}, silent)), NOW_MS)
     assert shown.phase == "not heard of, last in the air"
-    new = api.Drone.from_body(ours("Drone", "a", {}))
+    new = api.Drone.from_body(resource("Drone", "a", {}))
     assert (objects.state(new, NOW_MS).phase, objects.fix(new, NOW_MS)) == ("not heard of", None)
 
 
-def test_every_flight_state_has_words() -> None:
+def test_every_flight_state_has_a_phase_text() -> None:
     from typing import get_args
 
     from fractus_core.api.nodes import FlightState
@@ -287,31 +289,28 @@ def test_every_flight_state_has_words() -> None:
         ({"type": "PrivacyControl", "kind": "camera", "action": "blurFaces"}, "pictures: blurFaces"),
     ],
 )  # fmt: skip
-def test_policies_are_said_in_a_phrase(spec: Body, text: str) -> None:
-    assert objects.policy(api.Policy.from_body(ours("Policy", "p", spec))).text == text
-    broken = ours("Policy", "p", spec, {"conditions": [ready("False", "NoZone", "zone a is missing")]})
+def test_policy_is_described_in_a_phrase(spec: Body, text: str) -> None:
+    assert objects.policy(api.Policy.from_body(resource("Policy", "p", spec))).text == text
+    broken = resource("Policy", "p", spec, {"conditions": [ready("False", "NoZone", "zone a is missing")]})
     assert objects.policy(api.Policy.from_body(broken)).text == f"not in force: zone a is missing ({text})"
 
 
-def test_it_reads_nothing_that_has_secrets() -> None:
+def test_view_reads_no_kinds_with_secrets() -> None:
     assert {kind.KIND for kind in KINDS} == {
         "Drone", "EdgeNode", "Depot", "Zone", "Policy", "Application", "DeploymentPlan", "DirectLink",
     }  # fmt: skip
 
 
-# The command
-
-
 @pytest.mark.parametrize(
-    ("refusal", "said"),
+    ("refusal", "message"),
     [
         (KubeError(0, "Unreachable", "no route"), "no route; check the cluster and --context"),
         (KubeError(404, "NotFound", "not found"), "install the chart fractus-crds"),
         (KubeError(403, "Forbidden", "forbidden"), "the role view is enough"),
     ],
 )
-def test_a_cluster_that_cannot_be_read_is_told_at_the_start(
-    refusal: KubeError, said: str, monkeypatch: pytest.MonkeyPatch
+def test_unreadable_cluster_is_reported_at_start(
+    refusal: KubeError, message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Refusing(ApiServer):
         async def aclose(self) -> None:
@@ -325,6 +324,6 @@ def test_a_cluster_that_cannot_be_read_is_told_at_the_start(
 
     monkeypatch.setattr(command, "Client", lambda *_: server)
     monkeypatch.setattr(command, "from_environment", access)
-    done = CliRunner().invoke(command.view, [])
-    assert done.exit_code == 1
-    assert said in done.output
+    result = CliRunner().invoke(command.view, [])
+    assert result.exit_code == 1
+    assert message in result.output

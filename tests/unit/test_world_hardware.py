@@ -1,4 +1,4 @@
-"""A camera beside a node of the embedded cluster: what the file says, and the command that it becomes."""
+"""Command lines of the simulated cameras and vehicles of a cluster file."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def option(command: list[str], name: str) -> str:
     return command[command.index(name) + 1]
 
 
-def test_drone_carries_the_camera_that_its_description_describes() -> None:
+def test_drone_camera_command_follows_its_description() -> None:
     spec = cluster(DRONE)
     commands = hardware_commands(spec.nodes[0], spec.world_origin)
     camera = commands["camera"]
@@ -72,20 +72,22 @@ def test_drone_carries_the_camera_that_its_description_describes() -> None:
     assert float(option(camera, "--fov")) == 70
     assert float(option(camera, "--mount-pitch")) == -60
     assert "--stabilised" in camera
-    assert option(camera, "--vehicle") in commands["vehicle"], "the vehicle must listen where the camera connects"
+    assert option(camera, "--vehicle") in commands["vehicle"], (
+        "the vehicle must listen at the address that the camera connects to"
+    )
     assert "tcp:127.0.0.1:5760" in commands["vehicle"]
 
 
-def test_edge_node_has_a_fixed_camera_and_shares_the_world() -> None:
+def test_edge_node_camera_is_fixed_and_shares_the_world_origin() -> None:
     spec = cluster(DRONE, EDGE)
     camera = hardware_commands(spec.nodes[1], spec.world_origin)["camera"]
     assert option(camera, "--pose") == "50.001,4.001,6.0"
-    assert option(camera, "--origin") == "50.0,4.0", "the drone's camera comes first"
+    assert option(camera, "--origin") == "50.0,4.0", "the home of the drone is the world origin"
     assert "--vehicle" not in camera
     assert float(option(camera, "--mount-yaw")) == 90
 
 
-def test_nodes_without_a_camera_have_none() -> None:
+def test_node_without_camera_has_no_camera_command() -> None:
     spec = cluster(DRONE | {"hardware": {"vehicle": DRONE["hardware"]["vehicle"]}})
     commands = hardware_commands(spec.nodes[0], spec.world_origin)
     assert set(commands) == {"vehicle"}
@@ -93,7 +95,7 @@ def test_nodes_without_a_camera_have_none() -> None:
     assert commands["vehicle"].count("--listen") == 1
 
 
-def test_given_origin_wins_and_the_file_is_read_back() -> None:
+def test_specified_origin_and_seed_are_used() -> None:
     drone = copy.deepcopy(DRONE)
     drone["hardware"]["camera"] = {"origin": {"lat": 49.5, "lon": 3.5}, "seed": 3}
     spec = cluster(drone)
@@ -112,17 +114,19 @@ def test_given_origin_wins_and_the_file_is_read_back() -> None:
         (EDGE, ("class",), "cloud", "hardware.camera is for drones and edge nodes"),
     ],
 )
-def test_mistakes_are_named(node: dict[str, Any], path: tuple[str, ...], value: object, message: str) -> None:
-    wrong = copy.deepcopy(node)
-    inner = wrong
+def test_invalid_camera_configuration_error_names_field(
+    node: dict[str, Any], path: tuple[str, ...], value: object, message: str
+) -> None:
+    changed = copy.deepcopy(node)
+    parent = changed
     for key in path[:-1]:
-        inner = inner[key]
-    inner[path[-1]] = value
+        parent = parent[key]
+    parent[path[-1]] = value
     with pytest.raises(ClusterError, match=message):
-        cluster(wrong)
+        cluster(changed)
 
 
-def test_missing_program_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_missing_camera_program_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / "fractus-camera-world").unlink()
     monkeypatch.setattr(hardware.shutil, "which", lambda _: None)
     spec = cluster(DRONE)

@@ -1,4 +1,4 @@
-"""Where a place on earth lands in a picture, against projection through earth-centred coordinates."""
+"""Projection of ground positions into a picture, compared with an oracle in earth-centred coordinates."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def ecef(lat: float, lon: float, height_m: float) -> np.ndarray:
 
 
 def oracle(pose: Pose, mount: Mount, lat: float, lon: float) -> np.ndarray:
-    """The pixel of a place on the ellipsoid, by vectors: nothing of it is shared with the code under test."""
+    """Return the pixel of a position on the ellipsoid by vector algebra that shares no code with the code under test."""
     phi = math.radians(pose.lat)
     lam = math.radians(pose.lon)
     east = np.array([-math.sin(lam), math.cos(lam), 0.0])
@@ -69,22 +69,22 @@ PLACES = [(50.8637, 4.6785), (80.0, 25.0), (-79.9, -60.0), (10.0, 179.9999), (65
 
 @pytest.mark.parametrize(("pose", "mount"), ATTITUDES)
 @pytest.mark.parametrize(("lat", "lon"), PLACES)
-def test_places_land_where_they_should(pose: Pose, mount: Mount, lat: float, lon: float) -> None:
-    """Also five kilometres from the world's origin, where its north is not the camera's."""
-    for away_east, away_north in ((0.0, 0.0), (5000.0, -3000.0)):
+def test_projection_matches_oracle(pose: Pose, mount: Mount, lat: float, lon: float) -> None:
+    """Some cameras are five kilometres from the world's origin, where the two north directions differ."""
+    for east_m, north_m in ((0.0, 0.0), (5000.0, -3000.0)):
         frame = LocalFrame(lat, lon)
-        at = Pose(*frame.latlon(away_east, away_north), pose.height_m, pose.roll_deg, pose.pitch_deg, pose.yaw_deg)
-        view = View.of(at, mount, LENS, frame)
+        camera = Pose(*frame.latlon(east_m, north_m), pose.height_m, pose.roll_deg, pose.pitch_deg, pose.yaw_deg)
+        view = View.of(camera, mount, LENS, frame)
         inverse = view.ground_matrix()
         for u, v in ((960.0, 540.0), (100.0, 900.0), (1800.0, 500.0), (500.5, 300.5)):
             x, y, w = inverse @ np.array([u, v, 1.0])
             if w >= -0.05:
-                continue  # not the ground, or kilometres away
+                continue  # above the horizon, or kilometres away
             target = frame.latlon(x / w, y / w)
-            assert np.abs(oracle(at, mount, *target) - (u, v)).max() < 1.0
-            found, depth = view.project(np.array([[x / w, y / w, 0.0]]))
+            assert np.abs(oracle(camera, mount, *target) - (u, v)).max() < 1.0
+            pixels, depth = view.project(np.array([[x / w, y / w, 0.0]]))
             assert depth[0] > 0
-            assert found[0] == pytest.approx((u, v), abs=1e-6)
+            assert pixels[0] == pytest.approx((u, v), abs=1e-6)
 
 
 @settings(max_examples=examples(200), deadline=None)
@@ -97,19 +97,19 @@ def test_places_land_where_they_should(pose: Pose, mount: Mount, lat: float, lon
     st.floats(-180, 180),
     st.floats(-90, -35),
 )
-def test_any_attitude(
-    lat: float, lon: float, height: float, roll: float, pitch: float, yaw: float, mount: float
+def test_projection_matches_oracle_at_any_attitude(
+    lat: float, lon: float, height: float, roll: float, pitch: float, yaw: float, mount_pitch: float
 ) -> None:
     pose = Pose(lat, lon, height, roll, pitch, yaw)
-    sits = Mount(mount, 0.0, stabilised=False)
+    mount = Mount(mount_pitch, 0.0, stabilised=False)
     frame = LocalFrame(lat, lon)
-    view = View.of(pose, sits, LENS, frame)
+    view = View.of(pose, mount, LENS, frame)
     x, y, w = view.ground_matrix() @ np.array([700.0, 800.0, 1.0])
     if w < -0.1:
-        assert np.abs(oracle(pose, sits, *frame.latlon(x / w, y / w)) - (700.0, 800.0)).max() < 1.0
+        assert np.abs(oracle(pose, mount, *frame.latlon(x / w, y / w)) - (700.0, 800.0)).max() < 1.0
 
 
-def test_top_of_a_picture_that_looks_down_is_ahead() -> None:
+def test_top_of_downward_picture_points_ahead() -> None:
     frame = LocalFrame(50.0, 4.0)
     view = View.of(Pose(50.0, 4.0, 100.0, yaw_deg=90.0), Mount(), LENS, frame)
     (ahead, right), _ = view.project(np.array([[20.0, 0.0, 0.0], [0.0, -20.0, 0.0]]))
@@ -130,7 +130,7 @@ def test_top_of_a_picture_that_looks_down_is_ahead() -> None:
         (lambda: Pose(0.0, 0.0, 60_000.0), "more than 50 km"),
     ],
 )
-def test_impossible_cameras_are_refused(make: object, message: str) -> None:
+def test_impossible_camera_is_refused(make: object, message: str) -> None:
     assert callable(make)
     with pytest.raises(ValueError, match=message):
         make()

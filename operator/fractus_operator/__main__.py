@@ -89,7 +89,7 @@ async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
         orphaned_pods = OrphanedPods(store, cache)
         links = LinkEventRecorder(store, _now)
         background: list[Coroutine[Any, Any, None]] = [
-            *(informer.run() for informer in (*cache.informers(), links.informer)),
+            *(informer.run() for informer in (*cache.informers, links.informer)),
             *(queue.run() for queue in (*work_queues(store, cache, csr, conditions), links.work_queue)),
             run_periodically("node liveness", liveness.step, node_liveness.PERIOD_S),
             run_periodically("service rollout", services.step, service_rollout.PERIOD_S),
@@ -110,7 +110,7 @@ def _metrics_source(lease: LeaseThread, cache: ClusterCache, authority: Authorit
     """Return the metrics of a leader."""
     return metrics.MetricsSource(
         lambda: lease.left_s,
-        lambda: {i.kind.plural: (i.watching, i.age_s()) for i in cache.informers() if i.synced.is_set()},
+        lambda: {i.kind.plural: (i.watching, i.age_s()) for i in cache.informers if i.synced.is_set()},
         lambda: ((a.body.get("status") or {}).get("phase", "Pending") for a in cache.applications.values()),
         lambda: (displayed_flight_state(drone) for drone in cache.drones.values() if drone is not None),
         authority.certificate.not_valid_after_utc.timestamp(),

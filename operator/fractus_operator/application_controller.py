@@ -14,6 +14,7 @@ from fractus_core.identity.authority import Authority
 from fractus_core.identity.grant_signer import GrantSigner
 from fractus_core.planning.inventory import Inventory, Settings
 from fractus_core.planning.planner import Infeasible
+from fractus_core.planning.scale_up import full_nodes
 from fractus_core.validation import check_application
 
 from fractus_operator import kinds, status
@@ -27,12 +28,12 @@ from fractus_operator.labels import FINALIZER
 from fractus_operator.metrics import phase as timed
 from fractus_operator.metrics import reconciling
 from fractus_operator.parsing import SETTLED, Submitted
-from fractus_operator.pods import refusals
+from fractus_operator.pods import refusal_of
 from fractus_operator.replanning import (
     choose_plan,
     flown_generation,
     mission_changed,
-    present_plan,
+    of_generation,
     stuck_nodes,
     waits_for_landing,
 )
@@ -71,7 +72,12 @@ class BeingDeleted(Exception):
 
 @dataclass
 class _ApplicationState:
-    """State of one Application between reconciliations. Losing it, as in a restart, is harmless."""
+    """State of one Application between reconciliations. Losing it, as in a restart, is harmless.
+
+    Attributes:
+        excluded: Nodes that plans avoid, with the end of the exclusion and the reason.
+        checked: Uid, generation, and revision of the rules of the last valid Application.
+    """
 
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
     excluded: dict[str, tuple[datetime, str]] = field(default_factory=dict)
@@ -87,12 +93,6 @@ class _ApplicationState:
         if self.checked != revision:
             check_application(application, inventory.depots)
             self.checked = revision
-
-    def exclude(self, stuck: dict[str, str], now: datetime) -> dict[str, str]:
-        """Exclude nodes from plans for a while. Return all excluded nodes with the reason."""
-        self.excluded = {node: (end, reason) for node, (end, reason) in self.excluded.items() if end > now}
-        self.excluded |= {node: (now + EXCLUSION, reason) for node, reason in stuck.items()}
-        return {node: reason for node, (_, reason) in self.excluded.items()}
 
 
 class ApplicationController:
@@ -125,7 +125,7 @@ class ApplicationController:
         await self._cache.synced()
         with self._cache.subscriptions.subscribe(key) as inputs:
             while not stopped():
-                started = loop.time()
+                started_s = loop.time()
                 try:
                     with reconciling("application"):
                         try:
@@ -142,10 +142,9 @@ class ApplicationController:
                         error,
                     )
                     await self._reporter.report_failure(self._cache.applications.get(key), backoff.attempts, error)
-                took_s = loop.time() - started
-                if await inputs.changed(next_s):
-                    # Changes come in bursts, such as the pods of a plan. A change by a user ends the pause.
-                    await inputs.pause(min(_PAUSE_FACTOR * took_s, _MAX_PAUSE_S))
+                took_s = loop.time() - started_s
+                # Changes come in bursts, such as the pods of a plan. A change by a user ends the pause.
+                await inputs.changed(next_s, pause_s=min(_PAUSE_FACTOR * took_s, _MAX_PAUSE_S))
 
     async def reconcile(self, key: Key) -> float:
         """Take one step towards the desired state. The operator may be killed at any point, and the step repeated.
@@ -210,7 +209,9 @@ class ApplicationController:
             await self._reporter.report(submitted, update, flown_generation(submitted.application, observed.plan))
             await self._finish(submitted)
             return RESYNC_S
-        present = self._present_status(observed)
+        present = None
+        if observed.plan is not None and self._objects.of(observed.key, kinds.DEPLOYMENT):
+            present = self._deployed_status(observed, observed.plan, 0)
         try:
             await self._grants.refresh(observed)
             update, next_s = await self._deploy(self._cache.observe(submitted), state)
@@ -311,15 +312,22 @@ class ApplicationController:
         now = self._clock()
         stuck, recheck_s = stuck_nodes(observed.plan, observed.pods, now)
         stuck = {node: reason for node, reason in stuck.items() if node != observed.in_flight}
-        settings = replace(self._settings, excluded=state.exclude(stuck, now), time_s=now.timestamp())
-        unchecked = present_plan(application, observed.plan)
+        state.excluded = {node: (end, reason) for node, (end, reason) in state.excluded.items() if end > now}
+        state.excluded |= {node: (now + EXCLUSION, reason) for node, reason in stuck.items()}
+        excluded = {node: reason for node, (_, reason) in state.excluded.items()}
+        settings = replace(self._settings, excluded=excluded, time_s=now.timestamp())
+        unchecked = observed.plan
+        if unchecked is not None and not mission_changed(application, unchecked):
+            unchecked = of_generation(application, unchecked)
         present = unchecked
         if unchecked is not None:
             present = self._route_checks.checked(
                 observed.key, application, unchecked, rules=observed.rules, inventory=inventory, settings=settings
             )
         choice = choose_plan(application, present, inventory, settings, stuck=stuck, in_flight=observed.in_flight)
-        self._cache.subscriptions.set_placed(observed.key, placed=choice.suits, full=choice.full)
+        # On these nodes the plan would have more instances if they had free capacity.
+        full = full_nodes(application, inventory, settings, choice.plan)
+        self._cache.subscriptions.set_placed(observed.key, placed=choice.suits, full=full)
         if choice.plan is not observed.plan:
             self._cache.plans.decide(observed.key, observed.uid, choice.plan)
         if choice.plan is not unchecked:
@@ -350,15 +358,10 @@ class ApplicationController:
             self._cache.forget(key)
         return min(await self._finished_pods.expire(submitted), RESYNC_S)
 
-    def _present_status(self, observed: ObservedApplication) -> StatusUpdate | None:
-        """Return the status of the deployed part of the active plan, or None if nothing is deployed."""
-        if observed.plan is None or not self._objects.of(observed.key, kinds.DEPLOYMENT):
-            return None
-        return self._deployed_status(observed, observed.plan, 0)
-
     def _deployed_status(self, observed: ObservedApplication, plan: DeploymentPlanSpec, granted: int) -> StatusUpdate:
         node = plan.drone.node if plan.drone is not None else None
         reported = self._reporter.last(observed.submitted)
         flown = flight(node, self._cache.drone(node), reported) if node is not None else None
-        refused = refusals(self._objects.of(observed.key, kinds.DEPLOYMENT))
+        deployments = self._objects.of(observed.key, kinds.DEPLOYMENT)
+        refused = {body["metadata"]["name"]: refusal_of(body) for body in deployments}
         return status.deployed(plan, observed.pods, granted, flown, refused)

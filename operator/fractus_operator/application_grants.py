@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from fractus_core.api import Application, Grant
@@ -51,24 +51,28 @@ class ApplicationGrants:
         Raises:
             KubeError: The API server cannot be reached.
         """
-        valid = self._valid_grants(observed)
-        inputs = _inputs(observed.rules, valid)
+        valid, versions = self._valid_grants(observed)
+        inputs = (observed.rules, *versions)
         if self._refreshed.get(observed.key) == inputs:
             return
         inventory = self._cache.snapshot(observed.key, observed.uid)
         grants = [(grant, refresh(grant.spec, inventory)) for grant in valid]
         stale = [(grant, spec) for grant, spec in grants if spec != grant.spec]
-        if stale:
-            self._refreshed.pop(observed.key, None)
-        else:
+        if not stale:
             self._refreshed[observed.key] = inputs
-        try:
-            await self._objects.refresh(stale)
-        except KubeError as error:
+            return
+        self._refreshed.pop(observed.key, None)
+        writes = (self._objects.refresh_grant(grant, spec) for grant, spec in stale)
+        results = await asyncio.gather(*writes, return_exceptions=True)
+        failure = next((result for result in results if result is not None), None)
+        if failure is not None:
             # Either the watch reports a newer Grant, or the next reconciliation fails in the same way.
-            logger.warning("application grants: Grants not updated (application=%s/%s error=%s)", *observed.key, error)
-            if error.status not in REFUSALS and not isinstance(error, Conflict | NotFound):
-                raise
+            logger.warning(
+                "application grants: Grants not updated (application=%s/%s error=%s)", *observed.key, failure
+            )
+            refused = isinstance(failure, KubeError) and failure.status in REFUSALS
+            if not refused and not isinstance(failure, Conflict | NotFound):
+                raise failure
 
     def compile(
         self,
@@ -82,8 +86,8 @@ class ApplicationGrants:
         Raises:
             InvalidObject: Nothing can be granted.
         """
-        valid = self._valid_grants(observed)
-        inputs = _inputs(observed.rules, valid, application.metadata.uid, application.metadata.generation)
+        valid, versions = self._valid_grants(observed)
+        inputs = (observed.rules, *versions, application.metadata.uid, application.metadata.generation)
         known = self._compiled.get(observed.key)
         if known is not None and known.inputs == inputs and known.plan is plan:
             return known.grants
@@ -96,12 +100,11 @@ class ApplicationGrants:
         self._refreshed.pop(key, None)
         self._compiled.pop(key, None)
 
-    def _valid_grants(self, observed: ObservedApplication) -> list[Grant]:
-        """Return the Grants that the operator signed for this Application. Those of another uid are never signed again."""
+    def _valid_grants(self, observed: ObservedApplication) -> tuple[list[Grant], Inputs]:
+        """Return the Grants that the operator signed for this Application, and their versions.
+
+        Grants of another uid are never signed again.
+        """
         own = (grant for grant in observed.grants if grant.spec.application.uid == observed.uid)
-        return [grant for grant in own if self._signer.problem(grant) is None]
-
-
-def _inputs(rules: int, grants: Sequence[Grant], *more: object) -> Inputs:
-    versions = sorted((g.name, g.metadata.uid or "", g.metadata.resource_version or "") for g in grants)
-    return (rules, *versions, *more)
+        valid = [grant for grant in own if self._signer.problem(grant) is None]
+        return valid, tuple(sorted((g.name, g.metadata.uid or "", g.metadata.resource_version or "") for g in valid))

@@ -16,7 +16,7 @@ from fractus_core.planning.spatial_index import NodeLocations
 from fractus_operator import kinds
 from fractus_operator.active_plans import ActivePlans
 from fractus_operator.bookings import BookedHosts, Bookings, ByName
-from fractus_operator.drone_claims import DroneHolders, Fleet, may_share, offered_flights, shared_flight_lost
+from fractus_operator.drone_claims import DroneHolders, Fleet, offered_flights, shared_flight_lost
 from fractus_operator.kinds import Body, Key, Kind
 from fractus_operator.labels import label_key
 from fractus_operator.node_objects import NodeObjects
@@ -79,6 +79,7 @@ class ClusterCache:
         namespace: Namespace of the Fractus services.
 
     Attributes:
+        informers: All informers. Run each one in its own task.
         torn_down: The uids of Applications whose teardown has begun. Nothing more is created for them.
         rules_revision: Number of changes of the inputs of Grants: zones, policies, depots, and specs of nodes.
     """
@@ -121,20 +122,20 @@ class ClusterCache:
         self._known_grants: dict[Key, Grant] = {}
         self._pods: GroupedObjects[PodView] = GroupedObjects()
         self._locations = NodeLocations()
-
-    def informers(self) -> list[Informer[Any]]:
-        """Return all informers. Run each one in its own task."""
-        own: list[Informer[Any]] = [r for r in vars(self).values() if isinstance(r, Informer)]
-        return own + list(self.children.values()) + self.node_objects.informers()
+        self.informers: tuple[Informer[Any], ...] = (
+            *(value for value in vars(self).values() if isinstance(value, Informer)),
+            *self.children.values(),
+            *self.node_objects.informers,
+        )
 
     async def synced(self) -> None:
-        """Wait until every collection was listed once. Decisions need all of them."""
-        for informer in self.informers():
+        """Wait until every kind was listed once. Decisions need all of them."""
+        for informer in self.informers:
             await informer.synced.wait()
 
     def oldest_contact_s(self) -> float:
         """Return the seconds since the last message of the watch that has been silent for longest."""
-        return max(informer.age_s() for informer in self.informers())
+        return max(informer.age_s() for informer in self.informers)
 
     def add_listener(self, kind: Kind, listener: Callable[[Key], None]) -> None:
         """Call the listener with the key of every object of the kind that is created, changed or deleted."""
@@ -195,7 +196,9 @@ class ClusterCache:
         application = observed.submitted.application
         plan = observed.plan
         flights: Mapping[str, Flight] = {}
-        if may_share(application):
+        spec = application.spec if application is not None else None
+        if spec is not None and spec.driver is None and spec.points_of_interest is not None:
+            # Without a driver, the Application may share the flight of another one past its points of interest.
             others = (m for m in self.fleet.active_missions() if m.application.key != observed.key)
             flights = offered_flights(others, self.depots_by_name(), radius_m, plan)
         inventory = self.snapshot(observed.key, observed.uid, flights)

@@ -1,31 +1,39 @@
-"""Child objects of Applications: applied if missing or different, deleted if no longer desired."""
+"""Child objects of Applications: applied if missing or different, deleted if no longer desired.
+
+The operator may write and delete Secrets but not read them. The admission policy of the chart allows this only for Secrets that
+it created.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import logging
-from collections.abc import Awaitable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from http import HTTPStatus
 
 from fractus_core.api import Application, Grant, InvalidObject
 from fractus_core.api.grants import GrantSpec
 from fractus_core.identity.grant_signer import GrantSigner
 
 from fractus_operator import kinds
-from fractus_operator.comparison import contains, digest, is_current, stamped
+from fractus_operator.comparison import contains, is_current, stamped
 from fractus_operator.kinds import Body, Key, Kind, key_of
 from fractus_operator.labels import (
     APPLICATION_LABEL,
+    DIGEST_ANNOTATION,
     MANAGED_SELECTOR,
     NAMESPACE_LABEL,
     SLICE_LABEL,
     SLICES_BY,
+    label_key,
     label_value,
+    secret_name,
 )
 from fractus_operator.owned_objects import OwnedObjects, application_label_key
 from fractus_operator.parsing import parse_object
 from fractus_operator.resources.grant import regranted
-from fractus_operator.resources.secret import ComponentSecrets, SecretWrite
+from fractus_operator.resources.secret import SecretWrite
 from fractus_operator.store import Conflict, ContentType, KubeError, NotFound, Store
 
 logger = logging.getLogger(__name__)
@@ -38,7 +46,7 @@ A webhook that does not respond to such writes then leaves connections for plans
 _UNLIMITED = frozenset({kinds.DEPLOYMENT_PLAN, kinds.GRANT})
 
 _ALREADY_EXISTS = "AlreadyExists"
-_INADMISSIBLE = frozenset({403, 422})
+_INADMISSIBLE = frozenset({HTTPStatus.FORBIDDEN, HTTPStatus.UNPROCESSABLE_ENTITY})
 
 
 class NameTaken(Exception):
@@ -62,7 +70,8 @@ class ChildObjects:
         self._normalised: dict[tuple[Kind, Key], tuple[object, ...]] = {}
         self._taken: set[tuple[Kind, Key]] = set()
         """Names of objects whose creation failed because another object has the name."""
-        self._secrets = ComponentSecrets(store, self._limit)
+        self._undeleted_secrets: dict[Key, set[Key]] = {}
+        """By Application, the Secrets that could not be deleted together with their Deployments."""
 
     # -- reading --
 
@@ -94,9 +103,18 @@ class ChildObjects:
         if failures:
             raise failures[0]
 
-    async def refresh(self, grants: Sequence[tuple[Grant, GrantSpec]]) -> None:
-        """Update the specs of existing Grants. A failure does not stop the others."""
-        await gather_all(self._refresh_one(grant, spec) for grant, spec in grants)
+    async def refresh_grant(self, grant: Grant, spec: GrantSpec) -> None:
+        """Update the spec of an existing Grant. A deleted Grant is not created again.
+
+        Raises:
+            KubeError: The API server refused the change, or could not be reached.
+        """
+        key = ("", grant.name)
+        observed = self.get(kinds.GRANT, key)
+        if observed is None or "deletionTimestamp" in observed["metadata"]:
+            return
+        body = self._signer.sign(stamped(regranted(observed, spec)), grant)
+        self._caches[kinds.GRANT].record_write(key, await self._store.replace_spec(kinds.GRANT, observed, body))
 
     async def change(self, kind: Kind, observed: Body, fields: Body) -> None:
         """Change fields of a child object. A deleted object is not created again.
@@ -108,7 +126,7 @@ class ChildObjects:
         with contextlib.suppress(NotFound):
             self._caches[kind].record_write(key, await self._store.patch(kind, key, fields, ContentType.MERGE))
 
-    async def write_secret(self, application: Application, instance: str, body: Body, why: SecretWrite) -> bool:
+    async def write_secret(self, application: Application, instance: str, body: Body, reason: SecretWrite) -> bool:
         """Write the Secret of an instance. Return False if its Deployment belongs to another owner.
 
         Raises:
@@ -117,38 +135,47 @@ class ChildObjects:
         deployment = self.get(kinds.DEPLOYMENT, (application.key[0], instance))
         if deployment is not None and not _is_child(application, kinds.DEPLOYMENT, deployment):
             return False
-        await self._secrets.write(application.key, body, why)
+        async with self._limit:
+            self._undeleted_secrets.get(label_key(application.key), set()).discard(key_of(body))
+            if reason == "renewed":
+                # A failed creation counts against the quota of the namespace.
+                with contextlib.suppress(NotFound):
+                    await self._store.replace(kinds.SECRET, body)
+                    return True
+            try:
+                await self._store.create(kinds.SECRET, body)
+            except KubeError as refused:
+                exists = isinstance(refused, Conflict) and refused.reason == _ALREADY_EXISTS
+                # With an exhausted quota the API server reports Forbidden, even if the Secret exists.
+                if not exists and refused.status != HTTPStatus.FORBIDDEN:
+                    raise
+                if exists and reason == "lost":
+                    return True
+                try:
+                    await self._store.replace(kinds.SECRET, body)
+                except NotFound:
+                    raise refused from None
         return True
-
-    async def _refresh_one(self, grant: Grant, spec: GrantSpec) -> None:
-        key = ("", grant.name)
-        observed = self.get(kinds.GRANT, key)
-        if observed is None or "deletionTimestamp" in observed["metadata"]:
-            return
-        body = self._signer.sign(stamped(regranted(observed, spec)), grant)
-        self._caches[kinds.GRANT].record_write(key, await self._store.replace_spec(kinds.GRANT, observed, body))
 
     async def _apply_one(self, application: Application, kind: Kind, body: Body) -> None:
         async with contextlib.nullcontext() if kind in _UNLIMITED else self._limit:
             if kind is kinds.GRANT:
                 await self._apply_grant(application, body)
-            else:
-                await self._apply_object(application, kind, stamped(body))
-
-    async def _apply_object(self, application: Application, kind: Kind, desired: Body) -> None:
-        observed = self.get(kind, key_of(desired)) or await self._create(kind, desired, desired)
-        if observed is None or self._is_current(kind, desired, observed):
-            return
-        _check_owner(application, kind, observed)
-        try:
-            await self._store.take_ownership(kind, key_of(desired))
-        except KubeError as error:
-            if error.status not in _INADMISSIBLE:
-                raise
-            # Admission would refuse the current content, so it must be replaced first.
-            await self._store.apply(kind, desired)
-            await self._store.take_ownership(kind, key_of(desired))
-        self._record(kind, desired, await self._store.apply(kind, desired))
+                return
+            desired = stamped(body)
+            observed = self.get(kind, key_of(desired)) or await self._create(kind, desired, desired)
+            if observed is None or self._is_current(kind, desired, observed):
+                return
+            _check_owner(application, kind, observed)
+            try:
+                await self._store.take_ownership(kind, key_of(desired))
+            except KubeError as error:
+                if error.status not in _INADMISSIBLE:
+                    raise
+                # Admission would refuse the current content, so it must be replaced first.
+                await self._store.apply(kind, desired)
+                await self._store.take_ownership(kind, key_of(desired))
+            self._record(kind, desired, await self._store.apply(kind, desired))
 
     async def _apply_grant(self, application: Application, body: Body) -> None:
         """Create or replace a Grant. Its spec is signed as a whole, so it is not merged by server-side apply."""
@@ -217,7 +244,7 @@ class ChildObjects:
             for child in self.of(application.key, kind):
                 if child["metadata"]["name"] not in names and _is_child(application, kind, child):
                     await self._delete(kind, child)
-        await self._secrets.delete_remaining(application.key)
+        await self._delete_remaining_secrets(application.key)
 
     async def remove(self, key: Key, *of: Kind, orphan: bool = False) -> bool:
         """Delete all child objects of some kinds, one kind after the other. Return True if there were any.
@@ -232,7 +259,7 @@ class ChildObjects:
             for child in self.of(key, kind):
                 removed = True
                 await self._delete(kind, child, orphan=orphan)
-        await self._secrets.delete_remaining(key)
+        await self._delete_remaining_secrets(key)
         return removed
 
     async def remove_at_once(self, key: Key, kind: Kind) -> set[str]:
@@ -253,23 +280,43 @@ class ChildObjects:
             return False
         logger.info("child objects: deleting (kind=%s name=%s)", kind.name, body["metadata"]["name"])
         if kind is kinds.DEPLOYMENT:
-            await self._secrets.delete_for(application_label_key(body), body)
+            await self._delete_secret_of(body)
         self._normalised.pop((kind, key_of(body)), None)
         self._taken.discard((kind, key_of(body)))
         return await self._store.delete(kind, key_of(body), body["metadata"].get("uid"), orphan=orphan)
 
+    async def _delete_secret_of(self, deployment: Body) -> None:
+        """Delete the Secret of a Deployment that is about to be deleted. Later, its name could not be determined.
 
-async def gather_all(writes: Iterable[Awaitable[None]]) -> None:
-    """Run writes concurrently. When all have ended, raise the first failure."""
-    for result in await asyncio.gather(*writes, return_exceptions=True):
-        if isinstance(result, BaseException):
-            raise result
+        A failure does not prevent the deletion of the Deployment. A running pod keeps its mounted Secret.
+        """
+        namespace, instance = key_of(deployment)
+        secret = namespace, secret_name(instance)
+        try:
+            await self._store.delete(kinds.SECRET, secret)
+        except KubeError as error:
+            logger.debug("child objects: Secret not deleted yet (secret=%s/%s error=%s)", *secret, error)
+            self._undeleted_secrets.setdefault(application_label_key(deployment), set()).add(secret)
+
+    async def _delete_remaining_secrets(self, application: Key) -> None:
+        """Delete the Secrets that could not be deleted together with their Deployments.
+
+        Raises:
+            KubeError: The API server still refuses the deletion, or cannot be reached.
+        """
+        remaining = self._undeleted_secrets.get(label_key(application), set())
+        for secret in list(remaining):
+            await self._store.delete(kinds.SECRET, secret)
+            remaining.discard(secret)
+        if not remaining:
+            self._undeleted_secrets.pop(label_key(application), None)
 
 
 def _versions(desired: Body, observed: Body) -> tuple[object, ...]:
-    """Return the versions of a desired and an observed object. A change of the status does not count."""
+    """Return the digest of a stamped object and the version of an observed one. A change of the status does not count."""
     metadata = observed["metadata"]
-    return (digest(desired), metadata.get("uid"), metadata.get("generation") or metadata.get("resourceVersion"))
+    digest = desired["metadata"]["annotations"][DIGEST_ANNOTATION]
+    return (digest, metadata.get("uid"), metadata.get("generation") or metadata.get("resourceVersion"))
 
 
 def _check_owner(application: Application, kind: Kind, observed: Body) -> None:

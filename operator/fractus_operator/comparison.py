@@ -10,20 +10,17 @@ from fractus_operator.kinds import Body
 from fractus_operator.labels import CERTIFICATE_ANNOTATION, DIGEST_ANNOTATION
 
 
-def digest(desired: Body) -> str:
-    """Return a digest of a desired object. A renewed certificate does not change it."""
-    annotations = desired["metadata"].get("annotations") or {}
+def stamped(desired: Body) -> Body:
+    """Return the object with the digest of its content as an annotation. A renewed certificate does not change the digest."""
+    metadata = desired["metadata"]
+    annotations = metadata.get("annotations") or {}
+    content = desired
     if CERTIFICATE_ANNOTATION in annotations:
         rest = {name: value for name, value in annotations.items() if name != CERTIFICATE_ANNOTATION}
-        desired = {**desired, "metadata": {**desired["metadata"], "annotations": rest}}
-    return hashlib.sha256(json.dumps(desired, sort_keys=True, separators=(",", ":")).encode()).hexdigest()[:16]
-
-
-def stamped(desired: Body) -> Body:
-    """Return the object with the digest of its content as an annotation."""
-    metadata = dict(desired["metadata"])
-    metadata["annotations"] = {**metadata.get("annotations", {}), DIGEST_ANNOTATION: digest(desired)}
-    return {**desired, "metadata": metadata}
+        content = {**desired, "metadata": {**metadata, "annotations": rest}}
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"))
+    digest = hashlib.sha256(text.encode()).hexdigest()[:16]
+    return {**desired, "metadata": {**metadata, "annotations": {**annotations, DIGEST_ANNOTATION: digest}}}
 
 
 def is_current(desired: Body, observed: Body | None) -> bool:

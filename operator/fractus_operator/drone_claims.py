@@ -203,7 +203,10 @@ class Fleet:
         """
         while self._changed:
             node = next(iter(self._changed))
-            claim = self._claim(node)
+            claim = claims(self._plans.members(("", node)), self._grants.of(("", node))).get(node)
+            drone = self._drones.get(("", node))
+            if claim is None and drone is not None and drone.in_air:
+                claim = replace(self._last_claims.get(node) or self._claim_from_status(node), returning=True)
             if claim is None:
                 self._claims.pop(node, None)
             else:
@@ -224,13 +227,6 @@ class Fleet:
                 continue
             yield ActiveMission(submitted.application, plan.spec, drone, drone.in_air)
 
-    def _claim(self, node: str) -> Claim | None:
-        claim = claims(self._plans.members(("", node)), self._grants.of(("", node))).get(node)
-        drone = self._drones.get(("", node))
-        if claim is not None or drone is None or not drone.in_air:
-            return claim
-        return replace(self._last_claims.get(node) or self._claim_from_status(node), returning=True)
-
     def _claim_from_status(self, drone: str) -> Claim:
         """Return the claim of the Application that last flew a drone, from the status of the Applications.
 
@@ -240,13 +236,6 @@ class Fleet:
             if (submitted.body.get("status") or {}).get("drone") == drone:
                 return Claim(key, submitted.uid)
         return Claim(("fractus-system", "flight-home"), "")
-
-
-def may_share(application: Application | None) -> bool:
-    """Return True if sharing a flight is enough for an Application: it has no driver, only points of interest."""
-    return (
-        application is not None and application.spec.driver is None and application.spec.points_of_interest is not None
-    )
 
 
 def offered_flights(

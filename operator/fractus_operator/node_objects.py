@@ -106,6 +106,9 @@ class NodeObjects:
 
     Args:
         store: The API server.
+
+    Attributes:
+        informers: All informers. Run each one in its own task.
     """
 
     def __init__(self, store: Store) -> None:
@@ -123,6 +126,7 @@ class NodeObjects:
             )
             for kind in ACCOUNT_KINDS
         }
+        self.informers: tuple[Informer[Any], ...] = (self.known, *self.accounts.values())
         self._grants: GroupedObjects[Body] = GroupedObjects()
         self._account_listeners: list[_Listener] = []
         self._grant_listeners: list[_Listener] = []
@@ -133,10 +137,6 @@ class NodeObjects:
         self._account_listeners.append(accounts)
         self._grant_listeners.append(grants)
         self._report_listeners.append(reports)
-
-    def informers(self) -> list[Informer[Any]]:
-        """Return all informers. Run each one in its own task."""
-        return [self.known, *self.accounts.values()]
 
     def node_grants_of(self, node: str) -> KnownGrants | None:
         """Return the NodeGrants object of a node, or None."""

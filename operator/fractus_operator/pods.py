@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import NamedTuple
@@ -181,12 +181,6 @@ def refusal_of(deployment: Body) -> str:
         if (condition["type"], condition["status"], condition.get("reason")) == (REPLICA_FAILURE, "True", REFUSED):
             return str(condition.get("message") or REFUSED)[:_MAX_LOG]
     return ""
-
-
-def refusals(deployments: Iterable[Body]) -> dict[str, str]:
-    """Return why pods are refused, by name of the Deployment. Deployments without a refusal are omitted."""
-    messages = {body["metadata"]["name"]: refusal_of(body) for body in deployments}
-    return {name: message for name, message in messages.items() if message}
 
 
 def _controller(metadata: Body, kind: str) -> str | None:

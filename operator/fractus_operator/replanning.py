@@ -10,7 +10,7 @@ from fractus_core.api import Application
 from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.planning.inventory import Inventory, Settings
 from fractus_core.planning.planner import Infeasible, plan
-from fractus_core.planning.scale_up import full_nodes, next_free_node
+from fractus_core.planning.scale_up import next_free_node
 
 from fractus_operator.pods import PodView
 
@@ -29,13 +29,11 @@ class Choice:
         plan: The active plan, or a new one.
         reason: Why there is a new plan. None if the active plan is kept.
         fits: True if the active plan is kept because it fits, and not because there is no other.
-        full: Nodes on which the plan would have more instances if they had free capacity.
     """
 
     plan: DeploymentPlanSpec
     reason: str | None = None
     fits: bool = False
-    full: frozenset[str] = frozenset()
 
     @property
     def suits(self) -> bool:
@@ -66,19 +64,6 @@ def choose_plan(
         Infeasible: There is no plan, and the active plan does not fit.
         InvalidObject: The Application contradicts itself.
     """
-    choice = _choose(application, previous, inventory, settings, stuck=stuck, in_flight=in_flight)
-    return replace(choice, full=full_nodes(application, inventory, settings, choice.plan))
-
-
-def _choose(
-    application: Application,
-    previous: DeploymentPlanSpec | None,
-    inventory: Inventory,
-    settings: Settings,
-    *,
-    stuck: Mapping[str, str],
-    in_flight: str | None,
-) -> Choice:
     if in_flight is not None:
         # Calls of an Application in flight are checked one by one. No plan takes its drone away.
         settings = replace(settings, policy_conflicts="warn")
@@ -116,11 +101,6 @@ def mission_changed(application: Application | None, plan: DeploymentPlanSpec | 
 def flown_generation(application: Application | None, plan: DeploymentPlanSpec | None) -> int | None:
     """Return the generation of a plan if the current generation is another mission, else None."""
     return plan.application_generation if plan is not None and mission_changed(application, plan) else None
-
-
-def present_plan(application: Application, plan: DeploymentPlanSpec | None) -> DeploymentPlanSpec | None:
-    """Return a plan as the plan of the current generation if its mission is the same, else unchanged."""
-    return plan if plan is None or mission_changed(application, plan) else of_generation(application, plan)
 
 
 def of_generation(application: Application, plan: DeploymentPlanSpec) -> DeploymentPlanSpec:

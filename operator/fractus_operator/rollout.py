@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -18,7 +19,7 @@ from fractus_core.planning.link_planning import flown_path, plan_links
 from fractus_operator import kinds
 from fractus_operator.bookings import ByName
 from fractus_operator.cache import ClusterCache
-from fractus_operator.child_objects import ChildObjects, gather_all
+from fractus_operator.child_objects import ChildObjects
 from fractus_operator.comparison import contains
 from fractus_operator.kinds import Body, Key, key_of
 from fractus_operator.labels import CAUSE_ANNOTATION, CERTIFICATE_ANNOTATION, COMPONENT_LABEL
@@ -27,7 +28,7 @@ from fractus_operator.replanning import of_generation
 from fractus_operator.resources.children import children, deployment_plan
 from fractus_operator.resources.direct_link import direct_links, retargeted
 from fractus_operator.resources.secret import Certificate, Certificates
-from fractus_operator.resources.service import base_pods, endpoints
+from fractus_operator.resources.service import endpoints
 from fractus_operator.store import KubeError
 
 logger = logging.getLogger(__name__)
@@ -83,20 +84,6 @@ class Rollout:
             NameTaken: An object of another owner has the name of a child object.
             KubeError: The API server refused an object, or could not be reached.
         """
-        self.in_progress += 1
-        try:
-            return await self._apply(application, plan, grants, pods, rules)
-        finally:
-            self.in_progress -= 1
-
-    async def _apply(
-        self,
-        application: Application,
-        plan: DeploymentPlanSpec,
-        grants: Sequence[GrantSpec],
-        pods: Sequence[PodView],
-        rules: int,
-    ) -> bool:
         desired = children(application, plan, grants, pods, self._cache.drone)
         desired[kinds.DIRECT_LINK] = self._links(application, plan, pods)
         certificates = self._certificates_of(application, plan, pods)
@@ -104,33 +91,37 @@ class Rollout:
             annotation = certificates[body["metadata"]["name"]].annotation
             if annotation:
                 body["metadata"]["annotations"][CERTIFICATE_ANNOTATION] = annotation
-        # The plan is the record of which Application flies the drone, also after a crash. So it comes first.
-        await self._objects.apply(application, {kinds.DEPLOYMENT_PLAN: desired[kinds.DEPLOYMENT_PLAN]})
-        await self._objects.prune(application, desired)
-        # If the rules changed meanwhile, only existing Grants are applied. They are compiled again in the next step.
-        current = rules == self._cache.rules_revision
-        first = {
-            kinds.GRANT: [
-                body
-                for body in desired[kinds.GRANT]
-                if current or self._objects.get(kinds.GRANT, key_of(body)) is not None
-            ],
-            kinds.DEPLOYMENT: [body for body in desired[kinds.DEPLOYMENT] if not self._is_frozen(body, plan)],
-        }
-        last = {kind: desired[kind] for kind in _AFTER_DEPLOYMENTS}
-        failures: list[Exception] = []
-        for step in (
-            partial(self._objects.apply, application, first),
-            # Only for existing Deployments: if the name of a Deployment is taken, that of its Secret may be, too.
-            partial(self._write_secrets, application, certificates),
-            partial(self._objects.apply, application, last),
-        ):
-            try:
-                await step()
-            except Exception as error:
-                failures.append(error)
-        if failures:
-            raise failures[0]
+        self.in_progress += 1
+        try:
+            # The plan records which Application flies the drone, also after a crash. So it comes first.
+            await self._objects.apply(application, {kinds.DEPLOYMENT_PLAN: desired[kinds.DEPLOYMENT_PLAN]})
+            await self._objects.prune(application, desired)
+            # If the rules changed meanwhile, only existing Grants are applied. They are compiled again in the next step.
+            current = rules == self._cache.rules_revision
+            first = {
+                kinds.GRANT: [
+                    body
+                    for body in desired[kinds.GRANT]
+                    if current or self._objects.get(kinds.GRANT, key_of(body)) is not None
+                ],
+                kinds.DEPLOYMENT: [body for body in desired[kinds.DEPLOYMENT] if not self._is_frozen(body, plan)],
+            }
+            last = {kind: desired[kind] for kind in _AFTER_DEPLOYMENTS}
+            failures: list[Exception] = []
+            for step in (
+                partial(self._objects.apply, application, first),
+                # Only for existing Deployments: if the name of a Deployment is taken, that of its Secret may be, too.
+                partial(self._write_secrets, application, certificates),
+                partial(self._objects.apply, application, last),
+            ):
+                try:
+                    await step()
+                except Exception as error:
+                    failures.append(error)
+            if failures:
+                raise failures[0]
+        finally:
+            self.in_progress -= 1
         return current
 
     async def keep_plan(self, application: Application, plan: DeploymentPlanSpec) -> None:
@@ -209,7 +200,7 @@ class Rollout:
         """
         for body in self._objects.of(key, kinds.ENDPOINT_SLICE):
             component = body["metadata"]["labels"].get(COMPONENT_LABEL, "")
-            present = endpoints(base_pods(component, plan, pods))
+            present = endpoints(component, plan, pods)
             if not contains(body.get("endpoints"), present):
                 await self._objects.change(kinds.ENDPOINT_SLICE, body, {"endpoints": present})
         for body in self._objects.of(key, kinds.DIRECT_LINK):
@@ -240,22 +231,22 @@ class Rollout:
         return certificates
 
     async def _write_secrets(self, application: Application, certificates: Mapping[str, Certificate]) -> None:
-        """Write the Secrets that are due of existing Deployments. A failure does not stop the others."""
-        await gather_all(
-            self._write_secret(application, instance, certificate, certificate.secret)
-            for instance, certificate in certificates.items()
-            if certificate.secret is not None
-        )
+        """Write the due Secrets of existing Deployments. A failure does not stop the others. Raise the first failure at the end."""
+        namespace, _ = application.key
 
-    async def _write_secret(
-        self, application: Application, instance: str, certificate: Certificate, secret: Body
-    ) -> None:
-        key = (application.key[0], instance)
-        if self._objects.get(kinds.DEPLOYMENT, key) is None:
-            return
-        with self._certificates.writing(application.key, instance):
-            written = await self._objects.write_secret(application, instance, secret, certificate.why)
-        observed = self._objects.get(kinds.DEPLOYMENT, key)
-        if written and certificate.renewed_annotation and observed is not None:
-            annotations = {CERTIFICATE_ANNOTATION: certificate.renewed_annotation}
-            await self._objects.change(kinds.DEPLOYMENT, observed, {"metadata": {"annotations": annotations}})
+        async def write(instance: str, certificate: Certificate) -> None:
+            key = (namespace, instance)
+            if certificate.secret is None or self._objects.get(kinds.DEPLOYMENT, key) is None:
+                return
+            certificate.state.write_failed = True
+            written = await self._objects.write_secret(application, instance, certificate.secret, certificate.reason)
+            certificate.state.write_failed = False
+            deployment = self._objects.get(kinds.DEPLOYMENT, key)
+            if written and certificate.renewed_annotation and deployment is not None:
+                annotations = {CERTIFICATE_ANNOTATION: certificate.renewed_annotation}
+                await self._objects.change(kinds.DEPLOYMENT, deployment, {"metadata": {"annotations": annotations}})
+
+        writes = (write(instance, certificate) for instance, certificate in certificates.items())
+        for result in await asyncio.gather(*writes, return_exceptions=True):
+            if isinstance(result, BaseException):
+                raise result

@@ -186,7 +186,7 @@ def deployed(
         pods: Its current pods.
         granted: Number of instances with Grants.
         flown: Status of the flight, if the plan has a drone.
-        refused: Why pods cannot be created, by instance.
+        refused: Why pods cannot be created, by instance. Empty if they can.
     """
     alive = [pod for pod in pods if not pod.terminating and not pod.finished]
     missing: list[str] = []
@@ -201,7 +201,8 @@ def deployed(
         more = f" and {len(missing) - _MAX_NAMED} more" if len(missing) > _MAX_NAMED else ""
         message = f"waiting for {', '.join(missing[:_MAX_NAMED])}{more}"
         failures = _failures(pod for pod in alive if pod.instance in missing and not pod.ready)
-        refusals = _refusals({name: refused[name] for name in missing if name in refused})
+        named = sorted(name for name in missing if refused.get(name))[:_MAX_NAMED]
+        refusals = "; ".join(f"pods of {name} cannot be created: {refused[name]}" for name in named)
         message += "".join(f"; {text}" for text in (refusals, failures) if text)
         reason = "PodsNotReady"
         if refusals:
@@ -355,8 +356,3 @@ def _plan_summary(plan: DeploymentPlanSpec) -> str:
 
 def _failures(pods: Iterable[PodView]) -> str:
     return "; ".join(sorted(f"{pod.instance} failed with {pod.failure}" for pod in pods if pod.failure)[:_MAX_NAMED])
-
-
-def _refusals(refused: Mapping[str, str]) -> str:
-    listed = sorted(refused.items())[:_MAX_NAMED]
-    return "; ".join(f"pods of {name} cannot be created: {message}" for name, message in listed)

@@ -168,8 +168,16 @@ class Subscription:
         if urgent:
             self._urgent.set()
 
-    async def changed(self, timeout_s: float) -> bool:
-        """Wait for a change since the last call. Return False after the timeout."""
+    async def changed(self, timeout_s: float, *, pause_s: float = 0.0) -> bool:
+        """Wait for a change since the last call, and then for more changes until the pause ends or one is urgent.
+
+        Args:
+            timeout_s: Maximum time until the first change, in seconds.
+            pause_s: Duration of the pause, in seconds.
+
+        Returns:
+            False if nothing changed in time.
+        """
         try:
             async with asyncio.timeout(timeout_s):
                 await self._changed.wait()
@@ -177,14 +185,12 @@ class Subscription:
             return False
         finally:
             self._changed.clear()
+        if pause_s > 0:
+            with suppress(TimeoutError):
+                async with asyncio.timeout(pause_s):
+                    await self._urgent.wait()
+            self._urgent.clear()
         return True
-
-    async def pause(self, duration_s: float) -> None:
-        """Wait while changes accumulate, until one is urgent."""
-        with suppress(TimeoutError):
-            async with asyncio.timeout(duration_s):
-                await self._urgent.wait()
-        self._urgent.clear()
 
 
 class Subscriptions:

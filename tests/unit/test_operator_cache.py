@@ -169,7 +169,7 @@ class EventsOfTheCluster(RuleBasedStateMachine):
     # -- received events --
 
     def informer(self, kind: Kind) -> Informer[Any]:
-        return next(r for r in self.cache.informers() if r.kind == kind)
+        return next(r for r in self.cache.informers if r.kind == kind)
 
     def receive(self, kind: Kind, type_: str, body: Body) -> None:
         key = key_of(body)

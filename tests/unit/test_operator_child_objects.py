@@ -296,7 +296,7 @@ class Late(Store):
 def seen_by(store: Late) -> ClusterCache:
     """Return a cache that contains the pods."""
     cache = ClusterCache(store)
-    for informer in cache.informers():
+    for informer in cache.informers:
         informer.synced.set()
     for (_, key), body in store.there.items():
         if body["kind"] == "Pod":

@@ -17,7 +17,7 @@ from fractus_operator.comparison import contains, is_current, stamped
 from fractus_operator.conditions import ConditionUpdate, merge
 from fractus_operator.node_controller import geohash, location_labels
 from fractus_operator.node_liveness import displayed_flight_state
-from fractus_operator.pods import PodView, parse_host, parse_pod, refusals
+from fractus_operator.pods import PodView, parse_host, parse_pod, refusal_of
 from fractus_operator.replanning import (
     _with_names_of,
     of_generation,
@@ -222,7 +222,9 @@ def test_status_reports_why_pods_cannot_be_created() -> None:
     conditions = {"a": [scaled, failure], "b": [scaled, failure | {"status": "False"}], "c": []}
     conditions["e"] = [failure | {"reason": "FailedDelete"}]
     bodies = [{"metadata": {"name": name}, "status": {"conditions": found}} for name, found in conditions.items()]
-    assert refusals([*bodies, {"metadata": {"name": "d"}}]) == {"a": why}
+    bodies.append({"metadata": {"name": "d"}})
+    refused = {body["metadata"]["name"]: refusal_of(body) for body in bodies}
+    assert refused == {"a": why, "b": "", "c": "", "d": "", "e": ""}
 
 
 def test_status_reports_exit_code_and_last_log_lines() -> None:

@@ -125,7 +125,7 @@ class Cluster:
         self.cache = ClusterCache(self.api)
         self.keeper = NodeGrantsController(self.api, self.cache)
         self.tasks = [asyncio.create_task(work_queue.run()) for work_queue in self.keeper.work_queues()]
-        for informer in self.cache.informers():
+        for informer in self.cache.informers:
             informer.synced.set()
         self._versions = itertools.count(1000)
 

@@ -54,6 +54,7 @@ def built() -> dict[str, Any]:
         "endpoints": endpoint_slice(
             APPLICATION,
             checker,
+            PLAN,
             [
                 pod("b", "10.0.0.2"),
                 pod("a", "10.0.0.1"),

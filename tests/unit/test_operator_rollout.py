@@ -41,25 +41,23 @@ def pod(instance: str, *, ready: bool = False) -> Any:
 async def test_subscription_pause_ends_only_with_urgent_change() -> None:
     inputs = Subscription()
     inputs.wake()
-    assert await inputs.changed(20.0)
-    pause = asyncio.create_task(inputs.pause(20.0))
+    waiting = asyncio.create_task(inputs.changed(20.0, pause_s=20.0))
     await turns()
     inputs.wake()
     await turns()
-    assert not pause.done()
+    assert not waiting.done()
     inputs.wake(urgent=True)
     async with asyncio.timeout(10.0):
-        await pause
-    assert await inputs.changed(20.0)
+        assert await waiting
     inputs.wake(urgent=True)
-    assert await inputs.changed(20.0)
     async with asyncio.timeout(10.0):
-        await inputs.pause(20.0)
-    pause = asyncio.create_task(inputs.pause(20.0))
+        assert await inputs.changed(20.0, pause_s=20.0)
+    inputs.wake()
+    waiting = asyncio.create_task(inputs.changed(20.0, pause_s=20.0))
     await turns()
-    assert not pause.done(), "an urgent change ends one pause"
-    pause.cancel()
-    await asyncio.gather(pause, return_exceptions=True)
+    assert not waiting.done(), "an urgent change ends one pause"
+    waiting.cancel()
+    await asyncio.gather(waiting, return_exceptions=True)
 
 
 class FakeObjects:

@@ -260,7 +260,7 @@ class Api(Store):
 async def cache() -> ClusterCache:
     """Three drones on the ground, each with one outdated service."""
     found = ClusterCache(Api())
-    for informer in found.informers():
+    for informer in found.informers:
         informer.synced.set()
     for name in ("d1", "d2", "d3"):
         body = drone(at(0), "inactive").to_dict()

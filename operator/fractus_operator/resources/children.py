@@ -15,7 +15,7 @@ from fractus_operator.pods import PodView
 from fractus_operator.resources.deployment import deployment
 from fractus_operator.resources.grant import grant
 from fractus_operator.resources.network_policy import network_policies
-from fractus_operator.resources.service import base_pods, endpoint_slice, service
+from fractus_operator.resources.service import endpoint_slice, service
 
 
 def children(
@@ -44,10 +44,13 @@ def children(
         if component.container.ports:
             desired[kinds.SERVICE].append(service(application, component))
             if component.placement == "hybrid":
-                pods_of_base = base_pods(component.name, plan, pods)
-                desired[kinds.ENDPOINT_SLICE].append(endpoint_slice(application, component, pods_of_base))
+                desired[kinds.ENDPOINT_SLICE].append(endpoint_slice(application, component, plan, pods))
     if plan.drone is not None:
-        desired[kinds.DISRUPTION_BUDGET] = [disruption_budget(application)]
+        # Prevents evictions, such as those of kubectl drain, on the drone.
+        on_drone = {labels.APPLICATION_LABEL: label_value(application.name), labels.PLACEMENT_LABEL: "drone"}
+        budget = {"maxUnavailable": 0, "selector": {"matchLabels": on_drone}}
+        name = application.name
+        desired[kinds.DISRUPTION_BUDGET] = [owned_object(kinds.DISRUPTION_BUDGET, application, name, {}, spec=budget)]
     for placed in plan.placements:
         node = drone(placed.node) if placed.node is not None else None
         desired[kinds.DEPLOYMENT].append(deployment(application, placed, node))
@@ -57,10 +60,3 @@ def children(
 def deployment_plan(application: Application, plan: DeploymentPlanSpec) -> Body:
     """Return the DeploymentPlan of an Application. It has the name of the Application."""
     return owned_object(kinds.DEPLOYMENT_PLAN, application, application.name, {}, spec=plan.to_dict())
-
-
-def disruption_budget(application: Application) -> Body:
-    """Return the PodDisruptionBudget that prevents evictions, such as those of kubectl drain, on the drone."""
-    on_drone = {labels.APPLICATION_LABEL: label_value(application.name), labels.PLACEMENT_LABEL: "drone"}
-    spec = {"maxUnavailable": 0, "selector": {"matchLabels": on_drone}}
-    return owned_object(kinds.DISRUPTION_BUDGET, application, application.name, {}, spec=spec)

@@ -30,7 +30,12 @@ def deployment(application: Application, placed: PlannedInstance, drone: Drone |
     """
     component = application.spec.component(placed.component)
     identity = {labels.APPLICATION_LABEL: label_value(application.name), labels.INSTANCE_LABEL: placed.instance}
-    pod_labels = {**application_labels(application), **_instance_labels(component, placed)}
+    instance_labels = {
+        "app.kubernetes.io/name": component.slug,
+        labels.COMPONENT_LABEL: component.name,
+        labels.INSTANCE_LABEL: placed.instance,
+        labels.PLACEMENT_LABEL: placed.placement,
+    }
     spec: Body = {
         "replicas": placed.replicas,
         "revisionHistoryLimit": 0,
@@ -38,28 +43,22 @@ def deployment(application: Application, placed: PlannedInstance, drone: Drone |
         "strategy": {"type": "Recreate" if placed.node is not None else "RollingUpdate"},
         "template": {
             "metadata": {
-                "labels": pod_labels,
+                "labels": {**application_labels(application), **instance_labels},
                 "annotations": {"kubectl.kubernetes.io/default-container": component.slug},
             },
             "spec": _pod_spec(application, component, placed, drone),
         },
     }
-    body = owned_object(kinds.DEPLOYMENT, application, placed.instance, _instance_labels(component, placed), spec=spec)
-    body["metadata"]["annotations"] = {
-        labels.CAUSE_ANNOTATION: f"{_requested_digest(application, component)}@{placed.node or 'cloud'}"
-    }
-    return body
-
-
-def _requested_digest(application: Application, component: Component) -> str:
-    """Return a digest of the part of the manifest that determines a component's pods."""
+    body = owned_object(kinds.DEPLOYMENT, application, placed.instance, instance_labels, spec=spec)
+    # The part of the manifest that determines the pods, without defaults, because a new version of the API may add some.
     called = [application.spec.component(name).container.ports for name in component.egress]
-    # Without defaults, because a new version of the API may add some.
     content = [
         component.model_dump(mode="json", by_alias=True, exclude_defaults=True),
         [[port.port for port in ports] for ports in called],
     ]
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:12]
+    digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:12]
+    body["metadata"]["annotations"] = {labels.CAUSE_ANNOTATION: f"{digest}@{placed.node or 'cloud'}"}
+    return body
 
 
 def _pod_spec(application: Application, component: Component, placed: PlannedInstance, drone: Drone | None) -> Body:
@@ -75,8 +74,7 @@ def _pod_spec(application: Application, component: Component, placed: PlannedIns
             "fsGroup": COMPONENT_USER,
             "seccompProfile": {"type": "RuntimeDefault"},
         },
-        "affinity": {"nodeAffinity": _affinity(placed)},
-        "tolerations": _tolerations(placed, drone),
+        **_scheduling(placed, drone),
         "volumes": [
             {"name": "tls", "secret": {"secretName": labels.secret_name(placed.instance), "defaultMode": 0o440}},
             {"name": "tmp", "emptyDir": {"sizeLimit": "64Mi"}},
@@ -145,33 +143,21 @@ def _environment(application: Application, component: Component, placed: Planned
     return [*env, *(v.to_dict() for v in component.container.env)]
 
 
-def _affinity(placed: PlannedInstance) -> Body:
+def _scheduling(placed: PlannedInstance, drone: Drone | None) -> Body:
+    """Return affinity and tolerations of a pod. Pods on a drone or edge node tolerate an unreachable node, cloud pods do not."""
     terms: list[Body]
-    if placed.node is not None:
-        terms = [{"matchFields": [{"key": "metadata.name", "operator": "In", "values": [placed.node]}]}]
-    else:
+    tolerations: list[Body] = []
+    if placed.node is None:
         cloud = ((CLASS_LABEL, "cloud"), (CLOUD_LABEL, "true"))
         terms = [{"matchExpressions": [{"key": key, "operator": "In", "values": [value]}]} for key, value in cloud]
-    return {"requiredDuringSchedulingIgnoredDuringExecution": {"nodeSelectorTerms": terms}}
-
-
-def _tolerations(placed: PlannedInstance, drone: Drone | None) -> list[Body]:
-    """Return the tolerations of a pod. Pods on a drone or edge node tolerate an unreachable node, cloud pods do not."""
-    if placed.node is None:
-        return []
-    autonomy = drone.spec.autonomy if drone is not None else None
-    bound: Body = {} if autonomy is None else {"tolerationSeconds": autonomy}
-    return [
-        {"key": CLASS_LABEL, "operator": "Exists"},
-        {"key": "node.kubernetes.io/not-ready", "operator": "Exists", "effect": "NoExecute", **bound},
-        {"key": "node.kubernetes.io/unreachable", "operator": "Exists", "effect": "NoExecute", **bound},
-    ]
-
-
-def _instance_labels(component: Component, placed: PlannedInstance) -> dict[str, str]:
-    return {
-        "app.kubernetes.io/name": component.slug,
-        labels.COMPONENT_LABEL: component.name,
-        labels.INSTANCE_LABEL: placed.instance,
-        labels.PLACEMENT_LABEL: placed.placement,
-    }
+    else:
+        terms = [{"matchFields": [{"key": "metadata.name", "operator": "In", "values": [placed.node]}]}]
+        autonomy = drone.spec.autonomy if drone is not None else None
+        bound: Body = {} if autonomy is None else {"tolerationSeconds": autonomy}
+        tolerations = [
+            {"key": CLASS_LABEL, "operator": "Exists"},
+            {"key": "node.kubernetes.io/not-ready", "operator": "Exists", "effect": "NoExecute", **bound},
+            {"key": "node.kubernetes.io/unreachable", "operator": "Exists", "effect": "NoExecute", **bound},
+        ]
+    required = {"requiredDuringSchedulingIgnoredDuringExecution": {"nodeSelectorTerms": terms}}
+    return {"affinity": {"nodeAffinity": required}, "tolerations": tolerations}

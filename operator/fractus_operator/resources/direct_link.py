@@ -40,9 +40,7 @@ def direct_links(
     bodies = []
     for link in planned:
         services = tuple(
-            service
-            for placed in link.instances
-            for service in _services(application, placed, _callers(application, plan, placed), pods, cluster_ip)
+            service for placed in link.instances for service in _services(application, plan, placed, pods, cluster_ip)
         )
         if services:
             bodies.append(_direct_link(application, link, path, services))
@@ -79,16 +77,21 @@ def _direct_link(
 
 def _services(
     application: Application,
+    plan: DeploymentPlanSpec,
     placed: PlannedInstance,
-    callers: Sequence[str] | None,
     pods: Sequence[PodView],
     cluster_ip: Callable[[str], str | None],
 ) -> Iterable[LinkedService]:
-    """Return the ports of an instance behind the address of its component's Service."""
+    """Return the ports of an instance behind the address of its component's Service.
+
+    Each has the instances on the drone that may call it, or None if all may.
+    """
     component = application.spec.component(placed.component)
     address = cluster_ip(service_name(application.name, component))
     if address is None:
         return
+    components = application.spec.callers(placed.component)
+    callers = [p.instance for p in plan.placements if p.component in components and p.placement == "drone"]
     target = _target(placed.instance, pods)
     for port in component.container.ports:
         yield LinkedService(
@@ -96,16 +99,8 @@ def _services(
             instance=placed.instance,
             virtual=VirtualAddress(address=address, port=port.port, protocol=port.protocol),
             target=TargetAddress(address=target, port=port.port) if target is not None else None,
-            callers=_addressed(callers, pods) if callers is not None else None,
+            callers=_addressed(callers, pods) if components else None,
         )
-
-
-def _callers(application: Application, plan: DeploymentPlanSpec, placed: PlannedInstance) -> list[str] | None:
-    """Return the instances on the drone that may call an instance, or None if all may."""
-    components = application.spec.callers(placed.component)
-    if not components:
-        return None
-    return [p.instance for p in plan.placements if p.component in components and p.placement == "drone"]
 
 
 def _addressed(instances: Iterable[str], pods: Sequence[PodView]) -> tuple[Caller, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fractus_core.api import Application, Component
+from fractus_core.api import Application
 from fractus_core.api.plans import DeploymentPlanSpec
 
 from fractus_operator import kinds, labels
@@ -19,7 +19,7 @@ def network_policies(application: Application, plan: DeploymentPlanSpec) -> list
     A component without declared callers may be called by all, so it has no NetworkPolicy. Instances of a hybrid component
     on edge nodes are reached only over direct links. Callers without a link call the cloud base through its Service.
     """
-    policies = []
+    policies: list[Body] = []
     for component in application.spec.components:
         callers = sorted(application.spec.callers(component.name))
         if not component.container.ports or not callers:
@@ -33,6 +33,7 @@ def network_policies(application: Application, plan: DeploymentPlanSpec) -> list
         }
         selector: Body = {"matchLabels": {**same_application, labels.COMPONENT_LABEL: component.name}}
         name = service_name(application.name, component)
+        ingress = {name: (selector, sender)}
         placed = (p for p in plan.placements if p.component == component.name and p.placement == "hybrid")
         edges = sorted(p.instance for p in placed if p.role != "cloud")
         if edges:
@@ -40,11 +41,9 @@ def network_policies(application: Application, plan: DeploymentPlanSpec) -> list
             selector["matchExpressions"] = [{**at_edge, "operator": "NotIn"}]
             over_links = {"matchLabels": selector["matchLabels"], "matchExpressions": [at_edge]}
             link: Body = {"ipBlock": {"cidr": LINK_NETWORK}}
-            policies.append(_policy(application, component, f"{name}.edge", over_links, link))
-        policies.append(_policy(application, component, name, selector, sender))
+            ingress = {f"{name}.edge": (over_links, link), **ingress}
+        component_label = {labels.COMPONENT_LABEL: component.name}
+        for policy_name, (pods, source) in ingress.items():
+            spec = {"podSelector": pods, "policyTypes": ["Ingress"], "ingress": [{"from": [source]}]}
+            policies.append(owned_object(kinds.NETWORK_POLICY, application, policy_name, component_label, spec=spec))
     return policies
-
-
-def _policy(application: Application, component: Component, name: str, selector: Body, sender: Body) -> Body:
-    spec = {"podSelector": selector, "policyTypes": ["Ingress"], "ingress": [{"from": [sender]}]}
-    return owned_object(kinds.NETWORK_POLICY, application, name, {labels.COMPONENT_LABEL: component.name}, spec=spec)

@@ -34,16 +34,19 @@ def service(application: Application, component: Component) -> Body:
     return owned_object(kinds.SERVICE, application, name, {labels.COMPONENT_LABEL: component.name}, spec=spec)
 
 
-def endpoint_slice(application: Application, component: Component, pods: Iterable[PodView]) -> Body:
-    """Return the EndpointSlice of a hybrid component, with the ready pods of its base instance.
+def endpoint_slice(
+    application: Application, component: Component, plan: DeploymentPlanSpec, pods: Iterable[PodView]
+) -> Body:
+    """Return the EndpointSlice of a hybrid component, with the ready pods of its cloud base.
 
     Args:
         application: Application of the component.
         component: The hybrid component.
-        pods: Pods of its base instance.
+        plan: Plan of the Application.
+        pods: Pods of the Application.
     """
     name = service_name(application.name, component)
-    ready = [pod for pod in pods if pod.takes_calls]
+    ready = endpoints(component.name, plan, pods)
     slice_labels = {
         labels.COMPONENT_LABEL: component.name,
         "kubernetes.io/service-name": name,
@@ -54,20 +57,15 @@ def endpoint_slice(application: Application, component: Component, pods: Iterabl
         application,
         name,
         slice_labels,
-        addressType="IPv6" if any(":" in (pod.ip or "") for pod in ready) else "IPv4",
-        endpoints=endpoints(ready),
+        addressType="IPv6" if any(":" in endpoint["addresses"][0] for endpoint in ready) else "IPv4",
+        endpoints=ready,
         ports=[{"name": p.label, "port": p.port, "protocol": p.protocol} for p in component.container.ports],
     )
 
 
-def base_pods(component: str, plan: DeploymentPlanSpec, pods: Iterable[PodView]) -> list[PodView]:
-    """Return the pods of the cloud base of a hybrid component."""
+def endpoints(component: str, plan: DeploymentPlanSpec, pods: Iterable[PodView]) -> list[Body]:
+    """Return the endpoints of a hybrid component: the pods of its cloud base that take calls."""
     bases = {p.instance for p in plan.placements if p.component == component and p.role == "cloud"}
-    return [pod for pod in pods if pod.instance in bases]
-
-
-def endpoints(pods: Iterable[PodView]) -> list[Body]:
-    """Return the endpoints of an EndpointSlice for those pods that take calls."""
     return [
         {
             "addresses": [pod.ip],
@@ -76,5 +74,5 @@ def endpoints(pods: Iterable[PodView]) -> list[Body]:
             "targetRef": {"kind": "Pod", "namespace": pod.namespace, "name": pod.name},
         }
         for pod in sorted(pods, key=lambda pod: pod.name)
-        if pod.takes_calls
+        if pod.instance in bases and pod.takes_calls
     ]

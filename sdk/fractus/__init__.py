@@ -2,12 +2,13 @@
 
 from fractus import sync as sync
 from fractus.control import Control as Control
+from fractus.control import Motion as Motion
 from fractus.control_point import Circle as Circle
 from fractus.control_point import ControlPoint as ControlPoint
 from fractus.control_point import Polygon as Polygon
+from fractus.drone import CanI as CanI
 from fractus.drone import Mobility as Mobility
 from fractus.drone import mobility as mobility
-from fractus.dry_run import CanI as CanI
 from fractus.environment import Endpoint as Endpoint
 from fractus.environment import control_points as control_points
 from fractus.environment import egress as egress
@@ -42,7 +43,6 @@ from fractus.mission import MissionProgress as MissionProgress
 from fractus.mission import Waypoint as Waypoint
 from fractus.mission import orbit as orbit
 from fractus.mission import read_plan as read_plan
-from fractus.motion import Motion as Motion
 from fractus.pictures import Camera as Camera
 from fractus.pictures import camera as camera
 from fractus.runner import run as run

@@ -62,7 +62,6 @@ class _Connection:
     stub: Any
     stamp: _Stamp
     calls: int = 0
-    retired: bool = False
 
 
 class ServiceChannel:
@@ -100,7 +99,12 @@ class ServiceChannel:
     @asynccontextmanager
     async def stub(self) -> AsyncIterator[Any]:
         """Return the service's stub on a connection that stays open until the block ends."""
-        connection = self._current()
+        if self._connection is None or self._connection.stamp != self._stamp():
+            fresh = self._connect()
+            if self._connection is not None:
+                self._retired.add(self._connection)
+            self._connection = fresh
+        connection = self._connection
         connection.calls += 1
         try:
             yield connection.stub
@@ -155,18 +159,6 @@ class ServiceChannel:
                 await retries.pause(error)
             else:
                 return
-
-    def _current(self) -> _Connection:
-        stamp = self._stamp()
-        current = self._connection
-        if current is not None and current.stamp == stamp:
-            return current
-        fresh = self._connect()
-        if current is not None:
-            current.retired = True
-            self._retired.add(current)
-        self._connection = fresh
-        return fresh
 
     async def _close_unused(self) -> None:
         for connection in [c for c in self._retired if not c.calls]:

@@ -1,21 +1,18 @@
-"""Client of the mobility service: motion, state and control of the drone."""
+"""Client of the mobility service: motion, state, control and dry runs."""
 
 from __future__ import annotations
 
-from collections.abc import AsyncGenerator, Sequence
+from collections.abc import AsyncGenerator, Awaitable, Callable, Sequence
 from contextlib import aclosing
 from typing import Any, TypeVar
 
-from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc
+from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc, types_pb2
 
 from fractus.channel import CALL_TIMEOUT_S, RECONNECT_TIMEOUT_S, ServiceChannel, ServiceClient
-from fractus.control import Control, OnWait
-from fractus.dry_run import CanI
+from fractus.control import Control, Motion, OnProgress, OnWait
 from fractus.environment import Endpoint, endpoint
-from fractus.errors import ControlLost, Corrected
+from fractus.errors import ControlLost, Corrected, InvalidRequest
 from fractus.mission import Mission, Waypoint
-from fractus.motion import Motion, OnProgress
-from fractus.proto_requests import gimbal_request, goto_request, speed_request, takeoff_request, velocity_request
 from fractus.telemetry import Telemetry, Watch
 from fractus.values import (
     AltitudeReference,
@@ -62,7 +59,7 @@ class Mobility(ServiceClient):
         self._channel = ServiceChannel(endpoint, stub, timeout_s=timeout_s, reconnect_timeout_s=reconnect_timeout_s)
         self._strict = strict
         self._control: Control | None = None
-        self.can_i = CanI(self._check)
+        self.can_i = CanI(self._check_call)
         """Dry runs: `await drone.can_i.goto(lat, lon, 20)`."""
         self.watch = Watch(self.telemetry)
         """Changes of one part of the drone's state: `async for gps in drone.watch.gps()`."""
@@ -272,7 +269,7 @@ class Mobility(ServiceClient):
                 if complete:
                     return
 
-    async def _check(self, request: mobility_pb2.CheckCallRequest) -> Check:
+    async def _check_call(self, request: mobility_pb2.CheckCallRequest) -> Check:
         return Check.from_proto(await self._channel.unary("CheckCall", request))
 
     def _motion(self, method: str, request: Any, progress: OnProgress | None, timeout_s: float | None) -> Motion:
@@ -296,6 +293,86 @@ class Mobility(ServiceClient):
         return result
 
 
+class CanI:
+    """Dry runs of the calls of `Mobility`, with the same arguments.
+
+    Each method returns the policy engine's current verdict. Nothing is carried out or taken over. The component needs a
+    Grant, but not control of the drone.
+    """
+
+    def __init__(self, check: Callable[[mobility_pb2.CheckCallRequest], Awaitable[Check]]) -> None:
+        self._check = check
+
+    async def arm(self) -> Check:
+        """Judge `Mobility.arm`."""
+        return await self._judge(arm=mobility_pb2.ArmRequest())
+
+    async def disarm(self) -> Check:
+        """Judge `Mobility.disarm`."""
+        return await self._judge(disarm=mobility_pb2.DisarmRequest())
+
+    async def takeoff(self, altitude_m: float) -> Check:
+        """Judge `Mobility.takeoff`."""
+        return await self._judge(takeoff=takeoff_request(altitude_m))
+
+    async def land(self) -> Check:
+        """Judge `Mobility.land`."""
+        return await self._judge(land=mobility_pb2.LandRequest())
+
+    async def return_to_launch(self) -> Check:
+        """Judge `Mobility.return_to_launch`."""
+        return await self._judge(return_to_launch=mobility_pb2.ReturnToLaunchRequest())
+
+    async def hover(self) -> Check:
+        """Judge `Mobility.hover`."""
+        return await self._judge(hover=mobility_pb2.HoverRequest())
+
+    async def goto(
+        self,
+        lat: float,
+        lon: float,
+        alt: float,
+        *,
+        reference: AltitudeReference = AltitudeReference.HOME,
+        yaw_deg: float | None = None,
+        speed_mps: float | None = None,
+    ) -> Check:
+        """Judge `Mobility.goto`."""
+        return await self._judge(goto=goto_request(Position(lat, lon, alt, reference), yaw_deg, speed_mps))
+
+    async def set_speed(self, speed_mps: float) -> Check:
+        """Judge `Mobility.set_speed`."""
+        return await self._judge(set_speed=speed_request(speed_mps))
+
+    async def set_velocity(
+        self,
+        north_mps: float,
+        east_mps: float,
+        down_mps: float = 0.0,
+        *,
+        yaw_deg: float | None = None,
+        hold_s: float = 0.0,
+    ) -> Check:
+        """Judge `Mobility.set_velocity`."""
+        request = velocity_request(Velocity(north_mps, east_mps, down_mps), yaw_deg, hold_s)
+        return await self._judge(set_velocity=request)
+
+    async def point_gimbal(self, pitch_deg: float, yaw_deg: float = 0.0) -> Check:
+        """Judge `Mobility.point_gimbal`."""
+        return await self._judge(point_gimbal=gimbal_request(pitch_deg, yaw_deg))
+
+    async def position(self) -> Check:
+        """Judge `Mobility.position`."""
+        return await self._judge(get_position=mobility_pb2.GetPositionRequest())
+
+    async def speed(self) -> Check:
+        """Judge `Mobility.speed`."""
+        return await self._judge(get_speed=mobility_pb2.GetSpeedRequest())
+
+    async def _judge(self, **call: Any) -> Check:
+        return await self._check(mobility_pb2.CheckCallRequest(**call))
+
+
 def mobility(
     target: Endpoint | None = None, *, strict: bool = False, reconnect_timeout_s: float = RECONNECT_TIMEOUT_S
 ) -> Mobility:
@@ -310,3 +387,64 @@ def mobility(
         NotConfigured: The process is not in a pod of a Fractus application, and no target is given.
     """
     return Mobility(target or endpoint("mobility"), strict=strict, reconnect_timeout_s=reconnect_timeout_s)
+
+
+def takeoff_request(altitude_m: float) -> mobility_pb2.TakeoffRequest:
+    """Return the request of a takeoff."""
+    return mobility_pb2.TakeoffRequest(altitude_m=_number("altitude_m", altitude_m))
+
+
+def speed_request(speed_mps: float) -> mobility_pb2.SetSpeedRequest:
+    """Return the request of a ground speed."""
+    return mobility_pb2.SetSpeedRequest(speed_mps=_number("speed_mps", speed_mps))
+
+
+def goto_request(
+    target: Position, yaw_deg: float | None, speed_mps: float | None, acceptance_radius_m: float = 0.0
+) -> mobility_pb2.GotoRequest:
+    """Return the request of a leg to a position."""
+    return mobility_pb2.GotoRequest(
+        target=types_pb2.Position(
+            latitude_deg=_number("lat", target.lat),
+            longitude_deg=_number("lon", target.lon),
+            altitude_m=_number("alt", target.alt),
+            altitude_reference=target.reference.value,
+        ),
+        yaw_deg=None if yaw_deg is None else _number("yaw_deg", yaw_deg),
+        speed_mps=None if speed_mps is None else _number("speed_mps", speed_mps),
+        acceptance_radius_m=_number("acceptance_radius_m", acceptance_radius_m),
+    )
+
+
+def velocity_request(velocity: Velocity, yaw_deg: float | None, hold_s: float) -> mobility_pb2.SetVelocityRequest:
+    """Return the request of a velocity setpoint."""
+    return mobility_pb2.SetVelocityRequest(
+        velocity=types_pb2.Velocity(
+            north_mps=_number("north_mps", velocity.north),
+            east_mps=_number("east_mps", velocity.east),
+            down_mps=_number("down_mps", velocity.down),
+        ),
+        yaw_deg=None if yaw_deg is None else _number("yaw_deg", yaw_deg),
+        hold_s=_number("hold_s", hold_s),
+    )
+
+
+def gimbal_request(pitch_deg: float, yaw_deg: float) -> mobility_pb2.PointGimbalRequest:
+    """Return the request of a camera direction."""
+    return mobility_pb2.PointGimbalRequest(
+        pitch_deg=_number("pitch_deg", pitch_deg), yaw_deg=_number("yaw_deg", yaw_deg)
+    )
+
+
+def _number(name: str, value: Any) -> float:
+    """Return an argument as a float. Protobuf would send zero for some values that are not numbers.
+
+    Raises:
+        InvalidRequest: The value is not a number.
+    """
+    if not isinstance(value, str | bytes | bool | None):
+        try:
+            return float(value)
+        except (TypeError, ValueError, OverflowError):
+            pass
+    raise InvalidRequest(f"{name} must be a number, not {value!r:.40}; pass a float")

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fractus.control import Control
+from fractus.control import Control, Motion, OnProgress
 from fractus.errors import InvalidRequest, PolicyDenied
-from fractus.motion import Motion, OnProgress
 from fractus.values import AltitudeReference, Position, Progress
 
 EARTH_M = 6_371_008.8

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import operator
 from collections.abc import AsyncGenerator
+from typing import SupportsIndex
 
 import grpc
 import grpc.aio
@@ -12,12 +14,12 @@ from fractus_proto.v1 import camera_pb2, camera_pb2_grpc, types_pb2
 
 from fractus.channel import CALL_TIMEOUT_S, RECONNECT_TIMEOUT_S, ServiceChannel, ServiceClient
 from fractus.environment import Endpoint, endpoint
-from fractus.errors import FractusError, Unavailable, translate
-from fractus.proto_requests import capture_request
+from fractus.errors import FractusError, InvalidRequest, Unavailable, translate
 from fractus.values import Decision, ImageInfo, Picture, Result
 
 log = logging.getLogger(__name__)
 
+MAX_PIXELS = 2**31 - 1
 RETRIEVE_TIMEOUT_S = 60.0
 CAPTURE_TIMEOUT_S = 120.0
 """Face detection in pictures of several megapixels is slow."""
@@ -151,3 +153,13 @@ def camera(target: Endpoint | None = None, *, reconnect_timeout_s: float = RECON
         NotConfigured: The process is not in a pod of a Fractus application, and no target is given.
     """
     return Camera(target or endpoint("camera"), reconnect_timeout_s=reconnect_timeout_s)
+
+
+def capture_request(width: int, height: int) -> camera_pb2.CaptureImageRequest:
+    """Return the request of a picture with a size in pixels."""
+    for name, value in (("width", width), ("height", height)):
+        if not isinstance(value, SupportsIndex) or not 0 <= operator.index(value) <= MAX_PIXELS:
+            raise InvalidRequest(
+                f"CaptureImage: {name} must be a whole number of pixels, not {value!r:.40}; 0 selects the camera's default"
+            )
+    return camera_pb2.CaptureImageRequest(width=width, height=height)

@@ -15,7 +15,6 @@ from typing import Any, Concatenate, Generic, ParamSpec, Protocol, Self, TypeVar
 
 from fractus import control as _control
 from fractus import drone as _drone
-from fractus import dry_run as _dry_runs
 from fractus import mission as _missions
 from fractus import pictures as _pictures
 from fractus import telemetry as _telemetry
@@ -185,21 +184,21 @@ class Control(_Wrapper[_control.Control]):
             raise self.lost
 
 
-class CanI(_Wrapper[_dry_runs.CanI]):
+class CanI(_Wrapper[_drone.CanI]):
     """Dry runs of calls; see `fractus.CanI`."""
 
-    arm = _waiting(_dry_runs.CanI.arm)
-    disarm = _waiting(_dry_runs.CanI.disarm)
-    takeoff = _waiting(_dry_runs.CanI.takeoff)
-    land = _waiting(_dry_runs.CanI.land)
-    return_to_launch = _waiting(_dry_runs.CanI.return_to_launch)
-    hover = _waiting(_dry_runs.CanI.hover)
-    goto = _waiting(_dry_runs.CanI.goto)
-    set_speed = _waiting(_dry_runs.CanI.set_speed)
-    set_velocity = _waiting(_dry_runs.CanI.set_velocity)
-    point_gimbal = _waiting(_dry_runs.CanI.point_gimbal)
-    position = _waiting(_dry_runs.CanI.position)
-    speed = _waiting(_dry_runs.CanI.speed)
+    arm = _waiting(_drone.CanI.arm)
+    disarm = _waiting(_drone.CanI.disarm)
+    takeoff = _waiting(_drone.CanI.takeoff)
+    land = _waiting(_drone.CanI.land)
+    return_to_launch = _waiting(_drone.CanI.return_to_launch)
+    hover = _waiting(_drone.CanI.hover)
+    goto = _waiting(_drone.CanI.goto)
+    set_speed = _waiting(_drone.CanI.set_speed)
+    set_velocity = _waiting(_drone.CanI.set_velocity)
+    point_gimbal = _waiting(_drone.CanI.point_gimbal)
+    position = _waiting(_drone.CanI.position)
+    speed = _waiting(_drone.CanI.speed)
 
 
 class Watch(_Wrapper[_telemetry.Watch]):

@@ -36,15 +36,6 @@ class Position:
             AltitudeReference(message.altitude_reference),
         )
 
-    def to_proto(self) -> types_pb2.Position:
-        """Return the protobuf message."""
-        return types_pb2.Position(
-            latitude_deg=self.lat,
-            longitude_deg=self.lon,
-            altitude_m=self.alt,
-            altitude_reference=self.reference.value,
-        )
-
     def __str__(self) -> str:
         return f"{self.lat:.6f}, {self.lon:.6f}, {self.alt:.1f} m"
 
@@ -61,10 +52,6 @@ class Velocity:
     def from_proto(cls, message: types_pb2.Velocity) -> Velocity:
         """Create the value from its protobuf message."""
         return cls(message.north_mps, message.east_mps, message.down_mps)
-
-    def to_proto(self) -> types_pb2.Velocity:
-        """Return the protobuf message."""
-        return types_pb2.Velocity(north_mps=self.north, east_mps=self.east, down_mps=self.down)
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 from fractus import InvalidRequest, Position, Velocity
-from fractus.proto_requests import capture_request, goto_request, speed_request, takeoff_request, velocity_request
+from fractus.drone import goto_request, speed_request, takeoff_request, velocity_request
+from fractus.pictures import capture_request
 
 NUMBERS: dict[str, Callable[[Any], object]] = {
     "lat": lambda bad: goto_request(Position(bad, 1.0, 1.0), None, None),
